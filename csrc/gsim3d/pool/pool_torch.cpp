@@ -1,0 +1,101 @@
+#include "gsim3d/pool/pool.h"
+#include "gsim3d/torch/torch_utils.h"
+
+namespace gsim3d::binding {
+namespace {
+
+Segments segments_of(const char* op, const Tensor& rows, const Tensor& cu_rows, int64_t n_rows) {
+  check_dtype(op, "rows", rows, ScalarType::Long);
+  check_dtype(op, "cu_rows", cu_rows, ScalarType::Long);
+  check_shape(op, "rows", rows, {-1}, "[R]");
+  check(cu_rows.dim() == 1 && cu_rows.size(0) >= 1, op, ": cu_rows must be [M + 1]; got ", shape_of(cu_rows));
+  Segments segments{data<int64_t>(rows), data<int64_t>(cu_rows), cu_rows.size(0) - 1, rows.size(0), n_rows};
+  cpu::check_segments(op, segments);
+  return segments;
+}
+
+std::tuple<Tensor, Tensor> pool_max(const Tensor& x_, const Tensor& rows_, const Tensor& cu_rows_) {
+  const char* op = "pool_max";
+  check_shape(op, "x", x_, {-1, -1}, "[N, C]");
+  const Tensor x = rows_of(x_), rows = rows_of(rows_), cu_rows = rows_of(cu_rows_);
+  const Segments segments = segments_of(op, rows, cu_rows, x.size(0));
+  Tensor out = empty(x, {segments.n_segments, x.size(1)});
+  Tensor argmax = empty(x, {segments.n_segments, x.size(1)}, ScalarType::Long);
+  dispatch_float(op, "x", x, [&]<typename T>() {
+    cpu::pool_max(data<T>(x), segments, x.size(1), mutable_data<T>(out), mutable_data<int64_t>(argmax), torch_parallel());
+  });
+  return {out, argmax};
+}
+
+Tensor pool_max_backward(const Tensor& grad_, const Tensor& argmax_, int64_t n_rows) {
+  const char* op = "pool_max_backward";
+  const Tensor grad = rows_of(grad_), argmax = rows_of(argmax_);
+  check_shape(op, "argmax", argmax, {grad.size(0), grad.size(1)}, "[M, C]");
+  Tensor grad_x = empty(grad, {n_rows, grad.size(1)});
+  dispatch_float(op, "grad", grad, [&]<typename T>() {
+    cpu::pool_max_vjp(data<T>(grad), data<int64_t>(argmax), grad.size(0), n_rows, grad.size(1), mutable_data<T>(grad_x),
+                      torch_parallel());
+  });
+  return grad_x;
+}
+
+Tensor pool_mean(const Tensor& x_, const Tensor& rows_, const Tensor& cu_rows_) {
+  const char* op = "pool_mean";
+  check_shape(op, "x", x_, {-1, -1}, "[N, C]");
+  const Tensor x = rows_of(x_), rows = rows_of(rows_), cu_rows = rows_of(cu_rows_);
+  const Segments segments = segments_of(op, rows, cu_rows, x.size(0));
+  Tensor out = empty(x, {segments.n_segments, x.size(1)});
+  dispatch_float(op, "x", x, [&]<typename T>() {
+    cpu::pool_mean(data<T>(x), segments, x.size(1), mutable_data<T>(out), torch_parallel());
+  });
+  return out;
+}
+
+Tensor pool_mean_backward(const Tensor& grad_, const Tensor& rows_, const Tensor& cu_rows_, int64_t n_rows) {
+  const char* op = "pool_mean_backward";
+  const Tensor grad = rows_of(grad_), rows = rows_of(rows_), cu_rows = rows_of(cu_rows_);
+  const Segments segments = segments_of(op, rows, cu_rows, n_rows);
+  check_shape(op, "grad", grad, {segments.n_segments, -1}, "[M, C]");
+  Tensor grad_x = empty(grad, {n_rows, grad.size(1)});
+  dispatch_float(op, "grad", grad, [&]<typename T>() {
+    cpu::pool_mean_vjp(data<T>(grad), segments, grad.size(1), mutable_data<T>(grad_x), torch_parallel());
+  });
+  return grad_x;
+}
+
+Tensor unpool(const Tensor& x_, const Tensor& rows_, const Tensor& cu_rows_, int64_t n_rows) {
+  const char* op = "unpool";
+  const Tensor x = rows_of(x_), rows = rows_of(rows_), cu_rows = rows_of(cu_rows_);
+  const Segments segments = segments_of(op, rows, cu_rows, n_rows);
+  check_shape(op, "x", x, {segments.n_segments, -1}, "[M, C]");
+  Tensor out = empty(x, {n_rows, x.size(1)});
+  dispatch_float(op, "x", x, [&]<typename T>() {
+    cpu::unpool(data<T>(x), segments, x.size(1), mutable_data<T>(out), torch_parallel());
+  });
+  return out;
+}
+
+Tensor unpool_backward(const Tensor& grad_, const Tensor& rows_, const Tensor& cu_rows_) {
+  const char* op = "unpool_backward";
+  check_shape(op, "grad", grad_, {-1, -1}, "[N, C]");
+  const Tensor grad = rows_of(grad_), rows = rows_of(rows_), cu_rows = rows_of(cu_rows_);
+  const Segments segments = segments_of(op, rows, cu_rows, grad.size(0));
+  Tensor grad_x = empty(grad, {segments.n_segments, grad.size(1)});
+  dispatch_float(op, "grad", grad, [&]<typename T>() {
+    cpu::unpool_vjp(data<T>(grad), segments, grad.size(1), mutable_data<T>(grad_x), torch_parallel());
+  });
+  return grad_x;
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(gsim3d, CPU, m) {
+  m.impl("pool_max", TORCH_BOX(&pool_max));
+  m.impl("pool_max_backward", TORCH_BOX(&pool_max_backward));
+  m.impl("pool_mean", TORCH_BOX(&pool_mean));
+  m.impl("pool_mean_backward", TORCH_BOX(&pool_mean_backward));
+  m.impl("unpool", TORCH_BOX(&unpool));
+  m.impl("unpool_backward", TORCH_BOX(&unpool_backward));
+}
+
+}  // namespace gsim3d::binding

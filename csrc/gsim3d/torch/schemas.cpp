@@ -1,0 +1,57 @@
+// Every op of gsim3d on one page. Kernels are registered in <op>/<op>_torch.cpp; fakes, autograd and autocast rules in
+// gsim3d/ops/<op>.py. Sizes: B scenes, Q clouds, I images, N rows, C channels, H W pixels, D depths, P patches, K taps.
+#include <Python.h>
+#include <torch/csrc/stable/library.h>
+
+STABLE_TORCH_LIBRARY(gsim3d, m) {
+  // curve: space-filling-curve codes, their order, and all geometry of a network call.
+  m.def("curve_encode(Tensor grid, Tensor cloud, int curve, int depth, int shift) -> Tensor");
+  m.def("curve_sort(Tensor codes) -> (Tensor order, Tensor inverse)");
+  m.def(
+      "build_pyramid(Tensor positions, Tensor cu_rows, Tensor cloud_scene, Tensor cloud_slot, Tensor origin, float grid_size, "
+      "int slot_bits, int[] strides, int[] merge_windows, int[] patch_sizes, int[] curves, int[] kernel_sizes, "
+      "bool release) -> Tensor[]");
+
+  // sparse_conv: submanifold convolution over voxels; weight [C_out, K, K, K, C_in].
+  m.def(
+      "sparse_conv(Tensor x, Tensor weight, Tensor? bias, Tensor row_voxel, Tensor voxel_rows, Tensor cu_voxel_rows, "
+      "Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first) -> Tensor");
+  m.def(
+      "sparse_conv_grad_input(Tensor grad, Tensor weight, Tensor row_voxel, Tensor voxel_rows, Tensor cu_voxel_rows, "
+      "Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first) -> Tensor");
+  m.def(
+      "sparse_conv_grad_weight(Tensor grad, Tensor x, int kernel_size, Tensor row_voxel, Tensor voxel_rows, "
+      "Tensor cu_voxel_rows, Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first) -> (Tensor weight, Tensor bias)");
+
+  // patch_attn: attention inside patches of a serialized order, separate query and key tables; q, k, v [N, H, D].
+  m.def(
+      "patch_attention(Tensor q, Tensor k, Tensor v, Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) "
+      "-> (Tensor out, Tensor lse)");
+  m.def(
+      "patch_attention_backward(Tensor grad, Tensor q, Tensor k, Tensor v, Tensor out, Tensor lse, Tensor q_rows, "
+      "Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) -> (Tensor q, Tensor k, Tensor v)");
+
+  // pool: segment max and mean over clusters, and unpooling.
+  m.def("pool_max(Tensor x, Tensor rows, Tensor cu_rows) -> (Tensor out, Tensor argmax)");
+  m.def("pool_max_backward(Tensor grad, Tensor argmax, SymInt n_rows) -> Tensor");
+  m.def("pool_mean(Tensor x, Tensor rows, Tensor cu_rows) -> Tensor");
+  m.def("pool_mean_backward(Tensor grad, Tensor rows, Tensor cu_rows, SymInt n_rows) -> Tensor");
+  m.def("unpool(Tensor x, Tensor rows, Tensor cu_rows, SymInt n_rows) -> Tensor");
+  m.def("unpool_backward(Tensor grad, Tensor rows, Tensor cu_rows) -> Tensor");
+
+  // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
+  m.def(
+      "plane_sweep(Tensor features, Tensor homographies, Tensor translations, Tensor inverse_depths, Tensor src_images, "
+      "Tensor cu_src) -> Tensor");
+  m.def(
+      "plane_sweep_backward(Tensor grad, Tensor features, Tensor homographies, Tensor translations, Tensor inverse_depths, "
+      "Tensor src_images, Tensor cu_src) -> Tensor");
+
+  // raster: 3D Gaussian projection and blending; the tensors after depth are state kept for the backward pass.
+}
+
+// The library is loaded by importing it; its contents are the registered ops.
+PyMODINIT_FUNC PyInit__ops(void) {
+  static PyModuleDef module = {PyModuleDef_HEAD_INIT, "_ops", nullptr, -1, nullptr, nullptr, nullptr, nullptr, nullptr};
+  return PyModule_Create(&module);
+}

@@ -1,0 +1,123 @@
+// What every *_torch.cpp needs: checks with one style of message, dtype dispatch, torch's thread pool and scratch memory.
+// Written against torch's stable ABI (TORCH_TARGET_VERSION 2.11), so one binary serves torch 2.11 and later.
+#pragma once
+
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/ops.h>
+#include <torch/csrc/stable/tensor.h>
+#include <torch/headeronly/core/ScalarType.h>
+
+#include <cstdint>
+#include <initializer_list>
+#include <string>
+#include <vector>
+
+#include "gsim3d/core/check.h"
+#include "gsim3d/core/parallel.h"
+#include "gsim3d/core/workspace.h"
+
+namespace gsim3d::binding {
+
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+
+// Runs chunks on torch's intra-op pool.
+inline Parallel torch_parallel() {
+  return {[](void*, int64_t n_chunks, Parallel::Body body, void* state) {
+            torch::stable::parallel_for(0, n_chunks, 1, [&](int64_t begin, int64_t end) {
+              for (int64_t chunk = begin; chunk < end; ++chunk) body(state, chunk);
+            });
+          },
+          nullptr};
+}
+
+inline std::string shape_of(const Tensor& tensor) {
+  std::string text = "[";
+  for (int64_t i = 0; i < tensor.dim(); ++i) text += (i ? ", " : "") + std::to_string(tensor.size(i));
+  return text + "]";
+}
+
+// check_shape("pool_max", "x", x, {n, -1}, "[N, C]"): -1 accepts any size.
+inline void check_shape(const char* op, const char* name, const Tensor& tensor, std::initializer_list<int64_t> sizes,
+                        const char* wanted) {
+  bool ok = tensor.dim() == static_cast<int64_t>(sizes.size());
+  int64_t i = 0;
+  for (int64_t size : sizes) {
+    if (!ok) break;
+    ok = size < 0 || tensor.size(i) == size;
+    ++i;
+  }
+  if (ok) return;
+  std::string expected = "[";
+  i = 0;
+  for (int64_t size : sizes) expected += (i++ ? ", " : "") + (size < 0 ? std::string("*") : std::to_string(size));
+  detail::fail(op, ": ", name, " must be ", wanted, " = ", expected, "]; got ", shape_of(tensor));
+}
+
+inline const char* dtype_name(ScalarType type) {
+  switch (type) {
+    case ScalarType::Float: return "float32";
+    case ScalarType::Double: return "float64";
+    case ScalarType::Long: return "int64";
+    case ScalarType::Int: return "int32";
+    case ScalarType::Byte: return "uint8";
+    case ScalarType::Bool: return "bool";
+    case ScalarType::Half: return "float16";
+    case ScalarType::BFloat16: return "bfloat16";
+    default: return "another dtype";
+  }
+}
+
+inline void check_dtype(const char* op, const char* name, const Tensor& tensor, ScalarType wanted) {
+  check(tensor.scalar_type() == wanted, op, ": ", name, " must be ", dtype_name(wanted), "; got ",
+        dtype_name(tensor.scalar_type()));
+}
+
+// Contiguous, so that the core can read it by pointer.
+inline Tensor rows_of(const Tensor& tensor) { return torch::stable::contiguous(tensor); }
+
+// Calls f.template operator()<T>() with T = float or double, by the dtype of `tensor`.
+template <typename F>
+decltype(auto) dispatch_float(const char* op, const char* name, const Tensor& tensor, const F& f) {
+  const auto type = tensor.scalar_type();
+  check(type == ScalarType::Float || type == ScalarType::Double, op, ": ", name,
+        " must be float32 or float64; got ", dtype_name(type));
+  return type == ScalarType::Float ? f.template operator()<float>() : f.template operator()<double>();
+}
+
+template <typename T>
+const T* data(const Tensor& tensor) {
+  return static_cast<const T*>(tensor.data_ptr());
+}
+template <typename T>
+T* mutable_data(Tensor& tensor) {
+  return static_cast<T*>(tensor.data_ptr());
+}
+
+inline Tensor empty(const Tensor& like, std::initializer_list<int64_t> sizes) {
+  const std::vector<int64_t> shape(sizes);
+  return torch::stable::new_empty(like, shape);
+}
+inline Tensor empty(const Tensor& like, std::initializer_list<int64_t> sizes, ScalarType type) {
+  const std::vector<int64_t> shape(sizes);
+  return torch::stable::new_empty(like, shape, type);
+}
+
+// Scratch in tensors on the device of `like`; freed with the object.
+class TensorWorkspace {
+ public:
+  explicit TensorWorkspace(const Tensor& like) : like_(like) {}
+  operator Workspace() { return {&TensorWorkspace::allocate, this}; }
+
+ private:
+  static void* allocate(void* raw, size_t bytes) {
+    auto* self = static_cast<TensorWorkspace*>(raw);
+    self->blocks_.push_back(empty(self->like_, {static_cast<int64_t>(bytes)}, ScalarType::Byte));
+    return self->blocks_.back().data_ptr();
+  }
+
+  Tensor like_;
+  std::vector<Tensor> blocks_;
+};
+
+}  // namespace gsim3d::binding

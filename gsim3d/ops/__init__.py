@@ -1,0 +1,10 @@
+"""The kernels, usable alone: stateless functions over packed rows.
+
+Every op runs on CPU (and CUDA where compiled), is deterministic, differentiable, and works under
+``torch.compile(fullgraph=True)``. The same ops are ``torch.ops.gsim3d.*``.
+"""
+
+from gsim3d.ops import _load  # noqa: F401  (registers torch.ops.gsim3d)
+from gsim3d.ops.pool import pool_max, pool_mean, unpool
+
+__all__ = ["pool_max", "pool_mean", "unpool"]

@@ -1,0 +1,12 @@
+"""Loads the compiled op library, once; says what to type when it is missing."""
+
+import torch  # noqa: F401  (its libraries must be in the process before ours)
+
+try:
+    from gsim3d import _ops  # noqa: F401
+except ImportError as error:
+    raise ImportError(
+        "gsim3d's compiled ops could not be loaded. Build them from the repository with\n"
+        "    pip install --no-build-isolation -e .\n"
+        f"(torch {torch.__version__}; the loader said: {error})"
+    ) from error

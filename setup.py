@@ -1,0 +1,71 @@
+"""Builds gsim3d._ops (torch ops, stable ABI) and gsim3d._core (the torch-free core for numpy, pybind11).
+
+GSIM3D_CUDA=0 leaves CUDA out, GSIM3D_CUDA=1 insists on it; default: CUDA when this torch has CUDA and nvcc is found.
+"""
+
+import os
+import platform
+from pathlib import Path
+
+from pybind11.setup_helpers import Pybind11Extension
+from setuptools import setup
+from torch.utils import cpp_extension
+
+ROOT = Path(__file__).parent
+OPS = ["curve", "sparse_conv", "patch_attn", "pool", "plane_sweep", "raster"]  # one op, one folder
+CPU_FLAGS = ["-O3", "-std=c++20", "-fopenmp-simd", "-ffp-contract=off", "-fvisibility=hidden", "-Wall"]
+if platform.machine() in ("x86_64", "AMD64"):
+    CPU_FLAGS.append("-march=x86-64-v3")  # a fixed baseline: the same bits on every machine, no -march=native
+
+
+def sources(*suffixes: str) -> list[str]:
+    found = []
+    for op in OPS:
+        folder = ROOT / "csrc" / "gsim3d" / op
+        found += [path for suffix in suffixes for path in sorted(folder.glob(f"*{suffix}"))]
+    return [str(path.relative_to(ROOT)) for path in found]
+
+
+def wants_cuda() -> bool:
+    choice = os.environ.get("GSIM3D_CUDA", "")
+    import torch
+
+    possible = torch.version.cuda is not None and cpp_extension.CUDA_HOME is not None
+    if choice == "1" and not possible:
+        raise SystemExit("GSIM3D_CUDA=1, but this torch has no CUDA or nvcc was not found (set CUDA_HOME)")
+    return possible and choice != "0" and bool(sources("_cuda.cu"))
+
+
+def ops_extension():
+    cuda = wants_cuda()
+    define = ["-DTORCH_TARGET_VERSION=0x020b000000000000"]
+    make = cpp_extension.CUDAExtension if cuda else cpp_extension.CppExtension
+    flags = {"cxx": CPU_FLAGS + define + (["-DUSE_CUDA"] if cuda else [])}
+    if cuda:
+        flags["nvcc"] = ["-O3", "-std=c++20", "--extended-lambda", "-lineinfo", "-DUSE_CUDA", *define]
+    return make(
+        "gsim3d._ops",
+        ["csrc/gsim3d/torch/schemas.cpp", "csrc/gsim3d/core/parallel.cpp"]
+        + sources("_cpu.cpp", "_torch.cpp")
+        + (sources("_cuda.cu") if cuda else []),
+        include_dirs=[str(ROOT / "csrc")],
+        extra_compile_args=flags,
+        py_limited_api=True,
+    )
+
+
+def core_extension():
+    return Pybind11Extension(
+        "gsim3d._core",
+        ["csrc/gsim3d/numpy/core.cpp", "csrc/gsim3d/core/parallel.cpp", *sources("_cpu.cpp")],
+        include_dirs=[str(ROOT / "csrc")],
+        extra_compile_args=CPU_FLAGS,
+        cxx_std=20,
+    )
+
+
+setup(
+    ext_modules=[ops_extension()] + ([core_extension()] if (ROOT / "csrc/gsim3d/numpy/core.cpp").exists() else []),
+    cmdclass={"build_ext": cpp_extension.BuildExtension},
+    options={"bdist_wheel": {"py_limited_api": False}},
+)
