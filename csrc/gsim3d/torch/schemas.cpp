@@ -26,9 +26,9 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   // patch_attn: attention inside patches of a serialized order, separate query and key tables; q, k, v [N, H, D].
   m.def(
       "patch_attention(Tensor q, Tensor k, Tensor v, Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) "
-      "-> (Tensor out, Tensor lse)");
+      "-> (Tensor out, Tensor stats)");
   m.def(
-      "patch_attention_backward(Tensor grad, Tensor q, Tensor k, Tensor v, Tensor out, Tensor lse, Tensor q_rows, "
+      "patch_attention_backward(Tensor grad, Tensor q, Tensor k, Tensor v, Tensor out, Tensor stats, Tensor q_rows, "
       "Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) -> (Tensor q, Tensor k, Tensor v)");
 
   // pool: segment max and mean over clusters, and unpooling.
