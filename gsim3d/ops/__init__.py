@@ -5,6 +5,34 @@ Every op runs on CPU (and CUDA where compiled), is deterministic, differentiable
 """
 
 from gsim3d.ops import _load  # noqa: F401  (registers torch.ops.gsim3d)
+from gsim3d.ops.curve import (
+    CURVES,
+    KernelMap,
+    PatchTable,
+    Pyramid,
+    PyramidSpec,
+    Segments,
+    Stage,
+    Voxels,
+    build_pyramid,
+    curve_encode,
+    curve_sort,
+)
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
 
-__all__ = ["pool_max", "pool_mean", "unpool"]
+__all__ = [
+    "CURVES",
+    "KernelMap",
+    "PatchTable",
+    "Pyramid",
+    "PyramidSpec",
+    "Segments",
+    "Stage",
+    "Voxels",
+    "build_pyramid",
+    "curve_encode",
+    "curve_sort",
+    "pool_max",
+    "pool_mean",
+    "unpool",
+]
