@@ -19,6 +19,7 @@ from gsim3d.ops.curve import (
     curve_sort,
 )
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
+from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
 
 __all__ = [
     "CURVES",
@@ -32,7 +33,9 @@ __all__ = [
     "build_pyramid",
     "curve_encode",
     "curve_sort",
+    "plane_sweep",
     "pool_max",
     "pool_mean",
+    "sweep_geometry",
     "unpool",
 ]
