@@ -4,7 +4,7 @@ Every op runs on CPU (and CUDA where compiled), is deterministic, differentiable
 ``torch.compile(fullgraph=True)``. The same ops are ``torch.ops.gsim3d.*``.
 """
 
-from gsim3d.ops import _load  # noqa: F401  (registers torch.ops.gsim3d)
+from gsim3d.ops._load import cuda_compiled
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
 
-__all__ = ["pool_max", "pool_mean", "unpool"]
+__all__ = ["cuda_compiled", "pool_max", "pool_mean", "unpool"]
