@@ -4,7 +4,7 @@ Every op runs on CPU (and CUDA where compiled), is deterministic, differentiable
 ``torch.compile(fullgraph=True)``. The same ops are ``torch.ops.gsim3d.*``.
 """
 
-from gsim3d.ops import _load  # noqa: F401  (registers torch.ops.gsim3d)
+from gsim3d.ops._load import cuda_compiled
 from gsim3d.ops.curve import (
     CURVES,
     KernelMap,
@@ -31,6 +31,7 @@ __all__ = [
     "Stage",
     "Voxels",
     "build_pyramid",
+    "cuda_compiled",
     "curve_encode",
     "curve_sort",
     "plane_sweep",
