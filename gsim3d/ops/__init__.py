@@ -18,6 +18,7 @@ from gsim3d.ops.curve import (
     curve_encode,
     curve_sort,
 )
+from gsim3d.ops.patch_attn import patch_attention
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
 
@@ -34,6 +35,7 @@ __all__ = [
     "cuda_compiled",
     "curve_encode",
     "curve_sort",
+    "patch_attention",
     "plane_sweep",
     "pool_max",
     "pool_mean",

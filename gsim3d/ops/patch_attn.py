@@ -1,16 +1,10 @@
 """Attention inside patches of a serialized order, without storing the score matrix."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
-
-if TYPE_CHECKING:
-    from gsim3d.ops.curve import PatchTable
+from gsim3d.ops.curve import PatchTable
 
 
 def patch_attention(q: Tensor, k: Tensor, v: Tensor, table: PatchTable, *, scale: float | None = None) -> Tensor:
