@@ -1,2 +1,32 @@
-"""gsim3d learns 3D simulators from multi-view video."""
+"""gsim3d learns 3D simulators from multi-view video.
+
+``gsim3d.ops`` holds the kernels, usable alone; :class:`gsim3d.Simulator` is the learned simulator. Names load on first
+use, so ``gsim3d._core`` (the kernels on numpy arrays) works without torch.
+"""
+
+import importlib
+
 __version__ = "0.1.0"
+
+_HOME = {
+    "Cameras": "gsim3d.types",
+    "EffectsSpec": "gsim3d.effects",
+    "Frames": "gsim3d.types",
+    "Gaussians": "gsim3d.types",
+    "HardCaseError": "gsim3d.errors",
+    "InputError": "gsim3d.errors",
+    "Particles": "gsim3d.types",
+    "Simulator": "gsim3d.simulator",
+}
+
+__all__ = ["__version__", *_HOME]
+
+
+def __getattr__(name):
+    if name in _HOME:
+        return getattr(importlib.import_module(_HOME[name]), name)
+    raise AttributeError(f"module 'gsim3d' has no attribute {name!r}")
+
+
+def __dir__():
+    return sorted(__all__)

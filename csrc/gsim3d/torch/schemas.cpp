@@ -10,7 +10,7 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   m.def(
       "build_pyramid(Tensor positions, Tensor cu_rows, Tensor cloud_scene, Tensor cloud_slot, Tensor origin, float grid_size, "
       "int slot_bits, int[] strides, int[] merge_windows, int[] patch_sizes, int[] curves, int[] kernel_sizes, "
-      "bool release) -> Tensor[]");
+      "int[] cu_kernels, bool release) -> Tensor[]");
 
   // sparse_conv: submanifold convolution over voxels; weight [C_out, K, K, K, C_in].
   m.def(
@@ -26,9 +26,9 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   // patch_attn: attention inside patches of a serialized order, separate query and key tables; q, k, v [N, H, D].
   m.def(
       "patch_attention(Tensor q, Tensor k, Tensor v, Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) "
-      "-> (Tensor out, Tensor lse)");
+      "-> (Tensor out, Tensor stats)");
   m.def(
-      "patch_attention_backward(Tensor grad, Tensor q, Tensor k, Tensor v, Tensor out, Tensor lse, Tensor q_rows, "
+      "patch_attention_backward(Tensor grad, Tensor q, Tensor k, Tensor v, Tensor out, Tensor stats, Tensor q_rows, "
       "Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) -> (Tensor q, Tensor k, Tensor v)");
 
   // pool: segment max and mean over clusters, and unpooling.

@@ -1,0 +1,105 @@
+"""Plane-sweep cost volume: how well each pixel matches other views at each candidate depth."""
+
+import torch
+from torch import Tensor
+
+from gsim3d.ops import _load  # noqa: F401
+
+
+def sweep_geometry(
+    Ks: Tensor, viewmats: Tensor, src_images: Tensor, cu_src: Tensor, *, Ks_target: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """How pixels of each image move into its source images, for :func:`plane_sweep`.
+
+    Pair p of image i and source j maps array index (u, v) at depth d to ``q = A [u, v, 1] d + b`` with
+    ``A = S^-1 K_j R K_i^-1 S``, ``b = S^-1 K_j t``, where ``x_j = R x_i + t`` between the cameras and S moves by half a
+    pixel, since index 0 is the pixel centre 0.5. Computed in float64.
+
+    Args:
+        Ks: [I, 3, 3] intrinsics in pixels of the feature maps, pixel centres at +0.5.
+        viewmats: [I, 4, 4] world-to-camera, OpenCV axes, metres.
+        src_images: int64 [P], sources of image 0, then of image 1, ...
+        cu_src: int64 [I + 1], offsets into ``src_images``.
+        Ks_target: [P, 3, 3], intrinsics that project into the source of each pair; default: those of the source.
+    Returns:
+        homographies [P, 3, 3] and translations [P, 3] (metres), dtype of ``Ks``.
+    Gradients: none.
+
+    Example:
+        >>> A, b = sweep_geometry(torch.eye(3).expand(2, 3, 3), torch.eye(4).expand(2, 4, 4),
+        ...                       torch.tensor([1, 0]), torch.tensor([0, 1, 2]))
+        >>> A.shape, b.shape
+        (torch.Size([2, 3, 3]), torch.Size([2, 3]))
+    """
+    with torch.no_grad():
+        own = torch.repeat_interleave(
+            torch.arange(Ks.shape[0], device=Ks.device), cu_src[1:] - cu_src[:-1], output_size=src_images.shape[0]
+        )
+        intrinsics, poses = Ks.double(), viewmats.double()
+        target = intrinsics[src_images] if Ks_target is None else Ks_target.double()
+        half_pixel = torch.eye(3, dtype=torch.float64, device=Ks.device)
+        half_pixel[:2, 2] = 0.5
+        relative = poses[src_images] @ torch.linalg.inv(poses)[own]
+        to_index = torch.linalg.inv(half_pixel) @ target
+        homographies = to_index @ relative[:, :3, :3] @ (torch.linalg.inv(intrinsics) @ half_pixel)[own]
+        translations = (to_index @ relative[:, :3, 3:])[..., 0]
+        return homographies.to(Ks.dtype), translations.to(Ks.dtype)
+
+
+def plane_sweep(
+    features: Tensor,
+    homographies: Tensor,
+    translations: Tensor,
+    inverse_depths: Tensor,
+    src_images: Tensor,
+    cu_src: Tensor,
+) -> Tensor:
+    """Mean correlation of each pixel's feature with its sources' features at each candidate depth.
+
+    ``cost[i, k, v, u] = mean over sources j of <f_i(u, v), f_j(x, y)> / sqrt(C)`` with
+    ``q = A [u, v, 1] / inverse_depths[i, k] + b`` and ``(x, y) = (q_x, q_y) / max(q_z, 1e-3)`` in array-index coordinates;
+    f_j is interpolated bilinearly and is zero outside. No warped volume is formed.
+
+    Args:
+        features: [I, C, h, w], float32 or float64.
+        homographies, translations: [P, 3, 3] and [P, 3] of each pair, see :func:`sweep_geometry`; dtype of ``features``.
+        inverse_depths: [I, D], 1 / metres, positive.
+        src_images: int64 [P], sources of image 0, then of image 1, ...
+        cu_src: int64 [I + 1], offsets into ``src_images``; an image without sources costs 0.
+    Returns:
+        [I, D, h, w], dtype of ``features``.
+    Gradients: ``features``, once.
+    Determinism: every output and gradient element has one owner that sums in a fixed order.
+    Raises:
+        ValueError: an argument has a wrong shape, dtype or range, or geometry is not finite; the message names it.
+    Source: plane sweep of Collins (1996) as in MVSplat (Chen et al. 2024), with dot products interpolated.
+
+    Example:
+        >>> A, b = sweep_geometry(torch.eye(3).expand(2, 3, 3), torch.eye(4).expand(2, 4, 4),
+        ...                       torch.tensor([1, 0]), torch.tensor([0, 1, 2]))
+        >>> plane_sweep(torch.ones(2, 4, 1, 1), A, b, torch.ones(2, 1), torch.tensor([1, 0]), torch.tensor([0, 1, 2]))[0]
+        tensor([[[2.]]])
+    """
+    return torch.ops.gsim3d.plane_sweep(features, homographies, translations, inverse_depths, src_images, cu_src)
+
+
+@torch.library.register_fake("gsim3d::plane_sweep")
+def _(features, homographies, translations, inverse_depths, src_images, cu_src):
+    n_images, _, height, width = features.shape
+    return features.new_empty(n_images, inverse_depths.shape[1], height, width)
+
+
+@torch.library.register_fake("gsim3d::plane_sweep_backward")
+def _(grad, features, homographies, translations, inverse_depths, src_images, cu_src):
+    return features.new_empty(features.shape)
+
+
+def _setup(ctx, inputs, output):
+    ctx.save_for_backward(*inputs)
+
+
+def _backward(ctx, grad):
+    return torch.ops.gsim3d.plane_sweep_backward(grad, *ctx.saved_tensors), None, None, None, None, None
+
+
+torch.library.register_autograd("gsim3d::plane_sweep", _backward, setup_context=_setup)

@@ -1,0 +1,41 @@
+"""The torch-free core: its C++ tests, and a stranger's CMake project built against the installed package."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+def run(*command):
+    done = subprocess.run([str(c) for c in command], capture_output=True, text=True)
+    assert done.returncode == 0, f"{' '.join(map(str, command))}\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def build(tmp_path_factory):
+    assert shutil.which("cmake"), "cmake is needed for the C++ tests: pip install cmake"
+    folder = tmp_path_factory.mktemp("cmake")
+    run("cmake", "-S", ROOT, "-B", folder, "-DCMAKE_BUILD_TYPE=Release")
+    run("cmake", "--build", folder, "--parallel", "2")
+    return folder
+
+
+def test_core_tests_pass(build):
+    output = run("ctest", "--test-dir", build, "--output-on-failure")
+    assert "100% tests passed" in output
+    sources = len(list((ROOT / "tests" / "cpp").glob("test_*.cpp")))
+    assert f"out of {sources}" in output
+
+
+def test_foreign_project_builds_against_the_install_tree(build, tmp_path):
+    run("cmake", "--install", build, "--prefix", tmp_path / "prefix")
+    headers = {path.name for path in (tmp_path / "prefix" / "include" / "gsim3d").rglob("*.h")}
+    assert "pool.h" in headers and "torch_utils.h" not in headers
+    consumer = ROOT / "tests" / "cpp" / "consumer"
+    run("cmake", "-S", consumer, "-B", tmp_path / "app", f"-DCMAKE_PREFIX_PATH={tmp_path / 'prefix'}")
+    run("cmake", "--build", tmp_path / "app")
+    assert run(tmp_path / "app" / "app").split() == ["3", "3"]

@@ -1,0 +1,5 @@
+#!/usr/bin/env bash
+# The main job on one machine: makes multi-view video, learns a simulator from it, predicts held-out scenes.
+# Any further arguments go to `gsim3d demo` (see `python -m gsim3d demo --help`).
+source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
+exec python -m gsim3d demo --out runs/demo "$@"
