@@ -18,6 +18,19 @@ class Quirks:
         ray_depth: depth means distance along the ray when particles are placed (the plane sweep means z).
         corner_aligned_upsampling: coarse disparity and features are stretched from corner to corner instead of laid where
             the strided convolutions took them.
+    Dynamics:
+        stale_decoder_conv: the first convolution of each decoder stage reads the skip branch before the features from
+            below are added to it.
+        first_of_voxel: where rows share a cell, a convolution reads the lowest row of a neighbour cell, not the mean.
+        anchor_at_minimum: cells are counted from the smallest position of the call, so clouds of a call change each other.
+        slots_from_first: time slots count from the first step and their number follows the history's length.
+        unbounded_opacity: opacities have no upper limit.
+        frozen_rows_turn: frozen particles keep their place but not their orientation.
+    Renderer:
+        unpaired_sh_rotation: coefficients are in the published basis (the polar axis is y) and turn with matrices of
+            another sign convention, so colours do not turn with the particle.
+        three_sigma_tiles: a Gaussian ends at the tiles that its three-sigma square touches.
+        far_near_plane: Gaussians nearer than a fifth of the camera's near bound are culled.
     """
 
     tiled_shift_mask: bool = False
@@ -25,6 +38,15 @@ class Quirks:
     reference_intrinsics: bool = False
     ray_depth: bool = False
     corner_aligned_upsampling: bool = False
+    stale_decoder_conv: bool = False
+    first_of_voxel: bool = False
+    anchor_at_minimum: bool = False
+    slots_from_first: bool = False
+    unbounded_opacity: bool = False
+    frozen_rows_turn: bool = False
+    unpaired_sh_rotation: bool = False
+    three_sigma_tiles: bool = False
+    far_near_plane: bool = False
 
     @classmethod
     def release(cls) -> Quirks:
