@@ -21,6 +21,7 @@ from gsim3d.ops.curve import (
 from gsim3d.ops.patch_attn import patch_attention
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
+from gsim3d.ops.raster import Rendering, rasterize_gaussians
 
 __all__ = [
     "CURVES",
@@ -28,6 +29,7 @@ __all__ = [
     "PatchTable",
     "Pyramid",
     "PyramidSpec",
+    "Rendering",
     "Segments",
     "Stage",
     "Voxels",
@@ -39,6 +41,7 @@ __all__ = [
     "plane_sweep",
     "pool_max",
     "pool_mean",
+    "rasterize_gaussians",
     "sweep_geometry",
     "unpool",
 ]
