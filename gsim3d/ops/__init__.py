@@ -4,8 +4,8 @@ Every op runs on CPU (and CUDA where compiled), is deterministic, differentiable
 ``torch.compile(fullgraph=True)``. The same ops are ``torch.ops.gsim3d.*``.
 """
 
-from gsim3d.ops import _load  # noqa: F401  (registers torch.ops.gsim3d)
+from gsim3d.ops._load import cuda_compiled
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
 
-__all__ = ["plane_sweep", "pool_max", "pool_mean", "sweep_geometry", "unpool"]
+__all__ = ["cuda_compiled", "plane_sweep", "pool_max", "pool_mean", "sweep_geometry", "unpool"]

@@ -1,6 +1,6 @@
 """Loads the compiled op library, once; says what to type when it is missing."""
 
-import torch  # noqa: F401  (its libraries must be in the process before ours)
+import torch  # its libraries must be in the process before ours
 
 try:
     from gsim3d import _ops  # noqa: F401
@@ -10,3 +10,8 @@ except ImportError as error:
         "    pip install --no-build-isolation -e .\n"
         f"(torch {torch.__version__}; the loader said: {error})"
     ) from error
+
+
+def cuda_compiled() -> bool:
+    """Whether this build holds CUDA kernels."""
+    return torch._C._dispatch_has_kernel_for_dispatch_key("gsim3d::pool_max", "CUDA")

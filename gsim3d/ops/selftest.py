@@ -1,0 +1,199 @@
+"""A quick check of every op against plain torch, for ``gsim3d doctor``: small inputs, forward and backward."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gsim3d import ops
+from gsim3d.types import Cameras
+
+TOLERANCE = 1e-4  # float32, relative to the largest value of the expected tensor
+
+
+def _compare(device: str, function: Callable[..., Tensor], reference: Callable[..., Tensor], *inputs: Tensor) -> float:
+    """Worst error of output and gradients relative to the largest expected value; raises above TOLERANCE."""
+    results = []
+    for f, target in ((function, device), (reference, "cpu")):
+        leaves = [x.detach().to(target).requires_grad_() for x in inputs]
+        out = f(*leaves)
+        weights = torch.linspace(-1, 1, out.numel(), device=target).reshape(out.shape)
+        gradients = torch.autograd.grad((out * weights).sum(), leaves)
+        results.append([tensor.detach().cpu() for tensor in (out, *gradients)])
+    worst = 0.0
+    for name, got, expected in zip(["output", *(f"gradient {i}" for i in range(len(inputs)))], *results):
+        error = float((got - expected).abs().max() / expected.abs().max().clamp_min(1e-12))
+        if not error <= TOLERANCE:
+            raise AssertionError(f"{name} differs from plain torch by {error:.1e} of its largest value")
+        worst = max(worst, error)
+    return worst
+
+
+def _random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def _cloud(device: str) -> ops.Pyramid:
+    """The geometry of two small scenes with two time steps each; some points share a voxel."""
+    positions = torch.rand(120, 3, generator=torch.Generator().manual_seed(0)) * 0.4
+    spec = ops.PyramidSpec(
+        grid_size=0.05, slot_bits=1, strides=(2,), merge_windows=(2,), patch_sizes=(16, 16), kernel_sizes=((5, 3), (3,))
+    )
+    ids = torch.tensor([0, 0, 1, 1]), torch.tensor([0, 1, 0, 1])
+    cu_rows, origin = torch.tensor([0, 20, 60, 61, 120]), torch.zeros(2, 3, dtype=torch.float64)
+    return ops.build_pyramid(*(t.to(device) for t in (positions, cu_rows, *ids, origin)), spec)
+
+
+def _curve(device: str) -> float:
+    grid = torch.randint(0, 1 << 16, (200, 3), generator=torch.Generator().manual_seed(0))
+    cloud = torch.arange(200) // 50
+    expected = cloud << 48
+    for bit in range(16):
+        for axis in range(3):
+            expected |= ((grid[:, axis] >> bit) & 1) << (3 * bit + 2 - axis)
+    codes = ops.curve_encode(grid.to(device), cloud.to(device), "z").cpu()
+    if not torch.equal(codes, expected):
+        raise AssertionError("z codes differ from bit interleaving")
+    order, inverse = ops.curve_sort(codes[None].to(device))
+    if not torch.equal(order[0].cpu(), torch.argsort(expected, stable=True)):
+        raise AssertionError("the order is not that of a stable sort")
+    if not torch.equal(order[0][inverse[0]].cpu(), torch.arange(200)):
+        raise AssertionError("inverse is not the inverse of order")
+    stages = _cloud(device).stages
+    if sum(len(stage.voxels.rows) for stage in stages) != sum(len(stage.grid) for stage in stages):
+        raise AssertionError("the voxels of a stage do not hold each row once")
+    return 0.0
+
+
+def _sparse_conv(device: str) -> float:
+    stage = _cloud(device).stages[0]
+    grid, cloud, voxel = stage.grid.cpu(), stage.cloud.cpu(), stage.voxels.row_voxel.cpu()
+    n = len(grid)
+
+    def reference(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        ones = torch.nn.functional.one_hot(voxel).to(x.dtype)  # [N, voxels]
+        means = (ones.T @ x / ones.sum(0)[:, None])[voxel]
+        first = torch.stack([torch.arange(n)[voxel == v][0] for v in range(ones.shape[1])])
+        out = x @ weight[:, 1, 1, 1].T + bias
+        step = grid[first][None] - grid[:, None] + 1  # [N, voxels, 3]: tap that reads this voxel
+        near = ((step >= 0) & (step < 3)).all(-1) & (cloud[first][None] == cloud[:, None])
+        near &= ~(step == 1).all(-1)
+        for p, v in near.nonzero().tolist():
+            kx, ky, kz = step[p, v].tolist()
+            out = out.index_add(0, torch.tensor([p]), (means[first[v]] @ weight[:, kx, ky, kz].T)[None])
+        return out
+
+    return _compare(
+        device,
+        lambda x, w, b: ops.sparse_conv(x, w, b, stage.voxels, stage.kernel_maps[3]),
+        reference,
+        _random(n, 4),
+        _random(6, 3, 3, 3, 4, seed=1),
+        _random(6, seed=2),
+    )
+
+
+def _patch_attn(device: str) -> float:
+    stage = _cloud(device).stages[1]
+    table = stage.patches[2]
+    q_rows, kv_rows, cu_q, cu_k = (t.cpu() for t in (table.q_rows, table.kv_rows, table.cu_q, table.cu_k))
+    n = len(stage.grid)
+
+    def reference(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        out = torch.zeros_like(q)
+        for p in range(len(cu_q) - 1):
+            queries, keys = q_rows[cu_q[p] : cu_q[p + 1]], kv_rows[cu_k[p] : cu_k[p + 1]]
+            scores = torch.einsum("ihd,jhd->hij", q[queries], k[keys]) * q.shape[-1] ** -0.5
+            out = out.index_copy(0, queries, torch.einsum("hij,jhd->ihd", scores.softmax(-1), v[keys]))
+        return out
+
+    inputs = [_random(n, 2, 8, seed=seed) for seed in range(3)]
+    return _compare(device, lambda q, k, v: ops.patch_attention(q, k, v, table), reference, *inputs)
+
+
+def _pool(device: str) -> float:
+    rows = torch.randperm(40, generator=torch.Generator().manual_seed(1))
+    cu_rows = torch.tensor([0, 7, 8, 30, 40])
+    segments = [rows[a:b] for a, b in zip(cu_rows[:-1], cu_rows[1:])]
+    segment_of_row = torch.repeat_interleave(torch.arange(4), cu_rows.diff())[torch.argsort(rows)]
+    args = rows.to(device), cu_rows.to(device)
+    return _compare(
+        device,
+        lambda x: ops.unpool(ops.pool_max(x, *args) + ops.pool_mean(x, *args), *args, 40),
+        lambda x: torch.stack([x[s].amax(0) + x[s].mean(0) for s in segments])[segment_of_row],
+        _random(40, 5),
+    )
+
+
+def _plane_sweep(device: str) -> float:
+    height, width, depths = 6, 8, torch.tensor([[1.0, 0.8, 0.5], [0.9, 0.7, 0.4]])
+    K = torch.tensor([[8.0, 0, 3.5], [0, 8, 2.5], [0, 0, 1]]).expand(2, 3, 3)
+    viewmats = torch.eye(4).repeat(2, 1, 1)
+    viewmats[1, 0, 3] = 0.2
+    sources = torch.tensor([1, 0]), torch.tensor([0, 1, 2])
+    A, b = ops.sweep_geometry(K, viewmats, *sources)
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixels = torch.stack([u, v, torch.ones_like(u)], -1).float()
+
+    def reference(features: Tensor) -> Tensor:
+        costs = []
+        for image, source in ((0, 1), (1, 0)):
+            q = torch.einsum("ij,hwj->hwi", A[image].float(), pixels) / depths[image, :, None, None, None] + b[image].float()
+            xy = q[..., :2] / q[..., 2:].clamp_min(1e-3)
+            xy = 2 * xy / torch.tensor([width - 1, height - 1]) - 1
+            warped = torch.nn.functional.grid_sample(
+                features[source].expand(len(depths[image]), -1, -1, -1), xy, align_corners=True
+            )
+            costs.append((features[image][None] * warped).sum(1) / features.shape[1] ** 0.5)
+        return torch.stack(costs)
+
+    geometry = [t.to(device) for t in (A, b, depths, *sources)]
+    return _compare(device, lambda f: ops.plane_sweep(f, *geometry), reference, _random(2, 4, height, width))
+
+
+def _raster(device: str) -> float:
+    n, size, focal = 12, 16, 16.0
+    K = torch.tensor([[focal, 0, 7.0], [0, focal, 9.0], [0, 0, 1]])
+    cameras = Cameras(
+        torch.eye(4)[None], K[None], torch.tensor([0.1]), torch.tensor([10.0]), torch.tensor([0]), size, size
+    ).to(device)
+    depth = torch.linspace(2, 3, n)
+    pixel = torch.arange(size) + 0.5
+
+    def reference(means: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
+        image, transmittance = torch.zeros(size, size, 3), torch.ones(size, size)
+        for i in range(n):
+            x, y, z = means[i]
+            J = torch.stack([torch.stack([focal / z, 0 * z, -focal * x / z**2]), torch.stack([0 * z, focal / z, -focal * y / z**2])])
+            conic = torch.linalg.inv(J @ torch.diag(scales[i] ** 2) @ J.T + 0.3 * torch.eye(2))
+            offset = torch.stack(torch.meshgrid(pixel, pixel, indexing="xy"), -1) - torch.stack(
+                [focal * x / z + K[0, 2], focal * y / z + K[1, 2]]
+            )
+            power = -0.5 * torch.einsum("hwi,ij,hwj->hw", offset, conic, offset)
+            alpha = (opacities[i] * power.exp()).clamp_max(0.99)
+            alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
+            image = image + (transmittance * alpha)[..., None] * colors[i]
+            transmittance = transmittance * (1 - alpha)
+        return image[None]
+
+    def function(means: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
+        quats = torch.tensor([[1.0, 0, 0, 0]], device=means.device).expand(n, 4)
+        return ops.rasterize_gaussians(means, quats, scales, opacities, cameras, colors=colors).color
+
+    generator = torch.Generator().manual_seed(4)
+    means = torch.cat([torch.rand(n, 2, generator=generator) - 0.5, depth[:, None]], 1)
+    scales = 0.05 + 0.1 * torch.rand(n, 3, generator=generator)
+    opacities, colors = 0.2 + 0.5 * torch.rand(n, generator=generator), torch.rand(n, 3, generator=generator)
+    return _compare(device, function, reference, means, scales, opacities, colors)
+
+
+CHECKS: dict[str, Callable[[str], float]] = {
+    "curve": _curve,
+    "sparse_conv": _sparse_conv,
+    "patch_attn": _patch_attn,
+    "pool": _pool,
+    "plane_sweep": _plane_sweep,
+    "raster": _raster,
+}

@@ -1,0 +1,36 @@
+"""Fixtures shared by all tests: devices are parameters of a test, never an ``if`` in its body."""
+
+import os
+
+import pytest
+import torch
+
+import gsim3d.ops  # noqa: F401  (registers torch.ops.gsim3d)
+
+
+def cuda_problem() -> str | None:
+    """Why CUDA tests cannot run here; None when they can."""
+    if not torch._C._dispatch_has_kernel_for_dispatch_key("gsim3d::pool_max", "CUDA"):
+        return "CUDA not compiled"
+    return None if torch.cuda.is_available() else "no CUDA GPU"
+
+
+def _cuda() -> torch.device:
+    problem = cuda_problem()
+    if problem and os.environ.get("GSIM3D_REQUIRE_CUDA") == "1":
+        pytest.fail(f"GSIM3D_REQUIRE_CUDA=1, but: {problem}")
+    if problem:
+        pytest.skip(problem)
+    return torch.device("cuda")
+
+
+@pytest.fixture(params=["cpu", "cuda"])
+def device(request) -> torch.device:
+    """Runs the test once for each device."""
+    return _cuda() if request.param == "cuda" else torch.device("cpu")
+
+
+@pytest.fixture
+def devices() -> tuple[torch.device, torch.device]:
+    """(cpu, cuda), for tests that compare both; skipped, or failed with GSIM3D_REQUIRE_CUDA=1, without CUDA."""
+    return torch.device("cpu"), _cuda()

@@ -1,0 +1,98 @@
+"""README and CONTRIBUTING stay true: their commands, files, names and snippets exist and run."""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def commands() -> list[list[str]]:
+    found = []
+    for block in blocks("bash"):
+        for line in block.splitlines():
+            words = shlex.split(line, comments=True)
+            while words and "=" in words[0] and not words[0].startswith("-"):
+                words = words[1:]
+            if words:
+                found.append(words)
+    return found
+
+
+def test_the_two_commands_come_first():
+    assert commands()[:2] == [["bash", "tools/demo.sh"], ["bash", "tools/test.sh"]]
+
+
+@pytest.mark.parametrize("words", commands(), ids=" ".join)
+def test_command_exists(words):
+    if words[0] == "bash":
+        assert (ROOT / words[1]).is_file()
+    elif words[0] == "python" and words[1] != "-m":
+        assert (ROOT / words[1]).is_file()
+    elif words[0] == "gsim3d" or words[:3] == ["python", "-m", "gsim3d"]:
+        arguments = words[1:] if words[0] == "gsim3d" else words[3:]
+        text = subprocess.run(
+            [sys.executable, "-m", "gsim3d", arguments[0], "--help"], cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout
+        for word in arguments[1:]:
+            if word.startswith("--"):
+                assert word.split("=")[0] in text, f"{word} is not an option of gsim3d {arguments[0]}"
+    else:
+        assert words[0] in {"pip", "cmake", "ctest", "git", "cd", "torchrun"}, words
+
+
+@pytest.mark.parametrize("text", [README, CONTRIBUTING], ids=["README.md", "CONTRIBUTING.md"])
+def test_named_files_exist(text):
+    names = {name for name in re.findall(r"`((?:csrc|gsim3d|tests|tools|docs)/[^`\s]*)`", text) if "<" not in name}
+    names |= set(re.findall(r"\]\(([^)#:]+)\)", text))
+    assert len(names) > 3
+    missing = [name for name in names if not list(ROOT.glob(name.rstrip("/")))]
+    assert not missing
+
+
+def test_map_of_the_repository_is_complete():
+    named = set(re.findall(r"^ *(\S+?)/? {2,}\S", blocks("text")[0], re.MULTILINE))
+    for folder in ("csrc/gsim3d", "gsim3d"):
+        for path in (ROOT / folder).iterdir():
+            if path.name.startswith(("__pycache__", "_ops", "_core")):
+                continue
+            assert path.name in named, f"the map in README.md does not name {folder}/{path.name}"
+
+
+def test_ops_in_the_table_are_public():
+    from gsim3d import ops
+
+    table = README.split("## What is inside")[1].split("\n## ")[0]
+    functions = re.findall(r"^\| `(\w+)`", table, re.MULTILINE)
+    assert set(functions) == {name for name in ops.__all__ if callable(getattr(ops, name)) and name[0].islower()} - {
+        "cuda_compiled"
+    }
+
+
+def test_python_snippet_runs(tmp_path):
+    snippet = blocks("python")[0]
+    assert len([line for line in snippet.splitlines() if line.strip()]) <= 12
+    done = subprocess.run(
+        [sys.executable, "-c", snippet], capture_output=True, text=True, env={"PYTHONPATH": str(ROOT), "PATH": ""}
+    )
+    assert done.returncode == 0, done.stderr
+    expected = re.findall(r"#> (.*)", snippet)
+    assert expected and done.stdout.split() == " ".join(expected).split()
+
+
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="cmake is not installed")
+def test_cpp_snippet_is_the_tested_consumer():
+    consumer = ROOT / "tests" / "cpp" / "consumer"
+    assert blocks("cmake")[0].strip() in (consumer / "CMakeLists.txt").read_text()
+    assert blocks("cpp")[0].strip() in (consumer / "app.cpp").read_text()
