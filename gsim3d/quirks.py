@@ -18,6 +18,8 @@ class Quirks:
         ray_depth: depth means distance along the ray when particles are placed (the plane sweep means z).
         corner_aligned_upsampling: coarse disparity and features are stretched from corner to corner instead of laid where
             the strided convolutions took them.
+        world_moments: moments of viewing rays are taken about the world's origin instead of the scene's.
+        released_harmonics: the explicit variant's harmonics are turned into the world in a basis other than the renderer's.
     """
 
     tiled_shift_mask: bool = False
@@ -25,6 +27,8 @@ class Quirks:
     reference_intrinsics: bool = False
     ray_depth: bool = False
     corner_aligned_upsampling: bool = False
+    world_moments: bool = False
+    released_harmonics: bool = False
 
     @classmethod
     def release(cls) -> Quirks:
