@@ -2,12 +2,17 @@
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 
+#include <initializer_list>
 #include <string>
 #include <tuple>
 
 #include "gsim3d/core/check.h"
 #include "gsim3d/core/parallel.h"
 #include "gsim3d/core/version.h"
+#include "gsim3d/core/workspace.h"
+#include "gsim3d/curve/curve.h"
+#include "gsim3d/plane_sweep/plane_sweep.h"
+#include "gsim3d/plane_sweep/plane_sweep_math.h"
 #include "gsim3d/pool/pool.h"
 
 namespace py = pybind11;
@@ -18,9 +23,23 @@ template <typename T>
 using Array = py::array_t<T, py::array::c_style | py::array::forcecast>;
 using Indices = Array<int64_t>;
 
+// check_shape("plane_sweep", "features", features, {-1, -1, -1, -1}): -1 accepts any size.
+void check_shape(const char* op, const char* name, const py::array& array, std::initializer_list<int64_t> sizes) {
+  bool ok = array.ndim() == static_cast<int64_t>(sizes.size());
+  std::string wanted, got;
+  int64_t axis = 0;
+  for (int64_t size : sizes) {
+    ok = ok && (size < 0 || array.shape(axis) == size);
+    wanted += (axis++ ? ", " : "") + (size < 0 ? std::string("*") : std::to_string(size));
+  }
+  for (int64_t i = 0; i < array.ndim(); ++i) got += (i ? ", " : "") + std::to_string(array.shape(i));
+  gsim3d::check(ok, op, ": ", name, " must be [", wanted, "]; got [", got, "]");
+}
+
 gsim3d::Segments segments_of(const char* op, const Indices& rows, const Indices& cu_rows, int64_t n_rows) {
-  gsim3d::check(rows.ndim() == 1 && cu_rows.ndim() == 1 && cu_rows.size() >= 1, op,
-                ": rows must be [R] and cu_rows [M + 1]");
+  check_shape(op, "rows", rows, {-1});
+  check_shape(op, "cu_rows", cu_rows, {-1});
+  gsim3d::check(cu_rows.size() >= 1, op, ": cu_rows must be [M + 1]; got []");
   const gsim3d::Segments segments{rows.data(), cu_rows.data(), cu_rows.size() - 1, rows.size(), n_rows};
   gsim3d::cpu::check_segments(op, segments);
   return segments;
@@ -29,7 +48,7 @@ gsim3d::Segments segments_of(const char* op, const Indices& rows, const Indices&
 template <typename T>
 std::tuple<py::array_t<T>, py::array_t<int64_t>> pool_max(const Array<T>& x, const Indices& rows,
                                                           const Indices& cu_rows) {
-  gsim3d::check(x.ndim() == 2, "pool_max: x must be [N, C]; got ", x.ndim(), " dimensions");
+  check_shape("pool_max", "x", x, {-1, -1});
   const auto segments = segments_of("pool_max", rows, cu_rows, x.shape(0));
   py::array_t<T> out({segments.n_segments, x.shape(1)});
   py::array_t<int64_t> argmax({segments.n_segments, x.shape(1)});
@@ -40,11 +59,50 @@ std::tuple<py::array_t<T>, py::array_t<int64_t>> pool_max(const Array<T>& x, con
 
 template <typename T>
 py::array_t<T> pool_mean(const Array<T>& x, const Indices& rows, const Indices& cu_rows) {
-  gsim3d::check(x.ndim() == 2, "pool_mean: x must be [N, C]; got ", x.ndim(), " dimensions");
+  check_shape("pool_mean", "x", x, {-1, -1});
   const auto segments = segments_of("pool_mean", rows, cu_rows, x.shape(0));
   py::array_t<T> out({segments.n_segments, x.shape(1)});
   gsim3d::cpu::pool_mean(x.data(), segments, x.shape(1), out.mutable_data(), gsim3d::thread_pool());
   return out;
+}
+
+Indices curve_encode(const Indices& grid, const Indices& cloud, int64_t curve, int64_t depth) {
+  check_shape("curve_encode", "grid", grid, {-1, 3});
+  check_shape("curve_encode", "cloud", cloud, {grid.shape(0)});
+  Indices codes(grid.shape(0));
+  gsim3d::cpu::curve_encode(grid.data(), cloud.data(), grid.shape(0), curve, depth, 3 * depth, codes.mutable_data(),
+                            gsim3d::thread_pool());
+  return codes;
+}
+
+std::tuple<Indices, Indices> curve_sort(const Indices& codes) {
+  check_shape("curve_sort", "codes", codes, {-1, -1});
+  Indices order({codes.shape(0), codes.shape(1)}), inverse({codes.shape(0), codes.shape(1)});
+  gsim3d::HeapWorkspace workspace;
+  gsim3d::cpu::curve_sort(codes.data(), codes.shape(0), codes.shape(1), order.mutable_data(), inverse.mutable_data(),
+                          workspace, gsim3d::thread_pool());
+  return {order, inverse};
+}
+
+template <typename T>
+py::array_t<T> plane_sweep(const Array<T>& features, const Array<T>& homographies, const Array<T>& translations,
+                           const Array<T>& inverse_depths, const Indices& src_images, const Indices& cu_src) {
+  const char* op = "plane_sweep";
+  check_shape(op, "features", features, {-1, -1, -1, -1});
+  check_shape(op, "src_images", src_images, {-1});
+  check_shape(op, "homographies", homographies, {src_images.size(), 3, 3});
+  check_shape(op, "translations", translations, {src_images.size(), 3});
+  check_shape(op, "inverse_depths", inverse_depths, {features.shape(0), -1});
+  check_shape(op, "cu_src", cu_src, {features.shape(0) + 1});
+  const gsim3d::PlaneSweep<T> sweep{homographies.data(),  translations.data(),     inverse_depths.data(),
+                                    src_images.data(),    cu_src.data(),           features.shape(0),
+                                    src_images.size(),    inverse_depths.shape(1), features.shape(1),
+                                    features.shape(2),    features.shape(3)};
+  gsim3d::cpu::check_plane_sweep(op, sweep);
+  py::array_t<T> cost({sweep.n_images, sweep.n_depths, sweep.height, sweep.width});
+  gsim3d::HeapWorkspace workspace;
+  gsim3d::cpu::plane_sweep(features.data(), sweep, cost.mutable_data(), workspace, gsim3d::thread_pool());
+  return cost;
 }
 
 py::dict build_info() {
@@ -74,4 +132,12 @@ PYBIND11_MODULE(_core, m) {
   m.def("pool_mean", &pool_mean<double>, py::arg("x").noconvert(), py::arg("rows"), py::arg("cu_rows"));
   m.def("pool_mean", &pool_mean<float>, py::arg("x"), py::arg("rows"), py::arg("cu_rows"),
         "Mean over segments of rows: [M, C].");
+  m.def("curve_encode", &curve_encode, py::arg("grid"), py::arg("cloud"), py::arg("curve"), py::arg("depth") = 16,
+        "Codes [N] of cells [N, 3] along curve 0 z, 1 z-trans, 2 hilbert, 3 hilbert-trans; cloud << 3 depth above them.");
+  m.def("curve_sort", &curve_sort, py::arg("codes"), "Stable order and inverse, [R, N] each, of codes [R, N].");
+  m.def("plane_sweep", &plane_sweep<double>, py::arg("features").noconvert(), py::arg("homographies"),
+        py::arg("translations"), py::arg("inverse_depths"), py::arg("src_images"), py::arg("cu_src"));
+  m.def("plane_sweep", &plane_sweep<float>, py::arg("features"), py::arg("homographies"), py::arg("translations"),
+        py::arg("inverse_depths"), py::arg("src_images"), py::arg("cu_src"),
+        "Cost volume [I, D, h, w] of features [I, C, h, w].");
 }
