@@ -18,6 +18,8 @@ class Quirks:
         ray_depth: depth means distance along the ray when particles are placed (the plane sweep means z).
         corner_aligned_upsampling: coarse disparity and features are stretched from corner to corner instead of laid where
             the strided convolutions took them.
+        world_moments: moments of viewing rays are taken about the world's origin instead of the scene's.
+        released_harmonics: the explicit variant's harmonics are turned into the world in a basis other than the renderer's.
     Dynamics:
         stale_decoder_conv: the first convolution of each decoder stage reads the skip branch before the features from
             below are added to it.
@@ -38,6 +40,8 @@ class Quirks:
     reference_intrinsics: bool = False
     ray_depth: bool = False
     corner_aligned_upsampling: bool = False
+    world_moments: bool = False
+    released_harmonics: bool = False
     stale_decoder_conv: bool = False
     first_of_voxel: bool = False
     anchor_at_minimum: bool = False

@@ -5,7 +5,43 @@ Every op runs on CPU (and CUDA where compiled), is deterministic, differentiable
 """
 
 from gsim3d.ops._load import cuda_compiled
+from gsim3d.ops.curve import (
+    CURVES,
+    KernelMap,
+    PatchTable,
+    Pyramid,
+    PyramidSpec,
+    Segments,
+    Stage,
+    Voxels,
+    build_pyramid,
+    curve_encode,
+    curve_sort,
+)
+from gsim3d.ops.patch_attn import patch_attention
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
+from gsim3d.ops.raster import Rendering, rasterize_gaussians
 
-__all__ = ["cuda_compiled", "plane_sweep", "pool_max", "pool_mean", "sweep_geometry", "unpool"]
+__all__ = [
+    "CURVES",
+    "KernelMap",
+    "PatchTable",
+    "Pyramid",
+    "PyramidSpec",
+    "Rendering",
+    "Segments",
+    "Stage",
+    "Voxels",
+    "build_pyramid",
+    "cuda_compiled",
+    "curve_encode",
+    "curve_sort",
+    "patch_attention",
+    "plane_sweep",
+    "pool_max",
+    "pool_mean",
+    "rasterize_gaussians",
+    "sweep_geometry",
+    "unpool",
+]

@@ -1,0 +1,317 @@
+"""Space-filling curves, and all geometry of a call of the dynamics network as integers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsim3d.ops import _load  # noqa: F401
+
+CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
+
+
+def curve_encode(
+    grid: Tensor, cloud: Tensor | None, curve: str, *, depth: int = 16, shift: int | None = None
+) -> Tensor:
+    """Codes of cells along a space-filling curve, clouds above them.
+
+    ``code = cloud << shift | curve_code(x, y, z)``, 3 bits a level. The z curve interleaves the bits of x, y, z from high
+    to low; "hilbert" is Skilling's curve with x first; "-trans" curves exchange x and y. For all four,
+    ``code >> 3`` is the code of ``grid >> 1`` at ``depth - 1``.
+
+    Args:
+        grid: int64 [N, 3], cells in [0, 2^depth).
+        cloud: int64 [N], in [0, 2^(63 - shift)); None: 0.
+        curve: "z", "z-trans", "hilbert" or "hilbert-trans".
+        depth: levels of the curve, 1 to 16. Hilbert codes depend on it.
+        shift: position of the cloud's lowest bit, 3 depth to 62; default 3 depth.
+    Returns:
+        int64 [N].
+    Gradients: none. Determinism: integers.
+    Raises:
+        ValueError: a cell, a cloud, depth or shift is out of range; the message names row and axis.
+    Source: Morton order; Skilling, "Programming the Hilbert curve" (2004).
+
+    Example:
+        >>> curve_encode(torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1]]), None, "z")
+        tensor([4, 2, 1])
+    """
+    if curve not in CURVES:
+        raise ValueError(f"curve_encode: curve must be one of {', '.join(CURVES)}; got {curve!r}")
+    if cloud is None:
+        cloud = torch.zeros(grid.shape[:1], dtype=torch.int64, device=grid.device)
+    return torch.ops.gsim3d.curve_encode(grid, cloud, CURVES.index(curve), depth, 3 * depth if shift is None else shift)
+
+
+def curve_sort(codes: Tensor) -> tuple[Tensor, Tensor]:
+    """Stable ascending order of each row of codes, and its inverse.
+
+    ``order[r, i]`` is the index of the i-th smallest code of row r, ``inverse[r, order[r, i]] = i``; equal codes keep
+    their order.
+
+    Args:
+        codes: int64 [R, N], N below 2^32.
+    Returns:
+        order, inverse: int64 [R, N].
+    Gradients: none. Determinism: integers.
+
+    Example:
+        >>> curve_sort(torch.tensor([[30, 10, 20]]))
+        (tensor([[1, 2, 0]]), tensor([[2, 0, 1]]))
+    """
+    return torch.ops.gsim3d.curve_sort(codes)
+
+
+@dataclass(frozen=True)
+class PyramidSpec:
+    """The shape of the dynamics network, as far as geometry depends on it. S stages, S - 1 transitions.
+
+    grid_size: metres, edge of a cell at stage 0.
+    slot_bits: time slots of a cloud are in [0, 2^slot_bits).
+    strides: per transition, a power of two; cells of the next stage are that many cells wide.
+    merge_windows: per transition, a power of two; that many neighbouring slots of a scene become one cloud.
+    patch_sizes: per stage, rows that attend to each other.
+    kernel_sizes: per stage, odd sizes of the convolutions that run there.
+    release: the published model's cells and ties: counted from the minimum over all clouds of the call and truncated,
+        curve depth from the extent, equal codes by row. Clouds of one call then change each other.
+    """
+
+    grid_size: float
+    slot_bits: int
+    strides: tuple[int, ...]
+    merge_windows: tuple[int, ...]
+    patch_sizes: tuple[int, ...]
+    kernel_sizes: tuple[tuple[int, ...], ...]
+    release: bool = False
+
+    @property
+    def n_stages(self) -> int:
+        return len(self.patch_sizes)
+
+    def merged_bits(self) -> tuple[int, ...]:
+        """Slot bits that each stage merges; stage 0 merges none."""
+        bits, left = [0], self.slot_bits
+        for window in self.merge_windows:
+            bits.append(min(window.bit_length() - 1, left))
+            left -= bits[-1]
+        return tuple(bits)
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Segment s holds rows[cu_rows[s]] .. rows[cu_rows[s + 1] - 1]. rows int64 [R], cu_rows int64 [M + 1]."""
+
+    rows: Tensor
+    cu_rows: Tensor
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """Rows of equal cloud and cell; V voxels, ordered by (cloud, x, y, z).
+
+    row_voxel: int64 [N].   rows: int64 [N], rows of voxel 0, of voxel 1, ..., ascending in a voxel.   cu_rows: int64 [V + 1].
+    """
+
+    row_voxel: Tensor
+    rows: Tensor
+    cu_rows: Tensor
+
+
+@dataclass(frozen=True)
+class KernelMap:
+    """Pairs of neighbouring voxels of a convolution with ``kernel_size`` K, sorted by tap, then by tap_out.
+
+    Pairs cu_taps[t] .. cu_taps[t + 1] - 1 belong to tap t = (kx K + ky) K + kz: voxel tap_in lies at the offset
+    (kx, ky, kz) - K // 2 cells from voxel tap_out. The centre tap is empty: it reads the row itself.
+    tap_in, tap_out: int64 [L].   cu_taps: int64 [K^3 + 1].
+    """
+
+    kernel_size: int
+    tap_in: Tensor
+    tap_out: Tensor
+    cu_taps: Tensor
+
+
+@dataclass(frozen=True)
+class PatchTable:
+    """Patch p asks with rows q_rows[cu_q[p]:cu_q[p + 1]] and reads rows kv_rows[cu_k[p]:cu_k[p + 1]].
+
+    q_rows: int64 [N].   kv_rows: int64 [M].   cu_q, cu_k: int64 [P + 1].
+    """
+
+    q_rows: Tensor
+    kv_rows: Tensor
+    cu_q: Tensor
+    cu_k: Tensor
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Geometry of the N rows of one stage, in C clouds.
+
+    grid: int64 [N, 3].   cloud: int64 [N], dense ids ascending by (scene, slot left after merging).
+    cu_clouds: int64 [C + 1]; order[:, cu_clouds[c]:cu_clouds[c + 1]] are the rows of cloud c.
+    order: int64 [4, N], rows along each serialization, clouds one after another.
+    patches: attention patches of each serialization. A cloud is cut from its start; its last patch reads the last
+        ``patch_size`` rows of the cloud (all rows where it has fewer).
+    voxels, kernel_maps: convolution geometry, by kernel size.
+    cluster: rows of the stage before that each row pools; None at stage 0.
+    time_index: int64 [N], slot inside the merged window; None where no slots merge.
+    """
+
+    grid: Tensor
+    cloud: Tensor
+    cu_clouds: Tensor
+    order: Tensor
+    patches: tuple[PatchTable, ...]
+    voxels: Voxels
+    kernel_maps: dict[int, KernelMap]
+    cluster: Segments | None
+    time_index: Tensor | None
+
+    @property
+    def n_rows(self) -> int:
+        return self.grid.shape[0]
+
+    @property
+    def n_clouds(self) -> int:
+        return self.cu_clouds.shape[0] - 1
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """rows: int64 [N0], the input rows that take part, ascending (stage 0 has these rows); stages: finest first."""
+
+    rows: Tensor
+    stages: tuple[Stage, ...]
+
+
+def build_pyramid(
+    positions: Tensor,
+    cu_rows: Tensor,
+    cloud_scene: Tensor,
+    cloud_slot: Tensor,
+    origin: Tensor,
+    spec: PyramidSpec,
+    *,
+    curves: tuple[tuple[int, ...], ...] | None = None,
+) -> Pyramid:
+    """All geometry of a call of the dynamics network.
+
+    Cells of stage 0 are ``floor((p - origin) / grid_size)`` in float64; a row outside [0, 2^16) cells or not finite
+    sleeps: it is in no stage and not in ``Pyramid.rows``. Rows of a cloud are ordered along four curves of 16 levels,
+    equal codes by position (x, then y, then z), then by row. The next stage pools the rows that share a cell of
+    ``stride`` cells, in the order of serialization row 0, and merges clouds of a scene whose slots differ in the merged bits only.
+    A cloud's geometry depends on its scene alone, not on the other scenes of the call (except with ``spec.release``).
+
+    Args:
+        positions: [N, 3] metres, float32 or float64; rows of cloud q are cu_rows[q] .. cu_rows[q + 1].
+        cu_rows: int64 [Q + 1].
+        cloud_scene: int64 [Q] in [0, B).
+        cloud_slot: int64 [Q] in [0, 2^slot_bits), different for the clouds of a scene. Clouds without rows are fine.
+        origin: float64 [B, 3] metres, lower corner of each scene.
+        spec: the network's strides, windows, patch and kernel sizes.
+        curves: per stage the curve (index into CURVES) of each of the four serialization rows; default (0, 1, 2, 3).
+    Returns:
+        Pyramid; tensors int64 on the device of ``positions``.
+    Gradients: none. Determinism: integers. The order of the rows of a cloud permutes the results only.
+    Raises:
+        ValueError: an argument is malformed; the message names it.
+    Source: grid pooling and serialization of Point Transformer V3 (Wu et al. 2024), time merging of 3DGSim.
+
+    Example:
+        >>> spec = PyramidSpec(0.1, 0, (2,), (1,), (8, 8), ((3,), (3,)))
+        >>> points = torch.tensor([[0.05, 0.05, 0.05], [0.15, 0.05, 0.05], [0.55, 0.05, 0.05]])
+        >>> zero = torch.zeros(1, dtype=torch.int64)
+        >>> pyramid = build_pyramid(points, torch.tensor([0, 3]), zero, zero, torch.zeros(1, 3, dtype=torch.float64), spec)
+        >>> pyramid.stages[1].grid
+        tensor([[0, 0, 0],
+                [2, 0, 0]])
+    """
+    if curves is None:
+        curves = ((0, 1, 2, 3),) * spec.n_stages
+    cu_kernels = [0]
+    for sizes in spec.kernel_sizes:
+        cu_kernels.append(cu_kernels[-1] + len(sizes))
+    arrays = torch.ops.gsim3d.build_pyramid(
+        positions.detach(),
+        cu_rows,
+        cloud_scene,
+        cloud_slot,
+        origin,
+        spec.grid_size,
+        spec.slot_bits,
+        spec.strides,
+        spec.merge_windows,
+        spec.patch_sizes,
+        [curve for row in curves for curve in row],
+        [size for sizes in spec.kernel_sizes for size in sizes],
+        cu_kernels,
+        spec.release,
+    )
+    return _assemble(arrays, spec)
+
+
+def _assemble(arrays: list[Tensor], spec: PyramidSpec) -> Pyramid:
+    """Names the flat results, in the order that csrc/gsim3d/curve/pyramid.h states."""
+    left = list(arrays)
+    left.reverse()
+    take = left.pop
+    rows, stages = take(), []
+    for sizes, merged in zip(spec.kernel_sizes, spec.merged_bits(), strict=True):
+        cluster = Segments(stages[-1].order[0], take()) if stages else None
+        time_index = take() if merged else None
+        grid, cloud, cu_clouds, order, cu_q, cu_k, kv_rows = [take() for _ in range(7)]
+        patches = tuple(PatchTable(order[r], kv_rows[r], cu_q, cu_k) for r in range(4))
+        voxels = Voxels(take(), take(), take())
+        kernel_maps = {size: KernelMap(size, take(), take(), take()) for size in sizes}
+        stages.append(Stage(grid, cloud, cu_clouds, order, patches, voxels, kernel_maps, cluster, time_index))
+    return Pyramid(rows, tuple(stages))
+
+
+@torch.library.register_fake("gsim3d::curve_encode")
+def _(grid, cloud, curve, depth, shift):
+    return grid.new_empty(grid.shape[0])
+
+
+@torch.library.register_fake("gsim3d::curve_sort")
+def _(codes):
+    return codes.new_empty(codes.shape), codes.new_empty(codes.shape)
+
+
+@torch.library.register_fake("gsim3d::build_pyramid")
+def _(
+    positions,
+    cu_rows,
+    cloud_scene,
+    cloud_slot,
+    origin,
+    grid_size,
+    slot_bits,
+    strides,
+    merge_windows,
+    patch_sizes,
+    curves,
+    kernel_sizes,
+    cu_kernels,
+    release,
+):
+    size = torch.library.get_ctx().new_dynamic_size
+    n = size()
+    arrays = [(n,)]
+    for s in range(len(patch_sizes)):
+        if s > 0:
+            n = size()
+            arrays.append((n + 1,))
+            merged = min(merge_windows[s - 1].bit_length() - 1, slot_bits)
+            slot_bits -= merged
+            arrays += [(n,)] if merged else []
+        offsets = size(min=1)  # an unbacked size must be the whole size of some result, so offsets are counted, not patches
+        arrays += [(n, 3), (n,), (size(min=1),), (4, n), (offsets,), (offsets,), (4, size())]
+        arrays += [(n,), (n,), (size(min=1),)]
+        for kernel_size in kernel_sizes[cu_kernels[s] : cu_kernels[s + 1]]:
+            n_pairs = size()
+            arrays += [(n_pairs,), (n_pairs,), (kernel_size**3 + 1,)]
+    return [cu_rows.new_empty(shape) for shape in arrays]
