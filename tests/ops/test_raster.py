@@ -73,7 +73,7 @@ def test_any_number_of_features(device, n_features):
 def test_gradients_where_pixels_end(device):
     # Nearly opaque layers: most pixels end before their list does, each after another number of entries.
     scene = random_scene(n=80, clouds=2, images=2, width=20, height=18, sh_terms=0, seed=7, spread=0.2)
-    scene = scene.replace(opacities=0.9 + 0.08 * scene.opacities, scales=2 * scene.scales)
+    scene = scene.replace(opacities=0.9 + 0.08 * scene.opacities, scales=4 * scene.scales)
     kept = torch.ops.gsim3d.rasterize_gaussians(*operator_args(scene))
     assert (kept[4] < 1e-3).double().mean() > 0.2 and len(kept[5].unique()) > 20
     expected = gradients(scene.render_oracle, scene)
