@@ -67,12 +67,12 @@ class GaussianHead(nn.Module):
 
     def forward(self, particles: Particles, *, sh_degree: int | None = None) -> Gaussians:
         """The Gaussians of all rows; ``sh_degree``: leave out colours of higher degrees."""
-        sh, quats, scales = self._parameters(particles)
+        sh, quats, scales = self._shape_and_color(particles)
         if sh_degree is not None:
             sh = sh[:, : (sh_degree + 1) ** 2]
         return Gaussians(particles.means, quats, scales, particles.opacities, sh, particles.cu_rows)
 
-    def _parameters(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
+    def _shape_and_color(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
         if self.config.latents == 0:
             return particles.sh, particles.quats, particles.scales
         latents = torch.cat([particles.dynamic_latents, particles.static_latents], 1)
