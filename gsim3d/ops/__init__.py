@@ -18,8 +18,10 @@ from gsim3d.ops.curve import (
     curve_encode,
     curve_sort,
 )
+from gsim3d.ops.patch_attn import patch_attention
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
+from gsim3d.ops.raster import Rendering, rasterize_gaussians
 
 __all__ = [
     "CURVES",
@@ -27,6 +29,7 @@ __all__ = [
     "PatchTable",
     "Pyramid",
     "PyramidSpec",
+    "Rendering",
     "Segments",
     "Stage",
     "Voxels",
@@ -34,9 +37,11 @@ __all__ = [
     "cuda_compiled",
     "curve_encode",
     "curve_sort",
+    "patch_attention",
     "plane_sweep",
     "pool_max",
     "pool_mean",
+    "rasterize_gaussians",
     "sweep_geometry",
     "unpool",
 ]

@@ -26,9 +26,9 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   // patch_attn: attention inside patches of a serialized order, separate query and key tables; q, k, v [N, H, D].
   m.def(
       "patch_attention(Tensor q, Tensor k, Tensor v, Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) "
-      "-> (Tensor out, Tensor lse)");
+      "-> (Tensor out, Tensor stats)");
   m.def(
-      "patch_attention_backward(Tensor grad, Tensor q, Tensor k, Tensor v, Tensor out, Tensor lse, Tensor q_rows, "
+      "patch_attention_backward(Tensor grad, Tensor q, Tensor k, Tensor v, Tensor out, Tensor stats, Tensor q_rows, "
       "Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) -> (Tensor q, Tensor k, Tensor v)");
 
   // pool: segment max and mean over clusters, and unpooling.
@@ -47,7 +47,19 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "plane_sweep_backward(Tensor grad, Tensor features, Tensor homographies, Tensor translations, Tensor inverse_depths, "
       "Tensor src_images, Tensor cu_src) -> Tensor");
 
-  // raster: 3D Gaussian projection and blending; the tensors after depth are state kept for the backward pass.
+  // raster: 3D Gaussian projection and blending. color is [N, K, 3] SH coefficients or [N, 3]; cutoff 0 exact, 1 tile3sigma,
+  // 2 smooth; transmittance and last are kept for the backward pass.
+  m.def(
+      "rasterize_gaussians(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, Tensor features, "
+      "Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, int width, int height, "
+      "float near_plane, int cutoff) -> (Tensor color, Tensor alpha, Tensor depth, Tensor features, Tensor transmittance, "
+      "Tensor last)");
+  m.def(
+      "rasterize_gaussians_backward(Tensor grad_color, Tensor grad_alpha, Tensor grad_depth, Tensor grad_features, "
+      "Tensor transmittance, Tensor last, Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
+      "Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, int width, "
+      "int height, float near_plane, int cutoff) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, "
+      "Tensor color, Tensor features, Tensor background, Tensor viewmats)");
 }
 
 // The library is loaded by importing it; its contents are the registered ops.

@@ -1,0 +1,98 @@
+#include "gsim3d/patch_attn/patch_attn.h"
+#include "gsim3d/torch/torch_utils.h"
+
+namespace gsim3d::binding {
+namespace {
+
+// Heads are read in place, also inside a larger tensor, as long as a head's channels lie together.
+Tensor heads_of(const Tensor& x) { return x.size(2) <= 1 || x.stride(2) == 1 ? x : torch::stable::contiguous(x); }
+
+template <typename T>
+HeadRows<T> view_of(const Tensor& x) {
+  return {data<T>(x), x.stride(0), x.stride(1)};
+}
+
+struct Inputs {
+  Tensor q, k, v, q_rows, kv_rows, cu_q, cu_k;
+  PatchTable table;
+  AttentionSize size;
+};
+
+Inputs inputs_of(const char* op, const Tensor& q, const Tensor& k, const Tensor& v, const Tensor& q_rows,
+                 const Tensor& kv_rows, const Tensor& cu_q, const Tensor& cu_k, double scale) {
+  check_shape(op, "q", q, {-1, -1, -1}, "[Nq, H, D]");
+  check_shape(op, "k", k, {-1, q.size(1), q.size(2)}, "[Nk, H, D]");
+  check_shape(op, "v", v, {k.size(0), q.size(1), q.size(2)}, "[Nk, H, D]");
+  check_dtype(op, "k", k, q.scalar_type());
+  check_dtype(op, "v", v, q.scalar_type());
+  const std::pair<const char*, const Tensor&> lists[] = {
+      {"q_rows", q_rows}, {"kv_rows", kv_rows}, {"cu_q", cu_q}, {"cu_k", cu_k}};
+  for (const auto& [name, list] : lists) {
+    check_dtype(op, name, list, ScalarType::Long);
+    check(list.dim() == 1, op, ": ", name, " must have one dimension; got ", shape_of(list));
+  }
+  check(cu_q.size(0) >= 1, op, ": cu_q must be [P + 1]; got ", shape_of(cu_q));
+  check_shape(op, "cu_k", cu_k, {cu_q.size(0)}, "[P + 1]");
+  Inputs in{heads_of(q), heads_of(k), heads_of(v), rows_of(q_rows), rows_of(kv_rows), rows_of(cu_q), rows_of(cu_k), {}, {}};
+  in.table = {data<int64_t>(in.q_rows),
+              data<int64_t>(in.kv_rows),
+              data<int64_t>(in.cu_q),
+              data<int64_t>(in.cu_k),
+              cu_q.size(0) - 1,
+              q_rows.size(0),
+              kv_rows.size(0),
+              q.size(0),
+              k.size(0)};
+  in.size = {q.size(1), q.size(2), scale};
+  cpu::check_attention_size(op, in.size);
+  cpu::check_patch_table(op, in.table);
+  return in;
+}
+
+std::tuple<Tensor, Tensor> patch_attention(const Tensor& q, const Tensor& k, const Tensor& v, const Tensor& q_rows,
+                                           const Tensor& kv_rows, const Tensor& cu_q, const Tensor& cu_k, double scale) {
+  const char* op = "patch_attention";
+  const Inputs in = inputs_of(op, q, k, v, q_rows, kv_rows, cu_q, cu_k, scale);
+  Tensor out = empty(q, {q.size(0), q.size(1), q.size(2)});
+  Tensor stats = empty(q, {q.size(0), q.size(1), 2});
+  dispatch_float(op, "q", q, [&]<typename T>() {
+    cpu::patch_attention(view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v), in.table, in.size, mutable_data<T>(out),
+                         mutable_data<T>(stats), torch_parallel());
+  });
+  return {out, stats};
+}
+
+std::tuple<Tensor, Tensor, Tensor> patch_attention_backward(const Tensor& grad_, const Tensor& q, const Tensor& k,
+                                                            const Tensor& v, const Tensor& out_, const Tensor& stats_,
+                                                            const Tensor& q_rows, const Tensor& kv_rows,
+                                                            const Tensor& cu_q, const Tensor& cu_k, double scale) {
+  const char* op = "patch_attention_backward";
+  const Inputs in = inputs_of(op, q, k, v, q_rows, kv_rows, cu_q, cu_k, scale);
+  check_shape(op, "grad", grad_, {q.size(0), q.size(1), q.size(2)}, "[Nq, H, D]");
+  check_shape(op, "out", out_, {q.size(0), q.size(1), q.size(2)}, "[Nq, H, D]");
+  check_shape(op, "stats", stats_, {q.size(0), q.size(1), 2}, "[Nq, H, 2]");
+  check_dtype(op, "grad", grad_, q.scalar_type());
+  check_dtype(op, "out", out_, q.scalar_type());
+  check_dtype(op, "stats", stats_, q.scalar_type());
+  const Tensor grad = heads_of(grad_), out = rows_of(out_), stats = rows_of(stats_);
+  Tensor grad_q = empty(q, {q.size(0), q.size(1), q.size(2)});
+  Tensor grad_k = empty(k, {k.size(0), k.size(1), k.size(2)});
+  Tensor grad_v = empty(k, {k.size(0), k.size(1), k.size(2)});
+  dispatch_float(op, "q", q, [&]<typename T>() {
+    TensorWorkspace workspace(q);
+    cpu::patch_attention_vjp<T>(view_of<T>(grad), view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v), data<T>(out),
+                                data<T>(stats), in.table, in.size,
+                                {mutable_data<T>(grad_q), mutable_data<T>(grad_k), mutable_data<T>(grad_v)}, workspace,
+                                torch_parallel());
+  });
+  return {grad_q, grad_k, grad_v};
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(gsim3d, CPU, m) {
+  m.impl("patch_attention", TORCH_BOX(&patch_attention));
+  m.impl("patch_attention_backward", TORCH_BOX(&patch_attention_backward));
+}
+
+}  // namespace gsim3d::binding

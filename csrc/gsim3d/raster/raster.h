@@ -1,0 +1,92 @@
+// 3D Gaussian splatting: projection of packed Gaussians into pinhole images, and front-to-back blending.
+//
+// One call renders I images; image i shows the rows of cloud image_cloud[i]. For a pixel with centre p = (x + 0.5, y + 0.5):
+//   mu, Sigma = projection of the mean and (J W) R S S R^T (J W)^T + 0.3 I      (EWA splatting)
+//   alpha_n = min(0.99, opacity_n exp(-(p - mu)^T Sigma^-1 (p - mu) / 2)), left out where below 1/255
+//   T_n = prod_{m < n} (1 - alpha_m) over the Gaussians in front, sorted by camera z, ties by row
+//   color = sum_n alpha_n T_n color_n + T_end background;   depth, features: the same sums of camera z and of feature rows
+// A pixel ends before the first Gaussian that would bring T below 1e-4. Same bits for any number of threads.
+//
+// Sources: Zwicker et al., EWA splatting (2002); Kerbl et al., 3D Gaussian splatting (2023); conventions of gsplat (Apache-2.0).
+#pragma once
+
+#include <cstdint>
+
+#include "gsim3d/core/parallel.h"
+#include "gsim3d/core/workspace.h"
+
+namespace gsim3d {
+
+enum class RasterCutoff : int64_t {
+  kExact = 0,       // every pixel where alpha >= 1/255
+  kTile3Sigma = 1,  // of those, the pixels of the 16 x 16 tiles that a square of 3 standard deviations touches
+  kSmooth = 2,      // alpha fades to 0 between 2/255 and 1/255: once differentiable everywhere, for tests of gradients
+};
+
+template <typename T>
+struct RasterScene {
+  const T* means;       // [n_rows, 3] metres, world
+  const T* quats;       // [n_rows, 4] (w, x, y, z), any length; shorter than 1e-6: identity, no gradient
+  const T* scales;      // [n_rows, 3] metres, standard deviations
+  const T* opacities;   // [n_rows] in [0, 1]
+  const T* color;       // [n_rows, sh_terms, 3], or [n_rows, 3] with sh_terms = 0
+  const T* features;    // [n_rows, n_features]
+  const T* background;  // [n_images, 3]
+  const T* viewmats;    // [n_images, 4, 4] world to camera; x right, y down, z forward
+  const T* Ks;          // [n_images, 3, 3] pixels: [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]
+  const int64_t* image_cloud;  // [n_images]
+  const int64_t* cu_rows;      // [n_clouds + 1]
+  int64_t n_rows, n_clouds, n_images;
+  int64_t sh_terms;  // 0, 1, 4, 9 or 16
+  int64_t n_features, width, height;
+  T near_plane;  // metres; Gaussians whose centre is not beyond it are left out
+  RasterCutoff cutoff;
+};
+
+template <typename T>
+struct RasterImages {
+  T* color;          // [n_images, height, width, 3]
+  T* alpha;          // [n_images, height, width]
+  T* depth;          // [n_images, height, width] sum of weight * camera z, metres
+  T* features;       // [n_images, height, width, n_features]
+  T* transmittance;  // [n_images, height, width] T_end, kept for the backward pass
+  int32_t* last;     // [n_images, height, width] entries of the tile's list in front of the pixel's end; kept likewise
+};
+
+template <typename T>
+struct RasterImageGrads {
+  const T* color;
+  const T* alpha;
+  const T* depth;
+  const T* features;
+  const T* transmittance;  // values of the forward pass
+  const int32_t* last;     // values of the forward pass
+};
+
+template <typename T>
+struct RasterSceneGrads {
+  T* means;
+  T* quats;
+  T* scales;
+  T* opacities;
+  T* color;
+  T* features;
+  T* background;
+  T* viewmats;  // of the 12 upper entries taken as free numbers; the last row is 0
+};
+
+namespace cpu {
+
+// Throws ArgumentError for cameras, offsets or rows that cannot be rendered; the message names argument and row.
+template <typename T>
+void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, const Workspace& workspace,
+                    const Parallel& parallel);
+
+// Vector-Jacobian product of raster_forward; fills every array of `grads`. A Gaussian has no gradient through a pixel where
+// its alpha is cut to 0.99.
+template <typename T>
+void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& image_grads,
+                     const RasterSceneGrads<T>& grads, const Workspace& workspace, const Parallel& parallel);
+
+}  // namespace cpu
+}  // namespace gsim3d

@@ -1,0 +1,254 @@
+// Projection of Gaussians into splats, and the lists of splats of every tile.
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "gsim3d/core/check.h"
+#include "gsim3d/raster/raster_tiles.h"
+
+namespace gsim3d::raster {
+namespace {
+
+constexpr const char* kOp = "rasterize_gaussians";
+// Splats of one group should stay in the caches shared by the cores (64 bytes each in float32).
+constexpr int64_t kPairsPerGroup = 1 << 18;
+constexpr int64_t kRowsPerChunk = 2048;
+// Rounding of the exponent and of pixel coordinates, with room to spare: a bound may only err outwards.
+constexpr double kLevelSlack = 1e-3;
+constexpr double kPixelSlack = 0.01;
+
+template <typename T>
+void check_finite(const char* name, const T* values, int64_t row, int64_t width) {
+  for (int64_t i = 0; i < width; ++i)
+    check(std::isfinite(values[row * width + i]), kOp, ": ", name, " must be finite; got ", values[row * width + i],
+          " at row ", row);
+}
+
+// Names the first bad number of the rows of a block. Called only when there is one.
+template <typename T>
+void report_rows(const RasterScene<T>& scene, const int64_t* rows, int n, int64_t image, const Projection<Simd<T>>& p) {
+  const int64_t color_width = std::max<int64_t>(1, scene.sh_terms) * 3;
+  for (int lane = 0; lane < n; ++lane) {
+    const int64_t row = rows[lane];
+    check_finite("means", scene.means, row, 3);
+    check_finite("quats", scene.quats, row, 4);
+    check_finite("scales", scene.scales, row, 3);
+    check_finite(scene.sh_terms ? "sh" : "colors", scene.color, row, color_width);
+    for (int i = 0; i < 3; ++i)
+      check(scene.scales[row * 3 + i] >= 0, kOp, ": scales must not be negative; got ", scene.scales[row * 3 + i],
+            " at row ", row);
+    check(scene.opacities[row] >= 0 && scene.opacities[row] <= 1, kOp, ": opacities must be in [0, 1]; got ",
+          scene.opacities[row], " at row ", row);
+    check(!(p.z[lane] > scene.near_plane) || std::isfinite(p.determinant[lane]), kOp,
+          ": the projection overflows; scales or means are too large at row ", row, " for image ", image);
+  }
+}
+
+// First and last + 1 pixel whose centre lies in [low, high], within [0, size).
+template <typename T>
+void pixel_range(T low, T high, int64_t size, uint16_t& begin, uint16_t& end) {
+  const T first = std::ceil(low - T(0.5) - T(kPixelSlack)), last = std::floor(high - T(0.5) + T(kPixelSlack));
+  begin = first > 0 ? static_cast<uint16_t>(std::min(first, T(size))) : 0;
+  end = last >= 0 ? static_cast<uint16_t>(std::min(last + 1, T(size))) : 0;
+}
+
+// The release's rectangle of tiles, as a cut of the pixel rectangle. Its coordinates count from the centre of the first pixel.
+template <typename T>
+void cut_to_tiles(T x, T y, T xx, T yy, T determinant, Splat<T>& splat) {
+  const T middle = T(0.5) * (xx + yy);
+  const T largest = middle + std::sqrt(std::max(T(0.1), middle * middle - determinant));
+  const T radius = std::ceil(3 * std::sqrt(largest));
+  const auto cut = [radius](T centre, uint16_t& begin, uint16_t& end) {
+    const T position = centre - T(0.5);
+    const T first = std::max(T(0), std::trunc((position - radius) / kTile)) * kTile;
+    const T last = std::max(T(0), std::trunc((position + radius + (kTile - 1)) / kTile)) * kTile;
+    begin = static_cast<uint16_t>(std::max(T(begin), std::min(T(end), first)));
+    end = static_cast<uint16_t>(std::min(T(end), last));
+  };
+  cut(x, splat.x0, splat.x1);
+  cut(y, splat.y0, splat.y1);
+}
+
+template <typename T, int kTerms>
+void project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, const Chunk& chunk, Splat<T>* splats) {
+  using V = Simd<T>;
+  const T log2e_half = T(0.72134752044448170);
+  for_row_blocks<T>(chunk.begin, chunk.end, [&](const int64_t* rows, int n) {
+    V mean[3], quat[4], scale[3];
+    for (int i = 0; i < 3; ++i) mean[i] = gather(scene.means, rows, 3, i);
+    for (int i = 0; i < 4; ++i) quat[i] = gather(scene.quats, rows, 4, i);
+    for (int i = 0; i < 3; ++i) scale[i] = gather(scene.scales, rows, 3, i);
+    const V opacity = gather(scene.opacities, rows, 1, 0);
+    const Projection<V> p = project(camera, mean, quat, scale);
+    const auto in_front = p.z > V{} + camera.near_plane;
+
+    constexpr int kColumns = std::max(1, kTerms) * 3;
+    V coefficients[kColumns], color[3];
+    for (int i = 0; i < kColumns; ++i) coefficients[i] = gather(scene.color, rows, kColumns, i);
+    if constexpr (kTerms > 0) {
+      V basis[kTerms];
+      sh_basis<kTerms>(view_direction(camera, p.point).unit, basis);
+      sh_color<kTerms>(basis, coefficients, color);
+    } else {
+      for (int c = 0; c < 3; ++c) color[c] = coefficients[c];
+    }
+
+    // x - x is 0 for a finite x only; the sum of such zeros stays 0.
+    V zero = V{};
+    for (int i = 0; i < 3; ++i) zero += (mean[i] - mean[i]) + (scale[i] - scale[i]);
+    for (int i = 0; i < 4; ++i) zero += quat[i] - quat[i];
+    for (int i = 0; i < kColumns; ++i) zero += coefficients[i] - coefficients[i];
+    zero += in_front ? p.determinant - p.determinant : V{};
+    auto good = (zero == V{}) & (opacity >= V{}) & (opacity <= V{} + T(1));
+    for (int i = 0; i < 3; ++i) good &= scale[i] >= V{};
+    if (any(~good)) report_rows(scene, rows, n, chunk.image, p);
+
+    const Footprint<V> shape = footprint_of(p.xy, p.yy, p.determinant);
+    for (int lane = 0; lane < n; ++lane) {
+      Splat<T>& splat = splats[rows[lane] - chunk.begin];
+      splat.x0 = splat.x1 = splat.y0 = splat.y1 = 0;
+      if (!in_front[lane] || !(opacity[lane] >= T(kMinAlpha))) continue;
+      splat.x = p.x[lane], splat.y = p.y[lane], splat.z = p.z[lane];
+      splat.slope = shape.slope[lane], splat.tight = shape.tight[lane] * log2e_half;
+      splat.loose = shape.loose[lane] * log2e_half;
+      splat.opacity = opacity[lane];
+      splat.level = std::log2(opacity[lane] * T(1 / kMinAlpha)) + T(kLevelSlack);
+      for (int c = 0; c < 3; ++c) splat.color[c] = color[c][lane];
+      const T spread = splat.level / log2e_half;
+      const T reach_x = std::sqrt(spread * p.xx[lane]), reach_y = std::sqrt(spread * p.yy[lane]);
+      pixel_range(splat.x - reach_x, splat.x + reach_x, scene.width, splat.x0, splat.x1);
+      pixel_range(splat.y - reach_y, splat.y + reach_y, scene.height, splat.y0, splat.y1);
+      if (scene.cutoff == RasterCutoff::kTile3Sigma)
+        cut_to_tiles(splat.x, splat.y, p.xx[lane], p.yy[lane], p.determinant[lane], splat);
+      if (splat.x0 >= splat.x1 || splat.y0 >= splat.y1) splat.x0 = splat.x1 = splat.y0 = splat.y1 = 0;
+    }
+  });
+}
+
+// Calls f(tile) for every tile with a pixel that may see the splat, row by row. A row of tiles is cut to the columns between
+// the leftmost and the rightmost point of the ellipse within it.
+template <typename T, typename F>
+void for_tiles(const Splat<T>& splat, int64_t tiles_x, const F& f) {
+  if (splat.x0 >= splat.x1) return;
+  const int64_t tx0 = splat.x0 / kTile, tx1 = (splat.x1 - 1) / kTile, ty0 = splat.y0 / kTile, ty1 = (splat.y1 - 1) / kTile;
+  if (tx0 == tx1 || ty0 == ty1) {
+    for (int64_t ty = ty0; ty <= ty1; ++ty)
+      for (int64_t tx = tx0; tx <= tx1; ++tx) f(ty * tiles_x + tx);
+    return;
+  }
+  // Height above the centre of the rightmost point: Sigma_xy sqrt(spread / Sigma_xx).
+  const T variance_x = 1 / splat.tight + splat.slope * splat.slope / splat.loose;
+  const T rightmost = splat.slope / splat.loose * std::sqrt(splat.level / variance_x);
+  const auto half_width = [&](T dy) {
+    return std::sqrt(std::max(T(0), (splat.level - splat.loose * dy * dy) / splat.tight));
+  };
+  for (int64_t ty = ty0; ty <= ty1; ++ty) {
+    const T low = T(std::max<int64_t>(splat.y0, ty * kTile)) + T(0.5) - splat.y;
+    const T high = T(std::min<int64_t>(splat.y1, (ty + 1) * kTile)) - T(0.5) - splat.y;
+    const T at_right = std::clamp(rightmost, low, high), at_left = std::clamp(-rightmost, low, high);
+    uint16_t begin, end;
+    pixel_range(splat.x + splat.slope * at_left - half_width(at_left), splat.x + splat.slope * at_right + half_width(at_right),
+                splat.x1, begin, end);
+    begin = std::max(begin, splat.x0);
+    if (begin >= end) continue;
+    for (int64_t tx = begin / kTile; tx <= (end - 1) / kTile; ++tx) f(ty * tiles_x + tx);
+  }
+}
+
+template <typename T>
+void choose_images(const RasterScene<T>& scene, Group<T>& group) {
+  group.first = group.last;
+  group.image_pair.assign(1, 0);
+  group.image_chunk.assign(1, 0);
+  group.chunks.clear();
+  group.cameras.clear();
+  // A chunk counts its splats in every tile, so it should hold at least as many rows as there are tiles.
+  const int64_t rows_per_chunk = std::max(kRowsPerChunk, group.n_tiles());
+  for (int64_t image = group.first; image < scene.n_images; ++image) {
+    const int64_t begin = scene.cu_rows[scene.image_cloud[image]], end = scene.cu_rows[scene.image_cloud[image] + 1];
+    const int64_t pairs = group.image_pair.back();
+    if (image > group.first && pairs + end - begin > kPairsPerGroup) break;
+    for (int64_t row = begin; row < end; row += rows_per_chunk)
+      group.chunks.push_back({image, row, std::min(end, row + rows_per_chunk), pairs + row - begin});
+    group.image_pair.push_back(pairs + end - begin);
+    group.image_chunk.push_back(static_cast<int64_t>(group.chunks.size()));
+    group.cameras.push_back(make_camera(scene.viewmats + 16 * image, scene.Ks + 9 * image, scene.width, scene.height,
+                                        scene.near_plane));
+    group.last = image + 1;
+  }
+}
+
+}  // namespace
+
+template <typename T>
+bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, const Parallel& parallel, Group<T>& group) {
+  if (group.last >= scene.n_images) return false;
+  group.tiles_x = (scene.width + kTile - 1) / kTile, group.tiles_y = (scene.height + kTile - 1) / kTile;
+  choose_images(scene, group);
+  const int64_t n_images = group.last - group.first, n_tiles = group.n_tiles();
+  const int64_t n_chunks = static_cast<int64_t>(group.chunks.size());
+  group.splats = scratch.take<Splat<T>>(kSplats, group.n_pairs());
+  group.cursor = scratch.take<int64_t>(kCursor, n_chunks * n_tiles);
+  group.tile_begin = scratch.take<int64_t>(kTileBegin, n_images * n_tiles + 1);
+  if (backward) group.pair_begin = scratch.take<int64_t>(kPairBegin, group.n_pairs() + 1);
+
+  parallel.chunks(n_chunks, [&](int64_t c) {
+    const Chunk& chunk = group.chunks[c];
+    Splat<T>* splats = group.splats + chunk.pair;
+    dispatch_sh(scene.sh_terms, [&](auto terms) {
+      project_chunk<T, decltype(terms)::value>(scene, group.cameras[chunk.image - group.first], chunk, splats);
+    });
+    int64_t* counts = group.cursor + c * n_tiles;
+    std::fill_n(counts, n_tiles, int64_t{0});
+    for (int64_t i = 0; i < chunk.end - chunk.begin; ++i) {
+      int64_t count = 0;
+      for_tiles(splats[i], group.tiles_x, [&](int64_t tile) { ++counts[tile], ++count; });
+      if (backward) group.pair_begin[chunk.pair + i + 1] = count;
+    }
+  });
+
+  int64_t total = 0;
+  for (int64_t image = 0; image < n_images; ++image)
+    for (int64_t tile = 0; tile < n_tiles; ++tile) {
+      group.tile_begin[image * n_tiles + tile] = total;
+      for (int64_t c = group.image_chunk[image]; c < group.image_chunk[image + 1]; ++c) {
+        const int64_t count = group.cursor[c * n_tiles + tile];
+        group.cursor[c * n_tiles + tile] = total;
+        total += count;
+      }
+    }
+  group.tile_begin[n_images * n_tiles] = group.n_instances = total;
+  check(total <= std::numeric_limits<int32_t>::max(), kOp, ": the Gaussians of one image touch ", total,
+        " tiles together, more than 2^31; scales are too large");
+  group.instances = scratch.take<Instance<T>>(kInstances, total);
+  if (backward) {
+    group.positions = scratch.take<int64_t>(kPositions, total);
+    group.pair_begin[0] = 0;
+    for (int64_t pair = 0; pair < group.n_pairs(); ++pair) group.pair_begin[pair + 1] += group.pair_begin[pair];
+  }
+
+  parallel.chunks(n_chunks, [&](int64_t c) {
+    const Chunk& chunk = group.chunks[c];
+    int64_t* cursor = group.cursor + c * n_tiles;
+    const int64_t first_pair = group.image_pair[chunk.image - group.first];
+    for (int64_t pair = chunk.pair; pair < chunk.pair + chunk.end - chunk.begin; ++pair) {
+      const Splat<T>& splat = group.splats[pair];
+      Instance<T> instance{0, static_cast<uint32_t>(pair - first_pair)};
+      std::memcpy(&instance.key, &splat.z, sizeof(T));
+      int64_t* positions = backward ? group.positions + group.pair_begin[pair] : nullptr;
+      for_tiles(splat, group.tiles_x, [&](int64_t tile) {
+        if (positions) *positions++ = cursor[tile];
+        group.instances[cursor[tile]++] = instance;
+      });
+    }
+  });
+  return true;
+}
+
+#define GSIM3D_INSTANTIATE(T) \
+  template bool next_group<T>(const RasterScene<T>&, bool, Scratch&, const Parallel&, Group<T>&);
+GSIM3D_INSTANTIATE(float)
+GSIM3D_INSTANTIATE(double)
+#undef GSIM3D_INSTANTIATE
+
+}  // namespace gsim3d::raster

@@ -1,0 +1,145 @@
+#include "gsim3d/raster/raster.h"
+#include "gsim3d/torch/torch_utils.h"
+
+namespace gsim3d::binding {
+namespace {
+
+// The arguments that forward and backward share, contiguous and checked against each other.
+struct SceneTensors {
+  const char* op;
+  Tensor means, quats, scales, opacities, color, features, background, viewmats, Ks, image_cloud, cu_rows;
+  int64_t width, height;
+  double near_plane;
+  int64_t cutoff;
+
+  SceneTensors contiguous() const {
+    return {op,           rows_of(means),      rows_of(quats),    rows_of(scales), rows_of(opacities),   rows_of(color),
+            rows_of(features), rows_of(background), rows_of(viewmats), rows_of(Ks),     rows_of(image_cloud), rows_of(cu_rows),
+            width,        height,              near_plane,        cutoff};
+  }
+
+  int64_t n_rows() const { return means.size(0); }
+  int64_t n_images() const { return image_cloud.size(0); }
+
+  void check_all() const {
+    check_shape(op, "means", means, {-1, 3}, "[N, 3]");
+    const int64_t n = n_rows();
+    check_shape(op, "quats", quats, {n, 4}, "[N, 4]");
+    check_shape(op, "scales", scales, {n, 3}, "[N, 3]");
+    check_shape(op, "opacities", opacities, {n}, "[N]");
+    if (color.dim() == 3)
+      check_shape(op, "sh", color, {n, -1, 3}, "[N, K, 3]");
+    else
+      check_shape(op, "colors", color, {n, 3}, "[N, 3]");
+    check_shape(op, "features", features, {n, -1}, "[N, F]");
+    check_shape(op, "image_cloud", image_cloud, {-1}, "[I]");
+    const int64_t images = n_images();
+    check_shape(op, "background", background, {images, 3}, "[I, 3]");
+    check_shape(op, "viewmats", viewmats, {images, 4, 4}, "[I, 4, 4]");
+    check_shape(op, "Ks", Ks, {images, 3, 3}, "[I, 3, 3]");
+    check_dtype(op, "image_cloud", image_cloud, ScalarType::Long);
+    check_dtype(op, "cu_rows", cu_rows, ScalarType::Long);
+    check(cu_rows.dim() == 1 && cu_rows.size(0) >= 1, op, ": cu_rows must be [Q + 1]; got ", shape_of(cu_rows));
+    check(color.dim() != 3 || color.size(1) >= 1, op, ": sh must have 1, 4, 9 or 16 coefficients (degree 0 to 3); got 0");
+    const auto type = means.scalar_type();
+    check_dtype(op, "quats", quats, type);
+    check_dtype(op, "scales", scales, type);
+    check_dtype(op, "opacities", opacities, type);
+    check_dtype(op, color.dim() == 3 ? "sh" : "colors", color, type);
+    check_dtype(op, "features", features, type);
+    check_dtype(op, "background", background, type);
+    check_dtype(op, "viewmats", viewmats, type);
+    check_dtype(op, "Ks", Ks, type);
+  }
+
+  template <typename T>
+  RasterScene<T> scene() const {
+    return {data<T>(means),    data<T>(quats),     data<T>(scales),   data<T>(opacities),
+            data<T>(color),    data<T>(features),  data<T>(background), data<T>(viewmats),
+            data<T>(Ks),       data<int64_t>(image_cloud), data<int64_t>(cu_rows),
+            n_rows(),          cu_rows.size(0) - 1, n_images(),
+            color.dim() == 3 ? color.size(1) : 0,  features.size(1), width, height,
+            static_cast<T>(near_plane), static_cast<RasterCutoff>(cutoff)};
+  }
+};
+
+using Images = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
+                           const Tensor& color, const Tensor& features, const Tensor& background, const Tensor& viewmats,
+                           const Tensor& Ks, const Tensor& image_cloud, const Tensor& cu_rows, int64_t width,
+                           int64_t height, double near_plane, int64_t cutoff) {
+  const SceneTensors given{"rasterize_gaussians", means,    quats, scales,      opacities, color, features, background,
+                           viewmats,              Ks,       image_cloud, cu_rows, width,   height, near_plane, cutoff};
+  given.check_all();
+  const SceneTensors in = given.contiguous();
+  const int64_t n = in.n_images();
+  check(width >= 0 && height >= 0, given.op, ": width and height must be positive; got ", width, " and ", height);
+  Tensor out_color = empty(in.means, {n, height, width, 3}), alpha = empty(in.means, {n, height, width});
+  Tensor depth = empty(in.means, {n, height, width});
+  Tensor out_features = empty(in.means, {n, height, width, in.features.size(1)});
+  Tensor transmittance = empty(in.means, {n, height, width}), last = empty(in.means, {n, height, width}, ScalarType::Int);
+  TensorWorkspace workspace(in.means);
+  dispatch_float(given.op, "means", in.means, [&]<typename T>() {
+    cpu::raster_forward<T>(in.scene<T>(),
+                           {mutable_data<T>(out_color), mutable_data<T>(alpha), mutable_data<T>(depth),
+                            mutable_data<T>(out_features), mutable_data<T>(transmittance), mutable_data<int32_t>(last)},
+                           workspace, torch_parallel());
+  });
+  return {out_color, alpha, depth, out_features, transmittance, last};
+}
+
+using SceneGrads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor& grad_alpha_, const Tensor& grad_depth_,
+                                        const Tensor& grad_features_, const Tensor& transmittance_, const Tensor& last_,
+                                        const Tensor& means, const Tensor& quats, const Tensor& scales,
+                                        const Tensor& opacities, const Tensor& color, const Tensor& features,
+                                        const Tensor& background, const Tensor& viewmats, const Tensor& Ks,
+                                        const Tensor& image_cloud, const Tensor& cu_rows, int64_t width, int64_t height,
+                                        double near_plane, int64_t cutoff) {
+  const char* op = "rasterize_gaussians_backward";
+  const SceneTensors given{op,       means, quats,       scales,  opacities, color,  features,   background,
+                           viewmats, Ks,    image_cloud, cu_rows, width,     height, near_plane, cutoff};
+  given.check_all();
+  const SceneTensors in = given.contiguous();
+  const Tensor grad_color = rows_of(grad_color_), grad_alpha = rows_of(grad_alpha_), grad_depth = rows_of(grad_depth_);
+  const Tensor grad_features = rows_of(grad_features_), transmittance = rows_of(transmittance_), last = rows_of(last_);
+  const int64_t n = in.n_images();
+  check_shape(op, "grad_color", grad_color, {n, height, width, 3}, "[I, H, W, 3]");
+  check_shape(op, "grad_alpha", grad_alpha, {n, height, width}, "[I, H, W]");
+  check_shape(op, "grad_depth", grad_depth, {n, height, width}, "[I, H, W]");
+  check_shape(op, "grad_features", grad_features, {n, height, width, in.features.size(1)}, "[I, H, W, F]");
+  check_shape(op, "transmittance", transmittance, {n, height, width}, "[I, H, W]");
+  check_shape(op, "last", last, {n, height, width}, "[I, H, W]");
+  for (const Tensor* tensor : {&grad_color, &grad_alpha, &grad_depth, &grad_features, &transmittance})
+    check_dtype(op, "image gradients", *tensor, in.means.scalar_type());
+  check_dtype(op, "last", last, ScalarType::Int);
+
+  const auto like = [](const Tensor& tensor) { return torch::stable::new_empty(tensor, tensor.sizes()); };
+  Tensor grad_means = like(in.means), grad_quats = like(in.quats), grad_scales = like(in.scales);
+  Tensor grad_opacities = like(in.opacities), grad_in_color = like(in.color), grad_in_features = like(in.features);
+  Tensor grad_background = like(in.background), grad_viewmats = like(in.viewmats);
+  TensorWorkspace workspace(in.means);
+  dispatch_float(op, "means", in.means, [&]<typename T>() {
+    cpu::raster_backward<T>(
+        in.scene<T>(),
+        {data<T>(grad_color), data<T>(grad_alpha), data<T>(grad_depth), data<T>(grad_features), data<T>(transmittance),
+         data<int32_t>(last)},
+        {mutable_data<T>(grad_means), mutable_data<T>(grad_quats), mutable_data<T>(grad_scales),
+         mutable_data<T>(grad_opacities), mutable_data<T>(grad_in_color), mutable_data<T>(grad_in_features),
+         mutable_data<T>(grad_background), mutable_data<T>(grad_viewmats)},
+        workspace, torch_parallel());
+  });
+  return {grad_means,    grad_quats,       grad_scales,     grad_opacities,
+          grad_in_color, grad_in_features, grad_background, grad_viewmats};
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(gsim3d, CPU, m) {
+  m.impl("rasterize_gaussians", TORCH_BOX(&rasterize_gaussians));
+  m.impl("rasterize_gaussians_backward", TORCH_BOX(&rasterize_gaussians_backward));
+}
+
+}  // namespace gsim3d::binding

@@ -1,0 +1,71 @@
+"""Attention inside patches of a serialized order, without storing the score matrix."""
+
+import torch
+from torch import Tensor
+
+from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops.curve import PatchTable
+
+
+def patch_attention(q: Tensor, k: Tensor, v: Tensor, table: PatchTable, *, scale: float | None = None) -> Tensor:
+    """Softmax attention of every query row over the key rows of its patch.
+
+    ``out[i] = sum_j softmax_j(scale * <q[i], k[j]>) v[j]`` for each head, over the keys ``j`` in
+    ``kv_rows[cu_k[p]:cu_k[p + 1]]`` of the patch ``p`` that lists ``i`` in ``q_rows[cu_q[p]:cu_q[p + 1]]``.
+    A query row that no patch lists, or whose patch has no keys, gets 0.
+
+    Args:
+        q: queries [Nq, H, D], float32 or float64; D a multiple of 4 from 4 to 128. On the CPU under ``torch.autocast``
+            the call computes in float32.
+        k, v: keys and values [Nk, H, D]. The three may be views of one qkv tensor; they are read in place.
+        table: patches; a row at most once in ``q_rows``, any number of times in ``kv_rows``.
+        scale: factor of the dot products; default ``D ** -0.5``.
+    Returns:
+        [Nq, H, D], dtype of ``q``.
+    Gradients: ``q``, ``k`` and ``v``, once.
+    Determinism: equal bits for any number of threads, with AVX2 and AVX-512, for any numbering of the rows, and with any
+        other patches beside; only the order of the keys inside a patch rounds differently.
+    Raises:
+        ValueError: a shape, dtype, head dim, scale or table is malformed; the message names the argument.
+    Source: Dao et al. 2022 (FlashAttention), applied to the patches of Point Transformer V3 (Wu et al. 2024).
+
+    Example:
+        >>> from gsim3d.ops import PatchTable
+        >>> rows, cu = torch.tensor([0, 1, 2]), torch.tensor([0, 1, 3])
+        >>> x = torch.ones(3, 1, 4)
+        >>> patch_attention(x, x, torch.arange(12.0).view(3, 1, 4), PatchTable(rows, rows, cu, cu))[:, 0, 0]
+        tensor([0., 6., 6.])
+    """
+    if scale is None:
+        scale = q.shape[-1] ** -0.5
+    return torch.ops.gsim3d.patch_attention(
+        q, k, v, table.q_rows, table.kv_rows, table.cu_q, table.cu_k, float(scale)
+    )[0]
+
+
+@torch.library.register_fake("gsim3d::patch_attention")
+def _(q, k, v, q_rows, kv_rows, cu_q, cu_k, scale):
+    return q.new_empty(q.shape), q.new_empty(q.shape[0], q.shape[1], 2)
+
+
+@torch.library.register_fake("gsim3d::patch_attention_backward")
+def _(grad, q, k, v, out, stats, q_rows, kv_rows, cu_q, cu_k, scale):
+    return q.new_empty(q.shape), k.new_empty(k.shape), k.new_empty(k.shape)
+
+
+def _setup(ctx, inputs, output):
+    ctx.set_materialize_grads(False)
+    ctx.mark_non_differentiable(output[1])
+    q, k, v, q_rows, kv_rows, cu_q, cu_k, ctx.scale = inputs
+    ctx.save_for_backward(q, k, v, *output, q_rows, kv_rows, cu_q, cu_k)
+
+
+def _backward(ctx, grad, _grad_stats):
+    if grad is None:
+        return (None,) * 8
+    grads = torch.ops.gsim3d.patch_attention_backward(grad, *ctx.saved_tensors, ctx.scale)
+    return *grads, None, None, None, None, None
+
+
+torch.library.register_autograd("gsim3d::patch_attention", _backward, setup_context=_setup)
+torch.library.register_autocast("gsim3d::patch_attention", "cpu", torch.float32)
