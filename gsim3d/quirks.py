@@ -20,6 +20,19 @@ class Quirks:
             the strided convolutions took them.
         world_moments: moments of viewing rays are taken about the world's origin instead of the scene's.
         released_harmonics: the explicit variant's harmonics are turned into the world in a basis other than the renderer's.
+    Dynamics:
+        stale_decoder_conv: the first convolution of each decoder stage reads the skip branch before the features from
+            below are added to it.
+        first_of_voxel: where rows share a cell, a convolution reads the lowest row of a neighbour cell, not the mean.
+        anchor_at_minimum: cells are counted from the smallest position of the call, so clouds of a call change each other.
+        slots_from_first: time slots count from the first step and their number follows the history's length.
+        unbounded_opacity: opacities have no upper limit.
+        frozen_rows_turn: frozen particles keep their place but not their orientation.
+    Renderer:
+        unpaired_sh_rotation: coefficients are in the published basis (the polar axis is y) and turn with matrices of
+            another sign convention, so colours do not turn with the particle.
+        three_sigma_tiles: a Gaussian ends at the tiles that its three-sigma square touches.
+        far_near_plane: Gaussians nearer than a fifth of the camera's near bound are culled.
     """
 
     tiled_shift_mask: bool = False
@@ -29,6 +42,15 @@ class Quirks:
     corner_aligned_upsampling: bool = False
     world_moments: bool = False
     released_harmonics: bool = False
+    stale_decoder_conv: bool = False
+    first_of_voxel: bool = False
+    anchor_at_minimum: bool = False
+    slots_from_first: bool = False
+    unbounded_opacity: bool = False
+    frozen_rows_turn: bool = False
+    unpaired_sh_rotation: bool = False
+    three_sigma_tiles: bool = False
+    far_near_plane: bool = False
 
     @classmethod
     def release(cls) -> Quirks:
