@@ -17,7 +17,7 @@ ROOMS = [
     {"data", "interop", "generate"},
     {"train"},
     {"evaluate"},
-    {"demo", "doctor"},
+    {"simulate", "demo", "doctor"},
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}
