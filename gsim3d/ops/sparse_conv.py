@@ -1,16 +1,10 @@
 """Submanifold convolution over voxels: features of occupied neighbour cells, outputs at the same rows."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
-
-if TYPE_CHECKING:
-    from gsim3d.ops.curve import KernelMap, Voxels
+from gsim3d.ops.curve import KernelMap, Voxels
 
 
 def sparse_conv(
