@@ -5,15 +5,19 @@
 #include <initializer_list>
 #include <string>
 #include <tuple>
+#include <vector>
 
 #include "gsim3d/core/check.h"
 #include "gsim3d/core/parallel.h"
 #include "gsim3d/core/version.h"
 #include "gsim3d/core/workspace.h"
 #include "gsim3d/curve/curve.h"
+#include "gsim3d/patch_attn/patch_attn.h"
 #include "gsim3d/plane_sweep/plane_sweep.h"
 #include "gsim3d/plane_sweep/plane_sweep_math.h"
 #include "gsim3d/pool/pool.h"
+#include "gsim3d/raster/raster.h"
+#include "gsim3d/raster/raster_math.h"
 
 namespace py = pybind11;
 
@@ -105,6 +109,78 @@ py::array_t<T> plane_sweep(const Array<T>& features, const Array<T>& homographie
   return cost;
 }
 
+template <typename T>
+py::array_t<T> patch_attention(const Array<T>& q, const Array<T>& k, const Array<T>& v, const Indices& q_rows,
+                               const Indices& kv_rows, const Indices& cu_q, const Indices& cu_k, double scale) {
+  const char* op = "patch_attention";
+  check_shape(op, "q", q, {-1, -1, -1});
+  check_shape(op, "k", k, {-1, q.shape(1), q.shape(2)});
+  check_shape(op, "v", v, {k.shape(0), q.shape(1), q.shape(2)});
+  check_shape(op, "q_rows", q_rows, {-1});
+  check_shape(op, "kv_rows", kv_rows, {-1});
+  check_shape(op, "cu_q", cu_q, {-1});
+  gsim3d::check(cu_q.size() >= 1, op, ": cu_q must be [P + 1]; got [0]");
+  check_shape(op, "cu_k", cu_k, {cu_q.size()});
+  const gsim3d::PatchTable table{q_rows.data(),   kv_rows.data(),  cu_q.data(),   cu_k.data(),  cu_q.size() - 1,
+                                 q_rows.size(), kv_rows.size(), q.shape(0), k.shape(0)};
+  const gsim3d::AttentionSize size{q.shape(1), q.shape(2), scale};
+  gsim3d::cpu::check_attention_size(op, size);
+  gsim3d::cpu::check_patch_table(op, table);
+  const auto heads = [&](const Array<T>& x) {
+    return gsim3d::HeadRows<T>{x.data(), x.shape(1) * x.shape(2), x.shape(2)};
+  };
+  py::array_t<T> out({q.shape(0), q.shape(1), q.shape(2)}), stats({q.shape(0), q.shape(1), py::ssize_t{2}});
+  gsim3d::cpu::patch_attention(heads(q), heads(k), heads(v), table, size, out.mutable_data(), stats.mutable_data(),
+                               gsim3d::thread_pool());
+  return out;
+}
+
+// One cloud of Gaussians seen by I cameras.
+template <typename T>
+py::dict rasterize_gaussians(const Array<T>& means, const Array<T>& quats, const Array<T>& scales,
+                             const Array<T>& opacities, const Array<T>& colors, const Array<T>& viewmats,
+                             const Array<T>& Ks, int64_t width, int64_t height, const Array<T>& background,
+                             T near_plane) {
+  const char* op = "rasterize_gaussians";
+  check_shape(op, "means", means, {-1, 3});
+  const int64_t n = means.shape(0);
+  check_shape(op, "quats", quats, {n, 4});
+  check_shape(op, "scales", scales, {n, 3});
+  check_shape(op, "opacities", opacities, {n});
+  check_shape(op, "colors", colors, {n, 3});
+  check_shape(op, "viewmats", viewmats, {-1, 4, 4});
+  const int64_t n_images = viewmats.shape(0);
+  check_shape(op, "Ks", Ks, {n_images, 3, 3});
+  check_shape(op, "background", background, {3});
+  gsim3d::check(width > 0 && height > 0 && width <= (1 << 16) && height <= (1 << 16), op,
+                ": width and height must be in [1, 65536]; got ", width, " x ", height);
+  std::vector<T> backgrounds;
+  for (int64_t i = 0; i < n_images; ++i) backgrounds.insert(backgrounds.end(), background.data(), background.data() + 3);
+  const std::vector<int64_t> image_cloud(static_cast<size_t>(n_images), 0);
+  const int64_t cu_rows[2] = {0, n};
+  const gsim3d::RasterScene<T> scene{means.data(),       quats.data(),    scales.data(), opacities.data(), colors.data(),
+                                     nullptr,            backgrounds.data(), viewmats.data(), Ks.data(), image_cloud.data(),
+                                     cu_rows,            n,               1,             n_images,         0,
+                                     0,                  width,           height,        near_plane,
+                                     gsim3d::RasterCutoff::kExact};
+  py::array_t<T> color({n_images, height, width, int64_t{3}}), alpha({n_images, height, width}),
+      depth({n_images, height, width});
+  gsim3d::HeapWorkspace scratch;
+  const gsim3d::Workspace workspace = scratch;
+  const gsim3d::RasterImages<T> images{color.mutable_data(),
+                                       alpha.mutable_data(),
+                                       depth.mutable_data(),
+                                       nullptr,
+                                       workspace.take<T>(n_images * height * width),
+                                       workspace.take<int32_t>(n_images * height * width)};
+  gsim3d::cpu::raster_forward(scene, images, workspace, gsim3d::thread_pool());
+  py::dict result;
+  result["color"] = color;
+  result["alpha"] = alpha;
+  result["depth"] = depth;
+  return result;
+}
+
 py::dict build_info() {
   py::dict info;
   info["version"] = GSIM3D_VERSION;
@@ -120,6 +196,18 @@ py::dict build_info() {
   return info;
 }
 
+py::dict constants() {
+  py::dict values;
+  values["raster_min_alpha"] = gsim3d::raster::kMinAlpha;
+  values["raster_max_alpha"] = gsim3d::raster::kMaxAlpha;
+  values["raster_min_transmittance"] = gsim3d::raster::kMinTransmittance;
+  values["raster_dilation"] = gsim3d::raster::kDilation;
+  values["plane_sweep_min_depth"] = gsim3d::plane_sweep_math::kMinDepth<double>;
+  values["patch_attn_max_head_dim"] = gsim3d::cpu::kMaxHeadDim;
+  values["curve_max_depth"] = gsim3d::kMaxDepth;
+  return values;
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_core, m) {
@@ -132,6 +220,19 @@ PYBIND11_MODULE(_core, m) {
   m.def("pool_mean", &pool_mean<double>, py::arg("x").noconvert(), py::arg("rows"), py::arg("cu_rows"));
   m.def("pool_mean", &pool_mean<float>, py::arg("x"), py::arg("rows"), py::arg("cu_rows"),
         "Mean over segments of rows: [M, C].");
+  m.attr("constants") = constants();
+  m.def("patch_attention", &patch_attention<double>, py::arg("q").noconvert(), py::arg("k"), py::arg("v"), py::arg("q_rows"),
+        py::arg("kv_rows"), py::arg("cu_q"), py::arg("cu_k"), py::arg("scale"));
+  m.def("patch_attention", &patch_attention<float>, py::arg("q"), py::arg("k"), py::arg("v"), py::arg("q_rows"),
+        py::arg("kv_rows"), py::arg("cu_q"), py::arg("cu_k"), py::arg("scale"),
+        "Attention [Nq, H, D] of query rows to the key rows of their patch.");
+  m.def("rasterize_gaussians", &rasterize_gaussians<double>, py::arg("means").noconvert(), py::arg("quats"),
+        py::arg("scales"), py::arg("opacities"), py::arg("colors"), py::arg("viewmats"), py::arg("Ks"), py::arg("width"),
+        py::arg("height"), py::arg("background"), py::arg("near_plane") = 0.01);
+  m.def("rasterize_gaussians", &rasterize_gaussians<float>, py::arg("means"), py::arg("quats"), py::arg("scales"),
+        py::arg("opacities"), py::arg("colors"), py::arg("viewmats"), py::arg("Ks"), py::arg("width"), py::arg("height"),
+        py::arg("background"), py::arg("near_plane") = 0.01f,
+        "One cloud of Gaussians seen by I cameras: {color [I, H, W, 3], alpha [I, H, W], depth [I, H, W]}.");
   m.def("curve_encode", &curve_encode, py::arg("grid"), py::arg("cloud"), py::arg("curve"), py::arg("depth") = 16,
         "Codes [N] of cells [N, 3] along curve 0 z, 1 z-trans, 2 hilbert, 3 hilbert-trans; cloud << 3 depth above them.");
   m.def("curve_sort", &curve_sort, py::arg("codes"), "Stable order and inverse, [R, N] each, of codes [R, N].");

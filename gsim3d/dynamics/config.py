@@ -1,0 +1,108 @@
+"""The shape of the dynamics model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gsim3d.ops.curve import PyramidSpec
+from gsim3d.quirks import Quirks
+
+STEM_KERNEL, BLOCK_KERNEL = 5, 3  # edges of the convolutions, in cells
+
+
+@dataclass(frozen=True)
+class DynamicsConfig:
+    """S stages; every per-stage tuple starts at the finest.
+
+    State:
+        dynamic_latents, static_latents: channels of Particles.dynamic_latents and .static_latents.
+        explicit: particles carry their own Gaussian parameters (quats, scales, sh), and all of them change with time.
+        sh_degree: of explicit particles.
+        scale_min, scale_max: metres, limits of explicit scales.
+        max_step: metres; one step moves a particle by less than this along each axis. None: no limit.
+        max_latent_step: the same for each dynamic latent. None: no limit.
+        position_features: the network also sees positions relative to the scene's origin (in units of
+            ``position_length`` metres) and inside the cell. Learning where the ground is takes far less data so; without
+            it the network knows particles by their neighbours only, and motion does not depend on the place.
+    Geometry:
+        grid_size: metres, edge of a cell at stage 0.
+        history_bits: a history has 1 to 2^history_bits steps.
+        strides, merge_windows: S - 1 powers of two: how much coarser the next stage is, how many time slots it merges.
+        patch_sizes: rows that attend to each other.
+        time_embedding: merged steps are told apart by a learned vector.
+    Network:
+        encoder_depths, encoder_channels, encoder_heads: S each.
+        decoder_depths, decoder_channels, decoder_heads: S - 1 each, stages 0 to S - 2.
+        mlp_ratio: hidden channels of a block's MLP over its channels.
+        norm: "layer", or "batch" as published: evaluation uses running statistics, training those of the call's rows.
+        zero_init: the last layer starts at zero, so an untrained model predicts that nothing changes.
+    Training:
+        drop_path: share of rows that skip a branch of a block, growing from 0 at the first block.
+        shuffle_orders: the four curves of a stage change places at random.
+        checkpointing: blocks are computed again in the backward pass instead of being kept.
+    """
+
+    dynamic_latents: int = 32
+    static_latents: int = 32
+    explicit: bool = False
+    sh_degree: int = 3
+    scale_min: float = 0.0002
+    scale_max: float = 0.1
+    max_step: float | None = 0.5
+    max_latent_step: float | None = None
+    position_features: bool = False
+    position_length: float = 1.0
+    grid_size: float = 0.004
+    history_bits: int = 2
+    strides: tuple[int, ...] = (4, 2, 2, 2)
+    merge_windows: tuple[int, ...] = (2, 2, 2, 8)
+    patch_sizes: tuple[int, ...] = (1024,) * 5
+    time_embedding: bool = True
+    encoder_depths: tuple[int, ...] = (2, 2, 2, 6, 2)
+    encoder_channels: tuple[int, ...] = (32, 64, 128, 256, 512)
+    encoder_heads: tuple[int, ...] = (2, 4, 8, 16, 32)
+    decoder_depths: tuple[int, ...] = (2, 2, 2, 2)
+    decoder_channels: tuple[int, ...] = (64, 64, 128, 256)
+    decoder_heads: tuple[int, ...] = (4, 4, 8, 16)
+    mlp_ratio: int = 4
+    norm: str = "batch"
+    zero_init: bool = False
+    drop_path: float = 0.3
+    shuffle_orders: bool = True
+    checkpointing: bool = False
+    quirks: Quirks = field(default_factory=Quirks)
+
+    def __post_init__(self):
+        n = self.n_stages
+        sizes = {
+            "strides": n - 1, "merge_windows": n - 1, "patch_sizes": n,
+            "encoder_depths": n, "encoder_heads": n,
+            "decoder_depths": n - 1, "decoder_channels": n - 1, "decoder_heads": n - 1,
+        }  # fmt: skip
+        for name, size in sizes.items():
+            if len(getattr(self, name)) != size:
+                raise ValueError(
+                    f"DynamicsConfig: {name} must have {size} entries, for {n} stages; got {getattr(self, name)}"
+                )
+        for name in ("encoder", "decoder"):
+            for channels, heads in zip(getattr(self, f"{name}_channels"), getattr(self, f"{name}_heads"), strict=True):
+                if channels % heads:
+                    raise ValueError(f"DynamicsConfig: {name}_channels {channels} cannot be split into {heads} heads")
+        if self.norm not in ("layer", "batch"):
+            raise ValueError(f'DynamicsConfig: norm must be "layer" or "batch"; got {self.norm!r}')
+
+    @property
+    def n_stages(self) -> int:
+        return len(self.encoder_channels)
+
+    def pyramid_spec(self, history_bits: int) -> PyramidSpec:
+        """What the geometry op needs to know, for a history of up to 2^history_bits steps."""
+        return PyramidSpec(
+            grid_size=self.grid_size,
+            slot_bits=history_bits,
+            strides=tuple(self.strides),
+            merge_windows=tuple(self.merge_windows),
+            patch_sizes=tuple(self.patch_sizes),
+            kernel_sizes=((STEM_KERNEL, BLOCK_KERNEL),) + ((BLOCK_KERNEL,),) * (self.n_stages - 1),
+            release=self.quirks.anchor_at_minimum,
+        )

@@ -1,0 +1,66 @@
+"""Batch normalisation of packed rows, as the published model has it."""
+
+from __future__ import annotations
+
+import torch
+import torch.distributed
+import torch.distributed.nn.functional
+from torch import Tensor, nn
+
+
+class RowBatchNorm(nn.Module):
+    """Normalises each channel by statistics over rows; running statistics in evaluation.
+
+    Differs from ``nn.BatchNorm1d`` in three ways: one row or none is fine (running statistics are then kept), statistics
+    are float32 or wider, and processes combine theirs in the order of their ranks, so a run repeats bit by bit.
+    """
+
+    EPS = 1e-3
+    MOMENTUM = 0.01
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
+        self.register_buffer("running_mean", torch.zeros(channels))
+        self.register_buffer("running_var", torch.ones(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not self.training:
+            return self._normalise(x, self.running_mean, self.running_var)
+        mean, var, n_rows = _statistics(x.float() if x.dtype in (torch.float16, torch.bfloat16) else x)
+        with torch.no_grad():
+            rate = self.MOMENTUM * (n_rows > 1).to(self.running_var)
+            self.running_mean.lerp_(mean.to(self.running_mean), rate)
+            unbiased = var * n_rows / (n_rows - 1).clamp(min=1)
+            self.running_var.lerp_(unbiased.to(self.running_var), rate)
+        return self._normalise(x, mean, var)
+
+    def _normalise(self, x: Tensor, mean: Tensor, var: Tensor) -> Tensor:
+        scale = self.weight * torch.rsqrt(var + self.EPS)
+        return (x - mean) * scale + self.bias
+
+
+def _statistics(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean and biased variance of each column over the rows of all processes, and the number of rows."""
+    n_rows = x.new_full((), x.shape[0])
+    mean = x.sum(0) / n_rows.clamp(min=1)
+    spread = (x - mean).square().sum(0)
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        mine = torch.cat([n_rows[None], mean, spread])
+        n_rows, mean, spread = _combine(torch.distributed.nn.functional.all_gather(mine), x.shape[1])
+    return mean, spread / n_rows.clamp(min=1), n_rows
+
+
+def _combine(parts: tuple[Tensor, ...], n_channels: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Row counts, means and sums of squared deviations of several processes as one, added in the order given."""
+    counts, means, spreads = zip(*(part.split([1, n_channels, n_channels]) for part in parts), strict=True)
+    n_rows = sum(counts).clamp(min=1)
+    mean = sum(count * mean for count, mean in zip(counts, means, strict=True)) / n_rows
+    between = sum(count * (part - mean).square() for count, part in zip(counts, means, strict=True))
+    return sum(counts)[0], mean, sum(spreads) + between
+
+
+def make_norm(kind: str, channels: int) -> nn.Module:
+    """"layer" or "batch"."""
+    return nn.LayerNorm(channels) if kind == "layer" else RowBatchNorm(channels)

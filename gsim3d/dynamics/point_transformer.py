@@ -1,0 +1,273 @@
+"""A U-shaped transformer over packed point clouds of several time steps.
+
+Stem, then encoder stages that pool space and merge time, then decoder stages that go back to the rows of stage 0. All
+geometry (neighbours, patches, clusters) comes from a :class:`gsim3d.ops.Pyramid`; this file holds features and weights.
+Source: Point Transformer V3 (Wu et al. 2024), time merging of 3DGSim.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.utils.checkpoint import checkpoint
+
+from gsim3d import ops
+from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
+from gsim3d.dynamics.norm import make_norm
+from gsim3d.ops.curve import PatchTable, Pyramid, Stage
+
+TIME_EMBEDDING_STD = 0.02
+
+
+class SparseConv(nn.Module):
+    """Submanifold convolution; weight [C_out, K, K, K, C_in]."""
+
+    def __init__(self, in_channels: int, out_channels: int, kernel_size: int, *, bias: bool, duplicates: str):
+        super().__init__()
+        self.kernel_size, self.duplicates = kernel_size, duplicates
+        bound = (in_channels * kernel_size**3) ** -0.5
+        shape = (out_channels, kernel_size, kernel_size, kernel_size, in_channels)
+        self.weight = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(out_channels).uniform_(-bound, bound)) if bias else None
+
+    def forward(self, x: Tensor, stage: Stage) -> Tensor:
+        kernel_map = stage.kernel_maps[self.kernel_size]
+        return ops.sparse_conv(x, self.weight, self.bias, stage.voxels, kernel_map, duplicates=self.duplicates)
+
+
+class PositionEncoding(nn.Module):
+    """What a row learns about its place from its neighbours: convolution, linear layer, norm."""
+
+    def __init__(self, channels: int, duplicates: str):
+        super().__init__()
+        self.conv = SparseConv(channels, channels, BLOCK_KERNEL, bias=True, duplicates=duplicates)
+        self.linear = nn.Linear(channels, channels)
+        self.norm = nn.LayerNorm(channels)
+
+    def forward(self, x: Tensor, stage: Stage) -> Tensor:
+        return self.norm(self.linear(self.conv(x, stage)))
+
+
+class Attention(nn.Module):
+    """Multi-head attention inside the patches of one serialization."""
+
+    def __init__(self, channels: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.proj = nn.Linear(channels, channels)
+
+    def forward(self, x: Tensor, patches: PatchTable) -> Tensor:
+        q, k, v = self.qkv(x).unflatten(1, (3, self.heads, -1)).unbind(1)
+        return self.proj(ops.patch_attention(q, k, v, patches).flatten(1))
+
+
+class MLP(nn.Module):
+    def __init__(self, channels: int, hidden: int):
+        super().__init__()
+        self.fc1 = nn.Linear(channels, hidden)
+        self.fc2 = nn.Linear(hidden, channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.fc2(F.gelu(self.fc1(x)))
+
+
+class Block(nn.Module):
+    """Position encoding, attention and MLP, each added to what came in."""
+
+    def __init__(self, channels: int, heads: int, drop_path: float, config: DynamicsConfig):
+        super().__init__()
+        self.drop_path, self.checkpointing = drop_path, config.checkpointing
+        self.position = PositionEncoding(channels, duplicates_rule(config))
+        self.norm1 = nn.LayerNorm(channels)
+        self.attention = Attention(channels, heads)
+        self.norm2 = nn.LayerNorm(channels)
+        self.mlp = MLP(channels, config.mlp_ratio * channels)
+
+    def forward(
+        self,
+        x: Tensor,
+        stage: Stage,
+        row: int,
+        *,
+        conv_input: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """x [N, C] with attention along serialization ``row``. ``conv_input``: what the convolution reads, default x."""
+        conv_input = x if conv_input is None else conv_input
+        # Drawn here: a generator does not repeat itself when the block is computed again in the backward pass.
+        keep = [self._draw_keep(x, generator) for _ in range(2)]
+        if self.checkpointing and self.training and torch.is_grad_enabled():
+            arguments = (x, conv_input, stage, row, *keep)
+            return checkpoint(self._compute, *arguments, use_reentrant=False, preserve_rng_state=False)
+        return self._compute(x, conv_input, stage, row, *keep)
+
+    def _compute(self, x, conv_input, stage, row, keep_attention, keep_mlp):
+        x = x + self.position(conv_input, stage)
+        x = x + scaled(self.attention(self.norm1(x), stage.patches[row]), keep_attention)
+        return x + scaled(self.mlp(self.norm2(x)), keep_mlp)
+
+    def _draw_keep(self, x: Tensor, generator: torch.Generator | None) -> Tensor | None:
+        """[N, 1]: 0 for rows that skip a branch, 1 / share kept for the others; None: nobody skips."""
+        if not self.training or generator is None or self.drop_path == 0:
+            return None
+        draws = torch.rand(x.shape[0], 1, generator=generator, device=generator.device)
+        return (draws >= self.drop_path).to(x) / (1 - self.drop_path)
+
+
+def scaled(x: Tensor, keep: Tensor | None) -> Tensor:
+    return x if keep is None else x * keep
+
+
+def duplicates_rule(config: DynamicsConfig) -> str:
+    return "first" if config.quirks.first_of_voxel else "mean"
+
+
+class Stem(nn.Module):
+    """Features of the particles -> channels of stage 0."""
+
+    def __init__(self, in_channels: int, config: DynamicsConfig):
+        super().__init__()
+        channels = config.encoder_channels[0]
+        self.conv = SparseConv(in_channels, channels, STEM_KERNEL, bias=False, duplicates=duplicates_rule(config))
+        self.norm = make_norm(config.norm, channels)
+
+    def forward(self, x: Tensor, stage: Stage) -> Tensor:
+        return F.gelu(self.norm(self.conv(x, stage)))
+
+
+class Pool(nn.Module):
+    """Maximum over the rows of a larger cell."""
+
+    def __init__(self, in_channels: int, out_channels: int, norm: str):
+        super().__init__()
+        self.proj = nn.Linear(in_channels, out_channels)
+        self.norm = make_norm(norm, out_channels)
+
+    def forward(self, x: Tensor, stage: Stage) -> Tensor:
+        return F.gelu(self.norm(ops.pool_max(self.proj(x), stage.cluster.rows, stage.cluster.cu_rows)))
+
+
+class Merge(nn.Module):
+    """Marks each row with its step inside the merged window. (That steps share a cloud is part of the geometry.)"""
+
+    def __init__(self, window: int, channels: int):
+        super().__init__()
+        self.time_embedding = nn.Parameter(torch.empty(window, channels))
+        nn.init.trunc_normal_(self.time_embedding, std=TIME_EMBEDDING_STD)
+
+    def forward(self, x: Tensor, stage: Stage) -> Tensor:
+        if stage.time_index is None:
+            return x
+        # A product with a one-hot matrix: its gradient is a sum in row order, where indexing would use atomics on CUDA.
+        return x + F.one_hot(stage.time_index, self.time_embedding.shape[0]).to(x) @ self.time_embedding
+
+
+class EncoderStage(nn.Module):
+    def __init__(self, index: int, drop_paths: list[float], config: DynamicsConfig):
+        super().__init__()
+        channels = config.encoder_channels
+        self.pool = Pool(channels[index - 1], channels[index], config.norm) if index > 0 else None
+        window = config.merge_windows[index - 1] if index > 0 else 1
+        self.merge = Merge(window, channels[index]) if window > 1 and config.time_embedding else None
+        self.blocks = nn.ModuleList(
+            Block(channels[index], config.encoder_heads[index], drop_path, config) for drop_path in drop_paths
+        )
+
+    def forward(self, x: Tensor, stage: Stage, generator: torch.Generator | None) -> Tensor:
+        if self.pool is not None:
+            x = self.pool(x, stage)
+        if self.merge is not None:
+            x = self.merge(x, stage)
+        for i, block in enumerate(self.blocks):
+            x = block(x, stage, i % len(stage.patches), generator=generator)
+        return x
+
+
+class Unpool(nn.Module):
+    """Features of the coarser rows, added to those the encoder had at this stage."""
+
+    def __init__(self, in_channels: int, skip_channels: int, out_channels: int, norm: str):
+        super().__init__()
+        self.proj = nn.Linear(in_channels, out_channels)
+        self.proj_norm = make_norm(norm, out_channels)
+        self.skip = nn.Linear(skip_channels, out_channels)
+        self.skip_norm = make_norm(norm, out_channels)
+
+    def forward(self, x: Tensor, skip: Tensor, coarse: Stage) -> tuple[Tensor, Tensor]:
+        """Both together, and the skip branch alone."""
+        below = F.gelu(self.proj_norm(self.proj(x)))
+        skip = F.gelu(self.skip_norm(self.skip(skip)))
+        return skip + ops.unpool(below, coarse.cluster.rows, coarse.cluster.cu_rows, skip.shape[0]), skip
+
+
+class DecoderStage(nn.Module):
+    def __init__(self, index: int, drop_paths: list[float], config: DynamicsConfig):
+        super().__init__()
+        channels = config.decoder_channels
+        below = (*channels, config.encoder_channels[-1])[index + 1]
+        self.unpool = Unpool(below, config.encoder_channels[index], channels[index], config.norm)
+        self.blocks = nn.ModuleList(
+            Block(channels[index], config.decoder_heads[index], drop_path, config) for drop_path in drop_paths
+        )
+        self.stale_conv = config.quirks.stale_decoder_conv
+
+    def forward(
+        self, x: Tensor, skip: Tensor, stage: Stage, coarse: Stage, generator: torch.Generator | None
+    ) -> Tensor:
+        x, skip = self.unpool(x, skip, coarse)
+        for i, block in enumerate(self.blocks):
+            conv_input = skip if self.stale_conv and i == 0 else x
+            x = block(x, stage, i % len(stage.patches), conv_input=conv_input, generator=generator)
+        return x
+
+
+class Head(nn.Module):
+    def __init__(self, channels: int, out_channels: int, zero_init: bool):
+        super().__init__()
+        self.norm = nn.LayerNorm(channels)
+        self.fc1 = nn.Linear(channels, channels)
+        self.fc2 = nn.Linear(channels, out_channels)
+        if zero_init:
+            nn.init.zeros_(self.fc2.weight)
+            nn.init.zeros_(self.fc2.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.fc2(self.fc1(F.gelu(self.norm(x))))
+
+
+class PointTransformer(nn.Module):
+    """Features [N, in_channels] of all clouds -> features [N, decoder_channels[0]] of the same rows, and a head.
+
+    Args of forward:
+        x: features of the rows of stage 0.
+        pyramid: their geometry.
+        generator: of drop path, in training; None: no drop path.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, config: DynamicsConfig):
+        super().__init__()
+        self.stem = Stem(in_channels, config)
+        rates = linear_rates(config.drop_path, config.encoder_depths)
+        self.encoder = nn.ModuleList(EncoderStage(s, rates[s], config) for s in range(config.n_stages))
+        rates = linear_rates(config.drop_path, config.decoder_depths)
+        self.decoder = nn.ModuleList(DecoderStage(s, rates[s][::-1], config) for s in range(config.n_stages - 1))
+        self.head = Head((*config.decoder_channels, config.encoder_channels[-1])[0], out_channels, config.zero_init)
+
+    def forward(self, x: Tensor, pyramid: Pyramid, *, generator: torch.Generator | None = None) -> Tensor:
+        stages = pyramid.stages
+        x = self.stem(x, stages[0])
+        skips = []
+        for encoder, stage in zip(self.encoder, stages, strict=True):
+            x = encoder(x, stage, generator)
+            skips.append(x)
+        for s in reversed(range(len(self.decoder))):
+            x = self.decoder[s](x, skips[s], stages[s], stages[s + 1], generator)
+        return x
+
+
+def linear_rates(last: float, depths: tuple[int, ...]) -> list[list[float]]:
+    """Drop-path rates of the blocks of each stage: from 0 at the first block to ``last`` at the last one."""
+    rates = iter(torch.linspace(0, last, sum(depths)).tolist())
+    return [[next(rates) for _ in range(depth)] for depth in depths]

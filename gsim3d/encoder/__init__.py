@@ -1,0 +1,6 @@
+"""Images of calibrated cameras -> particles: multi-view features, cost volume, depth, view-independent latents."""
+
+from gsim3d.encoder.config import EncoderConfig
+from gsim3d.encoder.encoder import Encoder
+
+__all__ = ["Encoder", "EncoderConfig"]

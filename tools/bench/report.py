@@ -1,0 +1,89 @@
+#!/usr/bin/env python
+"""Runs the benchmark of every op and writes docs/benchmarks.md (and docs/benchmarks.json, the numbers behind it).
+
+    python tools/bench/report.py                  all ops
+    python tools/bench/report.py raster pool      run these again, keep the other numbers
+
+Let nothing else run meanwhile.
+"""
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+OPS = ["curve", "sparse_conv", "patch_attn", "pool", "plane_sweep", "raster"]
+NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
+INTRODUCTION = """# Benchmarks
+
+Written by `python tools/bench/report.py`; do not edit. Every case first compares the results of both sides, then times
+them in turns in one process, float32. "torch" is the best form of the op in plain torch that we found (vectorised; the
+code is in `tools/bench/<op>.py`). Medians of repeated runs; spread is the distance between the quartiles as a part
+of the median. "faster" below 1 means that torch is faster.
+"""
+
+
+def processor() -> str:
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    flags = next((line for line in lines if line.startswith("flags")), "")
+    wide = ", AVX-512" if "avx512f" in flags else ""
+    return (names[0] if names else platform.processor() or platform.machine()) + wide
+
+
+def commit() -> str:
+    done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
+    return done.stdout.strip() or "unknown"
+
+
+def run(op: str) -> dict:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "numbers.json"
+        env = {**os.environ, "PYTHONPATH": str(ROOT)}
+        subprocess.run([sys.executable, f"tools/bench/{op}.py", "--json", str(file)], cwd=ROOT, env=env, check=True)
+        record = json.loads(file.read_text())
+    today = datetime.date.today().isoformat()
+    return {**record, "machine": processor(), "commit": commit(), "date": today, "python": platform.python_version()}
+
+
+def page(records: dict[str, dict]) -> str:
+    text = INTRODUCTION
+    for op in OPS:
+        if op not in records:
+            continue
+        r = records[op]
+        text += (
+            f"\n## {op}\n\n{r['machine']}, {r['threads']} threads, torch {r['torch']}, Python {r['python']}, "
+            f"commit {r['commit']}, {r['date']}.\n\n"
+            "| case | gsim3d ms | torch ms | faster | spread | error |\n| --- | ---: | ---: | ---: | ---: | ---: |\n"
+        )
+        for row in r["results"]:
+            spread = max(row["gsim3d"]["spread"], row["torch"]["spread"])
+            text += (
+                f"| {row['case']} | {row['gsim3d']['ms']:.2f} | {row['torch']['ms']:.2f} | {row['faster']:.1f}x "
+                f"| {spread:.0%} | {row['error']:.0e} |\n"
+            )
+    return text
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("ops", nargs="*", choices=[[], *OPS], help="default: all")
+    ops = parser.parse_args().ops or OPS
+    records = json.loads(NUMBERS.read_text()) if NUMBERS.exists() else {}
+    NUMBERS.parent.mkdir(exist_ok=True)
+    for op in ops:
+        records[op] = run(op)
+        NUMBERS.write_text(json.dumps(records, indent=1) + "\n")
+        PAGE.write_text(page(records))
+
+
+if __name__ == "__main__":
+    main()
