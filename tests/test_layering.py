@@ -10,7 +10,7 @@ ROOT = Path(__file__).parent.parent
 ROOMS = [
     {"errors"},
     {"types"},
-    {"ops", "quirks", "effects"},
+    {"ops", "quirks", "effects", "harmonics"},
     {"encoder", "dynamics", "renderer"},
     {"presets"},
     {"simulator"},
