@@ -171,18 +171,19 @@ def _template(metadata: dict, where: Path) -> str:
     if not isinstance(template, str):
         raise InputError(f"{where}: file_path_template must be text; got {template!r}")
     try:
-        fields = {field for _, field, _, _ in string.Formatter().parse(template) if field is not None}
+        parts = [part for part in string.Formatter().parse(template) if part[1] is not None]
     except ValueError as error:
         raise InputError(f"{where}: file_path_template {template!r} is no format string: {error}") from error
+    fields = {field for _, field, _, _ in parts}
     if fields != TEMPLATE_FIELDS:
         raise InputError(
             f"{where}: file_path_template must use the fields {', '.join(sorted(TEMPLATE_FIELDS))}, each as it is; "
             f"got {', '.join(sorted(fields)) or 'none'}"
         )
-    try:
-        template.format(cam_ix=0, n_step=0, img_type="rgb")
-    except (ValueError, TypeError, LookupError) as error:
-        raise InputError(f"{where}: file_path_template {template!r} cannot be filled in: {error}") from error
+    # Only plain fields and zero-padded numbers: a format width of 10^9 would fill the memory.
+    for _, field, spec, conversion in parts:
+        if conversion or not re.fullmatch(r"" if field == "img_type" else r"(0?\d{1,2})?d?", spec):
+            raise InputError(f"{where}: file_path_template may format numbers like {{n_step:04d}} only; got {template!r}")
     return template
 
 
