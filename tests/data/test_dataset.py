@@ -13,7 +13,8 @@ from tests.data.scene_folder import write_scene
 def scenes(tmp_path):
     opened = []
     for number in range(2):
-        write_scene(tmp_path / f"s{number}", n_steps=6, n_cams=5, seed=number, edits={"origin": [float(number), 0.0, 0.0]})
+        edits = {"origin": [float(number), 0.0, 0.0]}
+        write_scene(tmp_path / f"s{number}", n_steps=6, n_cams=5, seed=number, edits=edits)
         opened.append(Scene.open(tmp_path / f"s{number}"))
     return opened
 
