@@ -51,11 +51,6 @@ TOLERANCES = {
     "encoder_order": Tolerance(2e-5, 1.8e-6, EPYC, "float32 sums in another order through a deep network"),
     "film_golden": Tolerance(5e-6, 4.1e-7, EPYC, "float32 on both sides"),
     "dynamics_golden": Tolerance(1e-5, 5.7e-6, EPYC, "float32 networks of up to 14 blocks, another order of additions"),
-    "encoder_golden": Tolerance(1e-4, 1e-5, EPYC, "a deep float32 network; published runs differ by 1e-5 among themselves"),
-    "sh_golden": Tolerance(1e-5, 1e-6, EPYC, "the published rotation matrices are float32"),
-    "encoder_order": Tolerance(1e-4, 1e-5, EPYC, "float32 sums in another order through a deep network"),
-    "film_golden": Tolerance(1e-5, 1e-6, EPYC, "float32 on both sides"),
-    "dynamics_golden": Tolerance(1e-5, 2e-6, EPYC, "float32 networks of up to 14 blocks, another order of additions"),
 }
 
 
