@@ -15,6 +15,8 @@ import numpy as np
 from gsim3d.errors import InputError
 from gsim3d.generate import cameras, physics, render, shapes, writer
 
+DENSITY = 45.0  # kg per cubic metre of the body's bounding box, about half of which it fills
+DAMPING = 0.01  # seconds; a bounce dies away after about a second
 MAX_ATTEMPTS = 40  # draws of one scene before the options are called impossible
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 MESH_UPS = ("y", "z")
@@ -46,16 +48,16 @@ class Elastic:
     drop_height: tuple[float, float] = (0.5, 0.7)  # of the lowest point; never less than the body's own height
     speed: float = 0.35  # largest horizontal speed at the start, m/s
     spin: float = 1.2  # largest, rad/s
-    young: tuple[float, float] = (5e3, 9e3)  # Pa; density 90 kg/m^3 of the bounding box's half
+    young: tuple[float, float] = (5e3, 9e3)  # Pa
     cells: int = 3  # of the control lattice along each axis
     max_timestep: float = 1 / 480
     distance: float = 2.6
     elevations: tuple[float, float] = (18.0, 42.0)  # degrees, of the low and the high ring
     target_height: float = 0.52
-    fov: float = 41.0  # degrees
-    ground_radius: float = 1.0
-    near: float = 1.2
-    far: float = 4.0
+    fov: float = 42.0  # degrees
+    ground_radius: float = 0.85
+    near: float = 1.5
+    far: float = 3.8
 
     name = "elastic"
 
@@ -88,6 +90,19 @@ class Elastic:
             raise InputError(f"objects and mesh files need names of their own; repeated: {repeated}, all: {names}")
         for path in self.meshes:
             shapes.load_body(path, self.mesh_up)
+        self._check_ground()
+
+    def _check_ground(self) -> None:
+        rig = self.rig()
+        angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+        rim = self.ground_radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(64)], 1)
+        pixels, depth = cameras.project(rim, rig.viewmats, rig.Ks)
+        seen = (depth > 0) & (pixels >= 0).all(-1) & (pixels <= rig.size).all(-1)
+        if seen.any() and not (rig.near <= depth[seen].min() and depth[seen].max() <= rig.far):
+            low, high = depth[seen].min(), depth[seen].max()
+            raise InputError(
+                f"the ground is seen from {low:.2f} to {high:.2f} m, beyond near {rig.near} and far {rig.far}"
+            )
 
     def object_names(self) -> list[str]:
         """Names of objects and mesh files, in the order in which trajectories are dealt to them."""
@@ -182,8 +197,8 @@ class Elastic:
             velocity,
             rng.uniform(0, self.spin) * axis / np.linalg.norm(axis),
             young=rng.uniform(*self.young),
-            damping=0.01,
-            mass=45.0 * float(np.prod(np.ptp(collision, axis=0))),
+            damping=DAMPING,
+            mass=DENSITY * float(np.prod(np.ptp(collision, axis=0))),
             cells=self.cells,
         )
         self._check_view(rig, (vertices + place)[None])  # many draws fail here, before the costly part
