@@ -44,7 +44,6 @@ TOLERANCES = {
     "sh_golden": Tolerance(1e-5, 1e-6, EPYC, "the published rotation matrices are float32"),
     "encoder_order": Tolerance(1e-4, 1e-5, EPYC, "float32 sums in another order through a deep network"),
     "film_golden": Tolerance(1e-5, 1e-6, EPYC, "float32 on both sides"),
-    "dynamics_golden": Tolerance(1e-5, 2e-6, EPYC, "float32 networks of up to 14 blocks, another order of additions"),
 }
 
 
