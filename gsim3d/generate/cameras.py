@@ -59,8 +59,8 @@ def two_rings(n_cams, size, near, far, *, distance, target_height, elevations, f
 
 def project(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels [V, N, 2] and depths [V, N] of world points [N, 3] in every camera."""
-    local = (viewmats[:, None, :3, :3] * points[None, :, None, :]).sum(-1) + viewmats[:, None, :3, 3]
-    image = (Ks[:, None] * local[:, :, None, :]).sum(-1)
+    local = np.einsum("vij,nj->vni", viewmats[:, :3, :3], points) + viewmats[:, None, :3, 3]
+    image = np.einsum("vij,vnj->vni", Ks, local)
     return image[..., :2] / image[..., 2:], local[..., 2]
 
 
@@ -78,7 +78,7 @@ def pixel_rays(rig: Rig, samples: int) -> tuple[np.ndarray, np.ndarray]:
         [(x - K[..., 0, 2]) / K[..., 0, 0], (y - K[..., 1, 2]) / K[..., 1, 1], np.ones((rig.n_cams, x.size))], -1
     )
     rotations = rig.viewmats[:, :3, :3]
-    directions = (rotations.swapaxes(1, 2)[:, None] * local[:, :, None, :]).sum(-1)
+    directions = np.einsum("vji,vnj->vni", rotations, local)
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     origins = -(rotations * rig.viewmats[:, :3, 3:]).sum(1)
     return origins, directions.reshape(rig.n_cams, rig.size, rig.size, samples**2, 3)

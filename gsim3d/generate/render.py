@@ -17,6 +17,7 @@ AMBIENT = 0.42  # light from the sky on a face that looks up; half of it on a fa
 DIFFUSE = 0.68
 SHADOW_OFFSET = 2e-3  # metres along the normal, so that a shadow ray does not meet its own face
 LIGHT_DIRECTION = np.array([0.36, 0.24, 0.90]) / np.linalg.norm([0.36, 0.24, 0.90])  # towards the light
+ACROSS_LIGHT = np.linalg.svd(LIGHT_DIRECTION[None])[2][1:]  # two unit vectors that are at right angles to it
 GROUND_COLORS = np.array([[0.80, 0.80, 0.76], [0.36, 0.42, 0.48], [0.62, 0.47, 0.36]])
 GROUND_RINGS = 4
 GROUND_SECTORS = 12
@@ -81,6 +82,7 @@ class Renderer:
         self.ground_distance = np.where(hit, distance, np.inf).astype(np.float32)
         self.ground_rays = np.flatnonzero(hit)
         self.ground_points = points[hit]
+        self.ground_across = self.ground_points @ ACROSS_LIGHT.T
         albedo = ground_color(self.ground_points, radius)
         self.ground_shadowed = (albedo * AMBIENT).astype(np.float32)
         lit = np.broadcast_to(background, (*hit.shape, 3)).astype(np.float32)
@@ -128,11 +130,9 @@ class Renderer:
     def _cast_shadow(self, tree, vertices, color):
         # Only ground points whose way to the light passes the body's bounding sphere can lie in shadow.
         centre = (vertices.min(0) + vertices.max(0)) / 2
-        radius = np.sqrt(((vertices - centre) ** 2).sum(1).max())
-        to_centre = centre - self.ground_points
-        along = (to_centre * LIGHT_DIRECTION).sum(1)
-        near = (to_centre**2).sum(1) - along**2 < radius**2
-        dark = np.flatnonzero(near)
+        radius = 1.01 * np.linalg.norm(vertices - centre, axis=1).max()
+        x, y = (self.ground_across - ACROSS_LIGHT @ centre).T
+        dark = np.flatnonzero(x * x + y * y < radius * radius)
         dark = dark[self._occluded(tree, self.ground_points[dark])]
         color[self.ground_rays[dark]] = self.ground_shadowed[dark]
 
@@ -144,15 +144,15 @@ class Renderer:
 
     def _shade(self, tree, vertices, face, weights) -> np.ndarray:
         rows = self.faces[face]
-        points = (weights[..., None] * vertices[rows]).sum(1)
-        normals = (weights[..., None] * vertex_normals(vertices, self.faces)[rows]).sum(1)
+        points = np.einsum("nk,nkc->nc", weights, vertices[rows])
+        normals = np.einsum("nk,nkc->nc", weights, vertex_normals(vertices, self.faces)[rows])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        facing = np.maximum((normals * LIGHT_DIRECTION).sum(1), 0)
+        facing = np.maximum(np.einsum("nc,c->n", normals, LIGHT_DIRECTION), 0)
         lit = np.flatnonzero(facing > 0)
         blocked = self._occluded(tree, points[lit] + SHADOW_OFFSET * normals[lit])
         facing[lit[blocked]] = 0
         light = AMBIENT * (0.75 + 0.25 * normals[:, 2]) + DIFFUSE * facing
-        return self.paint((weights[..., None] * self.corners[face]).sum(1)) * light[:, None]
+        return self.paint(np.einsum("nk,nkc->nc", weights, self.corners[face])) * light[:, None]
 
     def _collect(self, color, ids) -> View:
         """Means of the rays of each pixel; its id is what most of them hit, the higher id on a draw."""
@@ -163,7 +163,10 @@ class Renderer:
             rgb += per_ray[..., ray, :]
         rgb = np.clip(rgb * np.float32(255 / shape[3]) + np.float32(0.5), 0, 255).astype(np.uint8)
         ids = ids.reshape(shape)
-        count = {i: (ids == i).sum(-1) for i in (BACKGROUND, GROUND, BODY)}
+        count = {}
+        for label in (BACKGROUND, GROUND, BODY):
+            hits = (ids == label).view(np.uint8)
+            count[label] = sum((hits[..., ray] for ray in range(1, shape[3])), hits[..., 0])
         ground = count[GROUND] >= count[BACKGROUND]
         body = count[BODY] >= np.maximum(count[GROUND], count[BACKGROUND])
         segmentation = np.where(body, BODY, np.where(ground, GROUND, BACKGROUND)).astype(np.uint8)

@@ -52,10 +52,10 @@ class Elastic:
     distance: float = 2.6
     elevations: tuple[float, float] = (18.0, 42.0)  # degrees, of the low and the high ring
     target_height: float = 0.52
-    fov: float = 41.0  # degrees
-    ground_radius: float = 1.0
-    near: float = 1.2
-    far: float = 4.0
+    fov: float = 42.0  # degrees
+    ground_radius: float = 0.85
+    near: float = 1.5
+    far: float = 3.8
 
     name = "elastic"
 
@@ -88,6 +88,19 @@ class Elastic:
             raise InputError(f"objects and mesh files need names of their own; repeated: {repeated}, all: {names}")
         for path in self.meshes:
             shapes.load_body(path, self.mesh_up)
+        self._check_ground()
+
+    def _check_ground(self) -> None:
+        rig = self.rig()
+        angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+        rim = self.ground_radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(64)], 1)
+        pixels, depth = cameras.project(rim, rig.viewmats, rig.Ks)
+        seen = (depth > 0) & (pixels >= 0).all(-1) & (pixels <= rig.size).all(-1)
+        if seen.any() and not (rig.near <= depth[seen].min() and depth[seen].max() <= rig.far):
+            low, high = depth[seen].min(), depth[seen].max()
+            raise InputError(
+                f"the ground is seen from {low:.2f} to {high:.2f} m, beyond near {rig.near} and far {rig.far}"
+            )
 
     def object_names(self) -> list[str]:
         """Names of objects and mesh files, in the order in which trajectories are dealt to them."""
