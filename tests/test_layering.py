@@ -10,7 +10,7 @@ ROOT = Path(__file__).parent.parent
 ROOMS = [
     {"errors"},
     {"types"},
-    {"ops", "quirks", "effects", "harmonics"},
+    {"ops", "quirks", "effects", "harmonics", "layers"},
     {"encoder", "dynamics", "renderer"},
     {"presets"},
     {"simulator"},

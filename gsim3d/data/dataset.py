@@ -75,6 +75,8 @@ def make_frames(
             image_cloud += [len(cloud_scene)] * len(chosen)
             cloud_scene.append(number)
             cloud_step.append(slot)
+    if not images:
+        raise InputError("make_frames needs at least one step")
     labels = torch.cat(labels) if masked else None
     return Frames(
         images=torch.cat(images).float() / 255,
@@ -105,8 +107,6 @@ def _cams_per_step(cams, n_steps: int, scene: Scene) -> list[list[int]]:
 
 
 def _join_cameras(cameras: list[Cameras], image_cloud: list[int]) -> Cameras:
-    if not cameras:
-        raise InputError("make_frames needs at least one step")
     return Cameras(
         viewmats=torch.cat([c.viewmats for c in cameras]),
         Ks=torch.cat([c.Ks for c in cameras]),

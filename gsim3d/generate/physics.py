@@ -53,8 +53,8 @@ def _model_xml(fall: Fall, timestep: float) -> str:
   <worldbody>
     <geom type="plane" size="9 9 .1" pos="0 0 {-CONTACT_RADIUS}" {contact}/>
     <body name="root">
-      <flexcomp name="soft" type="mesh" dim="3" mesh="body" dof="trilinear" cellcount="{cells}" origin="{_numbers(centre)}"
-                mass="{fall.mass:.9g}" radius="{CONTACT_RADIUS}">
+      <flexcomp name="soft" type="mesh" dim="3" mesh="body" dof="trilinear" cellcount="{cells}"
+                origin="{_numbers(centre)}" mass="{fall.mass:.9g}" radius="{CONTACT_RADIUS}">
         <elasticity young="{fall.young:.9g}" poisson="{POISSON}" damping="{fall.damping:.9g}"/>
         <contact selfcollide="none" {contact}/>
       </flexcomp>
