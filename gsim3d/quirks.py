@@ -29,8 +29,8 @@ class Quirks:
         unbounded_opacity: opacities have no upper limit.
         frozen_rows_turn: frozen particles keep their place but not their orientation.
     Renderer:
-        unpaired_sh_rotation: coefficients are in the published basis (the polar axis is y) and turn with matrices of
-            another sign convention, so colours do not turn with the particle.
+        released_head_harmonics: the head's coefficients are in the published basis (the polar axis is y) and turn with
+            matrices of another sign convention, so colours do not turn with the particle.
         three_sigma_tiles: a Gaussian ends at the tiles that its three-sigma square touches.
         far_near_plane: Gaussians nearer than a fifth of the camera's near bound are culled.
     """
@@ -48,7 +48,7 @@ class Quirks:
     slots_from_first: bool = False
     unbounded_opacity: bool = False
     frozen_rows_turn: bool = False
-    unpaired_sh_rotation: bool = False
+    released_head_harmonics: bool = False
     three_sigma_tiles: bool = False
     far_near_plane: bool = False
 

@@ -10,14 +10,14 @@ ROOT = Path(__file__).parent.parent
 ROOMS = [
     {"errors"},
     {"types"},
-    {"ops", "quirks", "effects"},
+    {"ops", "quirks", "effects", "harmonics"},
     {"encoder", "dynamics", "renderer"},
     {"presets"},
     {"simulator"},
     {"data", "interop", "generate"},
     {"train"},
     {"evaluate"},
-    {"demo", "doctor"},
+    {"simulate", "demo", "doctor"},
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}

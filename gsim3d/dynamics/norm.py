@@ -30,10 +30,10 @@ class RowBatchNorm(nn.Module):
             return self._normalise(x, self.running_mean, self.running_var)
         mean, var, n_rows = _statistics(x.float() if x.dtype in (torch.float16, torch.bfloat16) else x)
         with torch.no_grad():
-            keep = self.MOMENTUM * (n_rows > 1)
-            self.running_mean.lerp_(mean.to(self.running_mean.dtype), keep)
+            rate = self.MOMENTUM * (n_rows > 1).to(self.running_var)
+            self.running_mean.lerp_(mean.to(self.running_mean), rate)
             unbiased = var * n_rows / (n_rows - 1).clamp(min=1)
-            self.running_var.lerp_(unbiased.to(self.running_var.dtype), keep.to(self.running_var.dtype))
+            self.running_var.lerp_(unbiased.to(self.running_var), rate)
         return self._normalise(x, mean, var)
 
     def _normalise(self, x: Tensor, mean: Tensor, var: Tensor) -> Tensor:

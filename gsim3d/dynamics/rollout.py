@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import torch
 
-from gsim3d.dynamics.dynamics import Dynamics, newest_clouds
+from gsim3d.dynamics.dynamics import newest_clouds
 from gsim3d.types import Particles
 
 
@@ -15,17 +16,13 @@ def append_step(history: Particles, step: Particles, max_steps: int) -> Particle
 
     Scenes without a cloud in ``step`` stay as they are.
     """
-    both = concatenate([history, step])
-    newest = newest_clouds(both)
-    counts = torch.diff(newest, prepend=newest.new_full((1,), -1))
-    age = torch.repeat_interleave(newest, counts) - torch.arange(both.n_clouds, device=newest.device)
-    return both.select_clouds((age < max_steps).nonzero()[:, 0])
+    return last_steps(concatenate([history, step]), max_steps)
 
 
 def last_steps(particles: Particles, n_steps: int) -> Particles:
     """The last ``n_steps`` clouds of each scene."""
     newest = newest_clouds(particles)
-    counts = torch.diff(newest, prepend=newest.new_full((1,), -1))
+    counts = torch.diff(newest, prepend=newest.new_full((1,), -1))  # clouds of each scene
     age = torch.repeat_interleave(newest, counts) - torch.arange(particles.n_clouds, device=newest.device)
     return particles.select_clouds((age < n_steps).nonzero()[:, 0])
 
@@ -49,27 +46,20 @@ def concatenate(parts: list[Particles]) -> Particles:
 
 
 def rollout(
-    dynamics: Dynamics,
-    history: Particles,
-    n_steps: int,
-    *,
-    max_steps: int | None = None,
-    generator: torch.Generator | None = None,
+    predict: Callable[[Particles], Particles], history: Particles, n_steps: int, max_steps: int
 ) -> list[Particles]:
     """The next ``n_steps`` steps, each fed back; gradients flow through all of them.
 
     Args:
-        dynamics: predicts one step.
-        history: the last steps of every scene.
+        predict: last steps of every scene -> the next step, as :class:`Dynamics`.
+        history: where to start from.
         n_steps: how many steps to predict.
-        max_steps: length of the sliding history; default the model's longest.
-        generator: as in :meth:`Dynamics.forward`.
+        max_steps: how many steps of each scene ``predict`` is given at most.
     Returns:
         One Particles a step, one cloud a scene each; rows are those of the newest step of ``history`` throughout.
     """
-    max_steps = 2**dynamics.config.history_bits if max_steps is None else max_steps
     history, steps = last_steps(history, max_steps), []
     for _ in range(n_steps):
-        steps.append(dynamics(history, generator=generator))
+        steps.append(predict(history))
         history = append_step(history, steps[-1], max_steps)
     return steps

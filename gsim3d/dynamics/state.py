@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from gsim3d.dynamics.config import DynamicsConfig
+from gsim3d.harmonics import degree_damping
 from gsim3d.types import FROZEN, Particles
 
 SCALE_STEP_SHARE = 1 / 6  # of the range of scales, the most that one step changes a scale
-SH_DEGREE_DAMPING = (1.0, 0.1 * 0.25, 0.1 * 0.25**2, 0.1 * 0.25**3)  # of coefficients, by degree
 POSITION_CHANNELS = 6
 
 
@@ -21,7 +21,7 @@ class StateLayout:
     """Order and width of the channels: fields that change, then fields that do not, each by the alphabet.
 
     inputs, outputs: (field of Particles, channels). Positions are no input by themselves (``position_features`` appends
-    six channels); a rotation is predicted as a rotation vector.
+    six channels); a rotation is predicted as a rotation vector. Harmonics are flat as (3, K), quaternions as (x, y, z, w).
     """
 
     config: DynamicsConfig
@@ -58,7 +58,7 @@ class StateLayout:
             if value is None or value[:1].numel() != n * min(1, particles.n_rows):
                 got = "None" if value is None else list(value.shape)
                 raise ValueError(f"Dynamics: particles.{name} must have {n} channels a row; got {got}")
-            columns.append(value.reshape(particles.n_rows, n))
+            columns.append(_flat(name, value))
         if self.config.position_features:
             columns.append(position_features(particles, self.config.grid_size, self.config.position_length))
         return torch.cat(columns, 1)
@@ -77,8 +77,8 @@ class StateLayout:
                 parts["dynamic_latents"], config.max_latent_step
             )
         if config.explicit:
-            damping = sh_damping(config.sh_degree, parts["sh"])
-            new["sh"] = particles.sh + parts["sh"].reshape(particles.sh.shape) * damping[:, None]
+            damping = degree_damping(config.sh_degree, particles.sh)
+            new["sh"] = particles.sh + parts["sh"].unflatten(1, (3, -1)).mT * damping[:, None]
             opacities = (particles.opacities + parts["opacities"][:, 0]).clamp(
                 0, None if config.quirks.unbounded_opacity else 1
             )
@@ -90,6 +90,15 @@ class StateLayout:
             )
             new["scales"] = hold(frozen, particles.scales, scales.clamp(config.scale_min, config.scale_max))
         return new
+
+
+def _flat(name: str, value: Tensor) -> Tensor:
+    """A field of Particles as [N, channels], in the order that published weights expect."""
+    if name == "sh":
+        return value.mT.flatten(1)
+    if name == "quats":
+        return value.roll(-1, 1)
+    return value.reshape(value.shape[0], -1) if value.numel() else value.reshape(value.shape[0], 1)
 
 
 def position_features(particles: Particles, grid_size: float, length: float) -> Tensor:
@@ -109,11 +118,6 @@ def hold(frozen: Tensor, before: Tensor, after: Tensor) -> Tensor:
 
 def bounded(x: Tensor, limit: float | None) -> Tensor:
     return x if limit is None else limit * torch.tanh(x)
-
-
-def sh_damping(degree: int, like: Tensor) -> Tensor:
-    """[K]: how much smaller coefficients of higher degrees start out."""
-    return like.new_tensor([SH_DEGREE_DAMPING[d] for d in range(degree + 1) for _ in range(2 * d + 1)])
 
 
 def rotate_left(quats: Tensor, rotation_vectors: Tensor) -> Tensor:

@@ -88,13 +88,13 @@ class EncoderConfig:
             cost_unet_dim=32,
             cost_unet_levels=2,
             cost_unet_attention=(2,),
-            refine_unet_dim=16,
+            refine_unet_dim=8,
             refine_unet_levels=3,
             refine_unet_attention=(),
-            upsampled_dim=16,
+            upsampled_dim=13,  # the heads then read 24 channels, whole vectors
             disparity_dim=16,
             dynamic_dim=16,
-            static_dim=16,
+            static_dim=8,
             condition_dim=8,
         )
 

@@ -102,23 +102,23 @@ def rasterize_gaussians(
         name, wanted = ("sh", "[N, K, 3]") if colors is None else ("colors", "[N, 3]")
         raise ValueError(f"rasterize_gaussians: {name} must be {wanted}; got {list(color.shape)}")
     n_images = cameras.viewmats.shape[0]
+    real = torch.float64 if means.dtype == torch.float64 else torch.float32
     if background is None:
-        background = means.new_zeros(n_images, 3)
+        background = means.new_zeros(n_images, 3, dtype=real)
     elif background.dim() == 1:
         background = background.expand(n_images, -1)
     if cu_rows is None:
         cu_rows = torch.tensor([0, means.shape[0]], device=means.device)
-    rest = () if features is None else (features,)
     args = (
         means,
         quats,
         scales,
         opacities,
         color,
-        *(rest or (means.new_empty(means.shape[0], 0),)),
+        means.new_empty(means.shape[0], 0) if features is None else features,
         background,
-        cameras.viewmats.to(means.dtype),
-        cameras.Ks.to(means.dtype),
+        cameras.viewmats.to(real),
+        cameras.Ks.to(real),
         cameras.image_cloud,
         cu_rows,
         cameras.width,
@@ -126,10 +126,7 @@ def rasterize_gaussians(
         near_plane,
         CUTOFFS[cutoff],
     )
-    if torch.compiler.is_compiling():
-        out = torch.ops.gsim3d.rasterize_gaussians(*args)
-    else:
-        out = _named_errors(args)
+    out = torch.ops.gsim3d.rasterize_gaussians(*args) if torch.compiler.is_compiling() else _named_errors(args)
     return Rendering(out[0], out[1], out[2], None if features is None else out[3])
 
 

@@ -1,0 +1,77 @@
+"""The ``gsim3d`` command: generate, train, simulate, evaluate, demo, doctor."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+
+from gsim3d.errors import HardCaseError, InputError
+
+# command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called
+COMMANDS = {
+    "generate": ("gsim3d.generate.command", "simulate and film bodies that fall: a data set of multi-view video"),
+    "train": ("gsim3d.train.command", "learn a simulator from a data set"),
+    "simulate": ("gsim3d.simulate", "predict the future of one scene: video and .ply"),
+    "evaluate": ("gsim3d.evaluate.command", "measure predictions on a data set: PSNR and SSIM by step"),
+    "demo": ("gsim3d.demo", "all of it at a small size, in minutes on a CPU"),
+    "doctor": ("gsim3d.doctor", "what is installed, what was compiled, and whether every kernel works here"),
+}
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message):
+        self.exit(2, f"gsim3d: error: {message} (see {self.prog} --help)\n")
+
+
+def _overview() -> str:
+    lines = [f"  {name:<10} {text}" for name, (_, text) in COMMANDS.items()]
+    return "commands:\n" + "\n".join(lines) + "\n\nA first try: gsim3d demo --out runs/demo\nHelp on one command: gsim3d train --help"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs one command; the exit code is 0, or 2 with one line on stderr where the input is wrong."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    name = arguments[0] if arguments else None
+    if name not in COMMANDS:
+        parser = _Parser(
+            prog="gsim3d",
+            description="Learns 3D simulators from multi-view video.",
+            epilog=_overview(),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            usage="gsim3d [--help] [--version] COMMAND ...",
+        )
+        parser.add_argument("--version", action="store_true", help="print the version and exit")
+        parser.add_argument("command", nargs="?", metavar="COMMAND", help="one of the commands below")
+        known, _ = parser.parse_known_args(arguments)
+        if known.version:
+            from gsim3d import __version__
+
+            print(f"gsim3d {__version__}")
+            return 0
+        if known.command is None and not arguments:
+            parser.print_help()
+            return 0
+        given = known.command or arguments[0]
+        parser.error(f"unknown command {given!r}; commands: {', '.join(COMMANDS)}")
+    try:
+        module = importlib.import_module(COMMANDS[name][0])
+        parser = _Parser(prog=f"gsim3d {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
+        module.add_arguments(parser)
+        return module.run(parser.parse_args(arguments[1:])) or 0
+    except (InputError, HardCaseError) as error:
+        return _fail(str(error))
+    except OSError as error:
+        return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except KeyboardInterrupt:
+        print("gsim3d: interrupted", file=sys.stderr)
+        return 130
+
+
+def _fail(message: str) -> int:
+    print(f"gsim3d: error: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""How well a simulator predicts: metrics, the protocol, reports."""

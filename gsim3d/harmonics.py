@@ -1,0 +1,86 @@
+"""Real spherical harmonics of view-dependent colour: basis, damping, rotation."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+MAX_DEGREE = 3
+# Radians between neighbours of the spiral of 2 l + 1 directions on which degree l is read, and where it starts: with these
+# the harmonics' values there have condition numbers of 1.4, 2.4 and 3.4.
+SPIRALS = {1: (4.32, 0.5), 2: (5.20, 1.0), 3: (4.04, 0.98)}
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """[..., 3] unit directions -> [..., (degree + 1)^2], the real basis of 3D Gaussian splatting, degree at most 3."""
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [torch.full_like(x, 0.28209479177387814)]
+    if degree > 0:
+        basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if degree > 1:
+        a, b, c = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
+        basis += [a * x * y, -a * y * z, b * (2 * zz - xx - yy), -a * x * z, c * (xx - yy)]
+    if degree > 2:
+        a, b, c, d = 0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154
+        basis += [-a * y * (3 * xx - yy), b * x * y * z, -c * y * (4 * zz - xx - yy)]
+        basis += [d * z * (2 * zz - 3 * xx - 3 * yy), -c * x * (4 * zz - xx - yy)]
+        basis += [b / 2 * z * (xx - yy), -a * x * (xx - 3 * yy)]
+    return torch.stack(basis, -1)
+
+
+def degree_damping(degree: int, like: Tensor) -> Tensor:
+    """[(degree + 1)^2]: 1 for the constant, then 0.1 / 4^l, so that colour starts out almost independent of the view."""
+    values = [0.1 * 0.25**level if level else 1.0 for level in range(degree + 1) for _ in range(2 * level + 1)]
+    return torch.tensor(values, dtype=like.dtype, device=like.device)
+
+
+def rotate_harmonics(sh: Tensor, rotations: Tensor) -> Tensor:
+    """Coefficients of the functions turned along: the new colour in direction ``R d`` is the old one in ``d``.
+
+    Degree by degree: with n_i fixed directions and Y the basis, the turned coefficients are ``Y(R n)^T Y(n)^-T sh``,
+    a polynomial in the entries of R. It is exact for every rotation, and smooth.
+
+    Args:
+        sh: [N, K, C], K = 1, 4, 9 or 16.
+        rotations: [N, 3, 3].
+    Returns:
+        [N, K, C].
+    """
+    degree = math.isqrt(sh.shape[1]) - 1
+    turned = [sh[:, :1]]
+    for level in range(1, degree + 1):
+        columns = slice(level**2, (level + 1) ** 2)
+        directions = _spiral(level)
+        read = torch.linalg.inv(sh_basis(directions, level)[:, columns]).T.to(sh)
+        values = sh_basis(directions.to(sh) @ rotations.mT, level)[..., columns]  # [N, 2 l + 1 directions, 2 l + 1]
+        turned.append(values.mT @ (read @ sh[:, columns]))
+    return torch.cat(turned, 1)
+
+
+def rotate_unpaired_harmonics(sh: Tensor, rotations: Tensor) -> Tensor:
+    """What the published model does with ``sh`` in its basis: the turned coefficients, in the standard basis.
+
+    Its basis is the standard one of (z, x, y) and equals that of its rotation matrices up to alternating signs, which it
+    leaves out.
+    """
+    permute = _axis_permutation(rotations)
+    signs = torch.pow(-1.0, torch.arange(sh.shape[1], device=sh.device)).to(sh)[:, None]
+    turned = signs * rotate_harmonics(signs * sh, permute @ rotations @ permute.mT)
+    return rotate_harmonics(turned, permute.mT.expand_as(rotations))
+
+
+def _axis_permutation(like: Tensor) -> Tensor:
+    """[3, 3]: (x, y, z) -> (z, x, y)."""
+    return torch.eye(3, dtype=like.dtype, device=like.device)[[2, 0, 1]]
+
+
+def _spiral(level: int) -> Tensor:
+    """float64 [2 l + 1, 3] directions of the upper half sphere."""
+    turn, start = SPIRALS[level]
+    i = torch.arange(2 * level + 1, dtype=torch.float64)
+    z = (i + start) / (2 * level + 1)
+    radius = (1 - z * z).clamp(min=0).sqrt()
+    return torch.stack([radius * torch.cos(turn * i), radius * torch.sin(turn * i), z], -1)

@@ -1,0 +1,48 @@
+"""Video files that browsers play: VP9 in MP4."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.errors import InputError
+
+
+def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
+    """Writes RGB frames as VP9 in MP4; the file appears complete or not at all.
+
+    Args:
+        path: ends in .mp4.
+        frames: uint8 [H, W, 3] each, RGB, H and W even and the same for all; at least one.
+        fps: frames a second, positive.
+    Raises:
+        InputError: wrong name, shape or rate, or OpenCV cannot write VP9 here.
+    """
+    import cv2
+
+    path = Path(path)
+    if path.suffix != ".mp4":
+        raise InputError(f"{path}: a video file must end in .mp4")
+    if not fps > 0:
+        raise InputError(f"{path}: frames a second must be positive; got {fps}")
+    shapes = {(frame.dtype.name, frame.shape) for frame in frames}
+    kind, shape = next(iter(shapes), ("nothing", ()))
+    if len(shapes) != 1 or kind != "uint8" or len(shape) != 3 or shape[2] != 3 or shape[0] % 2 or shape[1] % 2:
+        raise InputError(f"{path}: frames must be uint8 [H, W, 3] of one even size; got {sorted(map(str, shapes))[:3]}")
+    temporary = path.with_name(f".{path.stem}.part.mp4")
+    log_level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"vp09"), float(fps), (shape[1], shape[0]))
+        if not writer.isOpened():
+            raise InputError(f"{path}: this OpenCV cannot write VP9 video here (folder missing or codec not built in)")
+        for frame in frames:
+            writer.write(np.ascontiguousarray(frame[..., ::-1]))
+        writer.release()
+        os.replace(temporary, path)
+    finally:
+        cv2.utils.logging.setLogLevel(log_level)
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,144 @@
+"""Model sizes that are known to work: functions that return a ModelConfig."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gsim3d.dynamics import DynamicsConfig
+from gsim3d.encoder import EncoderConfig
+from gsim3d.renderer import RendererConfig
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The three parts of a simulator; they must agree on the particles that pass between them."""
+
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
+    renderer: RendererConfig = field(default_factory=RendererConfig)
+
+    def __post_init__(self):
+        encoder, dynamics, renderer = self.encoder, self.dynamics, self.renderer
+        latents = encoder.dynamic_dim + encoder.static_dim
+        sh_degrees = (encoder.sh_degree, dynamics.sh_degree, renderer.sh_degree)
+        agreements = {
+            "encoder.dynamic_dim and dynamics.dynamic_latents": (encoder.dynamic_dim, dynamics.dynamic_latents),
+            "encoder.static_dim and dynamics.static_latents": (encoder.static_dim, dynamics.static_latents),
+            "encoder.explicit and dynamics.explicit": (encoder.explicit, dynamics.explicit),
+            "renderer.latents and what it reads": (renderer.latents, 0 if encoder.explicit else latents),
+            "the three sh_degree": sh_degrees if encoder.explicit else (0,),
+            "the three quirks": (encoder.quirks, dynamics.quirks, renderer.quirks),
+        }
+        for what, values in agreements.items():
+            if len(set(values)) > 1:
+                raise ValueError(f"ModelConfig: {what} must be equal; got {', '.join(map(str, values))}")
+
+
+def tiny() -> ModelConfig:
+    """Trains on two CPU cores in minutes: 64-pixel images, tabletop scenes of about a metre, up to 2 steps of history."""
+    encoder = EncoderConfig.tiny()
+    return ModelConfig(
+        encoder=encoder,
+        dynamics=DynamicsConfig(
+            dynamic_latents=encoder.dynamic_dim,
+            static_latents=encoder.static_dim,
+            max_step=0.25,
+            max_latent_step=1.0,
+            position_features=True,
+            grid_size=0.05,
+            history_bits=1,
+            strides=(2, 4),
+            merge_windows=(2, 1),
+            patch_sizes=(256, 256, 256),
+            encoder_depths=(1, 1, 2),
+            encoder_channels=(32, 48, 64),
+            encoder_heads=(2, 3, 4),
+            decoder_depths=(1, 1),
+            decoder_channels=(32, 48),
+            decoder_heads=(2, 3),
+            mlp_ratio=2,
+            norm="layer",
+            zero_init=True,
+            drop_path=0.0,
+            shuffle_orders=False,
+        ),
+        renderer=RendererConfig(
+            latents=encoder.dynamic_dim + encoder.static_dim,
+            sh_degree=0,
+            scale_min=0.002,
+            scale_max=0.08,
+            initial_scale=0.02,
+        ),
+    )
+
+
+def small() -> ModelConfig:
+    """About 4 million parameters, 128-pixel images, up to 4 steps of history: a day on one GPU."""
+    encoder = EncoderConfig(
+        feature_dim=64,
+        cnn_dims=(32, 48, 64),
+        transformer_layers=4,
+        transformer_mlp_ratio=2,
+        cost_unet_dim=64,
+        refine_unet_dim=32,
+        upsampled_dim=32,
+        disparity_dim=32,
+        dynamic_dim=32,
+        static_dim=32,
+    )
+    return ModelConfig(
+        encoder=encoder,
+        dynamics=DynamicsConfig(
+            dynamic_latents=encoder.dynamic_dim,
+            static_latents=encoder.static_dim,
+            max_latent_step=1.0,
+            position_features=True,
+            grid_size=0.02,
+            history_bits=2,
+            strides=(2, 2, 2),
+            merge_windows=(2, 2, 1),
+            patch_sizes=(512,) * 4,
+            encoder_depths=(2, 2, 2, 2),
+            encoder_channels=(32, 64, 96, 128),
+            encoder_heads=(2, 4, 6, 8),
+            decoder_depths=(1, 1, 1),
+            decoder_channels=(64, 64, 96),
+            decoder_heads=(4, 4, 6),
+            norm="layer",
+            zero_init=True,
+            drop_path=0.1,
+        ),
+        renderer=RendererConfig(latents=64, sh_degree=1, scale_min=0.0005, scale_max=0.1, initial_scale=0.01),
+    )
+
+
+def paper_latent(n_steps: int = 4) -> ModelConfig:
+    """The latent model of the paper (32 + 32 latents) for a history of ``n_steps``: 1, 2, 4 or 8."""
+    return ModelConfig(
+        encoder=EncoderConfig(),
+        dynamics=DynamicsConfig(history_bits=_bits(n_steps)),
+        renderer=RendererConfig(),
+    )
+
+
+def paper_explicit(n_steps: int = 4) -> ModelConfig:
+    """The explicit model of the paper (all Gaussian parameters and 16 static latents) for a history of ``n_steps``."""
+    return ModelConfig(
+        encoder=EncoderConfig(dynamic_dim=0, static_dim=16, explicit=True),
+        dynamics=DynamicsConfig(
+            dynamic_latents=0,
+            static_latents=16,
+            explicit=True,
+            scale_min=0.004,
+            scale_max=0.14,
+            max_step=0.05,
+            history_bits=_bits(n_steps),
+        ),
+        renderer=RendererConfig(latents=0, scale_min=0.004, scale_max=0.14),
+    )
+
+
+def _bits(n_steps: int) -> int:
+    if n_steps not in (1, 2, 4, 8):
+        raise ValueError(f"n_steps must be 1, 2, 4 or 8; got {n_steps}")
+    return n_steps.bit_length() - 1

@@ -1,0 +1,191 @@
+"""Checkpoints: folders that appear whole, a pointer to the last good one, and a single file to ship.
+
+A run folder holds ``checkpoints/step_000500/`` and ``checkpoints/last`` (the name of the newest good folder). A
+checkpoint folder holds
+
+- ``model.safetensors``, ``ema.safetensors`` (float32 weights; the second averaged, absent without averaging),
+- ``optimizer.safetensors`` (moments by parameter name; absent when the weights only were saved),
+- ``config.yaml`` (model, data, effects, training),
+- ``state.json`` (step, next sample, versions, hash of every file, hash of the checkpoint it continued).
+
+Nothing here is a pickle: reading a checkpoint runs no code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import torch
+import yaml
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from gsim3d import __version__
+from gsim3d.errors import InputError
+from gsim3d.train.settings import load_yaml
+
+FORMAT = 1
+STATE, CONFIG = "state.json", "config.yaml"
+_WEIGHTS = {"model": "model.safetensors", "ema": "ema.safetensors", "optimizer": "optimizer.safetensors"}
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint holds.
+
+    model, ema, optimizer: tensors by name; ema and optimizer may be empty.
+    config: the content of config.yaml: format, model, data, effects, train.
+    state: step, next_sample, and what else resuming needs; plain JSON values.
+    digest: hash that names this checkpoint; None before it is written.
+    """
+
+    model: dict[str, Tensor]
+    config: dict[str, Any]
+    state: dict[str, Any] = field(default_factory=dict)
+    ema: dict[str, Tensor] = field(default_factory=dict)
+    optimizer: dict[str, Tensor] = field(default_factory=dict)
+    digest: str | None = None
+
+    @property
+    def weights(self) -> dict[str, Tensor]:
+        """The weights to predict with: averaged ones where there are any."""
+        return self.ema or self.model
+
+
+def save(run: str | Path, checkpoint: Checkpoint, keep: int = 2) -> Path:
+    """Writes the checkpoint into the run folder, points to it, and removes all but the ``keep`` newest.
+
+    A process that is killed at any moment leaves the previous checkpoint good and pointed to.
+    """
+    root = Path(run) / "checkpoints"
+    root.mkdir(parents=True, exist_ok=True)
+    folder = root / f"step_{checkpoint.state['step']:06d}"
+    part = root / f".{folder.name}.part"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    for name, file in _WEIGHTS.items():
+        tensors = getattr(checkpoint, name)
+        if tensors:
+            save_file({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, part / file)
+    (part / CONFIG).write_text(yaml.safe_dump({"format": FORMAT, **checkpoint.config}, sort_keys=False))
+    state = {
+        **checkpoint.state,
+        "versions": {"gsim3d": __version__, "torch": str(torch.__version__), "python": platform.python_version()},
+        "sha256": {path.name: _sha256(path) for path in sorted(part.iterdir())},
+    }
+    (part / STATE).write_text(json.dumps(state, indent=1))
+    for path in [*part.iterdir(), part]:
+        _sync(path)
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(part, folder)
+    _write_text(root / "last", folder.name)
+    for old in sorted(root.glob("step_*"))[:-keep]:
+        if old != folder:
+            shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+def exists(run: str | Path) -> bool:
+    """Whether the run folder has a checkpoint to go on from."""
+    return (Path(run) / "checkpoints" / "last").is_file()
+
+
+def load(path: str | Path) -> Checkpoint:
+    """Reads a run folder (its last good checkpoint), a checkpoint folder, or a single exported file.
+
+    Raises:
+        InputError: it is none of these, or a file is missing, truncated or changed; the message names it.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such checkpoint")
+    if path.is_file():
+        return _load_single(path)
+    pointer = path / "checkpoints" / "last"
+    if pointer.is_file():
+        path = path / "checkpoints" / pointer.read_text().strip()
+    if not (path / STATE).is_file():
+        raise InputError(f"{path}: not a checkpoint (a run folder, a folder with {STATE}, or a .safetensors file)")
+    try:
+        content = (path / STATE).read_bytes()
+        state = json.loads(content)
+        hashes = dict(state["sha256"])
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f"{path / STATE}: not a checkpoint's state, the checkpoint is broken") from None
+    for name, expected in hashes.items():
+        file = path / Path(name).name
+        if not file.is_file() or _sha256(file) != expected:
+            raise InputError(f"{file}: missing, truncated or changed since it was written; use another checkpoint")
+    if not {CONFIG, _WEIGHTS["model"]} <= set(hashes):
+        raise InputError(f"{path}: the checkpoint holds no {CONFIG} or no {_WEIGHTS['model']}")
+    config = _known_format(load_yaml(path / CONFIG), path / CONFIG)
+    tensors = {name: _read_tensors(path / file) if file in hashes else {} for name, file in _WEIGHTS.items()}
+    return Checkpoint(config=config, state=state, digest=hashlib.sha256(content).hexdigest(), **tensors)
+
+
+def export(checkpoint: Checkpoint, path: str | Path) -> None:
+    """Writes the weights to predict with as one .safetensors file whose metadata holds config and state."""
+    path = Path(path)
+    if path.suffix != ".safetensors":
+        raise InputError(f"{path}: a single-file checkpoint must end in .safetensors")
+    metadata = {
+        "gsim3d_config": json.dumps({"format": FORMAT, **checkpoint.config}),
+        "gsim3d_state": json.dumps({"step": checkpoint.state.get("step", 0), "parent": checkpoint.digest}),
+    }
+    part = path.with_name(f".{path.name}.part")
+    save_file({k: v.detach().cpu().contiguous().clone() for k, v in checkpoint.weights.items()}, part, metadata)
+    os.replace(part, path)
+
+
+def _load_single(path: Path) -> Checkpoint:
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+        config, state = json.loads(metadata["gsim3d_config"]), json.loads(metadata["gsim3d_state"])
+    except (safetensors.SafetensorError, KeyError, ValueError):
+        raise InputError(f"{path}: not a gsim3d checkpoint file") from None
+    return Checkpoint(model=_read_tensors(path), config=_known_format(config, path), state=state, digest=_sha256(path))
+
+
+def _known_format(config: dict, where: Path) -> dict:
+    if config.get("format") != FORMAT:
+        raise InputError(f"{where}: checkpoint format {config.get('format')!r}; this version reads {FORMAT}")
+    missing = [name for name in ("model", "data") if not isinstance(config.get(name), dict)]
+    if missing:
+        raise InputError(f"{where}: the section {missing[0]} is missing")
+    return {name: value for name, value in config.items() if name != "format"}
+
+
+def _read_tensors(path: Path) -> dict[str, Tensor]:
+    try:
+        return load_file(path)
+    except (safetensors.SafetensorError, OSError) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from None
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _write_text(path: Path, text: str) -> None:
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text)
+    os.replace(part, path)
+
+
+def _sync(path: Path) -> None:
+    """The data reaches the disk before the rename that makes it visible."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,138 @@
+"""What a training run is."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+from gsim3d.errors import InputError
+from gsim3d.train.losses import BALANCE, DISCOUNT
+
+
+def _at_least(config: Any, **bounds: float) -> None:
+    for name, bound in bounds.items():
+        if getattr(config, name) < bound:
+            raise InputError(f"{name} must be at least {bound}; got {getattr(config, name)}")
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """A part of the training with one kind of sample; the optimizer runs through all parts.
+
+    steps: optimizer steps.
+    horizon: simulated steps after the encoded ones; 0 trains encoder and renderer alone.
+    history: encoded steps; 0: as many as the data section says.
+    batch: scenes a step.
+    target_views: images of each step that the loss compares.
+    loss_stride: the loss looks at every n-th simulated step, and at the last.
+    learning_rate: peak, reached after ``warm_up`` of the stage's steps, then falling (one cycle a stage).
+    warm_up: share of the stage's steps.
+    """
+
+    steps: int
+    horizon: int = 0
+    history: int = 0
+    batch: int = 1
+    target_views: int = 5
+    loss_stride: int = 1
+    learning_rate: float = 2e-4
+    warm_up: float = 0.01
+
+    def __post_init__(self):
+        _at_least(self, steps=1, horizon=0, history=0, batch=1, target_views=1, loss_stride=1, learning_rate=0, warm_up=0)
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Which frames and views a sample shows.
+
+    history: T, encoded steps.
+    context_views: input images of each step.
+    context_cameras: the cameras they come from; empty: all but ``target_only_cameras``.
+    target_only_cameras: cameras that are never an input.
+    """
+
+    history: int = 2
+    context_views: int = 4
+    context_cameras: tuple[int, ...] = ()
+    target_only_cameras: tuple[int, ...] = ()
+
+    def __post_init__(self):
+        _at_least(self, history=1, context_views=1)
+        if set(self.context_cameras) & set(self.target_only_cameras):
+            raise InputError("data: context_cameras and target_only_cameras share a camera")
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss: ``balance`` and ``discount`` as in :func:`gsim3d.train.losses.time_weights`.
+
+    body_weight: extra weight of pixels that show a body that may move, relative to 1 of any other pixel.
+    """
+
+    balance: float = BALANCE
+    discount: float = DISCOUNT
+    body_weight: float = 0.0
+
+    def __post_init__(self):
+        _at_least(self, balance=0, discount=0, body_weight=0)
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """AdamW, clipped at a global gradient norm; ``ema_decay`` is that of the averaged weights (0: no averaging)."""
+
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-8
+    weight_decay: float = 1e-3
+    clip_norm: float = 0.5
+    ema_decay: float = 0.999
+
+    def __post_init__(self):
+        _at_least(self, beta1=0, beta2=0, eps=0, weight_decay=0, clip_norm=0, ema_decay=0)
+        for name in ("beta1", "beta2", "ema_decay"):
+            if getattr(self, name) >= 1:
+                raise InputError(f"optimizer.{name} must be below 1; got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A training run.
+
+    preset: the model's sizes, a function of gsim3d.presets such as ``tiny``.
+    model: changes of the preset, nested like the model section of a checkpoint's config.yaml.
+    stages: run one after another.
+    seed: all randomness follows from it and from the step.
+    checkpoint_every, log_every: steps; the last step is always saved.
+    keep_checkpoints: older ones are removed.
+    """
+
+    stages: tuple[StageConfig, ...] = (StageConfig(steps=1000), StageConfig(steps=4000, horizon=12))
+    preset: str = "tiny"
+    model: dict = dataclasses.field(default_factory=dict)
+    data: DataConfig = DataConfig()
+    loss: LossConfig = LossConfig()
+    optimizer: OptimizerConfig = OptimizerConfig()
+    seed: int = 0
+    checkpoint_every: int = 500
+    keep_checkpoints: int = 2
+    log_every: int = 10
+
+    def __post_init__(self):
+        _at_least(self, seed=0, checkpoint_every=1, keep_checkpoints=1, log_every=1)
+        if not self.stages:
+            raise InputError("stages: at least one is needed")
+
+    @property
+    def n_steps(self) -> int:
+        return sum(stage.steps for stage in self.stages)
+
+    def stage_of(self, step: int) -> tuple[StageConfig, int]:
+        """The stage that optimizer step ``step`` belongs to, and the step's place in it."""
+        for stage in self.stages:
+            if step < stage.steps:
+                return stage, step
+            step -= stage.steps
+        raise IndexError("step lies after the last stage")

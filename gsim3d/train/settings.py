@@ -1,0 +1,120 @@
+"""Nested dataclasses from plain data and back: typed, naming every key that is unknown, missing or of a wrong type."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from gsim3d.errors import InputError
+
+T = TypeVar("T")
+
+
+def load_yaml(path: str | Path) -> dict:
+    """A YAML file that holds a mapping; plain data only."""
+    path = Path(path)
+    try:
+        content = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path}: cannot read: {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: must hold a mapping of settings")
+    return content
+
+
+def to_dict(value: Any) -> Any:
+    """Dataclasses, tuples and plain values as what YAML and JSON can hold."""
+    if dataclasses.is_dataclass(value):
+        return {f.name: to_dict(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+    if isinstance(value, (tuple, list)):
+        return [to_dict(item) for item in value]
+    if isinstance(value, dict):
+        return {key: to_dict(item) for key, item in value.items()}
+    return value
+
+
+def from_dict(cls: type[T], content: dict, where: str = "", base: T | None = None) -> T:
+    """The dataclass ``cls`` from nested plain data; what ``content`` leaves out comes from ``base``, else the defaults.
+
+    Raises:
+        InputError: an unknown key, a missing one or a value of another type; the message names the key.
+    """
+    if not isinstance(content, dict):
+        raise InputError(f"{where or cls.__name__}: must be a mapping of settings; got {content!r}")
+    hints = typing.get_type_hints(cls)
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
+    unknown = [str(key) for key in content if key not in fields]
+    if unknown:
+        raise InputError(f"{_join(where, unknown[0])}: unknown setting; known here: {', '.join(fields)}")
+    values = {}
+    for name, field in fields.items():
+        if name in content:
+            before = getattr(base, name) if base is not None else None
+            values[name] = _convert(hints[name], content[name], _join(where, name), before)
+        elif base is not None:
+            values[name] = getattr(base, name)
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise InputError(f"{_join(where, name)}: this setting is missing")
+    try:
+        return cls(**values)
+    except InputError as error:
+        raise InputError(f"{where}: {error}" if where else str(error)) from None
+    except ValueError as error:
+        raise InputError(f"{where or cls.__name__}: {error}") from None
+
+
+def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        problems = []
+        for option in arguments:
+            if option is type(None):
+                continue
+            try:
+                return _convert(option, value, where, base)
+            except InputError as error:
+                problems.append(error)
+        raise problems[0]
+    if dataclasses.is_dataclass(hint):
+        return from_dict(hint, value, where, base)
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise InputError(f"{where}: must be a list; got {value!r}")
+        if len(arguments) == 2 and arguments[1] is Ellipsis:
+            arguments = (arguments[0],) * len(value)
+        if arguments and len(arguments) != len(value):
+            raise InputError(f"{where}: must hold {len(arguments)} values; got {len(value)}")
+        kinds = arguments or (Any,) * len(value)
+        return tuple(_convert(kind, item, f"{where}[{i}]", None) for i, (kind, item) in enumerate(zip(kinds, value)))
+    if origin is typing.Literal:
+        if value not in arguments:
+            raise InputError(f"{where}: must be one of {', '.join(map(repr, arguments))}; got {value!r}")
+        return value
+    if hint is float and isinstance(value, str):  # YAML 1.1 reads 2e-4 as text
+        try:
+            value = float(value)
+        except ValueError:
+            pass
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    plain = {bool: "true or false", int: "a whole number", float: "a number", str: "text", dict: "a mapping"}
+    if hint in plain or origin is dict:
+        kind = hint if hint in plain else dict
+        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+            raise InputError(f"{where}: must be {plain[kind]}; got {value!r}")
+        if kind is float and value != value:
+            raise InputError(f"{where}: must be a number; got {value!r}")
+    return value
+
+
+def _join(where: str, name: str) -> str:
+    return f"{where}.{name}" if where else name

@@ -1,0 +1,65 @@
+"""PSNR and SSIM against independent float64 references, and their edges."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr, ssim
+from tests.oracle.metrics import psnr_reference, ssim_reference
+
+
+def images(seed, *shape):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def test_psnr_equals_its_definition():
+    pred, target = images(0, 3, 9, 7, 3) * 1.4 - 0.2, images(1, 3, 9, 7, 3)
+    mask = images(2, 3, 9, 7) > 0.6
+    for chosen in (None, mask):
+        for i in range(3):
+            expected = psnr_reference(pred[i].numpy(), target[i].numpy(), None if chosen is None else mask[i].numpy())
+            assert psnr(pred, target, chosen)[i].item() == pytest.approx(expected, abs=1e-9)
+
+
+def test_psnr_is_capped_and_an_empty_mask_is_not_counted():
+    image = images(0, 2, 4, 4, 3)
+    assert psnr(image, image).tolist() == [PSNR_CAP, PSNR_CAP]
+    mask = torch.zeros(2, 4, 4, dtype=torch.bool)
+    mask[0, 0, 0] = True
+    values = psnr(image, image, mask)
+    assert values[0] == PSNR_CAP and values[1].isnan()
+    assert mean_of_counted(values) == PSNR_CAP
+    assert mean_of_counted(values[1:]) is None
+
+
+def test_psnr_of_a_known_error():
+    target = torch.full((1, 5, 5, 3), 0.5)
+    assert psnr(target + 0.1, target).item() == pytest.approx(20.0, abs=1e-5)
+    assert psnr(target + 9.0, target).item() == pytest.approx(-20 * math.log10(0.5), abs=1e-9)  # clipped to 1
+
+
+def test_ssim_equals_its_definition():
+    pred, target = images(3, 2, 17, 13, 3), images(4, 2, 17, 13, 3)
+    pred[1] = target[1] + 0.05 * pred[1]
+    for i in range(2):
+        expected = ssim_reference(pred[i].numpy().astype(np.float64), target[i].numpy().astype(np.float64))
+        assert ssim(pred, target)[i].item() == pytest.approx(expected, abs=1e-10)
+
+
+def test_ssim_edges():
+    image = images(5, 1, 11, 11, 3)
+    assert ssim(image, image).item() == pytest.approx(1.0, abs=1e-12)
+    flat = torch.full((1, 12, 12, 1), 0.3)
+    assert ssim(flat, flat).item() == pytest.approx(1.0, abs=1e-12)
+    with pytest.raises(ValueError, match="at least 11"):
+        ssim(image[:, :10], image[:, :10])
+
+
+def test_shapes_are_checked():
+    image = images(6, 1, 12, 12, 3)
+    with pytest.raises(ValueError, match="images must both be"):
+        psnr(image, image[:, :5])
+    with pytest.raises(ValueError, match="mask must be bool"):
+        psnr(image, image, torch.ones(1, 12, 12))

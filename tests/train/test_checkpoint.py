@@ -1,0 +1,120 @@
+"""Checkpoints: whole or absent, checked when read, readable without running code."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+import safetensors
+import torch
+
+from gsim3d.errors import InputError
+from gsim3d.train import checkpoint
+from gsim3d.train.checkpoint import Checkpoint
+
+
+def example(step=10, **changes):
+    generator = torch.Generator().manual_seed(step)
+    weights = {name: torch.randn(3, 2, generator=generator) for name in ("encoder.weight", "dynamics.weight")}
+    fields = {
+        "model": weights,
+        "ema": {name: value + 1 for name, value in weights.items()},
+        "optimizer": {"exp_avg.encoder.weight": torch.zeros(3, 2)},
+        "config": {"model": {"a": 1}, "data": {"history": 2}, "train": {"seed": 3}},
+        "state": {"step": step, "next_sample": 2 * step},
+    }
+    return Checkpoint(**{**fields, **changes})
+
+
+def test_round_trip(tmp_path):
+    before = example()
+    folder = checkpoint.save(tmp_path, before)
+    assert folder == tmp_path / "checkpoints" / "step_000010"
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "config.yaml", "ema.safetensors", "model.safetensors", "optimizer.safetensors", "state.json",
+    ]  # fmt: skip
+    for path in (tmp_path, folder):
+        after = checkpoint.load(path)
+        assert after.config == before.config
+        assert after.state["step"] == 10 and after.state["next_sample"] == 20 and after.state["versions"]["torch"]
+        for name in ("model", "ema", "optimizer"):
+            assert getattr(after, name).keys() == getattr(before, name).keys()
+            assert all(torch.equal(value, getattr(before, name)[key]) for key, value in getattr(after, name).items())
+
+
+def test_the_pointer_names_the_newest_and_old_ones_go(tmp_path):
+    for step in (5, 10, 15):
+        checkpoint.save(tmp_path, example(step), keep=2)
+    assert (tmp_path / "checkpoints" / "last").read_text() == "step_000015"
+    assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["last", "step_000010", "step_000015"]
+    assert checkpoint.load(tmp_path).state["step"] == 15
+    assert not checkpoint.exists(tmp_path / "other") and checkpoint.exists(tmp_path)
+
+
+def test_a_kill_while_writing_leaves_the_last_one_good(tmp_path):
+    checkpoint.save(tmp_path, example(5))
+    script = (
+        "import os, signal\n"
+        "from gsim3d.train import checkpoint\n"
+        "from tests.train.test_checkpoint import example\n"
+        "checkpoint._sync = lambda path: os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"checkpoint.save({str(tmp_path)!r}, example(10))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": os.getcwd()})
+    assert done.returncode == -signal.SIGKILL
+    assert checkpoint.load(tmp_path).state["step"] == 5
+    checkpoint.save(tmp_path, example(10))
+    assert checkpoint.load(tmp_path).state["step"] == 10
+
+
+@pytest.mark.parametrize("file", ["model.safetensors", "ema.safetensors", "optimizer.safetensors", "config.yaml"])
+def test_a_truncated_changed_or_missing_file_is_named(tmp_path, file):
+    folder = checkpoint.save(tmp_path, example())
+    content = (folder / file).read_bytes()
+    for broken in (content[:-3], content[:-1] + bytes([content[-1] ^ 1]), None):
+        (folder / file).unlink()
+        if broken is not None:
+            (folder / file).write_bytes(broken)
+        with pytest.raises(InputError, match=file):
+            checkpoint.load(tmp_path)
+        (folder / file).write_bytes(content)
+    checkpoint.load(tmp_path)
+
+
+def test_what_is_not_a_checkpoint_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no such checkpoint"):
+        checkpoint.load(tmp_path / "missing")
+    with pytest.raises(InputError, match="not a checkpoint"):
+        checkpoint.load(tmp_path)
+    (tmp_path / "a.safetensors").write_bytes(b"something else")
+    with pytest.raises(InputError, match="not a gsim3d checkpoint file"):
+        checkpoint.load(tmp_path / "a.safetensors")
+    folder = checkpoint.save(tmp_path, example())
+    (folder / "state.json").write_text("{")
+    with pytest.raises(InputError, match="state.json"):
+        checkpoint.load(folder)
+
+
+def test_another_format_is_refused(tmp_path):
+    folder = checkpoint.save(tmp_path, example())
+    config = (folder / "config.yaml").read_text().replace("format: 1", "format: 99")
+    (folder / "config.yaml").write_text(config)
+    state = json.loads((folder / "state.json").read_text())
+    state["sha256"]["config.yaml"] = checkpoint._sha256(folder / "config.yaml")
+    (folder / "state.json").write_text(json.dumps(state))
+    with pytest.raises(InputError, match="format 99"):
+        checkpoint.load(folder)
+
+
+def test_single_file_holds_the_averaged_weights_and_the_config(tmp_path):
+    before = example()
+    checkpoint.save(tmp_path, before)
+    checkpoint.export(checkpoint.load(tmp_path), tmp_path / "a.safetensors")
+    with safetensors.safe_open(tmp_path / "a.safetensors", "pt") as file:
+        assert json.loads(file.metadata()["gsim3d_config"])["model"] == {"a": 1}
+    after = checkpoint.load(tmp_path / "a.safetensors")
+    assert after.config == before.config and after.state["step"] == 10
+    assert after.state["parent"] == checkpoint.load(tmp_path).digest
+    assert all(torch.equal(value, before.ema[name]) for name, value in after.weights.items())

@@ -1,0 +1,70 @@
+"""The loss, the learning-rate schedule and the random numbers of training."""
+
+import math
+
+import pytest
+import torch
+
+from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
+from gsim3d.train.randomness import generator
+from gsim3d.train.schedule import one_cycle
+
+
+def test_time_weights_are_the_papers():
+    weights = time_weights(4, 12)
+    assert weights[:4].tolist() == pytest.approx([0.125] * 4)
+    assert weights[4:].tolist() == pytest.approx([0.5 * 0.87**j for j in range(12)], rel=1e-6)
+    assert weights[4:].sum().item() == pytest.approx(3.12, abs=0.01)
+    assert time_weights(2, 0).tolist() == [0.5, 0.5]
+    with pytest.raises(ValueError, match="n_past"):
+        time_weights(0, 3)
+
+
+def test_image_loss_by_hand():
+    pred, target = torch.zeros(3, 2, 2, 3), torch.zeros(3, 2, 2, 3)
+    target[0] += 0.1
+    target[1] += 0.3
+    target[2] += 0.2
+    weights = torch.tensor([0.25, 2.0])
+    loss, by_step = image_loss(pred, target, torch.tensor([0, 0, 1]), weights)
+    assert by_step.tolist() == pytest.approx([(0.01 + 0.09) / 2, 0.04])
+    assert loss.item() == pytest.approx(0.25 * 0.05 + 2 * 0.04)
+
+
+def test_pixel_weights_make_a_weighted_mean():
+    pred, target = torch.zeros(1, 1, 2, 3), torch.tensor([1.0, 3.0]).reshape(1, 1, 2, 1).expand(1, 1, 2, 3)
+    assert image_errors(pred, target, torch.tensor([[[3.0, 1.0]]])).item() == pytest.approx((3 * 1 + 1 * 9) / 4)
+    assert image_errors(pred, target, torch.ones(1, 1, 2)).item() == image_errors(pred, target).item()
+
+
+def test_a_step_without_images_counts_nothing():
+    assert mean_by_step(torch.tensor([2.0, 4.0]), torch.tensor([2, 2]), 4).tolist() == [0, 0, 3, 0]
+
+
+def test_one_cycle_start_peak_and_end():
+    rates = [one_cycle(step, 1000, 2e-4, warm_up=0.1) for step in range(1000)]
+    assert rates[0] == pytest.approx(8e-6)
+    assert max(rates) == pytest.approx(2e-4) and rates.index(max(rates)) == 99
+    assert rates[-1] == pytest.approx(8e-10)
+    assert rates[:100] == sorted(rates[:100]) and rates[99:] == sorted(rates[99:], reverse=True)
+    assert all(math.isfinite(one_cycle(0, n, 1.0, 0.0)) for n in (1, 2))
+
+
+def test_one_cycle_is_torchs():
+    parameter = torch.nn.Parameter(torch.zeros(1))
+    optimizer = torch.optim.SGD([parameter], lr=1)
+    theirs = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-4, total_steps=200, pct_start=0.1, cycle_momentum=False)
+    for step in range(200):
+        assert one_cycle(step, 200, 2e-4, 0.1) == pytest.approx(theirs.get_last_lr()[0], rel=1e-9, abs=1e-15)
+        optimizer.step()
+        if step < 199:
+            theirs.step()
+
+
+def test_randomness_depends_on_its_four_arguments_only():
+    def draw(*key):
+        return torch.rand(4, generator=generator(*key)).tolist()
+
+    assert draw(1, 2, 3, "views") == draw(1, 2, 3, "views")
+    keys = [(1, 2, 3, "views"), (0, 2, 3, "views"), (1, 0, 3, "views"), (1, 2, 0, "views"), (1, 2, 3, "scene")]
+    assert len({tuple(draw(*key)) for key in keys}) == len(keys)
