@@ -17,6 +17,16 @@ class Tolerance:
 EPYC = "AMD EPYC (Zen 4), torch 2.13 CPU"
 
 TOLERANCES = {
+    "patch_attn_float32": Tolerance(1e-6, 3.4e-7, EPYC, "float32 dot products, weights and sums of up to 130 values against float64"),
+    "patch_attn_float64": Tolerance(2e-15, 6.4e-16, EPYC, "as patch_attn_float32, in float64"),
+    "patch_attn_grad_float32": Tolerance(3e-6, 1.1e-6, EPYC, "as patch_attn_float32"),
+    "patch_attn_grad_float64": Tolerance(5e-15, 1.5e-15, EPYC, "as patch_attn_float32, in float64"),
+    "patch_attn_scale_float32": Tolerance(5e-6, 1.7e-6, EPYC, "logits up to 60: their rounding becomes an error of the weights"),
+    "patch_attn_scale_float64": Tolerance(1e-14, 3.6e-15, EPYC, "as patch_attn_scale_float32, in float64"),
+    "patch_attn_weight_float32": Tolerance(3e-6, 1.2e-6, EPYC, "relative error of a weight exp(-x), x up to 80: log2(e) is rounded"),
+    "patch_attn_weight_float64": Tolerance(3e-14, 1e-14, EPYC, "as patch_attn_weight_float32 in float64, x up to 700"),
+    "patch_attn_huge_logits": Tolerance(3e-6, 8.5e-7, EPYC, "exact dot products; scale and weights are rounded"),
+    "patch_attn_golden": Tolerance(3e-6, 4.2e-7, EPYC, "float32 linear layers of the published block around the op"),
     "pool_float32": Tolerance(1e-6, 2e-7, EPYC, "float32 sums of up to 20 rows against float64"),
     "pool_float64": Tolerance(1e-14, 4e-16, EPYC, "float64 sums of up to 20 rows, another order of additions"),
     "raster_float32": Tolerance(1e-5, 2.2e-6, EPYC, "float32 exponents and products of up to 60 layers against float64"),

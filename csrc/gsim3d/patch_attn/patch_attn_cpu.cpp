@@ -56,11 +56,11 @@ struct Task {
 // Small patches share a task; a large one is cut into tasks of at most `most_queries`.
 std::vector<Task> make_tasks(const PatchTable& table, int64_t dim, int64_t most_queries) {
   std::vector<Task> tasks;
-  int64_t work = kTaskWork;
+  int64_t work = 0;  // of the last task
   for (int64_t p = 0; p < table.n_patches; ++p) {
     const int64_t q_end = table.cu_q[p + 1], n_keys = table.cu_k[p + 1] - table.cu_k[p];
     const int64_t work_here = (q_end - table.cu_q[p]) * n_keys * dim;
-    if (work + work_here <= kTaskWork) {
+    if (!tasks.empty() && work + work_here <= kTaskWork) {
       tasks.back().patch_end = p + 1;
       tasks.back().q_end = q_end;
       tasks.back().n_keys = std::max(tasks.back().n_keys, n_keys);
@@ -167,7 +167,7 @@ void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const He
 
   const RowSlots listed(table);
   const T scale = static_cast<T>(size.scale);
-  parallel.range(table.n_k, std::max<int64_t>(1, (1 << 14) / (heads * dim)), [&](int64_t begin, int64_t end) {
+  parallel.range(table.n_k, (1 << 14) / std::max<int64_t>(1, heads * dim) + 1, [&](int64_t begin, int64_t end) {
     for (int64_t row = begin; row < end; ++row)
       for (int64_t head = 0; head < heads; ++head) {
         T* grad_k = grads[1] + (row * heads + head) * dim;

@@ -1,0 +1,59 @@
+// Submanifold convolution over voxels: a row reads itself through the centre tap and the occupied neighbour voxels through
+// the other taps. Rows of one voxel (duplicates) have their own outputs; a tap reads one value a voxel.
+//
+// Source: Graham et al., "3D semantic segmentation with submanifold sparse convolutional networks", 2018. T is float or
+// double. The same bits for any number of threads and any vector width: an output is one chain of fma in the order of taps,
+// a weight gradient is summed in fixed blocks of pairs that are added in a fixed tree.
+#pragma once
+
+#include <cstdint>
+
+#include "gsim3d/core/parallel.h"
+#include "gsim3d/core/workspace.h"
+
+namespace gsim3d {
+
+// Which rows share a voxel, and which voxels a tap connects: y[tap_out[i]] += W[tap] x[tap_in[i]] for the pairs
+// cu_taps[tap] <= i < cu_taps[tap + 1] of tap (kx * K + ky) * K + kz.
+struct SparseConvMap {
+  const int64_t* row_voxel;      // [n_rows], the voxel of each row
+  const int64_t* voxel_rows;     // [n_rows], rows of voxel 0, of voxel 1, ...; ascending inside a voxel
+  const int64_t* cu_voxel_rows;  // [n_voxels + 1], from 0 to n_rows; no voxel is empty
+  const int64_t* tap_in;         // [n_pairs]; a voxel at most once a tap
+  const int64_t* tap_out;        // [n_pairs]; ascending inside a tap
+  const int64_t* cu_taps;        // [K^3 + 1]; the centre tap has no pairs
+  int64_t n_rows, n_voxels, n_pairs, kernel_size;
+  bool first;  // taps read the lowest row of a voxel instead of the mean of its rows
+};
+
+namespace cpu {
+
+// Throws ArgumentError unless `map` is well formed. `op` starts the message.
+void check_sparse_conv_map(const char* op, const SparseConvMap& map);
+
+// out[p] = bias + W_centre x[p] + sum over taps W_tap xbar[neighbour voxel of p].
+template <typename T>
+void sparse_conv(const T* x,       // [n_rows, c_in]
+                 const T* weight,  // [c_out, K, K, K, c_in]
+                 const T* bias,    // [c_out] or null
+                 const SparseConvMap& map, int64_t c_in, int64_t c_out,
+                 T* out,  // [n_rows, c_out]
+                 const Workspace& workspace, const Parallel& parallel);
+
+template <typename T>
+void sparse_conv_vjp_input(const T* grad,    // [n_rows, c_out]
+                           const T* weight,  // [c_out, K, K, K, c_in]
+                           const SparseConvMap& map, int64_t c_in, int64_t c_out,
+                           T* grad_x,  // [n_rows, c_in]
+                           const Workspace& workspace, const Parallel& parallel);
+
+template <typename T>
+void sparse_conv_vjp_weight(const T* grad,  // [n_rows, c_out]
+                            const T* x,     // [n_rows, c_in]
+                            const SparseConvMap& map, int64_t c_in, int64_t c_out,
+                            T* grad_weight,  // [c_out, K, K, K, c_in]
+                            T* grad_bias,    // [c_out]
+                            const Workspace& workspace, const Parallel& parallel);
+
+}  // namespace cpu
+}  // namespace gsim3d

@@ -1,0 +1,127 @@
+#include <optional>
+
+#include "gsim3d/sparse_conv/sparse_conv.h"
+#include "gsim3d/torch/torch_utils.h"
+
+namespace gsim3d::binding {
+namespace {
+
+// The index tensors of a call, contiguous and checked, and their view for the core.
+struct Geometry {
+  Tensor row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps;
+  SparseConvMap map;
+
+  Geometry(const char* op, int64_t n_rows, int64_t kernel_size, bool first, const Tensor& row_voxel_,
+           const Tensor& voxel_rows_, const Tensor& cu_voxel_rows_, const Tensor& tap_in_, const Tensor& tap_out_,
+           const Tensor& cu_taps_)
+      : row_voxel(rows_of(row_voxel_)),
+        voxel_rows(rows_of(voxel_rows_)),
+        cu_voxel_rows(rows_of(cu_voxel_rows_)),
+        tap_in(rows_of(tap_in_)),
+        tap_out(rows_of(tap_out_)),
+        cu_taps(rows_of(cu_taps_)) {
+    check_dtype(op, "row_voxel", row_voxel, ScalarType::Long);
+    check_dtype(op, "voxel_rows", voxel_rows, ScalarType::Long);
+    check_dtype(op, "cu_voxel_rows", cu_voxel_rows, ScalarType::Long);
+    check_dtype(op, "tap_in", tap_in, ScalarType::Long);
+    check_dtype(op, "tap_out", tap_out, ScalarType::Long);
+    check_dtype(op, "cu_taps", cu_taps, ScalarType::Long);
+    check_shape(op, "row_voxel", row_voxel, {n_rows}, "[N]");
+    check_shape(op, "voxel_rows", voxel_rows, {n_rows}, "[N]");
+    check(cu_voxel_rows.dim() == 1 && cu_voxel_rows.size(0) >= 1, op, ": cu_voxel_rows must be [V + 1]; got ",
+          shape_of(cu_voxel_rows));
+    check_shape(op, "tap_in", tap_in, {-1}, "[L]");
+    check_shape(op, "tap_out", tap_out, {tap_in.size(0)}, "[L] like tap_in");
+    check_shape(op, "cu_taps", cu_taps, {kernel_size * kernel_size * kernel_size + 1}, "[K^3 + 1]");
+    map = {data<int64_t>(row_voxel), data<int64_t>(voxel_rows), data<int64_t>(cu_voxel_rows), data<int64_t>(tap_in),
+           data<int64_t>(tap_out),   data<int64_t>(cu_taps),    n_rows,                       cu_voxel_rows.size(0) - 1,
+           tap_in.size(0),           kernel_size,               first};
+    cpu::check_sparse_conv_map(op, map);
+  }
+};
+
+void check_kernel_size(const char* op, int64_t kernel_size) {
+  check(kernel_size % 2 == 1 && kernel_size > 0 && kernel_size < 1024, op, ": kernel_size must be odd; got ", kernel_size);
+}
+
+void check_weight(const char* op, const Tensor& weight) {
+  check(weight.dim() == 5 && weight.size(1) == weight.size(2) && weight.size(1) == weight.size(3), op,
+        ": weight must be [C_out, K, K, K, C_in]; got ", shape_of(weight));
+  check_kernel_size(op, weight.size(1));
+}
+
+Tensor sparse_conv(const Tensor& x_, const Tensor& weight_, const std::optional<Tensor>& bias_, const Tensor& row_voxel,
+                   const Tensor& voxel_rows, const Tensor& cu_voxel_rows, const Tensor& tap_in, const Tensor& tap_out,
+                   const Tensor& cu_taps, bool first) {
+  const char* op = "sparse_conv";
+  check_shape(op, "x", x_, {-1, -1}, "[N, C_in]");
+  check_weight(op, weight_);
+  const int64_t c_in = x_.size(1), c_out = weight_.size(0);
+  check(weight_.size(4) == c_in, op, ": weight must be [C_out, K, K, K, C_in] with C_in=", c_in, " from x; got ",
+        shape_of(weight_));
+  check_dtype(op, "weight", weight_, x_.scalar_type());
+  const Tensor x = rows_of(x_), weight = rows_of(weight_), bias = bias_ ? rows_of(*bias_) : x;
+  if (bias_) {
+    check_shape(op, "bias", bias, {c_out}, "[C_out]");
+    check_dtype(op, "bias", bias, x.scalar_type());
+  }
+  const Geometry geometry(op, x.size(0), weight.size(1), first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps);
+  Tensor out = empty(x, {x.size(0), c_out});
+  dispatch_float(op, "x", x, [&]<typename T>() {
+    TensorWorkspace workspace(x);
+    cpu::sparse_conv(data<T>(x), data<T>(weight), bias_ ? data<T>(bias) : nullptr, geometry.map, c_in, c_out,
+                     mutable_data<T>(out), workspace, torch_parallel());
+  });
+  return out;
+}
+
+Tensor sparse_conv_grad_input(const Tensor& grad_, const Tensor& weight_, const Tensor& row_voxel, const Tensor& voxel_rows,
+                              const Tensor& cu_voxel_rows, const Tensor& tap_in, const Tensor& tap_out,
+                              const Tensor& cu_taps, bool first) {
+  const char* op = "sparse_conv_grad_input";
+  check_weight(op, weight_);
+  check_shape(op, "grad", grad_, {-1, weight_.size(0)}, "[N, C_out]");
+  check_dtype(op, "weight", weight_, grad_.scalar_type());
+  const Tensor grad = rows_of(grad_), weight = rows_of(weight_);
+  const int64_t n_rows = grad.size(0), c_in = weight.size(4);
+  const Geometry geometry(op, n_rows, weight.size(1), first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps);
+  Tensor grad_x = empty(grad, {n_rows, c_in});
+  dispatch_float(op, "grad", grad, [&]<typename T>() {
+    TensorWorkspace workspace(grad);
+    cpu::sparse_conv_vjp_input(data<T>(grad), data<T>(weight), geometry.map, c_in, weight.size(0),
+                               mutable_data<T>(grad_x), workspace, torch_parallel());
+  });
+  return grad_x;
+}
+
+std::tuple<Tensor, Tensor> sparse_conv_grad_weight(const Tensor& grad_, const Tensor& x_, int64_t kernel_size,
+                                                   const Tensor& row_voxel, const Tensor& voxel_rows,
+                                                   const Tensor& cu_voxel_rows, const Tensor& tap_in,
+                                                   const Tensor& tap_out, const Tensor& cu_taps, bool first) {
+  const char* op = "sparse_conv_grad_weight";
+  check_kernel_size(op, kernel_size);
+  check_shape(op, "x", x_, {-1, -1}, "[N, C_in]");
+  check_shape(op, "grad", grad_, {x_.size(0), -1}, "[N, C_out]");
+  check_dtype(op, "x", x_, grad_.scalar_type());
+  const Tensor grad = rows_of(grad_), x = rows_of(x_);
+  const int64_t c_in = x.size(1), c_out = grad.size(1);
+  const Geometry geometry(op, x.size(0), kernel_size, first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps);
+  Tensor grad_weight = empty(grad, {c_out, kernel_size, kernel_size, kernel_size, c_in});
+  Tensor grad_bias = empty(grad, {c_out});
+  dispatch_float(op, "grad", grad, [&]<typename T>() {
+    TensorWorkspace workspace(grad);
+    cpu::sparse_conv_vjp_weight(data<T>(grad), data<T>(x), geometry.map, c_in, c_out, mutable_data<T>(grad_weight),
+                                mutable_data<T>(grad_bias), workspace, torch_parallel());
+  });
+  return {grad_weight, grad_bias};
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY_IMPL(gsim3d, CPU, m) {
+  m.impl("sparse_conv", TORCH_BOX(&sparse_conv));
+  m.impl("sparse_conv_grad_input", TORCH_BOX(&sparse_conv_grad_input));
+  m.impl("sparse_conv_grad_weight", TORCH_BOX(&sparse_conv_grad_weight));
+}
+
+}  // namespace gsim3d::binding

@@ -1,0 +1,98 @@
+"""Submanifold convolution over voxels: features of occupied neighbour cells, outputs at the same rows."""
+
+import torch
+from torch import Tensor
+
+from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops.curve import KernelMap, Voxels
+
+
+def sparse_conv(
+    x: Tensor, weight: Tensor, bias: Tensor | None, voxels: Voxels, kernel_map: KernelMap, *, duplicates: str = "mean"
+) -> Tensor:
+    """Convolution over the occupied voxels, with one output a row.
+
+    ``out[p] = bias + W_centre x[p] + sum over taps t of W_t xbar[u]``, where ``u`` is the voxel at offset
+    ``t - K // 2`` cells from the voxel of row ``p`` (nothing where it is empty) and ``xbar[u]`` is one value a voxel:
+    the mean of its rows, or its lowest row. Rows that share a voxel keep their own centre term.
+
+    Args:
+        x: features [N, C_in], float32 or float64.
+        weight: [C_out, K, K, K, C_in], K odd; axes 1 to 3 walk x, y, z.
+        bias: [C_out] or None.
+        voxels: which rows share a voxel (``Stage.voxels`` of :func:`gsim3d.ops.build_pyramid`).
+        kernel_map: pairs of neighbouring voxels for K (``Stage.kernel_maps[K]``).
+        duplicates: "mean", or "first" for the lowest row, which depends on the order of the rows.
+    Returns:
+        [N, C_out], dtype of ``x``.
+    Gradients: ``x``, ``weight``, ``bias``, once.
+    Determinism: the same bits for any number of threads; an output is one chain of sums in the order of taps.
+    Raises:
+        ValueError: shapes, dtypes, ``voxels`` or ``kernel_map`` are malformed; the message names the argument.
+    Source: Graham et al., "3D semantic segmentation with submanifold sparse convolutional networks", 2018.
+
+    Example, two rows in one voxel and no neighbours:
+        >>> from gsim3d.ops import KernelMap, Voxels
+        >>> none = torch.zeros(0, dtype=torch.int64)
+        >>> voxels = Voxels(torch.tensor([0, 0]), torch.tensor([0, 1]), torch.tensor([0, 2]))
+        >>> kernel_map = KernelMap(3, none, none, torch.zeros(28, dtype=torch.int64))
+        >>> sparse_conv(torch.tensor([[1.0], [2.0]]), torch.ones(1, 3, 3, 3, 1), None, voxels, kernel_map)
+        tensor([[1.],
+                [2.]])
+    """
+    if duplicates not in ("mean", "first"):
+        raise ValueError(f'sparse_conv: duplicates must be "mean" or "first"; got {duplicates!r}')
+    if weight.dim() == 5 and weight.shape[1] != kernel_map.kernel_size:
+        raise ValueError(
+            f"sparse_conv: kernel_map must have the weight's kernel size {weight.shape[1]}; got {kernel_map.kernel_size}"
+        )
+    return torch.ops.gsim3d.sparse_conv(
+        x,
+        weight,
+        bias,
+        voxels.row_voxel,
+        voxels.rows,
+        voxels.cu_rows,
+        kernel_map.tap_in,
+        kernel_map.tap_out,
+        kernel_map.cu_taps,
+        duplicates == "first",
+    )
+
+
+@torch.library.register_fake("gsim3d::sparse_conv")
+def _(x, weight, bias, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first):
+    return x.new_empty(x.shape[0], weight.shape[0])
+
+
+@torch.library.register_fake("gsim3d::sparse_conv_grad_input")
+def _(grad, weight, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first):
+    return grad.new_empty(grad.shape[0], weight.shape[4])
+
+
+@torch.library.register_fake("gsim3d::sparse_conv_grad_weight")
+def _(grad, x, kernel_size, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first):
+    c_out, k = grad.shape[1], kernel_size
+    return grad.new_empty(c_out, k, k, k, x.shape[1]), grad.new_empty(c_out)
+
+
+def _setup(ctx, inputs, output):
+    x, weight, bias, *geometry, first = inputs
+    ctx.save_for_backward(x, weight, *geometry)
+    ctx.first = first
+    ctx.has_bias = bias is not None
+
+
+def _backward(ctx, grad):
+    x, weight, *geometry = ctx.saved_tensors
+    needs_x, needs_weight, needs_bias = ctx.needs_input_grad[:3]
+    grad_x = grad_weight = grad_bias = None
+    if needs_x:
+        grad_x = torch.ops.gsim3d.sparse_conv_grad_input(grad, weight, *geometry, ctx.first)
+    if needs_weight or needs_bias:
+        grad_weight, grad_bias = torch.ops.gsim3d.sparse_conv_grad_weight(grad, x, weight.shape[1], *geometry, ctx.first)
+    return grad_x, grad_weight, grad_bias if ctx.has_bias else None, *[None] * 7
+
+
+torch.library.register_autograd("gsim3d::sparse_conv", _backward, setup_context=_setup)
+torch.library.register_autocast("gsim3d::sparse_conv", "cpu", torch.float32)

@@ -1,0 +1,66 @@
+"""Float64 references for sparse convolution: a dictionary of voxels, and a dense conv3d."""
+
+import torch
+from torch import Tensor
+
+
+def voxel_dictionary(cells: Tensor) -> dict[tuple, list[int]]:
+    """Rows of each occupied cell, ascending; ``cells`` int64 [N, 4] are (cloud, x, y, z)."""
+    table: dict[tuple, list[int]] = {}
+    for row, cell in enumerate(cells.tolist()):
+        table.setdefault(tuple(cell), []).append(row)
+    return table
+
+
+def kernel_tables(cells: Tensor, kernel_size: int) -> tuple[Tensor, ...]:
+    """(row_voxel, rows, cu_rows, tap_in, tap_out, cu_taps), int64, of the cells; voxels in ascending order of cells."""
+    table = voxel_dictionary(cells)
+    voxels = sorted(table)
+    index = {cell: v for v, cell in enumerate(voxels)}
+    row_voxel = torch.tensor([index[tuple(cell)] for cell in cells.tolist()], dtype=torch.int64)
+    rows = torch.tensor([row for cell in voxels for row in table[cell]], dtype=torch.int64)
+    counts = [len(table[cell]) for cell in voxels]
+    tap_in, tap_out, cu_taps = [], [], [0]
+    reach = range(-(kernel_size // 2), kernel_size // 2 + 1)
+    for dx, dy, dz in ((dx, dy, dz) for dx in reach for dy in reach for dz in reach):
+        for v, (cloud, x, y, z) in enumerate(voxels):
+            u = index.get((cloud, x + dx, y + dy, z + dz))
+            if u is not None and (dx, dy, dz) != (0, 0, 0):
+                tap_in.append(u)
+                tap_out.append(v)
+        cu_taps.append(len(tap_in))
+    cu_rows = torch.cumsum(torch.tensor([0, *counts]), 0)
+    return row_voxel, rows, cu_rows, *(torch.tensor(t, dtype=torch.int64) for t in (tap_in, tap_out, cu_taps))
+
+
+def sparse_conv(x: Tensor, weight: Tensor, bias: Tensor | None, cells: Tensor, duplicates: str) -> Tensor:
+    """Row by row, tap by tap, from a dictionary of voxels; differentiable in x, weight, bias."""
+    table = voxel_dictionary(cells)
+    kernel_size = weight.shape[1]
+    radius = kernel_size // 2
+    out = []
+    for row, (cloud, cx, cy, cz) in enumerate(cells.tolist()):
+        y = weight[:, radius, radius, radius] @ x[row]
+        if bias is not None:
+            y = y + bias
+        for i in range(kernel_size):
+            for j in range(kernel_size):
+                for k in range(kernel_size):
+                    neighbours = table.get((cloud, cx + i - radius, cy + j - radius, cz + k - radius))
+                    if neighbours is None or (i, j, k) == (radius, radius, radius):
+                        continue
+                    value = x[neighbours].mean(0) if duplicates == "mean" else x[neighbours[0]]
+                    y = y + weight[:, i, j, k] @ value
+        out.append(y)
+    return torch.stack(out) if out else x.new_zeros(0, weight.shape[0])
+
+
+def dense_conv(x: Tensor, weight: Tensor, bias: Tensor | None, cells: Tensor) -> Tensor:
+    """conv3d of the cells of one cloud in a zero volume, read at the cells; cells without duplicates."""
+    cx, cy, cz = (cells[:, 1:] - cells[:, 1:].amin(0)).T
+    size = [int(c.amax()) + 1 for c in (cx, cy, cz)]
+    flat = (cx * size[1] + cy) * size[2] + cz
+    volume = x.new_zeros(x.shape[1], size[0] * size[1] * size[2]).index_copy(1, flat, x.T)
+    kernel = weight.permute(0, 4, 1, 2, 3)
+    full = torch.nn.functional.conv3d(volume.reshape(1, -1, *size), kernel, bias, padding=weight.shape[1] // 2)[0]
+    return full[:, cx, cy, cz].T
