@@ -102,8 +102,9 @@ class Attention(nn.Module):
         else:
             self.mlp = None
 
-    def forward(self, x: Tensor, attend) -> Tensor:
-        message = self.norm1(self.merge(attend(self.q_proj(x), self.k_proj(x), self.v_proj(x))))
+    def forward(self, x: Tensor, source: Tensor, attend) -> Tensor:
+        """x asks, source answers; attend(q, k, v) knows who sees whom."""
+        message = self.norm1(self.merge(attend(self.q_proj(x), self.k_proj(source), self.v_proj(source))))
         if self.mlp is not None:
             message = self.norm2(self.mlp(torch.cat([x, message], -1)))
         return x + message
@@ -148,6 +149,6 @@ class MultiViewTransformer(nn.Module):
                 q, k, v = (windows.cut(t, shifted) for t in (q, k, v))
                 return windows.join(F.scaled_dot_product_attention(q, k, v, mask), shifted)
 
-            x = layer.self_attn(x, attend_self)
-            x = layer.cross_attn_ffn(x, attend_others)
+            # Other views are read as they entered the layer, before they looked at themselves.
+            x = layer.cross_attn_ffn(layer.self_attn(x, x, attend_self), x, attend_others)
         return x.permute(0, 1, 4, 2, 3)

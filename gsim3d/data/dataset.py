@@ -1,0 +1,197 @@
+"""Windows of scenes with drawn views: what a training or test step sees.
+
+Every draw is a function of (seed, step, sample, purpose), so it does not depend on what was drawn before.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from gsim3d.data.genesis import Scene
+from gsim3d.errors import InputError
+from gsim3d.types import Cameras, Frames
+
+MOVING_BODY = 3  # segmentation id of every body that may move
+FEW_SCENES = 15  # below so many, one scene is held out
+
+
+def split_scenes(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, list]:
+    """(train, test): every k-th scene of the list is held out, int(test_fraction * n) of them.
+
+    Of fewer than 15 scenes one is held out; of a single scene none. No scene is in both lists.
+    """
+    if not 0 <= test_fraction < 1:
+        raise InputError(f"test_fraction must lie in [0, 1); got {test_fraction}")
+    n = len(scenes)
+    # The small term keeps int(0.1 * 30) at 3 whatever the rounding of the product.
+    n_test = min(1, n - 1) if n < FEW_SCENES else int(test_fraction * n + 1e-9)
+    if n_test < 1 or test_fraction == 0:
+        return list(scenes), []
+    held_out = set(range(0, n_test * (n // n_test), n // n_test))
+    return [s for i, s in enumerate(scenes) if i not in held_out], [scenes[i] for i in sorted(held_out)]
+
+
+def generator(seed: int, step: int, sample: int, purpose: str) -> np.random.Generator:
+    """Random numbers that belong to one purpose of one sample of one step."""
+    return np.random.default_rng([seed, step, sample, zlib.crc32(purpose.encode())])
+
+
+def make_frames(
+    scenes: Sequence[Scene], cams_per_scene: Sequence, steps_per_scene: Sequence, *, masked: bool = True
+) -> Frames:
+    """Images of some cameras at some steps of some scenes, packed cloud after cloud.
+
+    Clouds are sorted by (scene, step): scenes in the order given (one may come twice), steps as given, which
+    must ascend; ``cloud_step`` counts them from 0.
+
+    Args:
+        cams_per_scene: for each scene its camera numbers, the same at every step, or one list a step.
+        steps_per_scene: for each scene its step numbers.
+        masked: also read the labels: masks = not background, dynamic = bodies that may move.
+
+    Raises: InputError for missing files, numbers out of range, and scenes whose image sizes differ.
+    """
+    if not (len(scenes) == len(cams_per_scene) == len(steps_per_scene)) or not len(scenes):
+        raise InputError(
+            "make_frames needs one list of cameras and one of steps for each of one or more scenes; "
+            f"got {len(scenes)} scenes, {len(cams_per_scene)} and {len(steps_per_scene)} lists"
+        )
+    images, labels, cameras, cloud_scene, cloud_step, image_cloud = [], [], [], [], [], []
+    for number, (scene, cams, steps) in enumerate(zip(scenes, cams_per_scene, steps_per_scene)):
+        _check_size(scene, scenes[0])
+        steps = [int(s) for s in steps]
+        if any(b <= a for a, b in zip(steps, steps[1:])):
+            raise InputError(f"{scene.path}: steps must ascend; got {steps}")
+        for slot, (step, chosen) in enumerate(zip(steps, _cams_per_step(cams, len(steps), scene))):
+            images.append(scene.images(chosen, [step])[0])
+            if masked:
+                labels.append(scene.segmentation(chosen, [step])[0])
+            cameras.append(scene.cameras.select(torch.tensor(chosen, dtype=torch.int64)))
+            image_cloud += [len(cloud_scene)] * len(chosen)
+            cloud_scene.append(number)
+            cloud_step.append(slot)
+    labels = torch.cat(labels) if masked else None
+    return Frames(
+        images=torch.cat(images).float() / 255,
+        cameras=_join_cameras(cameras, image_cloud),
+        cloud_scene=torch.tensor(cloud_scene, dtype=torch.int64),
+        cloud_step=torch.tensor(cloud_step, dtype=torch.int64),
+        origin=torch.from_numpy(np.stack([scene.origin for scene in scenes])),
+        masks=labels > 0 if masked else None,
+        dynamic=labels == MOVING_BODY if masked else None,
+    )
+
+
+def _check_size(scene: Scene, first: Scene) -> None:
+    if (scene.width, scene.height) != (first.width, first.height):
+        raise InputError(
+            f"{scene.path} has images of {scene.width}x{scene.height} pixels, {first.path} of "
+            f"{first.width}x{first.height}; one call takes one size"
+        )
+
+
+def _cams_per_step(cams, n_steps: int, scene: Scene) -> list[list[int]]:
+    cams = [list(c) if isinstance(c, (list, tuple, range, np.ndarray)) else c for c in cams]
+    if cams and isinstance(cams[0], list):
+        if len(cams) != n_steps:
+            raise InputError(f"{scene.path}: cameras are given for {len(cams)} steps, but there are {n_steps}")
+        return [[int(c) for c in step_cams] for step_cams in cams]
+    return [[int(c) for c in cams]] * n_steps
+
+
+def _join_cameras(cameras: list[Cameras], image_cloud: list[int]) -> Cameras:
+    if not cameras:
+        raise InputError("make_frames needs at least one step")
+    return Cameras(
+        viewmats=torch.cat([c.viewmats for c in cameras]),
+        Ks=torch.cat([c.Ks for c in cameras]),
+        near=torch.cat([c.near for c in cameras]),
+        far=torch.cat([c.far for c in cameras]),
+        image_cloud=torch.tensor(image_cloud, dtype=torch.int64),
+        width=cameras[0].width,
+        height=cameras[0].height,
+    )
+
+
+@dataclass(frozen=True)
+class Window:
+    """Consecutive steps of one scene: the first ``n_context`` are given, the rest is to be predicted.
+
+    context_cams, target_cams: camera numbers for each step (targets at every step, context at the given ones).
+    """
+
+    scene: Scene
+    start: int
+    n_context: int
+    context_cams: tuple[tuple[int, ...], ...]
+    target_cams: tuple[tuple[int, ...], ...]
+
+    @property
+    def steps(self) -> range:
+        return range(self.start, self.start + len(self.target_cams))
+
+
+@dataclass(frozen=True)
+class WindowSampler:
+    """Draws windows and views for training.
+
+    Args:
+        scenes: at least one, each with at least n_context + n_future steps.
+        n_context, n_future: given and predicted steps of a window.
+        n_context_views, n_target_views: cameras drawn afresh at every step; targets are none of the context's.
+        seed: of all draws.
+    """
+
+    scenes: Sequence[Scene]
+    n_context: int
+    n_future: int
+    n_context_views: int
+    n_target_views: int
+    seed: int = 0
+
+    def __post_init__(self):
+        if not self.scenes:
+            raise InputError("no scene to draw from")
+        for scene in self.scenes:
+            if scene.n_steps < self.n_context + self.n_future:
+                raise InputError(
+                    f"{scene.path} has {scene.n_steps} steps; windows of "
+                    f"{self.n_context} + {self.n_future} steps do not fit"
+                )
+            if scene.n_cams < self.n_context_views + self.n_target_views:
+                raise InputError(
+                    f"{scene.path} has {scene.n_cams} cameras; {self.n_context_views} context and "
+                    f"{self.n_target_views} target views do not fit"
+                )
+
+    def draw(self, step: int, sample: int) -> Window:
+        """The window of sample number ``sample`` of training step ``step``."""
+        rng = generator(self.seed, step, sample, "window")
+        scene = self.scenes[int(rng.integers(len(self.scenes)))]
+        length = self.n_context + self.n_future
+        start = int(rng.integers(scene.n_steps - length + 1))
+        views = generator(self.seed, step, sample, "views")
+        n_views = self.n_context_views + self.n_target_views
+        drawn = [tuple(int(c) for c in views.permutation(scene.n_cams)[:n_views]) for _ in range(length)]
+        return Window(
+            scene,
+            start,
+            self.n_context,
+            context_cams=tuple(cams[: self.n_context_views] for cams in drawn[: self.n_context]),
+            target_cams=tuple(cams[self.n_context_views :] for cams in drawn),
+        )
+
+
+def window_frames(windows: Sequence[Window], *, masked: bool = True) -> tuple[Frames, Frames]:
+    """(context, targets) of several windows; the scene of row b is ``windows[b].scene``, steps count from its start."""
+    scenes = [w.scene for w in windows]
+    context = make_frames(
+        scenes, [w.context_cams for w in windows], [list(w.steps)[: w.n_context] for w in windows], masked=masked
+    )
+    targets = make_frames(scenes, [w.target_cams for w in windows], [list(w.steps) for w in windows], masked=masked)
+    return context, targets

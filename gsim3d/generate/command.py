@@ -1,0 +1,87 @@
+"""`gsim3d generate`: make a data set of multi-view video."""
+
+from __future__ import annotations
+
+import argparse
+
+EPILOG = """\
+examples:
+  gsim3d generate data/demo                            34 short scenes at 64 pixels, about a minute on 2 cores
+  gsim3d generate data/set --size 128 --trajectories 200 --objects ball,star
+  gsim3d generate data/cow --mesh cow.obj --objects none --seed 7
+  gsim3d generate data/full --preset paper             1200 trajectories of 84 frames at 128 pixels
+
+layout:
+  OUT/<object>/<sample>/metadata.json                  cameras (world-to-camera, pixels), fps, near, far, origin
+  OUT/<object>/<sample>/cam_<j>/rgb_<step>.png         colour
+                               /seg_<step>.png         0 background, 1 ground, 3 body
+                               /inst_<step>.png        0 background, 1 ground, 2 body
+  OUT/<object>/<sample>/states.npy                     control lattice of the body at every step, metres
+  OUT/manifest.json                                    options, hashes, rejected draws, machine, versions
+
+The same options give the same bytes for any number of processes. It may be killed at any time: run it again and
+it goes on where it stopped. A larger --trajectories adds scenes to a finished set.
+"""
+
+_OPTIONS = {
+    "size": "image_size",
+    "frames": "n_frames",
+    "fps": "fps",
+    "trajectories": "n_trajectories",
+    "seed": "seed",
+    "objects": "objects",
+    "mesh": "meshes",
+    "mesh_up": "mesh_up",
+    "drop": "drop_height",
+    "body_size": "body_size",
+    "background": "background",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of `gsim3d generate` to ``parser``."""
+    parser.description = "Simulate soft bodies that fall and film them with calibrated cameras on two rings."
+    parser.epilog = EPILOG
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("out", metavar="OUT", help="folder of the data set; made if absent, continued if unfinished")
+    parser.add_argument("--world", default="elastic", help="what is simulated: elastic (default)")
+    parser.add_argument("--preset", default="demo", help="options to start from: demo (default) or paper")
+    parser.add_argument("--size", type=int, metavar="PX", help="width and height of the images")
+    parser.add_argument("--frames", type=int, metavar="N", help="steps of a trajectory")
+    parser.add_argument("--fps", type=float, help="steps a second")
+    parser.add_argument("--trajectories", type=int, metavar="N", help="number of scenes, dealt to the objects in turn")
+    parser.add_argument("--seed", type=int, help="another seed gives other trajectories (default 0)")
+    parser.add_argument(
+        "--objects", type=_names, metavar="A,B", help="ball,blob,box,capsule,ellipsoid,star,torus (all), or none"
+    )
+    parser.add_argument(
+        "--mesh", action="append", metavar="FILE", help="a mesh file as a further object, with its texture; repeatable"
+    )
+    parser.add_argument("--mesh-up", choices=("y", "z"), help="which axis of mesh files points up (default y)")
+    parser.add_argument("--drop", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of drop heights, metres")
+    parser.add_argument(
+        "--body-size", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of body diameters, metres"
+    )
+    parser.add_argument("--background", choices=("black", "white"), help="colour behind the ground (default black)")
+    parser.add_argument("--processes", type=int, metavar="N", help="default: one a core")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return () if text == "none" else tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def run(args: argparse.Namespace) -> int:
+    """Makes the data set that ``args`` describe; returns the exit code."""
+    from gsim3d.generate.run import generate
+
+    given = {field: getattr(args, option) for option, field in _OPTIONS.items()}
+    changes = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items() if v is not None}
+    report = generate(
+        args.out, args.world, preset=args.preset, processes=args.processes, progress=not args.quiet, **changes
+    )
+    kept = len(report.folders) - report.n_made
+    print(f"{len(report.folders)} scenes in {args.out}: {report.n_made} made, {kept} already there")
+    for reason, count in sorted(report.rejected.items()):
+        print(f"  {count} draws rejected and drawn again: {reason}")
+    return 0

@@ -1,0 +1,132 @@
+"""Makes a whole data set with all cores, in any order, with the same bytes every time."""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import multiprocessing
+import os
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsim3d.errors import InputError
+from gsim3d.generate import writer
+from gsim3d.generate.worlds import build_world
+
+NEEDED = {"mujoco": "mujoco-core==4.0.0", "embreex": "embreex", "trimesh": "trimesh"}
+
+
+@dataclass(frozen=True)
+class Report:
+    """What `generate` did: scene folders in order, how many were made now, and draws rejected by reason."""
+
+    folders: list[Path]
+    n_made: int
+    rejected: dict[str, int]
+
+
+def generate(
+    out: str | Path,
+    world: str = "elastic",
+    *,
+    preset: str = "demo",
+    processes: int | None = None,
+    progress: bool = True,
+    **changes,
+) -> Report:
+    """Simulates and films a data set of multi-view video with masks, in the layout that `gsim3d.data` reads.
+
+    The bytes depend on the options only, not on the number of processes. Finished scenes are kept: after a
+    kill, call it again; to get more trajectories, call it with a larger ``n_trajectories``.
+    A script that calls it with several processes needs the usual ``if __name__ == "__main__":``.
+
+    Args:
+        out: folder, made if absent; scenes go to out/<object>/<sample>.
+        world: one of worlds.WORLDS.
+        preset: one of worlds.PRESETS; ``changes`` replace single options of it (fields of the world's class).
+        processes: default: as many as there are cores.
+        progress: show a progress bar.
+
+    Raises: InputError for impossible options, missing packages, and folders that hold something else.
+    """
+    _require_packages()
+    settings = build_world(world, preset, changes)
+    if processes is not None and processes < 1:
+        raise InputError(f"processes must be 1 or more; got {processes}")
+    out = Path(out)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is not a folder")
+    out.mkdir(parents=True, exist_ok=True)
+    with _only_one_writer(out):
+        scenes = settings.scenes()
+        fingerprints = {name: settings.fingerprint(name) for name in settings.object_names()}
+        folders = [writer.scene_folder(out, *scene) for scene in scenes]
+        missing = [
+            scene
+            for scene, folder in zip(scenes, folders)
+            if not writer.is_finished(folder, fingerprints[scene[0]])
+        ]
+        _make_all(settings, out, missing, processes or len(os.sched_getaffinity(0)), progress)
+        manifest = writer.write_manifest(out, folders, {"world": world, **dataclasses.asdict(settings)})
+    return Report(folders, len(missing), manifest["rejected"])
+
+
+def _require_packages() -> None:
+    for module, package in NEEDED.items():
+        try:
+            __import__(module)
+        except ImportError as error:
+            raise InputError(f"generate needs {package}: pip install 'gsim3d[generate]' ({error})") from error
+
+
+@contextmanager
+def _only_one_writer(out: Path) -> Iterator[None]:
+    """Holds a lock on the folder itself, so that nothing is left behind."""
+    handle = os.open(out, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"another process is writing to {out}; wait for it or choose another folder") from None
+        yield
+    finally:
+        os.close(handle)
+
+
+def _make_all(settings, out: Path, scenes: list, processes: int, progress: bool) -> None:
+    from tqdm import tqdm
+
+    bar = tqdm(total=len(scenes), desc="scenes", unit="scene", disable=not progress or not scenes)
+    with bar:
+        if processes == 1 or len(scenes) <= 1:
+            for scene in scenes:
+                _make_one(settings, out, scene)
+                bar.update()
+            return
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(min(processes, len(scenes)), context, _start_worker) as pool:
+            jobs = [pool.submit(_make_one, settings, out, scene) for scene in scenes]
+            try:
+                for job in as_completed(jobs):
+                    job.result()
+                    bar.update()
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+
+
+def _make_one(settings, out: Path, scene: tuple[str, int]) -> None:
+    writer.write_scene(out, settings.make(*scene))
+
+
+def _start_worker() -> None:
+    import cv2
+
+    cv2.setNumThreads(1)
+    # A worker whose parent was killed would wait for work for ever.
+    parent = multiprocessing.parent_process()
+    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()

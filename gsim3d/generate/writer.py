@@ -1,0 +1,169 @@
+"""Scene folders and the manifest of a generated data set.
+
+Layout: OUT/<object>/<sample>/metadata.json, cam_<j>/{rgb,seg,inst}_<step>.png, states.npy; OUT/manifest.json.
+A scene is written to a hidden folder beside its place and renamed when it is whole.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import shutil
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.errors import InputError
+from gsim3d.generate.cameras import Rig, workspace_origin
+from gsim3d.generate.render import View
+
+GENERATOR_VERSION = 1  # raise it whenever the same options would give other bytes
+FILE_TEMPLATE = "cam_{cam_ix}/{img_type}_{n_step:04d}"
+PNG_COMPRESSION = 3
+PACKAGES = ("numpy", "mujoco-core", "embreex", "trimesh", "opencv-contrib-python-headless")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One filmed trajectory, ready to be written. ``states`` float32 [T, c+1, c+1, c+1, 3]: control lattice, metres."""
+
+    object: str
+    sample: int
+    fps: float
+    rig: Rig
+    views: list[View]
+    states: np.ndarray
+    body_height: float
+    extras: dict
+    fingerprint: str
+
+
+def scene_folder(out: Path, name: str, sample: int) -> Path:
+    return out / name / f"{sample:04d}"
+
+
+def is_finished(folder: Path, fingerprint: str) -> bool:
+    """Whether ``folder`` holds a finished scene; InputError when it was made with other options."""
+    metadata = folder / "metadata.json"
+    if not metadata.is_file():
+        return False
+    if read_metadata(folder).get("fingerprint") != fingerprint:
+        raise InputError(f"{folder} was made with other options; choose another folder or remove it")
+    return True
+
+
+def read_metadata(folder: Path) -> dict:
+    try:
+        return json.loads((folder / "metadata.json").read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder / 'metadata.json'} cannot be read: {error}") from error
+
+
+def write_scene(out: Path, scene: Scene) -> Path:
+    """Writes ``scene`` below ``out``; the folder appears whole or not at all."""
+    folder = scene_folder(out, scene.object, scene.sample)
+    unfinished = folder.with_name(f".{folder.name}.unfinished")
+    for leftover in (unfinished, folder):
+        if leftover.exists():
+            shutil.rmtree(leftover)
+    unfinished.mkdir(parents=True)
+    images_hash = hashlib.sha256()
+    for cam in range(scene.rig.n_cams):
+        (unfinished / f"cam_{cam}").mkdir()
+    for step, view in enumerate(scene.views):
+        for image_type, images in (("rgb", view.rgb[..., ::-1]), ("seg", view.segmentation), ("inst", view.instances)):
+            images_hash.update(np.ascontiguousarray(images).tobytes())
+            for cam, image in enumerate(images):
+                file = FILE_TEMPLATE.format(cam_ix=cam, img_type=image_type, n_step=step) + ".png"
+                (unfinished / file).write_bytes(_png(image))
+    np.save(unfinished / "states.npy", scene.states)
+    hashes = {"states_sha256": hashlib.sha256(scene.states.tobytes()).hexdigest()}
+    hashes["images_sha256"] = images_hash.hexdigest()
+    _write_json(unfinished / "metadata.json", {**_metadata(scene), **hashes})
+    os.replace(unfinished, folder)
+    return folder
+
+
+def _png(image: np.ndarray) -> bytes:
+    import cv2
+
+    done, data = cv2.imencode(".png", np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
+    if not done:
+        raise RuntimeError("OpenCV could not encode a PNG")
+    return data.tobytes()
+
+
+def _metadata(scene: Scene) -> dict:
+    rig = scene.rig
+    cams = {
+        f"cam_{cam}": {
+            "extrinsics": rig.viewmats[cam].tolist(),
+            "intrinsics": rig.Ks[cam].tolist(),
+            "resolution": [rig.size, rig.size],
+        }
+        for cam in range(rig.n_cams)
+    }
+    return {
+        "n_steps": len(scene.views),
+        "n_cams": rig.n_cams,
+        "file_path_template": FILE_TEMPLATE,
+        "fps": scene.fps,
+        "near": rig.near,
+        "far": rig.far,
+        "origin": workspace_origin(rig).tolist(),
+        "object": scene.object,
+        "sample": scene.sample,
+        "body_height": scene.body_height,
+        "generator_version": GENERATOR_VERSION,
+        "fingerprint": scene.fingerprint,
+        **scene.extras,
+        **cams,
+    }
+
+
+def _write_json(path: Path, content: dict) -> None:
+    text = json.dumps(content, indent=1) + "\n"
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    unfinished.write_text(text)
+    os.replace(unfinished, path)
+
+
+def write_manifest(out: Path, folders: list[Path], settings: dict) -> dict:
+    """Writes OUT/manifest.json: options, hashes of every scene, rejected draws, machine and versions."""
+    scenes, rejected = {}, {}
+    for folder in folders:
+        metadata = read_metadata(folder)
+        scenes[folder.relative_to(out).as_posix()] = {
+            key: metadata[key] for key in ("states_sha256", "images_sha256", "fingerprint", "attempt")
+        }
+        for reason in metadata["rejected"]:
+            rejected[reason] = rejected.get(reason, 0) + 1
+    manifest = {
+        "generator_version": GENERATOR_VERSION,
+        "settings": settings,
+        "machine": {"processor": _processor(), "system": platform.platform(), "python": platform.python_version()},
+        "versions": {package: _version(package) for package in PACKAGES},
+        "rejected": rejected,
+        "scenes": scenes,
+    }
+    _write_json(out / "manifest.json", manifest)
+    return manifest
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "absent"
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())

@@ -1,0 +1,393 @@
+"""The encoder on ragged clouds, masks and odd cameras; its independence of neighbours and order; its errors."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from gsim3d.encoder import Encoder, EncoderConfig
+from gsim3d.encoder.depth import feature_intrinsics, upsample, upsampling_matrix
+from gsim3d.encoder.sh import degree_damping, quat_multiply, rotation_of_harmonics, rotation_to_quat, sh_basis
+from gsim3d.errors import HardCaseError, InputError
+from gsim3d.quirks import Quirks
+from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames
+from tests.asserts import assert_close_relative_to_max, assert_same_bits
+
+SIZE = 16
+CONFIG = EncoderConfig(
+    feature_dim=8,
+    cnn_dims=(8, 8),
+    cnn_blocks=1,
+    transformer_layers=2,
+    transformer_mlp_ratio=1,
+    n_depths=6,
+    cost_unet_dim=8,
+    cost_unet_levels=2,
+    cost_unet_attention=(2,),
+    refine_unet_dim=8,
+    refine_unet_levels=2,
+    refine_unet_attention=(),
+    upsampled_dim=5,
+    disparity_dim=8,
+    dynamic_dim=3,
+    static_dim=2,
+    condition_dim=4,
+)
+ROW_FIELDS = ("means", "opacities", "dynamic_latents", "static_latents")
+
+
+def look_at(angle: float) -> torch.Tensor:
+    """World-to-camera of a camera 3 m from the z axis that looks at the origin."""
+    center = torch.tensor([3 * math.cos(angle), 3 * math.sin(angle), 1.5], dtype=torch.float64)
+    forward = -center / center.norm()
+    right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    right = right / right.norm()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ center
+    return pose
+
+
+def make_frames(clouds: list[int], n_clouds: int | None = None, seed: int = 0) -> Frames:
+    """One image for every entry of ``clouds``, which names its cloud."""
+    n = len(clouds)
+    generator = torch.Generator().manual_seed(seed)
+    viewmats = torch.stack([look_at(0.4 + 1.1 * i) for i in range(n)])
+    K = torch.tensor([[18.0, 0.0, 8.3], [0.0, 17.0, 7.6], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    near, far = torch.full((n,), 1.5), torch.full((n,), 6.0)
+    cameras = Cameras(viewmats, K.repeat(n, 1, 1), near, far, torch.tensor(clouds), SIZE, SIZE)
+    n_clouds = n_clouds or max(clouds) + 1
+    images = torch.rand(n, 3, SIZE, SIZE, generator=generator)
+    origin = torch.tensor([[-2.0, -2.0, -0.5]], dtype=torch.float64)
+    return Frames(images, cameras, torch.zeros(n_clouds, dtype=torch.int64), torch.arange(n_clouds), origin)
+
+
+def select(frames: Frames, images: list[int], clouds: list[int]) -> Frames:
+    """Frames with the chosen images, which show the named clouds."""
+    rows, n_clouds = torch.tensor(images), max(clouds) + 1
+    return dataclasses.replace(
+        frames,
+        images=frames.images[rows],
+        cameras=frames.cameras.select(rows, torch.tensor(clouds)),
+        cloud_scene=torch.zeros(n_clouds, dtype=torch.int64),
+        cloud_step=torch.arange(n_clouds),
+        masks=None if frames.masks is None else frames.masks[rows],
+        dynamic=None if frames.dynamic is None else frames.dynamic[rows],
+    )
+
+
+def make_encoder(**changes) -> Encoder:
+    """Random weights, zero-initialised norms included, so that every branch counts."""
+    torch.manual_seed(0)
+    encoder = Encoder(dataclasses.replace(CONFIG, **changes))
+    generator = torch.Generator().manual_seed(1)
+    for parameter in encoder.parameters():
+        if parameter.dim() == 1:
+            parameter.data.uniform_(-0.5, 0.5, generator=generator)
+    return encoder
+
+
+def image_rows(particles, image: int) -> list[torch.Tensor]:
+    """Fields of the particles of the ``image``-th image, where no pixel is masked."""
+    rows = slice(image * SIZE**2, (image + 1) * SIZE**2)
+    return [getattr(particles, name)[rows] for name in ROW_FIELDS]
+
+
+@pytest.mark.parametrize("n_views", [1, 2, 3, 5])
+def test_any_number_of_views(n_views):
+    particles = make_encoder()(make_frames([0] * n_views))
+    n = n_views * SIZE**2
+    assert particles.means.shape == (n, 3) and particles.opacities.shape == (n,)
+    assert particles.dynamic_latents.shape == (n, 3) and particles.static_latents.shape == (n, 2)
+    assert particles.cu_rows.tolist() == [0, n] and particles.activity.dtype == torch.uint8
+    assert all(getattr(particles, name).isfinite().all() for name in ROW_FIELDS)
+
+
+def test_particles_lie_on_the_rays_of_their_pixels_between_near_and_far():
+    """The principal point is far from the centre, so an encoder that ignores it fails."""
+    frames = make_frames([0, 0, 0])
+    frames = dataclasses.replace(frames, cameras=dataclasses.replace(frames.cameras, Ks=frames.cameras.Ks.clone()))
+    frames.cameras.Ks[:, 0, 2] += 5
+    particles = make_encoder()(frames)
+    means = particles.means.double().unflatten(0, (3, -1))
+    cameras = frames.cameras
+    in_camera = means @ cameras.viewmats[:, :3, :3].mT + cameras.viewmats[:, None, :3, 3]
+    pixels = in_camera @ cameras.Ks.mT
+    pixels = pixels[..., :2] / pixels[..., 2:]
+    v, u = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+    assert (pixels - torch.stack([u, v], -1).flatten(0, 1)).abs().max() <= 0.5 + 1e-4
+    assert in_camera[..., 2].min() >= 1.5 - 1e-4 and in_camera[..., 2].max() <= 6 + 1e-4
+
+
+def test_a_shifted_crop_is_a_shifted_principal_point():
+    """Cropping a feature map by whole feature pixels and shifting the principal point sees the same world."""
+    K = make_frames([0]).cameras.Ks
+    cropped = K.clone()
+    cropped[:, 0, 2] -= 8
+    point = torch.tensor([0.3, 0.2, 2.0], dtype=torch.float64)
+    full, crop = (feature_intrinsics(k, 4, Quirks())[0] @ point for k in (K, cropped))
+    assert torch.allclose(full[:2] / full[2] - crop[:2] / crop[2], torch.tensor([2.0, 0.0], dtype=torch.float64))
+
+
+def test_feature_pixels_are_where_strided_convolutions_look():
+    """Image index 4 i and feature index i are the same direction."""
+    K = make_frames([0]).cameras.Ks
+    ray = torch.linalg.inv(K[0]) @ torch.tensor([4 * 2 + 0.5, 4 * 3 + 0.5, 1], dtype=torch.float64)
+    pixel = feature_intrinsics(K, 4, Quirks())[0] @ ray
+    assert torch.allclose(pixel[:2] / pixel[2], torch.tensor([2.5, 3.5], dtype=torch.float64))
+    encoder = make_encoder(transformer_layers=0)
+    image = torch.zeros(1, 3, SIZE, SIZE)
+    weight = torch.zeros_like(encoder.cnn.conv1.weight)
+    weight[:, :, 3, 3] = 1
+    image[0, :, 8, 4] = 1  # row 8, column 4
+    seen = torch.nn.functional.conv2d(image, weight, stride=2, padding=3)[0, 0]
+    assert seen[4, 2] == 3 and seen.sum() == 3
+
+
+def test_views_of_one_count_or_another_in_one_call():
+    """Ragged clouds, interleaved images and a cloud without any: each cloud as if encoded alone."""
+    frames = make_frames([2, 0, 2, 3, 2, 0], n_clouds=4)
+    encoder = make_encoder()
+    particles = encoder(frames)
+    pixels = SIZE**2
+    assert particles.cu_rows.tolist() == [0, 2 * pixels, 2 * pixels, 5 * pixels, 6 * pixels]
+    for images, first in (([1, 5], 0), ([0, 2, 4], 2), ([3], 5)):
+        alone = encoder(select(frames, images, [0] * len(images)))
+        for name in ROW_FIELDS:
+            rows = getattr(particles, name)[first * pixels : (first + len(images)) * pixels]
+            assert_close_relative_to_max(rows, getattr(alone, name), "encoder_order", name)
+
+
+def test_a_cloud_does_not_change_its_neighbours():
+    frames = make_frames([0, 0, 1, 1, 2])
+    encoder = make_encoder()
+    before = encoder(frames)
+    other = frames.images.clone()
+    other[2:4] = torch.rand(2, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(9)) * 100
+    after = encoder(dataclasses.replace(frames, images=other))
+    for image in (0, 1, 4):
+        for a, b in zip(image_rows(before, image), image_rows(after, image), strict=True):
+            assert_same_bits(a, b)
+    assert not torch.equal(before.means, after.means)
+
+
+def test_permuted_views_permute_particles():
+    frames = make_frames([0, 0, 0])
+    encoder = make_encoder()
+    before, after = encoder(frames), encoder(select(frames, [2, 0, 1], [0, 0, 0]))
+    for new, old in enumerate([2, 0, 1]):
+        for a, b in zip(image_rows(after, new), image_rows(before, old), strict=True):
+            assert_close_relative_to_max(a, b, "encoder_order")
+
+
+def test_a_moved_scene_gives_moved_particles():
+    """Cameras and origin move along; features do not notice."""
+    frames = make_frames([0, 0, 0])
+    shift = torch.tensor([4.0, -3.0, 2.0], dtype=torch.float64)
+    moved = frames.cameras.viewmats.clone()
+    moved[:, :3, 3] -= moved[:, :3, :3] @ shift
+    there = dataclasses.replace(
+        frames, cameras=dataclasses.replace(frames.cameras, viewmats=moved), origin=frames.origin + shift
+    )
+    encoder = make_encoder()
+    before, after = encoder(frames), encoder(there)
+    assert_close_relative_to_max(after.means - shift.float(), before.means, "encoder_order")
+    for name in ROW_FIELDS[1:]:
+        assert_close_relative_to_max(getattr(after, name), getattr(before, name), "encoder_order", name)
+    released = make_encoder(quirks=dataclasses.replace(Quirks(), world_moments=True))
+    assert not torch.allclose(released(frames).dynamic_latents, released(there).dynamic_latents, atol=1e-3)
+
+
+def test_masks_drop_pixels_and_dynamic_sets_activity():
+    frames = make_frames([0, 1, 0])
+    generator = torch.Generator().manual_seed(3)
+    masks = torch.rand(3, SIZE, SIZE, generator=generator) > 0.5
+    masks[1] = False
+    dynamic = torch.rand(3, SIZE, SIZE, generator=generator) > 0.5
+    encoder = make_encoder()
+    everything = encoder(frames)
+    particles = encoder(dataclasses.replace(frames, masks=masks, dynamic=dynamic))
+    order = [0, 2, 1]
+    kept = masks[order].flatten()
+    n = int(kept.sum())
+    assert particles.cu_rows.tolist() == [0, n, n]
+    for name in ROW_FIELDS:
+        assert_same_bits(getattr(particles, name), getattr(everything, name)[kept])
+    expected = torch.where(dynamic[order].flatten()[kept], DYNAMIC, FROZEN)
+    assert torch.equal(particles.activity.long(), expected)
+    assert everything.activity.eq(DYNAMIC).all()
+
+
+def test_gradients_are_finite_and_reach_every_parameter():
+    frames = make_frames([0, 0, 1])
+    frames.images.requires_grad_()
+    encoder = make_encoder()
+    particles = encoder(frames)
+    generator = torch.Generator().manual_seed(0)
+    sum((getattr(particles, name) * torch.randn(getattr(particles, name).shape, generator=generator)).sum() for name in ROW_FIELDS).backward()
+    assert frames.images.grad.isfinite().all() and frames.images.grad.abs().max() > 0
+    for name, parameter in encoder.named_parameters():
+        assert parameter.grad is not None and parameter.grad.isfinite().all(), name
+        assert parameter.grad.abs().max() > 0, name
+
+
+def test_training_twice_gives_the_same_bits():
+    def train() -> list[torch.Tensor]:
+        encoder, frames = make_encoder(), make_frames([0, 0, 0])
+        optimizer = torch.optim.Adam(encoder.parameters(), 1e-3)
+        for _ in range(3):
+            optimizer.zero_grad()
+            particles = encoder(frames)
+            (particles.means.square().mean() + particles.dynamic_latents.square().mean()).backward()
+            optimizer.step()
+        return list(encoder.parameters())
+
+    for a, b in zip(train(), train(), strict=True):
+        assert_same_bits(a, b)
+
+
+def test_untrained_depth_is_near_the_middle_of_disparity_with_translucent_particles():
+    torch.manual_seed(0)
+    frames = make_frames([0, 0, 0])
+    particles = Encoder(EncoderConfig.tiny())(frames)
+    in_camera = torch.einsum("iab,inb->ina", frames.cameras.viewmats[:, :3, :3].float(), particles.means.unflatten(0, (3, -1)))
+    disparity = 1 / (in_camera[..., 2] + frames.cameras.viewmats[:, None, 2, 3])
+    middle, span = (1 / 1.5 + 1 / 6) / 2, 1 / 1.5 - 1 / 6
+    assert (disparity - middle).abs().mean() < 0.2 * span
+    assert (particles.opacities - 0.5).abs().max() < 0.1
+
+
+@pytest.mark.parametrize("poses", ["equal", "apart"])
+def test_degenerate_cameras(poses):
+    """Zero baseline and views without overlap: finite values and gradients."""
+    frames = make_frames([0, 0])
+    viewmats = frames.cameras.viewmats.clone()
+    viewmats[1] = viewmats[0]
+    if poses == "apart":
+        viewmats[1, :3] *= torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)[:, None]  # looks the other way
+    frames = dataclasses.replace(frames, cameras=dataclasses.replace(frames.cameras, viewmats=viewmats))
+    frames.images.requires_grad_()
+    encoder = make_encoder()
+    particles = encoder(frames)
+    particles.means.sum().backward()
+    assert particles.means.isfinite().all() and frames.images.grad.isfinite().all()
+
+
+def test_constant_images():
+    frames = make_frames([0, 0])
+    frames = dataclasses.replace(frames, images=torch.ones_like(frames.images).requires_grad_())
+    particles = make_encoder()(frames)
+    (particles.means.sum() + particles.dynamic_latents.sum()).backward()
+    assert particles.means.isfinite().all() and frames.images.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("factor, aligned", [(2, False), (4, False), (4, True)])
+def test_upsampling(factor, aligned):
+    x = torch.rand(2, 3, 5, 7, generator=torch.Generator().manual_seed(0))
+    quirks = dataclasses.replace(Quirks(), corner_aligned_upsampling=aligned)
+    ours = upsample(x, factor, quirks)
+    if aligned:
+        expected = torch.nn.functional.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=True)
+        assert_close_relative_to_max(ours, expected, 1e-5)
+    else:
+        assert torch.allclose(ours[..., ::factor, ::factor], x)
+    assert torch.allclose(upsampling_matrix(5, factor, aligned, x).sum(1), torch.ones(5 * factor))
+
+
+def test_explicit_variant():
+    frames = make_frames([0, 0])
+    particles = make_encoder(explicit=True, dynamic_dim=0, static_dim=0)(frames)
+    n = 2 * SIZE**2
+    assert particles.quats.shape == (n, 4) and particles.scales.shape == (n, 3) and particles.sh.shape == (n, 16, 3)
+    assert particles.dynamic_latents.shape == (n, 0)
+    assert torch.allclose(particles.quats.norm(dim=-1), torch.ones(n), atol=1e-5) and particles.scales.min() > 0
+
+
+def rotations(n: int) -> torch.Tensor:
+    q, _ = torch.linalg.qr(torch.randn(n, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
+    return q * torch.linalg.det(q)[:, None, None]
+
+
+def test_turned_harmonics_see_the_turned_world():
+    R = rotations(10)
+    directions = torch.nn.functional.normalize(torch.randn(20, 3, dtype=torch.float64), dim=-1)
+    coefficients = torch.randn(10, 16, dtype=torch.float64)
+    turned = torch.einsum("ikl,il->ik", rotation_of_harmonics(R, 3, released=False), coefficients)
+    seen = torch.einsum("ndk,nk->nd", sh_basis(directions @ R.mT, 3), turned)  # directions R d in the world
+    assert torch.allclose(seen, torch.einsum("dk,nk->nd", sh_basis(directions, 3), coefficients), atol=1e-10)
+    assert degree_damping(3, R)[[0, 1, 4, 9]].tolist() == [1, 0.025, 0.00625, 0.0015625]
+
+
+def test_quaternions_of_rotations():
+    R = torch.cat([rotations(30), torch.diag_embed(torch.tensor([[1.0, -1, -1], [-1, 1, -1], [-1, -1, 1]]).double())])
+    q = rotation_to_quat(R)
+    x = torch.randn(3, dtype=torch.float64)
+    pure = torch.cat([x.new_zeros(1), x]).expand(len(q), 4)
+    conjugate = q * torch.tensor([1.0, -1, -1, -1], dtype=torch.float64)
+    assert torch.allclose(quat_multiply(quat_multiply(q, pure), conjugate)[:, 1:], R @ x)
+
+
+@pytest.mark.parametrize("quirk", [field.name for field in dataclasses.fields(Quirks())])
+def test_every_quirk_is_off_by_default_and_on_in_the_release(quirk):
+    assert not getattr(Quirks(), quirk) and getattr(Quirks.release(), quirk)
+
+
+def replace_cameras(frames: Frames, **changes) -> Frames:
+    return dataclasses.replace(frames, cameras=dataclasses.replace(frames.cameras, **changes))
+
+
+def broken(frames: Frames, name: str) -> Frames:
+    """Frames with one fault."""
+    poses, Ks = frames.cameras.viewmats.clone(), frames.cameras.Ks
+    poses[1, 0, 0] = math.nan
+    images = frames.images.clone()
+    images[1, 0, 2, 3] = math.inf
+    faults = {
+        "channels": lambda: dataclasses.replace(frames, images=frames.images[:, :2]),
+        "size": lambda: dataclasses.replace(frames, images=frames.images[..., :12]),
+        "camera size": lambda: replace_cameras(frames, width=SIZE * 2),
+        "cameras": lambda: replace_cameras(frames, Ks=Ks[:1]),
+        "cloud": lambda: replace_cameras(frames, image_cloud=torch.tensor([0, 5])),
+        "mask": lambda: dataclasses.replace(frames, masks=torch.ones(2, SIZE, SIZE)),
+        "pose": lambda: replace_cameras(frames, viewmats=poses),
+        "image": lambda: dataclasses.replace(frames, images=images),
+        "near": lambda: replace_cameras(frames, near=torch.tensor([1.0, 0.0])),
+        "far": lambda: replace_cameras(frames, far=torch.tensor([6.0, 1.0])),
+    }
+    return faults[name]()
+
+
+@pytest.mark.parametrize(
+    "fault, error, message",
+    [
+        ("channels", InputError, r"images must be \[I, 3, H, W\]"),
+        ("size", InputError, "multiples of 8"),
+        ("camera size", InputError, "cameras are 16 x 32 pixels, images 16 x 16"),
+        ("cameras", InputError, r"cameras.Ks must be \[2, 3, 3\]"),
+        ("cloud", InputError, r"image_cloud must be in \[0, 1\)"),
+        ("mask", InputError, "masks must be bool"),
+        ("pose", HardCaseError, r"cameras.viewmats must be finite; image 1 \(scene 0, step 0\)"),
+        ("image", HardCaseError, r"images must be finite; image 1"),
+        ("near", HardCaseError, "cameras.near must be positive; image 1"),
+        ("far", HardCaseError, "cameras.far must be finite and larger than near; image 1"),
+    ],
+)
+def test_errors_name_what_is_wrong(fault, error, message):
+    with pytest.raises(error, match=message):
+        make_encoder()(broken(make_frames([0, 0]), fault))
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"downscale_factor": 3}, "downscale_factor"),
+        ({"feature_dim": 6}, "feature_dim"),
+        ({"n_depths": 1}, "n_depths"),
+        ({"cost_unet_dim": 12}, "cost_unet_dim"),
+        ({"refine_unet_dim": 48}, "refine_unet_dim"),
+    ],
+)
+def test_config_errors(changes, message):
+    with pytest.raises(InputError, match=message):
+        EncoderConfig(**changes)
