@@ -17,6 +17,9 @@ class Tolerance:
 EPYC = "AMD EPYC (Zen 4), torch 2.13 CPU"
 
 TOLERANCES = {
+    "generate_binding": Tolerance(1e-6, 1e-7, EPYC, "metres; MuJoCo stores the rest lattice in float32"),
+    "generate_free_fall": Tolerance(1e-2, 4e-3, EPYC, "metres after 0.3 s: velocity is a step of 1/480 s ahead of position"),
+    "generate_machines": Tolerance(2e-3, 5e-6, EPYC, "metres; heights are recorded to 5 digits, contact amplifies the last bits of others"),
     "patch_attn_float32": Tolerance(1e-6, 3.4e-7, EPYC, "float32 dot products, weights and sums of up to 130 values against float64"),
     "patch_attn_float64": Tolerance(2e-15, 6.4e-16, EPYC, "as patch_attn_float32, in float64"),
     "patch_attn_grad_float32": Tolerance(3e-6, 1.1e-6, EPYC, "as patch_attn_float32"),
@@ -27,6 +30,10 @@ TOLERANCES = {
     "patch_attn_weight_float64": Tolerance(3e-14, 1e-14, EPYC, "as patch_attn_weight_float32 in float64, x up to 700"),
     "patch_attn_huge_logits": Tolerance(3e-6, 8.5e-7, EPYC, "exact dot products; scale and weights are rounded"),
     "patch_attn_golden": Tolerance(3e-6, 4.2e-7, EPYC, "float32 linear layers of the published block around the op"),
+    "plane_sweep_float32": Tolerance(1e-5, 2e-6, EPYC, "sample places are float32"),
+    "plane_sweep_float64": Tolerance(2e-14, 4e-15, EPYC, "as plane_sweep_float32, in float64"),
+    "plane_sweep_grad_float32": Tolerance(1e-5, 1.2e-6, EPYC, "as plane_sweep_float32"),
+    "plane_sweep_grad_float64": Tolerance(1e-14, 1.8e-15, EPYC, "as plane_sweep_float32, in float64"),
     "pool_float32": Tolerance(1e-6, 2e-7, EPYC, "float32 sums of up to 20 rows against float64"),
     "pool_float64": Tolerance(1e-14, 4e-16, EPYC, "float64 sums of up to 20 rows, another order of additions"),
     "raster_float32": Tolerance(1e-5, 2.2e-6, EPYC, "float32 exponents and products of up to 60 layers against float64"),
@@ -39,11 +46,11 @@ TOLERANCES = {
     "raster_golden_grad": Tolerance(3e-5, 8.2e-6, EPYC, "as raster_golden"),
     "raster_golden_float32": Tolerance(3e-5, 5.8e-6, EPYC, "float32 on both sides"),
     "raster_grad_float64": Tolerance(2e-13, 1.1e-14, EPYC, "as raster_grad_float32, in float64"),
-    "encoder_golden": Tolerance(1e-4, 1e-5, EPYC, "a deep float32 network; published runs differ by 1e-5 among themselves"),
-    "sh_golden": Tolerance(1e-5, 1e-6, EPYC, "the published rotation matrices are float32"),
-    "encoder_order": Tolerance(1e-4, 1e-5, EPYC, "float32 sums in another order through a deep network"),
-    "film_golden": Tolerance(1e-5, 1e-6, EPYC, "float32 on both sides"),
-    "dynamics_golden": Tolerance(1e-5, 2e-6, EPYC, "float32 networks of up to 14 blocks, another order of additions"),
+    "encoder_golden": Tolerance(1e-4, 9.2e-6, EPYC, "a deep float32 network; published runs differ by 1e-5 among themselves"),
+    "sh_golden": Tolerance(1e-5, 1.1e-6, EPYC, "the published rotation matrices are float32"),
+    "encoder_order": Tolerance(2e-5, 1.8e-6, EPYC, "float32 sums in another order through a deep network"),
+    "film_golden": Tolerance(5e-6, 4.1e-7, EPYC, "float32 on both sides"),
+    "dynamics_golden": Tolerance(1e-5, 5.7e-6, EPYC, "float32 networks of up to 14 blocks, another order of additions"),
 }
 
 

@@ -171,18 +171,19 @@ def _template(metadata: dict, where: Path) -> str:
     if not isinstance(template, str):
         raise InputError(f"{where}: file_path_template must be text; got {template!r}")
     try:
-        fields = {field for _, field, _, _ in string.Formatter().parse(template) if field is not None}
+        parts = [part for part in string.Formatter().parse(template) if part[1] is not None]
     except ValueError as error:
         raise InputError(f"{where}: file_path_template {template!r} is no format string: {error}") from error
+    fields = {field for _, field, _, _ in parts}
     if fields != TEMPLATE_FIELDS:
         raise InputError(
             f"{where}: file_path_template must use the fields {', '.join(sorted(TEMPLATE_FIELDS))}, each as it is; "
             f"got {', '.join(sorted(fields)) or 'none'}"
         )
-    try:
-        template.format(cam_ix=0, n_step=0, img_type="rgb")
-    except (ValueError, TypeError, LookupError) as error:
-        raise InputError(f"{where}: file_path_template {template!r} cannot be filled in: {error}") from error
+    # Only plain fields and zero-padded numbers: a format width of 10^9 would fill the memory.
+    for _, field, spec, conversion in parts:
+        if conversion or not re.fullmatch(r"" if field == "img_type" else r"(0?\d{1,2})?d?", spec):
+            raise InputError(f"{where}: file_path_template may format numbers like n_step:04d only; got {template!r}")
     return template
 
 
@@ -215,13 +216,13 @@ def _cameras(metadata: dict, n_cams: int, where: Path) -> tuple[np.ndarray, np.n
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
             raise InputError(f"{where}: cam_{cam}.extrinsics must be a rigid motion, world to camera")
         if np.abs(viewmat[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
-            raise InputError(f"{where}: the last row of cam_{cam}.extrinsics must be 0 0 0 1; got {viewmat[3].tolist()}")
+            raise InputError(f"{where}: cam_{cam}.extrinsics must end in the row 0 0 0 1; got {viewmat[3].tolist()}")
         if not (K[0, 0] > 0 and K[1, 1] > 0 and np.abs(K[2] - [0, 0, 1]).max() <= ROTATION_TOLERANCE):
             raise InputError(f"{where}: cam_{cam}.intrinsics must hold focal lengths in pixels and end in 0 0 1")
         if (size != np.round(size)).any() or (size < 1).any() or (size > MAX_SIZE).any():
             raise InputError(f"{where}: cam_{cam}.resolution must be [width, height] in pixels; got {size.tolist()}")
         if sizes and (size != sizes[0]).any():
-            raise InputError(f"{where}: cam_{cam} has resolution {size.tolist()}, cam_0 {sizes[0].tolist()}; one is needed")
+            raise InputError(f"{where}: cam_{cam} has resolution {size.tolist()}, but cam_0 {sizes[0].tolist()}")
         viewmats.append(viewmat)
         Ks.append(K)
         sizes.append(size)

@@ -123,6 +123,9 @@ def bounded(x: Tensor, limit: float | None) -> Tensor:
 def rotate_left(quats: Tensor, rotation_vectors: Tensor) -> Tensor:
     """Unit quaternions of ``quats`` turned further about world axes: exp(v) q.
 
+    Of the two quaternions of a rotation the result is the one whose largest component is positive: the network reads
+    quaternions, and should see one rotation as one.
+
     Args:
         quats: [N, 4] (w, x, y, z), not zero, any length.
         rotation_vectors: [N, 3] radians, world axes.
@@ -136,4 +139,5 @@ def rotate_left(quats: Tensor, rotation_vectors: Tensor) -> Tensor:
     v = ratio * rotation_vectors
     qw, qv = quats[:, :1], quats[:, 1:]
     turned = torch.cat([w * qw - (v * qv).sum(1, keepdim=True), w * qv + qw * v + torch.linalg.cross(v, qv)], 1)
-    return turned / turned.norm(dim=1, keepdim=True)
+    largest = turned.detach().gather(1, turned.detach().abs().argmax(1, keepdim=True))
+    return turned / (turned.norm(dim=1, keepdim=True) * torch.where(largest < 0, -1, 1))

@@ -15,6 +15,8 @@ import numpy as np
 from gsim3d.errors import InputError
 from gsim3d.generate import cameras, physics, render, shapes, writer
 
+DENSITY = 45.0  # kg per cubic metre of the body's bounding box, about half of which it fills
+DAMPING = 0.01  # seconds; a bounce dies away after about a second
 MAX_ATTEMPTS = 40  # draws of one scene before the options are called impossible
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 MESH_UPS = ("y", "z")
@@ -46,7 +48,7 @@ class Elastic:
     drop_height: tuple[float, float] = (0.5, 0.7)  # of the lowest point; never less than the body's own height
     speed: float = 0.35  # largest horizontal speed at the start, m/s
     spin: float = 1.2  # largest, rad/s
-    young: tuple[float, float] = (5e3, 9e3)  # Pa; density 90 kg/m^3 of the bounding box's half
+    young: tuple[float, float] = (5e3, 9e3)  # Pa
     cells: int = 3  # of the control lattice along each axis
     max_timestep: float = 1 / 480
     distance: float = 2.6
@@ -195,8 +197,8 @@ class Elastic:
             velocity,
             rng.uniform(0, self.spin) * axis / np.linalg.norm(axis),
             young=rng.uniform(*self.young),
-            damping=0.01,
-            mass=45.0 * float(np.prod(np.ptp(collision, axis=0))),
+            damping=DAMPING,
+            mass=DENSITY * float(np.prod(np.ptp(collision, axis=0))),
             cells=self.cells,
         )
         self._check_view(rig, (vertices + place)[None])  # many draws fail here, before the costly part

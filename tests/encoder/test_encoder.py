@@ -8,8 +8,9 @@ import torch
 
 from gsim3d.encoder import Encoder, EncoderConfig
 from gsim3d.encoder.depth import feature_intrinsics, upsample, upsampling_matrix
-from gsim3d.encoder.sh import degree_damping, quat_multiply, rotation_of_harmonics, rotation_to_quat, sh_basis
+from gsim3d.encoder.camera_frame import quat_multiply, rotation_of_harmonics, rotation_to_quat
 from gsim3d.errors import HardCaseError, InputError
+from gsim3d.harmonics import degree_damping, sh_basis
 from gsim3d.quirks import Quirks
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames
 from tests.asserts import assert_close_relative_to_max, assert_same_bits

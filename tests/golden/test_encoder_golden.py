@@ -8,8 +8,9 @@ import torch
 from gsim3d.encoder import Encoder, EncoderConfig
 from gsim3d.encoder.depth import Views
 from gsim3d.encoder.heads import Conditioning, PixelRays, pluecker
-from gsim3d.encoder.sh import rotation_of_harmonics, sh_basis
-from gsim3d.interop.encoder_names import published_encoder_state
+from gsim3d.encoder.camera_frame import rotation_of_harmonics
+from gsim3d.harmonics import sh_basis
+from gsim3d.interop.released import encoder_weights
 from gsim3d.quirks import Quirks
 from gsim3d.types import Cameras, Frames
 from tests.asserts import assert_close_relative_to_max, relative_to_max
@@ -31,7 +32,7 @@ OUTPUTS = {
 def load_encoder(file, config: EncoderConfig = CONFIG) -> Encoder:
     encoder = Encoder(config)
     weights = file / "w"
-    encoder.load_state_dict(published_encoder_state({name: weights[name] for name in weights.keys()}))
+    encoder.load_state_dict(encoder_weights({name: weights[name] for name in weights.keys()}))
     return encoder
 
 

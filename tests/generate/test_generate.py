@@ -1,0 +1,259 @@
+"""Whole data sets: layout, determinism, resuming, options, errors, and what the demo's scenes show."""
+
+import argparse
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsim3d.data import Scene, find_scenes, make_frames
+from gsim3d.errors import InputError
+from gsim3d.generate import generate
+from gsim3d.generate.cameras import project
+from gsim3d.generate.command import add_arguments, run
+from gsim3d.generate.worlds import PRESETS, WORLDS, build_world
+from tests.tolerances import TOLERANCES
+
+SMALL = {
+    "image_size": 32, "n_frames": 4, "n_cams": 3, "n_trajectories": 3, "samples": 1, "objects": ("ball", "torus"),
+}  # fmt: skip
+
+RECORDED_HEIGHTS = {
+    "ball": [0.99818, 0.98924, 0.96327, 0.92026, 0.86023, 0.78316, 0.68906, 0.57793, 0.44977, 0.30458],
+    "box": [1.02873, 1.01979, 0.99382, 0.95081, 0.89078, 0.81371, 0.71961, 0.60848, 0.48032, 0.33513],
+    "torus": [0.87354, 0.8646, 0.83862, 0.79562, 0.73558, 0.65852, 0.56442, 0.45329, 0.32513, 0.18826],
+}  # fmt: skip
+
+
+def tree_hash(folder: Path) -> str:
+    """Hash of all names and bytes of the scenes below ``folder``."""
+    digest = hashlib.sha256()
+    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+        digest.update(file.relative_to(folder).as_posix().encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    out = tmp_path_factory.mktemp("set") / "made"
+    return out, generate(out, processes=1, progress=False, **SMALL)
+
+
+def test_layout(made):
+    out, report = made
+    names = [folder.relative_to(out).as_posix() for folder in report.folders]
+    assert names == ["ball/0000", "ball/0001", "torus/0000"] and report.n_made == 3
+    assert sorted(os.listdir(out)) == ["ball", "manifest.json", "torus"]
+    assert len(list(report.folders[0].rglob("*.png"))) == 3 * 3 * 4
+    assert find_scenes(out) == report.folders
+
+
+def test_the_reader_reads_it(made):
+    out, report = made
+    scene = Scene.open(report.folders[0])
+    assert (scene.n_steps, scene.n_cams, scene.width, scene.height) == (4, 3, 32, 32)
+    world = build_world("elastic", "demo", SMALL)
+    assert (scene.fps, scene.near, scene.far) == (world.fps, world.near, world.far)
+    rig = world.rig()
+    np.testing.assert_allclose(scene.cameras.viewmats, rig.viewmats, atol=1e-6)
+    np.testing.assert_allclose(scene.cameras.Ks, rig.Ks, atol=1e-4)
+    frames = make_frames([scene], [[0, 1, 2]], [[0, 3]])
+    assert frames.masks.any() and frames.dynamic.any() and not (frames.dynamic & ~frames.masks).any()
+    assert (frames.images.permute(0, 2, 3, 1)[~frames.masks].mean() < 0.1).all()
+
+
+def test_states_and_labels_agree(made):
+    """The box of the body's control lattice, projected, holds the body's pixels and is not much larger."""
+    for folder in made[1].folders:
+        scene = Scene.open(folder)
+        states = np.load(folder / "states.npy")
+        assert states.dtype == np.float32 and states.shape == (4, 4, 4, 4, 3)
+        viewmats, Ks = (np.asarray(a, dtype=np.float64) for a in (scene.cameras.viewmats, scene.cameras.Ks))
+        labels = scene.segmentation(range(3), [0])[0].numpy()
+        pixels, _ = project(states[0].reshape(-1, 3).astype(np.float64), viewmats, Ks)
+        for cam in range(3):
+            y, x = np.nonzero(labels[cam] == 3)
+            low, high = pixels[cam].min(0), pixels[cam].max(0)
+            assert x.min() >= low[0] - 1 and y.min() >= low[1] - 1
+            assert x.max() <= high[0] and y.max() <= high[1]
+            assert (high - low < 1.8 * np.array([np.ptp(x) + 1, np.ptp(y) + 1]) + 2).all()
+
+
+def test_manifest(made):
+    out, report = made
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["settings"]["image_size"] == 32 and manifest["settings"]["world"] == "elastic"
+    assert set(manifest["scenes"]) == {"ball/0000", "torus/0000", "ball/0001"}
+    assert manifest["versions"]["mujoco-core"] == "4.0.0" and manifest["machine"]["processor"]
+    assert manifest["rejected"] == report.rejected
+    for name, entry in manifest["scenes"].items():
+        states = np.load(out / name / "states.npy")
+        assert entry["states_sha256"] == hashlib.sha256(states.tobytes()).hexdigest()
+        digest = hashlib.sha256()
+        scene = Scene.open(out / name)
+        for step in range(scene.n_steps):
+            digest.update(scene.images(range(3), [step])[0].permute(0, 2, 3, 1).flip(-1).contiguous().numpy().tobytes())
+            digest.update(scene.segmentation(range(3), [step])[0].contiguous().numpy().tobytes())
+            instances = scene.segmentation(range(3), [step])[0].numpy().copy()
+            instances[instances == 3] = 2
+            digest.update(instances.tobytes())
+        assert entry["images_sha256"] == digest.hexdigest()
+
+
+def test_the_same_bytes_for_two_processes_and_after_a_kill(made, tmp_path):
+    out, _ = made
+    again = tmp_path / "again"
+    half = again / "ball" / ".0001.unfinished" / "cam_0"
+    half.mkdir(parents=True)
+    (half / "rgb_0000.png").write_bytes(b"half")
+    (again / "ball" / "0000").mkdir()
+    generate(again, processes=2, progress=False, **SMALL)
+    assert tree_hash(again) == tree_hash(out)
+
+
+def test_finished_scenes_are_kept_and_more_can_be_added(made, tmp_path):
+    out = tmp_path / "copy"
+    shutil.copytree(made[0], out)
+    before = {file: file.stat().st_mtime_ns for file in out.rglob("*.png")}
+    shutil.rmtree(out / "torus")
+    more = {**SMALL, "n_trajectories": 4}
+    report = generate(out, processes=1, progress=False, **more)
+    assert report.n_made == 2 and len(report.folders) == 4
+    assert all(file.stat().st_mtime_ns == before[file] for file in (out / "ball").rglob("*.png"))
+    assert tree_hash(out / "torus" / "0000") == tree_hash(made[0] / "torus" / "0000")
+
+
+def test_other_options_do_not_mix(made):
+    with pytest.raises(InputError, match="made with other options"):
+        generate(made[0], processes=1, progress=False, **{**SMALL, "seed": 1})
+
+
+def test_another_seed_gives_another_scene(made, tmp_path):
+    changes = {**SMALL, "n_trajectories": 1, "seed": 1}
+    generate(tmp_path, processes=1, progress=False, **changes)
+    assert not np.array_equal(np.load(tmp_path / "ball/0000/states.npy"), np.load(made[0] / "ball/0000/states.npy"))
+
+
+@pytest.mark.slow
+def test_killed_and_resumed(tmp_path):
+    """A run whose every process may be killed at any moment goes on to the same bytes."""
+    changes = {**SMALL, "n_trajectories": 6, "n_frames": 12}
+    generate(tmp_path / "whole", processes=1, progress=False, **changes)
+    call = f"generate({str(tmp_path / 'killed')!r}, processes=2, progress=False, **{changes!r})"
+    program = f"from gsim3d.generate import generate\nif __name__ == '__main__':\n    {call}\n"
+    (tmp_path / "run.py").write_text(program)
+    command = [sys.executable, str(tmp_path / "run.py")]
+    environment = {**os.environ, "PYTHONPATH": os.getcwd()}
+    process = subprocess.Popen(command, env=environment)
+    deadline = time.time() + 120
+    while len(list((tmp_path / "killed").glob("*/*/metadata.json"))) < 2:
+        assert time.time() < deadline and process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    while True:  # the workers end by themselves, and with them the last changes in the folder
+        snapshot = sorted(str(path) for path in (tmp_path / "killed").rglob("*"))
+        time.sleep(2)
+        if snapshot == sorted(str(path) for path in (tmp_path / "killed").rglob("*")):
+            break
+    assert len(list((tmp_path / "killed").glob("*/*/metadata.json"))) < 6
+    subprocess.run(command, env=environment, check=True)
+    assert tree_hash(tmp_path / "killed") == tree_hash(tmp_path / "whole")
+
+
+@pytest.fixture(scope="module")
+def demo_scenes():
+    """The demo's first scenes of three objects, filmed small."""
+    world = build_world("elastic", "demo", {"image_size": 16, "n_cams": 2, "samples": 1})
+    return world, [world.make(name, 0) for name in ("ball", "box", "torus")]
+
+
+def test_demo_bodies_fall_their_height_and_deform(demo_scenes):
+    world, scenes = demo_scenes
+    assert world.n_frames / world.fps >= 0.9
+    for scene in scenes:
+        nodes = scene.states[..., 2].reshape(world.n_frames, -1)
+        used = np.sort(nodes, axis=1)[:, nodes.shape[1] // 4 : -nodes.shape[1] // 4]  # loose corner nodes lie outside
+        centre = used.mean(1)
+        assert centre[0] - centre.min() > scene.body_height
+        assert centre[-1] - centre.min() > 0.01 or np.ptp(centre[-3:]) < 0.05  # it has landed, and not sunk
+    ball = scenes[0].states
+    middle = ball[:, 1:3, 1:3, :, 2]
+    assert (np.ptp(middle, axis=-1).mean((1, 2)) / np.ptp(middle[0], axis=-1).mean()).min() < 0.8
+
+
+def test_first_frames_are_those_of_other_machines(demo_scenes):
+    """Heights of the middle of the body at the first ten frames, as computed on another day elsewhere."""
+    _, scenes = demo_scenes
+    for scene in scenes:
+        heights = scene.states[:10, 1:3, 1:3, 1:3, 2].mean((1, 2, 3))
+        np.testing.assert_allclose(heights, RECORDED_HEIGHTS[scene.object], atol=TOLERANCES["generate_machines"].value)
+
+
+def test_impossible_options_say_why(tmp_path):
+    cases = [
+        ({"n_frames": 0}, "n_frames"),
+        ({"fps": -1.0}, "fps"),
+        ({"drop_height": (2.0, 1.0)}, "drop_height"),
+        ({"background": "green"}, "background"),
+        ({"objects": ("cube",)}, "cube.*choose from"),
+        ({"objects": ()}, "objects"),
+        ({"meshes": ("absent.obj",)}, "absent.obj"),
+        ({"near": 3.0}, "the ground is seen from"),
+        ({"far": 1.0}, "far must lie beyond near"),
+        ({"colour": 1}, "has no option 'colour'"),
+        ({"drop_height": (3.0, 4.0)}, "none of .* draws"),
+        ({"processes": 0}, "processes"),
+        ({"world": "cloth"}, "world 'cloth'"),
+        ({"preset": "huge"}, "preset 'huge'"),
+    ]
+    for changes, message in cases:
+        options = {"processes": 1, **SMALL, **changes}
+        with pytest.raises(InputError, match=message):
+            generate(tmp_path / "out", progress=False, **options)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="not a folder"):
+        generate(tmp_path / "file", progress=False, **SMALL)
+
+
+def test_two_writers_do_not_share_a_folder(tmp_path):
+    import fcntl
+
+    handle = os.open(tmp_path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        with pytest.raises(InputError, match="another process"):
+            generate(tmp_path, processes=1, progress=False, **SMALL)
+    finally:
+        os.close(handle)
+
+
+def test_presets_build():
+    for preset in PRESETS:
+        for world in WORLDS:
+            assert build_world(world, preset, {}).scenes()
+    demo = build_world("elastic", "demo", {})
+    assert demo.image_size == 64 and demo.n_cams == 12 and demo.n_trajectories >= 28
+
+
+def test_command(tmp_path, capsys):
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    assert "examples:" in parser.format_help()
+    mesh = tmp_path / "pyramid.obj"
+    mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nv 0.3 1 0.3\nf 1 2 3\nf 1 4 2\nf 2 4 3\nf 3 4 1\n")
+    text = f"{tmp_path / 'out'} --size 16 --frames 2 --fps 30 --trajectories 1 --objects none --mesh {mesh} --quiet"
+    assert run(parser.parse_args([*text.split(), "--drop", "0.5", "0.6", "--background", "white"])) == 0
+    assert "1 scenes in" in capsys.readouterr().out
+    scene = Scene.open(tmp_path / "out" / "pyramid" / "0000")
+    assert (scene.n_steps, scene.fps, scene.width) == (2, 30.0, 16)
+    assert (scene.images([0], [0])[0, 0, :, 0, 0] == 255).all()
