@@ -35,7 +35,7 @@ class ModelConfig:
 
 
 def tiny() -> ModelConfig:
-    """Trains on two CPU cores in minutes: 64-pixel images, tabletop scenes of about a metre, up to 2 steps of history."""
+    """Trains on two CPU cores in minutes: 64-pixel images, scenes of about a metre, up to 2 steps of history."""
     encoder = EncoderConfig.tiny()
     return ModelConfig(
         encoder=encoder,
