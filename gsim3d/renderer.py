@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from gsim3d import ops
 from gsim3d.harmonics import degree_damping, rotate_harmonics, rotate_unpaired_harmonics
+from gsim3d.layers import RowLinear
 from gsim3d.ops.raster import Rendering
 from gsim3d.quirks import Quirks
 from gsim3d.types import Cameras, Gaussians, Particles
@@ -56,8 +57,8 @@ class GaussianHead(nn.Module):
         if config.latents == 0:
             return
         hidden, n_out = 4 * config.latents, 3 * config.n_harmonics + 4 + 3
-        self.fc1 = nn.Linear(config.latents, hidden)
-        self.fc2 = nn.Linear(hidden, n_out)
+        self.fc1 = RowLinear(config.latents, hidden)
+        self.fc2 = RowLinear(hidden, n_out)
         with torch.no_grad():
             self.fc2.bias.zero_()
             self.fc2.bias[-4] = 1.0  # the identity rotation
