@@ -35,7 +35,7 @@ class ModelConfig:
 
 
 def tiny() -> ModelConfig:
-    """Trains on two CPU cores in minutes: 64-pixel images, tabletop scenes of about a metre, up to 2 steps of history."""
+    """Trains on two CPU cores in minutes: 64-pixel images, scenes of about a metre, up to 2 steps of history."""
     encoder = EncoderConfig.tiny()
     return ModelConfig(
         encoder=encoder,
@@ -79,7 +79,7 @@ def small() -> ModelConfig:
         cnn_dims=(32, 48, 64),
         transformer_layers=4,
         transformer_mlp_ratio=2,
-        cost_unet_dim=64,
+        cost_unet_dim=32,
         refine_unet_dim=32,
         upsampled_dim=32,
         disparity_dim=32,
@@ -99,11 +99,11 @@ def small() -> ModelConfig:
             merge_windows=(2, 2, 1),
             patch_sizes=(512,) * 4,
             encoder_depths=(2, 2, 2, 2),
-            encoder_channels=(32, 64, 96, 128),
-            encoder_heads=(2, 4, 6, 8),
+            encoder_channels=(32, 48, 64, 128),
+            encoder_heads=(2, 3, 4, 8),
             decoder_depths=(1, 1, 1),
-            decoder_channels=(64, 64, 96),
-            decoder_heads=(4, 4, 6),
+            decoder_channels=(32, 48, 64),
+            decoder_heads=(2, 3, 4),
             norm="layer",
             zero_init=True,
             drop_path=0.1,

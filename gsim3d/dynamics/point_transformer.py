@@ -94,7 +94,7 @@ class Block(nn.Module):
         conv_input: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """x [N, C] with attention along serialization ``row``. ``conv_input``: what the convolution reads, default x."""
+        """x [N, C] with attention along serialization ``row``. ``conv_input``: read by the convolution, default x."""
         conv_input = x if conv_input is None else conv_input
         # Drawn here: a generator does not repeat itself when the block is computed again in the backward pass.
         keep = [self._draw_keep(x, generator) for _ in range(2)]
@@ -269,5 +269,6 @@ class PointTransformer(nn.Module):
 
 def linear_rates(last: float, depths: tuple[int, ...]) -> list[list[float]]:
     """Drop-path rates of the blocks of each stage: from 0 at the first block to ``last`` at the last one."""
-    rates = iter(torch.linspace(0, last, sum(depths)).tolist())
+    n_blocks = sum(depths)
+    rates = iter([last * i / max(n_blocks - 1, 1) for i in range(n_blocks)])
     return [[next(rates) for _ in range(depth)] for depth in depths]

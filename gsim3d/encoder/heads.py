@@ -29,7 +29,7 @@ class PixelRays:
         return cls(poses[:, :3, 3], poses[:, :3, :3], torch.linalg.inv(views.Ks))
 
     def directions(self, height: int, width: int, offset: Tensor) -> Tensor:
-        """[I, 3, H, W] world directions of z-depth 1 through pixel centres moved by ``offset`` [I or 1, 2, H, W] pixels."""
+        """[I, 3, H, W] world directions of z-depth 1 through pixel centres + ``offset`` [I or 1, 2, H, W] pixels."""
         v, u = torch.meshgrid(
             torch.arange(height, device=offset.device) + 0.5,
             torch.arange(width, device=offset.device) + 0.5,

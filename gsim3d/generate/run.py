@@ -17,7 +17,7 @@ from gsim3d.errors import InputError
 from gsim3d.generate import writer
 from gsim3d.generate.worlds import build_world
 
-NEEDED = {"mujoco": "mujoco-core==4.0.0", "embreex": "embreex", "trimesh": "trimesh"}
+NEEDED = {"mujoco": "mujoco-core==4.0.0", "embreex": "embreex", "trimesh": "trimesh", "PIL": "pillow"}
 
 
 @dataclass(frozen=True)
