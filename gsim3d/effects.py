@@ -91,8 +91,9 @@ class EffectsSpec:
     def __post_init__(self):
         _one_of("dynamics.background", self.dynamics.background, BACKGROUNDS)
         _one_of("appearance.changing", self.appearance.changing, CHANGING)
-        if self.dynamics.history is not None and self.dynamics.history < 1:
-            raise InputError(f"effects: dynamics.history must be at least 1; got {self.dynamics.history}")
+        history = self.dynamics.history
+        if history is not None and not (isinstance(history, int) and history >= 1):
+            raise InputError(f"effects: dynamics.history must be an integer of at least 1; got {history!r}")
         if self.appearance.view_dependent not in (None, 0, 1, 2, 3):
             raise InputError(f"effects: appearance.view_dependent must be 0 to 3; got {self.appearance.view_dependent}")
 

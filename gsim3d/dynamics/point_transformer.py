@@ -269,5 +269,6 @@ class PointTransformer(nn.Module):
 
 def linear_rates(last: float, depths: tuple[int, ...]) -> list[list[float]]:
     """Drop-path rates of the blocks of each stage: from 0 at the first block to ``last`` at the last one."""
-    rates = iter(torch.linspace(0, last, sum(depths)).tolist())
+    n_blocks = sum(depths)
+    rates = iter([last * i / max(n_blocks - 1, 1) for i in range(n_blocks)])
     return [[next(rates) for _ in range(depth)] for depth in depths]

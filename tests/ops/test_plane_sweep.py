@@ -28,7 +28,7 @@ def rotation(axis: int, angle: float) -> torch.Tensor:
 
 
 def make(sources=RAGGED, *, channels=5, depths=11, size=(7, 9), dtype=torch.float64, seed=0):
-    """(features, homographies, translations, inverse_depths, src_images, cu_src) of cameras around a point 3 m ahead."""
+    """(features, homographies, translations, inverse_depths, src_images, cu_src), cameras around a point 3 m ahead."""
     generator = torch.Generator().manual_seed(seed)
     n, (height, width) = len(sources), size
     Ks = torch.tensor([[1.1 * width, 0, 0.5 * width + 0.7], [0, 1.2 * width, 0.5 * height - 0.4], [0, 0, 1]]).double()
@@ -108,7 +108,8 @@ def test_geometry_maps_world_points_between_images():
     """A point seen by image i at index (u, v) and depth d appears in its source where q points."""
     generator = torch.Generator().manual_seed(0)
     Ks = torch.eye(3, dtype=torch.float64).repeat(2, 1, 1)
-    Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2] = (torch.rand(2, generator=generator).double() + k for k in (8, 9, 3, 4))
+    for row, col, value in ((0, 0, 8), (1, 1, 9), (0, 2, 3), (1, 2, 4)):
+        Ks[:, row, col] = torch.rand(2, generator=generator).double() + value
     viewmats = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     viewmats[:, :3, :3] = torch.stack([rotation(0, 0.3), rotation(1, -0.4)])
     viewmats[:, :3, 3] = torch.randn(2, 3, generator=generator).double() * 0.3

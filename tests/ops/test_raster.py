@@ -14,6 +14,11 @@ OUTPUTS = ("color", "alpha", "depth", "features")
 DTYPES = {torch.float32: "float32", torch.float64: "float64"}
 
 
+def operator_args(scene):
+    leaves = [x.clone().requires_grad_() for x in scene.inputs]
+    return (*leaves, scene.Ks, scene.image_cloud, scene.cu_rows, scene.width, scene.height, 0.01, 0)
+
+
 # ---- 1 forward against the oracle ----------------------------------------------------------------------------------
 
 
@@ -61,6 +66,18 @@ def test_any_number_of_features(device, n_features):
     for a, e in zip(moved.render(), scene.render_oracle(), strict=True):
         assert_close_relative_to_max(a, e, "raster_float64")
     expected = gradients(scene.render_oracle, scene)
+    for name, a, e in zip(Scene.NAMES, gradients(moved.render, moved), expected, strict=True):
+        assert_close_relative_to_max(a, e, "raster_grad_float64", name)
+
+
+def test_gradients_where_pixels_end(device):
+    # Nearly opaque layers: most pixels end before their list does, each after another number of entries.
+    scene = random_scene(n=80, clouds=2, images=2, width=20, height=18, sh_terms=0, seed=7, spread=0.2)
+    scene = scene.replace(opacities=0.9 + 0.08 * scene.opacities, scales=4 * scene.scales)
+    kept = torch.ops.gsim3d.rasterize_gaussians(*operator_args(scene))
+    assert (kept[4] < 1e-3).double().mean() > 0.2 and len(kept[5].unique()) > 20
+    expected = gradients(scene.render_oracle, scene)
+    moved = scene.to(device)
     for name, a, e in zip(Scene.NAMES, gradients(moved.render, moved), expected, strict=True):
         assert_close_relative_to_max(a, e, "raster_grad_float64", name)
 
@@ -114,11 +131,6 @@ def test_devices_agree(devices, sh_terms):
 
 
 # ---- 5 opcheck -----------------------------------------------------------------------------------------------------
-
-
-def operator_args(scene):
-    leaves = [x.clone().requires_grad_() for x in scene.inputs]
-    return (*leaves, scene.Ks, scene.image_cloud, scene.cu_rows, scene.width, scene.height, 0.01, 0)
 
 
 def test_opcheck(device):

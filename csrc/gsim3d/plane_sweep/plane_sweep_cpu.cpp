@@ -124,7 +124,8 @@ class Walker {
   }
 
   void start_image(int64_t image) {
-    for (int64_t k = 0; k < sweep_.n_depths; ++k) depths_[k] = T(1) / sweep_.inverse_depths[image * sweep_.n_depths + k];
+    const T* inverse = sweep_.inverse_depths + image * sweep_.n_depths;
+    for (int64_t k = 0; k < sweep_.n_depths; ++k) depths_[k] = T(1) / inverse[k];
   }
 
   // costs[k] += score at depth k. feature: [stride], source: [height * width, stride].
@@ -276,8 +277,8 @@ void check_plane_sweep(const char* op, const PlaneSweep<T>& sweep) {
     check(sweep.cu_src[i] <= sweep.cu_src[i + 1], op, ": cu_src must not descend; got ", sweep.cu_src[i], " then ",
           sweep.cu_src[i + 1], " at ", i);
   for (int64_t p = 0; p < sweep.n_pairs; ++p) {
-    check(sweep.src_images[p] >= 0 && sweep.src_images[p] < n, op, ": src_images must be in [0, I) with I=", n, "; got ",
-          sweep.src_images[p], " at ", p);
+    const int64_t source = sweep.src_images[p];
+    check(source >= 0 && source < n, op, ": src_images must be in [0, I) with I=", n, "; got ", source, " at ", p);
     for (int64_t e = 0; e < 9; ++e)
       check(std::isfinite(sweep.homographies[9 * p + e]), op, ": homographies must be finite; got ",
             sweep.homographies[9 * p + e], " in pair ", p);

@@ -14,6 +14,7 @@ constexpr int kPixels = kTile * kTile;
 // How often a tile asks whether any pixel still takes light: rarely enough to cost nothing.
 constexpr int64_t kLiveInterval = 16;
 constexpr int64_t kInsertionSort = 32;
+constexpr int64_t kPrefetch = 6;
 
 // A tile's list in order of depth; `place` is the position in the tile's part of the instances, ascending with the row.
 template <typename T>
@@ -73,6 +74,10 @@ class Tile {
 
   int64_t place(int64_t i) const { return entries_[i].place; }
   const Splat<T>& splat(int64_t i) const { return splats_[instances_[entries_[i].place].row]; }
+  // Sorted by depth, splats lie anywhere: fetch the one that is needed a few steps later.
+  void prefetch(int64_t i) const {
+    if (i >= 0 && i < n) __builtin_prefetch(&splat(i));
+  }
   int64_t row(int64_t i) const { return first_row_ + instances_[entries_[i].place].row; }
 
   // Calls f(pixel of the tile, pixel of all images) for the pixels inside the image.
@@ -151,6 +156,7 @@ void blend_tile(const RasterScene<T>& scene, const Group<T>& group, const Raster
       for (int i = 0; i < kPixels; i += kL) live += load<V>(transmittance + i);
       if (!any(live > V{})) break;
     }
+    tile.prefetch(k + kPrefetch);
     const Splat<T>& splat = tile.splat(k);
     const T* feature = scene.features + tile.row(k) * n_features;
     const T values[4] = {splat.color[0], splat.color[1], splat.color[2], splat.z};
@@ -227,6 +233,7 @@ void blend_tile_vjp(const RasterScene<T>& scene, const Group<T>& group, const Ra
   for (int64_t k = n_used; k < tile.n; ++k) std::fill_n(slots + (tile.begin + tile.place(k)) * slot_width, slot_width, T(0));
 
   for (int64_t k = n_used - 1; k >= 0; --k) {
+    tile.prefetch(k - kPrefetch);
     const Splat<T>& splat = tile.splat(k);
     const T* feature = scene.features + tile.row(k) * n_features;
     const T values[4] = {splat.color[0], splat.color[1], splat.color[2], splat.z};

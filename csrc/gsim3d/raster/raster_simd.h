@@ -104,8 +104,14 @@ bool any(M mask) {
 
 // Sum over lanes in the fixed order of halves.
 inline float sum_lanes(Float8 v) {
+#if defined(__AVX2__) && defined(__FMA__)
+  const __m128 four = _mm_add_ps(_mm256_castps256_ps128((__m256)v), _mm256_extractf128_ps((__m256)v, 1));
+  const __m128 two = _mm_add_ps(four, _mm_movehl_ps(four, four));
+  return _mm_cvtss_f32(_mm_add_ss(two, _mm_movehdup_ps(two)));
+#else
   const float a = v[0] + v[4], b = v[1] + v[5], c = v[2] + v[6], d = v[3] + v[7];
   return (a + c) + (b + d);
+#endif
 }
 inline double sum_lanes(Double4 v) { return (v[0] + v[2]) + (v[1] + v[3]); }
 
