@@ -34,8 +34,8 @@ class RowLayerNorm(nn.LayerNorm):
 class RowBatchNorm(nn.Module):
     """Normalises each channel by statistics over rows; running statistics in evaluation.
 
-    Differs from ``nn.BatchNorm1d`` in three ways: one row or none is fine (running statistics are then kept), statistics
-    are float32 or wider, and processes combine theirs in the order of their ranks, so a run repeats bit by bit.
+    Differs from ``nn.BatchNorm1d`` in three ways: one row or none is fine (running statistics are then kept),
+    statistics are float32 or wider, and processes combine theirs in the order of their ranks, so a run repeats bit by bit.
     """
 
     EPS = 1e-3
