@@ -73,7 +73,7 @@ class OutputEffects:
 
 @dataclass(frozen=True)
 class EffectsSpec:
-    """Everything absent is off, except what makes up the model (history, view_dependent, opacity_changes): that is its own.
+    """Everything absent is off; what makes up the model (history, view_dependent, opacity_changes) is then the model's own.
 
     Example:
         >>> spec = EffectsSpec.from_dict({"dynamics": {"background": "masked_out", "history": 2}})
@@ -91,8 +91,9 @@ class EffectsSpec:
     def __post_init__(self):
         _one_of("dynamics.background", self.dynamics.background, BACKGROUNDS)
         _one_of("appearance.changing", self.appearance.changing, CHANGING)
-        if self.dynamics.history is not None and self.dynamics.history < 1:
-            raise InputError(f"effects: dynamics.history must be at least 1; got {self.dynamics.history}")
+        history = self.dynamics.history
+        if history is not None and not (isinstance(history, int) and history >= 1):
+            raise InputError(f"effects: dynamics.history must be an integer of at least 1; got {history!r}")
         if self.appearance.view_dependent not in (None, 0, 1, 2, 3):
             raise InputError(f"effects: appearance.view_dependent must be 0 to 3; got {self.appearance.view_dependent}")
 

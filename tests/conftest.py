@@ -34,3 +34,12 @@ def device(request) -> torch.device:
 def devices() -> tuple[torch.device, torch.device]:
     """(cpu, cuda), for tests that compare both; skipped, or failed with GSIM3D_REQUIRE_CUDA=1, without CUDA."""
     return torch.device("cpu"), _cuda()
+
+
+@pytest.fixture(scope="module")
+def one_thread():
+    """Tiny tensors are fastest on one thread, the more so where several test runs share the cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

@@ -1,22 +1,6 @@
-"""Readers of recorded scenes, splits, and windows with drawn views."""
+"""Readers of recorded scenes, splits, windows, and the packing of images into Frames."""
 
-from gsim3d.data.dataset import (
-    Window,
-    WindowSampler,
-    generator,
-    make_frames,
-    split_scenes,
-    window_frames,
-)
+from gsim3d.data.dataset import Window, generator, make_frames, split_scenes
 from gsim3d.data.genesis import Scene, find_scenes
 
-__all__ = [
-    "Scene",
-    "Window",
-    "WindowSampler",
-    "find_scenes",
-    "generator",
-    "make_frames",
-    "split_scenes",
-    "window_frames",
-]
+__all__ = ["Scene", "Window", "find_scenes", "generator", "make_frames", "split_scenes"]

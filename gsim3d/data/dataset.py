@@ -1,7 +1,4 @@
-"""Windows of scenes with drawn views: what a training or test step sees.
-
-Every draw is a function of (seed, step, sample, purpose), so it does not depend on what was drawn before.
-"""
+"""Splits of scenes, windows of steps, and the packing of images into Frames."""
 
 from __future__ import annotations
 
@@ -37,7 +34,7 @@ def split_scenes(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, l
 
 
 def generator(seed: int, step: int, sample: int, purpose: str) -> np.random.Generator:
-    """Random numbers that belong to one purpose of one sample of one step."""
+    """Random numbers of one purpose of one sample of one step; they do not depend on what was drawn before."""
     return np.random.default_rng([seed, step, sample, zlib.crc32(purpose.encode())])
 
 
@@ -134,64 +131,3 @@ class Window:
     @property
     def steps(self) -> range:
         return range(self.start, self.start + len(self.target_cams))
-
-
-@dataclass(frozen=True)
-class WindowSampler:
-    """Draws windows and views for training.
-
-    Args:
-        scenes: at least one, each with at least n_context + n_future steps.
-        n_context, n_future: given and predicted steps of a window.
-        n_context_views, n_target_views: cameras drawn afresh at every step; targets are none of the context's.
-        seed: of all draws.
-    """
-
-    scenes: Sequence[Scene]
-    n_context: int
-    n_future: int
-    n_context_views: int
-    n_target_views: int
-    seed: int = 0
-
-    def __post_init__(self):
-        if not self.scenes:
-            raise InputError("no scene to draw from")
-        for scene in self.scenes:
-            if scene.n_steps < self.n_context + self.n_future:
-                raise InputError(
-                    f"{scene.path} has {scene.n_steps} steps; windows of "
-                    f"{self.n_context} + {self.n_future} steps do not fit"
-                )
-            if scene.n_cams < self.n_context_views + self.n_target_views:
-                raise InputError(
-                    f"{scene.path} has {scene.n_cams} cameras; {self.n_context_views} context and "
-                    f"{self.n_target_views} target views do not fit"
-                )
-
-    def draw(self, step: int, sample: int) -> Window:
-        """The window of sample number ``sample`` of training step ``step``."""
-        rng = generator(self.seed, step, sample, "window")
-        scene = self.scenes[int(rng.integers(len(self.scenes)))]
-        length = self.n_context + self.n_future
-        start = int(rng.integers(scene.n_steps - length + 1))
-        views = generator(self.seed, step, sample, "views")
-        n_views = self.n_context_views + self.n_target_views
-        drawn = [tuple(int(c) for c in views.permutation(scene.n_cams)[:n_views]) for _ in range(length)]
-        return Window(
-            scene,
-            start,
-            self.n_context,
-            context_cams=tuple(cams[: self.n_context_views] for cams in drawn[: self.n_context]),
-            target_cams=tuple(cams[self.n_context_views :] for cams in drawn),
-        )
-
-
-def window_frames(windows: Sequence[Window], *, masked: bool = True) -> tuple[Frames, Frames]:
-    """(context, targets) of several windows; the scene of row b is ``windows[b].scene``, steps count from its start."""
-    scenes = [w.scene for w in windows]
-    context = make_frames(
-        scenes, [w.context_cams for w in windows], [list(w.steps)[: w.n_context] for w in windows], masked=masked
-    )
-    targets = make_frames(scenes, [w.target_cams for w in windows], [list(w.steps) for w in windows], masked=masked)
-    return context, targets

@@ -14,7 +14,7 @@ from torch.utils.checkpoint import checkpoint
 
 from gsim3d import ops
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
-from gsim3d.dynamics.norm import make_norm
+from gsim3d.layers import RowLayerNorm, RowLinear, make_norm
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
 TIME_EMBEDDING_STD = 0.02
@@ -42,8 +42,8 @@ class PositionEncoding(nn.Module):
     def __init__(self, channels: int, duplicates: str):
         super().__init__()
         self.conv = SparseConv(channels, channels, BLOCK_KERNEL, bias=True, duplicates=duplicates)
-        self.linear = nn.Linear(channels, channels)
-        self.norm = nn.LayerNorm(channels)
+        self.linear = RowLinear(channels, channels)
+        self.norm = RowLayerNorm(channels)
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
         return self.norm(self.linear(self.conv(x, stage)))
@@ -55,8 +55,8 @@ class Attention(nn.Module):
     def __init__(self, channels: int, heads: int):
         super().__init__()
         self.heads = heads
-        self.qkv = nn.Linear(channels, 3 * channels)
-        self.proj = nn.Linear(channels, channels)
+        self.qkv = RowLinear(channels, 3 * channels)
+        self.proj = RowLinear(channels, channels)
 
     def forward(self, x: Tensor, patches: PatchTable) -> Tensor:
         q, k, v = self.qkv(x).unflatten(1, (3, self.heads, -1)).unbind(1)
@@ -66,8 +66,8 @@ class Attention(nn.Module):
 class MLP(nn.Module):
     def __init__(self, channels: int, hidden: int):
         super().__init__()
-        self.fc1 = nn.Linear(channels, hidden)
-        self.fc2 = nn.Linear(hidden, channels)
+        self.fc1 = RowLinear(channels, hidden)
+        self.fc2 = RowLinear(hidden, channels)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.fc2(F.gelu(self.fc1(x)))
@@ -80,9 +80,9 @@ class Block(nn.Module):
         super().__init__()
         self.drop_path, self.checkpointing = drop_path, config.checkpointing
         self.position = PositionEncoding(channels, duplicates_rule(config))
-        self.norm1 = nn.LayerNorm(channels)
+        self.norm1 = RowLayerNorm(channels)
         self.attention = Attention(channels, heads)
-        self.norm2 = nn.LayerNorm(channels)
+        self.norm2 = RowLayerNorm(channels)
         self.mlp = MLP(channels, config.mlp_ratio * channels)
 
     def forward(
@@ -94,7 +94,7 @@ class Block(nn.Module):
         conv_input: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """x [N, C] with attention along serialization ``row``. ``conv_input``: what the convolution reads, default x."""
+        """x [N, C] with attention along serialization ``row``. ``conv_input``: read by the convolution, default x."""
         conv_input = x if conv_input is None else conv_input
         # Drawn here: a generator does not repeat itself when the block is computed again in the backward pass.
         keep = [self._draw_keep(x, generator) for _ in range(2)]
@@ -142,7 +142,7 @@ class Pool(nn.Module):
 
     def __init__(self, in_channels: int, out_channels: int, norm: str):
         super().__init__()
-        self.proj = nn.Linear(in_channels, out_channels)
+        self.proj = RowLinear(in_channels, out_channels)
         self.norm = make_norm(norm, out_channels)
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
@@ -190,9 +190,9 @@ class Unpool(nn.Module):
 
     def __init__(self, in_channels: int, skip_channels: int, out_channels: int, norm: str):
         super().__init__()
-        self.proj = nn.Linear(in_channels, out_channels)
+        self.proj = RowLinear(in_channels, out_channels)
         self.proj_norm = make_norm(norm, out_channels)
-        self.skip = nn.Linear(skip_channels, out_channels)
+        self.skip = RowLinear(skip_channels, out_channels)
         self.skip_norm = make_norm(norm, out_channels)
 
     def forward(self, x: Tensor, skip: Tensor, coarse: Stage) -> tuple[Tensor, Tensor]:
@@ -226,9 +226,9 @@ class DecoderStage(nn.Module):
 class Head(nn.Module):
     def __init__(self, channels: int, out_channels: int, zero_init: bool):
         super().__init__()
-        self.norm = nn.LayerNorm(channels)
-        self.fc1 = nn.Linear(channels, channels)
-        self.fc2 = nn.Linear(channels, out_channels)
+        self.norm = RowLayerNorm(channels)
+        self.fc1 = RowLinear(channels, channels)
+        self.fc2 = RowLinear(channels, out_channels)
         if zero_init:
             nn.init.zeros_(self.fc2.weight)
             nn.init.zeros_(self.fc2.bias)
@@ -269,5 +269,6 @@ class PointTransformer(nn.Module):
 
 def linear_rates(last: float, depths: tuple[int, ...]) -> list[list[float]]:
     """Drop-path rates of the blocks of each stage: from 0 at the first block to ``last`` at the last one."""
-    rates = iter(torch.linspace(0, last, sum(depths)).tolist())
+    n_blocks = sum(depths)
+    rates = iter([last * i / max(n_blocks - 1, 1) for i in range(n_blocks)])
     return [[next(rates) for _ in range(depth)] for depth in depths]

@@ -20,7 +20,7 @@ class EncoderConfig:
         cnn_blocks: residual blocks of each stage.
         transformer_layers: layers of self- and cross-view attention.
         transformer_mlp_ratio: hidden channels of their feed-forward parts over 2 C.
-        window_split: K; attention sees windows of 1/K of the feature map along each axis, shifted in every second layer.
+        window_split: K; attention sees windows of 1/K of the feature map along each axis, shifted in every other layer.
     Depth:
         n_depths: D, depth candidates between far and near, evenly spaced in disparity.
         cost_unet_dim, cost_unet_levels: channels and resolutions of the U-Net on the cost volume.
@@ -33,7 +33,7 @@ class EncoderConfig:
         condition_dim: hidden channels of the network that scales and shifts features by depth and viewing ray.
         explicit: also predict rotation, scale and spherical harmonics of each particle.
         sh_degree: degree of these harmonics.
-        scale_range: smallest and largest predicted scale, in tenths of the summed width and height of a pixel at its depth.
+        scale_range: smallest and largest predicted scale, in tenths of a pixel's width plus height at its depth.
     quirks: published behaviour to imitate.
     """
 
@@ -64,7 +64,8 @@ class EncoderConfig:
     def __post_init__(self):
         if self.downscale_factor not in (2, 4, 8) or self.downscale_factor > 2 ** len(self.cnn_dims):
             raise InputError(
-                f"EncoderConfig: downscale_factor must be 2, 4 or 8 and at most 2^len(cnn_dims); got {self.downscale_factor}"
+                "EncoderConfig: downscale_factor must be 2, 4 or 8 and at most 2^len(cnn_dims); "
+                f"got {self.downscale_factor}"
             )
         if self.feature_dim % 4 or self.feature_dim < 4:
             raise InputError(f"EncoderConfig: feature_dim must be a multiple of 4; got {self.feature_dim}")

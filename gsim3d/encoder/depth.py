@@ -45,8 +45,8 @@ class Depth:
 def upsampling_matrix(n: int, factor: int, corner_aligned: bool, like: Tensor) -> Tensor:
     """[factor * n, n], the weights of bilinear upsampling along one axis.
 
-    Input i lies at output index factor * i, where strided convolutions took it from, and the last outputs repeat the last
-    input; corner-aligned, the first and last input lie at the first and last output.
+    Input i lies at output index factor * i, where strided convolutions took it from, and the last outputs repeat the
+    last input; corner-aligned, the first and last input lie at the first and last output.
     """
     stride = (factor * n - 1) / max(1, n - 1) if corner_aligned else factor
     place = (torch.arange(factor * n, device=like.device) / stride).clamp(max=n - 1)

@@ -17,8 +17,8 @@ from gsim3d.types import DYNAMIC, FROZEN, Frames, Particles
 class Encoder(nn.Module):
     """Multi-view features, a plane sweep, depth refinement and view-independent latents: one particle a pixel.
 
-    Clouds are encoded independently of each other; each may have any number of views, one included (its depth then rests
-    on its features alone).
+    Clouds are encoded independently of each other; each may have any number of views, one included (its depth then
+    rests on its features alone).
 
     Example:
         >>> encoder = Encoder(EncoderConfig.tiny())
@@ -84,9 +84,10 @@ class Encoder(nn.Module):
             joined = (values[0] if len(values) == 1 else torch.cat(values)[place[order]]).flatten(0, 1)
             return joined if kept is None else joined[kept]
 
-        per_image = (
-            torch.full_like(order, n_pixels) if kept is None else frames.masks[order].flatten(1).sum(1, dtype=torch.int64)
-        )
+        if frames.masks is None:
+            per_image = torch.full_like(order, n_pixels)
+        else:
+            per_image = frames.masks[order].flatten(1).sum(1, dtype=torch.int64)
         per_cloud = torch.zeros_like(n_views).index_add_(0, frames.cameras.image_cloud[order], per_image)
         cu_rows = torch.zeros(n_views.shape[0] + 1, dtype=torch.int64, device=device)
         cu_rows[1:] = per_cloud.cumsum(0)

@@ -8,9 +8,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gsim3d.encoder import sh
+from gsim3d.encoder import camera_frame
 from gsim3d.encoder.config import EncoderConfig
 from gsim3d.encoder.depth import Depth, Views
+from gsim3d.harmonics import degree_damping
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class PixelRays:
         return cls(poses[:, :3, 3], poses[:, :3, :3], torch.linalg.inv(views.Ks))
 
     def directions(self, height: int, width: int, offset: Tensor) -> Tensor:
-        """[I, 3, H, W] world directions of z-depth 1 through pixel centres moved by ``offset`` [I or 1, 2, H, W] pixels."""
+        """[I, 3, H, W] world directions of z-depth 1 through pixel centres + ``offset`` [I or 1, 2, H, W] pixels."""
         v, u = torch.meshgrid(
             torch.arange(height, device=offset.device) + 0.5,
             torch.arange(width, device=offset.device) + 0.5,
@@ -137,10 +138,10 @@ def explicit_gaussians(raw: Tensor, depth: Tensor, geometry: PixelRays, config: 
     pixel_size = geometry.inverse_Ks[:, :2, :2].sum((1, 2)).to(raw.dtype)[:, None, None]
     scales = (smallest + (largest - smallest) * raw_scales.sigmoid()) * (_rows(depth) * 0.1 * pixel_size)
     rotations = geometry.rotations.to(raw.dtype)
-    turn = sh.rotation_to_quat(rotations)[:, None]
-    quats = sh.quat_multiply(turn, F.normalize(raw_quats.roll(1, -1), dim=-1))  # raw: real part last
-    damping = sh.degree_damping(config.sh_degree, raw)
+    turn = camera_frame.rotation_to_quat(rotations)[:, None]
+    quats = camera_frame.quat_multiply(turn, F.normalize(raw_quats.roll(1, -1), dim=-1))  # raw: real part last
+    damping = degree_damping(config.sh_degree, raw)
     in_camera = raw_sh.reshape(n_images, -1, 3, damping.shape[0]) * damping
-    turn_sh = sh.rotation_of_harmonics(geometry.rotations, config.sh_degree, config.quirks.released_harmonics)
+    turn_sh = camera_frame.rotation_of_harmonics(geometry.rotations, config.sh_degree, config.quirks.released_harmonics)
     turned = torch.einsum("ikl,incl->inkc", turn_sh.to(raw.dtype), in_camera)
     return {"quats": quats, "scales": scales, "sh": turned}

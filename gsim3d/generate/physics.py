@@ -68,7 +68,8 @@ class Lattice:
     """Control lattice of a flex over time.
 
     nodes [T, c+1, c+1, c+1, 3]: metres, world; frame 0 is a box of equal cells.
-    occupied bool [c, c, c]: cells that hold collision vertices; nodes of no such cell carry no body and drift freely.
+    occupied bool [c, c, c]: cells that hold collision vertices and whose corners all move with the body; nodes of no
+        such cell drift freely or stay behind.
     """
 
     nodes: np.ndarray
@@ -90,15 +91,18 @@ def simulate(fall: Fall, n_frames: int, fps: float, max_timestep: float) -> Latt
     mujoco.mj_forward(model, data)
     shape = (fall.cells + 1,) * 3
     rest = _box_lattice(fall)
+    movable = model.body_dofnum[bodies] == 3  # a node without mass is welded to the world
     occupied = _occupied_cells(fall)
     used = np.zeros(shape, dtype=bool)
-    for step in np.ndindex(2, 2, 2):
-        used[tuple(slice(s, s + fall.cells) for s in step)] |= occupied
+    corners = [tuple(slice(s, s + fall.cells) for s in step) for step in np.ndindex(2, 2, 2)]
+    for corner in corners:
+        occupied &= movable.reshape(shape)[corner]
+    for corner in corners:
+        used[corner] |= occupied
     start = data.xpos[bodies].reshape(*shape, 3)
-    if np.abs(start - rest)[used].max() > 1e-5:
-        raise RuntimeError("MuJoCo has laid out the nodes of the flex in another order than x, y, z")
+    if not used.any() or np.abs(start - rest)[used].max() > 1e-5:
+        raise RuntimeError("MuJoCo has laid out the nodes of the flex otherwise than by x, y, z")
     velocity = fall.velocity + np.cross(fall.spin, rest - rest[used].mean(0))
-    movable = model.body_dofnum[bodies] == 3
     data.qvel[model.body_dofadr[bodies[movable]][:, None] + np.arange(3)] = velocity.reshape(-1, 3)[movable]
     nodes = np.empty((n_frames, *shape, 3))
     nodes[0] = rest

@@ -17,12 +17,16 @@ from gsim3d.errors import InputError
 from gsim3d.generate import writer
 from gsim3d.generate.worlds import build_world
 
-NEEDED = {"mujoco": "mujoco-core==4.0.0", "embreex": "embreex", "trimesh": "trimesh"}
+NEEDED = {"mujoco": "mujoco-core==4.0.0", "embreex": "embreex", "trimesh": "trimesh", "PIL": "pillow"}
 
 
 @dataclass(frozen=True)
 class Report:
-    """What `generate` did: scene folders in order, how many were made now, and draws rejected by reason."""
+    """What `generate` did.
+
+    folders: scenes in the order of `gsim3d.data.find_scenes`, so that splits of both lists agree.
+    n_made: how many were made now.    rejected: number of draws that were not filmed, by reason.
+    """
 
     folders: list[Path]
     n_made: int
@@ -72,7 +76,11 @@ def generate(
         ]
         _make_all(settings, out, missing, processes or len(os.sched_getaffinity(0)), progress)
         manifest = writer.write_manifest(out, folders, {"world": world, **dataclasses.asdict(settings)})
-    return Report(folders, len(missing), manifest["rejected"])
+    from gsim3d.data import find_scenes  # not above: the worker processes do without torch
+
+    wanted = set(folders)
+    ordered = [folder for folder in find_scenes(out) if folder in wanted]
+    return Report(ordered, len(missing), manifest["rejected"])
 
 
 def _require_packages() -> None:

@@ -30,6 +30,47 @@ _DYNAMICS = [
     (r"\.norm_pre\.", ".norm."),
 ]
 
+# The first that matches the start of a name below "encoder.".
+_ENCODER = [
+    (r"backbone\.backbone\.layer1\.", "cnn.stages.0."),
+    (r"backbone\.backbone\.layer2\.", "cnn.stages.1."),
+    (r"backbone\.backbone\.layer3\.", "cnn.stages.2."),
+    (r"backbone\.backbone\.", "cnn."),
+    (r"backbone\.transformer\.", "transformer."),
+    (r"depth_predictor\.corr_refine_net\.([01])\.", r"depth.cost_volume.refine_in.\1."),
+    (r"depth_predictor\.corr_refine_net\.3\.", "depth.cost_volume.unet."),
+    (r"depth_predictor\.corr_refine_net\.4\.", "depth.cost_volume.refine_out."),
+    (r"depth_predictor\.regressor_residual\.", "depth.cost_volume.residual."),
+    (r"depth_predictor\.depth_head_lowres\.", "depth.cost_volume.head."),
+    (r"depth_predictor\.upsampler\.0\.", "depth.upsampler."),
+    (r"depth_predictor\.proj_feature\.", "depth.proj_feature."),
+    (r"depth_predictor\.refine_unet\.([01])\.", r"depth.refine_in.\1."),
+    (r"depth_predictor\.refine_unet\.3\.", "depth.refine_unet."),
+    (r"depth_predictor\.to_disparity\.", "depth.to_disparity."),
+    (r"depth_predictor\.to_gaussians\.", "heads.to_gaussians."),
+    (r"depth_predictor\.global_cond\.", "heads.conditioning.net."),
+]
+# Two convolutions there, the channels of one here.
+_LATENTS = [f"depth_predictor.to_mono_features.{kind}_latent_features." for kind in ("dynamic", "static")]
+
+
+def encoder_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
+    """State dict below "encoder." -> that of :class:`gsim3d.encoder.Encoder`."""
+    weights = {}
+    for name, value in published.items():
+        if name.startswith(tuple(_LATENTS)):
+            continue
+        for pattern, replacement in _ENCODER:
+            name, count = re.subn(f"^{pattern}", replacement, name)
+            if count:
+                break
+        weights[name.replace(".downsample.0.", ".downsample.")] = value
+    for kind in ("weight", "bias"):
+        parts = [published[prefix + kind] for prefix in _LATENTS if prefix + kind in published]
+        if parts:
+            weights[f"heads.to_latents.{kind}"] = torch.cat(parts)
+    return weights
+
 
 def dynamics_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
     """State dict below "dynamic_model.net." -> that of :class:`gsim3d.dynamics.point_transformer.PointTransformer`."""

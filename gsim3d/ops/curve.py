@@ -17,8 +17,8 @@ def curve_encode(
 ) -> Tensor:
     """Codes of cells along a space-filling curve, clouds above them.
 
-    ``code = cloud << shift | curve_code(x, y, z)``, 3 bits a level. The z curve interleaves the bits of x, y, z from high
-    to low; "hilbert" is Skilling's curve with x first; "-trans" curves exchange x and y. For all four,
+    ``code = cloud << shift | curve_code(x, y, z)``, 3 bits a level. The z curve interleaves the bits of x, y, z from
+    high to low; "hilbert" is Skilling's curve with x first; "-trans" curves exchange x and y. For all four,
     ``code >> 3`` is the code of ``grid >> 1`` at ``depth - 1``.
 
     Args:
@@ -111,7 +111,8 @@ class Segments:
 class Voxels:
     """Rows of equal cloud and cell; V voxels, ordered by (cloud, x, y, z).
 
-    row_voxel: int64 [N].   rows: int64 [N], rows of voxel 0, of voxel 1, ..., ascending in a voxel.   cu_rows: int64 [V + 1].
+    row_voxel: int64 [N].
+    rows: int64 [N], the rows of voxel 0, then of voxel 1, ..., ascending in a voxel.   cu_rows: int64 [V + 1].
     """
 
     row_voxel: Tensor
@@ -203,7 +204,8 @@ def build_pyramid(
     Cells of stage 0 are ``floor((p - origin) / grid_size)`` in float64; a row outside [0, 2^16) cells or not finite
     sleeps: it is in no stage and not in ``Pyramid.rows``. Rows of a cloud are ordered along four curves of 16 levels,
     equal codes by position (x, then y, then z), then by row. The next stage pools the rows that share a cell of
-    ``stride`` cells, in the order of serialization row 0, and merges clouds of a scene whose slots differ in the merged bits only.
+    ``stride`` cells, in the order of serialization row 0, and merges clouds of a scene whose slots differ in the merged
+    bits only.
     A cloud's geometry depends on its scene alone, not on the other scenes of the call (except with ``spec.release``).
 
     Args:
@@ -225,7 +227,8 @@ def build_pyramid(
         >>> spec = PyramidSpec(0.1, 0, (2,), (1,), (8, 8), ((3,), (3,)))
         >>> points = torch.tensor([[0.05, 0.05, 0.05], [0.15, 0.05, 0.05], [0.55, 0.05, 0.05]])
         >>> zero = torch.zeros(1, dtype=torch.int64)
-        >>> pyramid = build_pyramid(points, torch.tensor([0, 3]), zero, zero, torch.zeros(1, 3, dtype=torch.float64), spec)
+        >>> origin = torch.zeros(1, 3, dtype=torch.float64)
+        >>> pyramid = build_pyramid(points, torch.tensor([0, 3]), zero, zero, origin, spec)
         >>> pyramid.stages[1].grid
         tensor([[0, 0, 0],
                 [2, 0, 0]])
@@ -308,7 +311,7 @@ def _(
             merged = min(merge_windows[s - 1].bit_length() - 1, slot_bits)
             slot_bits -= merged
             arrays += [(n,)] if merged else []
-        offsets = size(min=1)  # an unbacked size must be the whole size of some result, so offsets are counted, not patches
+        offsets = size(min=1)  # P + 1 as one symbol: an unbacked size must be the whole size of some result
         arrays += [(n, 3), (n,), (size(min=1),), (4, n), (offsets,), (offsets,), (4, size())]
         arrays += [(n,), (n,), (size(min=1),)]
         for kernel_size in kernel_sizes[cu_kernels[s] : cu_kernels[s + 1]]:

@@ -15,8 +15,8 @@ def patch_attention(q: Tensor, k: Tensor, v: Tensor, table: PatchTable, *, scale
     A query row that no patch lists, or whose patch has no keys, gets 0.
 
     Args:
-        q: queries [Nq, H, D], float32 or float64; D a multiple of 4 from 4 to 128. On the CPU under ``torch.autocast``
-            the call computes in float32.
+        q: queries [Nq, H, D], float32 or float64; D a multiple of 4 from 4 to 128. Under ``torch.autocast`` the CPU
+            computes in float32.
         k, v: keys and values [Nk, H, D]. The three may be views of one qkv tensor; they are read in place.
         table: patches; a row at most once in ``q_rows``, any number of times in ``kv_rows``.
         scale: factor of the dot products; default ``D ** -0.5``.

@@ -57,12 +57,12 @@ def plane_sweep(
     """Mean correlation of each pixel's feature with its sources' features at each candidate depth.
 
     ``cost[i, k, v, u] = mean over sources j of <f_i(u, v), f_j(x, y)> / sqrt(C)`` with
-    ``q = A [u, v, 1] / inverse_depths[i, k] + b`` and ``(x, y) = (q_x, q_y) / max(q_z, 1e-3)`` in array-index coordinates;
+    ``q = A [u, v, 1] / inverse_depths[i, k] + b`` and ``(x, y) = (q_x, q_y) / max(q_z, 1e-3)`` in array indices;
     f_j is interpolated bilinearly and is zero outside. No warped volume is formed.
 
     Args:
         features: [I, C, h, w], float32 or float64.
-        homographies, translations: [P, 3, 3] and [P, 3] of each pair, see :func:`sweep_geometry`; dtype of ``features``.
+        homographies, translations: [P, 3, 3] and [P, 3] from :func:`sweep_geometry`; dtype of ``features``.
         inverse_depths: [I, D], 1 / metres, positive.
         src_images: int64 [P], sources of image 0, then of image 1, ...
         cu_src: int64 [I + 1], offsets into ``src_images``; an image without sources costs 0.
@@ -77,7 +77,8 @@ def plane_sweep(
     Example:
         >>> A, b = sweep_geometry(torch.eye(3).expand(2, 3, 3), torch.eye(4).expand(2, 4, 4),
         ...                       torch.tensor([1, 0]), torch.tensor([0, 1, 2]))
-        >>> plane_sweep(torch.ones(2, 4, 1, 1), A, b, torch.ones(2, 1), torch.tensor([1, 0]), torch.tensor([0, 1, 2]))[0]
+        >>> features, inverse_depths = torch.ones(2, 4, 1, 1), torch.ones(2, 1)
+        >>> plane_sweep(features, A, b, inverse_depths, torch.tensor([1, 0]), torch.tensor([0, 1, 2]))[0]
         tensor([[[2.]]])
     """
     return torch.ops.gsim3d.plane_sweep(features, homographies, translations, inverse_depths, src_images, cu_src)

@@ -98,6 +98,11 @@ def exists(run: str | Path) -> bool:
     return (Path(run) / "checkpoints" / "last").is_file()
 
 
+def digest_of(folder: Path) -> str:
+    """The hash that names the checkpoint in ``folder``: that of its state, which holds the hashes of all its files."""
+    return _sha256(folder / STATE)
+
+
 def load(path: str | Path) -> Checkpoint:
     """Reads a run folder (its last good checkpoint), a checkpoint folder, or a single exported file.
 
@@ -115,8 +120,7 @@ def load(path: str | Path) -> Checkpoint:
     if not (path / STATE).is_file():
         raise InputError(f"{path}: not a checkpoint (a run folder, a folder with {STATE}, or a .safetensors file)")
     try:
-        content = (path / STATE).read_bytes()
-        state = json.loads(content)
+        state = json.loads((path / STATE).read_bytes())
         hashes = dict(state["sha256"])
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{path / STATE}: not a checkpoint's state, the checkpoint is broken") from None
@@ -128,7 +132,7 @@ def load(path: str | Path) -> Checkpoint:
         raise InputError(f"{path}: the checkpoint holds no {CONFIG} or no {_WEIGHTS['model']}")
     config = _known_format(load_yaml(path / CONFIG), path / CONFIG)
     tensors = {name: _read_tensors(path / file) if file in hashes else {} for name, file in _WEIGHTS.items()}
-    return Checkpoint(config=config, state=state, digest=hashlib.sha256(content).hexdigest(), **tensors)
+    return Checkpoint(config=config, state=state, digest=digest_of(path), **tensors)
 
 
 def export(checkpoint: Checkpoint, path: str | Path) -> None:

@@ -25,7 +25,7 @@ class StageConfig:
     history: encoded steps; 0: as many as the data section says.
     batch: scenes a step.
     target_views: images of each step that the loss compares.
-    loss_stride: the loss looks at every n-th simulated step, and at the last.
+    from_start: share of the windows that begin at a scene's first step; the others begin anywhere.
     learning_rate: peak, reached after ``warm_up`` of the stage's steps, then falling (one cycle a stage).
     warm_up: share of the stage's steps.
     """
@@ -35,12 +35,12 @@ class StageConfig:
     history: int = 0
     batch: int = 1
     target_views: int = 5
-    loss_stride: int = 1
+    from_start: float = 0.0
     learning_rate: float = 2e-4
     warm_up: float = 0.01
 
     def __post_init__(self):
-        _at_least(self, steps=1, horizon=0, history=0, batch=1, target_views=1, loss_stride=1, learning_rate=0, warm_up=0)
+        _at_least(self, steps=1, horizon=0, history=0, batch=1, target_views=1, from_start=0, learning_rate=0, warm_up=0)
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,18 @@ class DataConfig:
     history: T, encoded steps.
     context_views: input images of each step.
     context_cameras: the cameras they come from; empty: all but ``target_only_cameras``.
-    target_only_cameras: cameras that are never an input.
+    target_only_cameras: cameras that are never an input; a loss may look at them.
+    background_stride: of pixels that show what never moves, those on every n-th row and column become particles.
     """
 
     history: int = 2
     context_views: int = 4
     context_cameras: tuple[int, ...] = ()
     target_only_cameras: tuple[int, ...] = ()
+    background_stride: int = 1
 
     def __post_init__(self):
-        _at_least(self, history=1, context_views=1)
+        _at_least(self, history=1, context_views=1, background_stride=1)
         if set(self.context_cameras) & set(self.target_only_cameras):
             raise InputError("data: context_cameras and target_only_cameras share a camera")
 
@@ -103,6 +105,7 @@ class TrainConfig:
 
     preset: the model's sizes, a function of gsim3d.presets such as ``tiny``.
     model: changes of the preset, nested like the model section of a checkpoint's config.yaml.
+    effects: what a scene calls for, as :class:`gsim3d.effects.EffectsSpec` reads it.
     stages: run one after another.
     seed: all randomness follows from it and from the step.
     checkpoint_every, log_every: steps; the last step is always saved.
@@ -112,6 +115,7 @@ class TrainConfig:
     stages: tuple[StageConfig, ...] = (StageConfig(steps=1000), StageConfig(steps=4000, horizon=12))
     preset: str = "tiny"
     model: dict = dataclasses.field(default_factory=dict)
+    effects: dict = dataclasses.field(default_factory=dict)
     data: DataConfig = DataConfig()
     loss: LossConfig = LossConfig()
     optimizer: OptimizerConfig = OptimizerConfig()

@@ -8,8 +8,9 @@ import torch
 
 from gsim3d.encoder import Encoder, EncoderConfig
 from gsim3d.encoder.depth import feature_intrinsics, upsample, upsampling_matrix
-from gsim3d.encoder.sh import degree_damping, quat_multiply, rotation_of_harmonics, rotation_to_quat, sh_basis
+from gsim3d.encoder.camera_frame import quat_multiply, rotation_of_harmonics, rotation_to_quat
 from gsim3d.errors import HardCaseError, InputError
+from gsim3d.harmonics import degree_damping, sh_basis
 from gsim3d.quirks import Quirks
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -225,7 +226,8 @@ def test_gradients_are_finite_and_reach_every_parameter():
     encoder = make_encoder()
     particles = encoder(frames)
     generator = torch.Generator().manual_seed(0)
-    sum((getattr(particles, name) * torch.randn(getattr(particles, name).shape, generator=generator)).sum() for name in ROW_FIELDS).backward()
+    fields = [getattr(particles, name) for name in ROW_FIELDS]
+    sum((x * torch.randn(x.shape, generator=generator)).sum() for x in fields).backward()
     assert frames.images.grad.isfinite().all() and frames.images.grad.abs().max() > 0
     for name, parameter in encoder.named_parameters():
         assert parameter.grad is not None and parameter.grad.isfinite().all(), name
@@ -251,8 +253,9 @@ def test_untrained_depth_is_near_the_middle_of_disparity_with_translucent_partic
     torch.manual_seed(0)
     frames = make_frames([0, 0, 0])
     particles = Encoder(EncoderConfig.tiny())(frames)
-    in_camera = torch.einsum("iab,inb->ina", frames.cameras.viewmats[:, :3, :3].float(), particles.means.unflatten(0, (3, -1)))
-    disparity = 1 / (in_camera[..., 2] + frames.cameras.viewmats[:, None, 2, 3])
+    viewmats = frames.cameras.viewmats.float()
+    depth = torch.einsum("ib,inb->in", viewmats[:, 2, :3], particles.means.unflatten(0, (3, -1))) + viewmats[:, 2, 3:]
+    disparity = 1 / depth
     middle, span = (1 / 1.5 + 1 / 6) / 2, 1 / 1.5 - 1 / 6
     assert (disparity - middle).abs().mean() < 0.2 * span
     assert (particles.opacities - 0.5).abs().max() < 0.1
@@ -295,9 +298,22 @@ def test_upsampling(factor, aligned):
     assert torch.allclose(upsampling_matrix(5, factor, aligned, x).sum(1), torch.ones(5 * factor))
 
 
-def test_explicit_variant():
+def test_the_paper_s_size():
+    """Parameters of the published encoders: latents of 64 and 64, of 32 and 32 channels, and the explicit variant."""
+    with torch.device("meta"):
+        sizes = [
+            EncoderConfig(dynamic_dim=64, static_dim=64),
+            EncoderConfig(),
+            EncoderConfig(explicit=True, dynamic_dim=0, static_dim=0),
+        ]
+        counts = [sum(p.numel() for p in Encoder(size).parameters()) for size in sizes]
+    assert counts == PUBLISHED_COUNTS
+
+
+@pytest.mark.parametrize("quirks", [Quirks(), Quirks.release()])
+def test_explicit_variant(quirks):
     frames = make_frames([0, 0])
-    particles = make_encoder(explicit=True, dynamic_dim=0, static_dim=0)(frames)
+    particles = make_encoder(explicit=True, dynamic_dim=0, static_dim=0, quirks=quirks)(frames)
     n = 2 * SIZE**2
     assert particles.quats.shape == (n, 4) and particles.scales.shape == (n, 3) and particles.sh.shape == (n, 16, 3)
     assert particles.dynamic_latents.shape == (n, 0)

@@ -1,4 +1,4 @@
-"""The encoder with published weights against tensors of the published model (golden files h_encoder, i_film, j_sh_rotation)."""
+"""The encoder with published weights against tensors of the published model (h_encoder, i_film, j_sh_rotation)."""
 
 import dataclasses
 
@@ -8,8 +8,9 @@ import torch
 from gsim3d.encoder import Encoder, EncoderConfig
 from gsim3d.encoder.depth import Views
 from gsim3d.encoder.heads import Conditioning, PixelRays, pluecker
-from gsim3d.encoder.sh import rotation_of_harmonics, sh_basis
-from gsim3d.interop.encoder_names import published_encoder_state
+from gsim3d.encoder.camera_frame import rotation_of_harmonics
+from gsim3d.harmonics import sh_basis
+from gsim3d.interop.released import encoder_weights
 from gsim3d.quirks import Quirks
 from gsim3d.types import Cameras, Frames
 from tests.asserts import assert_close_relative_to_max, relative_to_max
@@ -18,7 +19,13 @@ from tests.golden_files import golden
 pytestmark = pytest.mark.golden
 STEPS, VIEWS, SIZE = 2, 4, 32
 CONFIG = EncoderConfig(
-    feature_dim=32, n_depths=16, cost_unet_dim=32, refine_unet_dim=32, dynamic_dim=8, static_dim=8, quirks=Quirks.release()
+    feature_dim=32,
+    n_depths=16,
+    cost_unet_dim=32,
+    refine_unet_dim=32,
+    dynamic_dim=8,
+    static_dim=8,
+    quirks=Quirks.release(),
 )
 OUTPUTS = {
     "means": "means",
@@ -31,7 +38,7 @@ OUTPUTS = {
 def load_encoder(file, config: EncoderConfig = CONFIG) -> Encoder:
     encoder = Encoder(config)
     weights = file / "w"
-    encoder.load_state_dict(published_encoder_state({name: weights[name] for name in weights.keys()}))
+    encoder.load_state_dict(encoder_weights({name: weights[name] for name in weights.keys()}))
     return encoder
 
 
@@ -151,7 +158,8 @@ def test_view_conditioning():
     n_views = 3
     net = Conditioning(20, 67)
     net.net.load_state_dict({name: file[f"w/global_cond.{name}"] for name in net.net.state_dict()})
-    inputs = [file[f"in/{name}"].requires_grad_() for name in ("mono_features", "depths", "raw_densities", "xy_offsets")]
+    names = ("mono_features", "depths", "raw_densities", "xy_offsets")
+    inputs = [file[f"in/{name}"].requires_grad_() for name in names]
     height, width = inputs[0].shape[-2:]
 
     def view_major(t: torch.Tensor) -> torch.Tensor:
@@ -166,7 +174,7 @@ def test_view_conditioning():
     out = net(*inputs, embedding)
     assert_close_relative_to_max(out, file["out"], "film_golden")
     gradients = torch.autograd.grad(out, inputs, file["cotangent"])
-    for gradient, name in zip(gradients, ("mono_features", "depths", "raw_densities", "xy_offsets"), strict=True):
+    for gradient, name in zip(gradients, names, strict=True):
         assert_close_relative_to_max(gradient, file[f"grad/{name}"], "film_golden", name)
 
 
@@ -176,7 +184,8 @@ def test_released_rotation_of_harmonics(degree):
     file = golden("j_sh_rotation")
     turn = rotation_of_harmonics(file["rotmat"].double(), degree, released=True)
     ours = torch.einsum("ikl,icl->ick", turn, file[f"deg{degree}/sh"].double())
-    directions = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)).double(), dim=-1)
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(100, 3, generator=generator).double(), dim=-1)
     colors = ours @ sh_basis(directions, degree).T
     published = file[f"f64/deg{degree}/out_float64"] @ sh_basis(directions[:, [2, 0, 1]], degree).T
     assert_close_relative_to_max(colors, published, "sh_golden")

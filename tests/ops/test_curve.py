@@ -134,7 +134,10 @@ def test_any_number_of_threads():
     "change, message",
     [
         ({"curve": "peano"}, "curve must be one of z, z-trans, hilbert, hilbert-trans; got 'peano'"),
-        ({"grid": torch.tensor([[0, 0, 0], [0, 70000, 0]])}, r"grid must be in \[0, 65536\) at depth 16; got 70000 at row 1, axis 1"),
+        (
+            {"grid": torch.tensor([[0, 0, 0], [0, 70000, 0]])},
+            r"grid must be in \[0, 65536\) at depth 16; got 70000 at row 1, axis 1",
+        ),
         ({"grid": torch.tensor([[0, 0, -1], [0, 0, 0]])}, r"got -1 at row 0, axis 2"),
         ({"grid": torch.tensor([[2**40, 0, 0], [0, 0, 0]])}, r"got 1099511627776 at row 0, axis 0"),
         ({"grid": torch.zeros(2, 2, dtype=torch.int64)}, r"grid must be \[N, 3\]"),

@@ -260,7 +260,8 @@ def test_rows_outside_the_table(device):
     moved = case.to(device)
     out, grad_q, grad_k, grad_v = gradients(moved.attend, moved.inputs, cotangent_of(case))
     with_keys = oracle.multiplicity(*lists(case.table), case.q.shape[0], case.k.shape[0])
-    for x, counts in ((out, with_keys.sum(1)), (grad_q, with_keys.sum(1)), (grad_k, with_keys.sum(0)), (grad_v, with_keys.sum(0))):
+    queries, keys = with_keys.sum(1), with_keys.sum(0)
+    for x, counts in ((out, queries), (grad_q, queries), (grad_k, keys), (grad_v, keys)):
         assert torch.count_nonzero(x[counts == 0]) == 0 and (counts == 0).any()
         assert torch.count_nonzero(x[counts > 0]) > 0
 
@@ -268,7 +269,7 @@ def test_rows_outside_the_table(device):
 @pytest.mark.parametrize("offset", [0, 2**20])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3, 1e25])
 def test_huge_logits(device, scale, offset):
-    # Whole numbers keep every dot product exact in float32, so logits up to 1e31 must give the weights of their differences.
+    # Whole numbers keep every dot product exact in float32, so logits up to 1e31 must give the weights of differences.
     case = random_case(dim=16, scale=scale, dtype=torch.float32)
     whole = [(2 * x).round() for x in case.inputs]
     whole[0][..., 0], whole[1][..., 0] = 1024, offset / 1024

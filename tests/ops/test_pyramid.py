@@ -64,7 +64,8 @@ def assert_matches_oracle(arguments, spec, curves=None):
     for stage, expected in zip(pyramid.stages, stages):
         assert [tuple(cell) for cell in stage.grid.tolist()] == expected["grid"]
         assert stage.cloud.tolist() == expected["cloud"]
-        assert stage.cu_clouds.diff().tolist() == expected["cloud_sizes"] and stage.n_clouds == len(expected["cloud_sizes"])
+        assert stage.cu_clouds.diff().tolist() == expected["cloud_sizes"]
+        assert stage.n_clouds == len(expected["cloud_sizes"])
         assert stage.order.tolist() == expected["order"]
         for table, patches in zip(stage.patches, expected["patches"]):
             got = list(zip(split(table.q_rows, table.cu_q), split(table.kv_rows, table.cu_k)))
@@ -167,7 +168,8 @@ def test_no_rows_and_no_clouds():
     empty = scene((0,) * 7)
     assert_matches_oracle(empty, SPEC)
     none = torch.zeros(0, dtype=torch.int64)
-    pyramid = build_pyramid(torch.zeros(0, 3), torch.tensor([0]), none, none, torch.zeros(0, 3, dtype=torch.float64), SPEC)
+    origin = torch.zeros(0, 3, dtype=torch.float64)
+    pyramid = build_pyramid(torch.zeros(0, 3), torch.tensor([0]), none, none, origin, SPEC)
     assert [t.shape for t in flat(pyramid)] == [t.shape for t in flat(build_pyramid(**empty, spec=SPEC))]
 
 
@@ -192,8 +194,9 @@ def test_sleeping_rows_leave_the_others_alone():
     arguments = scene((40, 25, 30, 35, 1, 0, 0))
     expected = build_pyramid(**arguments, spec=SPEC)
     far = SPEC.grid_size * 65536
-    poison = [[float("nan"), 0, 0], [0, float("inf"), 0], [0, 0, -float("inf")], [far + 0.1, 0, 0], [0, -1e-6, 0], [0, 0, 3e38]]
-    positions = torch.cat([torch.tensor(poison), arguments["positions"][:40], torch.tensor(poison), arguments["positions"][40:]])
+    poison = torch.zeros(6, 3)
+    poison[range(6), [0, 1, 2, 0, 1, 2]] = torch.tensor([math.nan, math.inf, -math.inf, far + 0.1, -1e-6, 3e38])
+    positions = torch.cat([poison, arguments["positions"][:40], poison, arguments["positions"][40:]])
     cu_rows = arguments["cu_rows"] + 12
     cu_rows[0] = 0
     pyramid = build_pyramid(**(arguments | {"positions": positions, "cu_rows": cu_rows}), spec=SPEC)
@@ -206,7 +209,8 @@ def test_sleeping_rows_leave_the_others_alone():
 def test_the_last_cell_takes_part():
     top = 65535.5 * 0.1
     arguments = scene((4, 0, 0, 0, 0, 0, 0), dtype=torch.float64)
-    arguments["positions"] = torch.tensor([[top, top, top], [0.0, 0.0, 0.0], [top, 0.0, top], [top - 0.1, top, top]]).double()
+    corners = [[top, top, top], [0.0, 0.0, 0.0], [top, 0.0, top], [top - 0.1, top, top]]
+    arguments["positions"] = torch.tensor(corners, dtype=torch.float64)
     pyramid = assert_matches_oracle(arguments, SPEC)
     assert pyramid.stages[0].grid[0].tolist() == [65535] * 3 and len(pyramid.rows) == 4
     assert len(pyramid.stages[0].kernel_maps[3].tap_in) == 2  # nothing wraps around to the next column
@@ -252,8 +256,8 @@ def test_the_order_of_input_rows_permutes_the_results_only():
     expected = build_pyramid(**arguments, spec=spec, curves=SHUFFLED)
     assert len(expected.stages[0].voxels.cu_rows) - 1 < expected.stages[0].n_rows  # some rows share a voxel
     generator = torch.Generator().manual_seed(6)
-    order = [a + torch.randperm(b - a, generator=generator) for a, b in itertools.pairwise(arguments["cu_rows"].tolist())]
-    order = torch.cat(order)
+    offsets = arguments["cu_rows"].tolist()
+    order = torch.cat([a + torch.randperm(b - a, generator=generator) for a, b in itertools.pairwise(offsets)])
     moved = build_pyramid(**(arguments | {"positions": arguments["positions"][order]}), spec=spec, curves=SHUFFLED)
     was = order[moved.rows]  # input row, before the permutation, of each row of stage 0
     assert torch.equal(was[moved.stages[0].order], expected.rows[expected.stages[0].order])
@@ -299,7 +303,8 @@ def test_any_number_of_threads():
     zero = torch.zeros(1, dtype=torch.int64)
     origin = torch.zeros(1, 3, dtype=torch.float64)
     spec = dataclasses.replace(SPEC, grid_size=0.03, patch_sizes=(1024,) * 4)
-    assert_same_bits_for_any_threads(lambda: flat(build_pyramid(positions, torch.tensor([0, 50000]), zero, zero, origin, spec)))
+    arguments = (positions, torch.tensor([0, 50000]), zero, zero, origin, spec)
+    assert_same_bits_for_any_threads(lambda: flat(build_pyramid(*arguments)))
 
 
 # The published model's geometry; the golden tests compare the rest of it
@@ -328,7 +333,7 @@ def test_release_does_not_pool_below_one_level():
 def test_release_extent():
     arguments = scene()
     arguments["positions"][0] = 3277.5
-    with pytest.raises(ValueError, match=r"with release, positions must span fewer than 2\^15 cells of 0.1 m; got .* on axis 0"):
+    with pytest.raises(ValueError, match=r"with release, positions must span fewer than 2\^15 cells .* on axis 0"):
         build_pyramid(**arguments, spec=dataclasses.replace(SPEC, release=True))
 
 
@@ -340,12 +345,12 @@ def test_release_extent():
     [
         ({"positions": torch.zeros(151, 2)}, r"positions must be \[N, 3\]"),
         ({"positions": torch.zeros(151, 3).half()}, "positions must be float32 or float64; got float16"),
-        ({"cu_rows": torch.tensor([0, 40, 65, 95, 130, 131, 131, 150])}, "cu_rows must run from 0 to N=151; got 0 .. 150"),
-        ({"cu_rows": torch.tensor([0, 40, 65, 60, 130, 131, 131, 151])}, "cu_rows must not descend; got 65 then 60 at 2"),
-        ({"cu_rows": torch.tensor([0, 400, 65, 95, 130, 131, 131, 151])}, "cu_rows must not descend; got 400 then 65 at 1"),
+        ({"cu_rows": torch.tensor([0, 9, 9, 9, 9, 9, 9, 150])}, "cu_rows must run from 0 to N=151; got 0 .. 150"),
+        ({"cu_rows": torch.tensor([0, 40, 65, 60, 70, 70, 70, 151])}, "cu_rows must not descend; got 65 then 60 at 2"),
+        ({"cu_rows": torch.tensor([0, 400, 9, 9, 9, 9, 9, 151])}, "cu_rows must not descend; got 400 then 9 at 1"),
         ({"cu_rows": torch.zeros(8)}, "cu_rows must be int64; got float32"),
         ({"cu_rows": torch.zeros(0, dtype=torch.int64)}, r"cu_rows must be \[Q \+ 1\]; got \[0\]"),
-        ({"cloud_scene": torch.tensor([0, 0, 0, 0, 1, 1, 3])}, r"cloud_scene must be in \[0, B\) with B=3 from origin; got 3 at 6"),
+        ({"cloud_scene": torch.tensor([0, 0, 0, 0, 1, 1, 3])}, r"cloud_scene must be in \[0, B\) .* got 3 at 6"),
         ({"cloud_scene": torch.tensor([0])}, r"cloud_scene must be \[Q\]"),
         ({"cloud_slot": torch.tensor([0, 1, 2, 4, 2, 3, 3])}, r"cloud_slot must be in \[0, 4\); got 4 at 3"),
         ({"cloud_slot": torch.tensor([0, 1, 2, 3, 2, 2, 3])}, "cloud_slot must differ .* got slot 2 twice in scene 1"),

@@ -1,4 +1,7 @@
-"""Patch attention as one dense softmax: a matrix counts how often a query's patch lists a key. Imports nothing from gsim3d."""
+"""Patch attention as one dense softmax: a matrix counts how often a query's patch lists a key.
+
+Imports nothing from gsim3d.
+"""
 
 import torch
 
@@ -13,7 +16,8 @@ def multiplicity(q_rows, kv_rows, cu_q, cu_k, n_q, n_k):
     """[n_q, n_k]: how many entries of the query's patch are that key."""
     n_patches = cu_q.shape[0] - 1
     listed = torch.zeros(n_patches, n_k, dtype=torch.float64)
-    listed.index_put_((patch_of_entries(cu_k), kv_rows), torch.ones(kv_rows.shape[0], dtype=torch.float64), accumulate=True)
+    ones = torch.ones(kv_rows.shape[0], dtype=torch.float64)
+    listed.index_put_((patch_of_entries(cu_k), kv_rows), ones, accumulate=True)
     counts = torch.zeros(n_q, n_k, dtype=torch.float64)
     counts[q_rows] = listed[patch_of_entries(cu_q)]
     return counts

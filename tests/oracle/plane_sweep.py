@@ -1,4 +1,4 @@
-"""Plane sweep in plain torch: warps features with grid_sample, as the published model does. Imports nothing from gsim3d."""
+"""Plane sweep in plain torch: warps features with grid_sample. Knows nothing of the op."""
 
 import torch
 import torch.nn.functional as F
@@ -15,7 +15,8 @@ def plane_sweep(features, homographies, translations, inverse_depths, src_images
         cost = features.new_zeros(n_depths, height, width)
         pairs = range(int(cu_src[i]), int(cu_src[i + 1]))
         for p in pairs:
-            places = (homographies[p] @ pixels)[:, None] / inverse_depths[i][None, :, None] + translations[p][:, None, None]
+            places = (homographies[p] @ pixels)[:, None] / inverse_depths[i][None, :, None]
+            places = places + translations[p][:, None, None]
             xy = places[:2] / places[2].clamp(min=1e-3)
             # grid_sample with align_corners=False: index x lies at (2 x + 1) / width - 1.
             grid = torch.stack([(2 * xy[0] + 1) / width - 1, (2 * xy[1] + 1) / height - 1], -1)

@@ -43,7 +43,7 @@ def kernel_map(voxels, kernel_size):
 
 
 def stage_geometry(rows, depth, curves, patch_size, kernel_sizes):
-    """Orders, patches, voxels and maps of rows (key of cloud, cell, tie) in row order; keys are dense ids afterwards."""
+    """Orders, patches, voxels and maps of ``rows``: (scene and slot of the cloud, cell, what orders equal cells)."""
     keys = sorted({key for key, _, _ in rows})
     cloud = [keys.index(key) for key, _, _ in rows]
     grid = [cell for _, cell, _ in rows]

@@ -34,25 +34,21 @@ def kernel_tables(cells: Tensor, kernel_size: int) -> tuple[Tensor, ...]:
 
 
 def sparse_conv(x: Tensor, weight: Tensor, bias: Tensor | None, cells: Tensor, duplicates: str) -> Tensor:
-    """Row by row, tap by tap, from a dictionary of voxels; differentiable in x, weight, bias."""
+    """Tap by tap, neighbours from a dictionary of voxels; differentiable in x, weight, bias."""
     table = voxel_dictionary(cells)
-    kernel_size = weight.shape[1]
-    radius = kernel_size // 2
-    out = []
-    for row, (cloud, cx, cy, cz) in enumerate(cells.tolist()):
-        y = weight[:, radius, radius, radius] @ x[row]
-        if bias is not None:
-            y = y + bias
-        for i in range(kernel_size):
-            for j in range(kernel_size):
-                for k in range(kernel_size):
-                    neighbours = table.get((cloud, cx + i - radius, cy + j - radius, cz + k - radius))
-                    if neighbours is None or (i, j, k) == (radius, radius, radius):
-                        continue
-                    value = x[neighbours].mean(0) if duplicates == "mean" else x[neighbours[0]]
-                    y = y + weight[:, i, j, k] @ value
-        out.append(y)
-    return torch.stack(out) if out else x.new_zeros(0, weight.shape[0])
+    radius = weight.shape[1] // 2
+    out = x @ weight[:, radius, radius, radius].T
+    out = out if bias is None else out + bias
+    reach = range(-radius, radius + 1)
+    for offset in ((dx, dy, dz) for dx in reach for dy in reach for dz in reach if (dx, dy, dz) != (0, 0, 0)):
+        read = x.new_zeros(len(cells), len(cells))  # read[p, q]: how much of row q row p sees through this tap
+        for row, (cloud, *cell) in enumerate(cells.tolist()):
+            neighbours = table.get((cloud, *(c + d for c, d in zip(cell, offset))), [])
+            neighbours = neighbours if duplicates == "mean" else neighbours[:1]
+            read[row, neighbours] = 1 / max(1, len(neighbours))
+        dx, dy, dz = (d + radius for d in offset)
+        out = out + read @ x @ weight[:, dx, dy, dz].T
+    return out
 
 
 def dense_conv(x: Tensor, weight: Tensor, bias: Tensor | None, cells: Tensor) -> Tensor:

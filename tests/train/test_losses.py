@@ -1,4 +1,4 @@
-"""The loss, the learning-rate schedule and the random numbers of training."""
+"""The loss and the learning-rate schedule."""
 
 import math
 
@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
-from gsim3d.train.randomness import generator
 from gsim3d.train.schedule import one_cycle
 
 
@@ -59,12 +58,3 @@ def test_one_cycle_is_torchs():
         optimizer.step()
         if step < 199:
             theirs.step()
-
-
-def test_randomness_depends_on_its_four_arguments_only():
-    def draw(*key):
-        return torch.rand(4, generator=generator(*key)).tolist()
-
-    assert draw(1, 2, 3, "views") == draw(1, 2, 3, "views")
-    keys = [(1, 2, 3, "views"), (0, 2, 3, "views"), (1, 0, 3, "views"), (1, 2, 0, "views"), (1, 2, 3, "scene")]
-    assert len({tuple(draw(*key)) for key in keys}) == len(keys)

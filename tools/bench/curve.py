@@ -1,9 +1,9 @@
-"""Codes along four curves and their order, against plain torch."""
+"""Codes along four curves, their order, and all geometry of a network call, against plain torch."""
 
 import torch
 from harness import Bench
 
-from gsim3d.ops import CURVES, curve_encode, curve_sort
+from gsim3d.ops import CURVES, PyramidSpec, build_pyramid, curve_encode, curve_sort
 
 DEPTH = 16
 
@@ -57,6 +57,49 @@ def surface(n_clouds, rows, seed=0):
     return torch.cat([xy, 0.3 + 0.1 * torch.sin(6 * xy.sum(1, keepdim=True))], 1)
 
 
+def plain_kernel_map(keys, kernel_size):
+    """Pairs of neighbours by binary search in the sorted voxel keys (x, y, z with 17 bits each, one spare)."""
+    reach = torch.arange(kernel_size) - kernel_size // 2
+    tap_in, tap_out = [], []
+    for offset in ((reach[:, None, None] << 34) + (reach[:, None] << 17) + reach).flatten().tolist():
+        wanted = keys + offset
+        at = torch.searchsorted(keys, wanted).clamp_max(len(keys) - 1)
+        hit = (keys[at] == wanted).nonzero()[:, 0] if offset else torch.zeros(0, dtype=torch.int64)
+        tap_in.append(at[hit])
+        tap_out.append(hit)
+    return [torch.cat(tap_in), torch.cat(tap_out)]
+
+
+def plain_pyramid(grid, spec):
+    """Cells, orders, clusters and convolution maps of one cloud whose points have a cell each."""
+    results = []
+    cloud = torch.zeros(len(grid), dtype=torch.int64)
+    codes = torch.stack([plain_code(grid, cloud, curve) for curve in CURVES])
+    for s, kernel_sizes in enumerate(spec.kernel_sizes):
+        if s > 0:
+            drop = spec.strides[s - 1].bit_length() - 1
+            _, counts = torch.unique_consecutive(codes[0][order[0]] >> (3 * drop), return_counts=True)
+            first = order[0][counts.cumsum(0) - counts]
+            grid, codes = grid[first] >> drop, codes[:, first] >> (3 * drop)
+        order = torch.argsort(codes, dim=1, stable=True)
+        keys, voxel_rows = ((grid[:, 0] << 34) + (grid[:, 1] << 17) + grid[:, 2]).sort()
+        results += [grid, order, voxel_rows]
+        for size in kernel_sizes:
+            results += plain_kernel_map(keys, size)
+    return results
+
+
+def our_pyramid(positions, spec):
+    zero = torch.zeros(1, dtype=torch.int64)
+    origin = torch.zeros(1, 3, dtype=torch.float64)
+    results = []
+    for stage in build_pyramid(positions, torch.tensor([0, len(positions)]), zero, zero, origin, spec).stages:
+        results += [stage.grid, stage.order, stage.voxels.rows]
+        for taps in stage.kernel_maps.values():
+            results += [taps.tap_in, taps.tap_out]
+    return results
+
+
 def main():
     bench = Bench("curve")
     for n in (65536, 262144):
@@ -65,7 +108,16 @@ def main():
         codes = ours(grid, cloud)[0]
         bench.compare(f"4 codes of {n // 1024}k points", lambda: ours(grid, cloud)[0], lambda: plain(grid, cloud)[0])
         bench.compare(f"4 sorts and inverses of {n // 1024}k", lambda: curve_sort(codes), lambda: plain_sort(codes))
-        bench.compare(f"4 codes, sorts, inverses of {n // 1024}k", lambda: ours(grid, cloud), lambda: plain(grid, cloud))
+        bench.compare(f"both of {n // 1024}k", lambda: ours(grid, cloud), lambda: plain(grid, cloud))
+    spec = PyramidSpec(0.004, 0, (4, 2, 2, 2), (1, 1, 1, 1), (1024,) * 5, ((5, 3), (3,), (3,), (3,), (3,)))
+    cells = torch.unique(torch.floor(surface(1, 65536) / spec.grid_size).long(), dim=0)
+    cells = cells[torch.randperm(len(cells), generator=torch.Generator().manual_seed(0))]
+    positions = ((cells + 0.5) * spec.grid_size).float()
+    bench.compare(
+        f"geometry of 5 stages, {len(cells)} points",
+        lambda: our_pyramid(positions, spec),
+        lambda: plain_pyramid(torch.floor(positions.double() / spec.grid_size).long(), spec),
+    )
     bench.finish()
 
 

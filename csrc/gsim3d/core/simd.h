@@ -23,7 +23,8 @@
 #define GSIM3D_SIMD_INLINE inline __attribute__((always_inline))
 
 #ifdef GSIM3D_SIMD_X86
-#define GSIM3D_SIMD_AVX512_BEGIN _Pragma("GCC push_options") _Pragma("GCC target(\"arch=x86-64-v4,prefer-vector-width=512\")")
+#define GSIM3D_SIMD_AVX512_BEGIN \
+  _Pragma("GCC push_options") _Pragma("GCC target(\"arch=x86-64-v4,prefer-vector-width=512\")")
 #define GSIM3D_SIMD_AVX512_END _Pragma("GCC pop_options")
 #endif
 
@@ -35,8 +36,9 @@ inline bool use_avx512() {
   static const bool use = [] {
     const char* wish = std::getenv("GSIM3D_SIMD");
     if (wish && std::string_view(wish) == "avx2") return false;
-    return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512cd") &&
-           __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl");
+    return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+           __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
+           __builtin_cpu_supports("avx512vl");
   }();
   return use;
 #else

@@ -47,17 +47,17 @@ GSIM3D_SIMD_INLINE Lanes<T> fill(T x) {
 // a * b + c, rounded once.
 #if GSIM3D_SIMD_BYTES == 64
 GSIM3D_SIMD_INLINE Lanes<float> fma(const Lanes<float>& a, const Lanes<float>& b, const Lanes<float>& c) {
-  return reinterpret_cast<Lanes<float>>(_mm512_fmadd_ps(reinterpret_cast<__m512>(a), reinterpret_cast<__m512>(b), reinterpret_cast<__m512>(c)));
+  return _mm512_fmadd_ps(a, b, c);
 }
 GSIM3D_SIMD_INLINE Lanes<double> fma(const Lanes<double>& a, const Lanes<double>& b, const Lanes<double>& c) {
-  return reinterpret_cast<Lanes<double>>(_mm512_fmadd_pd(reinterpret_cast<__m512d>(a), reinterpret_cast<__m512d>(b), reinterpret_cast<__m512d>(c)));
+  return _mm512_fmadd_pd(a, b, c);
 }
 #elif GSIM3D_SIMD_BYTES == 32
 GSIM3D_SIMD_INLINE Lanes<float> fma(const Lanes<float>& a, const Lanes<float>& b, const Lanes<float>& c) {
-  return reinterpret_cast<Lanes<float>>(_mm256_fmadd_ps(reinterpret_cast<__m256>(a), reinterpret_cast<__m256>(b), reinterpret_cast<__m256>(c)));
+  return _mm256_fmadd_ps(a, b, c);
 }
 GSIM3D_SIMD_INLINE Lanes<double> fma(const Lanes<double>& a, const Lanes<double>& b, const Lanes<double>& c) {
-  return reinterpret_cast<Lanes<double>>(_mm256_fmadd_pd(reinterpret_cast<__m256d>(a), reinterpret_cast<__m256d>(b), reinterpret_cast<__m256d>(c)));
+  return _mm256_fmadd_pd(a, b, c);
 }
 #else
 template <typename V>

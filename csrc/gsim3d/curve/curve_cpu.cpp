@@ -36,9 +36,9 @@ int64_t load_block(const int64_t* grid, int64_t n, bool trans, Block& block) {
 }
 
 void encode_block(Block& block, int64_t n, bool hilbert, int depth) {
-  if (hilbert) {
+  for (int level = hilbert ? depth - 1 : 0; level > 0; --level) {
 #pragma omp simd
-    for (int64_t i = 0; i < n; ++i) transpose_axes(block.a[i], block.b[i], block.c[i], depth);
+    for (int64_t i = 0; i < n; ++i) transpose_level(block.a[i], block.b[i], block.c[i], level);
   }
 #pragma omp simd
   for (int64_t i = 0; i < n; ++i) block.code[i] = interleave(block.a[i], block.b[i], block.c[i]);
@@ -55,8 +55,8 @@ bool is_trans(Curve curve) { return curve == Curve::kZTrans || curve == Curve::k
   for (int64_t i = row;; ++i)
     for (int axis = 0; axis < 3; ++axis)
       check(grid[3 * i + axis] >= 0 && grid[3 * i + axis] < int64_t{1} << depth,
-            "curve_encode: grid must be in [0, ", int64_t{1} << depth, ") at depth ", depth, "; got ", grid[3 * i + axis],
-            " at row ", i, ", axis ", axis);
+            "curve_encode: grid must be in [0, ", int64_t{1} << depth, ") at depth ", depth, "; got ",
+            grid[3 * i + axis], " at row ", i, ", axis ", axis);
 }
 
 }  // namespace
@@ -133,7 +133,8 @@ int plan_passes(uint64_t differs, int* shifts) {
   return n;
 }
 
-void finish(const uint64_t* keys, const uint32_t* index, int64_t n, int64_t* order, int64_t* inverse, uint64_t* sorted) {
+void finish(const uint64_t* keys, const uint32_t* index, int64_t n, int64_t* order, int64_t* inverse,
+            uint64_t* sorted) {
   for (int64_t i = 0; i < n; ++i) order[i] = index ? index[i] : i;
   if (inverse)
     for (int64_t i = 0; i < n; ++i) inverse[order[i]] = i;

@@ -1,6 +1,6 @@
 // Space-filling curves as integer arithmetic: host, device and compile time.
 //
-// A code holds 3 bits a level, 16 levels at most. All four curves have the prefix property: code >> 3 is the code of the
+// A code holds 3 bits a level, 16 levels at most. All four curves have the prefix property: code >> 3 is the code of
 // cell >> 1 at depth - 1, so pooling by 2 is a shift. "trans" curves exchange x and y.
 #pragma once
 
@@ -40,28 +40,27 @@ constexpr GSIM3D_HD uint64_t gray_to_binary(uint64_t v) {
   return v;
 }
 
-// Skilling's transform (AIP Conf. Proc. 707, 2004) turns the axes into the transposed Hilbert index, level by level: an
-// axis whose bit is set inverts the lower bits of the first axis, otherwise it exchanges them with its own.
-constexpr GSIM3D_HD void transpose_axes(uint32_t& a, uint32_t& b, uint32_t& c, int depth) {
-  for (int level = depth - 1; level > 0; --level) {
-    const uint32_t low = (1u << level) - 1;
-    a ^= low & (0u - ((a >> level) & 1u));
-    const uint32_t set_b = 0u - ((b >> level) & 1u);
-    const uint32_t swap_b = (a ^ b) & low & ~set_b;
-    a ^= (low & set_b) | swap_b;
-    b ^= swap_b;
-    const uint32_t set_c = 0u - ((c >> level) & 1u);
-    const uint32_t swap_c = (a ^ c) & low & ~set_c;
-    a ^= (low & set_c) | swap_c;
-    c ^= swap_c;
-  }
+// One level of Skilling's transform (AIP Conf. Proc. 707, 2004), which turns the axes into the transposed Hilbert index
+// from the highest level down: an axis whose bit is set inverts the lower bits of the first axis, otherwise it swaps them
+// with its own.
+constexpr GSIM3D_HD void transpose_level(uint32_t& a, uint32_t& b, uint32_t& c, int level) {
+  const uint32_t low = (1u << level) - 1;
+  a ^= low & (0u - ((a >> level) & 1u));
+  const uint32_t set_b = 0u - ((b >> level) & 1u);
+  const uint32_t swap_b = (a ^ b) & low & ~set_b;
+  a ^= (low & set_b) | swap_b;
+  b ^= swap_b;
+  const uint32_t set_c = 0u - ((c >> level) & 1u);
+  const uint32_t swap_c = (a ^ c) & low & ~set_c;
+  a ^= (low & set_c) | swap_c;
+  c ^= swap_c;
 }
 
 constexpr GSIM3D_HD uint64_t z_code(uint32_t a, uint32_t b, uint32_t c) { return interleave(a, b, c); }
 
 // Depends on depth: equal for depth and depth + 3, different in between.
 constexpr GSIM3D_HD uint64_t hilbert_code(uint32_t a, uint32_t b, uint32_t c, int depth) {
-  transpose_axes(a, b, c, depth);
+  for (int level = depth - 1; level > 0; --level) transpose_level(a, b, c, level);
   return gray_to_binary(interleave(a, b, c));
 }
 

@@ -12,18 +12,23 @@ constexpr int64_t kRowGrain = 16384;
 constexpr int64_t kVoxelChunk = 4096;  // voxels whose neighbours one task looks up
 constexpr uint64_t kAxisMask = 0xffff;
 
+// A voxel and its neighbour at a tap; 32 bits suffice because radix_sort takes fewer than 2^32 rows.
+struct Pair {
+  uint32_t tap, voxel, neighbour;
+};
+
 uint64_t voxel_key(int64_t cloud, const int64_t* cell) {
   return static_cast<uint64_t>(cloud) << 48 | static_cast<uint64_t>(cell[0]) << 32 |
          static_cast<uint64_t>(cell[1]) << 16 | static_cast<uint64_t>(cell[2]);
 }
 
-// Calls found(p, neighbour, kz) for every voxel p in [begin, end) and every occupied cell at (dx, dy, kz - radius) of it
-// with kz < kz_end. Keys ascend, so the column of cells that p reads moves forward with p and one cursor serves all.
+// Calls found(p, neighbour, kz) for every voxel p in [begin, end) and every occupied cell at (dx, dy, kz - radius) from
+// it with kz < kz_end. Keys ascend, so the column of cells that p reads moves forward with p and one cursor serves all.
 template <typename F>
 void sweep_column(const VoxelKeys& voxels, int64_t begin, int64_t end, int64_t dx, int64_t dy, int64_t radius,
                   int64_t kz_end, const F& found) {
   const uint64_t* keys = voxels.keys;
-  const uint64_t step = static_cast<uint64_t>(dx) * (uint64_t{1} << 32) + static_cast<uint64_t>(dy) * (uint64_t{1} << 16);
+  const uint64_t step = (static_cast<uint64_t>(dx) << 32) + (static_cast<uint64_t>(dy) << 16);
   const int64_t top = static_cast<int64_t>(kAxisMask);
   int64_t cursor = -1;
   for (int64_t p = begin; p < end; ++p) {
@@ -84,14 +89,17 @@ VoxelKeys append_voxels(const int64_t* grid, const int64_t* cloud, int64_t n, co
 void append_kernel_map(const VoxelKeys& voxels, int64_t kernel_size, const Arrays& arrays, const Parallel& parallel) {
   const int64_t n_taps = kernel_size * kernel_size * kernel_size, half = n_taps / 2;
   const int64_t n_chunks = (voxels.n + kVoxelChunk - 1) / kVoxelChunk;
+  std::vector<std::vector<Pair>> found(static_cast<size_t>(n_chunks));
   std::vector<int64_t> next(static_cast<size_t>(n_chunks * half), 0);  // first counts, then where each chunk writes
-  const auto for_chunks = [&](const auto& f) {
-    parallel.chunks(n_chunks, [&](int64_t chunk) {
-      f(chunk * kVoxelChunk, std::min(voxels.n, (chunk + 1) * kVoxelChunk), next.data() + chunk * half);
-    });
-  };
-  for_chunks([&](int64_t begin, int64_t end, int64_t* count) {
-    sweep_first_half(voxels, begin, end, kernel_size, [&](int64_t tap, int64_t, int64_t) { ++count[tap]; });
+  parallel.chunks(n_chunks, [&](int64_t chunk) {
+    std::vector<Pair>& pairs = found[chunk];
+    pairs.reserve(4 * kVoxelChunk);
+    int64_t* count = next.data() + chunk * half;
+    sweep_first_half(voxels, chunk * kVoxelChunk, std::min(voxels.n, (chunk + 1) * kVoxelChunk), kernel_size,
+                     [&](uint32_t tap, uint32_t p, uint32_t q) {
+                       pairs.push_back({tap, p, q});
+                       ++count[tap];
+                     });
   });
 
   std::vector<int64_t> cu(static_cast<size_t>(n_taps + 1), 0);
@@ -116,15 +124,16 @@ void append_kernel_map(const VoxelKeys& voxels, int64_t kernel_size, const Array
   std::copy(cu.begin(), cu.end(), cu_taps);
   // A pair seen from its other end belongs to the mirrored tap; neighbours at one offset ascend with the voxel, so both
   // lists come out ascending.
-  for_chunks([&](int64_t begin, int64_t end, int64_t* to) {
-    sweep_first_half(voxels, begin, end, kernel_size, [&](int64_t tap, int64_t p, int64_t q) {
+  parallel.chunks(n_chunks, [&](int64_t chunk) {
+    int64_t* to = next.data() + chunk * half;
+    for (const auto [tap, p, q] : found[chunk]) {
       const int64_t at = to[tap]++;
       const int64_t mirrored = cu[n_taps - 1 - tap] + at - cu[tap];
       tap_in[at] = q;
       tap_out[at] = p;
       tap_in[mirrored] = p;
       tap_out[mirrored] = q;
-    });
+    }
   });
 }
 

@@ -38,9 +38,9 @@ struct PyramidSpec {
   const int64_t* merge_windows;   // [n_stages - 1], powers of two: slots merged into one cloud
   const int64_t* patch_sizes;     // [n_stages]
   const int64_t* curves;          // [n_stages, 4], curve of each serialization row
-  const int64_t* kernel_sizes;    // odd; those of stage s are kernel_sizes[cu_kernels[s]] .. kernel_sizes[cu_kernels[s + 1] - 1]
+  const int64_t* kernel_sizes;    // odd; those of stage s lie between cu_kernels[s] and cu_kernels[s + 1]
   const int64_t* cu_kernels;      // [n_stages + 1]
-  bool release;                   // cells from the minimum over all clouds, truncated; depth from the extent; ties by row
+  bool release;  // as published: cells truncated from the minimum over all clouds, depth from the extent, ties by row
 };
 
 // The clouds of a call: rows cu_rows[q] .. cu_rows[q + 1] - 1 are cloud q.
@@ -59,15 +59,15 @@ namespace cpu {
 // Appends, in this order:
 //   rows [N0]: input rows that take part, ascending; the others are not finite or outside [0, 2^16) cells of the origin
 //   for every stage, N rows in C clouds and V voxels:
-//     cu_cluster [N + 1]    except at stage 0: row i pools rows order[0, cu_cluster[i]:cu_cluster[i + 1]] of the stage before
+//     cu_cluster [N + 1]    except at stage 0: row i pools rows order[0, cu_cluster[i]:cu_cluster[i + 1]] of stage s - 1
 //     time_index [N]        only where slots merge: slot inside the merged window
 //     grid [N, 3], cloud [N], cu_clouds [C + 1]: order[:, cu_clouds[c]:cu_clouds[c + 1]] are the rows of cloud c
 //     order [4, N]          rows by (cloud, code, position inside the cell, row)
 //     cu_q [P + 1], cu_k [P + 1], kv_rows [4, M]: patch p asks rows order[r, cu_q[p]:cu_q[p + 1]] and reads
 //                           kv_rows[r, cu_k[p]:cu_k[p + 1]]; the last patch of a cloud reads a whole patch of rows
 //     row_voxel [N], voxel_rows [N], cu_voxel_rows [V + 1]: rows of equal (cloud, cell); voxels by (cloud, x, y, z)
-//     for every kernel size K: tap_in [L], tap_out [L], cu_taps [K^3 + 1]: voxel tap_in lies at offset tap - centre from
-//                           voxel tap_out, tap = (kx K + ky) K + kz; ascending in tap_out inside a tap; centre empty
+//     for every kernel size K: tap_in [L], tap_out [L], cu_taps [K^3 + 1]: voxel tap_in lies at (kx, ky, kz) - K / 2
+//                           cells from tap_out, tap = (kx K + ky) K + kz; ascending in tap_out in a tap; centre empty
 // T is float or double. Throws ArgumentError where clouds or spec are malformed.
 template <typename T>
 void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,

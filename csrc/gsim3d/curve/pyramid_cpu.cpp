@@ -42,8 +42,8 @@ int log2_of(int64_t v) { return std::countr_zero(static_cast<uint64_t>(v)); }
 void check_spec(const PyramidSpec& spec) {
   const char* op = "build_pyramid";
   check(std::isfinite(spec.grid_size) && spec.grid_size > 0, op, ": grid_size must be positive; got ", spec.grid_size);
-  check(spec.slot_bits >= 0 && spec.slot_bits <= kMaxSlotBits, op, ": slot_bits must be in [0, ", kMaxSlotBits, "]; got ",
-        spec.slot_bits);
+  check(spec.slot_bits >= 0 && spec.slot_bits <= kMaxSlotBits, op, ": slot_bits must be in [0, ", kMaxSlotBits,
+        "]; got ", spec.slot_bits);
   int bits = 0;
   for (int64_t s = 0; s + 1 < spec.n_stages; ++s) {
     check(is_power_of_two(spec.strides[s]), op, ": strides must be powers of two; got ", spec.strides[s]);
@@ -68,8 +68,8 @@ template <typename T>
 void check_clouds(const PyramidClouds<T>& clouds, const PyramidSpec& spec) {
   const char* op = "build_pyramid";
   const int64_t* cu = clouds.cu_rows;
-  check(cu[0] == 0 && cu[clouds.n_clouds] == clouds.n_rows, op, ": cu_rows must run from 0 to N=", clouds.n_rows, "; got ",
-        cu[0], " .. ", cu[clouds.n_clouds]);
+  check(cu[0] == 0 && cu[clouds.n_clouds] == clouds.n_rows, op, ": cu_rows must run from 0 to N=", clouds.n_rows,
+        "; got ", cu[0], " .. ", cu[clouds.n_clouds]);
   std::vector<Key> keys;
   for (int64_t q = 0; q < clouds.n_clouds; ++q) {
     check(cu[q] <= cu[q + 1], op, ": cu_rows must not descend; got ", cu[q], " then ", cu[q + 1], " at ", q);
@@ -113,8 +113,9 @@ std::array<T, 3> minimum_corner(const PyramidClouds<T>& clouds, double grid_size
     }
   }
   for (int a = 0; a < 3; ++a)
-    check(!((high[a] - low[a]) / T(grid_size) >= T(kReleaseCells)), "build_pyramid: with release, positions must span fewer than 2^15 cells of ",
-          grid_size, " m; got ", low[a], " .. ", high[a], " m on axis ", a);
+    check(!((high[a] - low[a]) / T(grid_size) >= T(kReleaseCells)),
+          "build_pyramid: with release, positions must span fewer than 2^15 cells of ", grid_size, " m; got ", low[a],
+          " .. ", high[a], " m on axis ", a);
   return low;
 }
 
@@ -132,8 +133,8 @@ bool cell_of(const T* p, const double* origin, const T* corner, double grid_size
 
 // Rows that take part, and their cells and clouds. Ids count the clouds that have rows, by scene and slot.
 template <typename T>
-Stage first_stage(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const int64_t** rows_out, const Arrays& arrays,
-                  const Workspace& workspace, const Parallel& parallel) {
+Stage first_stage(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const int64_t** rows_out,
+                  const Arrays& arrays, const Workspace& workspace, const Parallel& parallel) {
   std::array<T, 3> corner{};
   if (spec.release) corner = minimum_corner(clouds, spec.grid_size);
   int64_t* cells = workspace.take<int64_t>(3 * clouds.n_rows);

@@ -2,11 +2,11 @@
 //
 //   out[q] = sum_k softmax_k(scale <query[q], key[k]>) value[k],   q in q_rows[cu_q[p] ..], k in kv_rows[cu_k[p] ..]
 //
-// The score matrix is never stored: tiles of 64 queries x 64 keys stay in the L1 cache, with a running maximum and sum a
-// query. Bits do not depend on the number of threads, on the instruction set, on other patches or on the numbering of
+// The score matrix is never stored: tiles of 64 queries x 64 keys stay in the L1 cache, with a running maximum and sum
+// a query. Bits do not depend on the number of threads, on the instruction set, on other patches or on the numbering of
 // the rows, only on the order of the keys inside a patch. T is float or double.
 //
-// A NaN in a query row reaches its own result; one in a key or value row reaches the queries of the patches that list it.
+// A NaN in a query row reaches its own result; in a key or value row, the queries of the patches that list it.
 #pragma once
 
 #include <cstdint>

@@ -1,7 +1,9 @@
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <limits>
 #include <new>
+#include <type_traits>
 #include <vector>
 
 #include "gsim3d/core/check.h"
@@ -14,9 +16,9 @@ namespace {
 
 constexpr int64_t kTile = 64;       // queries and keys of a tile: dot products and weights fit the L1 cache
 constexpr int64_t kSlotLanes = 16;  // rows of key gradients are padded to it: whole vectors on every machine
-constexpr int64_t kTaskQueries = 256;
 constexpr int64_t kWholePatch = std::numeric_limits<int64_t>::max() / 2;
 constexpr int64_t kTaskWork = 1 << 20;  // queries x keys x dim that pay for handing a task to a thread
+constexpr int64_t kTasks = 64;          // long patches are cut until there are about so many tasks
 
 namespace baseline {
 using namespace simd::baseline;
@@ -52,6 +54,12 @@ class Scratch {
 struct Task {
   int64_t patch_begin, patch_end, q_begin, q_end, n_keys;  // n_keys: of the largest patch
 };
+
+// Each task packs the keys of its patches again, so a task has many queries unless there are few tasks.
+int64_t queries_of_task(const PatchTable& table, int64_t heads) {
+  const int64_t share = table.n_q_listed * heads / kTasks / kTile * kTile;
+  return std::clamp<int64_t>(share, 2 * kTile, 16 * kTile);
+}
 
 // Small patches share a task; a large one is cut into tasks of at most `most_queries`.
 std::vector<Task> make_tasks(const PatchTable& table, int64_t dim, int64_t most_queries) {
@@ -122,7 +130,8 @@ void check_patch_table(const char* op, const PatchTable& table) {
   std::vector<char> seen(static_cast<size_t>(table.n_q), 0);
   for (int64_t i = 0; i < table.n_q_listed; ++i) {
     const int64_t row = table.q_rows[i];
-    check(row >= 0 && row < table.n_q, op, ": q_rows must be in [0, N) with N=", table.n_q, " from q; got ", row, " at ", i);
+    check(row >= 0 && row < table.n_q, op, ": q_rows must be in [0, N) with N=", table.n_q, " from q; got ", row, " at ",
+          i);
     check(!seen[row], op, ": q_rows must list a row at most once; got ", row, " again at ", i);
     seen[row] = 1;
   }
@@ -132,8 +141,8 @@ void check_patch_table(const char* op, const PatchTable& table) {
 }
 
 void check_attention_size(const char* op, const AttentionSize& size) {
-  check(size.dim >= 4 && size.dim <= kMaxHeadDim && size.dim % 4 == 0, op, ": head dim must be a multiple of 4 from 4 to ",
-        kMaxHeadDim, "; got ", size.dim);
+  check(size.dim >= 4 && size.dim <= kMaxHeadDim && size.dim % 4 == 0, op,
+        ": head dim must be a multiple of 4 from 4 to ", kMaxHeadDim, "; got ", size.dim);
   check(std::abs(size.scale) <= 1e30, op, ": scale must be finite, at most 1e30 in size; got ", size.scale);
 }
 
@@ -144,10 +153,11 @@ void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<
     clear(out, table.n_q * size.heads * size.dim, parallel);
     clear(stats, table.n_q * size.heads * 2, parallel);
   }
+  const int64_t most_queries = queries_of_task(table, size.heads);
   if (simd::use_avx512())
-    run_tasks(avx512::Forward<T>{q, k, v, table, size, out, stats}, kTaskQueries, parallel);
+    run_tasks(avx512::Forward<T>{q, k, v, table, size, out, stats}, most_queries, parallel);
   else
-    run_tasks(baseline::Forward<T>{q, k, v, table, size, out, stats}, kTaskQueries, parallel);
+    run_tasks(baseline::Forward<T>{q, k, v, table, size, out, stats}, most_queries, parallel);
 }
 
 template <typename T>

@@ -16,28 +16,28 @@ GSIM3D_SIMD_INLINE void product_block(int64_t steps, const T* a, const T* b, int
   Lanes<T> sum[M][N];
 #pragma GCC unroll 16
   for (int i = 0; i < M; ++i)
-#pragma GCC unroll 4
+#pragma GCC unroll 2
     for (int j = 0; j < N; ++j) sum[i][j] = kAdd ? load(c + i * c_row + j * W<T>) : Lanes<T>{};
   for (int64_t s = 0; s < steps; ++s) {
     Lanes<T> row[N];
-#pragma GCC unroll 4
+#pragma GCC unroll 2
     for (int j = 0; j < N; ++j) row[j] = load(b + s * b_step + j * W<T>);
 #pragma GCC unroll 16
     for (int i = 0; i < M; ++i) {
       const Lanes<T> factor = fill(a[i * kARow + s * kAStep]);
-#pragma GCC unroll 4
+#pragma GCC unroll 2
       for (int j = 0; j < N; ++j) sum[i][j] = fma(factor, row[j], sum[i][j]);
     }
   }
 #pragma GCC unroll 16
   for (int i = 0; i < M; ++i)
-#pragma GCC unroll 4
+#pragma GCC unroll 2
     for (int j = 0; j < N; ++j) store(c + i * c_row + j * W<T>, sum[i][j]);
 }
 
 template <typename T, int N, bool kAdd, int64_t kARow, int64_t kAStep>
 void product_strip(int64_t rows, int64_t steps, const T* a, const T* b, int64_t b_step, T* c, int64_t c_row) {
-  constexpr int kTall = N == 4 ? 4 : kRegisters / (4 * N);
+  constexpr int kTall = N == 2 ? kRegisters / 4 : 8;  // the sums fill half of the registers
   int64_t i = 0;
   for (; i + kTall <= rows; i += kTall)
     product_block<T, kTall, N, kAdd, kARow, kAStep>(steps, a + i * kARow, b, b_step, c + i * c_row, c_row);
@@ -50,11 +50,9 @@ void product_strip(int64_t rows, int64_t steps, const T* a, const T* b, int64_t 
 
 // C [rows, columns] = A B, or C += A B; columns is a multiple of the vector width.
 template <typename T, bool kAdd, int64_t kARow, int64_t kAStep>
-void product(int64_t rows, int64_t columns, int64_t steps, const T* a, const T* b, int64_t b_step, T* c, int64_t c_row) {
+void product(int64_t rows, int64_t columns, int64_t steps, const T* a, const T* b, int64_t b_step, T* c,
+             int64_t c_row) {
   int64_t j = 0;
-  if constexpr (kRegisters == 32)
-    for (; j + 4 * W<T> <= columns; j += 4 * W<T>)
-      product_strip<T, 4, kAdd, kARow, kAStep>(rows, steps, a, b + j, b_step, c + j, c_row);
   for (; j + 2 * W<T> <= columns; j += 2 * W<T>)
     product_strip<T, 2, kAdd, kARow, kAStep>(rows, steps, a, b + j, b_step, c + j, c_row);
   for (; j < columns; j += W<T>)
@@ -75,29 +73,50 @@ GSIM3D_SIMD_INLINE Lanes<T> weight(const Lanes<T>& x, const Lanes<T>& slope, con
   return p * reinterpret_cast<Lanes<T>>(reinterpret_cast<Bits<T>>(whole) << E::kMantissaBits);
 }
 
+// The part of softmax_step for N vectors of queries; side by side they hide the latency of their maxima and sums.
+template <typename T, int N>
+GSIM3D_SIMD_INLINE void softmax_columns(int64_t n_keys, int64_t dim, const Softmax<T>& softmax, T* dots, T* largest,
+                                        T* sum, T* out) {
+  const Lanes<T> slope = fill(softmax.slope), lowest = fill(softmax.lowest);
+  Lanes<T> top[N], total[N], shrink[N];
+  for (int j = 0; j < N; ++j) top[j] = load(largest + j * W<T>);
+  for (int64_t i = 0; i < n_keys; ++i)
+#pragma GCC unroll 2
+    for (int j = 0; j < N; ++j) top[j] = max_keeping_nan(load(dots + i * kTile + j * W<T>), top[j]);
+  for (int j = 0; j < N; ++j) {
+    shrink[j] = weight<T>(load(largest + j * W<T>) - top[j], slope, lowest);
+    total[j] = load(sum + j * W<T>) * shrink[j];
+    store(largest + j * W<T>, top[j]);
+  }
+  for (int64_t i = 0; i < n_keys; ++i)
+#pragma GCC unroll 2
+    for (int j = 0; j < N; ++j) {
+      T* at = dots + i * kTile + j * W<T>;
+      const Lanes<T> p = weight<T>(load(at) - top[j], slope, lowest);
+      store(at, p);
+      total[j] += p;
+    }
+  for (int j = 0; j < N; ++j) store(sum + j * W<T>, total[j]);
+  for (int64_t d = 0; d < dim; ++d)
+#pragma GCC unroll 2
+    for (int j = 0; j < N; ++j) {
+      T* at = out + d * kTile + j * W<T>;
+      store(at, load(at) * shrink[j]);
+    }
+}
+
 // Dot products to weights, in place, and the running softmax: `largest` and `sum` [columns], `out` [dim, columns].
 template <typename T>
 void softmax_step(int64_t n_keys, int64_t columns, int64_t dim, const Softmax<T>& softmax, T* dots, T* largest, T* sum,
                   T* out) {
-  const Lanes<T> slope = fill(softmax.slope), lowest = fill(softmax.lowest);
-  for (int64_t j = 0; j < columns; j += W<T>) {
-    const Lanes<T> before = load(largest + j);
-    Lanes<T> top = before;
-    for (int64_t i = 0; i < n_keys; ++i) top = max_keeping_nan(load(dots + i * kTile + j), top);
-    const Lanes<T> shrink = weight<T>(before - top, slope, lowest);
-    Lanes<T> total = load(sum + j) * shrink;
-    for (int64_t i = 0; i < n_keys; ++i) {
-      const Lanes<T> p = weight<T>(load(dots + i * kTile + j) - top, slope, lowest);
-      store(dots + i * kTile + j, p);
-      total += p;
-    }
-    store(largest + j, top);
-    store(sum + j, total);
-    for (int64_t d = 0; d < dim; ++d) store(out + d * kTile + j, load(out + d * kTile + j) * shrink);
-  }
+  int64_t j = 0;
+  for (; j + 2 * W<T> <= columns; j += 2 * W<T>)
+    softmax_columns<T, 2>(n_keys, dim, softmax, dots + j, largest + j, sum + j, out + j);
+  for (; j < columns; j += W<T>)
+    softmax_columns<T, 1>(n_keys, dim, softmax, dots + j, largest + j, sum + j, out + j);
 }
 
-// weights: dot products to weights; slopes: <grad, value> to the gradient of the dot product divided by scale; in place.
+// In place: dot products to weights; <grad, value> in `slopes` to the gradient of the dot product divided by scale.
 template <typename T>
 void softmax_vjp_step(int64_t n_keys, int64_t columns, const Softmax<T>& softmax, const T* largest, const T* delta,
                       T* weights, T* slopes) {
@@ -113,20 +132,93 @@ void softmax_vjp_step(int64_t n_keys, int64_t columns, const Softmax<T>& softmax
 
 inline int64_t whole_vectors(int64_t n, int64_t width) { return (n + width - 1) / width * width; }
 
-// Rows of a head as panels [dim, kTile]; lanes beyond the rows are 0.
+// to[c][r] = from[r][c] for 4 x 4 elements.
 template <typename T>
-void pack_panel(const HeadRows<T>& x, const int64_t* rows, int64_t n, int64_t head, int64_t dim, T* panel) {
-  for (int64_t i = 0; i < n; ++i) {
-    const T* row = x.at(rows[i], head);
-    for (int64_t d = 0; d < dim; ++d) panel[d * kTile + i] = row[d];
-  }
-  for (int64_t d = 0; d < dim && n < kTile; ++d) std::fill(panel + d * kTile + n, panel + (d + 1) * kTile, T(0));
+GSIM3D_SIMD_INLINE void transpose_quads(const T* const (&from)[4], T* const (&to)[4]) {
+  typedef T Quad __attribute__((vector_size(4 * sizeof(T))));
+  typedef std::conditional_t<sizeof(T) == 4, int32_t, int64_t> Index __attribute__((vector_size(4 * sizeof(T))));
+  Quad row[4];
+  for (int r = 0; r < 4; ++r) std::memcpy(&row[r], from[r], sizeof(Quad));
+  const Quad low02 = __builtin_shuffle(row[0], row[2], Index{0, 4, 1, 5});
+  const Quad high02 = __builtin_shuffle(row[0], row[2], Index{2, 6, 3, 7});
+  const Quad low13 = __builtin_shuffle(row[1], row[3], Index{0, 4, 1, 5});
+  const Quad high13 = __builtin_shuffle(row[1], row[3], Index{2, 6, 3, 7});
+  const Quad column[4] = {
+      __builtin_shuffle(low02, low13, Index{0, 4, 1, 5}), __builtin_shuffle(low02, low13, Index{2, 6, 3, 7}),
+      __builtin_shuffle(high02, high13, Index{0, 4, 1, 5}), __builtin_shuffle(high02, high13, Index{2, 6, 3, 7})};
+  for (int c = 0; c < 4; ++c) std::memcpy(to[c], &column[c], sizeof(Quad));
 }
 
+// Rows of dim elements, row(i) for i in [0, n), as a panel [dim, kTile]; lanes beyond the rows become 0.
+template <typename T, typename Row>
+void rows_to_panel(const Row& row, int64_t n, int64_t dim, T* panel) {
+  if (n < kTile) std::fill_n(panel, dim * kTile, T(0));
+  int64_t i = 0;
+  for (; i + 4 <= n; i += 4)
+    for (int64_t d = 0; d < dim; d += 4) {
+      T* to = panel + d * kTile + i;
+      transpose_quads<T>({row(i) + d, row(i + 1) + d, row(i + 2) + d, row(i + 3) + d},
+                         {to, to + kTile, to + 2 * kTile, to + 3 * kTile});
+    }
+  for (; i < n; ++i)
+    for (int64_t d = 0; d < dim; ++d) panel[d * kTile + i] = row(i)[d];
+}
+
+template <typename T, typename Row>
+void panel_to_rows(const T* panel, int64_t n, int64_t dim, const Row& row) {
+  int64_t i = 0;
+  for (; i + 4 <= n; i += 4)
+    for (int64_t d = 0; d < dim; d += 4) {
+      const T* from = panel + d * kTile + i;
+      transpose_quads<T>({from, from + kTile, from + 2 * kTile, from + 3 * kTile},
+                         {row(i) + d, row(i + 1) + d, row(i + 2) + d, row(i + 3) + d});
+    }
+  for (; i < n; ++i)
+    for (int64_t d = 0; d < dim; ++d) row(i)[d] = panel[d * kTile + i];
+}
+
+// One head of listed rows.
 template <typename T>
-void pack_panels(const HeadRows<T>& x, const int64_t* rows, int64_t n, int64_t head, int64_t dim, T* panels) {
+struct ListedRows {
+  HeadRows<T> x;
+  const int64_t* rows;
+  int64_t head;
+
+  const T* operator()(int64_t i) const { return x.at(rows[i], head); }
+};
+
+// The same rows of a result [N, H, D].
+template <typename T>
+struct ResultRows {
+  T* x;
+  AttentionSize size;
+  const int64_t* rows;
+  int64_t head;
+
+  T* operator()(int64_t i) const { return x + (rows[i] * size.heads + head) * size.dim; }
+};
+
+// Rows of a packed matrix.
+template <typename T>
+struct PackedRows {
+  T* x;
+  int64_t stride;
+
+  T* operator()(int64_t i) const { return x + i * stride; }
+};
+
+template <typename T>
+void rows_to_panels(const HeadRows<T>& x, const int64_t* rows, int64_t n, int64_t head, int64_t dim, T* panels) {
   for (int64_t i = 0; i < n; i += kTile)
-    pack_panel(x, rows + i, std::min(kTile, n - i), head, dim, panels + i * dim);
+    rows_to_panel(ListedRows<T>{x, rows + i, head}, std::min(kTile, n - i), dim, panels + i * dim);
+}
+
+// panel[d, :] *= factor, a number a lane.
+template <typename T>
+void scale_panel(int64_t dim, const T* factor, T* panel) {
+  for (int64_t d = 0; d < dim; ++d)
+    for (int64_t j = 0; j < kTile; j += W<T>)
+      store(panel + d * kTile + j, load(panel + d * kTile + j) * load(factor + j));
 }
 
 template <typename T>
@@ -153,12 +245,12 @@ struct Forward {
     T* dots = result + dim * kTile;
     T* largest = dots + kTile * kTile;
     T* sum = largest + kTile;
-    pack_panels(k, table.kv_rows + table.cu_k[p], n_keys, head, dim, keys);
-    pack_panels(v, table.kv_rows + table.cu_k[p], n_keys, head, dim, values);
+    rows_to_panels(k, table.kv_rows + table.cu_k[p], n_keys, head, dim, keys);
+    rows_to_panels(v, table.kv_rows + table.cu_k[p], n_keys, head, dim, values);
     for (int64_t begin = q_begin; begin < q_end; begin += kTile) {
       const int64_t n = std::min(kTile, q_end - begin), columns = whole_vectors(n, W<T>);
       const int64_t* rows = table.q_rows + begin;
-      pack_panel(q, rows, n, head, dim, queries);
+      rows_to_panel(ListedRows<T>{q, rows, head}, n, dim, queries);
       for (int64_t i = 0; i < dim * kTile; ++i) queries[i] *= softmax.sign;
       std::fill_n(result, dim * kTile, T(0));
       std::fill_n(largest, kTile, std::numeric_limits<T>::lowest());
@@ -170,12 +262,13 @@ struct Forward {
         product<T, true, kTile, 1>(dim, columns, m, values + first * dim, dots, kTile, result, kTile);
       }
       for (int64_t i = 0; i < n; ++i) {
-        T* to = out + (rows[i] * size.heads + head) * dim;
-        for (int64_t d = 0; d < dim; ++d) to[d] = sum[i] == T(0) ? T(0) : result[d * kTile + i] / sum[i];
         T* pair = stats + (rows[i] * size.heads + head) * 2;
         pair[0] = sum[i] == T(0) ? T(0) : largest[i];
         pair[1] = sum[i];
       }
+      for (int64_t i = 0; i < kTile; ++i) largest[i] = sum[i] == T(0) ? T(0) : T(1) / sum[i];
+      scale_panel(dim, largest, result);
+      panel_to_rows(result, n, dim, ResultRows<T>{out, size, rows, head});
     }
   }
 };
@@ -217,12 +310,16 @@ struct Backward {
     T* value_slot = value_slots + (head * table.n_k_listed + first_key) * wide;
     std::fill_n(key_slot, n_keys * wide, T(0));
     std::fill_n(value_slot, n_keys * wide, T(0));
-    pack_panels(k, table.kv_rows + first_key, n_keys, head, dim, keys);
-    pack_panels(v, table.kv_rows + first_key, n_keys, head, dim, values);
+    rows_to_panels(k, table.kv_rows + first_key, n_keys, head, dim, keys);
+    rows_to_panels(v, table.kv_rows + first_key, n_keys, head, dim, values);
     for (int64_t begin = q_begin; begin < q_end; begin += kTile) {
       const int64_t n = std::min(kTile, q_end - begin), columns = whole_vectors(n, W<T>);
       const int64_t* rows = table.q_rows + begin;
-      pack_queries(rows, n, head, softmax.sign, queries, grads, query_rows, grad_rows, largest, delta);
+      pack_queries(rows, n, head, query_rows, grad_rows, largest);
+      rows_to_panel(PackedRows<T>{query_rows, wide}, n, dim, queries);
+      rows_to_panel(PackedRows<T>{grad_rows, wide}, n, dim, grads);
+      for (int64_t i = 0; i < dim * kTile; ++i) queries[i] *= softmax.sign;
+      find_delta(rows, n, head, grads, result, delta);
       std::fill_n(result, dim * kTile, T(0));
       for (int64_t first = 0; first < n_keys; first += kTile) {
         const int64_t m = std::min(kTile, n_keys - first);
@@ -233,39 +330,37 @@ struct Backward {
         product<T, true, kTile, 1>(m, wide, n, slopes, query_rows, wide, key_slot + first * wide, wide);
         product<T, true, kTile, 1>(m, wide, n, weights, grad_rows, wide, value_slot + first * wide, wide);
       }
-      for (int64_t i = 0; i < n; ++i) {
-        T* to = grad_q + (rows[i] * size.heads + head) * dim;
-        for (int64_t d = 0; d < dim; ++d) to[d] = result[d * kTile + i] * static_cast<T>(size.scale);
-      }
+      for (int64_t i = 0; i < dim * kTile; ++i) result[i] *= static_cast<T>(size.scale);
+      panel_to_rows(result, n, dim, ResultRows<T>{grad_q, size, rows, head});
     }
   }
 
-  // Queries and output gradients, both as panels and as rows. Gradients are divided by the sum of weights, so that the
-  // weights need not be; delta = <out, gradient>.
-  void pack_queries(const int64_t* rows, int64_t n, int64_t head, T sign, T* queries, T* grads, T* query_rows,
-                    T* grad_rows, T* largest, T* delta) const {
+  // Rows of queries and of output gradients. The latter are divided by the sum of weights, so that the weights need not
+  // be.
+  void pack_queries(const int64_t* rows, int64_t n, int64_t head, T* query_rows, T* grad_rows, T* largest) const {
     const int64_t dim = size.dim, wide = padded(dim);
-    std::fill_n(query_rows, n * wide, T(0));
-    std::fill_n(grad_rows, n * wide, T(0));
     for (int64_t i = 0; i < n; ++i) {
       const T* query = q.at(rows[i], head);
       const T* slope = grad.at(rows[i], head);
-      const T* result = out + (rows[i] * size.heads + head) * dim;
       const T* pair = stats + (rows[i] * size.heads + head) * 2;
+      const T share = T(1) / pair[1];
       largest[i] = pair[0];
-      delta[i] = T(0);
-      for (int64_t d = 0; d < dim; ++d) {
-        query_rows[i * wide + d] = query[d];
-        queries[d * kTile + i] = query[d] * sign;
-        grads[d * kTile + i] = grad_rows[i * wide + d] = slope[d] / pair[1];
-        delta[i] += grad_rows[i * wide + d] * result[d];
-      }
+      for (int64_t d = 0; d < dim; ++d) query_rows[i * wide + d] = query[d];
+      for (int64_t d = 0; d < dim; ++d) grad_rows[i * wide + d] = slope[d] * share;
+      std::fill(query_rows + i * wide + dim, query_rows + (i + 1) * wide, T(0));
+      std::fill(grad_rows + i * wide + dim, grad_rows + (i + 1) * wide, T(0));
     }
     std::fill(largest + n, largest + kTile, T(0));
-    std::fill(delta + n, delta + kTile, T(0));
-    for (int64_t d = 0; d < dim && n < kTile; ++d) {
-      std::fill(queries + d * kTile + n, queries + (d + 1) * kTile, T(0));
-      std::fill(grads + d * kTile + n, grads + (d + 1) * kTile, T(0));
+  }
+
+  // delta = <out, gradient / sum of weights>; `panel` is scratch.
+  void find_delta(const int64_t* rows, int64_t n, int64_t head, const T* grads, T* panel, T* delta) const {
+    rows_to_panel(ListedRows<T>{{out, size.heads * size.dim, size.dim}, rows, head}, n, size.dim, panel);
+    for (int64_t j = 0; j < kTile; j += W<T>) {
+      Lanes<T> total{};
+      for (int64_t d = 0; d < size.dim; ++d)
+        total = fma(load(grads + d * kTile + j), load(panel + d * kTile + j), total);
+      store(delta + j, total);
     }
   }
 };

@@ -33,7 +33,8 @@ Inputs inputs_of(const char* op, const Tensor& q, const Tensor& k, const Tensor&
   }
   check(cu_q.size(0) >= 1, op, ": cu_q must be [P + 1]; got ", shape_of(cu_q));
   check_shape(op, "cu_k", cu_k, {cu_q.size(0)}, "[P + 1]");
-  Inputs in{heads_of(q), heads_of(k), heads_of(v), rows_of(q_rows), rows_of(kv_rows), rows_of(cu_q), rows_of(cu_k), {}, {}};
+  Inputs in{heads_of(q),   heads_of(k),   heads_of(v), rows_of(q_rows), rows_of(kv_rows),
+            rows_of(cu_q), rows_of(cu_k), {},          {}};
   in.table = {data<int64_t>(in.q_rows),
               data<int64_t>(in.kv_rows),
               data<int64_t>(in.cu_q),
@@ -50,7 +51,8 @@ Inputs inputs_of(const char* op, const Tensor& q, const Tensor& k, const Tensor&
 }
 
 std::tuple<Tensor, Tensor> patch_attention(const Tensor& q, const Tensor& k, const Tensor& v, const Tensor& q_rows,
-                                           const Tensor& kv_rows, const Tensor& cu_q, const Tensor& cu_k, double scale) {
+                                           const Tensor& kv_rows, const Tensor& cu_q, const Tensor& cu_k,
+                                           double scale) {
   const char* op = "patch_attention";
   const Inputs in = inputs_of(op, q, k, v, q_rows, kv_rows, cu_q, cu_k, scale);
   Tensor out = empty(q, {q.size(0), q.size(1), q.size(2)});

@@ -5,8 +5,8 @@
 // all in array-index coordinates (the centre of the first pixel is 0, 0). Its cost is the mean over the sources of
 // <f_i(u, v), f_j(x, y)> / sqrt(C) with f_j interpolated bilinearly and zero outside the image.
 //
-// Interpolation is linear, so dot products are interpolated instead of features: each pixel of i meets each pixel of j at
-// most once, however many depths land beside it, and no warped volume exists. T is float or double.
+// Interpolation is linear, so dot products are interpolated instead of features: each pixel of i meets each pixel of j
+// at most once, however many depths land beside it, and no warped volume exists. T is float or double.
 #pragma once
 
 #include <cstdint>

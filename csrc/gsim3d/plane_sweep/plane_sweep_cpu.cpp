@@ -12,13 +12,24 @@ namespace {
 
 using namespace plane_sweep_math;
 
-// Channels are padded with zeros to whole vectors of 64 bytes.
+// One vector register of the baseline; channels are padded with zeros to whole vectors.
 template <typename T>
-constexpr int64_t kLanes = 64 / sizeof(T);
+constexpr int64_t kLanes = 32 / sizeof(T);
 template <typename T>
-struct Vector {
-  typedef T type __attribute__((vector_size(64), aligned(alignof(T)), may_alias));
+struct VectorOf {
+  typedef T type __attribute__((vector_size(32), aligned(alignof(T)), may_alias));
 };
+template <typename T>
+using Vector = typename VectorOf<T>::type;
+
+template <typename T>
+const Vector<T>& load(const T* from) {
+  return *reinterpret_cast<const Vector<T>*>(from);
+}
+template <typename T>
+Vector<T>& at(T* to) {
+  return *reinterpret_cast<Vector<T>*>(to);
+}
 
 constexpr int64_t kPixelsPerChunk = 128;   // one chunk of pixels is about 50 us of work
 constexpr int64_t kChannelsPerChunk = 64;  // of one source image in the backward pass
@@ -55,29 +66,45 @@ void to_planes(const T* pixels, int64_t n, int64_t rows, int64_t cols, T* planes
   });
 }
 
+// out[i] = <a, b[i]>: four at a time hide each other's latency and share the loads of a.
 template <typename T>
-T dot(const T* a, const T* b, int64_t n) {
-  using V = typename Vector<T>::type;
-  V sum = {};
-  for (int64_t c = 0; c < n; c += kLanes<T>)
-    sum += *reinterpret_cast<const V*>(a + c) * *reinterpret_cast<const V*>(b + c);
-  for (int64_t width = kLanes<T> / 2; width > 0; width /= 2)
-    for (int64_t lane = 0; lane < width; ++lane) sum[lane] += sum[lane + width];
-  return sum[0];
+void dot_four(const T* a, const T* const (&b)[4], int64_t n, T (&out)[4]) {
+  Vector<T> s0 = {}, s1 = {}, s2 = {}, s3 = {};
+  for (int64_t c = 0; c < n; c += kLanes<T>) {
+    const Vector<T> va = load(a + c);
+    s0 += va * load(b[0] + c);
+    s1 += va * load(b[1] + c);
+    s2 += va * load(b[2] + c);
+    s3 += va * load(b[3] + c);
+  }
+  const Vector<T> sums[4] = {s0, s1, s2, s3};
+  for (int i = 0; i < 4; ++i) {
+    out[i] = sums[i][0];
+    for (int64_t lane = 1; lane < kLanes<T>; ++lane) out[i] += sums[i][lane];
+  }
 }
 
+// to[c] += factor * from[c].
 template <typename T>
 void add_scaled(T* to, const T* from, T factor, int64_t n) {
-  using V = typename Vector<T>::type;
-  for (int64_t c = 0; c < n; c += kLanes<T>)
-    *reinterpret_cast<V*>(to + c) += *reinterpret_cast<const V*>(from + c) * factor;
+  for (int64_t c = 0; c < n; c += kLanes<T>) at(to + c) += load(from + c) * factor;
 }
 
-// What one thread needs for one pixel after another.
+// to[c] += sum over i of factors[i] * rows[places[i] * stride + c].
+template <typename T>
+void add_scaled_rows(T* to, const T* rows, const int32_t* places, const T* factors, int64_t count, int64_t stride) {
+  for (int64_t c = 0; c < stride; c += kLanes<T>) {
+    Vector<T> sum = at(to + c);
+    for (int64_t i = 0; i < count; ++i) sum += load(rows + places[i] * stride + c) * factors[i];
+    at(to + c) = sum;
+  }
+}
+
+// Follows one pixel after another along its line of samples in a source image.
 template <typename T>
 class Walker {
  public:
-  Walker(const PlaneSweep<T>& sweep)
+  explicit Walker(const PlaneSweep<T>& sweep)
       : sweep_(sweep),
         stride_(static_cast<int32_t>(table_stride(sweep.width))),
         outside_(static_cast<int32_t>(outside_corner(sweep.height, sweep.width))),
@@ -90,62 +117,70 @@ class Walker {
         pixel_(table_.size(), -1) {
     for (int64_t v = 0; v < sweep.height; ++v)
       for (int64_t u = 0; u < sweep.width; ++u) {
-        const int64_t at = (v + 1) * stride_ + u + 1;
-        stamp_[at] = 0;
-        pixel_[at] = static_cast<int32_t>(v * sweep.width + u);
+        const int64_t place = (v + 1) * stride_ + u + 1;
+        stamp_[place] = 0;
+        pixel_[place] = static_cast<int32_t>(v * sweep.width + u);
       }
   }
 
   void start_image(int64_t image) {
-    for (int64_t k = 0; k < sweep_.n_depths; ++k) depths_[k] = T(1) / sweep_.inverse_depths[image * sweep_.n_depths + k];
+    const T* inverse = sweep_.inverse_depths + image * sweep_.n_depths;
+    for (int64_t k = 0; k < sweep_.n_depths; ++k) depths_[k] = T(1) / inverse[k];
   }
 
-  // costs[k * step] += score at depth k, for all depths of one pixel and one source.
-  void add_costs(int64_t pair, int64_t pixel, const T* feature, const T* source, int64_t channels, T* costs, int64_t step) {
+  // costs[k] += score at depth k. feature: [stride], source: [height * width, stride].
+  void add_costs(int64_t pair, int64_t pixel, const T* feature, const T* source, int64_t stride, T* costs) {
     locate(pair, pixel);
-    ++epoch_;
-    int32_t corner = outside_;
-    T s00 = T(0), s01 = T(0), s10 = T(0), s11 = T(0);
-    for (int64_t k = 0; k < sweep_.n_depths; ++k) {
-      if (corners_[k] == outside_) continue;
-      if (corners_[k] != corner) {
-        corner = corners_[k];
-        s00 = score(corner, feature, source, channels);
-        s01 = score(corner + 1, feature, source, channels);
-        s10 = score(corner + stride_, feature, source, channels);
-        s11 = score(corner + stride_ + 1, feature, source, channels);
+    for_cells([&](int32_t corner) {
+      touch(corner);
+      touch(corner + 1);
+      touch(corner + stride_);
+      touch(corner + stride_ + 1);
+    });
+    const int64_t count = static_cast<int64_t>(touched_.size());
+    for (int64_t first = 0; first < count; first += 4) {
+      int32_t places[4];
+      const T* rows[4];
+      T scores[4];
+      for (int64_t i = 0; i < 4; ++i) {
+        places[i] = touched_[std::min(first + i, count - 1)];
+        rows[i] = source + pixel_[places[i]] * stride;
       }
-      costs[k * step] += interpolate(s00, s01, s10, s11, fx_[k], fy_[k]);
+      dot_four(feature, rows, stride, scores);
+      for (int64_t i = 0; i < 4; ++i) table_[places[i]] = scores[i];
+    }
+    const T* GSIM3D_RESTRICT table = table_.data();
+    for (int64_t k = 0; k < sweep_.n_depths; ++k) {
+      const T* top = table + corners_[k];
+      costs[k] += interpolate(top[0], top[1], top[stride_], top[stride_ + 1], fx_[k], fy_[k]);
     }
   }
 
-  // Calls f(source pixel, gradient of its score) for the source pixels that the costs of one pixel read.
-  template <typename F>
-  void for_score_grads(int64_t pair, int64_t pixel, const T* grads, int64_t step, const F& f) {
+  // The source pixels that the costs of one pixel read, and scale times the gradients of their scores.
+  void find_score_grads(int64_t pair, int64_t pixel, const T* grads, T scale) {
     locate(pair, pixel);
-    ++epoch_;
-    touched_.clear();
-    int32_t corner = outside_;
-    T g00 = T(0), g01 = T(0), g10 = T(0), g11 = T(0);
-    const auto flush = [&] {
-      if (corner == outside_) return;
+    int64_t k = 0;
+    T g00, g01, g10, g11;
+    for_cells([&](int32_t corner) {
+      while (corners_[k] != corner) ++k;  // samples outside
+      g00 = g01 = g10 = g11 = T(0);
+      for (; k < sweep_.n_depths && corners_[k] == corner; ++k)
+        interpolate_vjp(g00, g01, g10, g11, fx_[k], fy_[k], grads[k]);
       add_grad(corner, g00);
       add_grad(corner + 1, g01);
       add_grad(corner + stride_, g10);
       add_grad(corner + stride_ + 1, g11);
-    };
-    for (int64_t k = 0; k < sweep_.n_depths; ++k) {
-      if (corners_[k] == outside_) continue;
-      if (corners_[k] != corner) {
-        flush();
-        corner = corners_[k];
-        g00 = g01 = g10 = g11 = T(0);
-      }
-      interpolate_vjp(g00, g01, g10, g11, fx_[k], fy_[k], grads[k * step]);
+    });
+    weights_.resize(touched_.size());
+    for (size_t i = 0; i < touched_.size(); ++i) {
+      weights_[i] = table_[touched_[i]] * scale;
+      touched_[i] = pixel_[touched_[i]];
     }
-    flush();
-    for (const int32_t at : touched_) f(pixel_[at], table_[at]);
   }
+
+  int64_t count() const { return static_cast<int64_t>(touched_.size()); }
+  const int32_t* pixels() const { return touched_.data(); }
+  const T* weights() const { return weights_.data(); }
 
  private:
   static constexpr int64_t kBorder = std::numeric_limits<int64_t>::max();  // always up to date, always 0
@@ -169,33 +204,44 @@ class Walker {
     }
   }
 
-  T score(int32_t at, const T* feature, const T* source, int64_t channels) {
-    if (stamp_[at] < epoch_) {
-      stamp_[at] = epoch_;
-      table_[at] = dot(feature, source + pixel_[at] * channels, channels);
+  // f(corner) for every run of samples in one cell inside the image; starts a new list of touched pixels.
+  template <typename F>
+  void for_cells(const F& f) {
+    ++epoch_;
+    touched_.clear();
+    int32_t last = outside_;
+    for (int64_t k = 0; k < sweep_.n_depths; ++k) {
+      const int32_t corner = corners_[k];
+      if (corner != last && corner != outside_) f(corner);
+      last = corner;
     }
-    return table_[at];
   }
 
-  void add_grad(int32_t at, T grad) {
-    if (stamp_[at] == kBorder) return;
-    if (stamp_[at] < epoch_) {
-      stamp_[at] = epoch_;
-      table_[at] = grad;
-      touched_.push_back(at);
-    } else {
-      table_[at] += grad;
+  void touch(int32_t place) {
+    if (stamp_[place] >= epoch_) return;
+    stamp_[place] = epoch_;
+    touched_.push_back(place);
+  }
+
+  void add_grad(int32_t place, T grad) {
+    if (stamp_[place] == kBorder) return;
+    if (stamp_[place] < epoch_) {
+      stamp_[place] = epoch_;
+      table_[place] = T(0);
+      touched_.push_back(place);
     }
+    table_[place] += grad;
   }
 
   const PlaneSweep<T>& sweep_;
   const int32_t stride_, outside_;
   std::vector<int32_t> corners_;
   std::vector<T> fx_, fy_, depths_;
-  std::vector<T> table_;
-  std::vector<int64_t> stamp_;  // the pixel for which table_ was last filled
-  std::vector<int32_t> pixel_;  // of the source image; -1 on the border
+  std::vector<T> table_;         // scores, or gradients of scores; 0 on the border
+  std::vector<int64_t> stamp_;   // the step at which table_ was last filled
+  std::vector<int32_t> pixel_;   // of the source image; -1 on the border
   std::vector<int32_t> touched_;
+  std::vector<T> weights_;
   int64_t epoch_ = 0;
 };
 
@@ -231,8 +277,8 @@ void check_plane_sweep(const char* op, const PlaneSweep<T>& sweep) {
     check(sweep.cu_src[i] <= sweep.cu_src[i + 1], op, ": cu_src must not descend; got ", sweep.cu_src[i], " then ",
           sweep.cu_src[i + 1], " at ", i);
   for (int64_t p = 0; p < sweep.n_pairs; ++p) {
-    check(sweep.src_images[p] >= 0 && sweep.src_images[p] < n, op, ": src_images must be in [0, I) with I=", n, "; got ",
-          sweep.src_images[p], " at ", p);
+    const int64_t source = sweep.src_images[p];
+    check(source >= 0 && source < n, op, ": src_images must be in [0, I) with I=", n, "; got ", source, " at ", p);
     for (int64_t e = 0; e < 9; ++e)
       check(std::isfinite(sweep.homographies[9 * p + e]), op, ": homographies must be finite; got ",
             sweep.homographies[9 * p + e], " in pair ", p);
@@ -264,7 +310,8 @@ void plane_sweep(const T* features, const PlaneSweep<T>& sweep, T* cost, const W
       std::fill(costs.begin(), costs.end(), T(0));
       const T* feature = pixels + (image * n_pixels + pixel) * stride;
       for (int64_t pair = sweep.cu_src[image]; pair < sweep.cu_src[image + 1]; ++pair)
-        walker.add_costs(pair, pixel, feature, pixels + sweep.src_images[pair] * n_pixels * stride, stride, costs.data(), 1);
+        walker.add_costs(pair, pixel, feature, pixels + sweep.src_images[pair] * n_pixels * stride, stride,
+                         costs.data());
       for (int64_t k = 0; k < sweep.n_depths; ++k) out[k * n_pixels + pixel] = costs[k] * scale;
     }
   });
@@ -292,10 +339,8 @@ void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& swee
     for (int64_t pixel = begin; pixel < end; ++pixel)
       for (int64_t pair = sweep.cu_src[image]; pair < sweep.cu_src[image + 1]; ++pair) {
         const T* source = pixels + sweep.src_images[pair] * n_pixels * stride;
-        walker.for_score_grads(pair, pixel, grad_costs + (image * n_pixels + pixel) * grad_stride, 1,
-                               [&](int64_t at, T weight) {
-                                 add_scaled(out + pixel * stride, source + at * stride, weight * scale, stride);
-                               });
+        walker.find_score_grads(pair, pixel, grad_costs + (image * n_pixels + pixel) * grad_stride, scale);
+        add_scaled_rows(out + pixel * stride, source, walker.pixels(), walker.weights(), walker.count(), stride);
       }
   });
 
@@ -313,10 +358,9 @@ void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& swee
         const T scale = cost_scale(sweep, image);
         for (int64_t pixel = 0; pixel < n_pixels; ++pixel) {
           const T* feature = pixels + (image * n_pixels + pixel) * stride + first;
-          walker.for_score_grads(pair, pixel, grad_costs + (image * n_pixels + pixel) * grad_stride, 1,
-                                 [&](int64_t at, T weight) {
-                                   add_scaled(out + at * stride, feature, weight * scale, count);
-                                 });
+          walker.find_score_grads(pair, pixel, grad_costs + (image * n_pixels + pixel) * grad_stride, scale);
+          for (int64_t i = 0; i < walker.count(); ++i)
+            add_scaled(out + walker.pixels()[i] * stride, feature, walker.weights()[i], count);
         }
       }
   });

@@ -58,7 +58,8 @@ Tensor plane_sweep(const Tensor& features_, const Tensor& homographies, const Te
   Tensor cost = empty(features, {features.size(0), inverse_depths.size(1), features.size(2), features.size(3)});
   TensorWorkspace workspace(features);
   dispatch_float(op, "features", features, [&]<typename T>() {
-    cpu::plane_sweep(data<T>(features), geometry.sweep<T>(features), mutable_data<T>(cost), workspace, torch_parallel());
+    cpu::plane_sweep(data<T>(features), geometry.sweep<T>(features), mutable_data<T>(cost), workspace,
+                     torch_parallel());
   });
   return cost;
 }

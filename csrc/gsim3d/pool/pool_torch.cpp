@@ -30,6 +30,9 @@ std::tuple<Tensor, Tensor> pool_max(const Tensor& x_, const Tensor& rows_, const
 Tensor pool_max_backward(const Tensor& grad_, const Tensor& argmax_, int64_t n_rows) {
   const char* op = "pool_max_backward";
   const Tensor grad = rows_of(grad_), argmax = rows_of(argmax_);
+  check_shape(op, "grad", grad, {-1, -1}, "[M, C]");
+  check_dtype(op, "argmax", argmax, ScalarType::Long);
+  check(n_rows >= 0, op, ": n_rows must not be negative; got ", n_rows);
   check_shape(op, "argmax", argmax, {grad.size(0), grad.size(1)}, "[M, C]");
   Tensor grad_x = empty(grad, {n_rows, grad.size(1)});
   dispatch_float(op, "grad", grad, [&]<typename T>() {
@@ -53,6 +56,7 @@ Tensor pool_mean(const Tensor& x_, const Tensor& rows_, const Tensor& cu_rows_) 
 
 Tensor pool_mean_backward(const Tensor& grad_, const Tensor& rows_, const Tensor& cu_rows_, int64_t n_rows) {
   const char* op = "pool_mean_backward";
+  check_shape(op, "grad", grad_, {-1, -1}, "[M, C]");
   const Tensor grad = rows_of(grad_), rows = rows_of(rows_), cu_rows = rows_of(cu_rows_);
   const Segments segments = segments_of(op, rows, cu_rows, n_rows);
   check_shape(op, "grad", grad, {segments.n_segments, -1}, "[M, C]");
@@ -65,6 +69,7 @@ Tensor pool_mean_backward(const Tensor& grad_, const Tensor& rows_, const Tensor
 
 Tensor unpool(const Tensor& x_, const Tensor& rows_, const Tensor& cu_rows_, int64_t n_rows) {
   const char* op = "unpool";
+  check_shape(op, "x", x_, {-1, -1}, "[M, C]");
   const Tensor x = rows_of(x_), rows = rows_of(rows_), cu_rows = rows_of(cu_rows_);
   const Segments segments = segments_of(op, rows, cu_rows, n_rows);
   check_shape(op, "x", x, {segments.n_segments, -1}, "[M, C]");

@@ -1,4 +1,7 @@
-"""Batch normalisation of packed rows, as the published model has it."""
+"""Layers over packed rows: a row's result has the same bits whatever rows are packed with it.
+
+(Batch normalisation in training is the exception.) Gradients have the same bits on one thread and on two.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,33 @@ import torch
 import torch.distributed
 import torch.distributed.nn.functional
 from torch import Tensor, nn
+from torch.nn import functional as F
+
+MIN_ROWS = 16  # matrix products of fewer rows go through other code in BLAS, which rounds differently
+
+
+class RowLinear(nn.Linear):
+    """``nn.Linear`` of [N, C]."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        n_rows = x.shape[0]
+        if n_rows >= MIN_ROWS:
+            return F.linear(x, self.weight, self.bias)
+        return F.linear(F.pad(x, (0, 0, 0, MIN_ROWS - n_rows)), self.weight, self.bias)[:n_rows]
+
+
+class RowLayerNorm(nn.LayerNorm):
+    """``nn.LayerNorm`` of [N, C]; its weights' gradients do not depend on the number of threads, as torch's do."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.layer_norm(x, self.normalized_shape, eps=self.eps) * self.weight + self.bias
 
 
 class RowBatchNorm(nn.Module):
     """Normalises each channel by statistics over rows; running statistics in evaluation.
 
-    Differs from ``nn.BatchNorm1d`` in three ways: one row or none is fine (running statistics are then kept), statistics
-    are float32 or wider, and processes combine theirs in the order of their ranks, so a run repeats bit by bit.
+    Differs from ``nn.BatchNorm1d`` in three ways: one row or none is fine (running statistics are then kept),
+    statistics are float32 or wider, and processes combine theirs in the order of their ranks, so a run repeats bit by bit.
     """
 
     EPS = 1e-3
@@ -63,4 +86,4 @@ def _combine(parts: tuple[Tensor, ...], n_channels: int) -> tuple[Tensor, Tensor
 
 def make_norm(kind: str, channels: int) -> nn.Module:
     """"layer" or "batch"."""
-    return nn.LayerNorm(channels) if kind == "layer" else RowBatchNorm(channels)
+    return RowLayerNorm(channels) if kind == "layer" else RowBatchNorm(channels)

@@ -1,0 +1,224 @@
+"""``gsim3d demo``: the main job at a small size: make multi-view video, learn a simulator, predict scenes never seen."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gsim3d.errors import InputError
+from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
+
+EPILOG = """\
+Writes into DIR:
+  data/          multi-view video of soft bodies that fall on a round ground (simulated and filmed here)
+  model/         checkpoints and log of the training; model.safetensors beside it is the result in one file
+  rollout.mp4    held-out scenes, truth above prediction
+  psnr.png       PSNR over time against the baselines
+  metrics.json   all numbers; the most important ones are printed
+  gaussians/     the predicted 3D Gaussians of one scene, a .ply for each step
+  overview.png   input views, Gaussians, predicted and true frames in one picture
+
+About 10 minutes on 2 cores. Stopped and started again, it goes on where it was.
+
+example:
+  gsim3d demo --out runs/demo
+"""
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """data: options of gsim3d.generate's preset "demo" to change.   train: the training."""
+
+    data: dict[str, Any] = field(default_factory=dict)
+    train: TrainConfig = TrainConfig(
+        preset="tiny",
+        data=DataConfig(history=2, context_views=4, target_only_cameras=(2, 7), background_stride=2),
+        stages=(
+            StageConfig(steps=250, history=1, batch=2, target_views=4, learning_rate=2e-3, warm_up=0.1),
+            StageConfig(steps=150, horizon=4, target_views=3, from_start=0.3, learning_rate=1e-3, warm_up=0.1),
+            StageConfig(steps=150, horizon=8, target_views=3, from_start=0.4, learning_rate=1e-3, warm_up=0.1),
+            StageConfig(steps=100, horizon=12, target_views=2, from_start=0.5, learning_rate=7e-4, warm_up=0.1),
+        ),
+        loss=LossConfig(),
+        optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.99),
+        checkpoint_every=50,
+        log_every=1,
+    )
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Makes multi-view video, learns a simulator from it, and predicts scenes that it has never seen."
+    parser.epilog = EPILOG
+    parser.add_argument("--out", metavar="DIR", required=True, help="folder for everything; made if absent")
+
+
+def run(args: argparse.Namespace) -> int:
+    run_demo(args.out)
+    return 0
+
+
+def run_demo(out: str | Path, config: DemoConfig | None = None, *, progress: bool = True) -> dict:
+    """Runs the demo in the folder ``out``, from where it was left; returns the content of metrics.json.
+
+    Raises:
+        InputError: ``out`` is no folder or holds a run with other settings, or a package is missing.
+    """
+    config = config or DemoConfig()
+    out = Path(out)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out: {out} is not a folder")
+    start = time.perf_counter()
+    out.mkdir(parents=True, exist_ok=True)
+    seconds = _Stopwatch(out / "seconds.json")
+
+    from gsim3d.data import Scene, split_scenes
+    from gsim3d.evaluate.pictures import pyplot
+    from gsim3d.generate import generate
+
+    pyplot()
+    print("1/4 multi-view video of bodies that fall", flush=True)
+    with seconds.measure("data"):
+        folders = generate(out / "data", preset="demo", progress=progress, **config.data).folders
+    train_folders, test_folders = split_scenes(folders)
+    test = [Scene.open(folder) for folder in test_folders]
+    print(f"2/4 training on {len(train_folders)} scenes; {len(test)} are held out", flush=True)
+    digest = _train(out, config.train, train_folders, progress, seconds)
+    print("3/4 predicting the held-out scenes", flush=True)
+    with seconds.measure("evaluation"):
+        summary, restored = _evaluate(out, test, digest)
+    print("4/4 pictures", flush=True)
+    with seconds.measure("pictures"):
+        _pictures(out, restored, test, summary)
+    _report(out, summary, seconds.total, time.perf_counter() - start)
+    return summary
+
+
+class _Stopwatch:
+    """Seconds spent in each part, summed over all sittings and kept in a file."""
+
+    def __init__(self, file: Path):
+        self.file = file
+        try:
+            self.total = json.loads(file.read_text())
+        except (OSError, ValueError):
+            self.total = {}
+
+    @contextmanager
+    def measure(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.total[name] = round(self.total.get(name, 0.0) + time.perf_counter() - start, 1)
+            self.file.write_text(json.dumps(self.total))
+
+
+def _train(out: Path, config: TrainConfig, folders: list[Path], progress: bool, seconds: _Stopwatch) -> str:
+    """Trains to the end and exports; returns the hash of the last checkpoint."""
+    from gsim3d.data import Scene
+    from gsim3d.train import checkpoint
+    from gsim3d.train.loop import Trainer
+
+    trainer = Trainer(config, [Scene.open(folder) for folder in folders], out / "model")
+    if 0 < trainer.step < config.n_steps:
+        print(f"    going on from step {trainer.step}", flush=True)
+    if trainer.step < config.n_steps:
+        with seconds.measure("training"):
+            trainer.run(progress=progress)
+    saved = checkpoint.load(out / "model")
+    if not (out / "model.safetensors").is_file():
+        checkpoint.export(saved, out / "model.safetensors")
+    return saved.digest
+
+
+def _evaluate(out: Path, scenes: list, digest: str):
+    from gsim3d.evaluate.protocol import score_scene
+    from gsim3d.evaluate.report import summarize, write_json
+    from gsim3d.train.restore import restore
+
+    restored = restore(out / "model")
+    file = out / "metrics.json"
+    try:
+        summary = json.loads(file.read_text())
+    except (OSError, ValueError):
+        summary = {}
+    if summary.get("checkpoint") != digest:
+        summary = {"checkpoint": digest, **summarize([score_scene(restored, scene) for scene in scenes])}
+        write_json(file, summary)
+    return summary, restored
+
+
+def _pictures(out: Path, restored, scenes: list, summary: dict) -> None:
+    """All pictures; each is made again only where it is missing or older than the numbers."""
+    from gsim3d.evaluate.pictures import (
+        as_bytes,
+        comparison_frames,
+        true_images,
+        write_gaussians,
+        write_overview,
+        write_psnr_plot,
+    )
+    from gsim3d.evaluate.protocol import default_views, predict, render_steps
+    from gsim3d.interop import write_video
+
+    made = [out / name for name in ("rollout.mp4", "psnr.png", "overview.png")]
+    age = (out / "metrics.json").stat().st_mtime
+    if all(file.is_file() and file.stat().st_mtime >= age for file in made):
+        return
+    truth, images, first = [], [], None
+    for scene in scenes:
+        context, target = default_views(restored, scene)
+        prediction = predict(restored, scene, context, scene.n_steps - restored.data.history)
+        rendered = render_steps(restored, prediction.particles, scene, target[:1])
+        truth.append(true_images(scene, target[:1], range(prediction.n_steps)))
+        images.append(as_bytes(rendered))
+        if first is None:
+            first = (scene, prediction, rendered[:, 0], target[0])
+    import numpy as np
+
+    scene, prediction, rendered, cam = first
+    write_gaussians(out / "gaussians", restored, prediction)
+    write_psnr_plot(made[1], summary, scene.fps)
+    write_overview(made[2], restored, scene, prediction, rendered, cam)
+    write_video(made[0], comparison_frames(np.concatenate(truth, 1), np.concatenate(images, 1)), scene.fps)
+
+
+def comparisons(summary: dict) -> list[tuple[str, float, float]]:
+    """(what, model, baseline) of the three comparisons that the demo stands for; PSNR in dB."""
+    return [
+        ("PSNR of predicted steps, against constant", summary["future.psnr"], summary["constant.future.psnr"]),
+        ("the same, masked", summary["future.psnr_masked"], summary["constant.future.psnr_masked"]),
+        (
+            "masked, second half of the horizon, against copy",
+            summary["future_late.psnr_masked"],
+            summary["copy.future_late.psnr_masked"],
+        ),
+    ]
+
+
+def _report(out: Path, summary: dict, seconds: dict, now: float) -> None:
+    from gsim3d.evaluate.report import table
+
+    print()
+    print(table(summary))
+    print()
+    for what, model, baseline in comparisons(summary):
+        verdict = "better" if model > baseline else "WORSE"
+        print(f"{what + ':':52}{model:7.2f} dB, baseline {baseline:.2f} dB: {verdict} by {abs(model - baseline):.2f} dB")
+    parts = ", ".join(f"{name} {value:.0f}" for name, value in seconds.items())
+    print(f"\nseconds: {parts}; {sum(seconds.values()):.0f} in all, {now:.0f} in this call; peak memory {_peak_gib():.1f} GiB")
+    print(f"look at {out / 'rollout.mp4'} and {out / 'overview.png'}")
+
+
+def _peak_gib() -> float:
+    """Peak memory of this process and of the largest of its children, GiB."""
+    unit = 2**30 if sys.platform == "darwin" else 2**20
+    return sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / unit

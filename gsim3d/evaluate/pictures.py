@@ -1,0 +1,164 @@
+"""Pictures and videos of predictions."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsim3d.data import Scene
+from gsim3d.errors import InputError
+from gsim3d.evaluate.protocol import Prediction
+from gsim3d.interop import write_ply
+from gsim3d.renderer import render
+from gsim3d.train.restore import Restored
+from gsim3d.types import Cameras
+
+FRAME_SIZE = 256  # pixels; smaller frames are enlarged by a whole factor to at most this height
+GAP = 4  # pixels of white between frames
+SPLAT_SIZE = 320  # pixels, height and width of the picture of the Gaussians
+SPLAT_SHRINK = 0.45  # of their scales there, so that single ones can be told apart
+
+
+def as_bytes(images: Tensor) -> np.ndarray:
+    """Images in [0, 1] -> uint8."""
+    return (images * 255).round().to(torch.uint8).numpy()
+
+
+def true_images(scene: Scene, cams: Sequence[int], steps: Sequence[int]) -> np.ndarray:
+    """uint8 [S, V, H, W, 3]; black where the film has ended."""
+    known = [step for step in steps if step < scene.n_steps]
+    images = np.zeros((len(steps), len(cams), scene.height, scene.width, 3), np.uint8)
+    if known:
+        images[: len(known)] = scene.images(list(cams), known).permute(0, 1, 3, 4, 2).numpy()
+    return images
+
+
+def comparison_frames(truth: np.ndarray, predicted: np.ndarray) -> list[np.ndarray]:
+    """Video frames from two [S, V, H, W, 3]: truth above prediction, one column a view; height and width are even."""
+    factor = max(1, FRAME_SIZE // truth.shape[2])
+    frames = []
+    for rows in zip(truth, predicted, strict=True):
+        frame = _grid([[view.repeat(factor, 0).repeat(factor, 1) for view in row] for row in rows])
+        frames.append(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
+    return frames
+
+
+def _grid(rows: list[list[np.ndarray]]) -> np.ndarray:
+    height, width = rows[0][0].shape[:2]
+    canvas = np.full((len(rows) * (height + GAP) - GAP, len(rows[0]) * (width + GAP) - GAP, 3), 255, np.uint8)
+    for i, row in enumerate(rows):
+        for j, image in enumerate(row):
+            canvas[i * (height + GAP) :, j * (width + GAP) :][:height, :width] = image
+    return canvas
+
+
+@torch.no_grad()
+def write_gaussians(folder: str | Path, restored: Restored, prediction: Prediction) -> None:
+    """One .ply a step into ``folder``: step_0000.ply, ..."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    gaussians = restored.simulator.renderer(prediction.particles)
+    for step in range(prediction.n_steps):
+        write_ply(folder / f"step_{step:04d}.ply", gaussians, step)
+
+
+@torch.no_grad()
+def splat_picture(restored: Restored, prediction: Prediction, scene: Scene, cam: int, step: int) -> np.ndarray:
+    """The Gaussians of one step, drawn smaller than they are, on white, at a higher resolution than the images."""
+    zoom = SPLAT_SIZE / scene.height
+    camera = scene.cameras.select(torch.tensor([cam]), torch.tensor([0]))
+    Ks = camera.Ks * torch.tensor([zoom, zoom, 1.0])[:, None]
+    camera = Cameras(
+        camera.viewmats, Ks, camera.near, camera.far, camera.image_cloud, round(scene.width * zoom), SPLAT_SIZE
+    )
+    gaussians = restored.simulator.renderer(prediction.particles.select_clouds(torch.tensor([step])))
+    gaussians = dataclasses.replace(gaussians, scales=gaussians.scales * SPLAT_SHRINK)
+    return as_bytes(render(gaussians, camera, torch.ones(3)).color[0].clamp(0, 1))
+
+
+def write_overview(
+    path: str | Path, restored: Restored, scene: Scene, prediction: Prediction, images: Tensor, cam: int
+) -> None:
+    """One picture of the whole way: input views, Gaussians, predicted frames below true ones.
+
+    Args:
+        images: [S, H, W, 3] rendered from the prediction, as ``cam`` sees it.
+    """
+    plt = pyplot()
+    last_given, n_steps = prediction.n_encoded - 1, prediction.n_steps
+    inputs = true_images(scene, prediction.context_cams, [last_given])[0]
+    shown = np.linspace(prediction.n_encoded, n_steps - 1, 5).round().astype(int)
+    truth = true_images(scene, [cam], shown)[:, 0]
+    figure = plt.figure(figsize=(13.5, 4.1), facecolor="white")
+    parts = figure.add_gridspec(1, 3, width_ratios=(2, 2.05, 5.1), left=0.01, right=0.995, top=0.86, bottom=0.05, wspace=0.07)
+
+    def show(place, image, title=None, label=None):
+        axes = figure.add_subplot(place)
+        axes.imshow(image, interpolation="nearest")
+        axes.set(xticks=[], yticks=[])
+        for side in axes.spines.values():
+            side.set_visible(False)
+        if title:
+            axes.set_title(title, fontsize=9, color="#333333", pad=3)
+        if label:
+            axes.set_ylabel(label, fontsize=10, color="#333333")
+
+    views = parts[0].subgridspec(2, 2, hspace=0.06, wspace=0.06)
+    for k, image in enumerate(inputs[:4]):
+        show(views[k // 2, k % 2], image)
+    show(parts[1], splat_picture(restored, prediction, scene, cam, last_given))
+    frames = parts[2].subgridspec(2, 5, hspace=0.06, wspace=0.06)
+    for k, step in enumerate(shown):
+        time = f"+{(step - last_given) / scene.fps:.2f} s"
+        show(frames[0, k], truth[k], time, "truth" if k == 0 else None)
+        show(frames[1, k], as_bytes(images[step]), None, "predicted" if k == 0 else None)
+    heads = ((0.11, f"{len(inputs)} input views"), (0.34, "particles as 3D Gaussians"), (0.72, "the future, from a camera never seen"))
+    for x, text in heads:
+        figure.text(x, 0.94, text, ha="center", fontsize=12)
+    _save(figure, path)
+
+
+def write_psnr_plot(path: str | Path, summary: dict, fps: float) -> None:
+    """PSNR over time, given and predicted steps, for the model and the baselines."""
+    plt = pyplot()
+    figure, panels = plt.subplots(1, 2, figsize=(10, 3.8), sharex=True, layout="constrained")
+    lines = {"": ("model", "#1f5fbf", 2.4), "constant.": ("constant (last encoded particles)", "#c0504d", 1.6),
+             "copy.": ("copy (last true frame)", "#7f7f7f", 1.2),
+             "constant_velocity.": ("constant velocity", "#e0a030", 1.2)}  # fmt: skip
+    n_encoded = summary["n_encoded_steps"]
+    for axes, metric, title in zip(panels, ("psnr", "psnr_masked"), ("all pixels", "without background")):
+        if metric not in summary["by_step"]:
+            metric = "psnr"
+        for prefix, (label, color, width) in lines.items():
+            values = np.array(summary["by_step"][prefix + metric], dtype=float)
+            steps = np.arange(len(values)) - (n_encoded - 1)
+            axes.plot(steps / fps, values, color=color, linewidth=width, label=label)
+        axes.axvspan((0.5 - n_encoded) / fps, 0.5 / fps, color="#eeeeee", zorder=0)
+        axes.set(title=f"PSNR, {title}", xlabel="seconds after the last given frame", ylabel="dB")
+        axes.grid(alpha=0.3)
+    panels[0].legend(fontsize=8)
+    _save(figure, path)
+
+
+def pyplot():
+    """matplotlib's pyplot without a display. Raises InputError where matplotlib is not installed."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise InputError("plots need matplotlib: pip install 'gsim3d[plot]'") from None
+    matplotlib.use("Agg")
+    return importlib.import_module("matplotlib.pyplot")
+
+
+def _save(figure, path: str | Path) -> None:
+    path = Path(path)
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    figure.savefig(part, dpi=110)
+    pyplot().close(figure)
+    part.replace(path)

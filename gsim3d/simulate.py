@@ -1,0 +1,72 @@
+"""``gsim3d simulate``: predict the future of one scene."""
+
+from __future__ import annotations
+
+import argparse
+
+EPILOG = """\
+The scene's first steps are the input; the following ones are predicted, also beyond the end of the film. Written to DIR:
+rollout.mp4 (the truth above the prediction, side by side for each camera; VP9, plays in browsers), frames/ (predicted
+images as PNG) and gaussians/step_0000.ply ... (3D Gaussians of every step, for viewers of 3D Gaussian splatting).
+
+examples:
+  gsim3d simulate runs/model runs/data/ball/0000 --out runs/ball
+  gsim3d simulate model.safetensors runs/data/ball/0000 --out runs/ball --steps 48 --cameras 2 7
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Predicts the future of one scene and writes it as video and as 3D Gaussians."
+    parser.epilog = EPILOG
+    parser.add_argument("checkpoint", metavar="CHECKPOINT", help="run folder, checkpoint folder or .safetensors file")
+    parser.add_argument("scene", metavar="SCENE", help="scene folder (with metadata.json)")
+    parser.add_argument("--out", metavar="DIR", required=True, help="folder to write; must not exist yet")
+    parser.add_argument("--steps", type=int, help="steps to predict (default: to the end of the film)")
+    parser.add_argument("--start", type=int, default=0, help="first input step (default: 0)")
+    parser.add_argument("--cameras", type=int, nargs="+", metavar="CAM", help="cameras to show (default: up to 4 target cameras)")
+    parser.add_argument("--context", type=int, nargs="+", metavar="CAM", help="cameras to see (default: as in training)")
+
+
+def run(args: argparse.Namespace) -> int:
+    import os
+    import shutil
+    from pathlib import Path
+
+    import cv2
+
+    from gsim3d.data import Scene
+    from gsim3d.errors import InputError
+    from gsim3d.evaluate.pictures import as_bytes, comparison_frames, true_images, write_gaussians
+    from gsim3d.evaluate.protocol import default_views, predict, render_steps
+    from gsim3d.interop import write_video
+    from gsim3d.train.restore import restore
+
+    out = Path(args.out)
+    if out.exists():
+        raise InputError(f"--out: {out} exists already; name another folder or remove it")
+    if not out.absolute().parent.is_dir():
+        raise InputError(f"--out: the folder {out.absolute().parent} does not exist")
+    restored = restore(args.checkpoint)
+    scene = Scene.open(args.scene)
+    context, target = default_views(restored, scene)
+    cams = args.cameras or list(target[:4])
+    n_future = args.steps if args.steps is not None else max(1, scene.n_steps - args.start - restored.data.history)
+    if bad := [cam for cam in (*cams, *(args.context or ())) if not 0 <= cam < scene.n_cams]:
+        raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
+    prediction = predict(restored, scene, args.context or context, n_future, args.start)
+    images = as_bytes(render_steps(restored, prediction.particles, scene, cams))
+    part = out.with_name(f".{out.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        (part / "frames").mkdir(parents=True)
+        for step, views in enumerate(images):
+            for cam, image in zip(cams, views, strict=True):
+                cv2.imwrite(str(part / "frames" / f"cam_{cam}_{step:04d}.png"), image[..., ::-1])
+        truth = true_images(scene, cams, range(args.start, args.start + len(images)))
+        write_video(part / "rollout.mp4", comparison_frames(truth, images), scene.fps)
+        write_gaussians(part / "gaussians", restored, prediction)
+        os.replace(part, out)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    print(f"{prediction.n_encoded} steps encoded, {n_future} predicted; written: {out}")
+    return 0

@@ -1,0 +1,72 @@
+"""gsim3d train: learn a simulator from a data set."""
+
+from __future__ import annotations
+
+import argparse
+
+EPILOG = """\
+CONFIG is a YAML file; what it leaves out has a default, what it does not know is an error. For example
+
+  preset: tiny
+  data: {history: 2, context_views: 4, target_only_cameras: [2, 7]}
+  stages:
+    - {steps: 400, history: 1, batch: 2, learning_rate: 2.0e-3}      # encoder and renderer
+    - {steps: 800, horizon: 8, learning_rate: 1.0e-3}                # all parts, 8 simulated steps
+
+Scenes that `gsim3d evaluate` measures by default are left out (every 8th or so; see gsim3d.data.split_scenes).
+Called again, it goes on from the last checkpoint and repeats the same numbers as a run that was never stopped.
+
+examples:
+  gsim3d train --print-config > train.yaml
+  gsim3d train train.yaml --data runs/data --out runs/model
+  gsim3d train train.yaml --data runs/data --out runs/model --export model.safetensors
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Learns a simulator from multi-view video; writes checkpoints and a log into a run folder."
+    parser.epilog = EPILOG
+    parser.add_argument("config", metavar="CONFIG", nargs="?", help="YAML file with the run's settings")
+    parser.add_argument("--data", metavar="DIR", help="folder with scenes, as `gsim3d generate` makes")
+    parser.add_argument("--out", metavar="DIR", help="run folder; made if absent")
+    parser.add_argument("--until", type=int, metavar="STEP", help="stop after this optimizer step (default: the last)")
+    parser.add_argument("--export", metavar="FILE", help="also write the result as one .safetensors file")
+    parser.add_argument("--print-config", action="store_true", help="print all settings with their defaults and exit")
+
+
+def run(args: argparse.Namespace) -> int:
+    from pathlib import Path
+
+    import yaml
+
+    from gsim3d.data import Scene, find_scenes, split_scenes
+    from gsim3d.errors import InputError
+    from gsim3d.train import checkpoint
+    from gsim3d.train.config import TrainConfig
+    from gsim3d.train.settings import from_dict, load_yaml, to_dict
+
+    config = from_dict(TrainConfig, load_yaml(args.config)) if args.config else TrainConfig()
+    if args.print_config:
+        print(yaml.safe_dump(to_dict(config), sort_keys=False), end="")
+        return 0
+    for name in ("config", "data", "out"):
+        if getattr(args, name) is None:
+            raise InputError(f"{'CONFIG' if name == 'config' else f'--{name}'} is needed (see gsim3d train --help)")
+    if args.until is not None and args.until < 1:
+        raise InputError(f"--until must be at least 1; got {args.until}")
+    if args.export and (not args.export.endswith(".safetensors") or not Path(args.export).absolute().parent.is_dir()):
+        raise InputError(f"--export must name a .safetensors file in a folder that exists; got {args.export}")
+    folders, _ = split_scenes(find_scenes(args.data))
+    scenes = [Scene.open(folder) for folder in folders]
+
+    from gsim3d.train.loop import Trainer
+
+    trainer = Trainer(config, scenes, args.out)
+    if trainer.step:
+        print(f"going on from step {trainer.step} of {config.n_steps}")
+    trainer.run(until=args.until)
+    print(f"trained to step {trainer.step} of {config.n_steps}: {args.out}")
+    if args.export:
+        checkpoint.export(checkpoint.load(args.out), args.export)
+        print(f"written: {args.export}")
+    return 0

@@ -1,0 +1,244 @@
+"""The training loop: one step is a function of (weights, configuration, step), so a resumed run repeats it bit for bit."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from gsim3d.data import Scene, generator
+from gsim3d.dynamics import concatenate
+from gsim3d.effects import EffectsSpec, Plan
+from gsim3d.errors import InputError
+from gsim3d.simulator import Simulator
+from gsim3d.train import checkpoint
+from gsim3d.train.config import TrainConfig
+from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
+from gsim3d.train.restore import build_simulator, describe, model_config
+from gsim3d.train.samples import Batch, check_scenes, draw_batch
+from gsim3d.train.schedule import one_cycle
+from gsim3d.train.settings import to_dict
+
+LOG = "metrics.jsonl"
+EMA_WARM_UP = 10  # the average forgets its first values: decay is at most (1 + step) / (10 + step)
+# May change between two sittings of one run without changing the curve.
+FREE_SETTINGS = ("checkpoint_every", "keep_checkpoints", "log_every")
+
+
+class Trainer:
+    """One training run in a folder: weights, optimizer and averaged weights at some step.
+
+    Args:
+        config: the run. A folder that already has a checkpoint must have been started with the same one.
+        scenes: to train on, in a fixed order.
+        out: run folder, made if absent.
+    """
+
+    def __init__(self, config: TrainConfig, scenes: Sequence[Scene], out: str | Path):
+        check_scenes(scenes, config.data, config.stages)
+        self.config, self.scenes, self.out = config, list(scenes), Path(out)
+        self.plan_spec = EffectsSpec.from_dict(config.effects)
+        self.simulator = build_simulator(model_config(config), config.seed)
+        self.plan = self.simulator.plan(self.plan_spec)
+        _check_history(config, self.plan)
+        self.parameters = dict(self.simulator.named_parameters())
+        settings = config.optimizer
+        self.optimizer = torch.optim.AdamW(
+            self.parameters.values(),
+            lr=0.0,
+            betas=(settings.beta1, settings.beta2),
+            eps=settings.eps,
+            weight_decay=settings.weight_decay,
+        )
+        self.average = {k: v.clone() for k, v in self.simulator.state_dict().items()} if settings.ema_decay else {}
+        self.step = self.n_skipped = 0
+        self.seconds = 0.0
+        self.parent = None
+        if checkpoint.exists(self.out):
+            self._resume()
+
+    def run(self, *, until: int | None = None, progress: bool = True) -> None:
+        """Trains to the end of the configuration, or to optimizer step ``until``, and saves there."""
+        until = self.config.n_steps if until is None else min(until, self.config.n_steps)
+        self.out.mkdir(parents=True, exist_ok=True)
+        self.simulator.train()
+        bar = tqdm(total=until, initial=self.step, desc="training", unit="step", disable=not progress)
+        with bar, deterministic(), open(self.out / LOG, "a") as log:
+            while self.step < until:
+                start = time.perf_counter()
+                entry = self.train_step()
+                self.seconds += time.perf_counter() - start
+                if entry["step"] % self.config.log_every == 0 or "skipped" in entry or self.step == self.config.n_steps:
+                    log.write(json.dumps({**entry, "seconds": round(self.seconds, 2)}) + "\n")
+                    log.flush()
+                bar.set_postfix_str(_postfix(entry), refresh=False)
+                bar.update()
+                if self.step % self.config.checkpoint_every == 0 or self.step == until:
+                    self.save()
+
+    def train_step(self) -> dict:
+        """One optimizer step; what to log of it. Weights stay as they are where loss or gradient is not finite."""
+        stage, place = self.config.stage_of(self.step)
+        batch = draw_batch(self.scenes, self.config.data, stage, self.config.seed, self.step)
+        rate = one_cycle(place, stage.steps, stage.learning_rate, stage.warm_up)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss, errors = self.loss(batch)
+        entry = {"step": self.step, "loss": loss.item(), "learning_rate": rate}
+        if math.isfinite(entry["loss"]):
+            loss.backward()
+            entry["grad_norm"] = torch.nn.utils.clip_grad_norm_(
+                self.parameters.values(), self.config.optimizer.clip_norm or math.inf
+            ).item()
+        if math.isfinite(entry.get("grad_norm", math.nan)):
+            for group in self.optimizer.param_groups:
+                group["lr"] = rate
+            self.optimizer.step()
+            self._update_average()
+        else:
+            self.n_skipped += 1
+            entry["skipped"] = "the loss or its gradient is not finite"
+        past, future = errors[: batch.n_context], errors[batch.n_context :]
+        entry["past_psnr"] = _psnr(past)
+        if batch.n_future:
+            entry["future_psnr"] = _psnr(future)
+        self.step += 1
+        return {name: _plain(value) for name, value in entry.items()}
+
+    def loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """The loss of a batch, and the unweighted mean squared error of each step."""
+        loss_config, targets = self.config.loss, batch.targets
+        rng = generator(self.config.seed, self.step, 0, "dynamics")
+        noise = torch.Generator().manual_seed(int(rng.integers(2**63)))
+        particles = self.simulator.encode(batch.context)
+        if batch.n_future:
+            steps = self.simulator.rollout(particles, batch.n_future, self.plan, generator=noise)
+            particles = concatenate([particles, *steps])
+        images = self.simulator.render(particles, targets.cameras, plan=self.plan).color
+        truth = targets.images.permute(0, 2, 3, 1)
+        weight = 1 + loss_config.body_weight * targets.dynamic if loss_config.body_weight else None
+        weights = time_weights(
+            batch.n_context, batch.n_future, balance=loss_config.balance, discount=loss_config.discount
+        )
+        step = batch.target_step()
+        loss, _ = image_loss(images, truth, step, weights, weight)
+        with torch.no_grad():
+            errors = mean_by_step(image_errors(images, truth), step, batch.n_context + batch.n_future)
+        return loss, errors
+
+    def save(self) -> Path:
+        """Writes a checkpoint of this step into the run folder."""
+        moments = {}
+        for name, parameter in self.parameters.items():
+            for kind, value in self.optimizer.state[parameter].items():
+                moments[f"{kind}.{name}"] = value
+        state = {
+            "step": self.step,
+            "next_sample": self.step,
+            "n_skipped": self.n_skipped,
+            "seconds": self.seconds,
+            "parent": self.parent,
+        }
+        folder = checkpoint.save(
+            self.out,
+            checkpoint.Checkpoint(
+                model=self.simulator.state_dict(),
+                ema=self.average,
+                optimizer=moments,
+                config=describe(self.config, self.simulator.config, self.scenes[0], self.plan_spec),
+                state=state,
+            ),
+            self.config.keep_checkpoints,
+        )
+        self.parent = checkpoint.digest_of(folder)
+        return folder
+
+    def _resume(self) -> None:
+        saved = checkpoint.load(self.out)
+        before, now = dict(saved.config.get("train", {})), to_dict(self.config)
+        for name in now:
+            if name not in FREE_SETTINGS and before.get(name) != now[name]:
+                raise InputError(f"{self.out}: was started with another {name!r}; use another folder or the same setting")
+        self.simulator.load_state_dict(saved.model)
+        if self.average:
+            self.average = saved.ema
+        for key, value in saved.optimizer.items():
+            kind, name = key.split(".", 1)
+            if name in self.parameters:
+                self.optimizer.state[self.parameters[name]][kind] = value
+        self.step, self.n_skipped = saved.state["step"], saved.state["n_skipped"]
+        self.seconds, self.parent = saved.state["seconds"], saved.digest
+        self._cut_log()
+
+    def _cut_log(self) -> None:
+        """Drops what was logged after the checkpoint: those steps will be repeated."""
+        file = self.out / LOG
+        if file.exists():
+            lines = file.read_text().splitlines()
+            kept = [line for line in lines if _step_of(line) < self.step]
+            if kept != lines:
+                part = file.with_name(f".{file.name}.part")
+                part.write_text("".join(line + "\n" for line in kept))
+                os.replace(part, file)
+
+    def _update_average(self) -> None:
+        decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (EMA_WARM_UP + self.step))
+        with torch.no_grad():
+            for name, value in self.simulator.state_dict().items():
+                if name in self.average:
+                    if value.is_floating_point():
+                        self.average[name].lerp_(value, 1 - decay)
+                    else:
+                        self.average[name].copy_(value)
+
+
+@contextmanager
+def deterministic() -> Iterator[None]:
+    """Within it torch uses deterministic algorithms only."""
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    before = torch.are_deterministic_algorithms_enabled()
+    fill = torch.utils.deterministic.fill_uninitialized_memory
+    cudnn = torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark
+    torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # costs time and changes no result of a correct op
+    torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = True, False
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before)
+        torch.utils.deterministic.fill_uninitialized_memory = fill
+        torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = cudnn
+
+
+def _check_history(config: TrainConfig, plan: Plan) -> None:
+    for history in {config.data.history, *(stage.history for stage in config.stages if stage.horizon)}:
+        if history > plan.history:
+            raise InputError(f"data.history: {history} steps, but this model sees up to {plan.history}")
+
+
+def _psnr(errors: Tensor) -> float:
+    return -10 * math.log10(max(1e-10, errors.mean().item())) if bool(errors.isfinite().all()) else math.nan
+
+
+def _plain(value):
+    """JSON has no NaN: what is not finite is logged as text."""
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _step_of(line: str) -> float:
+    try:
+        return json.loads(line)["step"]
+    except (ValueError, KeyError, TypeError):
+        return math.inf  # the last line of a killed process
+
+
+def _postfix(entry: dict) -> str:
+    values = {name: entry.get(f"{name}_psnr") for name in ("past", "future")}
+    return ", ".join(f"{name} {value:.1f} dB" for name, value in values.items() if isinstance(value, float))

@@ -1,0 +1,93 @@
+"""From configurations and checkpoints to simulators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from gsim3d import presets
+from gsim3d.data import Scene
+from gsim3d.effects import EffectsSpec, Plan
+from gsim3d.errors import InputError
+from gsim3d.presets import ModelConfig
+from gsim3d.simulator import Simulator
+from gsim3d.train import checkpoint
+from gsim3d.train.config import DataConfig, TrainConfig
+from gsim3d.train.settings import from_dict, to_dict
+
+PRESETS = ("tiny", "small", "paper_latent", "paper_explicit")
+
+
+@dataclass(frozen=True)
+class Restored:
+    """A trained simulator and what it was trained for.
+
+    data: which frames and views it saw.   image_size: (width, height) pixels.   plan: of the effects it was trained with.
+    checkpoint: where it came from.
+    """
+
+    simulator: Simulator
+    data: DataConfig
+    image_size: tuple[int, int]
+    plan: Plan
+    checkpoint: checkpoint.Checkpoint
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raises InputError where the scene's images have another size than those of the training."""
+        if (scene.width, scene.height) != self.image_size:
+            raise InputError(
+                f"{scene.path}: images of {scene.width}x{scene.height} pixels; the model was trained on "
+                f"{self.image_size[0]}x{self.image_size[1]}"
+            )
+
+
+def model_config(config: TrainConfig) -> ModelConfig:
+    """The preset with the configuration's changes."""
+    if config.preset not in PRESETS:
+        raise InputError(f"preset: must be one of {', '.join(PRESETS)}; got {config.preset!r}")
+    base = getattr(presets, config.preset)()
+    return from_dict(ModelConfig, config.model, "model", base)
+
+
+def build_simulator(config: ModelConfig, seed: int) -> Simulator:
+    """A simulator whose first weights are a function of the seed; torch's own random state stays as it was."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Simulator(config)
+
+
+def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: EffectsSpec) -> dict:
+    """The content of a checkpoint's config.yaml."""
+    return {
+        "model": to_dict(model),
+        "data": {**to_dict(config.data), "image_size": [scene.width, scene.height], "near_far": "of each scene"},
+        "effects": {"spec": effects.to_dict(), "hash": effects.hash},
+        "train": to_dict(config),
+    }
+
+
+def restore(path: str | Path) -> Restored:
+    """The simulator of a checkpoint (run folder, checkpoint folder or single file), ready to predict.
+
+    Raises:
+        InputError: the checkpoint is broken or does not fit this version; the message names it.
+    """
+    saved = checkpoint.load(path)
+    data = dict(saved.config["data"])
+    image_size = tuple(data.pop("image_size", ()))
+    data.pop("near_far", None)
+    if len(image_size) != 2 or not all(isinstance(size, int) for size in image_size):
+        raise InputError(f"{path}: data.image_size must be [width, height]; got {list(image_size)}")
+    try:
+        simulator = build_simulator(from_dict(ModelConfig, saved.config["model"], "model"), seed=0)
+        settings = from_dict(DataConfig, data, "data")
+        spec = EffectsSpec.from_dict(saved.config.get("effects", {}).get("spec"))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    try:
+        simulator.load_state_dict(saved.weights)
+    except RuntimeError as error:
+        raise InputError(f"{path}: the weights do not fit the model: {str(error).splitlines()[-1].strip()}") from None
+    return Restored(simulator.eval(), settings, image_size, simulator.plan(spec), saved)

@@ -1,0 +1,112 @@
+"""What one training step sees: windows of scenes, their input images and the images that the loss compares."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsim3d.data import Scene, Window, generator, make_frames
+from gsim3d.errors import InputError
+from gsim3d.train.config import DataConfig, StageConfig
+from gsim3d.types import Frames
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Windows of B scenes, all of n_context + n_future steps.
+
+    context: input images of the first n_context steps of each.
+    targets: images of all steps; image i shows cloud b * (n_context + n_future) + t.
+    """
+
+    context: Frames
+    targets: Frames
+    n_context: int
+    n_future: int
+
+    def target_step(self) -> Tensor:
+        """int64 [I], the step in its window that each target image shows."""
+        return self.targets.cameras.image_cloud % (self.n_context + self.n_future)
+
+
+def check_scenes(scenes: Sequence[Scene], data: DataConfig, stages: Sequence[StageConfig]) -> None:
+    """Raises InputError, naming the scene, where windows or views of a stage do not fit."""
+    if not scenes:
+        raise InputError("there is no scene to train on")
+    for scene in scenes:
+        first = scenes[0]
+        if (scene.width, scene.height) != (first.width, first.height):
+            raise InputError(
+                f"{scene.path}: images of {scene.width}x{scene.height} pixels, those of {first.path} have "
+                f"{first.width}x{first.height}"
+            )
+        for stage in stages:
+            n_steps = (stage.history or data.history) + stage.horizon
+            if scene.n_steps < n_steps:
+                raise InputError(f"{scene.path}: {scene.n_steps} steps; windows of {n_steps} steps do not fit")
+            if scene.n_cams < stage.target_views:
+                raise InputError(f"{scene.path}: {scene.n_cams} cameras; {stage.target_views} target views do not fit")
+        if len(context_cameras(scene, data)) < data.context_views:
+            raise InputError(f"{scene.path}: too few cameras for {data.context_views} context views")
+
+
+def context_cameras(scene: Scene, data: DataConfig) -> list[int]:
+    """Cameras whose images may be an input, ascending."""
+    allowed = data.context_cameras or range(scene.n_cams)
+    for cam in (*allowed, *data.target_only_cameras):
+        if not 0 <= cam < scene.n_cams:
+            raise InputError(f"{scene.path}: camera {cam} does not exist; the scene has {scene.n_cams}")
+    return sorted(set(allowed) - set(data.target_only_cameras))
+
+
+def draw_batch(scenes: Sequence[Scene], data: DataConfig, stage: StageConfig, seed: int, step: int) -> Batch:
+    """The samples of optimizer step ``step``: a function of (seed, step, sample) only.
+
+    Context views are spread evenly around the list of allowed cameras, turned at random, the same at all steps of a
+    window; target views are any cameras, drawn afresh at every step.
+    """
+    n_context = stage.history or data.history
+    windows = [
+        _draw_window(scenes, data, stage, n_context, seed, step, sample) for sample in range(stage.batch)
+    ]
+    chosen = [window.scene for window in windows]
+    steps = [list(window.steps) for window in windows]
+    context = make_frames(chosen, [window.context_cams for window in windows], [s[:n_context] for s in steps])
+    targets = make_frames(chosen, [window.target_cams for window in windows], steps)
+    return Batch(thin_background(context, data.background_stride), targets, n_context, stage.horizon)
+
+
+def thin_background(frames: Frames, stride: int) -> Frames:
+    """``frames`` of whose fixed pixels only those on every ``stride``-th row and column become particles."""
+    if stride == 1 or frames.masks is None:
+        return frames
+    kept = torch.zeros(frames.masks.shape[1:], dtype=torch.bool, device=frames.masks.device)
+    kept[stride // 2 :: stride, stride // 2 :: stride] = True
+    return dataclasses.replace(frames, masks=frames.masks & (kept | frames.dynamic))
+
+
+def spread_views(cameras: Sequence[int], count: int, turn: int) -> tuple[int, ...]:
+    """``count`` of ``cameras``, evenly spread around the list, shifted by ``turn`` places."""
+    n = len(cameras)
+    return tuple(sorted(cameras[(turn + k * n // count) % n] for k in range(count)))
+
+
+def _draw_window(scenes, data: DataConfig, stage: StageConfig, n_context: int, seed: int, step: int, sample: int) -> Window:
+    rng = generator(seed, step, sample, "window")
+    scene = scenes[int(rng.integers(len(scenes)))]
+    n_steps = n_context + stage.horizon
+    last_start = scene.n_steps - n_steps
+    start = int(rng.integers(last_start + 1))
+    if rng.random() < stage.from_start:
+        start = 0
+    views = generator(seed, step, sample, "views")
+    cameras = context_cameras(scene, data)
+    context = spread_views(cameras, data.context_views, int(views.integers(len(cameras))))
+    targets = tuple(
+        tuple(int(cam) for cam in views.permutation(scene.n_cams)[: stage.target_views]) for _ in range(n_steps)
+    )
+    return Window(scene, start, n_context, (context,) * n_context, targets)

@@ -1,0 +1,105 @@
+"""Layout of the state and the rules that update it."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gsim3d.dynamics.state import StateLayout, bounded, position_features, rotate_left
+from gsim3d.quirks import Quirks
+from gsim3d.renderer import rotation_matrices
+from gsim3d.types import FROZEN
+from tests.asserts import assert_close_relative_to_max, assert_same_bits
+from tests.dynamics.scenes import EXPLICIT, TINY, make_history
+
+LATENT = StateLayout.of(dataclasses.replace(TINY, position_features=False))
+
+
+def test_channels_of_the_latent_state():
+    assert LATENT.inputs == (("dynamic_latents", 4), ("opacities", 1), ("static_latents", 3))
+    assert LATENT.outputs == (("dynamic_latents", 4), ("means", 3))
+    particles = make_history((5,))
+    packed = LATENT.pack(particles)
+    assert_same_bits(packed[:, 4], particles.opacities)
+    assert_same_bits(packed[:, 5:], particles.static_latents)
+
+
+def test_channels_of_the_explicit_state():
+    layout = StateLayout.of(dataclasses.replace(EXPLICIT, dynamic_latents=0, position_features=False))
+    assert [name for name, _ in layout.inputs] == ["sh", "opacities", "quats", "scales", "static_latents"]
+    assert [name for name, _ in layout.outputs] == ["sh", "means", "opacities", "quats", "scales"]
+    assert (layout.in_channels, layout.out_channels) == (12 + 1 + 4 + 3 + 3, 12 + 3 + 1 + 3 + 3)
+    particles = make_history((5,), config=EXPLICIT)
+    packed = layout.pack(particles)
+    assert_same_bits(packed[:, :4].contiguous(), particles.sh[:, :, 0].contiguous(), "red harmonics come first")
+    assert_same_bits(packed[:, 13:17], particles.quats.roll(-1, 1), "real part last")
+
+
+def test_position_features_are_relative_to_origin_and_cell():
+    particles = dataclasses.replace(
+        make_history((1,)), means=torch.tensor([[1.25, 2.0, 3.375]]), origin=torch.tensor([[1.0, 1.0, 1.0]]).double()
+    )
+    features = position_features(particles, grid_size=0.5, length=2.0)
+    assert features.tolist() == [[0.125, 0.5, 1.1875, 0.0, -1.0, 0.5]]
+
+
+def test_increments():
+    particles = make_history((20,), config=EXPLICIT)
+    layout = StateLayout.of(EXPLICIT)
+    prediction = 50 * torch.randn(20, layout.out_channels, generator=torch.Generator().manual_seed(0))
+    after = layout.advance(particles, prediction)
+    moves = particles.activity != FROZEN
+    assert ((after.means - particles.means).abs() <= EXPLICIT.max_step * 1.001).all()
+    assert ((after.dynamic_latents - particles.dynamic_latents).abs() <= EXPLICIT.max_latent_step * 1.001).all()
+    assert after.opacities.min() == 0 and after.opacities.max() == 1
+    assert after.scales.min() >= EXPLICIT.scale_min and after.scales.max() <= EXPLICIT.scale_max
+    assert_close_relative_to_max(after.quats.norm(dim=1), torch.ones(20), 1e-6)
+    assert not torch.equal(after.quats[moves], particles.quats[moves])
+
+
+def test_no_limit_adds_the_prediction_itself():
+    x = torch.tensor([-5.0, 0.1])
+    assert bounded(x, None) is x
+    assert_same_bits(bounded(x, 2.0), 2 * torch.tanh(x))
+
+
+@pytest.mark.parametrize("quirk", [False, True])
+def test_quirk_unbounded_opacity(quirk):
+    config = dataclasses.replace(EXPLICIT, quirks=Quirks(unbounded_opacity=quirk))
+    particles = make_history((20,), config=config, frozen_share=0.0)
+    layout = StateLayout.of(config)
+    after = layout.advance(particles, torch.full((20, layout.out_channels), 3.0))
+    assert (after.opacities.max() > 1) == quirk and after.opacities.min() >= 0
+
+
+@pytest.mark.parametrize("quirk", [False, True])
+def test_quirk_frozen_rows_turn(quirk):
+    config = dataclasses.replace(EXPLICIT, quirks=Quirks(frozen_rows_turn=quirk))
+    particles = make_history((20,), config=config, frozen_share=2.0)
+    layout = StateLayout.of(config)
+    after = layout.advance(particles, torch.ones(20, layout.out_channels))
+    assert torch.equal(after.quats, particles.quats) == (not quirk)
+    assert_same_bits(after.means, particles.means)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 9e-5, 1.1e-4, 1.0, 3.0, 7.0])
+def test_rotations_turn_about_world_axes(angle):
+    g = torch.Generator().manual_seed(0)
+    quats = torch.randn(10, 4, generator=g, dtype=torch.float64)
+    axes = torch.nn.functional.normalize(torch.randn(10, 3, generator=g, dtype=torch.float64), dim=1)
+    skew = torch.zeros(10, 3, 3, dtype=torch.float64)
+    x, y, z = (angle * axes).unbind(1)
+    skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -z, y, -x
+    expected = torch.linalg.matrix_exp(skew - skew.mT) @ rotation_matrices(quats / quats.norm(dim=1, keepdim=True))
+    turned = rotate_left(quats, angle * axes)
+    assert_close_relative_to_max(rotation_matrices(turned), expected, 1e-12)
+    assert (turned.gather(1, turned.abs().argmax(1, keepdim=True)) > 0).all()
+
+
+def test_gradients_of_rotations_also_at_zero():
+    g = torch.Generator().manual_seed(1)
+    quats = torch.randn(4, 4, generator=g, dtype=torch.float64, requires_grad=True)
+    vectors = torch.randn(4, 3, generator=g, dtype=torch.float64)
+    vectors[0] = 0
+    vectors[1] *= 1e-6
+    assert torch.autograd.gradcheck(rotate_left, (quats, vectors.requires_grad_()), atol=1e-6)

@@ -1,0 +1,141 @@
+"""The protocol: what the baselines show, how scores are averaged, and that reports hold no NaN."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+import torch
+
+from gsim3d import presets
+from gsim3d.data import Scene
+from gsim3d.effects import EffectsSpec
+from gsim3d.errors import InputError
+from gsim3d.evaluate.pictures import as_bytes, comparison_frames, splat_picture, true_images, write_psnr_plot
+from gsim3d.evaluate.protocol import (
+    METHODS,
+    SceneScores,
+    constant_velocity,
+    default_views,
+    predict,
+    render_steps,
+    score_scene,
+)
+from gsim3d.evaluate.report import summarize, table, write_json
+from gsim3d.train.checkpoint import Checkpoint
+from gsim3d.train.config import DataConfig
+from gsim3d.train.restore import Restored, build_simulator
+from tests.tiny_scenes import write_scene
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return Scene.open(write_scene(tmp_path_factory.mktemp("scene") / "0000"))
+
+
+@pytest.fixture(scope="module")
+def restored():
+    """An untrained model: tiny's dynamics starts as the identity, so a little noise in its head makes things move."""
+    simulator = build_simulator(presets.tiny(), seed=0).eval()
+    with torch.no_grad():
+        simulator.dynamics.net.head.fc2.weight.normal_(0, 0.02, generator=torch.Generator().manual_seed(0))
+    data = DataConfig(history=2, context_views=2, target_only_cameras=(3,), background_stride=2)
+    return Restored(simulator, data, (32, 32), simulator.plan(EffectsSpec()), Checkpoint({}, {}))
+
+
+def test_default_views(restored, scene):
+    assert default_views(restored, scene) == ((0, 2), (3,))
+    free = dataclasses.replace(restored, data=DataConfig(context_views=2))
+    assert default_views(free, scene) == ((0, 2), (1, 3, 4))
+
+
+def test_rollout_rows_keep_their_number_and_frozen_ones_their_place(restored, scene):
+    prediction = predict(restored, scene, (0, 2), 3)
+    assert prediction.n_steps == 5
+    clouds = [prediction.particles.select_clouds(torch.tensor([q])) for q in range(1, 5)]
+    assert len({cloud.n_rows for cloud in clouds}) == 1
+    frozen = clouds[0].activity == 1
+    assert torch.equal(clouds[0].means[frozen], clouds[-1].means[frozen])
+    assert (clouds[0].means[~frozen] != clouds[-1].means[~frozen]).any()
+
+
+def test_constant_velocity_continues_the_centroid(restored, scene):
+    prediction = predict(restored, scene, (0, 2), 3)
+
+    def centroid(particles, cloud):
+        cloud = particles.select_clouds(torch.tensor([cloud]))
+        return cloud.means[cloud.activity == 0].mean(0)
+
+    first, last = centroid(prediction.particles, 0), centroid(prediction.particles, 1)
+    moved = constant_velocity(prediction)
+    assert moved.n_clouds == 3
+    for j in range(3):
+        torch.testing.assert_close(centroid(moved, j), last + (j + 1) * (last - first), rtol=0, atol=1e-5)
+
+
+def test_scores_by_hand(restored, scene):
+    scores = score_scene(restored, scene)
+    assert set(scores.values) == set(METHODS) and scores.n_encoded == 2
+    truth = scene.images([3], range(6)).permute(0, 1, 3, 4, 2).float() / 255
+    for step in range(2, 6):
+        mse = (truth[1] - truth[step]).square().mean().item()
+        assert scores.values["copy"]["psnr"][step].item() == pytest.approx(-10 * math.log10(mse), abs=1e-4)
+    prediction = predict(restored, scene, (0, 2), 4)
+    images = render_steps(restored, prediction.particles, scene, [3])
+    for method, shown in (("model", 4), ("constant", 1), ("release_constant", 2)):
+        mask = scene.segmentation([3], [4])[0] > 0
+        mse = (images[shown] - truth[4])[mask].square().mean().item()
+        assert scores.values[method]["psnr_masked"][4].item() == pytest.approx(-10 * math.log10(mse), abs=1e-4)
+    assert scores.values["constant"]["psnr"][:2].isnan().all()
+
+
+def test_what_does_not_fit_is_named(restored, scene):
+    with pytest.raises(InputError, match="the model was trained on 64x64"):
+        predict(dataclasses.replace(restored, image_size=(64, 64)), scene, (0, 2), 1)
+    with pytest.raises(InputError, match="at least 1"):
+        predict(restored, scene, (0, 2), 0)
+    with pytest.raises(InputError, match="from step 5"):
+        predict(restored, scene, (0, 2), 1, start=5)
+    with pytest.raises(InputError, match="only 4 after the input"):
+        score_scene(restored, scene, n_future=5)
+
+
+def example_scores(name="a", shift=0.0, n_steps=6):
+    values = torch.arange(n_steps, dtype=torch.float64) + shift
+    return SceneScores(name, 2, {m: {"psnr": values.clone(), "ssim": values / 10} for m in METHODS})
+
+
+def test_summary_by_hand(tmp_path):
+    summary = summarize([example_scores("a"), example_scores("b", shift=2.0)])
+    assert summary["past.psnr"] == 1.5 and summary["future.psnr"] == 4.5 and summary["future_late.psnr"] == 5.5
+    assert summary["future_std.psnr"] == pytest.approx(math.sqrt(2)) and summary["constant.future.ssim"] == pytest.approx(0.45)
+    assert summary["by_step"]["psnr"] == [1, 2, 3, 4, 5, 6] and summary["scenes"]["b"]["future.psnr"] == 5.5
+    write_json(tmp_path / "a.json", summary)
+    assert json.loads((tmp_path / "a.json").read_text()) == summary
+    assert "predicted" in table(summary) and "4.50" in table(summary)
+    write_psnr_plot(tmp_path / "a.png", summary, fps=12)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "a.png"]
+
+
+def test_values_that_do_not_exist_are_null(tmp_path):
+    scores = example_scores()
+    scores.values["model"]["psnr"][2:] = torch.nan
+    summary = summarize([scores])
+    assert summary["future.psnr"] is None and summary["future_std.psnr"] is None
+    assert summary["by_step"]["psnr"][2:] == [None] * 4
+    write_json(tmp_path / "a.json", summary)
+    assert " - " in table(summary) + " "
+
+
+def test_pictures(restored, scene):
+    prediction = predict(restored, scene, (0, 2), 6)
+    images = as_bytes(render_steps(restored, prediction.particles, scene, [3, 1]))
+    truth = true_images(scene, [3, 1], range(8))
+    assert truth[5].any() and not truth[6:].any()  # the film has six steps
+    frames = comparison_frames(truth, images)
+    assert len(frames) == 8 and frames[0].shape == (516, 516, 3)
+    assert (frames[0][:256, :256] == truth[0, 0].repeat(8, 0).repeat(8, 1)).all()
+    assert (frames[0][260:, 260:] == images[0, 1].repeat(8, 0).repeat(8, 1)).all()
+    assert splat_picture(restored, prediction, scene, 3, 1).shape == (320, 320, 3)

@@ -1,0 +1,323 @@
+"""Sparse convolution, in the eight sections that every op has."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from gsim3d.ops import KernelMap, PyramidSpec, Voxels, build_pyramid, sparse_conv
+from tests.asserts import (
+    assert_close_relative_to_max,
+    assert_same_bits,
+    assert_same_bits_for_any_threads,
+    gradients,
+)
+from tests.oracle import sparse_conv as oracle
+
+RULES = ["mean", "first"]
+
+
+def random_cells(n: int, side: int, clouds: int = 2, seed: int = 0) -> torch.Tensor:
+    """int64 [n, 4]; several rows share a cell where the box is small."""
+    generator = torch.Generator().manual_seed(seed)
+    cells = torch.randint(0, side, (n, 4), generator=generator)
+    cells[:, 0] %= clouds
+    return cells
+
+
+def geometry(cells, kernel_size, device="cpu"):
+    tables = [t.to(device) for t in oracle.kernel_tables(cells, kernel_size)]
+    return Voxels(*tables[:3]), KernelMap(kernel_size, *tables[3:])
+
+
+def parameters(n, c_in, c_out, kernel_size, dtype=torch.float64, seed=1):
+    """x, weight, bias, cotangent."""
+    generator = torch.Generator().manual_seed(seed)
+    shapes = [(n, c_in), (c_out, *[kernel_size] * 3, c_in), (c_out,), (n, c_out)]
+    return [torch.randn(shape, generator=generator, dtype=torch.float64).to(dtype) for shape in shapes]
+
+
+def convolution(voxels, kernel_map, duplicates="mean"):
+    return lambda x, w, b=None: sparse_conv(x, w, b, voxels, kernel_map, duplicates=duplicates)
+
+
+def raw_arguments(voxels, kernel_map):
+    return voxels.row_voxel, voxels.rows, voxels.cu_rows, kernel_map.tap_in, kernel_map.tap_out, kernel_map.cu_taps
+
+
+# 1 forward against the oracle, 2 backward against autograd of the oracle
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("duplicates", RULES)
+@pytest.mark.parametrize("kernel_size, c_in, c_out", [(3, 5, 7), (3, 33, 70), (5, 17, 16), (1, 4, 8)])
+def test_forward_and_gradients_equal_the_oracle(kernel_size, c_in, c_out, duplicates, dtype, device):
+    cells = random_cells(60, 3)
+    x, weight, bias, cotangent = parameters(60, c_in, c_out, kernel_size, dtype)
+    ours = convolution(*geometry(cells, kernel_size, device), duplicates)
+    actual = gradients(ours, [t.to(device) for t in (x, weight, bias)], cotangent)
+    expected = gradients(
+        lambda x, w, b: oracle.sparse_conv(x, w, b, cells, duplicates), [t.double() for t in (x, weight, bias)], cotangent
+    )
+    name = "sparse_conv_float32" if dtype == torch.float32 else "sparse_conv_float64"
+    for what, a, b in zip(("result", "grad x", "grad weight", "grad bias"), actual, expected):
+        assert_close_relative_to_max(a, b, name, what)
+
+
+@pytest.mark.parametrize("kernel_size", [3, 5])
+@pytest.mark.parametrize("duplicates", RULES)
+def test_equals_a_dense_convolution_where_no_voxel_is_shared(kernel_size, duplicates, device):
+    cells = torch.unique(random_cells(150, 7, clouds=1), dim=0)
+    cells = cells[torch.randperm(len(cells), generator=torch.Generator().manual_seed(0))]
+    x, weight, bias, cotangent = parameters(len(cells), 6, 9, kernel_size)
+    ours = convolution(*geometry(cells, kernel_size, device), duplicates)
+    actual = gradients(ours, [t.to(device) for t in (x, weight, bias)], cotangent)
+    expected = gradients(lambda x, w, b: oracle.dense_conv(x, w, b, cells), [x, weight, bias], cotangent)
+    for a, b in zip(actual, expected):
+        assert_close_relative_to_max(a, b, "sparse_conv_float64")
+
+
+def test_long_taps_are_summed_in_several_blocks(device):
+    """More pairs than a block of the weight gradient holds, at the centre and beside it."""
+    n = 9000
+    cells = torch.stack([torch.zeros(n, dtype=torch.int64), torch.arange(n), *torch.zeros(2, n, dtype=torch.int64)], 1)
+    none = torch.zeros(0, dtype=torch.int64)
+    rows = torch.arange(n)
+    counts = torch.zeros(27, dtype=torch.int64)
+    counts[4], counts[22] = n - 1, n - 1  # offsets (-1, 0, 0) and (1, 0, 0)
+    cu_taps = torch.cat([none.new_zeros(1), torch.cumsum(counts, 0)])
+    kernel_map = KernelMap(3, torch.cat([rows[:-1], rows[1:]]), torch.cat([rows[1:], rows[:-1]]), cu_taps)
+    voxels = Voxels(rows, rows, torch.arange(n + 1))
+    voxels = Voxels(*(t.to(device) for t in (voxels.row_voxel, voxels.rows, voxels.cu_rows)))
+    kernel_map = KernelMap(3, *(t.to(device) for t in (kernel_map.tap_in, kernel_map.tap_out, kernel_map.cu_taps)))
+    x, weight, bias, cotangent = parameters(n, 3, 4, 3)
+    actual = gradients(convolution(voxels, kernel_map), [t.to(device) for t in (x, weight, bias)], cotangent)
+    expected = gradients(lambda x, w, b: oracle.dense_conv(x, w, b, cells), [x, weight, bias], cotangent)
+    for a, b in zip(actual, expected):
+        assert_close_relative_to_max(a, b, 1e-13)
+
+
+# 3 gradcheck
+@pytest.mark.parametrize("duplicates", RULES)
+def test_gradcheck(duplicates):
+    x, weight, bias, _ = parameters(10, 2, 1, 3)
+    inputs = [t.requires_grad_() for t in (x, weight, bias)]
+    torch.autograd.gradcheck(convolution(*geometry(random_cells(10, 2, clouds=1), 3), duplicates), inputs)
+
+
+# 4 CPU against CUDA
+@pytest.mark.parametrize("duplicates", RULES)
+def test_cuda_equals_cpu(duplicates, devices):
+    cells = random_cells(300, 5)
+    x, weight, bias, cotangent = parameters(300, 32, 48, 3, torch.float32)
+    results = []
+    for device in devices:
+        ours = convolution(*geometry(cells, 3, device), duplicates)
+        results.append(gradients(ours, [t.to(device) for t in (x, weight, bias)], cotangent))
+    for cpu, cuda in zip(*results):
+        assert_close_relative_to_max(cuda, cpu, "sparse_conv_float32")
+
+
+# 5 opcheck
+def test_opcheck():
+    voxels, kernel_map = geometry(random_cells(12, 2), 3)
+    x, weight, bias, cotangent = parameters(12, 2, 3, 3, torch.float32)
+    tables = raw_arguments(voxels, kernel_map)
+    inputs = [t.requires_grad_() for t in (x, weight, bias)]
+    torch.library.opcheck(torch.ops.gsim3d.sparse_conv.default, (*inputs, *tables, False))
+    checks = ("test_schema", "test_faketensor")
+    x, weight = x.detach(), weight.detach()
+    for op, arguments in (
+        (torch.ops.gsim3d.sparse_conv_grad_input, (cotangent, weight, *tables, True)),
+        (torch.ops.gsim3d.sparse_conv_grad_weight, (cotangent, x, 3, *tables, True)),
+    ):
+        torch.library.opcheck(op.default, arguments, test_utils=checks)
+
+
+# 6 torch.compile
+def test_compiled_equals_eager():
+    voxels, kernel_map = geometry(random_cells(40, 3), 3)
+    x, weight, bias, cotangent = parameters(40, 4, 6, 3, torch.float32)
+
+    def block(x, weight, bias):
+        return sparse_conv(x.sin(), weight, bias, voxels, kernel_map).relu()
+
+    compiled = torch.compile(block, fullgraph=True, backend="aot_eager")
+    eager = gradients(block, [x, weight, bias], cotangent)
+    for a, b in zip(gradients(compiled, [x, weight, bias], cotangent), eager):
+        assert_close_relative_to_max(a, b, "sparse_conv_float32")
+
+
+# 7 edges
+def test_no_rows(device):
+    voxels, kernel_map = geometry(torch.zeros(0, 4, dtype=torch.int64), 3, device)
+    x, weight, bias, cotangent = (t.to(device) for t in parameters(0, 2, 3, 3))
+    out, grad_x, grad_weight, grad_bias = gradients(convolution(voxels, kernel_map), [x, weight, bias], cotangent)
+    assert out.shape == (0, 3) and grad_x.shape == (0, 2)
+    assert grad_weight.shape == weight.shape and not grad_weight.any() and not grad_bias.any()
+
+
+@pytest.mark.parametrize("duplicates", RULES)
+def test_one_row_reads_itself_only(duplicates, device):
+    cells = torch.tensor([[0, 4, 5, 6]])
+    x, weight, bias, _ = (t.to(device) for t in parameters(1, 3, 2, 3))
+    out = convolution(*geometry(cells, 3, device), duplicates)(x, weight, bias)
+    assert_close_relative_to_max(out, x @ weight[:, 1, 1, 1].T + bias, 1e-14)
+
+
+def test_missing_bias_and_missing_gradients(device):
+    cells = random_cells(30, 3)
+    x, weight, _, cotangent = (t.to(device) for t in parameters(30, 3, 4, 3))
+    ours = convolution(*geometry(cells, 3, device))
+    expected = gradients(ours, [x, weight, torch.zeros(4, device=device, dtype=x.dtype)], cotangent)[:3]
+    for a, b in zip(gradients(ours, [x, weight], cotangent), expected):
+        assert_same_bits(a, b)
+    fixed = gradients(lambda x: ours(x, weight), [x], cotangent)
+    assert_same_bits(fixed[1], expected[1])
+    assert not ours(x, weight).requires_grad
+
+
+@pytest.mark.parametrize("c_in, c_out", [(1, 1), (8, 16), (16, 31), (32, 33), (24, 100), (130, 12)])
+def test_channel_counts_beside_the_vector_widths(c_in, c_out, device):
+    cells = random_cells(25, 2)
+    x, weight, bias, cotangent = parameters(25, c_in, c_out, 3, torch.float32)
+    ours = convolution(*geometry(cells, 3, device))
+    actual = gradients(ours, [t.to(device) for t in (x, weight, bias)], cotangent)
+    inputs = [t.double() for t in (x, weight, bias)]
+    expected = gradients(lambda x, w, b: oracle.sparse_conv(x, w, b, cells, "mean"), inputs, cotangent)
+    for a, b in zip(actual, expected):
+        assert_close_relative_to_max(a, b, "sparse_conv_float32")
+
+
+def test_a_cloud_does_not_change_another(device):
+    """Bit for bit, also when the other cloud has shared voxels and is packed before."""
+    alone, other = random_cells(50, 6, clouds=1), random_cells(200, 3, clouds=1, seed=5)
+    both = torch.cat([other, alone + torch.tensor([1, 0, 0, 0])])
+    x, weight, bias, _ = parameters(250, 8, 8, 3, torch.float32)
+    x, weight, bias = (t.to(device) for t in (x, weight, bias))
+    packed = convolution(*geometry(both, 3, device))(x, weight, bias)[200:]
+    assert_same_bits(packed, convolution(*geometry(alone, 3, device))(x[200:], weight, bias))
+
+
+def test_order_of_rows_does_not_matter_for_the_mean(device):
+    cells = random_cells(80, 3)
+    order = torch.randperm(80, generator=torch.Generator().manual_seed(3))
+    x, weight, bias, _ = (t.to(device) for t in parameters(80, 4, 5, 3))
+    out = convolution(*geometry(cells, 3, device))(x, weight, bias)
+    permuted = convolution(*geometry(cells[order], 3, device))(x[order.to(device)], weight, bias)
+    assert_close_relative_to_max(permuted, out[order.to(device)], "sparse_conv_float64")
+
+
+def test_nan_reaches_the_neighbours_only(device):
+    cells = torch.tensor([[0, 0, 0, 0], [0, 1, 0, 0], [0, 5, 5, 5]])
+    x, weight, bias, _ = (t.to(device) for t in parameters(3, 3, 2, 3, torch.float32))
+    x[0] = float("nan")
+    out = convolution(*geometry(cells, 3, device))(x, weight, bias)
+    assert out[:2].isnan().all() and torch.isfinite(out[2]).all()
+
+
+def test_non_contiguous_inputs(device):
+    cells = random_cells(30, 3)
+    x, weight, bias, _ = (t.to(device) for t in parameters(30, 4, 6, 3))
+    ours = convolution(*geometry(cells, 3, device))
+    strided = ours(x.T.contiguous().T, weight.permute(4, 1, 2, 3, 0).contiguous().permute(4, 1, 2, 3, 0), bias)
+    assert_same_bits(strided, ours(x, weight, bias))
+
+
+def test_autocast_computes_in_float32_on_the_cpu():
+    voxels, kernel_map = geometry(random_cells(20, 3), 3)
+    x, weight, bias, _ = parameters(20, 4, 6, 3, torch.float32)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        out = sparse_conv(x.bfloat16(), weight, bias, voxels, kernel_map)
+    assert_same_bits(out, sparse_conv(x.bfloat16().float(), weight, bias, voxels, kernel_map))
+
+
+def test_reads_the_geometry_of_build_pyramid():
+    cells = random_cells(70, 4, clouds=1)
+    spec = PyramidSpec(1.0, 0, (), (), (16,), ((3, 5),))
+    zero, origin = torch.zeros(1, dtype=torch.int64), torch.zeros(1, 3, dtype=torch.float64)
+    stage = build_pyramid(cells[:, 1:] + 0.5, torch.tensor([0, 70]), zero, zero, origin, spec).stages[0]
+    for kernel_size in (3, 5):
+        x, weight, bias, _ = parameters(70, 4, 6, kernel_size)
+        out = sparse_conv(x, weight, bias, stage.voxels, stage.kernel_maps[kernel_size])
+        assert_close_relative_to_max(out, oracle.sparse_conv(x, weight, bias, cells, "mean"), "sparse_conv_float64")
+
+
+def scene_for_bits():
+    x, weight, bias, cotangent = parameters(2000, 20, 40, 3, torch.float32)
+    ours = {rule: convolution(*geometry(random_cells(2000, 12), 3), rule) for rule in RULES}
+    return [t for rule in RULES for t in gradients(ours[rule], [x, weight, bias], cotangent)]
+
+
+def test_same_bits_for_any_number_of_threads():
+    assert_same_bits_for_any_threads(scene_for_bits)
+
+
+def test_same_bits_for_any_vector_width(tmp_path):
+    """GSIM3D_SIMD=avx2 forbids the wide variant, which other processors do not have."""
+    file = tmp_path / "narrow.pt"
+    code = (
+        "import sys, torch; from tests.ops.test_sparse_conv import scene_for_bits; torch.save(scene_for_bits(), sys.argv[1])"
+    )
+    subprocess.run([sys.executable, "-c", code, str(file)], env={**os.environ, "GSIM3D_SIMD": "avx2"}, check=True)
+    for actual, expected in zip(scene_for_bits(), torch.load(file)):
+        assert_same_bits(actual, expected)
+
+
+# 8 error messages
+def two_neighbours():
+    """Rows 0 and 1 share a voxel; row 2 is beside them at +z."""
+    return geometry(torch.tensor([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]), 3)
+
+
+def replaced(part, **fields):
+    return type(part)(**{**vars(part), **{k: torch.tensor(v) if isinstance(v, list) else v for k, v in fields.items()}})
+
+
+TAP_12, TAP_14 = [0] * 13 + [1] * 2, [2] * 13  # the pairs of two_neighbours: one in tap 12, one in tap 14
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        (dict(x=torch.zeros(3)), r"x must be \[N, C_in\]"),
+        (dict(x=torch.zeros(3, 2, dtype=torch.float16)), "weight must be float16; got float32"),
+        (dict(x=torch.zeros(3, 3)), "weight must be .* with C_in=3 from x; got"),
+        (dict(weight=torch.zeros(4, 2, 2, 2, 2)), "kernel_map must have the weight's kernel size 2; got 3"),
+        (dict(weight=torch.zeros(4, 3, 3, 2)), r"weight must be \[C_out, K, K, K, C_in\]; got \[4, 3, 3, 2\]"),
+        (dict(weight=torch.zeros(4, 3, 3, 1, 2)), r"weight must be \[C_out, K, K, K, C_in\]"),
+        (dict(bias=torch.zeros(3)), r"bias must be \[C_out\] = \[4\]; got \[3\]"),
+        (dict(bias=torch.zeros(4, dtype=torch.float64)), "bias must be float32; got float64"),
+        (dict(duplicates="last"), 'duplicates must be "mean" or "first"; got \'last\''),
+        (dict(row_voxel=[0, 0]), r"row_voxel must be \[N\] = \[3\]; got \[2\]"),
+        (dict(row_voxel=[0.0, 0.0, 1.0]), "row_voxel must be int64; got float32"),
+        (dict(row_voxel=[0, 1, 1]), "row_voxel must agree with voxel_rows: row 1 is listed in voxel 0; got 1"),
+        (dict(rows=[0, 0, 2]), "voxel_rows must ascend inside a voxel; got 0 then 0"),
+        (dict(rows=[0, 3, 2]), r"voxel_rows must be in \[0, N\) with N=3; got 3 at 1"),
+        (dict(cu_rows=[0, 2]), "cu_voxel_rows must run from 0 to N=3; got 0 .. 2"),
+        (dict(cu_rows=[0, 0, 3]), "cu_voxel_rows must ascend, no voxel is empty; got 0 then 0 at 0"),
+        (dict(cu_rows=[0, 9, 3]), "cu_voxel_rows must ascend, no voxel is empty; got 0 then 9 at 0"),
+        (dict(tap_in=[1]), r"tap_out must be \[L\] like tap_in"),
+        (dict(tap_in=[0, 2]), r"tap_in must be in \[0, V\) with V=2; got 2 at 1"),
+        (dict(tap_out=[-1, 1]), r"tap_out must be in \[0, V\) with V=2; got -1 at 0"),
+        (dict(cu_taps=[0, 2]), r"cu_taps must be \[K\^3 \+ 1\] = \[28\]; got \[2\]"),
+        (dict(cu_taps=TAP_12 + [3] * 12 + [2]), "cu_taps must not descend; got 3 then 2"),
+        (dict(cu_taps=[0] * 14 + [2] * 14), "the centre tap 13 must have no pairs; got 2"),
+        (dict(cu_taps=[0] * 15 + [2] * 13), "tap_out must ascend inside a tap; got 1 then 0"),
+        (dict(cu_taps=[0] * 15 + [2] * 13, tap_in=[1, 1], tap_out=[0, 1]), "tap_in must name a voxel at most once a tap"),
+    ],
+)
+def test_malformed_arguments_raise(wrong, message):
+    voxels, kernel_map = two_neighbours()
+    arguments = dict(x=torch.zeros(3, 2), weight=torch.zeros(4, 3, 3, 3, 2), bias=None, duplicates="mean")
+    voxels = replaced(voxels, **{k: v for k, v in wrong.items() if k in vars(voxels)})
+    kernel_map = replaced(kernel_map, **{k: v for k, v in wrong.items() if k in vars(kernel_map)})
+    arguments.update({k: v for k, v in wrong.items() if k in arguments})
+    with pytest.raises(ValueError, match=f"sparse_conv: {message}"):
+        sparse_conv(**arguments, voxels=voxels, kernel_map=kernel_map)
+
+
+def test_float16_is_refused():
+    voxels, kernel_map = two_neighbours()
+    with pytest.raises(ValueError, match="sparse_conv: x must be float32 or float64; got float16"):
+        sparse_conv(torch.zeros(3, 2).half(), torch.zeros(4, 3, 3, 3, 2).half(), None, voxels, kernel_map)

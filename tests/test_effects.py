@@ -1,0 +1,93 @@
+"""What a scene calls for: typed, serialisable, and honest about what cannot be done."""
+
+import json
+
+import pytest
+
+from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects, UnsupportedEffect, make_plan
+from gsim3d.errors import InputError
+
+MODEL = {"history": 4, "sh_degree": 3, "changes_opacity": False}
+FULL = EffectsSpec(
+    DynamicsEffects(background="masked_out", history=2),
+    AppearanceEffects(view_dependent=1, changing="dynamic"),
+    outputs=OutputEffects(depth=True),
+)
+
+
+def test_absent_is_off():
+    spec = EffectsSpec()
+    assert spec.to_dict() == {"version": 1} and EffectsSpec.from_dict(None) == spec == EffectsSpec.from_dict({})
+    plan = make_plan(spec, **MODEL)
+    assert (plan.history, plan.sh_degree) == (4, 3)
+    assert {"depth images", "actions", "insertion and removal", "changing opacities"} <= set(plan.skipped)
+
+
+@pytest.mark.parametrize("name", ["effects.yaml", "effects.json"])
+def test_round_trip(tmp_path, name):
+    path = tmp_path / name
+    FULL.save(path)
+    assert EffectsSpec.load(path) == FULL
+    assert EffectsSpec.from_dict(json.loads(json.dumps(FULL.to_dict()))) == FULL
+
+
+def test_hash_tells_specs_apart():
+    assert EffectsSpec().hash == EffectsSpec.from_dict({"version": 1}).hash != FULL.hash
+    assert len(FULL.hash) == 16
+
+
+def test_plan_says_what_is_kept_and_why_the_rest_is_not():
+    plan = make_plan(FULL, **MODEL)
+    assert (plan.history, plan.sh_degree) == (2, 1)
+    assert "view-dependent colour" in plan.kept and "depth images" in plan.kept
+    assert plan.skipped["frozen background"] == "background is masked_out"
+    assert not set(plan.kept) & set(plan.skipped)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"dynamics": {"actions": {"type": "keypoints3d"}}}, "unsupported effect dynamics.actions"),
+        ({"dynamics": {"contact": {"pairs": [["a", "b"]]}}}, "unsupported effect dynamics.contact"),
+        ({"dynamics": {"sleep": {"policy": "exact"}}}, "unsupported effect dynamics.sleep"),
+        ({"structure": {"insert": True}}, "unsupported effect structure.insert"),
+        ({"structure": {"remove": True}}, "unsupported effect structure.remove"),
+        ({"dynamics": {"history": 5}}, "unsupported effect dynamics.history: this model goes up to 4; got 5"),
+        ({"appearance": {"opacity_changes": True}}, "unsupported effect appearance.opacity_changes"),
+    ],
+)
+def test_what_cannot_be_simulated_raises(values, message):
+    with pytest.raises(UnsupportedEffect, match=message):
+        make_plan(EffectsSpec.from_dict(values), **MODEL)
+
+
+def test_view_dependence_beyond_the_model_raises():
+    with pytest.raises(UnsupportedEffect, match="view_dependent: this model goes up to 0; got 2"):
+        make_plan(EffectsSpec(appearance=AppearanceEffects(view_dependent=2)), **{**MODEL, "sh_degree": 0})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"dynamic": {}}, "unknown key dynamic; known: dynamics, appearance"),
+        ({"dynamics": {"backgroud": "frozen"}}, "unknown key dynamics.backgroud"),
+        ({"dynamics": 3}, "dynamics must be a mapping; got 3"),
+        ({"dynamics": {"background": "gone"}}, "dynamics.background must be one of frozen, masked_out, dynamic"),
+        ({"dynamics": {"history": 0}}, "dynamics.history must be an integer of at least 1; got 0"),
+        ({"dynamics": {"history": "2"}}, "dynamics.history must be an integer of at least 1; got '2'"),
+        ({"appearance": {"view_dependent": 4}}, "view_dependent must be 0 to 3; got 4"),
+        ({"appearance": {"changing": "bunny"}}, "appearance.changing must be one of"),
+        ({"version": 2}, "version must be 1; got 2"),
+    ],
+)
+def test_malformed_specs_raise(values, message):
+    with pytest.raises(InputError, match=message):
+        EffectsSpec.from_dict(values)
+
+
+def test_a_file_that_is_no_spec(tmp_path):
+    (tmp_path / "bad.yaml").write_text("- 1\n- 2\n")
+    with pytest.raises(InputError, match="must hold a mapping"):
+        EffectsSpec.load(tmp_path / "bad.yaml")
+    with pytest.raises(InputError, match="cannot read"):
+        EffectsSpec.load(tmp_path / "absent.yaml")

@@ -1,0 +1,252 @@
+"""The whole way: images -> particles -> later particles -> images."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from gsim3d import presets
+from gsim3d.dynamics import last_steps
+from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, UnsupportedEffect
+from gsim3d.encoder import EncoderConfig
+from gsim3d.presets import ModelConfig
+from gsim3d.renderer import RendererConfig
+from gsim3d.simulator import Simulator
+from gsim3d.types import FROZEN, Cameras, Frames
+from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
+from tests.dynamics.scenes import TINY
+
+SIZE = 16
+ENCODER = EncoderConfig(
+    feature_dim=8,
+    cnn_dims=(8, 8),
+    cnn_blocks=1,
+    transformer_layers=1,
+    transformer_mlp_ratio=1,
+    n_depths=6,
+    cost_unet_dim=8,
+    cost_unet_levels=2,
+    cost_unet_attention=(2,),
+    refine_unet_dim=8,
+    refine_unet_levels=2,
+    refine_unet_attention=(),
+    upsampled_dim=4,
+    disparity_dim=8,
+    dynamic_dim=4,
+    static_dim=3,
+    condition_dim=4,
+)
+CONFIG = ModelConfig(
+    ENCODER,
+    dataclasses.replace(TINY, grid_size=0.1),
+    RendererConfig(latents=7, sh_degree=1, scale_min=0.01, scale_max=0.3, initial_scale=0.1),
+)
+
+
+def look_at(angle):
+    center = torch.tensor([2 * math.cos(angle), 2 * math.sin(angle), 1.0], dtype=torch.float64)
+    forward = -center / center.norm()
+    right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    right = right / right.norm()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ center
+    return pose
+
+
+def make_frames(steps=(2,), n_views=2, seed=0, masked=True):
+    """Scene i has steps[i] steps; each step the same cameras."""
+    g = torch.Generator().manual_seed(seed)
+    n_clouds = sum(steps)
+    viewmats = torch.stack([look_at(0.3 + 1.2 * v) for v in range(n_views)]).repeat(n_clouds, 1, 1).float()
+    K = torch.tensor([[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]])
+    n = n_clouds * n_views
+    clouds = torch.arange(n_clouds).repeat_interleave(n_views)
+    cameras = Cameras(viewmats, K.repeat(n, 1, 1), torch.full((n,), 1.0), torch.full((n,), 3.5), clouds, SIZE, SIZE)
+    masks = torch.rand(n, SIZE, SIZE, generator=g) < 0.3 if masked else None
+    return Frames(
+        images=torch.rand(n, 3, SIZE, SIZE, generator=g),
+        cameras=cameras,
+        cloud_scene=torch.repeat_interleave(torch.arange(len(steps)), torch.tensor(steps)),
+        cloud_step=torch.cat([torch.arange(n_steps) for n_steps in steps]),
+        origin=torch.full((len(steps), 3), -4.0, dtype=torch.float64),
+        masks=masks,
+        dynamic=torch.rand(n, SIZE, SIZE, generator=g) < 0.7,
+    )
+
+
+def make_simulator(config=CONFIG, seed=0):
+    torch.manual_seed(seed)
+    return Simulator(config).eval()
+
+
+def target_cameras(frames, n_scenes):
+    """One camera for each scene's newest cloud."""
+    return frames.cameras.select(torch.zeros(n_scenes, dtype=torch.int64), torch.arange(n_scenes))
+
+
+def test_encode_step_rollout_render():
+    simulator, frames = make_simulator(), make_frames((2, 3, 1))
+    state = simulator.encode(frames)
+    assert state.n_clouds == 6
+    plan = simulator.plan(EffectsSpec())
+    steps = simulator.rollout(state, 3, plan)
+    assert [step.cloud_step.tolist() for step in steps] == [[2, 3, 1], [3, 4, 2], [4, 5, 3]]
+    image = simulator.render(steps[-1], target_cameras(frames, 3), torch.ones(3))
+    assert image.color.shape == (3, SIZE, SIZE, 3) and torch.isfinite(image.color).all() and image.alpha.max() > 0.05
+
+
+def test_rollout_is_repeated_steps():
+    simulator, frames = make_simulator(), make_frames((2, 3))
+    state = simulator.encode(frames)
+    plan = simulator.plan(EffectsSpec(dynamics=DynamicsEffects(history=2)))
+    steps = simulator.rollout(state, 3, plan)
+    for step in steps:
+        state = simulator.step(state, plan)
+        assert state.n_clouds == 4
+        newest = last_steps(state, 1)
+        assert_same_bits(newest.means, step.means)
+        assert_same_bits(newest.dynamic_latents, step.dynamic_latents)
+
+
+def test_masked_out_pixels_are_absent():
+    simulator, frames = make_simulator(), make_frames((2,))
+    changed = dataclasses.replace(frames, dynamic=frames.dynamic | ~frames.masks)
+    steps, others = (simulator.rollout(simulator.encode(f), 2) for f in (frames, changed))
+    assert_same_bits(steps[-1].means, others[-1].means)
+    assert steps[0].n_rows == int(frames.masks[2:].sum())
+
+
+def test_gradients_reach_every_parameter():
+    simulator, frames = make_simulator(), make_frames((2,))
+    with torch.no_grad():
+        for p in simulator.parameters():  # some layers start at zero and would hide those before them
+            p.add_(torch.randn_like(p), alpha=0.02)
+    steps = simulator.rollout(simulator.encode(frames), 2)
+    cameras = target_cameras(frames, 1)
+    sum(simulator.render(step, cameras).color.square().sum() for step in steps).backward()
+    without = [name for name, p in simulator.named_parameters() if p.grad is None or not p.grad.any()]
+    assert without == []
+
+
+def test_directional_derivatives_of_a_rollout_in_float64():
+    """Two steps from images to images: the derivative along random directions of all parameters, by differences."""
+    simulator, frames = make_simulator().double(), make_frames((2,))
+    frames = dataclasses.replace(frames, images=frames.images.double())
+    cameras = target_cameras(frames, 1)
+    parameters = list(simulator.parameters())
+    weights = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+
+    def loss():
+        steps = simulator.rollout(simulator.encode(frames), 2)
+        images = [simulator.render(step, cameras, cutoff="smooth").color[0] for step in steps]
+        return sum((weights * image).sum() for image in images)
+
+    grads = torch.autograd.grad(loss(), parameters)
+    g = torch.Generator().manual_seed(7)
+    for _ in range(3):
+        direction = [torch.randn(p.shape, generator=g, dtype=torch.float64) for p in parameters]
+        exact = sum((d * grad).sum() for d, grad in zip(direction, grads, strict=True)).item()
+        with torch.no_grad():
+            values = []
+            for step in (1, -2):
+                for p, d in zip(parameters, direction, strict=True):
+                    p.add_(d, alpha=step * 1e-7)
+                values.append(loss().item())
+            for p, d in zip(parameters, direction, strict=True):
+                p.add_(d, alpha=1e-7)
+        numeric = (values[0] - values[1]) / 2e-7
+        assert numeric == pytest.approx(exact, rel=1e-5)
+
+
+def test_rollout_and_images_have_the_same_bits_on_one_thread_and_two():
+    simulator, frames = make_simulator(), make_frames((2,))
+    state = simulator.encode(frames).detach()
+
+    def run():
+        with torch.no_grad():
+            step = simulator.rollout(state, 2)[-1]
+            return [step.means, simulator.render(step, target_cameras(frames, 1)).color]
+
+    for one, two in zip(with_threads(1, run), with_threads(2, run), strict=True):
+        assert_same_bits(two, one)
+
+
+def test_background_frozen_masked_out_and_dynamic():
+    simulator, frames = make_simulator(), make_frames((2,))
+    state = simulator.encode(frames)
+    newest = last_steps(state, 1)
+    frozen = newest.activity == FROZEN
+    steps = {
+        mode: simulator.rollout(state, 1, simulator.plan(EffectsSpec(dynamics=DynamicsEffects(background=mode))))[0]
+        for mode in ("frozen", "masked_out", "dynamic")
+    }
+    assert_same_bits(steps["frozen"].means[frozen], newest.means[frozen])
+    assert not torch.equal(steps["dynamic"].means[frozen], newest.means[frozen])
+    assert steps["masked_out"].n_rows == int((~frozen).sum())
+    without = simulator.rollout(state.select_rows(state.activity != FROZEN), 1)[0]
+    assert_same_bits(steps["masked_out"].means, without.means)
+
+
+@pytest.mark.parametrize("changing", ["all", "dynamic", "none"])
+def test_whose_features_change(changing):
+    simulator, frames = make_simulator(), make_frames((2,))
+    state = simulator.encode(frames)
+    newest = last_steps(state, 1)
+    plan = simulator.plan(EffectsSpec(appearance=AppearanceEffects(changing=changing)))
+    same = (simulator.rollout(state, 1, plan)[0].dynamic_latents == newest.dynamic_latents).all(1)
+    frozen = newest.activity == FROZEN
+    assert bool(same[frozen].all()) == (changing != "all") and bool(same[~frozen].all()) == (changing == "none")
+
+
+def test_one_step_of_history_equals_a_state_of_one_step():
+    simulator, frames = make_simulator(), make_frames((3,))
+    state = simulator.encode(frames)
+    plan = simulator.plan(EffectsSpec(dynamics=DynamicsEffects(history=1)))
+    assert "time merging" in plan.skipped
+    expected = simulator.rollout(last_steps(state, 1), 2, plan)
+    for actual, step in zip(simulator.rollout(state, 2, plan), expected, strict=True):
+        assert_same_bits(actual.means, step.means)
+
+
+def test_degree_zero_equals_higher_coefficients_of_zero():
+    simulator, frames = make_simulator(), make_frames((1,))
+    state = simulator.encode(frames)
+    plan = simulator.plan(EffectsSpec(appearance=AppearanceEffects(view_dependent=0)))
+    plain = simulator.render(state, target_cameras(frames, 1), plan=plan)
+    with torch.no_grad():
+        rows = simulator.renderer.fc2.weight[:12].view(3, 4, -1)
+        rows[:, 1:] = 0
+    assert_close_relative_to_max(simulator.render(state, target_cameras(frames, 1)).color, plain.color, 1e-6)
+
+
+def test_plan_names_parameters_without_use():
+    shorter = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, history_bits=1))
+    assert make_simulator(shorter).plan().unused == ("dynamics.net.encoder.2.merge.time_embedding",)
+    assert make_simulator().plan().unused == ()
+    with pytest.raises(UnsupportedEffect, match="history: this model goes up to 2"):
+        make_simulator(shorter).plan(EffectsSpec(dynamics=DynamicsEffects(history=3)))
+
+
+def test_presets_are_consistent_and_of_the_stated_size():
+    sizes = {}
+    for preset in (presets.tiny, presets.small, presets.paper_latent, presets.paper_explicit):
+        sizes[preset.__name__] = sum(p.numel() for p in Simulator(preset()).parameters())
+    assert sizes["tiny"] < 1.3e6 and 3.5e6 < sizes["small"] < 4.5e6
+    # The published models have 57,576,665 and 57,724,921; here the head's last layer has a bias of 55 entries as well.
+    assert sizes["paper_latent"] == 57_576_665 + 55 and sizes["paper_explicit"] == 57_724_921
+    with pytest.raises(ValueError, match="n_steps must be 1, 2, 4 or 8; got 3"):
+        presets.paper_latent(3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"renderer": dataclasses.replace(CONFIG.renderer, latents=8)}, "renderer.latents and what it reads"),
+        ({"encoder": dataclasses.replace(ENCODER, dynamic_dim=5)}, "encoder.dynamic_dim and dynamics.dynamic_latents"),
+    ],
+)
+def test_parts_that_do_not_fit_raise(change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(CONFIG, **change)

@@ -1,0 +1,196 @@
+"""Training: equal bits twice, resuming equals never having stopped, bad numbers are skipped, mistakes are named."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from gsim3d.data import Scene, find_scenes
+from gsim3d.errors import InputError
+from gsim3d.train import checkpoint
+from gsim3d.train.config import DataConfig, OptimizerConfig, StageConfig, TrainConfig
+from gsim3d.train.loop import Trainer, deterministic
+from gsim3d.train.restore import restore
+from gsim3d.train.samples import draw_batch, spread_views, thin_background
+from tests.tiny_scenes import write_scenes
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+CONFIG = TrainConfig(
+    stages=(
+        StageConfig(steps=3, history=1, batch=2, target_views=2, learning_rate=1e-3),
+        StageConfig(steps=3, horizon=2, target_views=2, from_start=0.5, learning_rate=1e-3),
+    ),
+    data=DataConfig(history=2, context_views=2, target_only_cameras=(3,), background_stride=2),
+    optimizer=OptimizerConfig(ema_decay=0.9),
+    log_every=1,
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_scenes(tmp_path_factory.mktemp("scenes"), 2)
+
+
+def scenes(folder):
+    return [Scene.open(path) for path in find_scenes(folder)]
+
+
+def curve(run):
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
+
+
+@pytest.fixture(scope="module")
+def finished(folder, tmp_path_factory, one_thread):
+    """A run that was never stopped."""
+    out = tmp_path_factory.mktemp("run")
+    Trainer(CONFIG, scenes(folder), out).run(progress=False)
+    return out
+
+
+def assert_same_checkpoint(a, b):
+    a, b = checkpoint.load(a), checkpoint.load(b)
+    for part in ("model", "ema", "optimizer"):
+        before, after = getattr(a, part), getattr(b, part)
+        assert before.keys() == after.keys() and before
+        assert all(torch.equal(before[name], after[name]) for name in before), part
+
+
+def test_the_log_and_the_weights_change(finished):
+    log = curve(finished)
+    assert [line["step"] for line in log] == list(range(6))
+    assert all(math.isfinite(line["loss"]) and line["grad_norm"] > 0 for line in log)
+    assert "future_psnr" not in log[0] and "future_psnr" in log[3]
+    saved = checkpoint.load(finished)
+    assert saved.state["step"] == 6 and saved.state["n_skipped"] == 0
+    assert all(name in saved.config for name in ("model", "data", "effects", "train"))
+    assert any(not torch.equal(saved.model[name], saved.ema[name]) for name in saved.model)
+
+
+def test_the_same_run_twice_gives_the_same_bits(folder, finished, tmp_path):
+    Trainer(CONFIG, scenes(folder), tmp_path).run(progress=False)
+    assert curve(tmp_path) == curve(finished)
+    assert_same_checkpoint(tmp_path, finished)
+
+
+def test_stopped_and_resumed_equals_never_stopped(folder, finished, tmp_path):
+    for until in (2, 4, None):
+        Trainer(CONFIG, scenes(folder), tmp_path).run(until=until, progress=False)
+    assert curve(tmp_path) == curve(finished)
+    assert_same_checkpoint(tmp_path, finished)
+
+
+def test_killed_after_the_last_checkpoint_repeats_those_steps(folder, finished, tmp_path):
+    script = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "from tests.train.test_loop import CONFIG, Trainer, scenes\n"
+        "trainer = Trainer(CONFIG, scenes(Path(sys.argv[1])), sys.argv[2])\n"
+        "trainer.run(until=2, progress=False)\n"
+        "trainer.save = lambda: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "trainer.run(until=5, progress=False)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.getcwd(), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", script, str(folder), str(tmp_path)], env=environment)
+    assert done.returncode == -signal.SIGKILL
+    assert len(curve(tmp_path)) == 5 and checkpoint.load(tmp_path).state["step"] == 2
+    Trainer(CONFIG, scenes(folder), tmp_path).run(progress=False)
+    assert curve(tmp_path) == curve(finished)
+    assert_same_checkpoint(tmp_path, finished)
+
+
+def test_another_configuration_does_not_resume(folder, finished):
+    with pytest.raises(InputError, match="another 'seed'"):
+        Trainer(TrainConfig(**{**vars(CONFIG), "seed": 1}), scenes(folder), finished)
+    assert Trainer(TrainConfig(**{**vars(CONFIG), "log_every": 5}), scenes(folder), finished).step == 6
+
+
+def test_steps_that_are_not_finite_change_nothing(folder, tmp_path):
+    trainer = Trainer(CONFIG, scenes(folder), tmp_path)
+    loss = trainer.loss
+    trainer.loss = lambda batch: tuple(value * (math.nan if trainer.step == 1 else 1) for value in loss(batch))
+    before = None
+    while trainer.step < 3:
+        if trainer.step == 1:
+            before = {name: value.clone() for name, value in trainer.simulator.state_dict().items()}
+            entry = trainer.train_step()
+            after = trainer.simulator.state_dict()
+            assert "not finite" in entry["skipped"] and entry["loss"] == "nan" and trainer.n_skipped == 1
+            assert all(torch.equal(value, after[name]) for name, value in before.items())
+        else:
+            assert "skipped" not in trainer.train_step()
+
+
+def test_a_restored_simulator_predicts_with_the_averaged_weights(folder, finished):
+    restored = restore(finished)
+    saved = checkpoint.load(finished)
+    weights = restored.simulator.state_dict()
+    assert all(torch.equal(value, weights[name]) for name, value in saved.ema.items())
+    assert restored.image_size == (32, 32) and restored.data == CONFIG.data and not restored.simulator.training
+
+
+def test_what_does_not_fit_is_named(folder, tmp_path):
+    long = TrainConfig(stages=(StageConfig(steps=1, horizon=9),), data=CONFIG.data)
+    with pytest.raises(InputError, match="windows of 11 steps do not fit"):
+        Trainer(long, scenes(folder), tmp_path)
+    with pytest.raises(InputError, match="too few cameras for 5 context views"):
+        data = DataConfig(context_views=5, target_only_cameras=(0,))
+        Trainer(TrainConfig(stages=CONFIG.stages, data=data), scenes(folder), tmp_path)
+    with pytest.raises(InputError, match="camera 77 does not exist"):
+        data = DataConfig(context_views=1, target_only_cameras=(77,))
+        Trainer(TrainConfig(stages=CONFIG.stages, data=data), scenes(folder), tmp_path)
+    with pytest.raises(InputError, match="5 steps, but this model sees up to 2"):
+        stages = (StageConfig(steps=1, horizon=1, target_views=2),)
+        Trainer(TrainConfig(stages=stages, data=DataConfig(history=5, context_views=2)), scenes(folder), tmp_path)
+    with pytest.raises(InputError, match="preset: must be one of"):
+        Trainer(TrainConfig(**{**vars(CONFIG), "preset": "huge"}), scenes(folder), tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_samples_depend_on_seed_and_step_only(folder):
+    stage = CONFIG.stages[1]
+
+    def key(seed, step):
+        batch = draw_batch(scenes(folder), CONFIG.data, stage, seed, step)
+        return batch.targets.images.sum().item(), batch.context.images.sum().item()
+
+    assert key(0, 3) == key(0, 3)
+    assert len({key(0, 3), key(0, 4), key(1, 3)}) == 3
+
+
+def test_target_only_cameras_are_never_an_input(folder):
+    known = scenes(folder)
+    forbidden = known[0].cameras.viewmats[3]
+    for step in range(20):
+        batch = draw_batch(known, CONFIG.data, CONFIG.stages[0], 0, step)
+        assert not (batch.context.cameras.viewmats == forbidden).all(-1).all(-1).any()
+
+
+def test_views_are_spread_evenly():
+    assert spread_views(range(12), 4, 0) == (0, 3, 6, 9)
+    assert spread_views(range(12), 4, 10) == (1, 4, 7, 10)
+    assert spread_views([0, 1, 3, 4], 4, 3) == (0, 1, 3, 4)
+
+
+def test_thinning_keeps_all_of_the_body(folder):
+    frames = draw_batch(scenes(folder), DataConfig(context_views=2), CONFIG.stages[0], 0, 0).context
+    thinned = thin_background(frames, 2)
+    body = frames.dynamic & frames.masks
+    assert torch.equal(thinned.masks & frames.dynamic, body)
+    ground = frames.masks & ~frames.dynamic
+    share = (thinned.masks & ~frames.dynamic).sum() / ground.sum()
+    assert 0.15 < share < 0.35
+    assert thin_background(frames, 1) is frames
+
+
+def test_deterministic_mode_is_left_as_it_was():
+    before = torch.are_deterministic_algorithms_enabled()
+    with deterministic():
+        assert torch.are_deterministic_algorithms_enabled()
+    assert torch.are_deterministic_algorithms_enabled() == before

@@ -1,0 +1,68 @@
+"""Pooling of feature rows over clusters and the way back, against the fastest plain torch form of each."""
+
+import time
+
+import torch
+from harness import Bench, with_gradients
+
+from gsim3d.ops import pool_max, pool_mean, unpool
+
+
+def clusters(n: int, mean_size: float, seed: int = 0):
+    """(rows, cu_rows, cluster of each row); rows of a cluster lie near each other, as after sorting along a curve."""
+    generator = torch.Generator().manual_seed(seed)
+    cluster = torch.sort(torch.randint(0, round(n / mean_size), (n,), generator=generator)).values
+    cluster = torch.unique(cluster, return_inverse=True)[1]
+    blocks = torch.arange(n).reshape(-1, 64)
+    order = torch.stack([block[torch.randperm(64, generator=generator)] for block in blocks]).reshape(-1)
+    cluster = cluster[order]
+    rows = torch.argsort(cluster, stable=True)
+    cu_rows = torch.zeros(int(cluster.max()) + 2, dtype=torch.int64)
+    cu_rows[1:] = torch.cumsum(torch.bincount(cluster), 0)
+    return rows, cu_rows, cluster
+
+
+def seconds(f, repeats: int = 3) -> float:
+    best = float("inf")
+    for _ in range(repeats):
+        start = time.perf_counter()
+        f()
+        best = min(best, time.perf_counter() - start)
+    return best
+
+
+def main():
+    bench = Bench("pool")
+    for n, channels, size in ((65536, 64, 4), (65536, 64, 1.5), (16384, 256, 4)):
+        rows, cu_rows, cluster = clusters(n, size)
+        m, counts = len(cu_rows) - 1, cu_rows.diff()
+        wide = cluster[:, None].expand(n, channels)
+        generator = torch.Generator().manual_seed(1)
+        x, small = torch.randn(n, channels, generator=generator), torch.randn(m, channels, generator=generator)
+        cases = {
+            "max": (
+                x,
+                lambda x: pool_max(x, rows, cu_rows),
+                lambda x: x.new_zeros(m, channels).scatter_reduce(0, wide, x, "amax", include_self=False),
+                lambda x: torch.segment_reduce(x.index_select(0, rows), "max", offsets=cu_rows, axis=0),
+            ),
+            "mean": (
+                x,
+                lambda x: pool_mean(x, rows, cu_rows),
+                lambda x: x.new_zeros(m, channels).index_add(0, cluster, x) / counts[:, None],
+                lambda x: x.new_zeros(m, channels).scatter_reduce(0, wide, x, "mean", include_self=False),
+                lambda x: torch.segment_reduce(x.index_select(0, rows), "mean", offsets=cu_rows, axis=0),
+            ),
+            "unpool": (small, lambda x: unpool(x, rows, cu_rows, n), lambda x: x.index_select(0, cluster)),
+        }
+        for name, (value, ours, *forms) in cases.items():
+            title = f"{name}, {n // 1024}k x {channels} rows to {m}"
+            plain = min(forms, key=lambda f: seconds(lambda: f(value)))
+            bench.compare(f"{title}: fwd", lambda: ours(value), lambda: plain(value))
+            runs = with_gradients([value], ours, *forms)
+            bench.compare(f"{title}: fwd+bwd", runs[0], min(runs[1:], key=seconds))
+    bench.finish()
+
+
+if __name__ == "__main__":
+    main()
