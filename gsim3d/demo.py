@@ -90,8 +90,7 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, *, progress: boo
     train_folders, test_folders = split_scenes(folders)
     test = [Scene.open(folder) for folder in test_folders]
     print(f"2/4 training on {len(train_folders)} scenes; {len(test)} are held out", flush=True)
-    with seconds.measure("training"):
-        digest = _train(out, config.train, train_folders, progress)
+    digest = _train(out, config.train, train_folders, progress, seconds)
     print("3/4 predicting the held-out scenes", flush=True)
     with seconds.measure("evaluation"):
         summary, restored = _evaluate(out, test, digest)
@@ -122,7 +121,7 @@ class _Stopwatch:
             self.file.write_text(json.dumps(self.total))
 
 
-def _train(out: Path, config: TrainConfig, folders: list[Path], progress: bool) -> str:
+def _train(out: Path, config: TrainConfig, folders: list[Path], progress: bool, seconds: _Stopwatch) -> str:
     """Trains to the end and exports; returns the hash of the last checkpoint."""
     from gsim3d.data import Scene
     from gsim3d.train import checkpoint
@@ -132,7 +131,8 @@ def _train(out: Path, config: TrainConfig, folders: list[Path], progress: bool) 
     if 0 < trainer.step < config.n_steps:
         print(f"    going on from step {trainer.step}", flush=True)
     if trainer.step < config.n_steps:
-        trainer.run(progress=progress)
+        with seconds.measure("training"):
+            trainer.run(progress=progress)
     saved = checkpoint.load(out / "model")
     if not (out / "model.safetensors").is_file():
         checkpoint.export(saved, out / "model.safetensors")

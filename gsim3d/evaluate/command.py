@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
 
     from gsim3d.data import Scene, find_scenes, split_scenes
     from gsim3d.errors import InputError
-    from gsim3d.evaluate.protocol import score_scene
+    from gsim3d.evaluate.protocol import check_horizon, score_scene
     from gsim3d.evaluate.report import summarize, table, write_json
     from gsim3d.train.restore import restore
 
@@ -47,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
     scenes = [Scene.open(folder) for folder in folders]
     for scene in scenes:
         restored.check_scene(scene)
+        check_horizon(restored, scene, args.steps)
     checkpoint = Path(args.checkpoint)
     out = Path(args.out) if args.out else (checkpoint if checkpoint.is_dir() else checkpoint.parent) / "metrics.json"
     if not out.parent.is_dir():

@@ -114,6 +114,19 @@ def constant_velocity(prediction: Prediction) -> Particles:
     return concatenate(steps)
 
 
+def check_horizon(restored: Restored, scene: Scene, n_future: int | None) -> int:
+    """Steps that can be predicted and compared: ``n_future``, or all that the film has after the input.
+
+    Raises:
+        InputError: the film is too short.
+    """
+    known = scene.n_steps - restored.data.history
+    n_future = known if n_future is None else n_future
+    if n_future > known or n_future < 1:
+        raise InputError(f"{scene.path}: {n_future} steps to compare, but only {max(0, known)} after the input")
+    return n_future
+
+
 def score_scene(
     restored: Restored,
     scene: Scene,
@@ -131,9 +144,7 @@ def score_scene(
     defaults = default_views(restored, scene)
     context_cams, target_cams = context_cams or defaults[0], list(target_cams or defaults[1])
     n_encoded = restored.data.history
-    n_future = scene.n_steps - n_encoded if n_future is None else n_future
-    if n_future > scene.n_steps - n_encoded:
-        raise InputError(f"{scene.path}: {n_future} steps to compare, but only {scene.n_steps - n_encoded} after the input")
+    n_future = check_horizon(restored, scene, n_future)
     prediction = predict(restored, scene, context_cams, n_future)
     steps = range(n_encoded + n_future)
     truth = scene.images(target_cams, steps).permute(0, 1, 3, 4, 2).float() / 255

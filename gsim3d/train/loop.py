@@ -181,10 +181,12 @@ class Trainer:
         """Drops what was logged after the checkpoint: those steps will be repeated."""
         file = self.out / LOG
         if file.exists():
-            lines = [line for line in file.read_text().splitlines() if _step_of(line) < self.step]
-            part = file.with_name(f".{file.name}.part")
-            part.write_text("".join(line + "\n" for line in lines))
-            os.replace(part, file)
+            lines = file.read_text().splitlines()
+            kept = [line for line in lines if _step_of(line) < self.step]
+            if kept != lines:
+                part = file.with_name(f".{file.name}.part")
+                part.write_text("".join(line + "\n" for line in kept))
+                os.replace(part, file)
 
     def _update_average(self) -> None:
         decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (EMA_WARM_UP + self.step))
@@ -238,6 +240,5 @@ def _step_of(line: str) -> float:
 
 
 def _postfix(entry: dict) -> str:
-    shown = [f"{name.split('_')[0]} {entry[name]:.1f} dB" for name in ("past_psnr", "future_psnr") if name in entry
-             and isinstance(entry[name], float)]  # fmt: skip
-    return ", ".join(shown)
+    values = {name: entry.get(f"{name}_psnr") for name in ("past", "future")}
+    return ", ".join(f"{name} {value:.1f} dB" for name, value in values.items() if isinstance(value, float))
