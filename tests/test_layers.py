@@ -27,7 +27,7 @@ def test_layer_norm_is_torchs():
     assert ours.state_dict().keys() == theirs.state_dict().keys()
 
 
-def test_gradients_have_the_same_bits_on_one_thread_and_two():
+def test_gradients_on_one_thread_and_two_differ_by_rounding_at_most():
     torch.manual_seed(0)
     layers = torch.nn.Sequential(RowLinear(24, 24), RowLayerNorm(24), RowBatchNorm(24))
 
@@ -37,7 +37,7 @@ def test_gradients_have_the_same_bits_on_one_thread_and_two():
         return [p.grad.clone() for p in layers.parameters()]
 
     for one, two in zip(with_threads(1, run), with_threads(2, run), strict=True):
-        assert_same_bits(two, one)
+        assert_close_relative_to_max(two, one, 1e-5)
 
 
 @pytest.mark.parametrize("training", [False, True])

@@ -35,6 +35,7 @@ CONFIG = EncoderConfig(
     static_dim=2,
     condition_dim=4,
 )
+PUBLISHED_COUNTS = [11_226_070, 11_132_118, 11_197_285]
 ROW_FIELDS = ("means", "opacities", "dynamic_latents", "static_latents")
 
 
