@@ -123,7 +123,8 @@ class Trainer:
             particles = concatenate([particles, *steps])
         images = self.simulator.render(particles, targets.cameras, plan=self.plan).color
         truth = targets.images.permute(0, 2, 3, 1)
-        weight = 1 + loss_config.body_weight * targets.dynamic if loss_config.body_weight else None
+        weighted = loss_config.body_weight and targets.dynamic is not None
+        weight = 1 + loss_config.body_weight * targets.dynamic if weighted else None
         weights = time_weights(
             batch.n_context, batch.n_future, balance=loss_config.balance, discount=loss_config.discount
         )

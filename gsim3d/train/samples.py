@@ -75,8 +75,10 @@ def draw_batch(scenes: Sequence[Scene], data: DataConfig, stage: StageConfig, se
     ]
     chosen = [window.scene for window in windows]
     steps = [list(window.steps) for window in windows]
-    context = make_frames(chosen, [window.context_cams for window in windows], [s[:n_context] for s in steps])
-    targets = make_frames(chosen, [window.target_cams for window in windows], steps)
+    masked = all(scene.has_segmentation() for scene in chosen)
+    context_cams = [window.context_cams for window in windows]
+    context = make_frames(chosen, context_cams, [s[:n_context] for s in steps], masked=masked)
+    targets = make_frames(chosen, [window.target_cams for window in windows], steps, masked=masked)
     return Batch(thin_background(context, data.background_stride), targets, n_context, stage.horizon)
 
 
