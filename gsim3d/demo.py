@@ -37,17 +37,17 @@ example:
 class DemoConfig:
     """data: options of gsim3d.generate's preset "demo" to change.   train: the training."""
 
-    data: dict[str, Any] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=lambda: {"n_frames": 18, "fps": 16.0})
     train: TrainConfig = TrainConfig(
         preset="tiny",
-        data=DataConfig(history=2, context_views=4, target_only_cameras=(2, 7), background_stride=2),
+        data=DataConfig(history=2, context_views=3, target_only_cameras=(2, 7), background_stride=2),
         stages=(
-            StageConfig(steps=250, history=1, batch=2, target_views=4, learning_rate=2e-3, warm_up=0.1),
-            StageConfig(steps=150, horizon=4, target_views=3, from_start=0.3, learning_rate=1e-3, warm_up=0.1),
-            StageConfig(steps=150, horizon=8, target_views=3, from_start=0.4, learning_rate=1e-3, warm_up=0.1),
-            StageConfig(steps=100, horizon=12, target_views=2, from_start=0.5, learning_rate=7e-4, warm_up=0.1),
+            StageConfig(steps=400, history=1, batch=2, target_views=2, learning_rate=2e-3, warm_up=0.1),
+            StageConfig(steps=150, horizon=3, target_views=2, from_start=0.4, learning_rate=2e-3, warm_up=0.1),
+            StageConfig(steps=200, horizon=7, target_views=2, from_start=0.4, learning_rate=1.5e-3, warm_up=0.1),
+            StageConfig(steps=200, horizon=14, target_views=2, from_start=0.4, learning_rate=1e-3, warm_up=0.1),
         ),
-        loss=LossConfig(),
+        loss=LossConfig(body_weight=2.0),
         optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.99),
         checkpoint_every=50,
         log_every=1,

@@ -73,7 +73,7 @@ class OutputEffects:
 
 @dataclass(frozen=True)
 class EffectsSpec:
-    """Everything absent is off, except what makes up the model (history, view_dependent, opacity_changes): that is its own.
+    """Everything absent is off; what makes up the model (history, view_dependent, opacity_changes) is then the model's own.
 
     Example:
         >>> spec = EffectsSpec.from_dict({"dynamics": {"background": "masked_out", "history": 2}})

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 MAX_DEGREE = 3
-# Radians between neighbours of the spiral of 2 l + 1 directions on which degree l is read, and where it starts: with these
-# the harmonics' values there have condition numbers of 1.4, 2.4 and 3.4.
+# Radians between neighbours of the spiral of 2 l + 1 directions on which degree l is read, and where it starts: with
+# these the harmonics' values there have condition numbers of 1.4, 2.4 and 3.4.
 SPIRALS = {1: (4.32, 0.5), 2: (5.20, 1.0), 3: (4.04, 0.98)}
 
 
@@ -32,7 +32,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def degree_damping(degree: int, like: Tensor) -> Tensor:
-    """[(degree + 1)^2]: 1 for the constant, then 0.1 / 4^l, so that colour starts out almost independent of the view."""
+    """[(degree + 1)^2]: 1 for the constant, then 0.1 / 4^l, so that colour starts almost independent of the view."""
     values = [0.1 * 0.25**level if level else 1.0 for level in range(degree + 1) for _ in range(2 * level + 1)]
     return torch.tensor(values, dtype=like.dtype, device=like.device)
 
@@ -63,8 +63,8 @@ def rotate_harmonics(sh: Tensor, rotations: Tensor) -> Tensor:
 def rotate_unpaired_harmonics(sh: Tensor, rotations: Tensor) -> Tensor:
     """What the published model does with ``sh`` in its basis: the turned coefficients, in the standard basis.
 
-    Its basis is the standard one of (z, x, y) and equals that of its rotation matrices up to alternating signs, which it
-    leaves out.
+    Its basis is the standard one of (z, x, y) and equals that of its rotation matrices up to alternating signs, which
+    it leaves out.
     """
     permute = _axis_permutation(rotations)
     signs = torch.pow(-1.0, torch.arange(sh.shape[1], device=sh.device)).to(sh)[:, None]

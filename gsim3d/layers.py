@@ -1,6 +1,7 @@
 """Layers over packed rows: a row's result has the same bits whatever rows are packed with it.
 
-(Batch normalisation in training is the exception.) Gradients have the same bits on one thread and on two.
+(Batch normalisation in training is the exception.) Gradients repeat bit by bit on the same number of threads; how BLAS
+splits the rows of a matrix product over threads is its own affair.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ class RowLinear(nn.Linear):
 
 
 class RowLayerNorm(nn.LayerNorm):
-    """``nn.LayerNorm`` of [N, C]; its weights' gradients do not depend on the number of threads, as torch's do."""
+    """``nn.LayerNorm`` of [N, C]; the gradients of its weights are plain sums, not torch's sums by thread."""
 
     def forward(self, x: Tensor) -> Tensor:
         return F.layer_norm(x, self.normalized_shape, eps=self.eps) * self.weight + self.bias
@@ -34,8 +35,8 @@ class RowLayerNorm(nn.LayerNorm):
 class RowBatchNorm(nn.Module):
     """Normalises each channel by statistics over rows; running statistics in evaluation.
 
-    Differs from ``nn.BatchNorm1d`` in three ways: one row or none is fine (running statistics are then kept), statistics
-    are float32 or wider, and processes combine theirs in the order of their ranks, so a run repeats bit by bit.
+    Differs from ``nn.BatchNorm1d`` in three ways: one row or none is fine (running statistics are then kept),
+    statistics are float32 or wider, and processes combine theirs in the order of their ranks, so a run repeats bit by bit.
     """
 
     EPS = 1e-3

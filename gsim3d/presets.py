@@ -35,14 +35,14 @@ class ModelConfig:
 
 
 def tiny() -> ModelConfig:
-    """Trains on two CPU cores in minutes: 64-pixel images, tabletop scenes of about a metre, up to 2 steps of history."""
+    """Trains on two CPU cores in minutes: 64-pixel images, scenes of about a metre, up to 2 steps of history."""
     encoder = EncoderConfig.tiny()
     return ModelConfig(
         encoder=encoder,
         dynamics=DynamicsConfig(
             dynamic_latents=encoder.dynamic_dim,
             static_latents=encoder.static_dim,
-            max_step=0.25,
+            max_step=0.5,
             max_latent_step=1.0,
             position_features=True,
             grid_size=0.05,
@@ -50,12 +50,12 @@ def tiny() -> ModelConfig:
             strides=(2, 4),
             merge_windows=(2, 1),
             patch_sizes=(256, 256, 256),
-            encoder_depths=(1, 1, 2),
-            encoder_channels=(32, 48, 64),
-            encoder_heads=(2, 3, 4),
+            encoder_depths=(1, 1, 1),
+            encoder_channels=(24, 32, 48),
+            encoder_heads=(3, 4, 6),
             decoder_depths=(1, 1),
-            decoder_channels=(32, 48),
-            decoder_heads=(2, 3),
+            decoder_channels=(24, 32),
+            decoder_heads=(3, 4),
             mlp_ratio=2,
             norm="layer",
             zero_init=True,

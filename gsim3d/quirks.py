@@ -24,7 +24,7 @@ class Quirks:
         stale_decoder_conv: the first convolution of each decoder stage reads the skip branch before the features from
             below are added to it.
         first_of_voxel: where rows share a cell, a convolution reads the lowest row of a neighbour cell, not the mean.
-        anchor_at_minimum: cells are counted from the smallest position of the call, so clouds of a call change each other.
+        anchor_at_minimum: cells are counted from the smallest position of the call, so its clouds change each other.
         slots_from_first: time slots count from the first step and their number follows the history's length.
         unbounded_opacity: opacities have no upper limit.
         frozen_rows_turn: frozen particles keep their place but not their orientation.

@@ -47,8 +47,8 @@ class RendererConfig:
 class GaussianHead(nn.Module):
     """Rotation, scale and colour of each particle from its latents; position and opacity are the particle's own.
 
-    Channels of the last layer: harmonics (3, K), rotation (x, y, z, w), scale (3). Colours are predicted in the particle's
-    frame and turn with it.
+    Channels of the last layer: harmonics (3, K), rotation (x, y, z, w), scale (3). Colours are predicted in the
+    particle's frame and turn with it.
     """
 
     def __init__(self, config: RendererConfig):
@@ -68,21 +68,21 @@ class GaussianHead(nn.Module):
 
     def forward(self, particles: Particles, *, sh_degree: int | None = None) -> Gaussians:
         """The Gaussians of all rows; ``sh_degree``: leave out colours of higher degrees."""
-        sh, quats, scales = self._shape_and_color(particles)
-        if sh_degree is not None:
-            sh = sh[:, : (sh_degree + 1) ** 2]
+        n_harmonics = self.config.n_harmonics if sh_degree is None else (sh_degree + 1) ** 2
+        sh, quats, scales = self._shape_and_color(particles, n_harmonics)
         return Gaussians(particles.means, quats, scales, particles.opacities, sh, particles.cu_rows)
 
-    def _shape_and_color(self, particles: Particles) -> tuple[Tensor, Tensor, Tensor]:
+    def _shape_and_color(self, particles: Particles, n_harmonics: int) -> tuple[Tensor, Tensor, Tensor]:
         if self.config.latents == 0:
-            return particles.sh, particles.quats, particles.scales
+            return particles.sh[:, :n_harmonics], particles.quats, particles.scales
         latents = torch.cat([particles.dynamic_latents, particles.static_latents], 1)
         raw = self.fc2(F.gelu(self.fc1(latents)))
         sh, quats, scales = raw.split([raw.shape[1] - 7, 4, 3], 1)
         quats = unit_quats(quats.roll(1, 1))
         smallest, largest = self.config.scale_min, self.config.scale_max
         scales = smallest + (largest - smallest) * scales.sigmoid()
-        sh = sh.unflatten(1, (3, -1)).mT * degree_damping(self.config.sh_degree, sh)[:, None]
+        damping = degree_damping(self.config.sh_degree, sh)[:n_harmonics, None]
+        sh = sh.unflatten(1, (3, -1))[:, :, :n_harmonics].mT * damping
         rotate = rotate_unpaired_harmonics if self.config.quirks.released_head_harmonics else rotate_harmonics
         return rotate(sh, rotation_matrices(quats)), quats, scales
 

@@ -6,8 +6,8 @@
     steps = simulator.rollout(state, 12, plan)        # particles of the next 12 steps
     images = simulator.render(steps[-1], cameras)     # any camera, pixels and depth
 
-A state holds the last steps of each scene (:class:`gsim3d.types.Particles`, clouds sorted by scene and step). Scenes are
-packed, not padded: particle counts, numbers of views and lengths of history may all differ.
+A state holds the last steps of each scene (:class:`gsim3d.types.Particles`, clouds sorted by scene and step). Scenes
+are packed, not padded: particle counts, numbers of views and lengths of history may all differ.
 """
 
 from __future__ import annotations
@@ -62,7 +62,9 @@ class Simulator(nn.Module):
         ]
         return dataclasses.replace(plan, unused=tuple(unused))
 
-    def step(self, state: Particles, plan: Plan | None = None, *, generator: torch.Generator | None = None) -> Particles:
+    def step(
+        self, state: Particles, plan: Plan | None = None, *, generator: torch.Generator | None = None
+    ) -> Particles:
         """The state one step later: each scene's oldest step leaves once the history is full.
 
         Args:

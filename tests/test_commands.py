@@ -144,7 +144,7 @@ BAD = {
     "missing image": (["simulate", "{run}", "{missing image}", "--out", "{new}"], "is missing"),
     "other image size": (["simulate", "{run}", "{large}", "--out", "{new}"], "images of 40x40 pixels"),
     "demo needs a folder": (["demo", "--out", "{config}"], "is not a folder"),
-    "unknown world": (["generate", "{new}", "--world", "lava"], "lava"),
+    "unknown world": (["generate", "lava", "--out", "{new}"], "lava"),
 }
 
 

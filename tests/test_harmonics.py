@@ -10,7 +10,8 @@ from tests.asserts import assert_close_relative_to_max
 
 
 def random_rotations(n, seed=0):
-    return rotation_matrices(unit_quats(torch.randn(n, 4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)))
+    quats = torch.randn(n, 4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return rotation_matrices(unit_quats(quats))
 
 
 def directions(n, seed=1):

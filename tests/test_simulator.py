@@ -131,7 +131,7 @@ def test_gradients_reach_every_parameter():
 
 
 def test_directional_derivatives_of_a_rollout_in_float64():
-    """Two steps from images to images: the derivative along random directions of all parameters, by finite differences."""
+    """Two steps from images to images: the derivative along random directions of all parameters, by differences."""
     simulator, frames = make_simulator().double(), make_frames((2,))
     frames = dataclasses.replace(frames, images=frames.images.double())
     cameras = target_cameras(frames, 1)

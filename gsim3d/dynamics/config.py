@@ -22,8 +22,8 @@ class DynamicsConfig:
         max_step: metres; one step moves a particle by less than this along each axis. None: no limit.
         max_latent_step: the same for each dynamic latent. None: no limit.
         position_features: the network also sees positions relative to the scene's origin (in units of
-            ``position_length`` metres) and inside the cell. Learning where the ground is takes far less data so; without
-            it the network knows particles by their neighbours only, and motion does not depend on the place.
+            ``position_length`` metres) and inside the cell. Learning where the ground is takes far less data so;
+            without it the network knows particles by their neighbours only, and motion does not depend on the place.
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.

@@ -17,10 +17,10 @@ from gsim3d.types import Particles
 class Dynamics(nn.Module):
     """Predicts how particles change in one step.
 
-    The network reads all steps of a history at once; each row of the newest step gets an increment. Steps are counted back
-    from the newest, so one model serves any history of 1 to ``2 ** config.history_bits`` steps. Scenes do not change each
-    other (in training with ``norm="batch"`` they do). Rows outside the 2^16 cells from the scene's origin, or not finite,
-    sleep: they keep their state and nobody sees them.
+    The network reads all steps of a history at once; each row of the newest step gets an increment. Steps are counted
+    back from the newest, so one model serves any history of 1 to ``2 ** config.history_bits`` steps. Scenes do not change
+    each other (in training with ``norm="batch"`` they do). Rows outside the 2^16 cells from the scene's origin, or not
+    finite, sleep: they keep their state and nobody sees them.
     """
 
     def __init__(self, config: DynamicsConfig):
@@ -33,7 +33,7 @@ class Dynamics(nn.Module):
         """The next step of every scene.
 
         Args:
-            history: clouds sorted by (scene, step); a scene's steps may differ in number and in rows, and gaps are fine.
+            history: clouds sorted by (scene, step); steps may have different numbers of rows, and gaps are fine.
             generator: of drop path and of the curves' shuffling, both in training only; None: neither happens.
         Returns:
             One cloud a scene, with the rows of the scene's newest step and the step after it.

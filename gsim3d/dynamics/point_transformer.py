@@ -94,7 +94,7 @@ class Block(nn.Module):
         conv_input: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """x [N, C] with attention along serialization ``row``. ``conv_input``: what the convolution reads, default x."""
+        """x [N, C] with attention along serialization ``row``. ``conv_input``: read by the convolution, default x."""
         conv_input = x if conv_input is None else conv_input
         # Drawn here: a generator does not repeat itself when the block is computed again in the backward pass.
         keep = [self._draw_keep(x, generator) for _ in range(2)]

@@ -21,7 +21,8 @@ class StateLayout:
     """Order and width of the channels: fields that change, then fields that do not, each by the alphabet.
 
     inputs, outputs: (field of Particles, channels). Positions are no input by themselves (``position_features`` appends
-    six channels); a rotation is predicted as a rotation vector. Harmonics are flat as (3, K), quaternions as (x, y, z, w).
+    six channels); a rotation is predicted as a rotation vector. Harmonics are flat as (3, K), quaternions as
+    (x, y, z, w).
     """
 
     config: DynamicsConfig

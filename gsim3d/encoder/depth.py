@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -137,7 +138,7 @@ class DepthPredictor(nn.Module):
         )
         last = self.to_disparity[2]
         nn.init.normal_(last.weight, std=INITIAL_OUTPUT / last.in_channels**0.5)
-        last.bias.data.copy_(torch.tensor([0.0, torch.tensor(INITIAL_OPACITY).logit().item()]))
+        last.bias.data.copy_(torch.tensor([0.0, math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))]))
 
     def forward(self, view_features: Tensor, cnn_features: Tensor, views: Views) -> Depth:
         """view_features and cnn_features: [I, C, h, w], with and without knowledge of the other views."""

@@ -6,18 +6,18 @@ import argparse
 
 EPILOG = """\
 examples:
-  gsim3d generate data/demo                            34 short scenes at 64 pixels, about a minute on 2 cores
-  gsim3d generate data/set --size 128 --trajectories 200 --objects ball,star
-  gsim3d generate data/cow --mesh cow.obj --objects none --seed 7
-  gsim3d generate data/full --preset paper             1200 trajectories of 84 frames at 128 pixels
+  gsim3d generate elastic --out data/demo                      34 short scenes at 64 pixels, a minute on 2 cores
+  gsim3d generate elastic --out data/set --size 128 --trajectories 200 --objects ball,star
+  gsim3d generate elastic --out data/cow --mesh cow.obj --objects none --seed 7
+  gsim3d generate elastic --out data/full --preset paper       1200 trajectories of 84 frames at 128 pixels
 
 layout:
-  OUT/<object>/<sample>/metadata.json                  cameras (world-to-camera, pixels), fps, near, far, origin
-  OUT/<object>/<sample>/cam_<j>/rgb_<step>.png         colour
+  DIR/<object>/<sample>/metadata.json                  cameras (world-to-camera, pixels), fps, near, far, origin
+  DIR/<object>/<sample>/cam_<j>/rgb_<step>.png         colour
                                /seg_<step>.png         0 background, 1 ground, 3 body
                                /inst_<step>.png        0 background, 1 ground, 2 body
-  OUT/<object>/<sample>/states.npy                     control lattice of the body at every step, metres
-  OUT/manifest.json                                    options, hashes, rejected draws, machine, versions
+  DIR/<object>/<sample>/states.npy                     control lattice of the body at every step, metres
+  DIR/manifest.json                                    options, hashes, rejected draws, machine, versions
 
 The same options give the same bytes for any number of processes. It may be killed at any time: run it again and
 it goes on where it stopped. A larger --trajectories adds scenes to a finished set.
@@ -43,8 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Simulate soft bodies that fall and film them with calibrated cameras on two rings."
     parser.epilog = EPILOG
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("out", metavar="OUT", help="folder of the data set; made if absent, continued if unfinished")
-    parser.add_argument("--world", default="elastic", help="what is simulated: elastic (default)")
+    parser.add_argument("world", metavar="WORLD", help="what is simulated: elastic")
+    parser.add_argument(
+        "--out", metavar="DIR", required=True, help="folder of the data set; made if absent, continued if unfinished"
+    )
     parser.add_argument("--preset", default="demo", help="options to start from: demo (default) or paper")
     parser.add_argument("--size", type=int, metavar="PX", help="width and height of the images")
     parser.add_argument("--frames", type=int, metavar="N", help="steps of a trajectory")

@@ -49,18 +49,19 @@ def rasterize_gaussians(
     """Renders clouds of 3D Gaussians into pinhole images.
 
     Image i shows cloud ``cameras.image_cloud[i]``. At a pixel with centre p, Gaussian n of that cloud has
-    ``alpha_n = min(0.99, opacity_n exp(-(p - mu_n)^T Sigma_n^-1 (p - mu_n) / 2))``, where ``mu_n`` is the projected mean
-    and ``Sigma_n`` the projected covariance plus 0.3 px^2 on its diagonal. Where it is at least 1/255, it adds
-    ``alpha_n T_n`` times its colour, camera z and features; ``T_n`` is the product of ``1 - alpha`` over the Gaussians in
-    front (order of camera z, ties by row). A pixel ends before ``T`` would fall below 1e-4; then the background is added.
+    ``alpha_n = min(0.99, opacity_n exp(-(p - mu_n)^T Sigma_n^-1 (p - mu_n) / 2))``, where ``mu_n`` is the projected
+    mean and ``Sigma_n`` the projected covariance plus 0.3 px^2 on its diagonal. Where it is at least 1/255, it adds
+    ``alpha_n T_n`` times its colour, camera z and features; ``T_n`` is the product of ``1 - alpha`` over the Gaussians
+    in front (order of camera z, ties by row). A pixel ends before ``T`` would fall below 1e-4; then the background is
+    added.
 
     Args:
         means: [N, 3] metres, world; float32 or float64.
         quats: [N, 4] (w, x, y, z), normalised inside; shorter than 1e-6 counts as the identity and has no gradient.
         scales: [N, 3] metres, standard deviations along the rotated axes, not negative.
         opacities: [N] in [0, 1].
-        cameras: I images. ``viewmats`` and ``Ks`` are cast to the dtype of ``means``; ``Ks`` may hold a skew; ``near`` and
-            ``far`` are not read.
+        cameras: I images. ``viewmats`` and ``Ks`` are cast to the dtype of ``means``; ``Ks`` may hold a skew; ``near``
+            and ``far`` are not read.
         sh: [N, K, 3], K = 1, 4, 9 or 16 coefficients of real spherical harmonics in the standard 3DGS basis and order;
             colour = sum + 0.5, clamped at 0. The direction is W^T (W mean + t), W and t from ``viewmats``.
         colors: [N, 3], in place of ``sh``.
@@ -140,10 +141,8 @@ def _named_errors(args):
 
 
 @torch.library.register_fake("gsim3d::rasterize_gaussians")
-def _(
-    means, quats, scales, opacities, color, features, background, viewmats, Ks, image_cloud, cu_rows, width, height,
-    near_plane, cutoff,
-):
+def _(means, quats, scales, opacities, color, features, background, viewmats, *rest):
+    _, _, _, width, height, _, _ = rest  # Ks, image_cloud, cu_rows, width, height, near_plane, cutoff
     shape = (viewmats.shape[0], height, width)
     return (
         means.new_empty(*shape, 3),
@@ -156,12 +155,8 @@ def _(
 
 
 @torch.library.register_fake("gsim3d::rasterize_gaussians_backward")
-def _(
-    grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, means, quats, scales, opacities, color,
-    features, background, viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff,
-):
-    inputs = (means, quats, scales, opacities, color, features, background, viewmats)
-    return tuple(torch.empty(x.shape, dtype=x.dtype, device=x.device) for x in inputs)
+def _(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, *inputs):
+    return tuple(torch.empty(x.shape, dtype=x.dtype, device=x.device) for x in inputs[:8])
 
 
 def _setup(ctx, inputs, output):

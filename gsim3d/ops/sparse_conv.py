@@ -42,9 +42,10 @@ def sparse_conv(
     """
     if duplicates not in ("mean", "first"):
         raise ValueError(f'sparse_conv: duplicates must be "mean" or "first"; got {duplicates!r}')
-    if weight.dim() == 5 and weight.shape[1] != kernel_map.kernel_size:
+    kernel_size = kernel_map.kernel_size
+    if weight.dim() == 5 and weight.shape[1] != kernel_size:
         raise ValueError(
-            f"sparse_conv: kernel_map must have the weight's kernel size {weight.shape[1]}; got {kernel_map.kernel_size}"
+            f"sparse_conv: kernel_map must have the weight's kernel size {weight.shape[1]}; got {kernel_size}"
         )
     return torch.ops.gsim3d.sparse_conv(
         x,
@@ -90,7 +91,9 @@ def _backward(ctx, grad):
     if needs_x:
         grad_x = torch.ops.gsim3d.sparse_conv_grad_input(grad, weight, *geometry, ctx.first)
     if needs_weight or needs_bias:
-        grad_weight, grad_bias = torch.ops.gsim3d.sparse_conv_grad_weight(grad, x, weight.shape[1], *geometry, ctx.first)
+        grad_weight, grad_bias = torch.ops.gsim3d.sparse_conv_grad_weight(
+            grad, x, weight.shape[1], *geometry, ctx.first
+        )
     return grad_x, grad_weight, grad_bias if ctx.has_bias else None, *[None] * 7
 
 

@@ -69,7 +69,8 @@ def make_history(n_rows=(40, 30), seed=0, config=TINY, frozen_share=0.25, dtype=
 
 def batch(histories):
     """Several scenes packed into one."""
-    names = [name for name in (*Particles.ROW_FIELDS, "cloud_step", "origin") if getattr(histories[0], name) is not None]
+    names = (*Particles.ROW_FIELDS, "cloud_step", "origin")
+    names = [name for name in names if getattr(histories[0], name) is not None]
     fields = {name: torch.cat([getattr(h, name) for h in histories]) for name in names}
     counts = torch.cat([torch.diff(h.cu_rows) for h in histories])
     scenes = [h.cloud_scene + i for i, h in enumerate(histories)]

@@ -49,7 +49,8 @@ def test_an_untrained_preset_predicts_that_nothing_changes():
 @pytest.mark.parametrize("config", [TINY, EXPLICIT])
 def test_scenes_do_not_change_each_other(config):
     dynamics = make_dynamics(config)
-    histories = [make_history(n, seed=i, config=config) for i, n in enumerate([(40, 30), (3,), (5, 6, 7), (60, 0, 1, 2)])]
+    sizes = [(40, 30), (3,), (5, 6, 7), (60, 0, 1, 2)]
+    histories = [make_history(n_rows, seed=i, config=config) for i, n_rows in enumerate(sizes)]
     together = dynamics(batch(histories))
     for i, history in enumerate(histories):
         assert_same_particles(together.select_clouds(torch.tensor([i])), dynamics(history), f"scene {i}")
@@ -91,7 +92,7 @@ def test_rows_outside_the_grid_sleep_and_nobody_sees_them(bad):
 
 def test_whole_cells_of_translation_change_nothing_but_positions():
     dynamics, history = make_dynamics(), make_history((30, 30))
-    history = dataclasses.replace(history, means=(history.means * 2**16).round() / 2**16)  # room to add without rounding
+    history = dataclasses.replace(history, means=(history.means * 2**16).round() / 2**16)  # adds without rounding
     shift = torch.tensor([16.0, -32.0, 48.0]) * TINY.grid_size
     moved = dataclasses.replace(history, means=history.means + shift, origin=history.origin + shift)
     step, moved_step = dynamics(history), dynamics(moved)

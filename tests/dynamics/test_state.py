@@ -46,7 +46,8 @@ def test_position_features_are_relative_to_origin_and_cell():
 def test_increments():
     particles = make_history((20,), config=EXPLICIT)
     layout = StateLayout.of(EXPLICIT)
-    after = layout.advance(particles, 50 * torch.randn(20, layout.out_channels, generator=torch.Generator().manual_seed(0)))
+    prediction = 50 * torch.randn(20, layout.out_channels, generator=torch.Generator().manual_seed(0))
+    after = layout.advance(particles, prediction)
     moves = particles.activity != FROZEN
     assert ((after.means - particles.means).abs() <= EXPLICIT.max_step * 1.001).all()
     assert ((after.dynamic_latents - particles.dynamic_latents).abs() <= EXPLICIT.max_latent_step * 1.001).all()

@@ -35,6 +35,7 @@ CONFIG = EncoderConfig(
     static_dim=2,
     condition_dim=4,
 )
+PUBLISHED_COUNTS = [11_226_070, 11_132_118, 11_197_285]
 ROW_FIELDS = ("means", "opacities", "dynamic_latents", "static_latents")
 
 
@@ -298,9 +299,22 @@ def test_upsampling(factor, aligned):
     assert torch.allclose(upsampling_matrix(5, factor, aligned, x).sum(1), torch.ones(5 * factor))
 
 
-def test_explicit_variant():
+def test_the_paper_s_size():
+    """Parameters of the published encoders: latents of 64 and 64, of 32 and 32 channels, and the explicit variant."""
+    with torch.device("meta"):
+        sizes = [
+            EncoderConfig(dynamic_dim=64, static_dim=64),
+            EncoderConfig(),
+            EncoderConfig(explicit=True, dynamic_dim=0, static_dim=0),
+        ]
+        counts = [sum(p.numel() for p in Encoder(size).parameters()) for size in sizes]
+    assert counts == PUBLISHED_COUNTS
+
+
+@pytest.mark.parametrize("quirks", [Quirks(), Quirks.release()])
+def test_explicit_variant(quirks):
     frames = make_frames([0, 0])
-    particles = make_encoder(explicit=True, dynamic_dim=0, static_dim=0)(frames)
+    particles = make_encoder(explicit=True, dynamic_dim=0, static_dim=0, quirks=quirks)(frames)
     n = 2 * SIZE**2
     assert particles.quats.shape == (n, 4) and particles.scales.shape == (n, 3) and particles.sh.shape == (n, 16, 3)
     assert particles.dynamic_latents.shape == (n, 0)

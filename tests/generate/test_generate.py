@@ -152,7 +152,8 @@ def test_killed_and_resumed(tmp_path):
     program = f"from gsim3d.generate import generate\nif __name__ == '__main__':\n    {call}\n"
     (tmp_path / "run.py").write_text(program)
     command = [sys.executable, str(tmp_path / "run.py")]
-    environment = {**os.environ, "PYTHONPATH": os.getcwd()}
+    paths = [os.getcwd(), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
     process = subprocess.Popen(command, env=environment)
     deadline = time.time() + 120
     while len(list((tmp_path / "killed").glob("*/*/metadata.json"))) < 2:

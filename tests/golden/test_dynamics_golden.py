@@ -155,7 +155,8 @@ def test_pooling_and_merging(file, stride, window):
     close(out, case[f"merge{window}/out/feat"], "features")
     if window == 1:
         stage.train()
-        close(stage(g["in/features"].reshape(-1, 6), pyramid.stages[1], None), case["train/feat"], "features in training")
+        out = stage(g["in/features"].reshape(-1, 6), pyramid.stages[1], None)
+        close(out, case["train/feat"], "features in training")
         close(stage.pool.norm.running_mean, case["train/running_mean_after"], "running mean")
         close(stage.pool.norm.running_var, case["train/running_var_after"], "running variance")
 
@@ -168,7 +169,8 @@ def test_rollout(file, case):
         CONFIGS["small"], grid_size=float(g["grid_size"]), max_step=float(g["metric"]) / 2
     )
     dynamics = Dynamics(config).eval()
-    dynamics.net.load_state_dict(dynamics_weights({key.removeprefix("net."): (g / "w")[key] for key in (g / "w").keys()}))
+    published = {key.removeprefix("net."): (g / "w")[key] for key in (g / "w").keys()}
+    dynamics.net.load_state_dict(dynamics_weights(published))
     c = g / case
     xyz = c["in/means"]
     mask = c["in/state_mask"][..., 0] if "in/state_mask" in c else torch.ones(xyz.shape[:3], dtype=torch.bool)

@@ -51,9 +51,10 @@ def inputs(file):
 def render(file, view, means, quats, scales, opacities, harmonics, cutoff):
     sh = torch.einsum("kj,nck->njc", basis_change().to(harmonics), harmonics)
     cameras = camera(file, view)
+    background = file["in/background"][view].to(means)
+    near_plane = 0.2 * float(cameras.near)
     return rasterize_gaussians(
-        means, quats, scales, opacities, cameras, sh=sh, background=file["in/background"][view].to(means),
-        near_plane=0.2 * float(cameras.near), cutoff=cutoff,
+        means, quats, scales, opacities, cameras, sh=sh, background=background, near_plane=near_plane, cutoff=cutoff
     )
 
 
@@ -88,8 +89,9 @@ def test_images_and_gradients(view, mode):
 def test_float32_image_and_depth(view):
     file = golden("j_raster")
     out = render(file, view, *(x.float() for x in inputs(file)), "tile3sigma")
-    assert_close_relative_to_max(out.color[0].permute(2, 0, 1), file[f"view{view}/image_float32"], "raster_golden_float32")
-    assert_close_relative_to_max(out.depth[0], file[f"view{view}/depth_image_float32"], "raster_golden_float32")
+    expected = file / f"view{view}"
+    assert_close_relative_to_max(out.color[0].permute(2, 0, 1), expected["image_float32"], "raster_golden_float32")
+    assert_close_relative_to_max(out.depth[0], expected["depth_image_float32"], "raster_golden_float32")
 
 
 def test_masked_rows_are_absent():

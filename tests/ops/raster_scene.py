@@ -54,16 +54,23 @@ class Scene:
         means, quats, scales, opacities, color, features, background, viewmats = inputs or self.inputs
         name = "sh" if color.dim() == 3 else "colors"
         out = rasterize_gaussians(
-            means, quats, scales, opacities, self.cameras(viewmats), features=features, background=background,
-            cu_rows=self.cu_rows, **{name: color}, **options,
+            means,
+            quats,
+            scales,
+            opacities,
+            self.cameras(viewmats),
+            features=features,
+            background=background,
+            cu_rows=self.cu_rows,
+            **{name: color},
+            **options,
         )
         return tuple(out)
 
     def render_oracle(self, *inputs: Tensor, **options) -> tuple[Tensor, ...]:
         inputs = inputs or self.inputs
-        return oracle.render(
-            *inputs, self.Ks, self.image_cloud, self.cu_rows, self.width, self.height, **options
-        )
+        size = (self.width, self.height)
+        return oracle.render(*inputs, self.Ks, self.image_cloud, self.cu_rows, size, **options)
 
     def cotangents(self, seed: int = 5) -> tuple[Tensor, ...]:
         g = torch.Generator().manual_seed(seed)
@@ -116,7 +123,7 @@ def random_scene(
 
 
 def facing(means, scales=0.1, opacities=0.5, width=16, height=16, focal=16.0, dtype=torch.float32, **fields) -> Scene:
-    """Gaussians [N, 3] in front of one camera at the origin with its axis through the image centre; white, no features."""
+    """Gaussians [N, 3] before one camera at the origin, its axis through the image centre; white, no features."""
     means = torch.as_tensor(means, dtype=dtype).reshape(-1, 3)
     n = len(means)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=dtype)

@@ -32,7 +32,11 @@ def functions(rows, cu_rows, n_rows):
     m = len(cu_rows) - 1
     return {
         "max": (lambda x: pool_max(x, rows, cu_rows), lambda x: oracle.pool_max(x, rows.cpu(), cu_rows.cpu()), n_rows),
-        "mean": (lambda x: pool_mean(x, rows, cu_rows), lambda x: oracle.pool_mean(x, rows.cpu(), cu_rows.cpu()), n_rows),
+        "mean": (
+            lambda x: pool_mean(x, rows, cu_rows),
+            lambda x: oracle.pool_mean(x, rows.cpu(), cu_rows.cpu()),
+            n_rows,
+        ),
         "unpool": (
             lambda x: unpool(x, rows, cu_rows, n_rows),
             lambda x: oracle.unpool(x, rows.cpu(), cu_rows.cpu(), n_rows),

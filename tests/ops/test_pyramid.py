@@ -41,10 +41,10 @@ def flat(pyramid):
     result = [pyramid.rows]
     for stage in pyramid.stages:
         result += [stage.grid, stage.cloud, stage.cu_clouds, stage.order]
-        result += [t for table in stage.patches for t in vars(table).values()]
-        result += vars(stage.voxels).values()
+        result += [t for table in stage.patches for t in (table.q_rows, table.kv_rows, table.cu_q, table.cu_k)]
+        result += [stage.voxels.row_voxel, stage.voxels.rows, stage.voxels.cu_rows]
         result += [t for m in stage.kernel_maps.values() for t in (m.tap_in, m.tap_out, m.cu_taps)]
-        result += vars(stage.cluster).values() if stage.cluster else []
+        result += [stage.cluster.rows, stage.cluster.cu_rows] if stage.cluster else []
         result += [stage.time_index] if stage.time_index is not None else []
     return result
 

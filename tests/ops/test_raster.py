@@ -35,7 +35,8 @@ def test_forward(device, sh_terms, cutoff, dtype):
 
 
 def test_long_lists_are_sorted_by_depth(device):
-    # Thousands of faint Gaussians in every tile: several chunks of rows, and the radix sort in place of the insertion sort.
+    # Thousands of faint Gaussians in every tile: several chunks of rows, and the radix sort in place of the insertion
+    # sort.
     scene = random_scene(n=5000, clouds=1, images=1, width=24, height=20, sh_terms=0, n_features=1, spread=0.3, seed=1)
     scene = scene.replace(opacities=0.02 * scene.opacities + 0.004, scales=0.3 * scene.scales)
     expected = scene.render_oracle()

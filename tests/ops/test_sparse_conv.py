@@ -57,7 +57,9 @@ def test_forward_and_gradients_equal_the_oracle(kernel_size, c_in, c_out, duplic
     ours = convolution(*geometry(cells, kernel_size, device), duplicates)
     actual = gradients(ours, [t.to(device) for t in (x, weight, bias)], cotangent)
     expected = gradients(
-        lambda x, w, b: oracle.sparse_conv(x, w, b, cells, duplicates), [t.double() for t in (x, weight, bias)], cotangent
+        lambda x, w, b: oracle.sparse_conv(x, w, b, cells, duplicates),
+        [t.double() for t in (x, weight, bias)],
+        cotangent,
     )
     name = "sparse_conv_float32" if dtype == torch.float32 else "sparse_conv_float64"
     for what, a, b in zip(("result", "grad x", "grad weight", "grad bias"), actual, expected):
@@ -256,9 +258,8 @@ def test_same_bits_for_any_number_of_threads():
 def test_same_bits_for_any_vector_width(tmp_path):
     """GSIM3D_SIMD=avx2 forbids the wide variant, which other processors do not have."""
     file = tmp_path / "narrow.pt"
-    code = (
-        "import sys, torch; from tests.ops.test_sparse_conv import scene_for_bits; torch.save(scene_for_bits(), sys.argv[1])"
-    )
+    scene = "from tests.ops.test_sparse_conv import scene_for_bits"
+    code = f"import sys, torch; {scene}; torch.save(scene_for_bits(), sys.argv[1])"
     subprocess.run([sys.executable, "-c", code, str(file)], env={**os.environ, "GSIM3D_SIMD": "avx2"}, check=True)
     for actual, expected in zip(scene_for_bits(), torch.load(file)):
         assert_same_bits(actual, expected)
@@ -304,7 +305,10 @@ TAP_12, TAP_14 = [0] * 13 + [1] * 2, [2] * 13  # the pairs of two_neighbours: on
         (dict(cu_taps=TAP_12 + [3] * 12 + [2]), "cu_taps must not descend; got 3 then 2"),
         (dict(cu_taps=[0] * 14 + [2] * 14), "the centre tap 13 must have no pairs; got 2"),
         (dict(cu_taps=[0] * 15 + [2] * 13), "tap_out must ascend inside a tap; got 1 then 0"),
-        (dict(cu_taps=[0] * 15 + [2] * 13, tap_in=[1, 1], tap_out=[0, 1]), "tap_in must name a voxel at most once a tap"),
+        (
+            dict(cu_taps=[0] * 15 + [2] * 13, tap_in=[1, 1], tap_out=[0, 1]),
+            "tap_in must name a voxel at most once a tap",
+        ),
     ],
 )
 def test_malformed_arguments_raise(wrong, message):

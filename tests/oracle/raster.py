@@ -1,4 +1,4 @@
-"""A dense renderer of 3D Gaussians in float64: every Gaussian at every pixel, sorted by depth, differentiated by autograd.
+"""A dense renderer of 3D Gaussians: every Gaussian at every pixel, sorted by depth, differentiated by autograd.
 
 Written from the formulas of EWA splatting and 3D Gaussian splatting, without tiles, bounds or bookkeeping. It imports
 nothing from gsim3d.
@@ -12,7 +12,7 @@ MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, DILATION, FIELD_MARGIN, TILE = 1 / 255,
 
 
 def legendre_basis(direction, degree):
-    """Real spherical harmonics in the 3DGS sign convention, from associated Legendre polynomials; [N, (degree + 1)^2]."""
+    """Real spherical harmonics [N, (degree + 1)^2] in the 3DGS signs, from associated Legendre polynomials."""
     x, y, z = direction.unbind(-1)
     rim = torch.sqrt(x * x + y * y)
     angle = torch.atan2(y, x)
@@ -66,17 +66,14 @@ def project(means, quats, scales, viewmat, K, width, height):
     return mean2d, axes @ axes.mT + DILATION * torch.eye(2, dtype=means.dtype), point
 
 
-def render_image(
-    means, quats, scales, opacities, color, features, background, viewmat, K, width, height, *, near_plane=0.01, cutoff="exact"
-):
-    """One image; ``color`` [N, K, 3] or [N, 3]. Returns color [H, W, 3], alpha, depth [H, W], features [H, W, F]."""
+def render_image(gaussians, background, viewmat, K, width, height, *, near_plane=0.01, cutoff="exact"):
+    """One image of (means, quats, scales, opacities, color, features); color [N, K, 3] or [N, 3]."""
     with torch.no_grad():
+        means = gaussians[0]
         z = (means @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2]
         order = torch.argsort(z, stable=True)
         order = order[z[order] > near_plane]
-    means, quats, scales, opacities, color, features = (
-        x[order] for x in (means, quats, scales, opacities, color, features)
-    )
+    means, quats, scales, opacities, color, features = (x[order] for x in gaussians)
     mean2d, covariance, point = project(means, quats, scales, viewmat, K, width, height)
     if color.dim() == 3:
         direction = torch.nn.functional.normalize(point @ viewmat[:3, :3], dim=-1)
@@ -124,15 +121,13 @@ def _tiles_touched(mean2d, covariance, x, y):
     return inside
 
 
-def render(means, quats, scales, opacities, color, features, background, viewmats, Ks, image_cloud, cu_rows, width, height, **options):
-    """All images of a call: the arguments of ``torch.ops.gsim3d.rasterize_gaussians``; four stacked results."""
+def render(
+    means, quats, scales, opacities, color, features, background, viewmats, Ks, image_cloud, cu_rows, size, **options
+):
+    """All images of a call, given as packed rows: color [I, H, W, 3], alpha, depth [I, H, W], features [I, H, W, F]."""
     images = []
     for i, cloud in enumerate(image_cloud.tolist()):
         rows = slice(int(cu_rows[cloud]), int(cu_rows[cloud + 1]))
-        images.append(
-            render_image(
-                means[rows], quats[rows], scales[rows], opacities[rows], color[rows], features[rows],
-                background[i], viewmats[i], Ks[i], width, height, **options,
-            )
-        )
+        gaussians = [x[rows] for x in (means, quats, scales, opacities, color, features)]
+        images.append(render_image(gaussians, background[i], viewmats[i], Ks[i], *size, **options))
     return tuple(torch.stack(parts) for parts in zip(*images))

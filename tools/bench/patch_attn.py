@@ -1,7 +1,8 @@
+#!/usr/bin/env python
 """Patch attention against torch's scaled_dot_product_attention (its flash kernel on the CPU).
 
 "gather": both start from one qkv tensor in row order; torch gathers it into patches and scatters the result back.
-"ready": torch's tensors lie as [patches, heads, rows, dim] already and its result stays there.
+"ready": nothing has to move; torch's tensors lie as [3, patches, heads, rows, dim] and its result stays there.
 """
 
 import torch
@@ -10,11 +11,12 @@ from harness import Bench
 
 from gsim3d.ops import PatchTable, patch_attention
 
-PATCH, N_PATCHES, HEADS = 1024, 16, 4
+HEADS = 4
+SIZES = ((16, 1024, 16), (16, 1024, 32), (16, 1024, 64), (128, 128, 16))  # patches, rows of a patch, head dim
 
 
 def with_gradient(leaf, f, cotangent):
-    """A callable that runs f and its gradient to ``leaf``; results of two layouts compare after ``f``'s own view."""
+    """A callable that gives f(leaf) and its gradient to ``leaf``."""
     leaf = leaf.detach().requires_grad_()
 
     def run():
@@ -24,64 +26,61 @@ def with_gradient(leaf, f, cotangent):
     return run
 
 
+def gather_case(bench, name, qkv, cotangent, n_patches, patch):
+    n, _, heads, dim = qkv.shape
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(1))
+    inverse = order.argsort()
+    cu = torch.arange(n_patches + 1) * patch
+    table = PatchTable(order, order, cu, cu)
+
+    def ours(x):
+        return patch_attention(*x.unbind(1), table)
+
+    def plain(x):
+        q, k, v = x.index_select(0, order).view(n_patches, patch, 3, heads, dim).permute(2, 0, 3, 1, 4)
+        out = F.scaled_dot_product_attention(q, k, v)
+        return out.transpose(1, 2).reshape(n, heads, dim).index_select(0, inverse)
+
+    bench.compare(f"{name}, gather", lambda: ours(qkv), lambda: plain(qkv))
+    pair = with_gradient(qkv, ours, cotangent), with_gradient(qkv, plain, cotangent)
+    bench.compare(f"{name}, gather, fwd+bwd", *pair)
+
+
+def ready_case(bench, name, qkv, cotangent, n_patches, patch):
+    rows, cu = torch.arange(qkv.shape[0]), torch.arange(n_patches + 1) * patch
+    table = PatchTable(rows, rows, cu, cu)
+
+    def ours(x):
+        return patch_attention(*x.unbind(1), table)
+
+    def plain(x):
+        return F.scaled_dot_product_attention(*x)
+
+    def to_patches(x):
+        return x.view(n_patches, patch, *x.shape[1:]).movedim(1, -2)
+
+    packed = to_patches(qkv).transpose(0, 1).contiguous()
+    bench.compare(f"{name}, ready", lambda: to_patches(ours(qkv)), lambda: plain(packed))
+    run_ours = with_gradient(qkv, ours, cotangent)
+    run_plain = with_gradient(packed, plain, to_patches(cotangent).contiguous())
+
+    def plain_in_our_order():
+        out, grad = run_plain()
+        return [out, grad.transpose(0, 1)]
+
+    bench.compare(f"{name}, ready, fwd+bwd", lambda: [to_patches(x) for x in run_ours()], plain_in_our_order)
+
+
 def main():
     bench = Bench("patch_attn")
-    n = PATCH * N_PATCHES
     generator = torch.Generator().manual_seed(0)
-    order = torch.randperm(n, generator=generator)
-    cu = torch.arange(N_PATCHES + 1) * PATCH
-    for dim in (16, 32, 64):
-        qkv = torch.randn(n, 3, HEADS, dim, generator=generator)
-        cotangent = torch.randn(n, HEADS, dim, generator=generator)
-        table = PatchTable(order, order, cu, cu)
-        inverse = torch.empty_like(order)
-        inverse[order] = torch.arange(n)
-
-        def ours(x):
-            return patch_attention(*x.unbind(1), table)
-
-        def gathered(x):
-            q, k, v = x.index_select(0, order).view(N_PATCHES, PATCH, 3, HEADS, dim).permute(2, 0, 3, 1, 4)
-            out = F.scaled_dot_product_attention(q, k, v)
-            return out.transpose(1, 2).reshape(n, HEADS, dim).index_select(0, inverse)
-
-        def ready(x):
-            return F.scaled_dot_product_attention(*x)
-
-        name = f"{HEADS} heads of {dim}, {N_PATCHES} patches of {PATCH}"
-        bench.compare(f"{name}, gather", lambda: ours(qkv), lambda: gathered(qkv))
-        bench.compare(
-            f"{name}, gather, fwd+bwd",
-            with_gradient(qkv, ours, cotangent),
-            with_gradient(qkv, gathered, cotangent),
-        )
-
-        # The same patches where nothing has to move: ours in row order, torch's as [3, P, H, rows, dim].
-        table = PatchTable(torch.arange(n), torch.arange(n), cu, cu)
-
-        def to_patches(x):
-            return x.view(N_PATCHES, PATCH, *x.shape[1:]).movedim(1, -2)
-
-        packed = to_patches(qkv).permute(1, 0, 2, 3, 4).contiguous()
-        bench.compare(f"{name}, ready", lambda: to_patches(ours(qkv)), lambda: ready(packed))
-        mine = with_gradient(qkv, ours, cotangent)
-        bench.compare(
-            f"{name}, ready, fwd+bwd",
-            lambda: [to_patches(x) for x in mine()],
-            with_packed(packed, ready, to_patches(cotangent).contiguous()),
-        )
+    for n_patches, patch, dim in SIZES:
+        qkv = torch.randn(n_patches * patch, 3, HEADS, dim, generator=generator)
+        cotangent = torch.randn(n_patches * patch, HEADS, dim, generator=generator)
+        name = f"{n_patches} x {patch}, {HEADS} heads of {dim}"
+        gather_case(bench, name, qkv, cotangent, n_patches, patch)
+        ready_case(bench, name, qkv, cotangent, n_patches, patch)
     bench.finish()
-
-
-def with_packed(leaf, f, cotangent):
-    """As with_gradient; the gradient [3, P, H, rows, dim] is returned as a view in the order of ours."""
-    run = with_gradient(leaf, f, cotangent)
-
-    def reordered():
-        out, grad = run()
-        return [out, grad.movedim(0, 1)]
-
-    return reordered
 
 
 if __name__ == "__main__":

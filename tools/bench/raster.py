@@ -1,4 +1,4 @@
-"""The rasterizer against a tile renderer in plain torch: 4 images of 128 x 128 pixels, 16k Gaussians of about a pixel each."""
+"""The rasterizer against a tile renderer in plain torch: 4 images of 128 x 128 px, 16k Gaussians of a pixel each."""
 
 import math
 
@@ -13,7 +13,7 @@ FOCAL = 1.1 * SIZE
 
 
 def scene(sh_terms, seed=0):
-    """What a feed-forward model gives: every pixel of a camera, unprojected onto a wavy sheet with a ball before it; seen
+    """What a feed-forward model gives: every pixel of a camera, unprojected onto a wavy sheet behind a ball, seen
     by another camera. One cloud an image."""
     g = torch.Generator().manual_seed(seed)
     n = IMAGES * SIZE * SIZE

@@ -68,7 +68,13 @@ def seconds(f, repeats: int = 3) -> float:
 
 def main():
     bench = Bench("sparse_conv")
-    for n, channels, neighbours in ((16384, 64, 2), (16384, 64, 10), (16384, 128, 2), (16384, 128, 10), (4096, 256, 10)):
+    for n, channels, neighbours in (
+        (16384, 64, 2),
+        (16384, 64, 10),
+        (16384, 128, 2),
+        (16384, 128, 10),
+        (4096, 256, 10),
+    ):
         voxels, kernel_map = occupied_cells(n, neighbours)
         generator = torch.Generator().manual_seed(1)
         x = torch.randn(n, channels, generator=generator)

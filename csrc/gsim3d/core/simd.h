@@ -23,8 +23,9 @@
 #define GSIM3D_SIMD_INLINE inline __attribute__((always_inline))
 
 #ifdef GSIM3D_SIMD_X86
-#define GSIM3D_SIMD_AVX512_BEGIN \
-  _Pragma("GCC push_options") _Pragma("GCC target(\"arch=x86-64-v4,prefer-vector-width=512\")")
+#define GSIM3D_SIMD_AVX512_BEGIN   \
+  _Pragma("GCC push_options")      \
+  _Pragma("GCC target(\"avx512f,avx512bw,avx512cd,avx512dq,avx512vl,prefer-vector-width=512\")")
 #define GSIM3D_SIMD_AVX512_END _Pragma("GCC pop_options")
 #endif
 

@@ -130,8 +130,8 @@ void check_patch_table(const char* op, const PatchTable& table) {
   std::vector<char> seen(static_cast<size_t>(table.n_q), 0);
   for (int64_t i = 0; i < table.n_q_listed; ++i) {
     const int64_t row = table.q_rows[i];
-    check(row >= 0 && row < table.n_q, op, ": q_rows must be in [0, N) with N=", table.n_q, " from q; got ", row, " at ",
-          i);
+    check(row >= 0 && row < table.n_q, op, ": q_rows must be in [0, N) with N=", table.n_q, " from q; got ", row,
+          " at ", i);
     check(!seen[row], op, ": q_rows must list a row at most once; got ", row, " again at ", i);
     seen[row] = 1;
   }

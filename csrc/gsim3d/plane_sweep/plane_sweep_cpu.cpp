@@ -183,7 +183,7 @@ class Walker {
   const T* weights() const { return weights_.data(); }
 
  private:
-  static constexpr int64_t kBorder = std::numeric_limits<int64_t>::max();  // always up to date, always 0
+  static constexpr int64_t kBorder = std::numeric_limits<int64_t>::max();  // always up to date
 
   void locate(int64_t pair, int64_t pixel) {
     const T* b = sweep_.translations + 3 * pair;
@@ -223,8 +223,8 @@ class Walker {
     touched_.push_back(place);
   }
 
+  // The border collects what nobody asks for.
   void add_grad(int32_t place, T grad) {
-    if (stamp_[place] == kBorder) return;
     if (stamp_[place] < epoch_) {
       stamp_[place] = epoch_;
       table_[place] = T(0);
@@ -237,7 +237,7 @@ class Walker {
   const int32_t stride_, outside_;
   std::vector<int32_t> corners_;
   std::vector<T> fx_, fy_, depths_;
-  std::vector<T> table_;         // scores, or gradients of scores; 0 on the border
+  std::vector<T> table_;         // scores, 0 on the border; or gradients of scores
   std::vector<int64_t> stamp_;   // the step at which table_ was last filled
   std::vector<int32_t> pixel_;   // of the source image; -1 on the border
   std::vector<int32_t> touched_;

@@ -1,8 +1,8 @@
 // Grid pooling and unpooling: reductions of feature rows over segments, and the way back.
 //
-// A segment list says which rows belong together: segment s holds rows[cu_rows[s]] .. rows[cu_rows[s + 1] - 1]. A row is in
-// at most one segment, so every result element has one owner and every sum runs in the order of the list: the same
-// bits for any number of threads. T is float or double.
+// A segment list says which rows belong together: segment s holds rows[cu_rows[s]] .. rows[cu_rows[s + 1] - 1]. A row
+// is in at most one segment, so every result element has one owner and every sum runs in the order of the list: the
+// same bits for any number of threads. T is float or double.
 #pragma once
 
 #include <cstdint>

@@ -90,20 +90,22 @@ void check_segments(const char* op, const Segments& segments) {
   if (well_formed(segments)) return;
   check(n_listed <= n_rows, op, ": rows must list each of the N=", n_rows, " rows at most once; got ", n_listed,
         " entries");
-  check(cu[0] == 0 && cu[n_segments] == n_listed, op, ": cu_rows must run from 0 to len(rows)=", n_listed, "; got ", cu[0],
-        " .. ", cu[n_segments]);
+  check(cu[0] == 0 && cu[n_segments] == n_listed, op, ": cu_rows must run from 0 to len(rows)=", n_listed, "; got ",
+        cu[0], " .. ", cu[n_segments]);
   for (int64_t s = 0; s < n_segments; ++s)
     check(cu[s] <= cu[s + 1], op, ": cu_rows must not descend; got ", cu[s], " then ", cu[s + 1], " at ", s);
   std::vector<char> seen(static_cast<size_t>(n_rows), 0);
   for (int64_t i = 0; i < n_listed; ++i) {
-    check(rows[i] >= 0 && rows[i] < n_rows, op, ": rows must be in [0, N) with N=", n_rows, "; got ", rows[i], " at ", i);
+    check(rows[i] >= 0 && rows[i] < n_rows, op, ": rows must be in [0, N) with N=", n_rows, "; got ", rows[i], " at ",
+          i);
     check(!seen[rows[i]], op, ": rows must list a row at most once; got ", rows[i], " again at ", i);
     seen[rows[i]] = 1;
   }
 }
 
 template <typename T>
-void pool_max(const T* x, const Segments& segments, int64_t channels, T* out, int64_t* argmax, const Parallel& parallel) {
+void pool_max(const T* x, const Segments& segments, int64_t channels, T* out, int64_t* argmax,
+              const Parallel& parallel) {
   check(segments.n_rows <= std::numeric_limits<int32_t>::max(), "pool_max: x must have fewer than 2^31 rows; got ",
         segments.n_rows);
   constexpr int64_t width = simd::baseline::W<T>;
@@ -194,10 +196,8 @@ void unpool(const T* x, const Segments& segments, int64_t channels, T* out, cons
   });
   parallel.range(segments.n_rows, grain(segments.n_rows, segments.n_rows, channels), [&](int64_t begin, int64_t end) {
     for (int64_t row = begin; row < end; ++row) {
-      if (owner[row] >= 0)
-        std::memcpy(out + row * channels, x + owner[row] * channels, sizeof(T) * channels);
-      else
-        std::fill_n(out + row * channels, channels, T(0));
+      if (owner[row] >= 0) std::memcpy(out + row * channels, x + owner[row] * channels, sizeof(T) * channels);
+      else std::fill_n(out + row * channels, channels, T(0));
     }
   });
 }
@@ -207,12 +207,12 @@ void unpool_vjp(const T* grad, const Segments& segments, int64_t channels, T* gr
   add_up<T, false>(grad, segments, channels, grad_x, parallel);
 }
 
-#define GSIM3D_INSTANTIATE(T)                                                                                          \
-  template void pool_max<T>(const T*, const Segments&, int64_t, T*, int64_t*, const Parallel&);                       \
-  template void pool_max_vjp<T>(const T*, const int64_t*, int64_t, int64_t, int64_t, T*, const Parallel&);            \
-  template void pool_mean<T>(const T*, const Segments&, int64_t, T*, const Parallel&);                                \
-  template void pool_mean_vjp<T>(const T*, const Segments&, int64_t, T*, const Parallel&);                            \
-  template void unpool<T>(const T*, const Segments&, int64_t, T*, const Parallel&);                                   \
+#define GSIM3D_INSTANTIATE(T)                                                                              \
+  template void pool_max<T>(const T*, const Segments&, int64_t, T*, int64_t*, const Parallel&);            \
+  template void pool_max_vjp<T>(const T*, const int64_t*, int64_t, int64_t, int64_t, T*, const Parallel&); \
+  template void pool_mean<T>(const T*, const Segments&, int64_t, T*, const Parallel&);                     \
+  template void pool_mean_vjp<T>(const T*, const Segments&, int64_t, T*, const Parallel&);                 \
+  template void unpool<T>(const T*, const Segments&, int64_t, T*, const Parallel&);                        \
   template void unpool_vjp<T>(const T*, const Segments&, int64_t, T*, const Parallel&);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)

@@ -22,7 +22,8 @@ std::tuple<Tensor, Tensor> pool_max(const Tensor& x_, const Tensor& rows_, const
   Tensor out = empty(x, {segments.n_segments, x.size(1)});
   Tensor argmax = empty(x, {segments.n_segments, x.size(1)}, ScalarType::Long);
   dispatch_float(op, "x", x, [&]<typename T>() {
-    cpu::pool_max(data<T>(x), segments, x.size(1), mutable_data<T>(out), mutable_data<int64_t>(argmax), torch_parallel());
+    cpu::pool_max(data<T>(x), segments, x.size(1), mutable_data<T>(out), mutable_data<int64_t>(argmax),
+                  torch_parallel());
   });
   return {out, argmax};
 }

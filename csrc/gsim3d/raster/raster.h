@@ -1,13 +1,14 @@
 // 3D Gaussian splatting: projection of packed Gaussians into pinhole images, and front-to-back blending.
 //
-// One call renders I images; image i shows the rows of cloud image_cloud[i]. For a pixel with centre p = (x + 0.5, y + 0.5):
+// One call renders I images; image i shows the rows of cloud image_cloud[i]. For a pixel centre p = (x + 0.5, y + 0.5):
 //   mu, Sigma = projection of the mean and (J W) R S S R^T (J W)^T + 0.3 I      (EWA splatting)
 //   alpha_n = min(0.99, opacity_n exp(-(p - mu)^T Sigma^-1 (p - mu) / 2)), left out where below 1/255
 //   T_n = prod_{m < n} (1 - alpha_m) over the Gaussians in front, sorted by camera z, ties by row
-//   color = sum_n alpha_n T_n color_n + T_end background;   depth, features: the same sums of camera z and of feature rows
+//   color = sum_n alpha_n T_n color_n + T_end background; depth, features: the same sums of camera z, of feature rows
 // A pixel ends before the first Gaussian that would bring T below 1e-4. Same bits for any number of threads.
 //
-// Sources: Zwicker et al., EWA splatting (2002); Kerbl et al., 3D Gaussian splatting (2023); conventions of gsplat (Apache-2.0).
+// Sources: Zwicker et al., EWA splatting (2002); Kerbl et al., 3D Gaussian splatting (2023); conventions of gsplat
+// (Apache-2.0).
 #pragma once
 
 #include <cstdint>
@@ -82,8 +83,8 @@ template <typename T>
 void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, const Workspace& workspace,
                     const Parallel& parallel);
 
-// Vector-Jacobian product of raster_forward; fills every array of `grads`. A Gaussian has no gradient through a pixel where
-// its alpha is cut to 0.99.
+// Vector-Jacobian product of raster_forward; fills every array of `grads`. A Gaussian has no gradient through a pixel
+// where its alpha is cut to 0.99.
 template <typename T>
 void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& image_grads,
                      const RasterSceneGrads<T>& grads, const Workspace& workspace, const Parallel& parallel);

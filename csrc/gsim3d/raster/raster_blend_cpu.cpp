@@ -1,5 +1,5 @@
-// Blending of one tile at a time. A typical Gaussian is a few pixels wide, so a tile visits, for each splat, only the rows and
-// the vectors of pixels within its bounds, not all of its 256 pixels.
+// Blending of one tile at a time. A typical Gaussian is a few pixels wide, so a tile visits, for each splat, only the
+// rows and the vectors of pixels within its bounds, not all of its 256 pixels.
 #include <algorithm>
 #include <cmath>
 #include <memory>
@@ -103,8 +103,9 @@ class Tile {
   int64_t first_row_;
 };
 
-// Calls f(offset, u, dy, exponent) for the vectors of pixels of the tile that may see the splat: offset of the first pixel
-// in the tile, u = dx - slope dy, and alpha = opacity 2^exponent. Every pixel within the splat's bounds is in one vector.
+// Calls f(offset, u, dy, exponent) for the vectors of pixels of the tile that may see the splat: offset of the first
+// pixel in the tile, u = dx - slope dy, and alpha = opacity 2^exponent. Every pixel within the splat's bounds is in
+// one vector.
 template <typename T, typename F>
 void for_vectors(const Splat<T>& splat, int tile_x, int tile_y, const F& f) {
   using V = Simd<T>;
@@ -143,7 +144,8 @@ void blend_tile(const RasterScene<T>& scene, const Group<T>& group, const Raster
   const Tile<T> tile(scene, group, task);
   const int64_t n_features = scene.n_features;
 
-  // Transmittance is 0 where a pixel has ended; what it had reached is in `ended`, and after how many entries in `last`.
+  // Transmittance is 0 where a pixel has ended; what it had reached is in `ended`, and after how many entries in
+  // `last`.
   alignas(32) T transmittance[kPixels] = {}, ended[kPixels], sums[4][kPixels] = {};
   int32_t last[kPixels];
   std::vector<T> feature_sums(static_cast<size_t>(n_features) * kPixels, T(0));
@@ -230,7 +232,8 @@ void blend_tile_vjp(const RasterScene<T>& scene, const Group<T>& group, const Ra
   });
   std::copy_n(background_sum, 3, tile_background);
   n_used = std::min(n_used, tile.n);
-  for (int64_t k = n_used; k < tile.n; ++k) std::fill_n(slots + (tile.begin + tile.place(k)) * slot_width, slot_width, T(0));
+  for (int64_t k = n_used; k < tile.n; ++k)
+    std::fill_n(slots + (tile.begin + tile.place(k)) * slot_width, slot_width, T(0));
 
   for (int64_t k = n_used - 1; k >= 0; --k) {
     tile.prefetch(k - kPrefetch);
@@ -302,8 +305,8 @@ void blend_group(const RasterScene<T>& scene, const Group<T>& group, const Raste
 }
 
 template <typename T>
-void blend_group_vjp(const RasterScene<T>& scene, const Group<T>& group, const RasterImageGrads<T>& image_grads, T* slots,
-                     T* tile_background, T* grad_background, const Parallel& parallel) {
+void blend_group_vjp(const RasterScene<T>& scene, const Group<T>& group, const RasterImageGrads<T>& image_grads,
+                     T* slots, T* tile_background, T* grad_background, const Parallel& parallel) {
   const int64_t n_tiles = group.n_tiles(), n = (group.last - group.first) * n_tiles;
   parallel.chunks(n, [&](int64_t i) {
     const int64_t task = mixed(i, n);
@@ -312,8 +315,10 @@ void blend_group_vjp(const RasterScene<T>& scene, const Group<T>& group, const R
     else
       blend_tile_vjp<T, false>(scene, group, image_grads, task, slots, tile_background + 3 * task);
   });
-  for (int64_t task = 0; task < n; ++task)
-    for (int c = 0; c < 3; ++c) grad_background[3 * (group.first + task / n_tiles) + c] += tile_background[3 * task + c];
+  for (int64_t task = 0; task < n; ++task) {
+    T* grad = grad_background + 3 * (group.first + task / n_tiles);
+    for (int c = 0; c < 3; ++c) grad[c] += tile_background[3 * task + c];
+  }
 }
 
 #define GSIM3D_INSTANTIATE(T)                                                                                          \

@@ -20,24 +20,25 @@ void check_scene(const RasterScene<T>& s) {
   check(s.sh_terms == 0 || s.sh_terms == 1 || s.sh_terms == 4 || s.sh_terms == 9 || s.sh_terms == 16, kOp,
         ": sh must have 1, 4, 9 or 16 coefficients (degree 0 to 3); got ", s.sh_terms);
   check(std::isfinite(s.near_plane) && s.near_plane > 0, kOp, ": near_plane must be positive; got ", s.near_plane);
-  check(s.cutoff == RasterCutoff::kExact || s.cutoff == RasterCutoff::kTile3Sigma || s.cutoff == RasterCutoff::kSmooth, kOp,
-        ": cutoff must be 0 (exact), 1 (tile3sigma) or 2 (smooth); got ", static_cast<int64_t>(s.cutoff));
-  check(s.cu_rows[0] == 0 && s.cu_rows[s.n_clouds] == s.n_rows, kOp, ": cu_rows must run from 0 to N=", s.n_rows, "; got ",
-        s.cu_rows[0], " .. ", s.cu_rows[s.n_clouds]);
+  const auto cutoff = static_cast<int64_t>(s.cutoff);
+  check(cutoff >= 0 && cutoff <= 2, kOp, ": cutoff must be 0 (exact), 1 (tile3sigma) or 2 (smooth); got ", cutoff);
+  check(s.cu_rows[0] == 0 && s.cu_rows[s.n_clouds] == s.n_rows, kOp, ": cu_rows must run from 0 to N=", s.n_rows,
+        "; got ", s.cu_rows[0], " .. ", s.cu_rows[s.n_clouds]);
   for (int64_t q = 0; q < s.n_clouds; ++q) {
     check(s.cu_rows[q] <= s.cu_rows[q + 1], kOp, ": cu_rows must not descend; got ", s.cu_rows[q], " then ",
           s.cu_rows[q + 1], " at ", q);
     check(s.cu_rows[q + 1] - s.cu_rows[q] <= INT32_MAX, kOp, ": a cloud must have fewer than 2^31 rows; cloud ", q);
   }
   for (int64_t i = 0; i < s.n_images; ++i) {
-    check(s.image_cloud[i] >= 0 && s.image_cloud[i] < s.n_clouds, kOp, ": image_cloud must be in [0, Q) with Q=", s.n_clouds,
-          "; got ", s.image_cloud[i], " for image ", i);
+    check(s.image_cloud[i] >= 0 && s.image_cloud[i] < s.n_clouds, kOp,
+          ": image_cloud must be in [0, Q) with Q=", s.n_clouds, "; got ", s.image_cloud[i], " for image ", i);
     for (int j = 0; j < 12; ++j)
       check(std::isfinite(s.viewmats[16 * i + j]), kOp, ": viewmats must be finite; got ", s.viewmats[16 * i + j],
             " for image ", i);
     const T* K = s.Ks + 9 * i;
     for (int j = 0; j < 9; ++j) check(std::isfinite(K[j]), kOp, ": Ks must be finite; got ", K[j], " for image ", i);
-    check(K[0] > 0 && K[4] > 0, kOp, ": focal lengths in Ks must be positive; got ", K[0], " and ", K[4], " for image ", i);
+    check(K[0] > 0 && K[4] > 0, kOp, ": focal lengths in Ks must be positive; got ", K[0], " and ", K[4],
+          " for image ", i);
     check(K[3] == 0 && K[6] == 0 && K[7] == 0 && K[8] == 1, kOp,
           ": Ks must be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]; got another pattern for image ", i);
     for (int c = 0; c < 3; ++c)
@@ -64,7 +65,8 @@ void scatter_add(Simd<T> value, const int64_t* rows, int n, int64_t width, int64
   for (int lane = 0; lane < n; ++lane) matrix[rows[lane] * width + column] += value[lane];
 }
 
-// Sums the slots of a chunk's splats and takes them through colour and projection; viewmat gradients go to `grad_viewmat`.
+// Sums the slots of a chunk's splats and takes them through colour and projection; viewmat gradients go to
+// `grad_viewmat`.
 template <typename T, int kTerms>
 void project_chunk_vjp(const RasterScene<T>& scene, const Group<T>& group, const Chunk& chunk, const T* slots,
                        const RasterSceneGrads<T>& grads, T grad_viewmat[12]) {
@@ -104,7 +106,8 @@ void project_chunk_vjp(const RasterScene<T>& scene, const Group<T>& group, const
 
     if constexpr (kTerms > 0) {
       const Direction<V> direction = view_direction(camera, p.point);
-      V coefficients[kTerms * 3], grad_coefficients[kTerms * 3], basis[kTerms], grad_basis[kTerms], color[3], grad_unit[3];
+      V coefficients[kTerms * 3], grad_coefficients[kTerms * 3], color[3];
+      V basis[kTerms], grad_basis[kTerms], grad_unit[3];
       for (int i = 0; i < kTerms * 3; ++i) coefficients[i] = gather(scene.color, rows, kTerms * 3, i);
       sh_basis<kTerms>(direction.unit, basis);
       sh_color<kTerms>(basis, coefficients, color);
@@ -124,7 +127,8 @@ void project_chunk_vjp(const RasterScene<T>& scene, const Group<T>& group, const
   for (int i = 0; i < 12; ++i) grad_viewmat[i] = sum_lanes(viewmat_sums[i]);
 }
 
-// Runs of rows of one cloud: their chunks in all images of the group, in order of images. One task owns the rows' gradients.
+// Runs of rows of one cloud: their chunks in all images of the group, in order of images. One task owns the rows'
+// gradients.
 template <typename T>
 std::vector<std::vector<int64_t>> chunks_by_rows(const RasterScene<T>& scene, const Group<T>& group) {
   std::vector<std::vector<int64_t>> tasks;

@@ -9,13 +9,13 @@
 
 namespace gsim3d::raster {
 
-constexpr double kMinAlpha = 1.0 / 255;         // weaker than the smallest step of an 8-bit image: left out
-constexpr double kMaxAlpha = 0.99;              // keeps 1 / (1 - alpha) in the backward pass below 100
-constexpr double kMinTransmittance = 1e-4;      // a pixel ends before falling below it; what is behind is invisible
-constexpr double kDilation = 0.3;               // px^2 added to both variances, so that no Gaussian falls between pixels
-constexpr double kFieldMargin = 0.15;           // the Jacobian is taken at most this part of the image outside of it
-constexpr double kMinQuat = 1e-6;               // shorter quaternions have no direction: identity, no gradient
-constexpr int kTile = 16;                       // pixels; part of the meaning of RasterCutoff::kTile3Sigma
+constexpr double kMinAlpha = 1.0 / 255;       // weaker than the smallest step of an 8-bit image: left out
+constexpr double kMaxAlpha = 0.99;            // keeps 1 / (1 - alpha) in the backward pass below 100
+constexpr double kMinTransmittance = 1e-4;    // a pixel ends before falling below it; what is behind is invisible
+constexpr double kDilation = 0.3;             // px^2, added to both variances: no Gaussian falls between pixels
+constexpr double kFieldMargin = 0.15;         // the Jacobian is taken at most this part of the image outside of it
+constexpr double kMinQuat = 1e-6;             // shorter quaternions have no direction: identity, no gradient
+constexpr int kTile = 16;                     // pixels; part of the meaning of RasterCutoff::kTile3Sigma
 
 // What the functions need of V beyond arithmetic; vector types specialise it.
 template <typename V>
@@ -66,7 +66,7 @@ GSIM3D_HD Camera<S> make_camera(const S* viewmat, const S* K, int64_t width, int
   return camera;
 }
 
-// ---- quaternion (w, x, y, z) of any length -> rotation matrix ---------------------------------------------------------
+// ---- quaternion (w, x, y, z) of any length -> rotation matrix -----------------------------------------------------
 
 template <typename V>
 struct Rotation {
@@ -112,7 +112,7 @@ GSIM3D_HD void rotation_of_vjp(const Rotation<V>& out, const V g[9], V grad_quat
   for (int i = 0; i < 4; ++i) grad_quat[i] = (u[i] - out.unit[i] * along) * out.inverse_norm;
 }
 
-// ---- Gaussian -> image: mean, depth and covariance in pixels ----------------------------------------------------------
+// ---- Gaussian -> image: mean, depth and covariance in pixels ------------------------------------------------------
 
 template <typename V>
 struct Projection {
@@ -178,7 +178,8 @@ struct ProjectionGrad {
   V point[3];    // in: of the camera-frame point from elsewhere (the view direction)
 };
 
-// With H = J W A, A = R diag(scale), Sigma = H H^T: grad_H = (G + G^T) H, grad_A = (J W)^T grad_H, grad_{JW} = grad_H A^T.
+// With H = J W A, A = R diag(scale), Sigma = H H^T: grad_H = (G + G^T) H, grad_A = (J W)^T grad_H, grad_{JW} = grad_H
+// A^T.
 template <typename V, typename S>
 GSIM3D_HD void project_vjp(const Camera<S>& camera, const V mean[3], const V scale[3], const Projection<V>& out,
                            const ProjectionGrad<V>& grad, V grad_mean[3], V grad_quat[4], V grad_scale[3],
@@ -231,7 +232,7 @@ GSIM3D_HD void project_vjp(const Camera<S>& camera, const V mean[3], const V sca
   }
 }
 
-// ---- view direction: W^T point, normalised; it points from the camera to the Gaussian ---------------------------------
+// ---- view direction: W^T point, normalised; it points from the camera to the Gaussian -----------------------------
 
 template <typename V>
 struct Direction {
@@ -270,7 +271,7 @@ GSIM3D_HD void view_direction_vjp(const Camera<S>& camera, const V point[3], con
   }
 }
 
-// ---- colour of real spherical harmonics, standard 3DGS basis and order, kTerms = 1, 4, 9 or 16 ------------------------
+// ---- colour of real spherical harmonics, standard 3DGS basis and order, kTerms = 1, 4, 9 or 16 --------------------
 
 template <int kTerms, typename V>
 GSIM3D_HD void sh_basis(const V d[3], V basis[kTerms]) {
@@ -354,7 +355,7 @@ GSIM3D_HD void sh_color_vjp(const V basis[kTerms], const V coefficients[kTerms *
   }
 }
 
-// ---- the footprint in the image ---------------------------------------------------------------------------------------
+// ---- the footprint in the image -----------------------------------------------------------------------------------
 
 // d^T Sigma^-1 d = tight (dx - slope dy)^2 + loose dy^2: a sum of squares, so needles lose no digits.
 template <typename V>
@@ -387,7 +388,7 @@ GSIM3D_HD void footprint_vjp(const Footprint<V>& shape, const Moments<V>& sums, 
   grad.yy = half * (b * b * sums.yy + c * c * sums.uu) - b * c * sums.uy;
 }
 
-// ---- opacity of one Gaussian at one pixel -----------------------------------------------------------------------------
+// ---- opacity of one Gaussian at one pixel -------------------------------------------------------------------------
 
 // alpha of RasterCutoff::kSmooth: 0 below kMinAlpha, untouched above twice that, a cubic step between.
 template <typename V>

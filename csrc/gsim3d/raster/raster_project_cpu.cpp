@@ -52,7 +52,8 @@ void pixel_range(T low, T high, int64_t size, uint16_t& begin, uint16_t& end) {
   end = last >= 0 ? static_cast<uint16_t>(std::min(last + 1, T(size))) : 0;
 }
 
-// The release's rectangle of tiles, as a cut of the pixel rectangle. Its coordinates count from the centre of the first pixel.
+// The release's rectangle of tiles, as a cut of the pixel rectangle. Its coordinates count from the centre of the
+// first pixel.
 template <typename T>
 void cut_to_tiles(T x, T y, T xx, T yy, T determinant, Splat<T>& splat) {
   const T middle = T(0.5) * (xx + yy);
@@ -125,12 +126,13 @@ void project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, const C
   });
 }
 
-// Calls f(tile) for every tile with a pixel that may see the splat, row by row. A row of tiles is cut to the columns between
-// the leftmost and the rightmost point of the ellipse within it.
+// Calls f(tile) for every tile with a pixel that may see the splat, row by row. A row of tiles is cut to the columns
+// between the leftmost and the rightmost point of the ellipse within it.
 template <typename T, typename F>
 void for_tiles(const Splat<T>& splat, int64_t tiles_x, const F& f) {
   if (splat.x0 >= splat.x1) return;
-  const int64_t tx0 = splat.x0 / kTile, tx1 = (splat.x1 - 1) / kTile, ty0 = splat.y0 / kTile, ty1 = (splat.y1 - 1) / kTile;
+  const int64_t tx0 = splat.x0 / kTile, tx1 = (splat.x1 - 1) / kTile;
+  const int64_t ty0 = splat.y0 / kTile, ty1 = (splat.y1 - 1) / kTile;
   if (tx0 == tx1 || ty0 == ty1) {
     for (int64_t ty = ty0; ty <= ty1; ++ty)
       for (int64_t tx = tx0; tx <= tx1; ++tx) f(ty * tiles_x + tx);
@@ -146,9 +148,10 @@ void for_tiles(const Splat<T>& splat, int64_t tiles_x, const F& f) {
     const T low = T(std::max<int64_t>(splat.y0, ty * kTile)) + T(0.5) - splat.y;
     const T high = T(std::min<int64_t>(splat.y1, (ty + 1) * kTile)) - T(0.5) - splat.y;
     const T at_right = std::clamp(rightmost, low, high), at_left = std::clamp(-rightmost, low, high);
+    const T left = splat.x + splat.slope * at_left - half_width(at_left);
+    const T right = splat.x + splat.slope * at_right + half_width(at_right);
     uint16_t begin, end;
-    pixel_range(splat.x + splat.slope * at_left - half_width(at_left), splat.x + splat.slope * at_right + half_width(at_right),
-                splat.x1, begin, end);
+    pixel_range(left, right, splat.x1, begin, end);
     begin = std::max(begin, splat.x0);
     if (begin >= end) continue;
     for (int64_t tx = begin / kTile; tx <= (end - 1) / kTile; ++tx) f(ty * tiles_x + tx);
@@ -181,7 +184,8 @@ void choose_images(const RasterScene<T>& scene, Group<T>& group) {
 }  // namespace
 
 template <typename T>
-bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, const Parallel& parallel, Group<T>& group) {
+bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, const Parallel& parallel,
+                Group<T>& group) {
   if (group.last >= scene.n_images) return false;
   group.tiles_x = (scene.width + kTile - 1) / kTile, group.tiles_y = (scene.height + kTile - 1) / kTile;
   choose_images(scene, group);
@@ -218,7 +222,7 @@ bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, co
       }
     }
   group.tile_begin[n_images * n_tiles] = group.n_instances = total;
-  check(total <= std::numeric_limits<int32_t>::max(), kOp, ": the Gaussians of one image touch ", total,
+  check(total <= std::numeric_limits<int32_t>::max(), kOp, ": the Gaussians touch ", total,
         " tiles together, more than 2^31; scales are too large");
   group.instances = scratch.take<Instance<T>>(kInstances, total);
   if (backward) {

@@ -85,7 +85,9 @@ struct Lanes<Double4> {
 
 #if defined(__AVX2__) && defined(__FMA__)
 inline Float8 fma(Float8 a, Float8 b, Float8 c) { return (Float8)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c); }
-inline Double4 fma(Double4 a, Double4 b, Double4 c) { return (Double4)_mm256_fmadd_pd((__m256d)a, (__m256d)b, (__m256d)c); }
+inline Double4 fma(Double4 a, Double4 b, Double4 c) {
+  return (Double4)_mm256_fmadd_pd((__m256d)a, (__m256d)b, (__m256d)c);
+}
 inline bool any(Int8 mask) { return _mm256_movemask_ps((__m256)mask) != 0; }
 inline bool any(Long4 mask) { return _mm256_movemask_pd((__m256d)mask) != 0; }
 #else
@@ -115,8 +117,9 @@ inline float sum_lanes(Float8 v) {
 }
 inline double sum_lanes(Double4 v) { return (v[0] + v[2]) + (v[1] + v[3]); }
 
-// 2^x for x <= 0, to the last bit but one; below -126 it stays at 2^-126. x = n + f with n the nearest integer: 2^f is a
-// polynomial, and n goes into the exponent bits. Adding 1.5 * 2^(mantissa bits) rounds to n and leaves it in the low bits.
+// 2^x for x <= 0, to the last bit but one; below -126 it stays at 2^-126. x = n + f with n the nearest integer: 2^f
+// is a polynomial, and n goes into the exponent bits. Adding 1.5 * 2^(mantissa bits) rounds to n and leaves it in the
+// low bits.
 inline Float8 exp2_of(Float8 x) {
   const Float8 low = Lanes<Float8>::splat(-126.0f);
   x = x < low ? low : x;

@@ -1,5 +1,6 @@
-// Inside of the CPU rasterizer: images are rendered in groups; every (row, image) pair of a group becomes a Splat, every tile
-// of 16 x 16 pixels gets the list of the splats that touch it, and a tile blends its list in order of depth.
+// Inside of the CPU rasterizer: images are rendered in groups; every (row, image) pair of a group becomes a Splat,
+// every tile of 16 x 16 pixels gets the list of the splats that touch it, and a tile blends its list in order of
+// depth.
 #pragma once
 
 #include <vector>
@@ -90,7 +91,8 @@ class Scratch {
   std::vector<std::pair<void*, size_t>> slots_;
 };
 
-// Calls f(rows, n) for blocks of kLanes<T> rows of [begin, end); the last block repeats its last row, n says how many count.
+// Calls f(rows, n) for blocks of kLanes<T> rows of [begin, end); the last block repeats its last row, n says how many
+// count.
 template <typename T, typename F>
 void for_row_blocks(int64_t begin, int64_t end, const F& f) {
   for (int64_t row = begin; row < end; row += kLanes<T>) {
@@ -123,7 +125,8 @@ void dispatch_sh(int64_t terms, const F& f) {
 // Next group of images after group.last: splats, lists, and with `backward` the way back from pairs to instances.
 // False when no image is left.
 template <typename T>
-bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, const Parallel& parallel, Group<T>& group);
+bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, const Parallel& parallel,
+                Group<T>& group);
 
 // Blends every tile of the group.
 template <typename T>
@@ -133,9 +136,10 @@ void blend_group(const RasterScene<T>& scene, const Group<T>& group, const Raste
 // Gradients of one instance: Moments (5), sum v, colour (3), depth, features.
 constexpr int kSlotFixed = 10;
 
-// Writes the gradients of every instance to slots [n_instances, kSlotFixed + n_features], and of the background.
+// Writes the gradients of every instance to its slot, and adds those of the background.
 template <typename T>
-void blend_group_vjp(const RasterScene<T>& scene, const Group<T>& group, const RasterImageGrads<T>& image_grads, T* slots,
+void blend_group_vjp(const RasterScene<T>& scene, const Group<T>& group, const RasterImageGrads<T>& image_grads,
+                     T* slots,            // [n_instances, kSlotFixed + n_features]
                      T* tile_background,  // [images * tiles, 3] scratch
                      T* grad_background,  // [n_images, 3]
                      const Parallel& parallel);

@@ -13,9 +13,11 @@ struct SceneTensors {
   int64_t cutoff;
 
   SceneTensors contiguous() const {
-    return {op,           rows_of(means),      rows_of(quats),    rows_of(scales), rows_of(opacities),   rows_of(color),
-            rows_of(features), rows_of(background), rows_of(viewmats), rows_of(Ks),     rows_of(image_cloud), rows_of(cu_rows),
-            width,        height,              near_plane,        cutoff};
+    SceneTensors copy = *this;
+    for (Tensor* tensor : {&copy.means, &copy.quats, &copy.scales, &copy.opacities, &copy.color, &copy.features,
+                           &copy.background, &copy.viewmats, &copy.Ks, &copy.image_cloud, &copy.cu_rows})
+      *tensor = rows_of(*tensor);
+    return copy;
   }
 
   int64_t n_rows() const { return means.size(0); }
@@ -40,7 +42,8 @@ struct SceneTensors {
     check_dtype(op, "image_cloud", image_cloud, ScalarType::Long);
     check_dtype(op, "cu_rows", cu_rows, ScalarType::Long);
     check(cu_rows.dim() == 1 && cu_rows.size(0) >= 1, op, ": cu_rows must be [Q + 1]; got ", shape_of(cu_rows));
-    check(color.dim() != 3 || color.size(1) >= 1, op, ": sh must have 1, 4, 9 or 16 coefficients (degree 0 to 3); got 0");
+    check(color.dim() != 3 || color.size(1) >= 1, op,
+          ": sh must have 1, 4, 9 or 16 coefficients (degree 0 to 3); got 0");
     const auto type = means.scalar_type();
     check_dtype(op, "quats", quats, type);
     check_dtype(op, "scales", scales, type);
@@ -54,23 +57,37 @@ struct SceneTensors {
 
   template <typename T>
   RasterScene<T> scene() const {
-    return {data<T>(means),    data<T>(quats),     data<T>(scales),   data<T>(opacities),
-            data<T>(color),    data<T>(features),  data<T>(background), data<T>(viewmats),
-            data<T>(Ks),       data<int64_t>(image_cloud), data<int64_t>(cu_rows),
-            n_rows(),          cu_rows.size(0) - 1, n_images(),
-            color.dim() == 3 ? color.size(1) : 0,  features.size(1), width, height,
-            static_cast<T>(near_plane), static_cast<RasterCutoff>(cutoff)};
+    return {.means = data<T>(means),
+            .quats = data<T>(quats),
+            .scales = data<T>(scales),
+            .opacities = data<T>(opacities),
+            .color = data<T>(color),
+            .features = data<T>(features),
+            .background = data<T>(background),
+            .viewmats = data<T>(viewmats),
+            .Ks = data<T>(Ks),
+            .image_cloud = data<int64_t>(image_cloud),
+            .cu_rows = data<int64_t>(cu_rows),
+            .n_rows = n_rows(),
+            .n_clouds = cu_rows.size(0) - 1,
+            .n_images = n_images(),
+            .sh_terms = color.dim() == 3 ? color.size(1) : 0,
+            .n_features = features.size(1),
+            .width = width,
+            .height = height,
+            .near_plane = static_cast<T>(near_plane),
+            .cutoff = static_cast<RasterCutoff>(cutoff)};
   }
 };
 
 using Images = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
-                           const Tensor& color, const Tensor& features, const Tensor& background, const Tensor& viewmats,
-                           const Tensor& Ks, const Tensor& image_cloud, const Tensor& cu_rows, int64_t width,
-                           int64_t height, double near_plane, int64_t cutoff) {
-  const SceneTensors given{"rasterize_gaussians", means,    quats, scales,      opacities, color, features, background,
-                           viewmats,              Ks,       image_cloud, cu_rows, width,   height, near_plane, cutoff};
+                           const Tensor& color, const Tensor& features, const Tensor& background,
+                           const Tensor& viewmats, const Tensor& Ks, const Tensor& image_cloud, const Tensor& cu_rows,
+                           int64_t width, int64_t height, double near_plane, int64_t cutoff) {
+  const SceneTensors given{"rasterize_gaussians", means, quats, scales, opacities, color, features, background,
+                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff};
   given.check_all();
   const SceneTensors in = given.contiguous();
   const int64_t n = in.n_images();
@@ -78,7 +95,8 @@ Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tenso
   Tensor out_color = empty(in.means, {n, height, width, 3}), alpha = empty(in.means, {n, height, width});
   Tensor depth = empty(in.means, {n, height, width});
   Tensor out_features = empty(in.means, {n, height, width, in.features.size(1)});
-  Tensor transmittance = empty(in.means, {n, height, width}), last = empty(in.means, {n, height, width}, ScalarType::Int);
+  Tensor transmittance = empty(in.means, {n, height, width});
+  Tensor last = empty(in.means, {n, height, width}, ScalarType::Int);
   TensorWorkspace workspace(in.means);
   dispatch_float(given.op, "means", in.means, [&]<typename T>() {
     cpu::raster_forward<T>(in.scene<T>(),
@@ -99,8 +117,8 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
                                         const Tensor& image_cloud, const Tensor& cu_rows, int64_t width, int64_t height,
                                         double near_plane, int64_t cutoff) {
   const char* op = "rasterize_gaussians_backward";
-  const SceneTensors given{op,       means, quats,       scales,  opacities, color,  features,   background,
-                           viewmats, Ks,    image_cloud, cu_rows, width,     height, near_plane, cutoff};
+  const SceneTensors given{op, means, quats, scales, opacities, color, features, background,
+                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff};
   given.check_all();
   const SceneTensors in = given.contiguous();
   const Tensor grad_color = rows_of(grad_color_), grad_alpha = rows_of(grad_alpha_), grad_depth = rows_of(grad_depth_);

@@ -1,9 +1,9 @@
-// Submanifold convolution over voxels: a row reads itself through the centre tap and the occupied neighbour voxels through
-// the other taps. Rows of one voxel (duplicates) have their own outputs; a tap reads one value a voxel.
+// Submanifold convolution over voxels: a row reads itself through the centre tap and the occupied neighbour voxels
+// through the other taps. Rows of one voxel (duplicates) have their own outputs; a tap reads one value a voxel.
 //
 // Source: Graham et al., "3D semantic segmentation with submanifold sparse convolutional networks", 2018. T is float or
-// double. The same bits for any number of threads and any vector width: an output is one chain of fma in the order of taps,
-// a weight gradient is summed in fixed blocks of pairs that are added in a fixed tree.
+// double. The same bits for any number of threads and any vector width: an output is one chain of fma in the order of
+// taps, a weight gradient is summed in fixed blocks of pairs that are added in a fixed tree.
 #pragma once
 
 #include <cstdint>
@@ -29,7 +29,7 @@ struct SparseConvMap {
 namespace cpu {
 
 // Throws ArgumentError unless `map` is well formed. `op` starts the message.
-void check_sparse_conv_map(const char* op, const SparseConvMap& map);
+void check_sparse_conv_map(const char* op, const SparseConvMap& map, const Parallel& parallel);
 
 // out[p] = bias + W_centre x[p] + sum over taps W_tap xbar[neighbour voxel of p].
 template <typename T>

@@ -1,11 +1,10 @@
-#include "gsim3d/sparse_conv/sparse_conv.h"
-
 #include <algorithm>
 #include <cstring>
 #include <vector>
 
 #include "gsim3d/core/check.h"
 #include "gsim3d/core/simd.h"
+#include "gsim3d/sparse_conv/sparse_conv.h"
 
 namespace gsim3d::cpu {
 namespace {
@@ -44,8 +43,9 @@ constexpr int64_t kBlockPairs = 4096;  // pairs of one block of a weight gradien
 constexpr int64_t kPanelPairs = 256;   // pairs gathered at a time: their panels fit the L2 cache
 constexpr int64_t kBiasRows = 1024;    // rows of one block of a bias gradient: part of the result's definition
 constexpr int64_t kTileOutputs = 96, kTileInputs = 128;  // largest tile of a weight gradient
-constexpr int64_t kPairsPerTap = 32;   // pairs of a tap in a block of voxels that pay for reading the tap's weights
+constexpr int64_t kPairsPerTap = 32;  // pairs of a tap in a block of voxels that pay for reading the tap's weights
 constexpr int64_t kElementsPerChunk = 32768;
+constexpr int64_t kPairsPerCheck = 16384;  // pairs that pay for handing a check to a thread
 
 // Padding that suits the panels of every instruction set.
 template <typename T>
@@ -60,8 +60,8 @@ enum class Share { kWhole, kEqualParts, kFirstRow };  // what the rows of a voxe
 
 // One feature row a voxel: a row of x where it can be, else computed in scratch.
 template <typename T>
-const T** voxel_values(const T* x, const SparseConvMap& map, int64_t channels, VoxelValue kind, const Workspace& workspace,
-                       const Parallel& parallel) {
+const T** voxel_values(const T* x, const SparseConvMap& map, int64_t channels, VoxelValue kind,
+                       const Workspace& workspace, const Parallel& parallel) {
   const T** values = workspace.take<const T*>(map.n_voxels);
   const int64_t* cu = map.cu_voxel_rows;
   int64_t n_shared = 0;
@@ -74,20 +74,21 @@ const T** voxel_values(const T* x, const SparseConvMap& map, int64_t channels, V
   int64_t* shared = workspace.take<int64_t>(n_shared);
   for (int64_t v = 0, i = 0; v < map.n_voxels; ++v)
     if (cu[v + 1] - cu[v] > 1) shared[i++] = v;
-  parallel.range(n_shared, std::max<int64_t>(1, kElementsPerChunk / (2 * channels + 1)), [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      const int64_t v = shared[i];
-      T* sum = scratch + i * channels;
-      std::fill_n(sum, channels, T(0));
-      for (int64_t r = cu[v]; r < cu[v + 1]; ++r) {
-        const T* row = x + map.voxel_rows[r] * channels;
-        for (int64_t c = 0; c < channels; ++c) sum[c] += row[c];
-      }
-      if (kind == VoxelValue::kMean)
-        for (int64_t c = 0; c < channels; ++c) sum[c] /= static_cast<T>(cu[v + 1] - cu[v]);
-      values[v] = sum;
-    }
-  });
+  parallel.range(n_shared, std::max<int64_t>(1, kElementsPerChunk / (2 * channels + 1)),
+                 [&](int64_t begin, int64_t end) {
+                   for (int64_t i = begin; i < end; ++i) {
+                     const int64_t v = shared[i];
+                     T* sum = scratch + i * channels;
+                     std::fill_n(sum, channels, T(0));
+                     for (int64_t r = cu[v]; r < cu[v + 1]; ++r) {
+                       const T* row = x + map.voxel_rows[r] * channels;
+                       for (int64_t c = 0; c < channels; ++c) sum[c] += row[c];
+                     }
+                     if (kind == VoxelValue::kMean)
+                       for (int64_t c = 0; c < channels; ++c) sum[c] /= static_cast<T>(cu[v + 1] - cu[v]);
+                     values[v] = sum;
+                   }
+                 });
   return values;
 }
 
@@ -158,7 +159,8 @@ template <typename T>
 void convolve_block(const Convolution<T>& conv, const SparseConvMap& map, const Pairs& pairs, int64_t block) {
   const int64_t v0 = block * pairs.block, v1 = std::min(map.n_voxels, v0 + pairs.block);
   const int64_t* cu = map.cu_voxel_rows;
-  const int64_t taps = taps_of(map), matrix = conv.c_read * round_up(conv.c_write, kColumnPad<T>), c_write = conv.c_write;
+  const int64_t taps = taps_of(map), matrix = conv.c_read * round_up(conv.c_write, kColumnPad<T>),
+                c_write = conv.c_write;
   const auto& multiply_rows = products<T>().multiply_rows;
 
   const int64_t n_rows = cu[v1] - cu[v0];
@@ -168,10 +170,8 @@ void convolve_block(const Convolution<T>& conv, const SparseConvMap& map, const 
     const int64_t row = map.voxel_rows[cu[v0] + i];
     from[i] = conv.x + row * conv.c_read;
     to[i] = conv.y + row * c_write;
-    if (conv.start)
-      std::copy_n(conv.start, c_write, to[i]);
-    else
-      std::fill_n(to[i], c_write, T(0));
+    if (conv.start) std::copy_n(conv.start, c_write, to[i]);
+    else std::fill_n(to[i], c_write, T(0));
   }
   multiply_rows(n_rows, conv.c_read, c_write, from.data(), conv.panels + taps / 2 * matrix, to.data());
 
@@ -245,6 +245,24 @@ void bias_vjp(const T* grad, int64_t n_rows, int64_t c_out, T* grad_bias, const 
   std::copy_n(blocks, c_out, grad_bias);
 }
 
+// What check_sparse_conv_map asks of the pairs of a tap, without messages and many times faster.
+bool pairs_are_well_formed(const SparseConvMap& map, int64_t begin, int64_t end) {
+  const uint64_t n_voxels = static_cast<uint64_t>(map.n_voxels);
+  bool good = true;
+  for (int64_t i = begin; i < end; ++i)
+    good &= static_cast<uint64_t>(map.tap_in[i]) < n_voxels && static_cast<uint64_t>(map.tap_out[i]) < n_voxels;
+  for (int64_t i = begin + 1; i < end; ++i) good &= map.tap_out[i - 1] < map.tap_out[i];
+  if (!good) return false;
+  std::vector<uint64_t> read(static_cast<size_t>(n_voxels / 64 + 1), 0);
+  uint64_t again = 0;
+  for (int64_t i = begin; i < end; ++i) {
+    const uint64_t voxel = static_cast<uint64_t>(map.tap_in[i]), bit = uint64_t{1} << (voxel % 64);
+    again |= read[voxel / 64] & bit;
+    read[voxel / 64] |= bit;
+  }
+  return !again;
+}
+
 // One block of pairs of one tap.
 struct WeightBlock {
   int64_t tap, begin, end;
@@ -253,16 +271,17 @@ struct WeightBlock {
 
 }  // namespace
 
-void check_sparse_conv_map(const char* op, const SparseConvMap& map) {
+void check_sparse_conv_map(const char* op, const SparseConvMap& map, const Parallel& parallel) {
   const int64_t *cu = map.cu_voxel_rows, *cu_taps = map.cu_taps, taps = taps_of(map), centre = taps / 2;
   check(cu[0] == 0 && cu[map.n_voxels] == map.n_rows, op, ": cu_voxel_rows must run from 0 to N=", map.n_rows, "; got ",
         cu[0], " .. ", cu[map.n_voxels]);
   for (int64_t v = 0; v < map.n_voxels; ++v) {
-    check(cu[v] < cu[v + 1] && cu[v + 1] <= map.n_rows, op, ": cu_voxel_rows must ascend, no voxel is empty; got ", cu[v],
-          " then ", cu[v + 1], " at ", v);
+    check(cu[v] < cu[v + 1] && cu[v + 1] <= map.n_rows, op, ": cu_voxel_rows must ascend, no voxel is empty; got ",
+          cu[v], " then ", cu[v + 1], " at ", v);
     for (int64_t i = cu[v]; i < cu[v + 1]; ++i) {
       const int64_t row = map.voxel_rows[i];
-      check(row >= 0 && row < map.n_rows, op, ": voxel_rows must be in [0, N) with N=", map.n_rows, "; got ", row, " at ", i);
+      check(row >= 0 && row < map.n_rows, op, ": voxel_rows must be in [0, N) with N=", map.n_rows, "; got ", row,
+            " at ", i);
       check(map.row_voxel[row] == v, op, ": row_voxel must agree with voxel_rows: row ", row, " is listed in voxel ", v,
             "; got ", map.row_voxel[row]);
       check(i == cu[v] || map.voxel_rows[i - 1] < row, op, ": voxel_rows must ascend inside a voxel; got ",
@@ -276,25 +295,33 @@ void check_sparse_conv_map(const char* op, const SparseConvMap& map) {
           " at ", t);
   check(cu_taps[centre] == cu_taps[centre + 1], op, ": the centre tap ", centre, " must have no pairs; got ",
         cu_taps[centre + 1] - cu_taps[centre]);
-  std::vector<int64_t> read_by(static_cast<size_t>(map.n_voxels), -1);  // the last tap that reads each voxel
-  for (int64_t t = 0; t < taps; ++t)
+  const auto check_tap = [&](int64_t t) {
+    if (pairs_are_well_formed(map, cu_taps[t], cu_taps[t + 1])) return;
+    std::vector<char> read(static_cast<size_t>(map.n_voxels), 0);
     for (int64_t i = cu_taps[t]; i < cu_taps[t + 1]; ++i) {
       const int64_t in = map.tap_in[i], out = map.tap_out[i];
-      check(in >= 0 && in < map.n_voxels, op, ": tap_in must be in [0, V) with V=", map.n_voxels, "; got ", in, " at ", i);
-      check(out >= 0 && out < map.n_voxels, op, ": tap_out must be in [0, V) with V=", map.n_voxels, "; got ", out, " at ", i);
-      check(i == cu_taps[t] || map.tap_out[i - 1] < out, op, ": tap_out must ascend inside a tap; got ", map.tap_out[i - 1],
-            " then ", out, " at ", i);
-      check(read_by[in] != t, op, ": tap_in must name a voxel at most once a tap; got ", in, " again at ", i);
-      read_by[in] = t;
+      check(in >= 0 && in < map.n_voxels, op, ": tap_in must be in [0, V) with V=", map.n_voxels, "; got ", in, " at ",
+            i);
+      check(out >= 0 && out < map.n_voxels, op, ": tap_out must be in [0, V) with V=", map.n_voxels, "; got ", out,
+            " at ", i);
+      check(i == cu_taps[t] || map.tap_out[i - 1] < out, op, ": tap_out must ascend inside a tap; got ",
+            map.tap_out[i - 1], " then ", out, " at ", i);
+      check(!read[in], op, ": tap_in must name a voxel at most once a tap; got ", in, " again at ", i);
+      read[in] = 1;
     }
+  };
+  // A few taps at a time: small maps are not worth a thread.
+  parallel.range(taps, std::max<int64_t>(1, kPairsPerCheck * taps / std::max<int64_t>(1, map.n_pairs)),
+                 [&](int64_t begin, int64_t end) {
+                   for (int64_t t = begin; t < end; ++t) check_tap(t);
+                 });
 }
 
 template <typename T>
-void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap& map, int64_t c_in, int64_t c_out, T* out,
-                 const Workspace& workspace, const Parallel& parallel) {
+void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap& map, int64_t c_in, int64_t c_out,
+                 T* out, const Workspace& workspace, const Parallel& parallel) {
   const int64_t matrix = c_in * round_up(c_out, kColumnPad<T>);
-  const T* panels =
-      pack_weights(weight, map, c_in, c_out, matrix, products<T>().pack_by_output, workspace, parallel);
+  const T* panels = pack_weights(weight, map, c_in, c_out, matrix, products<T>().pack_by_output, workspace, parallel);
   const auto kind = map.first ? VoxelValue::kFirst : VoxelValue::kMean;
   const T** values = voxel_values(x, map, c_in, kind, workspace, parallel);
   const Pairs pairs = pairs_by_output(map, workspace);
@@ -303,8 +330,8 @@ void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap
 }
 
 template <typename T>
-void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& map, int64_t c_in, int64_t c_out, T* grad_x,
-                           const Workspace& workspace, const Parallel& parallel) {
+void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& map, int64_t c_in, int64_t c_out,
+                           T* grad_x, const Workspace& workspace, const Parallel& parallel) {
   const int64_t matrix = c_out * round_up(c_in, kColumnPad<T>);
   const T* panels = pack_weights(weight, map, c_in, c_out, matrix, products<T>().pack_by_input, workspace, parallel);
   const T** values = voxel_values(grad, map, c_out, VoxelValue::kSum, workspace, parallel);
@@ -318,7 +345,8 @@ template <typename T>
 void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map, int64_t c_in, int64_t c_out,
                             T* grad_weight, T* grad_bias, const Workspace& workspace, const Parallel& parallel) {
   bias_vjp(grad, map.n_rows, c_out, grad_bias, workspace, parallel);
-  const T** inputs = voxel_values(x, map, c_in, map.first ? VoxelValue::kFirst : VoxelValue::kMean, workspace, parallel);
+  const T** inputs =
+      voxel_values(x, map, c_in, map.first ? VoxelValue::kFirst : VoxelValue::kMean, workspace, parallel);
   const T** grads = voxel_values(grad, map, c_out, VoxelValue::kSum, workspace, parallel);
 
   const int64_t taps = taps_of(map), size = c_out * c_in;
@@ -353,11 +381,14 @@ void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map,
         g[i] = own_row ? grad + (begin + i) * c_out : grads[map.tap_out[begin + i]];
         f[i] = own_row ? x + (begin + i) * c_in : inputs[map.tap_in[begin + i]];
       }
-      products<T>().add_outer_products(count, g, co0, rows, f, ci0, columns, left.data(), right.data(), sum.data(), tile_in);
+      products<T>().add_outer_products(count, g, co0, rows, f, ci0, columns, left.data(), right.data(), sum.data(),
+                                       tile_in);
     }
     const bool whole = block.partial < 0;
-    T* to = whole ? grad_weight + (co0 * taps + block.tap) * c_in + ci0 : partials + block.partial * size + co0 * c_in + ci0;
-    for (int64_t r = 0; r < rows; ++r) std::copy_n(sum.data() + r * tile_in, columns, to + r * (whole ? taps : 1) * c_in);
+    T* to = whole ? grad_weight + (co0 * taps + block.tap) * c_in + ci0
+                  : partials + block.partial * size + co0 * c_in + ci0;
+    for (int64_t r = 0; r < rows; ++r)
+      std::copy_n(sum.data() + r * tile_in, columns, to + r * (whole ? taps : 1) * c_in);
   });
 
   // The blocks of long taps; outputs are shared among threads.
@@ -367,17 +398,18 @@ void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map,
       if (slot < 0) continue;
       T* sums = partials + slot * size;
       add_in_tree(sums, first_block[t + 1] - first_block[t], size, begin * c_in, end * c_in);
-      for (int64_t co = begin; co < end; ++co) std::copy_n(sums + co * c_in, c_in, grad_weight + (co * taps + t) * c_in);
+      for (int64_t co = begin; co < end; ++co)
+        std::copy_n(sums + co * c_in, c_in, grad_weight + (co * taps + t) * c_in);
     }
   });
 }
 
-#define GSIM3D_INSTANTIATE(T)                                                                                          \
-  template void sparse_conv<T>(const T*, const T*, const T*, const SparseConvMap&, int64_t, int64_t, T*,              \
-                               const Workspace&, const Parallel&);                                                    \
-  template void sparse_conv_vjp_input<T>(const T*, const T*, const SparseConvMap&, int64_t, int64_t, T*,              \
-                                         const Workspace&, const Parallel&);                                          \
-  template void sparse_conv_vjp_weight<T>(const T*, const T*, const SparseConvMap&, int64_t, int64_t, T*, T*,         \
+#define GSIM3D_INSTANTIATE(T)                                                                                 \
+  template void sparse_conv<T>(const T*, const T*, const T*, const SparseConvMap&, int64_t, int64_t, T*,      \
+                               const Workspace&, const Parallel&);                                            \
+  template void sparse_conv_vjp_input<T>(const T*, const T*, const SparseConvMap&, int64_t, int64_t, T*,      \
+                                         const Workspace&, const Parallel&);                                  \
+  template void sparse_conv_vjp_weight<T>(const T*, const T*, const SparseConvMap&, int64_t, int64_t, T*, T*, \
                                           const Workspace&, const Parallel&);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)

@@ -71,10 +71,8 @@ void rows_of_panel(int64_t depth, int64_t width, const T* const* a, const T* b, 
     edges[i] = edge[i];
     std::copy_n(to[i], width, edge[i]);
   }
-  if (width < W<T>)
-    rows_block<T, M, 1>(depth, a, b, edges);
-  else
-    rows_block<T, M, 2>(depth, a, b, edges);
+  if (width < W<T>) rows_block<T, M, 1>(depth, a, b, edges);
+  else rows_block<T, M, 2>(depth, a, b, edges);
   for (int i = 0; i < M; ++i) std::copy_n(edge[i], width, to[i]);
 }
 
@@ -82,10 +80,8 @@ template <typename T, int M>
 void last_rows_of_panel(int64_t rows, int64_t depth, int64_t width, const T* const* a, const T* b, T* const* c,
                         int64_t column) {
   if constexpr (M > 0) {
-    if (rows == M)
-      rows_of_panel<T, M>(depth, width, a, b, c, column);
-    else
-      last_rows_of_panel<T, M - 1>(rows, depth, width, a, b, c, column);
+    if (rows == M) rows_of_panel<T, M>(depth, width, a, b, c, column);
+    else last_rows_of_panel<T, M - 1>(rows, depth, width, a, b, c, column);
   }
 }
 
@@ -119,8 +115,8 @@ void gather_panels(int64_t count, const T* const* rows, int64_t begin, int64_t w
 
 // sum[r, j] += sum over pairs p of left[p][r0 + r] right[p][j0 + j]. sum has sum_row columns and whole blocks of rows.
 template <typename T>
-void add_outer_products(int64_t count, const T* const* left, int64_t r0, int64_t rows, const T* const* right, int64_t j0,
-                        int64_t columns, T* left_panels, T* right_panels, T* sum, int64_t sum_row) {
+void add_outer_products(int64_t count, const T* const* left, int64_t r0, int64_t rows, const T* const* right,
+                        int64_t j0, int64_t columns, T* left_panels, T* right_panels, T* sum, int64_t sum_row) {
   gather_panels<T, kTall>(count, left, r0, rows, left_panels);
   gather_panels<T, kPanel<T>>(count, right, j0, columns, right_panels);
   for (int64_t j = 0; j < columns; j += kPanel<T>)

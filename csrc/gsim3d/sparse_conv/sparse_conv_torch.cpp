@@ -33,15 +33,24 @@ struct Geometry {
     check_shape(op, "tap_in", tap_in, {-1}, "[L]");
     check_shape(op, "tap_out", tap_out, {tap_in.size(0)}, "[L] like tap_in");
     check_shape(op, "cu_taps", cu_taps, {kernel_size * kernel_size * kernel_size + 1}, "[K^3 + 1]");
-    map = {data<int64_t>(row_voxel), data<int64_t>(voxel_rows), data<int64_t>(cu_voxel_rows), data<int64_t>(tap_in),
-           data<int64_t>(tap_out),   data<int64_t>(cu_taps),    n_rows,                       cu_voxel_rows.size(0) - 1,
-           tap_in.size(0),           kernel_size,               first};
-    cpu::check_sparse_conv_map(op, map);
+    map = {data<int64_t>(row_voxel),
+           data<int64_t>(voxel_rows),
+           data<int64_t>(cu_voxel_rows),
+           data<int64_t>(tap_in),
+           data<int64_t>(tap_out),
+           data<int64_t>(cu_taps),
+           n_rows,
+           cu_voxel_rows.size(0) - 1,
+           tap_in.size(0),
+           kernel_size,
+           first};
+    cpu::check_sparse_conv_map(op, map, torch_parallel());
   }
 };
 
 void check_kernel_size(const char* op, int64_t kernel_size) {
-  check(kernel_size % 2 == 1 && kernel_size > 0 && kernel_size < 1024, op, ": kernel_size must be odd; got ", kernel_size);
+  check(kernel_size % 2 == 1 && kernel_size > 0 && kernel_size < 1024, op, ": kernel_size must be odd; got ",
+        kernel_size);
 }
 
 void check_weight(const char* op, const Tensor& weight) {
@@ -65,7 +74,8 @@ Tensor sparse_conv(const Tensor& x_, const Tensor& weight_, const std::optional<
     check_shape(op, "bias", bias, {c_out}, "[C_out]");
     check_dtype(op, "bias", bias, x.scalar_type());
   }
-  const Geometry geometry(op, x.size(0), weight.size(1), first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps);
+  const Geometry geometry(op, x.size(0), weight.size(1), first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out,
+                          cu_taps);
   Tensor out = empty(x, {x.size(0), c_out});
   dispatch_float(op, "x", x, [&]<typename T>() {
     TensorWorkspace workspace(x);
@@ -75,16 +85,17 @@ Tensor sparse_conv(const Tensor& x_, const Tensor& weight_, const std::optional<
   return out;
 }
 
-Tensor sparse_conv_grad_input(const Tensor& grad_, const Tensor& weight_, const Tensor& row_voxel, const Tensor& voxel_rows,
-                              const Tensor& cu_voxel_rows, const Tensor& tap_in, const Tensor& tap_out,
-                              const Tensor& cu_taps, bool first) {
+Tensor sparse_conv_grad_input(const Tensor& grad_, const Tensor& weight_, const Tensor& row_voxel,
+                              const Tensor& voxel_rows, const Tensor& cu_voxel_rows, const Tensor& tap_in,
+                              const Tensor& tap_out, const Tensor& cu_taps, bool first) {
   const char* op = "sparse_conv_grad_input";
   check_weight(op, weight_);
   check_shape(op, "grad", grad_, {-1, weight_.size(0)}, "[N, C_out]");
   check_dtype(op, "weight", weight_, grad_.scalar_type());
   const Tensor grad = rows_of(grad_), weight = rows_of(weight_);
   const int64_t n_rows = grad.size(0), c_in = weight.size(4);
-  const Geometry geometry(op, n_rows, weight.size(1), first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps);
+  const Geometry geometry(op, n_rows, weight.size(1), first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out,
+                          cu_taps);
   Tensor grad_x = empty(grad, {n_rows, c_in});
   dispatch_float(op, "grad", grad, [&]<typename T>() {
     TensorWorkspace workspace(grad);
@@ -105,7 +116,8 @@ std::tuple<Tensor, Tensor> sparse_conv_grad_weight(const Tensor& grad_, const Te
   check_dtype(op, "x", x_, grad_.scalar_type());
   const Tensor grad = rows_of(grad_), x = rows_of(x_);
   const int64_t c_in = x.size(1), c_out = grad.size(1);
-  const Geometry geometry(op, x.size(0), kernel_size, first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps);
+  const Geometry geometry(op, x.size(0), kernel_size, first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out,
+                          cu_taps);
   Tensor grad_weight = empty(grad, {c_out, kernel_size, kernel_size, kernel_size, c_in});
   Tensor grad_bias = empty(grad, {c_out});
   dispatch_float(op, "grad", grad, [&]<typename T>() {

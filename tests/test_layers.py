@@ -1,0 +1,79 @@
+"""Layers over packed rows."""
+
+import pytest
+import torch
+
+from gsim3d.layers import RowBatchNorm, RowLayerNorm, RowLinear, _combine, _statistics
+from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
+
+
+def rows(n, channels=24, seed=0, dtype=torch.float32):
+    return torch.randn(n, channels, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 5, 15, 16, 17, 100])
+def test_rows_do_not_depend_on_the_rows_beside_them(n):
+    torch.manual_seed(0)
+    for layer in (RowLinear(24, 40), RowLayerNorm(24), RowBatchNorm(24).eval()):
+        assert_same_bits(layer(rows(300)[:n].clone()), layer(rows(300))[:n], type(layer).__name__)
+
+
+def test_layer_norm_is_torchs():
+    ours, theirs = RowLayerNorm(24), torch.nn.LayerNorm(24)
+    for layer in (ours, theirs):
+        torch.manual_seed(1)
+        torch.nn.init.normal_(layer.weight), torch.nn.init.normal_(layer.bias)
+    assert_close_relative_to_max(ours(rows(50)), theirs(rows(50)), 1e-6)
+    assert ours.state_dict().keys() == theirs.state_dict().keys()
+
+
+def test_gradients_on_one_thread_and_two_differ_by_rounding_at_most():
+    torch.manual_seed(0)
+    layers = torch.nn.Sequential(RowLinear(24, 24), RowLayerNorm(24), RowBatchNorm(24))
+
+    def run():
+        layers.zero_grad()
+        layers(rows(3000)).square().sum().backward()
+        return [p.grad.clone() for p in layers.parameters()]
+
+    for one, two in zip(with_threads(1, run), with_threads(2, run), strict=True):
+        assert_close_relative_to_max(two, one, 1e-5)
+
+
+@pytest.mark.parametrize("training", [False, True])
+def test_batch_norm_is_torchs(training):
+    ours = RowBatchNorm(24).double().train(training)
+    theirs = torch.nn.BatchNorm1d(24, eps=1e-3, momentum=0.01).double().train(training)
+    x = rows(50, dtype=torch.float64)
+    assert_close_relative_to_max(ours(x), theirs(x), 1e-13)
+    assert_close_relative_to_max(ours.running_mean, theirs.running_mean, 1e-13)
+    assert_close_relative_to_max(ours.running_var, theirs.running_var, 1e-13)
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_batch_norm_of_one_row_or_none(n):
+    layer = RowBatchNorm(4)
+    out = layer(rows(n, 4))
+    assert torch.isfinite(out).all() and not out.any()
+    assert layer.running_mean.tolist() == [0] * 4 and layer.running_var.tolist() == [1] * 4
+
+
+def test_statistics_of_several_processes_are_those_of_all_rows():
+    x = rows(60, dtype=torch.float64)
+    mean, var, n_rows = _statistics(x)
+    parts = []
+    for part in (x[:10], x[10:10], x[10:11], x[11:]):
+        count = part.new_full((1,), part.shape[0])
+        center = part.sum(0) / count.clamp(min=1)
+        parts.append(torch.cat([count, center, (part - center).square().sum(0)]))
+    combined = _combine(tuple(parts), 24)
+    assert combined[0] == n_rows == 60
+    assert_close_relative_to_max(combined[1], mean, 1e-13)
+    assert_close_relative_to_max(combined[2] / 60, var, 1e-13)
+    assert combined[0] == _combine(tuple(parts[::-1]), 24)[0]
+
+
+def test_batch_norm_gradients():
+    x = rows(5, 3, dtype=torch.float64).requires_grad_()
+    layer = RowBatchNorm(3).double()
+    assert torch.autograd.gradcheck(layer, x)
