@@ -51,6 +51,19 @@ def test_plane_sweep(dtype):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("first", [False, True])
+def test_sparse_conv(first, dtype):
+    x, weight, bias = random(3, 4, dtype=dtype), random(5, 3, 3, 3, 4, dtype=dtype, seed=1), random(5, dtype=dtype)
+    voxels = np.array([0, 0, 1]), np.array([0, 1, 2]), np.array([0, 2, 3])
+    taps = np.array([0, 1]), np.array([1, 0]), np.array([0] * 13 + [1] * 2 + [2] * 13)  # two neighbours along z
+    geometry = ops.Voxels(*map(torch.from_numpy, voxels)), ops.KernelMap(3, *map(torch.from_numpy, taps))
+    for b in (bias, None):
+        tensors = [None if t is None else torch.from_numpy(t) for t in (x, weight, b)]
+        expected = ops.sparse_conv(*tensors, *geometry, duplicates="first" if first else "mean")
+        same(_core.sparse_conv(x, weight, b, *voxels, *taps, first), expected)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
 def test_patch_attention(dtype):
     q, k, v = (random(5, 2, 8, dtype=dtype, seed=seed) for seed in range(3))
     tables = np.array([0, 4, 2, 1, 3]), np.array([0, 4, 2, 4, 2, 1, 3]), np.array([0, 3, 5]), np.array([0, 3, 7])
@@ -88,6 +101,10 @@ def test_constants_say_what_the_kernels_do():
     "call, message",
     [
         (lambda: _core.pool_mean(np.zeros((2, 1)), [0, 0], [0, 2]), "pool_mean: rows must list a row at most once"),
+        (
+            lambda: _core.sparse_conv(np.zeros((0, 2)), np.zeros((1, 2, 2, 2, 2)), None, [], [], [0], [], [], [0]),
+            "sparse_conv: kernel_size must be odd",
+        ),
         (lambda: _core.curve_encode(np.zeros((2, 2), int), [0, 0], 0), r"grid must be \[\*, 3\]; got \[2, 2\]"),
         (lambda: _core.curve_encode([[1 << 17, 0, 0]], [0], 0), "curve_encode: grid"),
         (

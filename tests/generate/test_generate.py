@@ -252,7 +252,7 @@ def test_command(tmp_path, capsys):
     assert "examples:" in parser.format_help()
     mesh = tmp_path / "pyramid.obj"
     mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nv 0.3 1 0.3\nf 1 2 3\nf 1 4 2\nf 2 4 3\nf 3 4 1\n")
-    text = f"{tmp_path / 'out'} --size 16 --frames 2 --fps 30 --trajectories 1 --objects none --mesh {mesh} --quiet"
+    text = f"elastic --out {tmp_path / 'out'} --size 16 --frames 2 --fps 30 --trajectories 1 --objects none --mesh {mesh} --quiet"
     assert run(parser.parse_args([*text.split(), "--drop", "0.5", "0.6", "--background", "white"])) == 0
     assert "1 scenes in" in capsys.readouterr().out
     scene = Scene.open(tmp_path / "out" / "pyramid" / "0000")

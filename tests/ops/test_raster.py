@@ -60,6 +60,16 @@ def test_backward(device, sh_terms, cutoff, dtype):
         assert_close_relative_to_max(a, e, f"raster_grad_{DTYPES[dtype]}", name)
 
 
+def test_gradients_of_many_rows(device):
+    # More rows than a chunk holds: sums over rows (viewmats, background) add up chunks.
+    scene = random_scene(n=2500, clouds=1, images=1, width=9, height=7, sh_terms=0, n_features=1, spread=0.3, seed=1)
+    scene = scene.replace(opacities=0.02 * scene.opacities + 0.004, scales=0.3 * scene.scales)
+    expected = gradients(scene.render_oracle, scene)
+    moved = scene.to(device)
+    for name, a, e in zip(Scene.NAMES, gradients(moved.render, moved), expected, strict=True):
+        assert_close_relative_to_max(a, e, "raster_grad_float64", name)
+
+
 @pytest.mark.parametrize("n_features", [0, 1, 8, 33])
 def test_any_number_of_features(device, n_features):
     scene = random_scene(n=20, n_features=n_features, sh_terms=0, seed=n_features)

@@ -1,8 +1,10 @@
 // gsim3d._core: the CPU core on numpy arrays, for callers without torch.
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
 
 #include <initializer_list>
+#include <optional>
 #include <string>
 #include <tuple>
 #include <vector>
@@ -18,6 +20,7 @@
 #include "gsim3d/pool/pool.h"
 #include "gsim3d/raster/raster.h"
 #include "gsim3d/raster/raster_math.h"
+#include "gsim3d/sparse_conv/sparse_conv.h"
 
 namespace py = pybind11;
 
@@ -107,6 +110,36 @@ py::array_t<T> plane_sweep(const Array<T>& features, const Array<T>& homographie
   gsim3d::HeapWorkspace workspace;
   gsim3d::cpu::plane_sweep(features.data(), sweep, cost.mutable_data(), workspace, gsim3d::thread_pool());
   return cost;
+}
+
+template <typename T>
+py::array_t<T> sparse_conv(const Array<T>& x, const Array<T>& weight, const std::optional<Array<T>>& bias,
+                           const Indices& row_voxel, const Indices& voxel_rows, const Indices& cu_voxel_rows,
+                           const Indices& tap_in, const Indices& tap_out, const Indices& cu_taps, bool first) {
+  const char* op = "sparse_conv";
+  check_shape(op, "x", x, {-1, -1});
+  gsim3d::check(weight.ndim() == 5, op, ": weight must be [C_out, K, K, K, C_in]; got ", weight.ndim(), " dimensions");
+  const int64_t kernel_size = weight.shape(1);
+  gsim3d::cpu::check_sparse_conv_kernel(op, kernel_size);
+  check_shape(op, "weight", weight, {-1, kernel_size, kernel_size, kernel_size, x.shape(1)});
+  if (bias) check_shape(op, "bias", *bias, {weight.shape(0)});
+  check_shape(op, "row_voxel", row_voxel, {x.shape(0)});
+  check_shape(op, "voxel_rows", voxel_rows, {x.shape(0)});
+  check_shape(op, "cu_voxel_rows", cu_voxel_rows, {-1});
+  gsim3d::check(cu_voxel_rows.size() >= 1, op, ": cu_voxel_rows must be [V + 1]; got [0]");
+  check_shape(op, "tap_in", tap_in, {-1});
+  check_shape(op, "tap_out", tap_out, {tap_in.size()});
+  check_shape(op, "cu_taps", cu_taps, {kernel_size * kernel_size * kernel_size + 1});
+  const gsim3d::SparseConvMap map{row_voxel.data(), voxel_rows.data(), cu_voxel_rows.data(),
+                                  tap_in.data(),    tap_out.data(),    cu_taps.data(),
+                                  x.shape(0),       cu_voxel_rows.size() - 1,
+                                  tap_in.size(),    kernel_size,       first};
+  gsim3d::cpu::check_sparse_conv_map(op, map, gsim3d::thread_pool());
+  py::array_t<T> out({x.shape(0), weight.shape(0)});
+  gsim3d::HeapWorkspace workspace;
+  gsim3d::cpu::sparse_conv(x.data(), weight.data(), bias ? bias->data() : nullptr, map, x.shape(1), weight.shape(0),
+                           out.mutable_data(), workspace, gsim3d::thread_pool());
+  return out;
 }
 
 template <typename T>
@@ -221,6 +254,13 @@ PYBIND11_MODULE(_core, m) {
   m.def("pool_mean", &pool_mean<float>, py::arg("x"), py::arg("rows"), py::arg("cu_rows"),
         "Mean over segments of rows: [M, C].");
   m.attr("constants") = constants();
+  m.def("sparse_conv", &sparse_conv<double>, py::arg("x").noconvert(), py::arg("weight"), py::arg("bias"),
+        py::arg("row_voxel"), py::arg("voxel_rows"), py::arg("cu_voxel_rows"), py::arg("tap_in"), py::arg("tap_out"),
+        py::arg("cu_taps"), py::arg("first") = false);
+  m.def("sparse_conv", &sparse_conv<float>, py::arg("x"), py::arg("weight"), py::arg("bias"), py::arg("row_voxel"),
+        py::arg("voxel_rows"), py::arg("cu_voxel_rows"), py::arg("tap_in"), py::arg("tap_out"), py::arg("cu_taps"),
+        py::arg("first") = false,
+        "Submanifold convolution [N, C_out] with weight [C_out, K, K, K, C_in]; duplicate rows: mean, or the first.");
   m.def("patch_attention", &patch_attention<double>, py::arg("q").noconvert(), py::arg("k"), py::arg("v"), py::arg("q_rows"),
         py::arg("kv_rows"), py::arg("cu_q"), py::arg("cu_k"), py::arg("scale"));
   m.def("patch_attention", &patch_attention<float>, py::arg("q"), py::arg("k"), py::arg("v"), py::arg("q_rows"),

@@ -2,8 +2,8 @@
 // through the other taps. Rows of one voxel (duplicates) have their own outputs; a tap reads one value a voxel.
 //
 // Source: Graham et al., "3D semantic segmentation with submanifold sparse convolutional networks", 2018. T is float or
-// double. The same bits for any number of threads and any vector width: an output is one chain of fma in the order of
-// taps, a weight gradient is summed in fixed blocks of pairs that are added in a fixed tree.
+// double. The same bits for any number of threads and any vector width: an output is summed in the order of taps by
+// chains of fma, a weight gradient is summed in fixed blocks of pairs that are added in a fixed tree.
 #pragma once
 
 #include <cstdint>
@@ -27,6 +27,9 @@ struct SparseConvMap {
 };
 
 namespace cpu {
+
+// Throws ArgumentError unless the kernel size is odd and sane.
+void check_sparse_conv_kernel(const char* op, int64_t kernel_size);
 
 // Throws ArgumentError unless `map` is well formed. `op` starts the message.
 void check_sparse_conv_map(const char* op, const SparseConvMap& map, const Parallel& parallel);

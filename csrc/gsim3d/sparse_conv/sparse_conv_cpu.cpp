@@ -44,6 +44,7 @@ constexpr int64_t kPanelPairs = 256;   // pairs gathered at a time: their panels
 constexpr int64_t kBiasRows = 1024;    // rows of one block of a bias gradient: part of the result's definition
 constexpr int64_t kTileOutputs = 96, kTileInputs = 128;  // largest tile of a weight gradient
 constexpr int64_t kPairsPerTap = 32;  // pairs of a tap in a block of voxels that pay for reading the tap's weights
+constexpr int64_t kMaxKernel = 1024;  // K^3 taps are counted in 64 bits; larger kernels are mistakes
 constexpr int64_t kElementsPerChunk = 32768;
 constexpr int64_t kPairsPerCheck = 16384;  // pairs that pay for handing a check to a thread
 
@@ -270,6 +271,11 @@ struct WeightBlock {
 };
 
 }  // namespace
+
+void check_sparse_conv_kernel(const char* op, int64_t kernel_size) {
+  check(kernel_size % 2 == 1 && kernel_size > 0 && kernel_size < kMaxKernel, op, ": kernel_size must be odd and below ",
+        kMaxKernel, "; got ", kernel_size);
+}
 
 void check_sparse_conv_map(const char* op, const SparseConvMap& map, const Parallel& parallel) {
   const int64_t *cu = map.cu_voxel_rows, *cu_taps = map.cu_taps, taps = taps_of(map), centre = taps / 2;

@@ -48,15 +48,10 @@ struct Geometry {
   }
 };
 
-void check_kernel_size(const char* op, int64_t kernel_size) {
-  check(kernel_size % 2 == 1 && kernel_size > 0 && kernel_size < 1024, op, ": kernel_size must be odd; got ",
-        kernel_size);
-}
-
 void check_weight(const char* op, const Tensor& weight) {
   check(weight.dim() == 5 && weight.size(1) == weight.size(2) && weight.size(1) == weight.size(3), op,
         ": weight must be [C_out, K, K, K, C_in]; got ", shape_of(weight));
-  check_kernel_size(op, weight.size(1));
+  cpu::check_sparse_conv_kernel(op, weight.size(1));
 }
 
 Tensor sparse_conv(const Tensor& x_, const Tensor& weight_, const std::optional<Tensor>& bias_, const Tensor& row_voxel,
@@ -110,7 +105,7 @@ std::tuple<Tensor, Tensor> sparse_conv_grad_weight(const Tensor& grad_, const Te
                                                    const Tensor& cu_voxel_rows, const Tensor& tap_in,
                                                    const Tensor& tap_out, const Tensor& cu_taps, bool first) {
   const char* op = "sparse_conv_grad_weight";
-  check_kernel_size(op, kernel_size);
+  cpu::check_sparse_conv_kernel(op, kernel_size);
   check_shape(op, "x", x_, {-1, -1}, "[N, C_in]");
   check_shape(op, "grad", grad_, {x_.size(0), -1}, "[N, C_out]");
   check_dtype(op, "x", x_, grad_.scalar_type());
