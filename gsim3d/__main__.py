@@ -26,7 +26,8 @@ class _Parser(argparse.ArgumentParser):
 
 def _overview() -> str:
     lines = [f"  {name:<10} {text}" for name, (_, text) in COMMANDS.items()]
-    return "commands:\n" + "\n".join(lines) + "\n\nA first try: gsim3d demo --out runs/demo\nHelp on one command: gsim3d train --help"
+    hints = ["", "A first try: gsim3d demo --out runs/demo", "Help on one command: gsim3d train --help"]
+    return "\n".join(["commands:", *lines, *hints])
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""``gsim3d demo``: the main job at a small size: make multi-view video, learn a simulator, predict scenes never seen."""
+"""``gsim3d demo``: the main job at a small size: make multi-view video, learn a simulator, predict unseen scenes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,9 @@ example:
 """
 
 
+_stage = partial(StageConfig, batch=2, target_views=2, warm_up=0.1)
+
+
 @dataclass(frozen=True)
 class DemoConfig:
     """data: options of gsim3d.generate's preset "demo" to change.   train: the training."""
@@ -42,20 +46,21 @@ class DemoConfig:
         preset="tiny",
         data=DataConfig(history=2, context_views=3, target_only_cameras=(2, 7), background_stride=2),
         stages=(
-            StageConfig(steps=400, history=1, batch=2, target_views=2, learning_rate=2e-3, warm_up=0.1),
-            StageConfig(steps=150, horizon=3, target_views=2, from_start=0.4, learning_rate=2e-3, warm_up=0.1),
-            StageConfig(steps=200, horizon=7, target_views=2, from_start=0.4, learning_rate=1.5e-3, warm_up=0.1),
-            StageConfig(steps=200, horizon=14, target_views=2, from_start=0.4, learning_rate=1e-3, warm_up=0.1),
+            _stage(steps=400, history=1, learning_rate=2e-3),
+            _stage(steps=100, horizon=3, from_start=0.4, learning_rate=2e-3),
+            _stage(steps=120, horizon=7, from_start=0.4, learning_rate=1.5e-3),
+            _stage(steps=110, horizon=14, from_start=0.5, learning_rate=1e-3),
         ),
         loss=LossConfig(body_weight=2.0),
-        optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.99),
+        optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.98),
+        workers=2,
         checkpoint_every=50,
         log_every=1,
     )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Makes multi-view video, learns a simulator from it, and predicts scenes that it has never seen."
+    parser.description = "Makes multi-view video, learns a simulator from it, and predicts scenes it has never seen."
     parser.epilog = EPILOG
     parser.add_argument("--out", metavar="DIR", required=True, help="folder for everything; made if absent")
 
@@ -212,9 +217,11 @@ def _report(out: Path, summary: dict, seconds: dict, now: float) -> None:
     print()
     for what, model, baseline in comparisons(summary):
         verdict = "better" if model > baseline else "WORSE"
-        print(f"{what + ':':52}{model:7.2f} dB, baseline {baseline:.2f} dB: {verdict} by {abs(model - baseline):.2f} dB")
+        margin = f"{verdict} by {abs(model - baseline):.2f} dB"
+        print(f"{what + ':':52}{model:7.2f} dB, baseline {baseline:.2f} dB: {margin}")
     parts = ", ".join(f"{name} {value:.0f}" for name, value in seconds.items())
-    print(f"\nseconds: {parts}; {sum(seconds.values()):.0f} in all, {now:.0f} in this call; peak memory {_peak_gib():.1f} GiB")
+    in_all = f"{sum(seconds.values()):.0f} in all, {now:.0f} in this call"
+    print(f"\nseconds: {parts}; {in_all}; peak memory {_peak_gib():.1f} GiB")
     print(f"look at {out / 'rollout.mp4'} and {out / 'overview.png'}")
 
 

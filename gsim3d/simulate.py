@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 
 EPILOG = """\
-The scene's first steps are the input; the following ones are predicted, also beyond the end of the film. Written to DIR:
-rollout.mp4 (the truth above the prediction, side by side for each camera; VP9, plays in browsers), frames/ (predicted
-images as PNG) and gaussians/step_0000.ply ... (3D Gaussians of every step, for viewers of 3D Gaussian splatting).
+The scene's first steps are the input; the following ones are predicted, also beyond the end of the film. Written to
+DIR: rollout.mp4 (truth above prediction, a column for each camera; VP9, plays in browsers), frames/ (predicted images
+as PNG) and gaussians/step_0000.ply ... (3D Gaussians of every step, for viewers of 3D Gaussian splatting).
 
 examples:
   gsim3d simulate runs/model runs/data/ball/0000 --out runs/ball
@@ -23,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", required=True, help="folder to write; must not exist yet")
     parser.add_argument("--steps", type=int, help="steps to predict (default: to the end of the film)")
     parser.add_argument("--start", type=int, default=0, help="first input step (default: 0)")
-    parser.add_argument("--cameras", type=int, nargs="+", metavar="CAM", help="cameras to show (default: up to 4 target cameras)")
-    parser.add_argument("--context", type=int, nargs="+", metavar="CAM", help="cameras to see (default: as in training)")
+    parser.add_argument("--cameras", type=int, nargs="+", metavar="CAM", help="cameras to show (default: up to 4 targets)")
+    parser.add_argument("--context", type=int, nargs="+", metavar="CAM", help="input cameras (default: spread evenly)")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 
 EPILOG = """\
-Every scene's first steps are encoded, all others predicted and compared with the film, seen from cameras that were no input.
-Prints PSNR (masked and unmasked) and SSIM for the model and for four baselines, then by step, and writes the same as JSON.
+Every scene's first steps are encoded, all others predicted and compared with the film, seen from cameras that
+were no input. Prints PSNR (masked and unmasked) and SSIM for the model and for four baselines, then by step, and
+writes the same as JSON.
 
 examples:
   gsim3d evaluate runs/model runs/data

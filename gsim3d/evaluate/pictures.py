@@ -96,7 +96,8 @@ def write_overview(
     shown = np.linspace(prediction.n_encoded, n_steps - 1, 5).round().astype(int)
     truth = true_images(scene, [cam], shown)[:, 0]
     figure = plt.figure(figsize=(13.5, 4.1), facecolor="white")
-    parts = figure.add_gridspec(1, 3, width_ratios=(2, 2.05, 5.1), left=0.01, right=0.995, top=0.86, bottom=0.05, wspace=0.07)
+    margins = {"left": 0.01, "right": 0.995, "top": 0.86, "bottom": 0.05}
+    parts = figure.add_gridspec(1, 3, width_ratios=(2, 2.05, 5.1), wspace=0.07, **margins)
 
     def show(place, image, title=None, label=None):
         axes = figure.add_subplot(place)
@@ -118,8 +119,9 @@ def write_overview(
         time = f"+{(step - last_given) / scene.fps:.2f} s"
         show(frames[0, k], truth[k], time, "truth" if k == 0 else None)
         show(frames[1, k], as_bytes(images[step]), None, "predicted" if k == 0 else None)
-    heads = ((0.11, f"{len(inputs)} input views"), (0.34, "particles as 3D Gaussians"), (0.72, "the future, from a camera never seen"))
-    for x, text in heads:
+    heads = {f"{len(inputs)} input views": 0.11, "particles as 3D Gaussians": 0.34}
+    heads["the future, from a camera never seen"] = 0.72
+    for text, x in heads.items():
         figure.text(x, 0.94, text, ha="center", fontsize=12)
     _save(figure, path)
 

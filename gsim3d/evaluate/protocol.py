@@ -1,4 +1,4 @@
-"""Encode the first steps of a scene, predict all others, compare them with the truth and with predictions that cost nothing.
+"""Encode the first steps of a scene, predict all others, compare them with the truth and with cheap predictions.
 
 Baselines:
 
@@ -50,8 +50,8 @@ class Prediction:
 class SceneScores:
     """Scores of one scene: metric values [S] by step for each method, means over the target views.
 
-    Steps before ``n_encoded`` are reconstructions, the others predictions; baselines have NaN at the former. A value that
-    no image has (an empty mask) is NaN.
+    Steps before ``n_encoded`` are reconstructions, the others predictions; baselines have NaN at the former. A value
+    that no image has (an empty mask) is NaN.
     """
 
     scene: str
@@ -63,7 +63,7 @@ def default_views(restored: Restored, scene: Scene) -> tuple[tuple[int, ...], tu
     """(context, target) cameras: inputs spread evenly; targets those kept from training's inputs, else all the rest."""
     cameras = context_cameras(scene, restored.data)
     if len(cameras) < restored.data.context_views:
-        raise InputError(f"{scene.path}: {len(cameras)} usable cameras, the model was trained with {restored.data.context_views}")
+        raise InputError(f"{scene.path}: {len(cameras)} usable cameras; training had {restored.data.context_views} views")
     context = spread_views(cameras, restored.data.context_views, 0)
     target = restored.data.target_only_cameras or tuple(c for c in range(scene.n_cams) if c not in context)
     return context, target or context
@@ -71,7 +71,7 @@ def default_views(restored: Restored, scene: Scene) -> tuple[tuple[int, ...], tu
 
 @torch.no_grad()
 def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_future: int, start: int = 0) -> Prediction:
-    """Encodes ``history`` steps of a scene from ``start`` and rolls out ``n_future`` steps; these may go beyond the film.
+    """Encodes ``history`` steps of a scene from ``start`` and rolls out ``n_future`` steps, also beyond the film's end.
 
     Raises:
         InputError: images of another size than in training, or cameras and steps that the scene has not.
@@ -79,7 +79,7 @@ def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_fut
     restored.check_scene(scene)
     n_encoded = restored.data.history
     if not 0 <= start <= scene.n_steps - n_encoded:
-        raise InputError(f"{scene.path}: {n_encoded} input steps from step {start} on do not fit its {scene.n_steps} steps")
+        raise InputError(f"{scene.path}: {n_encoded} steps from step {start} on do not fit its {scene.n_steps} steps")
     if n_future < 1:
         raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
     masked = scene.has_segmentation()
@@ -91,7 +91,7 @@ def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_fut
 
 @torch.no_grad()
 def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int]) -> Tensor:
-    """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles seen by its cameras ``cams``."""
+    """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles, seen by cameras ``cams``."""
     n_steps, n_views = particles.n_clouds, len(cams)
     rows = torch.tensor(list(cams)).repeat(n_steps)
     cameras = scene.cameras.select(rows, torch.arange(n_steps).repeat_interleave(n_views))
@@ -100,7 +100,7 @@ def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: S
 
 
 def constant_velocity(prediction: Prediction) -> Particles:
-    """The last encoded step and its continuation at the speed of its moving particles' centroid, one cloud a future step."""
+    """What may move goes on from the last encoded step at the speed of its centroid; one cloud a future step."""
     encoded = prediction.particles
     last = prediction.n_encoded - 1
     final = encoded.select_clouds(torch.tensor([last]))

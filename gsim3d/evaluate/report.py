@@ -18,10 +18,10 @@ from gsim3d.evaluate.protocol import METHODS, METRICS, SceneScores
 def summarize(scores: Sequence[SceneScores]) -> dict:
     """What metrics.json holds.
 
-    ``past.M`` and ``future.M``: the mean over steps of the mean over scenes of metric M; ``future_late.M`` over the second
-    half of the horizon only; ``future_std.M``: the mean over steps of the standard deviation between scenes. The same with
-    the prefix ``constant.``, ``copy.``, ... for the baselines. ``by_step``: means over scenes for each step. A value that
-    does not exist (an empty mask everywhere, one scene's deviation) is null.
+    ``past.M`` and ``future.M``: the mean over steps of the mean over scenes of metric M; ``future_late.M`` over the
+    second half of the horizon only; ``future_std.M``: the mean over steps of the standard deviation between scenes. The
+    same with the prefix ``constant.``, ``copy.``, ... for the baselines. ``by_step``: means over scenes for each step. A
+    value that does not exist (an empty mask everywhere, one scene's deviation) is null.
     """
     n_encoded = scores[0].n_encoded
     n_steps = min(len(s.values["model"]["psnr"]) for s in scores)
@@ -71,10 +71,12 @@ def table(summary: dict) -> str:
         "",
         f"{'':34}" + "".join(f"{head[m]:>13}" for m in shown),
     ]
-    rows = [("model, given steps", "past"), ("model, predicted steps", "future"), ("  second half of them", "future_late")]
-    for method in METHODS[1:]:
-        rows += [(f"{method}, predicted steps", f"{method}.future"), ("  second half of them", f"{method}.future_late")]
-    lines += [f"{name:34}" + "".join(f"{_number(summary.get(f'{key}.{m}'), m):>13}" for m in shown) for name, key in rows]
+    rows = [("model, given steps", "past")]
+    for method in METHODS:
+        prefix = "" if method == "model" else f"{method}."
+        rows += [(f"{method}, predicted steps", f"{prefix}future"), ("  second half of them", f"{prefix}future_late")]
+    for name, key in rows:
+        lines.append(f"{name:34}" + "".join(f"{_number(summary.get(f'{key}.{m}'), m):>13}" for m in shown))
     lines += ["", f"{'step':34}" + "".join(f"{head[m]:>13}" for m in shown)]
     for step in range(summary["n_encoded_steps"] + summary["n_future_steps"]):
         kind = "given" if step < summary["n_encoded_steps"] else "predicted"

@@ -148,6 +148,6 @@ def _read_vertices(path: Path, content: bytes) -> dict[str, np.ndarray]:
         raise InputError(f"{path}: unknown format {encoding}")
     dtype = np.dtype([(name, order + kind) for name, kind in fields])
     if len(body) < count * dtype.itemsize:
-        raise InputError(f"{path}: truncated: {len(body)} bytes, expected {count * dtype.itemsize} for {count} vertices")
+        raise InputError(f"{path}: truncated: {len(body)} bytes of {count} vertices; expected {count * dtype.itemsize}")
     table = np.frombuffer(body, dtype, count)
     return {name: table[name] for name, _ in fields}

@@ -40,7 +40,8 @@ class StageConfig:
     warm_up: float = 0.01
 
     def __post_init__(self):
-        _at_least(self, steps=1, horizon=0, history=0, batch=1, target_views=1, from_start=0, learning_rate=0, warm_up=0)
+        _at_least(self, steps=1, horizon=0, history=0, batch=1, target_views=1)
+        _at_least(self, from_start=0, learning_rate=0, warm_up=0)
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,8 @@ class TrainConfig:
     effects: what a scene calls for, as :class:`gsim3d.effects.EffectsSpec` reads it.
     stages: run one after another.
     seed: all randomness follows from it and from the step.
+    workers: samples of a step that are computed at the same time, each on its share of the CPU threads; the numbers are
+        the same for any count above 0. 0: a step's samples form one batch, as a GPU and batch normalisation want it.
     checkpoint_every, log_every: steps; the last step is always saved.
     keep_checkpoints: older ones are removed.
     """
@@ -120,12 +123,13 @@ class TrainConfig:
     loss: LossConfig = LossConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
     seed: int = 0
+    workers: int = 0
     checkpoint_every: int = 500
     keep_checkpoints: int = 2
     log_every: int = 10
 
     def __post_init__(self):
-        _at_least(self, seed=0, checkpoint_every=1, keep_checkpoints=1, log_every=1)
+        _at_least(self, seed=0, workers=0, checkpoint_every=1, keep_checkpoints=1, log_every=1)
         if not self.stages:
             raise InputError("stages: at least one is needed")
 

@@ -1,4 +1,4 @@
-"""The training loop: one step is a function of (weights, configuration, step), so a resumed run repeats it bit for bit."""
+"""The training loop. A step is a function of (weights, configuration, step): a resumed run repeats it bit for bit."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -29,7 +31,7 @@ from gsim3d.train.settings import to_dict
 
 LOG = "metrics.jsonl"
 EMA_WARM_UP = 10  # the average forgets its first values: decay is at most (1 + step) / (10 + step)
-# May change between two sittings of one run without changing the curve.
+# May change between two sittings of one run without changing the curve; so may the number of workers, if there are any.
 FREE_SETTINGS = ("checkpoint_every", "keep_checkpoints", "log_every")
 
 
@@ -49,6 +51,8 @@ class Trainer:
         self.simulator = build_simulator(model_config(config), config.seed)
         self.plan = self.simulator.plan(self.plan_spec)
         _check_history(config, self.plan)
+        if config.workers and self.simulator.config.dynamics.norm == "batch":
+            raise InputError("workers: must be 0 for a model with batch normalisation, which needs all samples at once")
         self.parameters = dict(self.simulator.named_parameters())
         settings = config.optimizer
         self.optimizer = torch.optim.AdamW(
@@ -87,17 +91,16 @@ class Trainer:
     def train_step(self) -> dict:
         """One optimizer step; what to log of it. Weights stay as they are where loss or gradient is not finite."""
         stage, place = self.config.stage_of(self.step)
-        batch = draw_batch(self.scenes, self.config.data, stage, self.config.seed, self.step)
         rate = one_cycle(place, stage.steps, stage.learning_rate, stage.warm_up)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss, errors = self.loss(batch)
+        groups = [[sample] for sample in range(stage.batch)] if self.config.workers else [list(range(stage.batch))]
+        loss, errors, gradients = _mean(self._map(self._gradients, groups))
+        for parameter, gradient in zip(self.parameters.values(), gradients, strict=True):
+            parameter.grad = gradient
         entry = {"step": self.step, "loss": loss.item(), "learning_rate": rate}
-        if math.isfinite(entry["loss"]):
-            loss.backward()
-            entry["grad_norm"] = torch.nn.utils.clip_grad_norm_(
-                self.parameters.values(), self.config.optimizer.clip_norm or math.inf
-            ).item()
-        if math.isfinite(entry.get("grad_norm", math.nan)):
+        entry["grad_norm"] = torch.nn.utils.clip_grad_norm_(
+            self.parameters.values(), self.config.optimizer.clip_norm or math.inf
+        ).item()
+        if math.isfinite(entry["loss"]) and math.isfinite(entry["grad_norm"]):
             for group in self.optimizer.param_groups:
                 group["lr"] = rate
             self.optimizer.step()
@@ -105,17 +108,36 @@ class Trainer:
         else:
             self.n_skipped += 1
             entry["skipped"] = "the loss or its gradient is not finite"
-        past, future = errors[: batch.n_context], errors[batch.n_context :]
-        entry["past_psnr"] = _psnr(past)
-        if batch.n_future:
-            entry["future_psnr"] = _psnr(future)
+        n_context = stage.history or self.config.data.history
+        entry["past_psnr"] = _psnr(errors[:n_context])
+        if stage.horizon:
+            entry["future_psnr"] = _psnr(errors[n_context:])
         self.step += 1
         return {name: _plain(value) for name, value in entry.items()}
 
-    def loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """The loss of a batch, and the unweighted mean squared error of each step."""
+    def _map(self, f: Callable, groups: list) -> list:
+        """f of every group, in order; with workers, several at a time."""
+        n_workers = min(self.config.workers, len(groups), torch.get_num_threads())
+        if n_workers < 2:
+            return [f(group) for group in groups]
+        n_threads = torch.get_num_threads()
+        try:
+            with ThreadPoolExecutor(n_workers, initializer=partial(_start_worker, n_threads // n_workers)) as pool:
+                return list(pool.map(f, groups))
+        finally:
+            torch.set_num_threads(n_threads)
+
+    def _gradients(self, samples: list[int]) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...]]:
+        """Loss, errors by step, and the gradient of the loss for every parameter (None where it has no part)."""
+        stage, _ = self.config.stage_of(self.step)
+        batch = draw_batch(self.scenes, self.config.data, stage, self.config.seed, self.step, samples)
+        loss, errors = self.loss(batch, samples[0])
+        return loss.detach(), errors, torch.autograd.grad(loss, list(self.parameters.values()), allow_unused=True)
+
+    def loss(self, batch: Batch, sample: int = 0) -> tuple[Tensor, Tensor]:
+        """The loss of a batch, and the unweighted mean squared error of each step; ``sample`` numbers the randomness."""
         loss_config, targets = self.config.loss, batch.targets
-        rng = generator(self.config.seed, self.step, 0, "dynamics")
+        rng = generator(self.config.seed, self.step, sample, "dynamics")
         noise = torch.Generator().manual_seed(int(rng.integers(2**63)))
         particles = self.simulator.encode(batch.context)
         if batch.n_future:
@@ -123,7 +145,8 @@ class Trainer:
             particles = concatenate([particles, *steps])
         images = self.simulator.render(particles, targets.cameras, plan=self.plan).color
         truth = targets.images.permute(0, 2, 3, 1)
-        weight = 1 + loss_config.body_weight * targets.dynamic if loss_config.body_weight else None
+        weighted = loss_config.body_weight and targets.dynamic is not None
+        weight = 1 + loss_config.body_weight * targets.dynamic if weighted else None
         weights = time_weights(
             batch.n_context, batch.n_future, balance=loss_config.balance, discount=loss_config.discount
         )
@@ -163,9 +186,10 @@ class Trainer:
     def _resume(self) -> None:
         saved = checkpoint.load(self.out)
         before, now = dict(saved.config.get("train", {})), to_dict(self.config)
+        before["workers"], now["workers"] = bool(before.get("workers")), bool(now["workers"])
         for name in now:
             if name not in FREE_SETTINGS and before.get(name) != now[name]:
-                raise InputError(f"{self.out}: was started with another {name!r}; use another folder or the same setting")
+                raise InputError(f"{self.out}: was started with another {name!r}; use the same or another folder")
         self.simulator.load_state_dict(saved.model)
         if self.average:
             self.average = saved.ema
@@ -215,6 +239,21 @@ def deterministic() -> Iterator[None]:
         torch.use_deterministic_algorithms(before)
         torch.utils.deterministic.fill_uninitialized_memory = fill
         torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = cudnn
+
+
+def _start_worker(n_threads: int) -> None:
+    """Gives this thread its share of the cores."""
+    torch.set_num_threads(n_threads)
+
+
+def _mean(results: list) -> tuple[Tensor, Tensor, list[Tensor | None]]:
+    """Means of losses, errors and gradients, added in the order of the samples."""
+    losses, errors, gradients = zip(*results, strict=True)
+    means = []
+    for parts in zip(*gradients, strict=True):
+        known = [part for part in parts if part is not None]
+        means.append(sum(known[1:], known[0]) / len(results) if known else None)
+    return sum(losses) / len(results), sum(errors) / len(results), means
 
 
 def _check_history(config: TrainConfig, plan: Plan) -> None:

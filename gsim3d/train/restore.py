@@ -24,7 +24,8 @@ PRESETS = ("tiny", "small", "paper_latent", "paper_explicit")
 class Restored:
     """A trained simulator and what it was trained for.
 
-    data: which frames and views it saw.   image_size: (width, height) pixels.   plan: of the effects it was trained with.
+    data: which frames and views it saw.   image_size: (width, height) pixels.
+    plan: of the effects it was trained with.
     checkpoint: where it came from.
     """
 

@@ -63,20 +63,22 @@ def context_cameras(scene: Scene, data: DataConfig) -> list[int]:
     return sorted(set(allowed) - set(data.target_only_cameras))
 
 
-def draw_batch(scenes: Sequence[Scene], data: DataConfig, stage: StageConfig, seed: int, step: int) -> Batch:
-    """The samples of optimizer step ``step``: a function of (seed, step, sample) only.
+def draw_batch(
+    scenes: Sequence[Scene], data: DataConfig, stage: StageConfig, seed: int, step: int, samples: Sequence[int]
+) -> Batch:
+    """Samples number ``samples`` of optimizer step ``step``: functions of (seed, step, sample) only.
 
     Context views are spread evenly around the list of allowed cameras, turned at random, the same at all steps of a
     window; target views are any cameras, drawn afresh at every step.
     """
     n_context = stage.history or data.history
-    windows = [
-        _draw_window(scenes, data, stage, n_context, seed, step, sample) for sample in range(stage.batch)
-    ]
+    windows = [_draw_window(scenes, data, stage, n_context, seed, step, sample) for sample in samples]
     chosen = [window.scene for window in windows]
     steps = [list(window.steps) for window in windows]
-    context = make_frames(chosen, [window.context_cams for window in windows], [s[:n_context] for s in steps])
-    targets = make_frames(chosen, [window.target_cams for window in windows], steps)
+    masked = all(scene.has_segmentation() for scene in chosen)
+    context_cams = [window.context_cams for window in windows]
+    context = make_frames(chosen, context_cams, [s[:n_context] for s in steps], masked=masked)
+    targets = make_frames(chosen, [window.target_cams for window in windows], steps, masked=masked)
     return Batch(thin_background(context, data.background_stride), targets, n_context, stage.horizon)
 
 
@@ -95,7 +97,9 @@ def spread_views(cameras: Sequence[int], count: int, turn: int) -> tuple[int, ..
     return tuple(sorted(cameras[(turn + k * n // count) % n] for k in range(count)))
 
 
-def _draw_window(scenes, data: DataConfig, stage: StageConfig, n_context: int, seed: int, step: int, sample: int) -> Window:
+def _draw_window(
+    scenes: Sequence[Scene], data: DataConfig, stage: StageConfig, n_context: int, seed: int, step: int, sample: int
+) -> Window:
     rng = generator(seed, step, sample, "window")
     scene = scenes[int(rng.integers(len(scenes)))]
     n_steps = n_context + stage.horizon

@@ -110,7 +110,8 @@ def example_scores(name="a", shift=0.0, n_steps=6):
 def test_summary_by_hand(tmp_path):
     summary = summarize([example_scores("a"), example_scores("b", shift=2.0)])
     assert summary["past.psnr"] == 1.5 and summary["future.psnr"] == 4.5 and summary["future_late.psnr"] == 5.5
-    assert summary["future_std.psnr"] == pytest.approx(math.sqrt(2)) and summary["constant.future.ssim"] == pytest.approx(0.45)
+    assert summary["future_std.psnr"] == pytest.approx(math.sqrt(2))
+    assert summary["constant.future.ssim"] == pytest.approx(0.45)
     assert summary["by_step"]["psnr"] == [1, 2, 3, 4, 5, 6] and summary["scenes"]["b"]["future.psnr"] == 5.5
     write_json(tmp_path / "a.json", summary)
     assert json.loads((tmp_path / "a.json").read_text()) == summary

@@ -51,7 +51,9 @@ def test_numbers_as_yaml_writes_them(tmp_path):
     assert from_dict(TrainConfig, load_yaml(tmp_path / "a.yaml")).stages[0].learning_rate == 2e-4
 
 
-@pytest.mark.parametrize("content, message", [("a: [", "not valid YAML"), ("- 1", "mapping"), ("!!python/name:os.system", "YAML")])
+@pytest.mark.parametrize(
+    "content, message", [("a: [", "not valid YAML"), ("- 1", "mapping"), ("!!python/name:os.system", "YAML")]
+)
 def test_broken_files(tmp_path, content, message):
     (tmp_path / "a.yaml").write_text(content)
     with pytest.raises(InputError, match=message):

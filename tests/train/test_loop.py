@@ -1,5 +1,6 @@
 """Training: equal bits twice, resuming equals never having stopped, bad numbers are skipped, mistakes are named."""
 
+import dataclasses
 import json
 import math
 import os
@@ -105,6 +106,30 @@ def test_killed_after_the_last_checkpoint_repeats_those_steps(folder, finished, 
     assert_same_checkpoint(tmp_path, finished)
 
 
+def test_any_number_of_workers_gives_the_same_bits(folder, tmp_path):
+    for workers in (1, 2, 3):
+        torch.set_num_threads(workers)
+        config = dataclasses.replace(CONFIG, stages=CONFIG.stages[:1], workers=workers)
+        Trainer(config, scenes(folder), tmp_path / str(workers)).run(progress=False)
+        assert torch.get_num_threads() == workers
+    torch.set_num_threads(1)
+    for workers in (2, 3):
+        assert curve(tmp_path / str(workers)) == curve(tmp_path / "1")
+        assert_same_checkpoint(tmp_path / str(workers), tmp_path / "1")
+
+
+def test_workers_give_the_gradient_of_the_whole_batch(folder, tmp_path):
+    gradients = []
+    for workers in (0, 1):
+        trainer = Trainer(dataclasses.replace(CONFIG, workers=workers), scenes(folder), tmp_path)
+        trainer.train_step()
+        gradients.append([parameter.grad for parameter in trainer.parameters.values()])
+    for whole, split in zip(*gradients, strict=True):
+        assert (whole is None) == (split is None)
+        if whole is not None:
+            torch.testing.assert_close(split, whole, rtol=1e-3, atol=1e-5)
+
+
 def test_another_configuration_does_not_resume(folder, finished):
     with pytest.raises(InputError, match="another 'seed'"):
         Trainer(TrainConfig(**{**vars(CONFIG), "seed": 1}), scenes(folder), finished)
@@ -114,7 +139,7 @@ def test_another_configuration_does_not_resume(folder, finished):
 def test_steps_that_are_not_finite_change_nothing(folder, tmp_path):
     trainer = Trainer(CONFIG, scenes(folder), tmp_path)
     loss = trainer.loss
-    trainer.loss = lambda batch: tuple(value * (math.nan if trainer.step == 1 else 1) for value in loss(batch))
+    trainer.loss = lambda *given: tuple(value * (math.nan if trainer.step == 1 else 1) for value in loss(*given))
     before = None
     while trainer.step < 3:
         if trainer.step == 1:
@@ -157,7 +182,7 @@ def test_samples_depend_on_seed_and_step_only(folder):
     stage = CONFIG.stages[1]
 
     def key(seed, step):
-        batch = draw_batch(scenes(folder), CONFIG.data, stage, seed, step)
+        batch = draw_batch(scenes(folder), CONFIG.data, stage, seed, step, [0, 1])
         return batch.targets.images.sum().item(), batch.context.images.sum().item()
 
     assert key(0, 3) == key(0, 3)
@@ -168,7 +193,7 @@ def test_target_only_cameras_are_never_an_input(folder):
     known = scenes(folder)
     forbidden = known[0].cameras.viewmats[3]
     for step in range(20):
-        batch = draw_batch(known, CONFIG.data, CONFIG.stages[0], 0, step)
+        batch = draw_batch(known, CONFIG.data, CONFIG.stages[0], 0, step, [0, 1])
         assert not (batch.context.cameras.viewmats == forbidden).all(-1).all(-1).any()
 
 
@@ -179,7 +204,7 @@ def test_views_are_spread_evenly():
 
 
 def test_thinning_keeps_all_of_the_body(folder):
-    frames = draw_batch(scenes(folder), DataConfig(context_views=2), CONFIG.stages[0], 0, 0).context
+    frames = draw_batch(scenes(folder), DataConfig(context_views=2), CONFIG.stages[0], 0, 0, [0]).context
     thinned = thin_background(frames, 2)
     body = frames.dynamic & frames.masks
     assert torch.equal(thinned.masks & frames.dynamic, body)
