@@ -70,7 +70,7 @@ class Bench:
         parser = argparse.ArgumentParser(description=f"gsim3d's {op} against plain torch on the CPU")
         parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results here")
         parser.add_argument("--threads", type=int, default=2)
-        parser.add_argument("--seconds", type=float, default=3.0, help="time for each side of a comparison")
+        parser.add_argument("--seconds", type=float, default=1.0, help="time for each side of a comparison")
         self.args = parser.parse_args()
         self.op, self.results = op, []
         torch.set_num_threads(self.args.threads)
