@@ -30,7 +30,7 @@ state() {
   { python -c 'import sys, importlib.metadata as m; print(sys.version, m.version("torch"))'
     find setup.py pyproject.toml csrc -type f -print0 | sort -z | xargs -0 cat; } 2>/dev/null | cksum
 }
-if [ ! -f "$stamp" ] || [ "$(cat "$stamp")" != "$(state)" ]; then
+if ! compgen -G "gsim3d/_ops*.so" >/dev/null || [ ! -f "$stamp" ] || [ "$(cat "$stamp")" != "$(state)" ]; then
   if ! python -c 'import torch' 2>/dev/null; then
     say "Installing torch $TORCH_VERSION"
     # The CPU build where one is offered; the plain index otherwise.
