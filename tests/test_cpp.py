@@ -17,9 +17,9 @@ def run(*command):
 
 @pytest.fixture(scope="module")
 def build(tmp_path_factory):
-    assert shutil.which("cmake"), "cmake is needed for the C++ tests: pip install cmake"
+    assert shutil.which("cmake") and shutil.which("ninja"), "the C++ tests need cmake and ninja: pip install -e .[dev]"
     folder = tmp_path_factory.mktemp("cmake")
-    run("cmake", "-S", ROOT, "-B", folder, "-DCMAKE_BUILD_TYPE=Release")
+    run("cmake", "-G", "Ninja", "-S", ROOT, "-B", folder, "-DCMAKE_BUILD_TYPE=Release")
     run("cmake", "--build", folder, "--parallel", "2")
     return folder
 
@@ -36,6 +36,6 @@ def test_foreign_project_builds_against_the_install_tree(build, tmp_path):
     headers = {path.name for path in (tmp_path / "prefix" / "include" / "gsim3d").rglob("*.h")}
     assert "pool.h" in headers and "torch_utils.h" not in headers
     consumer = ROOT / "tests" / "cpp" / "consumer"
-    run("cmake", "-S", consumer, "-B", tmp_path / "app", f"-DCMAKE_PREFIX_PATH={tmp_path / 'prefix'}")
+    run("cmake", "-G", "Ninja", "-S", consumer, "-B", tmp_path / "app", f"-DCMAKE_PREFIX_PATH={tmp_path / 'prefix'}")
     run("cmake", "--build", tmp_path / "app")
     assert run(tmp_path / "app" / "app").split() == ["3", "3"]

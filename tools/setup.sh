@@ -8,15 +8,17 @@ say() { printf '\033[1m%s\033[0m\n' "$*" >&2; }
 
 if [ -z "${VIRTUAL_ENV:-}" ]; then
   if [ ! -x .venv/bin/python ]; then
+    found=""
     for candidate in python3.12 python3.11 python3.13 python3 python; do
-      command -v "$candidate" >/dev/null 2>&1 || continue
-      "$candidate" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null && break
-      candidate=""
+      if "$candidate" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; then
+        found="$candidate"
+        break
+      fi
     done
-    [ -n "$candidate" ] || { say "gsim3d needs Python 3.11, 3.12 or 3.13; none was found"; exit 1; }
-    say "Making .venv with $("$candidate" --version)"
+    [ -n "$found" ] || { say "gsim3d needs Python 3.11, 3.12 or 3.13; none was found"; exit 1; }
+    say "Making .venv with $("$found" --version)"
     # A half-made environment must not be taken for a whole one at the next start.
-    rm -rf .venv.part && "$candidate" -m venv .venv.part && rm -rf .venv.part && "$candidate" -m venv .venv
+    rm -rf .venv && "$found" -m venv .venv || { rm -rf .venv; exit 1; }
   fi
   # shellcheck disable=SC1091
   source .venv/bin/activate
