@@ -27,7 +27,7 @@ Writes into DIR:
   gaussians/     the predicted 3D Gaussians of one scene, a .ply for each step
   overview.png   input views, Gaussians, predicted and true frames in one picture
 
-About 10 minutes on 2 cores. Stopped and started again, it goes on where it was.
+About 7 minutes on 2 cores. Stopped and started again, it goes on where it was.
 
 example:
   gsim3d demo --out runs/demo
