@@ -33,6 +33,21 @@ def split_scenes(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, l
     return [s for i, s in enumerate(scenes) if i not in held_out], [scenes[i] for i in sorted(held_out)]
 
 
+def published_split(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, list]:
+    """(train, test) by the rule of the published evaluation, for comparison with its numbers.
+
+    Every k-th scene is a test scene, k = n // max(1, int(test_fraction * n)), to the end of the list; but fewer than
+    15 test scenes are trained on as well, so that numbers of small sets say little. The published code took the scenes
+    in the order in which the file system listed them; here the order is the caller's.
+    """
+    n = len(scenes)
+    stride = n // (1 if n < FEW_SCENES else int(test_fraction * n + 1e-9))
+    test = list(scenes[::stride])
+    if len(test) < FEW_SCENES:
+        return list(scenes), test
+    return [scene for i, scene in enumerate(scenes) if i % stride], test
+
+
 def generator(seed: int, step: int, sample: int, purpose: str) -> np.random.Generator:
     """Random numbers of one purpose of one sample of one step; they do not depend on what was drawn before."""
     return np.random.default_rng([seed, step, sample, zlib.crc32(purpose.encode())])
