@@ -22,6 +22,12 @@ def clusters(n: int, mean_size: float, seed: int = 0):
     return rows, cu_rows, cluster
 
 
+def inverted(rows, cu_rows):
+    """The cluster of each row."""
+    sizes = cu_rows.diff()
+    return torch.empty_like(rows).index_copy(0, rows, torch.arange(len(sizes)).repeat_interleave(sizes))
+
+
 def seconds(f, repeats: int = 3) -> float:
     best = float("inf")
     for _ in range(repeats):
@@ -55,7 +61,13 @@ def main():
                 lambda x: x.new_zeros(m, channels).scatter_reduce(0, wide, x, "mean", include_self=False),
                 lambda x: torch.segment_reduce(x.index_select(0, rows), "mean", offsets=cu_rows, axis=0),
             ),
-            "unpool": (small, lambda x: unpool(x, rows, cu_rows, n), lambda x: x.index_select(0, cluster)),
+            # From the same lists as ours: spread the rows, or invert the list and gather.
+            "unpool": (
+                small,
+                lambda x: unpool(x, rows, cu_rows, n),
+                lambda x: x.new_zeros(n, channels).index_copy(0, rows, x.repeat_interleave(cu_rows.diff(), 0)),
+                lambda x: x.index_select(0, inverted(rows, cu_rows)),
+            ),
         }
         for name, (value, ours, *forms) in cases.items():
             title = f"{name}, {n // 1024}k x {channels} rows to {m}"
