@@ -17,6 +17,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from harness import commit
+
 ROOT = Path(__file__).resolve().parents[2]
 OPS = ["curve", "sparse_conv", "patch_attn", "pool", "plane_sweep", "raster"]
 NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
@@ -36,11 +38,6 @@ def processor() -> str:
     flags = next((line for line in lines if line.startswith("flags")), "")
     wide = ", AVX-512" if "avx512f" in flags else ""
     return (names[0] if names else platform.processor() or platform.machine()) + wide
-
-
-def commit() -> str:
-    done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
-    return done.stdout.strip() or "unknown"
 
 
 def run(op: str) -> dict:
