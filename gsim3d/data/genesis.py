@@ -3,7 +3,8 @@
 metadata.json holds n_steps, n_cams, file_path_template (fields cam_ix, n_step, img_type; ".png" is appended)
 and for each camera cam_<j>: extrinsics (4x4, world-to-camera, OpenCV axes), intrinsics (3x3, pixels) and
 resolution [W, H]. Optional: fps, near, far (metres), origin, bounds; extrinsics and intrinsics of cameras that move
-are lists with one matrix a step. Image types: rgb; seg (0 background, 1 ground and fixed parts, 3 bodies that may move).
+are lists with one matrix a step. Image types: rgb; seg (0 background, 1 ground and fixed parts, 3 bodies that may
+move).
 """
 
 from __future__ import annotations

@@ -79,9 +79,9 @@ class Scene:
         )
 
     def cameras_at(self, cams, steps) -> Cameras:
-        """Cameras ``cams`` at each of ``steps``, len(steps) * len(cams) rows, step by step; image_cloud counts the steps.
+        """Cameras ``cams`` at each of ``steps``: len(steps) * len(cams) rows, step by step.
 
-        Steps beyond the end of the film have the cameras of the last one.
+        ``image_cloud`` counts the steps from 0. Steps beyond the end of the film have the cameras of the last one.
         """
         steps = [min(int(step), self.n_steps - 1) for step in steps]
         steps, cams = self._numbers(cams, steps)

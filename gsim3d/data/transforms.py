@@ -1,11 +1,11 @@
 """Nerfstudio's transforms.json, with a time for every frame and any number of cameras.
 
 Keys of the file, or of single frames, which win: fl_x, fl_y, cx, cy, w, h; k1, k2, p1, p2, k3 (OpenCV's lens model).
-Each of ``frames``: file_path; transform_matrix, camera-to-world with OpenGL's axes (x right, y up, z backwards); time in
-seconds (any unit where fps is given); camera, its name; mask_path, an image that is not 0 on bodies that may move; or
-label_path, one with 0 background, 1 fixed parts, 3 bodies that may move. Without ``camera`` the path decides: frames
-whose paths differ in their last number only come from one camera. Without any ``time`` all show one instant and each
-has its own camera. Beside them: fps, near, far, origin, bounds.
+Each of ``frames``: file_path; transform_matrix, camera-to-world with OpenGL's axes (x right, y up, z backwards); time
+in seconds (any unit where fps is given); camera, its name; mask_path, an image that is not 0 on bodies that may move;
+or label_path, one with 0 background, 1 fixed parts, 3 bodies that may move. Without ``camera`` the path decides:
+frames whose paths differ in their last number only come from one camera. Without any ``time`` all show one instant
+and each has its own camera. Beside them: fps, near, far, origin, bounds.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ def read(folder: Path, problems: Problems) -> Recording:
     model = description.get("camera_model", "OPENCV")
     if model not in PINHOLES:
         raise InputError(
-            f"{source}: camera_model {model!r} is not read; undistort the images to a pinhole (known: {', '.join(PINHOLES)})"
+            f"{source}: camera_model {model!r} is not read; undistort the images to a pinhole "
+            f"(known: {', '.join(PINHOLES)})"
         )
     table, times = _table(description, frames, source, problems)
     names = sorted(table, key=natural_order)
