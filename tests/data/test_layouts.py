@@ -1,4 +1,4 @@
-"""One scene in every layout gives one and the same Scene, and its points project to the pixels where they were drawn."""
+"""One scene in every layout gives one and the same Scene; its points project to the pixels where they were drawn."""
 
 import numpy as np
 import pytest
