@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from gsim3d.data import Scene
-from gsim3d.data.images import read_png
+from gsim3d.data.images import IMAGE_SUFFIXES, as_color, read_image
+from gsim3d.data.recording import Problems
 from gsim3d.errors import InputError
 
-IMAGES = (".png", ".jpg", ".jpeg")
 VIDEOS = (".mp4", ".webm", ".mov", ".mkv", ".avi")
 RESERVED = ("model", "constant", "copy", "constant_velocity", "release_constant", "truth", "past", "future")
 
@@ -68,7 +68,10 @@ class Predictions:
             InputError: a folder, frame or video is missing, too short, broken or of another size.
         """
         folder = self._scene_folder(scene)
-        views = [self._view(folder / f"cam_{cam}", scene, n_encoded, n_future) for cam in cams]
+        views = []
+        for cam in cams:
+            frames = _view(folder / f"cam_{cam}", scene, cam, n_encoded, n_future)
+            views.append(np.stack([scene.as_pinhole(frame, cam, n_encoded + j) for j, frame in enumerate(frames)]))
         return torch.from_numpy(np.stack(views, 1))
 
     def _scene_folder(self, scene: Scene) -> Path:
@@ -77,20 +80,23 @@ class Predictions:
             raise InputError(f"{folder} is missing: predictions of {scene.path} are expected there")
         return folder
 
-    def _view(self, place: Path, scene: Scene, n_encoded: int, n_future: int) -> np.ndarray:
-        if place.is_dir():
-            return _from_frames(place, scene, range(n_encoded, n_encoded + n_future))
-        for suffix in VIDEOS:
-            if (video := place.with_name(place.name + suffix)).is_file():
-                return _from_video(video, scene, n_encoded, n_future)
-        raise InputError(f"{place} is missing: a folder of frames, or a video {place.name}{VIDEOS[0]}")
+
+def _view(place: Path, scene: Scene, cam: int, n_encoded: int, n_future: int) -> list[np.ndarray]:
+    """One camera's predicted frames [h, w, 3], RGB, of the size that the camera films."""
+    size = scene.recording.sizes[cam]
+    if place.is_dir():
+        return _from_frames(place, size, range(n_encoded, n_encoded + n_future))
+    for suffix in VIDEOS:
+        if (video := place.with_name(place.name + suffix)).is_file():
+            return _from_video(video, size, scene.n_steps, n_encoded, n_future)
+    raise InputError(f"{place} is missing: a folder of frames, or a video {place.name}{VIDEOS[0]}")
 
 
-def _from_frames(folder: Path, scene: Scene, steps: range) -> np.ndarray:
+def _from_frames(folder: Path, size: tuple[int, int], steps: range) -> list[np.ndarray]:
     files: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         number = re.search(r"(\d+)$", path.stem)
-        if path.suffix.lower() not in IMAGES or number is None:
+        if path.suffix.lower() not in IMAGE_SUFFIXES or number is None:
             continue
         if (step := int(number[1])) in files:
             raise InputError(f"{folder}: {files[step].name} and {path.name} are both step {step}")
@@ -100,41 +106,44 @@ def _from_frames(folder: Path, scene: Scene, steps: range) -> np.ndarray:
             f"{folder}: step {missing[0]} is missing ({len(missing)} of {len(steps)} are); file names end in the "
             f"number of their step, here {steps[0]} to {steps[-1]}"
         )
-    return np.stack([read_png(files[step], scene.height, scene.width, 3) for step in steps])
+    problems = Problems()  # raises the first one
+    found = ((files[step], f"predicted step {step}") for step in steps)
+    return [as_color(read_image(file, size, what, problems), file, what, problems) for file, what in found]
 
 
-def _from_video(video: Path, scene: Scene, n_encoded: int, n_future: int) -> np.ndarray:
-    frames = _decode(video, scene)
-    given_last, film = n_encoded + n_future, scene.n_steps
-    first = {film: 0, film - n_encoded: n_encoded, given_last: 0, n_future: n_encoded}
+def _from_video(video: Path, size: tuple[int, int], film: int, n_encoded: int, n_future: int) -> list[np.ndarray]:
+    frames = _decode(video, size, film)
+    last = n_encoded + n_future
+    first = {film: 0, film - n_encoded: n_encoded, last: 0, n_future: n_encoded}
     if len(frames) not in first:
         raise InputError(
-            f"{video} has {len(frames)} frames; to compare the {n_future} steps after the {n_encoded} given ones, it "
-            f"must have {given_last} (or the film's {film}), or {n_future} (or {film - n_encoded}) without the given"
+            f"{video} has {'more than ' if len(frames) > film else ''}{min(len(frames), film)} frames; to compare the "
+            f"{n_future} steps after the {n_encoded} given ones, it must have {last} (or the film's {film}), or without "
+            f"the given ones {n_future} (or {film - n_encoded})"
         )
-    if film - n_encoded == given_last == len(frames):
+    if len(frames) == film - n_encoded == last:
         raise InputError(f"{video} has {len(frames)} frames: is the first one step 0 or {n_encoded}? Use frames instead")
     start = n_encoded - first[len(frames)]
     return frames[start : start + n_future]
 
 
-def _decode(video: Path, scene: Scene) -> np.ndarray:
-    """uint8 [N, H, W, 3], RGB; of a video longer than the film, one frame more than the film has."""
+def _decode(video: Path, size: tuple[int, int], film: int) -> list[np.ndarray]:
+    """All frames, RGB; of a video longer than the film, one frame more than the film has."""
     import cv2
 
     capture = cv2.VideoCapture(str(video))
     try:
-        frames = []
-        while len(frames) <= scene.n_steps:
+        frames: list[np.ndarray] = []
+        while len(frames) <= film:
             more, frame = capture.read()
             if not more:
                 break
-            if frame.shape[:2] != (scene.height, scene.width):
+            if frame.shape[1::-1] != size:
                 found = f"{frame.shape[1]}x{frame.shape[0]}"
-                raise InputError(f"{video} has {found} pixels, its camera {scene.width}x{scene.height}: resize it")
+                raise InputError(f"{video} has {found} pixels, its camera {size[0]}x{size[1]}: resize it")
             frames.append(frame[..., ::-1])
     finally:
         capture.release()
     if not frames:
         raise InputError(f"{video} cannot be decoded")
-    return np.stack(frames)
+    return frames

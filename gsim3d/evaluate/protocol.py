@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.data import Scene, make_frames
+from gsim3d.data.recording import BACKGROUND
 from gsim3d.dynamics import concatenate
 from gsim3d.errors import InputError
 from gsim3d.evaluate.predictions import Predictions
@@ -79,11 +80,15 @@ def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_fut
 
 
 @torch.no_grad()
-def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int]) -> Tensor:
-    """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles, seen by cameras ``cams``."""
+def render_steps(
+    restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int], start: int = 0
+) -> Tensor:
+    """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles, seen by cameras ``cams``.
+
+    The first cloud is step ``start`` of the film, which matters where cameras move.
+    """
     n_steps, n_views = particles.n_clouds, len(cams)
-    rows = torch.tensor(list(cams)).repeat(n_steps)
-    cameras = scene.cameras.select(rows, torch.arange(n_steps).repeat_interleave(n_views))
+    cameras = scene.cameras_at(cams, range(start, start + n_steps))
     images = restored.simulator.render(particles, cameras, plan=restored.plan).color
     return images.clamp(0, 1).unflatten(0, (n_steps, n_views))
 
@@ -145,12 +150,14 @@ def score_scene(
     cams, steps = list(target_cams), range(n_encoded + n_future)
     images = scene.images(cams, steps).permute(0, 1, 3, 4, 2).float() / 255
     labels = scene.segmentation(cams, steps) if scene.has_segmentation() else None
-    truth = SceneTruth(scene.name, images, labels, n_encoded, metrics)
+    truth = SceneTruth(scene.name, images, labels, scene.valid(cams, steps), n_encoded, metrics)
     methods = {}
     if restored is not None:
         methods = _model_and_baselines(restored, scene, context_cams, cams, n_future)
     for other in others:
         predicted = other.images(scene, cams, n_encoded, n_future).float() / 255
+        if scene.recording.is_film and labels is not None:  # the film's own background is black there
+            predicted *= (labels[n_encoded:] != BACKGROUND)[..., None]
         methods[other.name] = torch.cat([images[:n_encoded], predicted])
     methods["copy"] = _held(images, n_encoded - 1, n_encoded)
     order = ("model", *(other.name for other in others), *METHODS[1:])
@@ -164,10 +171,14 @@ def _model_and_baselines(
     prediction = predict(restored, scene, context_cams, n_future)
     n_encoded = prediction.n_encoded
     images = {"model": render_steps(restored, prediction.particles, scene, cams)}
-    images["constant"] = _held(images["model"], n_encoded - 1, n_encoded)
-    moved = render_steps(restored, constant_velocity(prediction), scene, cams)
+    moved = render_steps(restored, constant_velocity(prediction), scene, cams, n_encoded)
     images["constant_velocity"] = torch.cat([images["model"][:n_encoded], moved])
-    images["release_constant"] = _held(images["model"], n_encoded, n_encoded)
+    for name, step in (("constant", n_encoded - 1), ("release_constant", n_encoded)):
+        images[name] = _held(images["model"], step, n_encoded)
+        if scene.cameras_move:
+            still = prediction.particles.select_clouds(torch.tensor([step]))
+            for later in range(n_encoded, prediction.n_steps):
+                images[name][later] = render_steps(restored, still, scene, cams, later)[0]
     return images
 
 

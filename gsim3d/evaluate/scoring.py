@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsim3d.data.dataset import MOVING_BODY
+from gsim3d.data.recording import BACKGROUND, MOVING
 from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import SSIM_WINDOW, psnr, ssim
 from gsim3d.perceptual import fvd, lpips, weights
@@ -84,17 +84,28 @@ class SceneTruth:
         name: of the scene.
         images: [S, V, H, W, 3], colours in [0, 1].
         labels: uint8 [S, V, H, W], 0 background, 3 bodies that may move; None: the scene has none.
+        filmed: bool [S, V, H, W], pixels that count; the others are black in the film; None: all.
         n_encoded: steps that were given.
         metrics: to measure; what does not apply here goes to ``not_measured``.
     """
 
-    def __init__(self, name: str, images: Tensor, labels: Tensor | None, n_encoded: int, metrics: Sequence[str]):
-        self.name, self.images, self.labels, self.n_encoded = name, images, labels, n_encoded
+    def __init__(
+        self,
+        name: str,
+        images: Tensor,
+        labels: Tensor | None,
+        filmed: Tensor | None,
+        n_encoded: int,
+        metrics: Sequence[str],
+    ):
+        self.name, self.images, self.labels, self.filmed, self.n_encoded = name, images, labels, filmed, n_encoded
         self.not_measured = {m: reason for m in metrics if (reason := self._problem(m))}
         self.metrics = [metric for metric in metrics if metric not in self.not_measured]
 
     def score(self, methods: dict[str, Tensor]) -> SceneScores:
         """Scores of the images [S, V, H, W, 3] of each method, colours in [0, 1]."""
+        if self.filmed is not None:
+            methods = {name: images * self.filmed[..., None] for name, images in methods.items()}
         values = {name: self._by_step(images, name) for name, images in methods.items()}
         clips = {}
         if "fvd" in self.metrics:
@@ -118,11 +129,11 @@ class SceneTruth:
         first = 0 if method == "model" else self.n_encoded
         n_steps, n_views = images.shape[:2]
         pred, true = images[first:].flatten(0, 1), self.images[first:].flatten(0, 1)
-        labels = None if self.labels is None else self.labels[first:].flatten(0, 1)
+        labels, filmed = (None if m is None else m[first:].flatten(0, 1) for m in (self.labels, self.filmed))
         measure = {
-            "psnr": lambda: psnr(pred, true),
-            "psnr_masked": lambda: psnr(pred, true, labels > 0),
-            "psnr_body": lambda: psnr(pred, true, labels == MOVING_BODY),
+            "psnr": lambda: psnr(pred, true, filmed),
+            "psnr_masked": lambda: psnr(pred, true, labels != BACKGROUND),
+            "psnr_body": lambda: psnr(pred, true, labels == MOVING),
             "ssim": lambda: ssim(pred, true),
             "lpips_alex": lambda: lpips.lpips(pred, true, "alex"),
             "lpips_vgg": lambda: lpips.lpips(pred, true, "vgg"),
