@@ -72,14 +72,17 @@ class LossConfig:
     """Weights of the loss: ``balance`` and ``discount`` as in :func:`gsim3d.train.losses.time_weights`.
 
     body_weight: extra weight of pixels that show a body that may move, relative to 1 of any other pixel.
+    perceptual: weight of LPIPS (VGG) beside the squared error, 0.05 in the paper and 0.01 for its rigid bodies; its
+        weights come with `gsim3d weights lpips`.
     """
 
     balance: float = BALANCE
     discount: float = DISCOUNT
     body_weight: float = 0.0
+    perceptual: float = 0.0
 
     def __post_init__(self):
-        _at_least(self, balance=0, discount=0, body_weight=0)
+        _at_least(self, balance=0, discount=0, body_weight=0, perceptual=0)
 
 
 @dataclass(frozen=True)

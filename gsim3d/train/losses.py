@@ -1,12 +1,16 @@
-"""The training loss: squared image errors, weighted over time."""
+"""The training loss: squared image errors, and perceptual ones where asked for, weighted over time."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from gsim3d.perceptual.lpips import LPIPS
+
 BALANCE = 0.5  # lambda of the paper: weight of the first simulated step; the encoded ones share the rest
 DISCOUNT = 0.87  # gamma of the paper: weight of a simulated step relative to the one before it
+
+MIN_SQUARE = 1e-10  # under the root of a feature vector's length: where all features are zero it keeps the gradient finite
 
 
 def time_weights(n_past: int, n_future: int, *, balance: float = BALANCE, discount: float = DISCOUNT) -> Tensor:
@@ -34,24 +38,38 @@ def image_errors(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> 
     return (errors * weight).sum((1, 2)) / weight.sum((1, 2)).clamp(min=1e-12)
 
 
+def perceptual_errors(network: LPIPS, pred: Tensor, target: Tensor) -> Tensor:
+    """LPIPS of each image [I] from [I, H, W, 3], for training: as the metric but smooth where features vanish.
+
+    Gradients: ``pred``.
+    """
+    features = network.features(pred.permute(0, 3, 1, 2))
+    with torch.no_grad():
+        wanted = [_unit(layer) for layer in network.features(target.permute(0, 3, 1, 2))]
+    layers = [
+        ((_unit(a) - b).square() * head[:, None, None]).sum(1).mean((1, 2))
+        for a, b, head in zip(features, wanted, network.heads, strict=True)
+    ]
+    return sum(layers[1:], layers[0])
+
+
+def _unit(features: Tensor) -> Tensor:
+    return features / (features.square().sum(1, keepdim=True) + MIN_SQUARE).sqrt()
+
+
 def mean_by_step(values: Tensor, step: Tensor, n_steps: int) -> Tensor:
     """Means [n_steps] of the values [I] of each step [I] (int64); a product with a small matrix, so order is fixed."""
     member = (step[None] == torch.arange(n_steps, device=step.device)[:, None]).to(values.dtype)
     return (member * values).sum(1) / member.sum(1).clamp(min=1)
 
 
-def image_loss(
-    pred: Tensor, target: Tensor, step: Tensor, weights: Tensor, pixel_weight: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Time-weighted squared image error ``sum_t weights[t] * mean over images of step t``.
+def image_loss(errors: Tensor, step: Tensor, weights: Tensor) -> Tensor:
+    """``sum_t weights[t] * mean over images of step t`` of the errors of each image.
 
     Args:
-        pred, target: [I, H, W, C], colours in [0, 1]; not clipped.
+        errors: [I].
         step: int64 [I], the step that each image shows.
         weights: [S] of :func:`time_weights`.
-        pixel_weight: [I, H, W], weights of pixels within an image; None: equal.
-    Returns:
-        the loss, and the means [S] by step.
     """
-    by_step = mean_by_step(image_errors(pred, target, pixel_weight), step, weights.shape[0])
-    return (weights.to(by_step) * by_step).sum(), by_step
+    by_step = mean_by_step(errors, step, weights.shape[0])
+    return (weights.to(by_step) * by_step).sum()

@@ -4,8 +4,10 @@ import math
 
 import pytest
 import torch
+from torch.nn import functional as F
 
-from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
+from gsim3d.perceptual.lpips import LPIPS
+from gsim3d.train.losses import image_errors, image_loss, mean_by_step, perceptual_errors, time_weights
 from gsim3d.train.schedule import one_cycle
 
 
@@ -24,10 +26,74 @@ def test_image_loss_by_hand():
     target[0] += 0.1
     target[1] += 0.3
     target[2] += 0.2
-    weights = torch.tensor([0.25, 2.0])
-    loss, by_step = image_loss(pred, target, torch.tensor([0, 0, 1]), weights)
-    assert by_step.tolist() == pytest.approx([(0.01 + 0.09) / 2, 0.04])
+    errors = image_errors(pred, target)
+    assert errors.tolist() == pytest.approx([0.01, 0.09, 0.04])
+    loss = image_loss(errors, torch.tensor([0, 0, 1]), torch.tensor([0.25, 2.0]))
     assert loss.item() == pytest.approx(0.25 * 0.05 + 2 * 0.04)
+
+
+def test_the_published_loss_by_hand():
+    """Two encoded and three simulated steps, two views each, errors 1 .. 10; the mean over views, then over time."""
+    errors, step = torch.arange(1.0, 11), torch.arange(5).repeat_interleave(2)
+    by_hand = 0.25 * 1.5 + 0.25 * 3.5 + 0.5 * 5.5 + 0.5 * 0.87 * 7.5 + 0.5 * 0.87**2 * 9.5
+    assert image_loss(errors, step, time_weights(2, 3)).item() == pytest.approx(by_hand, rel=1e-6)
+    shuffled = torch.randperm(10, generator=torch.Generator().manual_seed(0))
+    assert image_loss(errors[shuffled], step[shuffled], time_weights(2, 3)).item() == pytest.approx(by_hand, rel=1e-6)
+
+
+def random_lpips():
+    torch.manual_seed(0)
+    network = LPIPS("vgg").requires_grad_(False)
+    for head in network.heads:
+        head.uniform_(0, 1)
+    return network
+
+
+def images(n, seed):
+    return torch.rand(n, 32, 24, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def test_perceptual_errors_are_the_published_formula():
+    """Shifted to [-1, 1], normalised, five layers of unit feature vectors, weighted squares, spatial means, summed."""
+    network = random_lpips()
+    pred, target = images(2, 1), images(2, 2)
+    mean, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+
+    def layers(x):
+        x = (((2 * x - 1) - mean) / scale).permute(0, 3, 1, 2).double()
+        for i, conv in enumerate(network.convs):
+            if i in (2, 4, 7, 10):
+                x = F.max_pool2d(x, 2, 2)
+            x = F.relu(F.conv2d(x, conv.weight.double(), conv.bias.double(), padding=1))
+            if i in (1, 3, 6, 9, 12):
+                yield x / (x.square().sum(1, keepdim=True) + 1e-10).sqrt()
+
+    expected = torch.zeros(2, dtype=torch.float64)
+    for a, b, head in zip(layers(pred), layers(target), network.heads, strict=True):
+        expected += ((a - b).square() * head[:, None, None]).sum(1).mean((1, 2))
+    torch.testing.assert_close(perceptual_errors(network, pred, target).double(), expected, rtol=1e-4, atol=0)
+    assert perceptual_errors(network, pred, pred).tolist() == [0, 0]
+
+
+def test_perceptual_errors_agree_with_the_metric():
+    network = random_lpips()
+    for conv in network.convs:  # as in trained networks, features do not fade from layer to layer
+        conv.weight.mul_(2.5)
+    pred, target = images(2, 1), images(2, 2)
+    metric = network(pred.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2))
+    torch.testing.assert_close(perceptual_errors(network, pred, target), metric, rtol=1e-3, atol=0)
+
+
+def test_gradients_of_perceptual_errors():
+    network = random_lpips()
+    pred, target = images(1, 1).requires_grad_(), images(1, 2).requires_grad_()
+    perceptual_errors(network, pred, target).sum().backward()
+    assert target.grad is None and pred.grad.any() and pred.grad.isfinite().all()
+    for conv in network.convs:
+        conv.bias.fill_(-100.0)  # no feature is ever on: their length is zero
+    pred.grad = None
+    perceptual_errors(network, pred, target).sum().backward()
+    assert pred.grad.isfinite().all()
 
 
 def test_pixel_weights_make_a_weighted_mean():
@@ -47,6 +113,12 @@ def test_one_cycle_start_peak_and_end():
     assert rates[-1] == pytest.approx(8e-10)
     assert rates[:100] == sorted(rates[:100]) and rates[99:] == sorted(rates[99:], reverse=True)
     assert all(math.isfinite(one_cycle(0, n, 1.0, 0.0)) for n in (1, 2))
+
+
+def test_the_published_schedule():
+    """Peak 2e-4 at 1 % of the steps, from 8e-6 and down to 8e-10."""
+    rates = [one_cycle(step, 120_000, 2e-4) for step in (0, 1199, 119_999)]
+    assert rates == pytest.approx([8e-6, 2e-4, 8e-10], rel=1e-9)
 
 
 def test_one_cycle_is_torchs():
