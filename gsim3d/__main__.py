@@ -1,4 +1,4 @@
-"""The ``gsim3d`` command: generate, train, simulate, evaluate, demo, doctor."""
+"""The ``gsim3d`` command: generate, train, simulate, evaluate, import, demo, doctor."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ COMMANDS = {
     "train": ("gsim3d.train.command", "learn a simulator from a data set"),
     "simulate": ("gsim3d.simulate", "predict the future of one scene: video and .ply"),
     "evaluate": ("gsim3d.evaluate.command", "measure predictions on a data set: PSNR and SSIM by step"),
+    "import": ("gsim3d.import_released", "bring a checkpoint of the authors' release over: same weights, same predictions"),
     "demo": ("gsim3d.demo", "all of it at a small size, in minutes on a CPU"),
     "doctor": ("gsim3d.doctor", "what is installed, what was compiled, and whether every kernel works here"),
 }

@@ -18,7 +18,7 @@ ROOMS = [
     {"generate"},
     {"train"},
     {"evaluate"},
-    {"simulate", "demo", "doctor"},
+    {"simulate", "import_released", "demo", "doctor"},
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}

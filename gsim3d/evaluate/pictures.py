@@ -72,7 +72,7 @@ def write_gaussians(folder: str | Path, restored: Restored, prediction: Predicti
 def splat_picture(restored: Restored, prediction: Prediction, scene: Scene, cam: int, step: int) -> np.ndarray:
     """The Gaussians of one step, drawn smaller than they are, on white, at a higher resolution than the images."""
     zoom = SPLAT_SIZE / scene.height
-    camera = scene.cameras.select(torch.tensor([cam]), torch.tensor([0]))
+    camera = scene.cameras_at([cam], [step])
     Ks = camera.Ks * torch.tensor([zoom, zoom, 1.0])[:, None]
     camera = Cameras(
         camera.viewmats, Ks, camera.near, camera.far, camera.image_cloud, round(scene.width * zoom), SPLAT_SIZE

@@ -90,11 +90,15 @@ def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_fut
 
 
 @torch.no_grad()
-def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int]) -> Tensor:
-    """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles, seen by cameras ``cams``."""
+def render_steps(
+    restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int], start: int = 0
+) -> Tensor:
+    """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles, seen by cameras ``cams``.
+
+    The first cloud is step ``start`` of the film, which matters where cameras move.
+    """
     n_steps, n_views = particles.n_clouds, len(cams)
-    rows = torch.tensor(list(cams)).repeat(n_steps)
-    cameras = scene.cameras.select(rows, torch.arange(n_steps).repeat_interleave(n_views))
+    cameras = scene.cameras_at(cams, range(start, start + n_steps))
     images = restored.simulator.render(particles, cameras, plan=restored.plan).color
     return images.clamp(0, 1).unflatten(0, (n_steps, n_views))
 
@@ -155,7 +159,8 @@ def score_scene(
     moved = render_steps(restored, constant_velocity(prediction), scene, target_cams)
     images["constant_velocity"] = torch.cat([images["model"][:n_encoded], moved])
     images["release_constant"] = _held(images["model"], n_encoded, n_encoded)
-    values = {name: _scores(images[name], truth, labels) for name in METHODS}
+    filmed = scene.valid(target_cams, steps)
+    values = {name: _scores(images[name], truth, labels, filmed) for name in METHODS}
     for name in METHODS[1:]:
         for metric in values[name].values():
             metric[:n_encoded] = torch.nan
@@ -174,11 +179,15 @@ def _held(images: Tensor, step: int, n_encoded: int) -> Tensor:
     return held
 
 
-def _scores(images: Tensor, truth: Tensor, labels: Tensor | None) -> dict[str, Tensor]:
-    """Metric -> float64 [S], means over the views that have a value."""
+def _scores(images: Tensor, truth: Tensor, labels: Tensor | None, filmed: Tensor | None) -> dict[str, Tensor]:
+    """Metric -> float64 [S], means over the views that have a value; what was not filmed is no error."""
     n_steps, n_views = images.shape[:2]
     flat, true = images.flatten(0, 1), truth.flatten(0, 1)
-    scores = {"psnr": psnr(flat, true)}
+    inside = None
+    if filmed is not None:
+        inside = filmed.flatten(0, 1)
+        flat = flat * inside[..., None]
+    scores = {"psnr": psnr(flat, true, inside)}
     if labels is not None:
         scores["psnr_masked"] = psnr(flat, true, labels.flatten(0, 1) > 0)
         scores["psnr_body"] = psnr(flat, true, labels.flatten(0, 1) == 3)
