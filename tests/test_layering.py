@@ -14,7 +14,7 @@ ROOMS = [
     {"encoder", "dynamics", "renderer"},
     {"presets"},
     {"simulator"},
-    {"data", "interop"},
+    {"data", "interop", "perceptual"},
     {"generate"},
     {"train"},
     {"evaluate"},
