@@ -50,7 +50,7 @@ NO_MEANING = object()
 class ReleasedConfig:
     """What a published checkpoint is, in this model's terms.
 
-    data: history, context_views, context_cameras, target_only_cameras, image_size [W, H] and near_far [m, m].
+    data: the data section of a checkpoint's config.yaml.
     notes: what a user should know, one sentence each.
     ignored: keys of the file that change nothing here.
     """
@@ -211,7 +211,7 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
         model = ModelConfig(encoder, dynamics, renderer)
     except ValueError as error:
         raise InputError(f"the settings and the weights do not make a model: {error}") from None
-    data, effects, notes = _data(settings, history)
+    data, effects, notes = _data(settings, history, encoder.size_multiple)
     return ReleasedConfig(model, data, effects, (*sizes.notes, *notes), tuple(settings.unread()))
 
 
@@ -368,7 +368,7 @@ def _dynamics(settings: _Settings, sizes: _Sizes) -> dict[str, Any]:
     }
 
 
-def _data(settings: _Settings, history: int) -> tuple[dict[str, Any], EffectsSpec, list[str]]:
+def _data(settings: _Settings, history: int, size_multiple: int) -> tuple[dict[str, Any], EffectsSpec, list[str]]:
     """The data section of config.yaml, what is simulated, and notes on what differs."""
     height, width = settings.wholes("dataset.image_shape", 2)
     near, far = settings.positive("dataset.near"), settings.positive("dataset.far")
@@ -377,7 +377,12 @@ def _data(settings: _Settings, history: int) -> tuple[dict[str, Any], EffectsSpe
     sampler = "dataset.view_sampler"
     views = settings.get(f"{sampler}.test_context_views", None) or settings.get(f"{sampler}.context_views", None) or []
     targets = settings.get(f"{sampler}.test_target_views", None)
+    unit_cameras = settings.flag("dataset.make_baseline_1", False)
     notes = []
+    if settings.flag("dataset.baseline_scale_bounds", False):
+        raise InputError("dataset.baseline_scale_bounds: depth bounds that change with the scene are not supported")
+    if width % size_multiple or height % size_multiple:
+        raise InputError(f"dataset.image_shape: must be multiples of {size_multiple}; got {height}, {width}")
     if views and all(isinstance(group, list) for group in views):
         notes.append(f"{sampler} gives step t its own group of context views; here all steps use the first group")
         views = views[0]
@@ -391,7 +396,9 @@ def _data(settings: _Settings, history: int) -> tuple[dict[str, Any], EffectsSpe
         "context_cameras": views,
         "target_only_cameras": [cam for cam in targets if cam not in views],
         "image_size": [width, height],
+        "resize": [width, height],
         "near_far": [near, far],
+        "unit_cameras": unit_cameras,
     }
     with_seg = settings.flag("dataset.with_seg", False)
     effects = EffectsSpec(dynamics=DynamicsEffects(background="frozen" if with_seg else "dynamic"))
@@ -399,8 +406,6 @@ def _data(settings: _Settings, history: int) -> tuple[dict[str, Any], EffectsSpe
         notes.append("dataset.with_seg is false: the model never saw which pixels may move, so every particle may move")
     if not settings.flag("dataset.with_mask", False):
         notes.append("dataset.with_mask is false: it saw every pixel; here pixels that a scene labels 0 make no particle")
-    if settings.flag("dataset.make_baseline_1", False):
-        notes.append("dataset.make_baseline_1 is true: it works in units of the largest camera coordinate of a scene, so scenes must be divided by that")  # fmt: skip
     if settings.get("dataset.workspace_limits", None) is not None:
         notes.append("dataset.workspace_limits is set: the published dynamics left out what began outside; here it takes part")
     if any(settings.get("dataset.background_color", [0, 0, 0])):

@@ -15,9 +15,8 @@ from gsim3d.interop.released_import import import_released, published_shapes, un
 from gsim3d.simulator import Simulator
 from gsim3d.train.checkpoint import load
 from gsim3d.train.restore import restore
-from tests.interop.release import (
-    changed, full_config, random_weights, settings_of, small_config, write_release,
-)  # fmt: skip
+from tests.interop.release import changed, full_config, random_weights, settings_of, small_config, write_release
+from tests.tiny_scenes import write_scene
 
 VARIANTS = {"latent": (False, 4, 3), "explicit": (True, 0, 0), "explicit with latents": (True, 0, 2)}
 
@@ -121,6 +120,7 @@ def test_settings_that_no_weight_shows():
     assert read("dataset.n_step_state", 4).model.dynamics.history_bits == 2
     assert read("dataset.near", 0.5).data["near_far"] == [0.5, 4.0]
     assert read("dataset.image_shape", [64, 96]).data["image_size"] == [96, 64]
+    assert read("dataset.make_baseline_1", True).data["unit_cameras"] is True
     assert read("dataset.with_seg", False).effects.dynamics.background == "dynamic"
     assert read("dataset.view_sampler.test_context_views", [[1, 3], [0, 2]]).data["context_cameras"] == [1, 3]
 
@@ -151,6 +151,8 @@ def test_settings_that_no_weight_shows():
         ("dataset.n_step_state", 3, "n_step_state: must be 1, 2, 4, 8; got 3"),
         ("dataset.n_step_state_predict", -1, "predicts 2 steps at once"),
         ("dataset.far", 0.5, "far: must lie beyond near"),
+        ("dataset.image_shape", [100, 128], "image_shape: must be multiples of 16; got 100, 128"),
+        ("dataset.baseline_scale_bounds", True, "baseline_scale_bounds: .* not supported"),
         ("dataset.view_sampler.test_context_views", ["a"], "must be a list of camera numbers"),
     ],
 )  # fmt: skip
@@ -249,13 +251,27 @@ def test_a_wrong_setting_is_named_with_its_file(capsys, tmp_path):
     assert code == 2 and f"{tmp_path / 'model.yaml'}: model.encoder.num_surfaces: 2 is not supported" in err
 
 
+def test_the_imported_model_is_evaluated_at_its_own_size(capsys, tmp_path):
+    """Films of twice the size, with depth bounds of their own, are fitted to what the model was trained on."""
+    config = small_config()
+    settings = changed(settings_of(config), "dataset.view_sampler.num_context_views", 2)
+    files = write_release(tmp_path, random_weights(config), settings)
+    assert run_import(capsys, *files, tmp_path / "model")[0] == 0
+    scene = restore(tmp_path / "model").open_scene(write_scene(tmp_path / "scenes" / "ball", 4, size=64))
+    assert (scene.width, scene.height, scene.near, scene.far) == (32, 32, 1.0, 4.0)
+    arguments = ["evaluate", tmp_path / "model", tmp_path / "scenes", "--steps", "1", "--metrics", "psnr"]
+    assert main([str(argument) for argument in arguments]) == 0
+    metrics = json.loads((tmp_path / "model" / "metrics.json").read_text())
+    assert isinstance(metrics["future.psnr"], float)
+
+
 def test_what_was_found_is_kept_with_the_weights(tmp_path):
     config = small_config()
     weights = random_weights(config)
-    files = write_release(tmp_path, weights, changed(settings_of(config), "dataset.make_baseline_1", True))
+    files = write_release(tmp_path, weights, changed(settings_of(config), "dataset.speedup", 2))
     imported = import_released(files[0], yaml.safe_load(files[1].read_text()))
     assert imported.n_parameters == sum(v.numel() for k, v in weights.items() if "running" not in k and "num_b" not in k)
     assert main(["import", *map(str, (files[0], "--config", files[1], "-o", tmp_path / "model"))]) == 0
     state = json.loads((tmp_path / "model" / "state.json").read_text())["imported"]
     assert state["file"] == "model.ckpt" and state["untrained_blocks"] == 0
-    assert any("make_baseline_1" in note for note in state["notes"])
+    assert any("speedup" in note for note in state["notes"])
