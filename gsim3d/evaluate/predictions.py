@@ -132,8 +132,8 @@ def _from_video(video: Path, size: tuple[int, int], film: int, n_encoded: int, n
     if len(frames) not in first:
         raise InputError(
             f"{video} has {'more than ' if len(frames) > film else ''}{min(len(frames), film)} frames; to compare the "
-            f"{n_future} steps after the {n_encoded} given ones, it must have {last} (or the film's {film}), or without "
-            f"the given ones {n_future} (or {film - n_encoded})"
+            f"{n_future} steps after the {n_encoded} given ones, it must have {last} (or the film's {film}), or "
+            f"without the given ones {n_future} (or {film - n_encoded})"
         )
     if len(frames) == film - n_encoded == last:
         raise InputError(

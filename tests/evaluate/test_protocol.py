@@ -119,7 +119,7 @@ def test_constant_velocity_is_exact_for_a_body_that_translates(restored, scene):
 
 
 def test_baselines_of_a_body_that_translates(restored, scene, monkeypatch):
-    """The film shows the hand-made body: what continues it is right, what holds it is the worse the longer it is held."""
+    """The film shows the hand-made body: continuing it is right, holding it is worse the longer it is held."""
     truth = falling_apart(restored, scene, 6)
     monkeypatch.setattr(protocol, "predict", lambda *_: Prediction(truth, 2, (0, 2)))
     film = render_steps(restored, truth, scene, [3])
