@@ -8,9 +8,8 @@ import torch
 
 from gsim3d.encoder import Encoder, EncoderConfig
 from gsim3d.encoder.depth import feature_intrinsics, upsample, upsampling_matrix
-from gsim3d.encoder.camera_frame import quat_multiply, rotation_of_harmonics, rotation_to_quat
+from gsim3d.encoder.camera_frame import quat_multiply, rotation_to_quat
 from gsim3d.errors import HardCaseError, InputError
-from gsim3d.harmonics import degree_damping, sh_basis
 from gsim3d.quirks import Quirks
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -197,8 +196,6 @@ def test_a_moved_scene_gives_moved_particles():
     assert_close_relative_to_max(after.means - shift.float(), before.means, "encoder_order")
     for name in ROW_FIELDS[1:]:
         assert_close_relative_to_max(getattr(after, name), getattr(before, name), "encoder_order", name)
-    released = make_encoder(quirks=dataclasses.replace(Quirks(), world_moments=True))
-    assert not torch.allclose(released(frames).dynamic_latents, released(there).dynamic_latents, atol=1e-3)
 
 
 def test_masks_drop_pixels_and_dynamic_sets_activity():
@@ -326,16 +323,6 @@ def rotations(n: int) -> torch.Tensor:
     return q * torch.linalg.det(q)[:, None, None]
 
 
-def test_turned_harmonics_see_the_turned_world():
-    R = rotations(10)
-    directions = torch.nn.functional.normalize(torch.randn(20, 3, dtype=torch.float64), dim=-1)
-    coefficients = torch.randn(10, 16, dtype=torch.float64)
-    turned = torch.einsum("ikl,il->ik", rotation_of_harmonics(R, 3, released=False), coefficients)
-    seen = torch.einsum("ndk,nk->nd", sh_basis(directions @ R.mT, 3), turned)  # directions R d in the world
-    assert torch.allclose(seen, torch.einsum("dk,nk->nd", sh_basis(directions, 3), coefficients), atol=1e-10)
-    assert degree_damping(3, R)[[0, 1, 4, 9]].tolist() == [1, 0.025, 0.00625, 0.0015625]
-
-
 def test_quaternions_of_rotations():
     R = torch.cat([rotations(30), torch.diag_embed(torch.tensor([[1.0, -1, -1], [-1, 1, -1], [-1, -1, 1]]).double())])
     q = rotation_to_quat(R)
@@ -343,11 +330,6 @@ def test_quaternions_of_rotations():
     pure = torch.cat([x.new_zeros(1), x]).expand(len(q), 4)
     conjugate = q * torch.tensor([1.0, -1, -1, -1], dtype=torch.float64)
     assert torch.allclose(quat_multiply(quat_multiply(q, pure), conjugate)[:, 1:], R @ x)
-
-
-@pytest.mark.parametrize("quirk", [field.name for field in dataclasses.fields(Quirks())])
-def test_every_quirk_is_off_by_default_and_on_in_the_release(quirk):
-    assert not getattr(Quirks(), quirk) and getattr(Quirks.release(), quirk)
 
 
 def replace_cameras(frames: Frames, **changes) -> Frames:
