@@ -1,10 +1,14 @@
 """Builds gsim3d._ops (torch ops, stable ABI) and gsim3d._core (the torch-free core for numpy, pybind11).
 
 GSIM3D_CUDA=0 leaves CUDA out, GSIM3D_CUDA=1 insists on it; default: CUDA when this torch has CUDA and nvcc is found.
+TORCH_CUDA_ARCH_LIST chooses the GPUs to build for; default: the visible ones, or sm_80, sm_90a and sm_100 without any.
 """
 
 import os
 import platform
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 from pybind11.setup_helpers import Pybind11Extension
@@ -36,13 +40,38 @@ def wants_cuda() -> bool:
     return possible and choice != "0" and bool(sources("_cuda.cu"))
 
 
+def check_compiler() -> None:
+    """A GCC without a shared libstdc++ puts its own copy into the extension; exceptions then cannot leave it, and an
+    error message would end the process."""
+    command = shlex.split(os.environ.get("CXX", "c++"))
+    try:
+        answer = [subprocess.run([*command, option], capture_output=True, text=True).stdout.strip()
+                  for option in ("--version", "-print-file-name=libstdc++.so")]
+    except FileNotFoundError:
+        raise SystemExit(f"the C++ compiler {command[0]} was not found: install one, or set CXX") from None
+    if "Free Software Foundation" in answer[0] and not os.path.isabs(answer[1]):
+        raise SystemExit(f"{command[0]} has no shared libstdc++: set CXX to one that has, such as CXX=/usr/bin/g++")
+
+
+def cuda_architectures() -> str:
+    import torch
+
+    found = sorted({torch.cuda.get_device_capability(i) for i in range(torch.cuda.device_count())})
+    # 9.0a: the instructions of Hopper alone (wgmma, setmaxnreg)
+    return ";".join("9.0a" if c == (9, 0) else f"{c[0]}.{c[1]}" for c in found) or "8.0;9.0a;10.0"
+
+
 def ops_extension():
     cuda = wants_cuda()
     define = ["-DTORCH_TARGET_VERSION=0x020b000000000000"]
     make = cpp_extension.CUDAExtension if cuda else cpp_extension.CppExtension
     flags = {"cxx": CPU_FLAGS + define + (["-DUSE_CUDA"] if cuda else [])}
     if cuda:
-        flags["nvcc"] = ["-O3", "-std=c++20", "--extended-lambda", "-lineinfo", "-DUSE_CUDA", *define]
+        os.environ.setdefault("TORCH_CUDA_ARCH_LIST", cuda_architectures())
+        # torch's builder takes the operators of half types away; the core is compiled the same with and without torch
+        undo = [f"-U__CUDA_NO_{name}__" for name in
+                ("HALF_OPERATORS", "HALF_CONVERSIONS", "HALF2_OPERATORS", "BFLOAT16_CONVERSIONS")]
+        flags["nvcc"] = ["-O3", "-std=c++20", "--extended-lambda", "-lineinfo", *undo, *define]
     return make(
         "gsim3d._ops",
         ["csrc/gsim3d/torch/schemas.cpp", "csrc/gsim3d/core/parallel.cpp"]
@@ -64,8 +93,15 @@ def core_extension():
     )
 
 
+class BuildExtension(cpp_extension.BuildExtension):
+    def run(self):
+        if sys.platform == "linux":
+            check_compiler()
+        super().run()
+
+
 setup(
     ext_modules=[ops_extension()] + ([core_extension()] if (ROOT / "csrc/gsim3d/numpy/core.cpp").exists() else []),
-    cmdclass={"build_ext": cpp_extension.BuildExtension},
+    cmdclass={"build_ext": BuildExtension},
     options={"bdist_wheel": {"py_limited_api": False}},
 )

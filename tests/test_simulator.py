@@ -13,6 +13,7 @@ from gsim3d.encoder import EncoderConfig
 from gsim3d.presets import ModelConfig
 from gsim3d.renderer import RendererConfig
 from gsim3d.simulator import Simulator
+from gsim3d.train.loop import deterministic
 from gsim3d.types import FROZEN, Cameras, Frames
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import TINY
@@ -81,9 +82,20 @@ def make_simulator(config=CONFIG, seed=0):
     return Simulator(config).eval()
 
 
+def awake(simulator):
+    """Some layers start at zero and would hide those before them from gradients."""
+    with torch.no_grad():
+        for p in simulator.parameters():
+            p.add_(torch.randn_like(p), alpha=0.02)
+    return simulator
+
+
 def target_cameras(frames, n_scenes):
     """One camera for each scene's newest cloud."""
-    return frames.cameras.select(torch.zeros(n_scenes, dtype=torch.int64), torch.arange(n_scenes))
+    device = frames.images.device
+    return frames.cameras.select(
+        torch.zeros(n_scenes, dtype=torch.int64, device=device), torch.arange(n_scenes, device=device)
+    )
 
 
 def test_encode_step_rollout_render():
@@ -119,15 +131,60 @@ def test_masked_out_pixels_are_absent():
 
 
 def test_gradients_reach_every_parameter():
-    simulator, frames = make_simulator(), make_frames((2,))
-    with torch.no_grad():
-        for p in simulator.parameters():  # some layers start at zero and would hide those before them
-            p.add_(torch.randn_like(p), alpha=0.02)
+    simulator, frames = awake(make_simulator()), make_frames((2,))
     steps = simulator.rollout(simulator.encode(frames), 2)
     cameras = target_cameras(frames, 1)
     sum(simulator.render(step, cameras).color.square().sum() for step in steps).backward()
     without = [name for name, p in simulator.named_parameters() if p.grad is None or not p.grad.any()]
     assert without == []
+
+
+class Predict(torch.nn.Module):
+    """Pixels of the newest image and a target camera -> three sums over each image of a rollout of 2 steps."""
+
+    def __init__(self):
+        super().__init__()
+        self.simulator, self.frames = awake(make_simulator()).double(), make_frames((2,))
+        self.camera = target_cameras(self.frames, 1)
+        g = torch.Generator().manual_seed(5)
+        self.weights = torch.rand(3, SIZE, SIZE, 3, generator=g, dtype=torch.float64)
+
+    def forward(self, pixels, viewmat):
+        images = self.frames.images.double()
+        images[-1, :, 6:8, 6:8] = pixels
+        steps = self.simulator.rollout(self.simulator.encode(dataclasses.replace(self.frames, images=images)), 2)
+        camera = dataclasses.replace(self.camera, viewmats=viewmat)
+        colors = [self.simulator.render(step, camera, cutoff="smooth").color for step in steps]
+        return torch.cat([(self.weights * color).sum((1, 2, 3)) for color in colors])
+
+
+def test_gradcheck_of_a_rollout():
+    """Two steps in float64, element by element: pixels, the camera, and parameters of every room."""
+    predict = Predict()
+    names = (
+        "encoder.cnn.conv2.bias",
+        "encoder.depth.cost_volume.head.2.bias",
+        "encoder.heads.to_gaussians.2.bias",
+        "encoder.heads.to_latents.bias",
+        "dynamics.net.encoder.0.blocks.0.position.conv.bias",
+        "dynamics.net.encoder.1.blocks.0.attention.qkv.bias",
+        "dynamics.net.encoder.2.merge.time_embedding",
+        "dynamics.net.decoder.0.unpool.skip.bias",
+        "dynamics.net.head.fc2.bias",
+        "renderer.fc2.bias",
+    )
+    values = dict(predict.simulator.named_parameters())
+    pixels = torch.rand(3, 2, 2, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    inputs = [pixels, predict.camera.viewmats.double(), *(values[name].detach().clone() for name in names)]
+    inputs = [t.requires_grad_() for t in inputs]
+
+    def f(pixels, viewmat, *parameters):
+        replaced = {f"simulator.{name}": value for name, value in zip(names, parameters, strict=True)}
+        return torch.func.functional_call(predict, replaced, (pixels, viewmat))
+
+    jacobian = torch.autograd.functional.jacobian(f, tuple(inputs))
+    assert all(entry.abs().amax() > 1e-3 for entry in jacobian), "a check of zeros shows nothing"
+    torch.autograd.gradcheck(f, inputs, eps=1e-6, atol=1e-6, rtol=1e-4)
 
 
 def test_directional_derivatives_of_a_rollout_in_float64():
@@ -250,3 +307,27 @@ def test_presets_are_consistent_and_of_the_stated_size():
 def test_parts_that_do_not_fit_raise(change, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(CONFIG, **change)
+
+
+def images_and_gradients(device, dtype):
+    """A rollout of 2 steps in one picture each, and the gradient of every parameter."""
+    simulator = awake(make_simulator()).to(device, dtype)
+    frames = make_frames((2, 3)).to(device)
+    frames = dataclasses.replace(frames, images=frames.images.to(dtype))
+    steps = simulator.rollout(simulator.encode(frames), 2)
+    cameras = target_cameras(frames, 2).to(device)
+    images = torch.stack([simulator.render(step, cameras).color for step in steps])
+    return images.detach(), *torch.autograd.grad(images.square().sum(), list(simulator.parameters()))
+
+
+def test_cuda_equals_cpu(devices):
+    cpu, cuda = (images_and_gradients(device, torch.float64) for device in devices)
+    for i, (a, b) in enumerate(zip(cuda, cpu, strict=True)):
+        assert_close_relative_to_max(a, b, 1e-9, f"output {i}")
+
+
+def test_a_rollout_and_its_gradients_repeat_bit_by_bit(device):
+    with deterministic():
+        runs = [images_and_gradients(device, torch.float32) for _ in range(2)]
+    for i, (a, b) in enumerate(zip(*runs, strict=True)):
+        assert_same_bits(a, b, f"output {i}")

@@ -8,6 +8,7 @@
 #include <cstdint>
 
 #include "gsim3d/core/parallel.h"
+#include "gsim3d/core/stream.h"
 
 namespace gsim3d {
 
@@ -48,7 +49,7 @@ void pool_mean(const T* x, const Segments& segments, int64_t channels, T* out, c
 template <typename T>
 void pool_mean_vjp(const T* grad, const Segments& segments, int64_t channels, T* grad_x, const Parallel& parallel);
 
-// out[row] = x[s] for every row of segment s; 0 for a row in no segment.
+// out[row] = x[s] for every row of segment s; 0 for a row in no segment. Throws as check_segments does.
 template <typename T>
 void unpool(const T* x,  // [n_segments, channels]
             const Segments& segments, int64_t channels,
@@ -60,4 +61,28 @@ template <typename T>
 void unpool_vjp(const T* grad, const Segments& segments, int64_t channels, T* grad_x, const Parallel& parallel);
 
 }  // namespace cpu
+
+// The same functions on the device of `stream`. A row outside [0, n_rows) is skipped.
+namespace cuda {
+
+template <typename T>
+void pool_max(const T* x, const Segments& segments, int64_t channels, T* out, int64_t* argmax, Stream stream);
+
+template <typename T>
+void pool_max_vjp(const T* grad, const int64_t* argmax, int64_t n_segments, int64_t n_rows, int64_t channels, T* grad_x,
+                  Stream stream);
+
+template <typename T>
+void pool_mean(const T* x, const Segments& segments, int64_t channels, T* out, Stream stream);
+
+template <typename T>
+void pool_mean_vjp(const T* grad, const Segments& segments, int64_t channels, T* grad_x, Stream stream);
+
+template <typename T>
+void unpool(const T* x, const Segments& segments, int64_t channels, T* out, Stream stream);
+
+template <typename T>
+void unpool_vjp(const T* grad, const Segments& segments, int64_t channels, T* grad_x, Stream stream);
+
+}  // namespace cuda
 }  // namespace gsim3d

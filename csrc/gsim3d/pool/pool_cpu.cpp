@@ -187,14 +187,24 @@ void pool_mean_vjp(const T* grad, const Segments& segments, int64_t channels, T*
   });
 }
 
-// Rows are written in their order, which memory likes better than the order of segments.
+// Rows are written in their order, which memory likes better than the order of segments. Listing the owner of each row
+// tells whether the list is well formed on the way.
 template <typename T>
 void unpool(const T* x, const Segments& segments, int64_t channels, T* out, const Parallel& parallel) {
-  std::vector<int64_t> owner(static_cast<size_t>(segments.n_rows), -1);
-  for_segments(segments, 1, parallel, [&](int64_t s, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) owner[segments.rows[i]] = s;
-  });
-  parallel.range(segments.n_rows, grain(segments.n_rows, segments.n_rows, channels), [&](int64_t begin, int64_t end) {
+  const auto& [rows, cu, n_segments, n_listed, n_rows] = segments;
+  check(n_segments <= std::numeric_limits<int32_t>::max(), "unpool: x must have fewer than 2^31 rows; got ", n_segments);
+  bool good = n_rows >= 0 && n_listed <= n_rows && cu[0] == 0 && cu[n_segments] == n_listed;
+  std::vector<int32_t> owner(good ? static_cast<size_t>(n_rows) : 0, -1);
+  for (int64_t s = 0; good && s < n_segments; ++s) {
+    const int64_t end = cu[s + 1];
+    good = cu[s] <= end && end <= n_listed;
+    for (int64_t i = cu[s]; good && i < end; ++i) {
+      good = static_cast<uint64_t>(rows[i]) < static_cast<uint64_t>(n_rows) && owner[rows[i]] < 0;
+      if (good) owner[rows[i]] = static_cast<int32_t>(s);
+    }
+  }
+  if (!good) check_segments("unpool", segments);
+  parallel.range(n_rows, grain(n_rows, n_rows, channels), [&](int64_t begin, int64_t end) {
     for (int64_t row = begin; row < end; ++row) {
       if (owner[row] >= 0) std::memcpy(out + row * channels, x + owner[row] * channels, sizeof(T) * channels);
       else std::fill_n(out + row * channels, channels, T(0));

@@ -2,18 +2,25 @@
 // Written against torch's stable ABI (TORCH_TARGET_VERSION 2.11), so one binary serves torch 2.11 and later.
 #pragma once
 
+#include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
 
+#ifdef USE_CUDA
+#include <torch/csrc/inductor/aoti_torch/c/shim.h>
+#endif
+
 #include <cstdint>
 #include <initializer_list>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
 #include "gsim3d/core/check.h"
 #include "gsim3d/core/parallel.h"
+#include "gsim3d/core/stream.h"
 #include "gsim3d/core/workspace.h"
 
 namespace gsim3d::binding {
@@ -30,6 +37,44 @@ inline Parallel torch_parallel() {
           },
           nullptr};
 }
+
+// Whether this build holds CUDA kernels. A binding serves both backends:
+//   if constexpr (kWithCuda)
+//     if (x.is_cuda()) return cuda::f(..., TensorWorkspace(x), current_stream(x));
+//   cpu::f(..., torch_parallel());
+// inside its dtype lambda, where the discarded branch is not instantiated.
+#ifdef USE_CUDA
+constexpr bool kWithCuda = true;
+#else
+constexpr bool kWithCuda = false;
+#endif
+
+// Torch's current stream on the device of a tensor; that device is the current one while the object lives.
+class CurrentStream {
+ public:
+  explicit CurrentStream(int32_t device) : guard_(device), stream_{nullptr, device} {
+#ifdef USE_CUDA
+    if (aoti_torch_get_current_cuda_stream(device, &stream_.handle) != AOTI_TORCH_SUCCESS)
+      throw std::runtime_error("torch gave no CUDA stream for device " + std::to_string(device));
+#endif
+  }
+  operator Stream() const { return stream_; }
+
+ private:
+  torch::stable::accelerator::DeviceGuard guard_;
+  Stream stream_;
+};
+inline CurrentStream current_stream(const Tensor& tensor) { return CurrentStream(tensor.get_device_index()); }
+
+// GSIM3D_REGISTER(kernels): calls kernels(m), a generic function of m.impl(...) lines, once for every backend built.
+#ifdef USE_CUDA
+#define GSIM3D_REGISTER(kernels)                                 \
+  STABLE_TORCH_LIBRARY_IMPL(gsim3d, CPU, m) { kernels(m); }      \
+  STABLE_TORCH_LIBRARY_IMPL(gsim3d, CUDA, m) { kernels(m); }
+#else
+#define GSIM3D_REGISTER(kernels) \
+  STABLE_TORCH_LIBRARY_IMPL(gsim3d, CPU, m) { kernels(m); }
+#endif
 
 inline std::string shape_of(const Tensor& tensor) {
   std::string text = "[";
@@ -71,6 +116,16 @@ inline const char* dtype_name(ScalarType type) {
 inline void check_dtype(const char* op, const char* name, const Tensor& tensor, ScalarType wanted) {
   check(tensor.scalar_type() == wanted, op, ": ", name, " must be ", dtype_name(wanted), "; got ",
         dtype_name(tensor.scalar_type()));
+}
+
+inline std::string device_of(const Tensor& tensor) {
+  return tensor.is_cuda() ? "cuda:" + std::to_string(tensor.get_device_index()) : "cpu";
+}
+
+// Kernels read all tensors by pointer: one on another device would be read where it is not.
+inline void check_device(const char* op, const char* name, const Tensor& tensor, const Tensor& like) {
+  check(tensor.get_device_index() == like.get_device_index() && tensor.is_cuda() == like.is_cuda(), op, ": ", name,
+        " must be on ", device_of(like), " like the first argument; got ", device_of(tensor));
 }
 
 // Contiguous, so that the core can read it by pointer.
