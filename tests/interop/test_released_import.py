@@ -18,7 +18,13 @@ from gsim3d.train.restore import restore
 from tests.interop.release import changed, full_config, random_weights, settings_of, small_config, write_release
 from tests.tiny_scenes import write_scene
 
-VARIANTS = {"latent": (False, 4, 3), "explicit": (True, 0, 0), "explicit with latents": (True, 0, 2)}
+VARIANTS = {
+    "latent": {},
+    "explicit": {"explicit": True, "dynamic": 0, "static": 0},
+    "explicit with latents": {"explicit": True, "dynamic": 0, "static": 2},
+    "several steps a call": {"steps_per_call": 3, "predicts": "from_previous"},
+    "explicit, absolute": {"explicit": True, "dynamic": 2, "static": 1, "predicts": "absolute", "steps_per_call": 2},
+}
 
 
 def run_import(capsys, checkpoint, config, out):
@@ -29,7 +35,7 @@ def run_import(capsys, checkpoint, config, out):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_weights_and_settings_arrive(capsys, tmp_path, variant):
-    config = small_config(*VARIANTS[variant])
+    config = small_config(**VARIANTS[variant])
     weights = random_weights(config)
     files = write_release(tmp_path, weights, settings_of(config))
     code, out, err = run_import(capsys, *files, tmp_path / "model")
@@ -146,10 +152,10 @@ def test_settings_that_no_weight_shows():
         ("model.state_adapter.state_3dgs_params", ["means", "opacities", "scales"], "must be means and opacities, or all"),
         ("model.state_adapter.state_3dgs_params", ["means", "opacities", "rotations", "scales", "harmonics"],
          "describes the explicit variant, but the weights are of the latent one"),
-        ("model.state_adapter.pred_modality.means", "z_x", "pred_modality.means: 'z_x' is not supported"),
+        ("model.state_adapter.pred_modality.means", "z_x", "pred_modality: must be one of cx_x, cx_dx, z_x for all"),
         ("model.state_adapter.dynamic_state_keys", ["opacities"], "opacities that change are not supported"),
         ("dataset.n_step_state", 3, "n_step_state: must be 1, 2, 4, 8; got 3"),
-        ("dataset.n_step_state_predict", -1, "predicts 2 steps at once"),
+        ("dataset.n_step_state_predict", -1, "advances 2 old steps at once"),
         ("dataset.far", 0.5, "far: must lie beyond near"),
         ("dataset.image_shape", [100, 128], "image_shape: must be multiples of 16; got 100, 128"),
         ("dataset.baseline_scale_bounds", True, "baseline_scale_bounds: .* not supported"),
@@ -167,8 +173,7 @@ def test_settings_that_do_not_fit_are_refused(path, value, message):
     [
         ("model.state_adapter.dynamic_state_keys", ["means", "rotations"], "harmonics, opacities, scales is missing"),
         ("model.state_adapter.immune_to_static", [], "must be harmonics alone; got nothing"),
-        ("model.state_adapter.pred_inductive_bias", False, "must be true for explicit particles"),
-        ("model.state_adapter.pred_modality.rotations", "z_x", "pred_modality.rotations: 'z_x' is not supported"),
+        ("model.state_adapter.pred_modality.rotations", "z_x", "pred_modality: must be one of .*'rotations': 'z_x'"),
     ],
 )
 def test_settings_of_the_explicit_variant(path, value, message):
@@ -177,10 +182,14 @@ def test_settings_of_the_explicit_variant(path, value, message):
         read_config(changed(settings, path, value), shapes)
 
 
-def test_several_steps_at_once_are_refused():
+def test_several_steps_at_once():
     shapes, settings = shapes_and_settings()
     shapes[f"{DYNAMICS}dec.2.fc2.weight"] = (14, 8)
-    with pytest.raises(InputError, match="predicts 14 numbers a particle, a single step of this variant takes 7"):
+    read = read_config(settings, shapes)
+    assert read.model.dynamics.steps_per_call == 2
+    assert "dataset.n_step_predict_multiple is 1, but the weights have 2, which holds" in read.notes
+    shapes[f"{DYNAMICS}dec.2.fc2.weight"] = (15, 8)
+    with pytest.raises(InputError, match="predicts 15 numbers a particle, but a step of this variant takes 7"):
         read_config(settings, shapes)
 
 
