@@ -18,7 +18,7 @@ ROOMS = [
     {"generate"},
     {"train"},
     {"evaluate"},
-    {"simulate", "demo", "doctor"},
+    {"simulate", "check_data", "demo", "doctor"},
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}
