@@ -100,6 +100,11 @@ class Scene:
             height=self.height,
         )
 
+    @property
+    def cameras_move(self) -> bool:
+        """Whether a camera's place or lens changes with time."""
+        return len(self.recording.viewmats) > 1 or len(self.recording.Ks) > 1
+
     def images(self, cams, steps) -> Tensor:
         """uint8 [len(steps), len(cams), 3, H, W], RGB. Args: lists of camera and step numbers.
 
@@ -154,10 +159,14 @@ class Scene:
     def _K(self, cam: int, step: int) -> np.ndarray:
         return self.recording.Ks[step if len(self.recording.Ks) > 1 else 0, cam]
 
-    def _read_images(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
+    def as_pinhole(self, image: np.ndarray, cam: int, step: int) -> np.ndarray:
+        """An image [h, w, 3] as camera ``cam`` films it -> as :meth:`film` has it: undistorted, and padded."""
         undistorter = self._undistorters[cam]
+        return self._padded(image if undistorter is None else undistorter(image, self._K(cam, step)))
+
+    def _read_images(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
         for step, image in zip(steps, self.recording.read_images(cam, steps, Problems()), strict=True):
-            yield self._padded(image if undistorter is None else undistorter(image, self._K(cam, step)))
+            yield self.as_pinhole(image, cam, step)
 
     def _read_labels(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
         if self.recording.subtract_background:
