@@ -64,8 +64,8 @@ def _of_size(recording: Recording, size: tuple[int, int]) -> Recording:
     for cam, (w, h) in enumerate(recording.sizes):
         if w < width or h < height:
             raise InputError(
-                f"{recording.source}: camera {recording.camera_names[cam]} has images of {w}x{h} pixels; the model needs "
-                f"at least {width}x{height}"
+                f"{recording.source}: camera {recording.camera_names[cam]} has images of {w}x{h} pixels; the model "
+                f"needs at least {width}x{height}"
             )
         share = max(width / w, height / h)
         large = round(w * share), round(h * share)

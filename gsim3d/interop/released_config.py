@@ -259,7 +259,8 @@ def _updates(settings: _Settings, sizes: _Sizes, explicit: bool, n_dynamic: int,
     given = settings.get(f"{adapter}.pred_modality", {})
     said = {key: given.get(key, "z_x") if isinstance(given, dict) else given for key in sorted(changing)}
     if len(set(said.values())) > 1 or said["means"] not in PREDICTS:
-        raise InputError(f"{adapter}.pred_modality: must be one of {', '.join(PREDICTS)} for all that changes; got {said}")
+        known = ", ".join(PREDICTS)
+        raise InputError(f"{adapter}.pred_modality: must be one of {known} for all that changes; got {said}")
     immune = settings.names(f"{adapter}.immune_to_static") if explicit else {"harmonics"}
     if immune & EXPLICIT != {"harmonics"}:
         got = ", ".join(sorted(immune)) or "nothing"
@@ -278,10 +279,7 @@ def _updates(settings: _Settings, sizes: _Sizes, explicit: bool, n_dynamic: int,
             f"weights: the dynamics predicts {rows} numbers a particle, but a step of this variant takes {width}: this "
             "configuration belongs to another checkpoint"
         )
-    if settings.get("dataset.n_step_predict_multiple", 1) == 0:  # the release's way of saying that nothing is trained to move
-        steps_per_call = rows // width
-    else:
-        steps_per_call = sizes.agreed("dataset.n_step_predict_multiple", rows // width, 1)
+    steps_per_call = sizes.agreed("dataset.n_step_predict_multiple", rows // width, 1)
     metric = settings.positive(f"{adapter}.metric")
     max_step = metric / 2 if settings.flag(f"{adapter}.pred_inductive_bias") else None
     return {"predicts": predicts, "steps_per_call": steps_per_call, "max_step": max_step}
@@ -411,9 +409,9 @@ def _data(settings: _Settings, history: int, size_multiple: int) -> tuple[dict[s
     if not with_seg:
         notes.append("dataset.with_seg is false: the model never saw which pixels may move, so every particle may move")
     if not settings.flag("dataset.with_mask", False):
-        notes.append("dataset.with_mask is false: it saw every pixel; here pixels that a scene labels 0 make no particle")
+        notes.append("dataset.with_mask is false: it saw every pixel; here those that a scene labels 0 make no particle")
     if settings.get("dataset.workspace_limits", None) is not None:
-        notes.append("dataset.workspace_limits is set: the published dynamics left out what began outside; here it takes part")
+        notes.append("dataset.workspace_limits is set: published dynamics leave out what began outside, these do not")
     if any(settings.get("dataset.background_color", [0, 0, 0])):
         notes.append("dataset.background_color is not black: pass it as background when you render")
     if settings.get("dataset.speedup", 1) != 1:

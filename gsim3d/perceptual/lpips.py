@@ -82,11 +82,10 @@ class LPIPS(nn.Module):
 
     def maps(self, pred: Tensor, target: Tensor) -> list[Tensor]:
         """The weighted differences [I, h, w] of the five layers, each at its own resolution."""
-        pairs = zip(self.heads, self.features(pred), self.features(target), strict=True)
+        pairs = zip(self.heads, self._features(pred), self._features(target), strict=True)
         return [((_unit(a) - _unit(b)).square() * head[:, None, None]).sum(1) for head, a, b in pairs]
 
-    def features(self, images: Tensor) -> list[Tensor]:
-        """[I, C, h, w] of the five layers that are compared, not scaled."""
+    def _features(self, images: Tensor) -> list[Tensor]:
         x = ((2 * images - 1) - self.shift) / self.scale
         taps = []
         for layer, conv in zip(self.layers, self.convs):

@@ -72,7 +72,8 @@ class DataConfig:
     def __post_init__(self):
         _at_least(self, history=1, context_views=1, background_stride=1)
         if self.resize and (len(self.resize) != 2 or any(side < 1 or side % SIZE_MULTIPLE for side in self.resize)):
-            raise InputError(f"data.resize: must be [width, height], multiples of {SIZE_MULTIPLE}; got {list(self.resize)}")
+            wanted = f"must be [width, height], multiples of {SIZE_MULTIPLE}"
+            raise InputError(f"data.resize: {wanted}; got {list(self.resize)}")
         if self.near_far and (len(self.near_far) != 2 or not 0 < self.near_far[0] < self.near_far[1]):
             raise InputError(f"data.near_far: must be two rising distances above 0; got {list(self.near_far)}")
         if set(self.context_cameras) & set(self.target_only_cameras):

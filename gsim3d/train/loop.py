@@ -25,7 +25,7 @@ from gsim3d.perceptual.weights import load
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.config import TrainConfig
-from gsim3d.train.losses import image_errors, image_loss, mean_by_step, perceptual_errors, time_weights
+from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
 from gsim3d.train.restore import build_simulator, describe, model_config
 from gsim3d.train.samples import Batch, check_scenes, draw_batch
 from gsim3d.train.schedule import one_cycle
@@ -159,7 +159,8 @@ class Trainer:
         wrong = image_errors(images, truth, weight)
         if self.perceptual is not None:
             seen = images if targets.valid is None else torch.where(targets.valid[..., None], images, truth)
-            wrong = wrong + loss_config.perceptual * perceptual_errors(self.perceptual, seen, truth)
+            distances = self.perceptual(seen.permute(0, 3, 1, 2), targets.images)
+            wrong = wrong + loss_config.perceptual * distances
         loss = image_loss(wrong, step, weights)
         with torch.no_grad():
             errors = mean_by_step(image_errors(images, truth, targets.valid), step, batch.n_context + batch.n_future)

@@ -1,16 +1,13 @@
-"""The training loss: squared image errors, and perceptual ones where asked for, weighted over time."""
+"""The training loss: errors of images, weighted over time."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from gsim3d.perceptual.lpips import LPIPS
-
 BALANCE = 0.5  # lambda of the paper: weight of the first simulated step; the encoded ones share the rest
 DISCOUNT = 0.87  # gamma of the paper: weight of a simulated step relative to the one before it
 
-MIN_SQUARE = 1e-10  # under the root of a feature vector's length: where all features are zero it keeps the gradient finite
 
 
 def time_weights(n_past: int, n_future: int, *, balance: float = BALANCE, discount: float = DISCOUNT) -> Tensor:
@@ -36,25 +33,6 @@ def image_errors(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> 
     if weight is None:
         return errors.mean((1, 2))
     return (errors * weight).sum((1, 2)) / weight.sum((1, 2)).clamp(min=1e-12)
-
-
-def perceptual_errors(network: LPIPS, pred: Tensor, target: Tensor) -> Tensor:
-    """LPIPS of each image [I] from [I, H, W, 3], for training: as the metric but smooth where features vanish.
-
-    Gradients: ``pred``.
-    """
-    features = network.features(pred.permute(0, 3, 1, 2))
-    with torch.no_grad():
-        wanted = [_unit(layer) for layer in network.features(target.permute(0, 3, 1, 2))]
-    layers = [
-        ((_unit(a) - b).square() * head[:, None, None]).sum(1).mean((1, 2))
-        for a, b, head in zip(features, wanted, network.heads, strict=True)
-    ]
-    return sum(layers[1:], layers[0])
-
-
-def _unit(features: Tensor) -> Tensor:
-    return features / (features.square().sum(1, keepdim=True) + MIN_SQUARE).sqrt()
 
 
 def mean_by_step(values: Tensor, step: Tensor, n_steps: int) -> Tensor:

@@ -102,7 +102,8 @@ def test_units_of_the_cameras(tmp_path, made):
     assert np.abs(centers[0]).max() == pytest.approx(1)
     assert centers[-1] == pytest.approx(np.linalg.inv(made.viewmats[-1])[:, :3, 3] / extent)
     assert (scene.near, scene.far) == pytest.approx((1 / extent, 5 / extent))
-    assert scene.origin == pytest.approx(np.array(ORIGIN) / extent) and scene.bounds == pytest.approx(np.array(BOUNDS) / extent)
+    assert scene.origin == pytest.approx(np.array(ORIGIN) / extent)
+    assert scene.bounds == pytest.approx(np.array(BOUNDS) / extent)
     both = opened(tmp_path, recording, unit_cameras=True, near_far=(0.2, 4.0))
     assert (both.near, both.far) == (0.2, 4.0)  # given in the new unit
 

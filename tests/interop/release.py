@@ -116,7 +116,8 @@ def settings_of(config: ModelConfig, image_size=32) -> dict:
             },
             "name": "genesis", "with_mask": True, "with_seg": True, "image_shape": [image_size, image_size],
             "background_color": [0.0, 0.0, 0.0], "near": 1.0, "far": 4.0, "n_step_state": 2**dynamics.history_bits,
-            "n_step_state_predict": 1, "n_step_predict_multiple": dynamics.steps_per_call, "speedup": 1, "workspace_limits": None,
+            "n_step_state_predict": 1, "n_step_predict_multiple": dynamics.steps_per_call, "speedup": 1,
+            "workspace_limits": None,
         },
     }  # fmt: skip
 

@@ -149,7 +149,7 @@ def test_settings_that_no_weight_shows():
         ("model.encoder.costvolume_unet_channel_mult", [1, 2, 4], "must be ones"),
         ("model.state_adapter.gaussians.rotations", 6, "rotations: 6 is not supported"),
         ("model.state_adapter.learn_static_mask", True, "learn_static_mask: True is not supported"),
-        ("model.state_adapter.state_3dgs_params", ["means", "opacities", "scales"], "must be means and opacities, or all"),
+        ("model.state_adapter.state_3dgs_params", ["means", "opacities", "scales"], "must be means and opacities, or"),
         ("model.state_adapter.state_3dgs_params", ["means", "opacities", "rotations", "scales", "harmonics"],
          "describes the explicit variant, but the weights are of the latent one"),
         ("model.state_adapter.pred_modality.means", "z_x", "pred_modality: must be one of cx_x, cx_dx, z_x for all"),
@@ -279,7 +279,8 @@ def test_what_was_found_is_kept_with_the_weights(tmp_path):
     weights = random_weights(config)
     files = write_release(tmp_path, weights, changed(settings_of(config), "dataset.speedup", 2))
     imported = import_released(files[0], yaml.safe_load(files[1].read_text()))
-    assert imported.n_parameters == sum(v.numel() for k, v in weights.items() if "running" not in k and "num_b" not in k)
+    learned = [value for name, value in weights.items() if "running" not in name and "num_batches" not in name]
+    assert imported.n_parameters == sum(value.numel() for value in learned)
     assert main(["import", *map(str, (files[0], "--config", files[1], "-o", tmp_path / "model"))]) == 0
     state = json.loads((tmp_path / "model" / "state.json").read_text())["imported"]
     assert state["file"] == "model.ckpt" and state["untrained_blocks"] == 0

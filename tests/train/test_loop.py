@@ -20,7 +20,7 @@ from gsim3d.perceptual.weights import SOURCES, cache_folder
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer, deterministic
-from gsim3d.train.losses import image_loss, perceptual_errors, time_weights
+from gsim3d.train.losses import image_loss, time_weights
 from gsim3d.train.restore import restore
 from gsim3d.train.samples import draw_batch, spread_views, thin_background
 from tests.tiny_scenes import write_scenes
@@ -155,7 +155,7 @@ def test_the_perceptual_part_joins_the_loss(folder, tmp_path, monkeypatch):
     particles = simulator.encode(batch.context)
     particles = concatenate([particles, *simulator.rollout(particles, batch.n_future, trainers[0].plan)])
     images = simulator.render(particles, targets.cameras, plan=trainers[0].plan).color
-    distances = perceptual_errors(network, images, targets.images.permute(0, 2, 3, 1))
+    distances = network(images.permute(0, 3, 1, 2), targets.images)
     extra = 0.05 * image_loss(distances, batch.target_step(), time_weights(batch.n_context, batch.n_future))
     assert extra.item() > 1e-4
     assert loss.item() == pytest.approx(plain.item() + extra.item(), rel=1e-5)

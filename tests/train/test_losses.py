@@ -4,10 +4,8 @@ import math
 
 import pytest
 import torch
-from torch.nn import functional as F
 
-from gsim3d.perceptual.lpips import LPIPS
-from gsim3d.train.losses import image_errors, image_loss, mean_by_step, perceptual_errors, time_weights
+from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
 from gsim3d.train.schedule import one_cycle
 
 
@@ -39,61 +37,6 @@ def test_the_published_loss_by_hand():
     assert image_loss(errors, step, time_weights(2, 3)).item() == pytest.approx(by_hand, rel=1e-6)
     shuffled = torch.randperm(10, generator=torch.Generator().manual_seed(0))
     assert image_loss(errors[shuffled], step[shuffled], time_weights(2, 3)).item() == pytest.approx(by_hand, rel=1e-6)
-
-
-def random_lpips():
-    torch.manual_seed(0)
-    network = LPIPS("vgg").requires_grad_(False)
-    for head in network.heads:
-        head.uniform_(0, 1)
-    return network
-
-
-def images(n, seed):
-    return torch.rand(n, 32, 24, 3, generator=torch.Generator().manual_seed(seed))
-
-
-def test_perceptual_errors_are_the_published_formula():
-    """Shifted to [-1, 1], normalised, five layers of unit feature vectors, weighted squares, spatial means, summed."""
-    network = random_lpips()
-    pred, target = images(2, 1), images(2, 2)
-    mean, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
-
-    def layers(x):
-        x = (((2 * x - 1) - mean) / scale).permute(0, 3, 1, 2).double()
-        for i, conv in enumerate(network.convs):
-            if i in (2, 4, 7, 10):
-                x = F.max_pool2d(x, 2, 2)
-            x = F.relu(F.conv2d(x, conv.weight.double(), conv.bias.double(), padding=1))
-            if i in (1, 3, 6, 9, 12):
-                yield x / (x.square().sum(1, keepdim=True) + 1e-10).sqrt()
-
-    expected = torch.zeros(2, dtype=torch.float64)
-    for a, b, head in zip(layers(pred), layers(target), network.heads, strict=True):
-        expected += ((a - b).square() * head[:, None, None]).sum(1).mean((1, 2))
-    torch.testing.assert_close(perceptual_errors(network, pred, target).double(), expected, rtol=1e-4, atol=0)
-    assert perceptual_errors(network, pred, pred).tolist() == [0, 0]
-
-
-def test_perceptual_errors_agree_with_the_metric():
-    network = random_lpips()
-    for conv in network.convs:  # as in trained networks, features do not fade from layer to layer
-        conv.weight.mul_(2.5)
-    pred, target = images(2, 1), images(2, 2)
-    metric = network(pred.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2))
-    torch.testing.assert_close(perceptual_errors(network, pred, target), metric, rtol=1e-3, atol=0)
-
-
-def test_gradients_of_perceptual_errors():
-    network = random_lpips()
-    pred, target = images(1, 1).requires_grad_(), images(1, 2).requires_grad_()
-    perceptual_errors(network, pred, target).sum().backward()
-    assert target.grad is None and pred.grad.any() and pred.grad.isfinite().all()
-    for conv in network.convs:
-        conv.bias.fill_(-100.0)  # no feature is ever on: their length is zero
-    pred.grad = None
-    perceptual_errors(network, pred, target).sum().backward()
-    assert pred.grad.isfinite().all()
 
 
 def test_pixel_weights_make_a_weighted_mean():
