@@ -11,8 +11,16 @@ Tensor curve_encode(const Tensor& grid_, const Tensor& cloud_, int64_t curve, in
   check_dtype(op, "cloud", cloud_, ScalarType::Long);
   check_shape(op, "grid", grid_, {-1, 3}, "[N, 3]");
   check_shape(op, "cloud", cloud_, {grid_.size(0)}, "[N]");
+  check_device(op, "cloud", cloud_, grid_);
   const Tensor grid = rows_of(grid_), cloud = rows_of(cloud_);
   Tensor codes = empty(grid, {grid.size(0)});
+  if constexpr (kWithCuda) {
+    if (grid.is_cuda()) {
+      cuda::curve_encode(data<int64_t>(grid), data<int64_t>(cloud), grid.size(0), curve, depth, shift,
+                         mutable_data<int64_t>(codes), current_stream(grid));
+      return codes;
+    }
+  }
   cpu::curve_encode(data<int64_t>(grid), data<int64_t>(cloud), grid.size(0), curve, depth, shift,
                     mutable_data<int64_t>(codes), torch_parallel());
   return codes;
@@ -26,6 +34,13 @@ std::tuple<Tensor, Tensor> curve_sort(const Tensor& codes_) {
   Tensor order = empty(codes, {codes.size(0), codes.size(1)});
   Tensor inverse = empty(codes, {codes.size(0), codes.size(1)});
   TensorWorkspace workspace(codes);
+  if constexpr (kWithCuda) {
+    if (codes.is_cuda()) {
+      cuda::curve_sort(data<int64_t>(codes), codes.size(0), codes.size(1), mutable_data<int64_t>(order),
+                       mutable_data<int64_t>(inverse), workspace, current_stream(codes));
+      return {order, inverse};
+    }
+  }
   cpu::curve_sort(data<int64_t>(codes), codes.size(0), codes.size(1), mutable_data<int64_t>(order),
                   mutable_data<int64_t>(inverse), workspace, torch_parallel());
   return {order, inverse};
@@ -64,6 +79,7 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
             std::is_sorted(cu_kernels.begin(), cu_kernels.end()),
         op, ": cu_kernels must ascend from 0 to len(kernel_sizes)=", kernel_sizes.size());
 
+  check(!positions_.is_cuda(), op, ": positions must be on the CPU; got ", device_of(positions_));
   check_shape(op, "positions", positions_, {-1, 3}, "[N, 3]");
   check_dtype(op, "cu_rows", cu_rows_, ScalarType::Long);
   check_dtype(op, "cloud_scene", cloud_scene_, ScalarType::Long);
@@ -90,12 +106,14 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
   return std::move(arrays.made);
 }
 
-}  // namespace
-
-STABLE_TORCH_LIBRARY_IMPL(gsim3d, CPU, m) {
+void kernels(auto& m) {
   m.impl("curve_encode", TORCH_BOX(&curve_encode));
   m.impl("curve_sort", TORCH_BOX(&curve_sort));
   m.impl("build_pyramid", TORCH_BOX(&build_pyramid));
 }
+
+}  // namespace
+
+GSIM3D_REGISTER(kernels)
 
 }  // namespace gsim3d::binding
