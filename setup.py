@@ -6,6 +6,9 @@ TORCH_CUDA_ARCH_LIST chooses the GPUs to build for; default: the visible ones, o
 
 import os
 import platform
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 from pybind11.setup_helpers import Pybind11Extension
@@ -35,6 +38,19 @@ def wants_cuda() -> bool:
     if choice == "1" and not possible:
         raise SystemExit("GSIM3D_CUDA=1, but this torch has no CUDA or nvcc was not found (set CUDA_HOME)")
     return possible and choice != "0" and bool(sources("_cuda.cu"))
+
+
+def check_compiler() -> None:
+    """A GCC without a shared libstdc++ puts its own copy into the extension; exceptions then cannot leave it, and an
+    error message would end the process."""
+    command = shlex.split(os.environ.get("CXX", "c++"))
+    try:
+        answer = [subprocess.run([*command, option], capture_output=True, text=True).stdout.strip()
+                  for option in ("--version", "-print-file-name=libstdc++.so")]
+    except FileNotFoundError:
+        raise SystemExit(f"the C++ compiler {command[0]} was not found: install one, or set CXX") from None
+    if "Free Software Foundation" in answer[0] and not os.path.isabs(answer[1]):
+        raise SystemExit(f"{command[0]} has no shared libstdc++: set CXX to one that has, such as CXX=/usr/bin/g++")
 
 
 def cuda_architectures() -> str:
@@ -77,8 +93,15 @@ def core_extension():
     )
 
 
+class BuildExtension(cpp_extension.BuildExtension):
+    def run(self):
+        if sys.platform == "linux":
+            check_compiler()
+        super().run()
+
+
 setup(
     ext_modules=[ops_extension()] + ([core_extension()] if (ROOT / "csrc/gsim3d/numpy/core.cpp").exists() else []),
-    cmdclass={"build_ext": cpp_extension.BuildExtension},
+    cmdclass={"build_ext": BuildExtension},
     options={"bdist_wheel": {"py_limited_api": False}},
 )

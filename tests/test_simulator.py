@@ -81,6 +81,14 @@ def make_simulator(config=CONFIG, seed=0):
     return Simulator(config).eval()
 
 
+def awake(simulator):
+    """Some layers start at zero and would hide those before them from gradients."""
+    with torch.no_grad():
+        for p in simulator.parameters():
+            p.add_(torch.randn_like(p), alpha=0.02)
+    return simulator
+
+
 def target_cameras(frames, n_scenes):
     """One camera for each scene's newest cloud."""
     return frames.cameras.select(torch.zeros(n_scenes, dtype=torch.int64), torch.arange(n_scenes))
@@ -119,15 +127,60 @@ def test_masked_out_pixels_are_absent():
 
 
 def test_gradients_reach_every_parameter():
-    simulator, frames = make_simulator(), make_frames((2,))
-    with torch.no_grad():
-        for p in simulator.parameters():  # some layers start at zero and would hide those before them
-            p.add_(torch.randn_like(p), alpha=0.02)
+    simulator, frames = awake(make_simulator()), make_frames((2,))
     steps = simulator.rollout(simulator.encode(frames), 2)
     cameras = target_cameras(frames, 1)
     sum(simulator.render(step, cameras).color.square().sum() for step in steps).backward()
     without = [name for name, p in simulator.named_parameters() if p.grad is None or not p.grad.any()]
     assert without == []
+
+
+class Predict(torch.nn.Module):
+    """Pixels of the newest image and a target camera -> three sums over each image of a rollout of 2 steps."""
+
+    def __init__(self):
+        super().__init__()
+        self.simulator, self.frames = awake(make_simulator()).double(), make_frames((2,))
+        self.camera = target_cameras(self.frames, 1)
+        g = torch.Generator().manual_seed(5)
+        self.weights = torch.rand(3, SIZE, SIZE, 3, generator=g, dtype=torch.float64)
+
+    def forward(self, pixels, viewmat):
+        images = self.frames.images.double()
+        images[-1, :, 6:8, 6:8] = pixels
+        steps = self.simulator.rollout(self.simulator.encode(dataclasses.replace(self.frames, images=images)), 2)
+        camera = dataclasses.replace(self.camera, viewmats=viewmat)
+        colors = [self.simulator.render(step, camera, cutoff="smooth").color for step in steps]
+        return torch.cat([(self.weights * color).sum((1, 2, 3)) for color in colors])
+
+
+def test_gradcheck_of_a_rollout():
+    """Two steps in float64, element by element: pixels, the camera, and parameters of every room."""
+    predict = Predict()
+    names = (
+        "encoder.cnn.conv2.bias",
+        "encoder.depth.cost_volume.head.2.bias",
+        "encoder.heads.to_gaussians.2.bias",
+        "encoder.heads.to_latents.bias",
+        "dynamics.net.encoder.0.blocks.0.position.conv.bias",
+        "dynamics.net.encoder.1.blocks.0.attention.qkv.bias",
+        "dynamics.net.encoder.2.merge.time_embedding",
+        "dynamics.net.decoder.0.unpool.skip.bias",
+        "dynamics.net.head.fc2.bias",
+        "renderer.fc2.bias",
+    )
+    values = dict(predict.simulator.named_parameters())
+    pixels = torch.rand(3, 2, 2, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    inputs = [pixels, predict.camera.viewmats.double(), *(values[name].detach().clone() for name in names)]
+    inputs = [t.requires_grad_() for t in inputs]
+
+    def f(pixels, viewmat, *parameters):
+        replaced = {f"simulator.{name}": value for name, value in zip(names, parameters, strict=True)}
+        return torch.func.functional_call(predict, replaced, (pixels, viewmat))
+
+    jacobian = torch.autograd.functional.jacobian(f, tuple(inputs))
+    assert all(entry.abs().amax() > 1e-3 for entry in jacobian), "a check of zeros shows nothing"
+    torch.autograd.gradcheck(f, inputs, eps=1e-6, atol=1e-6, rtol=1e-4)
 
 
 def test_directional_derivatives_of_a_rollout_in_float64():

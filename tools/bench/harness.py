@@ -1,18 +1,23 @@
-"""What the benchmarks of the ops share: check first, then time gsim3d and plain torch in turns and print both.
+"""What the benchmarks of the ops share: check first, then time gsim3d and its peer in turns and print both.
 
-    bench = Bench("pool")                                        # reads the command line: --json, --threads, --seconds
-    bench.compare("64k rows", ours, plain)                       # callables without arguments; results must agree
+    bench = Bench("pool")                                # reads the command line: --device, --json, --threads, --seconds
+    bench.compare("64k rows", ours, plain)               # CPU: callables without arguments; results must agree
     bench.compare("64k rows, fwd+bwd", *with_gradients(inputs, ours_of, plain_of))
+    bench.gpu("64k rows", "float32", ours, {"torch": plain}, target_ratio=5, limit_ms=0.04)      # --device cuda
     bench.finish()
 
 Numbers are medians, "best" is the fastest round; the spread is the distance between the quartiles as a part of the
-median. The two sides take turns, so that a busy machine slows both.
+median. The two sides take turns, so that a busy machine slows both. On a GPU a number is the time between two events
+around one call as a program makes it, Python and launches included; beside it stands the time of the same call replayed
+from a CUDA graph, where it can be captured.
 """
 
 import argparse
+import datetime
 import json
 import platform
 import statistics
+import subprocess
 import time
 from pathlib import Path
 
@@ -20,6 +25,7 @@ import torch
 from torch import Tensor
 
 MIN_ROUNDS, MAX_ROUNDS = 5, 200
+RESULTS = Path(__file__).parent / "results"  # one JSON line for each row measured on a GPU
 
 
 def tensors_of(result) -> list[Tensor]:
@@ -48,7 +54,8 @@ def with_gradients(inputs: list[Tensor], *functions):
     leaves = [x.detach().clone().requires_grad_() if x.is_floating_point() else x for x in inputs]
     wanted = [x for x in leaves if x.requires_grad]
     with torch.no_grad():
-        cotangent = torch.randn(functions[0](*inputs).shape, generator=torch.Generator().manual_seed(0))
+        out = functions[0](*inputs)
+        cotangent = torch.randn(out.shape, generator=torch.Generator().manual_seed(0)).to(out)
 
     def both(f):
         def run():
@@ -65,15 +72,53 @@ def summary(seconds: list[float]) -> dict:
     return {"ms": 1e3 * median, "best_ms": 1e3 * min(seconds), "spread": (high - low) / median, "rounds": len(seconds)}
 
 
+def commit() -> str:
+    done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True)
+    return done.stdout.strip() or "unknown"
+
+
+def event_ms(f) -> float:
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    start.record()
+    f()
+    end.record()
+    end.synchronize()
+    return start.elapsed_time(end)
+
+
+def graph_of(f):
+    """f captured in a CUDA graph, or None where it cannot be (it waits for the device, say)."""
+    try:
+        side = torch.cuda.Stream()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            for _ in range(3):
+                f()
+        torch.cuda.current_stream().wait_stream(side)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            f()
+        return graph.replay
+    except RuntimeError:
+        torch.cuda.synchronize()
+        return None
+
+
 class Bench:
     def __init__(self, op: str):
-        parser = argparse.ArgumentParser(description=f"gsim3d's {op} against plain torch on the CPU")
+        parser = argparse.ArgumentParser(description=f"gsim3d's {op} against its peers")
+        parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
         parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results here")
         parser.add_argument("--threads", type=int, default=2)
         parser.add_argument("--seconds", type=float, default=1.0, help="time for each side of a comparison")
         self.args = parser.parse_args()
         self.op, self.results = op, []
         torch.set_num_threads(self.args.threads)
+        self.device = torch.device(self.args.device)
+        if self.args.device == "cuda":
+            print(f"{op}: {torch.cuda.get_device_name()}, torch {torch.__version__}")
+            print(f"{'case':<52}{'gsim3d ms':>10}{'graph':>9}{'peer ms':>10}{'graph':>9}{'ratio':>8}{'target':>8}{'error':>9}")
+            return
         print(f"{op}: {platform.machine()}, torch {torch.__version__}, {self.args.threads} threads")
         columns = f"{'gsim3d ms':>11}{'best':>10}{'torch ms':>11}{'best':>10}"
         print(f"{'case':<44}{columns}{'faster':>9}{'spread':>8}{'error':>9}")
@@ -99,7 +144,54 @@ class Bench:
         self.results.append(result)
         return result
 
+    def gpu(self, case: str, dtype: str, ours, peers: dict, *, target_ratio=None, limit_ms=None, tolerance=1e-5) -> None:
+        """``peers``: name -> callable, the fastest counts; empty where none is installed. ``tolerance`` bounds the error
+        against each peer, relative to the largest value; None where the caller has compared the results by its own rule."""
+        error = None
+        if tolerance is not None:
+            for name, peer in peers.items():
+                error = max(error or 0.0, worst_error(ours(), peer()))
+                if not error <= tolerance:
+                    raise AssertionError(f"{self.op}, {case}: differs from {name} by {error:.1e} of the largest value")
+        sides = {"gsim3d": ours, **peers}
+        times = {name: [] for name in sides}
+        for f in sides.values():
+            for _ in range(3):
+                f()
+        torch.cuda.synchronize()
+        start = time.perf_counter()
+        while len(times["gsim3d"]) < 20 or (
+            time.perf_counter() - start < self.args.seconds * len(sides) and len(times["gsim3d"]) < MAX_ROUNDS
+        ):
+            for name, f in sides.items():
+                times[name].append(event_ms(f))
+        replays = {name: graph_of(f) for name, f in sides.items()}
+        graph_ms = {
+            name: None if replay is None else statistics.median(event_ms(replay) for _ in range(30))
+            for name, replay in replays.items()
+        }
+        low, ours_ms, high = statistics.quantiles(times["gsim3d"], n=4, method="inclusive")
+        medians = {name: statistics.median(values) for name, values in times.items() if name != "gsim3d"}
+        peer = min(medians, key=medians.get) if medians else None
+        row = {
+            "op": self.op, "case": case, "dtype": dtype, "ours_ms": ours_ms, "ours_graph_ms": graph_ms["gsim3d"],
+            "peer": peer, "peer_ms": medians.get(peer), "peer_graph_ms": graph_ms.get(peer), "peers_ms": medians,
+            "target_ratio": target_ratio, "limit_ms": limit_ms, "gpu": torch.cuda.get_device_name(),
+            "torch": torch.__version__, "commit": commit(), "spread": (high - low) / ours_ms, "error": error,
+            "date": datetime.date.today().isoformat(),
+        }  # fmt: skip
+        cells = [ours_ms, graph_ms["gsim3d"], row["peer_ms"], row["peer_graph_ms"]]
+        text = "".join(f"{'-' if v is None else format(v, '.3f'):>{w}}" for v, w in zip(cells, (10, 9, 10, 9)))
+        ratio = "-" if peer is None else f"{row['peer_ms'] / ours_ms:.1f}x"
+        wanted = "-" if target_ratio is None else f"{target_ratio:g}x"
+        print(f"{case + ' ' + dtype:<52}{text}{ratio:>8}{wanted:>8}{'-' if error is None else format(error, '.0e'):>9}", flush=True)
+        self.results.append(row)
+
     def finish(self) -> None:
-        if self.args.json:
+        if self.args.device == "cuda":
+            file = self.args.json or RESULTS / f"{self.op}.jsonl"
+            file.parent.mkdir(exist_ok=True)
+            file.write_text("".join(json.dumps(row) + "\n" for row in self.results))
+        elif self.args.json:
             record = {"op": self.op, "threads": self.args.threads, "torch": torch.__version__, "results": self.results}
             self.args.json.write_text(json.dumps(record, indent=1) + "\n")

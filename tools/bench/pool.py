@@ -22,6 +22,12 @@ def clusters(n: int, mean_size: float, seed: int = 0):
     return rows, cu_rows, cluster
 
 
+def inverted(rows, cu_rows):
+    """The cluster of each row."""
+    sizes = cu_rows.diff()
+    return torch.empty_like(rows).index_copy(0, rows, torch.arange(len(sizes)).repeat_interleave(sizes))
+
+
 def seconds(f, repeats: int = 3) -> float:
     best = float("inf")
     for _ in range(repeats):
@@ -31,8 +37,45 @@ def seconds(f, repeats: int = 3) -> float:
     return best
 
 
+def gpu(bench):
+    """A quarter of 256k rows to a cluster; torch's forms as in the networks that use scatter or segment reductions."""
+    n, channels = 262144, 64
+    rows, cu_rows, cluster = (t.cuda() for t in clusters(n, 4))
+    m = len(cu_rows) - 1
+    generator = torch.Generator().manual_seed(1)
+    x = (torch.randperm(n * channels, generator=generator).reshape(n, channels) / (n * channels)).cuda()
+    small = torch.randn(m, channels, generator=generator).cuda()
+    wide = cluster[:, None].expand(n, channels)
+
+    def segment(x):
+        return torch.segment_reduce(x.index_select(0, rows), "max", offsets=cu_rows, axis=0, unsafe=True)
+
+    def scatter(x):
+        return x.new_zeros(m, channels).scatter_reduce(0, wide, x, "amax", include_self=False)
+
+    cases = {
+        "max": (x, lambda x: pool_max(x, rows, cu_rows), {"segment_reduce": segment, "scatter_reduce": scatter}),
+        "mean": (
+            x,
+            lambda x: pool_mean(x, rows, cu_rows),
+            {"scatter_reduce": lambda x: x.new_zeros(m, channels).scatter_reduce(0, wide, x, "mean", include_self=False)},
+        ),
+        "unpool": (small, lambda x: unpool(x, rows, cu_rows, n), {"index_select": lambda x: x.index_select(0, cluster)}),
+    }
+    for name, (value, ours, forms) in cases.items():
+        bench.gpu(f"{name}, 256k x 64 rows to {m}: fwd", "float32", lambda: ours(value),
+                  {peer: lambda f=f: f(value) for peer, f in forms.items()}, tolerance=1e-6)
+        runs = with_gradients([value], ours, *forms.values())
+        target = {"target_ratio": 5, "limit_ms": 0.04} if name == "max" else {}
+        bench.gpu(f"{name}, 256k x 64 rows to {m}: fwd+bwd", "float32", runs[0], dict(zip(forms, runs[1:])),
+                  tolerance=1e-6, **target)
+
+
 def main():
     bench = Bench("pool")
+    if bench.device.type == "cuda":
+        gpu(bench)
+        return bench.finish()
     for n, channels, size in ((65536, 64, 4), (65536, 64, 1.5), (16384, 256, 4)):
         rows, cu_rows, cluster = clusters(n, size)
         m, counts = len(cu_rows) - 1, cu_rows.diff()
@@ -55,7 +98,13 @@ def main():
                 lambda x: x.new_zeros(m, channels).scatter_reduce(0, wide, x, "mean", include_self=False),
                 lambda x: torch.segment_reduce(x.index_select(0, rows), "mean", offsets=cu_rows, axis=0),
             ),
-            "unpool": (small, lambda x: unpool(x, rows, cu_rows, n), lambda x: x.index_select(0, cluster)),
+            # From the same lists as ours: spread the rows, or invert the list and gather.
+            "unpool": (
+                small,
+                lambda x: unpool(x, rows, cu_rows, n),
+                lambda x: x.new_zeros(n, channels).index_copy(0, rows, x.repeat_interleave(cu_rows.diff(), 0)),
+                lambda x: x.index_select(0, inverted(rows, cu_rows)),
+            ),
         }
         for name, (value, ours, *forms) in cases.items():
             title = f"{name}, {n // 1024}k x {channels} rows to {m}"

@@ -1,8 +1,9 @@
 #!/usr/bin/env python
-"""Runs the benchmark of every op and writes docs/benchmarks.md (and docs/benchmarks.json, the numbers behind it).
+"""Runs the benchmark of every op on the CPU and writes docs/benchmarks.md (and docs/benchmarks.json, the numbers behind it).
 
     python tools/bench/report.py                  all ops
     python tools/bench/report.py raster pool      run these again, keep the other numbers
+    python tools/bench/report.py --page           only write the page again, with what tools/gpu_check.sh bench measured
 
 Let nothing else run meanwhile.
 """
@@ -17,16 +18,59 @@ import sys
 import tempfile
 from pathlib import Path
 
+from harness import RESULTS, commit
+
 ROOT = Path(__file__).resolve().parents[2]
 OPS = ["curve", "sparse_conv", "patch_attn", "pool", "plane_sweep", "raster"]
 NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
 INTRODUCTION = """# Benchmarks
 
 Written by `python tools/bench/report.py`; do not edit. Every case first compares the results of both sides, then times
-them in turns in one process, float32. "torch" is the best form of the op in plain torch that we found (vectorised; the
-code is in `tools/bench/<op>.py`). Medians of repeated runs; spread is the distance between the quartiles as a part
-of the median. "faster" below 1 means that torch is faster.
+them in turns in one process. [On a GPU](#on-a-gpu) against the fastest peer installed there, [on the CPU](#on-the-cpu)
+against plain torch.
 """
+GPU = """
+## On a GPU
+
+Medians of repeated calls between two events, as a program makes them: Python and launches included. "graph" is the same
+call replayed from a CUDA graph, "-" where it cannot be captured. "limit" is what the chip's rates allow by a count of bytes
+and operations; "wanted" is the ratio to the peer that we aim at. How each kernel got there: [performance log](performance-log.md).
+"""
+CPU = """
+## On the CPU
+
+float32. "torch" is the best form of the op in plain torch that we found (vectorised; the code is in
+`tools/bench/<op>.py`). Medians of repeated runs; spread is the distance between the quartiles as a part of the median.
+"faster" below 1 means that torch is faster.
+"""
+
+
+def number(value, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def gpu_tables() -> str:
+    files = sorted(RESULTS.glob("*.jsonl"))
+    text = GPU if files else ""
+    for file in files:
+        rows = [json.loads(line) for line in file.read_text().splitlines()]
+        if not rows:
+            continue
+        first = rows[0]
+        text += (
+            f"\n### {first['op']} on {first['gpu']}\n\ntorch {first['torch']}, commit {first['commit']}, {first['date']}.\n\n"
+            "| case | dtype | gsim3d ms | graph | peer | peer ms | graph | ratio | wanted | limit ms | spread |\n"
+            "| --- | --- | ---: | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
+        )
+        for row in rows:
+            ratio = "-" if row["peer_ms"] is None else f"{row['peer_ms'] / row['ours_ms']:.1f}x"
+            wanted = "-" if row["target_ratio"] is None else f"{row['target_ratio']:g}x"
+            text += (
+                f"| {row['case']} | {row['dtype']} | {number(row['ours_ms'])} | {number(row['ours_graph_ms'])} "
+                f"| {row['peer'] or '-'} | {number(row['peer_ms'])} | {number(row['peer_graph_ms'])} | {ratio} | {wanted} "
+                f"| {number(row['limit_ms'])} | {row['spread']:.0%} |\n"
+            )
+    return text
 
 
 def processor() -> str:
@@ -36,11 +80,6 @@ def processor() -> str:
     flags = next((line for line in lines if line.startswith("flags")), "")
     wide = ", AVX-512" if "avx512f" in flags else ""
     return (names[0] if names else platform.processor() or platform.machine()) + wide
-
-
-def commit() -> str:
-    done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
-    return done.stdout.strip() or "unknown"
 
 
 def run(op: str) -> dict:
@@ -54,13 +93,13 @@ def run(op: str) -> dict:
 
 
 def page(records: dict[str, dict]) -> str:
-    text = INTRODUCTION
+    text = INTRODUCTION + gpu_tables() + CPU
     for op in OPS:
         if op not in records:
             continue
         r = records[op]
         text += (
-            f"\n## {op}\n\n{r['machine']}, {r['threads']} threads, torch {r['torch']}, Python {r['python']}, "
+            f"\n### {op}\n\n{r['machine']}, {r['threads']} threads, torch {r['torch']}, Python {r['python']}, "
             f"commit {r['commit']}, {r['date']}.\n\n"
             "| case | gsim3d ms | torch ms | faster | spread | error |\n| --- | ---: | ---: | ---: | ---: | ---: |\n"
         )
@@ -76,13 +115,15 @@ def page(records: dict[str, dict]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("ops", nargs="*", choices=[[], *OPS], help="default: all")
-    ops = parser.parse_args().ops or OPS
+    parser.add_argument("--page", action="store_true", help="run nothing, write the page from the stored numbers")
+    args = parser.parse_args()
+    ops = [] if args.page else args.ops or OPS
     records = json.loads(NUMBERS.read_text()) if NUMBERS.exists() else {}
     NUMBERS.parent.mkdir(exist_ok=True)
     for op in ops:
         records[op] = run(op)
         NUMBERS.write_text(json.dumps(records, indent=1) + "\n")
-        PAGE.write_text(page(records))
+    PAGE.write_text(page(records))
 
 
 if __name__ == "__main__":

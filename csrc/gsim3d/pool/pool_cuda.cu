@@ -1,5 +1,3 @@
-#include <type_traits>
-
 #include "gsim3d/core/cuda_utils.cuh"
 #include "gsim3d/pool/pool.h"
 
@@ -8,81 +6,132 @@ namespace {
 
 constexpr int kThreads = 256;
 
-// One thread owns one channel of one segment and walks its rows in the order of the list: neighbours in a warp read
+// N channels that one thread moves at once; aligned, so that it is one load where 16 bytes hold them.
+template <typename T, int N>
+struct alignas(sizeof(T) * N) Pack {
+  T lane[N];
+};
+template <typename T, int N>
+__device__ __forceinline__ Pack<T, N> load(const T* at) {
+  return *reinterpret_cast<const Pack<T, N>*>(at);
+}
+template <typename T, int N>
+__device__ __forceinline__ void store(T* at, const Pack<T, N>& value) {
+  *reinterpret_cast<Pack<T, N>*>(at) = value;
+}
+
+// One thread owns N channels of one segment and walks its rows in the order of the list: neighbours in a warp read
 // neighbouring channels, and every sum has one order.
 struct Place {
   int64_t segment, channel;
 };
+template <int N>
 __device__ __forceinline__ bool find_place(int64_t n_segments, int64_t channels, Place& place) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= n_segments * channels) return false;
-  place = {i / channels, i % channels};
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x, per_row = channels / N;
+  if (i >= n_segments * per_row) return false;
+  place = {i / per_row, i % per_row * N};
   return true;
 }
 
-template <typename T>
+template <typename T, int N>
 __global__ void max_kernel(const T* __restrict__ x, Segments segments, int64_t channels, T* __restrict__ out,
                            int64_t* __restrict__ argmax) {
   Place at;
-  if (!find_place(segments.n_segments, channels, at)) return;
+  if (!find_place<N>(segments.n_segments, channels, at)) return;
   const Range range = range_of(segments.cu_rows, at.segment, segments.n_listed);
-  T best = 0;
-  int64_t where = -1;
+  Pack<T, N> best{};
+  int64_t where[N];
+#pragma unroll
+  for (int j = 0; j < N; ++j) where[j] = -1;
   for (int64_t i = range.begin; i < range.end; ++i) {
     const int64_t row = segments.rows[i];
     if (!inside(row, segments.n_rows)) continue;
-    const T value = x[row * channels + at.channel];
-    if (where < 0 || value > best || (value != value && best == best)) {
-      best = value;
-      where = row;
+    const Pack<T, N> value = load<T, N>(x + row * channels + at.channel);
+#pragma unroll
+    for (int j = 0; j < N; ++j) {
+      const T v = value.lane[j], b = best.lane[j];
+      if (where[j] < 0 || v > b || (v != v && b == b)) {
+        best.lane[j] = v;
+        where[j] = row;
+      }
     }
   }
-  out[at.segment * channels + at.channel] = best;
-  argmax[at.segment * channels + at.channel] = where;
+  const int64_t to = at.segment * channels + at.channel;
+  store(out + to, best);
+#pragma unroll
+  for (int j = 0; j < N; ++j) argmax[to + j] = where[j];
 }
 
 template <typename T>
 __global__ void max_vjp_kernel(const T* __restrict__ grad, const int64_t* __restrict__ argmax, int64_t n_segments,
                                int64_t n_rows, int64_t channels, T* __restrict__ grad_x) {
   Place at;
-  if (!find_place(n_segments, channels, at)) return;
+  if (!find_place<1>(n_segments, channels, at)) return;
   const int64_t i = at.segment * channels + at.channel, row = argmax[i];
   if (inside(row, n_rows)) grad_x[row * channels + at.channel] = grad[i];
 }
 
-template <typename T, bool kMean>
+template <typename T, int N, bool kMean>
 __global__ void sum_kernel(const T* __restrict__ x, Segments segments, int64_t channels, T* __restrict__ out) {
   Place at;
-  if (!find_place(segments.n_segments, channels, at)) return;
+  if (!find_place<N>(segments.n_segments, channels, at)) return;
   const Range range = range_of(segments.cu_rows, at.segment, segments.n_listed);
-  T sum = 0;
+  Pack<T, N> sum{};
   for (int64_t i = range.begin; i < range.end; ++i) {
     const int64_t row = segments.rows[i];
-    if (inside(row, segments.n_rows)) sum += x[row * channels + at.channel];
+    if (!inside(row, segments.n_rows)) continue;
+    const Pack<T, N> value = load<T, N>(x + row * channels + at.channel);
+#pragma unroll
+    for (int j = 0; j < N; ++j) sum.lane[j] += value.lane[j];
   }
-  if (kMean && range.end - range.begin > 1) sum /= static_cast<T>(range.end - range.begin);
-  out[at.segment * channels + at.channel] = sum;
+  if (kMean && range.end - range.begin > 1) {
+#pragma unroll
+    for (int j = 0; j < N; ++j) sum.lane[j] /= static_cast<T>(range.end - range.begin);
+  }
+  store(out + at.segment * channels + at.channel, sum);
 }
 
 // Every row of a segment gets the segment's value, divided by its size for the mean.
-template <typename T, bool kMean>
+template <typename T, int N, bool kMean>
 __global__ void spread_kernel(const T* __restrict__ x, Segments segments, int64_t channels, T* __restrict__ out) {
   Place at;
-  if (!find_place(segments.n_segments, channels, at)) return;
+  if (!find_place<N>(segments.n_segments, channels, at)) return;
   const Range range = range_of(segments.cu_rows, at.segment, segments.n_listed);
-  T value = x[at.segment * channels + at.channel];
-  if (kMean) value /= static_cast<T>(range.end - range.begin);
+  Pack<T, N> value = load<T, N>(x + at.segment * channels + at.channel);
+  if (kMean) {
+#pragma unroll
+    for (int j = 0; j < N; ++j) value.lane[j] /= static_cast<T>(range.end - range.begin);
+  }
   for (int64_t i = range.begin; i < range.end; ++i) {
     const int64_t row = segments.rows[i];
-    if (inside(row, segments.n_rows)) out[row * channels + at.channel] = value;
+    if (inside(row, segments.n_rows)) store(out + row * channels + at.channel, value);
   }
+}
+
+// Calls f.template operator()<N>(): N channels in 16 bytes where rows and pointers allow it, else one.
+template <typename T, typename F>
+void by_width(int64_t channels, const void* a, const void* b, const F& f) {
+  constexpr int kWide = 16 / sizeof(T);
+  const bool aligned = (reinterpret_cast<uintptr_t>(a) | reinterpret_cast<uintptr_t>(b)) % 16 == 0;
+  if (aligned && channels % kWide == 0) f.template operator()<kWide>();
+  else f.template operator()<1>();
+}
+
+template <typename T, bool kMean>
+void add_up(const char* op, const T* x, const Segments& segments, int64_t channels, T* out, Stream stream) {
+  by_width<T>(channels, x, out, [&]<int N>() {
+    launch(op, sum_kernel<T, N, kMean>, blocks_for(op, segments.n_segments * (channels / N), kThreads), kThreads, 0,
+           stream, x, segments, channels, out);
+  });
 }
 
 template <typename T, bool kMean>
 void spread(const char* op, const T* x, const Segments& segments, int64_t channels, T* out, Stream stream) {
   if (segments.n_listed != segments.n_rows) fill_zero(op, out, segments.n_rows * channels, stream);
-  launch(op, spread_kernel<T, kMean>, blocks_for(op, segments.n_segments * channels, kThreads), kThreads, 0, stream, x,
-         segments, channels, out);
+  by_width<T>(channels, x, out, [&]<int N>() {
+    launch(op, spread_kernel<T, N, kMean>, blocks_for(op, segments.n_segments * (channels / N), kThreads), kThreads, 0,
+           stream, x, segments, channels, out);
+  });
 }
 
 }  // namespace
@@ -90,8 +139,10 @@ void spread(const char* op, const T* x, const Segments& segments, int64_t channe
 template <typename T>
 void pool_max(const T* x, const Segments& segments, int64_t channels, T* out, int64_t* argmax, Stream stream) {
   const char* op = "pool_max";
-  launch(op, max_kernel<T>, blocks_for(op, segments.n_segments * channels, kThreads), kThreads, 0, stream, x, segments,
-         channels, out, argmax);
+  by_width<T>(channels, x, out, [&]<int N>() {
+    launch(op, max_kernel<T, N>, blocks_for(op, segments.n_segments * (channels / N), kThreads), kThreads, 0, stream, x,
+           segments, channels, out, argmax);
+  });
 }
 
 template <typename T>
@@ -105,9 +156,7 @@ void pool_max_vjp(const T* grad, const int64_t* argmax, int64_t n_segments, int6
 
 template <typename T>
 void pool_mean(const T* x, const Segments& segments, int64_t channels, T* out, Stream stream) {
-  const char* op = "pool_mean";
-  launch(op, sum_kernel<T, true>, blocks_for(op, segments.n_segments * channels, kThreads), kThreads, 0, stream, x,
-         segments, channels, out);
+  add_up<T, true>("pool_mean", x, segments, channels, out, stream);
 }
 
 template <typename T>
@@ -122,9 +171,7 @@ void unpool(const T* x, const Segments& segments, int64_t channels, T* out, Stre
 
 template <typename T>
 void unpool_vjp(const T* grad, const Segments& segments, int64_t channels, T* grad_x, Stream stream) {
-  const char* op = "unpool_backward";
-  launch(op, sum_kernel<T, false>, blocks_for(op, segments.n_segments * channels, kThreads), kThreads, 0, stream, grad,
-         segments, channels, grad_x);
+  add_up<T, false>("unpool_backward", grad, segments, channels, grad_x, stream);
 }
 
 #define GSIM3D_INSTANTIATE(T)                                                                        \

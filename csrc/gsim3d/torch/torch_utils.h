@@ -14,6 +14,7 @@
 
 #include <cstdint>
 #include <initializer_list>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
@@ -53,7 +54,8 @@ class CurrentStream {
  public:
   explicit CurrentStream(int32_t device) : guard_(device), stream_{nullptr, device} {
 #ifdef USE_CUDA
-    STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(device, &stream_.handle));
+    if (aoti_torch_get_current_cuda_stream(device, &stream_.handle) != AOTI_TORCH_SUCCESS)
+      throw std::runtime_error("torch gave no CUDA stream for device " + std::to_string(device));
 #endif
   }
   operator Stream() const { return stream_; }
