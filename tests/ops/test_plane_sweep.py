@@ -173,7 +173,7 @@ LARGE = {
 def test_large_sweeps_on_cuda(case, devices):
     arguments = make(**LARGE[case], dtype=torch.float32)
     for cpu, cuda, name in zip(*(run(arguments, device) for device in devices), ("cost", "gradient"), strict=True):
-        assert_close_relative_to_max(cuda, cpu, "plane_sweep_grad_float32", name)
+        assert_close_relative_to_max(cuda, cpu, "plane_sweep_large", name)
 
 
 def test_cuda_skips_what_is_out_of_range(devices):

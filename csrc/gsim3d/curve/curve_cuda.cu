@@ -1,7 +1,9 @@
 #include <cub/device/device_radix_sort.cuh>
+#include <cub/device/device_scan.cuh>
 
 #include "gsim3d/core/cuda_utils.cuh"
 #include "gsim3d/curve/curve.h"
+#include "gsim3d/curve/curve_device.cuh"
 
 namespace gsim3d::cuda {
 namespace {
@@ -26,12 +28,19 @@ __global__ void iota_kernel(int64_t n, uint32_t* __restrict__ index) {
   if (i < n) index[i] = static_cast<uint32_t>(i);
 }
 
-__global__ void write_order_kernel(const uint32_t* __restrict__ index, int64_t n, int64_t* __restrict__ order,
-                                   int64_t* __restrict__ inverse) {
+// Unsigned order of the flipped codes is signed order of the codes.
+__global__ void flip_sign_kernel(const int64_t* __restrict__ codes, int64_t n, uint64_t* __restrict__ keys) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= n) return;
+  if (i < n) keys[i] = static_cast<uint64_t>(codes[i]) ^ uint64_t{1} << 63;
+}
+
+__global__ void write_order_kernel(const uint32_t* __restrict__ index, int64_t n, int64_t total,
+                                   int64_t* __restrict__ order, int64_t* __restrict__ inverse) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= total) return;
+  const int64_t row = i / n * n;
   order[i] = index[i];
-  inverse[index[i]] = i;
+  inverse[row + index[i]] = i - row;
 }
 
 }  // namespace
@@ -51,26 +60,42 @@ void curve_encode(const int64_t* grid, const int64_t* cloud, int64_t n, int64_t 
   }
 }
 
+void sort_rows(const char* op, const uint64_t* keys, int64_t rows, int64_t n, int bits, uint64_t* sorted,
+               uint32_t* index, const Workspace& workspace, Stream stream) {
+  if (n == 0) return;
+  uint32_t* iota = workspace.take<uint32_t>(n);
+  launch(op, iota_kernel, blocks_for(op, n, kThreads), kThreads, 0, stream, n, iota);
+  size_t bytes = 0;
+  const auto sort = [&](void* scratch, int64_t r) {
+    check_cuda(cub::DeviceRadixSort::SortPairs(scratch, bytes, keys + r * n, sorted + r * n, iota, index + r * n, n, 0,
+                                               bits, native(stream)),
+               op);
+  };
+  sort(nullptr, 0);
+  void* scratch = workspace.take<char>(static_cast<int64_t>(bytes));
+  for (int64_t r = 0; r < rows; ++r) sort(scratch, r);
+}
+
+void exclusive_sums(const char* op, const uint32_t* values, int64_t n, uint32_t* sums, const Workspace& workspace,
+                    Stream stream) {
+  size_t bytes = 0;
+  check_cuda(cub::DeviceScan::ExclusiveSum(nullptr, bytes, values, sums, n, native(stream)), op);
+  void* scratch = workspace.take<char>(static_cast<int64_t>(bytes));
+  check_cuda(cub::DeviceScan::ExclusiveSum(scratch, bytes, values, sums, n, native(stream)), op);
+}
+
 void curve_sort(const int64_t* codes, int64_t rows, int64_t n, int64_t* order, int64_t* inverse,
                 const Workspace& workspace, Stream stream) {
   const char* op = "curve_sort";
   check(n < int64_t{1} << 32, op, ": rows must have fewer than 2^32 codes; got ", n);
-  if (n == 0) return;
-  const unsigned blocks = blocks_for(op, n, kThreads);
-  uint32_t* iota = workspace.take<uint32_t>(n);
-  uint32_t* index = workspace.take<uint32_t>(n);
-  int64_t* sorted = workspace.take<int64_t>(n);
-  launch(op, iota_kernel, blocks, kThreads, 0, stream, n, iota);
-  size_t bytes = 0;
-  const auto sort = [&](void* scratch, const int64_t* keys) {
-    check_cuda(cub::DeviceRadixSort::SortPairs(scratch, bytes, keys, sorted, iota, index, n, 0, 64, native(stream)), op);
-  };
-  sort(nullptr, codes);
-  void* scratch = workspace.take<char>(static_cast<int64_t>(bytes));
-  for (int64_t r = 0; r < rows; ++r) {
-    sort(scratch, codes + r * n);
-    launch(op, write_order_kernel, blocks, kThreads, 0, stream, index, n, order + r * n, inverse + r * n);
-  }
+  const int64_t total = rows * n;
+  if (total == 0) return;
+  uint64_t* keys = workspace.take<uint64_t>(total);
+  uint64_t* sorted = workspace.take<uint64_t>(total);
+  uint32_t* index = workspace.take<uint32_t>(total);
+  launch(op, flip_sign_kernel, blocks_for(op, total, kThreads), kThreads, 0, stream, codes, total, keys);
+  sort_rows(op, keys, rows, n, 64, sorted, index, workspace, stream);
+  launch(op, write_order_kernel, blocks_for(op, total, kThreads), kThreads, 0, stream, index, n, total, order, inverse);
 }
 
 }  // namespace gsim3d::cuda

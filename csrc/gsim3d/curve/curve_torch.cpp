@@ -79,7 +79,6 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
             std::is_sorted(cu_kernels.begin(), cu_kernels.end()),
         op, ": cu_kernels must ascend from 0 to len(kernel_sizes)=", kernel_sizes.size());
 
-  check(!positions_.is_cuda(), op, ": positions must be on the CPU; got ", device_of(positions_));
   check_shape(op, "positions", positions_, {-1, 3}, "[N, 3]");
   check_dtype(op, "cu_rows", cu_rows_, ScalarType::Long);
   check_dtype(op, "cloud_scene", cloud_scene_, ScalarType::Long);
@@ -90,6 +89,10 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
   check_shape(op, "cloud_scene", cloud_scene_, {n_clouds}, "[Q]");
   check_shape(op, "cloud_slot", cloud_slot_, {n_clouds}, "[Q]");
   check_shape(op, "origin", origin_, {-1, 3}, "[B, 3]");
+  check_device(op, "cu_rows", cu_rows_, positions_);
+  check_device(op, "cloud_scene", cloud_scene_, positions_);
+  check_device(op, "cloud_slot", cloud_slot_, positions_);
+  check_device(op, "origin", origin_, positions_);
 
   const Tensor positions = rows_of(positions_), cu_rows = rows_of(cu_rows_), cloud_scene = rows_of(cloud_scene_);
   const Tensor cloud_slot = rows_of(cloud_slot_), origin = rows_of(origin_);
@@ -101,6 +104,9 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
     const PyramidClouds<T> clouds{data<T>(positions),       data<int64_t>(cu_rows), data<int64_t>(cloud_scene),
                                   data<int64_t>(cloud_slot), data<double>(origin),   positions.size(0),
                                   n_clouds,                 origin.size(0)};
+    if constexpr (kWithCuda)
+      if (positions.is_cuda())
+        return cuda::build_pyramid(clouds, spec, {&TensorArrays::append, &arrays}, workspace, current_stream(positions));
     cpu::build_pyramid(clouds, spec, {&TensorArrays::append, &arrays}, workspace, torch_parallel());
   });
   return std::move(arrays.made);
