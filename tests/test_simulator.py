@@ -13,6 +13,7 @@ from gsim3d.encoder import EncoderConfig
 from gsim3d.presets import ModelConfig
 from gsim3d.renderer import RendererConfig
 from gsim3d.simulator import Simulator
+from gsim3d.train.loop import deterministic
 from gsim3d.types import FROZEN, Cameras, Frames
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import TINY
@@ -91,7 +92,10 @@ def awake(simulator):
 
 def target_cameras(frames, n_scenes):
     """One camera for each scene's newest cloud."""
-    return frames.cameras.select(torch.zeros(n_scenes, dtype=torch.int64), torch.arange(n_scenes))
+    device = frames.images.device
+    return frames.cameras.select(
+        torch.zeros(n_scenes, dtype=torch.int64, device=device), torch.arange(n_scenes, device=device)
+    )
 
 
 def test_encode_step_rollout_render():
@@ -303,3 +307,27 @@ def test_presets_are_consistent_and_of_the_stated_size():
 def test_parts_that_do_not_fit_raise(change, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(CONFIG, **change)
+
+
+def images_and_gradients(device, dtype):
+    """A rollout of 2 steps in one picture each, and the gradient of every parameter."""
+    simulator = awake(make_simulator()).to(device, dtype)
+    frames = make_frames((2, 3)).to(device)
+    frames = dataclasses.replace(frames, images=frames.images.to(dtype))
+    steps = simulator.rollout(simulator.encode(frames), 2)
+    cameras = target_cameras(frames, 2).to(device)
+    images = torch.stack([simulator.render(step, cameras).color for step in steps])
+    return images.detach(), *torch.autograd.grad(images.square().sum(), list(simulator.parameters()))
+
+
+def test_cuda_equals_cpu(devices):
+    cpu, cuda = (images_and_gradients(device, torch.float64) for device in devices)
+    for i, (a, b) in enumerate(zip(cuda, cpu, strict=True)):
+        assert_close_relative_to_max(a, b, 1e-9, f"output {i}")
+
+
+def test_a_rollout_and_its_gradients_repeat_bit_by_bit(device):
+    with deterministic():
+        runs = [images_and_gradients(device, torch.float32) for _ in range(2)]
+    for i, (a, b) in enumerate(zip(*runs, strict=True)):
+        assert_same_bits(a, b, f"output {i}")

@@ -145,8 +145,11 @@ class Bench:
         return result
 
     def gpu(self, case: str, dtype: str, ours, peers: dict, *, target_ratio=None, limit_ms=None, tolerance=1e-5) -> None:
-        """``peers``: name -> callable, the fastest counts; empty where none is installed. ``tolerance`` bounds the error
+        """``peers``: name -> callable, the fastest counts, or the milliseconds once recorded of a peer that cannot run here;
+        empty where there is none. ``tolerance`` bounds the error
         against each peer, relative to the largest value; None where the caller has compared the results by its own rule."""
+        recorded = {name: peer for name, peer in peers.items() if not callable(peer)}
+        peers = {name: peer for name, peer in peers.items() if callable(peer)}
         error = None
         if tolerance is not None:
             for name, peer in peers.items():
@@ -172,6 +175,7 @@ class Bench:
         }
         low, ours_ms, high = statistics.quantiles(times["gsim3d"], n=4, method="inclusive")
         medians = {name: statistics.median(values) for name, values in times.items() if name != "gsim3d"}
+        medians |= recorded
         peer = min(medians, key=medians.get) if medians else None
         row = {
             "op": self.op, "case": case, "dtype": dtype, "ours_ms": ours_ms, "ours_graph_ms": graph_ms["gsim3d"],
