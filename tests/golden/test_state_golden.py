@@ -9,10 +9,9 @@ from torch.nn import functional as F
 from gsim3d.dynamics import Dynamics, DynamicsConfig, last_steps, rollout
 from gsim3d.dynamics.state import StateLayout
 from gsim3d.harmonics import degree_damping
-from gsim3d.interop.released import dynamics_weights
 from gsim3d.quirks import Quirks
 from gsim3d.types import FROZEN
-from tests.golden.published import close, dynamics_config, particles_of
+from tests.golden.published import close, dynamics_config, particles_of, renamed
 from tests.golden_files import golden
 
 pytestmark = pytest.mark.golden
@@ -103,8 +102,7 @@ def load_dynamics(g):
         dynamics_config("small"), grid_size=float(g["grid_size"]), max_step=float(g["metric"]) / 2
     )
     dynamics = Dynamics(config).eval()
-    weights = {key.removeprefix("net."): value for key, value in (g / "w").dict().items()}
-    dynamics.net.load_state_dict(dynamics_weights(weights))
+    dynamics.net.load_state_dict(renamed(g / "w"))
     return dynamics
 
 
