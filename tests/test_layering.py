@@ -18,7 +18,7 @@ ROOMS = [
     {"generate"},
     {"train"},
     {"evaluate"},
-    {"simulate", "import_released", "demo", "doctor"},
+    {"simulate", "check_data", "import_released", "demo", "doctor"},
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}
