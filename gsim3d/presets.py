@@ -112,22 +112,28 @@ def small() -> ModelConfig:
     )
 
 
-def paper_latent(n_steps: int = 4) -> ModelConfig:
-    """The latent model of the paper (32 + 32 latents) for a history of ``n_steps``: 1, 2, 4 or 8."""
+def paper_latent(n_steps: int = 4, latents: int = 32) -> ModelConfig:
+    """The latent model of the paper for a history of ``n_steps``: 1, 2, 4 or 8.
+
+    latents: channels that change with time, and as many that do not; 32 in the paper, 64 in the published settings.
+    """
     return ModelConfig(
-        encoder=EncoderConfig(),
-        dynamics=DynamicsConfig(history_bits=_bits(n_steps)),
-        renderer=RendererConfig(),
+        encoder=EncoderConfig(dynamic_dim=latents, static_dim=latents),
+        dynamics=DynamicsConfig(dynamic_latents=latents, static_latents=latents, history_bits=_bits(n_steps)),
+        renderer=RendererConfig(latents=2 * latents),
     )
 
 
-def paper_explicit(n_steps: int = 4) -> ModelConfig:
-    """The explicit model of the paper (all Gaussian parameters and 16 static latents) for a history of ``n_steps``."""
+def paper_explicit(n_steps: int = 4, static_latents: int = 16) -> ModelConfig:
+    """The explicit model of the paper for a history of ``n_steps``: all Gaussian parameters change with time.
+
+    static_latents: channels beside them; 16 in the paper, none in the published settings.
+    """
     return ModelConfig(
-        encoder=EncoderConfig(dynamic_dim=0, static_dim=16, explicit=True),
+        encoder=EncoderConfig(dynamic_dim=0, static_dim=static_latents, explicit=True),
         dynamics=DynamicsConfig(
             dynamic_latents=0,
-            static_latents=16,
+            static_latents=static_latents,
             explicit=True,
             scale_min=0.004,
             scale_max=0.14,

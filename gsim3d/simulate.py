@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Predicts the future of one scene and writes it as video and as 3D Gaussians."
     parser.epilog = EPILOG
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help="run folder, checkpoint folder or .safetensors file")
-    parser.add_argument("scene", metavar="SCENE", help="scene folder (with metadata.json)")
+    parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/data.md)")
     parser.add_argument("--out", metavar="DIR", required=True, help="folder to write; must not exist yet")
     parser.add_argument("--steps", type=int, help="steps to predict (default: to the end of the film)")
     parser.add_argument("--start", type=int, default=0, help="first input step (default: 0)")
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     if bad := [cam for cam in (*cams, *(args.context or ())) if not 0 <= cam < scene.n_cams]:
         raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
     prediction = predict(restored, scene, args.context or context, n_future, args.start)
-    images = as_bytes(render_steps(restored, prediction.particles, scene, cams))
+    images = as_bytes(render_steps(restored, prediction.particles, scene, cams, args.start))
     part = out.with_name(f".{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     try:

@@ -77,6 +77,7 @@ class Frames(_Tensors):
     origin: float64 [B, 3] metres, lower corner of each scene's workspace; voxels are counted from it.
     masks: bool [I, H, W], pixels that become particles; None: all.
     dynamic: bool [I, H, W], pixels of bodies that may move; None: all.
+    valid: bool [I, H, W], pixels that were filmed: no padding; losses look at no others; None: all.
     """
 
     images: Tensor
@@ -86,6 +87,7 @@ class Frames(_Tensors):
     origin: Tensor
     masks: Tensor | None = None
     dynamic: Tensor | None = None
+    valid: Tensor | None = None
 
     def to(self, device):
         return dataclasses.replace(super().to(device), cameras=self.cameras.to(device))

@@ -142,7 +142,7 @@ BAD = {
     "broken metadata": (["simulate", "{run}", "{metadata}", "--out", "{new}"], "metadata.json cannot be read"),
     "broken image": (["simulate", "{run}", "{image}", "--out", "{new}"], "cannot be decoded"),
     "missing image": (["simulate", "{run}", "{missing image}", "--out", "{new}"], "is missing"),
-    "other image size": (["simulate", "{run}", "{large}", "--out", "{new}"], "images of 40x40 pixels"),
+    "other image size": (["simulate", "{run}", "{large}", "--out", "{new}"], "images of 48x48 pixels"),
     "demo needs a folder": (["demo", "--out", "{config}"], "is not a folder"),
     "unknown world": (["generate", "lava", "--out", "{new}"], "lava"),
 }
@@ -161,7 +161,7 @@ def test_bad_input_gets_one_line_and_exit_code_2(capsys, work, tmp_path, name):
     for broken in words & {"image", "missing image", "metadata"}:
         places[broken] = broken_scene(work, tmp_path, broken)
     if "large" in words:
-        places["large"] = write_scene(tmp_path / "large", size=40)
+        places["large"] = write_scene(tmp_path / "large", size=48)
     before = sorted(tmp_path.rglob("*"))
     code, _, err = call(capsys, *(argument.format(**places) for argument in arguments))
     lines = [line for line in err.splitlines() if line.startswith("gsim3d: error: ")]

@@ -14,11 +14,11 @@ ROOMS = [
     {"encoder", "dynamics", "renderer"},
     {"presets"},
     {"simulator"},
-    {"data", "interop"},
+    {"data", "interop", "perceptual"},
     {"generate"},
     {"train"},
     {"evaluate"},
-    {"simulate", "demo", "doctor"},
+    {"simulate", "import_released", "demo", "doctor"},
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gsim3d.data.genesis import Scene
+from gsim3d.data.recording import BACKGROUND, MOVING
+from gsim3d.data.scene import Scene
 from gsim3d.errors import InputError
 from gsim3d.types import Cameras, Frames
 
-MOVING_BODY = 3  # segmentation id of every body that may move
 FEW_SCENES = 15  # below so many, one scene is held out
 
 
@@ -33,6 +33,21 @@ def split_scenes(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, l
     return [s for i, s in enumerate(scenes) if i not in held_out], [scenes[i] for i in sorted(held_out)]
 
 
+def published_split(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, list]:
+    """(train, test) by the rule of the published evaluation, to compare with its numbers; not for other use.
+
+    Fewer than 15 scenes are tested on one, of which training has seen all; more than 15 may give more test scenes than
+    the fraction says (150 of 1200).
+    """
+    if not 0 < test_fraction < 1:
+        raise InputError(f"test_fraction must lie between 0 and 1; got {test_fraction}")
+    n = len(scenes)
+    n_test = 1 if n < FEW_SCENES else max(1, int(test_fraction * n))
+    held_out = set(range(0, n, max(1, n // n_test)))
+    test = [scenes[i] for i in sorted(held_out)]
+    return (list(scenes) if len(test) < FEW_SCENES else [s for i, s in enumerate(scenes) if i not in held_out]), test
+
+
 def generator(seed: int, step: int, sample: int, purpose: str) -> np.random.Generator:
     """Random numbers of one purpose of one sample of one step; they do not depend on what was drawn before."""
     return np.random.default_rng([seed, step, sample, zlib.crc32(purpose.encode())])
@@ -49,7 +64,8 @@ def make_frames(
     Args:
         cams_per_scene: for each scene its camera numbers, the same at every step, or one list a step.
         steps_per_scene: for each scene its step numbers.
-        masked: also read the labels: masks = not background, dynamic = bodies that may move.
+        masked: also read the labels: masks = not background, dynamic = bodies that may move. Otherwise masks leave
+            out what was not filmed only (padding, borders of undistorted images).
 
     Raises: InputError for missing files, numbers out of range, and scenes whose image sizes differ.
     """
@@ -58,7 +74,7 @@ def make_frames(
             "make_frames needs one list of cameras and one of steps for each of one or more scenes; "
             f"got {len(scenes)} scenes, {len(cams_per_scene)} and {len(steps_per_scene)} lists"
         )
-    images, labels, cameras, cloud_scene, cloud_step, image_cloud = [], [], [], [], [], []
+    images, labels, valid, cameras, cloud_scene, cloud_step, image_cloud = [], [], [], [], [], [], []
     for number, (scene, cams, steps) in enumerate(zip(scenes, cams_per_scene, steps_per_scene)):
         _check_size(scene, scenes[0])
         steps = [int(s) for s in steps]
@@ -68,21 +84,28 @@ def make_frames(
             images.append(scene.images(chosen, [step])[0])
             if masked:
                 labels.append(scene.segmentation(chosen, [step])[0])
-            cameras.append(scene.cameras.select(torch.tensor(chosen, dtype=torch.int64)))
+            filmed = scene.valid(chosen, [step])
+            valid.append(
+                torch.ones(images[-1].shape[:1] + images[-1].shape[2:]).bool() if filmed is None else filmed[0]
+            )
+            cameras.append(scene.cameras_at(chosen, [step]))
             image_cloud += [len(cloud_scene)] * len(chosen)
             cloud_scene.append(number)
             cloud_step.append(slot)
     if not images:
         raise InputError("make_frames needs at least one step")
     labels = torch.cat(labels) if masked else None
+    valid = torch.cat(valid)
+    valid = None if bool(valid.all()) else valid
     return Frames(
         images=torch.cat(images).float() / 255,
         cameras=_join_cameras(cameras, image_cloud),
         cloud_scene=torch.tensor(cloud_scene, dtype=torch.int64),
         cloud_step=torch.tensor(cloud_step, dtype=torch.int64),
         origin=torch.from_numpy(np.stack([scene.origin for scene in scenes])),
-        masks=labels > 0 if masked else None,
-        dynamic=labels == MOVING_BODY if masked else None,
+        masks=labels != BACKGROUND if masked else valid,
+        dynamic=labels == MOVING if masked else None,
+        valid=valid,
     )
 
 

@@ -6,6 +6,8 @@ Baselines:
 - ``copy``: the true last input frame of the same camera (no model at all);
 - ``constant_velocity``: the last encoded step; what may move goes on as far a step as its centroid went last;
 - ``release_constant``: the first predicted step, held still (the baseline of the published evaluation).
+
+Predictions of other models (predictions.py) are scored on the same steps, views and scenes.
 """
 
 from __future__ import annotations
@@ -18,15 +20,16 @@ import torch
 from torch import Tensor
 
 from gsim3d.data import Scene, make_frames
+from gsim3d.data.recording import BACKGROUND
 from gsim3d.dynamics import concatenate
 from gsim3d.errors import InputError
-from gsim3d.evaluate.metrics import psnr, ssim
+from gsim3d.evaluate.predictions import Predictions
+from gsim3d.evaluate.scoring import PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.train.restore import Restored
 from gsim3d.train.samples import context_cameras, spread_views, thin_background
 from gsim3d.types import DYNAMIC, Particles
 
 METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant")
-METRICS = ("psnr", "psnr_masked", "psnr_body", "ssim")
 
 
 @dataclass(frozen=True)
@@ -44,19 +47,6 @@ class Prediction:
     @property
     def n_steps(self) -> int:
         return self.particles.n_clouds
-
-
-@dataclass(frozen=True)
-class SceneScores:
-    """Scores of one scene: metric values [S] by step for each method, means over the target views.
-
-    Steps before ``n_encoded`` are reconstructions, the others predictions; baselines have NaN at the former. A value
-    that no image has (an empty mask) is NaN.
-    """
-
-    scene: str
-    n_encoded: int
-    values: dict[str, dict[str, Tensor]]
 
 
 def default_views(restored: Restored, scene: Scene) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -90,11 +80,15 @@ def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_fut
 
 
 @torch.no_grad()
-def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int]) -> Tensor:
-    """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles, seen by cameras ``cams``."""
+def render_steps(
+    restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int], start: int = 0
+) -> Tensor:
+    """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles, seen by cameras ``cams``.
+
+    The first cloud is step ``start`` of the film, which matters where cameras move.
+    """
     n_steps, n_views = particles.n_clouds, len(cams)
-    rows = torch.tensor(list(cams)).repeat(n_steps)
-    cameras = scene.cameras.select(rows, torch.arange(n_steps).repeat_interleave(n_views))
+    cameras = scene.cameras_at(cams, range(start, start + n_steps))
     images = restored.simulator.render(particles, cameras, plan=restored.plan).color
     return images.clamp(0, 1).unflatten(0, (n_steps, n_views))
 
@@ -114,13 +108,13 @@ def constant_velocity(prediction: Prediction) -> Particles:
     return concatenate(steps)
 
 
-def check_horizon(restored: Restored, scene: Scene, n_future: int | None) -> int:
-    """Steps that can be predicted and compared: ``n_future``, or all that the film has after the input.
+def horizon(scene: Scene, n_encoded: int, n_future: int | None) -> int:
+    """Steps that can be predicted and compared: ``n_future``, or all that the film has after ``n_encoded``.
 
     Raises:
         InputError: the film is too short.
     """
-    known = scene.n_steps - restored.data.history
+    known = scene.n_steps - n_encoded
     n_future = known if n_future is None else n_future
     if n_future > known or n_future < 1:
         raise InputError(f"{scene.path}: {n_future} steps to compare, but only {max(0, known)} after the input")
@@ -128,38 +122,64 @@ def check_horizon(restored: Restored, scene: Scene, n_future: int | None) -> int
 
 
 def score_scene(
-    restored: Restored,
+    restored: Restored | None,
     scene: Scene,
     *,
     context_cams: Sequence[int] | None = None,
     target_cams: Sequence[int] | None = None,
+    n_encoded: int | None = None,
     n_future: int | None = None,
+    metrics: Sequence[str] = PLAIN_METRICS,
+    others: Sequence[Predictions] = (),
 ) -> SceneScores:
     """Predicts a scene from its first steps and scores every method on the target views.
 
     Args:
-        context_cams, target_cams: default those of :func:`default_views`.
+        restored: the model; None: only ``others`` and ``copy`` are scored.
+        context_cams, target_cams: default those of :func:`default_views`; without a model targets must be given.
+        n_encoded: steps that the others were given; the model always takes those of its training.
         n_future: steps to predict; default to the end of the film.
+        metrics: see :func:`gsim3d.evaluate.scoring.measurable`.
+        others: predictions of other models.
     """
-    defaults = default_views(restored, scene)
-    context_cams, target_cams = context_cams or defaults[0], list(target_cams or defaults[1])
-    n_encoded = restored.data.history
-    n_future = check_horizon(restored, scene, n_future)
+    if restored is not None:
+        defaults = default_views(restored, scene)
+        context_cams, target_cams = context_cams or defaults[0], target_cams or defaults[1]
+        n_encoded = restored.data.history
+    n_future = horizon(scene, n_encoded, n_future)
+    cams, steps = list(target_cams), range(n_encoded + n_future)
+    images = scene.images(cams, steps).permute(0, 1, 3, 4, 2).float() / 255
+    labels = scene.segmentation(cams, steps) if scene.has_segmentation() else None
+    truth = SceneTruth(scene.name, images, labels, scene.valid(cams, steps), n_encoded, metrics)
+    methods = {}
+    if restored is not None:
+        methods = _model_and_baselines(restored, scene, context_cams, cams, n_future)
+    for other in others:
+        predicted = other.images(scene, cams, n_encoded, n_future).float() / 255
+        if scene.recording.is_film and labels is not None:  # the film's own background is black there
+            predicted *= (labels[n_encoded:] != BACKGROUND)[..., None]
+        methods[other.name] = torch.cat([images[:n_encoded], predicted])
+    methods["copy"] = _held(images, n_encoded - 1, n_encoded)
+    order = ("model", *(other.name for other in others), *METHODS[1:])
+    return truth.score({name: methods[name] for name in order if name in methods})
+
+
+def _model_and_baselines(
+    restored: Restored, scene: Scene, context_cams: Sequence[int], cams: list[int], n_future: int
+) -> dict[str, Tensor]:
+    """Images [S, V, H, W, 3] of the model and of the baselines made from its particles."""
     prediction = predict(restored, scene, context_cams, n_future)
-    steps = range(n_encoded + n_future)
-    truth = scene.images(target_cams, steps).permute(0, 1, 3, 4, 2).float() / 255
-    labels = scene.segmentation(target_cams, steps) if scene.has_segmentation() else None
-    images = {"model": render_steps(restored, prediction.particles, scene, target_cams)}
-    images["constant"] = _held(images["model"], n_encoded - 1, n_encoded)
-    images["copy"] = _held(truth, n_encoded - 1, n_encoded)
-    moved = render_steps(restored, constant_velocity(prediction), scene, target_cams)
+    n_encoded = prediction.n_encoded
+    images = {"model": render_steps(restored, prediction.particles, scene, cams)}
+    moved = render_steps(restored, constant_velocity(prediction), scene, cams, n_encoded)
     images["constant_velocity"] = torch.cat([images["model"][:n_encoded], moved])
-    images["release_constant"] = _held(images["model"], n_encoded, n_encoded)
-    values = {name: _scores(images[name], truth, labels) for name in METHODS}
-    for name in METHODS[1:]:
-        for metric in values[name].values():
-            metric[:n_encoded] = torch.nan
-    return SceneScores(scene.name, n_encoded, values)
+    for name, step in (("constant", n_encoded - 1), ("release_constant", n_encoded)):
+        images[name] = _held(images["model"], step, n_encoded)
+        if scene.cameras_move:
+            still = prediction.particles.select_clouds(torch.tensor([step]))
+            for later in range(n_encoded, prediction.n_steps):
+                images[name][later] = render_steps(restored, still, scene, cams, later)[0]
+    return images
 
 
 def _moving_centroid(cloud: Particles) -> Tensor:
@@ -173,14 +193,3 @@ def _held(images: Tensor, step: int, n_encoded: int) -> Tensor:
     held[n_encoded:] = images[step]
     return held
 
-
-def _scores(images: Tensor, truth: Tensor, labels: Tensor | None) -> dict[str, Tensor]:
-    """Metric -> float64 [S], means over the views that have a value."""
-    n_steps, n_views = images.shape[:2]
-    flat, true = images.flatten(0, 1), truth.flatten(0, 1)
-    scores = {"psnr": psnr(flat, true)}
-    if labels is not None:
-        scores["psnr_masked"] = psnr(flat, true, labels.flatten(0, 1) > 0)
-        scores["psnr_body"] = psnr(flat, true, labels.flatten(0, 1) == 3)
-    scores["ssim"] = ssim(flat, true)
-    return {name: value.reshape(n_steps, n_views).nanmean(1) for name, value in scores.items()}

@@ -67,8 +67,17 @@ def save(run: str | Path, checkpoint: Checkpoint, keep: int = 2) -> Path:
     """
     root = Path(run) / "checkpoints"
     root.mkdir(parents=True, exist_ok=True)
-    folder = root / f"step_{checkpoint.state['step']:06d}"
-    part = root / f".{folder.name}.part"
+    folder = write(root / f"step_{checkpoint.state['step']:06d}", checkpoint)
+    _write_text(root / "last", folder.name)
+    for old in sorted(root.glob("step_*"))[:-keep]:
+        if old != folder:
+            shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+def write(folder: Path, checkpoint: Checkpoint) -> Path:
+    """Writes a checkpoint folder, whole or not at all; one that is there is replaced."""
+    part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
     for name, file in _WEIGHTS.items():
@@ -86,10 +95,6 @@ def save(run: str | Path, checkpoint: Checkpoint, keep: int = 2) -> Path:
         _sync(path)
     shutil.rmtree(folder, ignore_errors=True)
     os.replace(part, folder)
-    _write_text(root / "last", folder.name)
-    for old in sorted(root.glob("step_*"))[:-keep]:
-        if old != folder:
-            shutil.rmtree(old, ignore_errors=True)
     return folder
 
 

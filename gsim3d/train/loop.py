@@ -147,13 +147,15 @@ class Trainer:
         truth = targets.images.permute(0, 2, 3, 1)
         weighted = loss_config.body_weight and targets.dynamic is not None
         weight = 1 + loss_config.body_weight * targets.dynamic if weighted else None
+        if targets.valid is not None:
+            weight = targets.valid.float() if weight is None else weight * targets.valid
         weights = time_weights(
             batch.n_context, batch.n_future, balance=loss_config.balance, discount=loss_config.discount
         )
         step = batch.target_step()
         loss, _ = image_loss(images, truth, step, weights, weight)
         with torch.no_grad():
-            errors = mean_by_step(image_errors(images, truth), step, batch.n_context + batch.n_future)
+            errors = mean_by_step(image_errors(images, truth, targets.valid), step, batch.n_context + batch.n_future)
         return loss, errors
 
     def save(self) -> Path:

@@ -84,7 +84,7 @@ def draw_batch(
 
 def thin_background(frames: Frames, stride: int) -> Frames:
     """``frames`` of whose fixed pixels only those on every ``stride``-th row and column become particles."""
-    if stride == 1 or frames.masks is None:
+    if stride == 1 or frames.masks is None or frames.dynamic is None:
         return frames
     kept = torch.zeros(frames.masks.shape[1:], dtype=torch.bool, device=frames.masks.device)
     kept[stride // 2 :: stride, stride // 2 :: stride] = True

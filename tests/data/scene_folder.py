@@ -19,7 +19,7 @@ def camera(cam: int, width: int, height: int) -> dict:
     }
 
 
-def write_scene(folder: Path, *, n_steps=4, n_cams=3, width=10, height=8, seed=0, edits=None) -> dict:
+def write_scene(folder: Path, *, n_steps=4, n_cams=3, width=32, height=16, seed=0, edits=None) -> dict:
     """Writes a scene of random images; ``edits`` replace metadata keys (None removes one). Returns the arrays."""
     template = "{img_type}/cam_{cam_ix}/{n_step:04d}"
     rng = np.random.default_rng(seed)

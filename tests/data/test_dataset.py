@@ -38,14 +38,14 @@ def test_make_frames_packs_clouds_by_scene_and_step(scenes):
     assert frames.cloud_scene.tolist() == [0, 0, 1, 1] and frames.cloud_step.tolist() == [0, 1, 0, 1]
     assert frames.cameras.image_cloud.tolist() == [0, 0, 1, 1, 2, 3, 3, 3]
     expected = [(0, 1, 0), (0, 1, 3), (0, 2, 0), (0, 2, 3), (1, 0, 1), (1, 5, 2), (1, 5, 4), (1, 5, 0)]
-    assert frames.images.shape == (8, 3, 8, 10) and frames.images.dtype == torch.float32
+    assert frames.images.shape == (8, 3, 16, 32) and frames.images.dtype == torch.float32
     for row, (scene, step, cam) in enumerate(expected):
         image = scenes[scene].images([cam], [step])[0, 0]
         label = scenes[scene].segmentation([cam], [step])[0, 0]
         assert torch.equal(frames.images[row], image.float() / 255)
         assert torch.equal(frames.masks[row], label > 0) and torch.equal(frames.dynamic[row], label == 3)
-        assert torch.equal(frames.cameras.viewmats[row], scenes[scene].cameras.viewmats[cam])
-        assert torch.equal(frames.cameras.Ks[row], scenes[scene].cameras.Ks[cam])
+        assert torch.equal(frames.cameras.viewmats[row], scenes[scene].cameras_at([cam], [step]).viewmats[0])
+        assert torch.equal(frames.cameras.Ks[row], scenes[scene].cameras_at([cam], [step]).Ks[0])
     assert frames.origin.dtype == torch.float64 and frames.origin.tolist() == [[0, 0, 0], [1, 0, 0]]
 
 
@@ -56,7 +56,7 @@ def test_make_frames_without_labels(scenes, tmp_path):
     assert not scene.has_segmentation()
     frames = make_frames([scene], [[0]], [[0]], masked=False)
     assert frames.masks is None and frames.dynamic is None
-    with pytest.raises(InputError, match="seg.*missing"):
+    with pytest.raises(InputError, match="no labels"):
         make_frames([scene], [[0]], [[0]])
 
 
@@ -69,8 +69,8 @@ def test_make_frames_errors(scenes, tmp_path):
         make_frames(scenes[:1], [[[0]]], [[0, 1]])
     with pytest.raises(InputError, match="at least one step"):
         make_frames(scenes[:1], [[0]], [[]])
-    write_scene(tmp_path / "wide", width=12)
-    with pytest.raises(InputError, match="12x8"):
+    write_scene(tmp_path / "wide", width=48)
+    with pytest.raises(InputError, match="48x16"):
         make_frames([scenes[0], Scene.open(tmp_path / "wide")], [[0], [0]], [[0], [0]])
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsim3d.data import Scene, find_scenes
-from gsim3d.data.genesis import frusta_origin
+from gsim3d.data.cameras import frusta_origin
 from gsim3d.errors import InputError
 from tests.data.scene_folder import camera, write_scene
 
@@ -17,10 +17,10 @@ def test_images_and_labels_come_back_as_written(tmp_path):
     written = write_scene(tmp_path)
     scene = Scene.open(tmp_path)
     images = scene.images([2, 0], [3, 1, 1])
-    assert images.shape == (3, 2, 3, 8, 10) and images.dtype == torch.uint8
+    assert images.shape == (3, 2, 3, 16, 32) and images.dtype == torch.uint8
     np.testing.assert_array_equal(images.permute(0, 1, 3, 4, 2), written["rgb"][[3, 1, 1]][:, [2, 0]])
     labels = scene.segmentation([1], [0])
-    assert labels.shape == (1, 1, 8, 10) and labels.dtype == torch.uint8
+    assert labels.shape == (1, 1, 16, 32) and labels.dtype == torch.uint8
     np.testing.assert_array_equal(labels[0, 0], written["seg"][0, 1])
 
 
@@ -36,10 +36,10 @@ def test_attributes(tmp_path):
 def test_cameras_keep_the_stored_convention(tmp_path):
     """Extrinsics are world-to-camera, intrinsics stay in pixels with the full principal point."""
     write_scene(tmp_path)
-    cameras = Scene.open(tmp_path).cameras
-    assert len(cameras) == 3 and (cameras.width, cameras.height) == (10, 8)
+    cameras = Scene.open(tmp_path).cameras_at(range(3), [0])
+    assert len(cameras) == 3 and (cameras.width, cameras.height) == (32, 16)
     for cam in range(3):
-        entry = camera(cam, 10, 8)
+        entry = camera(cam, 32, 16)
         np.testing.assert_allclose(cameras.viewmats[cam], entry["extrinsics"], atol=1e-7)
         np.testing.assert_array_equal(cameras.Ks[cam], entry["intrinsics"])
     assert cameras.near.tolist() == [1.0] * 3 and cameras.far.tolist() == [4.0] * 3
@@ -52,18 +52,18 @@ def test_default_origin_bounds_the_frusta(tmp_path):
     rng = np.random.default_rng(0)
     points = []
     for cam in range(3):
-        entry = camera(cam, 10, 8)
-        pixel = np.stack([rng.uniform(0, 10, 500), rng.uniform(0, 8, 500), np.ones(500)])
+        entry = camera(cam, 32, 16)
+        pixel = np.stack([rng.uniform(0, 32, 500), rng.uniform(0, 16, 500), np.ones(500)])
         local = np.linalg.inv(entry["intrinsics"]) @ pixel * rng.uniform(1, 4, 500)
         rotation, shift = np.array(entry["extrinsics"])[:3, :3], np.array(entry["extrinsics"])[:3, 3:]
         points.append((rotation.T @ (local - shift)).T)
     lowest = np.concatenate(points).min(0)
     assert (scene.origin <= lowest).all() and (scene.origin > lowest - 0.5).all()
-    moved = np.array([camera(cam, 10, 8)["extrinsics"] for cam in range(3)])
+    moved = np.array([camera(cam, 32, 16)["extrinsics"] for cam in range(3)])
     shift = np.array([1.5, -2.0, 0.25])
     moved[:, :3, 3] -= moved[:, :3, :3] @ shift
-    Ks = np.array([camera(cam, 10, 8)["intrinsics"] for cam in range(3)])
-    np.testing.assert_allclose(frusta_origin(moved, Ks, 10, 8, 1.0, 4.0), scene.origin + shift, atol=1e-12)
+    Ks = np.array([camera(cam, 32, 16)["intrinsics"] for cam in range(3)])
+    np.testing.assert_allclose(frusta_origin(moved, Ks, [(32, 16)] * 3, 1.0, 4.0), scene.origin + shift, atol=1e-12)
 
 
 def test_published_metadata_needs_no_extras(tmp_path):
@@ -77,7 +77,7 @@ def test_labels_and_colours_are_never_shifted(tmp_path):
     import cv2
 
     cv2.imwrite(str(tmp_path / "seg/cam_0/0000.png"), np.maximum(written["seg"][0, 0], 1))
-    cv2.imwrite(str(tmp_path / "rgb/cam_0/0000.png"), np.full((8, 10, 3), 7, dtype=np.uint8))
+    cv2.imwrite(str(tmp_path / "rgb/cam_0/0000.png"), np.full((16, 32, 3), 7, dtype=np.uint8))
     scene = Scene.open(tmp_path)
     assert scene.segmentation([0], [0]).min() == 1
     assert (scene.images([0], [0]) == 7).all()
@@ -125,7 +125,7 @@ def test_find_scenes_errors(tmp_path):
 
 
 def edited_camera(key, value, cam=0):
-    return {f"cam_{cam}": {**camera(cam, 10, 8), key: value}}
+    return {f"cam_{cam}": {**camera(cam, 32, 16), key: value}}
 
 
 NAN_MATRIX = [[float("nan")] * 4] * 4
@@ -160,9 +160,8 @@ MIRROR = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (edited_camera("extrinsics", MIRROR), "rigid motion"),
         (edited_camera("extrinsics", None), "cam_0.extrinsics"),
         (edited_camera("intrinsics", [[0, 0, 5], [0, 30, 4], [0, 0, 1]]), "focal lengths"),
-        (edited_camera("resolution", [10, 8.5]), "cam_0.resolution"),
-        (edited_camera("resolution", [10**9, 8]), "cam_0.resolution"),
-        (edited_camera("resolution", [8, 10], cam=2), "cam_2 has resolution"),
+        (edited_camera("resolution", [32, 16.5]), "cam_0.resolution"),
+        (edited_camera("resolution", [10**9, 16]), "cam_0.resolution"),
         ({"cam_1": 3}, "cam_1 is missing"),
     ],
 )
@@ -213,16 +212,16 @@ def test_broken_images_are_named(tmp_path):
     files[0].unlink()
     files[1].write_bytes(b"")
     files[2].write_bytes(files[3].read_bytes()[:40])
-    cv2.imwrite(str(files[3]), np.zeros((10, 8, 3), dtype=np.uint8))
+    cv2.imwrite(str(files[3]), np.zeros((32, 16, 3), dtype=np.uint8))
     scene = Scene.open(tmp_path)
-    for step, message in enumerate(["is missing", "cannot be decoded", "cannot be decoded", "8x10 pixels"]):
+    for step, message in enumerate(["is missing", "cannot be decoded", "cannot be decoded", "16x32 pixels"]):
         with pytest.raises(InputError, match=message) as error:
             scene.images([0], [step])
         assert str(files[step]) in str(error.value)
-    cv2.imwrite(str(tmp_path / "seg/cam_0/0000.png"), np.eye(10)[:8, :, None] * [255, 0, 0])
+    cv2.imwrite(str(tmp_path / "seg/cam_0/0000.png"), np.eye(32)[:16, :, None] * [255, 0, 0])
     with pytest.raises(InputError, match="one channel"):
         scene.segmentation([0], [0])
-    cv2.imwrite(str(files[0]), np.zeros((8, 10), dtype=np.uint16))
+    cv2.imwrite(str(files[0]), np.zeros((16, 32), dtype=np.uint16))
     with pytest.raises(InputError, match="8 bits"):
         scene.images([0], [0])
 

@@ -11,10 +11,9 @@ from gsim3d import presets
 from gsim3d.data import Scene
 from gsim3d.effects import EffectsSpec
 from gsim3d.errors import InputError
-from gsim3d.evaluate.pictures import as_bytes, comparison_frames, splat_picture, true_images, write_psnr_plot
+from gsim3d.evaluate.pictures import as_bytes, comparison_frames, splat_picture, true_images, write_curves
 from gsim3d.evaluate.protocol import (
     METHODS,
-    SceneScores,
     constant_velocity,
     default_views,
     predict,
@@ -22,6 +21,7 @@ from gsim3d.evaluate.protocol import (
     score_scene,
 )
 from gsim3d.evaluate.report import summarize, table, write_json
+from gsim3d.evaluate.scoring import SceneScores
 from gsim3d.train.checkpoint import Checkpoint
 from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import Restored, build_simulator
@@ -104,7 +104,7 @@ def test_what_does_not_fit_is_named(restored, scene):
 
 def example_scores(name="a", shift=0.0, n_steps=6):
     values = torch.arange(n_steps, dtype=torch.float64) + shift
-    return SceneScores(name, 2, {m: {"psnr": values.clone(), "ssim": values / 10} for m in METHODS})
+    return SceneScores(name, 2, {m: {"psnr": values.clone(), "ssim": values / 10} for m in METHODS}, {}, {})
 
 
 def test_summary_by_hand(tmp_path):
@@ -116,7 +116,7 @@ def test_summary_by_hand(tmp_path):
     write_json(tmp_path / "a.json", summary)
     assert json.loads((tmp_path / "a.json").read_text()) == summary
     assert "predicted" in table(summary) and "4.50" in table(summary)
-    write_psnr_plot(tmp_path / "a.png", summary, fps=12)
+    write_curves(tmp_path / "a.png", summary, fps=12)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "a.png"]
 
 

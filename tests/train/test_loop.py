@@ -191,7 +191,7 @@ def test_samples_depend_on_seed_and_step_only(folder):
 
 def test_target_only_cameras_are_never_an_input(folder):
     known = scenes(folder)
-    forbidden = known[0].cameras.viewmats[3]
+    forbidden = known[0].cameras_at([3], [0]).viewmats[0]
     for step in range(20):
         batch = draw_batch(known, CONFIG.data, CONFIG.stages[0], 0, step, [0, 1])
         assert not (batch.context.cameras.viewmats == forbidden).all(-1).all(-1).any()

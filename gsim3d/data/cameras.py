@@ -1,0 +1,218 @@
+"""Are these cameras what they should be? Checks in one convention, and what follows from cameras alone.
+
+Everything here is float64, world-to-camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsim3d.data.recording import Problems, Recording
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes (y up, z backwards) <-> OpenCV's
+ROTATION_TOLERANCE = 1e-3
+NORMALISED_FOCAL = 8.0  # pixels; a focal length below it, of an image larger than it, is no focal length in pixels
+MIN_SPREAD = 0.02  # mean squared sine of the optical axes around their mean: about 8 degrees
+MANY_STEPS = 64  # of moving cameras, so many steps are enough to see where they look
+NEAR_SHARE, FAR_SHARE = 0.3, 2.0  # near and far relative to the distances of the point that the cameras look at
+SAMPLES = 12  # points along each side of a frustum
+
+
+def inverse(viewmats: np.ndarray) -> np.ndarray:
+    """Camera-to-world from world-to-camera or back, [..., 4, 4], of rigid motions."""
+    result = np.zeros_like(viewmats)
+    rotation = viewmats[..., :3, :3].swapaxes(-1, -2)
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = -(rotation @ viewmats[..., :3, 3:])[..., 0]
+    result[..., 3, 3] = 1
+    return result
+
+
+def check_pose(matrices: np.ndarray, what: str, problems: Problems) -> bool:
+    """Whether [4, 4] or [S, 4, 4] are rigid motions of right-handed axes; names the frame of the first that is not."""
+    moving = matrices.ndim == 3
+    stack = matrices if moving else matrices[None]
+    rotation = stack[:, :3, :3]
+    last_row = np.abs(stack[:, 3] - [0, 0, 0, 1]).max(1)
+    skewed = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max((1, 2))
+    determinant = np.linalg.det(rotation)
+    for wrong, describe in (
+        (last_row > ROTATION_TOLERANCE, lambda s: f"must end in the row 0 0 0 1; got {stack[s, 3].tolist()}"),
+        (
+            skewed > ROTATION_TOLERANCE,
+            lambda s: f"must be a rigid motion: its rotation is not orthonormal (off by {skewed[s]:.3g}); "
+            "it holds a scale or shear, or is cut off",
+        ),
+        (
+            determinant < 0,
+            lambda s: "must be a rigid motion: its rotation is left-handed (determinant -1); one axis is mirrored",
+        ),
+    ):
+        if wrong.any():
+            step = int(np.argmax(wrong))
+            problems.add(f"{what}{f' (frame {step})' if moving else ''} {describe(step)}")
+            return False
+    return True
+
+
+def check_intrinsics(Ks: np.ndarray, size: tuple[int, int], what: str, problems: Problems) -> bool:
+    """Whether [3, 3] or [S, 3, 3] are pinhole intrinsics in pixels of an image of ``size``."""
+    moving = Ks.ndim == 3
+    for step, K in enumerate(Ks if moving else Ks[None]):
+        place = f"{what}{f' (frame {step})' if moving else ''}"
+        (fx, fy), (cx, cy) = np.diag(K)[:2], K[:2, 2]
+        if np.abs(K[2] - [0, 0, 1]).max() > ROTATION_TOLERANCE or abs(K[1, 0]) > ROTATION_TOLERANCE * abs(K[1, 1]):
+            problems.add(f"{place} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
+        elif not (fx > 0 and fy > 0):
+            problems.add(f"{place}: focal lengths must be positive; got fx {fx:g}, fy {fy:g}")
+        elif min(fx, fy) < NORMALISED_FOCAL < max(size) and max(cx, cy) <= 2:
+            problems.add(
+                f"{place}: focal lengths must be in pixels; fx {fx:g}, fy {fy:g} of a {size[0]}x{size[1]} image look "
+                "as if divided by its size"
+            )
+        elif not (0 <= cx <= size[0] and 0 <= cy <= size[1]):
+            problems.add(
+                f"{place}: the principal point ({cx:g}, {cy:g}) lies outside the image of {size[0]}x{size[1]} pixels"
+            )
+        else:
+            continue
+        return False
+    return True
+
+
+def positions_and_axes(viewmats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Camera centres and optical axes in the world, [..., 3] each."""
+    return inverse(viewmats)[..., :3, 3], viewmats[..., 2, :3]
+
+
+def focus(viewmats: np.ndarray) -> np.ndarray | None:
+    """The point [3] nearest to all optical axes of [N, 4, 4]; None where the axes are nearly parallel."""
+    centres, axes = positions_and_axes(viewmats)
+    across = np.eye(3) - axes[:, :, None] * axes[:, None]
+    if len(axes) < 2 or np.linalg.eigvalsh(across.mean(0))[0] < MIN_SPREAD:
+        return None
+    return np.linalg.solve(across.sum(0), (across @ centres[:, :, None]).sum(0)[:, 0])
+
+
+def check_directions(recording: Recording, problems: Problems) -> None:
+    """Do the cameras look at one scene? Finds flipped axes and exchanged directions, which no single matrix shows."""
+    viewmats, where = spread_steps(recording.viewmats), recording.source
+    if recording.bounds is not None:
+        _check_view_of_bounds(recording, viewmats, problems)
+        return
+    flat = viewmats.reshape(-1, 4, 4)
+    found = _agreement(flat)
+    if found is None:
+        return
+    behind, error = found
+    hint = _better_convention(flat, behind, error)
+    if behind.all() or (hint and error > 0.5):
+        hint = hint or "are the camera axes OpenGL's (y up, z backwards)?"
+        problems.add(f"{where}: the cameras look away from each other's views: {hint}")
+        return
+    behind = behind.reshape(viewmats.shape[:2])
+    for cam in np.flatnonzero(behind.any(0)):
+        frame = f", frame {int(np.argmax(behind[:, cam]))}" if len(viewmats) > 1 else ""
+        problems.add(
+            f"{where}: camera {recording.camera_names[cam]}{frame} looks away from the point that the others look at: "
+            "are its y and z axes flipped? (if it is right, give the bounds of the scene)"
+        )
+
+
+def _agreement(viewmats: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """(which cameras have the focus behind them, distance of the axes from it relative to its distance)."""
+    point = focus(viewmats)
+    if point is None:
+        return None
+    centres, axes = positions_and_axes(viewmats)
+    to_point = point - centres
+    depth = (to_point * axes).sum(1)
+    distance = np.linalg.norm(to_point, axis=1)
+    off = np.sqrt(np.maximum(distance**2 - depth**2, 0))
+    return depth <= 0, float(np.sqrt((off**2).mean()) / max(distance.mean(), 1e-12))
+
+
+def _better_convention(viewmats: np.ndarray, behind: np.ndarray, error: float) -> str | None:
+    """What the matrices seem to be instead, where another reading makes all cameras look at one point."""
+    readings = {
+        "are the camera axes OpenGL's (y up, z backwards) instead of OpenCV's?": OPENGL @ viewmats,
+        "are the matrices camera-to-world instead of world-to-camera, or the reverse?": inverse(viewmats),
+        "are the matrices camera-to-world with OpenGL's axes?": OPENGL @ inverse(viewmats),
+    }
+    scored = {}
+    for hint, reading in readings.items():
+        found = _agreement(reading)
+        if found is not None and not found[0].any() and found[1] < 0.2:
+            scored[hint] = found[1]
+    best = min(scored, key=scored.get, default=None)
+    return best if best and (behind.all() or scored[best] < error / 4) else None
+
+
+def _check_view_of_bounds(recording: Recording, viewmats: np.ndarray, problems: Problems) -> None:
+    low, high = recording.bounds
+    grid = np.stack(np.meshgrid(*[np.linspace(0, 1, 5)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    Ks = spread_steps(recording.Ks)
+    sizes = np.array(recording.sizes, dtype=np.float64)
+    seen = _visible(low + grid * (high - low), viewmats, Ks, sizes).any((0, 2))
+    for cam in np.flatnonzero(~seen):
+        problems.add(
+            f"{recording.source}: camera {recording.camera_names[cam]} sees nothing of the bounds {low.tolist()} to "
+            f"{high.tolist()}: are its y and z axes flipped, or is its matrix camera-to-world?"
+        )
+
+
+def spread_steps(values: np.ndarray) -> np.ndarray:
+    """At most MANY_STEPS of the steps of [S, ...], evenly spread."""
+    chosen = np.linspace(0, len(values) - 1, min(len(values), MANY_STEPS)).round().astype(int)
+    return values[chosen]
+
+
+def project(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [..., N, 2] and depths [..., N] of world points [N, 3] in cameras [..., 4, 4], [..., 3, 3]."""
+    local = points @ viewmats[..., :3, :3].swapaxes(-1, -2) + viewmats[..., None, :3, 3]
+    image = local @ Ks.swapaxes(-1, -2)
+    depth = local[..., 2]
+    return image[..., :2] / np.where(np.abs(depth) < 1e-12, 1e-12, depth)[..., None], depth
+
+
+def _visible(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """bool [S, V, N]: is a point in front of a camera and inside its image?"""
+    pixels, depth = project(points, viewmats, Ks)
+    return (depth > 0) & (pixels >= 0).all(-1) & (pixels <= sizes[:, None]).all(-1)
+
+
+def depth_range(viewmats: np.ndarray) -> tuple[float, float] | None:
+    """near and far around the point that cameras [N, 4, 4] look at; None where they look at none."""
+    point = focus(viewmats)
+    if point is None:
+        return None
+    distance = np.linalg.norm(point - positions_and_axes(viewmats)[0], axis=1)
+    return NEAR_SHARE * float(distance.min()), FAR_SHARE * float(distance.max())
+
+
+def frusta_points(viewmats, Ks, sizes: Sequence[tuple[int, int]], near: float, far: float, samples: int) -> np.ndarray:
+    """World points [S, V, samples^3, 3] on a grid inside the frusta of cameras [S, V, ...], corners included."""
+    share = np.linspace(0, 1, samples)
+    grid = np.stack(np.meshgrid(share, share, 1 / np.linspace(1 / near, 1 / far, samples), indexing="ij"), -1)
+    grid = grid.reshape(-1, 3)
+    corner = grid[:, :2] * np.asarray(sizes, dtype=np.float64)[:, None]
+    pixels = np.concatenate([corner, np.ones((*corner.shape[:2], 1))], -1)
+    rays = pixels @ np.linalg.inv(Ks).swapaxes(-1, -2)
+    local = rays * grid[:, 2:]
+    poses = inverse(viewmats)
+    return local @ poses[..., :3, :3].swapaxes(-1, -2) + poses[..., None, :3, 3]
+
+
+def frusta_origin(viewmats, Ks, sizes: Sequence[tuple[int, int]], near: float, far: float) -> np.ndarray:
+    """Lower corner, float64 [3], of the box around all camera frusta between ``near`` and ``far``."""
+    return frusta_points(viewmats, Ks, sizes, near, far, 2).reshape(-1, 3).min(0)
+
+
+def shared_view(viewmats, Ks, sizes: Sequence[tuple[int, int]], near: float, far: float) -> np.ndarray:
+    """Box [2, 3] around what most cameras see at one step: by default what is shown as the scene's bounds."""
+    points = frusta_points(viewmats[:1], Ks[:1], sizes, near, far, SAMPLES)[0].reshape(-1, 3)
+    seen_by = _visible(points, viewmats[:1], Ks[:1], np.asarray(sizes, dtype=np.float64))[0].sum(0)
+    shared = points[seen_by >= 0.75 * seen_by.max()]
+    return np.stack([shared.min(0), shared.max(0)])

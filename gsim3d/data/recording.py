@@ -1,0 +1,202 @@
+"""What every reader makes of a scene folder, and what readers share: problems, numbers, files, frame numbers."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.errors import InputError
+
+MAX_STEPS, MAX_CAMS, MAX_SIZE = 1_000_000, 10_000, 16_384  # beyond them a description is taken to be broken
+MAX_JSON = 256 * 2**20  # bytes of one description
+SPACING_TOLERANCE = 0.01  # of the time between two steps
+BACKGROUND, FIXED, MOVING = 0, 1, 3  # labels of pixels: nothing, what never moves, bodies that may move
+
+# (camera, ascending steps, problems) -> one image a step; None for one that has a problem
+ReadImages = Callable[[int, Sequence[int], "Problems"], Iterator[np.ndarray | None]]
+
+
+class Problems:
+    """Where readers say what is wrong: the first problem is raised, or all are collected."""
+
+    def __init__(self, collect: bool = False):
+        self.collect = collect
+        self.found: list[str] = []
+
+    def add(self, message: str) -> None:
+        if not self.collect:
+            raise InputError(message)
+        self.found.append(message)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One scene as its reader found it, in gsim3d's conventions (OpenCV axes, pixel centres at +0.5, metres).
+
+    layout: name of the layout.          source: file that describes the cameras.
+    n_steps, fps: steps, and steps a second.
+    camera_names: V names, as messages show them.
+    viewmats [S, V, 4, 4], Ks [S, V, 3, 3]: float64; S is 1 for cameras that stand still, else n_steps.
+    sizes: (width, height) of each camera's images.
+    read_images: uint8 [h, w, 3], RGB.   read_labels: uint8 [h, w] of BACKGROUND, FIXED, MOVING; None: no labels.
+    distortions: per camera None or OpenCV's coefficients k1 k2 p1 p2 [k3 ...]; images are not undistorted yet.
+    near, far, origin, bounds: None where nobody gave them.
+    is_film: shows a real background: it is painted black where labels say so.
+    subtract_background: labels come from what differs from the median image of the camera.
+    """
+
+    layout: str
+    source: Path
+    n_steps: int
+    fps: float
+    camera_names: tuple[str, ...]
+    viewmats: np.ndarray
+    Ks: np.ndarray
+    sizes: tuple[tuple[int, int], ...]
+    read_images: ReadImages
+    read_labels: ReadImages | None = None
+    distortions: tuple[np.ndarray | None, ...] = ()
+    near: float | None = None
+    far: float | None = None
+    origin: np.ndarray | None = None
+    bounds: np.ndarray | None = None
+    is_film: bool = False
+    subtract_background: bool = False
+
+
+def read_json(file: Path) -> dict:
+    """The JSON object in ``file``. Raises InputError when it cannot be read or is none."""
+    try:
+        if file.stat().st_size > MAX_JSON:
+            raise InputError(f"{file} is larger than {MAX_JSON >> 20} MiB: no description of a scene")
+        content = json.loads(file.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{file} cannot be read: {error}") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{file} must hold a JSON object; got {type(content).__name__}")
+    return content
+
+
+def whole(value, limit: int, what: str, problems: Problems) -> int:
+    """``value`` as a whole number from 1 to ``limit``; 1 where it is none."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value // 1 or not 1 <= value <= limit:
+        problems.add(f"{what} must be a whole number from 1 to {limit}; got {value!r}")
+        return 1
+    return int(value)
+
+
+def positive(value, what: str, problems: Problems) -> float | None:
+    """``value`` as a positive number; None where it is none or absent."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
+        problems.add(f"{what} must be a positive number; got {value!r}")
+        return None
+    return float(value)
+
+
+def array(value, shapes: Sequence[tuple[int, ...]], what: str, problems: Problems) -> np.ndarray | None:
+    """``value`` as finite float64 numbers of one of ``shapes``; None where it is not."""
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = None
+    if numbers is None or numbers.shape not in shapes:
+        wanted = " or ".join(str(list(shape)) for shape in shapes)
+        got = repr(value)[:80] if numbers is None else str(list(numbers.shape))
+        problems.add(f"{what} must be numbers of shape {wanted}; got {got}")
+        return None
+    if not np.isfinite(numbers).all():
+        place = np.argwhere(~np.isfinite(numbers))[0]
+        frame = f" (frame {place[0]})" if len(shapes) > 1 and numbers.ndim == max(map(len, shapes)) else ""
+        problems.add(f"{what}{frame} holds values that are not finite")
+        return None
+    return numbers
+
+
+def image_size(value, what: str, problems: Problems) -> tuple[int, int]:
+    """(width, height); (1, 1) where ``value`` is none."""
+    size = array(value, [(2,)], what, problems)
+    if size is None:
+        return 1, 1
+    if (size != np.round(size)).any() or (size < 1).any() or (size > MAX_SIZE).any():
+        problems.add(f"{what} must be [width, height] in pixels; got {size.tolist()}")
+        return 1, 1
+    return int(size[0]), int(size[1])
+
+
+def workspace(description: dict, where: Path, problems: Problems) -> dict:
+    """The optional keys that every layout takes beside its own: near, far, origin, bounds."""
+    found = {key: positive(description.get(key), f"{where}: {key}", problems) for key in ("near", "far")}
+    if None not in found.values() and found["far"] <= found["near"]:
+        problems.add(f"{where}: far must lie beyond near; got near {found['near']} and far {found['far']}")
+        found["near"] = found["far"] = None
+    for key, shape in (("origin", (3,)), ("bounds", (2, 3))):
+        value = description.get(key)
+        found[key] = None if value is None else array(value, [shape], f"{where}: {key}", problems)
+    bounds = found["bounds"]
+    if bounds is not None and (bounds[0] >= bounds[1]).any():
+        problems.add(f"{where}: bounds must be [lower corner, upper corner]; got {bounds.tolist()}")
+        found["bounds"] = None
+    return found
+
+
+def inside(folder: Path, relative: str, where: str) -> Path:
+    """``folder / relative``. Raises InputError when that leads out of ``folder``, also through links."""
+    file = folder / relative
+    try:
+        if file.resolve().is_relative_to(folder.resolve()):
+            return file
+    except (OSError, ValueError, RuntimeError):
+        pass
+    raise InputError(f"{where} leads out of the scene: {str(relative)[:200]!r}")
+
+
+def natural_order(text: str) -> list:
+    """Sort key by which frame2 comes before frame10."""
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", text)]
+
+
+def trailing_number(name: str) -> int | None:
+    """The last number in a file name without its ending."""
+    digits = re.findall(r"\d+", name)
+    return int(digits[-1]) if digits and len(digits[-1]) <= 9 else None
+
+
+def common_numbers(numbers: dict[str, Sequence[int]], where: Path, problems: Problems) -> list[int]:
+    """Frame numbers that all cameras have, evenly spaced; what a camera lacks is a problem."""
+    every = sorted(set().union(*numbers.values()))
+    for camera, own in numbers.items():
+        missing = sorted(set(every) - set(own))
+        if missing:
+            shown = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
+            longest = max(numbers, key=lambda name: len(numbers[name]))
+            problems.add(
+                f"{where}: camera {camera} has {len(own)} frames, camera {longest} {len(numbers[longest])}; "
+                f"missing: frame {shown}"
+            )
+    common = sorted(set(every).intersection(*numbers.values()))
+    gaps = np.diff(common)
+    if len(gaps) and (gaps != gaps.min()).any() and common == every:
+        late = int(np.argmax(gaps != gaps.min()))
+        problems.add(
+            f"{where}: frame numbers are times and must be evenly spaced; from frame {common[late]} on the next is "
+            f"{common[late + 1]}, but elsewhere {gaps.min()} later"
+        )
+    return common
+
+
+def step_rate(times: np.ndarray) -> tuple[float, int | None]:
+    """Steps a second of ascending ``times``, and the first step after which the spacing breaks (None: nowhere)."""
+    gaps = np.diff(times)
+    usual = float(np.median(gaps))
+    broken = np.abs(gaps - usual) > SPACING_TOLERANCE * usual
+    return 1 / usual, int(np.argmax(broken)) if broken.any() else None

@@ -1,0 +1,215 @@
+"""One recorded scene, whatever the layout of its folder: images, labels and cameras of every step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsim3d.data import layouts
+from gsim3d.data.cameras import check_directions, depth_range, frusta_origin, shared_view, spread_steps
+from gsim3d.data.images import ImageCache
+from gsim3d.data.masks import Undistorter, foreground, median_image
+from gsim3d.data.recording import BACKGROUND, MOVING, Problems, Recording
+from gsim3d.errors import InputError
+from gsim3d.types import Cameras
+
+SIZE_MULTIPLE = 16  # pixels; images are padded to it, so that the encoders of all presets can read them
+
+
+class Scene:
+    """One recorded scene.
+
+    path, name: folder, and its last two parts.    layout: of the folder, see :mod:`gsim3d.data.layouts`.
+    n_steps, n_cams, fps: steps, cameras, steps a second.    camera_names: as messages show them.
+    near, far: metres, the depth range in which the scene lies.
+    width, height: pixels of all images: those of the largest camera, padded on the right and below to multiples of 16.
+    origin: float64 [3] metres, lower corner of the workspace.
+    bounds: float64 [2, 3] metres, corners of the box that is shown as the scene's: given, or what most cameras see.
+    """
+
+    def __init__(self, path: Path, recording: Recording, cache_dir: str | Path | None = None):
+        self.path = path
+        self.name = "/".join(path.absolute().parts[-2:])
+        self.recording = recording
+        self.layout, self.camera_names = recording.layout, recording.camera_names
+        self.n_steps, self.fps, self.n_cams = recording.n_steps, recording.fps, len(recording.camera_names)
+        self.near, self.far = _depths(recording)
+        sizes = np.array(recording.sizes)
+        self.width, self.height = (int(-(-side // SIZE_MULTIPLE) * SIZE_MULTIPLE) for side in sizes.max(0))
+        view = (spread_steps(recording.viewmats), spread_steps(recording.Ks), recording.sizes, self.near, self.far)
+        self.bounds = shared_view(*view) if recording.bounds is None else recording.bounds
+        if recording.origin is not None:
+            self.origin = recording.origin
+        else:
+            self.origin = recording.bounds[0] if recording.bounds is not None else frusta_origin(*view)
+        self._undistorters = [
+            None if coefficients is None else Undistorter(coefficients, size)
+            for coefficients, size in zip(recording.distortions or (None,) * self.n_cams, recording.sizes, strict=True)
+        ]
+        self._medians: dict[int, np.ndarray] = {}
+        shape = (self.n_steps, self.n_cams, self.height, self.width)
+        stamp = (str(path.resolve()), recording.source.stat().st_mtime_ns)
+        self._images = ImageCache((*shape, 3), self._read_images, cache_dir, (*stamp, "rgb"))
+        self._labels = ImageCache(shape, self._read_labels, cache_dir, (*stamp, "seg"))
+
+    @staticmethod
+    def open(folder: str | Path, *, cache_dir: str | Path | None = None) -> Scene:
+        """Reads the description of the scene in ``folder``; images are decoded when they are asked for, each once.
+
+        Args:
+            cache_dir: folder for decoded images as memory-mapped files, for sets larger than the memory;
+                default: they stay in memory.
+
+        Raises: InputError that names file, camera and frame, and what is wrong with it.
+        """
+        path = Path(folder)
+        problems = Problems()
+        recording = layouts.layout_of(path).read(path, problems)
+        check_directions(recording, problems)
+        return Scene(path, recording, cache_dir)
+
+    def __repr__(self) -> str:
+        return (
+            f"Scene({str(self.path)!r}: {self.layout}, {self.n_steps} steps, {self.n_cams} cameras, "
+            f"{self.width}x{self.height})"
+        )
+
+    def cameras_at(self, cams, steps) -> Cameras:
+        """Cameras ``cams`` at each of ``steps``: len(steps) * len(cams) rows, step by step.
+
+        ``image_cloud`` counts the steps from 0. Steps beyond the end of the film have the cameras of the last one.
+        """
+        steps = [min(int(step), self.n_steps - 1) for step in steps]
+        steps, cams = self._numbers(cams, steps)
+        viewmats, Ks = (
+            torch.from_numpy(values[np.ix_([step if len(values) > 1 else 0 for step in steps], cams)]).flatten(0, 1)
+            for values in (self.recording.viewmats, self.recording.Ks)
+        )
+        n_rows = len(viewmats)
+        return Cameras(
+            viewmats=viewmats.float(),
+            Ks=Ks.float(),
+            near=torch.full((n_rows,), self.near),
+            far=torch.full((n_rows,), self.far),
+            image_cloud=torch.arange(len(steps)).repeat_interleave(len(cams)),
+            width=self.width,
+            height=self.height,
+        )
+
+    @property
+    def cameras_move(self) -> bool:
+        """Whether a camera's place or lens changes with time."""
+        return len(self.recording.viewmats) > 1 or len(self.recording.Ks) > 1
+
+    def images(self, cams, steps) -> Tensor:
+        """uint8 [len(steps), len(cams), 3, H, W], RGB. Args: lists of camera and step numbers.
+
+        Padding is black; so is the real background of films that have labels, because nothing of it is simulated.
+        """
+        images = self.film(cams, steps)
+        if self.recording.is_film and self.has_segmentation():
+            images *= (self.segmentation(cams, steps) != BACKGROUND)[:, :, None]
+        return images
+
+    def film(self, cams, steps) -> Tensor:
+        """As :meth:`images`, background included."""
+        images = self._images.get(*self._numbers(cams, steps))
+        return torch.from_numpy(images).permute(0, 1, 4, 2, 3).contiguous()
+
+    def segmentation(self, cams, steps) -> Tensor:
+        """uint8 [len(steps), len(cams), H, W]: 0 background, 1 ground and fixed parts, 3 bodies that may move."""
+        if not self.has_segmentation():
+            raise InputError(f"{self.path}: the scene has no labels: no image says what is background and what moves")
+        return torch.from_numpy(self._labels.get(*self._numbers(cams, steps)))
+
+    def has_segmentation(self) -> bool:
+        """Whether there are labels: the scene comes with some, or its background can be subtracted."""
+        return self.recording.read_labels is not None or self.recording.subtract_background
+
+    def valid(self, cams, steps) -> Tensor | None:
+        """bool [len(steps), len(cams), H, W], pixels that were filmed: no padding, no border left by undistortion.
+
+        None where that is all of them.
+        """
+        steps, cams = self._numbers(cams, steps)
+        full = all(self.recording.sizes[cam] == (self.width, self.height) for cam in cams)
+        if full and all(self._undistorters[cam] is None for cam in cams):
+            return None
+        valid = torch.zeros(len(steps), len(cams), self.height, self.width, dtype=torch.bool)
+        for j, cam in enumerate(cams):
+            width, height = self.recording.sizes[cam]
+            undistorter = self._undistorters[cam]
+            for i, step in enumerate(steps):
+                inner = True if undistorter is None else torch.from_numpy(undistorter.valid(self._K(cam, step)))
+                valid[i, j, :height, :width] = inner
+        return valid
+
+    def _numbers(self, cams, steps) -> tuple[list[int], list[int]]:
+        cams, steps = [int(c) for c in cams], [int(s) for s in steps]
+        for what, values, count in (("camera", cams, self.n_cams), ("step", steps, self.n_steps)):
+            for value in values:
+                if not 0 <= value < count:
+                    raise InputError(f"{self.path}: {what} {value} does not exist; the scene has {count}")
+        return steps, cams
+
+    def _K(self, cam: int, step: int) -> np.ndarray:
+        return self.recording.Ks[step if len(self.recording.Ks) > 1 else 0, cam]
+
+    def as_pinhole(self, image: np.ndarray, cam: int, step: int) -> np.ndarray:
+        """An image [h, w, 3] as camera ``cam`` films it -> as :meth:`film` has it: undistorted, and padded."""
+        undistorter = self._undistorters[cam]
+        return self._padded(image if undistorter is None else undistorter(image, self._K(cam, step)))
+
+    def _read_images(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
+        for step, image in zip(steps, self.recording.read_images(cam, steps, Problems()), strict=True):
+            yield self.as_pinhole(image, cam, step)
+
+    def _read_labels(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
+        if self.recording.subtract_background:
+            yield from self._subtracted(cam, steps)
+            return
+        undistorter = self._undistorters[cam]
+        for step, labels in zip(steps, self.recording.read_labels(cam, steps, Problems()), strict=True):
+            if undistorter is not None:
+                labels = undistorter(labels, self._K(cam, step), nearest=True)
+            yield self._padded(labels)
+
+    def _subtracted(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
+        width, height = self.recording.sizes[cam]
+
+        def film(wanted: Sequence[int]) -> np.ndarray:
+            return self._images.get(wanted, [cam])[:, 0, :height, :width]
+
+        if cam not in self._medians:
+            self._medians[cam] = median_image(film, self.n_steps)
+        valid = self.valid([cam], [0])
+        for step in steps:
+            labels = self._padded(foreground(film([step])[0], self._medians[cam]).astype(np.uint8) * MOVING)
+            yield labels if valid is None else labels * valid[0, 0].numpy()
+
+    def _padded(self, image: np.ndarray) -> np.ndarray:
+        if image.shape[:2] == (self.height, self.width):
+            return image
+        padded = np.zeros((self.height, self.width, *image.shape[2:]), image.dtype)
+        padded[: image.shape[0], : image.shape[1]] = image
+        return padded
+
+
+def _depths(recording: Recording) -> tuple[float, float]:
+    """near and far: given, or around the point that the cameras look at."""
+    near, far = recording.near, recording.far
+    if near is None or far is None:
+        guessed = depth_range(spread_steps(recording.viewmats).reshape(-1, 4, 4))
+        if guessed is None:
+            raise InputError(
+                f"{recording.source}: near and far (metres) are needed: the cameras look at no common point that "
+                "would tell how far the scene is"
+            )
+        near, far = near or guessed[0], far or guessed[1]
+    if far <= near:
+        raise InputError(f"{recording.source}: far must lie beyond near; got near {near:g} and far {far:g}")
+    return near, far

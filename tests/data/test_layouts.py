@@ -1,0 +1,104 @@
+"""One scene in every layout gives one and the same Scene; its points project to the pixels where they were drawn."""
+
+import numpy as np
+import pytest
+import torch
+
+from gsim3d.data import Scene, find_scenes, make_frames
+from gsim3d.errors import InputError
+from tests.data.made_scenes import (
+    BOUNDS,
+    COLOR,
+    FAR,
+    FPS,
+    HEIGHT,
+    N_CAMS,
+    N_STEPS,
+    NEAR,
+    ORIGIN,
+    WIDTH,
+    WRITERS,
+    make_scene,
+    write_films,
+    write_genesis,
+    write_kubric,
+    write_transforms,
+)
+
+CAMS, STEPS = range(N_CAMS), range(N_STEPS)
+
+
+@pytest.fixture(params=[False, True], ids=["still", "moving"])
+def made(request):
+    return make_scene(moving=request.param)
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_every_layout_gives_the_same_scene(tmp_path, made, layout):
+    scene = Scene.open(WRITERS[layout](tmp_path / "scene", made))
+    assert scene.layout == layout.split("'")[0]
+    assert (scene.n_steps, scene.n_cams, scene.width, scene.height) == (N_STEPS, N_CAMS, WIDTH, HEIGHT)
+    assert scene.fps == pytest.approx(FPS) and (scene.near, scene.far) == (NEAR, FAR)
+    assert scene.origin.tolist() == ORIGIN and scene.bounds.tolist() == BOUNDS
+    np.testing.assert_array_equal(scene.images(CAMS, STEPS).permute(0, 1, 3, 4, 2), made.rgb)
+    np.testing.assert_array_equal(scene.segmentation(CAMS, STEPS), made.labels)
+    assert scene.valid(CAMS, STEPS) is None
+    cameras = scene.cameras_at(CAMS, STEPS)
+    assert cameras.image_cloud.tolist() == np.repeat(STEPS, N_CAMS).tolist()
+    np.testing.assert_allclose(cameras.viewmats.unflatten(0, (N_STEPS, N_CAMS)), made.viewmats, atol=2e-6)
+    np.testing.assert_allclose(cameras.Ks.unflatten(0, (N_STEPS, N_CAMS)), made.Ks, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_the_ball_projects_to_where_it_was_drawn(tmp_path, made, layout):
+    scene = Scene.open(WRITERS[layout](tmp_path, made))
+    images = scene.images(CAMS, STEPS).flatten(0, 1)
+    cameras = scene.cameras_at(CAMS, STEPS)
+    for row, (viewmat, K) in enumerate(zip(cameras.viewmats.double(), cameras.Ks.double())):
+        local = viewmat[:3, :3] @ torch.from_numpy(made.centers[row // N_CAMS]) + viewmat[:3, 3]
+        assert NEAR < local[2] < FAR
+        image = K @ local / local[2]
+        y, x = torch.nonzero((images[row] == torch.from_numpy(COLOR)[:, None, None]).all(0)).double().T
+        # The outline of a ball of 0.22 m at 3 m is nearly a circle around its centre.
+        assert abs(x.mean() + 0.5 - image[0]) < 0.35 and abs(y.mean() + 0.5 - image[1]) < 0.35
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_frames_carry_the_cameras_of_their_step(tmp_path, layout):
+    made = make_scene(moving=True)
+    frames = make_frames([Scene.open(WRITERS[layout](tmp_path, made))], [[2, 0]], [[1, 3]])
+    for row, (step, cam) in enumerate([(1, 2), (1, 0), (3, 2), (3, 0)]):
+        np.testing.assert_allclose(frames.cameras.viewmats[row], made.viewmats[step, cam], atol=2e-6)
+        np.testing.assert_array_equal(frames.masks[row], made.labels[step, cam] > 0)
+        np.testing.assert_array_equal(frames.dynamic[row], made.labels[step, cam] == 3)
+
+
+def test_cameras_stand_still_after_the_end_of_the_film(tmp_path):
+    scene = Scene.open(write_films(tmp_path, make_scene(moving=True)))
+    cameras = scene.cameras_at([1], [2, 3, 4, 9])
+    assert torch.equal(cameras.viewmats[1], cameras.viewmats[3]) and cameras.image_cloud.tolist() == [0, 1, 2, 3]
+    assert not torch.equal(cameras.viewmats[0], cameras.viewmats[1])
+
+
+def test_a_data_set_may_mix_layouts(tmp_path):
+    made = make_scene()
+    for name, write in (("a/2", write_genesis), ("a/10", write_films), ("b", write_kubric), (".c", write_films)):
+        write(tmp_path / name, made)
+    write_transforms(tmp_path / "d" / "e" / "f", made)
+    found = [path.relative_to(tmp_path).as_posix() for path in find_scenes(tmp_path)]
+    assert found == ["a/2", "a/10", "b", "d/e/f"]
+    assert [Scene.open(tmp_path / name).layout for name in found] == ["genesis", "films", "kubric", "transforms"]
+    assert find_scenes(tmp_path / "b") == [tmp_path / "b"]
+
+
+def test_a_single_kubric_camera_is_a_scene(tmp_path):
+    made = make_scene()
+    write_kubric(tmp_path, made)
+    scene = Scene.open(tmp_path / "cam_1")
+    assert (scene.layout, scene.n_cams) == ("kubric", 1)
+    np.testing.assert_array_equal(scene.images([0], STEPS)[:, 0].permute(0, 2, 3, 1), made.rgb[:, 1])
+
+
+def test_a_folder_without_any_layout_is_named(tmp_path):
+    with pytest.raises(InputError, match="no metadata.json, transforms.json or cameras.json"):
+        Scene.open(tmp_path)
