@@ -8,9 +8,9 @@ ROOT = Path(__file__).parent.parent
 
 # Each room may import the rooms before it (and its own), never one after it.
 ROOMS = [
-    {"errors"},
+    {"errors", "quirks"},
     {"types"},
-    {"ops", "quirks", "effects", "harmonics", "layers"},
+    {"ops", "effects", "harmonics", "layers"},
     {"encoder", "dynamics", "renderer"},
     {"presets"},
     {"simulator"},

@@ -1,4 +1,4 @@
-"""Particles of the last steps -> particles of the next step."""
+"""Particles of the last steps -> particles of the next steps."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d import ops
+from gsim3d.dynamics.clouds import concatenate, newest_clouds
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.point_transformer import PointTransformer
 from gsim3d.dynamics.state import StateLayout
@@ -30,13 +31,13 @@ class Dynamics(nn.Module):
         self.net = PointTransformer(self.layout.in_channels, self.layout.out_channels, config)
 
     def forward(self, history: Particles, *, generator: torch.Generator | None = None) -> Particles:
-        """The next step of every scene.
+        """The next step of every scene, or the next ``config.steps_per_call`` steps.
 
         Args:
             history: clouds sorted by (scene, step); steps may have different numbers of rows, and gaps are fine.
             generator: of drop path and of the curves' shuffling, both in training only; None: neither happens.
         Returns:
-            One cloud a scene, with the rows of the scene's newest step and the step after it.
+            One cloud a scene and step, each with the rows of the scene's newest step.
         Gradients: features and positions of ``history``, parameters. Cells are constants.
         Raises:
             ValueError: clouds are not sorted, or a history is longer than the model's.
@@ -60,11 +61,16 @@ class Dynamics(nn.Module):
         is_newest = torch.zeros(history.n_clouds, dtype=torch.bool, device=newest.device).index_fill(0, newest, True)
         awake = is_newest[history.row_cloud()[pyramid.rows]].nonzero()[:, 0]
         row_of_state = torch.cumsum(is_newest[history.row_cloud()], 0) - 1
-        prediction = self.net.head(take_rows(features, awake))
+        prediction, is_awake = self.net.head(take_rows(features, awake)), None
         if awake.shape[0] < state.n_rows:
-            prediction = put_rows(prediction, row_of_state[pyramid.rows[awake]], state.n_rows)
-        state = self.layout.advance(state, prediction)
-        return dataclasses.replace(state, cloud_step=state.cloud_step + 1)
+            rows = row_of_state[pyramid.rows[awake]]
+            prediction = put_rows(prediction, rows, state.n_rows)
+            is_awake = torch.zeros(state.n_rows, dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
+        steps = [
+            dataclasses.replace(step, cloud_step=state.cloud_step + 1 + i)
+            for i, step in enumerate(self.layout.advance(state, prediction, is_awake))
+        ]
+        return steps[0] if len(steps) == 1 else concatenate(steps)
 
     def _slots(self, history: Particles, newest: Tensor) -> tuple[Tensor, int]:
         """Time slot of each cloud, and the bits they are counted in."""
@@ -86,20 +92,6 @@ class Dynamics(nn.Module):
             tuple(torch.randperm(4, generator=generator, device=generator.device).tolist())
             for _ in range(self.config.n_stages)
         )
-
-
-def newest_clouds(particles: Particles) -> Tensor:
-    """int64 [scenes that have a cloud], the last cloud of each."""
-    scene, step = particles.cloud_scene, particles.cloud_step
-    ascending = (scene[1:] > scene[:-1]) | ((scene[1:] == scene[:-1]) & (step[1:] > step[:-1]))
-    if not bool(ascending.all()):
-        raise ValueError(
-            "particles: clouds must be sorted by (scene, step), each once; "
-            f"got scenes {scene.tolist()}, steps {step.tolist()}"
-        )
-    is_last = torch.ones_like(scene, dtype=torch.bool)
-    is_last[:-1] = scene[1:] != scene[:-1]
-    return is_last.nonzero()[:, 0]
 
 
 def take_rows(x: Tensor, rows: Tensor) -> Tensor:

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from gsim3d.dynamics.state import StateLayout, bounded, position_features, rotate_left
-from gsim3d.quirks import Quirks
 from gsim3d.renderer import rotation_matrices
 from gsim3d.types import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -47,7 +46,7 @@ def test_increments():
     particles = make_history((20,), config=EXPLICIT)
     layout = StateLayout.of(EXPLICIT)
     prediction = 50 * torch.randn(20, layout.out_channels, generator=torch.Generator().manual_seed(0))
-    after = layout.advance(particles, prediction)
+    (after,) = layout.advance(particles, prediction)
     moves = particles.activity != FROZEN
     assert ((after.means - particles.means).abs() <= EXPLICIT.max_step * 1.001).all()
     assert ((after.dynamic_latents - particles.dynamic_latents).abs() <= EXPLICIT.max_latent_step * 1.001).all()
@@ -61,25 +60,6 @@ def test_no_limit_adds_the_prediction_itself():
     x = torch.tensor([-5.0, 0.1])
     assert bounded(x, None) is x
     assert_same_bits(bounded(x, 2.0), 2 * torch.tanh(x))
-
-
-@pytest.mark.parametrize("quirk", [False, True])
-def test_quirk_unbounded_opacity(quirk):
-    config = dataclasses.replace(EXPLICIT, quirks=Quirks(unbounded_opacity=quirk))
-    particles = make_history((20,), config=config, frozen_share=0.0)
-    layout = StateLayout.of(config)
-    after = layout.advance(particles, torch.full((20, layout.out_channels), 3.0))
-    assert (after.opacities.max() > 1) == quirk and after.opacities.min() >= 0
-
-
-@pytest.mark.parametrize("quirk", [False, True])
-def test_quirk_frozen_rows_turn(quirk):
-    config = dataclasses.replace(EXPLICIT, quirks=Quirks(frozen_rows_turn=quirk))
-    particles = make_history((20,), config=config, frozen_share=2.0)
-    layout = StateLayout.of(config)
-    after = layout.advance(particles, torch.ones(20, layout.out_channels))
-    assert torch.equal(after.quats, particles.quats) == (not quirk)
-    assert_same_bits(after.means, particles.means)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 9e-5, 1.1e-4, 1.0, 3.0, 7.0])
