@@ -32,7 +32,7 @@ class _Tensors:
         return self.map(lambda t: t.to(device))
 
     def detach(self):
-        return self.map(Tensor.detach)
+        return self.map(lambda t: t.detach() if t.is_floating_point() else t)
 
 
 @dataclass(frozen=True)
