@@ -71,9 +71,7 @@ class LPIPS(nn.Module):
             nn.Conv2d(width, layer.channels, layer.kernel, layer.stride, _padding(layer))
             for width, layer in zip(widths, self.layers)
         )
-        self.heads = nn.ParameterList(
-            nn.Parameter(torch.zeros(layer.channels)) for layer in self.layers if layer.tap
-        )
+        self.heads = nn.ParameterList(nn.Parameter(torch.zeros(layer.channels)) for layer in self.layers if layer.tap)
         self.register_buffer("shift", torch.tensor(SHIFT)[:, None, None], persistent=False)
         self.register_buffer("scale", torch.tensor(SCALE)[:, None, None], persistent=False)
 
