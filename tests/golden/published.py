@@ -82,9 +82,10 @@ def renderer_config(name: str, quirks: Quirks = FULL_PRECISION) -> RendererConfi
     )
 
 
-def renamed(published: Golden, prefix: str, ours: str) -> dict[str, Tensor]:
+def renamed(published: Golden, prefix: str = "", ours: str = "") -> dict[str, Tensor]:
     """Arrays of a part of the published network (``prefix`` is its place there) as a state dict of ours."""
-    named = dynamics_weights({prefix + key: value for key, value in published.dict().items()})
+    keys = [key for key in published.keys() if not key.endswith("num_batches_tracked")]
+    named = dynamics_weights({prefix + key.removeprefix("net."): published[key] for key in keys})
     assert all(key.startswith(ours) for key in named)
     return {key.removeprefix(ours): value for key, value in named.items()}
 
@@ -159,6 +160,7 @@ def assert_published_patches(table: PatchTable, order: Tensor, g: Golden) -> Non
     """Who attends to whom along ``order``: the same rows read in the same patches."""
     pad, unpad, ends = g["pad"], g["unpad"], g["cu_seqlens"].long()
     assert torch.equal(table.q_rows, order)
+    assert torch.equal(pad[unpad], torch.arange(len(order)))
     sequences = [order[pad[a:b]].sort().values for a, b in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)]
     starts, stops = table.cu_k[:-1].tolist(), table.cu_k[1:].tolist()
     read = [table.kv_rows[a:b].sort().values for a, b in zip(starts, stops, strict=True)]

@@ -8,7 +8,6 @@ import torch
 from gsim3d import ops
 from gsim3d.dynamics import point_transformer
 from gsim3d.dynamics.point_transformer import PointTransformer
-from gsim3d.interop.released import dynamics_weights
 from gsim3d.quirks import Quirks
 from tests.golden.published import (
     FULL_PRECISION,
@@ -36,7 +35,7 @@ def load(file, quirks=FULL_PRECISION):
     g = golden(f"f_dynamics_{file}")
     name = {"small": "small", "deep": "small_deep_dynamics"}[file.split("_")[0]]
     config = dataclasses.replace(dynamics_config(name, quirks), grid_size=float(g["grid_size"]))
-    weights = renamed(g / "w", "", "")
+    weights = renamed(g / "w")
     in_channels, out_channels = weights["stem.conv.weight"].shape[-1], weights["head.fc2.bias"].shape[0]
     net = PointTransformer(in_channels, out_channels, config).eval()
     net.load_state_dict(weights)
@@ -76,7 +75,7 @@ def test_gradients_of_all_weights():
     g, net, config = load("small_nodup")
     c = g / "T4_nomask"
     run(net, config, c).backward(c["cotangent"])
-    expected = dynamics_weights((c / "grad_w").dict())
+    expected = renamed(c / "grad_w")
     assert set(expected) == {name for name, _ in net.named_parameters()}
     for name, parameter in net.named_parameters():
         close(parameter.grad, expected[name], name)
@@ -87,7 +86,7 @@ def test_batch_norm_in_training(file):
     g, net, config = load(file)
     c = g / "T4_nomask"
     close(run(net.train(), config, c), c["out_trainBN_nodroppath"], "out")
-    after = dynamics_weights((c / "trainBN_after").dict())
+    after = renamed(c / "trainBN_after")
     assert set(after) == {name for name, _ in net.named_buffers()}
     for name, buffer in net.named_buffers():
         close(buffer, after[name], name)

@@ -165,9 +165,10 @@ def test_number_of_gaussians_in_each_pixel(view):
     alpha = file["f64/in/opacities"][:, :, None] * torch.exp(-distance / 2)
     alpha = torch.where(touched & (alpha >= MIN_ALPHA), alpha, 0)[torch.argsort(points[:, 2])]
     light = torch.cumprod(1 - alpha, 0)
-    assert not ((light > 0.9 * MIN_TRANSMITTANCE) & (light < 1.1 * MIN_TRANSMITTANCE)).any()  # no doubt where it ends
     counted = ((alpha > 0) & (light >= MIN_TRANSMITTANCE)).sum(0)
-    assert torch.equal(counted, file[f"view{view}/inter/ncontrib"])
+    clear = ((light / MIN_TRANSMITTANCE - 1).abs() > 1e-4).all(0)  # where it ends is not a matter of rounding
+    assert clear.float().mean() > 0.99
+    assert torch.equal(counted[clear], file[f"view{view}/inter/ncontrib"][clear])
 
 
 @pytest.mark.parametrize("view", [0, 1])
