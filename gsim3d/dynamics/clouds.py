@@ -1,27 +1,27 @@
-"""Clouds of particles as a history: which is newest, which are the last, and what comes behind them."""
+"""Clouds of particles as a history: which is newest, which are the last, and what comes behind them.
+
+All of it is bookkeeping on numbers that the host knows (:class:`gsim3d.types.CloudTable`); nothing waits for a device.
+"""
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 
-from gsim3d.types import Particles
+from gsim3d.types import CloudTable, Particles
 
 
-def newest_clouds(particles: Particles) -> Tensor:
-    """int64 [scenes that have a cloud], the last cloud of each."""
-    scene, step = particles.cloud_scene, particles.cloud_step
-    ascending = (scene[1:] > scene[:-1]) | ((scene[1:] == scene[:-1]) & (step[1:] > step[:-1]))
-    if not bool(ascending.all()):
+def newest_clouds(clouds: CloudTable) -> list[int]:
+    """The last cloud of each scene that has one."""
+    places = list(zip(clouds.scenes, clouds.steps))
+    if any(b <= a for a, b in zip(places, places[1:])):
         raise ValueError(
             "particles: clouds must be sorted by (scene, step), each once; "
-            f"got scenes {scene.tolist()}, steps {step.tolist()}"
+            f"got scenes {list(clouds.scenes)}, steps {list(clouds.steps)}"
         )
-    is_last = torch.ones_like(scene, dtype=torch.bool)
-    is_last[:-1] = scene[1:] != scene[:-1]
-    return is_last.nonzero()[:, 0]
+    scenes = clouds.scenes
+    return [q for q in range(len(scenes)) if q + 1 == len(scenes) or scenes[q + 1] != scenes[q]]
 
 
 def append_step(history: Particles, step: Particles, max_steps: int) -> Particles:
@@ -34,33 +34,36 @@ def append_step(history: Particles, step: Particles, max_steps: int) -> Particle
 
 def last_steps(particles: Particles, n_steps: int) -> Particles:
     """The last ``n_steps`` clouds of each scene."""
-    newest = newest_clouds(particles)
-    counts = torch.diff(newest, prepend=newest.new_full((1,), -1))  # clouds of each scene
-    age = torch.repeat_interleave(newest, counts) - torch.arange(particles.n_clouds, device=newest.device)
-    return particles.select_clouds((age < n_steps).nonzero()[:, 0])
+    newest, kept, begin = newest_clouds(particles.clouds), [], 0
+    for last in newest:
+        kept += range(max(begin, last + 1 - n_steps), last + 1)
+        begin = last + 1
+    return particles if len(kept) == particles.n_clouds else particles.select_clouds(kept)
 
 
-def concatenate(parts: list[Particles]) -> Particles:
+def concatenate(parts: Sequence[Particles]) -> Particles:
     """The clouds of several particle sets of the same scenes in one, sorted by (scene, step)."""
-    first = parts[0]
-    scene = torch.cat([p.cloud_scene for p in parts])
-    step = torch.cat([p.cloud_step for p in parts])
-    counts = torch.cat([torch.diff(p.cu_rows) for p in parts])
-    order = torch.argsort(step, stable=True)
-    order = order[torch.argsort(scene[order], stable=True)]
-    fields = {}
-    for name in Particles.ROW_FIELDS:
-        if getattr(first, name) is not None:
-            pieces = [piece for p in parts for piece in getattr(p, name).split(torch.diff(p.cu_rows).tolist())]
-            fields[name] = torch.cat([pieces[q] for q in order.tolist()]) if pieces else getattr(first, name)
-    cu_rows = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
-    cu_rows[1:] = torch.cumsum(counts[order], 0)
-    return dataclasses.replace(first, **fields, cu_rows=cu_rows, cloud_scene=scene[order], cloud_step=step[order])
+    tables = [part.clouds for part in parts]
+    places = [(table.scenes[q], table.steps[q], p, q) for p, table in enumerate(tables) for q in range(len(table))]
+    places.sort(key=lambda place: place[:2])
+    table = CloudTable.make(
+        (tables[p].count(q) for _, _, p, q in places),
+        (scene for scene, *_ in places),
+        (step for _, step, *_ in places),
+        parts[0].cu_rows.device,
+    )
+    pieces = [(p, *tables[p].row_runs([q])[0]) for *_, p, q in places]
+    fields = {
+        name: torch.cat([getattr(parts[p], name)[begin:end] for p, begin, end in pieces]) if pieces else value
+        for name, value in parts[0].row_fields().items()
+    }
+    return parts[0].with_clouds(table, **fields)
 
 
 def single_steps(particles: Particles) -> list[Particles]:
     """The clouds of scenes with equally many steps, step by step: one cloud a scene in each."""
-    n_scenes = newest_clouds(particles).shape[0]
+    n_scenes = len(newest_clouds(particles.clouds))
     n_steps = particles.n_clouds // n_scenes if n_scenes else 1
-    clouds = torch.arange(particles.n_clouds, device=particles.cloud_scene.device)
-    return [particles.select_clouds(clouds[clouds % n_steps == step]) for step in range(n_steps)]
+    if n_steps == 1:
+        return [particles]
+    return [particles.select_clouds(range(step, particles.n_clouds, n_steps)) for step in range(n_steps)]

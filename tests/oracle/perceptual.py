@@ -34,7 +34,7 @@ def lpips_reference(a, b, layers, weights, biases, heads):
     total = 0.0
     pairs = zip(features(a, layers, weights, biases), features(b, layers, weights, biases), heads, strict=True)
     for fa, fb, head in pairs:
-        fa, fb = (f / (np.sqrt((f**2).sum(0)) + 1e-10) for f in (fa, fb))
+        fa, fb = (f / np.sqrt((f**2).sum(0) + 1e-10) for f in (fa, fb))
         total += ((fa - fb) ** 2 * head[:, None, None]).sum(0).mean()
     return total
 

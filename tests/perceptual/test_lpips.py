@@ -66,6 +66,19 @@ def test_layers_are_compared_where_they_should_be(network):
     assert parameters == {"alex": 2_469_696, "vgg": 14_714_688}[network]
 
 
+def test_gradients_are_finite_where_no_feature_fires(network):
+    module = random_module(network)
+    for conv in module.convs:
+        conv.bias.fill_(-1e9 if conv is module.convs[0] else 0)  # nothing fires anywhere, on one side only
+    image = pattern(0, 1, 33, 33).permute(0, 3, 1, 2).requires_grad_()
+    distance = module(image, torch.zeros_like(image))
+    distance.sum().backward()
+    assert distance.item() == 0 and image.grad.isfinite().all()
+    whole = random_module(network)
+    whole(image, torch.zeros_like(image)).sum().backward()
+    assert image.grad.isfinite().all() and image.grad.abs().max() > 0
+
+
 def test_smallest_image(network, random_weights):
     side = lpips.MIN_SIZE[network]
     assert lpips.lpips(pattern(0, 1, side, side), pattern(1, 1, side, side), network).isfinite().all()
