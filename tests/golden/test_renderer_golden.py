@@ -14,6 +14,7 @@ from gsim3d.harmonics import (
     turn_predicted_harmonics,
 )
 from gsim3d.interop.released import head_weights
+from gsim3d.ops.raster import Rendering
 from gsim3d.renderer import (
     GaussianHead,
     render_as_published,
@@ -152,10 +153,11 @@ def close_but_for_flips(actual, expected, what):
     assert off.sum() <= 3 and far.max() < 1.5 / 255, f"{what}: {int(off.sum())} pixels are off, by up to {far.max():.3g}"
 
 
-def test_images_of_the_published_renderer():
+def test_images_of_the_published_renderer(device):
     """With its cameras as the release is given them, each view with its own near plane, in one call."""
     file = golden("j_raster")
-    out = render_as_published(gaussians_of(file), published_cameras(file), file["in/background"], quirks=FULL_PRECISION)
+    scene = gaussians_of(file).to(device), published_cameras(file).to(device), file["in/background"].to(device)
+    out = Rendering(*(t if t is None else t.cpu() for t in render_as_published(*scene, quirks=FULL_PRECISION)))
     for view in range(len(out.color)):
         expected = file / f"view{view}"
         close_but_for_flips(out.color[view].permute(2, 0, 1), expected["image_float32"], "image")
