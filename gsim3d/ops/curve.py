@@ -122,7 +122,7 @@ class Voxels:
 
 @dataclass(frozen=True)
 class KernelMap:
-    """Pairs of neighbouring voxels of a convolution with ``kernel_size`` K, sorted by tap, then by tap_out.
+    """Pairs of neighbouring voxels of a convolution with ``kernel_size`` K, sorted by tap, then by tap_out and tap_in.
 
     Pairs cu_taps[t] .. cu_taps[t + 1] - 1 belong to tap t = (kx K + ky) K + kz: voxel tap_in lies at the offset
     (kx, ky, kz) - K // 2 cells from voxel tap_out. The centre tap is empty: it reads the row itself.

@@ -67,7 +67,7 @@ namespace cpu {
 //                           kv_rows[r, cu_k[p]:cu_k[p + 1]]; the last patch of a cloud reads a whole patch of rows
 //     row_voxel [N], voxel_rows [N], cu_voxel_rows [V + 1]: rows of equal (cloud, cell); voxels by (cloud, x, y, z)
 //     for every kernel size K: tap_in [L], tap_out [L], cu_taps [K^3 + 1]: voxel tap_in lies at (kx, ky, kz) - K / 2
-//                           cells from tap_out, tap = (kx K + ky) K + kz; ascending in tap_out in a tap; centre empty
+//                           cells from tap_out, tap = (kx K + ky) K + kz; both ascend inside a tap; centre empty
 // T is float or double. Throws ArgumentError where clouds or spec are malformed.
 template <typename T>
 void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,
