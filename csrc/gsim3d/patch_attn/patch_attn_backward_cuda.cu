@@ -94,14 +94,14 @@ class QueryWarp {
           const float log_sum = log2f(pair.y);
           x = {pair.x, log_sum, delta[h], -fmaf(pair.x, args.slope, log_sum)};
         }
-        if (i < end && threadIdx.x % 4 == 0) args.numbers[head * args.table.n_q_listed + i] = x;
+        if (i < end) args.numbers[head * args.table.n_q_listed + i] = x;  // all four lanes, so that each may read it
         fast = fast && x.is_fast(args.slope);
-        largest_[m][h] = x.largest;
-        minus_log_sum_[m][h] = -x.log_sum;
         minus_delta_[m][h] = -x.delta;
         shift_[m][h] = FastWeights::prepare(x.shift);
       }
     }
+    numbers_ = args.numbers + head * args.table.n_q_listed + first;
+    n_ = static_cast<int>(min(end - first, int64_t{16 * M}));
     return __all_sync(kFullWarp, fast);
   }
 
@@ -115,21 +115,27 @@ class QueryWarp {
 #pragma unroll
       for (int i = 0; i < 8; ++i) slopes[m][i / 4][i % 4] = minus_delta_[m][i % 4 / 2];
     multiply_by_rows<T, D, M>(grad_, values_, step, slopes);
-    const uint8_t* valid = valid_ + step * kStep + 2 * (threadIdx.x % 4);
     uint32_t a[M][4];
 #pragma unroll
     for (int m = 0; m < M; ++m) {
+      if constexpr (kFast) {
 #pragma unroll
-      for (int i = 0; i < 8; ++i) {
-        const int h = i % 4 / 2;
-        const float score = s[m][i / 4][i % 4];
-        float& x = slopes[m][i / 4][i % 4];
-        if constexpr (kFast)
-          x *= weights_.at(i, score, shift_[m][h]);
-        else
-          x = valid[i / 4 * 8 + i % 2]
-                  ? x * careful_weight(score, largest_[m][h], weights_.slope(), minus_log_sum_[m][h])
-                  : 0.0f;
+        for (int i = 0; i < 8; ++i)
+          slopes[m][i / 4][i % 4] *= weights_.at(i, s[m][i / 4][i % 4], shift_[m][i % 4 / 2]);
+      } else {
+        const uint8_t* valid = valid_ + step * kStep + 2 * (threadIdx.x % 4);
+#pragma unroll
+        for (int h = 0; h < 2; ++h) {
+          const int at = 16 * m + threadIdx.x % kWarp / 4 + 8 * h;
+          const QueryNumbers query = at < n_ ? numbers_[at] : QueryNumbers::none();
+#pragma unroll
+          for (int i = 0; i < 4; ++i) {
+            float& x = slopes[m][i / 2][2 * h + i % 2];
+            const float p =
+                careful_weight(s[m][i / 2][2 * h + i % 2], query.largest, weights_.slope(), -query.log_sum);
+            x = valid[i / 2 * 8 + i % 2] ? x * p : 0.0f;
+          }
+        }
       }
       pack_tile<T, true>(slopes[m], a[m]);
     }
@@ -157,8 +163,10 @@ class QueryWarp {
   uint32_t keys_, values_;
   const uint8_t* valid_;
   uint32_t q_[M][D / 16][4], grad_[M][D / 16][4];
-  float grad_q_[M][D / 8][4], largest_[M][2], minus_log_sum_[M][2], minus_delta_[M][2];
+  float grad_q_[M][D / 8][4], minus_delta_[M][2];
   FastWeights::Shift shift_[M][2];
+  const QueryNumbers* numbers_;  // of the warp's queries, n_ of them
+  int n_;
 };
 
 template <typename T, int D>

@@ -11,7 +11,7 @@ namespace gsim3d::cuda {
 constexpr float kLargestShift = 4096.0f;
 // Of eight weights of a lane, so many are found by a polynomial: the special function unit is the bottleneck, and the
 // multipliers are idle beside it.
-constexpr int kByPolynomial = 2;
+constexpr int kByPolynomial = 0;
 
 // 2^(slope s + shift).
 class FastWeights {
@@ -23,7 +23,9 @@ class FastWeights {
   struct Shift {
     float shift, shift_by_span;
   };
-  __device__ __forceinline__ static Shift prepare(float shift) { return {shift, (shift - kLowest) / kSpan}; }
+  __device__ __forceinline__ static Shift prepare(float shift) {
+    return {shift, fmaf(shift, 1 / kSpan, -kLowest / kSpan)};
+  }
 
   // The weight of number i of a lane's eight.
   __device__ __forceinline__ float at(int i, float s, const Shift& shift) const {
@@ -52,10 +54,10 @@ class FastWeights {
   float slope_, slope_by_span_;
 };
 
-// The same for differences from the largest: exact where both are equal, however large they are.
-__device__ __forceinline__ float careful_weight(float s, float largest, float slope, float shift) {
-  const float difference = s - largest;
-  return exp2_unit(difference > 0 ? shift : fmaf(difference, slope, shift));
+// 2^(slope (s - reference) + shift), at most 1: exact where s is the reference, however large both are.
+__device__ __forceinline__ float careful_weight(float s, float reference, float slope, float shift) {
+  const float x = fmaf(s - reference, slope, shift);
+  return exp2_unit(x > 0 ? 0.0f : x);
 }
 
 __device__ __forceinline__ void clear(float (&x)[4]) {
