@@ -1,0 +1,457 @@
+#include "gsim3d/plane_sweep/plane_sweep_line.cuh"
+
+namespace gsim3d::cuda {
+namespace {
+
+using namespace plane_sweep_math;
+
+constexpr int kMaxWarps = 8;
+constexpr int kGroup = 8;                           // lanes that share a dot product
+constexpr int kOwned = 8;                           // source pixels whose gradients one warp holds
+constexpr int64_t kListBytes = int64_t{512} << 20;  // lines kept at once in the backward pass; more run in pieces
+
+// kVectors elements of a feature, one load.
+template <typename T, int kVectors>
+struct alignas(sizeof(T) * kVectors < 16 ? sizeof(T) * kVectors : 16) Pack {
+  T v[kVectors];
+};
+
+// Channels-last features: image i, pixel p at data + (i n_pixels + p) stride; stride is a multiple of a warp's packs.
+template <typename T>
+struct Pixels {
+  T* data;
+  int32_t stride;
+
+  __device__ __forceinline__ T* at(const LineSizes& s, int64_t image, int32_t pixel) const {
+    return data + (image * s.n_pixels + pixel) * stride;
+  }
+};
+
+// [n, rows, cols] -> [n, cols, stride], zeros in the padding.
+template <typename T>
+__global__ void to_pixels_kernel(const T* __restrict__ planes, int64_t rows, int64_t cols, int64_t stride,
+                                 int64_t col_tiles, T* __restrict__ pixels) {
+  __shared__ T tile[32][33];
+  const int64_t image = blockIdx.x / col_tiles, col0 = blockIdx.x % col_tiles * 32, row0 = int64_t{blockIdx.y} * 32;
+  for (int r = threadIdx.y; r < 32; r += 8) {
+    const int64_t row = row0 + r, col = col0 + threadIdx.x;
+    tile[r][threadIdx.x] = row < rows && col < cols ? planes[(image * rows + row) * cols + col] : T(0);
+  }
+  __syncthreads();
+  for (int c = threadIdx.y; c < 32; c += 8) {
+    const int64_t col = col0 + c, row = row0 + threadIdx.x;
+    if (col < cols && row < stride) pixels[(image * cols + col) * stride + row] = tile[threadIdx.x][c];
+  }
+}
+
+// [n, cols, stride] -> [n, rows, cols].
+template <typename T>
+__global__ void to_planes_kernel(const T* __restrict__ pixels, int64_t rows, int64_t cols, int64_t stride,
+                                 int64_t col_tiles, T* __restrict__ planes) {
+  __shared__ T tile[32][33];
+  const int64_t image = blockIdx.x / col_tiles, col0 = blockIdx.x % col_tiles * 32, row0 = int64_t{blockIdx.y} * 32;
+  for (int c = threadIdx.y; c < 32; c += 8) {
+    const int64_t col = col0 + c, row = row0 + threadIdx.x;
+    tile[threadIdx.x][c] = row < rows && col < cols ? pixels[(image * cols + col) * stride + row] : T(0);
+  }
+  __syncthreads();
+  for (int r = threadIdx.y; r < 32; r += 8) {
+    const int64_t row = row0 + r, col = col0 + threadIdx.x;
+    if (row < rows && col < cols) planes[(image * rows + row) * cols + col] = tile[r][threadIdx.x];
+  }
+}
+
+// 1 / (number of sources * sqrt(C)).
+template <typename T>
+__device__ __forceinline__ T cost_scale(const Range& pairs, int64_t channels) {
+  return T(1) / (static_cast<T>(pairs.end - pairs.begin) * sqrt(static_cast<T>(channels)));
+}
+
+// scores[r] (+)= <own, source pixel list[r]> over 32 kVectors channels, which start at `own` and `source`.
+template <typename T, int kVectors>
+__device__ __forceinline__ void add_dots(const T* __restrict__ own, const T* __restrict__ source, int32_t stride,
+                                         const int32_t* list, int32_t count, bool first, T* scores) {
+  using Four = Pack<T, 4>;
+  constexpr int kGroups = kWarp / kGroup;
+  constexpr int kTogether = 2;  // dot products of one group in flight
+  const int lane = threadIdx.x % kWarp, group = lane / kGroup, at = lane % kGroup;
+  Four feature[kVectors];
+#pragma unroll
+  for (int v = 0; v < kVectors; ++v) feature[v] = reinterpret_cast<const Four*>(own)[at + v * kGroup];
+  for (int32_t r0 = 0; r0 < count; r0 += kTogether * kGroups) {
+    T sum[kTogether];
+#pragma unroll
+    for (int t = 0; t < kTogether; ++t) {
+      const int32_t r = min(r0 + t * kGroups + group, count - 1);
+      const Four* from = reinterpret_cast<const Four*>(source + int64_t{list[r]} * stride);
+      sum[t] = 0;
+#pragma unroll
+      for (int v = 0; v < kVectors; ++v) {
+        const Four other = from[at + v * kGroup];
+#pragma unroll
+        for (int e = 0; e < 4; ++e) sum[t] += feature[v].v[e] * other.v[e];
+      }
+    }
+#pragma unroll
+    for (int t = 0; t < kTogether; ++t) {
+#pragma unroll
+      for (int offset = kGroup / 2; offset > 0; offset /= 2)
+        sum[t] += __shfl_xor_sync(kFullWarp, sum[t], offset);
+      const int32_t r = r0 + t * kGroups + group;
+      if (at == 0 && r < count) scores[r] = first ? sum[t] : scores[r] + sum[t];
+    }
+  }
+}
+
+template <typename T>
+GSIM3D_HD int64_t forward_bytes(const LineSizes& s) {
+  return line_bytes<T>(s) + aligned_bytes(s.capacity * sizeof(T)) + aligned_bytes(s.n_depths * sizeof(T));
+}
+
+// One warp owns one pixel.
+template <typename T, int kVectors>
+__global__ void __launch_bounds__(kMaxWarps* kWarp)
+    forward_kernel(Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s, T* __restrict__ cost) {
+  extern __shared__ __align__(16) char shared[];
+  const int lane = threadIdx.x % kWarp;
+  const int64_t at = (int64_t{blockIdx.x} * blockDim.x + threadIdx.x) / kWarp;
+  if (at >= sweep.n_images * s.n_pixels) return;
+  const int64_t image = at / s.n_pixels;
+  const int32_t pixel = static_cast<int32_t>(at % s.n_pixels);
+  char* memory = shared + threadIdx.x / kWarp * forward_bytes<T>(s);
+  const Line<T> line = carve_line<T>(memory, s);
+  T* scores = carve<T>(memory, s.capacity);
+  T* costs = carve<T>(memory, s.n_depths);
+  for (int32_t k = lane; k < s.n_depths; k += kWarp) costs[k] = 0;
+
+  const int32_t outside = static_cast<int32_t>(outside_corner(s.height, s.width));
+  const Range pairs = range_of(sweep.cu_src, image, sweep.n_pairs);
+  for (int64_t pair = pairs.begin; pair < pairs.end; ++pair) {
+    const int64_t source = sweep.src_images[pair];
+    if (!inside(source, sweep.n_images)) continue;
+    __syncwarp();
+    const int32_t count = trace(sweep, s, image, pair, pixel, line);
+    if (count == 0) continue;
+    for (int32_t c = 0; c < pixels.stride; c += kWarp * kVectors)
+      add_dots<T, kVectors>(pixels.at(s, image, pixel) + c, pixels.at(s, source, 0) + c, pixels.stride, line.list,
+                            count, c == 0, scores);
+    __syncwarp();
+    for (int32_t k = lane; k < s.n_depths; k += kWarp) {
+      if (line.corner[k] == outside) continue;
+      T corners[4] = {0, 0, 0, 0};
+      for_corners(line.corner[k], s, [&](int32_t q, int side) { corners[side] = scores[rank_of(line, q)]; });
+      costs[k] += interpolate(corners[0], corners[1], corners[2], corners[3], line.fx[k], line.fy[k]);
+    }
+  }
+  const T scale = pairs.begin < pairs.end ? cost_scale<T>(pairs, sweep.channels) : T(0);
+  for (int32_t k = lane; k < s.n_depths; k += kWarp)
+    cost[(image * s.n_depths + k) * s.n_pixels + pixel] = costs[k] * scale;
+}
+
+// The lines of pixels [first_pixel, first_pixel + n_pixels) for pairs [first_pair, first_pair + n_pairs), as the pass
+// over references leaves them for the pass over sources.
+template <typename T>
+struct Lines {
+  uint32_t* bits;    // [n_pairs, n_pixels, n_words]
+  uint16_t* before;  // [n_pairs, n_pixels, n_words]
+  T* weights;        // [n_pairs, n_pixels, capacity], gradients of the scores
+  int64_t first_pair, n_pairs;
+  int32_t first_pixel, n_pixels;
+
+  __device__ __forceinline__ int64_t slot(int64_t pair, int32_t pixel) const {
+    return (pair - first_pair) * n_pixels + pixel - first_pixel;
+  }
+};
+
+// weights[r] = gradient of the score with source pixel list[r]: the samples that touch it, in order.
+template <typename T>
+__device__ void score_gradients(const Line<T>& line, const LineSizes& s, int32_t count, const T* grads, T scale,
+                                int32_t* low, int32_t* high, T* weights) {
+  const int lane = threadIdx.x % kWarp;
+  const int32_t row = s.width + 2, outside = static_cast<int32_t>(outside_corner(s.height, s.width));
+  for (int32_t r = lane; r < count; r += kWarp) {
+    low[r] = s.n_depths;
+    high[r] = -1;
+  }
+  __syncwarp();
+  for (int32_t k = lane; k < s.n_depths; k += kWarp)
+    if (line.corner[k] != outside)
+      for_corners(line.corner[k], s, [&](int32_t q, int) {
+        const int32_t r = rank_of(line, q);
+        atomicMin(low + r, k);
+        atomicMax(high + r, k);
+      });
+  __syncwarp();
+  for (int32_t r = lane; r < count; r += kWarp) {
+    const int32_t q = line.list[r], y = q / s.width;
+    const int32_t place = (y + 1) * row + q - y * s.width + 1;
+    T sum = 0;
+    for (int32_t k = low[r]; k <= high[r]; ++k) {
+      const int32_t offset = place - line.corner[k];
+      const bool bottom = offset >= row, right = offset == 1 || offset == row + 1;
+      if (offset != 0 && offset != row && !right) continue;
+      const T lower = grads[k] * line.fy[k], part = bottom ? lower : grads[k] - lower, further = part * line.fx[k];
+      sum += right ? further : part - further;
+    }
+    weights[r] = sum * scale;
+  }
+  __syncwarp();
+}
+
+template <typename T>
+GSIM3D_HD int64_t backward_bytes(const LineSizes& s) {
+  return line_bytes<T>(s) + 2 * aligned_bytes(s.capacity * sizeof(int32_t)) + aligned_bytes(s.capacity * sizeof(T)) +
+         aligned_bytes(s.n_depths * sizeof(T));
+}
+
+// One warp owns 32 kVectors channels of one pixel as reference and gathers from its sources; the first block of channels
+// keeps the lines.
+template <typename T, int kVectors>
+__global__ void __launch_bounds__(kMaxWarps* kWarp)
+    reference_kernel(const T* __restrict__ grad, Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s,
+                     Lines<T> lines, bool add, Pixels<T> grad_pixels) {
+  using Own = Pack<T, kVectors>;
+  extern __shared__ __align__(16) char shared[];
+  const int lane = threadIdx.x % kWarp;
+  const int64_t at = (int64_t{blockIdx.x} * blockDim.x + threadIdx.x) / kWarp;
+  if (at >= sweep.n_images * lines.n_pixels) return;
+  const int64_t image = at / lines.n_pixels;
+  const int32_t pixel = lines.first_pixel + static_cast<int32_t>(at % lines.n_pixels);
+  const int32_t channel = (blockIdx.y * kWarp + lane) * kVectors;
+  char* memory = shared + threadIdx.x / kWarp * backward_bytes<T>(s);
+  const Line<T> line = carve_line<T>(memory, s);
+  int32_t* low = carve<int32_t>(memory, s.capacity);
+  int32_t* high = carve<int32_t>(memory, s.capacity);
+  T* weights = carve<T>(memory, s.capacity);
+  T* grads = carve<T>(memory, s.n_depths);
+  for (int32_t k = lane; k < s.n_depths; k += kWarp)
+    grads[k] = grad[(image * s.n_depths + k) * s.n_pixels + pixel];
+
+  Own sum{};
+  const Range pairs = range_of(sweep.cu_src, image, sweep.n_pairs);
+  const T scale = cost_scale<T>(pairs, sweep.channels);
+  const int64_t end = min(pairs.end, lines.first_pair + lines.n_pairs);
+  for (int64_t pair = max(pairs.begin, lines.first_pair); pair < end; ++pair) {
+    const int64_t source = sweep.src_images[pair];
+    if (!inside(source, sweep.n_images)) continue;
+    __syncwarp();
+    const int32_t count = trace(sweep, s, image, pair, pixel, line);
+    const int64_t slot = lines.slot(pair, pixel);
+    if (blockIdx.y == 0)
+      for (int32_t w = lane; w < s.n_words; w += kWarp) {
+        lines.bits[slot * s.n_words + w] = count ? line.bits[w] : 0;
+        if (count) lines.before[slot * s.n_words + w] = line.before[w];
+      }
+    if (count == 0) continue;
+    score_gradients(line, s, count, grads, scale, low, high, weights);
+    if (blockIdx.y == 0)
+      for (int32_t r = lane; r < count; r += kWarp) lines.weights[slot * s.capacity + r] = weights[r];
+    const T* from = pixels.at(s, source, 0) + channel;
+#pragma unroll 4
+    for (int32_t r = 0; r < count; ++r) {
+      const Own other = *reinterpret_cast<const Own*>(from + int64_t{line.list[r]} * pixels.stride);
+      const T weight = weights[r];
+#pragma unroll
+      for (int v = 0; v < kVectors; ++v) sum.v[v] += weight * other.v[v];
+    }
+  }
+  Own* to = reinterpret_cast<Own*>(grad_pixels.at(s, image, pixel) + channel);
+  if (add) {
+    const Own earlier = *to;
+#pragma unroll
+    for (int v = 0; v < kVectors; ++v) sum.v[v] += earlier.v[v];
+  }
+  *to = sum;
+}
+
+// The group of kOwned neighbouring source pixels of a task: the warps of a block take a square where rows hold whole
+// groups, for the sake of the first-level cache. -1: none.
+__device__ __forceinline__ int32_t group_of(int32_t task, const LineSizes& s) {
+  int32_t group = task;
+  if (s.width % kOwned == 0) {
+    const int32_t columns = s.width / kOwned, band = task / (columns * kMaxWarps), rest = task % (columns * kMaxWarps);
+    group = (band * kMaxWarps + rest % kMaxWarps) * columns + rest / kMaxWarps;
+  }
+  return group * int64_t{kOwned} < s.n_pixels ? group : -1;
+}
+
+int64_t n_tasks(const LineSizes& s) {
+  if (s.width % kOwned != 0) return (s.n_pixels + kOwned - 1) / kOwned;
+  return static_cast<int64_t>((s.height + kMaxWarps - 1) / kMaxWarps) * kMaxWarps * (s.width / kOwned);
+}
+
+// One warp owns 32 kVectors channels of kOwned pixels as sources and adds what every kept line gives them, by pairs,
+// then by pixels.
+template <typename T, int kVectors>
+__global__ void __launch_bounds__(kMaxWarps* kWarp)
+    source_kernel(Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s, Lines<T> lines, int64_t tasks_per_image,
+                  Pixels<T> grad_pixels) {
+  using Own = Pack<T, kVectors>;
+  const int lane = threadIdx.x % kWarp;
+  const int64_t at = (int64_t{blockIdx.x} * blockDim.x + threadIdx.x) / kWarp;
+  if (at >= sweep.n_images * tasks_per_image) return;
+  const int64_t source = at / tasks_per_image;
+  const int32_t group = group_of(static_cast<int32_t>(at % tasks_per_image), s);
+  if (group < 0) return;
+  const int32_t word = group * kOwned / 32, shift = group * kOwned % 32;
+  const int32_t channel = (blockIdx.y * kWarp + lane) * kVectors;
+
+  Own sums[kOwned] = {};
+  for (int64_t pair = lines.first_pair; pair < lines.first_pair + lines.n_pairs; ++pair) {
+    if (sweep.src_images[pair] != source) continue;
+    int64_t image = 0, past = sweep.n_images;  // the last image whose pairs begin at or before this one
+    while (past - image > 1) {
+      const int64_t middle = (image + past) / 2;
+      (sweep.cu_src[middle] <= pair ? image : past) = middle;
+    }
+    const Range owned = range_of(sweep.cu_src, image, sweep.n_pairs);
+    if (pair < owned.begin || pair >= owned.end) continue;
+    for (int32_t first = 0; first < lines.n_pixels; first += kWarp) {
+      const int64_t slot = lines.slot(pair, lines.first_pixel + first + lane);
+      unsigned bits = 0;
+      T weights[kOwned] = {};
+      if (first + lane < lines.n_pixels) {
+        const uint32_t all = lines.bits[slot * s.n_words + word];
+        bits = all >> shift & ((1u << kOwned) - 1);
+        if (bits) {
+          int32_t rank = lines.before[slot * s.n_words + word] + __popc(all & ((1u << shift) - 1));
+#pragma unroll
+          for (int q = 0; q < kOwned; ++q)
+            if (bits >> q & 1 && rank < s.capacity) weights[q] = lines.weights[slot * s.capacity + rank++];
+        }
+      }
+      const T* from = pixels.at(s, image, lines.first_pixel + first) + channel;
+      for (unsigned hits = __ballot_sync(kFullWarp, bits != 0); hits; hits &= hits - 1) {
+        const int hit = __ffs(hits) - 1;
+        const Own other = *reinterpret_cast<const Own*>(from + int64_t{hit} * pixels.stride);
+        const unsigned touched = __shfl_sync(kFullWarp, bits, hit);
+#pragma unroll
+        for (int q = 0; q < kOwned; ++q) {
+          if (!(touched >> q & 1)) continue;
+          const T weight = __shfl_sync(kFullWarp, weights[q], hit);
+#pragma unroll
+          for (int v = 0; v < kVectors; ++v) sums[q].v[v] += weight * other.v[v];
+        }
+      }
+    }
+  }
+#pragma unroll
+  for (int q = 0; q < kOwned; ++q) {
+    if (group * kOwned + q >= s.n_pixels) break;
+    Own* to = reinterpret_cast<Own*>(grad_pixels.at(s, source, group * kOwned + q) + channel);
+    Own total = *to;
+#pragma unroll
+    for (int v = 0; v < kVectors; ++v) total.v[v] += sums[q].v[v];
+    *to = total;
+  }
+}
+
+// Warps of a block whose lines fit in shared memory together.
+int64_t warps_for(const char* op, int64_t bytes, const LineSizes& s, Stream stream) {
+  int limit = 0;
+  check_cuda(cudaDeviceGetAttribute(&limit, cudaDevAttrMaxSharedMemoryPerBlockOptin, stream.device), op);
+  check(bytes <= limit, op, ": features and depths must be small enough for one pixel's line to fit ", limit,
+        " bytes of shared memory; got ", s.height, " x ", s.width, " pixels and ", s.n_depths, " depths");
+  return std::min<int64_t>(kMaxWarps, limit / bytes);
+}
+
+template <typename T>
+void check_lines(const char* op, const PlaneSweep<T>& sweep) {
+  check_sizes(op, sweep);
+  check(sweep.n_depths < 1 << 14, op, ": inverse_depths must have fewer than 2^14 depths; got ", sweep.n_depths);
+}
+
+template <typename T>
+Pixels<T> take_pixels(const PlaneSweep<T>& sweep, int vectors, const Workspace& workspace) {
+  const int64_t block = kWarp * vectors, stride = (sweep.channels + block - 1) / block * block;
+  return {workspace.take<T>(sweep.n_images * sweep.height * sweep.width * stride), static_cast<int32_t>(stride)};
+}
+
+dim3 transpose_grid(const char* op, int64_t n_images, int64_t n_pixels, int64_t stride) {
+  return {blocks_for(op, n_images * ((n_pixels + 31) / 32), 1), static_cast<unsigned>(stride / 32)};
+}
+
+template <typename T>
+Pixels<const T> make_pixels(const char* op, const T* features, const PlaneSweep<T>& sweep, int vectors,
+                            const Workspace& workspace, Stream stream) {
+  const Pixels<T> pixels = take_pixels(sweep, vectors, workspace);
+  const int64_t n_pixels = sweep.height * sweep.width;
+  launch(op, to_pixels_kernel<T>, transpose_grid(op, sweep.n_images, n_pixels, pixels.stride), dim3(32, 8), 0, stream,
+         features, sweep.channels, n_pixels, pixels.stride, (n_pixels + 31) / 32, pixels.data);
+  return {pixels.data, pixels.stride};
+}
+
+// f with kVectors = 1, 2 or 4 as a constant: a warp's packs should not be wider than the features.
+template <typename F>
+void for_vectors(int64_t channels, const F& f) {
+  if (channels <= kWarp) return f.template operator()<1>();
+  if (channels <= 2 * kWarp) return f.template operator()<2>();
+  return f.template operator()<4>();
+}
+
+}  // namespace
+
+template <typename T>
+void plane_sweep(const T* features, const PlaneSweep<T>& sweep, T* cost, const Workspace& workspace, Stream stream) {
+  const char* op = "plane_sweep";
+  check_lines(op, sweep);
+  const LineSizes s = line_sizes(sweep);
+  if (sweep.n_images * s.n_pixels * s.n_depths == 0) return;
+  const int64_t bytes = forward_bytes<T>(s), warps = warps_for(op, bytes, s, stream);
+  for_vectors(sweep.channels, [&]<int kVectors>() {
+    const Pixels<const T> pixels = make_pixels(op, features, sweep, kVectors, workspace, stream);
+    launch(op, forward_kernel<T, kVectors>, blocks_for(op, sweep.n_images * s.n_pixels, warps),
+           static_cast<unsigned>(warps * kWarp), warps * bytes, stream, pixels, sweep, s, cost);
+  });
+}
+
+template <typename T>
+void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& sweep, T* grad_features,
+                     const Workspace& workspace, Stream stream) {
+  const char* op = "plane_sweep_backward";
+  check_lines(op, sweep);
+  const LineSizes s = line_sizes(sweep);
+  if (sweep.n_pairs == 0 || s.n_depths == 0)
+    return fill_zero(op, grad_features, sweep.n_images * sweep.channels * s.n_pixels, stream);
+  if (sweep.n_images * s.n_pixels == 0) return;
+  const int64_t bytes = backward_bytes<T>(s), warps = warps_for(op, bytes, s, stream);
+  const int64_t line = s.n_words * (sizeof(uint32_t) + sizeof(uint16_t)) + s.capacity * sizeof(T);
+  const int64_t room = std::max<int64_t>(kListBytes / line, 1), per_pair = std::min<int64_t>(room, s.n_pixels);
+  const int64_t pairs = std::min(std::max<int64_t>(room / s.n_pixels, 1), sweep.n_pairs);
+  const bool whole = pairs == sweep.n_pairs && per_pair == s.n_pixels;
+  const int64_t tasks = n_tasks(s);
+  Lines<T> lines{workspace.take<uint32_t>(pairs * per_pair * s.n_words),
+                 workspace.take<uint16_t>(pairs * per_pair * s.n_words),
+                 workspace.take<T>(pairs * per_pair * s.capacity)};
+  for_vectors(sweep.channels, [&]<int kVectors>() {
+    const Pixels<const T> pixels = make_pixels(op, features, sweep, kVectors, workspace, stream);
+    const Pixels<T> grad_pixels = take_pixels(sweep, kVectors, workspace);
+    const unsigned blocks_of_channels = pixels.stride / (kWarp * kVectors);
+    if (!whole) fill_zero(op, grad_pixels.data, sweep.n_images * s.n_pixels * pixels.stride, stream);
+    for (lines.first_pair = 0; lines.first_pair < sweep.n_pairs; lines.first_pair += pairs) {
+      lines.n_pairs = std::min(pairs, sweep.n_pairs - lines.first_pair);
+      for (int64_t pixel = 0; pixel < s.n_pixels; pixel += per_pair) {
+        lines.first_pixel = static_cast<int32_t>(pixel);
+        lines.n_pixels = static_cast<int32_t>(std::min(per_pair, s.n_pixels - pixel));
+        launch(op, reference_kernel<T, kVectors>,
+               dim3(blocks_for(op, sweep.n_images * lines.n_pixels, warps), blocks_of_channels),
+               static_cast<unsigned>(warps * kWarp), warps * bytes, stream, grad, pixels, sweep, s, lines, !whole,
+               grad_pixels);
+        launch(op, source_kernel<T, kVectors>,
+               dim3(blocks_for(op, sweep.n_images * tasks, kMaxWarps), blocks_of_channels), kMaxWarps * kWarp, 0, stream,
+               pixels, sweep, s, lines, tasks, grad_pixels);
+      }
+    }
+    launch(op, to_planes_kernel<T>, transpose_grid(op, sweep.n_images, s.n_pixels, pixels.stride), dim3(32, 8), 0,
+           stream, grad_pixels.data, sweep.channels, s.n_pixels, pixels.stride, (s.n_pixels + 31) / 32, grad_features);
+  });
+}
+
+#define GSIM3D_INSTANTIATE(T)                                                                             \
+  template void plane_sweep<T>(const T*, const PlaneSweep<T>&, T*, const Workspace&, Stream);             \
+  template void plane_sweep_vjp<T>(const T*, const T*, const PlaneSweep<T>&, T*, const Workspace&, Stream);
+GSIM3D_INSTANTIATE(float)
+GSIM3D_INSTANTIATE(double)
+#undef GSIM3D_INSTANTIATE
+
+}  // namespace gsim3d::cuda
