@@ -58,7 +58,7 @@ def check_scene(folder: str | Path) -> SceneCheck:
         if recording.read_labels is not None:
             _check_labels(recording, problems)
     if scene is not None and not problems.found:
-        _check_agreement(scene, problems)
+        _check_agreement(Scene(path, recording), problems)  # its images go when it goes
     return SceneCheck(path, scene, tuple(dict.fromkeys(problems.found)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,6 @@ class Scene:
     near, far: metres, the depth range in which the scene lies.
     width, height: pixels of all images: those of the largest camera, padded on the right and below to multiples of 16.
     origin: float64 [3] metres, lower corner of the workspace.
-    bounds: float64 [2, 3] metres, corners of the box that is shown as the scene's: given, or what most cameras see.
     """
 
     def __init__(self, path: Path, recording: Recording, cache_dir: str | Path | None = None):
@@ -40,12 +40,10 @@ class Scene:
         self.near, self.far = _depths(recording)
         sizes = np.array(recording.sizes)
         self.width, self.height = (int(-(-side // SIZE_MULTIPLE) * SIZE_MULTIPLE) for side in sizes.max(0))
-        view = (spread_steps(recording.viewmats), spread_steps(recording.Ks), recording.sizes, self.near, self.far)
-        self.bounds = shared_view(*view) if recording.bounds is None else recording.bounds
         if recording.origin is not None:
             self.origin = recording.origin
         else:
-            self.origin = recording.bounds[0] if recording.bounds is not None else frusta_origin(*view)
+            self.origin = frusta_origin(*self._view()) if recording.bounds is None else recording.bounds[0]
         self._undistorters = [
             None if coefficients is None else Undistorter(coefficients, size)
             for coefficients, size in zip(recording.distortions or (None,) * self.n_cams, recording.sizes, strict=True)
@@ -71,6 +69,15 @@ class Scene:
         recording = layouts.layout_of(path).read(path, problems)
         check_directions(recording, problems)
         return Scene(path, recording, cache_dir)
+
+    @cached_property
+    def bounds(self) -> np.ndarray:
+        """float64 [2, 3] metres, corners of the box that is shown as the scene's: given, or what most cameras see."""
+        return shared_view(*self._view()) if self.recording.bounds is None else self.recording.bounds
+
+    def _view(self) -> tuple:
+        recording = self.recording
+        return spread_steps(recording.viewmats), spread_steps(recording.Ks), recording.sizes, self.near, self.far
 
     def __repr__(self) -> str:
         return (

@@ -1,5 +1,6 @@
 """Films of real cameras: videos, odd sizes, lenses, backgrounds; the whole way through train, simulate, evaluate."""
 
+import dataclasses
 import json
 import os
 
@@ -14,6 +15,9 @@ from gsim3d.data.check import check_scene, contact_sheet
 from gsim3d.data.masks import Undistorter
 from gsim3d.errors import InputError
 from gsim3d.interop import write_video
+from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.loop import Trainer
+from gsim3d.train.samples import draw_batch
 from tests.data.made_scenes import (
     FPS,
     N_CAMS,
@@ -319,6 +323,32 @@ def test_transforms_name_cameras_by_key_or_path(tmp_path):
     edit_json(tmp_path / "transforms.json", lambda content: [frame.pop("camera") for frame in content["frames"]])
     with pytest.raises(InputError, match="give every frame its camera"):
         Scene.open(tmp_path)
+
+
+def test_no_loss_and_no_metric_sees_the_padding(odd, tmp_path, one_thread):
+    """Other colours in pixels that were not filmed change neither the loss nor its gradient, elsewhere they do."""
+    scene = Scene.open(odd[0])
+    data, stage = DataConfig(history=1, context_views=2), StageConfig(steps=1, horizon=1, target_views=3)
+    trainer = Trainer(TrainConfig(data=data, stages=(stage,)), [scene], tmp_path / "run")
+    batch = draw_batch([scene], data, stage, 0, 0, [0])
+    assert batch.targets.valid is not None and not batch.targets.valid.all()
+    noise = torch.rand(batch.targets.images.shape, generator=torch.Generator().manual_seed(0))
+
+    def result(where):
+        images = torch.where(where[:, None], noise, batch.targets.images)
+        targets = dataclasses.replace(batch.targets, images=images)
+        loss, errors = trainer.loss(dataclasses.replace(batch, targets=targets))
+        loss.backward()
+        grads = [p.grad.clone() for p in trainer.simulator.parameters() if p.grad is not None]
+        trainer.simulator.zero_grad()
+        return loss, errors, grads
+
+    nowhere = torch.zeros_like(batch.targets.valid)
+    loss, errors, grads = result(nowhere)
+    padded = result(~batch.targets.valid)
+    assert torch.equal(padded[0], loss) and torch.equal(padded[1], errors)
+    assert all(torch.equal(a, b) for a, b in zip(padded[2], grads, strict=True))
+    assert not torch.equal(result(~nowhere)[0], loss)
 
 
 def test_train_simulate_evaluate_and_check_on_films(odd, tmp_path, capsys, one_thread):
