@@ -71,10 +71,8 @@ def render(file, view, means, quats, scales, opacities, harmonics, cutoff):
     near = file["in/near"][view].to(means)
     sh = torch.einsum("kj,nck->njc", basis_change().to(harmonics), harmonics)
     background = file["in/background"][view].to(means)
-    return rasterize_gaussians(
-        means / near, quats, scales / near, opacities, camera(file, view).to(means.device), sh=sh, background=background,
-        near_plane=NEAR_PLANE, cutoff=cutoff,
-    )  # fmt: skip
+    scene = means / near, quats, scales / near, opacities, camera(file, view).to(means.device)
+    return rasterize_gaussians(*scene, sh=sh, background=background, near_plane=NEAR_PLANE, cutoff=cutoff)
 
 
 @pytest.mark.parametrize("view", [0, 1])

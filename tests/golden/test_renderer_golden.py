@@ -150,7 +150,9 @@ def close_but_for_flips(actual, expected, what):
     error = (actual - expected).abs() / expected.abs().max()
     far = error.flatten(0, -3).amax(0) if error.dim() > 2 else error
     off = far > tolerance("raster_golden_float32")
-    assert off.sum() <= 3 and far.max() < 1.5 / 255, f"{what}: {int(off.sum())} pixels are off, by up to {far.max():.3g}"
+    assert (
+        off.sum() <= 3 and far.max() < 1.5 / 255
+    ), f"{what}: {int(off.sum())} pixels are off, by up to {far.max():.3g}"
 
 
 def test_images_of_the_published_renderer(device):
@@ -167,7 +169,9 @@ def test_images_of_the_published_renderer(device):
 
 def test_masked_rows_are_absent():
     file = golden("j_raster")
-    gaussians, cameras = gaussians_of(file, file["masked/mask"][:, 0]), published_cameras(file).select(torch.tensor([0]))
+    gaussians, cameras = gaussians_of(file, file["masked/mask"][:, 0]), published_cameras(file).select(
+        torch.tensor([0])
+    )
     out = render_as_published(gaussians, cameras, file["in/background"][:1], quirks=FULL_PRECISION)
     expected = file["f64/masked/view0_image"].float()
     close_but_for_flips(out.color[0].permute(2, 0, 1), expected, "image")
@@ -182,7 +186,12 @@ def test_cameras_of_the_published_renderer():
         settings = file / f"view{view}" / "raster_settings"
         near, far = given.near[view].double(), given.far[view].double()
         tangents = torch.stack([settings["tanfovx"], settings["tanfovy"]]).double()
-        close(SIZE / (2 * cameras.Ks[view].diagonal()[:2]), tangents, "tangents of half the opening angles", "golden_float32")
+        close(
+            SIZE / (2 * cameras.Ks[view].diagonal()[:2]),
+            tangents,
+            "tangents of half the opening angles",
+            "golden_float32",
+        )
         viewmat = given.viewmats[view].clone()
         viewmat[:3, 3] /= near
         close(viewmat.mT, settings["viewmatrix"].double(), "view matrix", "golden_float32")
