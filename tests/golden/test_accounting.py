@@ -29,7 +29,7 @@ def is_unused(entry: tuple[str, str]) -> bool:
 
 
 def read_by_tests(tmp_path: Path) -> set[tuple[str, str]]:
-    """What all golden tests of this folder read, in a process of their own, whatever else runs and in whatever order."""
+    """What all golden tests of this folder read, in a process of their own: whatever else runs, in any order."""
     log = tmp_path / "reads.json"
     command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.golden.reads", "-p", "no:cacheprovider", str(HERE)]
     done = subprocess.run(

@@ -56,7 +56,7 @@ def racing_conv(x: Tensor, weight: Tensor, bias: Tensor | None, voxels, kernel_m
 
     "native": taps before the centre add every row of the neighbour voxel into the first row of a voxel, taps after it
     give every row the first row of the neighbour. "implicit": taps before the centre give every row the first row of
-    the neighbour, taps after it give the first row only the last row of the neighbour. The centre tap reads its own row.
+    the neighbour, taps after it give the first row only the last row of the neighbour. The centre reads its own row.
     """
     size = weight.shape[1]
     n_voxels = len(voxels.cu_rows) - 1
