@@ -110,11 +110,12 @@ def cloud_table(xyz: Tensor) -> tuple[Tensor, Tensor]:
     return torch.arange(n_scenes).repeat_interleave(n_steps), torch.arange(n_steps).repeat(n_scenes)
 
 
-def pyramid_of(xyz: Tensor, mask: Tensor, config: DynamicsConfig) -> ops.Pyramid:
-    """The geometry of clouds [B, T, N, 3] as the published model makes it."""
+def pyramid_of(xyz: Tensor, mask: Tensor, config: DynamicsConfig, origin: Tensor | None = None) -> ops.Pyramid:
+    """The geometry of clouds [B, T, N, 3] as the published model makes it; it knows no ``origin`` [B, 3]."""
     scene, step = cloud_table(xyz)
     spec = config.pyramid_spec((xyz.shape[1] - 1).bit_length())
-    return ops.build_pyramid(xyz[mask], offsets(mask), scene, step, torch.zeros(xyz.shape[0], 3).double(), spec)
+    origin = torch.zeros(xyz.shape[0], 3) if origin is None else origin
+    return ops.build_pyramid(xyz[mask], offsets(mask), scene, step, origin.double(), spec)
 
 
 def particles_of(case: Golden) -> tuple[Particles, Tensor]:

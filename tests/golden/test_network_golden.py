@@ -9,6 +9,7 @@ from gsim3d import ops
 from gsim3d.dynamics import point_transformer
 from gsim3d.dynamics.point_transformer import PointTransformer
 from gsim3d.quirks import Quirks
+from tests.asserts import relative_to_max
 from tests.golden.published import (
     FULL_PRECISION,
     assert_published_stage,
@@ -23,6 +24,7 @@ from tests.golden.published import (
 )
 from tests.golden_files import golden
 from tests.oracle.sparse_conv import racing_conv
+from tests.tolerances import tolerance
 
 pytestmark = pytest.mark.golden
 
@@ -42,11 +44,11 @@ def load(file, quirks=FULL_PRECISION):
     return g, net, config
 
 
-def run(net, config, case, features=None):
+def run(net, config, case, features=None, origin=None):
     """[B, T, N, out] of a case of the file."""
     xyz, features = case["xyz"], case["features"] if features is None else features
     mask = mask_of(case, xyz)
-    out = net.head(net(features[mask], pyramid_of(xyz, mask, config)))
+    out = net.head(net(features[mask], pyramid_of(xyz, mask, config, origin)))
     return torch.zeros(*mask.shape, out.shape[-1]).masked_scatter(mask[..., None], out)
 
 
@@ -60,6 +62,23 @@ def test_network(file, case):
     close(out, c["out"], "out")
     (grad,) = torch.autograd.grad(out, features, c["cotangent"])
     close(grad, c["grad_features"], "gradient of the features")
+
+
+@pytest.mark.parametrize(
+    ("quirk", "file", "case"),
+    [
+        ("stale_decoder_conv", "small_nodup", "T4_nomask"),
+        ("first_of_voxel", "small_dup", "T4_nomask"),
+        ("anchor_at_minimum", "small_nodup", "T4_mask"),
+    ],
+)
+def test_each_quirk_is_what_the_published_model_does(quirk, file, case):
+    """Without any one of them the published numbers are missed."""
+    g, net, config = load(file, dataclasses.replace(FULL_PRECISION, **{quirk: False}))
+    c = g / case
+    with torch.no_grad():
+        out = run(net, config, c, origin=c["xyz"].amin((1, 2)) - 0.05)
+    assert relative_to_max(out, c["out"]) > 10 * tolerance("dynamics_golden")
 
 
 @pytest.mark.parametrize("case", CASES)
