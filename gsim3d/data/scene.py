@@ -189,7 +189,8 @@ class Scene:
         undistorter = self._undistorters[cam]
         for step, labels in zip(steps, self.recording.read_labels(cam, steps, Problems()), strict=True):
             if undistorter is not None:
-                labels = undistorter(labels, self._K(cam, step), nearest=True)
+                K = self._K(cam, step)
+                labels = undistorter(labels, K, nearest=True) * undistorter.valid(K)
             yield self._padded(labels)
 
     def _subtracted(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:

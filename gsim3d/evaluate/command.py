@@ -84,6 +84,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from dataclasses import replace
+
     from tqdm import tqdm
 
     from gsim3d.errors import InputError
@@ -100,11 +102,11 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--given: without a CHECKPOINT, say how many steps the other models were given, at least 1")
     if args.checkpoint is not None and args.given is not None:
         raise InputError("--given: with a CHECKPOINT it is the model's own history; leave the option out")
-    out = _out_file(args)
     restored = None if args.checkpoint is None else restore(args.checkpoint)
     others = [Predictions.open(given, args.data) for given in args.predictions]
     if len({other.name for other in others}) != len(others):
         raise InputError("--predictions: two have the same name; write NAME=DIR")
+    out = _out_file(args, others)
     n_encoded = args.given if restored is None else restored.data.history
     scenes = _scenes(args, restored)
     views, n_future = [], args.steps
@@ -122,14 +124,15 @@ def run(args: argparse.Namespace) -> int:
     with tqdm(scenes, desc="scenes", unit="scene") as progress:
         for scene, (context, targets) in zip(progress, views):
             given = {"context_cams": context, "target_cams": targets, "n_encoded": n_encoded, "n_future": n_future}
-            scores.append(score_scene(restored, scene, **given, metrics=metrics, others=others))
-    summary = summarize(scores, not_measured)
+            score = score_scene(restored, scene, **given, metrics=metrics, others=others)
+            scores.append(replace(score, scene=_name(scene, args.data)))
+    summary = {**_conditions(args, restored, others, scenes, views), **summarize(scores, not_measured)}
     print(table(summary))
     print("\nwritten: " + ", ".join(str(path) for path in _write(out, args, scenes, scores, summary)))
     return 0
 
 
-def _out_file(args: argparse.Namespace):
+def _out_file(args: argparse.Namespace, others: list):
     from pathlib import Path
 
     from gsim3d.errors import InputError
@@ -139,7 +142,7 @@ def _out_file(args: argparse.Namespace):
         if out.suffix != ".json":
             raise InputError(f"--out: the name must end in .json; got {out}")
     else:
-        place = Path(args.checkpoint or args.predictions[0].rpartition("=")[2])
+        place = Path(args.checkpoint or others[0].folder)
         out = (place if place.is_dir() else place.parent) / "metrics.json"
     if not out.parent.is_dir() and args.out:
         raise InputError(f"--out: the folder {out.parent} does not exist")
@@ -154,6 +157,27 @@ def _scenes(args: argparse.Namespace, restored) -> list:
     train, test = (split_scenes if args.split == "gsim3d" else published_split)(folders)
     chosen = {"all": folders, "train": train, "test": test or folders}[args.scenes]
     return [Scene.open(folder) if restored is None else restored.open_scene(folder) for folder in chosen]
+
+
+def _name(scene, root: str) -> str:
+    """The scene's folder below the data set's: two scenes never share it."""
+    below = scene.path.relative_to(root).as_posix()
+    return scene.name if below == "." else below
+
+
+def _conditions(args: argparse.Namespace, restored, others: list, scenes: list, views: list) -> dict:
+    """What was evaluated, and on what: without it two reports cannot be compared."""
+    return {
+        "checkpoint": None if restored is None else restored.checkpoint.digest,
+        "predictions": {other.name: str(other.folder) for other in others},
+        "data": str(args.data),
+        "part": args.scenes,
+        "split": args.split,
+        "cameras": {
+            _name(scene, args.data): {"context": None if context is None else list(context), "target": list(targets)}
+            for scene, (context, targets) in zip(scenes, views)
+        },
+    }
 
 
 def _write(out, args: argparse.Namespace, scenes: list, scores: list, summary: dict) -> list:

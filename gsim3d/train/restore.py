@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from gsim3d.data import Scene
 from gsim3d.effects import EffectsSpec, Plan
 from gsim3d.errors import InputError
 from gsim3d.presets import ModelConfig
+from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, TrainConfig
@@ -58,6 +60,17 @@ def model_config(config: TrainConfig) -> ModelConfig:
     return from_dict(ModelConfig, config.model, "model", base)
 
 
+def without_old_switches(model: dict) -> dict:
+    """A saved model section without quirks that are off and that this version has under other names."""
+    known = {field.name for field in dataclasses.fields(Quirks)}
+    parts = {}
+    for name, part in model.items():
+        if isinstance(part, dict) and isinstance(part.get("quirks"), dict):
+            part = {**part, "quirks": {key: on for key, on in part["quirks"].items() if on or key in known}}
+        parts[name] = part
+    return parts
+
+
 def build_simulator(config: ModelConfig, seed: int) -> Simulator:
     """A simulator whose first weights are a function of the seed; torch's own random state stays as it was."""
     with torch.random.fork_rng(devices=[]):
@@ -89,7 +102,7 @@ def restore(path: str | Path) -> Restored:
     if len(image_size) != 2 or not all(isinstance(size, int) for size in image_size):
         raise InputError(f"{path}: data.image_size must be [width, height]; got {list(image_size)}")
     try:
-        simulator = build_simulator(from_dict(ModelConfig, saved.config["model"], "model"), seed=0)
+        simulator = build_simulator(from_dict(ModelConfig, without_old_switches(saved.config["model"]), "model"), seed=0)
         settings = from_dict(DataConfig, data, "data")
         spec = EffectsSpec.from_dict(saved.config.get("effects", {}).get("spec"))
     except InputError as error:

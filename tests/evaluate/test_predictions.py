@@ -190,7 +190,21 @@ def test_the_command_scores_them_without_a_checkpoint(data, folder, capsys, no_w
     summary = json.loads(out.read_text())
     assert summary["methods"] == ["other", "copy"] and summary["other.future.psnr"] == 100.0
     assert summary["not_measured"]["fvd"] == "run gsim3d weights fvd"
+    assert summary["checkpoint"] is None and summary["predictions"] == {"other": str(folder)}
+    assert summary["cameras"]["ball/0001"] == {"context": None, "target": [1, 3]}
     assert sorted(p.name for p in folder.glob("metrics.*")) == [f"metrics.{e}" for e in ("csv", "json", "md", "png")]
+
+
+def test_scenes_of_the_same_name_stay_apart(data, folder, tmp_path, capsys, no_weights):
+    both, others = tmp_path / "both", tmp_path / "others"
+    for part in ("a", "b"):
+        shutil.copytree(data, both / part)
+        shutil.copytree(folder, others / part)
+    arguments = ["--predictions", others, both, "--given", 2, "--scenes", "all", "--metrics", "psnr"]
+    assert evaluate(capsys, *arguments, "--out", tmp_path / "m.json")[0] == 0
+    assert set(json.loads((tmp_path / "m.json").read_text())["scenes"]) == {
+        f"{p}/ball/000{i}" for p in "ab" for i in (0, 1)
+    }
 
 
 def test_a_report_is_not_written_where_predictions_do_not_fit(data, folder, capsys, no_weights):

@@ -155,11 +155,14 @@ def test_held_baselines_are_seen_by_cameras_that_move(restored, scene, tmp_path)
     (folder / "metadata.json").write_text(json.dumps(metadata))
     moving = Scene.open(folder)
     assert moving.cameras_move and not scene.cameras_move
-    images = protocol._model_and_baselines(restored, moving, (0, 2), [3], 4)
-    still = protocol._model_and_baselines(restored, scene, (0, 2), [3, 4], 4)
-    for name in ("constant", "release_constant"):
-        torch.testing.assert_close(images[name][2:4, 0], still[name][2:4, 0])
-        torch.testing.assert_close(images[name][4:, 0], still[name][4:, 1])  # from step 4 on, camera 3 is where 4 was
+    prediction = predict(restored, scene, (0, 2), 4)
+    still = render_steps(restored, prediction.particles, scene, [3, 4])
+    for step in (1, 2):
+        images = protocol._held(restored, prediction, None, step, moving, [3])
+        torch.testing.assert_close(images[:2, 0], still[step, 0].expand(2, 32, 32, 3))
+        torch.testing.assert_close(images[2:, 0], still[step, 1].expand(2, 32, 32, 3))  # camera 3 is where 4 was
+    values = score_scene(restored, moving, n_future=4).values
+    assert values["constant"]["psnr"][5] != values["constant"]["psnr"][2]
 
 
 def test_scores_by_hand(restored, scene):
