@@ -25,6 +25,7 @@ from gsim3d.data.images import IMAGE_SUFFIXES, as_color, as_labels, is_marked, r
 from gsim3d.data.masks import MIN_STEPS
 from gsim3d.data.recording import (
     MAX_CAMS,
+    MAX_NAME,
     MAX_STEPS,
     MOVING,
     Problems,
@@ -129,9 +130,11 @@ def read(folder: Path, problems: Problems) -> Recording:
 
 def _name(entry: dict, number: int, source: Path) -> str:
     name = entry.get("name")
-    if not isinstance(name, str) or not name or Path(name).name != name or name in OWN_FOLDERS or name.startswith("."):
+    plain = isinstance(name, str) and 0 < len(name) <= MAX_NAME and Path(name).name == name and "\0" not in name
+    if not plain or name in OWN_FOLDERS or name.startswith("."):
         raise InputError(
-            f"{source}: cameras[{number}].name must be the name of its folder or video, without ending; got {name!r}"
+            f"{source}: cameras[{number}].name must be the name of its folder or video, without ending; "
+            f"got {str(name)[:80]!r}"
         )
     return name
 

@@ -63,9 +63,11 @@ def read(folder: Path, problems: Problems) -> Recording:
         )
     for number, frame in enumerate(frames):
         for key in ("file_path", "mask_path", "label_path"):
-            if not isinstance(frame.get(key, ""), str) or (key == "file_path" and key not in frame):
-                raise InputError(f"{source}: frames[{number}].{key} must be text; got {frame.get(key)!r}")
-            inside(folder, frame.get(key, ""), f"{source}: frames[{number}].{key}")
+            if key != "file_path" and key not in frame:
+                continue
+            if not isinstance(frame.get(key), str):
+                raise InputError(f"{source}: frames[{number}].{key} must be text; got {str(frame.get(key))[:80]!r}")
+            inside(folder, frame[key], f"{source}: frames[{number}].{key}")
     table, times = _table(frames, source, problems)
     names = sorted(table, key=natural_order)
     if len(names) > MAX_CAMS:

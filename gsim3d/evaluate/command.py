@@ -108,11 +108,9 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--predictions: two have the same name; write NAME=DIR")
     out = _out_file(args, others)
     n_encoded = args.given if restored is None else restored.data.history
-    scenes = _scenes(args)
+    scenes = _scenes(args, restored)
     views, n_future = [], args.steps
     for scene in scenes:
-        if restored is not None:
-            restored.check_scene(scene)
         context, targets = (None, None) if restored is None else default_views(restored, scene)
         targets = args.cameras or targets or others[0].cameras(scenes[0])
         if bad := [cam for cam in (*targets, *(args.context or ())) if not 0 <= cam < scene.n_cams]:
@@ -151,14 +149,14 @@ def _out_file(args: argparse.Namespace, others: list):
     return out
 
 
-def _scenes(args: argparse.Namespace) -> list:
-    """The chosen scenes, opened."""
+def _scenes(args: argparse.Namespace, restored) -> list:
+    """The chosen scenes, opened as the model expects them."""
     from gsim3d.data import Scene, find_scenes, published_split, split_scenes
 
     folders = find_scenes(args.data)
     train, test = (split_scenes if args.split == "gsim3d" else published_split)(folders)
     chosen = {"all": folders, "train": train, "test": test or folders}[args.scenes]
-    return [Scene.open(folder) for folder in chosen]
+    return [Scene.open(folder) if restored is None else restored.open_scene(folder) for folder in chosen]
 
 
 def _name(scene, root: str) -> str:

@@ -1,8 +1,8 @@
 """Tensors of a file that ``torch.save`` wrote, read without running anything that is in it.
 
-Such a file is a zip archive: ``data.pkl`` says what there is, ``data/0``, ``data/1`` ... hold the numbers. A pickle can name
-any function to be called. Here tensors are rebuilt by this module, a few packages that training tools leave traces of
-become empty placeholders, and every other name is refused.
+Such a file is a zip archive: ``data.pkl`` says what there is, ``data/0``, ``data/1`` ... hold the numbers. A pickle can
+name any function to be called. Here tensors are rebuilt by this module, a few packages that training tools leave traces
+of become empty placeholders, and every other name is refused.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ _PLACEHOLDER_PACKAGES = {
 }  # fmt: skip
 _PLACEHOLDER_NAMES = {
     "collections.defaultdict", "collections.Counter", "collections.deque", "builtins.set", "builtins.frozenset",
-    "builtins.dict", "builtins.list", "builtins.tuple", "builtins.int", "builtins.float", "builtins.str", "builtins.bool",
-    "builtins.complex", "builtins.bytearray", "builtins.slice", "_codecs.encode", "torch.Size", "torch.device",
-    "torch.Generator", *(f"torch.{dtype}" for dtype in ("float32", "float64", "float16", "bfloat16", "int64", "int32")),
+    "builtins.dict", "builtins.list", "builtins.tuple", "builtins.int", "builtins.float", "builtins.str",
+    "builtins.bool", "builtins.complex", "builtins.bytearray", "builtins.slice", "_codecs.encode", "torch.Size",
+    "torch.device", "torch.Generator", *(f"torch.{dtype}" for dtype in ("float32", "float64", "float16", "bfloat16", "int64", "int32")),
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class StoredTensor:
-    """A tensor that is still in the file: ``shape`` and ``stride`` in elements of storage ``key``, from ``offset`` on."""
+    """A tensor that is still in the file: elements of storage ``key`` by ``shape`` and ``stride``, from ``offset`` on."""
 
     key: str
     dtype: torch.dtype
@@ -151,8 +151,8 @@ class ReleasedFile:
             self._zip = zipfile.ZipFile(self.path)
         except zipfile.BadZipFile:
             raise InputError(
-                f"{self.path}: not a checkpoint that torch.save wrote as a zip archive (it is truncated, another kind of "
-                "file, or older than torch 1.6; the last can be saved again with a newer torch)"
+                f"{self.path}: not a checkpoint that torch.save wrote as a zip archive (it is truncated, another kind "
+                "of file, or older than torch 1.6; the last can be saved again with a newer torch)"
             ) from None
         try:
             self._root, self._members = self._index()
@@ -173,7 +173,7 @@ class ReleasedFile:
         item = stored.dtype.itemsize
         available = member.file_size // item if member else 0
         if member is None or stored.end > available or stored.n_elements > available:
-            raise InputError(f"{self.path}: a tensor of {list(stored.shape)} does not fit its storage; the file is broken")
+            raise InputError(f"{self.path}: a tensor of {list(stored.shape)} does not fit its storage; it is broken")
         if stored.n_elements == 0:
             values = torch.zeros(stored.shape, dtype=stored.dtype)
         else:
@@ -216,7 +216,7 @@ class ReleasedFile:
 
 
 def state_dict(file: ReleasedFile) -> tuple[dict[str, StoredTensor], dict[str, int]]:
-    """The weights of a Lightning checkpoint, or of a file that holds nothing but weights; and epoch and step, if given."""
+    """The weights of a Lightning checkpoint, or of a file of nothing but weights; and epoch and step, if given."""
     content = file.content
     if not isinstance(content, dict):
         raise InputError(f"{file.path}: holds a {type(content).__name__}, not a checkpoint")
