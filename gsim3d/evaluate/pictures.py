@@ -32,7 +32,7 @@ CURVE_COLORS = {"model": "#1f5fbf", "constant": "#c0504d", "copy": "#7f7f7f", "c
 
 def as_bytes(images: Tensor) -> np.ndarray:
     """Images in [0, 1] -> uint8."""
-    return (images * 255).round().to(torch.uint8).numpy()
+    return (images * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def true_images(scene: Scene, cams: Sequence[int], steps: Sequence[int]) -> np.ndarray:
@@ -68,7 +68,7 @@ def write_gaussians(folder: str | Path, restored: Restored, prediction: Predicti
     """One .ply a step into ``folder``: step_0000.ply, ..."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    gaussians = restored.simulator.renderer(prediction.particles)
+    gaussians = restored.simulator.renderer(prediction.particles).to("cpu")
     for step in range(prediction.n_steps):
         write_ply(folder / f"step_{step:04d}.ply", gaussians, step)
 

@@ -1,5 +1,6 @@
 """The protocol: what the baselines show, how scores are averaged, and that reports hold no NaN."""
 
+import copy
 import dataclasses
 import json
 import math
@@ -186,6 +187,16 @@ def test_scores_by_hand(restored, scene):
         mse = (images[shown] - truth[4])[mask].square().mean().item()
         assert scores.values[method]["psnr_masked"][4].item() == pytest.approx(-10 * math.log10(mse), abs=1e-4)
     assert scores.values["constant"]["psnr"][:2].isnan().all()
+
+
+def test_scores_are_the_same_on_both_devices(restored, scene, devices):
+    cpu, cuda = (
+        score_scene(dataclasses.replace(restored, simulator=copy.deepcopy(restored.simulator).to(device)), scene).values
+        for device in devices
+    )
+    for method in METHODS:
+        for metric, values in cpu[method].items():
+            torch.testing.assert_close(cuda[method][metric], values, rtol=0, atol=0.01, equal_nan=True)
 
 
 def test_what_does_not_fit_is_named(restored, scene):
