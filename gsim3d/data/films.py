@@ -277,6 +277,8 @@ class _Video:
         return capture
 
     def read(self, numbers: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
+        import cv2
+
         capture = self._open()
         try:
             at, ended = -1, False
@@ -298,6 +300,6 @@ class _Video:
                     problems.add(f"video {self._file} (camera {self._name}, frame {number}) cannot be decoded")
                     yield None
                     continue
-                yield frame[..., ::-1]
+                yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
         finally:
             capture.release()

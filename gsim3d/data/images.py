@@ -82,12 +82,14 @@ def _header(data: bytes) -> tuple[tuple[int, int] | None, bool]:
 
 def as_color(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray | None:
     """uint8 [h, w, 3], RGB; alpha is dropped, grey repeated."""
+    import cv2
+
     if image.dtype != np.uint8:
         problems.add(f"image {file} ({place}) must have 8 bits a channel; got {image.dtype}")
         return None
     if image.ndim == 2:
         return np.repeat(image[..., None], 3, 2)
-    return image[..., 2::-1]
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
 
 
 def as_labels(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray | None:
