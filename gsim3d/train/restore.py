@@ -37,6 +37,12 @@ class Restored:
     plan: Plan
     checkpoint: checkpoint.Checkpoint
 
+    def open_scene(self, folder: str | Path) -> Scene:
+        """The scene in ``folder`` as the model expects it. Raises InputError as :meth:`check_scene` and the reader."""
+        scene = Scene.open(folder, fitting=self.data.fitting)
+        self.check_scene(scene)
+        return scene
+
     def check_scene(self, scene: Scene) -> None:
         """Raises InputError where the scene's images have another size than those of the training."""
         if (scene.width, scene.height) != self.image_size:
@@ -76,7 +82,7 @@ def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: Eff
     """The content of a checkpoint's config.yaml."""
     return {
         "model": to_dict(model),
-        "data": {**to_dict(config.data), "image_size": [scene.width, scene.height], "near_far": "of each scene"},
+        "data": {**to_dict(config.data), "image_size": [scene.width, scene.height]},
         "effects": {"spec": effects.to_dict(), "hash": effects.hash},
         "train": to_dict(config),
     }
@@ -91,7 +97,8 @@ def restore(path: str | Path) -> Restored:
     saved = checkpoint.load(path)
     data = dict(saved.config["data"])
     image_size = tuple(data.pop("image_size", ()))
-    data.pop("near_far", None)
+    if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
+        data.pop("near_far")
     if len(image_size) != 2 or not all(isinstance(size, int) for size in image_size):
         raise InputError(f"{path}: data.image_size must be [width, height]; got {list(image_size)}")
     try:
