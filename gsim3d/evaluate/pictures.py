@@ -77,14 +77,15 @@ def write_gaussians(folder: str | Path, restored: Restored, prediction: Predicti
 def splat_picture(restored: Restored, prediction: Prediction, scene: Scene, cam: int, step: int) -> np.ndarray:
     """The Gaussians of one step, drawn smaller than they are, on white, at a higher resolution than the images."""
     zoom = SPLAT_SIZE / scene.height
-    camera = scene.cameras_at([cam], [step])
-    Ks = camera.Ks * torch.tensor([zoom, zoom, 1.0])[:, None]
+    device = prediction.particles.means.device
+    camera = scene.cameras_at([cam], [step]).to(device)
+    Ks = camera.Ks * torch.tensor([zoom, zoom, 1.0], device=device)[:, None]
     camera = Cameras(
         camera.viewmats, Ks, camera.near, camera.far, camera.image_cloud, round(scene.width * zoom), SPLAT_SIZE
     )
-    gaussians = restored.simulator.renderer(prediction.particles.select_clouds(torch.tensor([step])))
+    gaussians = restored.simulator.renderer(prediction.particles.select_clouds(torch.tensor([step], device=device)))
     gaussians = dataclasses.replace(gaussians, scales=gaussians.scales * SPLAT_SHRINK)
-    return as_bytes(render(gaussians, camera, torch.ones(3)).color[0].clamp(0, 1))
+    return as_bytes(render(gaussians, camera, torch.ones(3, device=device)).color[0].clamp(0, 1))
 
 
 def write_overview(

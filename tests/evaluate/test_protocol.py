@@ -50,6 +50,10 @@ def restored():
     return Restored(simulator, data, (32, 32), simulator.plan(EffectsSpec()), Checkpoint({}, {}))
 
 
+def moved_to(device, restored):
+    return dataclasses.replace(restored, simulator=copy.deepcopy(restored.simulator).to(device))
+
+
 def test_default_views(restored, scene):
     assert default_views(restored, scene) == ((0, 2), (3,))
     free = dataclasses.replace(restored, data=DataConfig(context_views=2))
@@ -190,10 +194,7 @@ def test_scores_by_hand(restored, scene):
 
 
 def test_scores_are_the_same_on_both_devices(restored, scene, devices):
-    cpu, cuda = (
-        score_scene(dataclasses.replace(restored, simulator=copy.deepcopy(restored.simulator).to(device)), scene).values
-        for device in devices
-    )
+    cpu, cuda = (score_scene(moved_to(device, restored), scene).values for device in devices)
     for method in METHODS:
         for metric, values in cpu[method].items():
             torch.testing.assert_close(cuda[method][metric], values, rtol=0, atol=0.01, equal_nan=True)
@@ -238,7 +239,8 @@ def test_values_that_do_not_exist_are_null(tmp_path):
     assert " - " in table(summary) + " "
 
 
-def test_pictures(restored, scene):
+def test_pictures(restored, scene, device):
+    restored = moved_to(device, restored)
     prediction = predict(restored, scene, (0, 2), 6)
     images = as_bytes(render_steps(restored, prediction.particles, scene, [3, 1]))
     truth = true_images(scene, [3, 1], range(8))
