@@ -248,6 +248,27 @@ def test_a_video_that_is_cut_off_is_named(videos, tmp_path):
     assert any("video_2" in problem for problem in check_scene(folder).problems)
 
 
+def test_a_jpeg_that_is_cut_off_is_named(tmp_path):
+    """OpenCV fills the rest with grey; a thumbnail's end inside the header is not the end of the image."""
+    folder = write_films(tmp_path, make_scene())
+    for file in (folder / "cam_1").glob("*.png"):
+        cv2.imwrite(str(file.with_suffix(".jpg")), cv2.imread(str(file)))
+        file.unlink()
+    assert Scene.open(folder).film([1], [0]).float().mean() > 5
+    file = folder / "cam_1" / "004.jpg"
+    data = file.read_bytes()
+    thumbnail = b"\xff\xe1" + (2 + 400).to_bytes(2, "big") + b"\xff\xd8" + bytes(396) + b"\xff\xd9"
+    whole = data[:2] + thumbnail + data[2:]
+    file.write_bytes(whole)
+    assert Scene.open(folder).film([1], [2]).float().mean() > 5
+    for cut in (whole[: len(whole) * 3 // 4], whole[:-2]):
+        file.write_bytes(cut)
+        with pytest.raises(
+            InputError, match=r"004.jpg \(camera cam_1, frame 4\) cannot be decoded: its end is missing"
+        ):
+            Scene.open(folder).film([1], [2])
+
+
 def test_frame_numbers_are_times(tmp_path):
     scene = Scene.open(write_films(tmp_path, make_scene(), stride=3))
     assert scene.fps == pytest.approx(FPS) and scene.n_steps == N_STEPS
