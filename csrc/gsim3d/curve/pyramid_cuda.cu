@@ -195,16 +195,8 @@ __global__ void plan_depths_kernel(const uint32_t* top, Levels levels, int64_t n
 __global__ void encode_kernel(int64_t n, int64_t room, Intake intake, const int64_t* cu_rows, int64_t n_clouds,
                               const int32_t* depth_of_stage, StageArrays stage, uint64_t* __restrict__ codes) {
   const int64_t i = thread_index();
-  if (i >= room) return;
-  const int64_t n_awake = intake.start[n];
-  const bool awake = i < n && intake.awake[i];
-  // Rows asleep, and room beyond the rows, take the places after the last row.
-  const int64_t to = awake ? intake.start[i] : i < n ? n_awake + i - intake.start[i] : i;
-  if (!awake) {
-    stage.cells[to] = ~uint64_t{0};
-    for (int c = 0; c < kCurves; ++c) codes[c * room + to] = ~uint64_t{0};
-    return;
-  }
+  if (i >= n || !intake.awake[i]) return;
+  const int64_t to = intake.start[i];
   const uint64_t id = intake.cloud_id[segment_of(cu_rows, n_clouds, i)], cell = intake.cells[i];
   const uint32_t x = cell >> 32, y = cell >> 16 & kAxisMask, z = cell & kAxisMask;
   const int depth = *depth_of_stage;
@@ -387,12 +379,14 @@ template <typename T>
 // All arrays of the stages, in the order in which they are filled.
 std::vector<StageArrays> take_stages(const PyramidSpec& spec, int64_t room, int64_t n_clouds, const Workspace& workspace) {
   std::vector<StageArrays> stages;
+  uint64_t* cells = workspace.take<uint64_t>(spec.n_stages * room);
+  uint32_t* voxel_rows = workspace.take<uint32_t>(spec.n_stages * room);
   for (int64_t s = 0; s < spec.n_stages; ++s) {
     uint32_t* tables = workspace.take<uint32_t>(6 * (n_clouds + 1));
     const auto table = [&] { return std::exchange(tables, tables + n_clouds + 1); };
     int64_t* keys = workspace.take<int64_t>(2 * n_clouds);
     StageArrays stage;
-    stage.cells = workspace.take<uint64_t>(room);
+    stage.cells = cells + s * room;
     stage.codes = workspace.take<uint64_t>(kCurves * room);
     stage.rows = workspace.take<uint32_t>(kCurves * room);
     stage.cu_cluster = workspace.take<uint32_t>(room + 1);
@@ -405,7 +399,7 @@ std::vector<StageArrays> take_stages(const PyramidSpec& spec, int64_t room, int6
     stage.cu_clouds = table();
     stage.cu_patches = table();
     stage.cu_keys = table();
-    stage.voxel_rows = workspace.take<uint32_t>(room);
+    stage.voxel_rows = voxel_rows + s * room;
     stage.row_voxel = workspace.take<uint32_t>(room);
     stage.cu_voxels = workspace.take<uint32_t>(room + 1);
     stage.voxels = workspace.take<uint64_t>(room);
@@ -473,8 +467,15 @@ void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, cons
   uint32_t* run_rows = workspace.take<uint32_t>(kCurves * room);
   launch(kOp, encode_kernel, blocks, kThreads, 0, stream, n, room, intake, clouds.cu_rows, clouds.n_clouds, levels.depth,
          stages[0], run_codes);
-  sort_rows(kOp, run_codes, kCurves, room, 3 * kMaxDepth + cloud_bits, stages[0].codes,
-            spec.release ? stages[0].rows : run_rows, workspace, stream);
+  sort_rows(kOp,
+            {.keys = run_codes,
+             .n_rows = kCurves,
+             .room = room,
+             .bits = 3 * kMaxDepth + cloud_bits,
+             .sizes = count(0, kRows),
+             .sorted = stages[0].codes,
+             .index = spec.release ? stages[0].rows : run_rows},
+            workspace, stream);
   if (!spec.release)
     launch(kOp, order_ties_kernel<T>, list_blocks, kThreads, 0, stream, stages[0].codes, run_rows, intake.rows,
            clouds.positions, room, count(0, kRows), stages[0].rows);
@@ -487,7 +488,6 @@ void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, cons
     const StageArrays& before = stages[s - 1];
     const StageArrays& stage = stages[s];
     const int32_t* drop = levels.drop + s;
-    check_cuda(cudaMemsetAsync(stage.cells, 0xff, room * sizeof(uint64_t), native(stream)), kOp);
     launch(kOp, flag_clusters_kernel, list_blocks, kThreads, 0, stream, before, room, count(s - 1, kRows), drop, flags);
     exclusive_sums(kOp, flags, kCurves * room + 1, sums, workspace, stream);
     launch(kOp, make_rows_kernel, blocks, kThreads, 0, stream, before, stage, spec.curves[(s - 1) * kSerializations], room,

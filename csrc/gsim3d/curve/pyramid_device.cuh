@@ -23,7 +23,7 @@ enum Count : int { kRows, kClouds, kPatches, kKeys, kVoxels, kStageCounts };
 GSIM3D_HD int64_t count_at(int64_t stage, Count what) { return 1 + stage * kStageCounts + what; }
 GSIM3D_HD int64_t pairs_at(int64_t n_stages, int64_t kernel) { return 1 + n_stages * kStageCounts + kernel; }
 
-// One stage. A cell is packed as cloud, x, y, z with 16 bits each; unused room holds ones, which sort last.
+// One stage. A cell is packed as cloud, x, y, z with 16 bits each. Cells and voxel_rows of the stages follow each other.
 struct StageArrays {
   uint64_t* cells;       // [room], by row
   uint64_t* codes;       // [4, room], cloud << 3 depth | code, ascending along each curve

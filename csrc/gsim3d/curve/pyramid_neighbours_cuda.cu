@@ -183,11 +183,19 @@ void find_voxels(StageArrays* stages, int64_t n_stages, int64_t room, int cloud_
   uint64_t* sorted = workspace.take<uint64_t>(n_stages * room);
   uint32_t* flags = workspace.take<uint32_t>(n_stages * room + 1);
   uint32_t* sums = workspace.take<uint32_t>(n_stages * room + 1);
-  for (int64_t s = 0; s < n_stages; ++s) {
-    sort_rows(kOp, stages[s].cells, 1, room, 48 + cloud_bits, sorted + s * room, stages[s].voxel_rows, workspace, stream);
+  sort_rows(kOp,
+            {.keys = stages[0].cells,
+             .n_rows = n_stages,
+             .room = room,
+             .bits = 48 + cloud_bits,
+             .sizes = counts + count_at(0, kRows),
+             .size_stride = kStageCounts,
+             .sorted = sorted,
+             .index = stages[0].voxel_rows},
+            workspace, stream);
+  for (int64_t s = 0; s < n_stages; ++s)
     launch(kOp, flag_voxels_kernel, blocks_of(room), kThreads, 0, stream, sorted + s * room, room,
            counts + count_at(s, kRows), flags + s * room);
-  }
   exclusive_sums(kOp, flags, n_stages * room + 1, sums, workspace, stream);
   for (int64_t s = 0; s < n_stages; ++s)
     launch(kOp, list_voxels_kernel, blocks_of(room), kThreads, 0, stream, sorted + s * room, sums + s * room, stages[s],
