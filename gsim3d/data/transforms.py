@@ -61,7 +61,12 @@ def read(folder: Path, problems: Problems) -> Recording:
             f"{source}: camera_model {model!r} is not read; undistort the images to a pinhole "
             f"(known: {', '.join(PINHOLES)})"
         )
-    table, times = _table(description, frames, source, problems)
+    for number, frame in enumerate(frames):
+        for key in ("file_path", "mask_path", "label_path"):
+            if not isinstance(frame.get(key, ""), str) or (key == "file_path" and key not in frame):
+                raise InputError(f"{source}: frames[{number}].{key} must be text; got {frame.get(key)!r}")
+            inside(folder, frame.get(key, ""), f"{source}: frames[{number}].{key}")
+    table, times = _table(frames, source, problems)
     names = sorted(table, key=natural_order)
     if len(names) > MAX_CAMS:
         raise InputError(f"{source}: {len(names)} cameras; more than {MAX_CAMS} are taken to be a mistake")
@@ -118,11 +123,8 @@ def _still(matrices: np.ndarray) -> np.ndarray:
     return matrices[:1] if (matrices == matrices[:1]).all() else matrices
 
 
-def _table(description: dict, frames: list[dict], source: Path, problems: Problems) -> tuple[dict, np.ndarray]:
+def _table(frames: list[dict], source: Path, problems: Problems) -> tuple[dict, np.ndarray]:
     """(camera -> its frames step by step, times of the steps)."""
-    for number, frame in enumerate(frames):
-        if not isinstance(frame.get("file_path"), str):
-            raise InputError(f"{source}: frames[{number}].file_path must be text; got {frame.get('file_path')!r}")
     timeless = [number for number, frame in enumerate(frames) if "time" not in frame]
     if len(timeless) == len(frames):
         return {str(frame.get("camera", frame["file_path"])): [frame] for frame in frames}, np.zeros(1)
@@ -185,8 +187,7 @@ class _Camera:
 
     def files(self, folder: Path, key: str, steps: Sequence[int]) -> Iterator[tuple[Path, str]]:
         for step in steps:
-            relative = str(self.frames[step][key])
-            file = inside(folder, relative, f"{self._source}: {key} of {self.place(step)}")
+            file = inside(folder, self.frames[step][key], f"{self._source}: {key} of {self.place(step)}")
             if not file.suffix:
                 file = file.with_suffix(".png")  # as in the synthetic sets
             yield file, self.place(step)

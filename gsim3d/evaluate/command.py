@@ -117,19 +117,14 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
         views.append((args.context or context, targets))
         n_future = min(horizon(scene, n_encoded, args.steps), n_future or scene.n_steps)
-    scores = [
-        score_scene(
-            restored,
-            scene,
-            context_cams=context,
-            target_cams=targets,
-            n_encoded=n_encoded,
-            n_future=n_future,
-            metrics=metrics,
-            others=others,
-        )
-        for scene, (context, targets) in zip(tqdm(scenes, desc="scenes", unit="scene"), views)
-    ]
+    for scene, (_, targets) in zip(scenes, views):
+        for other in others:
+            other.check(scene, targets, n_encoded, n_future)
+    scores = []
+    with tqdm(scenes, desc="scenes", unit="scene") as progress:
+        for scene, (context, targets) in zip(progress, views):
+            given = {"context_cams": context, "target_cams": targets, "n_encoded": n_encoded, "n_future": n_future}
+            scores.append(score_scene(restored, scene, **given, metrics=metrics, others=others))
     summary = summarize(scores, not_measured)
     print(table(summary))
     print("\nwritten: " + ", ".join(str(path) for path in _write(out, args, scenes, scores, summary)))
@@ -176,6 +171,8 @@ def _write(out, args: argparse.Namespace, scenes: list, scores: list, summary: d
     write_csv(files[1], scores)
     write_markdown(files[2], summary, Path(args.data).absolute().name)
     rates = {scene.fps for scene in scenes}
+    if not summary["by_step"]:
+        return files[:3]
     try:
         write_curves(files[3], summary, rates.pop() if len(rates) == 1 else None)
     except InputError as error:

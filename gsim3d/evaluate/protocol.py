@@ -53,7 +53,9 @@ def default_views(restored: Restored, scene: Scene) -> tuple[tuple[int, ...], tu
     """(context, target) cameras: inputs spread evenly; targets those kept from training's inputs, else all the rest."""
     cameras = context_cameras(scene, restored.data)
     if len(cameras) < restored.data.context_views:
-        raise InputError(f"{scene.path}: {len(cameras)} usable cameras; training had {restored.data.context_views} views")
+        raise InputError(
+            f"{scene.path}: {len(cameras)} usable cameras; training had {restored.data.context_views} views"
+        )
     context = spread_views(cameras, restored.data.context_views, 0)
     target = restored.data.target_only_cameras or tuple(c for c in range(scene.n_cams) if c not in context)
     return context, target or context
@@ -80,9 +82,7 @@ def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_fut
 
 
 @torch.no_grad()
-def render_steps(
-    restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int], start: int = 0
-) -> Tensor:
+def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int], start: int = 0) -> Tensor:
     """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles, seen by cameras ``cams``.
 
     The first cloud is step ``start`` of the film, which matters where cameras move.
@@ -94,12 +94,15 @@ def render_steps(
 
 
 def constant_velocity(prediction: Prediction) -> Particles:
-    """What may move goes on from the last encoded step at the speed of its centroid; one cloud a future step."""
+    """What may move goes on from the last encoded step at the speed of its centroid; one cloud a future step.
+
+    Nothing moves where there was one step only, or where one of the last two shows nothing that may move.
+    """
     encoded = prediction.particles
     last = prediction.n_encoded - 1
     final = encoded.select_clouds(torch.tensor([last]))
     centroids = [_moving_centroid(encoded.select_clouds(torch.tensor([q]))) for q in range(max(0, last - 1), last + 1)]
-    velocity = centroids[-1] - centroids[0]
+    velocity = torch.nan_to_num(centroids[-1] - centroids[0])
     moving = (final.activity == DYNAMIC).to(final.means.dtype)[:, None]
     steps = []
     for j in range(1, prediction.n_steps - last):
@@ -183,8 +186,8 @@ def _model_and_baselines(
 
 
 def _moving_centroid(cloud: Particles) -> Tensor:
-    moving = cloud.means[cloud.activity == DYNAMIC]
-    return moving.mean(0) if len(moving) else cloud.means.new_zeros(3)
+    """[3]; NaN where nothing may move."""
+    return cloud.means[cloud.activity == DYNAMIC].mean(0)
 
 
 def _held(images: Tensor, step: int, n_encoded: int) -> Tensor:
@@ -192,4 +195,3 @@ def _held(images: Tensor, step: int, n_encoded: int) -> Tensor:
     held = images.clone()
     held[n_encoded:] = images[step]
     return held
-

@@ -43,7 +43,7 @@ PLAIN_METRICS = tuple(name for name, metric in METRICS.items() if metric.weights
 
 @dataclass(frozen=True)
 class SceneScores:
-    """Scores of one scene.
+    """Scores of one scene over ``n_steps`` steps, the first ``n_encoded`` of them given.
 
     values: method -> metric -> float64 [S] by step, means over the target views. Steps before ``n_encoded`` are
         reconstructions, the others predictions; all methods but the model have NaN at the former. A value that no
@@ -54,6 +54,7 @@ class SceneScores:
 
     scene: str
     n_encoded: int
+    n_steps: int
     values: dict[str, dict[str, Tensor]]
     clips: dict[str, Tensor]
     not_measured: dict[str, str]
@@ -110,7 +111,7 @@ class SceneTruth:
         clips = {}
         if "fvd" in self.metrics:
             clips = {name: self._clip_features(images) for name, images in {"truth": self.images, **methods}.items()}
-        return SceneScores(self.name, self.n_encoded, values, clips, self.not_measured)
+        return SceneScores(self.name, self.n_encoded, len(self.images), values, clips, self.not_measured)
 
     def _problem(self, metric: str) -> str | None:
         """Why ``metric`` cannot be measured here."""

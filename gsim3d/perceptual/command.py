@@ -23,11 +23,9 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    from gsim3d.perceptual.weights import SETS
-
     parser.description = "Installs the weights that LPIPS and FVD need; `gsim3d evaluate` measures them from then on."
     parser.epilog = EPILOG
-    parser.add_argument("metric", choices=tuple(SETS), help="the metric whose weights are wanted")
+    parser.add_argument("metric", choices=("lpips", "fvd"), help="the metric whose weights are wanted")
     parser.add_argument(
         "--from",
         dest="files",

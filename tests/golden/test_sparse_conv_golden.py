@@ -6,7 +6,7 @@ import torch
 from gsim3d.ops import KernelMap, Voxels, sparse_conv
 from tests.asserts import assert_close_relative_to_max, gradients
 from tests.golden_files import golden
-from tests.oracle.sparse_conv import kernel_tables
+from tests.oracle.sparse_conv import kernel_tables, racing_conv
 
 pytestmark = pytest.mark.golden
 CASES = [f"k{k}_{dup}_{bias}" for k in (3, 5) for dup in ("nodup", "dup") for bias in ("bias", "nobias")]
@@ -42,3 +42,21 @@ def test_equals_spconv_without_duplicates(name, duplicates):
     out = sparse_conv(x, weight, bias, voxels, kernel_map, duplicates=duplicates)
     assert torch.equal(voxels.cu_rows, torch.arange(len(x) + 1))
     assert_close_relative_to_max(out, case["spconv_cpu_out"], "golden_float32")
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if "_dup_" in name])
+@pytest.mark.parametrize("rule", ["native", "implicit"])
+def test_racing_rules_of_the_oracle(name, rule):
+    """The rules under which whole networks are compared; "native" is what spconv computes on one thread."""
+    case = golden("c_submconv3d") / name
+    inputs, voxels, kernel_map = inputs_of(case)
+
+    def conv(x, weight, bias=None):
+        return racing_conv(x, weight, bias, voxels, kernel_map, rule)
+
+    out, grad_x, grad_weight, *_ = gradients(conv, inputs, case["cotangent"])
+    assert_close_relative_to_max(out, case[f"out_{rule}"], "golden_float32", "result")
+    assert_close_relative_to_max(grad_x, case[f"grad_features_{rule}"], "golden_float32", "gradient of the features")
+    assert_close_relative_to_max(grad_weight, case[f"grad_weight_{rule}"], "golden_float32", "gradient of the weight")
+    if rule == "native":
+        assert_close_relative_to_max(out, case["spconv_cpu_out"], "golden_float32", "spconv")

@@ -1,5 +1,6 @@
 """The published model's own weights, in a published file: imported, they predict what it predicted."""
 
+import dataclasses
 import functools
 import json
 
@@ -9,11 +10,13 @@ import torch
 from gsim3d import ops
 from gsim3d.__main__ import main
 from gsim3d.dynamics import Dynamics
+from gsim3d.dynamics.point_transformer import Attention
 from gsim3d.encoder import Encoder
 from gsim3d.interop.released import dynamics_weights, encoder_weights, to_published
 from gsim3d.train.restore import restore
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames, Particles
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
+from tests.golden.published import FULL_PRECISION
 from tests.golden_files import golden, golden_path
 from tests.interop.release import changed, write_release
 
@@ -49,7 +52,11 @@ def _import(folder, dynamics, metric=None):
     }
     checkpoint, config = write_release(folder, weights, settings)
     assert main(["import", str(checkpoint), "--config", str(config), "-o", str(folder / "model")]) == 0
-    return restore(folder / "model").simulator, weights
+    simulator = restore(folder / "model").simulator
+    for module in simulator.modules():
+        if isinstance(module, Attention):
+            module.rounded_to_half = False  # the tensors were made in full precision
+    return simulator, weights
 
 
 def offsets(mask):
@@ -84,7 +91,7 @@ def test_network(import_model, file, case):
         torch.zeros(n_scenes, 3, dtype=torch.float64),
         dynamics.config.pyramid_spec((n_steps - 1).bit_length()),
     )
-    direct = Dynamics(dynamics.config).eval()
+    direct = Dynamics(dataclasses.replace(dynamics.config, quirks=FULL_PRECISION)).eval()
     direct.net.load_state_dict(dynamics_weights(part(file, "")))
     out = torch.zeros_like(expected)
     with torch.no_grad():

@@ -182,10 +182,13 @@ __global__ void merge_clouds_kernel(StageArrays before, StageArrays stage, int m
   *clouds = ids;
 }
 
-// The published depth follows the extent; where a stride drops more bits than are left, it drops none.
-__global__ void plan_depths_kernel(const uint32_t* top, Levels levels, int64_t n_stages) {
-  int depth = top ? 33 - __clz(*top) : kMaxDepth;
+// The published depth follows the extent; where a stride drops more bits than are left, it drops none. A malformed call
+// goes on without rows until the host sees its status.
+__global__ void plan_depths_kernel(const uint32_t* top, Levels levels, int64_t n_stages, int64_t* counts) {
+  if (*counts != 0) counts[count_at(0, kRows)] = 0;
+  int depth = top ? min(33 - __clz(*top), kMaxDepth) : kMaxDepth;
   for (int64_t s = 0; s < n_stages; ++s) {
+    if (*counts != 0) counts[count_at(s, kClouds)] = 0;
     if (levels.drop[s] > depth) levels.drop[s] = 0;
     depth -= levels.drop[s];
     levels.depth[s] = depth;
@@ -460,7 +463,8 @@ void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, cons
   }
   check_cuda(cudaMemcpyAsync(levels.drop, drops.data(), n_stages * sizeof(int32_t), cudaMemcpyHostToDevice, native(stream)),
              kOp);
-  launch(kOp, plan_depths_kernel, 1, 1, 0, stream, spec.release ? intake.top : nullptr, levels, n_stages);
+  launch(kOp, plan_depths_kernel, 1, 1, 0, stream, spec.release ? intake.top : nullptr, levels, n_stages,
+         counts);
 
   // The first stage: one sort a curve.
   uint64_t* run_codes = workspace.take<uint64_t>(kCurves * room);  // also the codes before the sort

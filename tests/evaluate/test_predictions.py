@@ -1,0 +1,220 @@
+"""Predictions of other models: found by scene, camera and step; what is missing, short or odd is named."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsim3d.__main__ import main
+from gsim3d.data import Scene
+from gsim3d.errors import InputError
+from gsim3d.evaluate.predictions import Predictions
+from gsim3d.evaluate.protocol import score_scene
+from gsim3d.interop import write_video
+from tests.tiny_scenes import write_scenes
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+GIVEN, N_STEPS = 2, 6
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write_scenes(tmp_path_factory.mktemp("films") / "data", 2, n_steps=N_STEPS)
+
+
+@pytest.fixture
+def folder(data, tmp_path):
+    """Perfect predictions of cameras 1 and 3 of both scenes, as frames; only what was to be predicted."""
+    for scene in sorted((data / "ball").iterdir()):
+        for cam in (1, 3):
+            target = tmp_path / "other" / "ball" / scene.name / f"cam_{cam}"
+            target.mkdir(parents=True)
+            for step in range(GIVEN, N_STEPS):
+                shutil.copy(scene / f"cam_{cam}" / f"rgb_{step:04d}.png", target / f"frame{step}.png")
+    return tmp_path / "other"
+
+
+def scene_of(data, name="0000"):
+    return Scene.open(data / "ball" / name)
+
+
+def flat_video(path, levels, size=(32, 32)):
+    """A video of grey frames, ``levels`` of 255."""
+    write_video(path, [np.full((size[1], size[0], 3), level, np.uint8) for level in levels], 12.0)
+
+
+def test_frames_are_found_by_scene_camera_and_step(data, folder):
+    scene, predictions = scene_of(data, "0001"), Predictions.open(str(folder), data)
+    assert predictions.name == "other" and predictions.cameras(scene) == (1, 3)
+    images = predictions.images(scene, [3, 1], GIVEN, 3)
+    assert torch.equal(images, scene.images([3, 1], range(2, 5)).permute(0, 1, 3, 4, 2))
+
+
+def test_perfect_predictions_score_perfectly_and_the_copy_beside_them_does_not(data, folder):
+    scores = score_scene(
+        None, scene_of(data), target_cams=(1, 3), n_encoded=GIVEN, others=[Predictions.open(f"perfect={folder}", data)]
+    )
+    assert list(scores.values) == ["perfect", "copy"]
+    assert scores.values["perfect"]["psnr"][GIVEN:].tolist() == [100.0] * 4
+    assert scores.values["perfect"]["psnr"][:GIVEN].isnan().all()
+    assert (scores.values["copy"]["psnr_body"][GIVEN:] < 40).all()
+
+
+@pytest.mark.parametrize("n_future, n_frames, first", [(4, 6, 2), (4, 4, 0), (1, 6, 2), (1, 3, 2), (1, 1, 0)])
+def test_the_length_of_a_video_tells_where_it_starts(data, folder, n_future, n_frames, first):
+    place = folder / "ball" / "0000"
+    shutil.rmtree(place / "cam_1")
+    levels = [20 + 30 * k for k in range(n_frames)]
+    flat_video(place / "cam_1.mp4", levels)
+    predictions = Predictions.open(str(folder), data)
+    assert predictions.cameras(scene_of(data)) == (1, 3)
+    images = predictions.images(scene_of(data), [1], GIVEN, n_future)
+    assert images.shape == (n_future, 1, 32, 32, 3)
+    means = images.float().mean((1, 2, 3, 4)).tolist()
+    assert means == pytest.approx(levels[first : first + n_future], abs=4)  # lossy
+
+
+def test_a_video_whose_length_says_two_things_is_refused(data, folder):
+    shutil.rmtree(folder / "ball" / "0000" / "cam_1")
+    flat_video(folder / "ball" / "0000" / "cam_1.mp4", [9] * 4)  # steps 0 to 3, or 2 to 5?
+    with pytest.raises(InputError, match="is the first one step 0 or 2"):
+        Predictions.open(str(folder), data).images(scene_of(data), [1], GIVEN, 2)
+
+
+def remove_scene(place):
+    shutil.rmtree(place)
+
+
+def remove_camera(place):
+    shutil.rmtree(place / "cam_1")
+
+
+def remove_step(place):
+    (place / "cam_1" / "frame3.png").unlink()
+
+
+def repeat_step(place):
+    shutil.copy(place / "cam_1" / "frame3.png", place / "cam_1" / "again_0003.png")
+
+
+def resize_step(place):
+    cv2.imwrite(str(place / "cam_1" / "frame4.png"), np.zeros((33, 31, 3), np.uint8))
+
+
+def break_step(place):
+    (place / "cam_1" / "frame4.png").write_bytes(b"no image")
+
+
+def short_video(place):
+    remove_camera(place)
+    flat_video(place / "cam_1.mp4", [9] * 3)
+
+
+def long_video(place):
+    remove_camera(place)
+    flat_video(place / "cam_1.mp4", [9] * 7)
+
+
+def large_video(place):
+    remove_camera(place)
+    flat_video(place / "cam_1.mp4", [9] * 6, (34, 32))
+
+
+def broken_video(place):
+    remove_camera(place)
+    (place / "cam_1.mp4").write_bytes(b"no video")
+
+
+@pytest.mark.parametrize(
+    "damage, message",
+    [
+        (remove_scene, r"other/ball/0001 is missing: predictions of .*data/ball/0001 are expected there"),
+        (remove_camera, r"other/ball/0001/cam_1 is missing: a folder of frames, or a video cam_1.mp4"),
+        (remove_step, r"cam_1: step 3 is missing \(1 of 4 are\); .* here 2 to 5"),
+        (repeat_step, r"again_0003.png and frame3.png are both step 3"),
+        (resize_step, r"frame4.png .*has 31x33 pixels, its camera 32x32"),
+        (break_step, r"frame4.png .*cannot be decoded"),
+        (short_video, r"cam_1.mp4 has 3 frames; .* must have 6 .* or without the given ones 4"),
+        (long_video, r"cam_1.mp4 has more than 6 frames"),
+        (large_video, r"cam_1.mp4 has 34x32 pixels, its camera 32x32: resize it"),
+        (broken_video, r"cam_1.mp4 cannot be decoded"),
+    ],
+)
+def test_what_does_not_fit_is_named(data, folder, damage, message, capfd):
+    damage(folder / "ball" / "0001")
+    with pytest.raises(InputError, match=message):
+        Predictions.open(str(folder), data).images(scene_of(data, "0001"), [1], GIVEN, 4)
+
+
+def test_folders_and_names_are_checked(data, folder, tmp_path):
+    with pytest.raises(InputError, match="nowhere is not a folder"):
+        Predictions.open("x=nowhere", data)
+    with pytest.raises(InputError, match="'copy' is taken"):
+        Predictions.open(f"copy={folder}", data)
+    (tmp_path / "other" / "ball" / "0000" / "cam_9").mkdir()
+    with pytest.raises(InputError, match="predictions of camera 9, but .* has 5 cameras"):
+        Predictions.open(str(folder), data).cameras(scene_of(data))
+    empty = tmp_path / "empty" / "ball" / "0000"
+    empty.mkdir(parents=True)
+    with pytest.raises(InputError, match="neither a folder nor a video"):
+        Predictions.open(str(tmp_path / "empty"), data).cameras(scene_of(data))
+
+
+def test_a_single_scene_is_its_own_data_set(data, folder):
+    root = data / "ball" / "0000"
+    predictions = Predictions.open(str(folder / "ball" / "0000"), root)
+    assert predictions.images(Scene.open(root), [1], GIVEN, 1).shape == (1, 1, 32, 32, 3)
+
+
+@pytest.fixture
+def no_weights(monkeypatch, tmp_path):
+    monkeypatch.setenv("GSIM3D_CACHE_DIR", str(tmp_path / "cache"))
+
+
+def evaluate(capsys, *arguments):
+    code = main(["evaluate", *map(str, arguments)])
+    output = capsys.readouterr()
+    return code, output.out, output.err
+
+
+def test_the_command_scores_them_without_a_checkpoint(data, folder, capsys, no_weights):
+    out = folder / "metrics.json"
+    code, text, _ = evaluate(capsys, "--predictions", folder, data, "--given", 2, "--scenes", "all")
+    assert (
+        code == 0 and "other, predicted steps" in text and "LPIPS vgg: not measured: run gsim3d weights lpips" in text
+    )
+    summary = json.loads(out.read_text())
+    assert summary["methods"] == ["other", "copy"] and summary["other.future.psnr"] == 100.0
+    assert summary["not_measured"]["fvd"] == "run gsim3d weights fvd"
+    assert sorted(p.name for p in folder.glob("metrics.*")) == [f"metrics.{e}" for e in ("csv", "json", "md", "png")]
+
+
+def test_a_report_is_not_written_where_predictions_do_not_fit(data, folder, capsys, no_weights):
+    remove_step(folder / "ball" / "0001")
+    code, _, err = evaluate(capsys, "--predictions", folder, data, "--given", 2, "--scenes", "all")
+    assert code == 2 and "step 3 is missing" in err and len(err.splitlines()) == 1  # found before anything is scored
+    assert not list(folder.glob("metrics.*"))
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["{data}"], "nothing to evaluate"),
+        (["{data}", "--predictions", "{other}"], "--given: without a CHECKPOINT"),
+        (["{data}", "--predictions", "{other}", "--given", "0"], "at least 1"),
+        (["{data}", "--predictions", "{other}", "--given", "6"], "only 0 after the input"),
+        (["{data}", "--predictions", "{other}", "--predictions", "{other}", "--given", "2"], "two have the same name"),
+        (["{data}", "--predictions", "{other}", "--given", "2", "--cameras", "7"], "camera 7 does not exist"),
+        (["{data}", "--predictions", "{other}", "--given", "2", "--metrics", "speed"], "'speed' does not exist"),
+        (["{data}", "--predictions", "{other}", "--given", "2", "--metrics", "fvd"], "run gsim3d weights fvd"),
+        (["{data}", "--predictions", "{other}", "--given", "2", "--out", "numbers.txt"], "must end in .json"),
+        (["{data}", "{data}", "--given", "2"], "with a CHECKPOINT"),
+    ],
+)
+def test_bad_options_are_named(data, folder, capsys, no_weights, arguments, message):
+    code, _, err = evaluate(capsys, *(argument.format(data=data, other=folder) for argument in arguments))
+    assert code == 2 and message in err and len(err.splitlines()) == 1
