@@ -17,8 +17,8 @@ __global__ void encode_kernel(const int64_t* __restrict__ grid, const int64_t* _
   if (i >= n) return;
   const int64_t x = grid[3 * i], y = grid[3 * i + 1], z = grid[3 * i + 2], id = cloud[i];
   const bool fits = static_cast<uint64_t>(x | y | z) >> depth == 0 && static_cast<uint64_t>(id) >> (63 - shift) == 0;
-  const uint64_t code = curve_code(kCurve, static_cast<uint32_t>(x), static_cast<uint32_t>(y), static_cast<uint32_t>(z),
-                                   depth);
+  const uint64_t code =
+      curve_code(kCurve, static_cast<uint32_t>(x), static_cast<uint32_t>(y), static_cast<uint32_t>(z), depth);
   codes[i] = fits ? (id << shift) | static_cast<int64_t>(code) : 0;
 }
 
@@ -32,10 +32,14 @@ void curve_encode(const int64_t* grid, const int64_t* cloud, int64_t n, int64_t 
            shift, codes);
   };
   switch (static_cast<Curve>(curve)) {
-    case Curve::kZ: return run(encode_kernel<Curve::kZ>);
-    case Curve::kZTrans: return run(encode_kernel<Curve::kZTrans>);
-    case Curve::kHilbert: return run(encode_kernel<Curve::kHilbert>);
-    case Curve::kHilbertTrans: return run(encode_kernel<Curve::kHilbertTrans>);
+    case Curve::kZ:
+      return run(encode_kernel<Curve::kZ>);
+    case Curve::kZTrans:
+      return run(encode_kernel<Curve::kZTrans>);
+    case Curve::kHilbert:
+      return run(encode_kernel<Curve::kHilbert>);
+    case Curve::kHilbertTrans:
+      return run(encode_kernel<Curve::kHilbertTrans>);
   }
 }
 

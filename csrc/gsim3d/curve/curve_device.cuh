@@ -11,15 +11,17 @@ namespace gsim3d::cuda {
 struct SortRows {
   const uint64_t* keys;  // [n_rows, room]
   int64_t n_rows, room;
-  int bits;               // keys of a row differ below this bit only
-  uint64_t flip;          // the order is that of key ^ flip
-  const int64_t* sizes;   // on the device: row r has sizes[r size_stride] <= room keys; null: room
+  int bits;              // keys of a row differ below this bit only
+  uint64_t flip;         // the order is that of key ^ flip
+  const int64_t* sizes;  // on the device: row r has sizes[r size_stride] <= room keys; null: room
   int64_t size_stride;
+  const int32_t*
+      squeeze;  // on the device: keys of row r hold a number above three of 16 bits, which lie below 2^squeeze[r]
   // What is wanted, each [n_rows, room]; the others are null.
-  uint64_t* sorted;   // the keys in order
-  uint32_t* index;    // the place of the i-th smallest key
-  int64_t* order;     // the same
-  int64_t* inverse;   // inverse[order[i]] = i
+  uint64_t* sorted;  // the keys in order
+  uint32_t* index;   // the place of the i-th smallest key
+  int64_t* order;    // the same
+  int64_t* inverse;  // inverse[order[i]] = i
 };
 
 // Stable ascending sort of every row. room < 2^30.

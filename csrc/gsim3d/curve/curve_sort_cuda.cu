@@ -1,10 +1,10 @@
-// Stable radix sort of several rows of 64-bit keys at once, 8 bits a pass. One launch serves all rows, so that short rows
-// fill the GPU together; a digit in which all keys of a row agree costs that row no pass; how many keys a row has may be
-// known on the device only.
+// Stable radix sort of several rows of 64-bit keys at once, 8 bits a pass. One launch serves all rows, so that short
+// rows fill the GPU together; a digit in which all keys of a row agree costs that row no pass; how many keys a row has
+// may be known on the device only.
 //
-// A pass takes each tile of a row through shared memory: ranks by digit inside the tile, then the tile's first place for
-// each digit, which is the sum over the tiles before it. Tiles publish their counts and look back over those of the tiles
-// before them (Merrill and Garland 2016; Adinets and Merrill 2022).
+// A pass takes each tile of a row through shared memory: ranks by digit inside the tile, then the tile's first place
+// for each digit, which is the sum over the tiles before it. Tiles publish their counts and look back over those of the
+// tiles before them (Merrill and Garland 2016; Adinets and Merrill 2022).
 #include <algorithm>
 
 #include "gsim3d/core/cuda_utils.cuh"
@@ -27,18 +27,32 @@ constexpr uint32_t kOfTile = 1u << 30, kUpToTile = 2u << 30, kCountMask = kOfTil
 
 struct Sort {
   SortRows rows;
-  uint32_t* totals;    // [rows, kMaxPasses, kDigits]: keys of each digit, then the first place of each digit
-  uint32_t* passes;    // [rows], bit p: pass p moves keys
-  uint32_t* published; // [kMaxPasses, rows, tiles, kDigits]
-  uint32_t* tickets;   // [kMaxPasses]
-  uint64_t* keys[2];   // [rows, room] each
-  uint32_t* index[2];  // [rows, room] each
-  int64_t tiles;       // of a row, at most
+  uint32_t* totals;     // [rows, kMaxPasses, kDigits]: keys of each digit, then the first place of each digit
+  uint32_t* passes;     // [rows], bit p: pass p moves keys
+  uint32_t* published;  // [kMaxPasses, rows, tiles, kDigits]
+  uint32_t* tickets;    // [kMaxPasses]
+  uint64_t* keys[2];    // [rows, room] each
+  uint32_t* index[2];   // [rows, room] each
+  int64_t tiles;        // of a row, at most
   int n_passes;
 };
 
 __device__ __forceinline__ int64_t size_of(const SortRows& rows, int64_t row) {
   return rows.sizes ? rows.sizes[row * rows.size_stride] : rows.room;
+}
+
+// Takes the zeros out of four packed numbers, which costs passes less, and back.
+__device__ __forceinline__ uint64_t squeezed(uint64_t key, int bits) {
+  return ((key >> 48 << bits | (key >> 32 & 0xffff)) << bits | (key >> 16 & 0xffff)) << bits | (key & 0xffff);
+}
+__device__ __forceinline__ uint64_t unsqueezed(uint64_t key, int bits) {
+  const uint64_t mask = (uint64_t{1} << bits) - 1;
+  return key >> 3 * bits << 48 | (key >> 2 * bits & mask) << 32 | (key >> bits & mask) << 16 | (key & mask);
+}
+
+// A key as the caller gave it, as the passes order it.
+__device__ __forceinline__ uint64_t ordered_key(const SortRows& rows, int64_t row, uint64_t key) {
+  return rows.squeeze ? squeezed(key, rows.squeeze[row]) : key ^ rows.flip;
 }
 
 __device__ __forceinline__ uint32_t digit_of(uint64_t key, int pass) {
@@ -66,7 +80,7 @@ __global__ void __launch_bounds__(kThreads) count_digits_kernel(Sort sort) {
     const int64_t i = first + threadIdx.x;
     const unsigned active = __ballot_sync(kFullWarp, i < n);
     if (i >= n) continue;
-    const uint64_t key = keys[i] ^ sort.rows.flip;
+    const uint64_t key = ordered_key(sort.rows, row, keys[i]);
     const uint32_t low = static_cast<uint32_t>(key), high = static_cast<uint32_t>(key >> 32);
     const uint64_t differs = uint64_t{__reduce_or_sync(active, high) ^ __reduce_and_sync(active, high)} << 32 |
                              (__reduce_or_sync(active, low) ^ __reduce_and_sync(active, low));
@@ -156,7 +170,6 @@ __global__ void __launch_bounds__(kThreads) move_keys_kernel(Sort sort, int pass
   if (!(passes >> pass & 1) || begin >= n) return;
   const int moves = __popc(passes & ((1u << pass) - 1));
   const Keys from = keys_after(sort, row, moves);
-  const uint64_t flip = moves == 0 ? sort.rows.flip : 0;
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
   const int count = static_cast<int>(min(n - begin, int64_t{kTile}));
 
@@ -169,7 +182,8 @@ __global__ void __launch_bounds__(kThreads) move_keys_kernel(Sort sort, int pass
     const int at = warp * kWarp * kItems + i * kWarp + lane;
     keys[i] = 0;
     if (at >= count) continue;
-    keys[i] = from.keys[begin + at] ^ flip;
+    keys[i] = from.keys[begin + at];
+    if (moves == 0) keys[i] = ordered_key(sort.rows, row, keys[i]);
     index[i] = from.index ? from.index[begin + at] : static_cast<uint32_t>(begin + at);
   }
   __syncthreads();
@@ -236,7 +250,11 @@ __global__ void finish_kernel(Sort sort) {
   const int moves = __popc(sort.passes[row]);
   const Keys keys = keys_after(sort, row, moves);
   const uint32_t index = keys.index ? keys.index[i] : static_cast<uint32_t>(i);
-  if (sort.rows.sorted) sort.rows.sorted[at + i] = keys.keys[i] ^ (moves > 0 ? sort.rows.flip : 0);
+  if (sort.rows.sorted) {
+    uint64_t key = keys.keys[i];
+    if (moves > 0) key = sort.rows.squeeze ? unsqueezed(key, sort.rows.squeeze[row]) : key ^ sort.rows.flip;
+    sort.rows.sorted[at + i] = key;
+  }
   if (sort.rows.index) sort.rows.index[at + i] = index;
   if (sort.rows.order) sort.rows.order[at + i] = index;
   if (sort.rows.inverse) sort.rows.inverse[at + index] = i;
@@ -251,7 +269,8 @@ void sort_rows(const char* op, const SortRows& rows, const Workspace& workspace,
   Sort sort{rows};
   sort.tiles = (rows.room + kTile - 1) / kTile;
   sort.n_passes = (rows.bits + kDigitBits - 1) / kDigitBits;
-  const int64_t n_totals = rows.n_rows * kMaxPasses * kDigits, n_published = sort.n_passes * rows.n_rows * sort.tiles * kDigits;
+  const int64_t n_totals = rows.n_rows * kMaxPasses * kDigits,
+                n_published = sort.n_passes * rows.n_rows * sort.tiles * kDigits;
   sort.totals = workspace.take<uint32_t>(n_totals + kMaxPasses + n_published);
   sort.tickets = sort.totals + n_totals;
   sort.published = sort.tickets + kMaxPasses;
@@ -266,8 +285,8 @@ void sort_rows(const char* op, const SortRows& rows, const Workspace& workspace,
          stream, sort);
   launch(op, plan_passes_kernel, n_rows, kThreads, 0, stream, sort);
   for (int pass = 0; pass < sort.n_passes; ++pass)
-    launch(op, move_keys_kernel, blocks_for(op, rows.n_rows * sort.tiles, 1), kThreads, sizeof(PassMemory), stream, sort,
-           pass);
+    launch(op, move_keys_kernel, blocks_for(op, rows.n_rows * sort.tiles, 1), kThreads, sizeof(PassMemory), stream,
+           sort, pass);
   launch(op, finish_kernel, dim3(blocks_for(op, rows.room, kThreads), n_rows), kThreads, 0, stream, sort);
 }
 

@@ -95,8 +95,7 @@ __device__ __forceinline__ void add_dots(const T* __restrict__ own, const T* __r
 #pragma unroll
     for (int t = 0; t < kTogether; ++t) {
 #pragma unroll
-      for (int offset = kGroup / 2; offset > 0; offset /= 2)
-        sum[t] += __shfl_xor_sync(kFullWarp, sum[t], offset);
+      for (int offset = kGroup / 2; offset > 0; offset /= 2) sum[t] += __shfl_xor_sync(kFullWarp, sum[t], offset);
       const int32_t r = r0 + t * kGroups + group;
       if (at == 0 && r < count) scores[r] = first ? sum[t] : scores[r] + sum[t];
     }
@@ -215,8 +214,8 @@ GSIM3D_HD int64_t backward_bytes(const LineSizes& s) {
          aligned_bytes(s.n_depths * sizeof(T));
 }
 
-// One warp owns 32 kVectors channels of one pixel as reference and gathers from its sources; the first block of channels
-// keeps the lines.
+// One warp owns 32 kVectors channels of one pixel as reference and gathers from its sources; the first block of
+// channels keeps the lines.
 template <typename T, int kVectors>
 __global__ void __launch_bounds__(kMaxWarps* kWarp)
     reference_kernel(const T* __restrict__ grad, Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s,
@@ -235,8 +234,7 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
   int32_t* high = carve<int32_t>(memory, s.capacity);
   T* weights = carve<T>(memory, s.capacity);
   T* grads = carve<T>(memory, s.n_depths);
-  for (int32_t k = lane; k < s.n_depths; k += kWarp)
-    grads[k] = grad[(image * s.n_depths + k) * s.n_pixels + pixel];
+  for (int32_t k = lane; k < s.n_depths; k += kWarp) grads[k] = grad[(image * s.n_depths + k) * s.n_pixels + pixel];
 
   Own sum{};
   const Range pairs = range_of(sweep.cu_src, image, sweep.n_pairs);
@@ -442,16 +440,15 @@ void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& swee
   if (sweep.n_images * s.n_pixels == 0) return;
   const int64_t bytes = backward_bytes<T>(s), warps = warps_for(op, bytes, s, stream);
   const int64_t summary = (s.n_words + 31) / 32;
-  const int64_t line = s.n_words * (sizeof(uint32_t) + sizeof(uint16_t)) + summary * sizeof(uint32_t) +
-                       s.capacity * sizeof(T);
+  const int64_t line =
+      s.n_words * (sizeof(uint32_t) + sizeof(uint16_t)) + summary * sizeof(uint32_t) + s.capacity * sizeof(T);
   const int64_t room = std::max<int64_t>(kListBytes / line, 1), per_pair = std::min<int64_t>(room, s.n_pixels);
   const int64_t pairs = std::min(std::max<int64_t>(room / s.n_pixels, 1), sweep.n_pairs);
   const bool whole = pairs == sweep.n_pairs && per_pair == s.n_pixels;
   const int64_t tasks = n_tasks(s);
-  Lines<T> lines{workspace.take<uint32_t>(pairs * per_pair * s.n_words),
-                 workspace.take<uint16_t>(pairs * per_pair * s.n_words),
-                 workspace.take<uint32_t>(pairs * per_pair * summary),
-                 workspace.take<T>(pairs * per_pair * s.capacity)};
+  Lines<T> lines{
+      workspace.take<uint32_t>(pairs * per_pair * s.n_words), workspace.take<uint16_t>(pairs * per_pair * s.n_words),
+      workspace.take<uint32_t>(pairs * per_pair * summary), workspace.take<T>(pairs * per_pair * s.capacity)};
   for_vectors(sweep.channels, [&]<int kVectors>() {
     const Pixels<const T> pixels = make_pixels(op, features, sweep, kVectors, workspace, stream);
     const Pixels<T> grad_pixels = take_pixels(sweep, kVectors, workspace);
@@ -467,8 +464,8 @@ void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& swee
                static_cast<unsigned>(warps * kWarp), warps * bytes, stream, grad, pixels, sweep, s, lines, !whole,
                grad_pixels);
         launch(op, source_kernel<T, kVectors>,
-               dim3(blocks_for(op, sweep.n_images * tasks, kMaxWarps), blocks_of_channels), kMaxWarps * kWarp, 0, stream,
-               pixels, sweep, s, lines, tasks, grad_pixels);
+               dim3(blocks_for(op, sweep.n_images * tasks, kMaxWarps), blocks_of_channels), kMaxWarps * kWarp, 0,
+               stream, pixels, sweep, s, lines, tasks, grad_pixels);
       }
     }
     launch(op, to_planes_kernel<T>, transpose_grid(op, sweep.n_images, s.n_pixels, pixels.stride), dim3(32, 8), 0,
@@ -476,8 +473,8 @@ void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& swee
   });
 }
 
-#define GSIM3D_INSTANTIATE(T)                                                                             \
-  template void plane_sweep<T>(const T*, const PlaneSweep<T>&, T*, const Workspace&, Stream);             \
+#define GSIM3D_INSTANTIATE(T)                                                                 \
+  template void plane_sweep<T>(const T*, const PlaneSweep<T>&, T*, const Workspace&, Stream); \
   template void plane_sweep_vjp<T>(const T*, const T*, const PlaneSweep<T>&, T*, const Workspace&, Stream);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)

@@ -1,7 +1,7 @@
 // The line of samples that one pixel draws in a source image, traced by one warp in shared memory.
 //
-// Every source pixel that a sample touches sets a flag; its rank among the flags is its place in the line's list. So each
-// source pixel is met once, and the order of the list depends on nothing but the geometry.
+// Every source pixel that a sample touches sets a flag; its rank among the flags is its place in the line's list. So
+// each source pixel is met once, and the order of the list depends on nothing but the geometry.
 #pragma once
 
 #include <algorithm>
@@ -20,9 +20,12 @@ struct LineSizes {
 template <typename T>
 LineSizes line_sizes(const PlaneSweep<T>& sweep) {
   const int64_t n_pixels = sweep.height * sweep.width;
-  return {static_cast<int32_t>(sweep.height),         static_cast<int32_t>(sweep.width),
-          static_cast<int32_t>(n_pixels),             static_cast<int32_t>(sweep.n_depths),
-          static_cast<int32_t>((n_pixels + 31) / 32), static_cast<int32_t>(std::min(4 * sweep.n_depths, n_pixels))};
+  return {static_cast<int32_t>(sweep.height),
+          static_cast<int32_t>(sweep.width),
+          static_cast<int32_t>(n_pixels),
+          static_cast<int32_t>(sweep.n_depths),
+          static_cast<int32_t>((n_pixels + 31) / 32),
+          static_cast<int32_t>(std::min(4 * sweep.n_depths, n_pixels))};
 }
 
 template <typename T>
@@ -73,8 +76,8 @@ __device__ __forceinline__ Line<T> carve_line(char*& at, const LineSizes& s) {
 // Four flags, one a byte, as four bits.
 __device__ __forceinline__ uint32_t pack_flags(uint32_t flags) { return flags * 0x01020408u >> 24 & 15; }
 
-// Fills the line of a pixel and a pair of its image; returns the length of the list, the same in every lane. Nothing but
-// that is filled where it is 0. The caller synchronises the warp between its last look at a line and the next call.
+// Fills the line of a pixel and a pair of its image; returns the length of the list, the same in every lane. Nothing
+// but that is filled where it is 0. The caller synchronises the warp between its last look at a line and the next call.
 template <typename T>
 __device__ int32_t trace(const PlaneSweep<T>& sweep, const LineSizes& s, int64_t image, int64_t pair, int32_t pixel,
                          const Line<T>& line) {
@@ -89,7 +92,8 @@ __device__ int32_t trace(const PlaneSweep<T>& sweep, const LineSizes& s, int64_t
     const Place<T> at = sample_place(ray, b, depth, s.height, s.width);
     line.fx[k] = at.fx;
     line.fy[k] = at.fy;
-    // The corners that lie in the image, a bit each, below the index of the top left one, moved so that none is negative.
+    // The corners that lie in the image, a bit each, below the index of the top left one, moved so that none is
+    // negative.
     const int32_t columns = (at.x >= 0 ? 5 : 0) | (at.x + 1 < s.width ? 10 : 0);
     const int32_t rows = (at.y >= 0 ? 3 : 0) | (at.y + 1 < s.height ? 12 : 0);
     const int32_t corners = at.inside ? columns & rows : 0, first = at.y * s.width + at.x;
@@ -136,8 +140,8 @@ __device__ int32_t trace(const PlaneSweep<T>& sweep, const LineSizes& s, int64_t
       line.list[rank] = q;
       return static_cast<uint16_t>(rank);
     };
-    line.places[k] = make_ushort4(place(0, first), place(1, first + 1), place(2, first + s.width),
-                                  place(3, first + s.width + 1));
+    line.places[k] =
+        make_ushort4(place(0, first), place(1, first + 1), place(2, first + s.width), place(3, first + s.width + 1));
   }
   __syncwarp();
   return count;
