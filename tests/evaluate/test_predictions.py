@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsim3d.__main__ import main
-from gsim3d.data import Scene
+from gsim3d.data import Fitting, Scene
 from gsim3d.errors import InputError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.protocol import score_scene
@@ -75,6 +75,13 @@ def test_what_is_done_to_the_film_is_done_to_its_predictions(tmp_path):
     for metric, best in (("psnr", 100.0), ("psnr_masked", 100.0), ("ssim", 1.0)):
         assert values["same"][metric][2:].tolist() == pytest.approx([best] * 3, abs=1e-9)
         assert (values["copy"][metric][2:] < 0.99 * best).all()
+
+
+def test_they_are_scaled_with_the_film_of_a_model_of_another_size(data, folder):
+    scene = Scene.open(data / "ball" / "0000", fitting=Fitting(size=(24, 16)))
+    images = Predictions.open(str(folder), data).images(scene, [3], GIVEN, 4)
+    assert images.shape == (4, 1, scene.height, scene.width, 3)
+    assert torch.equal(images, scene.images([3], range(2, 6)).permute(0, 1, 3, 4, 2))
 
 
 @pytest.mark.parametrize("n_future, n_frames, first", [(4, 6, 2), (4, 4, 0), (1, 6, 2), (1, 3, 2), (1, 1, 0)])
