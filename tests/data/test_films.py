@@ -248,8 +248,8 @@ def test_a_video_that_is_cut_off_is_named(videos, tmp_path):
     assert any("video_2" in problem for problem in check_scene(folder).problems)
 
 
-def test_a_jpeg_that_is_cut_off_is_named(tmp_path):
-    """OpenCV fills the rest with grey; a thumbnail's end inside the header is not the end of the image."""
+def test_images_that_are_cut_off_are_named(tmp_path):
+    """OpenCV fills the rest of a JPEG with grey; a thumbnail's end inside the header is not the end of the image."""
     folder = write_films(tmp_path, make_scene())
     for file in (folder / "cam_1").glob("*.png"):
         cv2.imwrite(str(file.with_suffix(".jpg")), cv2.imread(str(file)))
