@@ -310,6 +310,16 @@ def test_the_imported_model_is_evaluated_at_its_own_size(capsys, tmp_path):
     assert isinstance(metrics["future.psnr"], float)
 
 
+def test_the_file_that_is_wrong_is_named_however_it_was_written(capsys, tmp_path, monkeypatch):
+    config = small_config()
+    write_release(tmp_path, {"a": torch.ones(1)}, settings_of(config))
+    monkeypatch.chdir(tmp_path)
+    code, _, err = run_import(capsys, "./model.ckpt", "./model.yaml", "model")
+    assert code == 2 and err.startswith(
+        "gsim3d: error: model.ckpt: encoder.depth_predictor.to_gaussians.2.weight is missing"
+    )
+
+
 def test_what_was_found_is_kept_with_the_weights(tmp_path):
     config = small_config()
     weights = random_weights(config)
