@@ -243,6 +243,8 @@ def test_explicit_variant(quirks):
     assert particles.quats.shape == (n, 4) and particles.scales.shape == (n, 3) and particles.sh.shape == (n, 16, 3)
     assert particles.dynamic_latents.shape == (n, 0)
     assert torch.allclose(particles.quats.norm(dim=-1), torch.ones(n), atol=1e-5) and particles.scales.min() > 0
+    largest = particles.quats.gather(1, particles.quats.abs().argmax(1, keepdim=True))
+    assert largest.min() > 0  # one rotation is one quaternion
 
 
 def rotations(n: int) -> torch.Tensor:
