@@ -22,15 +22,6 @@ def rotation_to_quat(rotations: Tensor) -> Tensor:
     return F.normalize(chosen, dim=-1)
 
 
-def one_sign(quats: Tensor) -> Tensor:
-    """Of the two quaternions of each rotation [..., 4] the one whose largest component is positive.
-
-    The dynamics reads quaternions, and should see one rotation as one; it goes on with the same choice.
-    """
-    largest = quats.detach().gather(-1, quats.detach().abs().argmax(-1, keepdim=True))
-    return torch.where(largest < 0, -quats, quats)
-
-
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
     """[..., 4] x [..., 4], (w, x, y, z): first b, then a."""
     aw, ax, ay, az = a.unbind(-1)
