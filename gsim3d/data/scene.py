@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +16,7 @@ from gsim3d.data.cameras import check_directions, depth_range, frusta_origin, sh
 from gsim3d.data.fitting import Fitting, fit
 from gsim3d.data.images import ImageCache
 from gsim3d.data.masks import Undistorter, foreground, median_image
-from gsim3d.data.recording import BACKGROUND, MOVING, Problems, Recording
+from gsim3d.data.recording import BACKGROUND, MOVING, Problems, ReadImages, Recording
 from gsim3d.errors import InputError
 from gsim3d.types import Cameras
 
@@ -36,6 +37,8 @@ class Scene:
         self, path: Path, recording: Recording, cache_dir: str | Path | None = None, fitting: Fitting = Fitting()
     ):
         self.path = path
+        self.filmed_sizes = recording.sizes
+        self._filmed, self._fitting = recording, fitting
         recording = fit(recording, fitting)
         self.name = "/".join(path.absolute().parts[-2:])
         self.recording = recording
@@ -173,14 +176,14 @@ class Scene:
     def _K(self, cam: int, step: int) -> np.ndarray:
         return self.recording.Ks[step if len(self.recording.Ks) > 1 else 0, cam]
 
-    def as_pinhole(self, image: np.ndarray, cam: int, step: int) -> np.ndarray:
-        """An image [h, w, 3] as camera ``cam`` films it -> as :meth:`film` has it: undistorted, and padded."""
-        undistorter = self._undistorters[cam]
-        return self._padded(image if undistorter is None else undistorter(image, self._K(cam, step)))
+    def filmed_as(self, read_images: ReadImages) -> Scene:
+        """The same scene with other images of the size ``filmed_sizes``, which are fitted and undistorted like its own."""
+        return Scene(self.path, dataclasses.replace(self._filmed, read_images=read_images), None, self._fitting)
 
     def _read_images(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
+        undistorter = self._undistorters[cam]
         for step, image in zip(steps, self.recording.read_images(cam, steps, Problems()), strict=True):
-            yield self.as_pinhole(image, cam, step)
+            yield self._padded(image if undistorter is None else undistorter(image, self._K(cam, step)))
 
     def _read_labels(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
         if self.recording.subtract_background:

@@ -34,10 +34,12 @@ _PLACEHOLDER_PACKAGES = {
     "typing", "argparse", "datetime",
 }  # fmt: skip
 _PLACEHOLDER_NAMES = {
-    "collections.defaultdict", "collections.Counter", "collections.deque", "builtins.set", "builtins.frozenset",
-    "builtins.dict", "builtins.list", "builtins.tuple", "builtins.int", "builtins.float", "builtins.str",
-    "builtins.bool", "builtins.complex", "builtins.bytearray", "builtins.slice", "_codecs.encode", "torch.Size",
-    "torch.device", "torch.Generator", *(f"torch.{dtype}" for dtype in ("float32", "float64", "float16", "bfloat16", "int64", "int32")),
+    "collections.defaultdict", "collections.Counter", "collections.deque", "_codecs.encode",
+    "builtins.set", "builtins.frozenset", "builtins.dict", "builtins.list", "builtins.tuple", "builtins.int",
+    "builtins.long", "builtins.float", "builtins.complex", "builtins.str", "builtins.unicode", "builtins.bytes",
+    "builtins.bytearray", "builtins.bool", "builtins.slice",
+    "torch.Size", "torch.device", "torch.Generator", "torch.float32", "torch.float64", "torch.float16",
+    "torch.bfloat16", "torch.int64", "torch.int32",
 }  # fmt: skip
 
 

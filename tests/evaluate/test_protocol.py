@@ -145,7 +145,7 @@ def test_constant_velocity_without_a_motion_to_continue(restored, scene, hidden)
     assert torch.equal(constant_velocity(single).means, truth.means[:35].repeat(2, 1))
 
 
-def test_held_baselines_are_seen_by_cameras_that_move(restored, scene, tmp_path):
+def test_baselines_are_seen_by_cameras_that_move(restored, scene, tmp_path, monkeypatch):
     folder = tmp_path / "moving"
     shutil.copytree(scene.path, folder)
     metadata = json.loads((folder / "metadata.json").read_text())
@@ -161,8 +161,15 @@ def test_held_baselines_are_seen_by_cameras_that_move(restored, scene, tmp_path)
         images = protocol._held(restored, prediction, None, step, moving, [3])
         torch.testing.assert_close(images[:2, 0], still[step, 0].expand(2, 32, 32, 3))
         torch.testing.assert_close(images[2:, 0], still[step, 1].expand(2, 32, 32, 3))  # camera 3 is where 4 was
-    values = score_scene(restored, moving, n_future=4).values
-    assert values["constant"]["psnr"][5] != values["constant"]["psnr"][2]
+    body = falling_apart(restored, scene, 6)
+    monkeypatch.setattr(protocol, "predict", lambda *_: Prediction(body, 2, (0, 2)))
+    film = render_steps(restored, body, moving, [3])
+    monkeypatch.setattr(
+        moving, "images", lambda cams, steps: (film * 255).round().to(torch.uint8).permute(0, 1, 4, 2, 3)
+    )
+    values = {name: v["psnr"] for name, v in score_scene(restored, moving).values.items()}
+    assert (values["model"] > 50).all() and (values["constant_velocity"][2:] > 50).all()
+    assert (values["copy"][4:] < values["constant"][4:]).all()  # a still image does not follow the camera
 
 
 def test_scores_by_hand(restored, scene):

@@ -46,21 +46,23 @@ def load(file, quirks=FULL_PRECISION):
 
 def run(net, config, case, features=None, origin=None):
     """[B, T, N, out] of a case of the file."""
-    xyz, features = case["xyz"], case["features"] if features is None else features
+    device = net.head.fc2.weight.device
+    features = (case["features"] if features is None else features).to(device)
+    xyz = case["xyz"].to(device)
     mask = mask_of(case, xyz)
     out = net.head(net(features[mask], pyramid_of(xyz, mask, config, origin)))
-    return torch.zeros(*mask.shape, out.shape[-1]).masked_scatter(mask[..., None], out)
+    return out.new_zeros(*mask.shape, out.shape[-1]).masked_scatter(mask[..., None], out)
 
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("file", FILES)
-def test_network(file, case):
+def test_network(file, case, device):
     g, net, config = load(file)
     c = g / case
     features = c["features"].requires_grad_()
-    out = run(net, config, c, features)
+    out = run(net.to(device), config, c, features)
     close(out, c["out"], "out")
-    (grad,) = torch.autograd.grad(out, features, c["cotangent"])
+    (grad,) = torch.autograd.grad(out, features, c["cotangent"].to(device))
     close(grad, c["grad_features"], "gradient of the features")
 
 
@@ -90,10 +92,10 @@ def test_network_with_attention_rounded_to_half(file, case):
         assert_rounded_to_half(run(net, config, c), run(exact, config, c), c["out_fp16qkv"])
 
 
-def test_gradients_of_all_weights():
+def test_gradients_of_all_weights(device):
     g, net, config = load("small_nodup")
     c = g / "T4_nomask"
-    run(net, config, c).backward(c["cotangent"])
+    run(net.to(device), config, c).backward(c["cotangent"].to(device))
     expected = renamed(c / "grad_w")
     assert set(expected) == {name for name, _ in net.named_parameters()}
     for name, parameter in net.named_parameters():
@@ -101,10 +103,10 @@ def test_gradients_of_all_weights():
 
 
 @pytest.mark.parametrize("file", ["small_nodup", "deep_nodup"])
-def test_batch_norm_in_training(file):
+def test_batch_norm_in_training(file, device):
     g, net, config = load(file)
     c = g / "T4_nomask"
-    close(run(net.train(), config, c), c["out_trainBN_nodroppath"], "out")
+    close(run(net.to(device).train(), config, c), c["out_trainBN_nodroppath"], "out")
     after = renamed(c / "trainBN_after")
     assert set(after) == {name for name, _ in net.named_buffers()}
     for name, buffer in net.named_buffers():
