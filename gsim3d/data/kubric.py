@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.data.cameras import OPENGL, check_intrinsics, inverse
+from gsim3d.data.cameras import OPENGL, by_step, check_intrinsics, inverse
 from gsim3d.data.images import as_color, is_marked, read_image, read_files
 from gsim3d.data.recording import (
     BACKGROUND,
@@ -76,7 +76,7 @@ def read(folder: Path, problems: Problems) -> Recording:
         n_steps=len(numbers),
         fps=(fps or cameras[0].frame_rate) / stride,
         camera_names=tuple(camera.name for camera in cameras),
-        viewmats=np.stack([camera.viewmats(numbers, problems) for camera in cameras], 1),
+        viewmats=by_step([camera.viewmats(numbers, problems) for camera in cameras], len(numbers)),
         Ks=np.stack([camera.K for camera in cameras])[None],
         sizes=tuple(camera.size for camera in cameras),
         read_images=read_images,

@@ -62,9 +62,7 @@ class Scene:
         self._labels = ImageCache(shape, self._read_labels, cache_dir, (*stamp, "seg"))
 
     @staticmethod
-    def open(
-        folder: str | Path, *, cache_dir: str | Path | None = None, fitting: Fitting = Fitting()
-    ) -> Scene:
+    def open(folder: str | Path, *, cache_dir: str | Path | None = None, fitting: Fitting = Fitting()) -> Scene:
         """Reads the description of the scene in ``folder``; images are decoded when they are asked for, each once.
 
         Args:

@@ -6,7 +6,8 @@ import argparse
 
 EPILOG = """\
 Every scene's first steps are given, all others predicted and compared with the film, seen from cameras that were no
-input. Measured are PSNR (all pixels; masked: without background; body: what may move), SSIM, LPIPS and FVD, for
+input. Measured are psnr (all pixels), psnr_masked (without background), psnr_body (what may move), ssim, lpips_alex,
+lpips_vgg and fvd, for
 
   model              this checkpoint
   constant           its last encoded particles, held still: what the learned dynamics adds

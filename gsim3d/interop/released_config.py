@@ -86,6 +86,8 @@ class _Settings:
 
     def number(self, path: str, default: Any = NO_MEANING) -> float:
         value = self.get(path, default)
+        if isinstance(value, str) and re.fullmatch(r"-?\d+[eE][-+]?\d+", value):  # YAML 1.1 reads 4e-3 as text
+            value = float(value)
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
             raise InputError(f"{path}: must be a number; got {value!r}")
         return float(value)
@@ -378,27 +380,15 @@ def _data(settings: _Settings, history: int, size_multiple: int) -> tuple[dict[s
     near, far = settings.positive("dataset.near"), settings.positive("dataset.far")
     if far <= near:
         raise InputError(f"dataset.far: must lie beyond near; got near {near} and far {far}")
-    sampler = "dataset.view_sampler"
-    views = settings.get(f"{sampler}.test_context_views", None) or settings.get(f"{sampler}.context_views", None) or []
-    targets = settings.get(f"{sampler}.test_target_views", None)
     unit_cameras = settings.flag("dataset.make_baseline_1", False)
-    notes = []
     if settings.flag("dataset.baseline_scale_bounds", False):
         raise InputError("dataset.baseline_scale_bounds: depth bounds that change with the scene are not supported")
     if width % size_multiple or height % size_multiple:
         raise InputError(f"dataset.image_shape: must be multiples of {size_multiple}; got {height}, {width}")
-    if views and all(isinstance(group, list) for group in views):
-        notes.append(f"{sampler} gives step t its own group of context views; here all steps use the first group")
-        views = views[0]
-    targets = targets if isinstance(targets, list) else []
-    for name, cams in (("context_views", views), ("test_target_views", targets)):
-        if not isinstance(cams, list) or not all(type(cam) is int and cam >= 0 for cam in cams):
-            raise InputError(f"{sampler}.{name}: must be a list of camera numbers; got {cams!r}")
+    views, notes = _views(settings)
     data = {
         "history": history,
-        "context_views": settings.whole(f"{sampler}.num_context_views"),
-        "context_cameras": views,
-        "target_only_cameras": [cam for cam in targets if cam not in views],
+        **views,
         "image_size": [width, height],
         "resize": [width, height],
         "near_far": [near, far],
@@ -417,3 +407,27 @@ def _data(settings: _Settings, history: int, size_multiple: int) -> tuple[dict[s
     if settings.get("dataset.speedup", 1) != 1:
         notes.append(f"dataset.speedup is {settings.get('dataset.speedup')}: it saw every such frame only")
     return data, effects, notes
+
+
+def _views(settings: _Settings) -> tuple[dict[str, Any], list[str]]:
+    """Which cameras are the input, and which are looked at only."""
+    sampler, notes = "dataset.view_sampler", []
+    fixed, drawn = (settings.get(f"{sampler}.{name}", None) or [] for name in ("test_context_views", "context_views"))
+    inputs = fixed or drawn
+    if inputs and isinstance(inputs, list) and all(isinstance(group, list) for group in inputs):
+        notes.append(f"{sampler} gives step t its own group of context views; here all steps use the first group")
+        inputs = inputs[0]
+    targets = settings.get(f"{sampler}.test_target_views", None)
+    targets = targets if isinstance(targets, list) else []
+    for name, cams in (("test_context_views or context_views", inputs), ("test_target_views", targets)):
+        if not isinstance(cams, list) or not all(type(cam) is int and cam >= 0 for cam in cams):
+            raise InputError(f"{sampler}.{name}: must be a list of camera numbers; got {cams!r}")
+    count = settings.whole(f"{sampler}.num_context_views")
+    if inputs:  # all of those given for tests; as many as asked for, of those to draw from
+        count = len(inputs) if fixed else min(count, len(inputs))
+    views = {
+        "context_views": count,
+        "context_cameras": inputs,
+        "target_only_cameras": [cam for cam in targets if cam not in inputs],
+    }
+    return views, notes

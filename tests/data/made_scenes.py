@@ -128,7 +128,10 @@ def write_kubric(folder: Path, made: Made, subfolders=True) -> Path:
             save(rgba, np.concatenate([made.rgb[step, cam], alpha], -1))
             marked = np.where(labels == 3, 2, 0).astype(np.uint8)
             name = f"segmentation_{step}.png" if subfolders else f"segmentation_{step:05d}.png"
-            save(place / "segmentation" / name if subfolders else place / name, marked[..., None] * [0, 1, 90])
+            save(
+                place / "segmentation" / name if subfolders else place / name,
+                marked[..., None] * np.array([0, 1, 90], np.uint8),
+            )
         (place / "metadata.json").write_text(json.dumps({"camera": camera, "metadata": metadata, **EXTRAS}))
     return folder
 

@@ -11,7 +11,7 @@ import torch
 
 from gsim3d.__main__ import main
 from gsim3d.data import Scene, make_frames
-from gsim3d.data.check import check_scene, contact_sheet
+from gsim3d.data.check import check_scene
 from gsim3d.data.masks import Undistorter
 from gsim3d.errors import InputError
 from gsim3d.interop import write_video
@@ -366,21 +366,3 @@ def test_train_simulate_evaluate_and_check_on_films(odd, tmp_path, capsys, one_t
     assert np.isfinite(json.loads((tmp_path / "metrics.json").read_text())["future.psnr"])
     assert "3 cameras" in capsys.readouterr().out
     assert cv2.imread(str(tmp_path / "sheet.png")).shape[1] > 400
-
-
-def test_the_sheet_draws_the_bounds_where_they_project(tmp_path):
-    """On black frames only the drawing is left: corners of the bounds are where a plain projection puts them."""
-    made = make_scene()
-    made.rgb[:], made.labels[:] = 0, 0
-    scene = Scene.open(write_films(tmp_path, made))
-    sheet = contact_sheet([scene])
-    rows = sheet[22:, :].astype(int)
-    height = (len(sheet) - 2 * 22) // 3 - 6
-    for cam in range(3):
-        zoom, left = height / 32, cam * (round(48 * height / 32) + 6)
-        for corner in np.stack(np.meshgrid(*scene.bounds.T, indexing="ij"), -1).reshape(-1, 3):
-            local = made.viewmats[0, cam] @ [*corner, 1]
-            x, y = (zoom * (made.Ks[0, cam] @ local[:3] / local[2])[:2]).round().astype(int)
-            if 3 < x < 48 * zoom - 4 and 20 < y < height - 4:
-                patch = rows[y - 2 : y + 3, left + x - 2 : left + x + 3]
-                assert (np.abs(patch - [255, 220, 60]).sum(-1) < 150).any()

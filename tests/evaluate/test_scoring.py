@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from gsim3d.__main__ import main
 from gsim3d.evaluate import scoring
 from gsim3d.evaluate.report import markdown, notes, summarize, table, write_csv, write_json
 from gsim3d.evaluate.scoring import METRICS, SceneScores, SceneTruth
@@ -81,6 +82,13 @@ def test_what_cannot_be_measured_is_told(monkeypatch):
 def cheap_features(monkeypatch):
     """Instead of I3D: the mean colour of the first and the last frame of a clip."""
     monkeypatch.setattr(fvd, "clip_features", lambda clips: clips[:, [0, -1]].mean((2, 3)).flatten(1).double())
+
+
+def test_help_names_every_metric(capsys):
+    with pytest.raises(SystemExit):
+        main(["evaluate", "--help"])
+    text = capsys.readouterr().out
+    assert all(metric in text.split("Measured are")[1] for metric in METRICS)
 
 
 def test_fvd_compares_the_predicted_steps_of_all_scenes_and_views(cheap_features):

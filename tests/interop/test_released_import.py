@@ -128,7 +128,26 @@ def test_settings_that_no_weight_shows():
     assert read("dataset.image_shape", [64, 96]).data["image_size"] == [96, 64]
     assert read("dataset.make_baseline_1", True).data["unit_cameras"] is True
     assert read("dataset.with_seg", False).effects.dynamics.background == "dynamic"
-    assert read("dataset.view_sampler.test_context_views", [[1, 3], [0, 2]]).data["context_cameras"] == [1, 3]
+    assert read(f"{net}.grid_size", "4e-3").model.dynamics.grid_size == 0.004  # as YAML 1.1 reads it
+
+
+@pytest.mark.parametrize(
+    ("test_views", "train_views", "count", "cameras"),
+    [
+        ([1, 3, 5], None, 3, [1, 3, 5]),
+        ([[1, 3], [0, 2]], None, 2, [1, 3]),
+        (None, [0, 2, 4, 6, 8], 4, [0, 2, 4, 6, 8]),
+        (None, None, 4, []),
+    ],
+)
+def test_input_cameras(test_views, train_views, count, cameras):
+    shapes, settings = shapes_and_settings()
+    settings["dataset"]["view_sampler"].update(
+        num_context_views=4, test_context_views=test_views, context_views=train_views, test_target_views=[1, 7]
+    )
+    data = read_config(settings, shapes).data
+    assert (data["context_views"], data["context_cameras"]) == (count, cameras)
+    assert data["target_only_cameras"] == ([7] if test_views else [1, 7])
 
 
 @pytest.mark.parametrize(

@@ -135,6 +135,26 @@ def test_workers_give_the_gradient_of_the_whole_batch(folder, tmp_path):
             torch.testing.assert_close(split, whole, rtol=1e-3, atol=1e-5)
 
 
+def test_checkpointing_changes_no_gradient(folder, tmp_path):
+    """Every parameter gets the same bits, with drop path and shuffled curves drawn once."""
+    gradients = []
+    for checkpointing in (False, True):
+        model = {"drop_path": 0.3, "shuffle_orders": True, "zero_init": False, "checkpointing": checkpointing}
+        trainer = Trainer(dataclasses.replace(CONFIG, model={"dynamics": model}), scenes(folder), tmp_path)
+        trainer.simulator.train()
+        trainer.step = 4  # of the second stage, which rolls out
+        gradients.append(trainer._gradients([0])[2])
+    names = list(trainer.parameters)
+    unused = set(trainer.plan.unused)
+    for name, plain, again in zip(names, *gradients, strict=True):
+        if name in unused:
+            assert plain is None and again is None
+        else:
+            assert torch.equal(plain, again) and plain.isfinite().all(), name
+    trained = [name for name, gradient in zip(names, gradients[1]) if gradient is not None and gradient.any()]
+    assert any("attention.qkv" in name for name in trained) and any("mlp.fc1" in name for name in trained)
+
+
 def test_the_perceptual_part_joins_the_loss(folder, tmp_path, monkeypatch):
     monkeypatch.setenv("GSIM3D_CACHE_DIR", str(tmp_path / "cache"))
     config = dataclasses.replace(CONFIG, loss=LossConfig(perceptual=0.05))

@@ -202,9 +202,10 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) query_kernel(Back
         }
         if (!active) continue;
         int step = 0;
-        if (fast && plain)
+        if (fast && plain) {
 #pragma unroll 2
           for (; step < n / kStep; ++step) warp.template step<true>(step);
+        }
         for (; step * kStep < n; ++step) warp.template step<false>(step);
       }
       if (active) warp.store(args, first, q_range.end, share.head);
@@ -266,13 +267,14 @@ class KeyWarp {
     multiply_by_rows<T, D, M>(v_, grads_, step, slopes);
     uint32_t p[M][4], a[M][4];
     FastWeights::Shift shift[4];
-    if constexpr (kFast)
+    if constexpr (kFast) {
 #pragma unroll
       for (int j = 0; j < 2; ++j) {
         const float2 pair = *reinterpret_cast<const float2*>(numbers_.shift + step * kStep + 8 * j + 2 * t);
         shift[2 * j] = FastWeights::prepare(pair.x);
         shift[2 * j + 1] = FastWeights::prepare(pair.y);
       }
+    }
 #pragma unroll
     for (int j = 0; j < 2; ++j)
 #pragma unroll
