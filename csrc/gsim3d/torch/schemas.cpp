@@ -39,6 +39,13 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   m.def("unpool(Tensor x, Tensor rows, Tensor cu_rows, SymInt n_rows) -> Tensor");
   m.def("unpool_backward(Tensor grad, Tensor rows, Tensor cu_rows) -> Tensor");
 
+  // row_norm: layer normalisation of rows, and the residual sum behind it; stats [N, 2] are kept for the backward pass.
+  m.def(
+      "row_norm(Tensor x, Tensor weight, Tensor bias, Tensor? residual, float eps, ScalarType dtype) -> (Tensor out, "
+      "Tensor stats)");
+  m.def(
+      "row_norm_backward(Tensor grad, Tensor x, Tensor weight, Tensor stats) -> (Tensor x, Tensor weight, Tensor bias)");
+
   // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
   m.def(
       "plane_sweep(Tensor features, Tensor homographies, Tensor translations, Tensor inverse_depths, Tensor src_images, "
