@@ -115,18 +115,16 @@ def peak_gib(f) -> float:
     return torch.cuda.max_memory_allocated() / 2**30
 
 
-def measure(bench: Bench, case: str, f, dtype: torch.dtype, **options) -> None:
-    def run():
-        with torch.autocast("cuda", dtype, enabled=dtype != torch.float32):
-            return f()
-
-    try:
-        memory = peak_gib(run)
-    except torch.cuda.OutOfMemoryError:
-        print(f"{case}: out of memory")
-        return
-    bench.gpu(f"{case}, {memory:.1f} GiB", str(dtype).removeprefix("torch."), run, options.pop("peers", {}),
-              tolerance=None, **options)  # fmt: skip
+def measure(bench: Bench, case: str, f, dtype: torch.dtype, *, peers=None, target_ratio=None) -> None:
+    """The autocast context stays open, as in a rollout: weights are rounded once."""
+    with torch.autocast("cuda", dtype, enabled=dtype != torch.float32):
+        try:
+            memory = peak_gib(f)
+        except torch.cuda.OutOfMemoryError:
+            print(f"{case}: out of memory")
+            return
+        name = str(dtype).removeprefix("torch.")
+        bench.gpu(f"{case}, {memory:.1f} GiB", name, f, peers or {}, target_ratio=target_ratio, tolerance=None, capture=False)
 
 
 def dynamics(bench: Bench, n_steps: int, masked: bool, dtype: torch.dtype) -> None:
@@ -173,6 +171,7 @@ def training(bench: Bench, dtype: torch.dtype) -> None:
     truth = torch.rand(n_scenes * n_views, SIZE, SIZE, 3, device="cuda")
 
     def step():
+        torch.clear_autocast_cache()  # the weights have changed
         optimizer.zero_grad(set_to_none=True)
         state = simulator.encode(frames)
         steps = simulator.rollout(state, n_future)
