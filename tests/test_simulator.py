@@ -12,7 +12,7 @@ from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, Unsu
 from gsim3d.encoder import EncoderConfig
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
-from gsim3d.renderer import RendererConfig
+from gsim3d.renderer import RendererConfig, render, render_as_published
 from gsim3d.simulator import Simulator
 from gsim3d.train.loop import deterministic
 from gsim3d.types import FROZEN, Cameras, Frames
@@ -154,12 +154,20 @@ def test_published_behaviour_end_to_end():
     assert not [name for name in missing if "time_embedding" not in name], missing
 
 
-def test_the_published_renderer_draws_as_many_images_as_there_are_cameras():
+def test_the_published_renderer_draws_each_camera_s_cloud():
     simulator, frames = with_quirks(Quirks.release()), make_frames((2, 1))
     particles = simulator.encode(frames)
-    both = simulator.render(particles, frames.cameras, torch.rand(len(frames.cameras), 3))
-    assert both.color.shape == (len(frames.cameras), SIZE, SIZE, 3)
-    none = simulator.render(particles, frames.cameras.select(torch.zeros(0, dtype=torch.int64)))
+    cameras, background = frames.cameras, torch.rand(len(frames.cameras), 3)
+    images = simulator.render(particles, cameras, background).color
+    assert images.shape == (len(cameras), SIZE, SIZE, 3)
+    for i, cloud in enumerate(cameras.image_cloud.tolist()):
+        one = torch.tensor([i])
+        alone = simulator.renderer(particles.select_clouds([cloud]))
+        camera = cameras.select(one, torch.zeros_like(one))
+        image = render_as_published(alone, camera, background[i], quirks=Quirks.release()).color
+        assert_same_bits(image[0], images[i])
+        assert not torch.equal(render(alone, camera, background[i]).color[0], images[i])
+    none = simulator.render(particles, cameras.select(torch.zeros(0, dtype=torch.int64)))
     assert none.color.shape == (0, SIZE, SIZE, 3)
 
 

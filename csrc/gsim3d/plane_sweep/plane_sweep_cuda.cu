@@ -95,8 +95,7 @@ __device__ __forceinline__ void add_dots(const T* __restrict__ own, const T* __r
 #pragma unroll
     for (int t = 0; t < kTogether; ++t) {
 #pragma unroll
-      for (int offset = kGroup / 2; offset > 0; offset /= 2)
-        sum[t] += __shfl_xor_sync(kFullWarp, sum[t], offset);
+      for (int offset = kGroup / 2; offset > 0; offset /= 2) sum[t] += __shfl_xor_sync(kFullWarp, sum[t], offset);
       const int32_t r = r0 + t * kGroups + group;
       if (at == 0 && r < count) scores[r] = first ? sum[t] : scores[r] + sum[t];
     }
@@ -105,7 +104,7 @@ __device__ __forceinline__ void add_dots(const T* __restrict__ own, const T* __r
 
 template <typename T>
 GSIM3D_HD int64_t forward_bytes(const LineSizes& s) {
-  return line_bytes<T>(s) + aligned_bytes(s.capacity * sizeof(T)) + aligned_bytes(s.n_depths * sizeof(T));
+  return line_bytes<T>(s) + aligned_bytes((s.capacity + 1) * sizeof(T)) + aligned_bytes(s.n_depths * sizeof(T));
 }
 
 // One warp owns one pixel.
@@ -120,11 +119,11 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
   const int32_t pixel = static_cast<int32_t>(at % s.n_pixels);
   char* memory = shared + threadIdx.x / kWarp * forward_bytes<T>(s);
   const Line<T> line = carve_line<T>(memory, s);
-  T* scores = carve<T>(memory, s.capacity);
+  T* scores = carve<T>(memory, s.capacity + 1);
   T* costs = carve<T>(memory, s.n_depths);
+  if (lane == 0) scores[s.capacity] = 0;
   for (int32_t k = lane; k < s.n_depths; k += kWarp) costs[k] = 0;
 
-  const int32_t outside = static_cast<int32_t>(outside_corner(s.height, s.width));
   const Range pairs = range_of(sweep.cu_src, image, sweep.n_pairs);
   for (int64_t pair = pairs.begin; pair < pairs.end; ++pair) {
     const int64_t source = sweep.src_images[pair];
@@ -137,10 +136,8 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
                             count, c == 0, scores);
     __syncwarp();
     for (int32_t k = lane; k < s.n_depths; k += kWarp) {
-      if (line.corner[k] == outside) continue;
-      T corners[4] = {0, 0, 0, 0};
-      for_corners(line.corner[k], s, [&](int32_t q, int side) { corners[side] = scores[rank_of(line, q)]; });
-      costs[k] += interpolate(corners[0], corners[1], corners[2], corners[3], line.fx[k], line.fy[k]);
+      const ushort4 at = line.places[k];
+      costs[k] += interpolate(scores[at.x], scores[at.y], scores[at.z], scores[at.w], line.fx[k], line.fy[k]);
     }
   }
   const T scale = pairs.begin < pairs.end ? cost_scale<T>(pairs, sweep.channels) : T(0);
@@ -154,6 +151,7 @@ template <typename T>
 struct Lines {
   uint32_t* bits;    // [n_pairs, n_pixels, n_words]
   uint16_t* before;  // [n_pairs, n_pixels, n_words]
+  uint32_t* words;   // [n_pairs, n_words / 32, n_pixels], a bit for each word that is not zero
   T* weights;        // [n_pairs, n_pixels, capacity], gradients of the scores
   int64_t first_pair, n_pairs;
   int32_t first_pixel, n_pixels;
@@ -161,37 +159,49 @@ struct Lines {
   __device__ __forceinline__ int64_t slot(int64_t pair, int32_t pixel) const {
     return (pair - first_pair) * n_pixels + pixel - first_pixel;
   }
+  __device__ __forceinline__ uint32_t* words_of(const LineSizes& s, int64_t pair, int32_t pixel, int32_t at) const {
+    return words + ((pair - first_pair) * ((s.n_words + 31) / 32) + at) * n_pixels + pixel - first_pixel;
+  }
 };
+
+__device__ __forceinline__ bool holds(const ushort4& places, uint16_t place) {
+  return places.x == place || places.y == place || places.z == place || places.w == place;
+}
 
 // weights[r] = gradient of the score with source pixel list[r]: the samples that touch it, in order.
 template <typename T>
 __device__ void score_gradients(const Line<T>& line, const LineSizes& s, int32_t count, const T* grads, T scale,
                                 int32_t* low, int32_t* high, T* weights) {
   const int lane = threadIdx.x % kWarp;
-  const int32_t row = s.width + 2, outside = static_cast<int32_t>(outside_corner(s.height, s.width));
   for (int32_t r = lane; r < count; r += kWarp) {
     low[r] = s.n_depths;
     high[r] = -1;
   }
   __syncwarp();
-  for (int32_t k = lane; k < s.n_depths; k += kWarp)
-    if (line.corner[k] != outside)
-      for_corners(line.corner[k], s, [&](int32_t q, int) {
-        const int32_t r = rank_of(line, q);
-        atomicMin(low + r, k);
-        atomicMax(high + r, k);
-      });
+  const uint16_t none = static_cast<uint16_t>(s.capacity);
+  for (int32_t k = lane; k < s.n_depths; k += kWarp) {
+    const ushort4 own = line.places[k], nowhere = make_ushort4(none, none, none, none);
+    const ushort4 earlier = k > 0 ? line.places[k - 1] : nowhere;
+    const ushort4 later = k + 1 < s.n_depths ? line.places[k + 1] : nowhere;
+    const auto note = [&](uint16_t place) {
+      if (place == none) return;
+      if (!holds(earlier, place)) atomicMin(low + place, k);
+      if (!holds(later, place)) atomicMax(high + place, k);
+    };
+    note(own.x);
+    note(own.y);
+    note(own.z);
+    note(own.w);
+  }
   __syncwarp();
   for (int32_t r = lane; r < count; r += kWarp) {
-    const int32_t q = line.list[r], y = q / s.width;
-    const int32_t place = (y + 1) * row + q - y * s.width + 1;
     T sum = 0;
     for (int32_t k = low[r]; k <= high[r]; ++k) {
-      const int32_t offset = place - line.corner[k];
-      const bool bottom = offset >= row, right = offset == 1 || offset == row + 1;
-      if (offset != 0 && offset != row && !right) continue;
-      const T lower = grads[k] * line.fy[k], part = bottom ? lower : grads[k] - lower, further = part * line.fx[k];
-      sum += right ? further : part - further;
+      const ushort4 at = line.places[k];
+      if (!holds(at, static_cast<uint16_t>(r))) continue;
+      const T lower = grads[k] * line.fy[k], part = r == at.x || r == at.y ? grads[k] - lower : lower;
+      const T further = part * line.fx[k];
+      sum += r == at.y || r == at.w ? further : part - further;
     }
     weights[r] = sum * scale;
   }
@@ -204,8 +214,8 @@ GSIM3D_HD int64_t backward_bytes(const LineSizes& s) {
          aligned_bytes(s.n_depths * sizeof(T));
 }
 
-// One warp owns 32 kVectors channels of one pixel as reference and gathers from its sources; the first block of channels
-// keeps the lines.
+// One warp owns 32 kVectors channels of one pixel as reference and gathers from its sources; the first block of
+// channels keeps the lines.
 template <typename T, int kVectors>
 __global__ void __launch_bounds__(kMaxWarps* kWarp)
     reference_kernel(const T* __restrict__ grad, Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s,
@@ -224,8 +234,7 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
   int32_t* high = carve<int32_t>(memory, s.capacity);
   T* weights = carve<T>(memory, s.capacity);
   T* grads = carve<T>(memory, s.n_depths);
-  for (int32_t k = lane; k < s.n_depths; k += kWarp)
-    grads[k] = grad[(image * s.n_depths + k) * s.n_pixels + pixel];
+  for (int32_t k = lane; k < s.n_depths; k += kWarp) grads[k] = grad[(image * s.n_depths + k) * s.n_pixels + pixel];
 
   Own sum{};
   const Range pairs = range_of(sweep.cu_src, image, sweep.n_pairs);
@@ -238,9 +247,15 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
     const int32_t count = trace(sweep, s, image, pair, pixel, line);
     const int64_t slot = lines.slot(pair, pixel);
     if (blockIdx.y == 0)
-      for (int32_t w = lane; w < s.n_words; w += kWarp) {
-        lines.bits[slot * s.n_words + w] = count ? line.bits[w] : 0;
-        if (count) lines.before[slot * s.n_words + w] = line.before[w];
+      for (int32_t begin = 0; begin < s.n_words; begin += kWarp) {
+        const int32_t w = begin + lane;
+        const uint32_t bits = count > 0 && w < s.n_words ? line.bits[w] : 0;
+        if (bits) {
+          lines.bits[slot * s.n_words + w] = bits;
+          lines.before[slot * s.n_words + w] = line.before[w];
+        }
+        const uint32_t words = __ballot_sync(kFullWarp, bits != 0);
+        if (lane == 0) *lines.words_of(s, pair, pixel, begin / kWarp) = words;
       }
     if (count == 0) continue;
     score_gradients(line, s, count, grads, scale, low, high, weights);
@@ -307,10 +322,11 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
     const Range owned = range_of(sweep.cu_src, image, sweep.n_pairs);
     if (pair < owned.begin || pair >= owned.end) continue;
     for (int32_t first = 0; first < lines.n_pixels; first += kWarp) {
-      const int64_t slot = lines.slot(pair, lines.first_pixel + first + lane);
+      const int32_t pixel = lines.first_pixel + first + lane;
       unsigned bits = 0;
       T weights[kOwned] = {};
-      if (first + lane < lines.n_pixels) {
+      if (first + lane < lines.n_pixels && *lines.words_of(s, pair, pixel, word / 32) >> word % 32 & 1) {
+        const int64_t slot = lines.slot(pair, pixel);
         const uint32_t all = lines.bits[slot * s.n_words + word];
         bits = all >> shift & ((1u << kOwned) - 1);
         if (bits) {
@@ -321,17 +337,25 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
         }
       }
       const T* from = pixels.at(s, image, lines.first_pixel + first) + channel;
-      for (unsigned hits = __ballot_sync(kFullWarp, bits != 0); hits; hits &= hits - 1) {
-        const int hit = __ffs(hits) - 1;
-        const Own other = *reinterpret_cast<const Own*>(from + int64_t{hit} * pixels.stride);
-        const unsigned touched = __shfl_sync(kFullWarp, bits, hit);
+      // Two at a time, so that one load waits while the other's sums are formed.
+      for (unsigned hits = __ballot_sync(kFullWarp, bits != 0); hits;) {
+        const int one = __ffs(hits) - 1;
+        hits &= hits - 1;
+        const int two = hits ? __ffs(hits) - 1 : one;
+        const Own first_feature = *reinterpret_cast<const Own*>(from + int64_t{one} * pixels.stride);
+        const Own second_feature = *reinterpret_cast<const Own*>(from + int64_t{two} * pixels.stride);
+        const auto add = [&](int hit, unsigned touched, const Own& feature) {
 #pragma unroll
-        for (int q = 0; q < kOwned; ++q) {
-          if (!(touched >> q & 1)) continue;
-          const T weight = __shfl_sync(kFullWarp, weights[q], hit);
+          for (int q = 0; q < kOwned; ++q) {
+            if (!(touched >> q & 1)) continue;
+            const T weight = __shfl_sync(kFullWarp, weights[q], hit);
 #pragma unroll
-          for (int v = 0; v < kVectors; ++v) sums[q].v[v] += weight * other.v[v];
-        }
+            for (int v = 0; v < kVectors; ++v) sums[q].v[v] += weight * feature.v[v];
+          }
+        };
+        add(one, __shfl_sync(kFullWarp, bits, one), first_feature);
+        if (hits) add(two, __shfl_sync(kFullWarp, bits, two), second_feature);
+        hits &= hits - 1;
       }
     }
   }
@@ -415,14 +439,16 @@ void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& swee
     return fill_zero(op, grad_features, sweep.n_images * sweep.channels * s.n_pixels, stream);
   if (sweep.n_images * s.n_pixels == 0) return;
   const int64_t bytes = backward_bytes<T>(s), warps = warps_for(op, bytes, s, stream);
-  const int64_t line = s.n_words * (sizeof(uint32_t) + sizeof(uint16_t)) + s.capacity * sizeof(T);
+  const int64_t summary = (s.n_words + 31) / 32;
+  const int64_t line =
+      s.n_words * (sizeof(uint32_t) + sizeof(uint16_t)) + summary * sizeof(uint32_t) + s.capacity * sizeof(T);
   const int64_t room = std::max<int64_t>(kListBytes / line, 1), per_pair = std::min<int64_t>(room, s.n_pixels);
   const int64_t pairs = std::min(std::max<int64_t>(room / s.n_pixels, 1), sweep.n_pairs);
   const bool whole = pairs == sweep.n_pairs && per_pair == s.n_pixels;
   const int64_t tasks = n_tasks(s);
-  Lines<T> lines{workspace.take<uint32_t>(pairs * per_pair * s.n_words),
-                 workspace.take<uint16_t>(pairs * per_pair * s.n_words),
-                 workspace.take<T>(pairs * per_pair * s.capacity)};
+  Lines<T> lines{
+      workspace.take<uint32_t>(pairs * per_pair * s.n_words), workspace.take<uint16_t>(pairs * per_pair * s.n_words),
+      workspace.take<uint32_t>(pairs * per_pair * summary), workspace.take<T>(pairs * per_pair * s.capacity)};
   for_vectors(sweep.channels, [&]<int kVectors>() {
     const Pixels<const T> pixels = make_pixels(op, features, sweep, kVectors, workspace, stream);
     const Pixels<T> grad_pixels = take_pixels(sweep, kVectors, workspace);
@@ -438,8 +464,8 @@ void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& swee
                static_cast<unsigned>(warps * kWarp), warps * bytes, stream, grad, pixels, sweep, s, lines, !whole,
                grad_pixels);
         launch(op, source_kernel<T, kVectors>,
-               dim3(blocks_for(op, sweep.n_images * tasks, kMaxWarps), blocks_of_channels), kMaxWarps * kWarp, 0, stream,
-               pixels, sweep, s, lines, tasks, grad_pixels);
+               dim3(blocks_for(op, sweep.n_images * tasks, kMaxWarps), blocks_of_channels), kMaxWarps * kWarp, 0,
+               stream, pixels, sweep, s, lines, tasks, grad_pixels);
       }
     }
     launch(op, to_planes_kernel<T>, transpose_grid(op, sweep.n_images, s.n_pixels, pixels.stride), dim3(32, 8), 0,
@@ -447,8 +473,8 @@ void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& swee
   });
 }
 
-#define GSIM3D_INSTANTIATE(T)                                                                             \
-  template void plane_sweep<T>(const T*, const PlaneSweep<T>&, T*, const Workspace&, Stream);             \
+#define GSIM3D_INSTANTIATE(T)                                                                 \
+  template void plane_sweep<T>(const T*, const PlaneSweep<T>&, T*, const Workspace&, Stream); \
   template void plane_sweep_vjp<T>(const T*, const T*, const PlaneSweep<T>&, T*, const Workspace&, Stream);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
