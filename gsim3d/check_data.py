@@ -36,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     import os
+    from concurrent.futures import ThreadPoolExecutor
     from pathlib import Path
 
     import cv2
@@ -49,7 +50,9 @@ def run(args: argparse.Namespace) -> int:
     if out.suffix != ".png" or not out.absolute().parent.is_dir():
         raise InputError(f"--out must name a .png file in a folder that exists; got {out}")
     folders = find_scenes(args.data)
-    checks = [check_scene(folder) for folder in tqdm(folders, desc="scenes", unit="scene", disable=len(folders) == 1)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        made = tqdm(pool.map(check_scene, folders), "scenes", len(folders), unit="scene", disable=len(folders) == 1)
+        checks = list(made)
     for check in checks:
         print(describe(check.scene) if check.scene else f"{check.path}: cannot be opened")
         for problem in check.problems:

@@ -65,7 +65,7 @@ def rotate_harmonics(sh: Tensor, rotations: Tensor) -> Tensor:
 
 
 def turn_predicted_harmonics(sh: Tensor, rotations: Tensor, quirks: Quirks) -> Tensor:
-    """Predicted coefficients [N, K, C] of colours seen in a turned frame, in the world; ``rotations`` are frame-to-world.
+    """Predicted coefficients [N, K, C] of colours in a turned frame, turned into the world by ``rotations`` [N, 3, 3].
 
     Without quirks :func:`rotate_harmonics`; with them, as the published weights expect it.
     """

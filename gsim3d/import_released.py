@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help="published checkpoint (.ckpt)")
     parser.add_argument("--config", metavar="CONFIG", required=True, help="its resolved configuration (.yaml)")
-    parser.add_argument("-o", "--out", metavar="DIR", required=True, help="checkpoint folder to write; must not exist yet")
+    parser.add_argument("-o", "--out", metavar="DIR", required=True, help="folder to write; must not exist yet")
 
 
 def run(args: argparse.Namespace) -> int:

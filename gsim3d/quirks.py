@@ -18,8 +18,8 @@ class Quirks:
         integer_pixel_centers: the plane sweep puts feature pixel 0 at pixel coordinate 0 instead of its centre.
         reference_intrinsics: the plane sweep projects into a source view with the intrinsics of the reference view.
         ray_depth: depth means distance along the ray when particles are placed (the plane sweep means z).
-        corner_aligned_upsampling: coarse disparity and features are stretched from corner to corner instead of laid where
-            the strided convolutions took them.
+        corner_aligned_upsampling: coarse disparity and features are stretched from corner to corner instead of laid
+            where the strided convolutions took them.
         world_moments: moments of viewing rays are taken about the world's origin instead of the scene's.
     Dynamics:
         half_attention: queries, keys, values and results of attention are rounded to half precision.

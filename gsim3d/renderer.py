@@ -150,12 +150,14 @@ def render_as_published(
                 cutoff="tile3sigma" if quirks.three_sigma_tiles else "exact",
             )
         )
-    color, alpha, depth = (torch.cat([getattr(image, name) for image in images]) for name in ("color", "alpha", "depth"))
+    color, alpha, depth = (
+        torch.cat([getattr(image, name) for image in images]) for name in ("color", "alpha", "depth")
+    )
     return Rendering(color, alpha, depth, None)
 
 
 def with_centered_principal_point(cameras: Cameras) -> Cameras:
-    """Cameras of the same opening angles, measured through the middle of opposite edges, that look through the centre."""
+    """Cameras of the same opening angles, measured through the middles of opposite edges, with a centred view."""
     size = cameras.Ks.new_tensor([cameras.width, cameras.height], dtype=torch.float64)
     middle = torch.tensor([[[0, 0.5], [1, 0.5]], [[0.5, 0], [0.5, 1]]], dtype=torch.float64, device=size.device) * size
     pixels = F.pad(middle, (0, 1), value=1.0)  # [axis, edge, 3]
@@ -168,7 +170,7 @@ def with_centered_principal_point(cameras: Cameras) -> Cameras:
 
 
 def colors_with_z(sh: Tensor, means: Tensor, camera: Cameras) -> Tensor:
-    """[N, 3] colours of Gaussians [N, K, 3] seen by one camera, harmonic 14 as published; the gradient is without that."""
+    """[N, 3] colours of ``sh`` [N, K, 3] seen by one camera, harmonic 14 as published; its gradient is the true one."""
     pose = torch.linalg.inv(camera.viewmats[0].double())[:3, 3].to(means)
     directions = F.normalize(means - pose, dim=1)
     colors = torch.einsum("nk,nkc->nc", sh_basis(directions, math.isqrt(sh.shape[1]) - 1), sh) + 0.5

@@ -1,7 +1,7 @@
 """Tensors of the published model.
 
-They are read from ``$GSIM3D_GOLDEN_DIR``; where it is not set, from ``../shared/golden`` beside the repository, and where
-that is absent, from the small set in ``tests/golden/data``. A test that needs a file that is not there is skipped.
+They are read from ``$GSIM3D_GOLDEN_DIR``; where it is not set, from ``../shared/golden`` beside the repository, and
+where that is absent, from the small set in ``tests/golden/data``. A test whose file is not there is skipped.
 """
 
 import json

@@ -14,6 +14,7 @@ from gsim3d.encoder.depth import Views, feature_intrinsics, upsample
 from gsim3d.encoder.heads import PixelRays
 from gsim3d.encoder.transformer import MASKED, Windows
 from gsim3d.harmonics import published_axes, rotate_harmonics, sh_basis, turn_predicted_harmonics
+from gsim3d.ops import build_pyramid
 from gsim3d.quirks import Quirks
 from gsim3d.renderer import colors_with_z, render, render_as_published, rotation_matrices, unit_quats
 from gsim3d.types import Cameras, Gaussians
@@ -173,12 +174,24 @@ def test_first_of_voxel(quirk):
 
 @both_values
 def test_anchor_at_minimum(quirk):
-    """Whether another scene, or a particle far away, moves the cells of a scene."""
+    """Whether another scene moves the cells of a scene, and a particle far away those of its neighbours."""
     dynamics = with_quirks(anchor_at_minimum=quirk)
     history, other = make_history((30,)), make_history((30,), seed=1)
     other = dataclasses.replace(other, means=other.means - 0.4 * TINY.grid_size)
     together = dynamics(batch([history, other])).select_clouds(torch.tensor([0]))
     assert torch.equal(together.means, dynamics(history).means) == (not quirk)
+
+    far = history.means.clone()
+    far[0] = 0.01  # below all others, within the workspace
+    grids = [cells_of(dynamics, dataclasses.replace(history, means=means)) for means in (history.means, far)]
+    assert torch.equal(grids[0][1:], grids[1][1:]) == (not quirk)
+
+
+def cells_of(dynamics, history):
+    """Cells of the finest stage."""
+    spec = dynamics.config.pyramid_spec(0)
+    clouds = history.cu_rows, history.cloud_scene, history.cloud_step * 0, history.origin
+    return build_pyramid(history.means, *clouds, spec).stages[0].grid
 
 
 @both_values

@@ -11,6 +11,7 @@ from gsim3d.dynamics import last_steps
 from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, UnsupportedEffect
 from gsim3d.encoder import EncoderConfig
 from gsim3d.presets import ModelConfig
+from gsim3d.quirks import Quirks
 from gsim3d.renderer import RendererConfig
 from gsim3d.simulator import Simulator
 from gsim3d.train.loop import deterministic
@@ -120,6 +121,46 @@ def test_rollout_is_repeated_steps():
         newest = last_steps(state, 1)
         assert_same_bits(newest.means, step.means)
         assert_same_bits(newest.dynamic_latents, step.dynamic_latents)
+
+
+@pytest.mark.parametrize("changing", ["all", "none"])
+def test_several_steps_a_call(changing):
+    config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, steps_per_call=2))
+    simulator, frames = make_simulator(config), make_frames((2, 3))
+    state = simulator.encode(frames)
+    plan = simulator.plan(EffectsSpec(appearance=AppearanceEffects(changing=changing)))
+    steps = simulator.rollout(state, 3, plan)
+    assert [step.cloud_step.tolist() for step in steps] == [[2, 3], [3, 4], [4, 5]]
+    newest, after = last_steps(state, 1), last_steps(simulator.step(state, plan), 2)
+    assert after.cloud_step.tolist() == [2, 3, 3, 4]
+    for i, step in enumerate(steps[:2]):
+        assert_same_bits(after.select_clouds(torch.tensor([i, 2 + i])).means, step.means)
+        assert torch.equal(step.dynamic_latents, newest.dynamic_latents) == (changing == "none")
+
+
+def with_quirks(quirks):
+    parts = (dataclasses.replace(p, quirks=quirks) for p in (CONFIG.encoder, CONFIG.dynamics, CONFIG.renderer))
+    return make_simulator(ModelConfig(*parts))
+
+
+def test_published_behaviour_end_to_end():
+    """Every switch on: finite, and gradients reach every parameter of the network that a clean model would train."""
+    simulator, frames = awake(with_quirks(Quirks.release())), make_frames((2,))
+    steps = simulator.rollout(simulator.encode(frames), 2)
+    image = simulator.render(steps[-1], target_cameras(frames, 1), torch.ones(3))
+    assert image.color.shape == (1, SIZE, SIZE, 3) and torch.isfinite(image.color).all() and image.alpha.max() > 0.05
+    image.color.sum().backward()
+    missing = [name for name, p in simulator.named_parameters() if p.grad is None or not torch.isfinite(p.grad).all()]
+    assert not [name for name in missing if "time_embedding" not in name], missing
+
+
+def test_the_published_renderer_draws_as_many_images_as_there_are_cameras():
+    simulator, frames = with_quirks(Quirks.release()), make_frames((2, 1))
+    particles = simulator.encode(frames)
+    both = simulator.render(particles, frames.cameras, torch.rand(len(frames.cameras), 3))
+    assert both.color.shape == (len(frames.cameras), SIZE, SIZE, 3)
+    none = simulator.render(particles, frames.cameras.select(torch.zeros(0, dtype=torch.int64)))
+    assert none.color.shape == (0, SIZE, SIZE, 3)
 
 
 def test_masked_out_pixels_are_absent():

@@ -32,6 +32,12 @@ def inverse(viewmats: np.ndarray) -> np.ndarray:
     return result
 
 
+def by_step(matrices: Sequence[np.ndarray], n_steps: int) -> np.ndarray:
+    """[S, V, ...] of V cameras with [...] each that stands still or [n_steps, ...] that moves; S is 1 if none moves."""
+    full = np.stack([np.broadcast_to(matrix, (n_steps, *matrix.shape[-2:])) for matrix in matrices], 1)
+    return full[:1].copy() if (full == full[:1]).all() else full
+
+
 def check_pose(matrices: np.ndarray, what: str, problems: Problems) -> bool:
     """Whether [4, 4] or [S, 4, 4] are rigid motions of right-handed axes; names the frame of the first that is not."""
     moving = matrices.ndim == 3

@@ -58,7 +58,7 @@ def check_scene(folder: str | Path) -> SceneCheck:
         if recording.read_labels is not None:
             _check_labels(recording, problems)
     if scene is not None and not problems.found:
-        _check_agreement(scene, problems)
+        _check_agreement(Scene(path, recording), problems)  # its images go when it goes
     return SceneCheck(path, scene, tuple(dict.fromkeys(problems.found)))
 
 
@@ -135,14 +135,16 @@ def describe(scene: Scene) -> str:
     moves = ", moving" if len(scene.recording.viewmats) > 1 else ""
     labels = "subtracted" if scene.recording.subtract_background else "yes" if scene.has_segmentation() else "none"
     return (
-        f"{scene.name}: {scene.layout}, {scene.n_steps} steps at {scene.fps:g} a second, {scene.n_cams} cameras{moves}, "
+        f"{scene.name}: {scene.layout}, {scene.n_steps} steps at {scene.fps:g} a second, "
+        f"{scene.n_cams} cameras{moves}, "
         f"{pixels} pixels, depth {scene.near:.2f} to {scene.far:.2f} m, bounds {size} m, masks: {labels}"
     )
 
 
 def contact_sheet(scenes: Sequence[Scene]) -> np.ndarray:
-    """Frames of some cameras at some steps of some scenes, with what should lie in them drawn on top; uint8, blue first.
+    """Frames of some cameras at some steps of some scenes, with what should lie in them drawn on top.
 
+    Returns uint8 [H, W, 3], blue first.
     The blue box is the scene's bounds, the orange one the place where all cameras see a moving body; the arrows are the
     world's x, y and z axes (red, green, blue) at the middle of the lower face of the bounds; magenta squares are the
     other cameras; the yellow line is the outline of what is not background.

@@ -16,12 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.data.cameras import OPENGL, check_intrinsics, check_pose, inverse
-from gsim3d.data.images import as_color, as_labels, is_marked, read_files
+from gsim3d.data.cameras import OPENGL, by_step, check_intrinsics, check_pose, inverse
+from gsim3d.data.images import as_color, as_labels, as_mask, read_files
 from gsim3d.data.recording import (
     MAX_CAMS,
     MAX_STEPS,
-    MOVING,
     Problems,
     Recording,
     array,
@@ -63,9 +62,11 @@ def read(folder: Path, problems: Problems) -> Recording:
         )
     for number, frame in enumerate(frames):
         for key in ("file_path", "mask_path", "label_path"):
-            if not isinstance(frame.get(key, ""), str) or (key == "file_path" and key not in frame):
-                raise InputError(f"{source}: frames[{number}].{key} must be text; got {frame.get(key)!r}")
-            inside(folder, frame.get(key, ""), f"{source}: frames[{number}].{key}")
+            if key != "file_path" and key not in frame:
+                continue
+            if not isinstance(frame.get(key), str):
+                raise InputError(f"{source}: frames[{number}].{key} must be text; got {str(frame.get(key))[:80]!r}")
+            inside(folder, frame[key], f"{source}: frames[{number}].{key}")
     table, times = _table(frames, source, problems)
     names = sorted(table, key=natural_order)
     if len(names) > MAX_CAMS:
@@ -89,7 +90,7 @@ def read(folder: Path, problems: Problems) -> Recording:
         camera = cameras[cam]
         for step in steps:
             frame = camera.frames[step]
-            key, convert = ("label_path", as_labels) if "label_path" in frame else ("mask_path", _as_mask)
+            key, convert = ("label_path", as_labels) if "label_path" in frame else ("mask_path", as_mask)
             if key not in frame:
                 problems.add(f"{source}: {camera.place(step)} has no mask_path, though other frames have one")
                 yield None
@@ -103,8 +104,8 @@ def read(folder: Path, problems: Problems) -> Recording:
         n_steps=n_steps,
         fps=fps or 1.0,
         camera_names=tuple(names),
-        viewmats=_still(np.stack([camera.viewmats for camera in cameras], 1)),
-        Ks=_still(np.stack([camera.Ks for camera in cameras], 1)),
+        viewmats=by_step([camera.viewmats for camera in cameras], n_steps),
+        Ks=by_step([camera.Ks for camera in cameras], n_steps),
         sizes=tuple(camera.size for camera in cameras),
         read_images=read_images,
         read_labels=read_labels if has_labels else None,
@@ -112,15 +113,6 @@ def read(folder: Path, problems: Problems) -> Recording:
         is_film=True,
         **workspace(description, source, problems),
     )
-
-
-def _as_mask(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray:
-    return is_marked(image).astype(np.uint8) * MOVING
-
-
-def _still(matrices: np.ndarray) -> np.ndarray:
-    """The first step alone where [S, V, ...] are the same at all steps."""
-    return matrices[:1] if (matrices == matrices[:1]).all() else matrices
 
 
 def _table(frames: list[dict], source: Path, problems: Problems) -> tuple[dict, np.ndarray]:

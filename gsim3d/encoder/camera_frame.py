@@ -35,3 +35,9 @@ def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
         ],
         -1,
     )
+
+
+def with_positive_largest(quats: Tensor) -> Tensor:
+    """[..., 4], of the two quaternions of each rotation the one whose largest component is positive."""
+    largest = quats.detach().gather(-1, quats.detach().abs().argmax(-1, keepdim=True))
+    return torch.where(largest < 0, -quats, quats)

@@ -140,6 +140,7 @@ def explicit_gaussians(raw: Tensor, depth: Tensor, geometry: PixelRays, config: 
     rotations = geometry.rotations.to(raw.dtype)
     turn = camera_frame.rotation_to_quat(rotations)[:, None]
     quats = camera_frame.quat_multiply(turn, F.normalize(raw_quats.roll(1, -1), dim=-1))  # raw: real part last
+    quats = camera_frame.with_positive_largest(quats)  # as those that the dynamics writes and reads
     damping = degree_damping(config.sh_degree, raw)
     in_camera = raw_sh.reshape(n_images, -1, 3, damping.shape[0]) * damping
     each = torch.eye(len(damping), dtype=geometry.rotations.dtype, device=raw.device).repeat(n_images, 1, 1)

@@ -10,11 +10,10 @@ video holds all steps up to the last one compared or to the end of the film, or 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gsim3d.data import Scene
@@ -74,11 +73,13 @@ class Predictions:
             InputError: a folder, frame or video is missing, too short, broken or of another size.
         """
         folder = self._scene_folder(scene)
-        views = []
-        for cam in cams:
-            frames = _view(folder / f"cam_{cam}", scene, cam, n_encoded, n_future)
-            views.append(np.stack([scene.as_pinhole(frame, cam, n_encoded + j) for j, frame in enumerate(frames)]))
-        return torch.from_numpy(np.stack(views, 1))
+
+        def read(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray]:
+            size = scene.filmed_sizes[cam]
+            frames = _view(folder / f"cam_{cam}", size, scene.n_steps, n_encoded, n_future, problems)
+            return (frames[step - n_encoded] for step in steps)
+
+        return scene.filmed_as(read).film(cams, range(n_encoded, n_encoded + n_future)).permute(0, 1, 3, 4, 2)
 
     def _scene_folder(self, scene: Scene) -> Path:
         folder = self.folder / scene.path.relative_to(self.root)
@@ -87,13 +88,14 @@ class Predictions:
         return folder
 
 
-def _view(place: Path, scene: Scene, cam: int, n_encoded: int, n_future: int) -> list[np.ndarray]:
-    """One camera's predicted frames [h, w, 3], RGB, of the size that the camera films."""
-    size, steps = scene.recording.sizes[cam], range(n_encoded, n_encoded + n_future)
+def _view(
+    place: Path, size: tuple[int, int], film: int, n_encoded: int, n_future: int, problems: Problems
+) -> list[np.ndarray]:
+    """One camera's predicted frames [h, w, 3], RGB."""
+    steps = range(n_encoded, n_encoded + n_future)
     found = _find(place, steps)
     if isinstance(found, Path):
-        return _from_video(found, size, scene.n_steps, n_encoded, n_future)
-    problems = Problems()  # raises the first one
+        return _from_video(found, size, film, n_encoded, n_future)
     named = [(file, f"predicted step {step}") for file, step in zip(found, steps, strict=True)]
     return [as_color(read_image(file, size, what, problems), file, what, problems) for file, what in named]
 

@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     if args.export and (not args.export.endswith(".safetensors") or not Path(args.export).absolute().parent.is_dir()):
         raise InputError(f"--export must name a .safetensors file in a folder that exists; got {args.export}")
     folders, _ = split_scenes(find_scenes(args.data))
-    scenes = [Scene.open(folder) for folder in folders]
+    scenes = [Scene.open(folder, fitting=config.data.fitting) for folder in folders]
 
     from gsim3d.train.loop import Trainer
 

@@ -336,15 +336,6 @@ def test_masks_without_a_moving_body(copy):
     assert "no label image has a pixel of 3" in problem and "[0, 1]" in problem
 
 
-def test_exchanged_cameras_leave_moving_bodies_no_place(tmp_path):
-    made = make_scene()
-    made.labels[:, 1], made.labels[:, 2] = 0, np.fliplr(np.roll(made.labels[:, 2], 20, axis=2))
-    made.labels[:, 1, :4, :4] = 3
-    folder = WRITERS["genesis"](tmp_path / "scene", made)
-    (problem,) = check_scene(folder).problems
-    assert "no common place" in problem
-
-
 @pytest.mark.parametrize("text", ["", "{", "[1]", "\0", '{"cameras": 3}', '{"frames": [1]}', "{}"])
 @pytest.mark.parametrize("name", ["transforms.json", "cameras.json", "cam_0/metadata.json"])
 def test_descriptions_that_cannot_be_read(tmp_path, name, text):

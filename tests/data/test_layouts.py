@@ -18,6 +18,7 @@ from tests.data.made_scenes import (
     ORIGIN,
     WIDTH,
     WRITERS,
+    edit_json,
     make_scene,
     write_films,
     write_genesis,
@@ -71,6 +72,34 @@ def test_frames_carry_the_cameras_of_their_step(tmp_path, layout):
         np.testing.assert_allclose(frames.cameras.viewmats[row], made.viewmats[step, cam], atol=2e-6)
         np.testing.assert_array_equal(frames.masks[row], made.labels[step, cam] > 0)
         np.testing.assert_array_equal(frames.dynamic[row], made.labels[step, cam] == 3)
+
+
+@pytest.mark.parametrize("layout", ["genesis", "transforms", "films"])
+@pytest.mark.parametrize("moving", [False, True])
+def test_intrinsics_may_change_with_time(tmp_path, layout, moving):
+    made = make_scene(moving=moving, zoom=0.1)
+    scene = Scene.open(WRITERS[layout](tmp_path, made))
+    cameras = scene.cameras_at(CAMS, STEPS)
+    np.testing.assert_allclose(cameras.Ks.unflatten(0, (N_STEPS, N_CAMS)), made.Ks, rtol=1e-6)
+    np.testing.assert_allclose(cameras.viewmats.unflatten(0, (N_STEPS, N_CAMS)), made.viewmats, atol=2e-6)
+    assert not torch.equal(cameras.Ks[0], cameras.Ks[-N_CAMS])
+
+
+def test_the_same_lens_in_two_layouts(tmp_path):
+    lens = {"k1": 0.2, "k2": 0.05, "p1": 0.002, "p2": -0.004, "k3": 0.01}
+    made = make_scene(zoom=0.05)
+    films, transforms = write_films(tmp_path / "films", made), write_transforms(tmp_path / "transforms", made)
+    plain = Scene.open(films).film(CAMS, STEPS)
+    edit_json(
+        films / "cameras.json", lambda content: [c.update(distortion=[*lens.values()]) for c in content["cameras"]]
+    )
+    edit_json(transforms / "transforms.json", lambda content: content.update(lens))
+    one, other = Scene.open(films), Scene.open(transforms)
+    assert torch.equal(one.images(CAMS, STEPS), other.images(CAMS, STEPS))
+    assert torch.equal(one.segmentation(CAMS, STEPS), other.segmentation(CAMS, STEPS))
+    assert torch.equal(one.valid(CAMS, STEPS), other.valid(CAMS, STEPS)) and not one.valid(CAMS, STEPS).all()
+    assert not torch.equal(one.film(CAMS, STEPS), plain)
+    assert not (one.segmentation(CAMS, STEPS)[~one.valid(CAMS, STEPS)]).any()
 
 
 def test_cameras_stand_still_after_the_end_of_the_film(tmp_path):

@@ -5,10 +5,12 @@ import math
 
 import pytest
 import torch
+from torch.nn import functional as F
 
 from gsim3d.encoder import Encoder, EncoderConfig
-from gsim3d.encoder.depth import feature_intrinsics, upsample, upsampling_matrix
+from gsim3d.encoder.depth import Views, feature_intrinsics, upsample, upsampling_matrix
 from gsim3d.encoder.camera_frame import quat_multiply, rotation_to_quat
+from gsim3d.encoder.heads import PixelRays, explicit_gaussians
 from gsim3d.errors import HardCaseError, InputError
 from gsim3d.quirks import Quirks
 from gsim3d.types import DYNAMIC, FROZEN, Frames
@@ -253,6 +255,29 @@ def test_quaternions_of_rotations():
     pure = torch.cat([x.new_zeros(1), x]).expand(len(q), 4)
     conjugate = q * torch.tensor([1.0, -1, -1, -1], dtype=torch.float64)
     assert torch.allclose(quat_multiply(quat_multiply(q, pure), conjugate)[:, 1:], R @ x)
+
+
+def test_explicit_quaternions_are_those_that_a_matrix_gives():
+    """Published: (x, y, z, w) -> matrix, turned into the world, -> quaternion from its largest component, positive."""
+    config = EncoderConfig(explicit=True, dynamic_dim=0, static_dim=0, sh_degree=0)
+    generator = torch.Generator().manual_seed(0)
+    raw = torch.randn(3, 10, 5, 4, generator=generator, dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, :3, :3] = rotations(3)
+    Ks = torch.eye(3, dtype=torch.float64).repeat(3, 1, 1)
+    rays = PixelRays.of(Views(raw, Ks, torch.linalg.inv(poses), torch.ones(3), torch.ones(3), 3))
+    quats = explicit_gaussians(raw, torch.ones(3, 1, 5, 4).double(), rays, config)["quats"]
+    x, y, z, w = F.normalize(raw[:, 3:7].flatten(2).transpose(1, 2), dim=-1).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    in_camera = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    expected = rotation_to_quat(poses[:, None, :3, :3] @ in_camera)
+    largest = expected.gather(-1, expected.abs().argmax(-1, keepdim=True))
+    assert (largest > 0).all() and (expected[..., 0] < 0).any()
+    torch.testing.assert_close(quats, expected, rtol=0, atol=1e-12)
 
 
 def replace_cameras(frames: Frames, **changes) -> Frames:

@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from gsim3d.__main__ import main
-from gsim3d.data import Scene
+from gsim3d.data import Fitting, Scene
 from gsim3d.errors import InputError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.interop import write_video
+from tests.data.test_films import write_odd_films
 from tests.tiny_scenes import write_scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -43,8 +44,8 @@ def scene_of(data, name="0000"):
 
 
 def flat_video(path, levels, size=(32, 32)):
-    """A video of grey frames, ``levels`` of 255."""
-    write_video(path, [np.full((size[1], size[0], 3), level, np.uint8) for level in levels], 12.0)
+    """A video of frames of one colour: red of ``levels``, green 60, blue 200."""
+    write_video(path, [np.full((size[1], size[0], 3), (level, 60, 200), np.uint8) for level in levels], 12.0)
 
 
 def test_frames_are_found_by_scene_camera_and_step(data, folder):
@@ -64,6 +65,25 @@ def test_perfect_predictions_score_perfectly_and_the_copy_beside_them_does_not(d
     assert (scores.values["copy"]["psnr_body"][GIVEN:] < 40).all()
 
 
+def test_what_is_done_to_the_film_is_done_to_its_predictions(tmp_path):
+    """Odd sizes, a lens, a real background: a prediction that repeats the camera's own frames is perfect."""
+    write_odd_films(tmp_path / "room")
+    scene = Scene.open(tmp_path / "room")
+    assert scene.recording.is_film and scene.valid([0], [0]) is not None
+    same = Predictions.open(f"same={scene.path}", scene.path)
+    values = score_scene(None, scene, target_cams=(0, 1, 2), n_encoded=2, n_future=3, others=[same]).values
+    for metric, best in (("psnr", 100.0), ("psnr_masked", 100.0), ("ssim", 1.0)):
+        assert values["same"][metric][2:].tolist() == pytest.approx([best] * 3, abs=1e-9)
+        assert (values["copy"][metric][2:] < 0.99 * best).all()
+
+
+def test_they_are_scaled_with_the_film_of_a_model_of_another_size(data, folder):
+    scene = Scene.open(data / "ball" / "0000", fitting=Fitting(size=(24, 16)))
+    images = Predictions.open(str(folder), data).images(scene, [3], GIVEN, 4)
+    assert images.shape == (4, 1, scene.height, scene.width, 3)
+    assert torch.equal(images, scene.images([3], range(2, 6)).permute(0, 1, 3, 4, 2))
+
+
 @pytest.mark.parametrize("n_future, n_frames, first", [(4, 6, 2), (4, 4, 0), (1, 6, 2), (1, 3, 2), (1, 1, 0)])
 def test_the_length_of_a_video_tells_where_it_starts(data, folder, n_future, n_frames, first):
     place = folder / "ball" / "0000"
@@ -74,8 +94,9 @@ def test_the_length_of_a_video_tells_where_it_starts(data, folder, n_future, n_f
     assert predictions.cameras(scene_of(data)) == (1, 3)
     images = predictions.images(scene_of(data), [1], GIVEN, n_future)
     assert images.shape == (n_future, 1, 32, 32, 3)
-    means = images.float().mean((1, 2, 3, 4)).tolist()
-    assert means == pytest.approx(levels[first : first + n_future], abs=4)  # lossy
+    means = images.float().mean((1, 2, 3))
+    assert means[:, 0].tolist() == pytest.approx(levels[first : first + n_future], abs=8)  # lossy
+    assert means[:, 1:].tolist() == [pytest.approx([60, 200], abs=8)] * n_future
 
 
 def test_a_video_whose_length_says_two_things_is_refused(data, folder):
@@ -190,7 +211,21 @@ def test_the_command_scores_them_without_a_checkpoint(data, folder, capsys, no_w
     summary = json.loads(out.read_text())
     assert summary["methods"] == ["other", "copy"] and summary["other.future.psnr"] == 100.0
     assert summary["not_measured"]["fvd"] == "run gsim3d weights fvd"
+    assert summary["checkpoint"] is None and summary["predictions"] == {"other": str(folder)}
+    assert summary["cameras"]["ball/0001"] == {"context": None, "target": [1, 3]}
     assert sorted(p.name for p in folder.glob("metrics.*")) == [f"metrics.{e}" for e in ("csv", "json", "md", "png")]
+
+
+def test_scenes_of_the_same_name_stay_apart(data, folder, tmp_path, capsys, no_weights):
+    both, others = tmp_path / "both", tmp_path / "others"
+    for part in ("a", "b"):
+        shutil.copytree(data, both / part)
+        shutil.copytree(folder, others / part)
+    arguments = ["--predictions", others, both, "--given", 2, "--scenes", "all", "--metrics", "psnr"]
+    assert evaluate(capsys, *arguments, "--out", tmp_path / "m.json")[0] == 0
+    assert set(json.loads((tmp_path / "m.json").read_text())["scenes"]) == {
+        f"{p}/ball/000{i}" for p in "ab" for i in (0, 1)
+    }
 
 
 def test_a_report_is_not_written_where_predictions_do_not_fit(data, folder, capsys, no_weights):

@@ -145,7 +145,7 @@ def test_constant_velocity_without_a_motion_to_continue(restored, scene, hidden)
     assert torch.equal(constant_velocity(single).means, truth.means[:35].repeat(2, 1))
 
 
-def test_held_baselines_are_seen_by_cameras_that_move(restored, scene, tmp_path):
+def test_baselines_are_seen_by_cameras_that_move(restored, scene, tmp_path, monkeypatch):
     folder = tmp_path / "moving"
     shutil.copytree(scene.path, folder)
     metadata = json.loads((folder / "metadata.json").read_text())
@@ -155,11 +155,21 @@ def test_held_baselines_are_seen_by_cameras_that_move(restored, scene, tmp_path)
     (folder / "metadata.json").write_text(json.dumps(metadata))
     moving = Scene.open(folder)
     assert moving.cameras_move and not scene.cameras_move
-    images = protocol._model_and_baselines(restored, moving, (0, 2), [3], 4)
-    still = protocol._model_and_baselines(restored, scene, (0, 2), [3, 4], 4)
-    for name in ("constant", "release_constant"):
-        torch.testing.assert_close(images[name][2:4, 0], still[name][2:4, 0])
-        torch.testing.assert_close(images[name][4:, 0], still[name][4:, 1])  # from step 4 on, camera 3 is where 4 was
+    prediction = predict(restored, scene, (0, 2), 4)
+    still = render_steps(restored, prediction.particles, scene, [3, 4])
+    for step in (1, 2):
+        images = protocol._held(restored, prediction, None, step, moving, [3])
+        torch.testing.assert_close(images[:2, 0], still[step, 0].expand(2, 32, 32, 3))
+        torch.testing.assert_close(images[2:, 0], still[step, 1].expand(2, 32, 32, 3))  # camera 3 is where 4 was
+    body = falling_apart(restored, scene, 6)
+    monkeypatch.setattr(protocol, "predict", lambda *_: Prediction(body, 2, (0, 2)))
+    film = render_steps(restored, body, moving, [3])
+    monkeypatch.setattr(
+        moving, "images", lambda cams, steps: (film * 255).round().to(torch.uint8).permute(0, 1, 4, 2, 3)
+    )
+    values = {name: v["psnr"] for name, v in score_scene(restored, moving).values.items()}
+    assert (values["model"] > 50).all() and (values["constant_velocity"][2:] > 50).all()
+    assert (values["copy"][4:] < values["constant"][4:]).all()  # a still image does not follow the camera
 
 
 def test_scores_by_hand(restored, scene):

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from gsim3d.__main__ import main
 from gsim3d.evaluate import scoring
 from gsim3d.evaluate.report import markdown, notes, summarize, table, write_csv, write_json
 from gsim3d.evaluate.scoring import METRICS, SceneScores, SceneTruth
@@ -36,7 +37,7 @@ def test_masks_by_hand():
     predicted[..., : W // 2, :] += 0.1  # background
     predicted[:, 0, :, -2:] += 0.3
     scores = SceneTruth("a", truth, labels(), None, GIVEN, ("psnr", "psnr_masked", "psnr_body")).score(
-        {"model": predicted, "copy": predicted}
+        [("model", predicted), ("copy", predicted[GIVEN:])]
     )
     values = scores.values["model"]
     # One view has error 0.3 on 2 of the 7 columns that are no background, the other none at all: 100 dB.
@@ -55,7 +56,7 @@ def test_what_was_not_filmed_is_no_error():
     predicted = truth + 0.1 * filmed[..., None]
     predicted[..., 11:, :] = 0.7
     judge = SceneTruth("a", truth, None, filmed, GIVEN, ("psnr", "ssim"))
-    scores = judge.score({"model": predicted, "exact": truth + 0.5 * ~filmed[..., None]}).values
+    scores = judge.score([("model", predicted), ("exact", truth + 0.5 * ~filmed[..., None])]).values
     assert scores["model"]["psnr"][3].item() == db(0.1)
     assert scores["exact"]["psnr"][3].item() == 100 and scores["exact"]["ssim"][3].item() == pytest.approx(1)
 
@@ -71,7 +72,7 @@ def test_what_cannot_be_measured_is_told(monkeypatch):
         "lpips_vgg": "ball/3 has images of 14x10 pixels; it needs 16",
         "fvd": "it needs 10 predicted steps; ball/3 has 3",
     }
-    summary = summarize([judge.score({"model": film(height=10)})], {"psnr": "nobody wanted it"})
+    summary = summarize([judge.score([("model", film(height=10))])], {"psnr": "nobody wanted it"})
     assert "future.psnr" not in summary and len(notes(summary)) == len(METRICS)
     assert "PSNR masked: not measured: ball/3 has no segmentation" in table(summary)
     assert "FVD: not measured: it needs 10 predicted steps" in markdown(summary, "data")
@@ -83,13 +84,24 @@ def cheap_features(monkeypatch):
     monkeypatch.setattr(fvd, "clip_features", lambda clips: clips[:, [0, -1]].mean((2, 3)).flatten(1).double())
 
 
+def test_help_names_every_metric(capsys):
+    with pytest.raises(SystemExit):
+        main(["evaluate", "--help"])
+    text = capsys.readouterr().out
+    assert all(metric in text.split("Measured are")[1] for metric in METRICS)
+
+
 def test_fvd_compares_the_predicted_steps_of_all_scenes_and_views(cheap_features):
     films = [film(seed, n_steps=GIVEN + 10) for seed in range(3)]
     scores = []
     for i, truth in enumerate(films):
         predicted = truth + 0.1
         predicted[:GIVEN] = 9  # given steps do not count
-        scores.append(SceneTruth(f"{i}", truth, None, None, GIVEN, ("fvd",)).score({"model": predicted, "copy": truth}))
+        scores.append(
+            SceneTruth(f"{i}", truth, None, None, GIVEN, ("fvd",)).score(
+                [("model", predicted), ("copy", truth[GIVEN:])]
+            )
+        )
     assert scores[0].clips["truth"].shape == (V, 6)
     assert torch.equal(scores[1].clips["truth"], fvd.clip_features(films[1][GIVEN:].transpose(0, 1)))
     summary = summarize(scores)
@@ -97,7 +109,7 @@ def test_fvd_compares_the_predicted_steps_of_all_scenes_and_views(cheap_features
     assert summary["future.fvd"] == pytest.approx(6 * 0.1**2, rel=1e-4) and summary["n_clips"] == 6
     assert summary["copy.future.fvd"] == pytest.approx(0, abs=1e-12)
     assert notes(summary) == ["FVD: of 6 clips; below 256 it shows a trend, not a measurement"]
-    one = SceneTruth("a", films[0][:, :1], None, None, GIVEN, ("fvd",)).score({"model": films[0][:, :1]})
+    one = SceneTruth("a", films[0][:, :1], None, None, GIVEN, ("fvd",)).score([("model", films[0][:, :1])])
     assert "needs 2 clips" in summarize([one])["not_measured"]["fvd"]
 
 
@@ -107,8 +119,8 @@ def test_lpips_is_measured_where_its_weights_are(monkeypatch):
         scoring.lpips, "lpips", lambda a, b, network: called.append(network) or (a - b).abs().mean((1, 2, 3)).double()
     )
     truth = film(height=32, width=32)
-    scores = SceneTruth("a", truth, None, None, GIVEN, ("lpips_alex", "lpips_vgg")).score({"model": truth + 0.25})
-    assert called == ["alex", "vgg"]
+    scores = SceneTruth("a", truth, None, None, GIVEN, ("lpips_alex", "lpips_vgg")).score([("model", truth + 0.25)])
+    assert called == ["alex", "vgg"] * S
     assert scores.values["model"]["lpips_vgg"].tolist() == pytest.approx([0.25] * S)
 
 

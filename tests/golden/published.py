@@ -4,6 +4,7 @@ import dataclasses
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from gsim3d import ops
 from gsim3d.dynamics import DynamicsConfig
@@ -92,29 +93,30 @@ def renamed(published: Golden, prefix: str = "", ours: str = "") -> dict[str, Te
 
 def everywhere(xyz: Tensor) -> Tensor:
     """The mask [B, T, N] of clouds without masked particles."""
-    return torch.ones(xyz.shape[:3], dtype=torch.bool)
+    return torch.ones(xyz.shape[:3], dtype=torch.bool, device=xyz.device)
 
 
 def mask_of(case: Golden, xyz: Tensor, key: str = "state_mask") -> Tensor:
-    return case[key][..., 0] if key in case else everywhere(xyz)
+    return case[key][..., 0].to(xyz.device) if key in case else everywhere(xyz)
 
 
 def offsets(mask: Tensor) -> Tensor:
     """mask [B, T, N] -> cu_rows of the clouds (b, t)."""
-    return torch.cat([torch.zeros(1, dtype=torch.int64), mask.sum(2).flatten().cumsum(0)])
+    return F.pad(mask.sum(2).flatten().cumsum(0), (1, 0))
 
 
 def cloud_table(xyz: Tensor) -> tuple[Tensor, Tensor]:
     """Scene and step of the clouds of [B, T, N, 3]."""
-    n_scenes, n_steps = xyz.shape[:2]
-    return torch.arange(n_scenes).repeat_interleave(n_steps), torch.arange(n_steps).repeat(n_scenes)
+    scene, step = torch.meshgrid(*(torch.arange(n, device=xyz.device) for n in xyz.shape[:2]), indexing="ij")
+    return scene.flatten(), step.flatten()
 
 
-def pyramid_of(xyz: Tensor, mask: Tensor, config: DynamicsConfig) -> ops.Pyramid:
-    """The geometry of clouds [B, T, N, 3] as the published model makes it."""
+def pyramid_of(xyz: Tensor, mask: Tensor, config: DynamicsConfig, origin: Tensor | None = None) -> ops.Pyramid:
+    """The geometry of clouds [B, T, N, 3] as the published model makes it; it knows no ``origin`` [B, 3]."""
     scene, step = cloud_table(xyz)
     spec = config.pyramid_spec((xyz.shape[1] - 1).bit_length())
-    return ops.build_pyramid(xyz[mask], offsets(mask), scene, step, torch.zeros(xyz.shape[0], 3).double(), spec)
+    origin = xyz.new_zeros(xyz.shape[0], 3) if origin is None else origin
+    return ops.build_pyramid(xyz[mask], offsets(mask), scene, step, origin.double(), spec)
 
 
 def particles_of(case: Golden) -> tuple[Particles, Tensor]:
@@ -168,6 +170,15 @@ def assert_published_patches(table: PatchTable, order: Tensor, g: Golden) -> Non
     patch_of_row = torch.repeat_interleave(torch.arange(len(read)), table.cu_q.diff())
     sequence_of_slot = torch.repeat_interleave(torch.arange(len(sequences)), ends.diff())
     assert torch.equal(sequence_of_slot[unpad], patch_of_row)
+
+
+def on_cpu(stage: Stage) -> Stage:
+    """The parts of a stage that are compared."""
+    names = ("grid", "cloud", "cu_clouds", "order")
+    cluster = stage.cluster and dataclasses.replace(
+        stage.cluster, rows=stage.cluster.rows.cpu(), cu_rows=stage.cluster.cu_rows.cpu()
+    )
+    return dataclasses.replace(stage, **{name: getattr(stage, name).cpu() for name in names}, cluster=cluster)
 
 
 def members(stage: Stage) -> Tensor:

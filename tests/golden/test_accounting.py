@@ -29,7 +29,7 @@ def is_unused(entry: tuple[str, str]) -> bool:
 
 
 def read_by_tests(tmp_path: Path) -> set[tuple[str, str]]:
-    """What all golden tests of this folder read, in a process of their own: whatever else runs, and in whatever order."""
+    """What all golden tests of this folder read, in a process of their own: whatever else runs, in any order."""
     log = tmp_path / "reads.json"
     command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.golden.reads", "-p", "no:cacheprovider", str(HERE)]
     done = subprocess.run(
@@ -55,7 +55,9 @@ def test_every_array_is_read_or_listed(tmp_path):
     present = {name for name, _ in arrays}
     for name, key in unused():
         if name in present or name == "*":
-            assert any(fnmatch(array, key) for file, array in arrays if fnmatch(file, name)), f"no array is {name}: {key}"
+            assert any(
+                fnmatch(array, key) for file, array in arrays if fnmatch(file, name)
+            ), f"no array is {name}: {key}"
 
 
 def test_every_unused_array_has_a_reason():

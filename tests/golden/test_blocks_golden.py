@@ -17,6 +17,7 @@ from tests.golden.published import (
     dynamics_config,
     everywhere,
     members,
+    on_cpu,
     pyramid_of,
     renamed,
 )
@@ -82,28 +83,29 @@ def test_pooling(file, stride):
 @pytest.mark.parametrize("window", [1, 2, 4, 8])
 @pytest.mark.parametrize("stride", [2, 4])
 @pytest.mark.parametrize("file", ["nodup", "dup"])
-def test_merging(file, stride, window):
+def test_merging(file, stride, window, device):
     g = golden(f"d_pooling_merger_{file}")
     config = pooling_config(g, stride, window)
-    xyz = g["in/xyz"]
+    xyz = g["in/xyz"].to(device)
     first, second = pyramid_of(xyz, everywhere(xyz), config).stages
     case = g / f"pool{stride}" / f"merge{window}"
     merged = int(g["point_in/time_depth"]) - int(case["out/time_depth"])
     assert merged == min(window.bit_length() - 1, int(g["point_in/time_depth"]))
-    assert_published_stage(second, case, "out/", code_gap=0 if merged else 10)
+    assert_published_stage(on_cpu(second), case, "out/", code_gap=0 if merged else 10)
     assert (second.time_index is not None) == (merged > 0)
     if merged:
         before = g[f"pool{stride}/out/batch_time_coord"].long()
-        assert torch.equal(second.time_index, before % 2**merged)
+        assert torch.equal(second.time_index.cpu(), before % 2**merged)
     if "out/pooling_inverse" in case:
-        assert torch.equal(members(second), case["out/pooling_inverse"])
+        assert torch.equal(members(on_cpu(second)), case["out/pooling_inverse"])
     positions = pool_mean(xyz.reshape(-1, 3), second.cluster.rows, second.cluster.cu_rows)
     close(positions, case["out/coord"], "positions", "golden_float32")
-    out = pooling_stage(g, stride, window, config)(g["in/features"].reshape(first.n_rows, -1), second, None)
+    features = g["in/features"].reshape(first.n_rows, -1).to(device)
+    out = pooling_stage(g, stride, window, config).to(device)(features, second, None)
     close(out, case["out/feat"], "features", "golden_float32")
 
 
-def block_and_stage(g, order, quirks=FULL_PRECISION):
+def block_and_stage(g, order, quirks=FULL_PRECISION, device="cpu"):
     """A block with published weights, the rows' geometry and their features."""
     weights = renamed(g / f"order{order}" / "w", "enc.enc0.block0.", "encoder.0.blocks.0.")
     channels, heads = weights["norm1.weight"].shape[0], 2
@@ -114,16 +116,16 @@ def block_and_stage(g, order, quirks=FULL_PRECISION):
     )  # fmt: skip
     block = Block(channels, heads, 0.0, config).eval()
     block.load_state_dict(weights)
-    xyz = g["in/xyz"]
+    xyz = g["in/xyz"].to(device)
     (stage,) = pyramid_of(xyz, everywhere(xyz), config).stages
-    return block, stage, g["in/features"].reshape(-1, channels).requires_grad_()
+    return block.to(device), stage, g["in/features"].reshape(-1, channels).to(device).requires_grad_()
 
 
 @pytest.mark.parametrize("order", range(4))
 @pytest.mark.parametrize("file", ["nodup", "dup"])
-def test_block(file, order):
+def test_block(file, order, device):
     g = golden(f"e_block_{file}")
-    block, stage, x = block_and_stage(g, order)
+    block, stage, x = block_and_stage(g, order, device=device)
     seen = {}
     parts = {
         "cpe_conv": block.position.conv,
@@ -141,7 +143,7 @@ def test_block(file, order):
     for name in inside:
         close(seen[name], case[name], name)
     close(out, case["out"], "out")
-    (grad,) = torch.autograd.grad(out, x, g["cotangent"])
+    (grad,) = torch.autograd.grad(out, x, g["cotangent"].to(device))
     close(grad, case["grad_features"].reshape(x.shape), "gradient")
 
 

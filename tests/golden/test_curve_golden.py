@@ -1,4 +1,4 @@
-"""Codes, orders and patches of the published model, bit for bit (a_*, b_*; the stages of d_*, e_*, f_* in their tests)."""
+"""Codes, orders and patches of the published model, bit for bit (a_*, b_*; stages of d_*, e_*, f_* in their tests)."""
 
 import pytest
 import torch

@@ -61,16 +61,16 @@ def outputs_of(encoder: Encoder, modules: dict[str, torch.nn.Module], frames: Fr
     return seen | {"particles": encoder(frames)}
 
 
-def test_output_and_image_gradient():
+def test_output_and_image_gradient(device):
     file = golden("h_encoder")
-    frames = load_frames(file)
+    frames = load_frames(file).to(device)
     frames.images.requires_grad_()
-    particles = load_encoder(file)(frames)
+    particles = load_encoder(file).to(device)(frames)
     loss = 0
     for ours, theirs in OUTPUTS.items():
         value = column(getattr(particles, ours))
         assert_close_relative_to_max(value, file[f"out/{theirs}"].flatten(0, 2), "encoder_golden", ours)
-        loss = loss + (value * file[f"cotangent/{theirs}"].flatten(0, 2)).sum()
+        loss = loss + (value * file[f"cotangent/{theirs}"].flatten(0, 2).to(device)).sum()
     (gradient,) = torch.autograd.grad(loss, frames.images)
     assert_close_relative_to_max(gradient, file["grad/image"].reshape(gradient.shape), "encoder_golden", "gradient")
     n_scenes, n_steps, n = file["out/means"].shape[:3]

@@ -68,30 +68,28 @@ def quats_of(rotations: torch.Tensor) -> torch.Tensor:
 
 
 def render(file, view, means, quats, scales, opacities, harmonics, cutoff):
-    near = file["in/near"][view].double()
+    near = file["in/near"][view].to(means)
     sh = torch.einsum("kj,nck->njc", basis_change().to(harmonics), harmonics)
     background = file["in/background"][view].to(means)
-    return rasterize_gaussians(
-        means / near, quats, scales / near, opacities, camera(file, view), sh=sh, background=background,
-        near_plane=NEAR_PLANE, cutoff=cutoff,
-    )  # fmt: skip
+    scene = means / near, quats, scales / near, opacities, camera(file, view).to(means.device)
+    return rasterize_gaussians(*scene, sh=sh, background=background, near_plane=NEAR_PLANE, cutoff=cutoff)
 
 
 @pytest.mark.parametrize("view", [0, 1])
 @pytest.mark.parametrize("mode", CUTOFFS)
-def test_images_and_gradients(view, mode):
+def test_images_and_gradients(view, mode, device):
     file = golden("j_raster")
     expected = file / "f64" / f"view{view}_{mode}"
-    leaves = [x.requires_grad_() for x in inputs(file)]
+    leaves = [x.to(device).requires_grad_() for x in inputs(file)]
     # Without the cut to tiles, the published images still lack Gaussians whose square of tiles is off the image.
     visible = file[f"view{view}/inter/visible"]
-    kept = visible if mode == "notilecull" else torch.ones_like(visible)
+    kept = (visible if mode == "notilecull" else torch.ones_like(visible)).to(device)
     image = render(file, view, *(x[kept] for x in leaves), CUTOFFS[mode]).color[0].permute(2, 0, 1)
     assert_close_relative_to_max(image, expected["image"], "raster_golden", "image")
 
-    grads = torch.autograd.grad(image, leaves, file[f"f64/view{view}/cotangent"])
+    grads = torch.autograd.grad(image, leaves, file[f"f64/view{view}/cotangent"].to(device))
     # The published gradient is one of the covariance (upper triangle); scales and quaternions follow from it.
-    quats, scales = (leaves[i].detach().requires_grad_() for i in (1, 2))
+    quats, scales = (leaves[i].detach().cpu().requires_grad_() for i in (1, 2))
     upper = torch.triu(expected["grad/covariances"])
     grad_quats, grad_scales = torch.autograd.grad(covariance(quats, scales), (quats, scales), upper)
     checks = {

@@ -14,6 +14,7 @@ from gsim3d.harmonics import (
     turn_predicted_harmonics,
 )
 from gsim3d.interop.released import head_weights
+from gsim3d.ops.raster import Rendering
 from gsim3d.renderer import (
     GaussianHead,
     render_as_published,
@@ -149,13 +150,16 @@ def close_but_for_flips(actual, expected, what):
     error = (actual - expected).abs() / expected.abs().max()
     far = error.flatten(0, -3).amax(0) if error.dim() > 2 else error
     off = far > tolerance("raster_golden_float32")
-    assert off.sum() <= 3 and far.max() < 1.5 / 255, f"{what}: {int(off.sum())} pixels are off, by up to {far.max():.3g}"
+    assert (
+        off.sum() <= 3 and far.max() < 1.5 / 255
+    ), f"{what}: {int(off.sum())} pixels are off, by up to {far.max():.3g}"
 
 
-def test_images_of_the_published_renderer():
+def test_images_of_the_published_renderer(device):
     """With its cameras as the release is given them, each view with its own near plane, in one call."""
     file = golden("j_raster")
-    out = render_as_published(gaussians_of(file), published_cameras(file), file["in/background"], quirks=FULL_PRECISION)
+    scene = gaussians_of(file).to(device), published_cameras(file).to(device), file["in/background"].to(device)
+    out = Rendering(*(t if t is None else t.cpu() for t in render_as_published(*scene, quirks=FULL_PRECISION)))
     for view in range(len(out.color)):
         expected = file / f"view{view}"
         close_but_for_flips(out.color[view].permute(2, 0, 1), expected["image_float32"], "image")
@@ -165,7 +169,9 @@ def test_images_of_the_published_renderer():
 
 def test_masked_rows_are_absent():
     file = golden("j_raster")
-    gaussians, cameras = gaussians_of(file, file["masked/mask"][:, 0]), published_cameras(file).select(torch.tensor([0]))
+    gaussians, cameras = gaussians_of(file, file["masked/mask"][:, 0]), published_cameras(file).select(
+        torch.tensor([0])
+    )
     out = render_as_published(gaussians, cameras, file["in/background"][:1], quirks=FULL_PRECISION)
     expected = file["f64/masked/view0_image"].float()
     close_but_for_flips(out.color[0].permute(2, 0, 1), expected, "image")
@@ -180,7 +186,12 @@ def test_cameras_of_the_published_renderer():
         settings = file / f"view{view}" / "raster_settings"
         near, far = given.near[view].double(), given.far[view].double()
         tangents = torch.stack([settings["tanfovx"], settings["tanfovy"]]).double()
-        close(SIZE / (2 * cameras.Ks[view].diagonal()[:2]), tangents, "tangents of half the opening angles", "golden_float32")
+        close(
+            SIZE / (2 * cameras.Ks[view].diagonal()[:2]),
+            tangents,
+            "tangents of half the opening angles",
+            "golden_float32",
+        )
         viewmat = given.viewmats[view].clone()
         viewmat[:3, 3] /= near
         close(viewmat.mT, settings["viewmatrix"].double(), "view matrix", "golden_float32")

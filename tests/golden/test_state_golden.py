@@ -130,11 +130,12 @@ def assert_published_steps(steps, c, kept):
 
 @pytest.mark.parametrize("case", ["scene0_plain", "scene1_plain", "scene0_mask_static"])
 @pytest.mark.parametrize("file", ["nodup", "dup"])
-def test_rollout(file, case):
+def test_rollout(file, case, device):
     g = golden(f"k_rollout_{file}")
-    dynamics = load_dynamics(g)
+    dynamics = load_dynamics(g).to(device)
     c = g / case
     history, mask = particles_of(c)
+    history = history.to(device)
     n_history, n_steps = mask.shape[1], c["out/means"].shape[1]
     calls = []
 
@@ -152,12 +153,12 @@ def test_rollout(file, case):
     assert_published_steps(steps, c, kept)
     for i, output in enumerate(network_outputs):
         seen = torch.cat([mask[:, i:], kept[:, None].expand(-1, i, -1)], 1)  # simulated steps have the newest rows
-        assert torch.equal(calls[i].cu_rows.diff(), seen.sum(2).flatten())
+        assert torch.equal(calls[i].cu_rows.diff().cpu(), seen.sum(2).flatten())
         close(output, c[f"step{i}/net_out"][seen], f"output of the network in step {i}")
         if "in/state_mask" in c:
             assert torch.equal(c[f"step{i}/net_in_state_mask"][..., 0], seen)
             assert torch.equal(c["out/state_mask"][:, i, :, 0], kept)
-            moves = (steps[i].activity != FROZEN).float()
+            moves = (steps[i].activity != FROZEN).float().cpu()
             assert torch.equal(c["out/static_float"][:, i, :, 0][kept], moves)
 
 

@@ -55,8 +55,8 @@ def racing_conv(x: Tensor, weight: Tensor, bias: Tensor | None, voxels, kernel_m
     """Where rows share a voxel, what spconv's kernels compute in one of the orders that their threads may take.
 
     "native": taps before the centre add every row of the neighbour voxel into the first row of a voxel, taps after it
-    give every row the first row of the neighbour. "implicit": taps before the centre give every row the first row of the
-    neighbour, taps after it give the first row only the last row of the neighbour. The centre tap reads the row itself.
+    give every row the first row of the neighbour. "implicit": taps before the centre give every row the first row of
+    the neighbour, taps after it give the first row only the last row of the neighbour. The centre reads its own row.
     """
     size = weight.shape[1]
     n_voxels = len(voxels.cu_rows) - 1
