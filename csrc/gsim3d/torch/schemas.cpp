@@ -5,7 +5,7 @@
 
 STABLE_TORCH_LIBRARY(gsim3d, m) {
   // curve: space-filling-curve codes, their order, and all geometry of a network call.
-  m.def("curve_encode(Tensor grid, Tensor cloud, int curve, int depth, int shift) -> Tensor");
+  m.def("curve_encode(Tensor grid, Tensor cloud, int[] curves, int depth, int shift) -> Tensor");
   m.def("curve_sort(Tensor codes) -> (Tensor order, Tensor inverse)");
   m.def(
       "build_pyramid(Tensor positions, Tensor cu_rows, Tensor cloud_scene, Tensor cloud_slot, Tensor origin, float grid_size, "
