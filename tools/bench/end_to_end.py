@@ -29,16 +29,6 @@ RECORDED = {  # (steps of history, masked) -> forward, forward and backward [ms]
 TARGET = {(4, False): (15, 50), (2, False): (10, 35), (4, True): (4, 12), (2, True): (3, 9)}
 
 
-def full_model(n_steps: int) -> presets.ModelConfig:
-    """64 dynamic and 64 static latents, as in the published checkpoints."""
-    model = presets.paper_latent(n_steps)
-    return presets.ModelConfig(
-        dataclasses.replace(model.encoder, dynamic_dim=64, static_dim=64),
-        dataclasses.replace(model.dynamics, dynamic_latents=64, static_latents=64),
-        dataclasses.replace(model.renderer, latents=128),
-    )
-
-
 def recorded_scene(n_steps: int, n: int, moving_share: float) -> torch.Tensor:
     """[T, n, 3] metres."""
     g = torch.Generator(device="cuda").manual_seed(0)
@@ -131,7 +121,7 @@ def measure(bench: Bench, case: str, f, dtype: torch.dtype, *, peers=None, targe
 
 def dynamics(bench: Bench, n_steps: int, masked: bool, dtype: torch.dtype) -> None:
     torch.manual_seed(0)
-    model = Dynamics(full_model(n_steps).dynamics).cuda().eval()
+    model = Dynamics(presets.paper_latent(n_steps, 64).dynamics).cuda().eval()
     state = particles_at(recorded_scene(n_steps, 16384 if masked else 65536, 1.0 if masked else 0.2))
     parameters = list(model.parameters())
 
@@ -150,7 +140,7 @@ def dynamics(bench: Bench, n_steps: int, masked: bool, dtype: torch.dtype) -> No
 
 def whole(bench: Bench, dtype: torch.dtype) -> None:
     torch.manual_seed(0)
-    simulator = Simulator(full_model(4)).cuda().eval()
+    simulator = Simulator(presets.paper_latent(4, 64)).cuda().eval()
     frames, cameras = random_frames(1, 4, 4, 1.0), ring(9, 1)
 
     with torch.no_grad():
@@ -167,7 +157,7 @@ def training(bench: Bench, dtype: torch.dtype) -> None:
     computed again in the backward pass, as the authors do."""
     torch.manual_seed(0)
     n_scenes, n_past, n_future, n_views = 4, 4, 12, 9
-    model = full_model(n_past)
+    model = presets.paper_latent(n_past, 64)
     model = dataclasses.replace(model, dynamics=dataclasses.replace(model.dynamics, checkpointing=True))
     simulator = Simulator(model).cuda().train()
     optimizer = torch.optim.AdamW(simulator.parameters(), lr=1e-5)
