@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Learns a simulator from multi-view video; writes checkpoints and a log into a run folder."
     parser.epilog = EPILOG
     parser.add_argument("config", metavar="CONFIG", nargs="?", help="YAML file with the run's settings")
-    parser.add_argument("--data", metavar="DIR", help="folder with scenes, as `gsim3d generate` makes")
+    parser.add_argument("--data", metavar="DIR", help="folder with scenes of any layout (docs/data.md)")
     parser.add_argument("--out", metavar="DIR", help="run folder; made if absent")
     parser.add_argument("--until", type=int, metavar="STEP", help="stop after this optimizer step (default: the last)")
     parser.add_argument("--export", metavar="FILE", help="also write the result as one .safetensors file")
