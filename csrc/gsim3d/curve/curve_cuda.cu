@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <cub/device/device_scan.cuh>
 
 #include "gsim3d/core/cuda_utils.cuh"
@@ -9,37 +10,44 @@ namespace {
 
 constexpr int kThreads = 256;
 
+// The curves of one launch.
+constexpr int kTogether = 4;
+struct Curves {
+  int64_t id[kTogether];
+  int count;
+};
+
 // A cell or cloud that does not fit its bits has code 0.
-template <Curve kCurve>
-__global__ void encode_kernel(const int64_t* __restrict__ grid, const int64_t* __restrict__ cloud, int64_t n, int depth,
-                              int shift, int64_t* __restrict__ codes) {
+__global__ void encode_kernel(const int64_t* __restrict__ grid, const int64_t* __restrict__ cloud, int64_t n,
+                              Curves curves, int depth, int shift, int64_t* __restrict__ codes) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= n) return;
   const int64_t x = grid[3 * i], y = grid[3 * i + 1], z = grid[3 * i + 2], id = cloud[i];
   const bool fits = static_cast<uint64_t>(x | y | z) >> depth == 0 && static_cast<uint64_t>(id) >> (63 - shift) == 0;
-  const uint64_t code =
-      curve_code(kCurve, static_cast<uint32_t>(x), static_cast<uint32_t>(y), static_cast<uint32_t>(z), depth);
-  codes[i] = fits ? (id << shift) | static_cast<int64_t>(code) : 0;
+#pragma unroll
+  for (int c = 0; c < kTogether; ++c) {
+    if (c >= curves.count) break;
+    // A constant depth unrolls the levels.
+    const auto code_at = [&](int levels) {
+      return curve_code(static_cast<Curve>(curves.id[c]), static_cast<uint32_t>(x), static_cast<uint32_t>(y),
+                        static_cast<uint32_t>(z), levels);
+    };
+    const uint64_t code = depth == kMaxDepth ? code_at(kMaxDepth) : code_at(depth);
+    codes[c * n + i] = fits ? (id << shift) | static_cast<int64_t>(code) : 0;
+  }
 }
 
 }  // namespace
 
-void curve_encode(const int64_t* grid, const int64_t* cloud, int64_t n, int64_t curve, int64_t depth, int64_t shift,
-                  int64_t* codes, Stream stream) {
-  cpu::check_curve(curve, depth, shift);
-  const auto run = [&](auto kernel) {
-    launch("curve_encode", kernel, blocks_for("curve_encode", n, kThreads), kThreads, 0, stream, grid, cloud, n, depth,
-           shift, codes);
-  };
-  switch (static_cast<Curve>(curve)) {
-    case Curve::kZ:
-      return run(encode_kernel<Curve::kZ>);
-    case Curve::kZTrans:
-      return run(encode_kernel<Curve::kZTrans>);
-    case Curve::kHilbert:
-      return run(encode_kernel<Curve::kHilbert>);
-    case Curve::kHilbertTrans:
-      return run(encode_kernel<Curve::kHilbertTrans>);
+void curve_encode(const int64_t* grid, const int64_t* cloud, int64_t n, const int64_t* curves, int64_t n_curves,
+                  int64_t depth, int64_t shift, int64_t* codes, Stream stream) {
+  const char* op = "curve_encode";
+  for (int64_t c = 0; c < n_curves; ++c) cpu::check_curve(curves[c], depth, shift);
+  for (int64_t first = 0; first < n_curves; first += kTogether) {
+    Curves own{{}, static_cast<int>(std::min<int64_t>(kTogether, n_curves - first))};
+    std::copy_n(curves + first, own.count, own.id);
+    launch(op, encode_kernel, blocks_for(op, n, kThreads), kThreads, 0, stream, grid, cloud, n, own, depth, shift,
+           codes + first * n);
   }
 }
 

@@ -18,9 +18,9 @@ constexpr int kDigits = 1 << kDigitBits;
 constexpr int kMaxPasses = 64 / kDigitBits;
 constexpr int kThreads = kDigits;  // thread d looks after digit d
 constexpr int kWarps = kThreads / kWarp;
-constexpr int kItems = 16;  // keys a thread
+constexpr int kItems = 8;  // keys a thread
 constexpr int kTile = kThreads * kItems;
-constexpr int kTogether = 8;  // counts of earlier tiles read at once
+constexpr int kTogether = 16;  // counts of earlier tiles read at once
 
 // A count that a tile has published: nothing yet, of the tile alone, or of all tiles up to it.
 constexpr uint32_t kOfTile = 1u << 30, kUpToTile = 2u << 30, kCountMask = kOfTile - 1;
@@ -118,14 +118,11 @@ __device__ __forceinline__ uint32_t exclusive_block_sum(uint32_t value, uint32_t
 __global__ void __launch_bounds__(kThreads) plan_passes_kernel(Sort sort) {
   __shared__ uint32_t sums[kWarps];
   const int64_t row = blockIdx.x, n = size_of(sort.rows, row);
-  uint32_t passes = 0;
-  for (int p = 0; p < sort.n_passes; ++p) {
-    uint32_t* total = sort.totals + (row * kMaxPasses + p) * kDigits + threadIdx.x;
-    const uint32_t count = *total;
-    *total = exclusive_block_sum(count, sums);
-    if (__syncthreads_or(count > 0 && count < n)) passes |= 1u << p;
-  }
-  if (threadIdx.x == 0) sort.passes[row] = passes;
+  const int pass = blockIdx.y;
+  uint32_t* total = sort.totals + (row * kMaxPasses + pass) * kDigits + threadIdx.x;
+  const uint32_t count = *total;
+  *total = exclusive_block_sum(count, sums);
+  if (__syncthreads_or(count > 0 && count < n) && threadIdx.x == 0) atomicOr(sort.passes + row, 1u << pass);
 }
 
 struct PassMemory {
@@ -159,7 +156,7 @@ __device__ __forceinline__ uint32_t keys_before(const uint32_t* published, int64
   return sum;
 }
 
-__global__ void __launch_bounds__(kThreads) move_keys_kernel(Sort sort, int pass) {
+__global__ void __launch_bounds__(kThreads, 4) move_keys_kernel(Sort sort, int pass) {
   extern __shared__ __align__(16) char shared[];
   PassMemory& memory = *reinterpret_cast<PassMemory*>(shared);
   if (threadIdx.x == 0) memory.ticket = atomicAdd(sort.tickets + pass, 1u);
@@ -271,19 +268,20 @@ void sort_rows(const char* op, const SortRows& rows, const Workspace& workspace,
   sort.n_passes = (rows.bits + kDigitBits - 1) / kDigitBits;
   const int64_t n_totals = rows.n_rows * kMaxPasses * kDigits,
                 n_published = sort.n_passes * rows.n_rows * sort.tiles * kDigits;
-  sort.totals = workspace.take<uint32_t>(n_totals + kMaxPasses + n_published);
+  const int64_t n_zeros = n_totals + kMaxPasses + rows.n_rows + n_published;
+  sort.totals = workspace.take<uint32_t>(n_zeros);
   sort.tickets = sort.totals + n_totals;
-  sort.published = sort.tickets + kMaxPasses;
-  sort.passes = workspace.take<uint32_t>(rows.n_rows);
+  sort.passes = sort.tickets + kMaxPasses;
+  sort.published = sort.passes + rows.n_rows;
   for (int i = 0; i < 2; ++i) {
     sort.keys[i] = workspace.take<uint64_t>(rows.n_rows * rows.room);
     sort.index[i] = workspace.take<uint32_t>(rows.n_rows * rows.room);
   }
-  fill_zero(op, sort.totals, n_totals + kMaxPasses + n_published, stream);
+  fill_zero(op, sort.totals, n_zeros, stream);
   const unsigned n_rows = static_cast<unsigned>(rows.n_rows);
-  launch(op, count_digits_kernel, dim3(static_cast<unsigned>(std::min<int64_t>(sort.tiles, 64)), n_rows), kThreads, 0,
+  launch(op, count_digits_kernel, dim3(static_cast<unsigned>(std::min<int64_t>(sort.tiles, 128)), n_rows), kThreads, 0,
          stream, sort);
-  launch(op, plan_passes_kernel, n_rows, kThreads, 0, stream, sort);
+  launch(op, plan_passes_kernel, dim3(n_rows, sort.n_passes), kThreads, 0, stream, sort);
   for (int pass = 0; pass < sort.n_passes; ++pass)
     launch(op, move_keys_kernel, blocks_for(op, rows.n_rows * sort.tiles, 1), kThreads, sizeof(PassMemory), stream,
            sort, pass);

@@ -76,42 +76,36 @@ __device__ __forceinline__ Line<T> carve_line(char*& at, const LineSizes& s) {
 // Four flags, one a byte, as four bits.
 __device__ __forceinline__ uint32_t pack_flags(uint32_t flags) { return flags * 0x01020408u >> 24 & 15; }
 
-// Fills the line of a pixel and a pair of its image; returns the length of the list, the same in every lane. Nothing
-// but that is filled where it is 0. The caller synchronises the warp between its last look at a line and the next call.
+// Where one sample lies.
 template <typename T>
-__device__ int32_t trace(const PlaneSweep<T>& sweep, const LineSizes& s, int64_t image, int64_t pair, int32_t pixel,
-                         const Line<T>& line) {
-  using namespace plane_sweep_math;
+struct Sample {
+  int32_t first;    // index of the top left corner
+  int32_t corners;  // bits of those that lie in the image: top left, top right, bottom left, bottom right
+  T fx, fy;
+};
+
+template <typename T>
+__device__ __forceinline__ Sample<T> sample_at(const PlaneSweep<T>& sweep, const LineSizes& s, int64_t pair,
+                                               const plane_sweep_math::Ray<T>& ray, T depth) {
+  const T* at = sweep.translations + 3 * pair;
+  const T b[3] = {at[0], at[1], at[2]};
+  const plane_sweep_math::Place<T> place = plane_sweep_math::sample_place(ray, b, depth, s.height, s.width);
+  const int32_t columns = (place.x >= 0 ? 5 : 0) | (place.x + 1 < s.width ? 10 : 0);
+  const int32_t rows = (place.y >= 0 ? 3 : 0) | (place.y + 1 < s.height ? 12 : 0);
+  return {place.y * s.width + place.x, place.inside ? columns & rows : 0, place.fx, place.fy};
+}
+
+// Packs flags into bits and clears them; before[w]: how many are set in the words before w. Returns how many are set, the
+// same in every lane.
+__device__ __forceinline__ int32_t list_flags(uint8_t* touched, const LineSizes& s, uint32_t* all_bits,
+                                              uint16_t* before) {
   const int lane = threadIdx.x % kWarp;
-  const int32_t v = pixel / s.width;
-  const Ray<T> ray = source_ray(sweep.homographies + 9 * pair, static_cast<T>(pixel - v * s.width), static_cast<T>(v));
-  const T b[3] = {sweep.translations[3 * pair], sweep.translations[3 * pair + 1], sweep.translations[3 * pair + 2]};
-  bool touches = false;
-  for (int32_t k = lane; k < s.n_depths; k += kWarp) {
-    const T depth = T(1) / sweep.inverse_depths[image * s.n_depths + k];
-    const Place<T> at = sample_place(ray, b, depth, s.height, s.width);
-    line.fx[k] = at.fx;
-    line.fy[k] = at.fy;
-    // The corners that lie in the image, a bit each, below the index of the top left one, moved so that none is
-    // negative.
-    const int32_t columns = (at.x >= 0 ? 5 : 0) | (at.x + 1 < s.width ? 10 : 0);
-    const int32_t rows = (at.y >= 0 ? 3 : 0) | (at.y + 1 < s.height ? 12 : 0);
-    const int32_t corners = at.inside ? columns & rows : 0, first = at.y * s.width + at.x;
-    line.code[k] = (first + s.width + 1) << 4 | corners;
-    touches |= corners != 0;
-    if (corners & 1) line.touched[first] = 1;
-    if (corners & 2) line.touched[first + 1] = 1;
-    if (corners & 4) line.touched[first + s.width] = 1;
-    if (corners & 8) line.touched[first + s.width + 1] = 1;
-  }
-  if (!__any_sync(kFullWarp, touches)) return 0;
-  __syncwarp();
   int32_t count = 0;
   for (int32_t begin = 0; begin < s.n_words; begin += kWarp) {
     const int32_t w = begin + lane;
     uint32_t bits = 0;
     if (w < s.n_words) {
-      uint4* flags = reinterpret_cast<uint4*>(line.touched) + 2 * w;
+      uint4* flags = reinterpret_cast<uint4*>(touched) + 2 * w;
       const uint4 low = flags[0], high = flags[1];
       flags[0] = flags[1] = make_uint4(0, 0, 0, 0);
       bits = pack_flags(low.x) | pack_flags(low.y) << 4 | pack_flags(low.z) << 8 | pack_flags(low.w) << 12 |
@@ -125,11 +119,40 @@ __device__ int32_t trace(const PlaneSweep<T>& sweep, const LineSizes& s, int64_t
       if (lane >= offset) sum += from;
     }
     if (w < s.n_words) {
-      line.bits[w] = bits;
-      line.before[w] = static_cast<uint16_t>(count + sum - own);
+      all_bits[w] = bits;
+      before[w] = static_cast<uint16_t>(count + sum - own);
     }
     count += __shfl_sync(kFullWarp, sum, kWarp - 1);
   }
+  return count;
+}
+
+// Fills the line of a pixel and a pair of its image; returns the length of the list, the same in every lane. Nothing
+// but that is filled where it is 0. The caller synchronises the warp between its last look at a line and the next call.
+template <typename T>
+__device__ int32_t trace(const PlaneSweep<T>& sweep, const LineSizes& s, int64_t image, int64_t pair, int32_t pixel,
+                         const Line<T>& line) {
+  using namespace plane_sweep_math;
+  const int lane = threadIdx.x % kWarp;
+  const int32_t v = pixel / s.width;
+  const Ray<T> ray = source_ray(sweep.homographies + 9 * pair, static_cast<T>(pixel - v * s.width), static_cast<T>(v));
+  bool touches = false;
+  for (int32_t k = lane; k < s.n_depths; k += kWarp) {
+    const Sample<T> at = sample_at(sweep, s, pair, ray, T(1) / sweep.inverse_depths[image * s.n_depths + k]);
+    line.fx[k] = at.fx;
+    line.fy[k] = at.fy;
+    const int32_t corners = at.corners, first = at.first;
+    // The corners lie below the index of the top left one, which is moved so that it is not negative.
+    line.code[k] = (first + s.width + 1) << 4 | corners;
+    touches |= corners != 0;
+    if (corners & 1) line.touched[first] = 1;
+    if (corners & 2) line.touched[first + 1] = 1;
+    if (corners & 4) line.touched[first + s.width] = 1;
+    if (corners & 8) line.touched[first + s.width + 1] = 1;
+  }
+  if (!__any_sync(kFullWarp, touches)) return 0;
+  __syncwarp();
+  const int32_t count = list_flags(line.touched, s, line.bits, line.before);
   __syncwarp();
   const uint16_t none = static_cast<uint16_t>(s.capacity);
   for (int32_t k = lane; k < s.n_depths; k += kWarp) {
