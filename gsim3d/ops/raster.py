@@ -156,7 +156,9 @@ def _(means, quats, scales, opacities, color, features, background, viewmats, *r
 
 @torch.library.register_fake("gsim3d::rasterize_gaussians_backward")
 def _(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, *inputs):
-    return tuple(torch.empty(x.shape, dtype=x.dtype, device=x.device) for x in inputs[:8])
+    *inputs, viewmats_grad = inputs
+    shapes = [x.shape for x in inputs[:7]] + [(inputs[7].shape[0] if viewmats_grad else 0, 4, 4)]
+    return tuple(inputs[0].new_empty(shape) for shape in shapes)
 
 
 def _setup(ctx, inputs, output):
@@ -166,10 +168,11 @@ def _setup(ctx, inputs, output):
 
 
 def _backward(ctx, grad_color, grad_alpha, grad_depth, grad_features, _grad_transmittance, _grad_last):
-    grads = torch.ops.gsim3d.rasterize_gaussians_backward(
-        grad_color, grad_alpha, grad_depth, grad_features, *ctx.saved_tensors, *ctx.options
+    viewmats_grad = ctx.needs_input_grad[7]
+    *grads, viewmats = torch.ops.gsim3d.rasterize_gaussians_backward(
+        grad_color, grad_alpha, grad_depth, grad_features, *ctx.saved_tensors, *ctx.options, viewmats_grad
     )
-    return (*grads, None, None, None, None, None, None, None)
+    return (*grads, viewmats if viewmats_grad else None, None, None, None, None, None, None, None)
 
 
 torch.library.register_autograd("gsim3d::rasterize_gaussians", _backward, setup_context=_setup)

@@ -141,6 +141,66 @@ def test_devices_agree(devices, sh_terms):
         assert_close_relative_to_max(a, e, "raster_grad_float32", name)
 
 
+def test_same_bits_every_time_on_cuda(devices):
+    # Overlapping Gaussians, so that thousands of threads work on one tile and on one row.
+    scene = random_scene(n=20_000, width=64, height=48, sh_terms=4, dtype=torch.float32, seed=2).to(devices[1])
+    first = (*scene.render(), *gradients(scene.render, scene))
+    for _ in range(3):
+        for a, e in zip((*scene.render(), *gradients(scene.render, scene)), first, strict=True):
+            assert_same_bits(a, e)
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_more_than_the_first_group_holds_on_cuda(devices, wide):
+    """Scratch is made for clouds shown by equally many images and for small Gaussians. Here all images show the larger
+    cloud, or every Gaussian covers every tile: the rest is done in further groups, down to parts of an image."""
+    scene = random_scene(n=4000, clouds=2, images=6, width=40, height=33, sh_terms=4, dtype=torch.float32, seed=8)
+    scene = scene.replace(opacities=0.01 + 0.02 * scene.opacities, cu_rows=torch.tensor([0, 3900, 4000]))
+    scene = scene.replace(scales=20 * scene.scales) if wide else scene.replace(image_cloud=torch.zeros(6).long())
+    cpu, cuda = scene, scene.to(devices[1])
+    for name, a, e in zip(OUTPUTS, cuda.render(), cpu.render(), strict=True):
+        assert_close_relative_to_max(a, e, "raster_many_float32", name)
+    for name, a, e in zip(Scene.NAMES, gradients(cuda.render, cuda), gradients(cpu.render, cpu), strict=True):
+        assert_close_relative_to_max(a, e, "raster_grad_float32", name)
+    last = {name: getattr(scene, name)[5:] for name in ("background", "viewmats", "Ks", "image_cloud")}
+    for a, e in zip(scene.replace(**last).to(devices[1]).render(), cuda.render(), strict=True):
+        assert_same_bits(a[0], e[5])
+
+
+def test_gradient_of_the_viewmats_only_when_wanted_on_cuda(devices):
+    scene = random_scene(n=200, sh_terms=4, dtype=torch.float32).to(devices[1])
+    expected = gradients(scene.render, scene)[:7]
+    leaves = [x.clone().requires_grad_() for x in scene.inputs[:7]]
+    out = scene.render(*leaves, scene.viewmats)
+    for a, e in zip(torch.autograd.grad(out, leaves, scene.cotangents()), expected, strict=True):
+        assert_same_bits(a, e)
+
+
+def test_render_in_a_cuda_graph(devices):
+    scene = random_scene(n=300, sh_terms=4, dtype=torch.float32).to(devices[1])
+    leaves = [x.clone().requires_grad_() for x in scene.inputs]
+    cotangents = scene.cotangents()
+
+    def run():
+        out = scene.render(*leaves)
+        return [*out, *torch.autograd.grad(out, leaves, cotangents)]
+
+    expected = run()
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        run()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = run()
+    for tensor in captured:
+        tensor.detach().fill_(float("nan"))
+    graph.replay()
+    for a, e in zip(captured, expected, strict=True):
+        assert_same_bits(a, e)
+
+
 # ---- 5 opcheck -----------------------------------------------------------------------------------------------------
 
 
@@ -155,7 +215,7 @@ def test_opcheck_backward(device):
     kept = torch.ops.gsim3d.rasterize_gaussians(*args)[4:]
     torch.library.opcheck(
         torch.ops.gsim3d.rasterize_gaussians_backward,
-        (*scene.cotangents(), *kept, *args),
+        (*scene.cotangents(), *kept, *args, True),
         test_utils=("test_schema", "test_faketensor"),
     )
 

@@ -53,6 +53,11 @@ struct SceneTensors {
     check_dtype(op, "background", background, type);
     check_dtype(op, "viewmats", viewmats, type);
     check_dtype(op, "Ks", Ks, type);
+    for (const auto& [name, tensor] : std::initializer_list<std::pair<const char*, const Tensor&>>{
+             {"quats", quats}, {"scales", scales}, {"opacities", opacities}, {"color", color}, {"features", features},
+             {"background", background}, {"viewmats", viewmats}, {"Ks", Ks}, {"image_cloud", image_cloud},
+             {"cu_rows", cu_rows}})
+      check_device(op, name, tensor, means);
   }
 
   template <typename T>
@@ -99,10 +104,13 @@ Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tenso
   Tensor last = empty(in.means, {n, height, width}, ScalarType::Int);
   TensorWorkspace workspace(in.means);
   dispatch_float(given.op, "means", in.means, [&]<typename T>() {
-    cpu::raster_forward<T>(in.scene<T>(),
-                           {mutable_data<T>(out_color), mutable_data<T>(alpha), mutable_data<T>(depth),
-                            mutable_data<T>(out_features), mutable_data<T>(transmittance), mutable_data<int32_t>(last)},
-                           workspace, torch_parallel());
+    const RasterImages<T> images{mutable_data<T>(out_color),     mutable_data<T>(alpha),
+                                 mutable_data<T>(depth),         mutable_data<T>(out_features),
+                                 mutable_data<T>(transmittance), mutable_data<int32_t>(last)};
+    if constexpr (kWithCuda)
+      if (in.means.is_cuda())
+        return cuda::raster_forward<T>(in.scene<T>(), images, workspace, current_stream(in.means));
+    cpu::raster_forward<T>(in.scene<T>(), images, workspace, torch_parallel());
   });
   return {out_color, alpha, depth, out_features, transmittance, last};
 }
@@ -115,7 +123,7 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
                                         const Tensor& opacities, const Tensor& color, const Tensor& features,
                                         const Tensor& background, const Tensor& viewmats, const Tensor& Ks,
                                         const Tensor& image_cloud, const Tensor& cu_rows, int64_t width, int64_t height,
-                                        double near_plane, int64_t cutoff) {
+                                        double near_plane, int64_t cutoff, bool viewmats_grad) {
   const char* op = "rasterize_gaussians_backward";
   const SceneTensors given{op, means, quats, scales, opacities, color, features, background,
                            viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff};
@@ -133,31 +141,39 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
   for (const Tensor* tensor : {&grad_color, &grad_alpha, &grad_depth, &grad_features, &transmittance})
     check_dtype(op, "image gradients", *tensor, in.means.scalar_type());
   check_dtype(op, "last", last, ScalarType::Int);
+  for (const Tensor* tensor : {&grad_color, &grad_alpha, &grad_depth, &grad_features, &transmittance, &last})
+    check_device(op, "image gradients", *tensor, in.means);
 
   const auto like = [](const Tensor& tensor) { return torch::stable::new_empty(tensor, tensor.sizes()); };
   Tensor grad_means = like(in.means), grad_quats = like(in.quats), grad_scales = like(in.scales);
   Tensor grad_opacities = like(in.opacities), grad_in_color = like(in.color), grad_in_features = like(in.features);
-  Tensor grad_background = like(in.background), grad_viewmats = like(in.viewmats);
+  Tensor grad_background = like(in.background);
+  Tensor grad_viewmats = empty(in.viewmats, {viewmats_grad ? n : 0, 4, 4});
   TensorWorkspace workspace(in.means);
   dispatch_float(op, "means", in.means, [&]<typename T>() {
-    cpu::raster_backward<T>(
-        in.scene<T>(),
-        {data<T>(grad_color), data<T>(grad_alpha), data<T>(grad_depth), data<T>(grad_features), data<T>(transmittance),
-         data<int32_t>(last)},
-        {mutable_data<T>(grad_means), mutable_data<T>(grad_quats), mutable_data<T>(grad_scales),
-         mutable_data<T>(grad_opacities), mutable_data<T>(grad_in_color), mutable_data<T>(grad_in_features),
-         mutable_data<T>(grad_background), mutable_data<T>(grad_viewmats)},
-        workspace, torch_parallel());
+    const RasterImageGrads<T> image_grads{data<T>(grad_color),    data<T>(grad_alpha),    data<T>(grad_depth),
+                                          data<T>(grad_features), data<T>(transmittance), data<int32_t>(last)};
+    const RasterSceneGrads<T> grads{mutable_data<T>(grad_means),      mutable_data<T>(grad_quats),
+                                    mutable_data<T>(grad_scales),     mutable_data<T>(grad_opacities),
+                                    mutable_data<T>(grad_in_color),   mutable_data<T>(grad_in_features),
+                                    mutable_data<T>(grad_background), viewmats_grad ? mutable_data<T>(grad_viewmats)
+                                                                                    : nullptr};
+    if constexpr (kWithCuda)
+      if (in.means.is_cuda())
+        return cuda::raster_backward<T>(in.scene<T>(), image_grads, grads, workspace, current_stream(in.means));
+    cpu::raster_backward<T>(in.scene<T>(), image_grads, grads, workspace, torch_parallel());
   });
   return {grad_means,    grad_quats,       grad_scales,     grad_opacities,
           grad_in_color, grad_in_features, grad_background, grad_viewmats};
 }
 
-}  // namespace
-
-STABLE_TORCH_LIBRARY_IMPL(gsim3d, CPU, m) {
+void kernels(auto& m) {
   m.impl("rasterize_gaussians", TORCH_BOX(&rasterize_gaussians));
   m.impl("rasterize_gaussians_backward", TORCH_BOX(&rasterize_gaussians_backward));
 }
+
+}  // namespace
+
+GSIM3D_REGISTER(kernels)
 
 }  // namespace gsim3d::binding

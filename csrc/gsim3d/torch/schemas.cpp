@@ -58,7 +58,7 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "rasterize_gaussians_backward(Tensor grad_color, Tensor grad_alpha, Tensor grad_depth, Tensor grad_features, "
       "Tensor transmittance, Tensor last, Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
       "Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, int width, "
-      "int height, float near_plane, int cutoff) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, "
+      "int height, float near_plane, int cutoff, bool viewmats_grad) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, "
       "Tensor color, Tensor features, Tensor background, Tensor viewmats)");
 }
 

@@ -1,0 +1,174 @@
+// Inside of the CUDA rasterizer: gradients of entries summed up by their owners and taken through colour and
+// projection. One thread owns a row, for all images and in their order.
+#pragma once
+
+#include "gsim3d/raster/raster_blend.cuh"
+
+namespace gsim3d::raster {
+
+constexpr int kViewmatParts = 16;  // blocks that share the rows of an image
+
+// What the gradients of a group are made of.
+template <typename T>
+struct Slots {
+  T* entries;       // [max_entries, kSlotFixed + n_features]
+  T* unfinished;    // [n_rows, kSlotFixed] sums of an image's tiles in earlier groups
+  T* backgrounds;   // [n_images * n_spots, 3] by tile
+  T* viewmats;      // [n_images, kViewmatParts, 12], or null when nobody asks for them
+};
+
+// Sums of a pair's slots in the order of tiles, over all groups that had some of them; false when it has none.
+template <typename T>
+__device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t row, int64_t pair, const Slots<T>& slots,
+                          T (&sums)[kSlotFixed], T* features) {
+  const Spots spots = spots_of(job.records[pair]);
+  if (spots.count() == 0) return false;
+  const int n = group.count(spots);
+  const int64_t width = kSlotFixed + job.scene.n_features;
+  const T* slot = slots.entries + int64_t{job.slot_begin[pair]} * width;
+  for (int c = 0; c < kSlotFixed; ++c) sums[c] = group.resumed ? slots.unfinished[row * kSlotFixed + c] : T(0);
+  for (int i = 0; i < n; ++i, slot += width) {
+    for (int c = 0; c < kSlotFixed; ++c) sums[c] += slot[c];
+    if (features)
+      for (int64_t c = 0; c < job.scene.n_features; ++c) features[c] += slot[kSlotFixed + c];
+  }
+  return true;
+}
+
+// Gradients of one row, summed over images one after the other, so that groups leave no trace.
+template <typename T, int kColumns>
+struct RowGrad {
+  T mean[3], quat[4], scale[3], opacity, color[kColumns];
+
+  __device__ void load(const RasterSceneGrads<T>& from, int64_t row) {
+    for (int i = 0; i < 3; ++i) mean[i] = from.means[3 * row + i], scale[i] = from.scales[3 * row + i];
+    for (int i = 0; i < 4; ++i) quat[i] = from.quats[4 * row + i];
+    opacity = from.opacities[row];
+    for (int i = 0; i < kColumns; ++i) color[i] = from.color[row * kColumns + i];
+  }
+  __device__ void store(const RasterSceneGrads<T>& to, int64_t row) const {
+    for (int i = 0; i < 3; ++i) to.means[3 * row + i] = mean[i], to.scales[3 * row + i] = scale[i];
+    for (int i = 0; i < 4; ++i) to.quats[4 * row + i] = quat[i];
+    to.opacities[row] = opacity;
+    for (int i = 0; i < kColumns; ++i) to.color[row * kColumns + i] = color[i];
+  }
+};
+
+// Adds the gradients of a row in one image; `viewmat` is added to.
+template <typename T, int kTerms, int kColumns>
+__device__ void project_vjp_of(const Camera<T>& camera, const Gaussian<T>& gaussian, const T* coefficients,
+                               const T (&sums)[kSlotFixed], RowGrad<T, kColumns>& row, T (&viewmat)[12]) {
+  const Projection<T> p = project(camera, gaussian.mean, gaussian.quat, gaussian.scale);
+  ProjectionGrad<T> grad{};
+  footprint_vjp(footprint_of(p.xy, p.yy, p.determinant), Moments<T>{sums[0], sums[1], sums[2], sums[3], sums[4]}, grad);
+  grad.z = sums[9];
+  // alpha = opacity e^exponent: its gradient is that of the exponent over the opacity.
+  row.opacity += sums[5] / gaussian.opacity;
+  if constexpr (kTerms > 0) {
+    const Direction<T> direction = view_direction(camera, p.point);
+    T basis[kTerms], grad_basis[kTerms], grad_coefficients[kTerms * 3], color[3], grad_unit[3];
+    sh_basis<kTerms>(direction.unit, basis);
+    sh_color<kTerms>(basis, coefficients, color);
+    sh_color_vjp<kTerms>(basis, coefficients, color, sums + 6, grad_basis, grad_coefficients);
+    for (int i = 0; i < kColumns; ++i) row.color[i] += grad_coefficients[i];
+    if constexpr (kTerms > 1) {
+      sh_basis_vjp<kTerms>(direction.unit, grad_basis, grad_unit);
+      view_direction_vjp(camera, p.point, direction, grad_unit, grad.point, viewmat);
+    }
+  } else {
+    for (int c = 0; c < 3; ++c) row.color[c] += sums[6 + c];
+  }
+  T grad_mean[3], grad_quat[4], grad_scale[3];
+  project_vjp(camera, gaussian.mean, gaussian.scale, p, grad, grad_mean, grad_quat, grad_scale, viewmat);
+  for (int i = 0; i < 3; ++i) row.mean[i] += grad_mean[i], row.scale[i] += grad_scale[i];
+  for (int i = 0; i < 4; ++i) row.quat[i] += grad_quat[i];
+}
+
+// Adds the group's gradients to those of the rows.
+template <typename T, int kTerms>
+__device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const RasterSceneGrads<T>& grads) {
+  const RasterScene<T>& s = job.scene;
+  const Group group = *job.group;
+  constexpr int kColumns = kTerms > 0 ? kTerms * 3 : 3;
+  for (int64_t row = int64_t{blockIdx.x} * blockDim.x + threadIdx.x; row < s.n_rows;
+       row += int64_t{gridDim.x} * blockDim.x) {
+    const Gaussian<T> gaussian(s, row);
+    RowGrad<T, kColumns> grad;
+    bool seen = false;
+    for_images(job, row, [&](int64_t, const View<T>& view, int64_t pair) {
+      T sums[kSlotFixed], viewmat[12] = {};
+      if (!sum_slots(job, group, row, pair, slots, sums, grads.features + row * s.n_features)) return;
+      if (!group.finished) {
+        for (int c = 0; c < kSlotFixed; ++c) slots.unfinished[row * kSlotFixed + c] = sums[c];
+        return;
+      }
+      if (!seen) grad.load(grads, row);
+      seen = true;
+      project_vjp_of<T, kTerms>(view.camera, gaussian, s.color + row * kColumns, sums, grad, viewmat);
+    });
+    if (seen) grad.store(grads, row);
+  }
+}
+
+// Sum over the threads of a block, in a fixed order; for thread 0.
+template <typename T, int kValues>
+__device__ void reduce_block(T (&values)[kValues], T (&shared)[kWarps][kValues]) {
+  for (int i = 0; i < kValues; ++i)
+    for (int step = kWarp / 2; step > 0; step /= 2) values[i] += __shfl_down_sync(kFullWarp, values[i], step);
+  __syncthreads();
+  if (threadIdx.x % kWarp == 0)
+    for (int i = 0; i < kValues; ++i) shared[threadIdx.x / kWarp][i] = values[i];
+  __syncthreads();
+  if (threadIdx.x == 0)
+    for (int i = 0; i < kValues; ++i)
+      for (int w = 1; w < kWarps; ++w) values[i] += shared[w][i];
+}
+
+// Gradients of the viewmats of the images that the group completes, one part of the rows a block.
+template <typename T, int kTerms>
+__device__ void gather_viewmats(const Job<T>& job, const Slots<T>& slots) {
+  __shared__ T shared[kWarps][12];
+  const RasterScene<T>& s = job.scene;
+  const Group group = *job.group;
+  if (!group.finished) return;
+  constexpr int kColumns = kTerms > 0 ? kTerms * 3 : 3;
+  const int64_t end = group.last * kViewmatParts;
+  for (int64_t task = group.first * kViewmatParts + blockIdx.x; task < end; task += gridDim.x) {
+    const View<T>& view = job.views[task / kViewmatParts];
+    T viewmat[12] = {};
+    for (int64_t row = view.row_begin + (task % kViewmatParts) * kBlock + threadIdx.x; row < view.row_end;
+         row += kViewmatParts * kBlock) {
+      T sums[kSlotFixed];
+      if (!sum_slots<T>(job, group, row, view.pair + row - view.row_begin, slots, sums, nullptr)) continue;
+      RowGrad<T, kColumns> unused{};
+      project_vjp_of<T, kTerms>(view.camera, Gaussian<T>(s, row), s.color + row * kColumns, sums, unused, viewmat);
+    }
+    reduce_block(viewmat, shared);
+    if (threadIdx.x == 0)
+      for (int i = 0; i < 12; ++i) slots.viewmats[12 * task + i] = viewmat[i];
+  }
+}
+
+// Gradients that belong to images: of the background from the parts of the tiles, of the viewmats from those of the
+// rows.
+template <typename T>
+__device__ void gather_images(const Job<T>& job, const Slots<T>& slots, const RasterSceneGrads<T>& grads) {
+  __shared__ T shared[kWarps][3];
+  if (!job.group->finished) return;
+  for (int64_t image = job.group->first + blockIdx.x; image < job.group->last; image += gridDim.x) {
+    T sums[3] = {};
+    for (int64_t i = threadIdx.x; i < job.n_spots; i += kBlock)
+      for (int c = 0; c < 3; ++c) sums[c] += slots.backgrounds[3 * (image * job.n_spots + i) + c];
+    reduce_block(sums, shared);
+    if (threadIdx.x == 0)
+      for (int c = 0; c < 3; ++c)
+        grads.background[3 * image + c] = isfinite(job.scene.background[3 * image + c]) ? sums[c] : T(0);
+    if (slots.viewmats == nullptr || threadIdx.x >= 12) continue;
+    T sum = 0;
+    for (int part = 0; part < kViewmatParts; ++part)
+      sum += slots.viewmats[12 * (image * kViewmatParts + part) + threadIdx.x];
+    grads.viewmats[16 * image + threadIdx.x] = sum;
+  }
+}
+
+}  // namespace gsim3d::raster
