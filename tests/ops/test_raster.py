@@ -16,7 +16,8 @@ DTYPES = {torch.float32: "float32", torch.float64: "float64"}
 
 def operator_args(scene):
     leaves = [x.clone().requires_grad_() for x in scene.inputs]
-    return (*leaves, scene.Ks, scene.image_cloud, scene.cu_rows, scene.width, scene.height, 0.01, 0)
+    sizes = (2 * len(scene.means), 4 * len(scene.means)) if scene.means.is_cuda else (0, 0)
+    return (*leaves, scene.Ks, scene.image_cloud, scene.cu_rows, scene.width, scene.height, 0.01, 0, *sizes)
 
 
 # ---- 1 forward against the oracle ----------------------------------------------------------------------------------

@@ -97,13 +97,26 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
 // counts as black, and gradients of all of these are 0. Same bits from run to run, however large the scratch.
 namespace cuda {
 
+// What the forward pass keeps for the backward pass, in device memory of raster_state_bytes. It holds the lists of as
+// many images as have together at most max_pairs pairs of a Gaussian and an image, and max_entries pairs of a Gaussian
+// and a tile of 8 x 8 pixels that its bounds touch; both at least n_rows and below 2^31. The other images are made
+// anew where they are needed: slower, with the same result.
+struct RasterState {
+  void* memory;
+  int64_t max_pairs, max_entries;
+};
+
 template <typename T>
-void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, const Workspace& workspace,
-                    Stream stream);
+int64_t raster_state_bytes(const RasterScene<T>& scene, int64_t max_pairs, int64_t max_entries);
+
+template <typename T>
+void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, const RasterState& state,
+                    const Workspace& workspace, Stream stream);
 
 template <typename T>
 void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& image_grads,
-                     const RasterSceneGrads<T>& grads, const Workspace& workspace, Stream stream);
+                     const RasterSceneGrads<T>& grads, const RasterState& state, const Workspace& workspace,
+                     Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

@@ -111,8 +111,9 @@ __device__ inline T background_of(const RasterScene<T>& s, int64_t image, int ch
 
 // Row of the features of a pair.
 template <typename T>
-__device__ inline const T* features_of(const Job<T>& job, const View<T>& view, uint32_t pair) {
-  return job.scene.features + (view.row_begin + pair - view.pair) * job.scene.n_features;
+__device__ inline const T* features_of(const Job<T>& job, int64_t image, uint32_t pair) {
+  const int64_t row = job.views[image].row_begin + pair - job.pair_begin[image];
+  return job.scene.features + row * job.scene.n_features;
 }
 
 // ---- forward ------------------------------------------------------------------------------------------------------
@@ -138,7 +139,6 @@ __device__ void blend_spot(const Job<T>& job, const RasterImages<T>& images, int
   const RasterScene<T>& s = job.scene;
   const int lane = threadIdx.x % kWarp;
   const Spot spot(job, task);
-  const View<T>& view = job.views[spot.image];
   const int n_channels = kPass ? static_cast<int>(min(s.n_features - channel, int64_t{kFeatures})) : 0;
   Light<T> light[kHalves];
   T features[kHalves][kFeatures];
@@ -158,7 +158,7 @@ __device__ void blend_spot(const Job<T>& job, const RasterImages<T>& images, int
       put(record, lane, shared.batch);
       cover(record, spot.x0, spot.y0, bits);
       if constexpr (kPass) {
-        const T* row = features_of(job, view, pair) + channel;
+        const T* row = features_of(job, spot.image, pair) + channel;
         for (int c = 0; c < kFeatures; ++c) shared.features[c][lane] = c < n_channels ? row[c] : T(0);
       }
     }
@@ -306,7 +306,6 @@ __device__ void blend_spot_vjp(const Job<T>& job, const RasterImageGrads<T>& gra
   const RasterScene<T>& s = job.scene;
   const int lane = threadIdx.x % kWarp;
   const Spot spot(job, task);
-  const View<T>& view = job.views[spot.image];
   const int64_t slot_width = kSlotFixed + s.n_features;
   Behind<T> behind[kHalves];
   T background_sums[3] = {};
@@ -355,7 +354,7 @@ __device__ void blend_spot_vjp(const Job<T>& job, const RasterImageGrads<T>& gra
       const Record<T> record = job.records[pair];
       const int place = job.group->place(spots_of(record), spot.x0 / kSpot, spot.y0 / kSpot);
       slot = slots + (int64_t{job.slot_begin[pair]} + place) * slot_width;
-      entry_features = features_of(job, view, pair);
+      entry_features = features_of(job, spot.image, pair);
       put(record, lane, shared.batch);
       if (base + lane < n_used) cover(record, spot.x0, spot.y0, bits);
       mean_x = record.x, mean_y = record.y, slope = record.slope;

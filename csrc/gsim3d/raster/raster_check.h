@@ -23,6 +23,16 @@ void check_options(const RasterScene<T>& s) {
   check(cutoff >= 0 && cutoff <= 2, kOp, ": cutoff must be 0 (exact), 1 (tile3sigma) or 2 (smooth); got ", cutoff);
 }
 
+template <typename T>
+void check_state(const RasterScene<T>& s, const cuda::RasterState& state) {
+  constexpr const char* kOp = "rasterize_gaussians";
+  check(s.n_rows <= INT32_MAX && s.n_images < INT32_MAX, kOp, ": there must be fewer than 2^31 rows and images; got ",
+        s.n_rows, " and ", s.n_images);
+  for (const int64_t size : {state.max_pairs, state.max_entries})
+    check(size >= s.n_rows && size <= INT32_MAX, kOp, ": max_pairs and max_entries must be in [N, 2^31) with N=",
+          s.n_rows, "; got ", size);
+}
+
 // Calls f(std::integral_constant<int, terms>) for the number of SH terms of the scene (0: given colours).
 template <typename F>
 void dispatch_sh(int64_t terms, const F& f) {

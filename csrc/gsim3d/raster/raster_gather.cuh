@@ -84,29 +84,36 @@ __device__ void project_vjp_of(const Camera<T>& camera, const Gaussian<T>& gauss
   for (int i = 0; i < 4; ++i) row.quat[i] += grad_quat[i];
 }
 
-// Adds the group's gradients to those of the rows.
+// Writes the gradients of the rows in the first group, and adds to them in later ones.
 template <typename T, int kTerms>
 __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const RasterSceneGrads<T>& grads) {
   const RasterScene<T>& s = job.scene;
   const Group group = *job.group;
+  const bool is_first = group.spot_begin == 0;
   constexpr int kColumns = kTerms > 0 ? kTerms * 3 : 3;
-  for (int64_t row = int64_t{blockIdx.x} * blockDim.x + threadIdx.x; row < s.n_rows;
-       row += int64_t{gridDim.x} * blockDim.x) {
+  const int64_t n_chunks = group.rows_are_good ? count_chunks(job) : (s.n_rows + kBlock - 1) / kBlock;
+  for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
+    RowGrad<T, kColumns> grad{};
+    if (!group.rows_are_good) {
+      const int64_t row = chunk * kBlock + threadIdx.x;
+      if (row < s.n_rows) grad.store(grads, row);
+      continue;
+    }
+    const Rows rows(job, chunk);
+    const int64_t row = rows.row;
+    if (!rows.inside || (rows.first_image >= group.last && !is_first)) continue;
     const Gaussian<T> gaussian(s, row);
-    RowGrad<T, kColumns> grad;
-    bool seen = false;
-    for_images(job, row, [&](int64_t, const View<T>& view, int64_t pair) {
+    if (!is_first) grad.load(grads, row);
+    for (int64_t image = rows.first_image; image < group.last; image = job.views[image].next) {
       T sums[kSlotFixed], viewmat[12] = {};
-      if (!sum_slots(job, group, row, pair, slots, sums, grads.features + row * s.n_features)) return;
-      if (!group.finished) {
+      const int64_t pair = job.pair_begin[image] + row - job.views[image].row_begin;
+      if (!sum_slots(job, group, row, pair, slots, sums, grads.features + row * s.n_features)) continue;
+      if (group.finished)
+        project_vjp_of<T, kTerms>(job.views[image].camera, gaussian, s.color + row * kColumns, sums, grad, viewmat);
+      else
         for (int c = 0; c < kSlotFixed; ++c) slots.unfinished[row * kSlotFixed + c] = sums[c];
-        return;
-      }
-      if (!seen) grad.load(grads, row);
-      seen = true;
-      project_vjp_of<T, kTerms>(view.camera, gaussian, s.color + row * kColumns, sums, grad, viewmat);
-    });
-    if (seen) grad.store(grads, row);
+    }
+    grad.store(grads, row);
   }
 }
 
@@ -135,11 +142,12 @@ __device__ void gather_viewmats(const Job<T>& job, const Slots<T>& slots) {
   const int64_t end = group.last * kViewmatParts;
   for (int64_t task = group.first * kViewmatParts + blockIdx.x; task < end; task += gridDim.x) {
     const View<T>& view = job.views[task / kViewmatParts];
+    const int64_t first_pair = job.pair_begin[task / kViewmatParts];
     T viewmat[12] = {};
     for (int64_t row = view.row_begin + (task % kViewmatParts) * kBlock + threadIdx.x; row < view.row_end;
          row += kViewmatParts * kBlock) {
       T sums[kSlotFixed];
-      if (!sum_slots<T>(job, group, row, view.pair + row - view.row_begin, slots, sums, nullptr)) continue;
+      if (!sum_slots<T>(job, group, row, first_pair + row - view.row_begin, slots, sums, nullptr)) continue;
       RowGrad<T, kColumns> unused{};
       project_vjp_of<T, kTerms>(view.camera, Gaussian<T>(s, row), s.color + row * kColumns, sums, unused, viewmat);
     }
@@ -163,9 +171,9 @@ __device__ void gather_images(const Job<T>& job, const Slots<T>& slots, const Ra
     if (threadIdx.x == 0)
       for (int c = 0; c < 3; ++c)
         grads.background[3 * image + c] = isfinite(job.scene.background[3 * image + c]) ? sums[c] : T(0);
-    if (slots.viewmats == nullptr || threadIdx.x >= 12) continue;
+    if (slots.viewmats == nullptr || threadIdx.x >= 16) continue;
     T sum = 0;
-    for (int part = 0; part < kViewmatParts; ++part)
+    for (int part = 0; part < kViewmatParts && threadIdx.x < 12; ++part)
       sum += slots.viewmats[12 * (image * kViewmatParts + part) + threadIdx.x];
     grads.viewmats[16 * image + threadIdx.x] = sum;
   }

@@ -78,13 +78,18 @@ struct alignas(16) Entry<double> {
   }
 };
 
+struct Cloud {
+  int64_t chunk_begin;  // chunks of kBlock rows of all clouds before
+  int32_t first;        // first image that shows it, or kNoImage
+};
+
 template <typename T>
 struct View {
   Camera<T> camera;
   int64_t row_begin, row_end;  // empty when the camera or the cloud cannot be rendered
-  int64_t pair;                // index of the first row's record in the group
   int32_t next;                // the next image of the same cloud, or kNoImage
 };
+static_assert(sizeof(View<float>) == 112 && sizeof(View<double>) == 200);  // gsim3d/ops/raster.py counts with them
 
 // The group in work; on the device.
 struct Group {
@@ -93,7 +98,6 @@ struct Group {
   int x_begin, y_begin, x_end, y_end;  // of tiles spot_begin and spot_end
   bool resumed, finished;         // the first image was begun by an earlier group; the last one is completed
   bool rows_are_good;             // cu_rows runs from 0 to N without descending
-  unsigned long long n_slots;     // handed out so far
 
   // Of the tiles of a record those of this group: how many, and which place tile (x, y) has among them.
   __device__ int count(const Spots& spots) const {
@@ -104,21 +108,24 @@ struct Group {
   }
 };
 
-// Everything the phases read and write; passed to kernels by value.
+// Everything the phases read and write; passed to kernels by value. `views` and `clouds` are made once; the rest
+// belongs to the group in work.
 template <typename T>
 struct Job {
   RasterScene<T> scene;
-  int64_t spots_x, n_spots;          // tiles in a row of tiles, in an image
-  int64_t max_pairs, max_entries;    // what the scratch holds; both at least n_rows and below 2^31
+  int64_t spots_x, n_spots;        // tiles in a row of tiles, in an image
+  int64_t max_pairs, max_entries;  // what the arrays below hold; both at least n_rows and below 2^31
+  View<T>* views;                  // [n_images]
+  Cloud* clouds;                   // [n_clouds]
   Group* group;
-  View<T>* views;                    // [n_images]
-  int32_t* cloud_first;              // [n_clouds] first image of the cloud, or kNoImage
-  Record<T>* records;                // [max_pairs]
-  uint32_t* slot_begin;              // [max_pairs] backward pass: first of the pair's slots, else null
-  uint32_t* cursor;                  // [n_images * n_spots] counts, then write positions
-  uint32_t* spot_begin;              // [n_images * n_spots + 1] into entries
-  Entry<T>* entries;                 // [max_entries]
-  Entry<T>* spare;                   // [max_entries]
+  int32_t* pair_begin;      // [n_images] index of the first row's record
+  Record<T>* records;       // [max_pairs]
+  uint32_t* slot_begin;     // [max_pairs] first of the pair's slots of the backward pass
+  uint32_t* slot_cursor;    // [n_images] slots handed out
+  uint32_t* spot_begin;     // [n_images * n_spots + 1] into entries
+  uint32_t* cursor;         // [n_images * n_spots] counts, then write positions
+  Entry<T>* entries;        // [max_entries]
+  Entry<T>* spare;          // [max_entries]
 };
 
 // ---- plan: cameras and the images of each cloud; one block --------------------------------------------------------
@@ -130,38 +137,6 @@ __device__ bool camera_is_good(const T* viewmat, const T* K) {
   for (int i = 0; i < 9; ++i) good &= isfinite(K[i]);
   return good && K[0] > 0 && K[4] > 0 && K[3] == 0 && K[6] == 0 && K[7] == 0 && K[8] == 1;
 }
-
-template <typename T>
-__device__ void plan(const Job<T>& job) {
-  const RasterScene<T>& s = job.scene;
-  bool good = s.cu_rows[0] == 0 && s.cu_rows[s.n_clouds] == s.n_rows;
-  for (int64_t q = threadIdx.x; q < s.n_clouds; q += blockDim.x) {
-    good &= s.cu_rows[q] <= s.cu_rows[q + 1];
-    job.cloud_first[q] = kNoImage;
-  }
-  good = __syncthreads_and(good);
-  if (threadIdx.x == 0) *job.group = {.rows_are_good = good};
-  for (int64_t i = threadIdx.x; i < s.n_images; i += blockDim.x) {
-    View<T>& view = job.views[i];
-    view = {};
-    view.next = kNoImage;
-    const int64_t cloud = s.image_cloud[i];
-    if (!good || !cuda::inside(cloud, s.n_clouds) || !camera_is_good(s.viewmats + 16 * i, s.Ks + 9 * i)) continue;
-    view.camera = make_camera(s.viewmats + 16 * i, s.Ks + 9 * i, s.width, s.height, s.near_plane);
-    view.row_begin = s.cu_rows[cloud], view.row_end = s.cu_rows[cloud + 1];
-    atomicMin(job.cloud_first + cloud, static_cast<int32_t>(i));
-  }
-  __syncthreads();
-  for (int64_t i = threadIdx.x; i < s.n_images; i += blockDim.x) {
-    View<T>& view = job.views[i];
-    if (view.row_begin == view.row_end) continue;
-    int64_t j = i + 1;
-    while (j < s.n_images && !(s.image_cloud[j] == s.image_cloud[i] && job.views[j].row_end > 0)) ++j;
-    if (j < s.n_images) view.next = static_cast<int32_t>(j);
-  }
-}
-
-// ---- choose: the images after the last group whose pairs fit; one block --------------------------------------------
 
 // Inclusive sum over the threads of a block of up to 1024; `total` is the sum over all of them.
 __device__ inline uint64_t block_sum(uint64_t value, uint64_t& total) {
@@ -184,6 +159,45 @@ __device__ inline uint64_t block_sum(uint64_t value, uint64_t& total) {
 }
 
 template <typename T>
+__device__ void plan(const Job<T>& job) {
+  const RasterScene<T>& s = job.scene;
+  bool good = s.cu_rows[0] == 0 && s.cu_rows[s.n_clouds] == s.n_rows;
+  for (int64_t q = threadIdx.x; q < s.n_clouds; q += blockDim.x) good &= s.cu_rows[q] <= s.cu_rows[q + 1];
+  good = __syncthreads_and(good);
+  if (threadIdx.x == 0) *job.group = Group{.rows_are_good = good};
+  uint64_t before = 0;
+  for (int64_t base = 0; base < s.n_clouds; base += blockDim.x) {
+    const int64_t q = base + threadIdx.x;
+    const uint64_t n = good && q < s.n_clouds ? (s.cu_rows[q + 1] - s.cu_rows[q] + kBlock - 1) / kBlock : 0;
+    uint64_t total;
+    const uint64_t end = before + block_sum(n, total);
+    if (q < s.n_clouds) job.clouds[q] = {static_cast<int64_t>(end - n), kNoImage};
+    before += total;
+  }
+  __syncthreads();
+  for (int64_t i = threadIdx.x; i < s.n_images; i += blockDim.x) {
+    View<T>& view = job.views[i];
+    view = {};
+    view.next = kNoImage;
+    const int64_t cloud = s.image_cloud[i];
+    if (!good || !cuda::inside(cloud, s.n_clouds) || !camera_is_good(s.viewmats + 16 * i, s.Ks + 9 * i)) continue;
+    view.camera = make_camera(s.viewmats + 16 * i, s.Ks + 9 * i, s.width, s.height, s.near_plane);
+    view.row_begin = s.cu_rows[cloud], view.row_end = s.cu_rows[cloud + 1];
+    atomicMin(&job.clouds[cloud].first, static_cast<int32_t>(i));
+  }
+  __syncthreads();
+  for (int64_t i = threadIdx.x; i < s.n_images; i += blockDim.x) {
+    View<T>& view = job.views[i];
+    if (view.row_begin == view.row_end) continue;
+    int64_t j = i + 1;
+    while (j < s.n_images && !(s.image_cloud[j] == s.image_cloud[i] && job.views[j].row_end > 0)) ++j;
+    if (j < s.n_images) view.next = static_cast<int32_t>(j);
+  }
+}
+
+// ---- choose: the images after the last group whose pairs fit; one block --------------------------------------------
+
+template <typename T>
 __device__ void choose_images(const Job<T>& job) {
   const int64_t begin = job.group->spot_end, first = begin / job.n_spots;
   const bool resumed = begin % job.n_spots != 0;
@@ -196,7 +210,7 @@ __device__ void choose_images(const Job<T>& job) {
     uint64_t total;
     const uint64_t end = pairs + block_sum(n, total);
     const bool fits = inside && end <= static_cast<uint64_t>(job.max_pairs);
-    if (fits) job.views[i].pair = static_cast<int64_t>(end - n);
+    if (fits) job.pair_begin[i] = static_cast<int32_t>(end - n);
     const int n_fit = __syncthreads_count(fits);
     last = base + n_fit;
     if (n_fit < static_cast<int>(blockDim.x)) break;
@@ -210,31 +224,39 @@ __device__ void choose_images(const Job<T>& job) {
   group.x_begin = static_cast<int>(begin % job.n_spots % job.spots_x);
   group.y_begin = static_cast<int>(begin % job.n_spots / job.spots_x);
   group.resumed = resumed;
-  group.n_slots = 0;
 }
 
-// ---- rows: calls f(image, view, pair, row) for the images of the group that show a row, in order ------------------
+// ---- rows: a block takes a chunk of rows of one cloud, a thread a row ---------------------------------------------
 
-template <typename T, typename F>
-__device__ void for_images(const Job<T>& job, int64_t row, const F& f) {
-  const RasterScene<T>& s = job.scene;
-  if (!job.group->rows_are_good) return;
-  int64_t low = 0, high = s.n_clouds;  // the last cloud that begins at or before the row, and is not empty
-  while (high - low > 1) {
-    const int64_t middle = (low + high) / 2;
-    if (s.cu_rows[middle] <= row)
-      low = middle;
-    else
-      high = middle;
+struct Rows {
+  int64_t row;
+  bool inside;
+  int64_t first_image;  // of the group, that shows the cloud; kNoImage: none
+
+  template <typename T>
+  __device__ Rows(const Job<T>& job, int64_t chunk) {
+    const RasterScene<T>& s = job.scene;
+    int64_t low = 0, high = s.n_clouds;  // the last cloud that begins at or before the chunk
+    while (high - low > 1) {
+      const int64_t middle = (low + high) / 2;
+      if (job.clouds[middle].chunk_begin <= chunk)
+        low = middle;
+      else
+        high = middle;
+    }
+    row = s.cu_rows[low] + (chunk - job.clouds[low].chunk_begin) * kBlock + threadIdx.x;
+    inside = row < s.cu_rows[low + 1];
+    first_image = job.clouds[low].first;
+    while (first_image < job.group->first) first_image = job.views[first_image].next;
   }
-  const int64_t first = job.group->first, last = job.group->last;
-  int64_t image = job.cloud_first[low];
-  while (image < first) image = job.views[image].next;
-  while (image < last) {
-    const View<T>& view = job.views[image];
-    f(image, view, view.pair + row - view.row_begin);
-    image = view.next;
-  }
+};
+
+// Chunks of all clouds.
+template <typename T>
+__device__ int64_t count_chunks(const Job<T>& job) {
+  const int64_t last = job.scene.n_clouds - 1;
+  if (last < 0 || !job.group->rows_are_good) return 0;
+  return job.clouds[last].chunk_begin + (job.scene.n_rows - job.scene.cu_rows[last] + kBlock - 1) / kBlock;
 }
 
 // ---- project: records of all pairs, and the number of entries of every tile ---------------------------------------
@@ -287,8 +309,11 @@ template <typename T, int kTerms>
 __device__ void project_rows(const Job<T>& job) {
   const RasterScene<T>& s = job.scene;
   constexpr int kColumns = kTerms > 0 ? kTerms * 3 : 3;
-  for (int64_t row = int64_t{blockIdx.x} * blockDim.x + threadIdx.x; row < s.n_rows;
-       row += int64_t{gridDim.x} * blockDim.x) {
+  const int64_t last = job.group->last, n_chunks = count_chunks(job);
+  for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
+    const Rows rows(job, chunk);
+    if (!rows.inside || rows.first_image >= last) continue;
+    const int64_t row = rows.row;
     const Gaussian<T> gaussian(s, row);
     T coefficients[kColumns];
     bool good = gaussian.is_good();
@@ -298,15 +323,16 @@ __device__ void project_rows(const Job<T>& job) {
     }
     for (int64_t i = 0; i < s.n_features; ++i) good &= isfinite(s.features[row * s.n_features + i]);
     const bool may_show = good && gaussian.opacity >= T(kMinAlpha);
-    for_images(job, row, [&](int64_t image, const View<T>& view, int64_t pair) {
+    for (int64_t image = rows.first_image; image < last; image = job.views[image].next) {
+      const View<T>& view = job.views[image];
       Record<T> record{};
       if (may_show) record = record_of<T, kTerms>(s, view.camera, gaussian, coefficients);
-      job.records[pair] = record;
+      job.records[job.pair_begin[image] + row - view.row_begin] = record;
       const Spots spots = spots_of(record);
       uint32_t* counts = job.cursor + image * job.n_spots;
       for (int y = spots.y0; y < spots.y1; ++y)
         for (int x = spots.x0; x < spots.x1; ++x) atomicAdd(counts + y * job.spots_x + x, 1u);
-    });
+    }
   }
 }
 
@@ -354,17 +380,35 @@ __device__ void find_offsets(const Job<T>& job) {
 
 // ---- scatter: every record writes its entries; their order is whatever it is --------------------------------------
 
+// Inclusive sum over the lanes of a warp.
+__device__ inline int warp_sum(int value) {
+  for (int step = 1; step < kWarp; step *= 2) {
+    const int other = __shfl_up_sync(kFullWarp, value, step);
+    if (static_cast<int>(threadIdx.x % kWarp) >= step) value += other;
+  }
+  return value;
+}
+
 template <typename T>
 __device__ void scatter_rows(const Job<T>& job) {
   const Group group = *job.group;
-  for (int64_t row = int64_t{blockIdx.x} * blockDim.x + threadIdx.x; row < job.scene.n_rows;
-       row += int64_t{gridDim.x} * blockDim.x) {
-    for_images(job, row, [&](int64_t image, const View<T>&, int64_t pair) {
-      const Record<T> record = job.records[pair];
+  const int64_t n_chunks = count_chunks(job);
+  for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
+    const Rows rows(job, chunk);
+    for (int64_t image = rows.first_image; image < group.last; image = job.views[image].next) {
+      const int64_t pair = job.pair_begin[image] + rows.row - job.views[image].row_begin;
+      Record<T> record{};
+      if (rows.inside) record = job.records[pair];
       const Spots spots = spots_of(record);
-      if (job.slot_begin)
-        job.slot_begin[pair] =
-            static_cast<uint32_t>(atomicAdd(&job.group->n_slots, static_cast<unsigned long long>(group.count(spots))));
+      // An image has as many slots as entries.
+      const int n = group.count(spots), end = warp_sum(n);
+      uint32_t slot = 0;
+      if (threadIdx.x % kWarp == kWarp - 1 && end > 0)
+        slot = job.spot_begin[max(group.spot_begin, image * job.n_spots)] +
+               atomicAdd(job.slot_cursor + image, static_cast<uint32_t>(end));
+      slot = __shfl_sync(kFullWarp, slot, kWarp - 1);
+      if (n == 0) continue;
+      job.slot_begin[pair] = slot + end - n;
       const Entry<T> entry = Entry<T>::make(record.z, static_cast<uint32_t>(pair));
       for (int y = spots.y0; y < spots.y1; ++y)
         for (int x = spots.x0; x < spots.x1; ++x) {
@@ -372,7 +416,7 @@ __device__ void scatter_rows(const Job<T>& job) {
           if (spot >= group.spot_begin && spot < group.spot_end)
             job.entries[atomicAdd(job.cursor + spot, 1u)] = entry;
         }
-    });
+    }
   }
 }
 

@@ -85,12 +85,13 @@ struct SceneTensors {
   }
 };
 
-using Images = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Images = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
                            const Tensor& color, const Tensor& features, const Tensor& background,
                            const Tensor& viewmats, const Tensor& Ks, const Tensor& image_cloud, const Tensor& cu_rows,
-                           int64_t width, int64_t height, double near_plane, int64_t cutoff) {
+                           int64_t width, int64_t height, double near_plane, int64_t cutoff, int64_t max_pairs,
+                           int64_t max_entries) {
   const SceneTensors given{"rasterize_gaussians", means, quats, scales, opacities, color, features, background,
                            viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff};
   given.check_all();
@@ -102,35 +103,42 @@ Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tenso
   Tensor out_features = empty(in.means, {n, height, width, in.features.size(1)});
   Tensor transmittance = empty(in.means, {n, height, width});
   Tensor last = empty(in.means, {n, height, width}, ScalarType::Int);
+  Tensor state = empty(in.means, {0}, ScalarType::Byte);
   TensorWorkspace workspace(in.means);
   dispatch_float(given.op, "means", in.means, [&]<typename T>() {
     const RasterImages<T> images{mutable_data<T>(out_color),     mutable_data<T>(alpha),
                                  mutable_data<T>(depth),         mutable_data<T>(out_features),
                                  mutable_data<T>(transmittance), mutable_data<int32_t>(last)};
     if constexpr (kWithCuda)
-      if (in.means.is_cuda())
-        return cuda::raster_forward<T>(in.scene<T>(), images, workspace, current_stream(in.means));
+      if (in.means.is_cuda()) {
+        const RasterScene<T> scene = in.scene<T>();
+        state = empty(in.means, {cuda::raster_state_bytes(scene, max_pairs, max_entries)}, ScalarType::Byte);
+        return cuda::raster_forward<T>(scene, images, {state.data_ptr(), max_pairs, max_entries}, workspace,
+                                       current_stream(in.means));
+      }
     cpu::raster_forward<T>(in.scene<T>(), images, workspace, torch_parallel());
   });
-  return {out_color, alpha, depth, out_features, transmittance, last};
+  return {out_color, alpha, depth, out_features, transmittance, last, state};
 }
 
 using SceneGrads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor& grad_alpha_, const Tensor& grad_depth_,
                                         const Tensor& grad_features_, const Tensor& transmittance_, const Tensor& last_,
+                                        const Tensor& state_,
                                         const Tensor& means, const Tensor& quats, const Tensor& scales,
                                         const Tensor& opacities, const Tensor& color, const Tensor& features,
                                         const Tensor& background, const Tensor& viewmats, const Tensor& Ks,
                                         const Tensor& image_cloud, const Tensor& cu_rows, int64_t width, int64_t height,
-                                        double near_plane, int64_t cutoff, bool viewmats_grad) {
+                                        double near_plane, int64_t cutoff, int64_t max_pairs, int64_t max_entries,
+                                        bool viewmats_grad) {
   const char* op = "rasterize_gaussians_backward";
   const SceneTensors given{op, means, quats, scales, opacities, color, features, background,
                            viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff};
   given.check_all();
   const SceneTensors in = given.contiguous();
   const Tensor grad_color = rows_of(grad_color_), grad_alpha = rows_of(grad_alpha_), grad_depth = rows_of(grad_depth_);
-  const Tensor grad_features = rows_of(grad_features_), transmittance = rows_of(transmittance_), last = rows_of(last_);
+  const Tensor grad_features = rows_of(grad_features_), transmittance = rows_of(transmittance_), last = rows_of(last_), state = rows_of(state_);
   const int64_t n = in.n_images();
   check_shape(op, "grad_color", grad_color, {n, height, width, 3}, "[I, H, W, 3]");
   check_shape(op, "grad_alpha", grad_alpha, {n, height, width}, "[I, H, W]");
@@ -141,7 +149,8 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
   for (const Tensor* tensor : {&grad_color, &grad_alpha, &grad_depth, &grad_features, &transmittance})
     check_dtype(op, "image gradients", *tensor, in.means.scalar_type());
   check_dtype(op, "last", last, ScalarType::Int);
-  for (const Tensor* tensor : {&grad_color, &grad_alpha, &grad_depth, &grad_features, &transmittance, &last})
+  check_dtype(op, "state", state, ScalarType::Byte);
+  for (const Tensor* tensor : {&grad_color, &grad_alpha, &grad_depth, &grad_features, &transmittance, &last, &state})
     check_device(op, "image gradients", *tensor, in.means);
 
   const auto like = [](const Tensor& tensor) { return torch::stable::new_empty(tensor, tensor.sizes()); };
@@ -159,8 +168,12 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
                                     mutable_data<T>(grad_background), viewmats_grad ? mutable_data<T>(grad_viewmats)
                                                                                     : nullptr};
     if constexpr (kWithCuda)
-      if (in.means.is_cuda())
-        return cuda::raster_backward<T>(in.scene<T>(), image_grads, grads, workspace, current_stream(in.means));
+      if (in.means.is_cuda()) {
+        const RasterScene<T> scene = in.scene<T>();
+        check_shape(op, "state", state, {cuda::raster_state_bytes(scene, max_pairs, max_entries)}, "[bytes]");
+        return cuda::raster_backward<T>(scene, image_grads, grads, {state.data_ptr(), max_pairs, max_entries}, workspace,
+                                        current_stream(in.means));
+      }
     cpu::raster_backward<T>(in.scene<T>(), image_grads, grads, workspace, torch_parallel());
   });
   return {grad_means,    grad_quats,       grad_scales,     grad_opacities,
