@@ -141,21 +141,21 @@ def _named_errors(args):
         raise
 
 
-def _spots(n_images, width, height):
-    """Tiles of the lists of csrc/gsim3d/raster/raster_lists.cuh in all images."""
-    return n_images * ((width + 7) // 8) * ((height + 7) // 8)
+def _tiles(n_images, width, height):
+    return n_images * ((width + 15) // 16) * ((height + 15) // 16)
 
 
 def _sizes_of_state(means, n_images, n_clouds, width, height):
-    """(max_pairs, max_entries): what is kept on a GPU for the backward pass. Images beyond are made anew: slower, with
-    the same result. Exact for clouds shown by equally many images; entries for Gaussians of a few pixels."""
+    """(max_pairs, max_entries, max_slots): RasterLimits of csrc/gsim3d/raster/raster.h. Exact for clouds shown by equally
+    many images; about twice what Gaussians of a few pixels need."""
     if means.device.type != "cuda":
-        return 0, 0
-    n = means.shape[0]
+        return 0, 0, 0
+    n, tiles = means.shape[0], _tiles(n_images, width, height)
     views = (n_images + n_clouds - 1) // max(1, n_clouds)
     pairs = torch.sym_max(n, torch.sym_min(n * views, 2**25))
-    entries = torch.sym_min(pairs + pairs // 2 + 512 * _spots(n_images, width, height), 2**30)
-    return pairs, torch.sym_max(n, entries)
+    entries = torch.sym_min(pairs + pairs // 4 + 1024 * tiles, 2**30)
+    slots = torch.sym_min(pairs + pairs // 2 + 2048 * tiles, 2**30)
+    return pairs, torch.sym_max(n, entries), torch.sym_max(4 * n, slots)
 
 
 def _state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_entries):
@@ -164,7 +164,8 @@ def _state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_entrie
         return 0
     real = means.element_size()
     view = 112 if real == 4 else 200
-    lists = (12 * real * max_pairs, 4 * max_pairs, 4 * (_spots(n_images, width, height) + 1), 2 * real * max_entries)
+    tiles = _tiles(n_images, width, height)
+    lists = (8 * max_pairs, 12 * real * max_pairs, 4 * max_pairs, 4 * (tiles + 1), 4 * max_entries)
     return sum((n + 63) // 64 * 64 for n in (64, view * n_images, 16 * n_clouds, 4 * n_images, *lists))
 
 
@@ -173,7 +174,7 @@ def _(means, quats, scales, opacities, color, features, background, viewmats, *r
     _, _, cu_rows, width, height, _, _, *sizes = rest  # Ks, image_cloud, near_plane and cutoff do not count here
     n_images = viewmats.shape[0]
     shape = (n_images, height, width)
-    state = _state_bytes(means, n_images, cu_rows.shape[0] - 1, width, height, *sizes)
+    state = _state_bytes(means, n_images, cu_rows.shape[0] - 1, width, height, *sizes[:2])
     return (
         means.new_empty(*shape, 3),
         means.new_empty(shape),
@@ -203,7 +204,7 @@ def _backward(ctx, grad_color, grad_alpha, grad_depth, grad_features, *_kept):
     *grads, viewmats = torch.ops.gsim3d.rasterize_gaussians_backward(
         grad_color, grad_alpha, grad_depth, grad_features, *ctx.saved_tensors, *ctx.options, viewmats_grad
     )
-    return (*grads, viewmats if viewmats_grad else None, *[None] * 9)
+    return (*grads, viewmats if viewmats_grad else None, *[None] * 10)
 
 
 torch.library.register_autograd("gsim3d::rasterize_gaussians", _backward, setup_context=_setup)

@@ -16,7 +16,7 @@ DTYPES = {torch.float32: "float32", torch.float64: "float64"}
 
 def operator_args(scene):
     leaves = [x.clone().requires_grad_() for x in scene.inputs]
-    sizes = (2 * len(scene.means), 4 * len(scene.means)) if scene.means.is_cuda else (0, 0)
+    sizes = [factor * len(scene.means) if scene.means.is_cuda else 0 for factor in (2, 4, 8)]
     return (*leaves, scene.Ks, scene.image_cloud, scene.cu_rows, scene.width, scene.height, 0.01, 0, *sizes)
 
 

@@ -97,26 +97,26 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
 // counts as black, and gradients of all of these are 0. Same bits from run to run, however large the scratch.
 namespace cuda {
 
-// What the forward pass keeps for the backward pass, in device memory of raster_state_bytes. It holds the lists of as
-// many images as have together at most max_pairs pairs of a Gaussian and an image, and max_entries pairs of a Gaussian
-// and a tile of 8 x 8 pixels that its bounds touch; both at least n_rows and below 2^31. The other images are made
-// anew where they are needed: slower, with the same result.
-struct RasterState {
-  void* memory;
-  int64_t max_pairs, max_entries;
+// How much one call holds at once. Of the images, as many as stay within all three are rendered together and kept in
+// `state` for the backward pass; the others are made where they are needed: slower, with the same result.
+struct RasterLimits {
+  int64_t pairs;    // of a Gaussian and an image that shows its cloud; in [n_rows, 2^28]
+  int64_t entries;  // of a Gaussian and a tile of 16 x 16 pixels that its bounds touch; in [n_rows, 2^31)
+  int64_t slots;    // of a Gaussian and a quarter of a tile that its bounds touch; in [4 n_rows, 2^31)
 };
 
+// Device memory that the forward pass fills and the backward pass reads.
 template <typename T>
-int64_t raster_state_bytes(const RasterScene<T>& scene, int64_t max_pairs, int64_t max_entries);
+int64_t raster_state_bytes(const RasterScene<T>& scene, const RasterLimits& limits);
 
 template <typename T>
-void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, const RasterState& state,
+void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, const RasterLimits& limits, void* state,
                     const Workspace& workspace, Stream stream);
 
 template <typename T>
 void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& image_grads,
-                     const RasterSceneGrads<T>& grads, const RasterState& state, const Workspace& workspace,
-                     Stream stream);
+                     const RasterSceneGrads<T>& grads, const RasterLimits& limits, void* state,
+                     const Workspace& workspace, Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

@@ -5,9 +5,9 @@
 namespace gsim3d::cuda {
 namespace {
 
-template <typename T, bool kFade>
+template <typename T, bool kFade, bool kWithFeatures>
 __global__ void __launch_bounds__(kBlock) blend_vjp_kernel(Job<T> job, RasterImageGrads<T> grads, Slots<T> slots) {
-  blend_spots_vjp<T, kFade>(job, grads, slots.entries, slots.backgrounds, of_warp<BlendGradShared<T>>());
+  blend_tiles_vjp<T, kFade>(job, grads, slots, of_warp<BlendGradShared<T, kWithFeatures>>());
 }
 
 template <typename T, int kTerms>
@@ -25,17 +25,35 @@ __global__ void __launch_bounds__(kBlock) gather_images_kernel(Job<T> job, Slots
   gather_images(job, slots, grads);
 }
 
-template <typename T, int kTerms, bool kFade>
+template <typename T>
+__device__ void gather_any(const Job<T>& job, const Slots<T>& slots, const RasterSceneGrads<T>& grads) {
+  const auto gather = [&](auto terms) {
+    constexpr int kTerms = decltype(terms)::value;
+    if (slots.viewmats) gather_viewmats<T, kTerms>(job, slots);
+    cooperative_groups::this_grid().sync();
+    gather_rows<T, kTerms>(job, slots, grads);
+  };
+  switch (job.scene.sh_terms) {
+    case 0: return gather(std::integral_constant<int, 0>{});
+    case 1: return gather(std::integral_constant<int, 1>{});
+    case 4: return gather(std::integral_constant<int, 4>{});
+    case 9: return gather(std::integral_constant<int, 9>{});
+    default: return gather(std::integral_constant<int, 16>{});
+  }
+}
+
+template <typename T, bool kFade>
 __global__ void __launch_bounds__(kBlock) further_vjp_kernel(Job<T> first, Job<T> job, RasterImageGrads<T> image_grads,
                                                              Slots<T> slots, RasterSceneGrads<T> grads) {
   if (!go_on(first, job)) return;
   const auto grid = cooperative_groups::this_grid();
-  while (next_group<T, kTerms>(job)) {
-    blend_spots_vjp<T, kFade>(job, image_grads, slots.entries, slots.backgrounds, of_warp<BlendGradShared<T>>());
+  while (next_group(job)) {
+    for (int64_t i = int64_t{blockIdx.x} * kBlock + threadIdx.x; i < job.limits.slots; i += int64_t{gridDim.x} * kBlock)
+      slots.live[i] = 0;
     grid.sync();
-    if (slots.viewmats) gather_viewmats<T, kTerms>(job, slots);
+    blend_tiles_vjp<T, kFade>(job, image_grads, slots, of_warp<BlendGradShared<T, true>>());
     grid.sync();
-    gather_rows<T, kTerms>(job, slots, grads);
+    gather_any(job, slots, grads);
     gather_images(job, slots, grads);
     grid.sync();
   }
@@ -44,10 +62,12 @@ __global__ void __launch_bounds__(kBlock) further_vjp_kernel(Job<T> first, Job<T
 template <typename T>
 Slots<T> take_slots(const Job<T>& first, const Job<T>& further, bool viewmats, Arena& scratch) {
   const RasterScene<T>& s = first.scene;
+  const int64_t n = std::max(first.limits.slots, further.limits.slots);
   Slots<T> slots{};
-  slots.entries = scratch.take<T>(std::max(first.max_entries, further.max_entries) * (kSlotFixed + s.n_features));
+  slots.values = scratch.take<T>(n * (kSlotFixed + s.n_features));
+  slots.live = scratch.take<unsigned char>(n);
   slots.unfinished = scratch.take<T>(s.n_rows * kSlotFixed);
-  slots.backgrounds = scratch.take<T>(s.n_images * first.n_spots * 3);
+  slots.backgrounds = scratch.take<T>(s.n_images * first.n_tiles * kQuarters * 3);
   if (viewmats) slots.viewmats = scratch.take<T>(s.n_images * kViewmatParts * 12);
   return slots;
 }
@@ -56,10 +76,10 @@ Slots<T> take_slots(const Job<T>& first, const Job<T>& further, bool viewmats, A
 
 template <typename T>
 void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& image_grads,
-                     const RasterSceneGrads<T>& grads, const RasterState& state, const Workspace& workspace,
-                     Stream stream) {
+                     const RasterSceneGrads<T>& grads, const RasterLimits& limits, void* state,
+                     const Workspace& workspace, Stream stream) {
   check_options(scene);
-  check_state(scene, state);
+  check_limits(scene, limits);
   fill_zero(kRaster, grads.features, scene.n_rows * scene.n_features, stream);
   if (scene.n_images == 0) {
     fill_zero(kRaster, grads.means, scene.n_rows * 3, stream);
@@ -70,34 +90,38 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
     return;
   }
   const bool viewmats = grads.viewmats != nullptr;
-  Arena kept(state.memory), unused, count;
-  const Job<T> job = first_job(scene, state, kept, unused);
+  Arena kept(state), unused, count;
+  const Job<T> job = first_job(scene, limits, kept, unused);
   take_slots(job, further_job(job, count), viewmats, count);
   Arena scratch(workspace.take<unsigned char>(count.used()));
   const Job<T> further = further_job(job, scratch);
   const Slots<T> slots = take_slots(job, further, viewmats, scratch);
 
-  const size_t shared_bytes = kWarps * sizeof(BlendGradShared<T>);
-  dispatch_fade(scene.cutoff, [&](auto fade) {
-    constexpr bool kFade = decltype(fade)::value;
-    launch(kRaster, blend_vjp_kernel<T, kFade>, grid_for(scene.n_images * job.n_spots, kWarps), kBlock, shared_bytes,
-           stream, job, image_grads, slots);
-    dispatch_sh(scene.sh_terms, [&](auto terms) {
-      constexpr int kTerms = decltype(terms)::value;
-      if (viewmats)
-        launch(kRaster, gather_viewmats_kernel<T, kTerms>, grid_for(scene.n_images * kViewmatParts, 1), kBlock, 0,
-               stream, job, slots);
-      launch(kRaster, gather_rows_kernel<T, kTerms>, grid_of_chunks(scene), kBlock, 0, stream, job, slots, grads);
-      launch(kRaster, gather_images_kernel<T>, grid_for(scene.n_images, 1), kBlock, 0, stream, job, slots, grads);
-      launch_together(further_vjp_kernel<T, kTerms, kFade>, std::max(shared_bytes, kSortRun * sizeof(Entry<T>)),
-                      stream, job, further, image_grads, slots, grads);
-    });
+  fill_zero(kRaster, slots.live, limits.slots, stream);
+  dispatch_blend(scene, [&](auto fade, auto with_features) {
+    constexpr bool kFade = decltype(fade)::value, kWithFeatures = decltype(with_features)::value;
+    launch(kRaster, blend_vjp_kernel<T, kFade, kWithFeatures>, grid_for(scene.n_images * job.n_tiles, 1), kBlock,
+           kWarps * sizeof(BlendGradShared<T, kWithFeatures>), stream, job, image_grads, slots);
   });
+  dispatch_sh(scene.sh_terms, [&](auto terms) {
+    constexpr int kTerms = decltype(terms)::value;
+    if (viewmats)
+      launch(kRaster, gather_viewmats_kernel<T, kTerms>, grid_for(scene.n_images * kViewmatParts, 1), kBlock, 0, stream,
+             job, slots);
+    launch(kRaster, gather_rows_kernel<T, kTerms>, grid_of_chunks(scene), kBlock, 0, stream, job, slots, grads);
+  });
+  launch(kRaster, gather_images_kernel<T>, grid_for(scene.n_images, 1), kBlock, 0, stream, job, slots, grads);
+  const auto rest = [&](auto fade) {
+    launch_together(further_vjp_kernel<T, decltype(fade)::value>,
+                    std::max(kWarps * sizeof(BlendGradShared<T, true>), kSortRun * sizeof(Entry<T>)), stream, job,
+                    further, image_grads, slots, grads);
+  };
+  scene.cutoff == RasterCutoff::kSmooth ? rest(std::true_type{}) : rest(std::false_type{});
 }
 
 #define GSIM3D_INSTANTIATE(T)                                                                                      \
   template void raster_backward<T>(const RasterScene<T>&, const RasterImageGrads<T>&, const RasterSceneGrads<T>&,  \
-                                   const RasterState&, const Workspace&, Stream);
+                                   const RasterLimits&, void*, const Workspace&, Stream);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 #undef GSIM3D_INSTANTIATE

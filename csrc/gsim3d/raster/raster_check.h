@@ -24,13 +24,17 @@ void check_options(const RasterScene<T>& s) {
 }
 
 template <typename T>
-void check_state(const RasterScene<T>& s, const cuda::RasterState& state) {
+void check_limits(const RasterScene<T>& s, const cuda::RasterLimits& limits) {
   constexpr const char* kOp = "rasterize_gaussians";
-  check(s.n_rows <= INT32_MAX && s.n_images < INT32_MAX, kOp, ": there must be fewer than 2^31 rows and images; got ",
-        s.n_rows, " and ", s.n_images);
-  for (const int64_t size : {state.max_pairs, state.max_entries})
-    check(size >= s.n_rows && size <= INT32_MAX, kOp, ": max_pairs and max_entries must be in [N, 2^31) with N=",
-          s.n_rows, "; got ", size);
+  constexpr int64_t kMaxPairs = int64_t{1} << 28;
+  check(s.n_rows <= kMaxPairs && s.n_images < INT32_MAX, kOp, ": at most 2^28 rows and 2^31 - 2 images; got ", s.n_rows,
+        " and ", s.n_images);
+  const auto check_range = [kOp](const char* name, int64_t value, int64_t least, int64_t most) {
+    check(value >= least && value <= most, kOp, ": ", name, " must be in [", least, ", ", most, "]; got ", value);
+  };
+  check_range("max_pairs", limits.pairs, s.n_rows, kMaxPairs);
+  check_range("max_entries", limits.entries, s.n_rows, INT32_MAX);
+  check_range("max_slots", limits.slots, 4 * s.n_rows, INT32_MAX);
 }
 
 // Calls f(std::integral_constant<int, terms>) for the number of SH terms of the scene (0: given colours).

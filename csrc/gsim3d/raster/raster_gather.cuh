@@ -2,37 +2,36 @@
 // projection. One thread owns a row, for all images and in their order.
 #pragma once
 
-#include "gsim3d/raster/raster_blend.cuh"
+#include "gsim3d/raster/raster_blend_vjp.cuh"
 
 namespace gsim3d::raster {
 
 constexpr int kViewmatParts = 16;  // blocks that share the rows of an image
 
-// What the gradients of a group are made of.
-template <typename T>
-struct Slots {
-  T* entries;       // [max_entries, kSlotFixed + n_features]
-  T* unfinished;    // [n_rows, kSlotFixed] sums of an image's tiles in earlier groups
-  T* backgrounds;   // [n_images * n_spots, 3] by tile
-  T* viewmats;      // [n_images, kViewmatParts, 12], or null when nobody asks for them
-};
-
 // Sums of a pair's slots in the order of tiles, over all groups that had some of them; false when it has none.
 template <typename T>
-__device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t row, int64_t pair, const Slots<T>& slots,
-                          T (&sums)[kSlotFixed], T* features) {
-  const Spots spots = spots_of(job.records[pair]);
-  if (spots.count() == 0) return false;
-  const int n = group.count(spots);
-  const int64_t width = kSlotFixed + job.scene.n_features;
-  const T* slot = slots.entries + int64_t{job.slot_begin[pair]} * width;
+__device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t image, int64_t row, int64_t pair,
+                          const Slots<T>& slots, T (&sums)[kSlotFixed], T* features) {
+  const PixelRect bounds = job.bounds[pair];
+  if (bounds.x0 >= bounds.x1) return false;
+  const Squares tiles = squares_of(bounds, kTile), quarters = squares_of(bounds, kQuarter);
+  const int64_t width = kSlotFixed + job.scene.n_features, begin = job.slot_begin[pair];
+  bool any = group.resumed;
   for (int c = 0; c < kSlotFixed; ++c) sums[c] = group.resumed ? slots.unfinished[row * kSlotFixed + c] : T(0);
-  for (int i = 0; i < n; ++i, slot += width) {
-    for (int c = 0; c < kSlotFixed; ++c) sums[c] += slot[c];
-    if (features)
-      for (int64_t c = 0; c < job.scene.n_features; ++c) features[c] += slot[kSlotFixed + c];
-  }
-  return true;
+  for (int y = tiles.y0; y < tiles.y1; ++y)
+    for (int x = tiles.x0; x < tiles.x1; ++x) {
+      if (group.in_parts && !group.has(image * job.n_tiles + y * job.tiles_x + x)) continue;
+      for (uint32_t rest = quarters_of_tile(quarters, x, y); rest; rest &= rest - 1) {
+        const int64_t slot = begin + group.slot(tiles, quarters, x, y, __ffs(rest) - 1);
+        if (!slots.live[slot]) continue;
+        any = true;
+        const T* values = slots.values + slot * width;
+        for (int c = 0; c < kSlotFixed; ++c) sums[c] += values[c];
+        if (features)
+          for (int64_t c = 0; c < job.scene.n_features; ++c) features[c] += values[kSlotFixed + c];
+      }
+    }
+  return any || !group.finished;
 }
 
 // Gradients of one row, summed over images one after the other, so that groups leave no trace.
@@ -89,7 +88,7 @@ template <typename T, int kTerms>
 __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const RasterSceneGrads<T>& grads) {
   const RasterScene<T>& s = job.scene;
   const Group group = *job.group;
-  const bool is_first = group.spot_begin == 0;
+  const bool is_first = group.tile_begin == 0;
   constexpr int kColumns = kTerms > 0 ? kTerms * 3 : 3;
   const int64_t n_chunks = group.rows_are_good ? count_chunks(job) : (s.n_rows + kBlock - 1) / kBlock;
   for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
@@ -107,7 +106,7 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
     for (int64_t image = rows.first_image; image < group.last; image = job.views[image].next) {
       T sums[kSlotFixed], viewmat[12] = {};
       const int64_t pair = job.pair_begin[image] + row - job.views[image].row_begin;
-      if (!sum_slots(job, group, row, pair, slots, sums, grads.features + row * s.n_features)) continue;
+      if (!sum_slots(job, group, image, row, pair, slots, sums, grads.features + row * s.n_features)) continue;
       if (group.finished)
         project_vjp_of<T, kTerms>(job.views[image].camera, gaussian, s.color + row * kColumns, sums, grad, viewmat);
       else
@@ -141,13 +140,14 @@ __device__ void gather_viewmats(const Job<T>& job, const Slots<T>& slots) {
   constexpr int kColumns = kTerms > 0 ? kTerms * 3 : 3;
   const int64_t end = group.last * kViewmatParts;
   for (int64_t task = group.first * kViewmatParts + blockIdx.x; task < end; task += gridDim.x) {
-    const View<T>& view = job.views[task / kViewmatParts];
-    const int64_t first_pair = job.pair_begin[task / kViewmatParts];
+    const int64_t image = task / kViewmatParts;
+    const View<T>& view = job.views[image];
+    const int64_t first_pair = job.pair_begin[image];
     T viewmat[12] = {};
     for (int64_t row = view.row_begin + (task % kViewmatParts) * kBlock + threadIdx.x; row < view.row_end;
          row += kViewmatParts * kBlock) {
       T sums[kSlotFixed];
-      if (!sum_slots<T>(job, group, row, first_pair + row - view.row_begin, slots, sums, nullptr)) continue;
+      if (!sum_slots<T>(job, group, image, row, first_pair + row - view.row_begin, slots, sums, nullptr)) continue;
       RowGrad<T, kColumns> unused{};
       project_vjp_of<T, kTerms>(view.camera, Gaussian<T>(s, row), s.color + row * kColumns, sums, unused, viewmat);
     }
@@ -165,8 +165,9 @@ __device__ void gather_images(const Job<T>& job, const Slots<T>& slots, const Ra
   if (!job.group->finished) return;
   for (int64_t image = job.group->first + blockIdx.x; image < job.group->last; image += gridDim.x) {
     T sums[3] = {};
-    for (int64_t i = threadIdx.x; i < job.n_spots; i += kBlock)
-      for (int c = 0; c < 3; ++c) sums[c] += slots.backgrounds[3 * (image * job.n_spots + i) + c];
+    const int64_t n = job.n_tiles * kQuarters;
+    for (int64_t i = threadIdx.x; i < n; i += kBlock)
+      for (int c = 0; c < 3; ++c) sums[c] += slots.backgrounds[3 * (image * n + i) + c];
     reduce_block(sums, shared);
     if (threadIdx.x == 0)
       for (int c = 0; c < 3; ++c)

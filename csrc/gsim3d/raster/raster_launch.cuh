@@ -11,6 +11,7 @@
 
 #include "gsim3d/raster/raster_blend.cuh"
 #include "gsim3d/raster/raster_check.h"
+#include "gsim3d/raster/raster_sort.cuh"
 
 namespace gsim3d::cuda {
 
@@ -37,29 +38,32 @@ class Arena {
   int64_t used_ = 0;
 };
 
-// Arrays of a group; those that the backward pass reads again come first.
+// Arrays of a group; those that the backward pass reads again are kept.
 template <typename T>
 void take_group(Job<T>& job, Arena& kept, Arena& scratch) {
-  const int64_t n_images = job.scene.n_images, n_spots = n_images * job.n_spots;
+  const int64_t n_images = job.scene.n_images, n_tiles = n_images * job.n_tiles;
   job.group = kept.take<Group>(1);
   job.pair_begin = kept.take<int32_t>(n_images);
-  job.records = kept.take<Record<T>>(job.max_pairs);
-  job.slot_begin = kept.take<uint32_t>(job.max_pairs);
-  job.spot_begin = kept.take<uint32_t>(n_spots + 1);
-  job.entries = kept.take<Entry<T>>(job.max_entries);
-  job.cursor = scratch.take<uint32_t>(n_spots + n_images);
-  job.slot_cursor = job.cursor + n_spots;
-  job.spare = scratch.take<Entry<T>>(job.max_entries);
+  job.bounds = kept.take<PixelRect>(job.limits.pairs);
+  job.records = kept.take<Record<T>>(job.limits.pairs);
+  job.slot_begin = kept.take<uint32_t>(job.limits.pairs);
+  job.tile_begin = kept.take<uint32_t>(n_tiles + 1);
+  job.words = kept.take<uint32_t>(job.limits.entries);
+  job.slot_count = scratch.take<uint64_t>(n_images + (n_images + n_tiles + 1) / 2);
+  job.slot_cursor = reinterpret_cast<uint32_t*>(job.slot_count + n_images);
+  job.cursor = job.slot_cursor + n_images;
+  job.entries = scratch.take<Entry<T>>(job.limits.entries);
+  job.spare = scratch.take<Entry<T>>(job.limits.entries);
 }
 
 // The job of the first group; its arrays are in `state`.
 template <typename T>
-Job<T> first_job(const RasterScene<T>& s, const RasterState& state, Arena& kept, Arena& scratch) {
+Job<T> first_job(const RasterScene<T>& s, const RasterLimits& limits, Arena& kept, Arena& scratch) {
   Job<T> job{};
   job.scene = s;
-  job.spots_x = (s.width + kSpot - 1) / kSpot;
-  job.n_spots = job.spots_x * ((s.height + kSpot - 1) / kSpot);
-  job.max_pairs = state.max_pairs, job.max_entries = state.max_entries;
+  job.tiles_x = (s.width + kTile - 1) / kTile;
+  job.n_tiles = job.tiles_x * ((s.height + kTile - 1) / kTile);
+  job.limits = limits;
   job.views = kept.take<View<T>>(s.n_images);
   job.clouds = kept.take<Cloud>(s.n_clouds);
   take_group(job, kept, scratch);
@@ -69,10 +73,13 @@ Job<T> first_job(const RasterScene<T>& s, const RasterState& state, Arena& kept,
 // The job of all further groups, with arrays of its own.
 template <typename T>
 Job<T> further_job(const Job<T>& first, Arena& scratch) {
+  const RasterLimits& given = first.limits;
+  const int64_t n_rows = first.scene.n_rows;
   constexpr int64_t kPairs = int64_t{1} << 20, kEntries = int64_t{1} << 22;
   Job<T> job = first;
-  job.max_pairs = std::max(job.scene.n_rows, std::min(job.max_pairs, kPairs));
-  job.max_entries = std::max(job.scene.n_rows, std::min(job.max_entries, kEntries));
+  job.limits.pairs = std::max(n_rows, std::min(given.pairs, kPairs));
+  job.limits.entries = std::max(n_rows, std::min(given.entries, kEntries));
+  job.limits.slots = std::max(kQuarters * n_rows, std::min(given.slots, kEntries));
   take_group(job, scratch, scratch);
   return job;
 }
@@ -102,9 +109,11 @@ void launch_together(void (*kernel)(Formal...), size_t shared_bytes, Stream stre
              kRaster);
 }
 
-template <typename F>
-void dispatch_fade(RasterCutoff cutoff, const F& f) {
-  cutoff == RasterCutoff::kSmooth ? f(std::true_type{}) : f(std::false_type{});
+// Calls f(fade, with features) with two std::bool_constant.
+template <typename T, typename F>
+void dispatch_blend(const RasterScene<T>& s, const F& f) {
+  const auto with = [&](auto fade) { s.n_features ? f(fade, std::true_type{}) : f(fade, std::false_type{}); };
+  s.cutoff == RasterCutoff::kSmooth ? with(std::true_type{}) : with(std::false_type{});
 }
 
 extern __shared__ __align__(16) unsigned char dynamic_memory[];
@@ -118,26 +127,38 @@ __device__ Shared& of_warp() {
 // Whether tiles are left after the first group; then `job` starts behind it. Every block calls it.
 template <typename T>
 __device__ bool go_on(const Job<T>& first, const Job<T>& job) {
-  if (first.group->spot_end >= job.scene.n_images * job.n_spots) return false;
+  if (first.group->tile_end >= job.scene.n_images * job.n_tiles) return false;
   if (blockIdx.x == 0 && threadIdx.x == 0) *job.group = *first.group;
   cooperative_groups::this_grid().sync();
   return true;
 }
 
+template <typename T>
+__device__ void project_any(const Job<T>& job) {
+  switch (job.scene.sh_terms) {
+    case 0: return project_rows<T, 0>(job);
+    case 1: return project_rows<T, 1>(job);
+    case 4: return project_rows<T, 4>(job);
+    case 9: return project_rows<T, 9>(job);
+    default: return project_rows<T, 16>(job);
+  }
+}
+
 // Lists of the next group; false when no tile is left. Every block calls it.
-template <typename T, int kTerms>
+template <typename T>
 __device__ bool next_group(const Job<T>& job) {
   const auto grid = cooperative_groups::this_grid();
-  if (job.group->spot_end >= job.scene.n_images * job.n_spots) return false;
+  if (job.group->tile_end >= job.scene.n_images * job.n_tiles) return false;
   grid.sync();
   if (blockIdx.x == 0) choose_images(job);
   grid.sync();
   const int64_t first = job.group->first, last = job.group->last, thread = int64_t{blockIdx.x} * kBlock + threadIdx.x;
-  for (int64_t i = first * job.n_spots + thread; i < last * job.n_spots; i += int64_t{gridDim.x} * kBlock)
+  for (int64_t i = first * job.n_tiles + thread; i < last * job.n_tiles; i += int64_t{gridDim.x} * kBlock)
     job.cursor[i] = 0;
-  for (int64_t i = first + thread; i < last; i += int64_t{gridDim.x} * kBlock) job.slot_cursor[i] = 0;
+  for (int64_t i = first + thread; i < last; i += int64_t{gridDim.x} * kBlock)
+    job.slot_count[i] = 0, job.slot_cursor[i] = 0;
   grid.sync();
-  project_rows<T, kTerms>(job);
+  project_any(job);
   grid.sync();
   if (blockIdx.x == 0) find_offsets(job);
   grid.sync();

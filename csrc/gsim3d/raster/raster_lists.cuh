@@ -1,9 +1,10 @@
-// Inside of the CUDA rasterizer: projection, and the list of every tile in order of depth.
+// Inside of the CUDA rasterizer: projection, and which Gaussians each tile of 16 x 16 pixels may see.
 //
 // Images are rendered in groups: whole images, as many as the scratch holds, or a run of the tiles of one large image.
 // What fits is decided on the device, so nothing waits for it. Every (row, image) pair of a group owns a Record; every
-// tile of 8 x 8 pixels owns a run of entries, one for each record that may touch it. Tiles of all images are numbered
-// through. A phase is a function that any number of blocks may share.
+// tile owns a run of entries, one for each record whose bounds touch it. Tiles of all images are numbered through. A
+// tile has four quarters of 8 x 8 pixels; for the backward pass a pair owns a slot for each quarter that its bounds
+// touch. A phase is a function that any number of blocks may share.
 #pragma once
 
 #include <cmath>
@@ -18,63 +19,74 @@ namespace gsim3d::raster {
 using cuda::kFullWarp;
 using cuda::kWarp;
 
-constexpr int kBlock = 128;     // threads of a block in the phases that many blocks share
-constexpr int kSpot = 8;        // pixels; side of the tiles of the lists
-constexpr int kSortRun = 1024;  // entries sorted in shared memory at once
+constexpr int kBlock = 128;  // threads of a block in the phases that many blocks share
+constexpr int kQuarter = 8;  // pixels
+constexpr int kQuarters = 4;
 constexpr int32_t kNoImage = INT32_MAX;
 
-// What a tile needs of one Gaussian in one image.
+// What a tile needs of one Gaussian in one image. alpha = 2^(strength - (tight u)^2 - (loose dy)^2), u = dx - slope dy.
 template <typename T>
 struct alignas(16) Record {
-  T x, y, slope, tight;  // pixels; Footprint, tight and loose times log2(e) / 2, as in the CPU's Splat
-  T loose, opacity, z;
-  uint16_t x0, x1;  // pixels that may see it, as PixelRect; x0 = x1 = 0 when it is left out
+  T x, y, slope, tight;  // pixels; tight and loose are square roots of Footprint's times log2(e) / 2
+  T loose, strength, z;
+  uint16_t x0, x1;  // PixelRect
   T red, green, blue;
   uint16_t y0, y1;
 };
 
-// Tiles [x0, x1) x [y0, y1) of an image.
-struct Spots {
+// Squares [x0, x1) x [y0, y1) of an image: tiles or quarters.
+struct Squares {
   int x0, x1, y0, y1;
   __device__ int count() const { return (x1 - x0) * (y1 - y0); }
-  // How many of them come before tile (x, y), row by row.
+  // How many of them come before (x, y), row by row.
   __device__ int before(int x, int y) const {
     const int rows = min(max(y - y0, 0), y1 - y0), columns = min(max(x - x0, 0), x1 - x0);
     return rows * (x1 - x0) + (y >= y0 && y < y1 ? columns : 0);
   }
 };
 
-template <typename T>
-__device__ __forceinline__ Spots spots_of(const Record<T>& record) {
-  if (record.x0 >= record.x1) return {0, 0, 0, 0};
-  return {record.x0 / kSpot, (record.x1 + kSpot - 1) / kSpot, record.y0 / kSpot, (record.y1 + kSpot - 1) / kSpot};
+__device__ __forceinline__ Squares squares_of(const PixelRect& r, int side) {
+  if (r.x0 >= r.x1) return {0, 0, 0, 0};
+  return {r.x0 / side, (r.x1 + side - 1) / side, r.y0 / side, (r.y1 + side - 1) / side};
 }
 
-// A record's place in a tile's list: by the bits of its positive depth, which ascend with it, then by pair, which
-// ascends with the row.
+// The quarters of tile (x, y) that are among `quarters`: bit 2 * row + column.
+__device__ __forceinline__ uint32_t quarters_of_tile(const Squares& quarters, int x, int y) {
+  const uint32_t columns = (2 * x >= quarters.x0 ? 1u : 0u) | (2 * x + 1 < quarters.x1 ? 2u : 0u);
+  return (2 * y >= quarters.y0 ? columns : 0u) | (2 * y + 1 < quarters.y1 ? columns << 2 : 0u);
+}
+
+// What is kept of an entry after sorting: the pair, which ascends with the row, and the quarters.
+__device__ __forceinline__ uint32_t word_of(uint32_t pair, uint32_t quarters) { return pair << kQuarters | quarters; }
+__device__ __forceinline__ uint32_t pair_of(uint32_t word) { return word >> kQuarters; }
+
+// Sorts by the bits of the positive depth, which ascend with it, then by pair.
 template <typename T>
 struct Entry;
 
 template <>
 struct Entry<float> {
-  uint64_t word;
-  __device__ static Entry make(float z, uint32_t pair) { return {uint64_t{__float_as_uint(z)} << 32 | pair}; }
+  uint64_t key;
+  __device__ static Entry make(float z, uint32_t word) { return {uint64_t{__float_as_uint(z)} << 32 | word}; }
   __device__ static Entry last() { return {~uint64_t{0}}; }
-  __device__ uint32_t pair() const { return static_cast<uint32_t>(word); }
-  __device__ bool operator<(const Entry& other) const { return word < other.word; }
+  __device__ uint32_t word() const { return static_cast<uint32_t>(key); }
+  __device__ bool operator<(const Entry& other) const { return key < other.key; }
+  __device__ Entry from_lane(int mask) const { return {__shfl_xor_sync(kFullWarp, key, mask)}; }
 };
 
 template <>
 struct alignas(16) Entry<double> {
-  uint64_t key;
-  uint64_t row;
-  __device__ static Entry make(double z, uint32_t pair) {
-    return {static_cast<uint64_t>(__double_as_longlong(z)), pair};
+  uint64_t key, low;
+  __device__ static Entry make(double z, uint32_t word) {
+    return {static_cast<uint64_t>(__double_as_longlong(z)), word};
   }
   __device__ static Entry last() { return {~uint64_t{0}, ~uint64_t{0}}; }
-  __device__ uint32_t pair() const { return static_cast<uint32_t>(row); }
+  __device__ uint32_t word() const { return static_cast<uint32_t>(low); }
   __device__ bool operator<(const Entry& other) const {
-    return key < other.key || (key == other.key && row < other.row);
+    return key < other.key || (key == other.key && low < other.low);
+  }
+  __device__ Entry from_lane(int mask) const {
+    return {__shfl_xor_sync(kFullWarp, key, mask), __shfl_xor_sync(kFullWarp, low, mask)};
   }
 };
 
@@ -93,18 +105,24 @@ static_assert(sizeof(View<float>) == 112 && sizeof(View<double>) == 200);  // gs
 
 // The group in work; on the device.
 struct Group {
-  int64_t first, last;            // images
-  int64_t spot_begin, spot_end;   // tiles: of all of these images, or a run of one image's
-  int x_begin, y_begin, x_end, y_end;  // of tiles spot_begin and spot_end
-  bool resumed, finished;         // the first image was begun by an earlier group; the last one is completed
-  bool rows_are_good;             // cu_rows runs from 0 to N without descending
+  int64_t first, last;           // images
+  int64_t tile_begin, tile_end;  // of all of these images, or a run of one image's
+  int x_begin, y_begin, x_end, y_end;  // places of tiles tile_begin and tile_end
+  bool in_parts;           // a run of tiles of an image that is too large for a group
+  bool resumed, finished;  // an earlier group has begun the image; this one completes it
+  bool rows_are_good;      // cu_rows runs from 0 to N without descending
 
-  // Of the tiles of a record those of this group: how many, and which place tile (x, y) has among them.
-  __device__ int count(const Spots& spots) const {
-    return (finished ? spots.count() : spots.before(x_end, y_end)) - (resumed ? spots.before(x_begin, y_begin) : 0);
+  __device__ bool has(int64_t tile) const { return tile >= tile_begin && tile < tile_end; }
+  // Slots of a pair in this group. Of whole images one for each of the quarters, else four for each tile.
+  __device__ int n_slots(const Squares& tiles, const Squares& quarters) const {
+    if (!in_parts) return quarters.count();
+    return kQuarters * ((finished ? tiles.count() : tiles.before(x_end, y_end)) -
+                        (resumed ? tiles.before(x_begin, y_begin) : 0));
   }
-  __device__ int place(const Spots& spots, int x, int y) const {
-    return spots.before(x, y) - (resumed ? spots.before(x_begin, y_begin) : 0);
+  // Which of them belongs to a quarter of tile (x, y).
+  __device__ int slot(const Squares& tiles, const Squares& quarters, int x, int y, int quarter) const {
+    if (!in_parts) return quarters.before(2 * x + quarter % 2, 2 * y + quarter / 2);
+    return kQuarters * (tiles.before(x, y) - (resumed ? tiles.before(x_begin, y_begin) : 0)) + quarter;
   }
 };
 
@@ -113,19 +131,22 @@ struct Group {
 template <typename T>
 struct Job {
   RasterScene<T> scene;
-  int64_t spots_x, n_spots;        // tiles in a row of tiles, in an image
-  int64_t max_pairs, max_entries;  // what the arrays below hold; both at least n_rows and below 2^31
-  View<T>* views;                  // [n_images]
-  Cloud* clouds;                   // [n_clouds]
+  int64_t tiles_x, n_tiles;  // in a row of tiles, in an image
+  cuda::RasterLimits limits;  // what the arrays below hold
+  View<T>* views;            // [n_images]
+  Cloud* clouds;             // [n_clouds]
   Group* group;
-  int32_t* pair_begin;      // [n_images] index of the first row's record
-  Record<T>* records;       // [max_pairs]
-  uint32_t* slot_begin;     // [max_pairs] first of the pair's slots of the backward pass
-  uint32_t* slot_cursor;    // [n_images] slots handed out
-  uint32_t* spot_begin;     // [n_images * n_spots + 1] into entries
-  uint32_t* cursor;         // [n_images * n_spots] counts, then write positions
-  Entry<T>* entries;        // [max_entries]
-  Entry<T>* spare;          // [max_entries]
+  int32_t* pair_begin;     // [n_images] index of the first row's record
+  PixelRect* bounds;       // [pairs]
+  Record<T>* records;      // [pairs]; unset where the bounds are empty
+  uint32_t* slot_begin;    // [pairs] first of the pair's slots
+  uint32_t* tile_begin;    // [n_images * n_tiles + 1] into entries
+  uint32_t* words;         // [entries] in order of depth
+  uint32_t* cursor;        // [n_images * n_tiles] counts, then write positions
+  uint64_t* slot_count;    // [n_images] slots of all pairs, then those of the images before
+  uint32_t* slot_cursor;   // [n_images] handed out
+  Entry<T>* entries;       // [entries]
+  Entry<T>* spare;         // [entries]
 };
 
 // ---- plan: cameras and the images of each cloud; one block --------------------------------------------------------
@@ -199,8 +220,8 @@ __device__ void plan(const Job<T>& job) {
 
 template <typename T>
 __device__ void choose_images(const Job<T>& job) {
-  const int64_t begin = job.group->spot_end, first = begin / job.n_spots;
-  const bool resumed = begin % job.n_spots != 0;
+  const int64_t begin = job.group->tile_end, first = begin / job.n_tiles;
+  const bool resumed = begin % job.n_tiles != 0;
   uint64_t pairs = 0;
   int64_t last = first;
   for (int64_t base = first; base < job.scene.n_images; base += blockDim.x) {
@@ -209,7 +230,7 @@ __device__ void choose_images(const Job<T>& job) {
     const uint64_t n = inside ? job.views[i].row_end - job.views[i].row_begin : 0;
     uint64_t total;
     const uint64_t end = pairs + block_sum(n, total);
-    const bool fits = inside && end <= static_cast<uint64_t>(job.max_pairs);
+    const bool fits = inside && end <= static_cast<uint64_t>(job.limits.pairs);
     if (fits) job.pair_begin[i] = static_cast<int32_t>(end - n);
     const int n_fit = __syncthreads_count(fits);
     last = base + n_fit;
@@ -220,9 +241,9 @@ __device__ void choose_images(const Job<T>& job) {
   if (threadIdx.x != 0) return;
   Group& group = *job.group;
   group.first = first, group.last = resumed ? first + 1 : last;
-  group.spot_begin = begin;
-  group.x_begin = static_cast<int>(begin % job.n_spots % job.spots_x);
-  group.y_begin = static_cast<int>(begin % job.n_spots / job.spots_x);
+  group.tile_begin = begin;
+  group.x_begin = static_cast<int>(begin % job.n_tiles % job.tiles_x);
+  group.y_begin = static_cast<int>(begin % job.n_tiles / job.tiles_x);
   group.resumed = resumed;
 }
 
@@ -280,19 +301,20 @@ struct Gaussian {
   }
 };
 
-// The CPU refuses rows that are not good; here they are left out.
+// Empty bounds where the Gaussian is not seen; the record is then unset. The CPU refuses rows that are not good; here
+// they are left out.
 template <typename T, int kTerms>
-__device__ Record<T> record_of(const RasterScene<T>& s, const Camera<T>& camera, const Gaussian<T>& gaussian,
-                               const T* coefficients) {
-  Record<T> record{};
+__device__ PixelRect make_record(const RasterScene<T>& s, const Camera<T>& camera, const Gaussian<T>& gaussian,
+                                 const T* coefficients, Record<T>& record) {
   const Projection<T> p = project(camera, gaussian.mean, gaussian.quat, gaussian.scale);
-  if (!(p.z > camera.near_plane) || !isfinite(p.determinant)) return record;
-  const Footprint<T> shape = footprint_of(p.xy, p.yy, p.determinant);
-  record.x = p.x, record.y = p.y, record.z = p.z;
-  record.slope = shape.slope, record.tight = shape.tight * T(kLog2eHalf), record.loose = shape.loose * T(kLog2eHalf);
-  record.opacity = gaussian.opacity;
+  if (!(p.z > camera.near_plane) || !isfinite(p.determinant)) return {};
   const PixelRect bounds = pixel_bounds(p.x, p.y, p.xx, p.yy, p.determinant, level_of(gaussian.opacity), s.width,
                                         s.height, s.cutoff == RasterCutoff::kTile3Sigma);
+  if (bounds.x0 >= bounds.x1) return {};
+  const Footprint<T> shape = footprint_of(p.xy, p.yy, p.determinant);
+  record.x = p.x, record.y = p.y, record.z = p.z, record.slope = shape.slope;
+  record.tight = sqrt(shape.tight * T(kLog2eHalf)), record.loose = sqrt(shape.loose * T(kLog2eHalf));
+  record.strength = log2(gaussian.opacity);
   record.x0 = bounds.x0, record.x1 = bounds.x1, record.y0 = bounds.y0, record.y1 = bounds.y1;
   if constexpr (kTerms > 0) {
     T basis[kTerms], color[3];
@@ -302,7 +324,36 @@ __device__ Record<T> record_of(const RasterScene<T>& s, const Camera<T>& camera,
   } else {
     record.red = coefficients[0], record.green = coefficients[1], record.blue = coefficients[2];
   }
-  return record;
+  return bounds;
+}
+
+// Inclusive sum over the lanes of a warp.
+template <typename V>
+__device__ V warp_sum(V value) {
+  for (int step = 1; step < kWarp; step *= 2) {
+    const V other = __shfl_up_sync(kFullWarp, value, step);
+    if (static_cast<int>(threadIdx.x % kWarp) >= step) value += other;
+  }
+  return value;
+}
+
+// Shares the tiles of 32 records evenly among the lanes of their warp: calls f(lane that owns the record, x, y of a tile)
+// for all of them, 32 at a time; idle lanes have owner -1. All lanes take part.
+template <typename F>
+__device__ void for_tiles(const Squares& mine, const F& f) {
+  const int lane = threadIdx.x % kWarp, n = mine.count(), end = warp_sum(n);
+  const int total = __shfl_sync(kFullWarp, end, kWarp - 1);
+  for (int base = 0; base < total; base += kWarp) {
+    const int i = base + lane;
+    int owner = 0;  // the first lane whose sum exceeds i
+    for (int step = kWarp / 2; step > 0; step /= 2)
+      if (__shfl_sync(kFullWarp, end, owner + step - 1) <= i) owner += step;
+    const int begin = __shfl_sync(kFullWarp, end - n, owner), width = __shfl_sync(kFullWarp, mine.x1 - mine.x0, owner);
+    const int x0 = __shfl_sync(kFullWarp, mine.x0, owner), y0 = __shfl_sync(kFullWarp, mine.y0, owner);
+    const bool used = i < total;
+    const int place = used ? i - begin : 0, row = used ? place / width : 0;
+    f(used ? owner : -1, x0 + place - row * width, y0 + row);
+  }
 }
 
 template <typename T, int kTerms>
@@ -310,13 +361,14 @@ __device__ void project_rows(const Job<T>& job) {
   const RasterScene<T>& s = job.scene;
   constexpr int kColumns = kTerms > 0 ? kTerms * 3 : 3;
   const int64_t last = job.group->last, n_chunks = count_chunks(job);
+  const int lane = threadIdx.x % kWarp;
   for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
     const Rows rows(job, chunk);
-    if (!rows.inside || rows.first_image >= last) continue;
-    const int64_t row = rows.row;
+    if (rows.first_image >= last) continue;
+    const int64_t row = rows.inside ? rows.row : s.n_rows - 1;
     const Gaussian<T> gaussian(s, row);
     T coefficients[kColumns];
-    bool good = gaussian.is_good();
+    bool good = rows.inside && gaussian.is_good();
     for (int i = 0; i < kColumns; ++i) {
       coefficients[i] = s.color[row * kColumns + i];
       good &= isfinite(coefficients[i]);
@@ -325,25 +377,52 @@ __device__ void project_rows(const Job<T>& job) {
     const bool may_show = good && gaussian.opacity >= T(kMinAlpha);
     for (int64_t image = rows.first_image; image < last; image = job.views[image].next) {
       const View<T>& view = job.views[image];
-      Record<T> record{};
-      if (may_show) record = record_of<T, kTerms>(s, view.camera, gaussian, coefficients);
-      job.records[job.pair_begin[image] + row - view.row_begin] = record;
-      const Spots spots = spots_of(record);
-      uint32_t* counts = job.cursor + image * job.n_spots;
-      for (int y = spots.y0; y < spots.y1; ++y)
-        for (int x = spots.x0; x < spots.x1; ++x) atomicAdd(counts + y * job.spots_x + x, 1u);
+      PixelRect bounds{};
+      if (may_show) {
+        Record<T> record;
+        bounds = make_record<T, kTerms>(s, view.camera, gaussian, coefficients, record);
+        if (bounds.x0 < bounds.x1) job.records[job.pair_begin[image] + row - view.row_begin] = record;
+      }
+      if (rows.inside) job.bounds[job.pair_begin[image] + row - view.row_begin] = bounds;
+      uint32_t* counts = job.cursor + image * job.n_tiles;
+      for_tiles(squares_of(bounds, kTile), [&](int owner, int x, int y) {
+        const uint32_t tile = owner < 0 ? ~0u : static_cast<uint32_t>(y * job.tiles_x + x);
+        const unsigned same = __match_any_sync(kFullWarp, tile);
+        if (owner >= 0 && __ffs(same) - 1 == lane) atomicAdd(counts + tile, static_cast<uint32_t>(__popc(same)));
+      });
+      const uint32_t slots = warp_sum<uint32_t>(squares_of(bounds, kQuarter).count());
+      if (lane == kWarp - 1 && slots)
+        atomicAdd(reinterpret_cast<unsigned long long*>(job.slot_count + image), static_cast<unsigned long long>(slots));
     }
   }
 }
 
 // ---- offsets: where each tile's list begins, and how many tiles fit; one block ------------------------------------
 
+// The images whose slots fit, as the end of their tiles.
+template <typename T>
+__device__ int64_t images_by_slots(const Job<T>& job, int64_t first, int64_t last) {
+  uint64_t slots = 0;
+  for (int64_t base = first; base < last; base += blockDim.x) {
+    const int64_t i = base + threadIdx.x;
+    uint64_t total;
+    const uint64_t n = i < last ? job.slot_count[i] : 0, end = slots + block_sum(n, total);
+    if (i < last) job.slot_count[i] = end - n;
+    const int n_fit = __syncthreads_count(i < last && end <= static_cast<uint64_t>(job.limits.slots));
+    if (n_fit < static_cast<int>(blockDim.x)) return (base + n_fit) * job.n_tiles;
+    slots += total;
+  }
+  return last * job.n_tiles;
+}
+
 template <typename T>
 __device__ void find_offsets(const Job<T>& job) {
-  __shared__ unsigned long long images_fit, spots_fit;  // ends of the tiles that fit: of whole images, of any
+  __shared__ unsigned long long images_fit, tiles_fit;  // ends of the tiles that fit: of whole images, of any
   Group& group = *job.group;
-  const int64_t begin = group.spot_begin, end = group.last * job.n_spots;
-  if (threadIdx.x == 0) images_fit = spots_fit = begin;
+  const int64_t begin = group.tile_begin, end = group.last * job.n_tiles;
+  const int64_t by_slots = group.resumed ? begin : images_by_slots(job, group.first, group.last);
+  const uint64_t max_of_part = min(job.limits.entries, job.limits.slots / kQuarters);
+  if (threadIdx.x == 0) images_fit = tiles_fit = begin;
   uint64_t before = 0;
   constexpr int kItems = 8;
   for (int64_t base = begin; base < end; base += int64_t{blockDim.x} * kItems) {
@@ -355,136 +434,74 @@ __device__ void find_offsets(const Job<T>& job) {
       sum += counts[i];
     }
     uint64_t position = before + block_sum(sum, total) - sum;
-    int64_t spot = begin, image = begin;
+    int64_t tile = begin, image = begin;
     for (int i = 0; i < kItems; ++i) {
       if (mine + i >= end) break;
-      job.spot_begin[mine + i] = job.cursor[mine + i] = static_cast<uint32_t>(position);
+      job.tile_begin[mine + i] = job.cursor[mine + i] = static_cast<uint32_t>(position);
       position += counts[i];
-      if (position > static_cast<uint64_t>(job.max_entries)) continue;
-      spot = mine + i + 1;
-      if (spot % job.n_spots == 0) image = spot;
+      if (position <= max_of_part) tile = mine + i + 1;
+      if (position <= static_cast<uint64_t>(job.limits.entries) && (mine + i + 1) % job.n_tiles == 0)
+        image = mine + i + 1;
     }
-    atomicMax(&spots_fit, static_cast<unsigned long long>(spot));
+    atomicMax(&tiles_fit, static_cast<unsigned long long>(tile));
     atomicMax(&images_fit, static_cast<unsigned long long>(image));
     before += total;
-    if (mine < end && mine + kItems >= end) job.spot_begin[end] = static_cast<uint32_t>(position);
+    if (mine < end && mine + kItems >= end) job.tile_begin[end] = static_cast<uint32_t>(position);
   }
   __syncthreads();
   if (threadIdx.x != 0) return;
-  group.spot_end = static_cast<int64_t>(images_fit > static_cast<unsigned long long>(begin) ? images_fit : spots_fit);
-  group.last = (group.spot_end + job.n_spots - 1) / job.n_spots;
-  group.finished = group.spot_end % job.n_spots == 0;
-  group.x_end = static_cast<int>(group.spot_end % job.n_spots % job.spots_x);
-  group.y_end = static_cast<int>(group.spot_end % job.n_spots / job.spots_x);
+  const int64_t whole = min(static_cast<int64_t>(images_fit), by_slots);
+  group.tile_end = whole > begin ? whole : min(static_cast<int64_t>(tiles_fit), (group.first + 1) * job.n_tiles);
+  group.last = (group.tile_end + job.n_tiles - 1) / job.n_tiles;
+  group.finished = group.tile_end % job.n_tiles == 0;
+  group.in_parts = whole <= begin;
+  group.x_end = static_cast<int>(group.tile_end % job.n_tiles % job.tiles_x);
+  group.y_end = static_cast<int>(group.tile_end % job.n_tiles / job.tiles_x);
 }
 
 // ---- scatter: every record writes its entries; their order is whatever it is --------------------------------------
-
-// Inclusive sum over the lanes of a warp.
-__device__ inline int warp_sum(int value) {
-  for (int step = 1; step < kWarp; step *= 2) {
-    const int other = __shfl_up_sync(kFullWarp, value, step);
-    if (static_cast<int>(threadIdx.x % kWarp) >= step) value += other;
-  }
-  return value;
-}
 
 template <typename T>
 __device__ void scatter_rows(const Job<T>& job) {
   const Group group = *job.group;
   const int64_t n_chunks = count_chunks(job);
+  const int lane = threadIdx.x % kWarp;
   for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
     const Rows rows(job, chunk);
     for (int64_t image = rows.first_image; image < group.last; image = job.views[image].next) {
       const int64_t pair = job.pair_begin[image] + rows.row - job.views[image].row_begin;
-      Record<T> record{};
-      if (rows.inside) record = job.records[pair];
-      const Spots spots = spots_of(record);
-      // An image has as many slots as entries.
-      const int n = group.count(spots), end = warp_sum(n);
+      PixelRect bounds{};
+      if (rows.inside) bounds = job.bounds[pair];
+      const Squares tiles = squares_of(bounds, kTile), quarters = squares_of(bounds, kQuarter);
+      const T z = bounds.x0 < bounds.x1 ? job.records[pair].z : T(0);
+      const int n = group.n_slots(tiles, quarters), end = warp_sum(n);
+      if (__all_sync(kFullWarp, tiles.count() == 0)) continue;
       uint32_t slot = 0;
-      if (threadIdx.x % kWarp == kWarp - 1 && end > 0)
-        slot = job.spot_begin[max(group.spot_begin, image * job.n_spots)] +
-               atomicAdd(job.slot_cursor + image, static_cast<uint32_t>(end));
-      slot = __shfl_sync(kFullWarp, slot, kWarp - 1);
-      if (n == 0) continue;
-      job.slot_begin[pair] = slot + end - n;
-      const Entry<T> entry = Entry<T>::make(record.z, static_cast<uint32_t>(pair));
-      for (int y = spots.y0; y < spots.y1; ++y)
-        for (int x = spots.x0; x < spots.x1; ++x) {
-          const int64_t spot = image * job.n_spots + y * job.spots_x + x;
-          if (spot >= group.spot_begin && spot < group.spot_end)
-            job.entries[atomicAdd(job.cursor + spot, 1u)] = entry;
-        }
-    }
-  }
-}
-
-// ---- sort: entries of every tile; one block a tile at a time ------------------------------------------------------
-
-// Bitonic, in shared memory. n <= kSortRun.
-template <typename T>
-__device__ void sort_run(Entry<T>* list, int n, Entry<T>* shared) {
-  int size = 1;
-  while (size < n) size *= 2;
-  for (int i = threadIdx.x; i < size; i += blockDim.x) shared[i] = i < n ? list[i] : Entry<T>::last();
-  __syncthreads();
-  for (int run = 2; run <= size; run *= 2)
-    for (int step = run / 2; step > 0; step /= 2) {
-      for (int i = threadIdx.x; i < size / 2; i += blockDim.x) {
-        const int low = 2 * (i & ~(step - 1)) | (i & (step - 1)), high = low | step;
-        const Entry<T> a = shared[low], b = shared[high];
-        if ((b < a) == ((low & run) == 0)) shared[low] = b, shared[high] = a;
+      if (lane == kWarp - 1) {
+        // Slots of an image begin behind those of the images before it in the group.
+        slot = group.in_parts ? 0 : static_cast<uint32_t>(job.slot_count[image]);
+        slot += atomicAdd(job.slot_cursor + image, static_cast<uint32_t>(end));
       }
-      __syncthreads();
+      slot = __shfl_sync(kFullWarp, slot, kWarp - 1);
+      if (n > 0) job.slot_begin[pair] = slot + end - n;
+      for_tiles(tiles, [&](int owner, int x, int y) {
+        const int64_t tile = image * job.n_tiles + y * job.tiles_x + x;
+        const bool used = owner >= 0 && group.has(tile);
+        const int from = max(owner, 0);
+        const uint32_t word = word_of(__shfl_sync(kFullWarp, static_cast<uint32_t>(pair), from), 0) |
+                              quarters_of_tile({__shfl_sync(kFullWarp, quarters.x0, from),
+                                                __shfl_sync(kFullWarp, quarters.x1, from),
+                                                __shfl_sync(kFullWarp, quarters.y0, from),
+                                                __shfl_sync(kFullWarp, quarters.y1, from)}, x, y);
+        const T depth = __shfl_sync(kFullWarp, z, from);
+        const unsigned same = __match_any_sync(kFullWarp, used ? static_cast<uint32_t>(y * job.tiles_x + x) : ~0u);
+        const int leader = __ffs(same) - 1;
+        uint32_t position = 0;
+        if (used && leader == lane) position = atomicAdd(job.cursor + tile, static_cast<uint32_t>(__popc(same)));
+        position = __shfl_sync(kFullWarp, position, leader) + __popc(same & ((1u << lane) - 1));
+        if (used) job.entries[position] = Entry<T>::make(depth, word);
+      });
     }
-  for (int i = threadIdx.x; i < n; i += blockDim.x) list[i] = shared[i];
-  __syncthreads();
-}
-
-// Merges pairs of sorted runs of `run` entries; each thread finds where its outputs begin in both.
-template <typename T>
-__device__ void merge_runs(const Entry<T>* from, Entry<T>* to, int64_t n, int64_t run) {
-  constexpr int kItems = 16;  // divides 2 * run, so that a thread's outputs are of one pair of runs
-  for (int64_t begin = int64_t{threadIdx.x} * kItems; begin < n; begin += int64_t{blockDim.x} * kItems) {
-    const int64_t base = begin / (2 * run) * (2 * run);
-    const Entry<T>* a = from + base;
-    const int64_t n_a = min(run, n - base);
-    const Entry<T>* b = a + n_a;
-    const int64_t n_b = min(run, n - base - n_a);
-    const int64_t skip = begin - base;
-    int64_t low = max(int64_t{0}, skip - n_b), high = min(skip, n_a);
-    while (low < high) {
-      const int64_t middle = (low + high) / 2;
-      if (a[middle] < b[skip - 1 - middle])
-        low = middle + 1;
-      else
-        high = middle;
-    }
-    int64_t i = low, j = skip - low;
-    for (int k = 0; k < kItems && i + j < n_a + n_b; ++k)
-      to[base + skip + k] = j >= n_b || (i < n_a && a[i] < b[j]) ? a[i++] : b[j++];
-  }
-  __syncthreads();
-}
-
-template <typename T>
-__device__ void sort_lists(const Job<T>& job, Entry<T>* shared) {
-  const int64_t end = job.group->spot_end;
-  for (int64_t task = job.group->spot_begin + blockIdx.x; task < end; task += gridDim.x) {
-    const int64_t begin = job.spot_begin[task], n = job.spot_begin[task + 1] - begin;
-    Entry<T>* list = job.entries + begin;
-    Entry<T>* other = job.spare + begin;
-    for (int64_t i = 0; i < n; i += kSortRun)
-      sort_run<T>(list + i, static_cast<int>(min(n - i, int64_t{kSortRun})), shared);
-    for (int64_t run = kSortRun; run < n; run *= 2) {
-      merge_runs<T>(list, other, n, run);
-      Entry<T>* swapped = list;
-      list = other, other = swapped;
-    }
-    if (list != job.entries + begin)
-      for (int64_t i = threadIdx.x; i < n; i += blockDim.x) other[i] = list[i];
-    __syncthreads();
   }
 }
 

@@ -91,7 +91,7 @@ Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tenso
                            const Tensor& color, const Tensor& features, const Tensor& background,
                            const Tensor& viewmats, const Tensor& Ks, const Tensor& image_cloud, const Tensor& cu_rows,
                            int64_t width, int64_t height, double near_plane, int64_t cutoff, int64_t max_pairs,
-                           int64_t max_entries) {
+                           int64_t max_entries, int64_t max_slots) {
   const SceneTensors given{"rasterize_gaussians", means, quats, scales, opacities, color, features, background,
                            viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff};
   given.check_all();
@@ -112,9 +112,9 @@ Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tenso
     if constexpr (kWithCuda)
       if (in.means.is_cuda()) {
         const RasterScene<T> scene = in.scene<T>();
-        state = empty(in.means, {cuda::raster_state_bytes(scene, max_pairs, max_entries)}, ScalarType::Byte);
-        return cuda::raster_forward<T>(scene, images, {state.data_ptr(), max_pairs, max_entries}, workspace,
-                                       current_stream(in.means));
+        const cuda::RasterLimits limits{max_pairs, max_entries, max_slots};
+        state = empty(in.means, {cuda::raster_state_bytes(scene, limits)}, ScalarType::Byte);
+        return cuda::raster_forward<T>(scene, images, limits, state.data_ptr(), workspace, current_stream(in.means));
       }
     cpu::raster_forward<T>(in.scene<T>(), images, workspace, torch_parallel());
   });
@@ -131,7 +131,7 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
                                         const Tensor& background, const Tensor& viewmats, const Tensor& Ks,
                                         const Tensor& image_cloud, const Tensor& cu_rows, int64_t width, int64_t height,
                                         double near_plane, int64_t cutoff, int64_t max_pairs, int64_t max_entries,
-                                        bool viewmats_grad) {
+                                        int64_t max_slots, bool viewmats_grad) {
   const char* op = "rasterize_gaussians_backward";
   const SceneTensors given{op, means, quats, scales, opacities, color, features, background,
                            viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff};
@@ -170,8 +170,9 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
     if constexpr (kWithCuda)
       if (in.means.is_cuda()) {
         const RasterScene<T> scene = in.scene<T>();
-        check_shape(op, "state", state, {cuda::raster_state_bytes(scene, max_pairs, max_entries)}, "[bytes]");
-        return cuda::raster_backward<T>(scene, image_grads, grads, {state.data_ptr(), max_pairs, max_entries}, workspace,
+        const cuda::RasterLimits limits{max_pairs, max_entries, max_slots};
+        check_shape(op, "state", state, {cuda::raster_state_bytes(scene, limits)}, "[bytes]");
+        return cuda::raster_backward<T>(scene, image_grads, grads, limits, state.data_ptr(), workspace,
                                         current_stream(in.means));
       }
     cpu::raster_backward<T>(in.scene<T>(), image_grads, grads, workspace, torch_parallel());
