@@ -152,10 +152,10 @@ def _sizes_of_state(means, n_images, n_clouds, width, height):
         return 0, 0, 0
     n, tiles = means.shape[0], _tiles(n_images, width, height)
     views = (n_images + n_clouds - 1) // max(1, n_clouds)
-    pairs = torch.sym_max(n, torch.sym_min(n * views, 2**25))
-    entries = torch.sym_min(pairs + pairs // 4 + 1024 * tiles, 2**30)
-    slots = torch.sym_min(pairs + pairs // 2 + 2048 * tiles, 2**30)
-    return pairs, torch.sym_max(n, entries), torch.sym_max(4 * n, slots)
+    pairs = max(n, min(n * views, 2**25))
+    entries = min(pairs + pairs // 4 + 1024 * tiles, 2**30)
+    slots = min(pairs + pairs // 2 + 2048 * tiles, 2**30)
+    return pairs, max(n, entries), max(4 * n, slots)
 
 
 def _state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_entries):
