@@ -64,9 +64,10 @@ Slots<T> take_slots(const Job<T>& first, const Job<T>& further, bool viewmats, A
   const RasterScene<T>& s = first.scene;
   const int64_t n = std::max(first.limits.slots, further.limits.slots);
   Slots<T> slots{};
-  slots.values = scratch.take<T>(n * (kSlotFixed + s.n_features));
+  slots.sums = scratch.take<SlotSums<T>>(n);
+  slots.features = scratch.take<T>(n * s.n_features);
   slots.live = scratch.take<unsigned char>(n);
-  slots.unfinished = scratch.take<T>(s.n_rows * kSlotFixed);
+  slots.unfinished = scratch.take<SlotSums<T>>(s.n_rows);
   slots.backgrounds = scratch.take<T>(s.n_images * first.n_tiles * kQuarters * 3);
   if (viewmats) slots.viewmats = scratch.take<T>(s.n_images * kViewmatParts * 12);
   return slots;

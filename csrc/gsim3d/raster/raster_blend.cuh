@@ -15,8 +15,7 @@ constexpr int kWarps = kBlock / kWarp;
 static_assert(kWarps == kQuarters);  // a block blends a tile
 constexpr int kHalves = 2;           // pixels of a lane: of rows 0 to 3 of the quarter, and of rows 4 to 7
 constexpr int kHalfRows = kQuarter / kHalves;
-constexpr int kFeatures = 8;    // channels blended in one pass over a list
-constexpr int kSlotFixed = 10;  // gradients of an entry: Moments (5), sum v, colour (3), depth; features
+constexpr int kFeatures = 8;  // channels blended in one pass over a list
 
 // Bit b of the result of lane l is bit l of the value of lane b.
 __device__ inline uint32_t transpose_bits(uint32_t value, int lane) {

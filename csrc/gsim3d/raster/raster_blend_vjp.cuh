@@ -6,12 +6,20 @@
 
 namespace gsim3d::raster {
 
+// Gradients of an entry: Moments (5), sum v, colour (3), depth.
+constexpr int kSlotValues = 10;
+template <typename T>
+struct alignas(2 * sizeof(T)) SlotSums {
+  T value[kSlotValues];
+};
+
 // What the gradients of a group are made of.
 template <typename T>
 struct Slots {
-  T* values;            // [slots, kSlotFixed + n_features], unset where not live
+  SlotSums<T>* sums;    // [slots], unset where not live
+  T* features;          // [slots, n_features], likewise
   unsigned char* live;  // [slots] 1 where a pixel has seen the entry
-  T* unfinished;        // [n_rows, kSlotFixed] sums of an image's tiles in earlier groups
+  SlotSums<T>* unfinished;  // [n_rows] sums of an image's tiles in earlier groups
   T* backgrounds;       // [n_images * n_tiles * kQuarters, 3]
   T* viewmats;          // [n_images, kViewmatParts, 12], or null when nobody asks for them
 };
@@ -75,7 +83,7 @@ __device__ void sum_features(const RasterScene<T>& s, const RasterImageGrads<T>&
       for (int c = 0; c < kFeatures; ++c) sums[c] += shared.weight[lane][p] * shared.grad_features[c][p];
     }
     for (int c = 0; c < n_channels; ++c) {
-      T& to = slot[kSlotFixed + channel + c];
+      T& to = slot[channel + c];
       to = add ? to + sums[c] : sums[c];
     }
   }
@@ -152,11 +160,10 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
       slot = int64_t{slot_begin} + job.group->slot(squares_of(bounds, kTile), squares_of(bounds, kQuarter),
                                                    quarter.x0 / kTile, quarter.y0 / kTile, quarter.index);
     }
-    T* const values = slots.values + slot * (kSlotFixed + s.n_features);
     drop_batch(lane, shared.queue, held);
     fetch();
 
-    T sums[kSlotFixed] = {};
+    SlotSums<T> sums{};
     uint32_t live = 0;
 #pragma unroll
     for (int half = 0; half < kHalves; ++half) {
@@ -197,20 +204,21 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
         const int p = __ffs(rest) - 1;
         const T dy = from_y + T(p / kQuarter + half * kHalfRows), u = from_x + T(p % kQuarter) - slope * dy;
         const T v = shared.v[lane][p], weight = shared.weight[lane][p], vu = v * u, vy = v * dy;
-        sums[0] += vu;
-        sums[1] += vy;
-        sums[2] += vu * u;
-        sums[3] += vu * dy;
-        sums[4] += vy * dy;
-        sums[5] += v;
-        for (int c = 0; c < 4; ++c) sums[6 + c] += weight * shared.grad[c][half * kWarp + p];
+        sums.value[0] += vu;
+        sums.value[1] += vy;
+        sums.value[2] += vu * u;
+        sums.value[3] += vu * dy;
+        sums.value[4] += vy * dy;
+        sums.value[5] += v;
+        for (int c = 0; c < 4; ++c) sums.value[6 + c] += weight * shared.grad[c][half * kWarp + p];
       }
       if constexpr (kWithFeatures)
-        sum_features(s, grads, pixel, seen, lane, half > 0, shared, used ? values : nullptr);
+        sum_features(s, grads, pixel, seen, lane, half > 0, shared,
+                     used ? slots.features + slot * s.n_features : nullptr);
       __syncwarp();
     }
     if (live) {
-      for (int c = 0; c < kSlotFixed; ++c) values[c] = sums[c];
+      slots.sums[slot] = sums;
       slots.live[slot] = 1;
     }
   }

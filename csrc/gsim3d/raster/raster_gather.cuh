@@ -8,29 +8,31 @@ namespace gsim3d::raster {
 
 constexpr int kViewmatParts = 16;  // blocks that share the rows of an image
 
-// Sums of a pair's slots in the order of tiles, over all groups that had some of them; false when it has none.
+// Sums of a pair's slots in their order, over all groups that had some of them; false when it has none.
 template <typename T>
-__device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t image, int64_t row, int64_t pair,
-                          const Slots<T>& slots, T (&sums)[kSlotFixed], T* features) {
-  const PixelRect bounds = job.bounds[pair];
+__device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t row, const PixelRect& bounds,
+                          int64_t slot_begin, const Slots<T>& slots, SlotSums<T>& sums, T* features) {
   if (bounds.x0 >= bounds.x1) return false;
-  const Squares tiles = squares_of(bounds, kTile), quarters = squares_of(bounds, kQuarter);
-  const int64_t width = kSlotFixed + job.scene.n_features, begin = job.slot_begin[pair];
+  const int n = group.n_slots(squares_of(bounds, kTile), squares_of(bounds, kQuarter));
+  const int64_t n_features = features ? job.scene.n_features : 0;
   bool any = group.resumed;
-  for (int c = 0; c < kSlotFixed; ++c) sums[c] = group.resumed ? slots.unfinished[row * kSlotFixed + c] : T(0);
-  for (int y = tiles.y0; y < tiles.y1; ++y)
-    for (int x = tiles.x0; x < tiles.x1; ++x) {
-      if (group.in_parts && !group.has(image * job.n_tiles + y * job.tiles_x + x)) continue;
-      for (uint32_t rest = quarters_of_tile(quarters, x, y); rest; rest &= rest - 1) {
-        const int64_t slot = begin + group.slot(tiles, quarters, x, y, __ffs(rest) - 1);
-        if (!slots.live[slot]) continue;
-        any = true;
-        const T* values = slots.values + slot * width;
-        for (int c = 0; c < kSlotFixed; ++c) sums[c] += values[c];
-        if (features)
-          for (int64_t c = 0; c < job.scene.n_features; ++c) features[c] += values[kSlotFixed + c];
-      }
+  sums = group.resumed ? slots.unfinished[row] : SlotSums<T>{};
+  constexpr int kAtOnce = 4;
+  for (int i = 0; i < n; i += kAtOnce) {
+    bool live[kAtOnce];
+    SlotSums<T> some[kAtOnce];
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) live[k] = i + k < n && slots.live[slot_begin + i + k];
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) some[k] = live[k] ? slots.sums[slot_begin + i + k] : SlotSums<T>{};
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) {
+      any |= live[k];
+      for (int c = 0; c < kSlotValues; ++c) sums.value[c] += some[k].value[c];
+      for (int64_t c = 0; live[k] && c < n_features; ++c)
+        features[c] += slots.features[(slot_begin + i + k) * n_features + c];
     }
+  }
   return any || !group.finished;
 }
 
@@ -56,7 +58,8 @@ struct RowGrad {
 // Adds the gradients of a row in one image; `viewmat` is added to.
 template <typename T, int kTerms, int kColumns>
 __device__ void project_vjp_of(const Camera<T>& camera, const Gaussian<T>& gaussian, const T* coefficients,
-                               const T (&sums)[kSlotFixed], RowGrad<T, kColumns>& row, T (&viewmat)[12]) {
+                               const SlotSums<T>& slot, RowGrad<T, kColumns>& row, T (&viewmat)[12]) {
+  const T* sums = slot.value;
   const Projection<T> p = project(camera, gaussian.mean, gaussian.quat, gaussian.scale);
   ProjectionGrad<T> grad{};
   footprint_vjp(footprint_of(p.xy, p.yy, p.determinant), Moments<T>{sums[0], sums[1], sums[2], sums[3], sums[4]}, grad);
@@ -103,14 +106,29 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
     if (!rows.inside || (rows.first_image >= group.last && !is_first)) continue;
     const Gaussian<T> gaussian(s, row);
     if (!is_first) grad.load(grads, row);
-    for (int64_t image = rows.first_image; image < group.last; image = job.views[image].next) {
-      T sums[kSlotFixed], viewmat[12] = {};
-      const int64_t pair = job.pair_begin[image] + row - job.views[image].row_begin;
-      if (!sum_slots(job, group, image, row, pair, slots, sums, grads.features + row * s.n_features)) continue;
+    // What tells where an image's slots are is fetched while the image before is in work.
+    int64_t next = rows.first_image;
+    PixelRect next_bounds{};
+    uint32_t next_slot = 0;
+    const auto fetch = [&] {
+      if (next >= group.last) return;
+      const int64_t pair = job.pair_begin[next] + row - job.views[next].row_begin;
+      next_bounds = job.bounds[pair], next_slot = job.slot_begin[pair];
+    };
+    fetch();
+    while (next < group.last) {
+      const View<T>& view = job.views[next];
+      const PixelRect bounds = next_bounds;
+      const uint32_t slot_begin = next_slot;
+      next = view.next;
+      fetch();
+      SlotSums<T> sums;
+      T viewmat[12] = {};
+      if (!sum_slots(job, group, row, bounds, slot_begin, slots, sums, grads.features + row * s.n_features)) continue;
       if (group.finished)
-        project_vjp_of<T, kTerms>(job.views[image].camera, gaussian, s.color + row * kColumns, sums, grad, viewmat);
+        project_vjp_of<T, kTerms>(view.camera, gaussian, s.color + row * kColumns, sums, grad, viewmat);
       else
-        for (int c = 0; c < kSlotFixed; ++c) slots.unfinished[row * kSlotFixed + c] = sums[c];
+        slots.unfinished[row] = sums;
     }
     grad.store(grads, row);
   }
@@ -146,8 +164,9 @@ __device__ void gather_viewmats(const Job<T>& job, const Slots<T>& slots) {
     T viewmat[12] = {};
     for (int64_t row = view.row_begin + (task % kViewmatParts) * kBlock + threadIdx.x; row < view.row_end;
          row += kViewmatParts * kBlock) {
-      T sums[kSlotFixed];
-      if (!sum_slots<T>(job, group, image, row, first_pair + row - view.row_begin, slots, sums, nullptr)) continue;
+      const int64_t pair = first_pair + row - view.row_begin;
+      SlotSums<T> sums;
+      if (!sum_slots<T>(job, group, row, job.bounds[pair], job.slot_begin[pair], slots, sums, nullptr)) continue;
       RowGrad<T, kColumns> unused{};
       project_vjp_of<T, kTerms>(view.camera, Gaussian<T>(s, row), s.color + row * kColumns, sums, unused, viewmat);
     }

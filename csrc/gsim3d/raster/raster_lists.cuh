@@ -113,7 +113,7 @@ struct Group {
   bool rows_are_good;      // cu_rows runs from 0 to N without descending
 
   __device__ bool has(int64_t tile) const { return tile >= tile_begin && tile < tile_end; }
-  // Slots of a pair in this group. Of whole images one for each of the quarters, else four for each tile.
+  // Slots of a pair in this group, tile by tile. Of whole images one for each of the quarters, else four for each tile.
   __device__ int n_slots(const Squares& tiles, const Squares& quarters) const {
     if (!in_parts) return quarters.count();
     return kQuarters * ((finished ? tiles.count() : tiles.before(x_end, y_end)) -
@@ -121,8 +121,11 @@ struct Group {
   }
   // Which of them belongs to a quarter of tile (x, y).
   __device__ int slot(const Squares& tiles, const Squares& quarters, int x, int y, int quarter) const {
-    if (!in_parts) return quarters.before(2 * x + quarter % 2, 2 * y + quarter / 2);
-    return kQuarters * (tiles.before(x, y) - (resumed ? tiles.before(x_begin, y_begin) : 0)) + quarter;
+    if (in_parts) return kQuarters * (tiles.before(x, y) - (resumed ? tiles.before(x_begin, y_begin) : 0)) + quarter;
+    const int left = max(2 * x, quarters.x0), right = min(2 * x + 2, quarters.x1);
+    const int top = max(2 * y, quarters.y0), bottom = min(2 * y + 2, quarters.y1);
+    const int before = (top - quarters.y0) * (quarters.x1 - quarters.x0) + (bottom - top) * (left - quarters.x0);
+    return before + (2 * y + quarter / 2 - top) * (right - left) + 2 * x + quarter % 2 - left;
   }
 };
 
