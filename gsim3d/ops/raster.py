@@ -158,14 +158,14 @@ def _sizes_of_state(means, n_images, n_clouds, width, height):
     return pairs, max(n, entries), max(4 * n, slots)
 
 
-def _state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_entries):
+def _state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_slots):
     """raster_state_bytes of csrc/gsim3d/raster/raster.h."""
     if means.device.type != "cuda":
         return 0
     real = means.element_size()
     view = 112 if real == 4 else 200
     tiles = _tiles(n_images, width, height)
-    lists = (8 * max_pairs, 12 * real * max_pairs, 4 * max_pairs, 4 * (tiles + 1), 4 * max_entries)
+    lists = (8 * max_pairs, 12 * real * max_pairs, 4 * max_pairs, 32 * tiles, 4 * max_slots)
     return sum((n + 63) // 64 * 64 for n in (64, view * n_images, 16 * n_clouds, 4 * n_images, *lists))
 
 
@@ -174,7 +174,7 @@ def _(means, quats, scales, opacities, color, features, background, viewmats, *r
     _, _, cu_rows, width, height, _, _, *sizes = rest  # Ks, image_cloud, near_plane and cutoff do not count here
     n_images = viewmats.shape[0]
     shape = (n_images, height, width)
-    state = _state_bytes(means, n_images, cu_rows.shape[0] - 1, width, height, *sizes[:2])
+    state = _state_bytes(means, n_images, cu_rows.shape[0] - 1, width, height, sizes[0], sizes[2])
     return (
         means.new_empty(*shape, 3),
         means.new_empty(shape),

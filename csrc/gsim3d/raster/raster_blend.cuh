@@ -1,6 +1,6 @@
 // Inside of the CUDA rasterizer: blending of one quarter of a tile, 8 x 8 pixels, by one warp.
 //
-// The warp collects the tile's entries that touch its quarter into batches of 32. Lane by entry, it finds which of the
+// The warp takes the quarter's list in batches of 32. Lane by entry, it finds which of the
 // 64 pixels each Gaussian may reach, as two words of bits; transposed, they tell each pixel its Gaussians. Lane by
 // pixel, it then visits those only. The backward pass transposes once more: lane by entry, each Gaussian sums over its
 // own pixels, so no value is ever added up across lanes.
@@ -30,20 +30,18 @@ __device__ inline uint32_t transpose_bits(uint32_t value, int lane) {
 
 // A warp's part of the images.
 struct Quarter {
-  int64_t image, tile, begin;
-  int n;  // entries of the tile
-  int index, x0, y0;
+  int64_t image, index;  // index: of the quarter in all images
+  int32_t n;             // length of its list
+  int x0, y0;
 
   template <typename T>
-  __device__ Quarter(const Job<T>& job, int64_t tile)
-      : image(tile / job.n_tiles),
-        tile(tile),
-        begin(job.tile_begin[tile]),
-        n(static_cast<int>(job.tile_begin[tile + 1] - begin)),
-        index(threadIdx.x / kWarp) {
+  __device__ Quarter(const Job<T>& job, int64_t tile) : image(tile / job.n_tiles) {
+    const int part = threadIdx.x / kWarp;
     const int64_t place = tile - image * job.n_tiles;
-    x0 = static_cast<int>(place % job.tiles_x) * kTile + index % 2 * kQuarter;
-    y0 = static_cast<int>(place / job.tiles_x) * kTile + index / 2 * kQuarter;
+    index = tile * kQuarters + part;
+    n = static_cast<int32_t>(job.lists[index].n);
+    x0 = static_cast<int>(place % job.tiles_x) * kTile + part % 2 * kQuarter;
+    y0 = static_cast<int>(place / job.tiles_x) * kTile + part / 2 * kQuarter;
   }
 };
 
@@ -52,41 +50,6 @@ template <typename T>
 __device__ int64_t pixel_of(const RasterScene<T>& s, const Quarter& quarter, int half, int lane) {
   const int column = quarter.x0 + lane % kQuarter, row = quarter.y0 + lane / kQuarter + half * kHalfRows;
   return column < s.width && row < s.height ? (quarter.image * s.height + row) * s.width + column : -1;
-}
-
-// Entries of the tile that touch the quarter, in the order they are asked for.
-struct Queue {
-  uint32_t pairs[2 * kWarp];
-  int32_t places[2 * kWarp];  // in the tile's list
-};
-
-// Fills the queue from `next` on, forwards (kStep = 1) or backwards, until it holds a batch or the list ends.
-template <int kStep>
-__device__ void collect(const uint32_t* words, int n, int quarter, int lane, Queue& queue, int& held, int& next) {
-  while (held < kWarp && next >= 0 && next < n) {
-    const int place = next + kStep * lane;
-    const uint32_t word = place >= 0 && place < n ? words[place] : 0;
-    const bool hit = word >> quarter & 1;
-    const unsigned hits = __ballot_sync(kFullWarp, hit);
-    if (hit) {
-      const int to = held + __popc(hits & ((1u << lane) - 1));
-      queue.pairs[to] = pair_of(word), queue.places[to] = place;
-    }
-    held += __popc(hits);
-    next += kStep * kWarp;
-  }
-  __syncwarp();
-}
-
-// Moves what is behind the batch to the front.
-__device__ inline void drop_batch(int lane, Queue& queue, int& held) {
-  __syncwarp();
-  const uint32_t pair = queue.pairs[kWarp + lane];
-  const int32_t place = queue.places[kWarp + lane];
-  __syncwarp();
-  queue.pairs[lane] = pair, queue.places[lane] = place;
-  held = max(held - kWarp, 0);
-  __syncwarp();
 }
 
 // Values of the batch, by entry. With x, y counted from the first pixel's centre, alpha = 2^(strength - u^2 - v^2),
@@ -148,7 +111,6 @@ __device__ inline const T* features_of(const Job<T>& job, int64_t image, uint32_
 template <typename T, bool kWithFeatures>
 struct BlendShared {
   Batch<T> batch;
-  Queue queue;
   T features[kWithFeatures ? kFeatures : 1][kWarp];
 };
 
@@ -156,7 +118,7 @@ template <typename T>
 struct Light {
   T rest;        // transmittance
   T sums[4];     // colour, depth
-  int32_t last;  // entries of the tile in front of the pixel's end
+  int32_t last;  // entries of the list in front of the pixel's end
   bool ended;
 };
 
@@ -167,7 +129,7 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
   const RasterScene<T>& s = job.scene;
   const int lane = threadIdx.x % kWarp;
   const Quarter quarter(job, tile);
-  const uint32_t* words = job.words + quarter.begin;
+  const uint32_t* pairs = job.listed + job.lists[quarter.index].begin;
   const int n_channels = kPass ? static_cast<int>(min(s.n_features - channel, int64_t{kFeatures})) : 0;
   Light<T> light[kHalves];
   T features[kHalves][kFeatures];
@@ -177,19 +139,18 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
     for (int c = 0; c < kFeatures; ++c) features[half][c] = 0;
   }
 
-  int held = 0, next = 0;
+  // The records of a batch are fetched while the batch before is blended.
   uint32_t pair = 0;
   Record<T> record{};
-  // The records of a batch are fetched while the batch before is blended.
-  const auto fetch = [&] {
-    collect<1>(words, quarter.n, quarter.index, lane, shared.queue, held, next);
-    if (lane < held) pair = shared.queue.pairs[lane], record = job.records[pair];
+  const auto fetch = [&](int32_t base) {
+    if (base + lane < quarter.n) pair = pairs[base + lane], record = job.records[pair];
   };
-  fetch();
-  while (held > 0) {
+  fetch(0);
+  for (int32_t base = 0; base < quarter.n; base += kWarp) {
     if (__all_sync(kFullWarp, light[0].ended && light[1].ended)) break;
     uint32_t bits[kHalves] = {};
-    if (lane < held) {
+    __syncwarp();
+    if (base + lane < quarter.n) {
       put(record, quarter, lane, shared.batch);
       cover(record, quarter, bits);
       if constexpr (kPass) {
@@ -197,10 +158,8 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
         for (int c = 0; c < kFeatures; ++c) shared.features[c][lane] = c < n_channels ? row[c] : T(0);
       }
     }
-    const int32_t place = shared.queue.places[lane];
-    drop_batch(lane, shared.queue, held);
-    fetch();
-    int32_t ended_at[kHalves] = {-1, -1};
+    __syncwarp();
+    fetch(base + kWarp);
 #pragma unroll
     for (int half = 0; half < kHalves; ++half) {
       const T x = T(lane % kQuarter), y = T(lane / kQuarter + half * kHalfRows);
@@ -217,7 +176,7 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
           alpha = alpha >= T(kMinAlpha) ? alpha : T(0);
         const T weight = alpha * at.rest, rest = at.rest - weight;
         if (rest < T(kMinTransmittance)) {
-          ended_at[half] = j;
+          at.ended = true, at.last = base + j;
           break;
         }
         at.rest = rest;
@@ -228,12 +187,6 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
         }
       }
     }
-#pragma unroll
-    for (int half = 0; half < kHalves; ++half) {
-      const int32_t last = __shfl_sync(kFullWarp, place, max(ended_at[half], 0));
-      if (ended_at[half] >= 0) light[half].ended = true, light[half].last = last;
-    }
-    __syncwarp();
   }
 
 #pragma unroll

@@ -27,8 +27,6 @@ struct Slots {
 template <typename T, bool kWithFeatures>
 struct BlendGradShared {
   Batch<T> batch;
-  Queue queue;
-  int32_t places[kWarp];       // of the batch
   T grad[4][kHalves * kWarp];  // of colour and depth, by pixel
   T v[kWarp][kWarp];           // gradient of the exponent, by entry and pixel of a half
   T weight[kWarp][kWarp];
@@ -42,6 +40,12 @@ struct Behind {
   T sum;    // <grad, what lies behind>, weighted
   int32_t last;
 };
+
+// The bits of entries base .. base + 31 that are in front of `last`.
+__device__ inline uint32_t in_front(int32_t last, int32_t base) {
+  const int32_t n = last - base;
+  return n >= kWarp ? ~0u : n <= 0 ? 0u : (1u << n) - 1;
+}
 
 // <feature gradients of the lane's pixel, features of entry j>, for the entries in `mine`, into shared.v[j][lane].
 template <typename T>
@@ -97,7 +101,7 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
   const RasterScene<T>& s = job.scene;
   const int lane = threadIdx.x % kWarp;
   const Quarter quarter(job, tile);
-  const uint32_t* words = job.words + quarter.begin;
+  const uint32_t* pairs = job.listed + job.lists[quarter.index].begin;
   Behind<T> behind[kHalves];
   T background_sums[3] = {};
   int32_t n_used = 0;
@@ -128,29 +132,25 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
     for (int c = 0; c < 3; ++c) background_sums[c] += __shfl_xor_sync(kFullWarp, background_sums[c], step);
   }
   if (lane == 0)
-    for (int c = 0; c < 3; ++c) slots.backgrounds[3 * (tile * kQuarters + quarter.index) + c] = background_sums[c];
+    for (int c = 0; c < 3; ++c) slots.backgrounds[3 * quarter.index + c] = background_sums[c];
 
-  int held = 0, next = n_used - 1;
+  // The records of a batch are fetched while the batch before is in work.
   uint32_t pair = 0, slot_begin = 0;
   Record<T> record{};
-  // The records of a batch are fetched while the batch before is in work.
-  const auto fetch = [&] {
-    collect<-1>(words, quarter.n, quarter.index, lane, shared.queue, held, next);
-    if (lane < held) {
-      pair = shared.queue.pairs[lane];
-      record = job.records[pair];
-      slot_begin = job.slot_begin[pair];
-    }
+  const auto fetch = [&](int32_t base) {
+    if (base < 0 || base + lane >= n_used) return;
+    pair = pairs[base + lane];
+    record = job.records[pair], slot_begin = job.slot_begin[pair];
   };
-  fetch();
-  while (held > 0) {
-    const bool used = lane < held;
+  int32_t base = (n_used - 1) / kWarp * kWarp;  // what is behind the last entry in use has no gradients
+  if (n_used > 0) fetch(base);
+  for (; base >= 0 && n_used > 0; base -= kWarp) {
+    const bool used = base + lane < n_used;
     uint32_t bits[kHalves] = {};
     if (used) {
       put(record, quarter, lane, shared.batch);
       cover(record, quarter, bits);
     }
-    shared.places[lane] = shared.queue.places[lane];
     const T from_x = T(quarter.x0) + T(0.5) - record.x, from_y = T(quarter.y0) + T(0.5) - record.y;
     const T slope = record.slope;
     const T* entry_features = kWithFeatures && used ? features_of(job, quarter.image, pair) : nullptr;
@@ -158,10 +158,10 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
     if (used) {
       const PixelRect bounds{record.x0, record.x1, record.y0, record.y1};
       slot = int64_t{slot_begin} + job.group->slot(squares_of(bounds, kTile), squares_of(bounds, kQuarter),
-                                                   quarter.x0 / kTile, quarter.y0 / kTile, quarter.index);
+                                                   quarter.x0 / kTile, quarter.y0 / kTile, quarter.index % kQuarters);
     }
-    drop_batch(lane, shared.queue, held);
-    fetch();
+    __syncwarp();
+    fetch(base - kWarp);
 
     SlotSums<T> sums{};
     uint32_t live = 0;
@@ -169,16 +169,15 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
     for (int half = 0; half < kHalves; ++half) {
       const T x = T(lane % kQuarter), y = T(lane / kQuarter + half * kHalfRows);
       Behind<T>& at = behind[half];
-      uint32_t mine = transpose_bits(bits[half], lane);
-      while (mine && shared.places[__ffs(mine) - 1] >= at.last) mine &= mine - 1;
+      uint32_t mine = transpose_bits(bits[half], lane) & in_front(at.last, base);
       const int64_t pixel = kWithFeatures ? pixel_of(s, quarter, half, lane) : 0;
       if constexpr (kWithFeatures) dot_features(s, grads, entry_features, pixel, mine, lane, shared);
       T g[4];
       for (int c = 0; c < 4; ++c) g[c] = shared.grad[c][half * kWarp + lane];
       uint32_t seen = 0;
       while (mine) {
-        const uint32_t bit = mine & -mine;
-        const int j = __ffs(mine) - 1;
+        const int j = kWarp - 1 - __clz(mine);
+        const uint32_t bit = 1u << j;
         mine ^= bit;
         const T raw = alpha_at(shared.batch, j, x, y);
         T alpha = min_of(raw, T(kMaxAlpha));

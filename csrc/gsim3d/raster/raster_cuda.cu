@@ -70,7 +70,7 @@ void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, 
 
   const int64_t n_tiles = scene.n_images * job.n_tiles;
   fill_zero(kRaster, reinterpret_cast<unsigned char*>(job.slot_count),
-            scene.n_images * 12 + n_tiles * static_cast<int64_t>(sizeof(uint32_t)), stream);
+            scene.n_images * 16 + n_tiles * static_cast<int64_t>(sizeof(uint32_t)), stream);
   launch(kRaster, plan_kernel<T>, 1, kOneBlock, 0, stream, job);
   dispatch_sh(scene.sh_terms, [&](auto terms) {
     launch(kRaster, project_kernel<T, decltype(terms)::value>, grid_of_chunks(scene), kBlock, 0, stream, job);

@@ -47,11 +47,13 @@ void take_group(Job<T>& job, Arena& kept, Arena& scratch) {
   job.bounds = kept.take<PixelRect>(job.limits.pairs);
   job.records = kept.take<Record<T>>(job.limits.pairs);
   job.slot_begin = kept.take<uint32_t>(job.limits.pairs);
-  job.tile_begin = kept.take<uint32_t>(n_tiles + 1);
-  job.words = kept.take<uint32_t>(job.limits.entries);
-  job.slot_count = scratch.take<uint64_t>(n_images + (n_images + n_tiles + 1) / 2);
+  job.lists = kept.take<List>(n_tiles * kQuarters);
+  job.listed = kept.take<uint32_t>(job.limits.slots);
+  job.slot_count = scratch.take<uint64_t>(n_images + (2 * n_images + n_tiles + 1) / 2);
   job.slot_cursor = reinterpret_cast<uint32_t*>(job.slot_count + n_images);
-  job.cursor = job.slot_cursor + n_images;
+  job.list_cursor = job.slot_cursor + n_images;
+  job.cursor = job.list_cursor + n_images;
+  job.tile_begin = scratch.take<uint32_t>(n_tiles + 1);
   job.entries = scratch.take<Entry<T>>(job.limits.entries);
   job.spare = scratch.take<Entry<T>>(job.limits.entries);
 }
@@ -156,7 +158,7 @@ __device__ bool next_group(const Job<T>& job) {
   for (int64_t i = first * job.n_tiles + thread; i < last * job.n_tiles; i += int64_t{gridDim.x} * kBlock)
     job.cursor[i] = 0;
   for (int64_t i = first + thread; i < last; i += int64_t{gridDim.x} * kBlock)
-    job.slot_count[i] = 0, job.slot_cursor[i] = 0;
+    job.slot_count[i] = 0, job.slot_cursor[i] = 0, job.list_cursor[i] = 0;
   grid.sync();
   project_any(job);
   grid.sync();

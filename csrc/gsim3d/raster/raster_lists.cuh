@@ -56,7 +56,7 @@ __device__ __forceinline__ uint32_t quarters_of_tile(const Squares& quarters, in
   return (2 * y >= quarters.y0 ? columns : 0u) | (2 * y + 1 < quarters.y1 ? columns << 2 : 0u);
 }
 
-// What is kept of an entry after sorting: the pair, which ascends with the row, and the quarters.
+// What an entry says beside its depth: the pair, which ascends with the row, and the quarters that its bounds touch.
 __device__ __forceinline__ uint32_t word_of(uint32_t pair, uint32_t quarters) { return pair << kQuarters | quarters; }
 __device__ __forceinline__ uint32_t pair_of(uint32_t word) { return word >> kQuarters; }
 
@@ -103,6 +103,11 @@ struct View {
 };
 static_assert(sizeof(View<float>) == 112 && sizeof(View<double>) == 200);  // gsim3d/ops/raster.py counts with them
 
+// The list of a quarter of a tile.
+struct List {
+  uint32_t begin, n;
+};
+
 // The group in work; on the device.
 struct Group {
   int64_t first, last;           // images
@@ -143,13 +148,20 @@ struct Job {
   PixelRect* bounds;       // [pairs]
   Record<T>* records;      // [pairs]; unset where the bounds are empty
   uint32_t* slot_begin;    // [pairs] first of the pair's slots
-  uint32_t* tile_begin;    // [n_images * n_tiles + 1] into entries
-  uint32_t* words;         // [entries] in order of depth
+  List* lists;             // [n_images * n_tiles, kQuarters]
+  uint32_t* listed;        // [slots] pairs, list by list in order of depth
   uint32_t* cursor;        // [n_images * n_tiles] counts, then write positions
   uint64_t* slot_count;    // [n_images] slots of all pairs, then those of the images before
   uint32_t* slot_cursor;   // [n_images] handed out
+  uint32_t* tile_begin;    // [n_images * n_tiles + 1] into entries
+  uint32_t* list_cursor;   // [n_images] places of `listed` handed out; an image has as many as slots
   Entry<T>* entries;       // [entries]
   Entry<T>* spare;         // [entries]
+
+  // Slots of an image begin behind those of the images before it in the group.
+  __device__ uint32_t first_slot(int64_t image, const Group& in) const {
+    return in.in_parts ? 0 : static_cast<uint32_t>(slot_count[image]);
+  }
 };
 
 // ---- plan: cameras and the images of each cloud; one block --------------------------------------------------------
@@ -481,9 +493,7 @@ __device__ void scatter_rows(const Job<T>& job) {
       if (__all_sync(kFullWarp, tiles.count() == 0)) continue;
       uint32_t slot = 0;
       if (lane == kWarp - 1) {
-        // Slots of an image begin behind those of the images before it in the group.
-        slot = group.in_parts ? 0 : static_cast<uint32_t>(job.slot_count[image]);
-        slot += atomicAdd(job.slot_cursor + image, static_cast<uint32_t>(end));
+        slot = job.first_slot(image, group) + atomicAdd(job.slot_cursor + image, static_cast<uint32_t>(end));
       }
       slot = __shfl_sync(kFullWarp, slot, kWarp - 1);
       if (n > 0) job.slot_begin[pair] = slot + end - n;

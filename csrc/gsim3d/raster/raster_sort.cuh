@@ -1,5 +1,6 @@
-// Inside of the CUDA rasterizer: entries of every tile in order of depth. A block sorts one tile at a time, in
-// registers; what is longer than its registers hold is sorted in runs that are merged in memory.
+// Inside of the CUDA rasterizer: entries of every tile in order of depth, and from them the lists of its quarters. A
+// block sorts one tile at a time, in registers; what is longer than these hold is sorted in runs that are merged in
+// memory.
 #pragma once
 
 #include "gsim3d/raster/raster_lists.cuh"
@@ -95,8 +96,9 @@ __device__ void merge_runs(const Entry<T>* from, Entry<T>* to, int64_t n, int64_
   __syncthreads();
 }
 
+// Leaves the sorted entries in `list` or in `other`; returns which.
 template <typename T>
-__device__ void sort_long(Entry<T>* list, Entry<T>* other, int64_t n, Entry<T>* shared, uint32_t* words) {
+__device__ Entry<T>* sort_long(Entry<T>* list, Entry<T>* other, int64_t n, Entry<T>* shared) {
   for (int64_t i = 0; i < n; i += kSortRun) {
     Entry<T>* run = list + i;
     sort_run<kSortItems>(run, static_cast<int>(min(n - i, int64_t{kSortRun})), shared,
@@ -108,26 +110,54 @@ __device__ void sort_long(Entry<T>* list, Entry<T>* other, int64_t n, Entry<T>* 
     Entry<T>* swapped = list;
     list = other, other = swapped;
   }
-  for (int64_t i = threadIdx.x; i < n; i += kBlock) words[i] = list[i].word();
+  return list;
+}
+
+// Each warp writes the list of its quarter: the pairs of word(0), word(1), ... that touch it.
+template <typename T, typename F>
+__device__ void list_quarter(const Job<T>& job, int64_t tile, int64_t n, const F& word) {
+  const int lane = threadIdx.x % kWarp, quarter = threadIdx.x / kWarp;
+  uint32_t count = 0;
+  for (int64_t i = lane; i < n; i += kWarp) count += word(i) >> quarter & 1;
+  count = __reduce_add_sync(kFullWarp, count);
+  const int64_t image = tile / job.n_tiles;
+  uint32_t begin = 0;
+  if (lane == 0) {
+    begin = job.first_slot(image, *job.group) + atomicAdd(job.list_cursor + image, count);
+    job.lists[tile * kQuarters + quarter] = {begin, count};
+  }
+  uint32_t* to = job.listed + __shfl_sync(kFullWarp, begin, 0);
+  for (int64_t base = 0; base < n; base += kWarp) {
+    const uint32_t mine = base + lane < n ? word(base + lane) : 0;
+    const bool hit = mine >> quarter & 1;
+    const unsigned hits = __ballot_sync(kFullWarp, hit);
+    if (hit) to[__popc(hits & ((1u << lane) - 1))] = pair_of(mine);
+    to += __popc(hits);
+  }
 }
 
 template <typename T>
 __device__ void sort_lists(const Job<T>& job, Entry<T>* shared) {
   const int64_t end = job.group->tile_end;
+  auto* words = reinterpret_cast<uint32_t*>(shared);
+  const auto store = [words](int place, const Entry<T>& entry) { words[place] = entry.word(); };
   for (int64_t tile = job.group->tile_begin + blockIdx.x; tile < end; tile += gridDim.x) {
     const int64_t begin = job.tile_begin[tile], n = job.tile_begin[tile + 1] - begin;
     Entry<T>* list = job.entries + begin;
-    uint32_t* words = job.words + begin;
-    const auto store = [words](int place, const Entry<T>& entry) { words[place] = entry.word(); };
     const int length = static_cast<int>(min(n, int64_t{kSortRun} + 1));
-    if (length > kSortRun)
-      sort_long(list, job.spare + begin, n, shared, words);
-    else if (length > kSortRun / 2)
-      sort_run<kSortItems>(list, length, shared, store);
-    else if (length > kSortRun / 4)
-      sort_run<kSortItems / 2>(list, length, shared, store);
-    else if (length > 0)
-      sort_run<kSortItems / 4>(list, length, shared, store);
+    if (length > kSortRun) {
+      const Entry<T>* sorted = sort_long(list, job.spare + begin, n, shared);
+      list_quarter(job, tile, n, [sorted](int64_t i) { return sorted[i].word(); });
+    } else {
+      if (length > kSortRun / 2)
+        sort_run<kSortItems>(list, length, shared, store);
+      else if (length > kSortRun / 4)
+        sort_run<kSortItems / 2>(list, length, shared, store);
+      else
+        sort_run<kSortItems / 4>(list, length, shared, store);
+      __syncthreads();
+      list_quarter(job, tile, n, [words](int64_t i) { return words[i]; });
+    }
     __syncthreads();
   }
 }
