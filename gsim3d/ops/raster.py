@@ -165,7 +165,7 @@ def _state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_slots)
     real = means.element_size()
     view = 112 if real == 4 else 200
     tiles = _tiles(n_images, width, height)
-    lists = (8 * max_pairs, 12 * real * max_pairs, 4 * max_pairs, 32 * tiles, 4 * max_slots)
+    lists = (8 * max_pairs, 12 * real * max_pairs, 4 * max_pairs, 4 * tiles, 32 * tiles, 4 * max_slots)
     return sum((n + 63) // 64 * 64 for n in (64, view * n_images, 16 * n_clouds, 4 * n_images, *lists))
 
 

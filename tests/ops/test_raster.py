@@ -152,7 +152,7 @@ def test_same_bits_every_time_on_cuda(devices):
 
 
 @pytest.mark.parametrize("limits", [(1, 1, 4), (2, 4, 8), (3, 10, 12)], ids=str)
-def test_any_limits_give_the_same_bits_on_cuda(devices, limits):
+def test_any_limits_give_the_same_result_on_cuda(devices, limits):
     """What exceeds the limits is done in further groups of images, down to parts of one image."""
     scene = random_scene(n=2000, clouds=2, images=6, width=40, height=33, sh_terms=4, dtype=torch.float32, seed=8)
     scene = scene.replace(opacities=0.01 + 0.02 * scene.opacities, scales=8 * scene.scales).to(devices[1])
@@ -164,8 +164,9 @@ def test_any_limits_give_the_same_bits_on_cuda(devices, limits):
         out = torch.ops.gsim3d.rasterize_gaussians(*leaves, *args, *limits)[:4]
         return (*out, *torch.autograd.grad(out, leaves, cotangents))
 
+    # Other kernels render what exceeds the limits: the compiler may fuse other products and sums.
     for a, e in zip(render(*limits), render(6, 100, 400), strict=True):
-        assert_same_bits(a, e)
+        assert_close_relative_to_max(a, e, "raster_grad_float32")
 
 
 def test_more_than_the_first_group_holds_on_cuda(devices):
@@ -198,7 +199,7 @@ def test_render_in_a_cuda_graph(devices):
         out = torch.ops.gsim3d.rasterize_gaussians(*leaves, *args)[:4]
         return [*out, *torch.autograd.grad(out, leaves, cotangents)]
 
-    expected = run()
+    expected = [x.detach() for x in run()]  # a graph kept alive would tie its leaves to this stream
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):

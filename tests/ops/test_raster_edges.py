@@ -279,7 +279,7 @@ def test_bad_rows_are_left_out_on_cuda(devices, name, value, message):
         if field in rows:
             assert a[2].abs().max() == 0, field
             a = a[kept.to(a.device)]
-        assert_same_bits(a, e)
+        assert_close_relative_to_max(a, e, 1e-6, field)  # viewmats: a sum over rows, of which one is gone
 
 
 BAD_DATA = [

@@ -94,11 +94,11 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
 
 // The same functions on device memory. Nothing waits for the device, so its arrays are not checked: a row that the CPU
 // would refuse is left out, an image with a bad camera or cloud shows its background, a background that is not finite
-// counts as black, and gradients of all of these are 0. Same bits from run to run, however large the scratch.
+// counts as black, and gradients of all of these are 0. Same bits from run to run.
 namespace cuda {
 
 // How much one call holds at once. Of the images, as many as stay within all three are rendered together and kept in
-// `state` for the backward pass; the others are made where they are needed: slower, with the same result.
+// `state` for the backward pass; the others are made where they are needed: slower, equal but for rounding.
 struct RasterLimits {
   int64_t pairs;    // of a Gaussian and an image that shows its cloud; in [n_rows, 2^28]
   int64_t entries;  // of a Gaussian and a tile of 16 x 16 pixels that its bounds touch; in [n_rows, 2^31)

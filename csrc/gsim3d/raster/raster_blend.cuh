@@ -211,7 +211,9 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
 
 template <typename T, bool kFade, bool kWithFeatures>
 __device__ void blend_tiles(const Job<T>& job, const RasterImages<T>& images, BlendShared<T, kWithFeatures>& shared) {
-  for (int64_t tile = job.group->tile_begin + blockIdx.x; tile < job.group->tile_end; tile += gridDim.x) {
+  const int64_t first = job.group->tile_begin, n_tiles = job.group->tile_end - first;
+  for (int64_t i = blockIdx.x; i < n_tiles; i += gridDim.x) {
+    const int64_t tile = first + job.order[i];
     blend_quarter<T, kFade, false>(job, images, tile, 0, shared);
     if constexpr (kWithFeatures)
       for (int64_t channel = 0; channel < job.scene.n_features; channel += kFeatures) {

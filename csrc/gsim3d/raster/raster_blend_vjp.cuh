@@ -226,8 +226,9 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
 template <typename T, bool kFade, bool kWithFeatures>
 __device__ void blend_tiles_vjp(const Job<T>& job, const RasterImageGrads<T>& grads, const Slots<T>& slots,
                                 BlendGradShared<T, kWithFeatures>& shared) {
-  for (int64_t tile = job.group->tile_begin + blockIdx.x; tile < job.group->tile_end; tile += gridDim.x) {
-    blend_quarter_vjp<T, kFade>(job, grads, tile, slots, shared);
+  const int64_t first = job.group->tile_begin, n_tiles = job.group->tile_end - first;
+  for (int64_t i = blockIdx.x; i < n_tiles; i += gridDim.x) {
+    blend_quarter_vjp<T, kFade>(job, grads, first + job.order[i], slots, shared);
     __syncwarp();
   }
 }

@@ -13,7 +13,7 @@ __global__ void __launch_bounds__(kOneBlock) plan_kernel(Job<T> job) {
 
 template <typename T, int kTerms>
 __global__ void __launch_bounds__(kBlock) project_kernel(Job<T> job) {
-  project_rows<T, kTerms>(job);
+  project_rows<T, kTerms>(job, dynamic_memory);
 }
 
 template <typename T>
@@ -73,7 +73,8 @@ void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, 
             scene.n_images * 16 + n_tiles * static_cast<int64_t>(sizeof(uint32_t)), stream);
   launch(kRaster, plan_kernel<T>, 1, kOneBlock, 0, stream, job);
   dispatch_sh(scene.sh_terms, [&](auto terms) {
-    launch(kRaster, project_kernel<T, decltype(terms)::value>, grid_of_chunks(scene), kBlock, 0, stream, job);
+    constexpr int kTerms = decltype(terms)::value;
+    launch(kRaster, project_kernel<T, kTerms>, grid_of_chunks(scene), kBlock, kRowBytes<T, kTerms>, stream, job);
   });
   launch(kRaster, offsets_kernel<T>, 1, kOneBlock, 0, stream, job);
   launch(kRaster, scatter_kernel<T>, grid_of_chunks(scene), kBlock, 0, stream, job);
@@ -83,8 +84,8 @@ void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, 
     launch(kRaster, blend_kernel<T, kFade, kWithFeatures>, grid_for(n_tiles, 1), kBlock,
            kWarps * sizeof(BlendShared<T, kWithFeatures>), stream, job, images);
     launch_together(further_kernel<T, kFade>,
-                    std::max(kWarps * sizeof(BlendShared<T, true>), kSortRun * sizeof(Entry<T>)), stream, job, further,
-                    images);
+                    std::max({kWarps * sizeof(BlendShared<T, true>), kSortRun * sizeof(Entry<T>), kRowBytes<T, 16>}),
+                    stream, job, further, images);
   });
 }
 

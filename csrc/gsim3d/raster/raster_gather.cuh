@@ -36,7 +36,7 @@ __device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t row, co
   return any || !group.finished;
 }
 
-// Gradients of one row, summed over images one after the other, so that groups leave no trace.
+// Gradients of one row, summed over images one after the other.
 template <typename T, int kColumns>
 struct RowGrad {
   T mean[3], quat[4], scale[3], opacity, color[kColumns];
@@ -51,7 +51,6 @@ struct RowGrad {
     for (int i = 0; i < 3; ++i) to.means[3 * row + i] = mean[i], to.scales[3 * row + i] = scale[i];
     for (int i = 0; i < 4; ++i) to.quats[4 * row + i] = quat[i];
     to.opacities[row] = opacity;
-    for (int i = 0; i < kColumns; ++i) to.color[row * kColumns + i] = color[i];
   }
 };
 
@@ -86,28 +85,35 @@ __device__ void project_vjp_of(const Camera<T>& camera, const Gaussian<T>& gauss
   for (int i = 0; i < 4; ++i) row.quat[i] += grad_quat[i];
 }
 
-// Writes the gradients of the rows in the first group, and adds to them in later ones.
+// Writes the gradients of the rows in the first group, and adds to them in later ones. `memory`: SharedRows of the
+// colours.
 template <typename T, int kTerms>
-__device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const RasterSceneGrads<T>& grads) {
+__device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const RasterSceneGrads<T>& grads,
+                            unsigned char* memory) {
   const RasterScene<T>& s = job.scene;
   const Group group = *job.group;
   const bool is_first = group.tile_begin == 0;
-  constexpr int kColumns = kTerms > 0 ? kTerms * 3 : 3;
-  const int64_t n_chunks = group.rows_are_good ? count_chunks(job) : (s.n_rows + kBlock - 1) / kBlock;
-  for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
-    RowGrad<T, kColumns> grad{};
-    if (!group.rows_are_good) {
-      const int64_t row = chunk * kBlock + threadIdx.x;
-      if (row < s.n_rows) grad.store(grads, row);
-      continue;
+  constexpr int kColumns = kColorColumns<kTerms>;
+  const SharedRows<T, kColumns> colors(memory);
+  if (!group.rows_are_good) {
+    const RowGrad<T, kColumns> none{};
+    for (int64_t row = int64_t{blockIdx.x} * kBlock + threadIdx.x; row < s.n_rows; row += int64_t{gridDim.x} * kBlock) {
+      none.store(grads, row);
+      for (int i = 0; i < kColumns; ++i) grads.color[row * kColumns + i] = 0;
     }
+    return;
+  }
+  const int64_t n_chunks = count_chunks(job);
+  for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
     const Rows rows(job, chunk);
-    const int64_t row = rows.row;
-    if (!rows.inside || (rows.first_image >= group.last && !is_first)) continue;
+    if (rows.first_image >= group.last && !is_first) continue;
+    colors.load(s.color + rows.begin * kColumns, rows.count);
+    const int64_t row = rows.inside ? rows.row : rows.begin;
     const Gaussian<T> gaussian(s, row);
+    RowGrad<T, kColumns> grad{};
     if (!is_first) grad.load(grads, row);
     // What tells where an image's slots are is fetched while the image before is in work.
-    int64_t next = rows.first_image;
+    int64_t next = rows.inside ? rows.first_image : kNoImage;
     PixelRect next_bounds{};
     uint32_t next_slot = 0;
     const auto fetch = [&] {
@@ -126,11 +132,13 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
       T viewmat[12] = {};
       if (!sum_slots(job, group, row, bounds, slot_begin, slots, sums, grads.features + row * s.n_features)) continue;
       if (group.finished)
-        project_vjp_of<T, kTerms>(view.camera, gaussian, s.color + row * kColumns, sums, grad, viewmat);
+        project_vjp_of<T, kTerms>(view.camera, gaussian, colors.mine(), sums, grad, viewmat);
       else
         slots.unfinished[row] = sums;
     }
-    grad.store(grads, row);
+    if (rows.inside) grad.store(grads, row);
+    for (int i = 0; i < kColumns; ++i) colors.mine()[i] = grad.color[i];
+    colors.store(grads.color + rows.begin * kColumns, rows.count);
   }
 }
 

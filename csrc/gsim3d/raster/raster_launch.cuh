@@ -47,6 +47,7 @@ void take_group(Job<T>& job, Arena& kept, Arena& scratch) {
   job.bounds = kept.take<PixelRect>(job.limits.pairs);
   job.records = kept.take<Record<T>>(job.limits.pairs);
   job.slot_begin = kept.take<uint32_t>(job.limits.pairs);
+  job.order = kept.take<uint32_t>(n_tiles);
   job.lists = kept.take<List>(n_tiles * kQuarters);
   job.listed = kept.take<uint32_t>(job.limits.slots);
   job.slot_count = scratch.take<uint64_t>(n_images + (2 * n_images + n_tiles + 1) / 2);
@@ -111,6 +112,10 @@ void launch_together(void (*kernel)(Formal...), size_t shared_bytes, Stream stre
              kRaster);
 }
 
+// Dynamic shared memory of the phases that take rows: the colours.
+template <typename T, int kTerms>
+constexpr size_t kRowBytes = SharedRows<T, kColorColumns<kTerms>>::kBytes;
+
 // Calls f(fade, with features) with two std::bool_constant.
 template <typename T, typename F>
 void dispatch_blend(const RasterScene<T>& s, const F& f) {
@@ -138,11 +143,11 @@ __device__ bool go_on(const Job<T>& first, const Job<T>& job) {
 template <typename T>
 __device__ void project_any(const Job<T>& job) {
   switch (job.scene.sh_terms) {
-    case 0: return project_rows<T, 0>(job);
-    case 1: return project_rows<T, 1>(job);
-    case 4: return project_rows<T, 4>(job);
-    case 9: return project_rows<T, 9>(job);
-    default: return project_rows<T, 16>(job);
+    case 0: return project_rows<T, 0>(job, dynamic_memory);
+    case 1: return project_rows<T, 1>(job, dynamic_memory);
+    case 4: return project_rows<T, 4>(job, dynamic_memory);
+    case 9: return project_rows<T, 9>(job, dynamic_memory);
+    default: return project_rows<T, 16>(job, dynamic_memory);
   }
 }
 

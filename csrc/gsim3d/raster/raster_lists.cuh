@@ -148,6 +148,7 @@ struct Job {
   PixelRect* bounds;       // [pairs]
   Record<T>* records;      // [pairs]; unset where the bounds are empty
   uint32_t* slot_begin;    // [pairs] first of the pair's slots
+  uint32_t* order;         // [n_images * n_tiles] tiles, counted from the group's first, long lists first
   List* lists;             // [n_images * n_tiles, kQuarters]
   uint32_t* listed;        // [slots] pairs, list by list in order of depth
   uint32_t* cursor;        // [n_images * n_tiles] counts, then write positions
@@ -265,7 +266,9 @@ __device__ void choose_images(const Job<T>& job) {
 // ---- rows: a block takes a chunk of rows of one cloud, a thread a row ---------------------------------------------
 
 struct Rows {
-  int64_t row;
+  int64_t begin;  // of the block
+  int count;
+  int64_t row;  // of the thread
   bool inside;
   int64_t first_image;  // of the group, that shows the cloud; kNoImage: none
 
@@ -280,8 +283,10 @@ struct Rows {
       else
         high = middle;
     }
-    row = s.cu_rows[low] + (chunk - job.clouds[low].chunk_begin) * kBlock + threadIdx.x;
-    inside = row < s.cu_rows[low + 1];
+    begin = s.cu_rows[low] + (chunk - job.clouds[low].chunk_begin) * kBlock;
+    count = static_cast<int>(min(s.cu_rows[low + 1] - begin, int64_t{kBlock}));
+    row = begin + threadIdx.x;
+    inside = static_cast<int>(threadIdx.x) < count;
     first_image = job.clouds[low].first;
     while (first_image < job.group->first) first_image = job.views[first_image].next;
   }
@@ -371,23 +376,51 @@ __device__ void for_tiles(const Squares& mine, const F& f) {
   }
 }
 
+// A chunk of rows of a matrix with kColumns columns in shared memory, read and written by the block as a whole.
+template <typename T, int kColumns>
+class SharedRows {
+ public:
+  static constexpr int kStride = kColumns | 1;  // odd: the same column of 32 rows lies in 32 banks
+  static constexpr size_t kBytes = sizeof(T) * kBlock * kStride;
+
+  __device__ explicit SharedRows(unsigned char* memory) : memory_(reinterpret_cast<T*>(memory)) {}
+  __device__ T* mine() const { return memory_ + threadIdx.x * kStride; }
+
+  __device__ void load(const T* rows, int count) const {
+    __syncthreads();
+    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) memory_[i / kColumns * kStride + i % kColumns] = rows[i];
+    __syncthreads();
+  }
+  __device__ void store(T* rows, int count) const {
+    __syncthreads();
+    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) rows[i] = memory_[i / kColumns * kStride + i % kColumns];
+    __syncthreads();
+  }
+
+ private:
+  T* memory_;
+};
+
+template <int kTerms>
+constexpr int kColorColumns = kTerms > 0 ? kTerms * 3 : 3;
+
+// `memory`: SharedRows of the colours.
 template <typename T, int kTerms>
-__device__ void project_rows(const Job<T>& job) {
+__device__ void project_rows(const Job<T>& job, unsigned char* memory) {
   const RasterScene<T>& s = job.scene;
-  constexpr int kColumns = kTerms > 0 ? kTerms * 3 : 3;
+  constexpr int kColumns = kColorColumns<kTerms>;
+  const SharedRows<T, kColumns> colors(memory);
   const int64_t last = job.group->last, n_chunks = count_chunks(job);
   const int lane = threadIdx.x % kWarp;
   for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
     const Rows rows(job, chunk);
     if (rows.first_image >= last) continue;
-    const int64_t row = rows.inside ? rows.row : s.n_rows - 1;
+    colors.load(s.color + rows.begin * kColumns, rows.count);
+    const T* coefficients = colors.mine();
+    const int64_t row = rows.inside ? rows.row : rows.begin;
     const Gaussian<T> gaussian(s, row);
-    T coefficients[kColumns];
     bool good = rows.inside && gaussian.is_good();
-    for (int i = 0; i < kColumns; ++i) {
-      coefficients[i] = s.color[row * kColumns + i];
-      good &= isfinite(coefficients[i]);
-    }
+    for (int i = 0; i < kColumns && good; ++i) good &= isfinite(coefficients[i]);
     for (int64_t i = 0; i < s.n_features; ++i) good &= isfinite(s.features[row * s.n_features + i]);
     const bool may_show = good && gaussian.opacity >= T(kMinAlpha);
     for (int64_t image = rows.first_image; image < last; image = job.views[image].next) {
@@ -430,11 +463,40 @@ __device__ int64_t images_by_slots(const Job<T>& job, int64_t first, int64_t las
   return last * job.n_tiles;
 }
 
+// Long lists first, so that none of them is begun last. Lists of about equal length come in any order.
+template <typename T>
+__device__ void find_order(const Job<T>& job, int64_t begin, int64_t end) {
+  constexpr int kBins = 64, kBinWidth = 64;
+  __shared__ uint32_t bins[kBins];
+  const auto bin_of = [&](int64_t tile) {
+    return kBins - 1 - min(job.tile_begin[tile + 1] - job.tile_begin[tile], uint32_t{kBins * kBinWidth - 1}) / kBinWidth;
+  };
+  const int lane = threadIdx.x % kWarp;
+  if (threadIdx.x < kBins) bins[threadIdx.x] = 0;
+  for (const bool place : {false, true}) {
+    __syncthreads();
+    for (int64_t base = begin; base < end; base += blockDim.x) {
+      const int64_t tile = base + threadIdx.x;
+      const uint32_t bin = tile < end ? bin_of(tile) : kBins;
+      const unsigned same = __match_any_sync(kFullWarp, bin);
+      const int leader = __ffs(same) - 1;
+      uint32_t position = 0;
+      if (bin < kBins && lane == leader) position = atomicAdd(bins + bin, static_cast<uint32_t>(__popc(same)));
+      position = __shfl_sync(kFullWarp, position, leader) + __popc(same & ((1u << lane) - 1));
+      if (place && bin < kBins) job.order[position] = static_cast<uint32_t>(tile - begin);
+    }
+    __syncthreads();
+    if (place || threadIdx.x >= kWarp) continue;
+    const uint32_t a = bins[2 * lane], b = bins[2 * lane + 1], before = warp_sum(a + b) - a - b;
+    bins[2 * lane] = before, bins[2 * lane + 1] = before + a;
+  }
+}
+
 template <typename T>
 __device__ void find_offsets(const Job<T>& job) {
   __shared__ unsigned long long images_fit, tiles_fit;  // ends of the tiles that fit: of whole images, of any
   Group& group = *job.group;
-  const int64_t begin = group.tile_begin, end = group.last * job.n_tiles;
+  const int64_t begin = group.tile_begin, end = group.last * job.n_tiles;  // read before thread 0 writes the group
   const int64_t by_slots = group.resumed ? begin : images_by_slots(job, group.first, group.last);
   const uint64_t max_of_part = min(job.limits.entries, job.limits.slots / kQuarters);
   if (threadIdx.x == 0) images_fit = tiles_fit = begin;
@@ -464,9 +526,11 @@ __device__ void find_offsets(const Job<T>& job) {
     if (mine < end && mine + kItems >= end) job.tile_begin[end] = static_cast<uint32_t>(position);
   }
   __syncthreads();
-  if (threadIdx.x != 0) return;
   const int64_t whole = min(static_cast<int64_t>(images_fit), by_slots);
-  group.tile_end = whole > begin ? whole : min(static_cast<int64_t>(tiles_fit), (group.first + 1) * job.n_tiles);
+  const int64_t stop = whole > begin ? whole : min(static_cast<int64_t>(tiles_fit), (group.first + 1) * job.n_tiles);
+  find_order(job, begin, stop);
+  if (threadIdx.x != 0) return;
+  group.tile_end = stop;
   group.last = (group.tile_end + job.n_tiles - 1) / job.n_tiles;
   group.finished = group.tile_end % job.n_tiles == 0;
   group.in_parts = whole <= begin;

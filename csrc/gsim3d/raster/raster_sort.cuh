@@ -138,10 +138,11 @@ __device__ void list_quarter(const Job<T>& job, int64_t tile, int64_t n, const F
 
 template <typename T>
 __device__ void sort_lists(const Job<T>& job, Entry<T>* shared) {
-  const int64_t end = job.group->tile_end;
+  const int64_t first = job.group->tile_begin, n_tiles = job.group->tile_end - first;
   auto* words = reinterpret_cast<uint32_t*>(shared);
   const auto store = [words](int place, const Entry<T>& entry) { words[place] = entry.word(); };
-  for (int64_t tile = job.group->tile_begin + blockIdx.x; tile < end; tile += gridDim.x) {
+  for (int64_t i = blockIdx.x; i < n_tiles; i += gridDim.x) {
+    const int64_t tile = first + job.order[i];
     const int64_t begin = job.tile_begin[tile], n = job.tile_begin[tile + 1] - begin;
     Entry<T>* list = job.entries + begin;
     const int length = static_cast<int>(min(n, int64_t{kSortRun} + 1));
