@@ -1,4 +1,4 @@
-"""The ``gsim3d`` command: generate, train, simulate, evaluate, import, demo, doctor."""
+"""The ``gsim3d`` command: generate, check-data, train, simulate, evaluate, weights, import, demo, doctor."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from gsim3d.errors import HardCaseError, InputError
 # command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called
 COMMANDS = {
     "generate": ("gsim3d.generate.command", "simulate and film bodies that fall: a data set of multi-view video"),
+    "check-data": ("gsim3d.check_data", "what is wrong with recorded scenes, and a picture of their cameras"),
     "train": ("gsim3d.train.command", "learn a simulator from a data set"),
     "simulate": ("gsim3d.simulate", "predict the future of one scene: video and .ply"),
-    "evaluate": ("gsim3d.evaluate.command", "measure predictions on a data set: PSNR and SSIM by step"),
+    "evaluate": ("gsim3d.evaluate.command", "measure predictions on a data set, by step, beside baselines and other models"),
+    "weights": ("gsim3d.perceptual.command", "install the weights of LPIPS and FVD"),
     "import": ("gsim3d.import_released", "bring a checkpoint of the authors' release over: same weights, same predictions"),
     "demo": ("gsim3d.demo", "all of it at a small size, in minutes on a CPU"),
     "doctor": ("gsim3d.doctor", "what is installed, what was compiled, and whether every kernel works here"),
@@ -60,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
         module = importlib.import_module(COMMANDS[name][0])
         parser = _Parser(prog=f"gsim3d {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
         module.add_arguments(parser)
-        return module.run(parser.parse_args(arguments[1:])) or 0
+        return module.run(parser.parse_intermixed_args(arguments[1:])) or 0
     except (InputError, HardCaseError) as error:
         return _fail(str(error))
     except OSError as error:

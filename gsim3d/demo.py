@@ -155,7 +155,7 @@ def _evaluate(out: Path, scenes: list, digest: str):
         summary = json.loads(file.read_text())
     except (OSError, ValueError):
         summary = {}
-    if summary.get("checkpoint") != digest:
+    if summary.get("checkpoint") != digest or "methods" not in summary:
         summary = {"checkpoint": digest, **summarize([score_scene(restored, scene) for scene in scenes])}
         write_json(file, summary)
     return summary, restored
@@ -167,9 +167,9 @@ def _pictures(out: Path, restored, scenes: list, summary: dict) -> None:
         as_bytes,
         comparison_frames,
         true_images,
+        write_curves,
         write_gaussians,
         write_overview,
-        write_psnr_plot,
     )
     from gsim3d.evaluate.protocol import default_views, predict, render_steps
     from gsim3d.interop import write_video
@@ -191,7 +191,7 @@ def _pictures(out: Path, restored, scenes: list, summary: dict) -> None:
 
     scene, prediction, rendered, cam = first
     write_gaussians(out / "gaussians", restored, prediction)
-    write_psnr_plot(made[1], summary, scene.fps)
+    write_curves(made[1], summary, scene.fps, ("psnr", "psnr_masked"))
     write_overview(made[2], restored, scene, prediction, rendered, cam)
     write_video(made[0], comparison_frames(np.concatenate(truth, 1), np.concatenate(images, 1)), scene.fps)
 

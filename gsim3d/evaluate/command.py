@@ -5,57 +5,200 @@ from __future__ import annotations
 import argparse
 
 EPILOG = """\
-Every scene's first steps are encoded, all others predicted and compared with the film, seen from cameras that
-were no input. Prints PSNR (masked and unmasked) and SSIM for the model and for four baselines, then by step, and
-writes the same as JSON.
+Every scene's first steps are given, all others predicted and compared with the film, seen from cameras that were no
+input. Measured are psnr (all pixels), psnr_masked (without background), psnr_body (what may move), ssim, lpips_alex,
+lpips_vgg and fvd, for
+
+  model              this checkpoint
+  constant           its last encoded particles, held still: what the learned dynamics adds
+  copy               the true last given frame of the same camera: no model at all
+  constant_velocity  its last encoded particles; what may move goes on as its centroid went last
+  release_constant   its first predicted step, held still: the baseline of the published evaluation
+
+LPIPS and FVD need weights: run `gsim3d weights lpips` and `gsim3d weights fvd` once. Until then the report says that
+they were not measured. FVD takes a second or two a clip on a CPU; --metrics leaves it out.
+
+Other models, also those that know images only, are scored under the same conditions: put what they predict into
+DIR/<scene folder as below DATA>/cam_<j>/<name>_<step>.png, or one video DIR/<scene folder>/cam_<j>.mp4, of the size of
+the scene's images, and name DIR with --predictions. Without CHECKPOINT, --given says how many steps they were given.
+
+Written: FILE.json (all numbers), and beside it .csv (scene, method, step), .md (tables like the paper's) and .png
+(curves over time; needs matplotlib). docs/evaluation.md defines every number.
 
 examples:
   gsim3d evaluate runs/model runs/data
   gsim3d evaluate model.safetensors runs/data --scenes all --steps 16 --out metrics.json
+  gsim3d evaluate runs/model runs/data --metrics psnr psnr_masked ssim lpips_vgg
+  gsim3d evaluate runs/model runs/data --predictions video=runs/video_model
+  gsim3d evaluate --predictions runs/video_model runs/data --given 4
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Measures how well a simulator predicts the scenes of a data set."
     parser.epilog = EPILOG
-    parser.add_argument("checkpoint", metavar="CHECKPOINT", help="run folder, checkpoint folder or .safetensors file")
+    parser.add_argument(
+        "checkpoint",
+        metavar="CHECKPOINT",
+        nargs="?",
+        help="run folder, checkpoint folder or .safetensors file (left out: only --predictions are scored)",
+    )
     parser.add_argument("data", metavar="DATA", help="folder with scenes, or one scene folder")
+    parser.add_argument(
+        "--predictions",
+        metavar="[NAME=]DIR",
+        action="append",
+        default=[],
+        help="predictions of another model to score; may be given several times",
+    )
+    parser.add_argument("--given", type=int, metavar="N", help="steps that the other models were given (no CHECKPOINT)")
     parser.add_argument(
         "--scenes",
         choices=("test", "train", "all"),
         default="test",
         help="which part of the data set (default: test, the scenes that `gsim3d train` holds out)",
     )
-    parser.add_argument("--steps", type=int, help="steps to predict (default: to the end of each film)")
-    parser.add_argument("--out", metavar="FILE", help="JSON file (default: metrics.json beside the checkpoint's files)")
+    parser.add_argument(
+        "--split",
+        choices=("gsim3d", "published"),
+        default="gsim3d",
+        help="rule that holds scenes out (default: gsim3d; published: that of the released model, which leaks in small "
+        "sets)",
+    )
+    parser.add_argument("--steps", type=int, help="steps to predict (default: to the end of the shortest film)")
+    parser.add_argument(
+        "--cameras",
+        type=int,
+        nargs="+",
+        metavar="CAM",
+        help="cameras to compare (default: those kept from the training's inputs; without CHECKPOINT all predicted)",
+    )
+    parser.add_argument("--context", type=int, nargs="+", metavar="CAM", help="input cameras (default: spread evenly)")
+    parser.add_argument(
+        "--metrics", nargs="+", metavar="METRIC", help="what to measure (default: all whose weights are installed)"
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        help="JSON file (default: metrics.json beside the checkpoint's files, or in the folder of the predictions)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    from pathlib import Path
+    from dataclasses import replace
 
     from tqdm import tqdm
 
-    from gsim3d.data import Scene, find_scenes, split_scenes
     from gsim3d.errors import InputError
-    from gsim3d.evaluate.protocol import check_horizon, score_scene
-    from gsim3d.evaluate.report import summarize, table, write_json
+    from gsim3d.evaluate.predictions import Predictions
+    from gsim3d.evaluate.protocol import default_views, horizon, score_scene
+    from gsim3d.evaluate.report import summarize, table
+    from gsim3d.evaluate.scoring import measurable
     from gsim3d.train.restore import restore
 
-    restored = restore(args.checkpoint)
-    folders = find_scenes(args.data)
-    train, test = split_scenes(folders)
-    folders = {"all": folders, "train": train, "test": test or folders}[args.scenes]
-    scenes = [Scene.open(folder) for folder in folders]
+    metrics, not_measured = measurable(args.metrics)
+    if args.checkpoint is None and not args.predictions:
+        raise InputError("nothing to evaluate: name a CHECKPOINT, or predictions of other models with --predictions")
+    if args.checkpoint is None and (args.given is None or args.given < 1):
+        raise InputError("--given: without a CHECKPOINT, say how many steps the other models were given, at least 1")
+    if args.checkpoint is not None and args.given is not None:
+        raise InputError("--given: with a CHECKPOINT it is the model's own history; leave the option out")
+    restored = None if args.checkpoint is None else restore(args.checkpoint)
+    others = [Predictions.open(given, args.data) for given in args.predictions]
+    if len({other.name for other in others}) != len(others):
+        raise InputError("--predictions: two have the same name; write NAME=DIR")
+    out = _out_file(args, others)
+    n_encoded = args.given if restored is None else restored.data.history
+    scenes = _scenes(args, restored)
+    views, n_future = [], args.steps
     for scene in scenes:
-        restored.check_scene(scene)
-        check_horizon(restored, scene, args.steps)
-    checkpoint = Path(args.checkpoint)
-    out = Path(args.out) if args.out else (checkpoint if checkpoint.is_dir() else checkpoint.parent) / "metrics.json"
-    if not out.parent.is_dir():
-        raise InputError(f"--out: the folder {out.parent} does not exist")
-    scores = [score_scene(restored, scene, n_future=args.steps) for scene in tqdm(scenes, desc="scenes", unit="scene")]
-    summary = summarize(scores)
+        context, targets = (None, None) if restored is None else default_views(restored, scene)
+        targets = args.cameras or targets or others[0].cameras(scenes[0])
+        if bad := [cam for cam in (*targets, *(args.context or ())) if not 0 <= cam < scene.n_cams]:
+            raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
+        views.append((args.context or context, targets))
+        n_future = min(horizon(scene, n_encoded, args.steps), n_future or scene.n_steps)
+    for scene, (_, targets) in zip(scenes, views):
+        for other in others:
+            other.check(scene, targets, n_encoded, n_future)
+    scores = []
+    with tqdm(scenes, desc="scenes", unit="scene") as progress:
+        for scene, (context, targets) in zip(progress, views):
+            given = {"context_cams": context, "target_cams": targets, "n_encoded": n_encoded, "n_future": n_future}
+            score = score_scene(restored, scene, **given, metrics=metrics, others=others)
+            scores.append(replace(score, scene=_name(scene, args.data)))
+    summary = {**_conditions(args, restored, others, scenes, views), **summarize(scores, not_measured)}
     print(table(summary))
-    write_json(out, summary)
-    print(f"\nwritten: {out}")
+    print("\nwritten: " + ", ".join(str(path) for path in _write(out, args, scenes, scores, summary)))
     return 0
+
+
+def _out_file(args: argparse.Namespace, others: list):
+    from pathlib import Path
+
+    from gsim3d.errors import InputError
+
+    if args.out:
+        out = Path(args.out)
+        if out.suffix != ".json":
+            raise InputError(f"--out: the name must end in .json; got {out}")
+    else:
+        place = Path(args.checkpoint or others[0].folder)
+        out = (place if place.is_dir() else place.parent) / "metrics.json"
+    if not out.parent.is_dir() and args.out:
+        raise InputError(f"--out: the folder {out.parent} does not exist")
+    return out
+
+
+def _scenes(args: argparse.Namespace, restored) -> list:
+    """The chosen scenes, opened as the model expects them."""
+    from gsim3d.data import Scene, find_scenes, published_split, split_scenes
+
+    folders = find_scenes(args.data)
+    train, test = (split_scenes if args.split == "gsim3d" else published_split)(folders)
+    chosen = {"all": folders, "train": train, "test": test or folders}[args.scenes]
+    return [Scene.open(folder) if restored is None else restored.open_scene(folder) for folder in chosen]
+
+
+def _name(scene, root: str) -> str:
+    """The scene's folder below the data set's: two scenes never share it."""
+    below = scene.path.relative_to(root).as_posix()
+    return scene.name if below == "." else below
+
+
+def _conditions(args: argparse.Namespace, restored, others: list, scenes: list, views: list) -> dict:
+    """What was evaluated, and on what: without it two reports cannot be compared."""
+    return {
+        "checkpoint": None if restored is None else restored.checkpoint.digest,
+        "predictions": {other.name: str(other.folder) for other in others},
+        "data": str(args.data),
+        "part": args.scenes,
+        "split": args.split,
+        "cameras": {
+            _name(scene, args.data): {"context": None if context is None else list(context), "target": list(targets)}
+            for scene, (context, targets) in zip(scenes, views)
+        },
+    }
+
+
+def _write(out, args: argparse.Namespace, scenes: list, scores: list, summary: dict) -> list:
+    """Writes the report in all its forms; returns the files."""
+    from pathlib import Path
+
+    from gsim3d.errors import InputError
+    from gsim3d.evaluate.pictures import write_curves
+    from gsim3d.evaluate.report import write_csv, write_json, write_markdown
+
+    files = [out, out.with_suffix(".csv"), out.with_suffix(".md"), out.with_suffix(".png")]
+    write_json(files[0], summary)
+    write_csv(files[1], scores)
+    write_markdown(files[2], summary, Path(args.data).absolute().name)
+    rates = {scene.fps for scene in scenes}
+    if not summary["by_step"]:
+        return files[:3]
+    try:
+        write_curves(files[3], summary, rates.pop() if len(rates) == 1 else None)
+    except InputError as error:
+        print(f"no curves: {error}")
+        files.pop()
+    return files

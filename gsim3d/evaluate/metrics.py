@@ -8,7 +8,9 @@ from torch import Tensor
 
 PSNR_CAP = 100.0  # dB, given to images whose mean squared error is below 1e-10, perfect ones included
 
-_SSIM_SIGMA, _SSIM_RADIUS = 1.5, 5  # pixels; a window of 11
+SSIM_WINDOW = 11  # pixels
+
+_SSIM_SIGMA = 1.5  # pixels
 _SSIM_K1, _SSIM_K2 = 0.01, 0.03
 
 
@@ -45,10 +47,10 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
     Source: Wang et al. 2004, "Image quality assessment: from error visibility to structural similarity".
     """
     _check(pred, target, None)
-    size = 2 * _SSIM_RADIUS + 1
+    size, radius = SSIM_WINDOW, SSIM_WINDOW // 2
     if min(pred.shape[1:3]) < size:
         raise ValueError(f"ssim: images must be at least {size} x {size}; got {tuple(pred.shape[1:3])}")
-    offsets = torch.arange(-_SSIM_RADIUS, _SSIM_RADIUS + 1, dtype=torch.float64, device=pred.device)
+    offsets = torch.arange(-radius, radius + 1, dtype=torch.float64, device=pred.device)
     window = torch.exp(-0.5 * (offsets / _SSIM_SIGMA) ** 2)
     window = window / window.sum()
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from gsim3d.data import Scene
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import Prediction
+from gsim3d.evaluate.scoring import METRICS
 from gsim3d.interop import write_ply
 from gsim3d.renderer import render
 from gsim3d.train.restore import Restored
@@ -23,6 +24,10 @@ FRAME_SIZE = 256  # pixels; smaller frames are enlarged by a whole factor to at 
 GAP = 4  # pixels of white between frames
 SPLAT_SIZE = 320  # pixels, height and width of the picture of the Gaussians
 SPLAT_SHRINK = 0.45  # of their scales there, so that single ones can be told apart
+CURVE_LABELS = {"constant": "constant (last encoded particles)", "copy": "copy (last true frame)",
+                "constant_velocity": "constant velocity", "release_constant": "constant (first predicted)"}  # fmt: skip
+CURVE_COLORS = {"model": "#1f5fbf", "constant": "#c0504d", "copy": "#7f7f7f", "constant_velocity": "#e0a030",
+                "release_constant": "#d8a0a0"}  # fmt: skip
 
 
 def as_bytes(images: Tensor) -> np.ndarray:
@@ -126,25 +131,39 @@ def write_overview(
     _save(figure, path)
 
 
-def write_psnr_plot(path: str | Path, summary: dict, fps: float) -> None:
-    """PSNR over time, given and predicted steps, for the model and the baselines."""
+def write_curves(path: str | Path, summary: dict, fps: float | None, metrics: Sequence[str] = tuple(METRICS)) -> None:
+    """Metrics over time, given and predicted steps, of every method; the first with its deviation between scenes.
+
+    Args:
+        fps: steps a second; None: the axis counts steps.
+        metrics: those of them that the summary has by step are drawn, a panel each.
+    """
     plt = pyplot()
-    figure, panels = plt.subplots(1, 2, figsize=(10, 3.8), sharex=True, layout="constrained")
-    lines = {"": ("model", "#1f5fbf", 2.4), "constant.": ("constant (last encoded particles)", "#c0504d", 1.6),
-             "copy.": ("copy (last true frame)", "#7f7f7f", 1.2),
-             "constant_velocity.": ("constant velocity", "#e0a030", 1.2)}  # fmt: skip
-    n_encoded = summary["n_encoded_steps"]
-    for axes, metric, title in zip(panels, ("psnr", "psnr_masked"), ("all pixels", "without background")):
-        if metric not in summary["by_step"]:
-            metric = "psnr"
-        for prefix, (label, color, width) in lines.items():
-            values = np.array(summary["by_step"][prefix + metric], dtype=float)
-            steps = np.arange(len(values)) - (n_encoded - 1)
-            axes.plot(steps / fps, values, color=color, linewidth=width, label=label)
-        axes.axvspan((0.5 - n_encoded) / fps, 0.5 / fps, color="#eeeeee", zorder=0)
-        axes.set(title=f"PSNR, {title}", xlabel="seconds after the last given frame", ylabel="dB")
+    methods, n_encoded = summary["methods"], summary["n_encoded_steps"]
+    prefixes = {method: "" if method == "model" else f"{method}." for method in methods}
+    drawn = [m for m in metrics if f"{prefixes[methods[0]]}{m}" in summary["by_step"]]
+    columns = min(len(drawn), 3)
+    rows = -(-len(drawn) // columns)
+    figure, panels = plt.subplots(rows, columns, figsize=(5 * columns, 3.8 * rows), squeeze=False, layout="constrained")
+    unit = 1 if fps is None else fps
+    for axes, metric in zip(panels.flat, drawn):
+        for k, method in enumerate(methods):
+            values, deviation = (
+                np.array(summary[key][f"{prefixes[method]}{metric}"], dtype=float) for key in ("by_step", "by_step_std")
+            )
+            times = (np.arange(len(values)) - (n_encoded - 1)) / unit
+            color = CURVE_COLORS.get(method, f"C{k}")
+            axes.plot(times, values, color=color, linewidth=1.3 if k else 2.4, label=CURVE_LABELS.get(method, method))
+            if k == 0:
+                axes.fill_between(times, values - deviation, values + deviation, color=color, alpha=0.15, linewidth=0)
+        axes.axvspan((0.5 - n_encoded) / unit, 0.5 / unit, color="#eeeeee", zorder=0)
+        what = METRICS[metric]
+        axes.set(title=what.label, xlabel=f"{'steps' if fps is None else 'seconds'} after the last given frame")
+        axes.set_ylabel("dB" if metric.startswith("psnr") else "higher is better" if what.rises else "lower is better")
         axes.grid(alpha=0.3)
-    panels[0].legend(fontsize=8)
+    for axes in panels.flat[len(drawn) :]:
+        axes.remove()
+    panels[0, 0].legend(fontsize=8)
     _save(figure, path)
 
 

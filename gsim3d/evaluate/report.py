@@ -1,7 +1,9 @@
-"""Scores of many scenes in one table: means over scenes by step, then over steps."""
+"""Scores of many scenes in one place: means over scenes by step, then over steps; as JSON, CSV, markdown and text."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
 import os
@@ -12,83 +14,198 @@ import torch
 from torch import Tensor
 
 from gsim3d.evaluate.metrics import mean_of_counted
-from gsim3d.evaluate.protocol import METHODS, METRICS, SceneScores
+from gsim3d.evaluate.scoring import METRICS, SceneScores
+from gsim3d.perceptual.fvd import MIN_CLIPS, TREND_CLIPS, frechet_distance
 
 
-def summarize(scores: Sequence[SceneScores]) -> dict:
+def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None = None) -> dict:
     """What metrics.json holds.
 
     ``past.M`` and ``future.M``: the mean over steps of the mean over scenes of metric M; ``future_late.M`` over the
     second half of the horizon only; ``future_std.M``: the mean over steps of the standard deviation between scenes. The
-    same with the prefix ``constant.``, ``copy.``, ... for the baselines. ``by_step``: means over scenes for each step. A
-    value that does not exist (an empty mask everywhere, one scene's deviation) is null.
+    same with a prefix (``constant.``, ``copy.``, the name of other predictions) for all methods but the model.
+    ``future.fvd``: one distance between all predicted clips and the true ones; it has neither steps nor deviation.
+    ``by_step``, ``by_step_std``: means over scenes, and deviations between them, for each step. A value that does not
+    exist (an empty mask everywhere, one scene's deviation) is null. ``not_measured``: metric -> why.
+
+    Args:
+        not_measured: what was not even tried.
     """
     n_encoded = scores[0].n_encoded
-    n_steps = min(len(s.values["model"]["psnr"]) for s in scores)
+    methods = list(scores[0].values)
+    n_steps = min(s.n_steps for s in scores)
     late = n_encoded + (n_steps - n_encoded) // 2
-    result: dict = {"n_scenes": len(scores), "n_encoded_steps": n_encoded, "n_future_steps": n_steps - n_encoded}
+    missing = dict(not_measured or {})
+    for scene in scores:
+        missing = {**scene.not_measured, **missing}
+    result: dict = {
+        "n_scenes": len(scores),
+        "n_encoded_steps": n_encoded,
+        "n_future_steps": n_steps - n_encoded,
+        "methods": methods,
+    }
     by_step: dict = {}
-    for method in METHODS:
-        prefix = "" if method == "model" else f"{method}."
+    by_step_std: dict = {}
+    for method in methods:
+        prefix = _prefix(method)
         for metric in METRICS:
-            if not all(metric in s.values[method] for s in scores):
+            if metric in missing or metric not in scores[0].values[method]:
                 continue
             table = torch.stack([s.values[method][metric][:n_steps] for s in scores])
-            mean = table.nanmean(0)
+            mean, deviation = table.nanmean(0), _deviation(table)
             if method == "model":
                 result[f"past.{metric}"] = mean_of_counted(mean[:n_encoded])
+                result[f"past_std.{metric}"] = mean_of_counted(deviation[:n_encoded])
             result[f"{prefix}future.{metric}"] = mean_of_counted(mean[n_encoded:])
             result[f"{prefix}future_late.{metric}"] = mean_of_counted(mean[late:])
-            result[f"{prefix}future_std.{metric}"] = mean_of_counted(_deviation(table[:, n_encoded:]))
-            by_step[f"{prefix}{metric}"] = [None if math.isnan(value) else value for value in mean.tolist()]
+            result[f"{prefix}future_std.{metric}"] = mean_of_counted(deviation[n_encoded:])
+            by_step[f"{prefix}{metric}"] = _numbers(mean)
+            by_step_std[f"{prefix}{metric}"] = _numbers(deviation)
+    if scores[0].clips and "fvd" not in missing:
+        _add_fvd(result, missing, scores, methods)
+    result["not_measured"] = missing
     result["by_step"] = by_step
-    result["scenes"] = {
-        s.scene: {
-            f"future.{metric}": mean_of_counted(s.values["model"][metric][n_encoded:])
-            for metric in METRICS
-            if metric in s.values["model"]
-        }
-        for s in scores
-    }
+    result["by_step_std"] = by_step_std
+    result["scenes"] = {s.scene: _of_scene(s, missing) for s in scores}
     return result
+
+
+def _add_fvd(result: dict, missing: dict, scores: Sequence[SceneScores], methods: Sequence[str]) -> None:
+    clips = {method: torch.cat([s.clips[method] for s in scores]) for method in ("truth", *methods)}
+    result["n_clips"] = len(clips["truth"])
+    if result["n_clips"] < MIN_CLIPS:
+        missing["fvd"] = f"it needs {MIN_CLIPS} clips (scenes times target views); there is one"
+        return
+    for method in methods:
+        result[f"{_prefix(method)}future.fvd"] = frechet_distance(clips[method], clips["truth"])
+
+
+def _of_scene(scores: SceneScores, missing: dict) -> dict:
+    return {
+        f"{_prefix(method)}future.{metric}": mean_of_counted(values[scores.n_encoded :])
+        for method, metrics in scores.values.items()
+        for metric, values in metrics.items()
+        if metric not in missing
+    }
 
 
 def write_json(path: str | Path, content: dict) -> None:
     """Writes ``content``; the file appears complete or not at all."""
-    path = Path(path)
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
-    os.replace(part, path)
+    _write(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def write_csv(path: str | Path, scores: Sequence[SceneScores]) -> None:
+    """One row for each scene, method and step: scene, method, step, part (given or predicted), then the metrics.
+
+    A value that does not exist is empty. FVD, a distance between sets of clips, has no place in it.
+    """
+    metrics = [name for name in METRICS if any(name in s.values[method] for s in scores for method in s.values)]
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["scene", "method", "step", "part", *metrics])
+    for s in scores:
+        for method, values in s.values.items():
+            first = 0 if method == "model" else s.n_encoded
+            for step in range(first, s.n_steps):
+                numbers = [float(values[m][step]) if m in values else math.nan for m in metrics]
+                part = "given" if step < s.n_encoded else "predicted"
+                rows.writerow([s.scene, method, step, part, *("" if math.isnan(v) else repr(v) for v in numbers)])
+    _write(path, text.getvalue())
+
+
+def write_markdown(path: str | Path, summary: dict, dataset: str) -> None:
+    """Tables as the paper prints them: a row for each method, mean and deviation between scenes; then the horizons."""
+    _write(path, markdown(summary, dataset))
+
+
+def markdown(summary: dict, dataset: str) -> str:
+    """The text of :func:`write_markdown`."""
+    shown = [m for m in METRICS if any(f"{_prefix(method)}future.{m}" in summary for method in summary["methods"])]
+    span = f"{summary['n_encoded_steps']}-{summary['n_future_steps']}"
+    head = [f"{METRICS[m].label} ({'↑' if METRICS[m].rises else '↓'})" for m in shown]
+    lines = [_row(["Dataset", "Method", *head]), _row(["---"] * (2 + len(head)))]
+    for method in summary["methods"]:
+        key = f"{_prefix(method)}future"
+        lines.append(_row([dataset, f"{method} ({span})", *(_with_deviation(summary, key, m) for m in shown)]))
+    by_step = [m for m in shown if METRICS[m].by_step]
+    lines += ["", _row(["Horizon", "Method", *(METRICS[m].label for m in by_step)]), _row(["---"] * (2 + len(by_step)))]
+    for name, part in (("given steps", "past"), ("predicted, all", "future"), ("second half", "future_late")):
+        for method in summary["methods"]:
+            key = f"{_prefix(method)}{part}"
+            if any(f"{key}.{m}" in summary for m in by_step):
+                lines.append(_row([name, method, *(_number(summary.get(f"{key}.{m}"), m) for m in by_step)]))
+    lines += ["", f"{summary['n_scenes']} scenes; {summary['n_encoded_steps']} steps given, "
+              f"{summary['n_future_steps']} predicted. Mean over steps of the mean over scenes ± mean over steps of the "
+              "standard deviation between scenes. Masked: without background; body: what may move."]  # fmt: skip
+    return "\n".join([*lines, *(f"\n{note}" for note in notes(summary))]) + "\n"
+
+
+def notes(summary: dict) -> list[str]:
+    """What a reader of the numbers must know: metrics that were not measured, and an FVD of too few clips."""
+    found = [f"{METRICS[m].label}: not measured: {reason}" for m, reason in summary["not_measured"].items()]
+    if 0 < summary.get("n_clips", 0) < TREND_CLIPS and "fvd" not in summary["not_measured"]:
+        found.append(f"FVD: of {summary['n_clips']} clips; below {TREND_CLIPS} it shows a trend, not a measurement")
+    return found
 
 
 def table(summary: dict) -> str:
-    """The summary for people: one line a method, then the model by step."""
-    shown = [m for m in METRICS if f"future.{m}" in summary]
-    head = {"psnr": "PSNR", "psnr_masked": "PSNR masked", "psnr_body": "PSNR body", "ssim": "SSIM"}
+    """The summary for people: one line a method, then the first method by step."""
+    methods = summary["methods"]
+    shown = [m for m in METRICS if f"{_prefix(methods[0])}future.{m}" in summary]
+    by_step = [m for m in shown if METRICS[m].by_step]
     lines = [
         f"{summary['n_scenes']} scenes, {summary['n_encoded_steps']} steps given, {summary['n_future_steps']} predicted"
         " (PSNR in dB; masked: without background; body: what may move)",
         "",
-        f"{'':34}" + "".join(f"{head[m]:>13}" for m in shown),
+        f"{'':34}" + "".join(f"{METRICS[m].label:>13}" for m in shown),
     ]
-    rows = [("model, given steps", "past")]
-    for method in METHODS:
-        prefix = "" if method == "model" else f"{method}."
+    rows = [("model, given steps", "past")] if "model" in methods else []
+    for method in methods:
+        prefix = _prefix(method)
         rows += [(f"{method}, predicted steps", f"{prefix}future"), ("  second half of them", f"{prefix}future_late")]
     for name, key in rows:
         lines.append(f"{name:34}" + "".join(f"{_number(summary.get(f'{key}.{m}'), m):>13}" for m in shown))
-    lines += ["", f"{'step':34}" + "".join(f"{head[m]:>13}" for m in shown)]
-    for step in range(summary["n_encoded_steps"] + summary["n_future_steps"]):
+    lines += ["", f"{f'{methods[0]}, step':34}" + "".join(f"{METRICS[m].label:>13}" for m in by_step)]
+    first = 0 if "model" in methods else summary["n_encoded_steps"]
+    for step in range(first, summary["n_encoded_steps"] + summary["n_future_steps"]):
         kind = "given" if step < summary["n_encoded_steps"] else "predicted"
-        values = "".join(f"{_number(summary['by_step'][m][step], m):>13}" for m in shown)
-        lines.append(f"{f'{step:4d} {kind}':34}{values}")
-    return "\n".join(lines)
+        numbers = [_number(summary["by_step"][f"{_prefix(methods[0])}{m}"][step], m) for m in by_step]
+        lines.append(f"{f'{step:4d} {kind}':34}" + "".join(f"{number:>13}" for number in numbers))
+    extra = notes(summary)
+    return "\n".join([*lines, *([""] if extra else []), *extra])
+
+
+def _prefix(method: str) -> str:
+    return "" if method == "model" else f"{method}."
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _with_deviation(summary: dict, key: str, metric: str) -> str:
+    deviation = summary.get(f"{key}_std.{metric}")
+    mean = _number(summary.get(f"{key}.{metric}"), metric)
+    return mean if deviation is None else f"{mean} ± {_number(deviation, metric)}"
 
 
 def _deviation(table: Tensor) -> Tensor:
-    """Standard deviation [S] over scenes (n - 1) of [scenes, S]; NaN for a single scene."""
-    return table.std(0) if len(table) > 1 else torch.full(table.shape[1:], torch.nan)
+    """Standard deviation [S] over the scenes (n - 1) of [scenes, S] that have a value; NaN where fewer than two do."""
+    counted = (~table.isnan()).sum(0)
+    squares = (table - table.nanmean(0)).square().nansum(0)
+    return torch.where(counted > 1, squares / (counted - 1).clamp(min=1), torch.nan).sqrt()
+
+
+def _numbers(values: Tensor) -> list[float | None]:
+    return [None if math.isnan(value) else value for value in values.tolist()]
 
 
 def _number(value: float | None, metric: str) -> str:
-    return "-" if value is None else f"{value:.4f}" if metric == "ssim" else f"{value:.2f}"
+    return "-" if value is None else f"{value:.{METRICS[metric].digits}f}"
+
+
+def _write(path: str | Path, text: str) -> None:
+    path = Path(path)
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text)
+    os.replace(part, path)

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._autocast import follow_autocast
 from gsim3d.ops.curve import KernelMap, Voxels
 
 
@@ -17,7 +18,8 @@ def sparse_conv(
     the mean of its rows, or its lowest row. Rows that share a voxel keep their own centre term.
 
     Args:
-        x: features [N, C_in], float32 or float64.
+        x: features [N, C_in], float32 or float64; on CUDA also float16 and bfloat16, summed in float32. Under
+            ``torch.autocast`` the CPU computes in float32, CUDA in autocast's dtype.
         weight: [C_out, K, K, K, C_in], K odd; axes 1 to 3 walk x, y, z.
         bias: [C_out] or None.
         voxels: which rows share a voxel (``Stage.voxels`` of :func:`gsim3d.ops.build_pyramid`).
@@ -26,9 +28,11 @@ def sparse_conv(
     Returns:
         [N, C_out], dtype of ``x``.
     Gradients: ``x``, ``weight``, ``bias``, once.
-    Determinism: the same bits for any number of threads; an output is one chain of sums in the order of taps.
+    Determinism: the same bits for any number of threads, and in every run on CUDA. On the CPU an output is one chain of
+        sums in the order of taps.
     Raises:
         ValueError: shapes, dtypes, ``voxels`` or ``kernel_map`` are malformed; the message names the argument.
+            CUDA does not look into the index lists: pairs and rows out of range take no part.
     Source: Graham et al., "3D semantic segmentation with submanifold sparse convolutional networks", 2018.
 
     Example, two rows in one voxel and no neighbours:
@@ -99,3 +103,4 @@ def _backward(ctx, grad):
 
 torch.library.register_autograd("gsim3d::sparse_conv", _backward, setup_context=_setup)
 torch.library.register_autocast("gsim3d::sparse_conv", "cpu", torch.float32)
+follow_autocast("sparse_conv")

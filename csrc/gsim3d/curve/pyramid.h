@@ -10,6 +10,7 @@
 #include <initializer_list>
 
 #include "gsim3d/core/parallel.h"
+#include "gsim3d/core/stream.h"
 #include "gsim3d/core/workspace.h"
 
 namespace gsim3d {
@@ -67,11 +68,19 @@ namespace cpu {
 //                           kv_rows[r, cu_k[p]:cu_k[p + 1]]; the last patch of a cloud reads a whole patch of rows
 //     row_voxel [N], voxel_rows [N], cu_voxel_rows [V + 1]: rows of equal (cloud, cell); voxels by (cloud, x, y, z)
 //     for every kernel size K: tap_in [L], tap_out [L], cu_taps [K^3 + 1]: voxel tap_in lies at (kx, ky, kz) - K / 2
-//                           cells from tap_out, tap = (kx K + ky) K + kz; ascending in tap_out in a tap; centre empty
+//                           cells from tap_out, tap = (kx K + ky) K + kz; both ascend inside a tap; centre empty
 // T is float or double. Throws ArgumentError where clouds or spec are malformed.
 template <typename T>
 void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,
                    const Workspace& workspace, const Parallel& parallel);
+
+// Throw ArgumentError where a part of the input is malformed.
+void check_spec(const PyramidSpec& spec);
+template <typename T>
+void check_clouds(const PyramidClouds<T>& clouds, const PyramidSpec& spec);
+// With `release`: the corners [3] of all positions.
+template <typename T>
+void check_extent(const T* low, const T* high, double grid_size);
 
 // The pieces that need cells only.
 
@@ -92,4 +101,14 @@ void append_patches(const int64_t* cu_clouds, int64_t n_clouds, const int64_t* o
                     const Arrays& arrays);
 
 }  // namespace cpu
+
+namespace cuda {
+
+// The same results on the device of `stream`, in arrays on that device. Waits for the stream once, for the counts that
+// size the arrays.
+template <typename T>
+void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,
+                   const Workspace& workspace, Stream stream);
+
+}  // namespace cuda
 }  // namespace gsim3d

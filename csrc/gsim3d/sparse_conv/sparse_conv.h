@@ -4,11 +4,13 @@
 // Source: Graham et al., "3D semantic segmentation with submanifold sparse convolutional networks", 2018. T is float or
 // double. The same bits for any number of threads and any vector width: an output is summed in the order of taps by
 // chains of fma, a weight gradient is summed in fixed blocks of pairs that are added in a fixed tree.
+// On CUDA T may also be Float16 or BFloat16 (core/half.h), with float sums.
 #pragma once
 
 #include <cstdint>
 
 #include "gsim3d/core/parallel.h"
+#include "gsim3d/core/stream.h"
 #include "gsim3d/core/workspace.h"
 
 namespace gsim3d {
@@ -19,7 +21,7 @@ struct SparseConvMap {
   const int64_t* row_voxel;      // [n_rows], the voxel of each row
   const int64_t* voxel_rows;     // [n_rows], rows of voxel 0, of voxel 1, ...; ascending inside a voxel
   const int64_t* cu_voxel_rows;  // [n_voxels + 1], from 0 to n_rows; no voxel is empty
-  const int64_t* tap_in;         // [n_pairs]; a voxel at most once a tap
+  const int64_t* tap_in;         // [n_pairs]; ascending inside a tap, as voxels are ordered by their cells
   const int64_t* tap_out;        // [n_pairs]; ascending inside a tap
   const int64_t* cu_taps;        // [K^3 + 1]; the centre tap has no pairs
   int64_t n_rows, n_voxels, n_pairs, kernel_size;
@@ -59,4 +61,21 @@ void sparse_conv_vjp_weight(const T* grad,  // [n_rows, c_out]
                             const Workspace& workspace, const Parallel& parallel);
 
 }  // namespace cpu
+
+// As on the CPU, with device memory and on a stream. Indices are not checked: pairs and rows out of range take no part.
+namespace cuda {
+
+template <typename T>
+void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap& map, int64_t c_in, int64_t c_out,
+                 T* out, const Workspace& workspace, Stream stream);
+
+template <typename T>
+void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& map, int64_t c_in, int64_t c_out,
+                           T* grad_x, const Workspace& workspace, Stream stream);
+
+template <typename T>
+void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map, int64_t c_in, int64_t c_out,
+                            T* grad_weight, T* grad_bias, const Workspace& workspace, Stream stream);
+
+}  // namespace cuda
 }  // namespace gsim3d

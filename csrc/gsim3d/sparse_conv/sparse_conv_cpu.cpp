@@ -252,16 +252,11 @@ bool pairs_are_well_formed(const SparseConvMap& map, int64_t begin, int64_t end)
   bool good = true;
   for (int64_t i = begin; i < end; ++i)
     good &= static_cast<uint64_t>(map.tap_in[i]) < n_voxels && static_cast<uint64_t>(map.tap_out[i]) < n_voxels;
-  for (int64_t i = begin + 1; i < end; ++i) good &= map.tap_out[i - 1] < map.tap_out[i];
-  if (!good) return false;
-  std::vector<uint64_t> read(static_cast<size_t>(n_voxels / 64 + 1), 0);
-  uint64_t again = 0;
-  for (int64_t i = begin; i < end; ++i) {
-    const uint64_t voxel = static_cast<uint64_t>(map.tap_in[i]), bit = uint64_t{1} << (voxel % 64);
-    again |= read[voxel / 64] & bit;
-    read[voxel / 64] |= bit;
+  for (int64_t i = begin + 1; i < end; ++i) {
+    good &= map.tap_in[i - 1] < map.tap_in[i];
+    good &= map.tap_out[i - 1] < map.tap_out[i];
   }
-  return !again;
+  return good;
 }
 
 // One block of pairs of one tap.
@@ -303,7 +298,6 @@ void check_sparse_conv_map(const char* op, const SparseConvMap& map, const Paral
         cu_taps[centre + 1] - cu_taps[centre]);
   const auto check_tap = [&](int64_t t) {
     if (pairs_are_well_formed(map, cu_taps[t], cu_taps[t + 1])) return;
-    std::vector<char> read(static_cast<size_t>(map.n_voxels), 0);
     for (int64_t i = cu_taps[t]; i < cu_taps[t + 1]; ++i) {
       const int64_t in = map.tap_in[i], out = map.tap_out[i];
       check(in >= 0 && in < map.n_voxels, op, ": tap_in must be in [0, V) with V=", map.n_voxels, "; got ", in, " at ",
@@ -312,8 +306,8 @@ void check_sparse_conv_map(const char* op, const SparseConvMap& map, const Paral
             " at ", i);
       check(i == cu_taps[t] || map.tap_out[i - 1] < out, op, ": tap_out must ascend inside a tap; got ",
             map.tap_out[i - 1], " then ", out, " at ", i);
-      check(!read[in], op, ": tap_in must name a voxel at most once a tap; got ", in, " again at ", i);
-      read[in] = 1;
+      check(i == cu_taps[t] || map.tap_in[i - 1] < in, op, ": tap_in must ascend inside a tap; got ", map.tap_in[i - 1],
+            " then ", in, " at ", i);
     }
   };
   // A few taps at a time: small maps are not worth a thread.

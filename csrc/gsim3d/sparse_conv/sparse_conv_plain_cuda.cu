@@ -1,0 +1,198 @@
+// Products of sparse convolution by fused multiply-adds: exact float32 and float64, and 16-bit types of any size.
+#include "gsim3d/sparse_conv/sparse_conv_device.cuh"
+
+namespace gsim3d::cuda::conv {
+namespace {
+
+constexpr int kThreads = 256;
+constexpr int kRows = 64;     // pairs of one product
+constexpr int kColumns = 64;  // output channels of a block
+constexpr int kDepth = 16;    // channels staged at a time
+constexpr int kPitch = kRows + 4;
+
+template <typename E>
+__device__ __forceinline__ Sum<E> widen(E value) {
+  return static_cast<Sum<E>>(value);
+}
+
+// sums[4][4] += a[k][4 rows from r] b[k][4 columns from c], k = 0 .. kDepth - 1.
+template <typename T>
+__device__ __forceinline__ void multiply(const T (*a)[kPitch], const T (*b)[kPitch], int r, int c, T (&sums)[4][4]) {
+#pragma unroll
+  for (int k = 0; k < kDepth; ++k) {
+    T left[4], right[4];
+#pragma unroll
+    for (int i = 0; i < 4; ++i) {
+      left[i] = a[k][r + i];
+      right[i] = b[k][c + i];
+    }
+#pragma unroll
+    for (int i = 0; i < 4; ++i)
+#pragma unroll
+      for (int j = 0; j < 4; ++j) sums[i][j] = fma(left[i], right[j], sums[i][j]);
+  }
+}
+
+template <typename E>
+struct alignas(16) Stage {
+  Sum<E> a[kDepth][kPitch];
+  Sum<E> b[kDepth][kPitch];
+};
+
+// Adds the products of the thread's row (of kRows; null: zeros) with B_tap to sums. All threads call it.
+template <typename E, bool kTransposed>
+__device__ __forceinline__ void multiply_rows(const Convolution<E>& conv, const E* row, int32_t tap, int32_t n0,
+                                              Stage<E>& stage, Sum<E> (&sums)[4][4]) {
+  const int thread = threadIdx.x, r = thread / 4, kr = thread % 4 * 4;
+  for (int32_t k0 = 0; k0 < conv.c_read; k0 += kDepth) {
+    Sum<E> left[4], right[4];
+#pragma unroll
+    for (int i = 0; i < 4; ++i) {
+      left[i] = row != nullptr && k0 + kr + i < conv.c_read ? widen(row[k0 + kr + i]) : Sum<E>(0);
+      const int32_t k = kTransposed ? k0 + thread / 16 : k0 + kr + i;
+      const int32_t n = kTransposed ? n0 + thread % 16 * 4 + i : n0 + r;
+      const int64_t at = kTransposed ? (static_cast<int64_t>(k) * conv.taps + tap) * conv.weight_row + n
+                                     : (static_cast<int64_t>(n) * conv.taps + tap) * conv.weight_row + k;
+      right[i] = k < conv.c_read && n < conv.c_write ? widen(conv.weight[at]) : Sum<E>(0);
+    }
+    __syncthreads();
+#pragma unroll
+    for (int i = 0; i < 4; ++i) {
+      stage.a[kr + i][r] = left[i];
+      if constexpr (kTransposed)
+        stage.b[thread / 16][thread % 16 * 4 + i] = right[i];
+      else
+        stage.b[kr + i][r] = right[i];
+    }
+    __syncthreads();
+    multiply(stage.a, stage.b, thread / 16 * 4, thread % 16 * 4, sums);
+  }
+}
+
+// One block: a tile of voxels, kColumns output channels. The sums of the tile's voxels lie in shared memory; a tap has
+// every voxel at most once, so each sum has one owner between two barriers.
+template <typename E, bool kTransposed>
+__global__ void __launch_bounds__(kThreads) convolve(Convolution<E> conv) {
+  using T = Sum<E>;
+  extern __shared__ __align__(16) char memory[];
+  Stage<E>& stage = *reinterpret_cast<Stage<E>*>(memory);
+  T* tile = reinterpret_cast<T*>(memory + sizeof(Stage<E>));  // [kTile, kColumns]
+  const int thread = threadIdx.x, r = thread / 16 * 4, c = thread % 16 * 4;
+  const int64_t v0 = static_cast<int64_t>(blockIdx.x) * kTile;
+  const int32_t n0 = blockIdx.y * kColumns, centre = conv.taps / 2;
+  for (int i = thread; i < kTile * kColumns; i += kThreads) tile[i] = T(0);
+  __syncthreads();
+
+  for (int32_t tap = 0; tap < conv.taps; ++tap) {
+    if (tap == centre) continue;
+    const int32_t count = conv.pairs.counts[static_cast<int64_t>(blockIdx.x) * conv.taps + tap];
+    const int64_t list = tap * conv.pairs.pitch + v0;
+    for (int32_t m0 = 0; m0 < count; m0 += kRows) {
+      const int32_t mine = m0 + thread / 4;
+      const E* row = mine < count ? conv.values.at(conv.pairs.sources[list + mine]) : nullptr;
+      T sums[4][4] = {};
+      multiply_rows<E, kTransposed>(conv, row, tap, n0, stage, sums);
+#pragma unroll
+      for (int i = 0; i < 4; ++i)
+        if (m0 + r + i < count) {
+          T* to = tile + conv.pairs.places[list + m0 + r + i] * kColumns + c;
+#pragma unroll
+          for (int j = 0; j < 4; ++j) to[j] += sums[i][j];
+        }
+    }
+  }
+  __syncthreads();
+
+  const int64_t n_rows = conv.values.n_rows;
+  const int64_t begin = min(max(conv.cu_voxel_rows[v0], int64_t{0}), n_rows);
+  const int64_t end = min(max(conv.cu_voxel_rows[min(v0 + kTile, conv.n_voxels)], begin), n_rows);
+  for (int64_t m0 = begin; m0 < end; m0 += kRows) {
+    const int64_t mine = m0 + thread / 4, index = mine < end ? conv.voxel_rows[mine] : -1;
+    const E* row = inside(index, n_rows) ? conv.values.rows + index * conv.c_read : nullptr;
+    T sums[4][4] = {};
+    multiply_rows<E, kTransposed>(conv, row, centre, n0, stage, sums);
+#pragma unroll
+    for (int i = 0; i < 4; ++i) {
+      if (m0 + r + i >= end) continue;
+      const Part part = part_of(conv, m0 + r + i, v0);
+      if (part.row < 0) continue;
+#pragma unroll
+      for (int j = 0; j < 4; ++j) {
+        const int32_t n = n0 + c + j;
+        if (n >= conv.c_write) continue;
+        T y = sums[i][j];
+        if (conv.bias != nullptr) y += widen(conv.bias[n]);
+        if (part.place >= 0) y += tile[part.place * kColumns + c + j] / static_cast<T>(part.parts);
+        conv.y[part.row * conv.c_write + n] = static_cast<E>(y);
+      }
+    }
+  }
+}
+
+// One block: a block of pairs of a tap, kRows x kColumns of its outer products.
+template <typename E>
+__global__ void __launch_bounds__(kThreads) multiply_pairs(OuterProducts<E> products, int32_t column_tiles) {
+  using T = Sum<E>;
+  __shared__ Stage<E> stage;
+  const PairBlock block = find_block(products.cu_taps, products.taps, products.n_pairs, products.n_rows,
+                                     products.block_pairs, static_cast<int32_t>(blockIdx.x), -1);
+  if (block.tap < 0) return;
+  const int thread = threadIdx.x, pair = thread / 16, from = thread % 16 * 4;
+  const int32_t co = blockIdx.y / column_tiles * kRows, ci = blockIdx.y % column_tiles * kColumns;
+  T sums[4][4] = {};
+  for (int64_t p0 = block.begin; p0 < block.end; p0 += kDepth) {
+    const int64_t p = p0 + pair;
+    int32_t out = -1, in = -1;
+    if (p < block.end) {
+      const bool own = block.tap == products.taps / 2;
+      out = own ? static_cast<int32_t>(p) : products.grad_sources.of(products.tap_out[p]);
+      in = own ? static_cast<int32_t>(p) : products.input_sources.of(products.tap_in[p]);
+    }
+    const bool both = out >= 0 && in >= 0;
+    const E* left = both ? products.grads.at(out) : nullptr;
+    const E* right = both ? products.inputs.at(in) : nullptr;
+    __syncthreads();
+#pragma unroll
+    for (int i = 0; i < 4; ++i) {
+      stage.a[pair][from + i] = both && co + from + i < products.c_out ? widen(left[co + from + i]) : T(0);
+      stage.b[pair][from + i] = both && ci + from + i < products.c_in ? widen(right[ci + from + i]) : T(0);
+    }
+    __syncthreads();
+    multiply(stage.a, stage.b, thread / 16 * 4, thread % 16 * 4, sums);
+  }
+  T* to = products.partials + static_cast<int64_t>(blockIdx.x) * products.c_out * products.c_in;
+#pragma unroll
+  for (int i = 0; i < 4; ++i)
+#pragma unroll
+    for (int j = 0; j < 4; ++j) {
+      const int32_t o = co + thread / 16 * 4 + i, n = ci + thread % 16 * 4 + j;
+      if (o < products.c_out && n < products.c_in) to[static_cast<int64_t>(o) * products.c_in + n] = sums[i][j];
+    }
+}
+
+}  // namespace
+
+template <typename E>
+void convolve_plain(const char* op, const Convolution<E>& conv, int64_t n_tiles, bool transposed, Stream stream) {
+  const dim3 blocks(blocks_for(op, n_tiles, 1), blocks_for(op, conv.c_write, kColumns));
+  const size_t bytes = sizeof(Stage<E>) + sizeof(Sum<E>) * kTile * kColumns;
+  launch(op, transposed ? convolve<E, true> : convolve<E, false>, blocks, kThreads, bytes, stream, conv);
+}
+
+template <typename E>
+void outer_products_plain(const char* op, const OuterProducts<E>& products, int64_t n_blocks, Stream stream) {
+  const unsigned columns = blocks_for(op, products.c_in, kColumns);
+  const dim3 blocks(blocks_for(op, n_blocks, 1), blocks_for(op, products.c_out, kRows) * columns);
+  launch(op, multiply_pairs<E>, blocks, kThreads, 0, stream, products, static_cast<int32_t>(columns));
+}
+
+#define GSIM3D_INSTANTIATE(E)                                                                 \
+  template void convolve_plain<E>(const char*, const Convolution<E>&, int64_t, bool, Stream); \
+  template void outer_products_plain<E>(const char*, const OuterProducts<E>&, int64_t, Stream);
+GSIM3D_INSTANTIATE(float)
+GSIM3D_INSTANTIATE(double)
+GSIM3D_INSTANTIATE(__half)
+GSIM3D_INSTANTIATE(__nv_bfloat16)
+#undef GSIM3D_INSTANTIATE
+
+}  // namespace gsim3d::cuda::conv

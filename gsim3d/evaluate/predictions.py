@@ -1,0 +1,167 @@
+"""Predictions of other models: a folder of videos or frames, laid out as the data set is.
+
+    DIR/<scene folder, as below DATA>/cam_<j>/<frames>.png      each name ends in the number of its step
+    DIR/<scene folder, as below DATA>/cam_<j>.mp4               or one video a camera
+
+Steps count from 0, the first frame of the film. Frames of steps that were given may be there; they are not read. A
+video holds all steps up to the last one compared or to the end of the film, or only those after the given ones.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from gsim3d.data import Scene
+from gsim3d.data.images import IMAGE_SUFFIXES, as_color, read_image
+from gsim3d.data.recording import Problems
+from gsim3d.errors import InputError
+
+VIDEOS = (".mp4", ".webm", ".mov", ".mkv", ".avi")
+RESERVED = ("model", "constant", "copy", "constant_velocity", "release_constant", "truth", "past", "future")
+
+
+class Predictions:
+    """Predicted images of one model for the scenes of a data set.
+
+    name: in tables and reports.   folder: where they lie.   root: folder of the data set.
+    """
+
+    def __init__(self, name: str, folder: Path, root: Path):
+        self.name, self.folder, self.root = name, folder, root
+
+    @staticmethod
+    def open(given: str, root: str | Path) -> Predictions:
+        """From ``NAME=DIR``, or ``DIR``, whose last part is then the name.
+
+        Raises:
+            InputError: the folder does not exist, or the name is taken by a baseline.
+        """
+        name, _, folder = given.rpartition("=") if re.match(r"[\w-]+=", given) else ("", "", given)
+        folder = Path(folder)
+        if not folder.is_dir():
+            raise InputError(f"--predictions: {folder} is not a folder")
+        name = name or re.sub(r"[^\w-]", "_", folder.absolute().name)
+        if name in RESERVED:
+            raise InputError(f"--predictions: the name {name!r} is taken; name them otherwise: OTHER={folder}")
+        return Predictions(name, folder, Path(root))
+
+    def cameras(self, scene: Scene) -> tuple[int, ...]:
+        """Cameras of which there are predictions for ``scene``. Raises InputError where there is none."""
+        folder = self._scene_folder(scene)
+        stems = {path.stem if path.suffix in VIDEOS else path.name for path in folder.iterdir()}
+        cams = sorted(int(match[1]) for stem in stems if (match := re.fullmatch(r"cam_(\d+)", stem)))
+        if not cams:
+            raise InputError(f"{folder}: holds neither a folder nor a video named cam_<number>")
+        if cams[-1] >= scene.n_cams:
+            raise InputError(f"{folder}: predictions of camera {cams[-1]}, but {scene.path} has {scene.n_cams} cameras")
+        return tuple(cams)
+
+    def check(self, scene: Scene, cams: Sequence[int], n_encoded: int, n_future: int) -> None:
+        """Raises InputError where a folder, a frame or a video is missing; nothing is decoded."""
+        for cam in cams:
+            _find(self._scene_folder(scene) / f"cam_{cam}", range(n_encoded, n_encoded + n_future))
+
+    def images(self, scene: Scene, cams: list[int], n_encoded: int, n_future: int) -> Tensor:
+        """uint8 [n_future, V, H, W, 3]: the steps after the first ``n_encoded``, as cameras ``cams`` see them.
+
+        Raises:
+            InputError: a folder, frame or video is missing, too short, broken or of another size.
+        """
+        folder = self._scene_folder(scene)
+
+        def read(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray]:
+            size = scene.filmed_sizes[cam]
+            frames = _view(folder / f"cam_{cam}", size, scene.n_steps, n_encoded, n_future, problems)
+            return (frames[step - n_encoded] for step in steps)
+
+        return scene.filmed_as(read).film(cams, range(n_encoded, n_encoded + n_future)).permute(0, 1, 3, 4, 2)
+
+    def _scene_folder(self, scene: Scene) -> Path:
+        folder = self.folder / scene.path.relative_to(self.root)
+        if not folder.is_dir():
+            raise InputError(f"{folder} is missing: predictions of {scene.path} are expected there")
+        return folder
+
+
+def _view(
+    place: Path, size: tuple[int, int], film: int, n_encoded: int, n_future: int, problems: Problems
+) -> list[np.ndarray]:
+    """One camera's predicted frames [h, w, 3], RGB."""
+    steps = range(n_encoded, n_encoded + n_future)
+    found = _find(place, steps)
+    if isinstance(found, Path):
+        return _from_video(found, size, film, n_encoded, n_future)
+    named = [(file, f"predicted step {step}") for file, step in zip(found, steps, strict=True)]
+    return [as_color(read_image(file, size, what, problems), file, what, problems) for file, what in named]
+
+
+def _find(place: Path, steps: range) -> Path | list[Path]:
+    """The video, or the frames of ``steps``."""
+    if place.is_dir():
+        return _frames(place, steps)
+    for suffix in VIDEOS:
+        if (video := place.with_name(place.name + suffix)).is_file():
+            return video
+    raise InputError(f"{place} is missing: a folder of frames, or a video {place.name}{VIDEOS[0]}")
+
+
+def _frames(folder: Path, steps: range) -> list[Path]:
+    files: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        number = re.search(r"(\d+)$", path.stem)
+        if path.suffix.lower() not in IMAGE_SUFFIXES or number is None:
+            continue
+        if (step := int(number[1])) in files:
+            raise InputError(f"{folder}: {files[step].name} and {path.name} are both step {step}")
+        files[step] = path
+    if missing := [step for step in steps if step not in files]:
+        raise InputError(
+            f"{folder}: step {missing[0]} is missing ({len(missing)} of {len(steps)} are); file names end in the "
+            f"number of their step, here {steps[0]} to {steps[-1]}"
+        )
+    return [files[step] for step in steps]
+
+
+def _from_video(video: Path, size: tuple[int, int], film: int, n_encoded: int, n_future: int) -> list[np.ndarray]:
+    frames = _decode(video, size, film)
+    last = n_encoded + n_future
+    first = {film: 0, film - n_encoded: n_encoded, last: 0, n_future: n_encoded}
+    if len(frames) not in first:
+        raise InputError(
+            f"{video} has {'more than ' if len(frames) > film else ''}{min(len(frames), film)} frames; to compare the "
+            f"{n_future} steps after the {n_encoded} given ones, it must have {last} (or the film's {film}), or "
+            f"without the given ones {n_future} (or {film - n_encoded})"
+        )
+    if len(frames) == film - n_encoded == last:
+        raise InputError(
+            f"{video} has {len(frames)} frames: is the first one step 0 or {n_encoded}? Use frames instead"
+        )
+    start = n_encoded - first[len(frames)]
+    return frames[start : start + n_future]
+
+
+def _decode(video: Path, size: tuple[int, int], film: int) -> list[np.ndarray]:
+    """All frames, RGB; of a video longer than the film, one frame more than the film has."""
+    import cv2
+
+    capture = cv2.VideoCapture(str(video))
+    try:
+        frames: list[np.ndarray] = []
+        while len(frames) <= film:
+            more, frame = capture.read()
+            if not more:
+                break
+            if frame.shape[1::-1] != size:
+                found = f"{frame.shape[1]}x{frame.shape[0]}"
+                raise InputError(f"{video} has {found} pixels, its camera {size[0]}x{size[1]}: resize it")
+            frames.append(frame[..., ::-1])
+    finally:
+        capture.release()
+    if not frames:
+        raise InputError(f"{video} cannot be decoded")
+    return frames

@@ -1,0 +1,156 @@
+"""Which metrics there are, and what predicted images of one scene score by step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsim3d.data.recording import BACKGROUND, MOVING
+from gsim3d.errors import InputError
+from gsim3d.evaluate.metrics import SSIM_WINDOW, psnr, ssim
+from gsim3d.perceptual import fvd, lpips, weights
+
+
+@dataclass(frozen=True)
+class Metric:
+    """label: its name in tables.   digits: after the point.   rises: whether more is better.
+
+    weights: what must be installed to measure it (a key of gsim3d.perceptual.weights.SOURCES), or nothing.
+    by_step: whether each image has a value of its own.
+    """
+
+    label: str
+    digits: int
+    rises: bool = True
+    weights: str | None = None
+    by_step: bool = True
+
+
+METRICS = {
+    "psnr": Metric("PSNR", 2),
+    "psnr_masked": Metric("PSNR masked", 2),
+    "psnr_body": Metric("PSNR body", 2),
+    "ssim": Metric("SSIM", 4),
+    "lpips_alex": Metric("LPIPS alex", 4, rises=False, weights="lpips_alex"),
+    "lpips_vgg": Metric("LPIPS vgg", 4, rises=False, weights="lpips_vgg"),
+    "fvd": Metric("FVD", 1, rises=False, weights="fvd_i3d", by_step=False),
+}
+PLAIN_METRICS = tuple(name for name, metric in METRICS.items() if metric.weights is None)
+
+
+@dataclass(frozen=True)
+class SceneScores:
+    """Scores of one scene over ``n_steps`` steps, the first ``n_encoded`` of them given.
+
+    values: method -> metric -> float64 [S] by step, means over the target views. Steps before ``n_encoded`` are
+        reconstructions, which only the model has; a value that no image has (that step, or an empty mask) is NaN.
+    clips: method (and ``"truth"``) -> I3D features [V, 400] of the predicted steps in each target view, for FVD.
+    not_measured: metric -> why this scene has no value.
+    """
+
+    scene: str
+    n_encoded: int
+    n_steps: int
+    values: dict[str, dict[str, Tensor]]
+    clips: dict[str, Tensor]
+    not_measured: dict[str, str]
+
+
+def measurable(names: Sequence[str] | None = None) -> tuple[tuple[str, ...], dict[str, str]]:
+    """(metrics to measure, {metric: why not}): those named, or all whose weights are installed.
+
+    Raises:
+        InputError: a metric does not exist, or one that was named has no weights here.
+    """
+    missing = {n: m.weights for n, m in METRICS.items() if m.weights and not weights.installed(m.weights)}
+    if names is None:
+        chosen = tuple(name for name in METRICS if name not in missing)
+        return chosen, {name: weights.how_to_install(needed) for name, needed in missing.items()}
+    for name in names:
+        if name not in METRICS:
+            raise InputError(f"metric {name!r} does not exist; metrics: {', '.join(METRICS)}")
+        if name in missing:
+            raise weights.WeightsMissing(f"metric {name} needs weights: {weights.how_to_install(missing[name])}")
+    return tuple(name for name in METRICS if name in names), {}
+
+
+class SceneTruth:
+    """What predictions of one scene are compared with.
+
+    Args:
+        name: of the scene.
+        images: [S, V, H, W, 3], colours in [0, 1].
+        labels: uint8 [S, V, H, W], 0 background, 3 bodies that may move; None: the scene has none.
+        filmed: bool [S, V, H, W], pixels that count; the others are black in the film; None: all.
+        n_encoded: steps that were given.
+        metrics: to measure; what does not apply here goes to ``not_measured``.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        images: Tensor,
+        labels: Tensor | None,
+        filmed: Tensor | None,
+        n_encoded: int,
+        metrics: Sequence[str],
+    ):
+        self.name, self.images, self.labels, self.filmed, self.n_encoded = name, images, labels, filmed, n_encoded
+        self.not_measured = {m: reason for m in metrics if (reason := self._problem(m))}
+        self.metrics = [metric for metric in metrics if metric not in self.not_measured]
+
+    def score(self, methods: Iterable[tuple[str, Tensor]]) -> SceneScores:
+        """Scores of (name, images) one after another, so that only one method's images need to be in memory.
+
+        Images are [S, V, H, W, 3], colours in [0, 1], or only the predicted steps of them.
+        """
+        values, clips = {}, {}
+        with_clips = "fvd" in self.metrics
+        if with_clips:
+            clips["truth"] = self._clip_features(self.images)
+        for name, images in methods:
+            if self.filmed is not None:
+                images = images * self.filmed[-len(images) :, ..., None]
+            values[name] = self._by_step(images)
+            if with_clips:
+                clips[name] = self._clip_features(images)
+        return SceneScores(self.name, self.n_encoded, len(self.images), values, clips, self.not_measured)
+
+    def _problem(self, metric: str) -> str | None:
+        """Why ``metric`` cannot be measured here."""
+        n_steps, _, height, width = self.images.shape[:4]
+        smallest = {"ssim": SSIM_WINDOW, "lpips_alex": lpips.MIN_SIZE["alex"], "lpips_vgg": lpips.MIN_SIZE["vgg"]}
+        if metric in ("psnr_masked", "psnr_body") and self.labels is None:
+            return f"{self.name} has no segmentation"
+        if min(height, width) < smallest.get(metric, 1):
+            return f"{self.name} has images of {width}x{height} pixels; it needs {smallest[metric]}"
+        if metric == "fvd" and n_steps - self.n_encoded < fvd.MIN_FRAMES:
+            return f"it needs {fvd.MIN_FRAMES} predicted steps; {self.name} has {n_steps - self.n_encoded}"
+        return None
+
+    def _by_step(self, images: Tensor) -> dict[str, Tensor]:
+        """Metric -> float64 [S], means over the views that have a value; NaN for steps without images."""
+        n_steps = len(self.images)
+        scores = {m: torch.full((n_steps,), torch.nan, dtype=torch.float64) for m in self.metrics if METRICS[m].by_step}
+        for step, pred in enumerate(images, n_steps - len(images)):
+            true = self.images[step]
+            labels, filmed = (None if mask is None else mask[step] for mask in (self.labels, self.filmed))
+            measure = {
+                "psnr": lambda: psnr(pred, true, filmed),
+                "psnr_masked": lambda: psnr(pred, true, labels != BACKGROUND),
+                "psnr_body": lambda: psnr(pred, true, labels == MOVING),
+                "ssim": lambda: ssim(pred, true),
+                "lpips_alex": lambda: lpips.lpips(pred, true, "alex"),
+                "lpips_vgg": lambda: lpips.lpips(pred, true, "vgg"),
+            }
+            for metric, values in scores.items():
+                values[step] = measure[metric]().nanmean()
+        return scores
+
+    def _clip_features(self, images: Tensor) -> Tensor:
+        """[V, 400], of the predicted steps."""
+        n_future = len(self.images) - self.n_encoded
+        return fvd.clip_features(images[-n_future:].transpose(0, 1)).cpu()
