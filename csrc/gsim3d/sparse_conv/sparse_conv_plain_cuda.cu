@@ -107,8 +107,8 @@ __global__ void __launch_bounds__(kThreads) convolve(Convolution<E> conv) {
   const int64_t begin = min(max(conv.cu_voxel_rows[v0], int64_t{0}), n_rows);
   const int64_t end = min(max(conv.cu_voxel_rows[min(v0 + kTile, conv.n_voxels)], begin), n_rows);
   for (int64_t m0 = begin; m0 < end; m0 += kRows) {
-    const int64_t mine = m0 + thread / 4, index = mine < end ? conv.voxel_rows[mine] : -1;
-    const E* row = inside(index, n_rows) ? conv.values.rows + index * conv.c_read : nullptr;
+    const int64_t mine = m0 + thread / 4, index = mine < end ? conv.pairs.rows[mine] : -1;
+    const E* row = index >= 0 ? conv.values.rows + index * conv.c_read : nullptr;
     T sums[4][4] = {};
     multiply_rows<E, kTransposed>(conv, row, centre, n0, stage, sums);
 #pragma unroll
@@ -134,28 +134,21 @@ template <typename E>
 __global__ void __launch_bounds__(kThreads) multiply_pairs(OuterProducts<E> products, int32_t column_tiles) {
   using T = Sum<E>;
   __shared__ Stage<E> stage;
-  const PairBlock block = find_block(products.cu_taps, products.taps, products.n_pairs, products.n_rows,
-                                     products.block_pairs, static_cast<int32_t>(blockIdx.x), -1);
-  if (block.tap < 0) return;
+  const PairBlock block = pair_block(products, blockIdx.x);
   const int thread = threadIdx.x, pair = thread / 16, from = thread % 16 * 4;
   const int32_t co = blockIdx.y / column_tiles * kRows, ci = blockIdx.y % column_tiles * kColumns;
   T sums[4][4] = {};
-  for (int64_t p0 = block.begin; p0 < block.end; p0 += kDepth) {
+  for (int64_t p0 = block.pairs.begin; p0 < block.pairs.end; p0 += kDepth) {
     const int64_t p = p0 + pair;
-    int32_t out = -1, in = -1;
-    if (p < block.end) {
-      const bool own = block.tap == products.taps / 2;
-      out = own ? static_cast<int32_t>(p) : products.grad_sources.of(products.tap_out[p]);
-      in = own ? static_cast<int32_t>(p) : products.input_sources.of(products.tap_in[p]);
-    }
-    const bool both = out >= 0 && in >= 0;
-    const E* left = both ? products.grads.at(out) : nullptr;
-    const E* right = both ? products.inputs.at(in) : nullptr;
+    const PairSources rows = p < block.pairs.end ? pair_sources(products, block.tap, p) : PairSources{-1, -1};
+    const bool real = rows.out >= 0;
+    const E* left = real ? products.grads.at(rows.out) : nullptr;
+    const E* right = real ? products.inputs.at(rows.in) : nullptr;
     __syncthreads();
 #pragma unroll
     for (int i = 0; i < 4; ++i) {
-      stage.a[pair][from + i] = both && co + from + i < products.c_out ? widen(left[co + from + i]) : T(0);
-      stage.b[pair][from + i] = both && ci + from + i < products.c_in ? widen(right[ci + from + i]) : T(0);
+      stage.a[pair][from + i] = real && co + from + i < products.c_out ? widen(left[co + from + i]) : T(0);
+      stage.b[pair][from + i] = real && ci + from + i < products.c_in ? widen(right[ci + from + i]) : T(0);
     }
     __syncthreads();
     multiply(stage.a, stage.b, thread / 16 * 4, thread % 16 * 4, sums);

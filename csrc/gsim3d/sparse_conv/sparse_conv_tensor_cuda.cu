@@ -11,18 +11,21 @@ namespace {
 
 constexpr int kThreads = 256;
 constexpr int kWarps = kThreads / kWarp;
-constexpr int kChunk = 128;  // pairs of one product
-constexpr int kDepth = 64;   // channels of one stage
+constexpr int kDepth = 64;  // channels of one stage
 constexpr int kStages = 3;
 constexpr int kWarpColumns = 32;
+constexpr size_t kStaticBytes = 128;  // of shared memory, beside Memory
 
 template <typename E, int kColumns>
-struct Memory {
+struct alignas(128) Memory {
+  static constexpr int kChunk = kColumns;  // pairs of one product; a narrow block fits an SM twice
   E a[kStages][kChunk * kDepth];
   E b[kStages][kColumns * kDepth];
-  uint8_t places[kStages][kChunk];
   float sums[kTile * kColumns];
-  // then counts[taps]
+  uint8_t places[kStages][kChunk];
+  // then the list of products
+
+  static size_t bytes(int32_t taps) { return sizeof(Memory) + sizeof(uint32_t) * taps * (kTile / kChunk); }
 };
 
 // Consecutive voxels start at different banks.
@@ -31,190 +34,299 @@ __device__ __forceinline__ int sum_offset(int place, int column) {
   return place * kColumns + (column ^ ((place & 3) << 3));
 }
 
-// The products of a block, one after another: taps in order, the centre (rows of the tile's voxels) last; each in
-// chunks of pairs, those in stages of channels.
-struct Jobs {
-  const int32_t* counts;  // [taps], in shared memory
-  int32_t taps, depth, n_rows;
-  int32_t index = -1, tap = 0, count = 0, m0 = 0, k0 = 0;
+// One product of a block: `rows` pairs of a tap from pair m0 of its list on.
+struct Product {
+  int32_t tap, m0, rows;
 
-  __device__ Jobs(const int32_t* counts, int32_t taps, int32_t depth, int32_t n_rows)
-      : counts(counts), taps(taps), depth(depth), n_rows(n_rows) {
-    next_tap();
-  }
-  __device__ bool done() const { return index >= taps; }
-  __device__ bool centre() const { return tap == taps / 2; }
-  __device__ bool last_stage() const { return k0 + kDepth >= depth; }
-  __device__ void next_tap() {
-    m0 = 0;
-    do {
-      if (++index >= taps) return;
-      tap = index == taps - 1 ? taps / 2 : index < taps / 2 ? index : index + 1;
-      count = centre() ? n_rows : counts[tap];
-    } while (count == 0);
-  }
-  __device__ void advance() {
-    k0 += kDepth;
-    if (k0 < depth) return;
-    k0 = 0;
-    m0 += kChunk;
-    if (m0 >= count) next_tap();
+  __device__ uint32_t packed() const { return static_cast<uint32_t>(tap) << 12 | m0 / 64 << 8 | rows; }
+  __device__ static Product unpacked(uint32_t bits) {
+    return {static_cast<int32_t>(bits >> 12), static_cast<int32_t>(bits >> 8 & 15) * 64,
+            static_cast<int32_t>(bits & 255)};
   }
 };
 
+// Lists the products of a tile, taps in order, without the centre's; returns their number. A whole warp calls it.
+__device__ int32_t list_products(const int32_t* counts, int32_t taps, int32_t chunk, uint32_t* list) {
+  const int lane = threadIdx.x % kWarp;
+  int32_t before = 0;
+  for (int32_t t0 = 0; t0 < taps; t0 += kWarp) {
+    const int32_t tap = t0 + lane, count = tap < taps && tap != taps / 2 ? min(counts[tap], kTile) : 0;
+    const int32_t products = (count + chunk - 1) / chunk;
+    int32_t through = products;
+#pragma unroll
+    for (int step = 1; step < kWarp; step *= 2) {
+      const int32_t other = __shfl_up_sync(kFullWarp, through, step);
+      if (lane >= step) through += other;
+    }
+    for (int32_t i = 0; i < products; ++i)
+      list[before + through - products + i] = Product{tap, i * chunk, min(chunk, count - i * chunk)}.packed();
+    before += __shfl_sync(kFullWarp, through, kWarp - 1);
+  }
+  return before;
+}
+
+// sums += a b over `steps` times 16 channels, for kActive blocks of 16 rows. Addresses are those of the first step and
+// block; a step flips bits 5 and 6 of the address of a row of 128 bytes.
+template <typename E, int kActive, int kBlocks, int kBlockBytes, int kWeightRow, bool kTransposed>
+__device__ __forceinline__ void multiply_stage(uint32_t a, uint32_t b, int steps,
+                                               float (&sums)[kBlocks][kWarpColumns / 8][4]) {
+#pragma unroll
+  for (int k = 0; k < kDepth / 16; ++k) {
+    if (k >= steps) break;
+    uint32_t right[kWarpColumns / 16][4], left[kActive][4];
+#pragma unroll
+    for (int j = 0; j < kWarpColumns / 16; ++j) {
+      if constexpr (kTransposed)
+        load_matrices_transposed((b ^ (j * 32)) + k * 16 * kWeightRow * static_cast<int>(sizeof(E)), right[j]);
+      else
+        load_matrices((b ^ (k * 32)) + j * 16 * kWeightRow * static_cast<int>(sizeof(E)), right[j]);
+    }
+#pragma unroll
+    for (int i = 0; i < kActive; ++i) load_matrices((a ^ (k * 32)) + i * kBlockBytes, left[i]);
+#pragma unroll
+    for (int i = 0; i < kActive; ++i)
+#pragma unroll
+      for (int j = 0; j < kWarpColumns / 8; ++j)
+        multiply_add<E>(left[i], right[j / 2][j % 2 * 2], right[j / 2][j % 2 * 2 + 1], sums[i][j]);
+  }
+}
+
+// Adds the products of a tap's pairs to the sums of the voxels they write.
+template <int kColumns, int kBlocks, int kRowsApart>
+__device__ __forceinline__ void add_to_voxels(const float (&products)[kBlocks][kWarpColumns / 8][4], int first_row,
+                                              int column, int rows, const uint8_t* places, float* sums) {
+  const int lane = threadIdx.x % kWarp;
+#pragma unroll
+  for (int i = 0; i < kBlocks; ++i)
+#pragma unroll
+    for (int h = 0; h < 2; ++h) {
+      const int row = first_row + i * kRowsApart + lane / 4 + h * 8;
+      if (row >= rows) continue;
+      const int place = places[row];
+#pragma unroll
+      for (int j = 0; j < kWarpColumns / 8; ++j) {
+        float2& sum = *reinterpret_cast<float2*>(sums + sum_offset<kColumns>(place, column + j * 8 + lane % 4 * 2));
+        sum = float2{sum.x + products[i][j][2 * h], sum.y + products[i][j][2 * h + 1]};
+      }
+    }
+}
+
+template <typename E>
+__device__ __forceinline__ uint32_t packed(float x, float y) {
+  const E pair[2] = {static_cast<E>(x), static_cast<E>(y)};
+  uint32_t bits;
+  memcpy(&bits, pair, sizeof(bits));
+  return bits;
+}
+
+// Writes rows voxel_rows[i0 + row]: products of the centre tap, the voxel's share, the bias. All lanes call it.
+template <typename E, int kColumns, int kBlocks, int kRowsApart>
+__device__ __forceinline__ void write_rows(const Convolution<E>& conv,
+                                           const float (&products)[kBlocks][kWarpColumns / 8][4], int first_row,
+                                           int column, int rows, int64_t i0, int64_t v0, int32_t n0,
+                                           const float* sums) {
+  const int lane = threadIdx.x % kWarp, odd = lane % 2;
+  const bool whole = conv.c_write % 4 == 0;  // rows of whole groups of four columns
+#pragma unroll
+  for (int i = 0; i < kBlocks; ++i)
+#pragma unroll
+    for (int h = 0; h < 2; ++h) {
+      const int row = first_row + i * kRowsApart + lane / 4 + h * 8;
+      const Part part = row < rows ? part_of(conv, i0 + row, v0) : Part{-1, -1, 1};
+      const float parts = static_cast<float>(part.parts);
+      float2 y[kWarpColumns / 8];
+#pragma unroll
+      for (int j = 0; j < kWarpColumns / 8; ++j) {
+        const int c = column + j * 8 + lane % 4 * 2;
+        y[j] = float2{products[i][j][2 * h], products[i][j][2 * h + 1]};
+        if (conv.bias != nullptr) {
+          if (n0 + c < conv.c_write) y[j].x += static_cast<float>(conv.bias[n0 + c]);
+          if (n0 + c + 1 < conv.c_write) y[j].y += static_cast<float>(conv.bias[n0 + c + 1]);
+        }
+        if (part.place >= 0) {
+          const float2 sum = *reinterpret_cast<const float2*>(sums + sum_offset<kColumns>(part.place, c));
+          y[j].x += sum.x / parts;
+          y[j].y += sum.y / parts;
+        }
+      }
+      E* to = conv.y + part.row * conv.c_write + n0;
+      // Two lanes exchange halves of two column groups: each then writes 8 bytes, four lanes a whole sector.
+#pragma unroll
+      for (int j = 0; j < kWarpColumns / 8; j += 2) {
+        const uint32_t low = packed<E>(y[j].x, y[j].y), high = packed<E>(y[j + 1].x, y[j + 1].y);
+        const uint32_t other = __shfl_xor_sync(kFullWarp, odd ? low : high, 1);
+        const int c = column + (j + odd) * 8 + lane % 4 / 2 * 4;
+        if (part.row < 0) continue;
+        if (whole) {
+          if (n0 + c < conv.c_write) *reinterpret_cast<uint2*>(to + c) = odd ? uint2{other, high} : uint2{low, other};
+          continue;
+        }
+#pragma unroll
+        for (int e = 0; e < 4; ++e) {
+          const int single = column + (j + e / 2) * 8 + lane % 4 * 2 + e % 2;
+          const float value = e % 2 ? y[j + e / 2].y : y[j + e / 2].x;
+          if (n0 + single < conv.c_write) to[single] = static_cast<E>(value);
+        }
+      }
+    }
+}
+
 template <typename E, int kColumns, bool kTransposed>
-__global__ void __launch_bounds__(kThreads) convolve(Convolution<E> conv, int32_t column_blocks) {
+__global__ void __launch_bounds__(kThreads, kColumns == 64 ? 2 : 1)
+    convolve(Convolution<E> conv, int32_t column_blocks) {
+  using Shared = Memory<E, kColumns>;
+  constexpr int kChunk = Shared::kChunk;
   constexpr int kWarpsAcross = kColumns / kWarpColumns, kWarpsDown = kWarps / kWarpsAcross;
-  constexpr int kBlocks = kChunk / 16 / kWarpsDown;    // blocks of 16 pairs of one warp
-  constexpr int kRowsApart = kThreads / (kDepth / 8);  // a thread copies one chunk of 8 channels of every 32nd pair
-  constexpr int kRowsCopied = kChunk / kRowsApart;
+  constexpr int kBlocks = kChunk / 16 / kWarpsDown;  // blocks of 16 pairs of one warp
+  constexpr int kRowBytes = kDepth * sizeof(E);
+  constexpr int kBlockBytes = kWarpsDown * 16 * kRowBytes;
+  // A thread copies 16 bytes of every kRowsApart-th pair, and of every kWeightsApart-th row of weights.
+  constexpr int kRowsApart = kThreads / (kDepth / 8), kRowsCopied = kChunk / kRowsApart;
   constexpr int kWeightRow = kTransposed ? kColumns : kDepth;  // elements of a row of b
-  constexpr int kWeightRows = kTransposed ? kDepth : kColumns;
   constexpr int kWeightsApart = kThreads / (kWeightRow / 8);
+  constexpr int kWeightsCopied = (kTransposed ? kDepth : kColumns) / kWeightsApart;
+  static_assert(kRowsApart % 8 == 0 && kWeightsApart % 8 == 0);  // the rows of a thread have one permutation of chunks
+  constexpr uint32_t kStageA = sizeof(Shared::a) / kStages, kStageB = sizeof(Shared::b) / kStages;
 
   extern __shared__ __align__(128) char raw[];
-  auto& memory = *reinterpret_cast<Memory<E, kColumns>*>(raw);
-  int32_t* counts = reinterpret_cast<int32_t*>(raw + sizeof(memory));
+  auto& memory = *reinterpret_cast<Shared*>(raw);
+  uint32_t* listed = reinterpret_cast<uint32_t*>(raw + sizeof(Shared));
+  __shared__ int32_t listed_count;
   const int thread = threadIdx.x, lane = thread % kWarp, warp = thread / kWarp;
   const int warp_down = warp / kWarpsAcross, warp_across = warp % kWarpsAcross;
   const int64_t tile = blockIdx.x / column_blocks, v0 = tile * kTile;
-  const int32_t n0 = blockIdx.x % column_blocks * kColumns;
+  const int32_t n0 = blockIdx.x % column_blocks * kColumns, centre = conv.taps / 2;
   const int64_t n_rows = conv.values.n_rows;
   const int64_t begin = min(max(conv.cu_voxel_rows[v0], int64_t{0}), n_rows);
   const int64_t end = min(max(conv.cu_voxel_rows[min(v0 + kTile, conv.n_voxels)], begin), n_rows);
 
-  for (int i = thread; i < conv.taps; i += kThreads) counts[i] = conv.pairs.counts[tile * conv.taps + i];
+  if (warp == 0) {
+    const int32_t n = list_products(conv.pairs.counts + tile * conv.taps, conv.taps, kChunk, listed);
+    if (lane == 0) listed_count = n;
+  }
   for (int i = thread * 4; i < kTile * kColumns; i += kThreads * 4)
     *reinterpret_cast<float4*>(memory.sums + i) = float4{0, 0, 0, 0};
   __syncthreads();
-
-  Jobs copied(counts, conv.taps, conv.c_read, static_cast<int32_t>(end - begin));
-  Jobs job = copied;
-
-  // The rows that this thread copies for `copied`: looked up one product ahead.
-  int32_t sources[kRowsCopied];
-  const auto look_up = [&] {
-#pragma unroll
-    for (int i = 0; i < kRowsCopied; ++i) {
-      const int32_t at = copied.m0 + thread / (kDepth / 8) + i * kRowsApart;
-      sources[i] = -1;
-      if (at >= copied.count) continue;
-      if (copied.centre()) {
-        const int64_t row = conv.voxel_rows[begin + at];
-        if (inside(row, n_rows)) sources[i] = static_cast<int32_t>(row);
-      } else {
-        sources[i] = conv.pairs.sources[copied.tap * conv.pairs.pitch + v0 + at];
-      }
-    }
+  const int32_t n_listed = listed_count;
+  const int32_t n_products = n_listed + static_cast<int32_t>((end - begin + kChunk - 1) / kChunk);
+  const auto product_at = [&](int32_t i) {
+    if (i < n_listed) return Product::unpacked(listed[i]);
+    const int32_t m0 = (i - n_listed) * kChunk;
+    return Product{centre, m0, static_cast<int32_t>(min(end - begin - m0, int64_t{kChunk}))};
   };
 
+  // Where this thread copies to, and from where. Sources are looked up one product ahead.
+  const int row = thread / (kDepth / 8), chunk = thread % (kDepth / 8);
+  const int weight_row = thread / (kWeightRow / 8), weight_chunk = thread % (kWeightRow / 8);
+  const uint32_t to_a = shared_address(memory.a[0] + chunk_offset<kDepth>(row, chunk));
+  const uint32_t to_b = shared_address(memory.b[0] + chunk_offset<kWeightRow>(weight_row, weight_chunk));
+  const int64_t weight_step = static_cast<int64_t>(conv.taps) * conv.weight_row;
+  // Columns beyond the last are computed from whatever weights are there and never written.
+  const int32_t weight_column = kTransposed ? min(n0 + weight_chunk * 8, conv.weight_row - 8) : weight_chunk * 8;
+  const E* weights = conv.weight + weight_column;
+  Product copied{}, next = product_at(0);
+  int32_t copied_index = 0, copied_k = 0, sources[kRowsCopied];
+  const E* rows_from[kRowsCopied];
+  uint32_t real_rows = 0;
+  const auto look_up = [&] {
+    const int32_t* from =
+        next.tap == centre ? conv.pairs.rows + begin : conv.pairs.sources + next.tap * conv.pairs.pitch + v0;
+    from += next.m0 + row;
+#pragma unroll
+    for (int i = 0; i < kRowsCopied; ++i) sources[i] = row + i * kRowsApart < next.rows ? from[i * kRowsApart] : -1;
+  };
   const auto copy_next = [&](int stage) {
-    if (!copied.done()) {
-      const int chunk = thread % (kDepth / 8), k = copied.k0 + chunk * 8;
-      const int rows = min(kChunk, (copied.count - copied.m0 + 15) / 16 * 16);
+    if (copied_index < n_products) {
+      if (copied_k == 0) {
+        copied = next;
+        real_rows = 0;
 #pragma unroll
-      for (int i = 0; i < kRowsCopied; ++i) {
-        const int row = thread / (kDepth / 8) + i * kRowsApart;
-        const bool real = sources[i] >= 0 && k < conv.c_read;
-        if (row < rows)
-          copy_async(shared_address(memory.a[stage] + chunk_offset<kDepth>(row, chunk)),
-                     real ? conv.values.at(sources[i]) + k : conv.values.rows, real);
+        for (int i = 0; i < kRowsCopied; ++i) {
+          const bool real = sources[i] >= 0;
+          rows_from[i] = conv.values.at(real ? sources[i] : 0) + chunk * 8;
+          real_rows |= static_cast<uint32_t>(real) << i;
+        }
+        if (copied_index + 1 < n_products) {
+          next = product_at(copied_index + 1);
+          look_up();
+        }
       }
+      const bool inside_row = copied_k + chunk * 8 < conv.c_read;
+      const int rows = (copied.rows + 15) / 16 * 16;
 #pragma unroll
-      for (int i = 0; i < kWeightRows / kWeightsApart; ++i) {
-        const int row = thread / (kWeightRow / 8) + i * kWeightsApart, part = thread % (kWeightRow / 8);
-        const int32_t first = kTransposed ? copied.k0 + row : n0 + row;  // index of the weight's first dimension
-        const int32_t last = (kTransposed ? n0 : copied.k0) + part * 8;  // and of its last
-        const bool real = first < conv.c_out && last < conv.weight_row;
-        const E* from = conv.weight + (static_cast<int64_t>(first) * conv.taps + copied.tap) * conv.weight_row + last;
-        copy_async(shared_address(memory.b[stage] + chunk_offset<kWeightRow>(row, part)), real ? from : conv.weight,
-                   real);
+      for (int i = 0; i < kRowsCopied; ++i)
+        if (row + i * kRowsApart < rows)
+          copy_async(to_a + stage * kStageA + i * kRowsApart * kRowBytes, rows_from[i] + (inside_row ? copied_k : 0),
+                     inside_row && (real_rows >> i & 1));
+      const E* from = weights + static_cast<int64_t>(copied.tap) * conv.weight_row + (kTransposed ? 0 : copied_k);
+#pragma unroll
+      for (int i = 0; i < kWeightsCopied; ++i) {
+        const int32_t r = weight_row + i * kWeightsApart;
+        const int32_t output = kTransposed ? copied_k + r : n0 + r;  // index of the weight's first dimension
+        const bool real = kTransposed ? output < conv.c_out : inside_row;
+        copy_async(to_b + stage * kStageB + i * kWeightsApart * kWeightRow * static_cast<int>(sizeof(E)),
+                   real ? from + min(output, conv.c_out - 1) * weight_step : conv.weight, real);
       }
-      if (!copied.centre() && copied.last_stage() && thread < kChunk / 16)
+      if (thread < kChunk / 16 && copied.tap != centre && copied_k + kDepth >= conv.c_read)
         copy_async(shared_address(memory.places[stage] + thread * 16),
                    conv.pairs.places + copied.tap * conv.pairs.pitch + v0 + copied.m0 + thread * 16, true);
-      copied.advance();
-      if (!copied.done() && copied.k0 == 0) look_up();
+      copied_k += kDepth;
+      if (copied_k >= conv.c_read) {
+        copied_k = 0;
+        ++copied_index;
+      }
     }
     close_copies();
   };
 
+  // Where this warp's matrices lie in the first stage.
+  const uint32_t from_a = shared_address(memory.a[0] + chunk_offset<kDepth>(warp_down * 16 + lane % 16, lane / 16));
+  const uint32_t from_b =
+      kTransposed
+          ? shared_address(memory.b[0] + chunk_offset<kWeightRow>(lane / 8 % 2 * 8 + lane % 8,
+                                                                  warp_across * kWarpColumns / 8 + lane / 16))
+          : shared_address(memory.b[0] + chunk_offset<kWeightRow>(warp_across * kWarpColumns + lane / 16 * 8 + lane % 8,
+                                                                  lane / 8 % 2));
   float sums[kBlocks][kWarpColumns / 8][4] = {};
-  if (!copied.done()) look_up();
+  if (n_products > 0) look_up();
   for (int stage = 0; stage < kStages - 1; ++stage) copy_next(stage);
 
-  for (int stage = 0; !job.done(); stage = (stage + 1) % kStages) {
-    wait_for_copies<kStages - 2>();
-    __syncthreads();
-    copy_next((stage + kStages - 1) % kStages);
-
-    const int rows = min(kChunk, job.count - job.m0);
-    const int depth = min(kDepth, conv.c_read - job.k0);
-#pragma unroll
-    for (int k = 0; k < kDepth; k += 16) {
-      if (k >= depth) break;
-      uint32_t b[kWarpColumns / 16][4];
-#pragma unroll
-      for (int j = 0; j < kWarpColumns / 16; ++j) {
-        const int column = warp_across * kWarpColumns + j * 16;
-        if constexpr (kTransposed)
-          load_matrices_transposed(
-              shared_address(memory.b[stage] +
-                             chunk_offset<kWeightRow>(k + lane / 8 % 2 * 8 + lane % 8, column / 8 + lane / 16)),
-              b[j]);
-        else
-          load_matrices(shared_address(memory.b[stage] + chunk_offset<kWeightRow>(column + lane / 16 * 8 + lane % 8,
-                                                                                  k / 8 + lane / 8 % 2)),
-                        b[j]);
+  int stage = 0;
+  for (int32_t index = 0; index < n_products; ++index) {
+    const Product product = product_at(index);
+    const int active = max(0, (product.rows - warp_down * 16 + kWarpsDown * 16 - 1) / (kWarpsDown * 16));
+    int last_stage = 0;
+    for (int32_t k0 = 0; k0 == 0 || k0 < conv.c_read; k0 += kDepth, stage = stage + 1 == kStages ? 0 : stage + 1) {
+      wait_for_copies<kStages - 2>();
+      __syncthreads();
+      copy_next(stage == 0 ? kStages - 1 : stage - 1);
+      const uint32_t a = from_a + stage * kStageA, b = from_b + stage * kStageB;
+      const int steps = (conv.c_read - k0 + 15) / 16;
+      const auto multiply = [&]<int kActive>() {
+        multiply_stage<E, kActive, kBlocks, kBlockBytes, kWeightRow, kTransposed>(a, b, steps, sums);
+      };
+      if constexpr (kBlocks >= 4) {
+        if (active == 4) multiply.template operator()<4>();
+        if (active == 3) multiply.template operator()<3>();
       }
-#pragma unroll
-      for (int i = 0; i < kBlocks; ++i) {
-        const int row = (warp_down + i * kWarpsDown) * 16;
-        if (row >= rows) break;
-        uint32_t a[4];
-        load_matrices(shared_address(memory.a[stage] + chunk_offset<kDepth>(row + lane % 16, k / 8 + lane / 16)), a);
-#pragma unroll
-        for (int j = 0; j < kWarpColumns / 8; ++j)
-          multiply_add<E>(a, b[j / 2][j % 2 * 2], b[j / 2][j % 2 * 2 + 1], sums[i][j]);
-      }
+      if constexpr (kBlocks >= 2)
+        if (active == 2) multiply.template operator()<2>();
+      if (active == 1) multiply.template operator()<1>();
+      last_stage = stage;
     }
-
-    if (job.last_stage()) {
+    const int first_row = warp_down * 16, column = warp_across * kWarpColumns;
+    if (index >= n_listed)
+      write_rows<E, kColumns, kBlocks, kWarpsDown * 16>(conv, sums, first_row, column, product.rows, begin + product.m0,
+                                                        v0, n0, memory.sums);
+    else
+      add_to_voxels<kColumns, kBlocks, kWarpsDown * 16>(sums, first_row, column, product.rows,
+                                                        memory.places[last_stage], memory.sums);
 #pragma unroll
-      for (int i = 0; i < kBlocks; ++i) {
+    for (int i = 0; i < kBlocks; ++i)
 #pragma unroll
-        for (int h = 0; h < 2; ++h) {
-          const int row = (warp_down + i * kWarpsDown) * 16 + lane / 4 + h * 8;
-          const int column = warp_across * kWarpColumns + lane % 4 * 2;
-          if (row < rows && !job.centre()) {
-            const int place = memory.places[stage][row];
+      for (int j = 0; j < kWarpColumns / 8; ++j)
 #pragma unroll
-            for (int j = 0; j < kWarpColumns / 8; ++j) {
-              float2& sum = *reinterpret_cast<float2*>(memory.sums + sum_offset<kColumns>(place, column + j * 8));
-              sum = float2{sum.x + sums[i][j][2 * h], sum.y + sums[i][j][2 * h + 1]};
-            }
-          } else if (row < rows) {
-            const Part part = part_of(conv, begin + job.m0 + row, v0);
-#pragma unroll
-            for (int j = 0; j < kWarpColumns / 8; ++j)
-#pragma unroll
-              for (int e = 0; e < 2; ++e) {
-                const int32_t n = n0 + column + j * 8 + e;
-                if (part.row < 0 || n >= conv.c_write) continue;
-                float y = sums[i][j][2 * h + e];
-                if (conv.bias != nullptr) y += static_cast<float>(conv.bias[n]);
-                if (part.place >= 0)
-                  y += memory.sums[sum_offset<kColumns>(part.place, column + j * 8 + e)] /
-                       static_cast<float>(part.parts);
-                conv.y[part.row * conv.c_write + n] = static_cast<E>(y);
-              }
-          }
-#pragma unroll
-          for (int j = 0; j < kWarpColumns / 8; ++j) sums[i][j][2 * h] = sums[i][j][2 * h + 1] = 0;
-        }
-      }
-    }
-    job.advance();
+        for (int e = 0; e < 4; ++e) sums[i][j][e] = 0;
   }
   wait_for_copies<0>();
 }
@@ -225,13 +337,13 @@ template <typename E>
 void convolve_tensor(const char* op, const Convolution<E>& conv, int64_t n_tiles, bool transposed, Stream stream) {
   const auto queue = [&]<int kColumns>() {
     const int64_t column_blocks = blocks_for(op, conv.c_write, kColumns);
-    const size_t bytes = sizeof(Memory<E, kColumns>) + sizeof(int32_t) * conv.taps;
     launch(op, transposed ? convolve<E, kColumns, true> : convolve<E, kColumns, false>,
-           blocks_for(op, n_tiles * column_blocks, 1), kThreads, bytes, stream, conv, column_blocks);
+           blocks_for(op, n_tiles * column_blocks, 1), kThreads, Memory<E, kColumns>::bytes(conv.taps), stream, conv,
+           column_blocks);
   };
   int shared_bytes = 0;
   check_cuda(cudaDeviceGetAttribute(&shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, stream.device), op);
-  const bool wide = sizeof(Memory<E, 128>) + sizeof(int32_t) * conv.taps <= static_cast<size_t>(shared_bytes);
+  const bool wide = Memory<E, 128>::bytes(conv.taps) + kStaticBytes <= static_cast<size_t>(shared_bytes);
   if (conv.c_write > 64 && wide)
     queue.template operator()<128>();
   else

@@ -7,7 +7,8 @@ namespace {
 
 constexpr int kThreads = 256;
 constexpr int kWarps = kThreads / kWarp;
-constexpr int kDepth = kPairStep;  // pairs of one stage
+constexpr int kDepth = 64;     // pairs of one stage
+constexpr int kListed = 2048;  // pairs whose rows are looked up at a time
 constexpr int kStages = 3;
 constexpr int kWarpColumns = 32;
 
@@ -15,7 +16,7 @@ template <typename E, int kSide>
 struct Memory {
   E grads[kStages][kDepth * kSide];
   E inputs[kStages][kDepth * kSide];
-  // then the sources of the block's pairs: grads[block_pairs], inputs[block_pairs]
+  PairSources pairs[kListed];
 };
 
 // One block: kSide x kSide of the outer products of a block of pairs.
@@ -25,76 +26,65 @@ __global__ void __launch_bounds__(kThreads) multiply_pairs(OuterProducts<E> prod
   constexpr int kBlocks = kSide / 16 / kWarpsDown;  // blocks of 16 outputs of one warp
   constexpr int kChunks = kSide / 8, kPairsApart = kThreads / kChunks;
 
-  const PairBlock block = find_block(products.cu_taps, products.taps, products.n_pairs, products.n_rows,
-                                     products.block_pairs, static_cast<int32_t>(blockIdx.x), -1);
-  if (block.tap < 0) return;
   extern __shared__ __align__(128) char raw[];
   auto& memory = *reinterpret_cast<Memory<E, kSide>*>(raw);
-  int32_t* outs = reinterpret_cast<int32_t*>(raw + sizeof(memory));
-  int32_t* ins = outs + products.block_pairs;
   const int thread = threadIdx.x, lane = thread % kWarp, warp = thread / kWarp;
   const int warp_down = warp / kWarpsAcross, warp_across = warp % kWarpsAcross;
   const int32_t co = blockIdx.y / column_tiles * kSide, ci = blockIdx.y % column_tiles * kSide;
-  const int32_t n_pairs = static_cast<int32_t>(block.end - block.begin);
+  const PairBlock block = pair_block(products, blockIdx.x);
 
-  for (int32_t i = thread; i < n_pairs; i += kThreads) {
-    const int64_t p = block.begin + i;
-    const bool own = block.tap == products.taps / 2;
-    const int32_t out = own ? static_cast<int32_t>(p) : products.grad_sources.of(products.tap_out[p]);
-    const int32_t in = own ? static_cast<int32_t>(p) : products.input_sources.of(products.tap_in[p]);
-    outs[i] = in < 0 ? -1 : out;
-    ins[i] = out < 0 ? -1 : in;
-  }
-  __syncthreads();
-
+  int32_t n_listed = 0;
   const auto copy_stage = [&](int32_t p0, int stage) {
-    if (p0 < n_pairs) {
+    if (p0 < n_listed) {
       const int chunk = thread % kChunks;
       const bool left = co + chunk * 8 < products.c_out, right = ci + chunk * 8 < products.c_in;
 #pragma unroll
       for (int i = 0; i < kDepth / kPairsApart; ++i) {
         const int pair = thread / kChunks + i * kPairsApart;
-        const int32_t out = p0 + pair < n_pairs ? outs[p0 + pair] : -1, in = p0 + pair < n_pairs ? ins[p0 + pair] : -1;
-        const bool real_left = left && out >= 0, real_right = right && in >= 0;
+        const PairSources rows = p0 + pair < n_listed ? memory.pairs[p0 + pair] : PairSources{-1, -1};
+        const bool real_left = left && rows.out >= 0, real_right = right && rows.in >= 0;
         copy_async(shared_address(memory.grads[stage] + chunk_offset<kSide>(pair, chunk)),
-                   real_left ? products.grads.at(out) + co + chunk * 8 : products.grads.rows, real_left);
+                   real_left ? products.grads.at(rows.out) + co + chunk * 8 : products.grads.rows, real_left);
         copy_async(shared_address(memory.inputs[stage] + chunk_offset<kSide>(pair, chunk)),
-                   real_right ? products.inputs.at(in) + ci + chunk * 8 : products.inputs.rows, real_right);
+                   real_right ? products.inputs.at(rows.in) + ci + chunk * 8 : products.inputs.rows, real_right);
       }
     }
     close_copies();
   };
 
   float sums[kBlocks][kWarpColumns / 8][4] = {};
-  for (int stage = 0; stage < kStages - 1; ++stage) copy_stage(stage * kDepth, stage);
-  for (int32_t p0 = 0, stage = 0; p0 < n_pairs; p0 += kDepth, stage = (stage + 1) % kStages) {
-    wait_for_copies<kStages - 2>();
+  for (int64_t begin = block.pairs.begin; begin < block.pairs.end; begin += kListed) {
+    n_listed = static_cast<int32_t>(min(block.pairs.end - begin, int64_t{kListed}));
     __syncthreads();
-    copy_stage(p0 + (kStages - 1) * kDepth, (stage + kStages - 1) % kStages);
+    for (int32_t i = thread; i < n_listed; i += kThreads)
+      memory.pairs[i] = pair_sources(products, block.tap, begin + i);
+    __syncthreads();
+    for (int stage = 0; stage < kStages - 1; ++stage) copy_stage(stage * kDepth, stage);
+    for (int32_t p0 = 0, stage = 0; p0 < n_listed; p0 += kDepth, stage = (stage + 1) % kStages) {
+      wait_for_copies<kStages - 2>();
+      __syncthreads();
+      copy_stage(p0 + (kStages - 1) * kDepth, (stage + kStages - 1) % kStages);
 #pragma unroll
-    for (int k = 0; k < kDepth; k += 16) {
-      uint32_t b[kWarpColumns / 16][4];
+      for (int k = 0; k < kDepth; k += 16) {
+        uint32_t b[kWarpColumns / 16][4];
 #pragma unroll
-      for (int j = 0; j < kWarpColumns / 16; ++j)
-        load_matrices_transposed(
-            shared_address(memory.inputs[stage] +
-                           chunk_offset<kSide>(k + lane / 8 % 2 * 8 + lane % 8,
-                                               warp_across * kWarpColumns / 8 + j * 2 + lane / 16)),
-            b[j]);
+        for (int j = 0; j < kWarpColumns / 16; ++j) {
+          const int row = k + lane / 8 % 2 * 8 + lane % 8, chunk = warp_across * kWarpColumns / 8 + j * 2 + lane / 16;
+          load_matrices_transposed(shared_address(memory.inputs[stage] + chunk_offset<kSide>(row, chunk)), b[j]);
+        }
 #pragma unroll
-      for (int i = 0; i < kBlocks; ++i) {
-        uint32_t a[4];
-        load_matrices_transposed(
-            shared_address(memory.grads[stage] + chunk_offset<kSide>(k + lane / 16 * 8 + lane % 8,
-                                                                     (warp_down * kBlocks + i) * 2 + lane / 8 % 2)),
-            a);
+        for (int i = 0; i < kBlocks; ++i) {
+          const int row = k + lane / 16 * 8 + lane % 8, chunk = (warp_down * kBlocks + i) * 2 + lane / 8 % 2;
+          uint32_t a[4];
+          load_matrices_transposed(shared_address(memory.grads[stage] + chunk_offset<kSide>(row, chunk)), a);
 #pragma unroll
-        for (int j = 0; j < kWarpColumns / 8; ++j)
-          multiply_add<E>(a, b[j / 2][j % 2 * 2], b[j / 2][j % 2 * 2 + 1], sums[i][j]);
+          for (int j = 0; j < kWarpColumns / 8; ++j)
+            multiply_add<E>(a, b[j / 2][j % 2 * 2], b[j / 2][j % 2 * 2 + 1], sums[i][j]);
+        }
       }
     }
+    wait_for_copies<0>();
   }
-  wait_for_copies<0>();
 
   float* to = products.partials + static_cast<int64_t>(blockIdx.x) * products.c_out * products.c_in;
 #pragma unroll
@@ -118,8 +108,8 @@ void outer_products_tensor(const char* op, const OuterProducts<E>& products, int
   const auto queue = [&]<int kSide>() {
     const unsigned columns = blocks_for(op, products.c_in, kSide);
     const dim3 blocks(blocks_for(op, n_blocks, 1), blocks_for(op, products.c_out, kSide) * columns);
-    const size_t bytes = sizeof(Memory<E, kSide>) + 2 * sizeof(int32_t) * products.block_pairs;
-    launch(op, multiply_pairs<E, kSide>, blocks, kThreads, bytes, stream, products, static_cast<int32_t>(columns));
+    launch(op, multiply_pairs<E, kSide>, blocks, kThreads, sizeof(Memory<E, kSide>), stream, products,
+           static_cast<int32_t>(columns));
   };
   if (products.c_in > 64 || products.c_out > 64)
     queue.template operator()<128>();
