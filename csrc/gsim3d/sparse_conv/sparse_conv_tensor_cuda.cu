@@ -9,8 +9,6 @@
 namespace gsim3d::cuda::conv {
 namespace {
 
-constexpr int kThreads = 256;
-constexpr int kWarps = kThreads / kWarp;
 constexpr int kDepth = 64;  // channels of one stage
 constexpr int kStages = 3;
 constexpr int kWarpColumns = 32;
@@ -18,7 +16,9 @@ constexpr size_t kStaticBytes = 128;  // of shared memory, beside Memory
 
 template <typename E, int kColumns>
 struct alignas(128) Memory {
-  static constexpr int kChunk = kColumns;  // pairs of one product; a narrow block fits an SM twice
+  static constexpr int kChunk = kColumns;  // pairs of one product
+  // 16 warps an SM: one wide block, or two narrow ones.
+  static constexpr int kThreads = 4 * kColumns, kBlocksOnSm = kColumns == 64 ? 2 : 1;
   E a[kStages][kChunk * kDepth];
   E b[kStages][kColumns * kDepth];
   float sums[kTile * kColumns];
@@ -65,9 +65,9 @@ __device__ int32_t list_products(const int32_t* counts, int32_t taps, int32_t ch
   return before;
 }
 
-// sums += a b over `steps` times 16 channels, for kActive blocks of 16 rows. Addresses are those of the first step and
-// block; a step flips bits 5 and 6 of the address of a row of 128 bytes.
-template <typename E, int kActive, int kBlocks, int kBlockBytes, int kWeightRow, bool kTransposed>
+// sums (+)= a b over `steps` times 16 channels, for kActive blocks of 16 rows; kFirst starts from zero. Addresses are
+// those of the first step and block; a step flips bits 5 and 6 of the address of a row of 128 bytes.
+template <typename E, bool kFirst, int kActive, int kBlocks, int kBlockBytes, int kWeightRow, bool kTransposed>
 __device__ __forceinline__ void multiply_stage(uint32_t a, uint32_t b, int steps,
                                                float (&sums)[kBlocks][kWarpColumns / 8][4]) {
 #pragma unroll
@@ -86,8 +86,10 @@ __device__ __forceinline__ void multiply_stage(uint32_t a, uint32_t b, int steps
 #pragma unroll
     for (int i = 0; i < kActive; ++i)
 #pragma unroll
-      for (int j = 0; j < kWarpColumns / 8; ++j)
+      for (int j = 0; j < kWarpColumns / 8; ++j) {
+        if (kFirst && k == 0) sums[i][j][0] = sums[i][j][1] = sums[i][j][2] = sums[i][j][3] = 0;
         multiply_add<E>(left[i], right[j / 2][j % 2 * 2], right[j / 2][j % 2 * 2 + 1], sums[i][j]);
+      }
   }
 }
 
@@ -119,7 +121,7 @@ __device__ __forceinline__ uint32_t packed(float x, float y) {
   return bits;
 }
 
-// Writes rows voxel_rows[i0 + row]: products of the centre tap, the voxel's share, the bias. All lanes call it.
+// Writes rows voxel_rows[i0 + row]: products of the centre tap and the voxel's share. All lanes call it.
 template <typename E, int kColumns, int kBlocks, int kRowsApart>
 __device__ __forceinline__ void write_rows(const Convolution<E>& conv,
                                            const float (&products)[kBlocks][kWarpColumns / 8][4], int first_row,
@@ -133,20 +135,16 @@ __device__ __forceinline__ void write_rows(const Convolution<E>& conv,
     for (int h = 0; h < 2; ++h) {
       const int row = first_row + i * kRowsApart + lane / 4 + h * 8;
       const Part part = row < rows ? part_of(conv, i0 + row, v0) : Part{-1, -1, 1};
-      const float parts = static_cast<float>(part.parts);
+      const float share = part.parts == 1 ? 1.0f : 1.0f / static_cast<float>(part.parts);
       float2 y[kWarpColumns / 8];
 #pragma unroll
       for (int j = 0; j < kWarpColumns / 8; ++j) {
         const int c = column + j * 8 + lane % 4 * 2;
         y[j] = float2{products[i][j][2 * h], products[i][j][2 * h + 1]};
-        if (conv.bias != nullptr) {
-          if (n0 + c < conv.c_write) y[j].x += static_cast<float>(conv.bias[n0 + c]);
-          if (n0 + c + 1 < conv.c_write) y[j].y += static_cast<float>(conv.bias[n0 + c + 1]);
-        }
         if (part.place >= 0) {
           const float2 sum = *reinterpret_cast<const float2*>(sums + sum_offset<kColumns>(part.place, c));
-          y[j].x += sum.x / parts;
-          y[j].y += sum.y / parts;
+          y[j].x += sum.x * share;
+          y[j].y += sum.y * share;
         }
       }
       E* to = conv.y + part.row * conv.c_write + n0;
@@ -172,10 +170,10 @@ __device__ __forceinline__ void write_rows(const Convolution<E>& conv,
 }
 
 template <typename E, int kColumns, bool kTransposed>
-__global__ void __launch_bounds__(kThreads, kColumns == 64 ? 2 : 1)
+__global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColumns>::kBlocksOnSm)
     convolve(Convolution<E> conv, int32_t column_blocks) {
   using Shared = Memory<E, kColumns>;
-  constexpr int kChunk = Shared::kChunk;
+  constexpr int kChunk = Shared::kChunk, kThreads = Shared::kThreads, kWarps = kThreads / kWarp;
   constexpr int kWarpsAcross = kColumns / kWarpColumns, kWarpsDown = kWarps / kWarpsAcross;
   constexpr int kBlocks = kChunk / 16 / kWarpsDown;  // blocks of 16 pairs of one warp
   constexpr int kRowBytes = kDepth * sizeof(E);
@@ -204,8 +202,15 @@ __global__ void __launch_bounds__(kThreads, kColumns == 64 ? 2 : 1)
     const int32_t n = list_products(conv.pairs.counts + tile * conv.taps, conv.taps, kChunk, listed);
     if (lane == 0) listed_count = n;
   }
+  static_assert(kThreads * 4 / kColumns % 4 == 0);  // a thread starts the same columns of each of its voxels
+  float start[4];
+#pragma unroll
+  for (int e = 0; e < 4; ++e) {
+    const int32_t n = n0 + sum_offset<kColumns>(thread * 4 / kColumns, thread * 4 % kColumns + e) % kColumns;
+    start[e] = conv.bias != nullptr && n < conv.c_write ? static_cast<float>(conv.bias[n]) : 0.0f;
+  }
   for (int i = thread * 4; i < kTile * kColumns; i += kThreads * 4)
-    *reinterpret_cast<float4*>(memory.sums + i) = float4{0, 0, 0, 0};
+    *reinterpret_cast<float4*>(memory.sums + i) = float4{start[0], start[1], start[2], start[3]};
   __syncthreads();
   const int32_t n_listed = listed_count;
   const int32_t n_products = n_listed + static_cast<int32_t>((end - begin + kChunk - 1) / kChunk);
@@ -287,7 +292,7 @@ __global__ void __launch_bounds__(kThreads, kColumns == 64 ? 2 : 1)
                                                                   warp_across * kWarpColumns / 8 + lane / 16))
           : shared_address(memory.b[0] + chunk_offset<kWeightRow>(warp_across * kWarpColumns + lane / 16 * 8 + lane % 8,
                                                                   lane / 8 % 2));
-  float sums[kBlocks][kWarpColumns / 8][4] = {};
+  float sums[kBlocks][kWarpColumns / 8][4];
   if (n_products > 0) look_up();
   for (int stage = 0; stage < kStages - 1; ++stage) copy_next(stage);
 
@@ -302,16 +307,21 @@ __global__ void __launch_bounds__(kThreads, kColumns == 64 ? 2 : 1)
       copy_next(stage == 0 ? kStages - 1 : stage - 1);
       const uint32_t a = from_a + stage * kStageA, b = from_b + stage * kStageB;
       const int steps = (conv.c_read - k0 + 15) / 16;
-      const auto multiply = [&]<int kActive>() {
-        multiply_stage<E, kActive, kBlocks, kBlockBytes, kWeightRow, kTransposed>(a, b, steps, sums);
+      const auto multiply = [&]<bool kFirst, int kActive>() {
+        multiply_stage<E, kFirst, kActive, kBlocks, kBlockBytes, kWeightRow, kTransposed>(a, b, steps, sums);
       };
-      if constexpr (kBlocks >= 4) {
-        if (active == 4) multiply.template operator()<4>();
-        if (active == 3) multiply.template operator()<3>();
+      static_assert(kBlocks <= 2);
+      if (kBlocks == 2 && active == 2) {
+        if (k0 == 0)
+          multiply.template operator()<true, kBlocks>();
+        else
+          multiply.template operator()<false, kBlocks>();
+      } else if (active == 1) {
+        if (k0 == 0)
+          multiply.template operator()<true, 1>();
+        else
+          multiply.template operator()<false, 1>();
       }
-      if constexpr (kBlocks >= 2)
-        if (active == 2) multiply.template operator()<2>();
-      if (active == 1) multiply.template operator()<1>();
       last_stage = stage;
     }
     const int first_row = warp_down * 16, column = warp_across * kWarpColumns;
@@ -321,12 +331,6 @@ __global__ void __launch_bounds__(kThreads, kColumns == 64 ? 2 : 1)
     else
       add_to_voxels<kColumns, kBlocks, kWarpsDown * 16>(sums, first_row, column, product.rows,
                                                         memory.places[last_stage], memory.sums);
-#pragma unroll
-    for (int i = 0; i < kBlocks; ++i)
-#pragma unroll
-      for (int j = 0; j < kWarpColumns / 8; ++j)
-#pragma unroll
-        for (int e = 0; e < 4; ++e) sums[i][j][e] = 0;
   }
   wait_for_copies<0>();
 }
@@ -338,8 +342,8 @@ void convolve_tensor(const char* op, const Convolution<E>& conv, int64_t n_tiles
   const auto queue = [&]<int kColumns>() {
     const int64_t column_blocks = blocks_for(op, conv.c_write, kColumns);
     launch(op, transposed ? convolve<E, kColumns, true> : convolve<E, kColumns, false>,
-           blocks_for(op, n_tiles * column_blocks, 1), kThreads, Memory<E, kColumns>::bytes(conv.taps), stream, conv,
-           column_blocks);
+           blocks_for(op, n_tiles * column_blocks, 1), Memory<E, kColumns>::kThreads,
+           Memory<E, kColumns>::bytes(conv.taps), stream, conv, column_blocks);
   };
   int shared_bytes = 0;
   check_cuda(cudaDeviceGetAttribute(&shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, stream.device), op);

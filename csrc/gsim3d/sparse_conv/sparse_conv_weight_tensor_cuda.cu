@@ -8,20 +8,26 @@ namespace {
 constexpr int kThreads = 256;
 constexpr int kWarps = kThreads / kWarp;
 constexpr int kDepth = 64;     // pairs of one stage
-constexpr int kListed = 2048;  // pairs whose rows are looked up at a time
+constexpr int kListed = 1024;  // pairs whose rows are looked up at a time
 constexpr int kStages = 3;
 constexpr int kWarpColumns = 32;
 
+template <typename E>
+struct PairRows {
+  const E* out;  // null: no pair
+  const E* in;
+};
+
 template <typename E, int kSide>
-struct Memory {
+struct alignas(128) Memory {
   E grads[kStages][kDepth * kSide];
   E inputs[kStages][kDepth * kSide];
-  PairSources pairs[kListed];
+  PairRows<E> pairs[kListed];
 };
 
 // One block: kSide x kSide of the outer products of a block of pairs.
 template <typename E, int kSide>
-__global__ void __launch_bounds__(kThreads) multiply_pairs(OuterProducts<E> products, int32_t column_tiles) {
+__global__ void __launch_bounds__(kThreads, 2) multiply_pairs(OuterProducts<E> products, int32_t column_tiles) {
   constexpr int kWarpsAcross = kSide / kWarpColumns, kWarpsDown = kWarps / kWarpsAcross;
   constexpr int kBlocks = kSide / 16 / kWarpsDown;  // blocks of 16 outputs of one warp
   constexpr int kChunks = kSide / 8, kPairsApart = kThreads / kChunks;
@@ -33,20 +39,30 @@ __global__ void __launch_bounds__(kThreads) multiply_pairs(OuterProducts<E> prod
   const int32_t co = blockIdx.y / column_tiles * kSide, ci = blockIdx.y % column_tiles * kSide;
   const PairBlock block = pair_block(products, blockIdx.x);
 
+  // Where this thread copies 16 bytes of every kPairsApart-th pair to, and where this warp's first matrices lie.
+  constexpr uint32_t kRowBytes = kSide * sizeof(E), kStageBytes = kDepth * kRowBytes;
+  static_assert(kPairsApart % 8 == 0 && (kBlocks == 1 || kBlocks == 4));  // one permutation of chunks for all accesses
+  const int pair = thread / kChunks, chunk = thread % kChunks;
+  const uint32_t to_grads = shared_address(memory.grads[0] + chunk_offset<kSide>(pair, chunk));
+  const uint32_t to_inputs = shared_address(memory.inputs[0] + chunk_offset<kSide>(pair, chunk));
+  const bool left = co + chunk * 8 < products.c_out, right = ci + chunk * 8 < products.c_in;
+  const int32_t left_column = left ? co + chunk * 8 : 0, right_column = right ? ci + chunk * 8 : 0;
+  const uint32_t from_grads = shared_address(
+      memory.grads[0] + chunk_offset<kSide>(lane / 16 * 8 + lane % 8, warp_down * kBlocks * 2 + lane / 8 % 2));
+  const uint32_t from_inputs = shared_address(
+      memory.inputs[0] + chunk_offset<kSide>(lane / 8 % 2 * 8 + lane % 8, warp_across * kWarpColumns / 8 + lane / 16));
+
   int32_t n_listed = 0;
   const auto copy_stage = [&](int32_t p0, int stage) {
     if (p0 < n_listed) {
-      const int chunk = thread % kChunks;
-      const bool left = co + chunk * 8 < products.c_out, right = ci + chunk * 8 < products.c_in;
 #pragma unroll
       for (int i = 0; i < kDepth / kPairsApart; ++i) {
-        const int pair = thread / kChunks + i * kPairsApart;
-        const PairSources rows = p0 + pair < n_listed ? memory.pairs[p0 + pair] : PairSources{-1, -1};
-        const bool real_left = left && rows.out >= 0, real_right = right && rows.in >= 0;
-        copy_async(shared_address(memory.grads[stage] + chunk_offset<kSide>(pair, chunk)),
-                   real_left ? products.grads.at(rows.out) + co + chunk * 8 : products.grads.rows, real_left);
-        copy_async(shared_address(memory.inputs[stage] + chunk_offset<kSide>(pair, chunk)),
-                   real_right ? products.inputs.at(rows.in) + ci + chunk * 8 : products.inputs.rows, real_right);
+        const PairRows<E> rows = memory.pairs[p0 + pair + i * kPairsApart];  // the list ends with whole stages
+        const bool real = rows.out != nullptr;
+        copy_async(to_grads + stage * kStageBytes + i * kPairsApart * kRowBytes,
+                   (real ? rows.out : products.grads.rows) + left_column, real && left);
+        copy_async(to_inputs + stage * kStageBytes + i * kPairsApart * kRowBytes,
+                   (real ? rows.in : products.inputs.rows) + right_column, real && right);
       }
     }
     close_copies();
@@ -56,27 +72,28 @@ __global__ void __launch_bounds__(kThreads) multiply_pairs(OuterProducts<E> prod
   for (int64_t begin = block.pairs.begin; begin < block.pairs.end; begin += kListed) {
     n_listed = static_cast<int32_t>(min(block.pairs.end - begin, int64_t{kListed}));
     __syncthreads();
-    for (int32_t i = thread; i < n_listed; i += kThreads)
-      memory.pairs[i] = pair_sources(products, block.tap, begin + i);
+    for (int32_t i = thread; i < (n_listed + kDepth - 1) / kDepth * kDepth; i += kThreads) {
+      const PairSources rows = i < n_listed ? pair_sources(products, block.tap, begin + i) : PairSources{-1, -1};
+      memory.pairs[i] = {rows.out < 0 ? nullptr : products.grads.at(rows.out),
+                         rows.out < 0 ? nullptr : products.inputs.at(rows.in)};
+    }
     __syncthreads();
     for (int stage = 0; stage < kStages - 1; ++stage) copy_stage(stage * kDepth, stage);
-    for (int32_t p0 = 0, stage = 0; p0 < n_listed; p0 += kDepth, stage = (stage + 1) % kStages) {
+    for (int32_t p0 = 0, stage = 0; p0 < n_listed; p0 += kDepth, stage = stage + 1 == kStages ? 0 : stage + 1) {
       wait_for_copies<kStages - 2>();
       __syncthreads();
-      copy_stage(p0 + (kStages - 1) * kDepth, (stage + kStages - 1) % kStages);
+      copy_stage(p0 + (kStages - 1) * kDepth, stage == 0 ? kStages - 1 : stage - 1);
+      const uint32_t a_stage = from_grads + stage * kStageBytes, b_stage = from_inputs + stage * kStageBytes;
 #pragma unroll
       for (int k = 0; k < kDepth; k += 16) {
         uint32_t b[kWarpColumns / 16][4];
 #pragma unroll
-        for (int j = 0; j < kWarpColumns / 16; ++j) {
-          const int row = k + lane / 8 % 2 * 8 + lane % 8, chunk = warp_across * kWarpColumns / 8 + j * 2 + lane / 16;
-          load_matrices_transposed(shared_address(memory.inputs[stage] + chunk_offset<kSide>(row, chunk)), b[j]);
-        }
+        for (int j = 0; j < kWarpColumns / 16; ++j)
+          load_matrices_transposed((b_stage ^ (j * 32)) + k * kRowBytes, b[j]);
 #pragma unroll
         for (int i = 0; i < kBlocks; ++i) {
-          const int row = k + lane / 16 * 8 + lane % 8, chunk = (warp_down * kBlocks + i) * 2 + lane / 8 % 2;
           uint32_t a[4];
-          load_matrices_transposed(shared_address(memory.grads[stage] + chunk_offset<kSide>(row, chunk)), a);
+          load_matrices_transposed((a_stage ^ (i * 32)) + k * kRowBytes, a);
 #pragma unroll
           for (int j = 0; j < kWarpColumns / 8; ++j)
             multiply_add<E>(a, b[j / 2][j % 2 * 2], b[j / 2][j % 2 * 2 + 1], sums[i][j]);
