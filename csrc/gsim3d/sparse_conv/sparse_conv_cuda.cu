@@ -224,7 +224,7 @@ TilePairs pairs_of(const char* op, const SparseConvMap& map, bool transposed, bo
   launch(op, list_pairs, blocks_for(op, n_tiles * taps, kWarps), kThreads, 0, stream,
          transposed ? map.tap_in : map.tap_out, transposed ? map.tap_out : map.tap_in, map.cu_taps, taps, map.n_pairs,
          n_tiles, sources_of(map, first), pitch, sources, places, counts, rows);
-  return {sources, places, counts, rows, pitch};
+  return {sources, places, counts, rows, static_cast<int32_t>(pitch)};
 }
 
 template <typename E>

@@ -62,6 +62,11 @@ struct Sources {
   }
 };
 
+// A product of two numbers that are not negative, in one instruction.
+__device__ __forceinline__ int64_t wide_product(int32_t a, int32_t b) {
+  return static_cast<int64_t>(static_cast<uint64_t>(static_cast<uint32_t>(a)) * static_cast<uint32_t>(b));
+}
+
 // Rows of features, then the values of shared voxels; both with `channels` columns.
 template <typename E>
 struct Values {
@@ -70,8 +75,8 @@ struct Values {
   int32_t n_rows, channels;
 
   __device__ const E* at(int32_t source) const {
-    return source < n_rows ? rows + static_cast<int64_t>(source) * channels
-                           : shared + static_cast<int64_t>(source - n_rows) * channels;
+    const bool alone = source < n_rows;
+    return (alone ? rows : shared) + wide_product(alone ? source : source - n_rows, channels);
   }
 };
 
@@ -81,7 +86,7 @@ struct TilePairs {
   const uint8_t* places;   // [taps, pitch], the written voxel of the tile
   const int32_t* counts;   // [tiles, taps]
   const int32_t* rows;     // [n_rows], voxel_rows where they are in range, else -1
-  int64_t pitch;           // tiles * kTile
+  int32_t pitch;           // tiles * kTile
 };
 
 enum class Share { kWhole, kEqualParts, kFirstRow };  // what the rows of a voxel get of the voxel's sum

@@ -86,7 +86,7 @@ __global__ void __launch_bounds__(kThreads) convolve(Convolution<E> conv) {
   for (int32_t tap = 0; tap < conv.taps; ++tap) {
     if (tap == centre) continue;
     const int32_t count = conv.pairs.counts[static_cast<int64_t>(blockIdx.x) * conv.taps + tap];
-    const int64_t list = tap * conv.pairs.pitch + v0;
+    const int64_t list = wide_product(tap, conv.pairs.pitch) + v0;
     for (int32_t m0 = 0; m0 < count; m0 += kRows) {
       const int32_t mine = m0 + thread / 4;
       const E* row = mine < count ? conv.values.at(conv.pairs.sources[list + mine]) : nullptr;

@@ -65,14 +65,13 @@ __device__ int32_t list_products(const int32_t* counts, int32_t taps, int32_t ch
   return before;
 }
 
-// sums (+)= a b over `steps` times 16 channels, for kActive blocks of 16 rows; kFirst starts from zero. Addresses are
-// those of the first step and block; a step flips bits 5 and 6 of the address of a row of 128 bytes.
+// sums (+)= a b over a stage (channels beyond the last are zeros), for kActive blocks of 16 rows; kFirst starts from
+// zero. Addresses are those of the first step and block; a step flips bits 5 and 6 of the address of a row of 128
+// bytes.
 template <typename E, bool kFirst, int kActive, int kBlocks, int kBlockBytes, int kWeightRow, bool kTransposed>
-__device__ __forceinline__ void multiply_stage(uint32_t a, uint32_t b, int steps,
-                                               float (&sums)[kBlocks][kWarpColumns / 8][4]) {
+__device__ __forceinline__ void multiply_stage(uint32_t a, uint32_t b, float (&sums)[kBlocks][kWarpColumns / 8][4]) {
 #pragma unroll
   for (int k = 0; k < kDepth / 16; ++k) {
-    if (k >= steps) break;
     uint32_t right[kWarpColumns / 16][4], left[kActive][4];
 #pragma unroll
     for (int j = 0; j < kWarpColumns / 16; ++j) {
@@ -226,17 +225,23 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
   const uint32_t to_a = shared_address(memory.a[0] + chunk_offset<kDepth>(row, chunk));
   const uint32_t to_b = shared_address(memory.b[0] + chunk_offset<kWeightRow>(weight_row, weight_chunk));
   const int64_t weight_step = static_cast<int64_t>(conv.taps) * conv.weight_row;
-  // Columns beyond the last are computed from whatever weights are there and never written.
-  const int32_t weight_column = kTransposed ? min(n0 + weight_chunk * 8, conv.weight_row - 8) : weight_chunk * 8;
-  const E* weights = conv.weight + weight_column;
+  // Outputs beyond the last are computed from whatever weights are there and never written.
+  const E* weights[kWeightsCopied];
+#pragma unroll
+  for (int i = 0; i < kWeightsCopied; ++i) {
+    const int32_t r = weight_row + i * kWeightsApart;
+    weights[i] = kTransposed ? conv.weight + r * weight_step + min(n0 + weight_chunk * 8, conv.weight_row - 8)
+                             : conv.weight + min(n0 + r, conv.c_out - 1) * weight_step + weight_chunk * 8;
+  }
   Product copied{}, next = product_at(0);
   int32_t copied_index = 0, copied_k = 0, sources[kRowsCopied];
   const E* rows_from[kRowsCopied];
-  uint32_t real_rows = 0;
+  bool real_rows[kRowsCopied];
+  int64_t copied_list = 0, next_list = 0;  // where the product's pairs are listed
   const auto look_up = [&] {
-    const int32_t* from =
-        next.tap == centre ? conv.pairs.rows + begin : conv.pairs.sources + next.tap * conv.pairs.pitch + v0;
-    from += next.m0 + row;
+    const bool own = next.tap == centre;
+    next_list = own ? begin + next.m0 : wide_product(next.tap, conv.pairs.pitch) + v0 + next.m0;
+    const int32_t* from = (own ? conv.pairs.rows : conv.pairs.sources) + next_list + row;
 #pragma unroll
     for (int i = 0; i < kRowsCopied; ++i) sources[i] = row + i * kRowsApart < next.rows ? from[i * kRowsApart] : -1;
   };
@@ -244,12 +249,11 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
     if (copied_index < n_products) {
       if (copied_k == 0) {
         copied = next;
-        real_rows = 0;
+        copied_list = next_list;
 #pragma unroll
         for (int i = 0; i < kRowsCopied; ++i) {
-          const bool real = sources[i] >= 0;
-          rows_from[i] = conv.values.at(real ? sources[i] : 0) + chunk * 8;
-          real_rows |= static_cast<uint32_t>(real) << i;
+          real_rows[i] = sources[i] >= 0;
+          rows_from[i] = conv.values.at(max(sources[i], 0)) + chunk * 8;
         }
         if (copied_index + 1 < n_products) {
           next = product_at(copied_index + 1);
@@ -257,29 +261,24 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
         }
       }
       const bool inside_row = copied_k + chunk * 8 < conv.c_read;
-      const int rows = (copied.rows + 15) / 16 * 16;
+      const int32_t k = inside_row ? copied_k : 0;
 #pragma unroll
       for (int i = 0; i < kRowsCopied; ++i)
-        if (row + i * kRowsApart < rows)
-          copy_async(to_a + stage * kStageA + i * kRowsApart * kRowBytes, rows_from[i] + (inside_row ? copied_k : 0),
-                     inside_row && (real_rows >> i & 1));
-      const E* from = weights + static_cast<int64_t>(copied.tap) * conv.weight_row + (kTransposed ? 0 : copied_k);
+        if (row + i * kRowsApart < (copied.rows + 15 & ~15))
+          copy_async(to_a + stage * kStageA + i * kRowsApart * kRowBytes, rows_from[i] + k, inside_row && real_rows[i]);
+      const int64_t weights_at = wide_product(copied.tap, conv.weight_row) + (kTransposed ? copied_k * weight_step : k);
 #pragma unroll
       for (int i = 0; i < kWeightsCopied; ++i) {
-        const int32_t r = weight_row + i * kWeightsApart;
-        const int32_t output = kTransposed ? copied_k + r : n0 + r;  // index of the weight's first dimension
-        const bool real = kTransposed ? output < conv.c_out : inside_row;
+        const bool real = kTransposed ? copied_k + weight_row + i * kWeightsApart < conv.c_out : inside_row;
         copy_async(to_b + stage * kStageB + i * kWeightsApart * kWeightRow * static_cast<int>(sizeof(E)),
-                   real ? from + min(output, conv.c_out - 1) * weight_step : conv.weight, real);
+                   kTransposed && !real ? conv.weight : weights[i] + weights_at, real);
       }
-      if (thread < kChunk / 16 && copied.tap != centre && copied_k + kDepth >= conv.c_read)
-        copy_async(shared_address(memory.places[stage] + thread * 16),
-                   conv.pairs.places + copied.tap * conv.pairs.pitch + v0 + copied.m0 + thread * 16, true);
-      copied_k += kDepth;
-      if (copied_k >= conv.c_read) {
-        copied_k = 0;
-        ++copied_index;
-      }
+      const bool last = copied_k + kDepth >= conv.c_read;
+      if (last && thread < kChunk / 16 && copied.tap != centre)
+        copy_async(shared_address(memory.places[stage] + thread * 16), conv.pairs.places + copied_list + thread * 16,
+                   true);
+      copied_k = last ? 0 : copied_k + kDepth;
+      copied_index += last;
     }
     close_copies();
   };
@@ -306,9 +305,8 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
       __syncthreads();
       copy_next(stage == 0 ? kStages - 1 : stage - 1);
       const uint32_t a = from_a + stage * kStageA, b = from_b + stage * kStageB;
-      const int steps = (conv.c_read - k0 + 15) / 16;
       const auto multiply = [&]<bool kFirst, int kActive>() {
-        multiply_stage<E, kFirst, kActive, kBlocks, kBlockBytes, kWeightRow, kTransposed>(a, b, steps, sums);
+        multiply_stage<E, kFirst, kActive, kBlocks, kBlockBytes, kWeightRow, kTransposed>(a, b, sums);
       };
       static_assert(kBlocks <= 2);
       if (kBlocks == 2 && active == 2) {
