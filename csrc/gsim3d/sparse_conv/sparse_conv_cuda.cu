@@ -108,23 +108,40 @@ __global__ void __launch_bounds__(kThreads)
   if (lane == 0) counts[tile * taps + tap] = count;
 }
 
-// partials[block, c] = sum over the rows of a block; threads of a column take every fourth row.
-template <typename E>
+template <typename E, int kVector>
+struct alignas(sizeof(E) * kVector) Vector {
+  E values[kVector];
+};
+
+// partials[block, c] = sum over the rows of a block. Eight threads lie side by side with kVector columns each, 32 take
+// turns at the rows; their sums are added in a tree.
+template <typename E, int kVector>
 __global__ void __launch_bounds__(kThreads)
     sum_rows(const E* grad, int64_t n_rows, int32_t channels, Sum<E>* partials) {
-  constexpr int kColumns = 64, kLanes = kThreads / kColumns;
-  __shared__ Sum<E> sums[kLanes][kColumns];
-  const int lane = threadIdx.x / kColumns, column = threadIdx.x % kColumns;
-  const int32_t c = blockIdx.y * kColumns + column;
+  constexpr int kAcross = 8, kRowsAtOnce = kThreads / kAcross;
+  __shared__ Sum<E> sums[kWarps][kAcross * kVector];
+  const int column = threadIdx.x % kAcross * kVector, lane = threadIdx.x / kAcross;
+  const int32_t c0 = blockIdx.y * kAcross * kVector, c = c0 + column;
   const int64_t begin = static_cast<int64_t>(blockIdx.x) * kBiasRows, end = min(n_rows, begin + kBiasRows);
-  Sum<E> sum = 0;
+  Sum<E> sum[kVector] = {};
   if (c < channels)
-    for (int64_t row = begin + lane; row < end; row += kLanes) sum += static_cast<Sum<E>>(grad[row * channels + c]);
-  sums[lane][column] = sum;
+    for (int64_t row = begin + lane; row < end; row += kRowsAtOnce) {
+      const auto values = *reinterpret_cast<const Vector<E, kVector>*>(grad + row * channels + c);
+#pragma unroll
+      for (int i = 0; i < kVector; ++i) sum[i] += static_cast<Sum<E>>(values.values[i]);
+    }
+#pragma unroll
+  for (int i = 0; i < kVector; ++i) {
+    sum[i] += __shfl_xor_sync(kFullWarp, sum[i], kAcross);
+    sum[i] += __shfl_xor_sync(kFullWarp, sum[i], 2 * kAcross);
+    if (threadIdx.x % kWarp < kAcross) sums[threadIdx.x / kWarp][column + i] = sum[i];
+  }
   __syncthreads();
-  if (lane == 0 && c < channels)
-    partials[static_cast<int64_t>(blockIdx.x) * channels + c] =
-        (sums[0][column] + sums[1][column]) + (sums[2][column] + sums[3][column]);
+  const int i = threadIdx.x;
+  if (i >= kAcross * kVector || c0 + i >= channels) return;
+  static_assert(kWarps == 8);
+  partials[static_cast<int64_t>(blockIdx.x) * channels + c0 + i] =
+      ((sums[0][i] + sums[1][i]) + (sums[2][i] + sums[3][i])) + ((sums[4][i] + sums[5][i]) + (sums[6][i] + sums[7][i]));
 }
 
 // Adding blocks up: kAdders threads take every kAdders-th block, then their sums are added in a tree. A thread has
@@ -334,7 +351,10 @@ void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map,
 
   const int64_t bias_blocks = (map.n_rows + kBiasRows - 1) / kBiasRows;
   Sum<E>* bias_partials = workspace.take<Sum<E>>(bias_blocks * c_out);
-  launch(op, sum_rows<E>, dim3(blocks_for(op, bias_blocks, 1), blocks_for(op, c_out, 64)), kThreads, 0, stream,
+  constexpr int kVector = kAlignment / sizeof(E);
+  const bool vectors = c_out % kVector == 0 && aligned(native_data(grad));
+  launch(op, vectors ? sum_rows<E, kVector> : sum_rows<E, 1>,
+         dim3(blocks_for(op, bias_blocks, 1), blocks_for(op, c_out, vectors ? 8 * kVector : 8)), kThreads, 0, stream,
          native_data(grad), map.n_rows, c_out, bias_partials);
 
   const WeightPlan plan = plan_of(map, c_in, c_out);
