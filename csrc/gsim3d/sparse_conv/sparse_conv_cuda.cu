@@ -61,6 +61,23 @@ __global__ void __launch_bounds__(kThreads)
   to[i] = c < channels ? from[row * channels + c] : E(0);
 }
 
+// to[ci, tap, co] = from[co, tap, ci], with zeros for co up to `padded`.
+template <typename E>
+__global__ void __launch_bounds__(kThreads)
+    transpose_weights(const E* from, int32_t taps, int32_t c_in, int32_t c_out, int32_t padded, E* to) {
+  __shared__ E square[kWarp][kWarp + 2];
+  const int32_t ci0 = blockIdx.x * kWarp, co0 = blockIdx.y * kWarp, tap = blockIdx.z, lane = threadIdx.x % kWarp;
+  for (int r = threadIdx.x / kWarp; r < kWarp; r += kWarps) {
+    const int64_t co = co0 + r;
+    square[r][lane] = co < c_out && ci0 + lane < c_in ? from[(co * taps + tap) * c_in + ci0 + lane] : E(0);
+  }
+  __syncthreads();
+  for (int r = threadIdx.x / kWarp; r < kWarp; r += kWarps) {
+    const int64_t ci = ci0 + r;
+    if (ci < c_in && co0 + lane < padded) to[(ci * taps + tap) * padded + co0 + lane] = square[lane][r];
+  }
+}
+
 // The pairs that write each tile through each tap: `written` ascends inside a tap. One warp for a tile and a tap.
 __global__ void __launch_bounds__(kThreads)
     list_pairs(const int64_t* written, const int64_t* read, const int64_t* cu_taps, int32_t taps, int64_t n_pairs,
@@ -244,14 +261,6 @@ TilePairs pairs_of(const char* op, const SparseConvMap& map, bool transposed, bo
   return {sources, places, counts, rows, static_cast<int32_t>(pitch)};
 }
 
-template <typename E>
-void convolve(const char* op, const Convolution<E>& convolution, int64_t n_tiles, bool transposed, Stream stream) {
-  if constexpr (kIsHalf<E>)
-    if (convolution.c_read > 0 && convolution.weight_row > 0)
-      return convolve_tensor(op, convolution, n_tiles, transposed, stream);
-  convolve_plain(op, convolution, n_tiles, transposed, stream);
-}
-
 // How a weight gradient is cut: the same for the same sizes, whatever the GPU.
 struct WeightPlan {
   int64_t chunk_voxels, n_chunks, centre_parts;
@@ -308,7 +317,9 @@ void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap
                                    static_cast<int32_t>(weights.channels),
                                    Share::kWhole,
                                    native_data(out)};
-  convolve(op, convolution, tiles_of(map), false, stream);
+  if constexpr (kIsHalf<E>)
+    if (c_in > 0) return convolve_tensor(op, convolution, tiles_of(map), stream);
+  convolve_plain(op, convolution, tiles_of(map), false, stream);
 }
 
 template <typename T>
@@ -319,11 +330,18 @@ void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& 
   check_sizes(op, map, c_in, c_out);
   const int64_t taps = taps_of(map);
   const Padded<E> rows = padded(op, native_data(grad), map.n_rows, c_out, workspace, stream);
-  const Padded<E> weights = padded(op, native_data(weight), c_out * taps, c_in, workspace, stream);
+  const E* weights = native_data(weight);
+  if constexpr (kIsHalf<E>) {
+    E* transposed = workspace.take<E>(c_in * taps * rows.channels);
+    const dim3 squares(blocks_for(op, c_in, kWarp), blocks_for(op, rows.channels, kWarp), static_cast<unsigned>(taps));
+    launch(op, transpose_weights<E>, squares, kThreads, 0, stream, weights, taps, c_in, c_out, rows.channels,
+           transposed);
+    weights = transposed;
+  }
   const Values<E> values = values_of(op, rows.data, map, rows.channels, VoxelValue::kSum, false, workspace, stream);
   const TilePairs pairs = pairs_of(op, map, true, false, workspace, stream);
   const Convolution<E> convolution{values,
-                                   weights.data,
+                                   weights,
                                    nullptr,
                                    pairs,
                                    map.cu_voxel_rows,
@@ -333,10 +351,12 @@ void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& 
                                    static_cast<int32_t>(rows.channels),
                                    static_cast<int32_t>(c_in),
                                    static_cast<int32_t>(c_out),
-                                   static_cast<int32_t>(weights.channels),
+                                   static_cast<int32_t>(c_in),
                                    map.first ? Share::kFirstRow : Share::kEqualParts,
                                    native_data(grad_x)};
-  convolve(op, convolution, tiles_of(map), true, stream);
+  if constexpr (kIsHalf<E>)
+    if (c_out > 0) return convolve_tensor(op, convolution, tiles_of(map), stream);
+  convolve_plain(op, convolution, tiles_of(map), true, stream);
 }
 
 template <typename T>

@@ -92,7 +92,8 @@ struct TilePairs {
 enum class Share { kWhole, kEqualParts, kFirstRow };  // what the rows of a voxel get of the voxel's sum
 
 // y[p] = bias + values[p] B_centre + share of (sum over pairs that write voxel v(p): values[source] B_tap), where
-// B_tap[k, n] is weight[n, tap, k], or weight[k, tap, n] for the gradient of the input.
+// B_tap[k, n] is weight[n, tap, k]; for the gradient of the input weight[k, tap, n] or, on tensor cores, the same of a
+// transposed copy of the weights.
 template <typename E>
 struct Convolution {
   Values<E> values;
@@ -209,7 +210,7 @@ __device__ PairSources pair_sources(const OuterProducts<E>& products, int32_t ta
 template <typename E>
 void convolve_plain(const char* op, const Convolution<E>& conv, int64_t n_tiles, bool transposed, Stream stream);
 template <typename E>
-void convolve_tensor(const char* op, const Convolution<E>& conv, int64_t n_tiles, bool transposed, Stream stream);
+void convolve_tensor(const char* op, const Convolution<E>& conv, int64_t n_tiles, Stream stream);
 template <typename E>
 void outer_products_plain(const char* op, const OuterProducts<E>& products, int64_t n_blocks, Stream stream);
 template <typename E>

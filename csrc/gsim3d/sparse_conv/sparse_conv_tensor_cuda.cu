@@ -11,11 +11,10 @@ namespace {
 
 constexpr int kDepth = 64;  // channels of one stage
 constexpr int kStages = 3;
-constexpr int kWarpColumns = 32;
-constexpr size_t kStaticBytes = 128;  // of shared memory, beside Memory
+constexpr int kWarpsAcross = 2;  // groups of columns
 
 template <typename E, int kColumns>
-struct alignas(128) Memory {
+struct alignas(128) Memory {               // at a multiple of 1024 bytes
   static constexpr int kChunk = kColumns;  // pairs of one product
   // 16 warps an SM: one wide block, or two narrow ones.
   static constexpr int kThreads = 4 * kColumns, kBlocksOnSm = kColumns == 64 ? 2 : 1;
@@ -23,15 +22,22 @@ struct alignas(128) Memory {
   E b[kStages][kColumns * kDepth];
   float sums[kTile * kColumns];
   uint8_t places[kStages][kChunk];
+  int32_t n_listed;
   // then the list of products
 
   static size_t bytes(int32_t taps) { return sizeof(Memory) + sizeof(uint32_t) * taps * (kTile / kChunk); }
 };
 
-// Consecutive voxels start at different banks.
+// Neighbouring voxels start at different banks.
 template <int kColumns>
 __device__ __forceinline__ int sum_offset(int place, int column) {
-  return place * kColumns + (column ^ ((place & 3) << 3));
+  return place * kColumns + (column ^ ((place & 1) << 4));
+}
+
+// The output column that row `row` of the staged weights holds. A thread gets columns 2 t, 2 t + 1 of every eight rows
+// from the tensor cores; in this order those of two neighbouring groups are four columns side by side.
+__device__ __forceinline__ int column_of(int row) {
+  return (row & ~15) | (row >> 1 & 3) << 2 | (row >> 3 & 1) << 1 | (row & 1);
 }
 
 // One product of a block: `rows` pairs of a tap from pair m0 of its list on.
@@ -65,132 +71,127 @@ __device__ int32_t list_products(const int32_t* counts, int32_t taps, int32_t ch
   return before;
 }
 
-// sums (+)= a b over a stage (channels beyond the last are zeros), for kActive blocks of 16 rows; kFirst starts from
-// zero. Addresses are those of the first step and block; a step flips bits 5 and 6 of the address of a row of 128
-// bytes.
-template <typename E, bool kFirst, int kActive, int kBlocks, int kBlockBytes, int kWeightRow, bool kTransposed>
-__device__ __forceinline__ void multiply_stage(uint32_t a, uint32_t b, float (&sums)[kBlocks][kWarpColumns / 8][4]) {
+// The sums of a warp: rows lane / 4 and lane / 4 + 8 of its 16, for groups of eight columns.
+template <int kColumns>
+using Sums = float[kColumns / kWarpsAcross / 8][4];
+
+// Queues sums (+)= a b over a stage, whose channels beyond the last are zeros; `first` starts from zero. a and b are
+// the addresses of the 64 rows of a group of four warps, whatever lies in rows that are not used, and of its columns.
+// The sums are there after finish_stage.
+template <typename E, int kColumns>
+__device__ __forceinline__ void start_stage(uint32_t a, uint32_t b, bool first, Sums<kColumns>& sums) {
+#ifdef __CUDA_ARCH_FEAT_SM90_ALL
+  fence_sums(sums);
+  start_group_products();
+#pragma unroll
+  for (int k = 0; k < kDepth / 16; ++k)
+    multiply_add_group<E>(rows_descriptor(a + k * 32), rows_descriptor(b + k * 32), !first || k > 0, sums);
+  close_group_products();
+#else
+  constexpr int kGroups = kColumns / kWarpsAcross / 8, kBytes = sizeof(E);
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp % 4;
+  if (first)
+#pragma unroll
+    for (int j = 0; j < kGroups; ++j) sums[j][0] = sums[j][1] = sums[j][2] = sums[j][3] = 0;
+  a += chunk_offset<kDepth>(warp * 16 + lane % 16, lane / 16) * kBytes;
+  b += chunk_offset<kDepth>(lane / 16 * 8 + lane % 8, lane / 8 % 2) * kBytes;
 #pragma unroll
   for (int k = 0; k < kDepth / 16; ++k) {
-    uint32_t right[kWarpColumns / 16][4], left[kActive][4];
+    uint32_t left[4];
+    load_matrices(a ^ (k * 32), left);
 #pragma unroll
-    for (int j = 0; j < kWarpColumns / 16; ++j) {
-      if constexpr (kTransposed)
-        load_matrices_transposed((b ^ (j * 32)) + k * 16 * kWeightRow * static_cast<int>(sizeof(E)), right[j]);
-      else
-        load_matrices((b ^ (k * 32)) + j * 16 * kWeightRow * static_cast<int>(sizeof(E)), right[j]);
+    for (int j = 0; j < kGroups; j += 2) {
+      uint32_t right[4];
+      load_matrices((b ^ (k * 32)) + j * 8 * kDepth * kBytes, right);
+      multiply_add<E>(left, right[0], right[1], sums[j]);
+      multiply_add<E>(left, right[2], right[3], sums[j + 1]);
     }
+  }
+#endif
+}
+
+template <int kColumns>
+__device__ __forceinline__ void finish_stage(Sums<kColumns>& sums) {
+#ifdef __CUDA_ARCH_FEAT_SM90_ALL
+  wait_for_group_products();
+  fence_sums(sums);
+#endif
+}
+
+// Adds the products of a tap's pairs to the sums of the voxels they write. `column` is the warp's first.
+template <int kColumns>
+__device__ __forceinline__ void add_to_voxels(const Sums<kColumns>& products, int first_row, int column, int rows,
+                                              const uint8_t* places, float* sums) {
+  const int lane = threadIdx.x % kWarp;
 #pragma unroll
-    for (int i = 0; i < kActive; ++i) load_matrices((a ^ (k * 32)) + i * kBlockBytes, left[i]);
+  for (int h = 0; h < 2; ++h) {
+    const int row = first_row + lane / 4 + h * 8;
+    if (row >= rows) continue;
+    const int offset = sum_offset<kColumns>(places[row], column + lane % 4 * 4);
 #pragma unroll
-    for (int i = 0; i < kActive; ++i)
-#pragma unroll
-      for (int j = 0; j < kWarpColumns / 8; ++j) {
-        if (kFirst && k == 0) sums[i][j][0] = sums[i][j][1] = sums[i][j][2] = sums[i][j][3] = 0;
-        multiply_add<E>(left[i], right[j / 2][j % 2 * 2], right[j / 2][j % 2 * 2 + 1], sums[i][j]);
-      }
+    for (int j = 0; j < kColumns / kWarpsAcross / 16; ++j) {
+      float4& sum = *reinterpret_cast<float4*>(sums + (offset ^ (j * 16)));
+      const float *low = products[2 * j] + 2 * h, *high = products[2 * j + 1] + 2 * h;
+      sum = float4{sum.x + low[0], sum.y + low[1], sum.z + high[0], sum.w + high[1]};
+    }
   }
 }
 
-// Adds the products of a tap's pairs to the sums of the voxels they write.
-template <int kColumns, int kBlocks, int kRowsApart>
-__device__ __forceinline__ void add_to_voxels(const float (&products)[kBlocks][kWarpColumns / 8][4], int first_row,
-                                              int column, int rows, const uint8_t* places, float* sums) {
-  const int lane = threadIdx.x % kWarp;
-#pragma unroll
-  for (int i = 0; i < kBlocks; ++i)
-#pragma unroll
-    for (int h = 0; h < 2; ++h) {
-      const int row = first_row + i * kRowsApart + lane / 4 + h * 8;
-      if (row >= rows) continue;
-      const int place = places[row];
-#pragma unroll
-      for (int j = 0; j < kWarpColumns / 8; ++j) {
-        float2& sum = *reinterpret_cast<float2*>(sums + sum_offset<kColumns>(place, column + j * 8 + lane % 4 * 2));
-        sum = float2{sum.x + products[i][j][2 * h], sum.y + products[i][j][2 * h + 1]};
-      }
-    }
-}
-
-template <typename E>
-__device__ __forceinline__ uint32_t packed(float x, float y) {
-  const E pair[2] = {static_cast<E>(x), static_cast<E>(y)};
-  uint32_t bits;
-  memcpy(&bits, pair, sizeof(bits));
-  return bits;
-}
-
-// Writes rows voxel_rows[i0 + row]: products of the centre tap and the voxel's share. All lanes call it.
-template <typename E, int kColumns, int kBlocks, int kRowsApart>
-__device__ __forceinline__ void write_rows(const Convolution<E>& conv,
-                                           const float (&products)[kBlocks][kWarpColumns / 8][4], int first_row,
+// Writes rows voxel_rows[i0 + row]: products of the centre tap and the voxel's share.
+template <typename E, int kColumns>
+__device__ __forceinline__ void write_rows(const Convolution<E>& conv, const Sums<kColumns>& products, int first_row,
                                            int column, int rows, int64_t i0, int64_t v0, int32_t n0,
                                            const float* sums) {
-  const int lane = threadIdx.x % kWarp, odd = lane % 2;
+  struct alignas(4 * sizeof(E)) Four {
+    E values[4];
+  };
+  const int lane = threadIdx.x % kWarp;
   const bool whole = conv.c_write % 4 == 0;  // rows of whole groups of four columns
 #pragma unroll
-  for (int i = 0; i < kBlocks; ++i)
+  for (int h = 0; h < 2; ++h) {
+    const int row = first_row + lane / 4 + h * 8;
+    if (row >= rows) continue;
+    const Part part = part_of(conv, i0 + row, v0);
+    if (part.row < 0) continue;
+    const float share = part.parts == 1 ? 1.0f : 1.0f / static_cast<float>(part.parts);
+    E* to = conv.y + part.row * conv.c_write + n0;
 #pragma unroll
-    for (int h = 0; h < 2; ++h) {
-      const int row = first_row + i * kRowsApart + lane / 4 + h * 8;
-      const Part part = row < rows ? part_of(conv, i0 + row, v0) : Part{-1, -1, 1};
-      const float share = part.parts == 1 ? 1.0f : 1.0f / static_cast<float>(part.parts);
-      float2 y[kWarpColumns / 8];
+    for (int j = 0; j < kColumns / kWarpsAcross / 16; ++j) {
+      const int c = column + j * 16 + lane % 4 * 4;
+      float4 sum{0, 0, 0, 0};
+      if (part.place >= 0) sum = *reinterpret_cast<const float4*>(sums + sum_offset<kColumns>(part.place, c));
+      const float *low = products[2 * j] + 2 * h, *high = products[2 * j + 1] + 2 * h;
+      const Four four{static_cast<E>(low[0] + share * sum.x), static_cast<E>(low[1] + share * sum.y),
+                      static_cast<E>(high[0] + share * sum.z), static_cast<E>(high[1] + share * sum.w)};
+      if (whole) {
+        if (n0 + c < conv.c_write) *reinterpret_cast<Four*>(to + c) = four;
+      } else {
 #pragma unroll
-      for (int j = 0; j < kWarpColumns / 8; ++j) {
-        const int c = column + j * 8 + lane % 4 * 2;
-        y[j] = float2{products[i][j][2 * h], products[i][j][2 * h + 1]};
-        if (part.place >= 0) {
-          const float2 sum = *reinterpret_cast<const float2*>(sums + sum_offset<kColumns>(part.place, c));
-          y[j].x += sum.x * share;
-          y[j].y += sum.y * share;
-        }
-      }
-      E* to = conv.y + part.row * conv.c_write + n0;
-      // Two lanes exchange halves of two column groups: each then writes 8 bytes, four lanes a whole sector.
-#pragma unroll
-      for (int j = 0; j < kWarpColumns / 8; j += 2) {
-        const uint32_t low = packed<E>(y[j].x, y[j].y), high = packed<E>(y[j + 1].x, y[j + 1].y);
-        const uint32_t other = __shfl_xor_sync(kFullWarp, odd ? low : high, 1);
-        const int c = column + (j + odd) * 8 + lane % 4 / 2 * 4;
-        if (part.row < 0) continue;
-        if (whole) {
-          if (n0 + c < conv.c_write) *reinterpret_cast<uint2*>(to + c) = odd ? uint2{other, high} : uint2{low, other};
-          continue;
-        }
-#pragma unroll
-        for (int e = 0; e < 4; ++e) {
-          const int single = column + (j + e / 2) * 8 + lane % 4 * 2 + e % 2;
-          const float value = e % 2 ? y[j + e / 2].y : y[j + e / 2].x;
-          if (n0 + single < conv.c_write) to[single] = static_cast<E>(value);
-        }
+        for (int e = 0; e < 4; ++e)
+          if (n0 + c + e < conv.c_write) to[c + e] = four.values[e];
       }
     }
+  }
 }
 
-template <typename E, int kColumns, bool kTransposed>
+template <typename E, int kColumns>
 __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColumns>::kBlocksOnSm)
     convolve(Convolution<E> conv, int32_t column_blocks) {
   using Shared = Memory<E, kColumns>;
-  constexpr int kChunk = Shared::kChunk, kThreads = Shared::kThreads, kWarps = kThreads / kWarp;
-  constexpr int kWarpsAcross = kColumns / kWarpColumns, kWarpsDown = kWarps / kWarpsAcross;
-  constexpr int kBlocks = kChunk / 16 / kWarpsDown;  // blocks of 16 pairs of one warp
-  constexpr int kRowBytes = kDepth * sizeof(E);
-  constexpr int kBlockBytes = kWarpsDown * 16 * kRowBytes;
-  // A thread copies 16 bytes of every kRowsApart-th pair, and of every kWeightsApart-th row of weights.
-  constexpr int kRowsApart = kThreads / (kDepth / 8), kRowsCopied = kChunk / kRowsApart;
-  constexpr int kWeightRow = kTransposed ? kColumns : kDepth;  // elements of a row of b
-  constexpr int kWeightsApart = kThreads / (kWeightRow / 8);
-  constexpr int kWeightsCopied = (kTransposed ? kDepth : kColumns) / kWeightsApart;
-  static_assert(kRowsApart % 8 == 0 && kWeightsApart % 8 == 0);  // the rows of a thread have one permutation of chunks
+  constexpr int kChunk = Shared::kChunk, kThreads = Shared::kThreads;
+  constexpr int kRowBytes = kDepth * sizeof(E), kWarpColumns = kColumns / kWarpsAcross;
+  // A thread copies 16 bytes of every kRowsApart-th pair and of every kRowsApart-th row of weights.
+  constexpr int kRowsApart = kThreads / (kDepth / 8), kCopied = kColumns / kRowsApart;
+  static_assert(kRowsApart % 16 == 0 && kChunk == kColumns);
   constexpr uint32_t kStageA = sizeof(Shared::a) / kStages, kStageB = sizeof(Shared::b) / kStages;
 
-  extern __shared__ __align__(128) char raw[];
+  extern __shared__ __align__(1024) char raw[];
   auto& memory = *reinterpret_cast<Shared*>(raw);
   uint32_t* listed = reinterpret_cast<uint32_t*>(raw + sizeof(Shared));
-  __shared__ int32_t listed_count;
   const int thread = threadIdx.x, lane = thread % kWarp, warp = thread / kWarp;
-  const int warp_down = warp / kWarpsAcross, warp_across = warp % kWarpsAcross;
+  // Four warps in a row work on 64 rows and the same columns.
+  const int group_row = warp / (4 * kWarpsAcross) * 64, first_row = group_row + warp % 4 * 16;
+  const int column = warp / 4 % kWarpsAcross * kWarpColumns;
   const int64_t tile = blockIdx.x / column_blocks, v0 = tile * kTile;
   const int32_t n0 = blockIdx.x % column_blocks * kColumns, centre = conv.taps / 2;
   const int64_t n_rows = conv.values.n_rows;
@@ -199,9 +200,9 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
 
   if (warp == 0) {
     const int32_t n = list_products(conv.pairs.counts + tile * conv.taps, conv.taps, kChunk, listed);
-    if (lane == 0) listed_count = n;
+    if (lane == 0) memory.n_listed = n;
   }
-  static_assert(kThreads * 4 / kColumns % 4 == 0);  // a thread starts the same columns of each of its voxels
+  static_assert(kThreads * 4 / kColumns % 2 == 0);  // a thread starts the same columns of each of its voxels
   float start[4];
 #pragma unroll
   for (int e = 0; e < 4; ++e) {
@@ -211,7 +212,7 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
   for (int i = thread * 4; i < kTile * kColumns; i += kThreads * 4)
     *reinterpret_cast<float4*>(memory.sums + i) = float4{start[0], start[1], start[2], start[3]};
   __syncthreads();
-  const int32_t n_listed = listed_count;
+  const int32_t n_listed = memory.n_listed;
   const int32_t n_products = n_listed + static_cast<int32_t>((end - begin + kChunk - 1) / kChunk);
   const auto product_at = [&](int32_t i) {
     if (i < n_listed) return Product::unpacked(listed[i]);
@@ -221,29 +222,24 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
 
   // Where this thread copies to, and from where. Sources are looked up one product ahead.
   const int row = thread / (kDepth / 8), chunk = thread % (kDepth / 8);
-  const int weight_row = thread / (kWeightRow / 8), weight_chunk = thread % (kWeightRow / 8);
   const uint32_t to_a = shared_address(memory.a[0] + chunk_offset<kDepth>(row, chunk));
-  const uint32_t to_b = shared_address(memory.b[0] + chunk_offset<kWeightRow>(weight_row, weight_chunk));
-  const int64_t weight_step = static_cast<int64_t>(conv.taps) * conv.weight_row;
-  // Outputs beyond the last are computed from whatever weights are there and never written.
-  const E* weights[kWeightsCopied];
+  const uint32_t to_b = shared_address(memory.b[0] + chunk_offset<kDepth>(row, chunk));
+  const int64_t weight_step = static_cast<int64_t>(conv.taps) * conv.c_read;
+  const E* weights[kCopied];  // columns beyond the last repeat it and are never written
 #pragma unroll
-  for (int i = 0; i < kWeightsCopied; ++i) {
-    const int32_t r = weight_row + i * kWeightsApart;
-    weights[i] = kTransposed ? conv.weight + r * weight_step + min(n0 + weight_chunk * 8, conv.weight_row - 8)
-                             : conv.weight + min(n0 + r, conv.c_out - 1) * weight_step + weight_chunk * 8;
-  }
+  for (int i = 0; i < kCopied; ++i)
+    weights[i] = conv.weight + min(n0 + column_of(row + i * kRowsApart), conv.c_write - 1) * weight_step + chunk * 8;
   Product copied{}, next = product_at(0);
-  int32_t copied_index = 0, copied_k = 0, sources[kRowsCopied];
-  const E* rows_from[kRowsCopied];
-  bool real_rows[kRowsCopied];
+  int32_t copied_index = 0, copied_k = 0, sources[kCopied];
+  const E* rows_from[kCopied];
+  bool real_rows[kCopied];
   int64_t copied_list = 0, next_list = 0;  // where the product's pairs are listed
   const auto look_up = [&] {
     const bool own = next.tap == centre;
     next_list = own ? begin + next.m0 : wide_product(next.tap, conv.pairs.pitch) + v0 + next.m0;
     const int32_t* from = (own ? conv.pairs.rows : conv.pairs.sources) + next_list + row;
 #pragma unroll
-    for (int i = 0; i < kRowsCopied; ++i) sources[i] = row + i * kRowsApart < next.rows ? from[i * kRowsApart] : -1;
+    for (int i = 0; i < kCopied; ++i) sources[i] = row + i * kRowsApart < next.rows ? from[i * kRowsApart] : -1;
   };
   const auto copy_next = [&](int stage) {
     if (copied_index < n_products) {
@@ -251,7 +247,7 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
         copied = next;
         copied_list = next_list;
 #pragma unroll
-        for (int i = 0; i < kRowsCopied; ++i) {
+        for (int i = 0; i < kCopied; ++i) {
           real_rows[i] = sources[i] >= 0;
           rows_from[i] = conv.values.at(max(sources[i], 0)) + chunk * 8;
         }
@@ -263,16 +259,13 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
       const bool inside_row = copied_k + chunk * 8 < conv.c_read;
       const int32_t k = inside_row ? copied_k : 0;
 #pragma unroll
-      for (int i = 0; i < kRowsCopied; ++i)
+      for (int i = 0; i < kCopied; ++i)
         if (row + i * kRowsApart < (copied.rows + 15 & ~15))
           copy_async(to_a + stage * kStageA + i * kRowsApart * kRowBytes, rows_from[i] + k, inside_row && real_rows[i]);
-      const int64_t weights_at = wide_product(copied.tap, conv.weight_row) + (kTransposed ? copied_k * weight_step : k);
+      const int64_t weights_at = wide_product(copied.tap, conv.c_read) + k;
 #pragma unroll
-      for (int i = 0; i < kWeightsCopied; ++i) {
-        const bool real = kTransposed ? copied_k + weight_row + i * kWeightsApart < conv.c_out : inside_row;
-        copy_async(to_b + stage * kStageB + i * kWeightsApart * kWeightRow * static_cast<int>(sizeof(E)),
-                   kTransposed && !real ? conv.weight : weights[i] + weights_at, real);
-      }
+      for (int i = 0; i < kCopied; ++i)
+        copy_async(to_b + stage * kStageB + i * kRowsApart * kRowBytes, weights[i] + weights_at, inside_row);
       const bool last = copied_k + kDepth >= conv.c_read;
       if (last && thread < kChunk / 16 && copied.tap != centre)
         copy_async(shared_address(memory.places[stage] + thread * 16), conv.pairs.places + copied_list + thread * 16,
@@ -283,52 +276,29 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
     close_copies();
   };
 
-  // Where this warp's matrices lie in the first stage.
-  const uint32_t from_a = shared_address(memory.a[0] + chunk_offset<kDepth>(warp_down * 16 + lane % 16, lane / 16));
-  const uint32_t from_b =
-      kTransposed
-          ? shared_address(memory.b[0] + chunk_offset<kWeightRow>(lane / 8 % 2 * 8 + lane % 8,
-                                                                  warp_across * kWarpColumns / 8 + lane / 16))
-          : shared_address(memory.b[0] + chunk_offset<kWeightRow>(warp_across * kWarpColumns + lane / 16 * 8 + lane % 8,
-                                                                  lane / 8 % 2));
-  float sums[kBlocks][kWarpColumns / 8][4];
+  const uint32_t from_a = shared_address(memory.a[0]) + group_row * kRowBytes;
+  const uint32_t from_b = shared_address(memory.b[0]) + column * kRowBytes;
+  Sums<kColumns> sums;
   if (n_products > 0) look_up();
   for (int stage = 0; stage < kStages - 1; ++stage) copy_next(stage);
 
   int stage = 0;
   for (int32_t index = 0; index < n_products; ++index) {
     const Product product = product_at(index);
-    const int active = max(0, (product.rows - warp_down * 16 + kWarpsDown * 16 - 1) / (kWarpsDown * 16));
     int last_stage = 0;
-    for (int32_t k0 = 0; k0 == 0 || k0 < conv.c_read; k0 += kDepth, stage = stage + 1 == kStages ? 0 : stage + 1) {
+    for (int32_t k0 = 0; k0 < conv.c_read; k0 += kDepth, stage = stage + 1 == kStages ? 0 : stage + 1) {
       wait_for_copies<kStages - 2>();
+      publish_copies();
       __syncthreads();
+      start_stage<E, kColumns>(from_a + stage * kStageA, from_b + stage * kStageB, k0 == 0, sums);
       copy_next(stage == 0 ? kStages - 1 : stage - 1);
-      const uint32_t a = from_a + stage * kStageA, b = from_b + stage * kStageB;
-      const auto multiply = [&]<bool kFirst, int kActive>() {
-        multiply_stage<E, kFirst, kActive, kBlocks, kBlockBytes, kWeightRow, kTransposed>(a, b, sums);
-      };
-      static_assert(kBlocks <= 2);
-      if (kBlocks == 2 && active == 2) {
-        if (k0 == 0)
-          multiply.template operator()<true, kBlocks>();
-        else
-          multiply.template operator()<false, kBlocks>();
-      } else if (active == 1) {
-        if (k0 == 0)
-          multiply.template operator()<true, 1>();
-        else
-          multiply.template operator()<false, 1>();
-      }
+      finish_stage<kColumns>(sums);
       last_stage = stage;
     }
-    const int first_row = warp_down * 16, column = warp_across * kWarpColumns;
     if (index >= n_listed)
-      write_rows<E, kColumns, kBlocks, kWarpsDown * 16>(conv, sums, first_row, column, product.rows, begin + product.m0,
-                                                        v0, n0, memory.sums);
+      write_rows<E, kColumns>(conv, sums, first_row, column, product.rows, begin + product.m0, v0, n0, memory.sums);
     else
-      add_to_voxels<kColumns, kBlocks, kWarpsDown * 16>(sums, first_row, column, product.rows,
-                                                        memory.places[last_stage], memory.sums);
+      add_to_voxels<kColumns>(sums, first_row, column, product.rows, memory.places[last_stage], memory.sums);
   }
   wait_for_copies<0>();
 }
@@ -336,23 +306,22 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
 }  // namespace
 
 template <typename E>
-void convolve_tensor(const char* op, const Convolution<E>& conv, int64_t n_tiles, bool transposed, Stream stream) {
+void convolve_tensor(const char* op, const Convolution<E>& conv, int64_t n_tiles, Stream stream) {
   const auto queue = [&]<int kColumns>() {
     const int64_t column_blocks = blocks_for(op, conv.c_write, kColumns);
-    launch(op, transposed ? convolve<E, kColumns, true> : convolve<E, kColumns, false>,
-           blocks_for(op, n_tiles * column_blocks, 1), Memory<E, kColumns>::kThreads,
+    launch(op, convolve<E, kColumns>, blocks_for(op, n_tiles * column_blocks, 1), Memory<E, kColumns>::kThreads,
            Memory<E, kColumns>::bytes(conv.taps), stream, conv, column_blocks);
   };
   int shared_bytes = 0;
   check_cuda(cudaDeviceGetAttribute(&shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, stream.device), op);
-  const bool wide = Memory<E, 128>::bytes(conv.taps) + kStaticBytes <= static_cast<size_t>(shared_bytes);
+  const bool wide = Memory<E, 128>::bytes(conv.taps) <= static_cast<size_t>(shared_bytes);
   if (conv.c_write > 64 && wide)
     queue.template operator()<128>();
   else
     queue.template operator()<64>();
 }
 
-template void convolve_tensor<__half>(const char*, const Convolution<__half>&, int64_t, bool, Stream);
-template void convolve_tensor<__nv_bfloat16>(const char*, const Convolution<__nv_bfloat16>&, int64_t, bool, Stream);
+template void convolve_tensor<__half>(const char*, const Convolution<__half>&, int64_t, Stream);
+template void convolve_tensor<__nv_bfloat16>(const char*, const Convolution<__nv_bfloat16>&, int64_t, Stream);
 
 }  // namespace gsim3d::cuda::conv
