@@ -5,6 +5,7 @@
 #include <cuda_fp16.h>
 
 #include <cstdint>
+#include <type_traits>
 
 namespace gsim3d::cuda::conv {
 
@@ -65,8 +66,9 @@ __device__ __forceinline__ void publish_copies() {
 }
 
 #ifdef __CUDA_ARCH_FEAT_SM90_ALL
-// Products of a group of four warps (wgmma), 64 rows by 8 N columns, with both factors in shared memory as rows of 128
-// bytes whose chunks are permuted as in chunk_offset, at multiples of 1024 bytes.
+// Products of a group of four warps (wgmma), 64 rows by 32 or 64 columns, with both factors in shared memory: rows of
+// 128 bytes whose chunks are permuted as in chunk_offset, from a multiple of 1024 bytes on. A row of memory holds 64
+// steps of the sum for a row (column) of the left (right) factor; with kTurned 64 rows (columns) for a step of the sum.
 __device__ __forceinline__ uint64_t rows_descriptor(uint32_t address) {
   constexpr uint64_t kEightRows = 1024 / 16, kPermuted128 = 1;
   return (address & 0x3ffff) / 16 | uint64_t{1} << 16 | kEightRows << 32 | kPermuted128 << 62;
@@ -88,34 +90,38 @@ __device__ __forceinline__ void fence_sums(float (&sums)[kGroups][4]) {
 }
 
 #define GSIM3D_SUMS(j) "+f"(d[j][0]), "+f"(d[j][1]), "+f"(d[j][2]), "+f"(d[j][3])
-#define GSIM3D_GROUP_PRODUCT(E, TYPE)                                                                        \
-  template <>                                                                                                \
-  __device__ __forceinline__ void multiply_add_group<E>(uint64_t a, uint64_t b, bool add, float(&d)[4][4]) { \
-    asm volatile(                                                                                            \
-        "{.reg .pred p; setp.ne.b32 p, %18, 0;\n"                                                            \
-        "wgmma.mma_async.sync.aligned.m64n32k16.f32." TYPE "." TYPE                                          \
-        " {%0,%1,%2,%3,%4,%5,%6,%7,%8,%9,%10,%11,%12,%13,%14,%15}, %16, %17, p, 1, 1, 0, 0;}"                \
-        : GSIM3D_SUMS(0), GSIM3D_SUMS(1), GSIM3D_SUMS(2), GSIM3D_SUMS(3)                                     \
-        : "l"(a), "l"(b), "r"(static_cast<int>(add)));                                                       \
-  }                                                                                                          \
-  template <>                                                                                                \
-  __device__ __forceinline__ void multiply_add_group<E>(uint64_t a, uint64_t b, bool add, float(&d)[8][4]) { \
-    asm volatile(                                                                                            \
-        "{.reg .pred p; setp.ne.b32 p, %34, 0;\n"                                                            \
-        "wgmma.mma_async.sync.aligned.m64n64k16.f32." TYPE "." TYPE                                          \
-        " {%0,%1,%2,%3,%4,%5,%6,%7,%8,%9,%10,%11,%12,%13,%14,%15,%16,%17,%18,%19,%20,%21,%22,%23,%24,"       \
-        "%25,%26,%27,%28,%29,%30,%31}, %32, %33, p, 1, 1, 0, 0;}"                                            \
-        : GSIM3D_SUMS(0), GSIM3D_SUMS(1), GSIM3D_SUMS(2), GSIM3D_SUMS(3), GSIM3D_SUMS(4), GSIM3D_SUMS(5),    \
-          GSIM3D_SUMS(6), GSIM3D_SUMS(7)                                                                     \
-        : "l"(a), "l"(b), "r"(static_cast<int>(add)));                                                       \
-  }
-template <typename E>
-__device__ void multiply_add_group(uint64_t a, uint64_t b, bool add, float (&sums)[4][4]);
-template <typename E>
-__device__ void multiply_add_group(uint64_t a, uint64_t b, bool add, float (&sums)[8][4]);
-GSIM3D_GROUP_PRODUCT(__half, "f16")
-GSIM3D_GROUP_PRODUCT(__nv_bfloat16, "bf16")
-#undef GSIM3D_GROUP_PRODUCT
+#define GSIM3D_GROUP_PRODUCT_32(TYPE)                                                           \
+  asm volatile(                                                                                 \
+      "{.reg .pred p; setp.ne.b32 p, %18, 0;\n"                                                 \
+      "wgmma.mma_async.sync.aligned.m64n32k16.f32." TYPE "." TYPE                               \
+      " {%0,%1,%2,%3,%4,%5,%6,%7,%8,%9,%10,%11,%12,%13,%14,%15}, %16, %17, p, 1, 1, %19, %19;}" \
+      : GSIM3D_SUMS(0), GSIM3D_SUMS(1), GSIM3D_SUMS(2), GSIM3D_SUMS(3)                          \
+      : "l"(a), "l"(b), "r"(static_cast<int>(add)), "n"(static_cast<int>(kTurned)))
+#define GSIM3D_GROUP_PRODUCT_64(TYPE)                                                                    \
+  asm volatile(                                                                                          \
+      "{.reg .pred p; setp.ne.b32 p, %34, 0;\n"                                                          \
+      "wgmma.mma_async.sync.aligned.m64n64k16.f32." TYPE "." TYPE                                        \
+      " {%0,%1,%2,%3,%4,%5,%6,%7,%8,%9,%10,%11,%12,%13,%14,%15,%16,%17,%18,%19,%20,%21,%22,%23,%24,%25," \
+      "%26,%27,%28,%29,%30,%31}, %32, %33, p, 1, 1, %35, %35;}"                                          \
+      : GSIM3D_SUMS(0), GSIM3D_SUMS(1), GSIM3D_SUMS(2), GSIM3D_SUMS(3), GSIM3D_SUMS(4), GSIM3D_SUMS(5),  \
+        GSIM3D_SUMS(6), GSIM3D_SUMS(7)                                                                   \
+      : "l"(a), "l"(b), "r"(static_cast<int>(add)), "n"(static_cast<int>(kTurned)))
+template <typename E, bool kTurned>
+__device__ __forceinline__ void multiply_add_group(uint64_t a, uint64_t b, bool add, float (&d)[4][4]) {
+  if constexpr (std::is_same_v<E, __half>)
+    GSIM3D_GROUP_PRODUCT_32("f16");
+  else
+    GSIM3D_GROUP_PRODUCT_32("bf16");
+}
+template <typename E, bool kTurned>
+__device__ __forceinline__ void multiply_add_group(uint64_t a, uint64_t b, bool add, float (&d)[8][4]) {
+  if constexpr (std::is_same_v<E, __half>)
+    GSIM3D_GROUP_PRODUCT_64("f16");
+  else
+    GSIM3D_GROUP_PRODUCT_64("bf16");
+}
+#undef GSIM3D_GROUP_PRODUCT_32
+#undef GSIM3D_GROUP_PRODUCT_64
 #undef GSIM3D_SUMS
 #endif
 

@@ -85,7 +85,7 @@ __device__ __forceinline__ void start_stage(uint32_t a, uint32_t b, bool first, 
   start_group_products();
 #pragma unroll
   for (int k = 0; k < kDepth / 16; ++k)
-    multiply_add_group<E>(rows_descriptor(a + k * 32), rows_descriptor(b + k * 32), !first || k > 0, sums);
+    multiply_add_group<E, false>(rows_descriptor(a + k * 32), rows_descriptor(b + k * 32), !first || k > 0, sums);
   close_group_products();
 #else
   constexpr int kGroups = kColumns / kWarpsAcross / 8, kBytes = sizeof(E);
