@@ -1,4 +1,4 @@
-"""The ``gsim3d`` command: generate, train, simulate, evaluate, weights, import, demo, doctor."""
+"""The ``gsim3d`` command: generate, check-data, train, simulate, evaluate, weights, import, demo, doctor."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from gsim3d.errors import HardCaseError, InputError
 # command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called
 COMMANDS = {
     "generate": ("gsim3d.generate.command", "simulate and film bodies that fall: a data set of multi-view video"),
+    "check-data": ("gsim3d.check_data", "what is wrong with recorded scenes, and a picture of their cameras"),
     "train": ("gsim3d.train.command", "learn a simulator from a data set"),
     "simulate": ("gsim3d.simulate", "predict the future of one scene: video and .ply"),
     "evaluate": ("gsim3d.evaluate.command", "measure predictions on a data set, by step, beside baselines and other models"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 
@@ -10,7 +11,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from gsim3d import ops
-from gsim3d.harmonics import degree_damping, rotate_harmonics, rotate_unpaired_harmonics
+from gsim3d.harmonics import (
+    degree_damping,
+    published_axes,
+    rotate_harmonics,
+    sh_basis,
+    turn_predicted_harmonics,
+)
 from gsim3d.layers import RowLinear
 from gsim3d.ops.raster import Rendering
 from gsim3d.quirks import Quirks
@@ -18,6 +25,7 @@ from gsim3d.types import Cameras, Gaussians, Particles
 
 NEAR_PLANE = 0.01  # metres; what is nearer to a camera is not drawn
 RELEASED_NEAR_SHARE = 0.2  # of the cameras' near bound
+HARMONIC_14 = 1.445305721320277  # its factor
 MIN_QUAT_NORM = 1e-6  # a shorter quaternion has no direction worth a gradient
 
 
@@ -83,8 +91,7 @@ class GaussianHead(nn.Module):
         scales = smallest + (largest - smallest) * scales.sigmoid()
         damping = degree_damping(self.config.sh_degree, sh)[:n_harmonics, None]
         sh = sh.unflatten(1, (3, -1))[:, :, :n_harmonics].mT * damping
-        rotate = rotate_unpaired_harmonics if self.config.quirks.released_head_harmonics else rotate_harmonics
-        return rotate(sh, rotation_matrices(quats)), quats, scales
+        return turn_predicted_harmonics(sh, rotation_matrices(quats), self.config.quirks), quats, scales
 
 
 def render(
@@ -113,14 +120,66 @@ def render(
     )
 
 
-def release_options(cameras: Cameras, quirks: Quirks) -> dict[str, float | str]:
-    """Keyword arguments with which :func:`render` draws as the published model's renderer does."""
-    options: dict[str, float | str] = {}
-    if quirks.far_near_plane:
-        options["near_plane"] = RELEASED_NEAR_SHARE * float(cameras.near.max())
-    if quirks.three_sigma_tiles:
-        options["cutoff"] = "tile3sigma"
-    return options
+def render_as_published(
+    gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None, *, quirks: Quirks
+) -> Rendering:
+    """:func:`render` with the quirks of the published renderer, image by image as there."""
+    if len(cameras) == 0:
+        return render(gaussians, cameras, background)
+    images = []
+    for i in range(len(cameras)):
+        one = torch.tensor([i], device=cameras.near.device)
+        camera = cameras.select(one, torch.zeros_like(one))
+        camera = with_centered_principal_point(camera) if quirks.centered_principal_point else camera
+        cloud = int(cameras.image_cloud[i])
+        first, end = gaussians.cu_rows[cloud : cloud + 2].tolist()
+        means, quats, scales, opacities, sh = (
+            getattr(gaussians, name)[first:end] for name in ("means", "quats", "scales", "opacities", "sh")
+        )
+        color = {"colors": colors_with_z(sh, means, camera)} if quirks.z_in_harmonic_14 else {"sh": sh}
+        images.append(
+            ops.rasterize_gaussians(
+                means,
+                quats,
+                scales,
+                opacities,
+                camera,
+                **color,
+                background=background if background is None or background.dim() == 1 else background[one],
+                near_plane=RELEASED_NEAR_SHARE * float(camera.near) if quirks.far_near_plane else NEAR_PLANE,
+                cutoff="tile3sigma" if quirks.three_sigma_tiles else "exact",
+            )
+        )
+    color, alpha, depth = (
+        torch.cat([getattr(image, name) for image in images]) for name in ("color", "alpha", "depth")
+    )
+    return Rendering(color, alpha, depth, None)
+
+
+def with_centered_principal_point(cameras: Cameras) -> Cameras:
+    """Cameras of the same opening angles, measured through the middles of opposite edges, with a centred view."""
+    size = cameras.Ks.new_tensor([cameras.width, cameras.height], dtype=torch.float64)
+    middle = torch.tensor([[[0, 0.5], [1, 0.5]], [[0.5, 0], [0.5, 1]]], dtype=torch.float64, device=size.device) * size
+    pixels = F.pad(middle, (0, 1), value=1.0)  # [axis, edge, 3]
+    rays = F.normalize(torch.einsum("iab,xeb->ixea", torch.linalg.inv(cameras.Ks.double()), pixels), dim=-1)
+    cosine = (rays[:, :, 0] * rays[:, :, 1]).sum(-1)
+    focal = size / (2 * ((1 - cosine) / (1 + cosine)).sqrt())
+    Ks = torch.diag_embed(F.pad(focal, (0, 1), value=1.0))
+    Ks[:, :2, 2] = size / 2
+    return dataclasses.replace(cameras, Ks=Ks.to(cameras.Ks))
+
+
+def colors_with_z(sh: Tensor, means: Tensor, camera: Cameras) -> Tensor:
+    """[N, 3] colours of ``sh`` [N, K, 3] seen by one camera, harmonic 14 as published; its gradient is the true one."""
+    pose = torch.linalg.inv(camera.viewmats[0].double())[:3, 3].to(means)
+    directions = F.normalize(means - pose, dim=1)
+    colors = torch.einsum("nk,nkc->nc", sh_basis(directions, math.isqrt(sh.shape[1]) - 1), sh) + 0.5
+    if sh.shape[1] == 16:
+        axes = published_axes(sh)
+        x, y, z = directions.detach().unbind(1)
+        weight = HARMONIC_14 * (z - y) * (z * z - x * x)
+        colors = colors + weight[:, None] * rotate_harmonics(sh.detach(), axes.expand(sh.shape[0], 3, 3))[:, 14]
+    return colors.clamp(min=0)
 
 
 def unit_quats(quats: Tensor) -> Tensor:

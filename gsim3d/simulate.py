@@ -34,7 +34,6 @@ def run(args: argparse.Namespace) -> int:
 
     import cv2
 
-    from gsim3d.data import Scene
     from gsim3d.errors import InputError
     from gsim3d.evaluate.pictures import as_bytes, comparison_frames, true_images, write_gaussians
     from gsim3d.evaluate.protocol import default_views, predict, render_steps
@@ -47,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     if not out.absolute().parent.is_dir():
         raise InputError(f"--out: the folder {out.absolute().parent} does not exist")
     restored = restore(args.checkpoint)
-    scene = Scene.open(args.scene)
+    scene = restored.open_scene(args.scene)
     context, target = default_views(restored, scene)
     cams = args.cameras or list(target[:4])
     n_future = args.steps if args.steps is not None else max(1, scene.n_steps - args.start - restored.data.history)

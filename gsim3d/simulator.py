@@ -18,12 +18,13 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from gsim3d.dynamics import Dynamics, append_step, last_steps, rollout
+from gsim3d.dynamics import Dynamics, append_step, concatenate, last_steps, rollout
 from gsim3d.effects import EffectsSpec, Plan, make_plan
 from gsim3d.encoder import Encoder
 from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
-from gsim3d.renderer import GaussianHead, release_options, render
+from gsim3d.quirks import Quirks
+from gsim3d.renderer import GaussianHead, render, render_as_published
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames, Particles
 
 
@@ -65,7 +66,7 @@ class Simulator(nn.Module):
     def step(
         self, state: Particles, plan: Plan | None = None, *, generator: torch.Generator | None = None
     ) -> Particles:
-        """The state one step later: each scene's oldest step leaves once the history is full.
+        """The state one call of the dynamics later: each scene's oldest steps leave once the history is full.
 
         Args:
             state: last steps of every scene.
@@ -112,8 +113,10 @@ class Simulator(nn.Module):
             cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
         """
         gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None)
-        options = {"cutoff": cutoff} | release_options(cameras, self.config.renderer.quirks)
-        return render(gaussians, cameras, background, **options)
+        quirks = self.config.renderer.quirks
+        if quirks != Quirks():
+            return render_as_published(gaussians, cameras, background, quirks=quirks)
+        return render(gaussians, cameras, background, cutoff=cutoff)
 
     def _prepare(self, state: Particles, plan: Plan) -> Particles:
         """``state`` with the background as the plan wants it."""
@@ -124,10 +127,10 @@ class Simulator(nn.Module):
         return state
 
     def _predict(self, state: Particles, plan: Plan, generator: torch.Generator | None) -> Particles:
-        """The next step of every scene, without the changes that the plan leaves out."""
+        """The next steps of every scene, without the changes that the plan leaves out."""
         step = self.dynamics(state, generator=generator)
         appearance = plan.spec.appearance
-        newest = last_steps(state, 1)
+        newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
         if appearance.changing != "all":
             held = (step.activity == FROZEN) | (appearance.changing == "none")
             latents = torch.where(held[:, None], newest.dynamic_latents, step.dynamic_latents)

@@ -8,7 +8,10 @@ Units are metres and pixels; axes are OpenCV's (x right, y down, z forward); qua
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate, groupby
 
 import torch
 from torch import Tensor
@@ -29,7 +32,7 @@ class _Tensors:
         return self.map(lambda t: t.to(device))
 
     def detach(self):
-        return self.map(Tensor.detach)
+        return self.map(lambda t: t.detach() if t.is_floating_point() else t)
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,66 @@ class Frames(_Tensors):
         return dataclasses.replace(super().to(device), cameras=self.cameras.to(device))
 
 
+@functools.lru_cache(maxsize=512)
+def constant(values: tuple[int, ...], device: torch.device) -> Tensor:
+    """int64 tensor of ``values``, the same object at every call: read it, never write to it.
+
+    A step that repeats sends nothing to the device, and can be captured in a CUDA graph.
+    """
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=torch.int64, device=device)
+
+
+@dataclass(frozen=True, eq=False)
+class CloudTable:
+    """``cu_rows``, ``cloud_scene`` and ``cloud_step`` of packed clouds as numbers that the host knows.
+
+    starts: Q + 1 row numbers. scenes, steps: Q numbers. tensors: the three on the device of the rows.
+    """
+
+    starts: tuple[int, ...]
+    scenes: tuple[int, ...]
+    steps: tuple[int, ...]
+    tensors: tuple[Tensor, Tensor, Tensor]
+
+    @classmethod
+    def read(cls, cu_rows: Tensor, cloud_scene: Tensor, cloud_step: Tensor) -> CloudTable:
+        """Waits for the device, once."""
+        values = torch.cat([cu_rows, cloud_scene, cloud_step]).tolist()
+        n, m = cu_rows.shape[0], cu_rows.shape[0] + cloud_scene.shape[0]
+        tensors = (cu_rows, cloud_scene, cloud_step)
+        return cls(tuple(values[:n]), tuple(values[n:m]), tuple(values[m:]), tensors)
+
+    @classmethod
+    def make(cls, counts: Iterable[int], scenes: Iterable[int], steps: Iterable[int], device) -> CloudTable:
+        """``counts``: rows of each cloud."""
+        numbers = tuple(accumulate(counts, initial=0)), tuple(scenes), tuple(steps)
+        return cls(*numbers, tuple(constant(values, device) for values in numbers))
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def count(self, cloud: int) -> int:
+        """Rows of a cloud."""
+        return self.starts[cloud + 1] - self.starts[cloud]
+
+    def row_runs(self, clouds: Sequence[int]) -> list[tuple[int, int]]:
+        """(first row, one behind the last) of ``clouds``; clouds that follow each other share a run."""
+        runs = []
+        for _, group in groupby(enumerate(clouds), lambda pair: pair[1] - pair[0]):
+            members = [cloud for _, cloud in group]
+            runs.append((self.starts[members[0]], self.starts[members[-1] + 1]))
+        return runs
+
+
+def take_runs(x: Tensor, runs: Sequence[tuple[int, int]]) -> Tensor:
+    """The rows of ``runs`` one after another; a view where there is one run."""
+    pieces = [x[begin:end] for begin, end in runs]
+    if len(pieces) == 1:
+        return pieces[0]
+    return torch.cat(pieces) if pieces else x[:0]
+
+
 @dataclass(frozen=True)
 class Particles(_Tensors):
     """The state of the simulator: particles with view-independent latent features.
@@ -120,6 +183,7 @@ class Particles(_Tensors):
     quats: Tensor | None = None
     scales: Tensor | None = None
     sh: Tensor | None = None
+    known: CloudTable | None = None  # see clouds
 
     ROW_FIELDS = (
         "means", "opacities", "dynamic_latents", "static_latents", "activity", "quats", "scales", "sh",
@@ -133,6 +197,23 @@ class Particles(_Tensors):
     def n_clouds(self) -> int:
         return self.cloud_scene.shape[0]
 
+    @property
+    def clouds(self) -> CloudTable:
+        """The clouds as the host knows them. Only the first look at clouds that came as tensors waits for the device."""
+        tensors = (self.cu_rows, self.cloud_scene, self.cloud_step)
+        if self.known is None or any(a is not b for a, b in zip(self.known.tensors, tensors)):
+            object.__setattr__(self, "known", CloudTable.read(*tensors))
+        return self.known
+
+    def with_clouds(self, table: CloudTable, **fields) -> Particles:
+        """These particles packed as ``table`` says; ``fields`` replaces what changes with it."""
+        cu_rows, scene, step = table.tensors
+        return dataclasses.replace(self, **fields, cu_rows=cu_rows, cloud_scene=scene, cloud_step=step, known=table)
+
+    def row_fields(self) -> dict[str, Tensor]:
+        """The tensors that have one row a particle, by name."""
+        return {name: value for name in self.ROW_FIELDS if (value := getattr(self, name)) is not None}
+
     def row_cloud(self) -> Tensor:
         """int64 [N], the cloud of each row."""
         counts = self.cu_rows[1:] - self.cu_rows[:-1]
@@ -144,21 +225,20 @@ class Particles(_Tensors):
         """Keeps ``rows`` (bool [N]); clouds stay, even where they become empty."""
         kept = torch.zeros(self.n_rows + 1, dtype=torch.int64, device=rows.device)
         kept[1:] = torch.cumsum(rows, 0)
-        fields = {k: getattr(self, k)[rows] for k in self.ROW_FIELDS if getattr(self, k) is not None}
+        fields = {name: value[rows] for name, value in self.row_fields().items()}
         return dataclasses.replace(self, **fields, cu_rows=kept[self.cu_rows])
 
-    def select_clouds(self, clouds: Tensor) -> Particles:
-        """The particles of ``clouds`` (int64, ascending)."""
-        counts = self.cu_rows[1:] - self.cu_rows[:-1]
-        keep = torch.zeros(self.n_clouds, dtype=torch.bool, device=clouds.device)
-        keep[clouds] = True
-        rows = torch.repeat_interleave(keep, counts, output_size=self.n_rows)
-        fields = {k: getattr(self, k)[rows] for k in self.ROW_FIELDS if getattr(self, k) is not None}
-        cu_rows = torch.zeros(clouds.shape[0] + 1, dtype=torch.int64, device=clouds.device)
-        cu_rows[1:] = torch.cumsum(counts[clouds], 0)
-        return dataclasses.replace(
-            self, **fields, cu_rows=cu_rows, cloud_scene=self.cloud_scene[clouds], cloud_step=self.cloud_step[clouds]
+    def select_clouds(self, clouds: Sequence[int] | Tensor) -> Particles:
+        """The particles of ``clouds``, ascending."""
+        chosen = clouds.tolist() if isinstance(clouds, Tensor) else list(clouds)
+        table, runs = self.clouds, self.clouds.row_runs(chosen)
+        table = CloudTable.make(
+            (table.count(q) for q in chosen),
+            (table.scenes[q] for q in chosen),
+            (table.steps[q] for q in chosen),
+            self.cu_rows.device,
         )
+        return self.with_clouds(table, **{name: take_runs(x, runs) for name, x in self.row_fields().items()})
 
 
 @dataclass(frozen=True)

@@ -91,6 +91,19 @@ def test_evaluate_counts_scenes(capsys, work):
     assert code == 0 and "2 scenes" in out and (work / "run" / "metrics.json").is_file()
 
 
+def test_evaluate_takes_other_views_and_metrics_and_options_anywhere(capsys, work, tmp_path):
+    arguments = [work / "run", "--out", tmp_path / "m.json", work / "data", "--steps", "2", "--metrics", "ssim", "psnr"]
+    code, out, _ = call(capsys, "evaluate", *arguments, "--cameras", "1", "4", "--context", "0", "2")
+    assert code == 0 and "masked:" in out and "PSNR masked" not in out
+    metrics = json.loads((tmp_path / "m.json").read_text())
+    assert metrics["cameras"] == {"ball/0000": {"context": [0, 2], "target": [1, 4]}}
+    assert metrics["part"] == "test" and metrics["data"] == str(work / "data") and len(metrics["checkpoint"]) == 64
+    assert metrics["methods"] == ["model", "constant", "copy", "constant_velocity", "release_constant"]
+    assert list(metrics["by_step"])[:2] == ["psnr", "ssim"] and metrics["not_measured"] == {}
+    for file in ("m.csv", "m.md", "m.png"):
+        assert (tmp_path / file).stat().st_size > 100
+
+
 def test_simulate_writes_video_frames_and_gaussians(capsys, work, tmp_path):
     scene, out = work / "data" / "ball" / "0000", tmp_path / "out"
     code, _, _ = call(capsys, "simulate", work / "run", scene, "--out", out, "--steps", "7", "--cameras", "3", "1")
@@ -131,6 +144,8 @@ BAD = {
     "out folder is missing": (["evaluate", "{run}", "{data}", "--out", "{new}/a/b.json"], "does not exist"),
     "too many steps": (["evaluate", "{run}", "{data}", "--steps", "99"], "only 4 after the input"),
     "bad choice": (["evaluate", "{run}", "{data}", "--scenes", "some"], "invalid choice: 'some'"),
+    "no such view": (["evaluate", "{run}", "{data}", "--cameras", "9"], "camera 9 does not exist"),
+    "no such input view": (["evaluate", "{run}", "{data}", "--context", "7"], "camera 7 does not exist"),
     "out exists": (["simulate", "{run}", "{scene}", "--out", "{empty}"], "exists already"),
     "scene is missing": (["simulate", "{run}", "{new}/scene", "--out", "{new}"], "no metadata.json"),
     "no such camera": (["simulate", "{run}", "{scene}", "--out", "{new}", "--cameras", "9"], "camera 9 does not exist"),

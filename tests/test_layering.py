@@ -8,9 +8,10 @@ ROOT = Path(__file__).parent.parent
 
 # Each room may import the rooms before it (and its own), never one after it.
 ROOMS = [
-    {"errors"},
+    {"errors", "quirks"},
     {"types"},
-    {"ops", "quirks", "effects", "harmonics", "layers"},
+    {"ops", "effects", "harmonics"},
+    {"layers"},
     {"encoder", "dynamics", "renderer"},
     {"presets"},
     {"simulator"},
@@ -18,7 +19,7 @@ ROOMS = [
     {"generate"},
     {"train"},
     {"evaluate"},
-    {"simulate", "import_released", "demo", "doctor"},
+    {"simulate", "check_data", "import_released", "demo", "doctor"},
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}

@@ -37,6 +37,13 @@ def test_has_an_autograd_rule_exactly_where_needed(op):
     assert has_kernel(op, "Autograd") == needs_autograd(op), f"{op}: torch.library.register_autograd in gsim3d/ops"
 
 
+@pytest.mark.parametrize("op", [op for op in OPS if needs_autograd(op)])
+@pytest.mark.parametrize("device", ["CPU", "CUDA"])
+def test_has_an_autocast_rule(op, device):
+    """Without one the op meets the half-precision results of the layers around it, which most kernels do not take."""
+    assert has_kernel(op, f"Autocast{device}"), f"{op}: torch.library.register_autocast in gsim3d/ops"
+
+
 def test_a_missing_autograd_rule_is_an_error():
     """torch only warns and drops the gradient; the filter in pyproject.toml must match its text."""
     library = torch.library.Library("gsim3d_registry_test", "DEF")

@@ -7,8 +7,7 @@ import torch
 
 from gsim3d import ops
 from gsim3d.harmonics import sh_basis
-from gsim3d.quirks import Quirks
-from gsim3d.renderer import GaussianHead, RendererConfig, release_options, render, rotation_matrices, unit_quats
+from gsim3d.renderer import GaussianHead, RendererConfig, render, rotation_matrices, unit_quats
 from gsim3d.types import Cameras
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, make_history
@@ -113,31 +112,6 @@ def test_gradients_of_the_head():
 
     inputs = [t.clone().requires_grad_() for t in (particles.dynamic_latents, particles.static_latents)]
     assert torch.autograd.gradcheck(f, inputs)
-
-
-@pytest.mark.parametrize("quirk", [False, True])
-def test_quirk_released_head_harmonics(quirk):
-    particles = make_history((10,))
-    expected = make_head()(particles)
-    actual = make_head(dataclasses.replace(CONFIG, quirks=Quirks(released_head_harmonics=quirk)))(particles)
-    assert_close_relative_to_max(actual.sh[:, 0], expected.sh[:, 0], 1e-6)
-    assert torch.equal(actual.sh, expected.sh) == (not quirk)
-
-
-@pytest.mark.parametrize("quirk", [False, True])
-def test_quirk_three_sigma_tiles(quirk):
-    options = release_options(make_cameras(), Quirks(three_sigma_tiles=quirk))
-    assert options == ({"cutoff": "tile3sigma"} if quirk else {})
-
-
-@pytest.mark.parametrize("quirk", [False, True])
-def test_quirk_far_near_plane(quirk):
-    particles = make_history((1,))
-    particles = dataclasses.replace(particles, means=torch.tensor([[0.5, 0.5, -1.0]]))  # 0.5 m before the camera
-    cameras = make_cameras(near=3.0)
-    options = release_options(cameras, Quirks(far_near_plane=quirk))
-    image = render(make_head()(particles), cameras, **options)
-    assert (image.alpha.max() == 0) == quirk
 
 
 def test_render_is_the_op():

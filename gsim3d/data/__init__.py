@@ -1,7 +1,8 @@
 """Readers of recorded scenes, splits, windows, and the packing of images into Frames."""
 
 from gsim3d.data.dataset import Window, generator, make_frames, published_split, split_scenes
+from gsim3d.data.fitting import Fitting
 from gsim3d.data.layouts import find_scenes
 from gsim3d.data.scene import Scene
 
-__all__ = ["Scene", "Window", "find_scenes", "generator", "make_frames", "published_split", "split_scenes"]
+__all__ = ["Fitting", "Scene", "Window", "find_scenes", "generator", "make_frames", "published_split", "split_scenes"]

@@ -6,6 +6,7 @@ Everything here is float64, world-to-camera, OpenCV axes (x right, y down, z for
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from gsim3d.data.recording import Problems, Recording
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes (y up, z backwards) <-> OpenCV's
 ROTATION_TOLERANCE = 1e-3
 NORMALISED_FOCAL = 8.0  # pixels; a focal length below it, of an image larger than it, is no focal length in pixels
+MAX_ERROR = 0.5  # of axes that meet: their distance from the point over its distance
 MIN_SPREAD = 0.02  # mean squared sine of the optical axes around their mean: about 8 degrees
 MANY_STEPS = 64  # of moving cameras, so many steps are enough to see where they look
 NEAR_SHARE, FAR_SHARE = 0.3, 2.0  # near and far relative to the distances of the point that the cameras look at
@@ -28,6 +30,12 @@ def inverse(viewmats: np.ndarray) -> np.ndarray:
     result[..., :3, 3] = -(rotation @ viewmats[..., :3, 3:])[..., 0]
     result[..., 3, 3] = 1
     return result
+
+
+def by_step(matrices: Sequence[np.ndarray], n_steps: int) -> np.ndarray:
+    """[S, V, ...] of V cameras with [...] each that stands still or [n_steps, ...] that moves; S is 1 if none moves."""
+    full = np.stack([np.broadcast_to(matrix, (n_steps, *matrix.shape[-2:])) for matrix in matrices], 1)
+    return full[:1].copy() if (full == full[:1]).all() else full
 
 
 def check_pose(matrices: np.ndarray, what: str, problems: Problems) -> bool:
@@ -96,23 +104,39 @@ def focus(viewmats: np.ndarray) -> np.ndarray | None:
     return np.linalg.solve(across.sum(0), (across @ centres[:, :, None]).sum(0)[:, 0])
 
 
+@dataclass(frozen=True)
+class _Convergence:
+    """How [N, 4, 4] look at the point nearest to all their axes.
+
+    behind: bool [N], who has it behind.   error: distance of the axes from it over its distance.
+    plausible: share of the cameras that have it before them at a distance that a scene may have.
+    """
+
+    behind: np.ndarray
+    error: float
+    plausible: float
+
+    @property
+    def fits(self) -> bool:
+        return self.plausible == 1 and self.error < MAX_ERROR
+
+
 def check_directions(recording: Recording, problems: Problems) -> None:
     """Do the cameras look at one scene? Finds flipped axes and exchanged directions, which no single matrix shows."""
     viewmats, where = spread_steps(recording.viewmats), recording.source
     if recording.bounds is not None:
         _check_view_of_bounds(recording, viewmats, problems)
         return
-    flat = viewmats.reshape(-1, 4, 4)
-    found = _agreement(flat)
-    if found is None:
+    depths = (recording.near, recording.far)
+    found = _convergence(viewmats.reshape(-1, 4, 4), depths)
+    if found is None or found.fits:
         return
-    behind, error = found
-    hint = _better_convention(flat, behind, error)
-    if behind.all() or (hint and error > 0.5):
+    hint = _better_convention(viewmats.reshape(-1, 4, 4), depths)
+    if found.behind.all() or (hint and (found.plausible < 0.5 or found.error > MAX_ERROR)):
         hint = hint or "are the camera axes OpenGL's (y up, z backwards)?"
-        problems.add(f"{where}: the cameras look away from each other's views: {hint}")
+        problems.add(f"{where}: the cameras look away from one another's views: {hint}")
         return
-    behind = behind.reshape(viewmats.shape[:2])
+    behind = found.behind.reshape(viewmats.shape[:2])
     for cam in np.flatnonzero(behind.any(0)):
         frame = f", frame {int(np.argmax(behind[:, cam]))}" if len(viewmats) > 1 else ""
         problems.add(
@@ -121,8 +145,8 @@ def check_directions(recording: Recording, problems: Problems) -> None:
         )
 
 
-def _agreement(viewmats: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """(which cameras have the focus behind them, distance of the axes from it relative to its distance)."""
+def _convergence(viewmats: np.ndarray, depths: tuple[float | None, float | None]) -> _Convergence | None:
+    """None where the axes are nearly parallel. ``depths``: near and far, None where nobody gave them."""
     point = focus(viewmats)
     if point is None:
         return None
@@ -131,23 +155,28 @@ def _agreement(viewmats: np.ndarray) -> tuple[np.ndarray, float] | None:
     depth = (to_point * axes).sum(1)
     distance = np.linalg.norm(to_point, axis=1)
     off = np.sqrt(np.maximum(distance**2 - depth**2, 0))
-    return depth <= 0, float(np.sqrt((off**2).mean()) / max(distance.mean(), 1e-12))
+    # Cameras read the wrong way round often stand at nearly one place, where their axes meet too.
+    least = 0.2 * np.linalg.norm(viewmats[:, :3, 3], axis=1).mean() if depths[0] is None else depths[0] / 2
+    most = np.inf if depths[1] is None else 2 * depths[1]
+    plausible = (depth > 0) & (distance >= least) & (distance <= most)
+    error = np.sqrt((off**2).mean()) / max(distance.mean(), 1e-12)
+    return _Convergence(depth <= 0, float(error), float(plausible.mean()))
 
 
-def _better_convention(viewmats: np.ndarray, behind: np.ndarray, error: float) -> str | None:
+def _better_convention(viewmats: np.ndarray, depths: tuple[float | None, float | None]) -> str | None:
     """What the matrices seem to be instead, where another reading makes all cameras look at one point."""
     readings = {
-        "are the camera axes OpenGL's (y up, z backwards) instead of OpenCV's?": OPENGL @ viewmats,
-        "are the matrices camera-to-world instead of world-to-camera, or the reverse?": inverse(viewmats),
+        "are the camera axes OpenGL's (y up, z backwards) where OpenCV's are expected, or the reverse?": OPENGL
+        @ viewmats,
+        "are the matrices camera-to-world where world-to-camera is expected, or the reverse?": inverse(viewmats),
         "are the matrices camera-to-world with OpenGL's axes?": OPENGL @ inverse(viewmats),
     }
-    scored = {}
+    errors = {}
     for hint, reading in readings.items():
-        found = _agreement(reading)
-        if found is not None and not found[0].any() and found[1] < 0.2:
-            scored[hint] = found[1]
-    best = min(scored, key=scored.get, default=None)
-    return best if best and (behind.all() or scored[best] < error / 4) else None
+        found = _convergence(reading, depths)
+        if found is not None and found.fits:
+            errors[hint] = found.error
+    return min(errors, key=errors.get, default=None)
 
 
 def _check_view_of_bounds(recording: Recording, viewmats: np.ndarray, problems: Problems) -> None:

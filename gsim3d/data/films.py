@@ -20,13 +20,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.data.cameras import check_intrinsics, check_pose
-from gsim3d.data.images import IMAGE_SUFFIXES, as_color, as_labels, is_marked, read_files
+from gsim3d.data.cameras import by_step, check_intrinsics, check_pose
+from gsim3d.data.images import IMAGE_SUFFIXES, as_color, as_labels, as_mask, read_files
 from gsim3d.data.masks import MIN_STEPS
 from gsim3d.data.recording import (
     MAX_CAMS,
+    MAX_NAME,
     MAX_STEPS,
-    MOVING,
     Problems,
     Recording,
     array,
@@ -80,13 +80,13 @@ def read(folder: Path, problems: Problems) -> Recording:
         problems.add(f"{source}: fps is needed" + (f": the videos have {sorted(rates)}" if rates else ""))
         rates = {1.0}
     unit = description.get("units", "m")
-    if unit not in UNITS:
+    if not isinstance(unit, str) or unit not in UNITS:
         raise InputError(f"{source}: units must be one of {', '.join(UNITS)}; got {unit!r}")
     cameras = [
         _camera(entry, name, size, len(numbers), description, source, problems)
         for name, entry, size in zip(names, entries, sizes)
     ]
-    viewmats, Ks = (_by_step([camera[i] for camera in cameras], len(numbers)) for i in (0, 1))
+    viewmats, Ks = (by_step([camera[i] for camera in cameras], len(numbers)) for i in (0, 1))
     viewmats[..., :3, 3] *= UNITS[unit]
     given = {
         key: None if value is None else value * UNITS[unit]
@@ -105,7 +105,7 @@ def read(folder: Path, problems: Problems) -> Recording:
 
     def read_labels(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
         wanted = [numbers[step] for step in steps]
-        return labels[cam].read(wanted, problems, as_labels if masks == "labels" else _as_mask)
+        return labels[cam].read(wanted, problems, as_labels if masks == "labels" else as_mask)
 
     labels = [_Frames(folder, Path(masks) / n, n, s) for n, s in zip(names, sizes)] if masks in OWN_FOLDERS else None
     stride = numbers[1] - numbers[0] if len(numbers) > 1 else 1
@@ -129,9 +129,11 @@ def read(folder: Path, problems: Problems) -> Recording:
 
 def _name(entry: dict, number: int, source: Path) -> str:
     name = entry.get("name")
-    if not isinstance(name, str) or not name or Path(name).name != name or name in OWN_FOLDERS or name.startswith("."):
+    plain = isinstance(name, str) and 0 < len(name) <= MAX_NAME and Path(name).name == name and "\0" not in name
+    if not plain or name in OWN_FOLDERS or name.startswith("."):
         raise InputError(
-            f"{source}: cameras[{number}].name must be the name of its folder or video, without ending; got {name!r}"
+            f"{source}: cameras[{number}].name must be the name of its folder or video, without ending; "
+            f"got {str(name)[:80]!r}"
         )
     return name
 
@@ -178,16 +180,6 @@ def _masks(folder: Path, description: dict, source: Path) -> str:
     if wanted == "none":
         return wanted
     return next((name for name in reversed(OWN_FOLDERS) if (folder / name).is_dir()), wanted)
-
-
-def _by_step(matrices: list[np.ndarray], n_steps: int) -> np.ndarray:
-    if all(matrix.ndim == 2 for matrix in matrices):
-        return np.stack(matrices)[None]
-    return np.stack([np.broadcast_to(matrix, (n_steps, *matrix.shape[-2:])) for matrix in matrices], 1)
-
-
-def _as_mask(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray:
-    return is_marked(image).astype(np.uint8) * MOVING
 
 
 def _frames_of(folder: Path, name: str, size: tuple[int, int], source: Path, problems: Problems) -> _Frames | _Video:
@@ -274,6 +266,8 @@ class _Video:
         return capture
 
     def read(self, numbers: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
+        import cv2
+
         capture = self._open()
         try:
             at, ended = -1, False
@@ -295,6 +289,6 @@ class _Video:
                     problems.add(f"video {self._file} (camera {self._name}, frame {number}) cannot be decoded")
                     yield None
                     continue
-                yield frame[..., ::-1]
+                yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
         finally:
             capture.release()

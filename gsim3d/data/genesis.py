@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.data.cameras import check_intrinsics, check_pose
+from gsim3d.data.cameras import by_step, check_intrinsics, check_pose
 from gsim3d.data.images import as_color, as_labels, read_files
 from gsim3d.data.recording import (
     MAX_CAMS,
@@ -77,8 +77,8 @@ def read(folder: Path, problems: Problems) -> Recording:
         n_steps=n_steps,
         fps=positive(metadata.get("fps", DEFAULT_FPS), f"{source}: fps", problems) or DEFAULT_FPS,
         camera_names=tuple(f"cam_{cam}" for cam in range(n_cams)),
-        viewmats=_by_step(viewmats, n_steps),
-        Ks=_by_step(Ks, n_steps),
+        viewmats=by_step(viewmats, n_steps),
+        Ks=by_step(Ks, n_steps),
         sizes=tuple(sizes),
         read_images=reader("rgb", as_color),
         read_labels=reader("seg", as_labels) if has_labels else None,
@@ -99,13 +99,6 @@ def _camera(entry, what: str, n_steps: int, problems: Problems) -> tuple[np.ndar
     if found is not None and check_intrinsics(found, size, f"{what}.intrinsics", problems):
         K = found
     return viewmat, K, size
-
-
-def _by_step(matrices: list[np.ndarray], n_steps: int) -> np.ndarray:
-    """[S, V, ...] from matrices of cameras that stand still or move; S is 1 where none moves."""
-    if all(matrix.ndim == 2 for matrix in matrices):
-        return np.stack(matrices)[None]
-    return np.stack([np.broadcast_to(matrix, (n_steps, *matrix.shape[-2:])) for matrix in matrices], 1)
 
 
 def _template(metadata: dict, source: Path) -> str:

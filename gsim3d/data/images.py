@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.data.recording import Problems
+from gsim3d.data.recording import BACKGROUND, MOVING, Problems
 from gsim3d.errors import InputError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -82,12 +82,14 @@ def _header(data: bytes) -> tuple[tuple[int, int] | None, bool]:
 
 def as_color(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray | None:
     """uint8 [h, w, 3], RGB; alpha is dropped, grey repeated."""
+    import cv2
+
     if image.dtype != np.uint8:
         problems.add(f"image {file} ({place}) must have 8 bits a channel; got {image.dtype}")
         return None
     if image.ndim == 2:
         return np.repeat(image[..., None], 3, 2)
-    return image[..., 2::-1]
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
 
 
 def as_labels(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray | None:
@@ -99,6 +101,11 @@ def as_labels(image: np.ndarray, file: Path, place: str, problems: Problems) -> 
         problems.add(f"image {file} ({place}) must hold labels in one channel; got a colour image")
         return None
     return image if image.ndim == 2 else image[..., 0]
+
+
+def as_mask(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray:
+    """uint8 [h, w]: MOVING where any channel but alpha is not zero, else BACKGROUND."""
+    return np.where(is_marked(image), MOVING, BACKGROUND).astype(np.uint8)
 
 
 def is_marked(image: np.ndarray) -> np.ndarray:

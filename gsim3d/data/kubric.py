@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.data.cameras import OPENGL, check_intrinsics, inverse
+from gsim3d.data.cameras import OPENGL, by_step, check_intrinsics, inverse
 from gsim3d.data.images import as_color, is_marked, read_image, read_files
 from gsim3d.data.recording import (
     BACKGROUND,
@@ -76,7 +76,7 @@ def read(folder: Path, problems: Problems) -> Recording:
         n_steps=len(numbers),
         fps=(fps or cameras[0].frame_rate) / stride,
         camera_names=tuple(camera.name for camera in cameras),
-        viewmats=np.stack([camera.viewmats(numbers, problems) for camera in cameras], 1),
+        viewmats=by_step([camera.viewmats(numbers, problems) for camera in cameras], len(numbers)),
         Ks=np.stack([camera.K for camera in cameras])[None],
         sizes=tuple(camera.size for camera in cameras),
         read_images=read_images,
@@ -109,7 +109,7 @@ class _Camera:
 
     def __init__(self, scene: Path, folder: Path, problems: Problems):
         self.name = folder.name
-        self.source = inside(scene, folder.relative_to(scene).as_posix(), f"camera {folder.name}") / FILE
+        self.source = inside(scene, (folder / FILE).relative_to(scene).as_posix(), f"camera {folder.name}")
         self.description = read_json(self.source)
         entry, metadata = self.description.get("camera"), self.description.get("metadata", {})
         if not isinstance(entry, dict) or not isinstance(metadata, dict):
@@ -146,8 +146,9 @@ class _Camera:
         """[S, 4, 4], world-to-camera, OpenCV axes, of the poses ``numbers``."""
         matrices = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()
         what = f"{self.source}: camera {self.name}"
-        count = len(self._entry.get("positions") or ())
-        positions = array(self._entry.get("positions"), [(count, 3)], f"{what}: camera.positions", problems)
+        positions = self._entry.get("positions")
+        count = len(positions) if isinstance(positions, list) else 0
+        positions = array(positions, [(count, 3)], f"{what}: camera.positions", problems)
         quaternions = array(self._entry.get("quaternions"), [(count, 4)], f"{what}: camera.quaternions", problems)
         if positions is None or quaternions is None or not 0 < count <= MAX_STEPS:
             return matrices

@@ -12,7 +12,8 @@ NOISE_FACTOR = 6.0  # a pixel is foreground where it differs by so many times th
 MIN_DIFFERENCE = 18.0  # ... and by at least so much of 255
 BLUR = 1.2  # pixels; noise of single pixels and blocks of JPEG are smoothed before they are compared
 CLOSE_SHARE = 0.012  # of the image's height: gaps so wide are closed
-MIN_AREA = 0.001  # of the image; smaller spots are noise
+MIN_AREA = 0.001  # of the image; smaller spots are noise ...
+MAX_HOLE = 0.005  # ... and smaller holes are body that looks like what is behind it
 
 
 class Undistorter:
@@ -71,7 +72,15 @@ def foreground(image: np.ndarray, background: np.ndarray) -> np.ndarray:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, disc)
-    count, spots, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    large = stats[:, cv2.CC_STAT_AREA] >= MIN_AREA * mask.size
+    mask = (~_large(1 - mask, MAX_HOLE)).astype(np.uint8)
+    return _large(mask, MIN_AREA)
+
+
+def _large(mask: np.ndarray, least: float) -> np.ndarray:
+    """bool [h, w]: the connected parts of ``mask`` that cover at least ``least`` of the image."""
+    import cv2
+
+    _, parts, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] >= least * mask.size
     large[0] = False
-    return large[spots]
+    return large[parts]

@@ -14,6 +14,8 @@ import numpy as np
 from gsim3d.errors import InputError
 
 MAX_STEPS, MAX_CAMS, MAX_SIZE = 1_000_000, 10_000, 16_384  # beyond them a description is taken to be broken
+MAX_NUMBER = 1e9  # metres, pixels, seconds: likewise
+MAX_NAME = 200  # letters of a file name
 MAX_JSON = 256 * 2**20  # bytes of one description
 SPACING_TOLERANCE = 0.01  # of the time between two steps
 BACKGROUND, FIXED, MOVING = 0, 1, 3  # labels of pixels: nothing, what never moves, bodies that may move
@@ -119,6 +121,9 @@ def array(value, shapes: Sequence[tuple[int, ...]], what: str, problems: Problem
         frame = f" (frame {place[0]})" if len(shapes) > 1 and numbers.ndim == max(map(len, shapes)) else ""
         problems.add(f"{what}{frame} holds values that are not finite")
         return None
+    if (np.abs(numbers) > MAX_NUMBER).any():
+        problems.add(f"{what} holds {np.abs(numbers).max():g}; numbers beyond {MAX_NUMBER:g} are taken to be broken")
+        return None
     return numbers
 
 
@@ -150,14 +155,15 @@ def workspace(description: dict, where: Path, problems: Problems) -> dict:
 
 
 def inside(folder: Path, relative: str, where: str) -> Path:
-    """``folder / relative``. Raises InputError when that leads out of ``folder``, also through links."""
+    """``folder / relative``. Raises InputError when that is no file inside of ``folder``, links followed."""
     file = folder / relative
     try:
-        if file.resolve().is_relative_to(folder.resolve()):
+        root, place = folder.resolve(), file.resolve()
+        if place != root and place.is_relative_to(root) and len(file.name) <= MAX_NAME:
             return file
     except (OSError, ValueError, RuntimeError):
         pass
-    raise InputError(f"{where} leads out of the scene: {str(relative)[:200]!r}")
+    raise InputError(f"{where} is no file or leads out of the scene: {str(relative)[:200]!r}")
 
 
 def natural_order(text: str) -> list:

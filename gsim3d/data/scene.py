@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +13,10 @@ from torch import Tensor
 
 from gsim3d.data import layouts
 from gsim3d.data.cameras import check_directions, depth_range, frusta_origin, shared_view, spread_steps
+from gsim3d.data.fitting import Fitting, fit
 from gsim3d.data.images import ImageCache
 from gsim3d.data.masks import Undistorter, foreground, median_image
-from gsim3d.data.recording import BACKGROUND, MOVING, Problems, Recording
+from gsim3d.data.recording import BACKGROUND, MOVING, Problems, ReadImages, Recording
 from gsim3d.errors import InputError
 from gsim3d.types import Cameras
 
@@ -28,11 +31,15 @@ class Scene:
     near, far: metres, the depth range in which the scene lies.
     width, height: pixels of all images: those of the largest camera, padded on the right and below to multiples of 16.
     origin: float64 [3] metres, lower corner of the workspace.
-    bounds: float64 [2, 3] metres, corners of the box that is shown as the scene's: given, or what most cameras see.
     """
 
-    def __init__(self, path: Path, recording: Recording, cache_dir: str | Path | None = None):
+    def __init__(
+        self, path: Path, recording: Recording, cache_dir: str | Path | None = None, fitting: Fitting = Fitting()
+    ):
         self.path = path
+        self.filmed_sizes = recording.sizes
+        self._filmed, self._fitting = recording, fitting
+        recording = fit(recording, fitting)
         self.name = "/".join(path.absolute().parts[-2:])
         self.recording = recording
         self.layout, self.camera_names = recording.layout, recording.camera_names
@@ -40,29 +47,28 @@ class Scene:
         self.near, self.far = _depths(recording)
         sizes = np.array(recording.sizes)
         self.width, self.height = (int(-(-side // SIZE_MULTIPLE) * SIZE_MULTIPLE) for side in sizes.max(0))
-        view = (spread_steps(recording.viewmats), spread_steps(recording.Ks), recording.sizes, self.near, self.far)
-        self.bounds = shared_view(*view) if recording.bounds is None else recording.bounds
         if recording.origin is not None:
             self.origin = recording.origin
         else:
-            self.origin = recording.bounds[0] if recording.bounds is not None else frusta_origin(*view)
+            self.origin = frusta_origin(*self._view()) if recording.bounds is None else recording.bounds[0]
         self._undistorters = [
             None if coefficients is None else Undistorter(coefficients, size)
             for coefficients, size in zip(recording.distortions or (None,) * self.n_cams, recording.sizes, strict=True)
         ]
         self._medians: dict[int, np.ndarray] = {}
         shape = (self.n_steps, self.n_cams, self.height, self.width)
-        stamp = (str(path.resolve()), recording.source.stat().st_mtime_ns)
+        stamp = (str(path.resolve()), recording.source.stat().st_mtime_ns, *(fitting.size or ()))
         self._images = ImageCache((*shape, 3), self._read_images, cache_dir, (*stamp, "rgb"))
         self._labels = ImageCache(shape, self._read_labels, cache_dir, (*stamp, "seg"))
 
     @staticmethod
-    def open(folder: str | Path, *, cache_dir: str | Path | None = None) -> Scene:
+    def open(folder: str | Path, *, cache_dir: str | Path | None = None, fitting: Fitting = Fitting()) -> Scene:
         """Reads the description of the scene in ``folder``; images are decoded when they are asked for, each once.
 
         Args:
             cache_dir: folder for decoded images as memory-mapped files, for sets larger than the memory;
                 default: they stay in memory.
+            fitting: image size, depth range and unit that a model wants; default: as recorded.
 
         Raises: InputError that names file, camera and frame, and what is wrong with it.
         """
@@ -70,7 +76,16 @@ class Scene:
         problems = Problems()
         recording = layouts.layout_of(path).read(path, problems)
         check_directions(recording, problems)
-        return Scene(path, recording, cache_dir)
+        return Scene(path, recording, cache_dir, fitting)
+
+    @cached_property
+    def bounds(self) -> np.ndarray:
+        """float64 [2, 3] metres, corners of the box that is shown as the scene's: given, or what most cameras see."""
+        return shared_view(*self._view()) if self.recording.bounds is None else self.recording.bounds
+
+    def _view(self) -> tuple:
+        recording = self.recording
+        return spread_steps(recording.viewmats), spread_steps(recording.Ks), recording.sizes, self.near, self.far
 
     def __repr__(self) -> str:
         return (
@@ -159,14 +174,14 @@ class Scene:
     def _K(self, cam: int, step: int) -> np.ndarray:
         return self.recording.Ks[step if len(self.recording.Ks) > 1 else 0, cam]
 
-    def as_pinhole(self, image: np.ndarray, cam: int, step: int) -> np.ndarray:
-        """An image [h, w, 3] as camera ``cam`` films it -> as :meth:`film` has it: undistorted, and padded."""
-        undistorter = self._undistorters[cam]
-        return self._padded(image if undistorter is None else undistorter(image, self._K(cam, step)))
+    def filmed_as(self, read_images: ReadImages) -> Scene:
+        """The same scene with other images of sizes ``filmed_sizes``, which are fitted and undistorted like its own."""
+        return Scene(self.path, dataclasses.replace(self._filmed, read_images=read_images), None, self._fitting)
 
     def _read_images(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
+        undistorter = self._undistorters[cam]
         for step, image in zip(steps, self.recording.read_images(cam, steps, Problems()), strict=True):
-            yield self.as_pinhole(image, cam, step)
+            yield self._padded(image if undistorter is None else undistorter(image, self._K(cam, step)))
 
     def _read_labels(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
         if self.recording.subtract_background:
@@ -175,7 +190,8 @@ class Scene:
         undistorter = self._undistorters[cam]
         for step, labels in zip(steps, self.recording.read_labels(cam, steps, Problems()), strict=True):
             if undistorter is not None:
-                labels = undistorter(labels, self._K(cam, step), nearest=True)
+                K = self._K(cam, step)
+                labels = undistorter(labels, K, nearest=True) * undistorter.valid(K)
             yield self._padded(labels)
 
     def _subtracted(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:

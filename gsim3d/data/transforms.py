@@ -16,12 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.data.cameras import OPENGL, check_intrinsics, check_pose, inverse
-from gsim3d.data.images import as_color, as_labels, is_marked, read_files
+from gsim3d.data.cameras import OPENGL, by_step, check_intrinsics, check_pose, inverse
+from gsim3d.data.images import as_color, as_labels, as_mask, read_files
 from gsim3d.data.recording import (
     MAX_CAMS,
     MAX_STEPS,
-    MOVING,
     Problems,
     Recording,
     array,
@@ -61,7 +60,14 @@ def read(folder: Path, problems: Problems) -> Recording:
             f"{source}: camera_model {model!r} is not read; undistort the images to a pinhole "
             f"(known: {', '.join(PINHOLES)})"
         )
-    table, times = _table(description, frames, source, problems)
+    for number, frame in enumerate(frames):
+        for key in ("file_path", "mask_path", "label_path"):
+            if key != "file_path" and key not in frame:
+                continue
+            if not isinstance(frame.get(key), str):
+                raise InputError(f"{source}: frames[{number}].{key} must be text; got {str(frame.get(key))[:80]!r}")
+            inside(folder, frame[key], f"{source}: frames[{number}].{key}")
+    table, times = _table(frames, source, problems)
     names = sorted(table, key=natural_order)
     if len(names) > MAX_CAMS:
         raise InputError(f"{source}: {len(names)} cameras; more than {MAX_CAMS} are taken to be a mistake")
@@ -84,7 +90,7 @@ def read(folder: Path, problems: Problems) -> Recording:
         camera = cameras[cam]
         for step in steps:
             frame = camera.frames[step]
-            key, convert = ("label_path", as_labels) if "label_path" in frame else ("mask_path", _as_mask)
+            key, convert = ("label_path", as_labels) if "label_path" in frame else ("mask_path", as_mask)
             if key not in frame:
                 problems.add(f"{source}: {camera.place(step)} has no mask_path, though other frames have one")
                 yield None
@@ -98,8 +104,8 @@ def read(folder: Path, problems: Problems) -> Recording:
         n_steps=n_steps,
         fps=fps or 1.0,
         camera_names=tuple(names),
-        viewmats=_still(np.stack([camera.viewmats for camera in cameras], 1)),
-        Ks=_still(np.stack([camera.Ks for camera in cameras], 1)),
+        viewmats=by_step([camera.viewmats for camera in cameras], n_steps),
+        Ks=by_step([camera.Ks for camera in cameras], n_steps),
         sizes=tuple(camera.size for camera in cameras),
         read_images=read_images,
         read_labels=read_labels if has_labels else None,
@@ -109,20 +115,8 @@ def read(folder: Path, problems: Problems) -> Recording:
     )
 
 
-def _as_mask(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray:
-    return is_marked(image).astype(np.uint8) * MOVING
-
-
-def _still(matrices: np.ndarray) -> np.ndarray:
-    """The first step alone where [S, V, ...] are the same at all steps."""
-    return matrices[:1] if (matrices == matrices[:1]).all() else matrices
-
-
-def _table(description: dict, frames: list[dict], source: Path, problems: Problems) -> tuple[dict, np.ndarray]:
+def _table(frames: list[dict], source: Path, problems: Problems) -> tuple[dict, np.ndarray]:
     """(camera -> its frames step by step, times of the steps)."""
-    for number, frame in enumerate(frames):
-        if not isinstance(frame.get("file_path"), str):
-            raise InputError(f"{source}: frames[{number}].file_path must be text; got {frame.get('file_path')!r}")
     timeless = [number for number, frame in enumerate(frames) if "time" not in frame]
     if len(timeless) == len(frames):
         return {str(frame.get("camera", frame["file_path"])): [frame] for frame in frames}, np.zeros(1)
@@ -185,8 +179,7 @@ class _Camera:
 
     def files(self, folder: Path, key: str, steps: Sequence[int]) -> Iterator[tuple[Path, str]]:
         for step in steps:
-            relative = str(self.frames[step][key])
-            file = inside(folder, relative, f"{self._source}: {key} of {self.place(step)}")
+            file = inside(folder, self.frames[step][key], f"{self._source}: {key} of {self.place(step)}")
             if not file.suffix:
                 file = file.with_suffix(".png")  # as in the synthetic sets
             yield file, self.place(step)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from gsim3d.ops.curve import PyramidSpec
 from gsim3d.quirks import Quirks
 
+PREDICTS = ("from_newest", "from_previous", "absolute")
 STEM_KERNEL, BLOCK_KERNEL = 5, 3  # edges of the convolutions, in cells
 
 
@@ -19,7 +20,11 @@ class DynamicsConfig:
         explicit: particles carry their own Gaussian parameters (quats, scales, sh), and all of them change with time.
         sh_degree: of explicit particles.
         scale_min, scale_max: metres, limits of explicit scales.
-        max_step: metres; one step moves a particle by less than this along each axis. None: no limit.
+        predicts: "from_newest": the network predicts how much each later state differs from the newest one of the
+            history; "from_previous": from the state one step before it; "absolute": the state itself.
+        steps_per_call: steps that one call of the network predicts.
+        max_step: metres; one step moves a particle by less than this along each axis. None: no limit, and none to how
+            much a scale changes.
         max_latent_step: the same for each dynamic latent. None: no limit.
         position_features: the network also sees positions relative to the scene's origin (in units of
             ``position_length`` metres) and inside the cell. Learning where the ground is takes far less data so;
@@ -35,7 +40,7 @@ class DynamicsConfig:
         decoder_depths, decoder_channels, decoder_heads: S - 1 each, stages 0 to S - 2.
         mlp_ratio: hidden channels of a block's MLP over its channels.
         norm: "layer", or "batch" as published: evaluation uses running statistics, training those of the call's rows.
-        zero_init: the last layer starts at zero, so an untrained model predicts that nothing changes.
+        zero_init: the last layer starts at zero: an untrained model that predicts differences predicts none.
     Training:
         drop_path: share of rows that skip a branch of a block, growing from 0 at the first block.
         shuffle_orders: the four curves of a stage change places at random.
@@ -48,6 +53,8 @@ class DynamicsConfig:
     sh_degree: int = 3
     scale_min: float = 0.0002
     scale_max: float = 0.1
+    predicts: str = "from_newest"
+    steps_per_call: int = 1
     max_step: float | None = 0.5
     max_latent_step: float | None = None
     position_features: bool = False
@@ -90,6 +97,10 @@ class DynamicsConfig:
                     raise ValueError(f"DynamicsConfig: {name}_channels {channels} cannot be split into {heads} heads")
         if self.norm not in ("layer", "batch"):
             raise ValueError(f'DynamicsConfig: norm must be "layer" or "batch"; got {self.norm!r}')
+        if self.predicts not in PREDICTS:
+            raise ValueError(f"DynamicsConfig: predicts must be one of {', '.join(PREDICTS)}; got {self.predicts!r}")
+        if self.steps_per_call < 1:
+            raise ValueError(f"DynamicsConfig: steps_per_call must be at least 1; got {self.steps_per_call}")
 
     @property
     def n_stages(self) -> int:

@@ -1,17 +1,16 @@
-"""Particles of the last steps -> particles of the next step."""
+"""Particles of the last steps -> particles of the next steps."""
 
 from __future__ import annotations
-
-import dataclasses
 
 import torch
 from torch import Tensor, nn
 
 from gsim3d import ops
+from gsim3d.dynamics.clouds import concatenate, newest_clouds
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.point_transformer import PointTransformer
 from gsim3d.dynamics.state import StateLayout
-from gsim3d.types import Particles
+from gsim3d.types import CloudTable, Particles, constant, take_runs
 
 
 class Dynamics(nn.Module):
@@ -30,25 +29,26 @@ class Dynamics(nn.Module):
         self.net = PointTransformer(self.layout.in_channels, self.layout.out_channels, config)
 
     def forward(self, history: Particles, *, generator: torch.Generator | None = None) -> Particles:
-        """The next step of every scene.
+        """The next step of every scene, or the next ``config.steps_per_call`` steps.
 
         Args:
             history: clouds sorted by (scene, step); steps may have different numbers of rows, and gaps are fine.
             generator: of drop path and of the curves' shuffling, both in training only; None: neither happens.
         Returns:
-            One cloud a scene, with the rows of the scene's newest step and the step after it.
+            One cloud a scene and step, each with the rows of the scene's newest step.
         Gradients: features and positions of ``history``, parameters. Cells are constants.
         Raises:
             ValueError: clouds are not sorted, or a history is longer than the model's.
         """
-        newest = newest_clouds(history)
-        slots, history_bits = self._slots(history, newest)
+        clouds = history.clouds
+        newest = newest_clouds(clouds)
+        slots, history_bits = self._slots(clouds, newest)
         curves = self._draw_curves(generator) if self.training and self.config.shuffle_orders else None
         pyramid = ops.build_pyramid(
             history.means,
             history.cu_rows,
             history.cloud_scene,
-            slots,
+            constant(slots, history.cu_rows.device),
             history.origin,
             self.config.pyramid_spec(history_bits),
             curves=curves,
@@ -57,27 +57,44 @@ class Dynamics(nn.Module):
         features = self.net(features, pyramid, generator=generator if self.training else None)
 
         state = history.select_clouds(newest)
-        is_newest = torch.zeros(history.n_clouds, dtype=torch.bool, device=newest.device).index_fill(0, newest, True)
-        awake = is_newest[history.row_cloud()[pyramid.rows]].nonzero()[:, 0]
-        row_of_state = torch.cumsum(is_newest[history.row_cloud()], 0) - 1
-        prediction = self.net.head(take_rows(features, awake))
-        if awake.shape[0] < state.n_rows:
-            prediction = put_rows(prediction, row_of_state[pyramid.rows[awake]], state.n_rows)
-        state = self.layout.advance(state, prediction)
-        return dataclasses.replace(state, cloud_step=state.cloud_step + 1)
+        if pyramid.rows.shape[0] == history.n_rows:
+            prediction, is_awake = self.net.head(take_runs(features, clouds.row_runs(newest))), None
+        else:
+            prediction, is_awake = self._predict_awake(features, pyramid.rows, history, newest, state.n_rows)
+        table = state.clouds
+        counts = [table.count(q) for q in range(len(table))]
+        steps = [
+            step.with_clouds(CloudTable.make(counts, table.scenes, (s + 1 + i for s in table.steps), state.cu_rows.device))
+            for i, step in enumerate(self.layout.advance(state, prediction, is_awake))
+        ]
+        return steps[0] if len(steps) == 1 else concatenate(steps)
 
-    def _slots(self, history: Particles, newest: Tensor) -> tuple[Tensor, int]:
+    def _predict_awake(
+        self, features: Tensor, rows: Tensor, history: Particles, newest: list[int], n_rows: int
+    ) -> tuple[Tensor, Tensor]:
+        """(prediction [n_rows, .] of the newest clouds' rows, 0 for those that sleep; who is awake). ``rows``: awake
+        rows of ``history``."""
+        is_newest = torch.zeros(history.n_clouds, dtype=torch.bool, device=rows.device)
+        is_newest = is_newest.index_fill(0, constant(tuple(newest), rows.device), True)[history.row_cloud()]
+        row_of_state = torch.cumsum(is_newest, 0) - 1
+        awake = is_newest[rows].nonzero()[:, 0]
+        places = row_of_state[rows[awake]]
+        prediction = put_rows(self.net.head(take_rows(features, awake)), places, n_rows)
+        return prediction, torch.zeros(n_rows, dtype=torch.bool, device=rows.device).index_fill(0, places, True)
+
+    def _slots(self, clouds: CloudTable, newest: list[int]) -> tuple[tuple[int, ...], int]:
         """Time slot of each cloud, and the bits they are counted in."""
-        steps = history.cloud_step
-        counts = torch.diff(newest, prepend=newest.new_full((1,), -1))
-        first, last = steps[newest - counts + 1], steps[newest]
-        longest = int((last - first).max()) + 1 if newest.numel() else 1
-        bits = self.config.history_bits
+        slots, longest, begin, bits = [], 1, 0, self.config.history_bits
+        from_first = self.config.quirks.slots_from_first
+        for last in newest:
+            span = clouds.steps[last] - clouds.steps[begin]
+            longest = max(longest, span + 1)
+            shift = 0 if from_first else 2**bits - 1 - span
+            slots += [shift + clouds.steps[q] - clouds.steps[begin] for q in range(begin, last + 1)]
+            begin = last + 1
         if longest > 2**bits:
             raise ValueError(f"Dynamics: a history must span at most {2**bits} steps; got {longest}")
-        if self.config.quirks.slots_from_first:
-            return steps - torch.repeat_interleave(first, counts), (longest - 1).bit_length()
-        return 2**bits - 1 - (torch.repeat_interleave(last, counts) - steps), bits
+        return tuple(slots), (longest - 1).bit_length() if from_first else bits
 
     def _draw_curves(self, generator: torch.Generator | None) -> tuple[tuple[int, ...], ...] | None:
         if generator is None:
@@ -86,20 +103,6 @@ class Dynamics(nn.Module):
             tuple(torch.randperm(4, generator=generator, device=generator.device).tolist())
             for _ in range(self.config.n_stages)
         )
-
-
-def newest_clouds(particles: Particles) -> Tensor:
-    """int64 [scenes that have a cloud], the last cloud of each."""
-    scene, step = particles.cloud_scene, particles.cloud_step
-    ascending = (scene[1:] > scene[:-1]) | ((scene[1:] == scene[:-1]) & (step[1:] > step[:-1]))
-    if not bool(ascending.all()):
-        raise ValueError(
-            "particles: clouds must be sorted by (scene, step), each once; "
-            f"got scenes {scene.tolist()}, steps {step.tolist()}"
-        )
-    is_last = torch.ones_like(scene, dtype=torch.bool)
-    is_last[:-1] = scene[1:] != scene[:-1]
-    return is_last.nonzero()[:, 0]
 
 
 def take_rows(x: Tensor, rows: Tensor) -> Tensor:

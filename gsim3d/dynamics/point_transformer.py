@@ -37,7 +37,7 @@ class SparseConv(nn.Module):
 
 
 class PositionEncoding(nn.Module):
-    """What a row learns about its place from its neighbours: convolution, linear layer, norm."""
+    """What a row learns about its place from its neighbours, added to the row: convolution, linear layer, norm."""
 
     def __init__(self, channels: int, duplicates: str):
         super().__init__()
@@ -45,22 +45,25 @@ class PositionEncoding(nn.Module):
         self.linear = RowLinear(channels, channels)
         self.norm = RowLayerNorm(channels)
 
-    def forward(self, x: Tensor, stage: Stage) -> Tensor:
-        return self.norm(self.linear(self.conv(x, stage)))
+    def forward(self, x: Tensor, stage: Stage, residual: Tensor) -> Tensor:
+        return self.norm(self.linear(self.conv(x, stage)), residual)
 
 
 class Attention(nn.Module):
     """Multi-head attention inside the patches of one serialization."""
 
-    def __init__(self, channels: int, heads: int):
+    def __init__(self, channels: int, heads: int, *, rounded_to_half: bool):
         super().__init__()
-        self.heads = heads
+        self.heads, self.rounded_to_half = heads, rounded_to_half
         self.qkv = RowLinear(channels, 3 * channels)
         self.proj = RowLinear(channels, channels)
 
     def forward(self, x: Tensor, patches: PatchTable) -> Tensor:
-        q, k, v = self.qkv(x).unflatten(1, (3, self.heads, -1)).unbind(1)
-        return self.proj(ops.patch_attention(q, k, v, patches).flatten(1))
+        q, k, v = self._rounded(self.qkv(x)).unflatten(1, (3, self.heads, -1)).unbind(1)
+        return self.proj(self._rounded(ops.patch_attention(q, k, v, patches).flatten(1)))
+
+    def _rounded(self, x: Tensor) -> Tensor:
+        return x.half().to(x.dtype) if self.rounded_to_half else x
 
 
 class MLP(nn.Module):
@@ -81,7 +84,7 @@ class Block(nn.Module):
         self.drop_path, self.checkpointing = drop_path, config.checkpointing
         self.position = PositionEncoding(channels, duplicates_rule(config))
         self.norm1 = RowLayerNorm(channels)
-        self.attention = Attention(channels, heads)
+        self.attention = Attention(channels, heads, rounded_to_half=config.quirks.half_attention)
         self.norm2 = RowLayerNorm(channels)
         self.mlp = MLP(channels, config.mlp_ratio * channels)
 
@@ -104,7 +107,7 @@ class Block(nn.Module):
         return self._compute(x, conv_input, stage, row, *keep)
 
     def _compute(self, x, conv_input, stage, row, keep_attention, keep_mlp):
-        x = x + self.position(conv_input, stage)
+        x = self.position(conv_input, stage, x)
         x = x + scaled(self.attention(self.norm1(x), stage.patches[row]), keep_attention)
         return x + scaled(self.mlp(self.norm2(x)), keep_mlp)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.harmonics import degree_damping
@@ -21,8 +22,8 @@ class StateLayout:
     """Order and width of the channels: fields that change, then fields that do not, each by the alphabet.
 
     inputs, outputs: (field of Particles, channels). Positions are no input by themselves (``position_features`` appends
-    six channels); a rotation is predicted as a rotation vector. Harmonics are flat as (3, K), quaternions as
-    (x, y, z, w).
+    six channels); a difference of rotations is predicted as a rotation vector about world axes. Harmonics are flat as
+    (3, K), quaternions as (x, y, z, w). The channels of ``outputs`` repeat for every step of a call.
     """
 
     config: DynamicsConfig
@@ -39,8 +40,9 @@ class StateLayout:
             sh = 3 * (config.sh_degree + 1) ** 2
             inputs = [("dynamic_latents", dynamic), ("sh", sh), ("opacities", 1), ("quats", 4), ("scales", 3)]
             inputs += [("static_latents", static)]
-            outputs = [("dynamic_latents", dynamic), ("sh", sh), ("means", 3), ("opacities", 1), ("quats", 3)]
-            outputs += [("scales", 3)]
+            rotation = 4 if config.predicts == "absolute" else 3
+            outputs = [("dynamic_latents", dynamic), ("sh", sh), ("means", 3), ("opacities", 1)]
+            outputs += [("quats", rotation), ("scales", 3)]
         return cls(config, *(tuple((name, n) for name, n in fields if n > 0) for fields in (inputs, outputs)))
 
     @property
@@ -49,7 +51,7 @@ class StateLayout:
 
     @property
     def out_channels(self) -> int:
-        return sum(n for _, n in self.outputs)
+        return self.config.steps_per_call * sum(n for _, n in self.outputs)
 
     def pack(self, particles: Particles) -> Tensor:
         """[N, in_channels] of all rows."""
@@ -64,33 +66,94 @@ class StateLayout:
             columns.append(position_features(particles, self.config.grid_size, self.config.position_length))
         return torch.cat(columns, 1)
 
-    def advance(self, particles: Particles, prediction: Tensor) -> Particles:
-        """The particles one step later. A prediction of 0 changes nothing; prediction [N, out_channels]."""
-        parts = dict(zip(dict(self.outputs), prediction.split([n for _, n in self.outputs], 1), strict=True))
-        return dataclasses.replace(particles, **self._updates(particles, parts))
+    def advance(self, particles: Particles, prediction: Tensor, awake: Tensor | None = None) -> list[Particles]:
+        """The particles after 1, 2, ... ``steps_per_call`` steps.
 
-    def _updates(self, particles: Particles, parts: dict[str, Tensor]) -> dict[str, Tensor]:
+        Args:
+            particles: N rows, the newest state.
+            prediction: [N, out_channels].
+            awake: bool [N], rows that change at all; None: all.
+        """
+        widths = [n for _, n in self.outputs]
+        parts = prediction.unflatten(1, (self.config.steps_per_call, -1)).transpose(0, 1).split(widths, 2)
+        moves = (particles.activity != FROZEN)[:, None].to(prediction)
+        everywhere = torch.ones_like(moves)
+        if awake is not None:
+            moves, everywhere = moves * awake[:, None], everywhere * awake[:, None]
+        later = {}
+        for (name, _), part in zip(self.outputs, parts, strict=True):
+            # Latents and colours of frozen particles change too: a shadow may fall on them.
+            share = everywhere if name in ("dynamic_latents", "sh") else moves
+            if name == "quats" and self.config.steps_per_call == 1 and self.config.quirks.frozen_rows_turn:
+                share = everywhere
+            later[name] = self.later_values(name, getattr(particles, name), part, share)
+        return [
+            dataclasses.replace(particles, **{name: values[step] for name, values in later.items()})
+            for step in range(self.config.steps_per_call)
+        ]
+
+    def later_values(self, name: str, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
+        """One field of the particles after each step of a call.
+
+        Args:
+            name: of the field.
+            newest: [N, ...], its newest values.
+            predicted: [S, N, channels], of S steps.
+            share: [N, 1] or [S, N, 1], how much of a predicted change happens: 0 holds the value, bit by bit.
+        Returns:
+            [S, N, ...].
+        """
+        if name == "quats":
+            return self._later_quats(newest, predicted, share)
+        predicted = _unflat(name, predicted)
+        share = share.reshape(*share.shape[:-1], *(1,) * (newest.dim() - 1))
+        changes = self._target(name, predicted) - newest if self._absolute else self._change(name, predicted)
+        if self.config.predicts == "from_previous":
+            changes = changes.cumsum(0)
+        return hold(share, newest, self._in_range(name, newest + share * changes))
+
+    @property
+    def _absolute(self) -> bool:
+        return self.config.predicts == "absolute"
+
+    def _change(self, name: str, predicted: Tensor) -> Tensor:
         config = self.config
-        frozen = (particles.activity == FROZEN)[:, None]
-        new = {"means": hold(frozen, particles.means, particles.means + bounded(parts["means"], config.max_step))}
-        if "dynamic_latents" in parts:  # of frozen particles too: a shadow may fall on them
-            new["dynamic_latents"] = particles.dynamic_latents + bounded(
-                parts["dynamic_latents"], config.max_latent_step
-            )
-        if config.explicit:
-            damping = degree_damping(config.sh_degree, particles.sh)
-            new["sh"] = particles.sh + parts["sh"].unflatten(1, (3, -1)).mT * damping[:, None]
-            opacities = (particles.opacities + parts["opacities"][:, 0]).clamp(
-                0, None if config.quirks.unbounded_opacity else 1
-            )
-            new["opacities"] = hold(frozen[:, 0], particles.opacities, opacities)
-            quats = rotate_left(particles.quats, parts["quats"])
-            new["quats"] = quats if config.quirks.frozen_rows_turn else hold(frozen, particles.quats, quats)
-            scales = particles.scales + bounded(
-                parts["scales"], SCALE_STEP_SHARE * (config.scale_max - config.scale_min)
-            )
-            new["scales"] = hold(frozen, particles.scales, scales.clamp(config.scale_min, config.scale_max))
-        return new
+        if name == "means":
+            return bounded(predicted, config.max_step)
+        if name == "dynamic_latents":
+            return bounded(predicted, config.max_latent_step)
+        if name == "scales" and config.max_step is not None:
+            return bounded(predicted, SCALE_STEP_SHARE * (config.scale_max - config.scale_min))
+        return self._damped(predicted) if name == "sh" else predicted
+
+    def _target(self, name: str, predicted: Tensor) -> Tensor:
+        config = self.config
+        if name == "opacities":
+            return predicted.sigmoid()
+        if name == "scales":
+            return config.scale_min + (config.scale_max - config.scale_min) * predicted.sigmoid()
+        return self._damped(predicted) if name == "sh" else predicted
+
+    def _damped(self, sh: Tensor) -> Tensor:
+        return sh * degree_damping(self.config.sh_degree, sh)[:, None]
+
+    def _in_range(self, name: str, value: Tensor) -> Tensor:
+        if name == "scales":
+            return value.clamp(self.config.scale_min, self.config.scale_max)
+        if name == "opacities":
+            return value.clamp(0, None if self.config.quirks.unbounded_opacity else 1)
+        return value
+
+    def _later_quats(self, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
+        """As :meth:`later_values`, of rotations: unit quaternions, except where nothing changes."""
+        if self._absolute:
+            target = predicted.roll(1, 2)
+            return hold(share, newest, F.normalize(newest + share * (target - newest), dim=2))
+        later, before = [], newest
+        for vectors in (share * predicted).unbind(0):
+            later.append(rotate_left(before, vectors))
+            before = later[-1] if self.config.predicts == "from_previous" else newest
+        return hold(share, newest, torch.stack(later))
 
 
 def _flat(name: str, value: Tensor) -> Tensor:
@@ -100,6 +163,13 @@ def _flat(name: str, value: Tensor) -> Tensor:
     if name == "quats":
         return value.roll(-1, 1)
     return value.reshape(value.shape[0], -1) if value.numel() else value.reshape(value.shape[0], 1)
+
+
+def _unflat(name: str, value: Tensor) -> Tensor:
+    """[S, N, channels] -> [S, N, ...] as in Particles."""
+    if name == "sh":
+        return value.unflatten(2, (3, -1)).mT
+    return value[:, :, 0] if name == "opacities" else value
 
 
 def position_features(particles: Particles, grid_size: float, length: float) -> Tensor:
@@ -112,9 +182,9 @@ def position_features(particles: Particles, grid_size: float, length: float) -> 
     return torch.cat([relative / length, inside], 1).to(particles.means.dtype)
 
 
-def hold(frozen: Tensor, before: Tensor, after: Tensor) -> Tensor:
-    """``before`` where frozen: the same bits, and no gradient into the prediction."""
-    return torch.where(frozen, before, after)
+def hold(share: Tensor, newest: Tensor, later: Tensor) -> Tensor:
+    """``newest`` where the share is 0: the same bits, and no gradient into the prediction."""
+    return torch.where(share > 0, later, newest)
 
 
 def bounded(x: Tensor, limit: float | None) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from gsim3d.encoder import camera_frame
 from gsim3d.encoder.config import EncoderConfig
 from gsim3d.encoder.depth import Depth, Views
-from gsim3d.harmonics import degree_damping
+from gsim3d.harmonics import degree_damping, turn_predicted_harmonics
 
 
 @dataclass(frozen=True)
@@ -140,8 +140,10 @@ def explicit_gaussians(raw: Tensor, depth: Tensor, geometry: PixelRays, config: 
     rotations = geometry.rotations.to(raw.dtype)
     turn = camera_frame.rotation_to_quat(rotations)[:, None]
     quats = camera_frame.quat_multiply(turn, F.normalize(raw_quats.roll(1, -1), dim=-1))  # raw: real part last
+    quats = camera_frame.with_positive_largest(quats)  # as those that the dynamics writes and reads
     damping = degree_damping(config.sh_degree, raw)
     in_camera = raw_sh.reshape(n_images, -1, 3, damping.shape[0]) * damping
-    turn_sh = camera_frame.rotation_of_harmonics(geometry.rotations, config.sh_degree, config.quirks.released_harmonics)
+    each = torch.eye(len(damping), dtype=geometry.rotations.dtype, device=raw.device).repeat(n_images, 1, 1)
+    turn_sh = turn_predicted_harmonics(each, geometry.rotations, config.quirks)
     turned = torch.einsum("ikl,incl->inkc", turn_sh.to(raw.dtype), in_camera)
     return {"quats": quats, "scales": scales, "sh": turned}

@@ -6,7 +6,8 @@ import argparse
 
 EPILOG = """\
 Every scene's first steps are given, all others predicted and compared with the film, seen from cameras that were no
-input. Measured are PSNR (all pixels; masked: without background; body: what may move), SSIM, LPIPS and FVD, for
+input. Measured are psnr (all pixels), psnr_masked (without background), psnr_body (what may move), ssim, lpips_alex,
+lpips_vgg and fvd, for
 
   model              this checkpoint
   constant           its last encoded particles, held still: what the learned dynamics adds
@@ -84,6 +85,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from dataclasses import replace
+
     from tqdm import tqdm
 
     from gsim3d.errors import InputError
@@ -100,43 +103,37 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--given: without a CHECKPOINT, say how many steps the other models were given, at least 1")
     if args.checkpoint is not None and args.given is not None:
         raise InputError("--given: with a CHECKPOINT it is the model's own history; leave the option out")
-    out = _out_file(args)
     restored = None if args.checkpoint is None else restore(args.checkpoint)
     others = [Predictions.open(given, args.data) for given in args.predictions]
     if len({other.name for other in others}) != len(others):
         raise InputError("--predictions: two have the same name; write NAME=DIR")
+    out = _out_file(args, others)
     n_encoded = args.given if restored is None else restored.data.history
-    scenes = _scenes(args)
+    scenes = _scenes(args, restored)
     views, n_future = [], args.steps
     for scene in scenes:
-        if restored is not None:
-            restored.check_scene(scene)
         context, targets = (None, None) if restored is None else default_views(restored, scene)
         targets = args.cameras or targets or others[0].cameras(scenes[0])
         if bad := [cam for cam in (*targets, *(args.context or ())) if not 0 <= cam < scene.n_cams]:
             raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
         views.append((args.context or context, targets))
         n_future = min(horizon(scene, n_encoded, args.steps), n_future or scene.n_steps)
-    scores = [
-        score_scene(
-            restored,
-            scene,
-            context_cams=context,
-            target_cams=targets,
-            n_encoded=n_encoded,
-            n_future=n_future,
-            metrics=metrics,
-            others=others,
-        )
-        for scene, (context, targets) in zip(tqdm(scenes, desc="scenes", unit="scene"), views)
-    ]
-    summary = summarize(scores, not_measured)
+    for scene, (_, targets) in zip(scenes, views):
+        for other in others:
+            other.check(scene, targets, n_encoded, n_future)
+    scores = []
+    with tqdm(scenes, desc="scenes", unit="scene") as progress:
+        for scene, (context, targets) in zip(progress, views):
+            given = {"context_cams": context, "target_cams": targets, "n_encoded": n_encoded, "n_future": n_future}
+            score = score_scene(restored, scene, **given, metrics=metrics, others=others)
+            scores.append(replace(score, scene=_name(scene, args.data)))
+    summary = {**_conditions(args, restored, others, scenes, views), **summarize(scores, not_measured)}
     print(table(summary))
     print("\nwritten: " + ", ".join(str(path) for path in _write(out, args, scenes, scores, summary)))
     return 0
 
 
-def _out_file(args: argparse.Namespace):
+def _out_file(args: argparse.Namespace, others: list):
     from pathlib import Path
 
     from gsim3d.errors import InputError
@@ -146,21 +143,42 @@ def _out_file(args: argparse.Namespace):
         if out.suffix != ".json":
             raise InputError(f"--out: the name must end in .json; got {out}")
     else:
-        place = Path(args.checkpoint or args.predictions[0].rpartition("=")[2])
+        place = Path(args.checkpoint or others[0].folder)
         out = (place if place.is_dir() else place.parent) / "metrics.json"
     if not out.parent.is_dir() and args.out:
         raise InputError(f"--out: the folder {out.parent} does not exist")
     return out
 
 
-def _scenes(args: argparse.Namespace) -> list:
-    """The chosen scenes, opened."""
+def _scenes(args: argparse.Namespace, restored) -> list:
+    """The chosen scenes, opened as the model expects them."""
     from gsim3d.data import Scene, find_scenes, published_split, split_scenes
 
     folders = find_scenes(args.data)
     train, test = (split_scenes if args.split == "gsim3d" else published_split)(folders)
     chosen = {"all": folders, "train": train, "test": test or folders}[args.scenes]
-    return [Scene.open(folder) for folder in chosen]
+    return [Scene.open(folder) if restored is None else restored.open_scene(folder) for folder in chosen]
+
+
+def _name(scene, root: str) -> str:
+    """The scene's folder below the data set's: two scenes never share it."""
+    below = scene.path.relative_to(root).as_posix()
+    return scene.name if below == "." else below
+
+
+def _conditions(args: argparse.Namespace, restored, others: list, scenes: list, views: list) -> dict:
+    """What was evaluated, and on what: without it two reports cannot be compared."""
+    return {
+        "checkpoint": None if restored is None else restored.checkpoint.digest,
+        "predictions": {other.name: str(other.folder) for other in others},
+        "data": str(args.data),
+        "part": args.scenes,
+        "split": args.split,
+        "cameras": {
+            _name(scene, args.data): {"context": None if context is None else list(context), "target": list(targets)}
+            for scene, (context, targets) in zip(scenes, views)
+        },
+    }
 
 
 def _write(out, args: argparse.Namespace, scenes: list, scores: list, summary: dict) -> list:
@@ -176,6 +194,8 @@ def _write(out, args: argparse.Namespace, scenes: list, scores: list, summary: d
     write_csv(files[1], scores)
     write_markdown(files[2], summary, Path(args.data).absolute().name)
     rates = {scene.fps for scene in scenes}
+    if not summary["by_step"]:
+        return files[:3]
     try:
         write_curves(files[3], summary, rates.pop() if len(rates) == 1 else None)
     except InputError as error:

@@ -131,9 +131,7 @@ def write_overview(
     _save(figure, path)
 
 
-def write_curves(
-    path: str | Path, summary: dict, fps: float | None, metrics: Sequence[str] = tuple(METRICS)
-) -> None:
+def write_curves(path: str | Path, summary: dict, fps: float | None, metrics: Sequence[str] = tuple(METRICS)) -> None:
     """Metrics over time, given and predicted steps, of every method; the first with its deviation between scenes.
 
     Args:

@@ -10,10 +10,10 @@ video holds all steps up to the last one compared or to the end of the film, or 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gsim3d.data import Scene
@@ -61,6 +61,11 @@ class Predictions:
             raise InputError(f"{folder}: predictions of camera {cams[-1]}, but {scene.path} has {scene.n_cams} cameras")
         return tuple(cams)
 
+    def check(self, scene: Scene, cams: Sequence[int], n_encoded: int, n_future: int) -> None:
+        """Raises InputError where a folder, a frame or a video is missing; nothing is decoded."""
+        for cam in cams:
+            _find(self._scene_folder(scene) / f"cam_{cam}", range(n_encoded, n_encoded + n_future))
+
     def images(self, scene: Scene, cams: list[int], n_encoded: int, n_future: int) -> Tensor:
         """uint8 [n_future, V, H, W, 3]: the steps after the first ``n_encoded``, as cameras ``cams`` see them.
 
@@ -68,11 +73,13 @@ class Predictions:
             InputError: a folder, frame or video is missing, too short, broken or of another size.
         """
         folder = self._scene_folder(scene)
-        views = []
-        for cam in cams:
-            frames = _view(folder / f"cam_{cam}", scene, cam, n_encoded, n_future)
-            views.append(np.stack([scene.as_pinhole(frame, cam, n_encoded + j) for j, frame in enumerate(frames)]))
-        return torch.from_numpy(np.stack(views, 1))
+
+        def read(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray]:
+            size = scene.filmed_sizes[cam]
+            frames = _view(folder / f"cam_{cam}", size, scene.n_steps, n_encoded, n_future, problems)
+            return (frames[step - n_encoded] for step in steps)
+
+        return scene.filmed_as(read).film(cams, range(n_encoded, n_encoded + n_future)).permute(0, 1, 3, 4, 2)
 
     def _scene_folder(self, scene: Scene) -> Path:
         folder = self.folder / scene.path.relative_to(self.root)
@@ -81,18 +88,29 @@ class Predictions:
         return folder
 
 
-def _view(place: Path, scene: Scene, cam: int, n_encoded: int, n_future: int) -> list[np.ndarray]:
-    """One camera's predicted frames [h, w, 3], RGB, of the size that the camera films."""
-    size = scene.recording.sizes[cam]
+def _view(
+    place: Path, size: tuple[int, int], film: int, n_encoded: int, n_future: int, problems: Problems
+) -> list[np.ndarray]:
+    """One camera's predicted frames [h, w, 3], RGB."""
+    steps = range(n_encoded, n_encoded + n_future)
+    found = _find(place, steps)
+    if isinstance(found, Path):
+        return _from_video(found, size, film, n_encoded, n_future)
+    named = [(file, f"predicted step {step}") for file, step in zip(found, steps, strict=True)]
+    return [as_color(read_image(file, size, what, problems), file, what, problems) for file, what in named]
+
+
+def _find(place: Path, steps: range) -> Path | list[Path]:
+    """The video, or the frames of ``steps``."""
     if place.is_dir():
-        return _from_frames(place, size, range(n_encoded, n_encoded + n_future))
+        return _frames(place, steps)
     for suffix in VIDEOS:
         if (video := place.with_name(place.name + suffix)).is_file():
-            return _from_video(video, size, scene.n_steps, n_encoded, n_future)
+            return video
     raise InputError(f"{place} is missing: a folder of frames, or a video {place.name}{VIDEOS[0]}")
 
 
-def _from_frames(folder: Path, size: tuple[int, int], steps: range) -> list[np.ndarray]:
+def _frames(folder: Path, steps: range) -> list[Path]:
     files: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         number = re.search(r"(\d+)$", path.stem)
@@ -106,9 +124,7 @@ def _from_frames(folder: Path, size: tuple[int, int], steps: range) -> list[np.n
             f"{folder}: step {missing[0]} is missing ({len(missing)} of {len(steps)} are); file names end in the "
             f"number of their step, here {steps[0]} to {steps[-1]}"
         )
-    problems = Problems()  # raises the first one
-    found = ((files[step], f"predicted step {step}") for step in steps)
-    return [as_color(read_image(file, size, what, problems), file, what, problems) for file, what in found]
+    return [files[step] for step in steps]
 
 
 def _from_video(video: Path, size: tuple[int, int], film: int, n_encoded: int, n_future: int) -> list[np.ndarray]:
@@ -118,11 +134,13 @@ def _from_video(video: Path, size: tuple[int, int], film: int, n_encoded: int, n
     if len(frames) not in first:
         raise InputError(
             f"{video} has {'more than ' if len(frames) > film else ''}{min(len(frames), film)} frames; to compare the "
-            f"{n_future} steps after the {n_encoded} given ones, it must have {last} (or the film's {film}), or without "
-            f"the given ones {n_future} (or {film - n_encoded})"
+            f"{n_future} steps after the {n_encoded} given ones, it must have {last} (or the film's {film}), or "
+            f"without the given ones {n_future} (or {film - n_encoded})"
         )
     if len(frames) == film - n_encoded == last:
-        raise InputError(f"{video} has {len(frames)} frames: is the first one step 0 or {n_encoded}? Use frames instead")
+        raise InputError(
+            f"{video} has {len(frames)} frames: is the first one step 0 or {n_encoded}? Use frames instead"
+        )
     start = n_encoded - first[len(frames)]
     return frames[start : start + n_future]
 

@@ -13,7 +13,7 @@ Predictions of other models (predictions.py) are scored on the same steps, views
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -53,7 +53,9 @@ def default_views(restored: Restored, scene: Scene) -> tuple[tuple[int, ...], tu
     """(context, target) cameras: inputs spread evenly; targets those kept from training's inputs, else all the rest."""
     cameras = context_cameras(scene, restored.data)
     if len(cameras) < restored.data.context_views:
-        raise InputError(f"{scene.path}: {len(cameras)} usable cameras; training had {restored.data.context_views} views")
+        raise InputError(
+            f"{scene.path}: {len(cameras)} usable cameras; training had {restored.data.context_views} views"
+        )
     context = spread_views(cameras, restored.data.context_views, 0)
     target = restored.data.target_only_cameras or tuple(c for c in range(scene.n_cams) if c not in context)
     return context, target or context
@@ -80,9 +82,7 @@ def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_fut
 
 
 @torch.no_grad()
-def render_steps(
-    restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int], start: int = 0
-) -> Tensor:
+def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int], start: int = 0) -> Tensor:
     """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles, seen by cameras ``cams``.
 
     The first cloud is step ``start`` of the film, which matters where cameras move.
@@ -94,12 +94,15 @@ def render_steps(
 
 
 def constant_velocity(prediction: Prediction) -> Particles:
-    """What may move goes on from the last encoded step at the speed of its centroid; one cloud a future step."""
+    """What may move goes on from the last encoded step at the speed of its centroid; one cloud a future step.
+
+    Nothing moves where there was one step only, or where one of the last two shows nothing that may move.
+    """
     encoded = prediction.particles
     last = prediction.n_encoded - 1
     final = encoded.select_clouds(torch.tensor([last]))
     centroids = [_moving_centroid(encoded.select_clouds(torch.tensor([q]))) for q in range(max(0, last - 1), last + 1)]
-    velocity = centroids[-1] - centroids[0]
+    velocity = torch.nan_to_num(centroids[-1] - centroids[0])
     moving = (final.activity == DYNAMIC).to(final.means.dtype)[:, None]
     steps = []
     for j in range(1, prediction.n_steps - last):
@@ -151,45 +154,38 @@ def score_scene(
     images = scene.images(cams, steps).permute(0, 1, 3, 4, 2).float() / 255
     labels = scene.segmentation(cams, steps) if scene.has_segmentation() else None
     truth = SceneTruth(scene.name, images, labels, scene.valid(cams, steps), n_encoded, metrics)
-    methods = {}
-    if restored is not None:
-        methods = _model_and_baselines(restored, scene, context_cams, cams, n_future)
-    for other in others:
-        predicted = other.images(scene, cams, n_encoded, n_future).float() / 255
-        if scene.recording.is_film and labels is not None:  # the film's own background is black there
-            predicted *= (labels[n_encoded:] != BACKGROUND)[..., None]
-        methods[other.name] = torch.cat([images[:n_encoded], predicted])
-    methods["copy"] = _held(images, n_encoded - 1, n_encoded)
-    order = ("model", *(other.name for other in others), *METHODS[1:])
-    return truth.score({name: methods[name] for name in order if name in methods})
+
+    def methods() -> Iterator[tuple[str, Tensor]]:
+        if restored is not None:
+            prediction = predict(restored, scene, context_cams, n_future)
+            rendered = render_steps(restored, prediction.particles, scene, cams)
+            yield "model", rendered
+        for other in others:
+            predicted = other.images(scene, cams, n_encoded, n_future).float() / 255
+            if scene.recording.is_film and labels is not None:  # the film's own background is black there
+                predicted *= (labels[n_encoded:] != BACKGROUND)[..., None]
+            yield other.name, predicted
+        if restored is not None:
+            yield "constant", _held(restored, prediction, rendered, n_encoded - 1, scene, cams)
+        yield "copy", images[n_encoded - 1].expand(n_future, *images.shape[1:])
+        if restored is not None:
+            yield "constant_velocity", render_steps(restored, constant_velocity(prediction), scene, cams, n_encoded)
+            yield "release_constant", _held(restored, prediction, rendered, n_encoded, scene, cams)
+
+    return truth.score(methods())
 
 
-def _model_and_baselines(
-    restored: Restored, scene: Scene, context_cams: Sequence[int], cams: list[int], n_future: int
-) -> dict[str, Tensor]:
-    """Images [S, V, H, W, 3] of the model and of the baselines made from its particles."""
-    prediction = predict(restored, scene, context_cams, n_future)
-    n_encoded = prediction.n_encoded
-    images = {"model": render_steps(restored, prediction.particles, scene, cams)}
-    moved = render_steps(restored, constant_velocity(prediction), scene, cams, n_encoded)
-    images["constant_velocity"] = torch.cat([images["model"][:n_encoded], moved])
-    for name, step in (("constant", n_encoded - 1), ("release_constant", n_encoded)):
-        images[name] = _held(images["model"], step, n_encoded)
-        if scene.cameras_move:
-            still = prediction.particles.select_clouds(torch.tensor([step]))
-            for later in range(n_encoded, prediction.n_steps):
-                images[name][later] = render_steps(restored, still, scene, cams, later)[0]
-    return images
+def _held(
+    restored: Restored, prediction: Prediction, rendered: Tensor, step: int, scene: Scene, cams: Sequence[int]
+) -> Tensor:
+    """Images of the predicted steps that would be seen if everything stood still as it is at ``step``."""
+    later = range(prediction.n_encoded, prediction.n_steps)
+    if not scene.cameras_move:
+        return rendered[step].expand(len(later), *rendered.shape[1:])
+    still = prediction.particles.select_clouds(torch.tensor([step]))
+    return torch.cat([render_steps(restored, still, scene, cams, seen) for seen in later])
 
 
 def _moving_centroid(cloud: Particles) -> Tensor:
-    moving = cloud.means[cloud.activity == DYNAMIC]
-    return moving.mean(0) if len(moving) else cloud.means.new_zeros(3)
-
-
-def _held(images: Tensor, step: int, n_encoded: int) -> Tensor:
-    """``images`` with every future step replaced by that of ``step``."""
-    held = images.clone()
-    held[n_encoded:] = images[step]
-    return held
-
+    """[3]; NaN where nothing may move."""
+    return cloud.means[cloud.activity == DYNAMIC].mean(0)

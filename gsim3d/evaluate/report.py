@@ -33,7 +33,7 @@ def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None
     """
     n_encoded = scores[0].n_encoded
     methods = list(scores[0].values)
-    n_steps = min(len(values) for s in scores for metrics in s.values.values() for values in metrics.values())
+    n_steps = min(s.n_steps for s in scores)
     late = n_encoded + (n_steps - n_encoded) // 2
     missing = dict(not_measured or {})
     for scene in scores:
@@ -106,8 +106,7 @@ def write_csv(path: str | Path, scores: Sequence[SceneScores]) -> None:
     for s in scores:
         for method, values in s.values.items():
             first = 0 if method == "model" else s.n_encoded
-            n_steps = max((len(by_step) for by_step in values.values()), default=0)
-            for step in range(first, n_steps):
+            for step in range(first, s.n_steps):
                 numbers = [float(values[m][step]) if m in values else math.nan for m in metrics]
                 part = "given" if step < s.n_encoded else "predicted"
                 rows.writerow([s.scene, method, step, part, *("" if math.isnan(v) else repr(v) for v in numbers)])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -43,17 +43,17 @@ PLAIN_METRICS = tuple(name for name, metric in METRICS.items() if metric.weights
 
 @dataclass(frozen=True)
 class SceneScores:
-    """Scores of one scene.
+    """Scores of one scene over ``n_steps`` steps, the first ``n_encoded`` of them given.
 
     values: method -> metric -> float64 [S] by step, means over the target views. Steps before ``n_encoded`` are
-        reconstructions, the others predictions; all methods but the model have NaN at the former. A value that no
-        image has (an empty mask) is NaN.
+        reconstructions, which only the model has; a value that no image has (that step, or an empty mask) is NaN.
     clips: method (and ``"truth"``) -> I3D features [V, 400] of the predicted steps in each target view, for FVD.
     not_measured: metric -> why this scene has no value.
     """
 
     scene: str
     n_encoded: int
+    n_steps: int
     values: dict[str, dict[str, Tensor]]
     clips: dict[str, Tensor]
     not_measured: dict[str, str]
@@ -102,15 +102,22 @@ class SceneTruth:
         self.not_measured = {m: reason for m in metrics if (reason := self._problem(m))}
         self.metrics = [metric for metric in metrics if metric not in self.not_measured]
 
-    def score(self, methods: dict[str, Tensor]) -> SceneScores:
-        """Scores of the images [S, V, H, W, 3] of each method, colours in [0, 1]."""
-        if self.filmed is not None:
-            methods = {name: images * self.filmed[..., None] for name, images in methods.items()}
-        values = {name: self._by_step(images, name) for name, images in methods.items()}
-        clips = {}
-        if "fvd" in self.metrics:
-            clips = {name: self._clip_features(images) for name, images in {"truth": self.images, **methods}.items()}
-        return SceneScores(self.name, self.n_encoded, values, clips, self.not_measured)
+    def score(self, methods: Iterable[tuple[str, Tensor]]) -> SceneScores:
+        """Scores of (name, images) one after another, so that only one method's images need to be in memory.
+
+        Images are [S, V, H, W, 3], colours in [0, 1], or only the predicted steps of them.
+        """
+        values, clips = {}, {}
+        with_clips = "fvd" in self.metrics
+        if with_clips:
+            clips["truth"] = self._clip_features(self.images)
+        for name, images in methods:
+            if self.filmed is not None:
+                images = images * self.filmed[-len(images) :, ..., None]
+            values[name] = self._by_step(images)
+            if with_clips:
+                clips[name] = self._clip_features(images)
+        return SceneScores(self.name, self.n_encoded, len(self.images), values, clips, self.not_measured)
 
     def _problem(self, metric: str) -> str | None:
         """Why ``metric`` cannot be measured here."""
@@ -124,26 +131,26 @@ class SceneTruth:
             return f"it needs {fvd.MIN_FRAMES} predicted steps; {self.name} has {n_steps - self.n_encoded}"
         return None
 
-    def _by_step(self, images: Tensor, method: str) -> dict[str, Tensor]:
-        """Metric -> float64 [S], means over the views that have a value."""
-        first = 0 if method == "model" else self.n_encoded
-        n_steps, n_views = images.shape[:2]
-        pred, true = images[first:].flatten(0, 1), self.images[first:].flatten(0, 1)
-        labels, filmed = (None if m is None else m[first:].flatten(0, 1) for m in (self.labels, self.filmed))
-        measure = {
-            "psnr": lambda: psnr(pred, true, filmed),
-            "psnr_masked": lambda: psnr(pred, true, labels != BACKGROUND),
-            "psnr_body": lambda: psnr(pred, true, labels == MOVING),
-            "ssim": lambda: ssim(pred, true),
-            "lpips_alex": lambda: lpips.lpips(pred, true, "alex"),
-            "lpips_vgg": lambda: lpips.lpips(pred, true, "vgg"),
-        }
-        scores = {}
-        for metric in self.metrics:
-            if METRICS[metric].by_step:
-                scores[metric] = torch.full((n_steps,), torch.nan, dtype=torch.float64)
-                scores[metric][first:] = measure[metric]().reshape(n_steps - first, n_views).nanmean(1).cpu()
+    def _by_step(self, images: Tensor) -> dict[str, Tensor]:
+        """Metric -> float64 [S], means over the views that have a value; NaN for steps without images."""
+        n_steps = len(self.images)
+        scores = {m: torch.full((n_steps,), torch.nan, dtype=torch.float64) for m in self.metrics if METRICS[m].by_step}
+        for step, pred in enumerate(images, n_steps - len(images)):
+            true = self.images[step]
+            labels, filmed = (None if mask is None else mask[step] for mask in (self.labels, self.filmed))
+            measure = {
+                "psnr": lambda: psnr(pred, true, filmed),
+                "psnr_masked": lambda: psnr(pred, true, labels != BACKGROUND),
+                "psnr_body": lambda: psnr(pred, true, labels == MOVING),
+                "ssim": lambda: ssim(pred, true),
+                "lpips_alex": lambda: lpips.lpips(pred, true, "alex"),
+                "lpips_vgg": lambda: lpips.lpips(pred, true, "vgg"),
+            }
+            for metric, values in scores.items():
+                values[step] = measure[metric]().nanmean()
         return scores
 
     def _clip_features(self, images: Tensor) -> Tensor:
-        return fvd.clip_features(images[self.n_encoded :].transpose(0, 1)).cpu()
+        """[V, 400], of the predicted steps."""
+        n_future = len(self.images) - self.n_encoded
+        return fvd.clip_features(images[-n_future:].transpose(0, 1)).cpu()

@@ -1,7 +1,7 @@
 """Weights of the published model under the names of this one, and back.
 
-Two things differ beside the names: latents come from one convolution here, and explicit particles carry harmonics in the
-standard basis, so the layers of the dynamics that read and write them absorb a fixed change of basis.
+Two things differ beside the names: latents come from one convolution here, and explicit particles carry harmonics in
+the standard basis, so the layers of the dynamics that read and write them absorb a fixed change of basis.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def head_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def from_published(published: dict[str, Tensor], config: ModelConfig) -> dict[str, Tensor]:
-    """The published model's state dict -> that of :class:`gsim3d.Simulator` with ``config``; all names must be known."""
+    """The published model's state dict -> that of :class:`gsim3d.Simulator`; all names must be known."""
     parts = {part: _below(published, part) for part in (ENCODER, DYNAMICS, HEAD)}
     weights = {f"encoder.{name}": value for name, value in encoder_weights(parts[ENCODER]).items()}
     weights |= {f"dynamics.net.{name}": value for name, value in dynamics_weights(parts[DYNAMICS]).items()}
@@ -158,22 +158,25 @@ def _change_basis(weights: dict[str, Tensor], config: ModelConfig, matrix: Tenso
     """Weights of dynamics that see harmonics c as ``matrix @ c``."""
     layout = StateLayout.of(config.dynamics)
     wide = torch.block_diag(*[matrix] * 3)  # of the channels (3, K)
-    for names, fields, axis in (
-        (["stem.conv.weight"], layout.inputs, -1),
-        (["head.fc2.weight", "head.fc2.bias"], layout.outputs, 0),
+    for names, fields, axis, repeats in (
+        (["stem.conv.weight"], layout.inputs, -1, 1),
+        (["head.fc2.weight", "head.fc2.bias"], layout.outputs, 0, config.dynamics.steps_per_call),
     ):
-        start = 0
-        for field, width in fields:
-            if field == "sh":
-                break
-            start += width
+        first, width, total = _columns("sh", fields)
         for name in names:
-            before = weights[f"dynamics.net.{name}"]
-            after = before.clone()
-            part = before.narrow(axis, start, width).movedim(axis, -1)
-            after.narrow(axis, start, width).copy_((part.double() @ wide.T.to(part.device)).movedim(-1, axis))
+            after = weights[f"dynamics.net.{name}"].clone()
+            for start in range(first, repeats * total, total):
+                part = after.narrow(axis, start, width).movedim(axis, -1)
+                part.copy_(part.double() @ wide.T.to(part.device))
             weights[f"dynamics.net.{name}"] = after
     return weights
+
+
+def _columns(field: str, fields: tuple[tuple[str, int], ...]) -> tuple[int, int, int]:
+    """First channel and width of a field, and the width of all."""
+    names, widths = zip(*fields, strict=True)
+    place = names.index(field)
+    return sum(widths[:place]), widths[place], sum(widths)
 
 
 def _below(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -1,7 +1,7 @@
 """The published model's settings: what of its YAML file this model understands, ignores and refuses.
 
-Sizes that the weights show are taken from them; what no shape shows (strides, heads, cell size, limits, history) comes from
-the file.
+Sizes that the weights show are taken from them; what no shape shows (strides, heads, cell size, limits, history) comes
+from the file.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ CURVES = ["z", "z-trans", "hilbert", "hilbert-trans"]
 EXPLICIT = {"means", "opacities", "rotations", "scales", "harmonics"}
 MAX_SH_DEGREE = 3
 HISTORIES = (1, 2, 4, 8)
+PREDICTS = {"cx_x": "from_newest", "cx_dx": "from_previous", "z_x": "absolute"}
 # Settings that must have one value, for the model here has no other; section -> key -> value.
 FIXED = {
     "model.encoder": {
@@ -50,7 +51,7 @@ NO_MEANING = object()
 class ReleasedConfig:
     """What a published checkpoint is, in this model's terms.
 
-    data: history, context_views, context_cameras, target_only_cameras, image_size [W, H] and near_far [m, m].
+    data: the data section of a checkpoint's config.yaml.
     notes: what a user should know, one sentence each.
     ignored: keys of the file that change nothing here.
     """
@@ -85,6 +86,8 @@ class _Settings:
 
     def number(self, path: str, default: Any = NO_MEANING) -> float:
         value = self.get(path, default)
+        if isinstance(value, str) and re.fullmatch(r"-?\d+[eE][-+]?\d+", value):  # YAML 1.1 reads 4e-3 as text
+            value = float(value)
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
             raise InputError(f"{path}: must be a number; got {value!r}")
         return float(value)
@@ -184,7 +187,7 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
         for kind, prefix in zip(("dynamic", "static"), LATENTS, strict=True)
     )
     sh_degree = _sh_degree(sizes, explicit)
-    _check_updates(settings, sizes, explicit, n_dynamic, sh_degree)
+    updates = _updates(settings, sizes, explicit, n_dynamic, sh_degree)
     common = dict(explicit=explicit, sh_degree=sh_degree, quirks=Quirks.release())
     history = settings.whole("dataset.n_step_state")
     if history not in HISTORIES:
@@ -194,6 +197,7 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
         encoder = EncoderConfig(**_encoder(settings, sizes), dynamic_dim=n_dynamic, static_dim=n_static, **common)
         dynamics = DynamicsConfig(
             **_dynamics(settings, sizes),
+            **updates,
             dynamic_latents=n_dynamic,
             static_latents=n_static,
             scale_min=scale_min,
@@ -211,7 +215,7 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
         model = ModelConfig(encoder, dynamics, renderer)
     except ValueError as error:
         raise InputError(f"the settings and the weights do not make a model: {error}") from None
-    data, effects, notes = _data(settings, history)
+    data, effects, notes = _data(settings, history, encoder.size_multiple)
     return ReleasedConfig(model, data, effects, (*sizes.notes, *notes), tuple(settings.unread()))
 
 
@@ -227,8 +231,8 @@ def _is_explicit(settings: _Settings, sizes: _Sizes) -> bool:
     if explicit != (params == EXPLICIT):
         kind = {True: "explicit", False: "latent"}
         raise InputError(
-            f"model.state_adapter.state_3dgs_params describes the {kind[not explicit]} variant, but the weights are of the "
-            f"{kind[explicit]} one: this configuration belongs to another checkpoint"
+            f"model.state_adapter.state_3dgs_params describes the {kind[not explicit]} variant, but the weights are of "
+            f"the {kind[explicit]} one: this configuration belongs to another checkpoint"
         )
     return explicit
 
@@ -240,48 +244,52 @@ def _sh_degree(sizes: _Sizes, explicit: bool) -> int:
         n_harmonics = (sizes.needed(f"{HEAD}to_missing_3dgs.2.weight") - 7) / 3
     degree = next((d for d in range(MAX_SH_DEGREE + 1) if (d + 1) ** 2 == n_harmonics), None)
     if degree is None:
-        raise InputError(f"weights: colours have {n_harmonics:g} coefficients; supported are 1, 4, 9 and 16 (degree 0 to 3)")
+        raise InputError(f"weights: colours have {n_harmonics:g} coefficients; supported are 1, 4, 9 and 16")
     return sizes.agreed("model.state_adapter.gaussians.sh_degree", degree)
 
 
-def _check_updates(settings: _Settings, sizes: _Sizes, explicit: bool, n_dynamic: int, sh_degree: int) -> None:
-    """Refuses ways of turning a prediction into the next state that this model has not."""
+def _updates(settings: _Settings, sizes: _Sizes, explicit: bool, n_dynamic: int, sh_degree: int) -> dict[str, Any]:
+    """How a prediction becomes the next states; refuses ways that this model has not."""
     adapter = "model.state_adapter"
-    changing = {"means", "dynamic_latent_features"} | (settings.names(f"{adapter}.dynamic_state_keys") & EXPLICIT)
-    if explicit and not EXPLICIT <= changing:
+    changing = {"means"} | (settings.names(f"{adapter}.dynamic_state_keys") & EXPLICIT)
+    if explicit and changing != EXPLICIT:
         missing = ", ".join(sorted(EXPLICIT - changing))
-        raise InputError(f"{adapter}.dynamic_state_keys: explicit particles must change in everything; {missing} is missing")
+        raise InputError(f"{adapter}.dynamic_state_keys: explicit particles change in everything; {missing} is missing")
     if not explicit and "opacities" in changing:
         raise InputError(f"{adapter}.dynamic_state_keys: opacities that change are not supported beside latents")
-    modality = settings.get(f"{adapter}.pred_modality")
-    for key in sorted(changing & (EXPLICIT if explicit else {"means"}) | ({"dynamic_latent_features"} if n_dynamic else set())):
-        # Over one step a sum of increments (cx_dx) is the increment.
-        said = modality.get(key, "z_x") if isinstance(modality, dict) else modality
-        if said not in ("cx_x", "cx_dx"):
-            raise InputError(f"{adapter}.pred_modality.{key}: {said!r} is not supported; only increments (cx_x) are")
+    changing = (EXPLICIT if explicit else {"means"}) | ({"dynamic_latent_features"} if n_dynamic else set())
+    given = settings.get(f"{adapter}.pred_modality", {})
+    said = {key: given.get(key, "z_x") if isinstance(given, dict) else given for key in sorted(changing)}
+    if len(set(said.values())) > 1 or said["means"] not in PREDICTS:
+        known = ", ".join(PREDICTS)
+        raise InputError(f"{adapter}.pred_modality: must be one of {known} for all that changes; got {said}")
     immune = settings.names(f"{adapter}.immune_to_static") if explicit else {"harmonics"}
     if immune & EXPLICIT != {"harmonics"}:
-        raise InputError(f"{adapter}.immune_to_static: must be harmonics alone; got {', '.join(sorted(immune)) or 'nothing'}")
-    if explicit and not settings.flag(f"{adapter}.pred_inductive_bias"):
-        raise InputError(f"{adapter}.pred_inductive_bias: must be true for explicit particles, whose scales it limits")
+        got = ", ".join(sorted(immune)) or "nothing"
+        raise InputError(f"{adapter}.immune_to_static: must be harmonics alone; got {got}")
     history = settings.whole("dataset.n_step_state")
-    predicted = settings.whole("dataset.n_step_state_predict", 1)
-    predicted = history if predicted < 0 else min(predicted, history)
-    if predicted != 1:
-        raise InputError(f"dataset.n_step_state_predict: predicts {predicted} steps at once; only 1 is supported")
-    n_out = n_dynamic + (3 if not explicit else 3 * (sh_degree + 1) ** 2 + 3 + 1 + 3 + 3)
+    advanced = settings.whole("dataset.n_step_state_predict", 1)
+    advanced = history if advanced < 0 else min(advanced, history)
+    if advanced != 1:
+        raise InputError(f"dataset.n_step_state_predict: advances {advanced} old steps at once; only 1 is supported")
+    predicts = PREDICTS[said["means"]]
+    turn = 4 if predicts == "absolute" else 3
+    width = n_dynamic + 3 + (3 * (sh_degree + 1) ** 2 + 1 + turn + 3 if explicit else 0)
     rows = sizes.needed(f"{DYNAMICS}dec.{_n_stages(sizes) - 1}.fc2.weight")
-    if rows != n_out:
+    if rows % width:
         raise InputError(
-            f"weights: the dynamics predicts {rows} numbers a particle, a single step of this variant takes {n_out}; models "
-            "that predict several steps at once (n_step_predict_multiple above 1) are not supported"
+            f"weights: the dynamics predicts {rows} numbers a particle, but a step of this variant takes {width}: this "
+            "configuration belongs to another checkpoint"
         )
-    sizes.agreed("dataset.n_step_predict_multiple", 1, 1)
+    steps_per_call = sizes.agreed("dataset.n_step_predict_multiple", rows // width, 1)
+    metric = settings.positive(f"{adapter}.metric")
+    max_step = metric / 2 if settings.flag(f"{adapter}.pred_inductive_bias") else None
+    return {"predicts": predicts, "steps_per_call": steps_per_call, "max_step": max_step}
 
 
 def _encoder(settings: _Settings, sizes: _Sizes) -> dict[str, Any]:
     encoder, depth, cnn = "model.encoder", f"{ENCODER}depth_predictor.", f"{ENCODER}backbone.backbone."
-    layers = f"{ENCODER}backbone.transformer.layers"
+    layers, gaussians = f"{ENCODER}backbone.transformer.layers", "model.state_adapter.gaussians"
     feature_dim = sizes.agreed(f"{encoder}.d_feature", sizes.needed(f"{cnn}conv2.weight"))
     for unet in ("costvolume", "depth"):
         mult = settings.wholes(f"{encoder}.{unet}_unet_channel_mult")
@@ -311,7 +319,7 @@ def _encoder(settings: _Settings, sizes: _Sizes) -> dict[str, Any]:
         "refine_unet_attention": settings.wholes(f"{encoder}.depth_unet_attn_res"),
         "disparity_dim": sizes.needed(f"{depth}to_disparity.0.weight"),
         **({"condition_dim": condition_dim} if condition_dim else {}),
-        "scale_range": tuple(settings.positive(f"model.state_adapter.gaussians.cam_scale_{end}") for end in ("min", "max")),
+        "scale_range": tuple(settings.positive(f"{gaussians}.cam_scale_{end}") for end in ("min", "max")),
     }  # fmt: skip
 
 
@@ -347,9 +355,7 @@ def _dynamics(settings: _Settings, sizes: _Sizes) -> dict[str, Any]:
     if settings.wholes(f"{net}.dec_patch_size", n - 1) != patches[:-1]:
         raise InputError(f"{net}.dec_patch_size: must equal enc_patch_size of the same stages")
     first = f"{DYNAMICS}enc.enc0.block0.mlp.0.fc1.weight"
-    metric = settings.positive("model.state_adapter.metric")
     return {
-        "max_step": metric / 2 if settings.flag("model.state_adapter.pred_inductive_bias") else None,
         "grid_size": settings.positive(f"{net}.grid_size"),
         "strides": strides,
         "merge_windows": windows,
@@ -368,43 +374,62 @@ def _dynamics(settings: _Settings, sizes: _Sizes) -> dict[str, Any]:
     }
 
 
-def _data(settings: _Settings, history: int) -> tuple[dict[str, Any], EffectsSpec, list[str]]:
+def _data(settings: _Settings, history: int, size_multiple: int) -> tuple[dict[str, Any], EffectsSpec, list[str]]:
     """The data section of config.yaml, what is simulated, and notes on what differs."""
     height, width = settings.wholes("dataset.image_shape", 2)
     near, far = settings.positive("dataset.near"), settings.positive("dataset.far")
     if far <= near:
         raise InputError(f"dataset.far: must lie beyond near; got near {near} and far {far}")
-    sampler = "dataset.view_sampler"
-    views = settings.get(f"{sampler}.test_context_views", None) or settings.get(f"{sampler}.context_views", None) or []
-    targets = settings.get(f"{sampler}.test_target_views", None)
-    notes = []
-    if views and all(isinstance(group, list) for group in views):
-        notes.append(f"{sampler} gives step t its own group of context views; here all steps use the first group")
-        views = views[0]
-    targets = targets if isinstance(targets, list) else []
-    for name, cams in (("context_views", views), ("test_target_views", targets)):
-        if not isinstance(cams, list) or not all(type(cam) is int and cam >= 0 for cam in cams):
-            raise InputError(f"{sampler}.{name}: must be a list of camera numbers; got {cams!r}")
+    unit_cameras = settings.flag("dataset.make_baseline_1", False)
+    if settings.flag("dataset.baseline_scale_bounds", False):
+        raise InputError("dataset.baseline_scale_bounds: depth bounds that change with the scene are not supported")
+    if width % size_multiple or height % size_multiple:
+        raise InputError(f"dataset.image_shape: must be multiples of {size_multiple}; got {height}, {width}")
+    views, notes = _views(settings)
     data = {
         "history": history,
-        "context_views": settings.whole(f"{sampler}.num_context_views"),
-        "context_cameras": views,
-        "target_only_cameras": [cam for cam in targets if cam not in views],
+        **views,
         "image_size": [width, height],
+        "resize": [width, height],
         "near_far": [near, far],
+        "unit_cameras": unit_cameras,
     }
     with_seg = settings.flag("dataset.with_seg", False)
     effects = EffectsSpec(dynamics=DynamicsEffects(background="frozen" if with_seg else "dynamic"))
     if not with_seg:
         notes.append("dataset.with_seg is false: the model never saw which pixels may move, so every particle may move")
     if not settings.flag("dataset.with_mask", False):
-        notes.append("dataset.with_mask is false: it saw every pixel; here pixels that a scene labels 0 make no particle")
-    if settings.flag("dataset.make_baseline_1", False):
-        notes.append("dataset.make_baseline_1 is true: it works in units of the largest camera coordinate of a scene, so scenes must be divided by that")  # fmt: skip
+        notes.append(
+            "dataset.with_mask is false: it saw every pixel; here those that a scene labels 0 make no particle"
+        )
     if settings.get("dataset.workspace_limits", None) is not None:
-        notes.append("dataset.workspace_limits is set: the published dynamics left out what began outside; here it takes part")
+        notes.append("dataset.workspace_limits is set: published dynamics leave out what began outside, these do not")
     if any(settings.get("dataset.background_color", [0, 0, 0])):
         notes.append("dataset.background_color is not black: pass it as background when you render")
     if settings.get("dataset.speedup", 1) != 1:
         notes.append(f"dataset.speedup is {settings.get('dataset.speedup')}: it saw every such frame only")
     return data, effects, notes
+
+
+def _views(settings: _Settings) -> tuple[dict[str, Any], list[str]]:
+    """Which cameras are the input, and which are looked at only."""
+    sampler, notes = "dataset.view_sampler", []
+    fixed, drawn = (settings.get(f"{sampler}.{name}", None) or [] for name in ("test_context_views", "context_views"))
+    inputs = fixed or drawn
+    if inputs and isinstance(inputs, list) and all(isinstance(group, list) for group in inputs):
+        notes.append(f"{sampler} gives step t its own group of context views; here all steps use the first group")
+        inputs = inputs[0]
+    targets = settings.get(f"{sampler}.test_target_views", None)
+    targets = targets if isinstance(targets, list) else []
+    for name, cams in (("test_context_views or context_views", inputs), ("test_target_views", targets)):
+        if not isinstance(cams, list) or not all(type(cam) is int and cam >= 0 for cam in cams):
+            raise InputError(f"{sampler}.{name}: must be a list of camera numbers; got {cams!r}")
+    count = settings.whole(f"{sampler}.num_context_views")
+    if inputs:  # all of those given for tests; as many as asked for, of those to draw from
+        count = len(inputs) if fixed else min(count, len(inputs))
+    views = {
+        "context_views": count,
+        "context_cameras": inputs,
+        "target_only_cameras": [cam for cam in targets if cam not in inputs],
+    }
+    return views, notes

@@ -1,8 +1,8 @@
 """Tensors of a file that ``torch.save`` wrote, read without running anything that is in it.
 
-Such a file is a zip archive: ``data.pkl`` says what there is, ``data/0``, ``data/1`` ... hold the numbers. A pickle can name
-any function to be called. Here tensors are rebuilt by this module, a few packages that training tools leave traces of
-become empty placeholders, and every other name is refused.
+Such a file is a zip archive: ``data.pkl`` says what there is, ``data/0``, ``data/1`` ... hold the numbers. A pickle can
+name any function to be called. Here tensors are rebuilt by this module, a few packages that training tools leave traces
+of become empty placeholders, and every other name is refused.
 """
 
 from __future__ import annotations
@@ -34,16 +34,18 @@ _PLACEHOLDER_PACKAGES = {
     "typing", "argparse", "datetime",
 }  # fmt: skip
 _PLACEHOLDER_NAMES = {
-    "collections.defaultdict", "collections.Counter", "collections.deque", "builtins.set", "builtins.frozenset",
-    "builtins.dict", "builtins.list", "builtins.tuple", "builtins.int", "builtins.float", "builtins.str", "builtins.bool",
-    "builtins.complex", "builtins.bytearray", "builtins.slice", "_codecs.encode", "torch.Size", "torch.device",
-    "torch.Generator", *(f"torch.{dtype}" for dtype in ("float32", "float64", "float16", "bfloat16", "int64", "int32")),
+    "collections.defaultdict", "collections.Counter", "collections.deque", "_codecs.encode",
+    "builtins.set", "builtins.frozenset", "builtins.dict", "builtins.list", "builtins.tuple", "builtins.int",
+    "builtins.long", "builtins.float", "builtins.complex", "builtins.str", "builtins.unicode", "builtins.bytes",
+    "builtins.bytearray", "builtins.bool", "builtins.slice",
+    "torch.Size", "torch.device", "torch.Generator", "torch.float32", "torch.float64", "torch.float16",
+    "torch.bfloat16", "torch.int64", "torch.int32",
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class StoredTensor:
-    """A tensor that is still in the file: ``shape`` and ``stride`` in elements of storage ``key``, from ``offset`` on."""
+    """A tensor still in the file: elements of storage ``key`` from ``offset`` on, by ``shape`` and ``stride``."""
 
     key: str
     dtype: torch.dtype
@@ -151,8 +153,8 @@ class ReleasedFile:
             self._zip = zipfile.ZipFile(self.path)
         except zipfile.BadZipFile:
             raise InputError(
-                f"{self.path}: not a checkpoint that torch.save wrote as a zip archive (it is truncated, another kind of "
-                "file, or older than torch 1.6; the last can be saved again with a newer torch)"
+                f"{self.path}: not a checkpoint that torch.save wrote as a zip archive (it is truncated, another kind "
+                "of file, or older than torch 1.6; the last can be saved again with a newer torch)"
             ) from None
         try:
             self._root, self._members = self._index()
@@ -173,7 +175,7 @@ class ReleasedFile:
         item = stored.dtype.itemsize
         available = member.file_size // item if member else 0
         if member is None or stored.end > available or stored.n_elements > available:
-            raise InputError(f"{self.path}: a tensor of {list(stored.shape)} does not fit its storage; the file is broken")
+            raise InputError(f"{self.path}: a tensor of {list(stored.shape)} does not fit its storage; it is broken")
         if stored.n_elements == 0:
             values = torch.zeros(stored.shape, dtype=stored.dtype)
         else:
@@ -216,7 +218,7 @@ class ReleasedFile:
 
 
 def state_dict(file: ReleasedFile) -> tuple[dict[str, StoredTensor], dict[str, int]]:
-    """The weights of a Lightning checkpoint, or of a file that holds nothing but weights; and epoch and step, if given."""
+    """The weights of a Lightning checkpoint, or of a file of nothing but weights; and epoch and step, if given."""
     content = file.content
     if not isinstance(content, dict):
         raise InputError(f"{file.path}: holds a {type(content).__name__}, not a checkpoint")

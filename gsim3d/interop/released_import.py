@@ -34,10 +34,11 @@ class UntrainedSigns:
     def sentence(self) -> str:
         if self.blocks == 0 and not self.latent_heads:
             return "attention, MLP and latent heads have been trained"
-        heads = {True: "the latent heads too", False: "the latent heads have learned", None: "there are no latent heads"}
+        heads = {True: "the latent heads too", False: "the latent heads have learned", None: "it has no latent heads"}
         return (
-            f"{self.blocks} of {self.n_blocks} attention and MLP blocks look as they were drawn at random, never trained; "
-            f"{heads[self.latent_heads]} (the published training could lose these gradients: see docs/migration.md)"
+            f"{self.blocks} of {self.n_blocks} attention and MLP blocks look as they were drawn at random, never "
+            f"trained; {heads[self.latent_heads]} (the published training could lose these gradients: see "
+            "docs/migration.md)"
         )
 
 
@@ -58,8 +59,8 @@ def import_released(checkpoint: str | Path, settings: dict) -> Imported:
     """Reads a published checkpoint; ``settings`` is the mapping of its resolved YAML file.
 
     Raises:
-        InputError: the file is not such a checkpoint or could run code, a setting is not supported, or tensors are missing
-            or have another shape than the settings say; the message names them.
+        InputError: the file is not such a checkpoint or could run code, a setting is not supported, or tensors are
+            missing or have another shape than the settings say; the message names them.
     """
     with ReleasedFile(checkpoint) as file:
         stored, counts = state_dict(file)
@@ -107,7 +108,7 @@ def untrained_signs(published: dict[str, Tensor]) -> UntrainedSigns:
     """Looks for weights that are still as an initialisation draws them.
 
     The published training could cut the gradients of attention, MLPs and latent heads. What never had a gradient keeps
-    norms of one constant with no bias, and uniform weights of at most 1 / sqrt(inputs), or less where only weight decay acted.
+    norms of one constant with no bias, and uniform weights of at most 1 / sqrt(inputs), less where weight decay acted.
     """
     blocks = {match[1] for name in published if (match := re.match(rf"{re.escape(DYNAMICS)}(.*\.block\d+)\.", name))}
     untrained = [block for block in blocks if _drawn_block(published, f"{DYNAMICS}{block}.")]

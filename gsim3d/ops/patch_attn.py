@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._autocast import follow_autocast
 from gsim3d.ops.curve import PatchTable
 
 
@@ -15,16 +16,17 @@ def patch_attention(q: Tensor, k: Tensor, v: Tensor, table: PatchTable, *, scale
     A query row that no patch lists, or whose patch has no keys, gets 0.
 
     Args:
-        q: queries [Nq, H, D], float32 or float64; D a multiple of 4 from 4 to 128. Under ``torch.autocast`` the CPU
-            computes in float32.
+        q: queries [Nq, H, D], float32 or float64, on CUDA also bfloat16 and float16 (their softmax and sums are
+            float32); D a multiple of 4 from 4 to 128, fastest 16, 32 and 64. Under ``torch.autocast`` CUDA computes in
+            its dtype and the CPU in float32.
         k, v: keys and values [Nk, H, D]. The three may be views of one qkv tensor; they are read in place.
         table: patches; a row at most once in ``q_rows``, any number of times in ``kv_rows``.
         scale: factor of the dot products; default ``D ** -0.5``.
     Returns:
         [Nq, H, D], dtype of ``q``.
     Gradients: ``q``, ``k`` and ``v``, once.
-    Determinism: equal bits for any number of threads, with AVX2 and AVX-512, for any numbering of the rows, and with any
-        other patches beside; only the order of the keys inside a patch rounds differently.
+    Determinism: equal bits for any number of threads, with AVX2 and AVX-512, on one GPU in every run, for any numbering
+        of the rows, and with any other patches beside; only the order of the keys inside a patch rounds differently.
     Raises:
         ValueError: a shape, dtype, head dim, scale or table is malformed; the message names the argument.
     Source: Dao et al. 2022 (FlashAttention), applied to the patches of Point Transformer V3 (Wu et al. 2024).
@@ -45,7 +47,8 @@ def patch_attention(q: Tensor, k: Tensor, v: Tensor, table: PatchTable, *, scale
 
 @torch.library.register_fake("gsim3d::patch_attention")
 def _(q, k, v, q_rows, kv_rows, cu_q, cu_k, scale):
-    return q.new_empty(q.shape), q.new_empty(q.shape[0], q.shape[1], 2)
+    stats_dtype = torch.promote_types(q.dtype, torch.float32)
+    return q.new_empty(q.shape), q.new_empty(q.shape[0], q.shape[1], 2, dtype=stats_dtype)
 
 
 @torch.library.register_fake("gsim3d::patch_attention_backward")
@@ -69,3 +72,4 @@ def _backward(ctx, grad, _grad_stats):
 
 torch.library.register_autograd("gsim3d::patch_attention", _backward, setup_context=_setup)
 torch.library.register_autocast("gsim3d::patch_attention", "cpu", torch.float32)
+follow_autocast("patch_attention")

@@ -104,3 +104,5 @@ def _backward(ctx, grad):
 
 
 torch.library.register_autograd("gsim3d::plane_sweep", _backward, setup_context=_setup)
+for _device in ("cpu", "cuda"):
+    torch.library.register_autocast("gsim3d::plane_sweep", _device, torch.float32)

@@ -126,3 +126,6 @@ def _unpool_backward(ctx, grad):
 torch.library.register_autograd("gsim3d::pool_max", _pool_max_backward, setup_context=_pool_max_setup)
 torch.library.register_autograd("gsim3d::pool_mean", _pool_mean_backward, setup_context=_pool_mean_setup)
 torch.library.register_autograd("gsim3d::unpool", _unpool_backward, setup_context=_unpool_setup)
+for _op in ("pool_max", "pool_mean", "unpool"):
+    for _device in ("cpu", "cuda"):
+        torch.library.register_autocast(f"gsim3d::{_op}", _device, torch.float32)

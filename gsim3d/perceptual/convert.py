@@ -76,7 +76,10 @@ def i3d_tensors(tree: dict) -> dict[str, Tensor]:
     """State of :class:`gsim3d.perceptual.i3d.I3D`: batch norms are folded in float64."""
     params, statistics = tree["params"], tree["batch_stats"]
     logits = params[_LOGITS]["Conv_0"]
-    state = {"logits.weight": _tensor(logits["kernel"].transpose(4, 3, 0, 1, 2)), "logits.bias": _tensor(logits["bias"])}
+    state = {
+        "logits.weight": _tensor(logits["kernel"].transpose(4, 3, 0, 1, 2)),
+        "logits.bias": _tensor(logits["bias"]),
+    }
     for source, name in _STEM.items():
         _add_unit(state, f"{name}.conv", params[source], statistics[source])
     for block in params.keys() - _STEM.keys() - {_LOGITS}:

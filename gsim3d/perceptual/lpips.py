@@ -20,7 +20,9 @@ from gsim3d.perceptual.weights import load
 # Mean and deviation of the classifier's training images, for inputs in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
-MIN_NORM = 1e-10  # added to the length of a feature vector, so that a zero vector stays zero
+MIN_SQUARE = (
+    1e-10  # added to the squared length of a feature vector: where all features are zero, gradients stay finite
+)
 
 _CHUNK = 8  # images compared at once: bounds the memory of the features
 
@@ -61,7 +63,7 @@ MIN_SIZE = {"alex": 31, "vgg": 16}  # pixels; a smaller image leaves nothing aft
 
 
 class LPIPS(nn.Module):
-    """The distance as a module: [I, 3, H, W] twice, values in [0, 1] -> [I]. Differentiable where images differ."""
+    """The distance as a module: [I, 3, H, W] twice, values in [0, 1] -> [I]. Differentiable."""
 
     def __init__(self, network: str):
         super().__init__()
@@ -71,9 +73,7 @@ class LPIPS(nn.Module):
             nn.Conv2d(width, layer.channels, layer.kernel, layer.stride, _padding(layer))
             for width, layer in zip(widths, self.layers)
         )
-        self.heads = nn.ParameterList(
-            nn.Parameter(torch.zeros(layer.channels)) for layer in self.layers if layer.tap
-        )
+        self.heads = nn.ParameterList(nn.Parameter(torch.zeros(layer.channels)) for layer in self.layers if layer.tap)
         self.register_buffer("shift", torch.tensor(SHIFT)[:, None, None], persistent=False)
         self.register_buffer("scale", torch.tensor(SCALE)[:, None, None], persistent=False)
 
@@ -102,7 +102,7 @@ def _padding(layer: _Conv) -> int:
 
 
 def _unit(features: Tensor) -> Tensor:
-    return features / (features.square().sum(1, keepdim=True).sqrt() + MIN_NORM)
+    return features / (features.square().sum(1, keepdim=True) + MIN_SQUARE).sqrt()
 
 
 @torch.no_grad()

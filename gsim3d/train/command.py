@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Learns a simulator from multi-view video; writes checkpoints and a log into a run folder."
     parser.epilog = EPILOG
     parser.add_argument("config", metavar="CONFIG", nargs="?", help="YAML file with the run's settings")
-    parser.add_argument("--data", metavar="DIR", help="folder with scenes, as `gsim3d generate` makes")
+    parser.add_argument("--data", metavar="DIR", help="folder with scenes of any layout (docs/data.md)")
     parser.add_argument("--out", metavar="DIR", help="run folder; made if absent")
     parser.add_argument("--until", type=int, metavar="STEP", help="stop after this optimizer step (default: the last)")
     parser.add_argument("--export", metavar="FILE", help="also write the result as one .safetensors file")
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     if args.export and (not args.export.endswith(".safetensors") or not Path(args.export).absolute().parent.is_dir()):
         raise InputError(f"--export must name a .safetensors file in a folder that exists; got {args.export}")
     folders, _ = split_scenes(find_scenes(args.data))
-    scenes = [Scene.open(folder) for folder in folders]
+    scenes = [Scene.open(folder, fitting=config.data.fitting) for folder in folders]
 
     from gsim3d.train.loop import Trainer
 

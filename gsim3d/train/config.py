@@ -6,6 +6,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
+from gsim3d.data import Fitting
+from gsim3d.data.scene import SIZE_MULTIPLE
 from gsim3d.errors import InputError
 from gsim3d.train.losses import BALANCE, DISCOUNT
 
@@ -53,6 +55,9 @@ class DataConfig:
     context_cameras: the cameras they come from; empty: all but ``target_only_cameras``.
     target_only_cameras: cameras that are never an input; a loss may look at them.
     background_stride: of pixels that show what never moves, those on every n-th row and column become particles.
+    resize: (width, height) pixels: films are scaled to cover it and cropped around the centre; empty: as filmed.
+    near_far: metres, the depth range of all scenes; empty: each scene's own.
+    unit_cameras: lengths are in units of the largest coordinate of a scene's cameras.
     """
 
     history: int = 2
@@ -60,11 +65,24 @@ class DataConfig:
     context_cameras: tuple[int, ...] = ()
     target_only_cameras: tuple[int, ...] = ()
     background_stride: int = 1
+    resize: tuple[int, ...] = ()
+    near_far: tuple[float, ...] = ()
+    unit_cameras: bool = False
 
     def __post_init__(self):
         _at_least(self, history=1, context_views=1, background_stride=1)
+        if self.resize and (len(self.resize) != 2 or any(side < 1 or side % SIZE_MULTIPLE for side in self.resize)):
+            wanted = f"must be [width, height], multiples of {SIZE_MULTIPLE}"
+            raise InputError(f"data.resize: {wanted}; got {list(self.resize)}")
+        if self.near_far and (len(self.near_far) != 2 or not 0 < self.near_far[0] < self.near_far[1]):
+            raise InputError(f"data.near_far: must be two rising distances above 0; got {list(self.near_far)}")
         if set(self.context_cameras) & set(self.target_only_cameras):
             raise InputError("data: context_cameras and target_only_cameras share a camera")
+
+    @property
+    def fitting(self) -> Fitting:
+        """How scenes are to be opened."""
+        return Fitting(self.resize or None, self.near_far or None, self.unit_cameras)
 
 
 @dataclass(frozen=True)
@@ -72,14 +90,17 @@ class LossConfig:
     """Weights of the loss: ``balance`` and ``discount`` as in :func:`gsim3d.train.losses.time_weights`.
 
     body_weight: extra weight of pixels that show a body that may move, relative to 1 of any other pixel.
+    perceptual: weight of LPIPS (VGG) beside the squared error, 0.05 in the paper and 0.01 for its rigid bodies; its
+        weights come with `gsim3d weights lpips`.
     """
 
     balance: float = BALANCE
     discount: float = DISCOUNT
     body_weight: float = 0.0
+    perceptual: float = 0.0
 
     def __post_init__(self):
-        _at_least(self, balance=0, discount=0, body_weight=0)
+        _at_least(self, balance=0, discount=0, body_weight=0, perceptual=0)
 
 
 @dataclass(frozen=True)

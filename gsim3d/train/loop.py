@@ -20,6 +20,8 @@ from gsim3d.data import Scene, generator
 from gsim3d.dynamics import concatenate
 from gsim3d.effects import EffectsSpec, Plan
 from gsim3d.errors import InputError
+from gsim3d.perceptual.lpips import LPIPS
+from gsim3d.perceptual.weights import load
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.config import TrainConfig
@@ -53,6 +55,7 @@ class Trainer:
         _check_history(config, self.plan)
         if config.workers and self.simulator.config.dynamics.norm == "batch":
             raise InputError("workers: must be 0 for a model with batch normalisation, which needs all samples at once")
+        self.perceptual = load("lpips_vgg", partial(LPIPS, "vgg")) if config.loss.perceptual else None
         self.parameters = dict(self.simulator.named_parameters())
         settings = config.optimizer
         self.optimizer = torch.optim.AdamW(
@@ -153,7 +156,12 @@ class Trainer:
             batch.n_context, batch.n_future, balance=loss_config.balance, discount=loss_config.discount
         )
         step = batch.target_step()
-        loss, _ = image_loss(images, truth, step, weights, weight)
+        wrong = image_errors(images, truth, weight)
+        if self.perceptual is not None:
+            seen = images if targets.valid is None else torch.where(targets.valid[..., None], images, truth)
+            distances = self.perceptual(seen.permute(0, 3, 1, 2), targets.images)
+            wrong = wrong + loss_config.perceptual * distances
+        loss = image_loss(wrong, step, weights)
         with torch.no_grad():
             errors = mean_by_step(image_errors(images, truth, targets.valid), step, batch.n_context + batch.n_future)
         return loss, errors

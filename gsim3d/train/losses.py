@@ -1,4 +1,4 @@
-"""The training loss: squared image errors, weighted over time."""
+"""The training loss: errors of images, weighted over time."""
 
 from __future__ import annotations
 
@@ -40,18 +40,13 @@ def mean_by_step(values: Tensor, step: Tensor, n_steps: int) -> Tensor:
     return (member * values).sum(1) / member.sum(1).clamp(min=1)
 
 
-def image_loss(
-    pred: Tensor, target: Tensor, step: Tensor, weights: Tensor, pixel_weight: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Time-weighted squared image error ``sum_t weights[t] * mean over images of step t``.
+def image_loss(errors: Tensor, step: Tensor, weights: Tensor) -> Tensor:
+    """``sum_t weights[t] * mean over images of step t`` of the errors of each image.
 
     Args:
-        pred, target: [I, H, W, C], colours in [0, 1]; not clipped.
+        errors: [I].
         step: int64 [I], the step that each image shows.
         weights: [S] of :func:`time_weights`.
-        pixel_weight: [I, H, W], weights of pixels within an image; None: equal.
-    Returns:
-        the loss, and the means [S] by step.
     """
-    by_step = mean_by_step(image_errors(pred, target, pixel_weight), step, weights.shape[0])
-    return (weights.to(by_step) * by_step).sum(), by_step
+    by_step = mean_by_step(errors, step, weights.shape[0])
+    return (weights.to(by_step) * by_step).sum()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from gsim3d.data import Scene
 from gsim3d.effects import EffectsSpec, Plan
 from gsim3d.errors import InputError
 from gsim3d.presets import ModelConfig
+from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, TrainConfig
@@ -35,6 +37,12 @@ class Restored:
     plan: Plan
     checkpoint: checkpoint.Checkpoint
 
+    def open_scene(self, folder: str | Path) -> Scene:
+        """The scene in ``folder`` as the model expects it. Raises InputError as :meth:`check_scene` and the reader."""
+        scene = Scene.open(folder, fitting=self.data.fitting)
+        self.check_scene(scene)
+        return scene
+
     def check_scene(self, scene: Scene) -> None:
         """Raises InputError where the scene's images have another size than those of the training."""
         if (scene.width, scene.height) != self.image_size:
@@ -52,6 +60,17 @@ def model_config(config: TrainConfig) -> ModelConfig:
     return from_dict(ModelConfig, config.model, "model", base)
 
 
+def without_old_switches(model: dict) -> dict:
+    """A saved model section without quirks that are off and that this version has under other names."""
+    known = {field.name for field in dataclasses.fields(Quirks)}
+    parts = {}
+    for name, part in model.items():
+        if isinstance(part, dict) and isinstance(part.get("quirks"), dict):
+            part = {**part, "quirks": {key: on for key, on in part["quirks"].items() if on or key in known}}
+        parts[name] = part
+    return parts
+
+
 def build_simulator(config: ModelConfig, seed: int) -> Simulator:
     """A simulator whose first weights are a function of the seed; torch's own random state stays as it was."""
     with torch.random.fork_rng(devices=[]):
@@ -63,7 +82,7 @@ def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: Eff
     """The content of a checkpoint's config.yaml."""
     return {
         "model": to_dict(model),
-        "data": {**to_dict(config.data), "image_size": [scene.width, scene.height], "near_far": "of each scene"},
+        "data": {**to_dict(config.data), "image_size": [scene.width, scene.height]},
         "effects": {"spec": effects.to_dict(), "hash": effects.hash},
         "train": to_dict(config),
     }
@@ -78,11 +97,12 @@ def restore(path: str | Path) -> Restored:
     saved = checkpoint.load(path)
     data = dict(saved.config["data"])
     image_size = tuple(data.pop("image_size", ()))
-    data.pop("near_far", None)
+    if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
+        data.pop("near_far")
     if len(image_size) != 2 or not all(isinstance(size, int) for size in image_size):
         raise InputError(f"{path}: data.image_size must be [width, height]; got {list(image_size)}")
     try:
-        simulator = build_simulator(from_dict(ModelConfig, saved.config["model"], "model"), seed=0)
+        simulator = build_simulator(from_dict(ModelConfig, without_old_switches(saved.config["model"]), "model"), seed=0)
         settings = from_dict(DataConfig, data, "data")
         spec = EffectsSpec.from_dict(saved.config.get("effects", {}).get("spec"))
     except InputError as error:

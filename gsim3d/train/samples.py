@@ -42,7 +42,7 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, stages: Sequence[Sta
         if (scene.width, scene.height) != (first.width, first.height):
             raise InputError(
                 f"{scene.path}: images of {scene.width}x{scene.height} pixels, those of {first.path} have "
-                f"{first.width}x{first.height}"
+                f"{first.width}x{first.height}; data.resize brings all to one size"
             )
         for stage in stages:
             n_steps = (stage.history or data.history) + stage.horizon

@@ -25,15 +25,15 @@ class Made:
     centers: np.ndarray
 
 
-def make_scene(moving=False, width=WIDTH, height=HEIGHT, n_steps=N_STEPS, n_cams=N_CAMS) -> Made:
-    """Cameras on an arc, each with its own intrinsics; with ``moving`` they walk on, and all but their K change."""
+def make_scene(moving=False, zoom=0.0, width=WIDTH, height=HEIGHT, n_steps=N_STEPS, n_cams=N_CAMS) -> Made:
+    """Cameras on an arc, each with its own intrinsics; with ``moving`` they walk on, with ``zoom`` they zoom in."""
     shape = (n_steps, n_cams)
     viewmats, Ks = np.zeros((*shape, 4, 4)), np.zeros((*shape, 3, 3))
     rgb, labels = np.zeros((*shape, height, width, 3), np.uint8), np.zeros((*shape, height, width), np.uint8)
     centers = np.stack([[0.3 * np.cos(t), 0.1 * t - 0.2, 0.5 + 0.05 * t] for t in range(n_steps)])
     for step, cam in np.ndindex(*shape):
         viewmats[step, cam] = look_at(0.9 * cam + (0.15 * step if moving else 0), roll=0.2 * cam)
-        focal = 1.1 * width + cam
+        focal = (1.1 + zoom * step) * width + cam
         Ks[step, cam] = [[focal, 0, width / 2 + 2 - cam], [0, focal + 3, height / 2 + 1.5 * cam], [0, 0, 1]]
         rgb[step, cam], labels[step, cam] = draw(viewmats[step, cam], Ks[step, cam], width, height, centers[step])
     return Made(viewmats, Ks, rgb, labels, centers)
@@ -128,7 +128,10 @@ def write_kubric(folder: Path, made: Made, subfolders=True) -> Path:
             save(rgba, np.concatenate([made.rgb[step, cam], alpha], -1))
             marked = np.where(labels == 3, 2, 0).astype(np.uint8)
             name = f"segmentation_{step}.png" if subfolders else f"segmentation_{step:05d}.png"
-            save(place / "segmentation" / name if subfolders else place / name, marked[..., None] * [0, 1, 90])
+            save(
+                place / "segmentation" / name if subfolders else place / name,
+                marked[..., None] * np.array([0, 1, 90], np.uint8),
+            )
         (place / "metadata.json").write_text(json.dumps({"camera": camera, "metadata": metadata, **EXTRAS}))
     return folder
 

@@ -18,6 +18,7 @@ from tests.data.made_scenes import (
     ORIGIN,
     WIDTH,
     WRITERS,
+    edit_json,
     make_scene,
     write_films,
     write_genesis,
@@ -73,6 +74,34 @@ def test_frames_carry_the_cameras_of_their_step(tmp_path, layout):
         np.testing.assert_array_equal(frames.dynamic[row], made.labels[step, cam] == 3)
 
 
+@pytest.mark.parametrize("layout", ["genesis", "transforms", "films"])
+@pytest.mark.parametrize("moving", [False, True])
+def test_intrinsics_may_change_with_time(tmp_path, layout, moving):
+    made = make_scene(moving=moving, zoom=0.1)
+    scene = Scene.open(WRITERS[layout](tmp_path, made))
+    cameras = scene.cameras_at(CAMS, STEPS)
+    np.testing.assert_allclose(cameras.Ks.unflatten(0, (N_STEPS, N_CAMS)), made.Ks, rtol=1e-6)
+    np.testing.assert_allclose(cameras.viewmats.unflatten(0, (N_STEPS, N_CAMS)), made.viewmats, atol=2e-6)
+    assert not torch.equal(cameras.Ks[0], cameras.Ks[-N_CAMS])
+
+
+def test_the_same_lens_in_two_layouts(tmp_path):
+    lens = {"k1": 0.2, "k2": 0.05, "p1": 0.002, "p2": -0.004, "k3": 0.01}
+    made = make_scene(zoom=0.05)
+    films, transforms = write_films(tmp_path / "films", made), write_transforms(tmp_path / "transforms", made)
+    plain = Scene.open(films).film(CAMS, STEPS)
+    edit_json(
+        films / "cameras.json", lambda content: [c.update(distortion=[*lens.values()]) for c in content["cameras"]]
+    )
+    edit_json(transforms / "transforms.json", lambda content: content.update(lens))
+    one, other = Scene.open(films), Scene.open(transforms)
+    assert torch.equal(one.images(CAMS, STEPS), other.images(CAMS, STEPS))
+    assert torch.equal(one.segmentation(CAMS, STEPS), other.segmentation(CAMS, STEPS))
+    assert torch.equal(one.valid(CAMS, STEPS), other.valid(CAMS, STEPS)) and not one.valid(CAMS, STEPS).all()
+    assert not torch.equal(one.film(CAMS, STEPS), plain)
+    assert not (one.segmentation(CAMS, STEPS)[~one.valid(CAMS, STEPS)]).any()
+
+
 def test_cameras_stand_still_after_the_end_of_the_film(tmp_path):
     scene = Scene.open(write_films(tmp_path, make_scene(moving=True)))
     cameras = scene.cameras_at([1], [2, 3, 4, 9])
@@ -97,6 +126,18 @@ def test_a_single_kubric_camera_is_a_scene(tmp_path):
     scene = Scene.open(tmp_path / "cam_1")
     assert (scene.layout, scene.n_cams) == ("kubric", 1)
     np.testing.assert_array_equal(scene.images([0], STEPS)[:, 0].permute(0, 2, 3, 1), made.rgb[:, 1])
+
+
+def test_the_number_of_a_kubric_frame_is_that_of_its_pose(tmp_path):
+    made = make_scene(moving=True)
+    write_kubric(tmp_path, made)
+    for file in [*tmp_path.rglob("*_0.png"), *tmp_path.rglob("*_2.png")]:
+        file.unlink()
+    scene = Scene.open(tmp_path)
+    assert scene.n_steps == 2 and scene.fps == pytest.approx(FPS / 2)
+    cameras = scene.cameras_at(CAMS, [0, 1])
+    np.testing.assert_allclose(cameras.viewmats.unflatten(0, (2, N_CAMS)), made.viewmats[[1, 3]], atol=2e-6)
+    np.testing.assert_array_equal(scene.segmentation(CAMS, [0, 1]), made.labels[[1, 3]])
 
 
 def test_a_folder_without_any_layout_is_named(tmp_path):

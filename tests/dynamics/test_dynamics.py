@@ -203,6 +203,25 @@ def test_rollout_feeds_steps_back_and_carries_gradients_to_the_start():
     assert grad[20:].any() and torch.isfinite(grad).all()
 
 
+@pytest.mark.parametrize("predicts", ["from_newest", "from_previous", "absolute"])
+def test_several_steps_a_call(predicts):
+    config = dataclasses.replace(TINY, steps_per_call=3, predicts=predicts)
+    dynamics = make_dynamics(config)
+    both = batch([make_history((20, 25)), make_history((9,), seed=1)])
+    predicted = dynamics(both)
+    assert predicted.cloud_scene.tolist() == [0, 0, 0, 1, 1, 1]
+    assert predicted.cloud_step.tolist() == [2, 3, 4, 1, 2, 3]
+    assert predicted.cu_rows.diff().tolist() == [25, 25, 25, 9, 9, 9]
+    alone = dynamics(make_history((20, 25)))
+    assert_same_particles(predicted.select_clouds(torch.tensor([0, 1, 2])), alone)
+    steps = rollout(dynamics, both, 5, 4)
+    assert [step.cloud_step.tolist() for step in steps] == [[2, 1], [3, 2], [4, 3], [5, 4], [6, 5]]
+    for i, step in enumerate(steps[:3]):
+        assert_same_particles(step, predicted.select_clouds(torch.tensor([i, 3 + i])))
+    again = dynamics(last_steps(concatenate([both, predicted]), 4))
+    assert_same_particles(steps[3], again.select_clouds(torch.tensor([0, 3])))
+
+
 def test_append_step_keeps_the_last_steps_of_each_scene():
     both = batch([make_history((5, 6)), make_history((3,), seed=1)])
     step = make_dynamics()(both)
@@ -238,6 +257,8 @@ def test_errors_name_the_argument(change, message):
         ({"strides": (2,)}, "strides must have 2 entries"),
         ({"encoder_heads": (3, 3, 2)}, "8 cannot be split into 3 heads"),
         ({"norm": "group"}, 'norm must be "layer" or "batch"'),
+        ({"predicts": "velocity"}, "predicts must be one of from_newest"),
+        ({"steps_per_call": 0}, "steps_per_call must be at least 1"),
     ],
 )
 def test_config_errors(change, message):

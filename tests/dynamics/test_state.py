@@ -10,7 +10,7 @@ from gsim3d.quirks import Quirks
 from gsim3d.renderer import rotation_matrices
 from gsim3d.types import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
-from tests.dynamics.scenes import EXPLICIT, TINY, make_history
+from tests.dynamics.scenes import EXPLICIT, TINY, float_fields, make_history
 
 LATENT = StateLayout.of(dataclasses.replace(TINY, position_features=False))
 
@@ -47,7 +47,7 @@ def test_increments():
     particles = make_history((20,), config=EXPLICIT)
     layout = StateLayout.of(EXPLICIT)
     prediction = 50 * torch.randn(20, layout.out_channels, generator=torch.Generator().manual_seed(0))
-    after = layout.advance(particles, prediction)
+    (after,) = layout.advance(particles, prediction)
     moves = particles.activity != FROZEN
     assert ((after.means - particles.means).abs() <= EXPLICIT.max_step * 1.001).all()
     assert ((after.dynamic_latents - particles.dynamic_latents).abs() <= EXPLICIT.max_latent_step * 1.001).all()
@@ -63,23 +63,66 @@ def test_no_limit_adds_the_prediction_itself():
     assert_same_bits(bounded(x, 2.0), 2 * torch.tanh(x))
 
 
-@pytest.mark.parametrize("quirk", [False, True])
-def test_quirk_unbounded_opacity(quirk):
-    config = dataclasses.replace(EXPLICIT, quirks=Quirks(unbounded_opacity=quirk))
+def random_prediction(layout, n, scale=0.3):
+    return scale * torch.randn(n, layout.out_channels, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("predicts", ["from_newest", "from_previous", "absolute"])
+def test_the_first_step_of_a_call_is_the_step_of_a_call_of_one(predicts):
+    config = dataclasses.replace(EXPLICIT, predicts=predicts)
+    particles = make_history((20,), config=config)
+    one, three = StateLayout.of(config), StateLayout.of(dataclasses.replace(config, steps_per_call=3))
+    prediction = random_prediction(three, 20)
+    (alone,) = one.advance(particles, prediction[:, : one.out_channels])
+    steps = three.advance(particles, prediction)
+    assert len(steps) == 3
+    for name, value in float_fields(alone).items():
+        assert_same_bits(getattr(steps[0], name), value, name)
+    frozen = particles.activity == FROZEN
+    for step in steps:
+        assert_same_bits(step.means[frozen], particles.means[frozen])
+        assert_same_bits(step.quats[frozen], particles.quats[frozen])
+        assert not torch.equal(step.sh[frozen], particles.sh[frozen])
+
+
+def test_differences_from_the_step_before_add_up():
+    config = dataclasses.replace(EXPLICIT, predicts="from_previous", steps_per_call=2)
+    newest_only = dataclasses.replace(config, predicts="from_newest", steps_per_call=1)
     particles = make_history((20,), config=config, frozen_share=0.0)
-    layout = StateLayout.of(config)
-    after = layout.advance(particles, torch.full((20, layout.out_channels), 3.0))
-    assert (after.opacities.max() > 1) == quirk and after.opacities.min() >= 0
+    layout, single = StateLayout.of(config), StateLayout.of(newest_only)
+    prediction = 0.1 * random_prediction(layout, 20)  # far from the limits of scales and opacities
+    _, second = layout.advance(particles, prediction)
+    (first,) = single.advance(particles, prediction[:, : single.out_channels])
+    (again,) = single.advance(first, prediction[:, single.out_channels :])
+    for name, value in float_fields(again).items():
+        assert_close_relative_to_max(getattr(second, name), value, 1e-6, name)
 
 
-@pytest.mark.parametrize("quirk", [False, True])
-def test_quirk_frozen_rows_turn(quirk):
-    config = dataclasses.replace(EXPLICIT, quirks=Quirks(frozen_rows_turn=quirk))
-    particles = make_history((20,), config=config, frozen_share=2.0)
+def test_absolute_predictions_are_the_state():
+    config = dataclasses.replace(EXPLICIT, predicts="absolute", quirks=Quirks(unbounded_opacity=True))
     layout = StateLayout.of(config)
-    after = layout.advance(particles, torch.ones(20, layout.out_channels))
-    assert torch.equal(after.quats, particles.quats) == (not quirk)
-    assert_same_bits(after.means, particles.means)
+    assert dict(layout.outputs)["quats"] == 4
+    particles = make_history((20,), config=config, frozen_share=0.0)
+    prediction = random_prediction(layout, 20, 3.0)
+    (after,) = layout.advance(particles, prediction)
+    parts = dict(zip(dict(layout.outputs), prediction.split([n for _, n in layout.outputs], 1), strict=True))
+    assert_close_relative_to_max(after.means, parts["means"], 1e-6)
+    assert_close_relative_to_max(after.opacities, parts["opacities"][:, 0].sigmoid(), 1e-6)
+    direction = torch.nn.functional.normalize(parts["quats"].roll(1, 1), dim=1)
+    assert_close_relative_to_max(after.quats, direction, 1e-6)
+    assert after.scales.min() > config.scale_min and after.scales.max() < config.scale_max
+
+
+@pytest.mark.parametrize("predicts", ["from_newest", "from_previous", "absolute"])
+def test_rows_asleep_keep_every_bit(predicts):
+    config = dataclasses.replace(EXPLICIT, predicts=predicts, steps_per_call=2)
+    layout = StateLayout.of(config)
+    particles = make_history((20,), config=config)
+    awake = torch.arange(20) % 3 > 0
+    for step in layout.advance(particles, random_prediction(layout, 20), awake):
+        for name, value in float_fields(particles).items():
+            assert_same_bits(getattr(step, name)[~awake], value[~awake], name)
+        assert not torch.equal(step.dynamic_latents[awake], particles.dynamic_latents[awake])
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 9e-5, 1.1e-4, 1.0, 3.0, 7.0])

@@ -5,95 +5,21 @@ import math
 
 import pytest
 import torch
+from torch.nn import functional as F
 
 from gsim3d.encoder import Encoder, EncoderConfig
-from gsim3d.encoder.depth import feature_intrinsics, upsample, upsampling_matrix
-from gsim3d.encoder.camera_frame import quat_multiply, rotation_of_harmonics, rotation_to_quat
+from gsim3d.encoder.depth import Views, feature_intrinsics, upsample, upsampling_matrix
+from gsim3d.encoder.camera_frame import quat_multiply, rotation_to_quat
+from gsim3d.encoder.heads import PixelRays, explicit_gaussians
 from gsim3d.errors import HardCaseError, InputError
-from gsim3d.harmonics import degree_damping, sh_basis
+from gsim3d.harmonics import rotate_harmonics
 from gsim3d.quirks import Quirks
-from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames
+from gsim3d.renderer import rotation_matrices, unit_quats
+from gsim3d.types import DYNAMIC, FROZEN, Frames
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
+from tests.encoder.scenes import ROW_FIELDS, SIZE, image_rows, make_encoder, make_frames, select
 
-SIZE = 16
-CONFIG = EncoderConfig(
-    feature_dim=8,
-    cnn_dims=(8, 8),
-    cnn_blocks=1,
-    transformer_layers=2,
-    transformer_mlp_ratio=1,
-    n_depths=6,
-    cost_unet_dim=8,
-    cost_unet_levels=2,
-    cost_unet_attention=(2,),
-    refine_unet_dim=8,
-    refine_unet_levels=2,
-    refine_unet_attention=(),
-    upsampled_dim=5,
-    disparity_dim=8,
-    dynamic_dim=3,
-    static_dim=2,
-    condition_dim=4,
-)
 PUBLISHED_COUNTS = [11_226_070, 11_132_118, 11_197_285]
-ROW_FIELDS = ("means", "opacities", "dynamic_latents", "static_latents")
-
-
-def look_at(angle: float) -> torch.Tensor:
-    """World-to-camera of a camera 3 m from the z axis that looks at the origin."""
-    center = torch.tensor([3 * math.cos(angle), 3 * math.sin(angle), 1.5], dtype=torch.float64)
-    forward = -center / center.norm()
-    right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-    right = right / right.norm()
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ center
-    return pose
-
-
-def make_frames(clouds: list[int], n_clouds: int | None = None, seed: int = 0) -> Frames:
-    """One image for every entry of ``clouds``, which names its cloud."""
-    n = len(clouds)
-    generator = torch.Generator().manual_seed(seed)
-    viewmats = torch.stack([look_at(0.4 + 1.1 * i) for i in range(n)])
-    K = torch.tensor([[18.0, 0.0, 8.3], [0.0, 17.0, 7.6], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    near, far = torch.full((n,), 1.5), torch.full((n,), 6.0)
-    cameras = Cameras(viewmats, K.repeat(n, 1, 1), near, far, torch.tensor(clouds), SIZE, SIZE)
-    n_clouds = n_clouds or max(clouds) + 1
-    images = torch.rand(n, 3, SIZE, SIZE, generator=generator)
-    origin = torch.tensor([[-2.0, -2.0, -0.5]], dtype=torch.float64)
-    return Frames(images, cameras, torch.zeros(n_clouds, dtype=torch.int64), torch.arange(n_clouds), origin)
-
-
-def select(frames: Frames, images: list[int], clouds: list[int]) -> Frames:
-    """Frames with the chosen images, which show the named clouds."""
-    rows, n_clouds = torch.tensor(images), max(clouds) + 1
-    return dataclasses.replace(
-        frames,
-        images=frames.images[rows],
-        cameras=frames.cameras.select(rows, torch.tensor(clouds)),
-        cloud_scene=torch.zeros(n_clouds, dtype=torch.int64),
-        cloud_step=torch.arange(n_clouds),
-        masks=None if frames.masks is None else frames.masks[rows],
-        dynamic=None if frames.dynamic is None else frames.dynamic[rows],
-    )
-
-
-def make_encoder(**changes) -> Encoder:
-    """Random weights, zero-initialised norms included, so that every branch counts."""
-    torch.manual_seed(0)
-    encoder = Encoder(dataclasses.replace(CONFIG, **changes))
-    generator = torch.Generator().manual_seed(1)
-    for parameter in encoder.parameters():
-        if parameter.dim() == 1:
-            parameter.data.uniform_(-0.5, 0.5, generator=generator)
-    return encoder
-
-
-def image_rows(particles, image: int) -> list[torch.Tensor]:
-    """Fields of the particles of the ``image``-th image, where no pixel is masked."""
-    rows = slice(image * SIZE**2, (image + 1) * SIZE**2)
-    return [getattr(particles, name)[rows] for name in ROW_FIELDS]
 
 
 @pytest.mark.parametrize("n_views", [1, 2, 3, 5])
@@ -197,8 +123,6 @@ def test_a_moved_scene_gives_moved_particles():
     assert_close_relative_to_max(after.means - shift.float(), before.means, "encoder_order")
     for name in ROW_FIELDS[1:]:
         assert_close_relative_to_max(getattr(after, name), getattr(before, name), "encoder_order", name)
-    released = make_encoder(quirks=dataclasses.replace(Quirks(), world_moments=True))
-    assert not torch.allclose(released(frames).dynamic_latents, released(there).dynamic_latents, atol=1e-3)
 
 
 def test_masks_drop_pixels_and_dynamic_sets_activity():
@@ -326,14 +250,21 @@ def rotations(n: int) -> torch.Tensor:
     return q * torch.linalg.det(q)[:, None, None]
 
 
-def test_turned_harmonics_see_the_turned_world():
-    R = rotations(10)
-    directions = torch.nn.functional.normalize(torch.randn(20, 3, dtype=torch.float64), dim=-1)
-    coefficients = torch.randn(10, 16, dtype=torch.float64)
-    turned = torch.einsum("ikl,il->ik", rotation_of_harmonics(R, 3, released=False), coefficients)
-    seen = torch.einsum("ndk,nk->nd", sh_basis(directions @ R.mT, 3), turned)  # directions R d in the world
-    assert torch.allclose(seen, torch.einsum("dk,nk->nd", sh_basis(directions, 3), coefficients), atol=1e-10)
-    assert degree_damping(3, R)[[0, 1, 4, 9]].tolist() == [1, 0.025, 0.00625, 0.0015625]
+def test_explicit_particles_turn_with_the_scene():
+    """Cameras turn with the scene about the world's origin: so do places, orientations and colours."""
+    frames, turn = make_frames([0, 0]), rotations(1)[0]
+    viewmats = frames.cameras.viewmats.clone()
+    viewmats[:, :3, :3] = viewmats[:, :3, :3] @ turn.T
+    turned = dataclasses.replace(frames, cameras=dataclasses.replace(frames.cameras, viewmats=viewmats))
+    encoder = make_encoder(explicit=True, dynamic_dim=0, static_dim=0)
+    here, there = encoder(frames), encoder(turned)
+    turn = turn.float()
+    assert_close_relative_to_max(there.means, here.means @ turn.T, "encoder_order")
+    assert_close_relative_to_max(there.scales, here.scales, "encoder_order")
+    axes = [rotation_matrices(unit_quats(particles.quats)) for particles in (here, there)]
+    assert_close_relative_to_max(axes[1], turn @ axes[0], "encoder_order")
+    colors = rotate_harmonics(here.sh, turn.expand(len(here.sh), 3, 3))
+    assert_close_relative_to_max(there.sh[:, 1:], colors[:, 1:], "encoder_order")
 
 
 def test_quaternions_of_rotations():
@@ -345,9 +276,27 @@ def test_quaternions_of_rotations():
     assert torch.allclose(quat_multiply(quat_multiply(q, pure), conjugate)[:, 1:], R @ x)
 
 
-@pytest.mark.parametrize("quirk", [field.name for field in dataclasses.fields(Quirks())])
-def test_every_quirk_is_off_by_default_and_on_in_the_release(quirk):
-    assert not getattr(Quirks(), quirk) and getattr(Quirks.release(), quirk)
+def test_explicit_quaternions_are_those_that_a_matrix_gives():
+    """Published: (x, y, z, w) -> matrix, turned into the world, -> quaternion from its largest component, positive."""
+    config = EncoderConfig(explicit=True, dynamic_dim=0, static_dim=0, sh_degree=0)
+    generator = torch.Generator().manual_seed(0)
+    raw = torch.randn(3, 10, 5, 4, generator=generator, dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, :3, :3] = rotations(3)
+    Ks = torch.eye(3, dtype=torch.float64).repeat(3, 1, 1)
+    rays = PixelRays.of(Views(raw, Ks, torch.linalg.inv(poses), torch.ones(3), torch.ones(3), 3))
+    quats = explicit_gaussians(raw, torch.ones(3, 1, 5, 4).double(), rays, config)["quats"]
+    x, y, z, w = F.normalize(raw[:, 3:7].flatten(2).transpose(1, 2), dim=-1).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    in_camera = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    expected = rotation_to_quat(poses[:, None, :3, :3] @ in_camera)
+    largest = expected.gather(-1, expected.abs().argmax(-1, keepdim=True))
+    assert (largest > 0).all() and (expected[..., 0] < 0).any()
+    torch.testing.assert_close(quats, expected, rtol=0, atol=1e-12)
 
 
 def replace_cameras(frames: Frames, **changes) -> Frames:

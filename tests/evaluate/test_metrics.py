@@ -63,3 +63,14 @@ def test_shapes_are_checked():
         psnr(image, image[:, :5])
     with pytest.raises(ValueError, match="mask must be bool"):
         psnr(image, image, torch.ones(1, 12, 12))
+
+
+# structural_similarity of scikit-image 0.26 (gaussian_weights, sigma 1.5, win_size 11, data_range 1, channel_axis 2).
+SCIKIT_IMAGE = [-0.021749193141947943, 0.9881103296553451]
+
+
+def test_ssim_equals_scikit_image():
+    i, y, x, c = np.meshgrid(np.arange(2), np.arange(48), np.arange(64), np.arange(3), indexing="ij")
+    a, b = (0.5 + 0.5 * np.sin(0.37 * (s + 1) * y + 0.21 * (c + 1) * x + 0.9 * i + s) for s in (0, 1))
+    b[1] = a[1] + 0.1 * (b[1] - 0.5)
+    assert ssim(torch.from_numpy(b), torch.from_numpy(a)).tolist() == pytest.approx(SCIKIT_IMAGE, abs=1e-12)

@@ -3,17 +3,21 @@
 import dataclasses
 import json
 import math
+import shutil
 
 import pytest
 import torch
 
 from gsim3d import presets
 from gsim3d.data import Scene
+from gsim3d.dynamics import concatenate
 from gsim3d.effects import EffectsSpec
 from gsim3d.errors import InputError
+from gsim3d.evaluate import protocol
 from gsim3d.evaluate.pictures import as_bytes, comparison_frames, splat_picture, true_images, write_curves
 from gsim3d.evaluate.protocol import (
     METHODS,
+    Prediction,
     constant_velocity,
     default_views,
     predict,
@@ -75,6 +79,99 @@ def test_constant_velocity_continues_the_centroid(restored, scene):
         torch.testing.assert_close(centroid(moved, j), last + (j + 1) * (last - first), rtol=0, atol=1e-5)
 
 
+VELOCITY = torch.tensor([0.05, -0.03, 0.02])
+
+
+def falling_apart(restored, scene, n_steps):
+    """Hand-made particles: a body of 20 that moves by VELOCITY a step, and 15 on the ground that stay."""
+    encoded = predict(restored, scene, (0, 2), 1).particles.select_clouds(torch.tensor([0]))
+    chosen = torch.zeros(encoded.n_rows, dtype=torch.bool)
+    chosen[:35] = True
+    cloud = encoded.select_rows(chosen)
+    activity = torch.ones(35, dtype=torch.uint8)
+    activity[:20] = 0
+    means = torch.rand(35, 3, generator=torch.Generator().manual_seed(0)) * 0.5 + torch.tensor([-0.25, -0.25, 0.2])
+    steps = [
+        dataclasses.replace(
+            cloud,
+            activity=activity,
+            cloud_step=cloud.cloud_step + t,
+            means=means + t * VELOCITY * (activity == 0)[:, None],
+        )
+        for t in range(n_steps)
+    ]
+    return concatenate(steps)
+
+
+def test_constant_velocity_is_exact_for_a_body_that_translates(restored, scene):
+    truth = falling_apart(restored, scene, 6)
+    prediction = Prediction(truth, n_encoded=2, context_cams=(0, 2))
+    moved = constant_velocity(prediction)
+    torch.testing.assert_close(moved.means, truth.means[2 * 35 :], rtol=0, atol=1e-6)
+    assert torch.equal(moved.means.unflatten(0, (4, 35))[:, 20:], truth.means.unflatten(0, (6, 35))[:4, 20:])
+    # Only the mean motion counts: the same body turned into a cloud that also grows is continued, not grown.
+    later = truth.select_clouds(torch.tensor([1]))
+    grown = dataclasses.replace(later, means=torch.where((later.activity == 0)[:, None], later.means * 2, later.means))
+    pair = Prediction(concatenate([truth.select_clouds(torch.tensor([0])), grown, grown]), 2, (0, 2))
+    body = constant_velocity(pair).means[:20]
+    speed = grown.means[:20].mean(0) - truth.means[:20].mean(0)
+    torch.testing.assert_close(body, grown.means[:20] + speed, rtol=0, atol=1e-6)
+
+
+def test_baselines_of_a_body_that_translates(restored, scene, monkeypatch):
+    """The film shows the hand-made body: continuing it is right, holding it is worse the longer it is held."""
+    truth = falling_apart(restored, scene, 6)
+    monkeypatch.setattr(protocol, "predict", lambda *_: Prediction(truth, 2, (0, 2)))
+    film = render_steps(restored, truth, scene, [3])
+    monkeypatch.setattr(
+        scene, "images", lambda cams, steps: (film * 255).round().to(torch.uint8).permute(0, 1, 4, 2, 3)
+    )
+    values = {name: v["psnr"] for name, v in score_scene(restored, scene).values.items()}
+    assert (values["model"] > 50).all() and (values["constant_velocity"][2:] > 50).all()  # rounded to 8 bits
+    for name in ("constant", "copy", "release_constant"):
+        assert (values[name][3:] < 40).all() and values[name][5] < values[name][3]
+    assert values["release_constant"][2] > 50 and values["constant"][2] < 40
+    torch.testing.assert_close(values["copy"][2:], values["constant"][2:], rtol=0.02, atol=0)
+
+
+@pytest.mark.parametrize("hidden", [0, 1])
+def test_constant_velocity_without_a_motion_to_continue(restored, scene, hidden):
+    truth = falling_apart(restored, scene, 3)
+    activity = truth.activity.clone()
+    activity[35 * hidden : 35 * (hidden + 1)] = 1
+    unseen = Prediction(dataclasses.replace(truth, activity=activity), 2, (0, 2))
+    single = Prediction(truth, 1, (0, 2))
+    assert torch.equal(constant_velocity(unseen).means, truth.means[35:70])
+    assert torch.equal(constant_velocity(single).means, truth.means[:35].repeat(2, 1))
+
+
+def test_baselines_are_seen_by_cameras_that_move(restored, scene, tmp_path, monkeypatch):
+    folder = tmp_path / "moving"
+    shutil.copytree(scene.path, folder)
+    metadata = json.loads((folder / "metadata.json").read_text())
+    places = [metadata[f"cam_{cam}"]["extrinsics"] for cam in range(5)]
+    for cam in range(5):
+        metadata[f"cam_{cam}"]["extrinsics"] = [places[cam if step < 4 else (cam + 1) % 5] for step in range(6)]
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+    moving = Scene.open(folder)
+    assert moving.cameras_move and not scene.cameras_move
+    prediction = predict(restored, scene, (0, 2), 4)
+    still = render_steps(restored, prediction.particles, scene, [3, 4])
+    for step in (1, 2):
+        images = protocol._held(restored, prediction, None, step, moving, [3])
+        torch.testing.assert_close(images[:2, 0], still[step, 0].expand(2, 32, 32, 3))
+        torch.testing.assert_close(images[2:, 0], still[step, 1].expand(2, 32, 32, 3))  # camera 3 is where 4 was
+    body = falling_apart(restored, scene, 6)
+    monkeypatch.setattr(protocol, "predict", lambda *_: Prediction(body, 2, (0, 2)))
+    film = render_steps(restored, body, moving, [3])
+    monkeypatch.setattr(
+        moving, "images", lambda cams, steps: (film * 255).round().to(torch.uint8).permute(0, 1, 4, 2, 3)
+    )
+    values = {name: v["psnr"] for name, v in score_scene(restored, moving).values.items()}
+    assert (values["model"] > 50).all() and (values["constant_velocity"][2:] > 50).all()
+    assert (values["copy"][4:] < values["constant"][4:]).all()  # a still image does not follow the camera
+
+
 def test_scores_by_hand(restored, scene):
     scores = score_scene(restored, scene)
     assert set(scores.values) == set(METHODS) and scores.n_encoded == 2
@@ -104,7 +201,7 @@ def test_what_does_not_fit_is_named(restored, scene):
 
 def example_scores(name="a", shift=0.0, n_steps=6):
     values = torch.arange(n_steps, dtype=torch.float64) + shift
-    return SceneScores(name, 2, {m: {"psnr": values.clone(), "ssim": values / 10} for m in METHODS}, {}, {})
+    return SceneScores(name, 2, n_steps, {m: {"psnr": values.clone(), "ssim": values / 10} for m in METHODS}, {}, {})
 
 
 def test_summary_by_hand(tmp_path):

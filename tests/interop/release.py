@@ -20,7 +20,7 @@ from gsim3d.simulator import Simulator
 EXPLICIT_PARAMS = ["means", "opacities", "rotations", "scales", "harmonics"]
 
 
-def small_config(explicit=False, dynamic=4, static=3) -> ModelConfig:
+def small_config(explicit=False, dynamic=4, static=3, **dynamics) -> ModelConfig:
     """The published architecture with few channels."""
     quirks = Quirks.release()
     scales = {"scale_min": 0.004, "scale_max": 0.14}
@@ -33,7 +33,7 @@ def small_config(explicit=False, dynamic=4, static=3) -> ModelConfig:
             dynamic_latents=dynamic, static_latents=static, explicit=explicit, max_step=0.25, grid_size=0.05,
             history_bits=1, strides=(4, 2), merge_windows=(2, 2), patch_sizes=(32,) * 3,
             encoder_depths=(1, 2, 1), encoder_channels=(8, 16, 16), encoder_heads=(2, 4, 4),
-            decoder_depths=(1, 1), decoder_channels=(8, 16), decoder_heads=(2, 4), quirks=quirks, **scales,
+            decoder_depths=(1, 1), decoder_channels=(8, 16), decoder_heads=(2, 4), quirks=quirks, **scales, **dynamics,
         ),
         RendererConfig(latents=0 if explicit else dynamic + static, quirks=quirks, **scales),
     )  # fmt: skip
@@ -68,6 +68,7 @@ def settings_of(config: ModelConfig, image_size=32) -> dict:
     encoder, dynamics, renderer = config.encoder, config.dynamics, config.renderer
     explicit = encoder.explicit
     keys = EXPLICIT_PARAMS + ["dynamic_latent_features"]
+    modality = {"from_newest": "cx_x", "from_previous": "cx_dx", "absolute": "z_x"}[dynamics.predicts]
     net = {
         "in_channels": -1, "out_channels": -1, "grid_size": dynamics.grid_size,
         "order": ["z", "z-trans", "hilbert", "hilbert-trans"], "mlp_ratio": 4, "cls_mode": False,
@@ -103,7 +104,7 @@ def settings_of(config: ModelConfig, image_size=32) -> dict:
                 "state_3dgs_params": EXPLICIT_PARAMS if explicit else ["means", "opacities"],
                 "dynamic_latent_feature_dim": encoder.dynamic_dim, "static_latent_feature_dim": encoder.static_dim,
                 "learn_static_mask": False, "learn_background_mask": False,
-                "pred_modality": {key: "cx_x" for key in keys},
+                "pred_modality": {key: modality for key in keys},
                 "dynamic_state_keys": EXPLICIT_PARAMS if explicit else ["means", "rotations"],
                 "metric": 2 * dynamics.max_step, "immune_to_static": ["harmonics"], "pred_inductive_bias": True,
             },
@@ -115,7 +116,8 @@ def settings_of(config: ModelConfig, image_size=32) -> dict:
             },
             "name": "genesis", "with_mask": True, "with_seg": True, "image_shape": [image_size, image_size],
             "background_color": [0.0, 0.0, 0.0], "near": 1.0, "far": 4.0, "n_step_state": 2**dynamics.history_bits,
-            "n_step_state_predict": 1, "n_step_predict_multiple": 1, "speedup": 1, "workspace_limits": None,
+            "n_step_state_predict": 1, "n_step_predict_multiple": dynamics.steps_per_call, "speedup": 1,
+            "workspace_limits": None,
         },
     }  # fmt: skip
 

@@ -67,9 +67,10 @@ def test_small_has_about_four_million_parameters():
     assert 3.5e6 < n < 4.5e6
 
 
+@pytest.mark.parametrize("steps_per_call", [1, 2])
 @pytest.mark.parametrize(("explicit", "dynamic", "static"), [(False, 4, 3), (False, 4, 0), (True, 0, 2), (True, 0, 0)])
-def test_there_and_back(explicit, dynamic, static):
-    config = small_config(explicit, dynamic, static)
+def test_there_and_back(explicit, dynamic, static, steps_per_call):
+    config = small_config(explicit, dynamic, static, steps_per_call=steps_per_call)
     published = random_weights(config)
     ours = from_published(published, config)
     simulator = Simulator(config)
@@ -98,7 +99,7 @@ def test_harmonics_matrix_keeps_colours():
 
 def test_explicit_dynamics_say_the_same_in_either_basis():
     """The stem reads, and the head writes, harmonics of the standard basis as it did those of the published one."""
-    config = small_config(explicit=True, dynamic=0, static=2)
+    config = small_config(explicit=True, dynamic=0, static=2, steps_per_call=2)
     published = random_weights(config)
     ours = from_published(published, config)
     wide = torch.block_diag(*[harmonics_matrix(3)] * 3)
@@ -115,8 +116,9 @@ def test_explicit_dynamics_say_the_same_in_either_basis():
         x @ weights[f"{prefix}.weight"].double().T + weights[f"{prefix}.bias"].double()
         for weights, prefix in ((published, "dynamic_model.net.dec.2.fc2"), (ours, "dynamics.net.head.fc2"))
     )
-    assert_close_relative_to_max(mine[:, :48], theirs[:, :48] @ wide.T, 1e-6)
-    assert torch.equal(mine[:, 48:], theirs[:, 48:])
+    for first in (0, 58):  # of each of the two steps
+        assert_close_relative_to_max(mine[:, first : first + 48], theirs[:, first : first + 48] @ wide.T, 1e-6)
+        assert torch.equal(mine[:, first + 48 : first + 58], theirs[:, first + 48 : first + 58])
 
 
 def test_the_published_head_has_no_bias_in_its_last_layer():

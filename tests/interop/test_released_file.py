@@ -60,7 +60,8 @@ def test_what_training_tools_leave_is_passed_over(tmp_path, monkeypatch):
     config.content = {"a": 1}
     extra = {
         "hyper_parameters": config, "dirpath": Path("/some/where"), "score": np.float64(3.5), "array": np.arange(3.0),
-        "seen": {1, 2}, "table": collections.defaultdict(list, a=[1]), "device": torch.device("cpu"),
+        "seen": {1, 2}, "kinds": [int, str, float, bytes, dict, list],
+        "table": collections.defaultdict(list, a=[1]), "device": torch.device("cpu"),
     }  # fmt: skip
     path = write(tmp_path / "a.ckpt", {"state_dict": {"w": torch.ones(2)}, **extra})
     monkeypatch.delitem(sys.modules, "omegaconf.dictconfig")

@@ -1,5 +1,6 @@
 """The published model's own weights, in a published file: imported, they predict what it predicted."""
 
+import dataclasses
 import functools
 import json
 
@@ -9,11 +10,15 @@ import torch
 from gsim3d import ops
 from gsim3d.__main__ import main
 from gsim3d.dynamics import Dynamics
+from gsim3d.dynamics.point_transformer import Attention
 from gsim3d.encoder import Encoder
 from gsim3d.interop.released import dynamics_weights, encoder_weights, to_published
+from gsim3d.interop.released_config import read_config
+from gsim3d.interop.released_import import published_shapes
 from gsim3d.train.restore import restore
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames, Particles
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
+from tests.golden.published import FULL_PRECISION
 from tests.golden_files import golden, golden_path
 from tests.interop.release import changed, write_release
 
@@ -49,7 +54,11 @@ def _import(folder, dynamics, metric=None):
     }
     checkpoint, config = write_release(folder, weights, settings)
     assert main(["import", str(checkpoint), "--config", str(config), "-o", str(folder / "model")]) == 0
-    return restore(folder / "model").simulator, weights
+    simulator = restore(folder / "model").simulator
+    for module in simulator.modules():
+        if isinstance(module, Attention):
+            module.rounded_to_half = False  # the tensors were made in full precision
+    return simulator, weights
 
 
 def offsets(mask):
@@ -68,6 +77,23 @@ def test_the_whole_model_is_named(import_model):
             assert torch.equal(back[name], value), name
 
 
+VARIANTS = ["full_latent_4_1_12_intended", "full_latent_4_1_12_literal_yaml", "small", "small_deep_dynamics"]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_resolved_settings_make_the_listed_tensors(variant):
+    listed = json.loads(golden_path("params_full.json").read_text())[variant]
+    shapes = {entry["name"]: tuple(entry["shape"]) for entry in listed["entries"]}
+    read = read_config(listed["resolved_config"], shapes)
+    assert published_shapes(read.model) == shapes
+    assert not any("but the weights have" in note for note in read.notes)
+    net = listed["resolved_config"]["model"]["dynamic_model"]["model"]
+    dynamics = read.model.dynamics
+    assert (dynamics.grid_size, list(dynamics.strides)) == (net["grid_size"], net["stride"])
+    assert list(dynamics.merge_windows) == net["merge_window_size"]
+    assert dynamics.history_bits == 2 and read.data["near_far"] == [1.0, 8.0]
+
+
 @pytest.mark.parametrize("case", ["T4_nomask", "T2_mask"])
 @pytest.mark.parametrize("file", ["f_dynamics_small_nodup", "f_dynamics_small_dup"])
 def test_network(import_model, file, case):
@@ -84,7 +110,7 @@ def test_network(import_model, file, case):
         torch.zeros(n_scenes, 3, dtype=torch.float64),
         dynamics.config.pyramid_spec((n_steps - 1).bit_length()),
     )
-    direct = Dynamics(dynamics.config).eval()
+    direct = Dynamics(dataclasses.replace(dynamics.config, quirks=FULL_PRECISION)).eval()
     direct.net.load_state_dict(dynamics_weights(part(file, "")))
     out = torch.zeros_like(expected)
     with torch.no_grad():

@@ -15,11 +15,16 @@ from gsim3d.interop.released_import import import_released, published_shapes, un
 from gsim3d.simulator import Simulator
 from gsim3d.train.checkpoint import load
 from gsim3d.train.restore import restore
-from tests.interop.release import (
-    changed, full_config, random_weights, settings_of, small_config, write_release,
-)  # fmt: skip
+from tests.interop.release import changed, full_config, random_weights, settings_of, small_config, write_release
+from tests.tiny_scenes import write_scene
 
-VARIANTS = {"latent": (False, 4, 3), "explicit": (True, 0, 0), "explicit with latents": (True, 0, 2)}
+VARIANTS = {
+    "latent": {},
+    "explicit": {"explicit": True, "dynamic": 0, "static": 0},
+    "explicit with latents": {"explicit": True, "dynamic": 0, "static": 2},
+    "several steps a call": {"steps_per_call": 3, "predicts": "from_previous"},
+    "explicit, absolute": {"explicit": True, "dynamic": 2, "static": 1, "predicts": "absolute", "steps_per_call": 2},
+}
 
 
 def run_import(capsys, checkpoint, config, out):
@@ -30,7 +35,7 @@ def run_import(capsys, checkpoint, config, out):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_weights_and_settings_arrive(capsys, tmp_path, variant):
-    config = small_config(*VARIANTS[variant])
+    config = small_config(**VARIANTS[variant])
     weights = random_weights(config)
     files = write_release(tmp_path, weights, settings_of(config))
     code, out, err = run_import(capsys, *files, tmp_path / "model")
@@ -79,6 +84,22 @@ def test_tensors_that_do_not_fit_are_named(capsys, tmp_path):
     assert not (tmp_path / "model").exists()
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda w, name: w.pop(name), "its tensors do not fit the configuration; 1 missing: {name}$"),
+        (lambda w, name: w.update({name: w[name][1:]}), r"configuration; 1 of another shape: {name} is \[11\] instead"),
+    ],
+)
+def test_one_tensor_that_does_not_fit_is_enough(tmp_path, change, message):
+    config = small_config()
+    weights, name = random_weights(config), "encoder.backbone.backbone.layer2.0.downsample.0.bias"
+    change(weights, name)
+    checkpoint, _ = write_release(tmp_path, weights, {})
+    with pytest.raises(InputError, match=message.format(name=name)):
+        import_released(checkpoint, settings_of(config))
+
+
 def test_tensors_that_the_model_has_not_are_listed(capsys, tmp_path):
     config = small_config()
     weights = random_weights(config)
@@ -120,9 +141,30 @@ def test_settings_that_no_weight_shows():
     assert read("model.state_adapter.gaussians.scale_max", 0.2).model.renderer.scale_max == 0.2
     assert read("dataset.n_step_state", 4).model.dynamics.history_bits == 2
     assert read("dataset.near", 0.5).data["near_far"] == [0.5, 4.0]
-    assert read("dataset.image_shape", [64, 96]).data["image_size"] == [96, 64]
+    wide = read("dataset.image_shape", [64, 96]).data
+    assert wide["image_size"] == wide["resize"] == [96, 64]
+    assert read("dataset.make_baseline_1", True).data["unit_cameras"] is True
     assert read("dataset.with_seg", False).effects.dynamics.background == "dynamic"
-    assert read("dataset.view_sampler.test_context_views", [[1, 3], [0, 2]]).data["context_cameras"] == [1, 3]
+    assert read(f"{net}.grid_size", "4e-3").model.dynamics.grid_size == 0.004  # as YAML 1.1 reads it
+
+
+@pytest.mark.parametrize(
+    ("test_views", "train_views", "count", "cameras"),
+    [
+        ([1, 3, 5], None, 3, [1, 3, 5]),
+        ([[1, 3], [0, 2]], None, 2, [1, 3]),
+        (None, [0, 2, 4, 6, 8], 4, [0, 2, 4, 6, 8]),
+        (None, None, 4, []),
+    ],
+)
+def test_input_cameras(test_views, train_views, count, cameras):
+    shapes, settings = shapes_and_settings()
+    settings["dataset"]["view_sampler"].update(
+        num_context_views=4, test_context_views=test_views, context_views=train_views, test_target_views=[1, 7]
+    )
+    data = read_config(settings, shapes).data
+    assert (data["context_views"], data["context_cameras"]) == (count, cameras)
+    assert data["target_only_cameras"] == ([7] if test_views else [1, 7])
 
 
 @pytest.mark.parametrize(
@@ -143,14 +185,16 @@ def test_settings_that_no_weight_shows():
         ("model.encoder.costvolume_unet_channel_mult", [1, 2, 4], "must be ones"),
         ("model.state_adapter.gaussians.rotations", 6, "rotations: 6 is not supported"),
         ("model.state_adapter.learn_static_mask", True, "learn_static_mask: True is not supported"),
-        ("model.state_adapter.state_3dgs_params", ["means", "opacities", "scales"], "must be means and opacities, or all"),
+        ("model.state_adapter.state_3dgs_params", ["means", "opacities", "scales"], "must be means and opacities, or"),
         ("model.state_adapter.state_3dgs_params", ["means", "opacities", "rotations", "scales", "harmonics"],
          "describes the explicit variant, but the weights are of the latent one"),
-        ("model.state_adapter.pred_modality.means", "z_x", "pred_modality.means: 'z_x' is not supported"),
+        ("model.state_adapter.pred_modality.means", "z_x", "pred_modality: must be one of cx_x, cx_dx, z_x for all"),
         ("model.state_adapter.dynamic_state_keys", ["opacities"], "opacities that change are not supported"),
         ("dataset.n_step_state", 3, "n_step_state: must be 1, 2, 4, 8; got 3"),
-        ("dataset.n_step_state_predict", -1, "predicts 2 steps at once"),
+        ("dataset.n_step_state_predict", -1, "advances 2 old steps at once"),
         ("dataset.far", 0.5, "far: must lie beyond near"),
+        ("dataset.image_shape", [100, 128], "image_shape: must be multiples of 16; got 100, 128"),
+        ("dataset.baseline_scale_bounds", True, "baseline_scale_bounds: .* not supported"),
         ("dataset.view_sampler.test_context_views", ["a"], "must be a list of camera numbers"),
     ],
 )  # fmt: skip
@@ -165,8 +209,7 @@ def test_settings_that_do_not_fit_are_refused(path, value, message):
     [
         ("model.state_adapter.dynamic_state_keys", ["means", "rotations"], "harmonics, opacities, scales is missing"),
         ("model.state_adapter.immune_to_static", [], "must be harmonics alone; got nothing"),
-        ("model.state_adapter.pred_inductive_bias", False, "must be true for explicit particles"),
-        ("model.state_adapter.pred_modality.rotations", "z_x", "pred_modality.rotations: 'z_x' is not supported"),
+        ("model.state_adapter.pred_modality.rotations", "z_x", "pred_modality: must be one of .*'rotations': 'z_x'"),
     ],
 )
 def test_settings_of_the_explicit_variant(path, value, message):
@@ -175,10 +218,14 @@ def test_settings_of_the_explicit_variant(path, value, message):
         read_config(changed(settings, path, value), shapes)
 
 
-def test_several_steps_at_once_are_refused():
+def test_several_steps_at_once():
     shapes, settings = shapes_and_settings()
     shapes[f"{DYNAMICS}dec.2.fc2.weight"] = (14, 8)
-    with pytest.raises(InputError, match="predicts 14 numbers a particle, a single step of this variant takes 7"):
+    read = read_config(settings, shapes)
+    assert read.model.dynamics.steps_per_call == 2
+    assert "dataset.n_step_predict_multiple is 1, but the weights have 2, which holds" in read.notes
+    shapes[f"{DYNAMICS}dec.2.fc2.weight"] = (15, 8)
+    with pytest.raises(InputError, match="predicts 15 numbers a particle, but a step of this variant takes 7"):
         read_config(settings, shapes)
 
 
@@ -249,13 +296,38 @@ def test_a_wrong_setting_is_named_with_its_file(capsys, tmp_path):
     assert code == 2 and f"{tmp_path / 'model.yaml'}: model.encoder.num_surfaces: 2 is not supported" in err
 
 
+def test_the_imported_model_is_evaluated_at_its_own_size(capsys, tmp_path):
+    """Films of twice the size, with depth bounds of their own, are fitted to what the model was trained on."""
+    config = small_config()
+    settings = changed(settings_of(config), "dataset.view_sampler.num_context_views", 2)
+    files = write_release(tmp_path, random_weights(config), settings)
+    assert run_import(capsys, *files, tmp_path / "model")[0] == 0
+    scene = restore(tmp_path / "model").open_scene(write_scene(tmp_path / "scenes" / "ball", 4, size=64))
+    assert (scene.width, scene.height, scene.near, scene.far) == (32, 32, 1.0, 4.0)
+    arguments = ["evaluate", tmp_path / "model", tmp_path / "scenes", "--steps", "1", "--metrics", "psnr"]
+    assert main([str(argument) for argument in arguments]) == 0
+    metrics = json.loads((tmp_path / "model" / "metrics.json").read_text())
+    assert isinstance(metrics["future.psnr"], float)
+
+
+def test_the_file_that_is_wrong_is_named_however_it_was_written(capsys, tmp_path, monkeypatch):
+    config = small_config()
+    write_release(tmp_path, {"a": torch.ones(1)}, settings_of(config))
+    monkeypatch.chdir(tmp_path)
+    code, _, err = run_import(capsys, "./model.ckpt", "./model.yaml", "model")
+    assert code == 2 and err.startswith(
+        "gsim3d: error: model.ckpt: encoder.depth_predictor.to_gaussians.2.weight is missing"
+    )
+
+
 def test_what_was_found_is_kept_with_the_weights(tmp_path):
     config = small_config()
     weights = random_weights(config)
-    files = write_release(tmp_path, weights, changed(settings_of(config), "dataset.make_baseline_1", True))
+    files = write_release(tmp_path, weights, changed(settings_of(config), "dataset.speedup", 2))
     imported = import_released(files[0], yaml.safe_load(files[1].read_text()))
-    assert imported.n_parameters == sum(v.numel() for k, v in weights.items() if "running" not in k and "num_b" not in k)
+    learned = [value for name, value in weights.items() if "running" not in name and "num_batches" not in name]
+    assert imported.n_parameters == sum(value.numel() for value in learned)
     assert main(["import", *map(str, (files[0], "--config", files[1], "-o", tmp_path / "model"))]) == 0
     state = json.loads((tmp_path / "model" / "state.json").read_text())["imported"]
     assert state["file"] == "model.ckpt" and state["untrained_blocks"] == 0
-    assert any("make_baseline_1" in note for note in state["notes"])
+    assert any("speedup" in note for note in state["notes"])

@@ -27,6 +27,18 @@ def test_codes(curve, depth):
     assert curve_encode(grid, None, curve, depth=depth).tolist() == expected
 
 
+def test_several_curves_at_once(device):
+    grid, cloud = random_cells(70, 11).to(device), (torch.arange(70) % 3).to(device)
+    names = ("hilbert", "z", "hilbert", "z-trans", "hilbert-trans")
+    codes = curve_encode(grid, cloud, names, depth=11)
+    assert codes.shape == (5, 70)
+    for row, name in zip(codes, names):
+        assert torch.equal(row, curve_encode(grid, cloud, name, depth=11))
+    assert curve_encode(grid, cloud, ()).shape == (0, 70)
+    with pytest.raises(ValueError, match="curve must be one of .* got 'peano'"):
+        curve_encode(grid, cloud, ("z", "peano"))
+
+
 def test_cloud_bits_lie_above_the_shift():
     grid, cloud = random_cells(50, 16), torch.arange(50) % 7
     space = curve_encode(grid, None, "hilbert")
@@ -76,13 +88,45 @@ def test_devices_agree(devices):
             assert torch.equal(on_cuda.cpu(), on_cpu)
 
 
+@pytest.mark.parametrize("n", [1, 2, 33, 4095, 4097, 300001])
+@pytest.mark.parametrize("values", ["any", "few", "sorted", "equal", "extremes"])
+def test_sort_on_cuda(n, values, devices):
+    generator = torch.Generator().manual_seed(n)
+    high = 2**63 - 1
+    codes = {
+        "any": torch.randint(-high, high, (5, n), generator=generator),
+        "few": torch.randint(-3, 3, (5, n), generator=generator) << torch.arange(0, 60, 12)[:, None],
+        "sorted": torch.arange(5 * n).reshape(5, n),
+        "equal": torch.full((5, n), -5),
+        "extremes": torch.where(torch.rand(5, n, generator=generator) < 0.5, -(2**63), high),
+    }[values]
+    order, inverse = curve_sort(codes.to(devices[1]))
+    assert torch.equal(order.cpu(), torch.argsort(codes, dim=1, stable=True))
+    assert torch.equal(inverse.cpu().gather(1, order.cpu()), torch.arange(n).expand(5, n))
+
+
+def test_rows_out_of_range_on_cuda_have_code_zero(devices):
+    bad = torch.tensor([[70000, 0, 0], [0, -1, 0], [0, 0, 2**40], [1, 2, 3], [1, 2, 3], [1, 2, 3]])
+    cloud = torch.tensor([0, 0, 0, -1, 2**15, 1])
+    codes = curve_encode(bad.to(devices[1]), cloud.to(devices[1]), "hilbert").tolist()
+    assert codes[:5] == [0] * 5 and codes[5:] == curve_encode(bad[5:], cloud[5:], "hilbert").tolist()
+
+
+def test_devices_raise_alike(devices):
+    grid, cloud = torch.zeros(2, 3, dtype=torch.int64), torch.zeros(2, dtype=torch.int64)
+    with pytest.raises(ValueError, match=r"depth must be in \[1, 16\]; got 17"):
+        curve_encode(grid.to(devices[1]), None, "z", depth=17)
+    with pytest.raises(ValueError, match="cloud must be on cuda:0 like the first argument; got cpu"):
+        curve_encode(grid.to(devices[1]), cloud, "z")
+
+
 # 5 opcheck
 
 
 @pytest.mark.filterwarnings("error")
-def test_opcheck():
-    grid = random_cells(10, 16)
-    torch.library.opcheck(torch.ops.gsim3d.curve_encode, (grid, torch.arange(10), 2, 16, 48))
+def test_opcheck(device):
+    grid = random_cells(10, 16).to(device)
+    torch.library.opcheck(torch.ops.gsim3d.curve_encode, (grid, torch.arange(10, device=device), [2, 0], 16, 48))
     torch.library.opcheck(torch.ops.gsim3d.curve_sort, (torch.stack([grid[:, 0], grid[:, 1]]),))
 
 
@@ -101,10 +145,13 @@ def test_compile():
 # 7 edges
 
 
-def test_empty():
-    assert curve_encode(torch.zeros(0, 3, dtype=torch.int64), None, "hilbert").shape == (0,)
-    assert [t.shape for t in curve_sort(torch.zeros(4, 0, dtype=torch.int64))] == [(4, 0), (4, 0)]
-    assert [t.shape for t in curve_sort(torch.zeros(0, 4, dtype=torch.int64))] == [(0, 4), (0, 4)]
+def test_empty(device):
+    def zeros(*shape):
+        return torch.zeros(shape, dtype=torch.int64, device=device)
+
+    assert curve_encode(zeros(0, 3), None, "hilbert").shape == (0,)
+    assert [t.shape for t in curve_sort(zeros(4, 0))] == [(4, 0), (4, 0)]
+    assert [t.shape for t in curve_sort(zeros(0, 4))] == [(0, 4), (0, 4)]
 
 
 def test_non_contiguous():

@@ -164,11 +164,10 @@ def test_long_patches(device):
 
 
 def test_views_of_one_tensor(device):
-    case = self_case((70, 30, 9), dim=20, dtype=torch.float32)
+    case = self_case((70, 30, 9), dim=20, dtype=torch.float32).to(device)
     qkv = torch.stack(case.inputs, 1)
     expected = gradients(case.attend, case.inputs, cotangent_of(case))
-    moved = case.to(device)
-    out, grad = gradients(lambda x: moved.attend(*x.unbind(1)), [qkv.to(device)], cotangent_of(case))
+    out, grad = gradients(lambda x: case.attend(*x.unbind(1)), [qkv], cotangent_of(case))
     assert_same_bits(out, expected[0])
     assert_same_bits(grad, torch.stack(expected[1:], 1))
 
@@ -183,7 +182,6 @@ def test_gradcheck(scale):
 
 
 # ---- 4 CPU against CUDA --------------------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=DTYPES.values())
 @pytest.mark.parametrize("dim", [16, 20, 64])

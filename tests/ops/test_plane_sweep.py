@@ -146,6 +146,61 @@ def test_cpu_and_cuda_agree(case, devices):
         assert_close_relative_to_max(cuda, cpu, "plane_sweep_grad_float32", name)
 
 
+def run(arguments, device):
+    """Cost and gradient of the features on a device."""
+    features, *geometry = (t.to(device) for t in arguments)
+    cotangent = cotangent_of([arguments[0], None, None, arguments[3]]).to(device)
+    return gradients(lambda f: plane_sweep(f, *geometry), [features], cotangent)
+
+
+@pytest.mark.parametrize("case", ["ragged", "many depths", "channels of a block and a bit"])
+def test_cuda_gives_the_same_bits_every_time(case, devices):
+    arguments = make(**CASES[case] | {"size": (24, 32)}, dtype=torch.float32)
+    first = run(arguments, devices[1])
+    for _ in range(3):
+        for actual, expected in zip(run(arguments, devices[1]), first, strict=True):
+            assert_same_bits(actual, expected)
+
+
+LARGE = {
+    "pairs in pieces": dict(sources=((1,) * 6, (0,) * 6), channels=3, depths=8, size=(128, 128)),
+    "pixels in pieces": dict(sources=((), (0,)), channels=1, depths=2, size=(256, 256)),
+    "channels in blocks": dict(channels=260, size=(9, 16)),
+}
+
+
+@pytest.mark.parametrize("case", LARGE)
+def test_large_sweeps_on_cuda(case, devices):
+    arguments = make(**LARGE[case], dtype=torch.float32)
+    for cpu, cuda, name in zip(*(run(arguments, device) for device in devices), ("cost", "gradient"), strict=True):
+        assert_close_relative_to_max(cuda, cpu, "plane_sweep_large", name)
+
+
+def test_cuda_skips_what_is_out_of_range(devices):
+    """Unknown sources count as seeing nothing; whatever the offsets hold, nothing else is read."""
+    arguments = make(((1, 0), (0, 1)), dtype=torch.float32)
+    features, *geometry, src_images, cu_src = (t.to(devices[1]) for t in arguments)
+    cost = plane_sweep(features, *geometry, src_images, cu_src)
+    unknown = src_images.clone()
+    unknown[0] = 7
+    changed = plane_sweep(features, *geometry, unknown, cu_src)
+    assert_same_bits(changed[1], cost[1])
+    only = plane_sweep(features, *(t[1:] for t in geometry[:2]), geometry[2], src_images[1:], (cu_src - 1).clamp(min=0))
+    assert torch.allclose(changed[0] * 2, only[0])
+    for offsets in ([5, -9, 2**40], [0, 4, 2], [2**62, 0, 1]):
+        features.requires_grad_()
+        out = plane_sweep(features, *geometry, src_images - 1, torch.tensor(offsets, device=devices[1]))
+        out.sum().backward()
+        assert out.shape == cost.shape and features.grad.isfinite().all()
+
+
+def test_cuda_rejects_lines_beyond_shared_memory(devices):
+    features = torch.zeros(1, 1, 1, 1 << 22, device=devices[1])
+    geometry = torch.eye(3)[None], torch.zeros(1, 3), torch.ones(1, 1), torch.tensor([0]), torch.tensor([0, 1])
+    with pytest.raises(ValueError, match="small enough for one pixel's line .* got 1 x 4194304 pixels and 1 depths"):
+        plane_sweep(features, *(t.to(devices[1]) for t in geometry))
+
+
 # 5 opcheck
 def test_opcheck(device):
     features, *geometry = (t.to(device) for t in make(channels=3, depths=4, size=(4, 5)))
@@ -177,21 +232,22 @@ def test_same_bits_for_any_number_of_threads(case):
 
 
 @pytest.mark.parametrize("shape", [(0, 3, 4, 4), (1, 3, 0, 4), (1, 3, 4, 0)])
-def test_empty(shape):
+def test_empty(shape, device):
     n = shape[0]
-    features = torch.zeros(shape, requires_grad=True)
+    features = torch.zeros(shape, requires_grad=True, device=device)
     geometry = torch.zeros(0, 3, 3), torch.zeros(0, 3), torch.ones(n, 2)
-    cost = plane_sweep(features, *geometry, torch.zeros(0, dtype=torch.int64), torch.zeros(n + 1, dtype=torch.int64))
+    indices = torch.zeros(0, dtype=torch.int64), torch.zeros(n + 1, dtype=torch.int64)
+    cost = plane_sweep(features, *(t.to(device) for t in (*geometry, *indices)))
     assert cost.shape == (n, 2, *shape[2:])
     cost.sum().backward()
     assert features.grad.shape == shape
 
 
-def test_no_depths_and_no_sources():
-    arguments = make(depths=4)
+def test_no_depths_and_no_sources(device):
+    arguments = [t.to(device) for t in make(depths=4)]
     arguments[3] = arguments[3][:, :0]
     assert plane_sweep(*arguments).shape == (4, 0, 7, 9)
-    arguments = make(((), ()))
+    arguments = [t.to(device) for t in make(((), ()))]
     arguments[0].requires_grad_()
     cost = plane_sweep(*arguments)
     cost.sum().backward()
@@ -207,9 +263,9 @@ def test_non_contiguous_inputs():
     assert_same_bits(plane_sweep(last, *arguments[1:]), plane_sweep(*arguments))
 
 
-def test_images_of_other_clouds_do_not_matter():
+def test_images_of_other_clouds_do_not_matter(device):
     """Images 2 and 3 see each other only; changing them leaves 0 and 1 alone, bit for bit."""
-    features, *geometry = make(((1,), (0,), (3,), (2,)))
+    features, *geometry = (t.to(device) for t in make(((1,), (0,), (3,), (2,))))
     before = plane_sweep(features, *geometry)
     changed = features.clone()
     changed[2:] = torch.nan
@@ -217,8 +273,8 @@ def test_images_of_other_clouds_do_not_matter():
 
 
 @pytest.mark.parametrize("where", ["behind", "on the camera plane", "far outside", "overflow"])
-def test_points_that_no_source_sees_cost_nothing(where):
-    arguments = make(((1,), (0,)), dtype=torch.float32)
+def test_points_that_no_source_sees_cost_nothing(where, device):
+    arguments = [t.to(device) for t in make(((1,), (0,)), dtype=torch.float32)]
     A, b = arguments[1], arguments[2]
     if where == "behind":
         A[:, 2], b[:, 2] = -A[:, 2].abs(), -10.0

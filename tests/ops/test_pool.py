@@ -186,6 +186,15 @@ def test_non_contiguous_inputs(device):
     assert_same_bits(unpool(small, rows, cu_rows, 20), unpool(small.contiguous(), rows, cu_rows, 20))
 
 
+def test_autocast_computes_in_float32(device):
+    rows, cu_rows = (t.to(device) for t in segments(20, 6))
+    x = features(20, 8, dtype=torch.float32).to(device).bfloat16()
+    with torch.autocast(device.type, torch.bfloat16):
+        outs = [pool_max(x, rows, cu_rows), pool_mean(x, rows, cu_rows), unpool(x[:6], rows, cu_rows, 20)]
+    assert {out.dtype for out in outs} == {torch.float32}
+    assert_same_bits(outs[1], pool_mean(x.float(), rows, cu_rows))
+
+
 def test_one_large_segment(device):
     rows, cu_rows = torch.arange(1000, device=device), torch.tensor([0, 1000], device=device)
     x = features(1000, 19).to(device)

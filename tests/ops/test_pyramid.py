@@ -55,8 +55,12 @@ def split(values, offsets):
     return [values[a:b] for a, b in itertools.pairwise(offsets)]
 
 
-def assert_matches_oracle(arguments, spec, curves=None):
-    pyramid = build_pyramid(**arguments, spec=spec, curves=curves)
+def on(device, arguments):
+    return {name: tensor.to(device) for name, tensor in arguments.items()}
+
+
+def assert_matches_oracle(arguments, spec, curves=None, device="cpu"):
+    pyramid = build_pyramid(**on(device, arguments), spec=spec, curves=curves)
     lists = [t.tolist() for t in arguments.values()]
     rows, stages = oracle.build_pyramid(*lists, spec, curves or ((0, 1, 2, 3),) * spec.n_stages)
     assert pyramid.rows.tolist() == rows
@@ -89,8 +93,8 @@ def assert_matches_oracle(arguments, spec, curves=None):
 
 @pytest.mark.parametrize("curves", [None, SHUFFLED])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_pyramid(dtype, curves):
-    pyramid = assert_matches_oracle(scene(dtype=dtype), SPEC, curves)
+def test_pyramid(dtype, curves, device):
+    pyramid = assert_matches_oracle(scene(dtype=dtype), SPEC, curves, device)
     assert len(pyramid.rows) < 151  # scene 2 has rows below its origin
     assert [stage.time_index is not None for stage in pyramid.stages] == [False, True, False, True]
 
@@ -103,42 +107,101 @@ OTHER_NETWORKS = [
 
 
 @pytest.mark.parametrize("spec", OTHER_NETWORKS)
-def test_other_networks(spec):
+def test_other_networks(spec, device):
     arguments = scene()
     if spec.slot_bits == 0:
         arguments |= {"cloud_scene": torch.arange(7), "cloud_slot": torch.zeros(7, dtype=torch.int64)}
         arguments["origin"] = torch.zeros(7, 3, dtype=torch.float64)
-    assert_matches_oracle(arguments, spec)
+    assert_matches_oracle(arguments, spec, device=device)
 
 
-def test_clouds_in_any_order():
+def test_clouds_in_any_order(device):
     arguments = scene()
     arguments |= {"cloud_scene": torch.tensor([2, 0, 1, 0, 0, 1, 0]), "cloud_slot": torch.tensor([1, 3, 0, 0, 2, 3, 1])}
-    assert_matches_oracle(arguments, SPEC)
+    assert_matches_oracle(arguments, SPEC, device=device)
 
 
 @pytest.mark.parametrize("size", [2, 3, 16, 17, 31, 32, 33, 48, 50])
-def test_last_patch_reads_a_whole_patch(size):
+def test_last_patch_reads_a_whole_patch(size, device):
     arguments = scene((size, 0, 0, 0, 0, 0, 0))
-    table = assert_matches_oracle(arguments, SPEC).stages[0].patches[1]
+    table = assert_matches_oracle(arguments, SPEC, device=device).stages[0].patches[1]
     assert table.cu_k.diff().tolist() == [min(size, 16)] * math.ceil(size / 16)
 
 
 # 4 CPU against CUDA
 
 
-def test_devices_agree(devices):
-    results = [flat(build_pyramid(**{k: v.to(device) for k, v in scene().items()}, spec=SPEC)) for device in devices]
-    for on_cpu, on_cuda in zip(*results):
-        assert torch.equal(on_cpu, on_cuda.cpu())
+def large_scene(n_scenes=3, steps=4, rows=4000, extent=1.0, seed=0, dtype=torch.float32):
+    """Wavy sheets that move a little from step to step; some rows sleep, some share a place."""
+    generator = torch.Generator().manual_seed(seed)
+    n_clouds = n_scenes * steps
+    sizes = [int(n) for n in torch.randint(rows // 2, rows, (n_clouds,), generator=generator)]
+    sizes[1] = 0
+    xy = torch.rand(sum(sizes), 2, generator=generator, dtype=torch.float64)
+    positions = torch.cat([xy, 0.3 + 0.1 * torch.sin(6 * xy.sum(1, keepdim=True))], 1) * extent
+    positions[5::97] = positions[:1].clone()
+    positions[3::101, 1] = torch.tensor(-1e-3)
+    positions[11::211, 2] = torch.nan
+    order = torch.randperm(n_clouds, generator=generator)
+    return {
+        "positions": positions.to(dtype),
+        "cu_rows": torch.tensor([0, *itertools.accumulate(sizes)]),
+        "cloud_scene": order // steps,
+        "cloud_slot": order % steps,
+        "origin": torch.rand(n_scenes, 3, generator=generator, dtype=torch.float64) * -0.01,
+    }
+
+
+LARGE = PyramidSpec(0.01, 2, (4, 2, 2, 2), (2, 1, 2, 1), (1024, 64, 64, 64, 16), ((5, 3), (3,), (3,), (3,), (7,)))
+ONE_CELL = dataclasses.replace(LARGE, grid_size=4.0)
+NO_MERGE = dataclasses.replace(LARGE, merge_windows=(1, 1, 1, 1))
+AT_ONCE = dataclasses.replace(LARGE, merge_windows=(64, 1, 1, 1), strides=(1, 16, 2, 1))
+
+
+@pytest.mark.parametrize("curves", [None, (*SHUFFLED, (1, 1, 0, 3))], ids=["in order", "shuffled"])
+@pytest.mark.parametrize("release", [False, True], ids=["ours", "release"])
+@pytest.mark.parametrize("spec", [LARGE, ONE_CELL, NO_MERGE, AT_ONCE], ids=["large", "one cell", "no merge", "at once"])
+def test_devices_agree(spec, release, curves, devices):
+    spec = dataclasses.replace(spec, release=release)
+    arguments = large_scene()
+    on_cpu, on_cuda = (flat(build_pyramid(**on(device, arguments), spec=spec, curves=curves)) for device in devices)
+    for expected, actual in zip(on_cpu, on_cuda, strict=True):
+        assert actual.device.type == "cuda" and torch.equal(actual.cpu(), expected)
+
+
+@pytest.mark.parametrize("n_scenes, steps, rows", [(1, 1, 200000), (300, 3, 8), (2, 2, 3)])
+def test_devices_agree_at_any_size(n_scenes, steps, rows, devices):
+    arguments = large_scene(n_scenes, max(steps, 2), rows, dtype=torch.float64)
+    on_cpu, on_cuda = (flat(build_pyramid(**on(device, arguments), spec=LARGE)) for device in devices)
+    for expected, actual in zip(on_cpu, on_cuda, strict=True):
+        assert torch.equal(actual.cpu(), expected)
+
+
+def test_cuda_gives_the_same_bits_every_time(devices):
+    arguments = on(devices[1], large_scene())
+    first = flat(build_pyramid(**arguments, spec=LARGE))
+    for _ in range(3):
+        for actual, expected in zip(flat(build_pyramid(**arguments, spec=LARGE)), first, strict=True):
+            assert torch.equal(actual, expected)
+
+
+def test_other_streams(devices):
+    arguments = on(devices[1], large_scene())
+    first = flat(build_pyramid(**arguments, spec=LARGE))
+    torch.cuda.synchronize()
+    with torch.cuda.stream(torch.cuda.Stream()):
+        other = flat(build_pyramid(**arguments, spec=LARGE))
+    torch.cuda.synchronize()
+    for actual, expected in zip(other, first, strict=True):
+        assert torch.equal(actual, expected)
 
 
 # 5 opcheck
 
 
 @pytest.mark.filterwarnings("error")
-def test_opcheck():
-    arguments = (*scene().values(), 0.1, 2, [2], [2], [8, 8], [0, 1, 2, 3] * 2, [5, 3, 3], [0, 2, 3], False)
+def test_opcheck(device):
+    arguments = (*on(device, scene()).values(), 0.1, 2, [2], [2], [8, 8], [0, 1, 2, 3] * 2, [5, 3, 3], [0, 2, 3], False)
     torch.library.opcheck(torch.ops.gsim3d.build_pyramid, arguments)
 
 
@@ -164,28 +227,28 @@ def test_compile():
 # 7 edges
 
 
-def test_no_rows_and_no_clouds():
+def test_no_rows_and_no_clouds(device):
     empty = scene((0,) * 7)
-    assert_matches_oracle(empty, SPEC)
-    none = torch.zeros(0, dtype=torch.int64)
-    origin = torch.zeros(0, 3, dtype=torch.float64)
-    pyramid = build_pyramid(torch.zeros(0, 3), torch.tensor([0]), none, none, origin, SPEC)
+    assert_matches_oracle(empty, SPEC, device=device)
+    none = torch.zeros(0, dtype=torch.int64, device=device)
+    origin = torch.zeros(0, 3, dtype=torch.float64, device=device)
+    pyramid = build_pyramid(origin.float(), torch.tensor([0], device=device), none, none, origin, SPEC)
     assert [t.shape for t in flat(pyramid)] == [t.shape for t in flat(build_pyramid(**empty, spec=SPEC))]
 
 
-def test_one_row():
+def test_one_row(device):
     for cloud in range(7):
         sizes = [0] * 7
         sizes[cloud] = 1
         arguments = scene(sizes)
         arguments["positions"][:] = 1.0
-        assert_matches_oracle(arguments, SPEC)
+        assert_matches_oracle(arguments, SPEC, device=device)
 
 
-def test_all_rows_in_one_voxel():
+def test_all_rows_in_one_voxel(device):
     arguments = scene(extent=1e-3)
     arguments["origin"][:] = -0.05
-    pyramid = assert_matches_oracle(arguments, SPEC)
+    pyramid = assert_matches_oracle(arguments, SPEC, device=device)
     assert [stage.n_rows for stage in pyramid.stages] == [151, 6, 4, 4]
     assert pyramid.stages[3].n_clouds == 3
 
@@ -206,12 +269,12 @@ def test_sleeping_rows_leave_the_others_alone():
         assert torch.equal(a, b)
 
 
-def test_the_last_cell_takes_part():
+def test_the_last_cell_takes_part(device):
     top = 65535.5 * 0.1
     arguments = scene((4, 0, 0, 0, 0, 0, 0), dtype=torch.float64)
     corners = [[top, top, top], [0.0, 0.0, 0.0], [top, 0.0, top], [top - 0.1, top, top]]
     arguments["positions"] = torch.tensor(corners, dtype=torch.float64)
-    pyramid = assert_matches_oracle(arguments, SPEC)
+    pyramid = assert_matches_oracle(arguments, SPEC, device=device)
     assert pyramid.stages[0].grid[0].tolist() == [65535] * 3 and len(pyramid.rows) == 4
     assert len(pyramid.stages[0].kernel_maps[3].tap_in) == 2  # nothing wraps around to the next column
 
@@ -286,7 +349,7 @@ def test_non_contiguous_and_gradients():
         assert torch.equal(a, b) and not a.requires_grad
 
 
-def test_more_clouds_than_the_published_codes_hold():
+def test_more_clouds_than_the_published_codes_hold(device):
     arguments = {
         "positions": torch.rand(400, 3, generator=torch.Generator().manual_seed(0)),
         "cu_rows": torch.arange(0, 401, 4),
@@ -294,7 +357,7 @@ def test_more_clouds_than_the_published_codes_hold():
         "cloud_slot": torch.zeros(100, dtype=torch.int64),
         "origin": torch.zeros(100, 3, dtype=torch.float64),
     }
-    assert assert_matches_oracle(arguments, SPEC).stages[0].n_clouds == 100
+    assert assert_matches_oracle(arguments, SPEC, device=device).stages[0].n_clouds == 100
 
 
 def test_any_number_of_threads():
@@ -310,31 +373,31 @@ def test_any_number_of_threads():
 # The published model's geometry; the golden tests compare the rest of it
 
 
-def test_release_couples_clouds_and_orders_ties_by_row():
+def test_release_couples_clouds_and_orders_ties_by_row(device):
     spec = dataclasses.replace(SPEC, release=True)
     arguments = scene()
     arguments["positions"][100] = float("nan")
-    pyramid = build_pyramid(**arguments, spec=spec)
+    pyramid = build_pyramid(**on(device, arguments), spec=spec)
     assert pyramid.rows.tolist() == [i for i in range(151) if i != 100]
-    kept = arguments["positions"][pyramid.rows]
+    kept = arguments["positions"][pyramid.rows.cpu()]
     grid = ((kept - kept.amin(0)) / 0.1).trunc().long()
-    assert torch.equal(pyramid.stages[0].grid, grid)
+    assert torch.equal(pyramid.stages[0].grid.cpu(), grid)
     for order in pyramid.stages[0].order:
         for voxel in split(pyramid.stages[0].voxels.rows, pyramid.stages[0].voxels.cu_rows):
             assert [i for i in order.tolist() if i in voxel] == voxel
 
 
-def test_release_does_not_pool_below_one_level():
+def test_release_does_not_pool_below_one_level(device):
     spec = PyramidSpec(1.0, 2, (4,), (1,), (8, 8), ((3,), (3,)), release=True)
-    pyramid = build_pyramid(**scene(extent=0.9), spec=spec)  # one cell, so one level, less than the stride's two
+    pyramid = build_pyramid(**on(device, scene(extent=0.9)), spec=spec)  # one cell, so one level, less than the stride's two
     assert pyramid.stages[1].n_rows == 6
 
 
-def test_release_extent():
+def test_release_extent(device):
     arguments = scene()
     arguments["positions"][0] = 3277.5
     with pytest.raises(ValueError, match=r"with release, positions must span fewer than 2\^15 cells .* on axis 0"):
-        build_pyramid(**arguments, spec=dataclasses.replace(SPEC, release=True))
+        build_pyramid(**on(device, arguments), spec=dataclasses.replace(SPEC, release=True))
 
 
 # 8 errors
@@ -358,9 +421,9 @@ def test_release_extent():
         ({"origin": torch.full((3, 3), math.inf, dtype=torch.float64)}, "origin must be finite; got inf in scene 0"),
     ],
 )
-def test_errors(change, message):
+def test_errors(change, message, device):
     with pytest.raises(ValueError, match="build_pyramid: .*" + message):
-        build_pyramid(**(scene() | change), spec=SPEC)
+        build_pyramid(**on(device, scene() | change), spec=SPEC)
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ def render_image(gaussians, background, viewmat, K, width, height, *, near_plane
     else:
         alpha = torch.where(alpha >= MIN_ALPHA, alpha, 0)
     if cutoff == "tile3sigma":
-        alpha = torch.where(_tiles_touched(mean2d, covariance, x, y), alpha, 0)
+        alpha = torch.where(tiles_touched(mean2d, covariance, x, y), alpha, 0)
 
     light = torch.ones(height, width, dtype=means.dtype)
     going = torch.ones(height, width, dtype=torch.bool)
@@ -106,7 +106,7 @@ def render_image(gaussians, background, viewmat, K, width, height, *, near_plane
     return total[..., :3] + light[..., None] * background, 1 - light, total[..., 3], total[..., 4:]
 
 
-def _tiles_touched(mean2d, covariance, x, y):
+def tiles_touched(mean2d, covariance, x, y):
     """bool [N, H, W]: pixels of the tiles that a square of 3 standard deviations about the mean touches."""
     middle = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
     largest = middle + (middle**2 - torch.linalg.det(covariance)).clamp_min(0.1).sqrt()

@@ -51,6 +51,36 @@ def sparse_conv(x: Tensor, weight: Tensor, bias: Tensor | None, cells: Tensor, d
     return out
 
 
+def racing_conv(x: Tensor, weight: Tensor, bias: Tensor | None, voxels, kernel_map, rule: str) -> Tensor:
+    """Where rows share a voxel, what spconv's kernels compute in one of the orders that their threads may take.
+
+    "native": taps before the centre add every row of the neighbour voxel into the first row of a voxel, taps after it
+    give every row the first row of the neighbour. "implicit": taps before the centre give every row the first row of
+    the neighbour, taps after it give the first row only the last row of the neighbour. The centre reads its own row.
+    """
+    size = weight.shape[1]
+    n_voxels = len(voxels.cu_rows) - 1
+    first, last = voxels.rows[voxels.cu_rows[:-1]], voxels.rows[voxels.cu_rows[1:] - 1]
+    total = torch.zeros(n_voxels, x.shape[1], dtype=x.dtype).index_add(0, voxels.row_voxel, x)
+    out = x @ weight[:, size // 2, size // 2, size // 2].T
+    out = out if bias is None else out + bias
+    taps = weight.permute(1, 2, 3, 4, 0).flatten(0, 2)
+    for tap, (a, b) in enumerate(zip(kernel_map.cu_taps[:-1].tolist(), kernel_map.cu_taps[1:].tolist(), strict=True)):
+        source, target = kernel_map.tap_in[a:b], kernel_map.tap_out[a:b]
+        early = tap < size**3 // 2
+        if rule == "native":
+            values = total[source] if early else x[first[source]]
+        else:
+            values = x[first[source]] if early else x[last[source]]
+        to_first_row = early if rule == "native" else not early
+        if to_first_row:
+            out = out.index_add(0, first[target], values @ taps[tap])
+        else:
+            at_voxel = torch.zeros(n_voxels, weight.shape[0], dtype=x.dtype).index_add(0, target, values @ taps[tap])
+            out = out + at_voxel[voxels.row_voxel]
+    return out
+
+
 def dense_conv(x: Tensor, weight: Tensor, bias: Tensor | None, cells: Tensor) -> Tensor:
     """conv3d of the cells of one cloud in a zero volume, read at the cells; cells without duplicates."""
     cx, cy, cz = (cells[:, 1:] - cells[:, 1:].amin(0)).T

@@ -1,12 +1,18 @@
 """Configurations: typed, and nothing unknown is accepted."""
 
 import dataclasses
+import re
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
+import yaml
 
+from gsim3d import presets
+from gsim3d.data import Fitting
 from gsim3d.errors import InputError
 from gsim3d.train.config import StageConfig, TrainConfig
+from gsim3d.train.restore import model_config
 from gsim3d.train.settings import from_dict, load_yaml, to_dict
 
 
@@ -32,6 +38,13 @@ def test_what_is_left_out_comes_from_the_base():
         ({"seed": 1.5}, r"^seed: must be a whole number; got 1.5"),
         ({"seed": True}, r"^seed: must be a whole number"),
         ({"seed": -1}, r"seed must be at least 0"),
+        (
+            {"data": {"resize": [100, 128]}},
+            r"data\.resize: must be \[width, height\], multiples of 16; got \[100, 128\]",
+        ),
+        ({"data": {"resize": [128]}}, r"data\.resize: must be \[width, height\]"),
+        ({"data": {"near_far": [2, 1]}}, r"data\.near_far: must be two rising distances above 0; got \[2.0, 1.0\]"),
+        ({"loss": {"perceptual": -1}}, r"perceptual must be at least 0"),
         ({"optimizer": {"beta1": "x"}}, r"^optimizer\.beta1: must be a number"),
         ({"optimizer": {"beta1": 1.0}}, r"beta1 must be below 1"),
         ({"optimizer": 3}, r"^optimizer: must be a mapping"),
@@ -86,3 +99,18 @@ def test_stages_follow_one_another():
     assert [(config.stage_of(i)[0].horizon, config.stage_of(i)[1]) for i in range(5)] == [
         (0, 0), (0, 1), (0, 2), (4, 0), (4, 1),
     ]  # fmt: skip
+
+
+def test_the_documented_training_is_the_published_one():
+    text = (Path(__file__).parents[2] / "docs" / "migration.md").read_text()
+    config = from_dict(TrainConfig, yaml.safe_load(re.search(r"```yaml\n(.*?)```", text, re.DOTALL)[1]))
+    model, paper = model_config(config), presets.paper_latent(4)
+    assert model.encoder == paper.encoder and model.renderer == paper.renderer
+    assert model.dynamics == dataclasses.replace(paper.dynamics, checkpointing=True)
+    assert config.data.fitting == Fitting((128, 128), (1.5, 8.0), False)
+    assert (config.loss.balance, config.loss.discount, config.loss.perceptual) == (0.5, 0.87, 0.05)
+    optimizer = config.optimizer
+    assert (optimizer.beta1, optimizer.beta2, optimizer.eps) == (0.9, 0.999, 1e-8)
+    assert (optimizer.weight_decay, optimizer.clip_norm, optimizer.ema_decay) == (1e-3, 0.5, 0)
+    (stage,) = config.stages
+    assert (stage.horizon, stage.target_views, stage.learning_rate, stage.warm_up) == (12, 5, 2e-4, 0.01)

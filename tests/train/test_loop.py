@@ -10,12 +10,17 @@ import sys
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from gsim3d.data import Scene, find_scenes
+from gsim3d.dynamics import concatenate
 from gsim3d.errors import InputError
+from gsim3d.perceptual.lpips import LPIPS
+from gsim3d.perceptual.weights import SOURCES, cache_folder
 from gsim3d.train import checkpoint
-from gsim3d.train.config import DataConfig, OptimizerConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer, deterministic
+from gsim3d.train.losses import image_loss, time_weights
 from gsim3d.train.restore import restore
 from gsim3d.train.samples import draw_batch, spread_views, thin_background
 from tests.tiny_scenes import write_scenes
@@ -130,6 +135,52 @@ def test_workers_give_the_gradient_of_the_whole_batch(folder, tmp_path):
             torch.testing.assert_close(split, whole, rtol=1e-3, atol=1e-5)
 
 
+def test_checkpointing_changes_no_gradient(folder, tmp_path):
+    """Every parameter gets the same bits, with drop path and shuffled curves drawn once."""
+    gradients = []
+    for checkpointing in (False, True):
+        model = {"drop_path": 0.3, "shuffle_orders": True, "zero_init": False, "checkpointing": checkpointing}
+        trainer = Trainer(dataclasses.replace(CONFIG, model={"dynamics": model}), scenes(folder), tmp_path)
+        trainer.simulator.train()
+        trainer.step = 4  # of the second stage, which rolls out
+        gradients.append(trainer._gradients([0])[2])
+    names = list(trainer.parameters)
+    unused = set(trainer.plan.unused)
+    for name, plain, again in zip(names, *gradients, strict=True):
+        if name in unused:
+            assert plain is None and again is None
+        else:
+            assert torch.equal(plain, again) and plain.isfinite().all(), name
+    trained = [name for name, gradient in zip(names, gradients[1]) if gradient is not None and gradient.any()]
+    assert any("attention.qkv" in name for name in trained) and any("mlp.fc1" in name for name in trained)
+
+
+def test_the_perceptual_part_joins_the_loss(folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("GSIM3D_CACHE_DIR", str(tmp_path / "cache"))
+    config = dataclasses.replace(CONFIG, loss=LossConfig(perceptual=0.05))
+    with pytest.raises(InputError, match="gsim3d weights lpips"):
+        Trainer(config, scenes(folder), tmp_path / "run")
+    torch.manual_seed(0)
+    network = LPIPS("vgg").requires_grad_(False)
+    for head in network.heads:
+        head.fill_(0.5)
+    file = cache_folder() / "lpips_vgg.safetensors"
+    file.parent.mkdir(parents=True)
+    save_file(network.state_dict(), file, {"sha256": SOURCES["lpips_vgg"].sha256})
+    trainers = [Trainer(c, scenes(folder), tmp_path / "run") for c in (config, CONFIG)]
+    batch = draw_batch(trainers[0].scenes, CONFIG.data, CONFIG.stages[1], CONFIG.seed, 0, [0])
+    (loss, errors), (plain, same) = (trainer.loss(batch) for trainer in trainers)
+    assert torch.equal(errors, same)
+    simulator, targets = trainers[0].simulator, batch.targets
+    particles = simulator.encode(batch.context)
+    particles = concatenate([particles, *simulator.rollout(particles, batch.n_future, trainers[0].plan)])
+    images = simulator.render(particles, targets.cameras, plan=trainers[0].plan).color
+    distances = network(images.permute(0, 3, 1, 2), targets.images)
+    extra = 0.05 * image_loss(distances, batch.target_step(), time_weights(batch.n_context, batch.n_future))
+    assert extra.item() > 1e-4
+    assert loss.item() == pytest.approx(plain.item() + extra.item(), rel=1e-5)
+
+
 def test_another_configuration_does_not_resume(folder, finished):
     with pytest.raises(InputError, match="another 'seed'"):
         Trainer(TrainConfig(**{**vars(CONFIG), "seed": 1}), scenes(folder), finished)
@@ -158,6 +209,18 @@ def test_a_restored_simulator_predicts_with_the_averaged_weights(folder, finishe
     weights = restored.simulator.state_dict()
     assert all(torch.equal(value, weights[name]) for name, value in saved.ema.items())
     assert restored.image_size == (32, 32) and restored.data == CONFIG.data and not restored.simulator.training
+
+
+@pytest.mark.parametrize("on", [False, True])
+def test_a_switch_of_another_version_is_refused_only_where_it_is_on(finished, tmp_path, on):
+    saved = checkpoint.load(finished)
+    saved.config["model"]["renderer"]["quirks"]["released_head_harmonics"] = on
+    folder = checkpoint.write(tmp_path / "older", saved)
+    if on:
+        with pytest.raises(InputError, match="renderer.quirks.released_head_harmonics: unknown setting"):
+            restore(folder)
+    else:
+        assert restore(folder).simulator.config == restore(finished).simulator.config
 
 
 def test_what_does_not_fit_is_named(folder, tmp_path):

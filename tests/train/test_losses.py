@@ -24,10 +24,19 @@ def test_image_loss_by_hand():
     target[0] += 0.1
     target[1] += 0.3
     target[2] += 0.2
-    weights = torch.tensor([0.25, 2.0])
-    loss, by_step = image_loss(pred, target, torch.tensor([0, 0, 1]), weights)
-    assert by_step.tolist() == pytest.approx([(0.01 + 0.09) / 2, 0.04])
+    errors = image_errors(pred, target)
+    assert errors.tolist() == pytest.approx([0.01, 0.09, 0.04])
+    loss = image_loss(errors, torch.tensor([0, 0, 1]), torch.tensor([0.25, 2.0]))
     assert loss.item() == pytest.approx(0.25 * 0.05 + 2 * 0.04)
+
+
+def test_the_published_loss_by_hand():
+    """Two encoded and three simulated steps, two views each, errors 1 .. 10; the mean over views, then over time."""
+    errors, step = torch.arange(1.0, 11), torch.arange(5).repeat_interleave(2)
+    by_hand = 0.25 * 1.5 + 0.25 * 3.5 + 0.5 * 5.5 + 0.5 * 0.87 * 7.5 + 0.5 * 0.87**2 * 9.5
+    assert image_loss(errors, step, time_weights(2, 3)).item() == pytest.approx(by_hand, rel=1e-6)
+    shuffled = torch.randperm(10, generator=torch.Generator().manual_seed(0))
+    assert image_loss(errors[shuffled], step[shuffled], time_weights(2, 3)).item() == pytest.approx(by_hand, rel=1e-6)
 
 
 def test_pixel_weights_make_a_weighted_mean():
@@ -47,6 +56,12 @@ def test_one_cycle_start_peak_and_end():
     assert rates[-1] == pytest.approx(8e-10)
     assert rates[:100] == sorted(rates[:100]) and rates[99:] == sorted(rates[99:], reverse=True)
     assert all(math.isfinite(one_cycle(0, n, 1.0, 0.0)) for n in (1, 2))
+
+
+def test_the_published_schedule():
+    """Peak 2e-4 at 1 % of the steps, from 8e-6 and down to 8e-10."""
+    rates = [one_cycle(step, 120_000, 2e-4) for step in (0, 1199, 119_999)]
+    assert rates == pytest.approx([8e-6, 2e-4, 8e-10], rel=1e-9)
 
 
 def test_one_cycle_is_torchs():

@@ -36,12 +36,13 @@ def plain_code(grid, cloud, curve):
 
 def plain_sort(codes):
     order = torch.argsort(codes, dim=1, stable=True)
-    inverse = torch.empty_like(order).scatter_(1, order, torch.arange(codes.shape[1]).expand_as(order).contiguous())
+    places = torch.arange(codes.shape[1], device=codes.device).expand_as(order).contiguous()
+    inverse = torch.empty_like(order).scatter_(1, order, places)
     return order, inverse
 
 
 def ours(grid, cloud):
-    codes = torch.stack([curve_encode(grid, cloud, curve) for curve in CURVES])
+    codes = curve_encode(grid, cloud, CURVES)
     return codes, curve_sort(codes)
 
 
@@ -59,12 +60,12 @@ def surface(n_clouds, rows, seed=0):
 
 def plain_kernel_map(keys, kernel_size):
     """Pairs of neighbours by binary search in the sorted voxel keys (x, y, z with 17 bits each, one spare)."""
-    reach = torch.arange(kernel_size) - kernel_size // 2
+    reach = torch.arange(kernel_size, device=keys.device) - kernel_size // 2
     tap_in, tap_out = [], []
     for offset in ((reach[:, None, None] << 34) + (reach[:, None] << 17) + reach).flatten().tolist():
         wanted = keys + offset
         at = torch.searchsorted(keys, wanted).clamp_max(len(keys) - 1)
-        hit = (keys[at] == wanted).nonzero()[:, 0] if offset else torch.zeros(0, dtype=torch.int64)
+        hit = (keys[at] == wanted).nonzero()[:, 0] if offset else keys[:0]
         tap_in.append(at[hit])
         tap_out.append(hit)
     return [torch.cat(tap_in), torch.cat(tap_out)]
@@ -73,7 +74,7 @@ def plain_kernel_map(keys, kernel_size):
 def plain_pyramid(grid, spec):
     """Cells, orders, clusters and convolution maps of one cloud whose points have a cell each."""
     results = []
-    cloud = torch.zeros(len(grid), dtype=torch.int64)
+    cloud = torch.zeros_like(grid[:, 0])
     codes = torch.stack([plain_code(grid, cloud, curve) for curve in CURVES])
     for s, kernel_sizes in enumerate(spec.kernel_sizes):
         if s > 0:
@@ -90,18 +91,48 @@ def plain_pyramid(grid, spec):
 
 
 def our_pyramid(positions, spec):
-    zero = torch.zeros(1, dtype=torch.int64)
+    offsets, zero = torch.tensor([0, len(positions)]), torch.zeros(1, dtype=torch.int64)
     origin = torch.zeros(1, 3, dtype=torch.float64)
+    clouds = [t.to(positions.device) for t in (offsets, zero, zero, origin)]
     results = []
-    for stage in build_pyramid(positions, torch.tensor([0, len(positions)]), zero, zero, origin, spec).stages:
+    for stage in build_pyramid(positions, *clouds, spec).stages:
         results += [stage.grid, stage.order, stage.voxels.rows]
         for taps in stage.kernel_maps.values():
             results += [taps.tap_in, taps.tap_out]
     return results
 
 
+def network_input(spec, n=65536):
+    """Positions at the centres of different cells, shuffled."""
+    cells = torch.unique(torch.floor(surface(1, n) / spec.grid_size).long(), dim=0)
+    cells = cells[torch.randperm(len(cells), generator=torch.Generator().manual_seed(0))]
+    return ((cells + 0.5) * spec.grid_size).float()
+
+
+NETWORK = PyramidSpec(0.004, 0, (4, 2, 2, 2), (1, 1, 1, 1), (1024,) * 5, ((5, 3), (3,), (3,), (3,), (3,)))
+
+
+def gpu(bench):
+    for n in (65536, 262144):
+        generator = torch.Generator(device="cuda").manual_seed(n)
+        grid = (torch.rand(n, 3, generator=generator, device="cuda") * 60000).long()
+        cloud = torch.zeros(n, dtype=torch.int64, device="cuda")
+        codes = ours(grid, cloud)[0]
+        bench.gpu(f"4 sorts and inverses of {n // 1024}k", "int64", lambda: curve_sort(codes),
+                  {"torch.argsort": lambda: plain_sort(codes)}, tolerance=0)
+        bench.gpu(f"4 codes and their sorts, {n // 1024}k points", "int64", lambda: ours(grid, cloud),
+                  {"torch": lambda: plain(grid, cloud)}, tolerance=0, target_ratio=60, limit_ms=0.02 * n / 262144)
+    positions = network_input(NETWORK).cuda()
+    grid = torch.floor(positions.double() / NETWORK.grid_size).long()
+    bench.gpu(f"geometry of 5 stages, {len(grid)} points", "int64", lambda: our_pyramid(positions, NETWORK),
+              {"torch": lambda: plain_pyramid(grid, NETWORK)}, tolerance=0)
+
+
 def main():
     bench = Bench("curve")
+    if bench.device.type == "cuda":
+        gpu(bench)
+        return bench.finish()
     for n in (65536, 262144):
         grid = torch.floor(surface(4, n // 4) / 0.004).long()
         cloud = torch.arange(4).repeat_interleave(n // 4)
@@ -109,14 +140,11 @@ def main():
         bench.compare(f"4 codes of {n // 1024}k points", lambda: ours(grid, cloud)[0], lambda: plain(grid, cloud)[0])
         bench.compare(f"4 sorts and inverses of {n // 1024}k", lambda: curve_sort(codes), lambda: plain_sort(codes))
         bench.compare(f"both of {n // 1024}k", lambda: ours(grid, cloud), lambda: plain(grid, cloud))
-    spec = PyramidSpec(0.004, 0, (4, 2, 2, 2), (1, 1, 1, 1), (1024,) * 5, ((5, 3), (3,), (3,), (3,), (3,)))
-    cells = torch.unique(torch.floor(surface(1, 65536) / spec.grid_size).long(), dim=0)
-    cells = cells[torch.randperm(len(cells), generator=torch.Generator().manual_seed(0))]
-    positions = ((cells + 0.5) * spec.grid_size).float()
+    positions = network_input(NETWORK)
     bench.compare(
-        f"geometry of 5 stages, {len(cells)} points",
-        lambda: our_pyramid(positions, spec),
-        lambda: plain_pyramid(torch.floor(positions.double() / spec.grid_size).long(), spec),
+        f"geometry of 5 stages, {len(positions)} points",
+        lambda: our_pyramid(positions, NETWORK),
+        lambda: plain_pyramid(torch.floor(positions.double() / NETWORK.grid_size).long(), NETWORK),
     )
     bench.finish()
 

@@ -15,9 +15,9 @@ def plain(features, homographies, translations, inverse_depths, src_images, cu_s
     """The s-th sources of all images at once; every image has the same number."""
     n, channels, height, width = features.shape
     n_sources = len(src_images) // n
-    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    v, u = torch.meshgrid(*(torch.arange(n, device=features.device) for n in (height, width)), indexing="ij")
     pixels = torch.stack([u, v, torch.ones_like(u)]).reshape(3, -1).float()
-    scale = torch.tensor([2 / (width - 1), 2 / (height - 1)])
+    scale = torch.tensor([2 / (width - 1), 2 / (height - 1)], device=features.device)
     cost = 0
     for s in range(n_sources):
         A, b = homographies[s::n_sources], translations[s::n_sources]
@@ -46,8 +46,52 @@ def arguments(n_views, channels, depths, size):
     return features, A.float(), b.float(), inverse_depths, sources, cu_src
 
 
-if __name__ == "__main__":
+def scenes_on_rings(n_scenes, channels, depths, size):
+    """Four views a scene, a quarter turn apart on a ring of 3.5 m, every other view a source of each."""
+    n_views = 4
+    angle = torch.arange(n_views) * (math.pi / 2)
+    eye = torch.stack([3.5 * angle.cos(), 3.5 * angle.sin(), torch.full_like(angle, 1.6)], 1)
+    forward = F.normalize(-eye, dim=1)
+    right = F.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0]).expand_as(forward)), dim=1)
+    viewmats = torch.eye(4).repeat(n_views, 1, 1)
+    viewmats[:, :3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], 1)
+    viewmats[:, :3, 3] = -(viewmats[:, :3, :3] @ eye[..., None])[..., 0]
+    K = torch.tensor([[1.1 * size, 0, size / 2], [0, 1.1 * size, size / 2], [0, 0, 1.0]])
+    n = n_scenes * n_views
+    sources = torch.tensor([v // 4 * 4 + (v + s) % 4 for v in range(n) for s in range(1, n_views)])
+    cu_src = torch.arange(n + 1) * (n_views - 1)
+    A, b = sweep_geometry(K.repeat(n, 1, 1), viewmats.repeat(n_scenes, 1, 1), sources, cu_src)
+    features = torch.randn(n, channels, size, size, generator=torch.Generator().manual_seed(9))
+    inverse_depths = torch.linspace(1 / 8, 1 / 1.5, depths).repeat(n, 1)
+    return [t.cuda() for t in (features, A, b, inverse_depths, sources, cu_src)]
+
+
+def gpu(bench):
+    limits = {32: (0.016, 0.05), 64: (0.26, 0.8)}
+    for size, target in ((32, 45), (64, 25)):
+        features, *geometry = scenes_on_rings(4, 128, 64, size)
+        case = f"4 scenes x 4 views, {size}x{size}x128, D=64"
+
+        def ours(f):
+            return plane_sweep(f, *geometry)
+
+        def grid_sample(f):
+            return plain(f, *geometry)
+
+        ours_both, plain_both = with_gradients([features], ours, grid_sample)
+        for name, run, peer, limit in (
+            ("fwd", lambda: ours(features), lambda: grid_sample(features), limits[size][0]),
+            ("fwd+bwd", ours_both, plain_both, limits[size][1]),
+        ):
+            bench.gpu(f"{case}: {name}", "float32", run, {"grid_sample": peer}, target_ratio=target, limit_ms=limit,
+                      tolerance=TOLERANCE)
+
+
+def main():
     bench = Bench("plane_sweep")
+    if bench.device.type == "cuda":
+        gpu(bench)
+        return bench.finish()
     for n_views, channels, depths, size in ((4, 64, 64, 32), (4, 128, 64, 32), (4, 32, 24, 16)):
         features, *geometry = arguments(n_views, channels, depths, size)
 
@@ -61,3 +105,7 @@ if __name__ == "__main__":
         bench.compare(case, lambda: ours(features), lambda: torch_form(features), tolerance=TOLERANCE)
         bench.compare(f"{case}, fwd+bwd", *with_gradients([features], ours, torch_form), tolerance=TOLERANCE)
     bench.finish()
+
+
+if __name__ == "__main__":
+    main()

@@ -4,13 +4,18 @@
 #include <cstdint>
 
 #include "gsim3d/core/parallel.h"
+#include "gsim3d/core/stream.h"
 #include "gsim3d/core/workspace.h"
 #include "gsim3d/curve/curve_math.h"
 
-namespace gsim3d::cpu {
+namespace gsim3d {
+namespace cpu {
 
-// codes[i] = cloud[i] << shift | curve_code(curve, grid[i], depth). Throws ArgumentError unless 1 <= depth <= 16,
-// 3 depth <= shift <= 62, every cell is in [0, 2^depth) and every cloud in [0, 2^(63 - shift)).
+// Throws ArgumentError unless 0 <= curve < 4, 1 <= depth <= 16 and 3 depth <= shift <= 62.
+void check_curve(int64_t curve, int64_t depth, int64_t shift);
+
+// codes[i] = cloud[i] << shift | curve_code(curve, grid[i], depth). Throws ArgumentError as check_curve, and unless
+// every cell is in [0, 2^depth) and every cloud in [0, 2^(63 - shift)).
 void curve_encode(const int64_t* grid,   // [n, 3]
                   const int64_t* cloud,  // [n]
                   int64_t n, int64_t curve, int64_t depth, int64_t shift,
@@ -36,4 +41,20 @@ void radix_sort(const uint64_t* const* keys,  // [rows] pointers to [n]
 void curve_sort(const int64_t* codes, int64_t rows, int64_t n, int64_t* order, int64_t* inverse,
                 const Workspace& workspace, const Parallel& parallel);
 
-}  // namespace gsim3d::cpu
+}  // namespace cpu
+
+// The same functions on the device of `stream`. A row with a cell or cloud out of range has code 0.
+namespace cuda {
+
+// Codes along several curves at once.
+void curve_encode(const int64_t* grid, const int64_t* cloud, int64_t n,
+                  const int64_t* curves,  // [n_curves]
+                  int64_t n_curves, int64_t depth, int64_t shift,
+                  int64_t* codes,  // [n_curves, n]
+                  Stream stream);
+
+void curve_sort(const int64_t* codes, int64_t rows, int64_t n, int64_t* order, int64_t* inverse,
+                const Workspace& workspace, Stream stream);
+
+}  // namespace cuda
+}  // namespace gsim3d

@@ -61,13 +61,17 @@ bool is_trans(Curve curve) { return curve == Curve::kZTrans || curve == Curve::k
 
 }  // namespace
 
-void curve_encode(const int64_t* grid, const int64_t* cloud, int64_t n, int64_t curve_id, int64_t depth, int64_t shift,
-                  int64_t* codes, const Parallel& parallel) {
-  check(curve_id >= 0 && curve_id < kCurves, "curve_encode: curve must be 0 (z), 1 (z-trans), 2 (hilbert) or 3 ",
-        "(hilbert-trans); got ", curve_id);
+void check_curve(int64_t curve, int64_t depth, int64_t shift) {
+  check(curve >= 0 && curve < kCurves, "curve_encode: curve must be 0 (z), 1 (z-trans), 2 (hilbert) or 3 ",
+        "(hilbert-trans); got ", curve);
   check(depth >= 1 && depth <= kMaxDepth, "curve_encode: depth must be in [1, ", kMaxDepth, "]; got ", depth);
   check(shift >= 3 * depth && shift <= 62, "curve_encode: shift must be in [3 depth, 62] = [", 3 * depth, ", 62]; got ",
         shift);
+}
+
+void curve_encode(const int64_t* grid, const int64_t* cloud, int64_t n, int64_t curve_id, int64_t depth, int64_t shift,
+                  int64_t* codes, const Parallel& parallel) {
+  check_curve(curve_id, depth, shift);
   const Curve curve = static_cast<Curve>(curve_id);
   const int64_t clouds = int64_t{1} << (63 - shift);
   parallel.range(n, kEncodeGrain, [&](int64_t chunk_begin, int64_t chunk_end) {

@@ -5,16 +5,27 @@
 namespace gsim3d::binding {
 namespace {
 
-Tensor curve_encode(const Tensor& grid_, const Tensor& cloud_, int64_t curve, int64_t depth, int64_t shift) {
+Tensor curve_encode(const Tensor& grid_, const Tensor& cloud_, std::vector<int64_t> curves, int64_t depth,
+                    int64_t shift) {
   const char* op = "curve_encode";
   check_dtype(op, "grid", grid_, ScalarType::Long);
   check_dtype(op, "cloud", cloud_, ScalarType::Long);
   check_shape(op, "grid", grid_, {-1, 3}, "[N, 3]");
   check_shape(op, "cloud", cloud_, {grid_.size(0)}, "[N]");
+  check_device(op, "cloud", cloud_, grid_);
   const Tensor grid = rows_of(grid_), cloud = rows_of(cloud_);
-  Tensor codes = empty(grid, {grid.size(0)});
-  cpu::curve_encode(data<int64_t>(grid), data<int64_t>(cloud), grid.size(0), curve, depth, shift,
-                    mutable_data<int64_t>(codes), torch_parallel());
+  const int64_t n = grid.size(0), n_curves = static_cast<int64_t>(curves.size());
+  Tensor codes = empty(grid, {n_curves, n});
+  if constexpr (kWithCuda) {
+    if (grid.is_cuda()) {
+      cuda::curve_encode(data<int64_t>(grid), data<int64_t>(cloud), n, curves.data(), n_curves, depth, shift,
+                         mutable_data<int64_t>(codes), current_stream(grid));
+      return codes;
+    }
+  }
+  for (int64_t c = 0; c < n_curves; ++c)
+    cpu::curve_encode(data<int64_t>(grid), data<int64_t>(cloud), n, curves[c], depth, shift,
+                      mutable_data<int64_t>(codes) + c * n, torch_parallel());
   return codes;
 }
 
@@ -26,6 +37,13 @@ std::tuple<Tensor, Tensor> curve_sort(const Tensor& codes_) {
   Tensor order = empty(codes, {codes.size(0), codes.size(1)});
   Tensor inverse = empty(codes, {codes.size(0), codes.size(1)});
   TensorWorkspace workspace(codes);
+  if constexpr (kWithCuda) {
+    if (codes.is_cuda()) {
+      cuda::curve_sort(data<int64_t>(codes), codes.size(0), codes.size(1), mutable_data<int64_t>(order),
+                       mutable_data<int64_t>(inverse), workspace, current_stream(codes));
+      return {order, inverse};
+    }
+  }
   cpu::curve_sort(data<int64_t>(codes), codes.size(0), codes.size(1), mutable_data<int64_t>(order),
                   mutable_data<int64_t>(inverse), workspace, torch_parallel());
   return {order, inverse};
@@ -74,6 +92,10 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
   check_shape(op, "cloud_scene", cloud_scene_, {n_clouds}, "[Q]");
   check_shape(op, "cloud_slot", cloud_slot_, {n_clouds}, "[Q]");
   check_shape(op, "origin", origin_, {-1, 3}, "[B, 3]");
+  check_device(op, "cu_rows", cu_rows_, positions_);
+  check_device(op, "cloud_scene", cloud_scene_, positions_);
+  check_device(op, "cloud_slot", cloud_slot_, positions_);
+  check_device(op, "origin", origin_, positions_);
 
   const Tensor positions = rows_of(positions_), cu_rows = rows_of(cu_rows_), cloud_scene = rows_of(cloud_scene_);
   const Tensor cloud_slot = rows_of(cloud_slot_), origin = rows_of(origin_);
@@ -85,17 +107,22 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
     const PyramidClouds<T> clouds{data<T>(positions),       data<int64_t>(cu_rows), data<int64_t>(cloud_scene),
                                   data<int64_t>(cloud_slot), data<double>(origin),   positions.size(0),
                                   n_clouds,                 origin.size(0)};
+    if constexpr (kWithCuda)
+      if (positions.is_cuda())
+        return cuda::build_pyramid(clouds, spec, {&TensorArrays::append, &arrays}, workspace, current_stream(positions));
     cpu::build_pyramid(clouds, spec, {&TensorArrays::append, &arrays}, workspace, torch_parallel());
   });
   return std::move(arrays.made);
 }
 
-}  // namespace
-
-STABLE_TORCH_LIBRARY_IMPL(gsim3d, CPU, m) {
+void kernels(auto& m) {
   m.impl("curve_encode", TORCH_BOX(&curve_encode));
   m.impl("curve_sort", TORCH_BOX(&curve_sort));
   m.impl("build_pyramid", TORCH_BOX(&build_pyramid));
 }
+
+}  // namespace
+
+GSIM3D_REGISTER(kernels)
 
 }  // namespace gsim3d::binding

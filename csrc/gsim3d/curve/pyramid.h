@@ -10,6 +10,7 @@
 #include <initializer_list>
 
 #include "gsim3d/core/parallel.h"
+#include "gsim3d/core/stream.h"
 #include "gsim3d/core/workspace.h"
 
 namespace gsim3d {
@@ -73,6 +74,14 @@ template <typename T>
 void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,
                    const Workspace& workspace, const Parallel& parallel);
 
+// Throw ArgumentError where a part of the input is malformed.
+void check_spec(const PyramidSpec& spec);
+template <typename T>
+void check_clouds(const PyramidClouds<T>& clouds, const PyramidSpec& spec);
+// With `release`: the corners [3] of all positions.
+template <typename T>
+void check_extent(const T* low, const T* high, double grid_size);
+
 // The pieces that need cells only.
 
 // Appends row_voxel, voxel_rows, cu_voxel_rows. Returns the voxels' keys (cloud, x, y, z, 16 bits each), ascending, in
@@ -92,4 +101,14 @@ void append_patches(const int64_t* cu_clouds, int64_t n_clouds, const int64_t* o
                     const Arrays& arrays);
 
 }  // namespace cpu
+
+namespace cuda {
+
+// The same results on the device of `stream`, in arrays on that device. Waits for the stream once, for the counts that
+// size the arrays.
+template <typename T>
+void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,
+                   const Workspace& workspace, Stream stream);
+
+}  // namespace cuda
 }  // namespace gsim3d

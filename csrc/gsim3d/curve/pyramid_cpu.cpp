@@ -39,55 +39,6 @@ struct Stage {
 bool is_power_of_two(int64_t v) { return v > 0 && std::has_single_bit(static_cast<uint64_t>(v)); }
 int log2_of(int64_t v) { return std::countr_zero(static_cast<uint64_t>(v)); }
 
-void check_spec(const PyramidSpec& spec) {
-  const char* op = "build_pyramid";
-  check(std::isfinite(spec.grid_size) && spec.grid_size > 0, op, ": grid_size must be positive; got ", spec.grid_size);
-  check(spec.slot_bits >= 0 && spec.slot_bits <= kMaxSlotBits, op, ": slot_bits must be in [0, ", kMaxSlotBits,
-        "]; got ", spec.slot_bits);
-  int bits = 0;
-  for (int64_t s = 0; s + 1 < spec.n_stages; ++s) {
-    check(is_power_of_two(spec.strides[s]), op, ": strides must be powers of two; got ", spec.strides[s]);
-    check(is_power_of_two(spec.merge_windows[s]), op, ": merge_windows must be powers of two; got ",
-          spec.merge_windows[s]);
-    bits += log2_of(spec.strides[s]);
-  }
-  check(spec.release || bits < kMaxDepth, op, ": strides must multiply to at most 2^15; got 2^", bits);
-  for (int64_t s = 0; s < spec.n_stages; ++s) {
-    check(spec.patch_sizes[s] > 0, op, ": patch_sizes must be positive; got ", spec.patch_sizes[s]);
-    for (int64_t r = 0; r < kSerializations; ++r) {
-      const int64_t curve = spec.curves[s * kSerializations + r];
-      check(curve >= 0 && curve < kCurves, op, ": curves must be in [0, 4); got ", curve);
-    }
-    for (int64_t k = spec.cu_kernels[s]; k < spec.cu_kernels[s + 1]; ++k)
-      check(spec.kernel_sizes[k] % 2 == 1 && spec.kernel_sizes[k] > 0 && spec.kernel_sizes[k] <= kMaxKernelSize, op,
-            ": kernel_sizes must be odd and in [1, ", kMaxKernelSize, "]; got ", spec.kernel_sizes[k]);
-  }
-}
-
-template <typename T>
-void check_clouds(const PyramidClouds<T>& clouds, const PyramidSpec& spec) {
-  const char* op = "build_pyramid";
-  const int64_t* cu = clouds.cu_rows;
-  check(cu[0] == 0 && cu[clouds.n_clouds] == clouds.n_rows, op, ": cu_rows must run from 0 to N=", clouds.n_rows,
-        "; got ", cu[0], " .. ", cu[clouds.n_clouds]);
-  std::vector<Key> keys;
-  for (int64_t q = 0; q < clouds.n_clouds; ++q) {
-    check(cu[q] <= cu[q + 1], op, ": cu_rows must not descend; got ", cu[q], " then ", cu[q + 1], " at ", q);
-    check(clouds.scene[q] >= 0 && clouds.scene[q] < clouds.n_scenes, op, ": cloud_scene must be in [0, B) with B=",
-          clouds.n_scenes, " from origin; got ", clouds.scene[q], " at ", q);
-    check(clouds.slot[q] >= 0 && clouds.slot[q] < int64_t{1} << spec.slot_bits, op, ": cloud_slot must be in [0, ",
-          int64_t{1} << spec.slot_bits, "); got ", clouds.slot[q], " at ", q);
-    keys.emplace_back(clouds.scene[q], clouds.slot[q]);
-  }
-  std::sort(keys.begin(), keys.end());
-  const auto twice = std::adjacent_find(keys.begin(), keys.end());
-  if (twice != keys.end())
-    detail::fail(op, ": cloud_slot must differ between the clouds of a scene; got slot ", twice->second,
-                 " twice in scene ", twice->first);
-  for (int64_t i = 0; i < 3 * clouds.n_scenes; ++i)
-    check(std::isfinite(clouds.origin[i]), op, ": origin must be finite; got ", clouds.origin[i], " in scene ", i / 3);
-}
-
 // f(q, begin, end) for each piece of a cloud in rows [begin, end).
 template <typename T, typename F>
 void for_cloud_rows(const PyramidClouds<T>& clouds, int64_t begin, int64_t end, const F& f) {
@@ -112,10 +63,7 @@ std::array<T, 3> minimum_corner(const PyramidClouds<T>& clouds, double grid_size
       high[a] = std::max(high[a], p[a]);
     }
   }
-  for (int a = 0; a < 3; ++a)
-    check(!((high[a] - low[a]) / T(grid_size) >= T(kReleaseCells)),
-          "build_pyramid: with release, positions must span fewer than 2^15 cells of ", grid_size, " m; got ", low[a],
-          " .. ", high[a], " m on axis ", a);
+  check_extent(low.data(), high.data(), grid_size);
   return low;
 }
 
@@ -286,6 +234,63 @@ Stage next_stage(const Stage& before, int64_t stride, int64_t window, int64_t* s
 
 }  // namespace
 
+void check_spec(const PyramidSpec& spec) {
+  const char* op = "build_pyramid";
+  check(std::isfinite(spec.grid_size) && spec.grid_size > 0, op, ": grid_size must be positive; got ", spec.grid_size);
+  check(spec.slot_bits >= 0 && spec.slot_bits <= kMaxSlotBits, op, ": slot_bits must be in [0, ", kMaxSlotBits,
+        "]; got ", spec.slot_bits);
+  int bits = 0;
+  for (int64_t s = 0; s + 1 < spec.n_stages; ++s) {
+    check(is_power_of_two(spec.strides[s]), op, ": strides must be powers of two; got ", spec.strides[s]);
+    check(is_power_of_two(spec.merge_windows[s]), op, ": merge_windows must be powers of two; got ",
+          spec.merge_windows[s]);
+    bits += log2_of(spec.strides[s]);
+  }
+  check(spec.release || bits < kMaxDepth, op, ": strides must multiply to at most 2^15; got 2^", bits);
+  for (int64_t s = 0; s < spec.n_stages; ++s) {
+    check(spec.patch_sizes[s] > 0, op, ": patch_sizes must be positive; got ", spec.patch_sizes[s]);
+    for (int64_t r = 0; r < kSerializations; ++r) {
+      const int64_t curve = spec.curves[s * kSerializations + r];
+      check(curve >= 0 && curve < kCurves, op, ": curves must be in [0, 4); got ", curve);
+    }
+    for (int64_t k = spec.cu_kernels[s]; k < spec.cu_kernels[s + 1]; ++k)
+      check(spec.kernel_sizes[k] % 2 == 1 && spec.kernel_sizes[k] > 0 && spec.kernel_sizes[k] <= kMaxKernelSize, op,
+            ": kernel_sizes must be odd and in [1, ", kMaxKernelSize, "]; got ", spec.kernel_sizes[k]);
+  }
+}
+
+template <typename T>
+void check_clouds(const PyramidClouds<T>& clouds, const PyramidSpec& spec) {
+  const char* op = "build_pyramid";
+  const int64_t* cu = clouds.cu_rows;
+  check(cu[0] == 0 && cu[clouds.n_clouds] == clouds.n_rows, op, ": cu_rows must run from 0 to N=", clouds.n_rows,
+        "; got ", cu[0], " .. ", cu[clouds.n_clouds]);
+  std::vector<Key> keys;
+  for (int64_t q = 0; q < clouds.n_clouds; ++q) {
+    check(cu[q] <= cu[q + 1], op, ": cu_rows must not descend; got ", cu[q], " then ", cu[q + 1], " at ", q);
+    check(clouds.scene[q] >= 0 && clouds.scene[q] < clouds.n_scenes, op, ": cloud_scene must be in [0, B) with B=",
+          clouds.n_scenes, " from origin; got ", clouds.scene[q], " at ", q);
+    check(clouds.slot[q] >= 0 && clouds.slot[q] < int64_t{1} << spec.slot_bits, op, ": cloud_slot must be in [0, ",
+          int64_t{1} << spec.slot_bits, "); got ", clouds.slot[q], " at ", q);
+    keys.emplace_back(clouds.scene[q], clouds.slot[q]);
+  }
+  std::sort(keys.begin(), keys.end());
+  const auto twice = std::adjacent_find(keys.begin(), keys.end());
+  if (twice != keys.end())
+    detail::fail(op, ": cloud_slot must differ between the clouds of a scene; got slot ", twice->second,
+                 " twice in scene ", twice->first);
+  for (int64_t i = 0; i < 3 * clouds.n_scenes; ++i)
+    check(std::isfinite(clouds.origin[i]), op, ": origin must be finite; got ", clouds.origin[i], " in scene ", i / 3);
+}
+
+template <typename T>
+void check_extent(const T* low, const T* high, double grid_size) {
+  for (int a = 0; a < 3; ++a)
+    check(!((high[a] - low[a]) / T(grid_size) >= T(kReleaseCells)),
+          "build_pyramid: with release, positions must span fewer than 2^15 cells of ", grid_size, " m; got ", low[a],
+          " .. ", high[a], " m on axis ", a);
+}
+
 template <typename T>
 void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,
                    const Workspace& workspace, const Parallel& parallel) {
@@ -310,9 +315,13 @@ void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, cons
   }
 }
 
-template void build_pyramid<float>(const PyramidClouds<float>&, const PyramidSpec&, const Arrays&, const Workspace&,
-                                   const Parallel&);
-template void build_pyramid<double>(const PyramidClouds<double>&, const PyramidSpec&, const Arrays&, const Workspace&,
-                                    const Parallel&);
+#define GSIM3D_INSTANTIATE(T)                                                      \
+  template void check_clouds<T>(const PyramidClouds<T>&, const PyramidSpec&);       \
+  template void check_extent<T>(const T*, const T*, double);                        \
+  template void build_pyramid<T>(const PyramidClouds<T>&, const PyramidSpec&, const Arrays&, const Workspace&, \
+                                 const Parallel&);
+GSIM3D_INSTANTIATE(float)
+GSIM3D_INSTANTIATE(double)
+#undef GSIM3D_INSTANTIATE
 
 }  // namespace gsim3d::cpu

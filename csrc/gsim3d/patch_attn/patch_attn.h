@@ -4,14 +4,18 @@
 //
 // The score matrix is never stored: tiles of 64 queries x 64 keys stay in the L1 cache, with a running maximum and sum
 // a query. Bits do not depend on the number of threads, on the instruction set, on other patches or on the numbering of
-// the rows, only on the order of the keys inside a patch. T is float or double.
+// the rows, only on the order of the keys inside a patch. T is float or double, on CUDA also Float16 or BFloat16.
 //
 // A NaN in a query row reaches its own result; in a key or value row, the queries of the patches that list it.
 #pragma once
 
 #include <cstdint>
+#include <type_traits>
 
+#include "gsim3d/core/half.h"
 #include "gsim3d/core/parallel.h"
+#include "gsim3d/core/platform.h"
+#include "gsim3d/core/stream.h"
 #include "gsim3d/core/workspace.h"
 
 namespace gsim3d {
@@ -33,7 +37,7 @@ struct HeadRows {
   const T* data;
   int64_t row_stride, head_stride;  // in elements
 
-  const T* at(int64_t row, int64_t head) const { return data + row * row_stride + head * head_stride; }
+  GSIM3D_HD const T* at(int64_t row, int64_t head) const { return data + row * row_stride + head * head_stride; }
 };
 
 struct AttentionSize {
@@ -67,4 +71,22 @@ void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const He
                          const Workspace& workspace, const Parallel& parallel);
 
 }  // namespace cpu
+
+// The same functions on the device of `stream`; sums and softmax of 16-bit numbers are float32. A slot whose row is out
+// of range is skipped. Bits do not depend on timing, but differ from those of the CPU.
+namespace cuda {
+
+template <typename T>
+using StatsOf = std::conditional_t<sizeof(T) == 2, float, T>;
+
+template <typename T>
+void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
+                     const AttentionSize& size, T* out, StatsOf<T>* stats, Stream stream);
+
+template <typename T>
+void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v,
+                         const T* out, const StatsOf<T>* stats, const PatchTable& table, const AttentionSize& size,
+                         T* const (&grads)[3], const Workspace& workspace, Stream stream);
+
+}  // namespace cuda
 }  // namespace gsim3d

@@ -41,10 +41,12 @@ struct Softmax {
   T slope;   // |scale| log2(e)
   T lowest;  // differences below it give weight 0
 
+  static constexpr T kLowestNumber = std::numeric_limits<T>::lowest();
+
   GSIM3D_HD explicit Softmax(double scale)
       : sign(scale < 0 ? T(-1) : T(1)),
         slope(static_cast<T>((scale < 0 ? -scale : scale) * 1.4426950408889634074)),
-        lowest(slope > T(0) ? -T(Exp2<T>::kBias) / slope : std::numeric_limits<T>::lowest()) {}
+        lowest(slope > T(0) ? -T(Exp2<T>::kBias) / slope : kLowestNumber) {}
 };
 
 }  // namespace gsim3d::patch_attn

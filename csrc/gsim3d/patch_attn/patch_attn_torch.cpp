@@ -1,3 +1,6 @@
+#include <type_traits>
+
+#include "gsim3d/core/half.h"
 #include "gsim3d/patch_attn/patch_attn.h"
 #include "gsim3d/torch/torch_utils.h"
 
@@ -6,6 +9,25 @@ namespace {
 
 // Heads are read in place, also inside a larger tensor, as long as a head's channels lie together.
 Tensor heads_of(const Tensor& x) { return x.size(2) <= 1 || x.stride(2) == 1 ? x : torch::stable::contiguous(x); }
+
+// Calls f.template operator()<T>(): float or double, on CUDA also the 16-bit types.
+template <typename F>
+void dispatch(const char* op, const Tensor& q, const F& f) {
+  if constexpr (kWithCuda) {
+    if (q.is_cuda() && q.scalar_type() == ScalarType::Half) return f.template operator()<Float16>();
+    if (q.is_cuda() && q.scalar_type() == ScalarType::BFloat16) return f.template operator()<BFloat16>();
+  }
+  dispatch_float(op, "q", q, f);
+}
+
+template <typename T>
+constexpr bool kOnCpu = std::is_floating_point_v<T>;
+
+// The softmax of 16-bit numbers is float32.
+ScalarType stats_type(const Tensor& q) {
+  const ScalarType type = q.scalar_type();
+  return type == ScalarType::Half || type == ScalarType::BFloat16 ? ScalarType::Float : type;
+}
 
 template <typename T>
 HeadRows<T> view_of(const Tensor& x) {
@@ -25,10 +47,13 @@ Inputs inputs_of(const char* op, const Tensor& q, const Tensor& k, const Tensor&
   check_shape(op, "v", v, {k.size(0), q.size(1), q.size(2)}, "[Nk, H, D]");
   check_dtype(op, "k", k, q.scalar_type());
   check_dtype(op, "v", v, q.scalar_type());
+  check_device(op, "k", k, q);
+  check_device(op, "v", v, q);
   const std::pair<const char*, const Tensor&> lists[] = {
       {"q_rows", q_rows}, {"kv_rows", kv_rows}, {"cu_q", cu_q}, {"cu_k", cu_k}};
   for (const auto& [name, list] : lists) {
     check_dtype(op, name, list, ScalarType::Long);
+    check_device(op, name, list, q);
     check(list.dim() == 1, op, ": ", name, " must have one dimension; got ", shape_of(list));
   }
   check(cu_q.size(0) >= 1, op, ": cu_q must be [P + 1]; got ", shape_of(cu_q));
@@ -46,7 +71,8 @@ Inputs inputs_of(const char* op, const Tensor& q, const Tensor& k, const Tensor&
               k.size(0)};
   in.size = {q.size(1), q.size(2), scale};
   cpu::check_attention_size(op, in.size);
-  cpu::check_patch_table(op, in.table);
+  // On a GPU the lists stay where they are: kernels skip what is out of range.
+  if (!q.is_cuda()) cpu::check_patch_table(op, in.table);
   return in;
 }
 
@@ -56,10 +82,15 @@ std::tuple<Tensor, Tensor> patch_attention(const Tensor& q, const Tensor& k, con
   const char* op = "patch_attention";
   const Inputs in = inputs_of(op, q, k, v, q_rows, kv_rows, cu_q, cu_k, scale);
   Tensor out = empty(q, {q.size(0), q.size(1), q.size(2)});
-  Tensor stats = empty(q, {q.size(0), q.size(1), 2});
-  dispatch_float(op, "q", q, [&]<typename T>() {
-    cpu::patch_attention(view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v), in.table, in.size, mutable_data<T>(out),
-                         mutable_data<T>(stats), torch_parallel());
+  Tensor stats = empty(q, {q.size(0), q.size(1), 2}, stats_type(q));
+  dispatch(op, q, [&]<typename T>() {
+    if constexpr (kWithCuda)
+      if (q.is_cuda())
+        return cuda::patch_attention(view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v), in.table, in.size,
+                                     mutable_data<T>(out), mutable_data<cuda::StatsOf<T>>(stats), current_stream(q));
+    if constexpr (kOnCpu<T>)
+      cpu::patch_attention(view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v), in.table, in.size,
+                           mutable_data<T>(out), mutable_data<T>(stats), torch_parallel());
   });
   return {out, stats};
 }
@@ -75,26 +106,36 @@ std::tuple<Tensor, Tensor, Tensor> patch_attention_backward(const Tensor& grad_,
   check_shape(op, "stats", stats_, {q.size(0), q.size(1), 2}, "[Nq, H, 2]");
   check_dtype(op, "grad", grad_, q.scalar_type());
   check_dtype(op, "out", out_, q.scalar_type());
-  check_dtype(op, "stats", stats_, q.scalar_type());
+  check_dtype(op, "stats", stats_, stats_type(q));
+  check_device(op, "grad", grad_, q);
+  check_device(op, "out", out_, q);
+  check_device(op, "stats", stats_, q);
   const Tensor grad = heads_of(grad_), out = rows_of(out_), stats = rows_of(stats_);
   Tensor grad_q = empty(q, {q.size(0), q.size(1), q.size(2)});
   Tensor grad_k = empty(k, {k.size(0), k.size(1), k.size(2)});
   Tensor grad_v = empty(k, {k.size(0), k.size(1), k.size(2)});
-  dispatch_float(op, "q", q, [&]<typename T>() {
+  dispatch(op, q, [&]<typename T>() {
     TensorWorkspace workspace(q);
-    cpu::patch_attention_vjp<T>(view_of<T>(grad), view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v), data<T>(out),
-                                data<T>(stats), in.table, in.size,
-                                {mutable_data<T>(grad_q), mutable_data<T>(grad_k), mutable_data<T>(grad_v)}, workspace,
-                                torch_parallel());
+    T* const grads[3] = {mutable_data<T>(grad_q), mutable_data<T>(grad_k), mutable_data<T>(grad_v)};
+    if constexpr (kWithCuda)
+      if (q.is_cuda())
+        return cuda::patch_attention_vjp<T>(view_of<T>(grad), view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v),
+                                            data<T>(out), data<cuda::StatsOf<T>>(stats), in.table, in.size, grads,
+                                            workspace, current_stream(q));
+    if constexpr (kOnCpu<T>)
+      cpu::patch_attention_vjp<T>(view_of<T>(grad), view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v),
+                                  data<T>(out), data<T>(stats), in.table, in.size, grads, workspace, torch_parallel());
   });
   return {grad_q, grad_k, grad_v};
 }
 
-}  // namespace
-
-STABLE_TORCH_LIBRARY_IMPL(gsim3d, CPU, m) {
+void kernels(auto& m) {
   m.impl("patch_attention", TORCH_BOX(&patch_attention));
   m.impl("patch_attention_backward", TORCH_BOX(&patch_attention_backward));
 }
+
+}  // namespace
+
+GSIM3D_REGISTER(kernels)
 
 }  // namespace gsim3d::binding

@@ -10,8 +10,11 @@
 #pragma once
 
 #include <cstdint>
+#include <limits>
 
+#include "gsim3d/core/check.h"
 #include "gsim3d/core/parallel.h"
+#include "gsim3d/core/stream.h"
 #include "gsim3d/core/workspace.h"
 
 namespace gsim3d {
@@ -27,9 +30,18 @@ struct PlaneSweep {
   int64_t n_images, n_pairs, n_depths, channels, height, width;
 };
 
+// Throws ArgumentError unless there is a channel and pixels can be counted in 32 bits.
+template <typename T>
+void check_sizes(const char* op, const PlaneSweep<T>& sweep) {
+  check(sweep.channels > 0, op, ": features must have at least one channel; got 0");
+  check((sweep.height + 3) * (sweep.width + 2) < std::numeric_limits<int32_t>::max(), op,
+        ": features must have fewer than 2^31 pixels; got ", sweep.height, " x ", sweep.width);
+}
+
 namespace cpu {
 
-// Throws ArgumentError unless offsets and images are in range, geometry is finite and inverse depths are positive.
+// Throws ArgumentError as check_sizes, and unless offsets and images are in range, geometry is finite and inverse depths
+// are positive.
 template <typename T>
 void check_plane_sweep(const char* op, const PlaneSweep<T>& sweep);
 
@@ -50,4 +62,16 @@ void plane_sweep_vjp(const T* grad,      // [n_images, n_depths, height, width]
                      const Workspace& workspace, const Parallel& parallel);
 
 }  // namespace cpu
+
+// The same functions on the device of `stream`. A pair whose source is out of range counts as seeing nothing.
+namespace cuda {
+
+template <typename T>
+void plane_sweep(const T* features, const PlaneSweep<T>& sweep, T* cost, const Workspace& workspace, Stream stream);
+
+template <typename T>
+void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& sweep, T* grad_features,
+                     const Workspace& workspace, Stream stream);
+
+}  // namespace cuda
 }  // namespace gsim3d

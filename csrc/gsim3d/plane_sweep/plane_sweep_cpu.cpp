@@ -268,9 +268,7 @@ void for_pixel_chunks(const PlaneSweep<T>& sweep, const Parallel& parallel, cons
 template <typename T>
 void check_plane_sweep(const char* op, const PlaneSweep<T>& sweep) {
   const int64_t n = sweep.n_images;
-  check(sweep.channels > 0, op, ": features must have at least one channel; got 0");
-  check(table_size(sweep.height, sweep.width) < std::numeric_limits<int32_t>::max(), op,
-        ": features must have fewer than 2^31 pixels; got ", sweep.height, " x ", sweep.width);
+  check_sizes(op, sweep);
   check(sweep.cu_src[0] == 0 && sweep.cu_src[n] == sweep.n_pairs, op, ": cu_src must run from 0 to len(src_images)=",
         sweep.n_pairs, "; got ", sweep.cu_src[0], " .. ", sweep.cu_src[n]);
   for (int64_t i = 0; i < n; ++i)

@@ -30,11 +30,17 @@ struct Geometry {
     check_dtype(op, "homographies", homographies, type);
     check_dtype(op, "translations", translations, type);
     check_dtype(op, "inverse_depths", inverse_depths, type);
+    check_device(op, "homographies", homographies, features);
+    check_device(op, "translations", translations, features);
+    check_device(op, "inverse_depths", inverse_depths, features);
+    check_device(op, "src_images", src_images, features);
+    check_device(op, "cu_src", cu_src, features);
   }
 
+  // On a GPU the values stay where they are: kernels skip what is out of range.
   template <typename T>
   PlaneSweep<T> sweep(const Tensor& features) const {
-    PlaneSweep<T> sweep{data<T>(homographies),
+    const PlaneSweep<T> sweep{data<T>(homographies),
                         data<T>(translations),
                         data<T>(inverse_depths),
                         data<int64_t>(src_images),
@@ -45,7 +51,7 @@ struct Geometry {
                         features.size(1),
                         features.size(2),
                         features.size(3)};
-    cpu::check_plane_sweep(op, sweep);
+    if (!features.is_cuda()) cpu::check_plane_sweep(op, sweep);
     return sweep;
   }
 };
@@ -58,7 +64,11 @@ Tensor plane_sweep(const Tensor& features_, const Tensor& homographies, const Te
   Tensor cost = empty(features, {features.size(0), inverse_depths.size(1), features.size(2), features.size(3)});
   TensorWorkspace workspace(features);
   dispatch_float(op, "features", features, [&]<typename T>() {
-    cpu::plane_sweep(data<T>(features), geometry.sweep<T>(features), mutable_data<T>(cost), workspace,
+    const PlaneSweep<T> sweep = geometry.sweep<T>(features);
+    if constexpr (kWithCuda)
+      if (features.is_cuda())
+        return cuda::plane_sweep(data<T>(features), sweep, mutable_data<T>(cost), workspace, current_stream(features));
+    cpu::plane_sweep(data<T>(features), sweep, mutable_data<T>(cost), workspace,
                      torch_parallel());
   });
   return cost;
@@ -73,20 +83,28 @@ Tensor plane_sweep_backward(const Tensor& grad_, const Tensor& features_, const 
   check_shape(op, "grad", grad, {features.size(0), inverse_depths.size(1), features.size(2), features.size(3)},
               "[I, D, h, w]");
   check_dtype(op, "grad", grad, features.scalar_type());
+  check_device(op, "grad", grad, features);
   Tensor grad_features = empty(features, {features.size(0), features.size(1), features.size(2), features.size(3)});
   TensorWorkspace workspace(features);
   dispatch_float(op, "features", features, [&]<typename T>() {
-    cpu::plane_sweep_vjp(data<T>(grad), data<T>(features), geometry.sweep<T>(features), mutable_data<T>(grad_features),
-                         workspace, torch_parallel());
+    const PlaneSweep<T> sweep = geometry.sweep<T>(features);
+    if constexpr (kWithCuda)
+      if (features.is_cuda())
+        return cuda::plane_sweep_vjp(data<T>(grad), data<T>(features), sweep, mutable_data<T>(grad_features), workspace,
+                                     current_stream(features));
+    cpu::plane_sweep_vjp(data<T>(grad), data<T>(features), sweep, mutable_data<T>(grad_features), workspace,
+                         torch_parallel());
   });
   return grad_features;
 }
 
-}  // namespace
-
-STABLE_TORCH_LIBRARY_IMPL(gsim3d, CPU, m) {
+void kernels(auto& m) {
   m.impl("plane_sweep", TORCH_BOX(&plane_sweep));
   m.impl("plane_sweep_backward", TORCH_BOX(&plane_sweep_backward));
 }
+
+}  // namespace
+
+GSIM3D_REGISTER(kernels)
 
 }  // namespace gsim3d::binding

@@ -5,7 +5,7 @@
 
 STABLE_TORCH_LIBRARY(gsim3d, m) {
   // curve: space-filling-curve codes, their order, and all geometry of a network call.
-  m.def("curve_encode(Tensor grid, Tensor cloud, int curve, int depth, int shift) -> Tensor");
+  m.def("curve_encode(Tensor grid, Tensor cloud, int[] curves, int depth, int shift) -> Tensor");
   m.def("curve_sort(Tensor codes) -> (Tensor order, Tensor inverse)");
   m.def(
       "build_pyramid(Tensor positions, Tensor cu_rows, Tensor cloud_scene, Tensor cloud_slot, Tensor origin, float grid_size, "
@@ -38,6 +38,13 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   m.def("pool_mean_backward(Tensor grad, Tensor rows, Tensor cu_rows, SymInt n_rows) -> Tensor");
   m.def("unpool(Tensor x, Tensor rows, Tensor cu_rows, SymInt n_rows) -> Tensor");
   m.def("unpool_backward(Tensor grad, Tensor rows, Tensor cu_rows) -> Tensor");
+
+  // row_norm: layer normalisation of rows, and the residual sum behind it; stats [N, 2] are kept for the backward pass.
+  m.def(
+      "row_norm(Tensor x, Tensor weight, Tensor bias, Tensor? residual, float eps, ScalarType dtype) -> (Tensor out, "
+      "Tensor stats)");
+  m.def(
+      "row_norm_backward(Tensor grad, Tensor x, Tensor weight, Tensor stats) -> (Tensor x, Tensor weight, Tensor bias)");
 
   // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
   m.def(

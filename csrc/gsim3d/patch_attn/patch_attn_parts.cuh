@@ -1,0 +1,77 @@
+// What every CUDA kernel of patch attention shares: the work of a block, and where gradients of keys go.
+#pragma once
+
+#include <cstdint>
+#include <limits>
+#include <type_traits>
+
+#include "gsim3d/core/cuda_utils.cuh"
+#include "gsim3d/patch_attn/patch_attn.h"
+#include "gsim3d/patch_attn/patch_attn_math.h"
+
+namespace gsim3d::cuda {
+
+// Numbers are computed in float32, float64 ones in float64.
+template <typename T>
+using Wide = std::conditional_t<std::is_same_v<T, double>, double, float>;
+
+// A block computes one head of some rows of one patch: of its `splits` blocks, block s takes groups s, s + splits, ...
+// of `group` rows. Heads are neighbours, so that blocks in flight read the same lines of memory.
+struct Share {
+  int64_t patch, head, split;
+};
+struct Division {
+  int64_t heads, splits, n_shares;
+
+  __device__ __forceinline__ Share at(int64_t i) const {
+    return {i / (heads * splits), i % heads, i / heads % splits};
+  }
+};
+
+// As few blocks as possible, for each reads the whole other side of its patch (an eighth of the work on a group, about),
+// but enough to keep the `resident` ones that the GPU runs at a time busy to the end.
+inline Division divide(int64_t n_patches, int64_t n_listed, int64_t group, int64_t heads, int64_t resident) {
+  const int64_t groups = n_patches > 0 ? (n_listed + n_patches * group - 1) / (n_patches * group) : 1;
+  int64_t best = 1, least = std::numeric_limits<int64_t>::max();
+  for (int64_t splits = 1; splits < 2 * groups; splits *= 2) {
+    const int64_t rounds = (n_patches * heads * splits + resident - 1) / resident;
+    const int64_t cost = rounds * (8 * ((groups + splits - 1) / splits) + 1);
+    if (cost < least) {
+      best = splits;
+      least = cost;
+    }
+  }
+  return {heads, best, n_patches * heads * best};
+}
+inline int64_t multiprocessors(const char* what, Stream stream) {
+  int count = 0;
+  check_cuda(cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, stream.device), what);
+  return count;
+}
+inline unsigned blocks_of(const Division& division) {
+  return static_cast<unsigned>(division.n_shares < 0x7fffffff ? division.n_shares : 0x7fffffff);
+}
+
+// How often a row is listed as a key, and where first and last. Made by integer minima and sums, so the order in which
+// threads arrive does not show. Memory starts as all ones.
+struct RowUses {
+  unsigned long long* first;       // [n_k], slot in kv_rows
+  unsigned long long* minus_last;  // [n_k], ~slot
+  int* count_less_one;             // [n_k]
+};
+
+// Gradients of the keys and values: a row listed once is written at once, the others are summed over their slots later.
+template <typename T>
+struct KeyGradients {
+  T* k;                  // [n_k, H, D]
+  T* v;                  // [n_k, H, D]
+  Wide<T>* slots;        // [n_k_listed, H, 2, D], only slots of rows listed more than once are written
+  const int* count_less_one;
+
+  __device__ __forceinline__ bool at_once(int64_t row) const { return count_less_one[row] == 0; }
+  __device__ __forceinline__ Wide<T>* slot(int64_t slot, int64_t head, const AttentionSize& size) const {
+    return slots + (slot * size.heads + head) * 2 * size.dim;
+  }
+};
+
+}  // namespace gsim3d::cuda

@@ -1,0 +1,275 @@
+"""Everything that is wrong with a scene folder, and a picture that shows whether its cameras are right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.data import layouts
+from gsim3d.data.cameras import check_directions, positions_and_axes, project
+from gsim3d.data.recording import MOVING, Problems, Recording
+from gsim3d.data.scene import Scene
+from gsim3d.errors import InputError
+
+SHEET = 1440  # pixels, aimed width of the sheet
+TILE = 200, 420  # pixels, smallest and largest height of one frame in it
+GAP, LINE = 6, 22  # pixels between frames, and height of a line of text
+MAX_CAMERAS, MAX_SCENES = 6, 6  # shown of each scene, and of a data set; evenly spread
+MAX_COORDINATE = 8000.0  # pixels; lines that leave a frame by more are cut
+BOX, BODY, MASK, CAMERA = (255, 220, 60), (0, 140, 255), (0, 235, 255), (255, 90, 255)  # blue, green, red
+AXES = {"x": (60, 60, 255), "y": (70, 220, 70), "z": (255, 120, 60)}
+INK, PAPER, MISSING = (40, 40, 40), (255, 255, 255), (190, 190, 190)
+EDGE_POINTS = 24
+TEXT = 0.42  # size of letters, as OpenCV measures it
+HULL_GRID = 24  # points along each side of a box that is searched for moving bodies
+HULL_STEPS = 3  # where the masks are compared in space
+EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1]
+
+
+@dataclass(frozen=True)
+class SceneCheck:
+    """scene: None where it could not be opened.   problems: one line each, in the order in which they were found."""
+
+    path: Path
+    scene: Scene | None
+    problems: tuple[str, ...]
+
+
+def check_scene(folder: str | Path) -> SceneCheck:
+    """Reads everything in a scene folder, every image too, and collects what is wrong with it."""
+    path, problems = Path(folder), Problems(collect=True)
+    recording = scene = None
+    try:
+        recording = layouts.layout_of(path).read(path, problems)
+        if not problems.found:
+            check_directions(recording, problems)
+        scene = Scene(path, recording)
+    except InputError as error:
+        problems.add(str(error))
+    if recording is not None:
+        for cam, name in enumerate(recording.camera_names):
+            try:
+                _check_images(recording, cam, problems)
+            except InputError as error:
+                problems.add(f"camera {name}: {error}")
+        if recording.read_labels is not None:
+            _check_labels(recording, problems)
+    if scene is not None and not problems.found:
+        _check_agreement(Scene(path, recording), problems)  # its images go when it goes
+    return SceneCheck(path, scene, tuple(dict.fromkeys(problems.found)))
+
+
+def _check_images(recording: Recording, cam: int, problems: Problems) -> None:
+    for _ in recording.read_images(cam, range(recording.n_steps), problems):
+        pass
+
+
+def _check_labels(recording: Recording, problems: Problems) -> None:
+    before, seen = len(problems.found), set()
+    for cam, name in enumerate(recording.camera_names):
+        try:
+            for labels in recording.read_labels(cam, range(recording.n_steps), problems):
+                if labels is not None:
+                    seen |= set(np.flatnonzero(np.bincount(labels.ravel(), minlength=256)).tolist())
+        except InputError as error:
+            problems.add(f"camera {name}: {error}")
+    if MOVING not in seen and len(problems.found) == before:
+        problems.add(
+            f"{recording.source}: no label image has a pixel of {MOVING}, a body that may move; found {sorted(seen)}"
+        )
+
+
+def _check_agreement(scene: Scene, problems: Problems) -> None:
+    """Moving bodies lie where the views of the cameras cross: wrong poses leave no such place."""
+    if not scene.has_segmentation() or scene.n_cams < 2:
+        return
+    hulls = [moving_box(scene, step) for step in _spread(scene.n_steps, HULL_STEPS)]
+    compared = [box for box, n_cams in hulls if n_cams > 1]
+    if compared and all(box is None for box in compared):
+        problems.add(
+            f"{scene.recording.source}: the bodies that move in the masks of the cameras are at no common place in "
+            "space: a pose, an intrinsic or the order of the cameras is wrong, or the bounds are (see the picture)"
+        )
+
+
+def moving_box(scene: Scene, step: int) -> tuple[np.ndarray | None, int]:
+    """Box [2, 3] around the points that all cameras that see them see on a moving body, and how many cameras see one.
+
+    None where there is no such point. Points are tried on a grid in the scene's bounds, those that most cameras see,
+    then on a finer one around those that were found; masks are widened by half a cell.
+    """
+    labels = scene.segmentation(range(scene.n_cams), [step])[0].numpy()
+    seeing = np.flatnonzero((labels == MOVING).any((1, 2)))
+    coarse = _common_place(scene, step, labels, seeing, scene.bounds) if len(seeing) else None
+    fine = None if coarse is None else _common_place(scene, step, labels, seeing, coarse)
+    return (coarse if fine is None else fine), len(seeing)
+
+
+def _common_place(
+    scene: Scene, step: int, labels: np.ndarray, seeing: np.ndarray, box: np.ndarray
+) -> np.ndarray | None:
+    """Box around the grid points in ``box`` that lie on a moving body for the cameras ``seeing``."""
+    import cv2
+
+    recording = scene.recording
+    viewmats, Ks = (values[step if len(values) > 1 else 0] for values in (recording.viewmats, recording.Ks))
+    cell = (box[1] - box[0]) / (HULL_GRID - 1)
+    points = box[0] + np.stack(np.meshgrid(*[np.arange(HULL_GRID)] * 3, indexing="ij"), -1).reshape(-1, 3) * cell
+    inside, seen_by = np.ones(len(points), bool), np.zeros(len(points), int)
+    for cam in seeing:
+        pixels, depth = project(points, viewmats[cam], Ks[cam])
+        width, height = recording.sizes[cam]
+        place = np.floor(pixels.clip(-1, MAX_COORDINATE)).astype(int)
+        seen = (depth > 0) & (place >= 0).all(1) & (place < [width, height]).all(1)
+        if not seen.any():
+            continue
+        radius = int(np.ceil(Ks[cam, 0, 0] * np.linalg.norm(cell) / 2 / np.median(depth[seen])))
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        mask = cv2.dilate((labels[cam] == MOVING).astype(np.uint8), disc) > 0
+        inside[seen] &= mask[place[seen, 1], place[seen, 0]]
+        seen_by += seen
+    body = points[inside & (seen_by >= max(1, 0.75 * len(seeing)))]
+    return np.stack([body.min(0) - cell / 2, body.max(0) + cell / 2]) if len(body) else None
+
+
+def describe(scene: Scene) -> str:
+    """One line on a scene."""
+    size = " x ".join(f"{side:.2g}" for side in scene.bounds[1] - scene.bounds[0])
+    sizes = sorted(set(scene.recording.sizes))
+    pixels = ", ".join(f"{width}x{height}" for width, height in sizes[:2]) + (", ..." if len(sizes) > 2 else "")
+    moves = ", moving" if len(scene.recording.viewmats) > 1 else ""
+    labels = "subtracted" if scene.recording.subtract_background else "yes" if scene.has_segmentation() else "none"
+    return (
+        f"{scene.name}: {scene.layout}, {scene.n_steps} steps at {scene.fps:g} a second, "
+        f"{scene.n_cams} cameras{moves}, "
+        f"{pixels} pixels, depth {scene.near:.2f} to {scene.far:.2f} m, bounds {size} m, masks: {labels}"
+    )
+
+
+def contact_sheet(scenes: Sequence[Scene]) -> np.ndarray:
+    """Frames of some cameras at some steps of some scenes, with what should lie in them drawn on top.
+
+    Returns uint8 [H, W, 3], blue first.
+    The blue box is the scene's bounds, the orange one the place where all cameras see a moving body; the arrows are the
+    world's x, y and z axes (red, green, blue) at the middle of the lower face of the bounds; magenta squares are the
+    other cameras; the yellow line is the outline of what is not background.
+    """
+    shown = [scenes[i] for i in _spread(len(scenes), MAX_SCENES)]
+    blocks = []
+    for scene in shown:
+        steps = _spread(scene.n_steps, 3 if len(shown) == 1 else 1 if len(shown) > 3 else 2)
+        cams = _spread(scene.n_cams, MAX_CAMERAS)
+        aspect = sum(width / height for width, height in (scene.recording.sizes[cam] for cam in cams))
+        tile_height = int(np.clip((SHEET - GAP * len(cams)) / aspect, *TILE))
+        blocks.append(_text(describe(scene)))
+        for step in steps:
+            body = _try(lambda: moving_box(scene, step)[0] if scene.has_segmentation() else None)
+            blocks.append(_row([_tile(scene, cam, step, tile_height, body) for cam in cams]))
+    legend = (
+        "blue box: bounds of the scene; orange box: where all cameras see what moves; red, green, blue: x, y, z of the "
+        "world; magenta: other cameras; yellow: masks"
+    )
+    blocks.append(_text(legend))
+    width = max(block.shape[1] for block in blocks)
+    return np.concatenate([_widened(block, width) for block in blocks])
+
+
+def _try(compute):
+    try:
+        return compute()
+    except InputError:
+        return None
+
+
+def _spread(n: int, most: int) -> list[int]:
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)).tolist()
+
+
+def _tile(scene: Scene, cam: int, step: int, tile_height: int, body: np.ndarray | None) -> np.ndarray:
+    import cv2
+
+    width, height = scene.recording.sizes[cam]
+    zoom = tile_height / height
+    size = max(1, round(width * zoom)), tile_height
+    film = _try(lambda: scene.film([cam], [step])[0, 0, :, :height, :width].permute(1, 2, 0).numpy()[..., ::-1])
+    if film is None:
+        tile = np.full((size[1], size[0], 3), MISSING, np.uint8)
+        _write(tile, "unreadable", (8, tile_height // 2), INK)
+    else:
+        tile = cv2.resize(film, size, interpolation=cv2.INTER_AREA if zoom < 1 else cv2.INTER_NEAREST)
+    labels = _try(lambda: scene.segmentation([cam], [step])[0, 0, :height, :width].numpy())
+    if labels is not None:
+        mask = cv2.resize((labels > 0).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        outlines, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(tile, outlines, -1, MASK, 1)
+    _draw_scene(tile, scene, cam, step, zoom, body)
+    label = f"{scene.camera_names[cam][-24:]}, frame {step}"
+    (label_width, _), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, TEXT, 1)
+    tile[:17, : label_width + 8] = INK
+    _write(tile, label, (4, 13), PAPER)
+    return tile
+
+
+def _draw_scene(tile: np.ndarray, scene: Scene, cam: int, step: int, zoom: float, body: np.ndarray | None) -> None:
+    import cv2
+
+    recording = scene.recording
+    at = step if len(recording.viewmats) > 1 else 0
+    viewmat = recording.viewmats[at, cam]
+    K = np.diag([zoom, zoom, 1.0]) @ recording.Ks[step if len(recording.Ks) > 1 else 0, cam]
+
+    def line(start: np.ndarray, end: np.ndarray, color: tuple, thickness: int) -> np.ndarray | None:
+        """Draws the part in front of the camera; returns where it ends."""
+        pixels, depth = project(start + np.linspace(0, 1, EDGE_POINTS)[:, None] * (end - start), viewmat, K)
+        pixels = pixels.clip(-MAX_COORDINATE, MAX_COORDINATE).round().astype(int)
+        for i in np.flatnonzero((depth[:-1] > 1e-3) & (depth[1:] > 1e-3)):
+            cv2.line(tile, pixels[i].tolist(), pixels[i + 1].tolist(), color, thickness, cv2.LINE_AA)
+        return pixels[-1] if depth[-1] > 1e-3 else None
+
+    low, high = scene.bounds
+    for box, color in ((scene.bounds, BOX), (body, BODY)):
+        if box is not None:
+            corners = np.array([[box[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
+            for a, b in EDGES:
+                line(corners[a], corners[b], color, 1)
+    foot = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
+    for axis, (name, color) in enumerate(AXES.items()):
+        end = line(foot, foot + np.eye(3)[axis] * 0.3 * (high - low).min(), color, 2)
+        if end is not None:
+            _write(tile, name, (end + 2).tolist(), color)
+    centres, _ = positions_and_axes(recording.viewmats[at])
+    pixels, depth = project(centres, viewmat, K)
+    for other in np.flatnonzero(depth > 1e-3):
+        x, y = pixels[other].clip(-MAX_COORDINATE, MAX_COORDINATE).round().astype(int).tolist()
+        if other != cam and 0 <= x < tile.shape[1] and 0 <= y < tile.shape[0]:
+            cv2.rectangle(tile, (x - 3, y - 3), (x + 3, y + 3), CAMERA, 1)
+            _write(tile, scene.camera_names[other][-12:], (x + 5, y + 4), CAMERA)
+
+
+def _write(image: np.ndarray, text: str, place: Sequence[int], color: tuple) -> None:
+    import cv2
+
+    cv2.putText(image, text, tuple(place), cv2.FONT_HERSHEY_SIMPLEX, TEXT, color, 1, cv2.LINE_AA)
+
+
+def _row(tiles: list[np.ndarray]) -> np.ndarray:
+    gap = np.full((len(tiles[0]), GAP, 3), PAPER, np.uint8)
+    row = np.concatenate([part for tile in tiles for part in (gap, tile)][1:], 1)
+    return np.concatenate([row, np.full((GAP, row.shape[1], 3), PAPER, np.uint8)])
+
+
+def _text(text: str) -> np.ndarray:
+    import cv2
+
+    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT, 1)
+    line = np.full((LINE, width + 8, 3), PAPER, np.uint8)
+    _write(line, text, (4, LINE - 7), INK)
+    return line
+
+
+def _widened(block: np.ndarray, width: int) -> np.ndarray:
+    rest = np.full((block.shape[0], width - block.shape[1], 3), PAPER, np.uint8)
+    return np.concatenate([block, rest], 1)

@@ -1,0 +1,112 @@
+"""Films as a model expects them: of another size, with other depth bounds, in other units."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from gsim3d.data.recording import BACKGROUND, FIXED, MOVING, ReadImages, Recording
+from gsim3d.errors import InputError
+
+MIN_EXTENT = 1e-3  # metres; cameras nearer to the origin than this have no length to divide by
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """What is done to every scene; the defaults change nothing.
+
+    size: (width, height) pixels: images are scaled until they cover it, smoothly, and cropped around their centre.
+    near_far: metres, the depth range of all scenes (in the new unit).
+    unit_cameras: lengths are divided by the largest coordinate of a scene's cameras at its first step.
+    """
+
+    size: tuple[int, int] | None = None
+    near_far: tuple[float, float] | None = None
+    unit_cameras: bool = False
+
+
+def fit(recording: Recording, fitting: Fitting) -> Recording:
+    """``recording`` as ``fitting`` wants it. Raises InputError where images are smaller than the wanted size."""
+    if fitting.unit_cameras:
+        recording = _in_units_of_cameras(recording)
+    if fitting.size is not None and any(size != fitting.size for size in recording.sizes):
+        recording = _of_size(recording, fitting.size)
+    if fitting.near_far is not None:
+        near, far = fitting.near_far
+        recording = dataclasses.replace(recording, near=near, far=far)
+    return recording
+
+
+def _in_units_of_cameras(recording: Recording) -> Recording:
+    first = recording.viewmats[0]
+    centers = -np.einsum("vji,vj->vi", first[:, :3, :3], first[:, :3, 3])
+    extent = float(np.abs(centers).max())
+    if extent < MIN_EXTENT:
+        return recording
+    viewmats = recording.viewmats.copy()
+    viewmats[..., :3, 3] /= extent
+    lengths = {
+        name: value / extent
+        for name in ("near", "far", "origin", "bounds")
+        if (value := getattr(recording, name)) is not None
+    }
+    return dataclasses.replace(recording, viewmats=viewmats, **lengths)
+
+
+def _of_size(recording: Recording, size: tuple[int, int]) -> Recording:
+    width, height = size
+    scaled, corners, Ks = [], [], recording.Ks.copy()
+    for cam, (w, h) in enumerate(recording.sizes):
+        if w < width or h < height:
+            raise InputError(
+                f"{recording.source}: camera {recording.camera_names[cam]} has images of {w}x{h} pixels; the model "
+                f"needs at least {width}x{height}"
+            )
+        share = max(width / w, height / h)
+        large = round(w * share), round(h * share)
+        corner = (large[0] - width) // 2, (large[1] - height) // 2
+        for axis in (0, 1):
+            Ks[:, cam, axis] *= large[axis] / (w, h)[axis]
+            Ks[:, cam, axis, 2] -= corner[axis]
+        scaled.append(large)
+        corners.append(corner)
+
+    def changed(read: ReadImages, scale: Callable[[np.ndarray, tuple[int, int]], np.ndarray]) -> ReadImages:
+        def read_images(cam, steps, problems):
+            left, top = corners[cam]
+            for image in read(cam, steps, problems):
+                if image is not None:
+                    image = scale(image, scaled[cam])[top : top + height, left : left + width]
+                yield image
+
+        return read_images
+
+    return dataclasses.replace(
+        recording,
+        Ks=Ks,
+        sizes=(size,) * len(recording.sizes),
+        read_images=changed(recording.read_images, _scale_colors),
+        read_labels=None if recording.read_labels is None else changed(recording.read_labels, _scale_labels),
+    )
+
+
+def _smooth(maps: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    return F.interpolate(maps[None], size[::-1], mode="bilinear", antialias=True)[0]
+
+
+def _scale_colors(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """uint8 [h, w, 3] -> [h', w', 3]: bilinear, wide enough not to skip pixels."""
+    scaled = _smooth(torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1).float(), size)
+    return scaled.round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).numpy()
+
+
+def _scale_labels(labels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """uint8 [h, w] -> [h', w']: a pixel moves where any part of it does, and is background where all of it is."""
+    parts = torch.from_numpy(np.stack([labels != BACKGROUND, labels == MOVING])).float()
+    shown, moving = _smooth(parts, size) > 0
+    return torch.where(moving, MOVING, torch.where(shown, FIXED, BACKGROUND)).to(torch.uint8).numpy()
