@@ -94,6 +94,13 @@ def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: Eff
     }
 
 
+def check_device(device: str) -> None:
+    """Raises InputError where nothing can be computed on ``device``, "cpu" or "cuda"."""
+    if device == "cuda" and not (cuda_compiled() and torch.cuda.is_available()):
+        reason = "torch finds no GPU" if cuda_compiled() else "gsim3d was built without CUDA"
+        raise InputError(f"--device cuda: {reason} (see gsim3d doctor)")
+
+
 def restore(path: str | Path, device: str = "cpu") -> Restored:
     """The simulator of a checkpoint (run folder, checkpoint folder or single file), ready to predict on ``device``.
 
@@ -101,9 +108,7 @@ def restore(path: str | Path, device: str = "cpu") -> Restored:
         InputError: the checkpoint is broken or does not fit this version, or ``device`` is "cuda" where gsim3d was built
             without CUDA or torch finds no GPU; the message says which.
     """
-    if device == "cuda" and not (cuda_compiled() and torch.cuda.is_available()):
-        reason = "torch finds no GPU" if cuda_compiled() else "gsim3d was built without CUDA"
-        raise InputError(f"--device cuda: {reason} (see gsim3d doctor)")
+    check_device(device)
     saved = checkpoint.load(path)
     data = dict(saved.config["data"])
     image_size = tuple(data.pop("image_size", ()))
