@@ -7,7 +7,8 @@ using namespace plane_sweep_math;
 
 constexpr int kMaxWarps = 8;
 constexpr int kGroup = 8;                           // lanes that share a dot product
-constexpr int kOwned = 8;                           // source pixels whose gradients one warp holds
+constexpr int kPiece = 8, kOwned = 2 * kPiece;     // source pixels whose gradients a warp holds
+constexpr int kParts = 4, kTasks = kMaxWarps / kParts;  // warps that share them, and such groups of a block
 constexpr int64_t kListBytes = int64_t{512} << 20;  // lines kept at once in the backward pass; more run in pieces
 
 // kVectors elements of a feature, one load.
@@ -489,61 +490,81 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
   }
 }
 
-// The group of kOwned neighbouring source pixels of a task: the warps of a block take a square where rows hold whole
-// groups, for the sake of the first-level cache. -1: none.
-__device__ __forceinline__ int32_t group_of(int32_t task, const LineSizes& s) {
-  int32_t group = task;
-  if (s.width % kOwned == 0) {
-    const int32_t columns = s.width / kOwned, band = task / (columns * kMaxWarps), rest = task % (columns * kMaxWarps);
-    group = (band * kMaxWarps + rest % kMaxWarps) * columns + rest / kMaxWarps;
+// The source pixels of a task: two pieces of kPiece neighbours, one above the other where rows hold whole pieces. A piece
+// lies inside a word. -1: none.
+struct Pieces {
+  int32_t at[2];
+
+  __device__ __forceinline__ Pieces(int32_t task, const LineSizes& s) {
+    const int32_t n = (s.n_pixels + kPiece - 1) / kPiece, columns = s.width / kPiece;
+    const bool whole = s.width % kPiece == 0;
+    at[0] = whole ? task / columns * 2 * columns + task % columns : 2 * task;
+    at[1] = at[0] + (whole ? columns : 1);
+    if (at[1] >= n) at[1] = -1;
   }
-  return group * int64_t{kOwned} < s.n_pixels ? group : -1;
-}
+};
 
 int64_t n_tasks(const LineSizes& s) {
-  if (s.width % kOwned != 0) return (s.n_pixels + kOwned - 1) / kOwned;
-  return static_cast<int64_t>((s.height + kMaxWarps - 1) / kMaxWarps) * kMaxWarps * (s.width / kOwned);
+  if (s.width % kPiece == 0) return static_cast<int64_t>((s.height + 1) / 2) * (s.width / kPiece);
+  return ((s.n_pixels + kPiece - 1) / kPiece + 1) / 2;
 }
 
-// One warp owns 32 kVectors channels of kOwned pixels as sources and adds what every kept line gives them, by pairs,
-// then by pixels.
+// The image that owns a pair: the last whose pairs begin at or before it; -1 where the offsets say none.
+template <typename T>
+__device__ __forceinline__ int64_t owner_of(const PlaneSweep<T>& sweep, int64_t pair) {
+  int64_t image = 0, past = sweep.n_images;
+  while (past - image > 1) {
+    const int64_t middle = (image + past) / 2;
+    (sweep.cu_src[middle] <= pair ? image : past) = middle;
+  }
+  const Range owned = range_of(sweep.cu_src, image, sweep.n_pairs);
+  return pair >= owned.begin && pair < owned.end ? image : -1;
+}
+
+template <typename T, int kVectors>
+constexpr int64_t source_bytes() {
+  return int64_t{kTasks} * kOwned * kWarp * kVectors * sizeof(T);
+}
+
+// kParts warps own 32 kVectors channels of kOwned pixels as sources and add what every kept line gives them, by pairs, then
+// by pixels; each warp takes every kParts-th run of 32 pixels, and their sums are added in order.
 template <typename T, int kVectors>
 __global__ void __launch_bounds__(kMaxWarps* kWarp)
     source_kernel(Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s, Lines<T> lines, int64_t tasks_per_image,
                   Pixels<T> grad_pixels) {
   using Own = Pack<T, kVectors>;
-  const int lane = threadIdx.x % kWarp;
-  const int64_t at = (int64_t{blockIdx.x} * blockDim.x + threadIdx.x) / kWarp;
-  if (at >= sweep.n_images * tasks_per_image) return;
-  const int64_t source = at / tasks_per_image;
-  const int32_t group = group_of(static_cast<int32_t>(at % tasks_per_image), s);
-  if (group < 0) return;
-  const int32_t word = group * kOwned / 32, shift = group * kOwned % 32;
+  extern __shared__ __align__(16) char shared[];
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp, part = warp % kParts;
+  const int64_t at = int64_t{blockIdx.x} * kTasks + warp / kParts;
+  const bool works = at < sweep.n_images * tasks_per_image;
+  const int64_t source = works ? at / tasks_per_image : -1;
+  const Pieces pieces(works ? static_cast<int32_t>(at % tasks_per_image) : 0, s);
   const int32_t channel = (blockIdx.y * kWarp + lane) * kVectors;
 
   Own sums[kOwned] = {};
   for (int64_t pair = lines.first_pair; pair < lines.first_pair + lines.n_pairs; ++pair) {
     if (sweep.src_images[pair] != source) continue;
-    int64_t image = 0, past = sweep.n_images;  // the last image whose pairs begin at or before this one
-    while (past - image > 1) {
-      const int64_t middle = (image + past) / 2;
-      (sweep.cu_src[middle] <= pair ? image : past) = middle;
-    }
-    const Range owned = range_of(sweep.cu_src, image, sweep.n_pairs);
-    if (pair < owned.begin || pair >= owned.end) continue;
-    for (int32_t first = 0; first < lines.n_pixels; first += kWarp) {
+    const int64_t image = works ? owner_of(sweep, pair) : -1;
+    if (image < 0) continue;
+    for (int32_t first = part * kWarp; first < lines.n_pixels; first += kParts * kWarp) {
       const int32_t pixel = lines.first_pixel + first + lane;
       unsigned bits = 0;
       T weights[kOwned] = {};
-      if (first + lane < lines.n_pixels && *lines.words_of(s, pair, pixel, word / 32) >> word % 32 & 1) {
+      if (first + lane < lines.n_pixels) {
         const int64_t slot = lines.slot(pair, pixel);
-        const uint32_t all = lines.bits[slot * s.n_words + word];
-        bits = all >> shift & ((1u << kOwned) - 1);
-        if (bits) {
+#pragma unroll
+        for (int half = 0; half < 2; ++half) {
+          if (pieces.at[half] < 0) continue;
+          const int32_t word = pieces.at[half] * kPiece / 32, shift = pieces.at[half] * kPiece % 32;
+          if (!(*lines.words_of(s, pair, pixel, word / 32) >> word % 32 & 1)) continue;
+          const uint32_t all = lines.bits[slot * s.n_words + word];
+          const unsigned own = all >> shift & ((1u << kPiece) - 1);
+          if (!own) continue;
+          bits |= own << half * kPiece;
           int32_t rank = lines.before[slot * s.n_words + word] + __popc(all & ((1u << shift) - 1));
 #pragma unroll
-          for (int q = 0; q < kOwned; ++q)
-            if (bits >> q & 1 && rank < s.capacity) weights[q] = lines.weights[slot * s.capacity + rank++];
+          for (int q = 0; q < kPiece; ++q)
+            if (own >> q & 1 && rank < s.capacity) weights[half * kPiece + q] = lines.weights[slot * s.capacity + rank++];
         }
       }
       const T* from = pixels.at(s, image, lines.first_pixel + first) + channel;
@@ -569,14 +590,29 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
       }
     }
   }
+
+  Own* total = reinterpret_cast<Own*>(shared) + warp / kParts * kOwned * kWarp + lane;
+  for (int turn = 0; turn < kParts; ++turn) {
+    if (turn == part) {
 #pragma unroll
-  for (int q = 0; q < kOwned; ++q) {
-    if (group * kOwned + q >= s.n_pixels) break;
-    Own* to = reinterpret_cast<Own*>(grad_pixels.at(s, source, group * kOwned + q) + channel);
-    Own total = *to;
+      for (int q = 0; q < kOwned; ++q) {
+        Own sum = turn > 0 ? total[q * kWarp] : Own{};
 #pragma unroll
-    for (int v = 0; v < kVectors; ++v) total.v[v] += sums[q].v[v];
-    *to = total;
+        for (int v = 0; v < kVectors; ++v) sum.v[v] += sums[q].v[v];
+        total[q * kWarp] = sum;
+      }
+    }
+    __syncthreads();
+  }
+  if (!works) return;
+  for (int q = part; q < kOwned; q += kParts) {
+    const int32_t piece = pieces.at[q / kPiece], pixel = piece * kPiece + q % kPiece;
+    if (piece < 0 || pixel >= s.n_pixels) continue;
+    Own* to = reinterpret_cast<Own*>(grad_pixels.at(s, source, pixel) + channel);
+    Own sum = *to;
+#pragma unroll
+    for (int v = 0; v < kVectors; ++v) sum.v[v] += total[q * kWarp].v[v];
+    *to = sum;
   }
 }
 
@@ -680,8 +716,8 @@ void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& swee
                dim3(blocks_for(op, sweep.n_images * quads, kMaxWarps), blocks_of_channels), kMaxWarps * kWarp,
                kMaxWarps * gather_bytes<T>(), stream, pixels, sweep, s, lines, quads, !whole, grad_pixels);
         launch(op, source_kernel<T, kVectors>,
-               dim3(blocks_for(op, sweep.n_images * tasks, kMaxWarps), blocks_of_channels), kMaxWarps * kWarp, 0,
-               stream, pixels, sweep, s, lines, tasks, grad_pixels);
+               dim3(blocks_for(op, sweep.n_images * tasks, kTasks), blocks_of_channels), kMaxWarps * kWarp,
+               source_bytes<T, kVectors>(), stream, pixels, sweep, s, lines, tasks, grad_pixels);
       }
     }
     launch(op, to_planes_kernel<T>, transpose_grid(op, sweep.n_images, s.n_pixels, pixels.stride), dim3(32, 8), 0,
