@@ -6,7 +6,7 @@ namespace {
 using namespace plane_sweep_math;
 
 constexpr int kMaxWarps = 8;
-constexpr int kGroup = 8;                           // lanes that share a dot product
+constexpr int kGroup = 16;                          // lanes that share a dot product
 constexpr int kPiece = 8, kOwned = 2 * kPiece;     // source pixels whose gradients a warp holds
 constexpr int kParts = 4, kTasks = kMaxWarps / kParts;  // warps that share them, and such groups of a block
 constexpr int64_t kListBytes = int64_t{512} << 20;  // lines kept at once in the backward pass; more run in pieces
@@ -102,14 +102,14 @@ template <typename T>
 struct QuadMemory {
   uint8_t* touched;  // [n_words, 32]
   int32_t* list;     // [kRows]
-  T* scores;         // [kRows, kQuad]
+  T* scores;         // [kRows + 1, kQuad], the last 0
   uint32_t* bits;    // [n_words]
   uint16_t* before;  // [n_words]
 };
 
 template <typename T>
 GSIM3D_HD int64_t quad_bytes(const LineSizes& s) {
-  const int64_t flags = s.n_words * 32, rows = kRows * (sizeof(int32_t) + kQuad * sizeof(T));
+  const int64_t flags = s.n_words * 32, rows = kRows * sizeof(int32_t) + (kRows + 1) * kQuad * sizeof(T);
   return (flags > rows ? flags : rows) + aligned_bytes(s.n_words * sizeof(uint32_t)) +
          aligned_bytes(s.n_words * sizeof(uint16_t));
 }
@@ -119,7 +119,7 @@ __device__ __forceinline__ QuadMemory<T> carve_quad(char* at, const LineSizes& s
   QuadMemory<T> memory;
   char* end = at + quad_bytes<T>(s);
   memory.touched = reinterpret_cast<uint8_t*>(at);
-  memory.scores = carve<T>(at, kRows * kQuad);
+  memory.scores = carve<T>(at, (kRows + 1) * kQuad);
   memory.list = carve<int32_t>(at, kRows);
   at = end - aligned_bytes(s.n_words * sizeof(uint32_t)) - aligned_bytes(s.n_words * sizeof(uint16_t));
   memory.bits = carve<uint32_t>(at, s.n_words);
@@ -155,39 +155,57 @@ __device__ __forceinline__ int32_t mark(const Sample<T> (&samples)[kQuad], const
   return count;
 }
 
+// What a lane holds of 32 kVectors channels that kGroup lanes share.
+template <typename T, int kVectors>
+struct Share {
+  static constexpr int kWidth = kVectors == 1 ? 2 : 4, kPacks = 2 * kVectors / kWidth;
+  Pack<T, kWidth> packs[kPacks];
+
+  __device__ __forceinline__ void load(const T* __restrict__ from) {
+#pragma unroll
+    for (int e = 0; e < kPacks; ++e)
+      packs[e] = reinterpret_cast<const Pack<T, kWidth>*>(from)[threadIdx.x % kGroup + e * kGroup];
+  }
+};
+
 // scores[r, j] (+)= <own pixel j, source pixel list[r]> over 32 kVectors channels, which start at `source`.
 template <typename T, int kVectors>
-__device__ __forceinline__ void add_dots(const Pack<T, 4> (&own)[kQuad][kVectors], const T* __restrict__ source,
+__device__ __forceinline__ void add_dots(const Share<T, kVectors> (&own)[kQuad], const T* __restrict__ source,
                                          int32_t stride, const int32_t* list, int32_t count, bool first, T* scores) {
-  using Four = Pack<T, 4>;
+  using Part = Share<T, kVectors>;
   constexpr int kGroups = kWarp / kGroup;
-  const int lane = threadIdx.x % kWarp, group = lane / kGroup, at = lane % kGroup;
-  const bool lower_half = at & 4, odd_pair = at & 2;
-  for (int32_t r0 = 0; r0 < count; r0 += kGroups) {
-    const int32_t r = r0 + group;
-    const Four* from = reinterpret_cast<const Four*>(source + int64_t{list[min(r, count - 1)]} * stride) + at;
-    Four other[kVectors];
+  constexpr int kTogether = 4;  // source pixels of a group in flight
+  const int lane = threadIdx.x % kWarp, group = lane / kGroup;
+  const bool upper_half = lane & 8, odd_pair = lane & 4;
+  for (int32_t r0 = 0; r0 < count; r0 += kTogether * kGroups) {
+    Part other[kTogether];
 #pragma unroll
-    for (int v = 0; v < kVectors; ++v) other[v] = from[v * kGroup];
-    T sums[kQuad];
+    for (int t = 0; t < kTogether; ++t)
+      other[t].load(source + int64_t{list[min(r0 + t * kGroups + group, count - 1)]} * stride);
 #pragma unroll
-    for (int j = 0; j < kQuad; ++j) {
-      sums[j] = 0;
+    for (int t = 0; t < kTogether; ++t) {
+      T sums[kQuad];
 #pragma unroll
-      for (int v = 0; v < kVectors; ++v)
+      for (int j = 0; j < kQuad; ++j) {
+        sums[j] = 0;
 #pragma unroll
-        for (int e = 0; e < 4; ++e) sums[j] += own[j][v].v[e] * other[v].v[e];
-    }
-    // Lanes exchange halves of what they hold, so that each pair of lanes ends with one pixel's sum.
-    T a = lower_half ? sums[2] : sums[0], b = lower_half ? sums[3] : sums[1];
-    a += __shfl_xor_sync(kFullWarp, lower_half ? sums[0] : sums[2], 4);
-    b += __shfl_xor_sync(kFullWarp, lower_half ? sums[1] : sums[3], 4);
-    T sum = odd_pair ? b : a;
-    sum += __shfl_xor_sync(kFullWarp, odd_pair ? a : b, 2);
-    sum += __shfl_xor_sync(kFullWarp, sum, 1);
-    if (at % 2 == 0 && r < count) {
-      T& score = scores[r * kQuad + at / 2];
-      score = first ? sum : score + sum;
+        for (int e = 0; e < Part::kPacks; ++e)
+#pragma unroll
+          for (int c = 0; c < Part::kWidth; ++c) sums[j] += own[j].packs[e].v[c] * other[t].packs[e].v[c];
+      }
+      // Lanes exchange halves of what they hold, so that every four lanes end with one pixel's sum.
+      T a = upper_half ? sums[2] : sums[0], b = upper_half ? sums[3] : sums[1];
+      a += __shfl_xor_sync(kFullWarp, upper_half ? sums[0] : sums[2], 8);
+      b += __shfl_xor_sync(kFullWarp, upper_half ? sums[1] : sums[3], 8);
+      T sum = odd_pair ? b : a;
+      sum += __shfl_xor_sync(kFullWarp, odd_pair ? a : b, 4);
+      sum += __shfl_xor_sync(kFullWarp, sum, 2);
+      sum += __shfl_xor_sync(kFullWarp, sum, 1);
+      const int32_t r = r0 + t * kGroups + group;
+      if (lane % 4 == 0 && r < count) {
+        T& score = scores[r * kQuad + lane % kGroup / 4];
+        score = first ? sum : score + sum;
+      }
     }
   }
 }
@@ -195,7 +213,6 @@ __device__ __forceinline__ void add_dots(const Pack<T, 4> (&own)[kQuad][kVectors
 template <typename T, int kVectors>
 __global__ void __launch_bounds__(kMaxWarps* kWarp, 2)
     forward_kernel(Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s, int64_t quads, T* __restrict__ cost) {
-  using Four = Pack<T, 4>;
   extern __shared__ __align__(16) char shared[];
   const int lane = threadIdx.x % kWarp;
   const int64_t task = (int64_t{blockIdx.x} * blockDim.x + threadIdx.x) / kWarp;
@@ -204,7 +221,7 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, 2)
   const Quad quad(static_cast<int32_t>(task % quads), s);
   const QuadMemory<T> memory = carve_quad<T>(shared + threadIdx.x / kWarp * quad_bytes<T>(s), s);
 
-  Four own[kQuad][kVectors];
+  Share<T, kVectors> own[kQuad];
   int32_t held = -1;  // the block of channels in `own`
   const Range pairs = range_of(sweep.cu_src, image, sweep.n_pairs);
   const T scale = pairs.begin < pairs.end ? cost_scale<T>(pairs, sweep.channels) : T(0);
@@ -227,25 +244,25 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, 2)
       const int32_t count = mark(samples, s, memory);
       for (int32_t first = 0; first < count; first += kRows) {
         const int32_t rows = min(count - first, kRows);
-        const auto place = [&](int32_t q) {
-          const int32_t rank = memory.before[q >> 5] + __popc(memory.bits[q >> 5] & ((1u << (q & 31)) - 1));
-          return rank - first;
-        };
+        // Places in the list, 16 bits each; the last is that of a score that is 0.
+        uint2 places[kQuad];
 #pragma unroll
-        for (int j = 0; j < kQuad; ++j)
-          for_corners(samples[j], s, [&](int, int32_t q) {
-            const int32_t at = place(q);
-            if (at >= 0 && at < rows) memory.list[at] = q;
+        for (int j = 0; j < kQuad; ++j) {
+          uint32_t own_places[4] = {kRows, kRows, kRows, kRows};
+          for_corners(samples[j], s, [&](int side, int32_t q) {
+            const int32_t rank = memory.before[q >> 5] + __popc(memory.bits[q >> 5] & ((1u << (q & 31)) - 1)) - first;
+            if (rank < 0 || rank >= rows) return;
+            memory.list[rank] = q;
+            own_places[side] = rank;
           });
+          places[j] = make_uint2(own_places[0] | own_places[1] << 16, own_places[2] | own_places[3] << 16);
+        }
+        if (lane < kQuad) memory.scores[kRows * kQuad + lane] = 0;
         __syncwarp();
         for (int32_t c = 0; c < pixels.stride; c += kWarp * kVectors) {
           if (held != c) {
 #pragma unroll
-            for (int j = 0; j < kQuad; ++j) {
-              const Four* from = reinterpret_cast<const Four*>(pixels.at(s, image, quad.pixel(quad.holds(j) ? j : 0)) + c);
-#pragma unroll
-              for (int e = 0; e < kVectors; ++e) own[j][e] = from[lane % kGroup + e * kGroup];
-            }
+            for (int j = 0; j < kQuad; ++j) own[j].load(pixels.at(s, image, quad.pixel(quad.holds(j) ? j : 0)) + c);
             held = c;
           }
           add_dots<T, kVectors>(own, pixels.at(s, source, 0) + c, pixels.stride, memory.list, rows, c == 0,
@@ -254,12 +271,10 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, 2)
         __syncwarp();
 #pragma unroll
         for (int j = 0; j < kQuad; ++j) {
-          T corners[4] = {0, 0, 0, 0};
-          for_corners(samples[j], s, [&](int side, int32_t q) {
-            const int32_t at = place(q);
-            if (at >= 0 && at < rows) corners[side] = memory.scores[at * kQuad + j];
-          });
-          costs[j] += interpolate(corners[0], corners[1], corners[2], corners[3], samples[j].fx, samples[j].fy);
+          const T* scores = memory.scores + j;
+          const T top_left = scores[(places[j].x & 0xffff) * kQuad], top_right = scores[(places[j].x >> 16) * kQuad];
+          const T bottom_left = scores[(places[j].y & 0xffff) * kQuad], bottom_right = scores[(places[j].y >> 16) * kQuad];
+          costs[j] += interpolate(top_left, top_right, bottom_left, bottom_right, samples[j].fx, samples[j].fy);
         }
         __syncwarp();
       }
