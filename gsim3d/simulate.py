@@ -48,12 +48,12 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--out: the folder {out.absolute().parent} does not exist")
     restored = restore(args.checkpoint, args.device)
     scene = restored.open_scene(args.scene)
-    context, target = default_views(restored, scene)
+    context, target = default_views(restored, scene, args.context)
     cams = args.cameras or list(target[:4])
     n_future = args.steps if args.steps is not None else max(1, scene.n_steps - args.start - restored.data.history)
-    if bad := [cam for cam in (*cams, *(args.context or ())) if not 0 <= cam < scene.n_cams]:
+    if bad := [cam for cam in (*cams, *context) if not 0 <= cam < scene.n_cams]:
         raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
-    prediction = predict(restored, scene, args.context or context, n_future, args.start)
+    prediction = predict(restored, scene, context, n_future, args.start)
     images = as_bytes(render_steps(restored, prediction.particles, scene, cams, args.start))
     part = out.with_name(f".{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)

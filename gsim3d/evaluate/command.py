@@ -113,11 +113,13 @@ def run(args: argparse.Namespace) -> int:
     scenes = _scenes(args, restored)
     views, n_future = [], args.steps
     for scene in scenes:
-        context, targets = (None, None) if restored is None else default_views(restored, scene)
-        targets = args.cameras or targets or others[0].cameras(scenes[0])
-        if bad := [cam for cam in (*targets, *(args.context or ())) if not 0 <= cam < scene.n_cams]:
+        if restored is None:
+            context, targets = None, args.cameras or others[0].cameras(scenes[0])
+        else:
+            context, targets = default_views(restored, scene, args.context, args.cameras)
+        if bad := [cam for cam in (*targets, *(context or ())) if not 0 <= cam < scene.n_cams]:
             raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
-        views.append((args.context or context, targets))
+        views.append((context, targets))
         n_future = min(horizon(scene, n_encoded, args.steps), n_future or scene.n_steps)
     for scene, (_, targets) in zip(scenes, views):
         for other in others:

@@ -50,16 +50,25 @@ class Prediction:
         return self.particles.n_clouds
 
 
-def default_views(restored: Restored, scene: Scene) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """(context, target) cameras: inputs spread evenly; targets those kept from training's inputs, else all the rest."""
-    cameras = context_cameras(scene, restored.data)
-    if len(cameras) < restored.data.context_views:
-        raise InputError(
-            f"{scene.path}: {len(cameras)} usable cameras; training had {restored.data.context_views} views"
-        )
-    context = spread_views(cameras, restored.data.context_views, 0)
-    target = restored.data.target_only_cameras or tuple(c for c in range(scene.n_cams) if c not in context)
-    return context, target or context
+def default_views(
+    restored: Restored, scene: Scene, context: Sequence[int] | None = None, target: Sequence[int] | None = None
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """(context, target) cameras: those named, and for what is not named
+
+    inputs spread evenly, none of them a named target; targets those kept from training's inputs, else all the rest.
+    """
+    if not context:
+        cameras = [cam for cam in context_cameras(scene, restored.data) if cam not in (target or ())]
+        if len(cameras) < restored.data.context_views:
+            raise InputError(
+                f"{scene.path}: {len(cameras)} cameras left as inputs; training had {restored.data.context_views} "
+                "views (--context names inputs)"
+            )
+        context = spread_views(cameras, restored.data.context_views, 0)
+    if not target:
+        rest = tuple(cam for cam in range(scene.n_cams) if cam not in context)
+        target = restored.data.target_only_cameras or rest or context
+    return tuple(context), tuple(target)
 
 
 @torch.no_grad()
@@ -118,13 +127,14 @@ def horizon(scene: Scene, n_encoded: int, n_future: int | None) -> int:
     """Steps that can be predicted and compared: ``n_future``, or all that the film has after ``n_encoded``.
 
     Raises:
-        InputError: the film is too short.
+        InputError: the film is too short, or the number below 1.
     """
+    if n_future is not None and n_future < 1:
+        raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
     known = scene.n_steps - n_encoded
-    n_future = known if n_future is None else n_future
-    if n_future > known or n_future < 1:
-        raise InputError(f"{scene.path}: {n_future} steps to compare, but only {max(0, known)} after the input")
-    return n_future
+    if known < (n_future or 1):
+        raise InputError(f"{scene.path}: {n_future or 1} steps to compare, but only {max(0, known)} after the input")
+    return n_future or known
 
 
 def score_scene(
@@ -149,8 +159,7 @@ def score_scene(
         others: predictions of other models.
     """
     if restored is not None:
-        defaults = default_views(restored, scene)
-        context_cams, target_cams = context_cams or defaults[0], target_cams or defaults[1]
+        context_cams, target_cams = default_views(restored, scene, context_cams, target_cams)
         n_encoded = restored.data.history
     n_future = horizon(scene, n_encoded, n_future)
     cams, steps = list(target_cams), range(n_encoded + n_future)

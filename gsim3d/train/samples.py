@@ -60,9 +60,11 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, stages: Sequence[Sta
 def context_cameras(scene: Scene, data: DataConfig) -> list[int]:
     """Cameras whose images may be an input, ascending."""
     allowed = data.context_cameras or range(scene.n_cams)
-    for cam in (*allowed, *data.target_only_cameras):
-        if not 0 <= cam < scene.n_cams:
-            raise InputError(f"{scene.path}: camera {cam} does not exist; the scene has {scene.n_cams}")
+    for name in ("context_cameras", "target_only_cameras"):
+        if bad := [cam for cam in getattr(data, name) or () if not 0 <= cam < scene.n_cams]:
+            raise InputError(
+                f"{scene.path}: camera {bad[0]} of data.{name} does not exist; the scene has {scene.n_cams}"
+            )
     return sorted(set(allowed) - set(data.target_only_cameras))
 
 

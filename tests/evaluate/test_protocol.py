@@ -60,6 +60,19 @@ def test_default_views(restored, scene):
     assert default_views(free, scene) == ((0, 2), (1, 3, 4))
 
 
+def test_views_that_are_named(restored, scene):
+    assert default_views(restored, scene, (1, 3)) == ((1, 3), (3,))
+    assert default_views(restored, scene, (1, 0), (4, 1)) == ((1, 0), (4, 1))
+    context, target = default_views(restored, scene, None, (0, 3))
+    assert target == (0, 3) and len(context) == 2 and not {0, 3} & set(context)
+    with pytest.raises(InputError, match="1 cameras left as inputs; training had 2 views"):
+        default_views(restored, scene, None, (0, 1, 2))
+    elsewhere = dataclasses.replace(restored, data=DataConfig(context_views=2, target_only_cameras=(7,)))
+    assert default_views(elsewhere, scene, (0, 1), (2,)) == ((0, 1), (2,))
+    with pytest.raises(InputError, match="camera 7 of data.target_only_cameras does not exist; the scene has 5"):
+        default_views(elsewhere, scene, None, (2,))
+
+
 def test_rollout_rows_keep_their_number_and_frozen_ones_their_place(restored, scene):
     prediction = predict(restored, scene, (0, 2), 3)
     assert prediction.n_steps == 5
