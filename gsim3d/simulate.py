@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", type=int, default=0, help="first input step (default: 0)")
     parser.add_argument("--cameras", type=int, nargs="+", metavar="CAM", help="cameras to show (default: up to 4 targets)")
     parser.add_argument("--context", type=int, nargs="+", metavar="CAM", help="input cameras (default: spread evenly)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -45,14 +46,14 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--out: {out} exists already; name another folder or remove it")
     if not out.absolute().parent.is_dir():
         raise InputError(f"--out: the folder {out.absolute().parent} does not exist")
-    restored = restore(args.checkpoint)
+    restored = restore(args.checkpoint, args.device)
     scene = restored.open_scene(args.scene)
-    context, target = default_views(restored, scene)
+    context, target = default_views(restored, scene, args.context)
     cams = args.cameras or list(target[:4])
     n_future = args.steps if args.steps is not None else max(1, scene.n_steps - args.start - restored.data.history)
-    if bad := [cam for cam in (*cams, *(args.context or ())) if not 0 <= cam < scene.n_cams]:
+    if bad := [cam for cam in (*cams, *context) if not 0 <= cam < scene.n_cams]:
         raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
-    prediction = predict(restored, scene, args.context or context, n_future, args.start)
+    prediction = predict(restored, scene, context, n_future, args.start)
     images = as_bytes(render_steps(restored, prediction.particles, scene, cams, args.start))
     part = out.with_name(f".{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)

@@ -77,6 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--metrics", nargs="+", metavar="METRIC", help="what to measure (default: all whose weights are installed)"
     )
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
     parser.add_argument(
         "--out",
         metavar="FILE",
@@ -103,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--given: without a CHECKPOINT, say how many steps the other models were given, at least 1")
     if args.checkpoint is not None and args.given is not None:
         raise InputError("--given: with a CHECKPOINT it is the model's own history; leave the option out")
-    restored = None if args.checkpoint is None else restore(args.checkpoint)
+    restored = None if args.checkpoint is None else restore(args.checkpoint, args.device)
     others = [Predictions.open(given, args.data) for given in args.predictions]
     if len({other.name for other in others}) != len(others):
         raise InputError("--predictions: two have the same name; write NAME=DIR")
@@ -112,11 +113,13 @@ def run(args: argparse.Namespace) -> int:
     scenes = _scenes(args, restored)
     views, n_future = [], args.steps
     for scene in scenes:
-        context, targets = (None, None) if restored is None else default_views(restored, scene)
-        targets = args.cameras or targets or others[0].cameras(scenes[0])
-        if bad := [cam for cam in (*targets, *(args.context or ())) if not 0 <= cam < scene.n_cams]:
+        if restored is None:
+            context, targets = None, args.cameras or others[0].cameras(scenes[0])
+        else:
+            context, targets = default_views(restored, scene, args.context, args.cameras)
+        if bad := [cam for cam in (*targets, *(context or ())) if not 0 <= cam < scene.n_cams]:
             raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
-        views.append((args.context or context, targets))
+        views.append((context, targets))
         n_future = min(horizon(scene, n_encoded, args.steps), n_future or scene.n_steps)
     for scene, (_, targets) in zip(scenes, views):
         for other in others:

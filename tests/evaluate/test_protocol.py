@@ -1,5 +1,6 @@
 """The protocol: what the baselines show, how scores are averaged, and that reports hold no NaN."""
 
+import copy
 import dataclasses
 import json
 import math
@@ -49,10 +50,27 @@ def restored():
     return Restored(simulator, data, (32, 32), simulator.plan(EffectsSpec()), Checkpoint({}, {}))
 
 
+def moved_to(device, restored):
+    return dataclasses.replace(restored, simulator=copy.deepcopy(restored.simulator).to(device))
+
+
 def test_default_views(restored, scene):
     assert default_views(restored, scene) == ((0, 2), (3,))
     free = dataclasses.replace(restored, data=DataConfig(context_views=2))
     assert default_views(free, scene) == ((0, 2), (1, 3, 4))
+
+
+def test_views_that_are_named(restored, scene):
+    assert default_views(restored, scene, (1, 3)) == ((1, 3), (3,))
+    assert default_views(restored, scene, (1, 0), (4, 1)) == ((1, 0), (4, 1))
+    context, target = default_views(restored, scene, None, (0, 3))
+    assert target == (0, 3) and len(context) == 2 and not {0, 3} & set(context)
+    with pytest.raises(InputError, match="1 cameras left as inputs; training had 2 views"):
+        default_views(restored, scene, None, (0, 1, 2))
+    elsewhere = dataclasses.replace(restored, data=DataConfig(context_views=2, target_only_cameras=(7,)))
+    assert default_views(elsewhere, scene, (0, 1), (2,)) == ((0, 1), (2,))
+    with pytest.raises(InputError, match="camera 7 of data.target_only_cameras does not exist; the scene has 5"):
+        default_views(elsewhere, scene, None, (2,))
 
 
 def test_rollout_rows_keep_their_number_and_frozen_ones_their_place(restored, scene):
@@ -188,6 +206,13 @@ def test_scores_by_hand(restored, scene):
     assert scores.values["constant"]["psnr"][:2].isnan().all()
 
 
+def test_scores_are_the_same_on_both_devices(restored, scene, devices):
+    cpu, cuda = (score_scene(moved_to(device, restored), scene).values for device in devices)
+    for method in METHODS:
+        for metric, values in cpu[method].items():
+            torch.testing.assert_close(cuda[method][metric], values, rtol=0, atol=0.01, equal_nan=True)
+
+
 def test_what_does_not_fit_is_named(restored, scene):
     with pytest.raises(InputError, match="the model was trained on 64x64"):
         predict(dataclasses.replace(restored, image_size=(64, 64)), scene, (0, 2), 1)
@@ -227,7 +252,8 @@ def test_values_that_do_not_exist_are_null(tmp_path):
     assert " - " in table(summary) + " "
 
 
-def test_pictures(restored, scene):
+def test_pictures(restored, scene, device):
+    restored = moved_to(device, restored)
     prediction = predict(restored, scene, (0, 2), 6)
     images = as_bytes(render_steps(restored, prediction.particles, scene, [3, 1]))
     truth = true_images(scene, [3, 1], range(8))

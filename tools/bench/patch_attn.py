@@ -105,7 +105,8 @@ def gpu_case(bench, n, heads, dim, dtype, gather, target_ratio, limits_ms):
                 x = x[0].index_select(0, order).unbind(1)
             with sdpa_kernel(backend):
                 out = F.scaled_dot_product_attention(*(part.view(shape).transpose(1, 2) for part in x)).transpose(1, 2)
-            return out.reshape(n, heads, dim).index_select(0, inverse) if gather else out.view(n, heads, dim)
+            out = out.reshape(n, heads, dim)
+            return out.index_select(0, inverse) if gather else out
 
         return run
 

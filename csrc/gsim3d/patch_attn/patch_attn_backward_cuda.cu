@@ -1,13 +1,6 @@
 // Backward pass in 16-bit numbers on the tensor cores: one kernel owns queries, one owns keys. Each finds the weights
 // again from the saved maximum and sum, so no block adds to what another one wrote.
-//
-//   p = exp(scale s - lse),  ds = p (<grad, v> - delta),  delta = <grad, out>
-//   grad_q = scale sum_k ds k,  grad_k = scale sum_q ds q,  grad_v = sum_q p grad
-#include <cfloat>
-
-#include "gsim3d/patch_attn/patch_attn_mma_tile.cuh"
-#include "gsim3d/patch_attn/patch_attn_softmax.cuh"
-#include "gsim3d/patch_attn/patch_attn_tensor.h"
+#include "gsim3d/patch_attn/patch_attn_backward.cuh"
 
 namespace gsim3d::cuda {
 namespace {
@@ -24,27 +17,6 @@ struct Shape {
   static constexpr int kTileBytes = kTileRows * D * 2;
   static constexpr size_t kQuerySharedBytes = 2 * kTileBytes + kTileRows;
   static constexpr size_t kKeySharedBytes = 2 * kTileBytes + kTileRows * 3 * sizeof(float);
-};
-
-// What the weights and slopes of a query need. A slot whose row is out of range has log_sum = inf: its weights are 0.
-struct alignas(16) QueryNumbers {
-  float largest, log_sum, delta, shift;  // shift: of FastWeights
-
-  __device__ __forceinline__ static QueryNumbers none() { return {0.0f, INFINITY, 0.0f, -INFINITY}; }
-  __device__ __forceinline__ bool is_fast(float slope) const { return fabsf(largest * slope) <= kLargestShift; }
-};
-
-template <typename T>
-struct Backward {
-  HeadRows<T> grad, q, k, v, out;
-  const float* stats;  // [n_q, H, 2]
-  PatchTable table;
-  AttentionSize size;
-  Division division;
-  float slope, sign, scale;
-  QueryNumbers* numbers;  // [H, n_q_listed]
-  T* grad_q;              // [n_q, H, D]
-  KeyGradients<T> key_gradients;
 };
 
 // ---- queries ---------------------------------------------------------------------------------------------------------
@@ -193,11 +165,10 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) query_kernel(Back
         if (n_tiles > 1 || !loaded) {
           const int64_t* rows = table.kv_rows + k_range.begin + tile * S::kTileRows;
           __syncthreads();
-          copy_tile<T, D>(args.k, rows, n, table.n_k, share.head, keys);
-          copy_tile<T, D>(args.v, rows, n, table.n_k, share.head, values);
-          const bool all_valid = mark_rows(rows, n, table.n_k, valid);
+          const bool all_valid =
+              copy_tiles<D, kThreads>({args.k, args.v}, rows, n, table.n_k, share.head, {keys, values}, valid);
           wait_for_copies();
-          plain = __syncthreads_and(all_valid && finite_tile<T, D>(shared, n)) != 0;
+          plain = __syncthreads_and(all_valid && (kByPolynomial == 0 || finite_tile<T, D>(shared, n))) != 0;
           loaded = true;
         }
         if (!active) continue;
@@ -214,129 +185,6 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) query_kernel(Back
 }
 
 // ---- keys ------------------------------------------------------------------------------------------------------------
-
-// Numbers of the queries of a tile, in shared memory.
-struct TileNumbers {
-  const float* shift;         // [rows]
-  const float4* minus_delta;  // [rows / 2], of a pair of queries twice: a C tile of the tensor cores
-};
-
-template <typename T, int D>
-class KeyWarp {
-  static constexpr int M = Shape<D>::kRowTiles;
-
- public:
-  __device__ __forceinline__ KeyWarp(const Backward<T>& args, uint32_t queries, uint32_t grads,
-                                     const TileNumbers& numbers)
-      : weights_(args.slope), queries_(queries), grads_(grads), numbers_(numbers) {}
-
-  __device__ __forceinline__ void load(const Backward<T>& args, int64_t first, int64_t end, int64_t head) {
-    clear(grad_k_);
-    clear(grad_v_);
-#pragma unroll
-    for (int m = 0; m < M; ++m) {
-      const RowPair<T> k = find_rows(args.k, args.table.kv_rows, first + 16 * m, end, args.table.n_k, head);
-      const RowPair<T> v = find_rows(args.v, args.table.kv_rows, first + 16 * m, end, args.table.n_k, head);
-#pragma unroll
-      for (int s = 0; s < D / 16; ++s) {
-        load_fragment(k, s, k_[m][s]);
-        load_fragment(v, s, v_[m][s]);
-        if (args.sign < 0) negate(k_[m][s]);
-      }
-    }
-  }
-
-  // `careful`: numbers of the queries of the tile in global memory, n of them; nullptr for the fast way.
-  template <bool kFast>
-  __device__ __forceinline__ void step(int step, const QueryNumbers* careful, int n) {
-    const int t = threadIdx.x % 4;
-    float s[M][2][4], slopes[M][2][4];
-    clear(s);
-    multiply_by_rows<T, D, M>(k_, queries_, step, s);
-#pragma unroll
-    for (int j = 0; j < 2; ++j) {
-      const float4 start = numbers_.minus_delta[step * 8 + j * 4 + t];
-#pragma unroll
-      for (int m = 0; m < M; ++m) {
-        slopes[m][j][0] = start.x;
-        slopes[m][j][1] = start.y;
-        slopes[m][j][2] = start.z;
-        slopes[m][j][3] = start.w;
-      }
-    }
-    multiply_by_rows<T, D, M>(v_, grads_, step, slopes);
-    uint32_t p[M][4], a[M][4];
-    FastWeights::Shift shift[4];
-    if constexpr (kFast) {
-#pragma unroll
-      for (int j = 0; j < 2; ++j) {
-        const float2 pair = *reinterpret_cast<const float2*>(numbers_.shift + step * kStep + 8 * j + 2 * t);
-        shift[2 * j] = FastWeights::prepare(pair.x);
-        shift[2 * j + 1] = FastWeights::prepare(pair.y);
-      }
-    }
-#pragma unroll
-    for (int j = 0; j < 2; ++j)
-#pragma unroll
-      for (int i = 0; i < 2; ++i) {
-        QueryNumbers query;
-        if constexpr (!kFast) {
-          const int at = step * kStep + 8 * j + 2 * t + i;
-          query = at < n ? careful[at] : QueryNumbers::none();
-        }
-#pragma unroll
-        for (int m = 0; m < M; ++m)
-#pragma unroll
-          for (int h = 0; h < 2; ++h) {
-            float& x = s[m][j][2 * h + i];
-            if constexpr (kFast) x = weights_.at(4 * j + 2 * h + i, x, shift[2 * j + i]);
-            else x = careful_weight(x, query.largest, weights_.slope(), -query.log_sum);
-            slopes[m][j][2 * h + i] *= x;
-          }
-      }
-#pragma unroll
-    for (int m = 0; m < M; ++m) {
-      pack_tile<T>(s[m], p[m]);
-      pack_tile<T, true>(slopes[m], a[m]);
-    }
-    multiply_by_columns<T, D, M>(p, grads_, step, grad_v_);
-    multiply_by_columns<T, D, M>(a, queries_, step, grad_k_);
-  }
-
-  __device__ __forceinline__ void store(const Backward<T>& args, int64_t first, int64_t end, int64_t head) const {
-    const int t = threadIdx.x % 4;
-#pragma unroll
-    for (int m = 0; m < M; ++m)
-#pragma unroll
-      for (int h = 0; h < 2; ++h) {
-        const int64_t slot = first + 16 * m + threadIdx.x % kWarp / 4 + 8 * h;
-        const int64_t row = slot < end ? args.table.kv_rows[slot] : -1;
-        if (!inside(row, args.table.n_k)) continue;
-        const bool at_once = args.key_gradients.at_once(row);
-        const int64_t place = (row * args.size.heads + head) * D + 2 * t;
-        float* to = args.key_gradients.slot(slot, head, args.size) + 2 * t;
-#pragma unroll
-        for (int c = 0; c < D / 8; ++c) {
-          const float2 k = {grad_k_[m][c][2 * h] * args.scale, grad_k_[m][c][2 * h + 1] * args.scale};
-          const float2 v = {grad_v_[m][c][2 * h], grad_v_[m][c][2 * h + 1]};
-          if (at_once) {
-            *reinterpret_cast<uint32_t*>(args.key_gradients.k + place + 8 * c) = pack<T>(k.x, k.y);
-            *reinterpret_cast<uint32_t*>(args.key_gradients.v + place + 8 * c) = pack<T>(v.x, v.y);
-          } else {
-            *reinterpret_cast<float2*>(to + 8 * c) = k;
-            *reinterpret_cast<float2*>(to + D + 8 * c) = v;
-          }
-        }
-      }
-  }
-
- private:
-  FastWeights weights_;
-  uint32_t queries_, grads_;
-  TileNumbers numbers_;
-  uint32_t k_[M][D / 16][4], v_[M][D / 16][4];
-  float grad_k_[M][D / 8][4], grad_v_[M][D / 8][4];
-};
 
 template <typename T, int D>
 __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) key_kernel(Backward<T> args) {
@@ -357,7 +205,7 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) key_kernel(Backwa
          group += args.division.splits * S::kGroup) {
       const int64_t first = group + threadIdx.x / kWarp * 16 * S::kRowTiles;
       const bool active = first < k_range.end;
-      KeyWarp<T, D> warp(args, queries, grads, numbers);
+      KeyWarp<T, D, S::kRowTiles> warp(args, queries, grads, numbers);
       if (active) warp.load(args, first, k_range.end, share.head);
       for (int64_t tile = 0; tile < n_tiles; ++tile) {
         const int64_t begin = q_range.begin + tile * S::kTileRows;
@@ -365,8 +213,8 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) key_kernel(Backwa
         const QueryNumbers* listed = args.numbers + share.head * table.n_q_listed + begin;
         if (n_tiles > 1 || !loaded) {
           __syncthreads();
-          copy_tile<T, D>(args.q, table.q_rows + begin, n, table.n_q, share.head, queries);
-          copy_tile<T, D>(args.grad, table.q_rows + begin, n, table.n_q, share.head, grads);
+          copy_tiles<D, kThreads>({args.q, args.grad}, table.q_rows + begin, n, table.n_q, share.head,
+                                  {queries, grads}, nullptr);
           bool fast = true;
           for (int r = threadIdx.x; r < (n + kStep - 1) / kStep * kStep; r += kThreads) {
             const QueryNumbers x = r < n ? listed[r] : QueryNumbers::none();
@@ -379,11 +227,12 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) key_kernel(Backwa
           loaded = true;
         }
         if (!active) continue;
+        uint32_t ds[S::kRowTiles][4];
         if (plain) {
 #pragma unroll 2
-          for (int step = 0; step * kStep < n; ++step) warp.template step<true>(step, nullptr, n);
+          for (int step = 0; step * kStep < n; ++step) warp.template step<true>(step, nullptr, n, ds);
         } else {
-          for (int step = 0; step * kStep < n; ++step) warp.template step<false>(step, listed, n);
+          for (int step = 0; step * kStep < n; ++step) warp.template step<false>(step, listed, n, ds);
         }
       }
       if (active) warp.store(args, first, k_range.end, share.head);
@@ -395,10 +244,10 @@ template <typename T, int D>
 void run(Backward<T> args, Stream stream) {
   using S = Shape<D>;
   const PatchTable& table = args.table;
-  const int64_t wanted = 4 * multiprocessors(kOp, stream);
-  args.division = divide(table.n_patches, table.n_q_listed, S::kGroup, args.size.heads, wanted);
+  const int64_t resident = S::kBlocks * multiprocessors(kOp, stream);
+  args.division = divide(table.n_patches, table.n_q_listed, S::kGroup, args.size.heads, resident);
   launch(kOp, query_kernel<T, D>, blocks_of(args.division), kThreads, S::kQuerySharedBytes, stream, args);
-  args.division = divide(table.n_patches, table.n_k_listed, S::kGroup, args.size.heads, wanted);
+  args.division = divide(table.n_patches, table.n_k_listed, S::kGroup, args.size.heads, resident);
   launch(kOp, key_kernel<T, D>, blocks_of(args.division), kThreads, S::kKeySharedBytes, stream, args);
 }
 

@@ -13,6 +13,7 @@ namespace gsim3d::cuda {
 namespace {
 
 constexpr int kWarps = 8, kThreads = kWarps * kWarp;
+constexpr int kBlocks = 2;  // of a multiprocessor at a time
 constexpr const char* kOp = "patch_attention";
 
 template <int D>
@@ -189,7 +190,7 @@ class Warp {
 };
 
 template <typename T, int D>
-__global__ void __launch_bounds__(kThreads, 2) forward_kernel(Forward<T> args) {
+__global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> args) {
   using S = Shape<D>;
   extern __shared__ uint4 shared[];
   uint8_t* valid = reinterpret_cast<uint8_t*>(shared) + 2 * S::kTileBytes;
@@ -210,11 +211,10 @@ __global__ void __launch_bounds__(kThreads, 2) forward_kernel(Forward<T> args) {
       const int64_t* rows = table.kv_rows + k_range.begin + tile * S::kTileRows;
       const int n = tile_size(tile);
       __syncthreads();
-      copy_tile<T, D>(args.k, rows, n, table.n_k, share.head, keys);
-      copy_tile<T, D>(args.v, rows, n, table.n_k, share.head, values);
-      const bool all_valid = mark_rows(rows, n, table.n_k, valid);
+      const bool all_valid =
+          copy_tiles<D, kThreads>({args.k, args.v}, rows, n, table.n_k, share.head, {keys, values}, valid);
       wait_for_copies();
-      return __syncthreads_and(all_valid && finite_tile<T, D>(shared, n)) != 0;
+      return __syncthreads_and(all_valid && (kByPolynomial == 0 || finite_tile<T, D>(shared, n))) != 0;
     };
 
     bool loaded = false, plain = false;
@@ -251,7 +251,9 @@ __global__ void __launch_bounds__(kThreads, 2) forward_kernel(Forward<T> args) {
 }
 
 template <typename T, int D>
-void run(const Forward<T>& args, Stream stream) {
+void run(Forward<T> args, int64_t heads, Stream stream) {
+  args.division = divide(args.table.n_patches, args.table.n_q_listed, Shape<D>::kGroup, heads,
+                         kBlocks * multiprocessors(kOp, stream));
   launch(kOp, forward_kernel<T, D>, blocks_of(args.division), kThreads, Shape<D>::kSharedBytes, stream, args);
 }
 
@@ -261,14 +263,10 @@ template <typename T>
 void tensor_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
                     const AttentionSize& size, T* out, float* stats, Stream stream) {
   const patch_attn::Softmax<float> softmax(size.scale);
-  const auto with = [&](int64_t group) {
-    const Division division =
-        divide(table.n_patches, table.n_q_listed, group, size.heads, 4 * multiprocessors(kOp, stream));
-    return Forward<T>{q, k, v, table, division, softmax.slope, softmax.sign, out, stats};
-  };
-  if (size.dim == 16) run<T, 16>(with(Shape<16>::kGroup), stream);
-  else if (size.dim == 32) run<T, 32>(with(Shape<32>::kGroup), stream);
-  else run<T, 64>(with(Shape<64>::kGroup), stream);
+  Forward<T> args{q, k, v, table, {}, softmax.slope, softmax.sign, out, stats};
+  if (size.dim == 16) run<T, 16>(args, size.heads, stream);
+  else if (size.dim == 32) run<T, 32>(args, size.heads, stream);
+  else run<T, 64>(args, size.heads, stream);
 }
 
 template void tensor_forward<__nv_bfloat16>(const HeadRows<__nv_bfloat16>&, const HeadRows<__nv_bfloat16>&,

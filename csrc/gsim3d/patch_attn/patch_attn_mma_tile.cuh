@@ -30,29 +30,29 @@ struct TileLayout {
   }
 };
 
-// Queues copies of rows[0 .. n) of one head into a tile; the rows up to the next multiple of kStep become 0. A row
-// outside [0, n_rows) becomes 0, too, and `valid` tells: it has one byte a row of the tile.
-template <typename T, int D>
-__device__ __forceinline__ void copy_tile(const HeadRows<T>& x, const int64_t* rows, int n, int64_t n_rows, int64_t head,
-                                          uint32_t tile) {
-  constexpr int kChunks = TileLayout<D>::kChunks;
-  const int padded = (n + kStep - 1) / kStep * kStep;
-  for (int i = threadIdx.x; i < padded * kChunks; i += blockDim.x) {
-    const int r = i / kChunks, c = i % kChunks;
+// Queues copies of the listed rows of one head of two matrices into two tiles; rows beyond n up to the next multiple of
+// kStep, and rows outside [0, n_rows), become 0. Where `valid` is given, it gets a byte for each row: whether it takes
+// part. Returns whether all n rows that this thread saw do.
+template <int D, int kThreads, typename T>
+__device__ __forceinline__ bool copy_tiles(const HeadRows<T> (&x)[2], const int64_t* rows, int n, int64_t n_rows,
+                                           int64_t head, const uint32_t (&tiles)[2], uint8_t* valid) {
+  // A thread keeps its chunk of a row, and its place in a group of eight rows.
+  constexpr int kChunks = TileLayout<D>::kChunks, kRowsAtOnce = kThreads / kChunks;
+  static_assert(kRowsAtOnce % 8 == 0);
+  const int c = threadIdx.x % kChunks, padded = (n + kStep - 1) / kStep * kStep;
+  const T* from[2] = {x[0].at(0, head) + 8 * c, x[1].at(0, head) + 8 * c};
+  bool all = true;
+  uint32_t to = 16 * TileLayout<D>::chunk(threadIdx.x / kChunks, c);
+#pragma unroll 4
+  for (int r = threadIdx.x / kChunks; r < padded; r += kRowsAtOnce) {
     const int64_t row = r < n ? rows[r] : -1;
     const bool wanted = inside(row, n_rows);
-    copy_async(tile + 16 * TileLayout<D>::chunk(r, c), wanted ? x.at(row, head) + 8 * c : x.data, wanted);
-  }
-}
-
-// Marks the rows of a tile that take part, and tells whether rows[0 .. n) all do. Call before a barrier.
-__device__ __forceinline__ bool mark_rows(const int64_t* rows, int n, int64_t n_rows, uint8_t* valid) {
-  const int padded = (n + kStep - 1) / kStep * kStep;
-  bool all = true;
-  for (int r = threadIdx.x; r < padded; r += blockDim.x) {
-    const bool good = r < n && inside(rows[r], n_rows);
-    valid[r] = good;
-    all = all && (good || r >= n);
+#pragma unroll
+    for (int i = 0; i < 2; ++i)
+      copy_async(tiles[i] + to, wanted ? from[i] + row * x[i].row_stride : x[i].data, wanted);
+    if (valid != nullptr && c == 0) valid[r] = wanted;
+    all = all && (wanted || r >= n);
+    to += kRowsAtOnce * D * sizeof(T);
   }
   return all;
 }

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <limits>
 #include <type_traits>
 
 #include "gsim3d/core/cuda_utils.cuh"
@@ -27,12 +28,20 @@ struct Division {
   }
 };
 
-// Enough blocks to keep every multiprocessor busy, as few as possible: each reads the whole other side of its patch.
-inline Division divide(int64_t n_patches, int64_t n_listed, int64_t group, int64_t heads, int64_t wanted_blocks) {
+// As few blocks as possible, for each reads the whole other side of its patch (an eighth of the work on a group, about),
+// but enough to keep the `resident` ones that the GPU runs at a time busy to the end.
+inline Division divide(int64_t n_patches, int64_t n_listed, int64_t group, int64_t heads, int64_t resident) {
   const int64_t groups = n_patches > 0 ? (n_listed + n_patches * group - 1) / (n_patches * group) : 1;
-  int64_t splits = 1;
-  while (2 * splits <= groups && n_patches * heads * splits < wanted_blocks) splits *= 2;
-  return {heads, splits, n_patches * heads * splits};
+  int64_t best = 1, least = std::numeric_limits<int64_t>::max();
+  for (int64_t splits = 1; splits < 2 * groups; splits *= 2) {
+    const int64_t rounds = (n_patches * heads * splits + resident - 1) / resident;
+    const int64_t cost = rounds * (8 * ((groups + splits - 1) / splits) + 1);
+    if (cost < least) {
+      best = splits;
+      least = cost;
+    }
+  }
+  return {heads, best, n_patches * heads * best};
 }
 inline int64_t multiprocessors(const char* what, Stream stream) {
   int count = 0;

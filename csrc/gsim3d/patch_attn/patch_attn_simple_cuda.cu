@@ -368,7 +368,7 @@ void simple_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T
   with_lanes(size.dim, [&]<int L>() {
     using S = Shape<Wide<T>, L>;
     const Division division = divide(table.n_patches, table.n_q_listed, S::kGroup, size.heads,
-                                     8 * multiprocessors(op, stream));
+                                     4 * multiprocessors(op, stream));
     const Work<T> work{{}, q, k, v, {}, table, size, division, patch_attn::Softmax<Wide<T>>(size.scale), out, stats};
     launch(op, forward_kernel<T, L>, blocks_of(division), kThreads, S::kSharedBytes, stream, work);
   });
@@ -380,14 +380,14 @@ void simple_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRo
                      const KeyGradients<T>& key_gradients, const Workspace& workspace, Stream stream) {
   const char* op = "patch_attention_backward";
   const HeadRows<T> out_rows{out, size.heads * size.dim, size.dim};
-  const int64_t wanted = 8 * multiprocessors(op, stream);
+  const int64_t resident = 4 * multiprocessors(op, stream);
   Work<T> work{grad, q, k, v, out_rows, table, size, {}, patch_attn::Softmax<Wide<T>>(size.scale), grad_q,
                const_cast<Wide<T>*>(stats), workspace.take<Wide<T>>(size.heads * table.n_q_listed), key_gradients};
   with_lanes(size.dim, [&]<int L>() {
     using S = Shape<Wide<T>, L>;
-    work.division = divide(table.n_patches, table.n_q_listed, S::kGroup, size.heads, wanted);
+    work.division = divide(table.n_patches, table.n_q_listed, S::kGroup, size.heads, resident);
     launch(op, query_kernel<T, L>, blocks_of(work.division), kThreads, S::kSharedBytes, stream, work);
-    work.division = divide(table.n_patches, table.n_k_listed, kThreads / L, size.heads, wanted);
+    work.division = divide(table.n_patches, table.n_k_listed, kThreads / L, size.heads, resident);
     launch(op, key_kernel<T, L>, blocks_of(work.division), kThreads, S::kSharedBytes, stream, work);
   });
 }
