@@ -36,16 +36,15 @@ __device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t row, co
   return any || !group.finished;
 }
 
-// Gradients of one row, summed over images one after the other.
-template <typename T, int kColumns>
+// Gradients of one row but its colour, summed over images one after the other.
+template <typename T>
 struct RowGrad {
-  T mean[3], quat[4], scale[3], opacity, color[kColumns];
+  T mean[3], quat[4], scale[3], opacity;
 
   __device__ void load(const RasterSceneGrads<T>& from, int64_t row) {
     for (int i = 0; i < 3; ++i) mean[i] = from.means[3 * row + i], scale[i] = from.scales[3 * row + i];
     for (int i = 0; i < 4; ++i) quat[i] = from.quats[4 * row + i];
     opacity = from.opacities[row];
-    for (int i = 0; i < kColumns; ++i) color[i] = from.color[row * kColumns + i];
   }
   __device__ void store(const RasterSceneGrads<T>& to, int64_t row) const {
     for (int i = 0; i < 3; ++i) to.means[3 * row + i] = mean[i], to.scales[3 * row + i] = scale[i];
@@ -54,10 +53,10 @@ struct RowGrad {
   }
 };
 
-// Adds the gradients of a row in one image; `viewmat` is added to.
-template <typename T, int kTerms, int kColumns>
+// Adds the gradients of a row in one image to `row`, `grad_color` (unless null) and `viewmat`.
+template <typename T, int kTerms>
 __device__ void project_vjp_of(const Camera<T>& camera, const Gaussian<T>& gaussian, const T* coefficients,
-                               const SlotSums<T>& slot, RowGrad<T, kColumns>& row, T (&viewmat)[12]) {
+                               const SlotSums<T>& slot, RowGrad<T>& row, T* grad_color, T (&viewmat)[12]) {
   const T* sums = slot.value;
   const Projection<T> p = project(camera, gaussian.mean, gaussian.quat, gaussian.scale);
   ProjectionGrad<T> grad{};
@@ -71,13 +70,13 @@ __device__ void project_vjp_of(const Camera<T>& camera, const Gaussian<T>& gauss
     sh_basis<kTerms>(direction.unit, basis);
     sh_color<kTerms>(basis, coefficients, color);
     sh_color_vjp<kTerms>(basis, coefficients, color, sums + 6, grad_basis, grad_coefficients);
-    for (int i = 0; i < kColumns; ++i) row.color[i] += grad_coefficients[i];
+    for (int i = 0; i < kTerms * 3 && grad_color; ++i) grad_color[i] += grad_coefficients[i];
     if constexpr (kTerms > 1) {
       sh_basis_vjp<kTerms>(direction.unit, grad_basis, grad_unit);
       view_direction_vjp(camera, p.point, direction, grad_unit, grad.point, viewmat);
     }
   } else {
-    for (int c = 0; c < 3; ++c) row.color[c] += sums[6 + c];
+    for (int c = 0; c < 3 && grad_color; ++c) grad_color[c] += sums[6 + c];
   }
   T grad_mean[3], grad_quat[4], grad_scale[3];
   project_vjp(camera, gaussian.mean, gaussian.scale, p, grad, grad_mean, grad_quat, grad_scale, viewmat);
@@ -86,7 +85,7 @@ __device__ void project_vjp_of(const Camera<T>& camera, const Gaussian<T>& gauss
 }
 
 // Writes the gradients of the rows in the first group, and adds to them in later ones. `memory`: SharedRows of the
-// colours.
+// colours and of their gradients.
 template <typename T, int kTerms>
 __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const RasterSceneGrads<T>& grads,
                             unsigned char* memory) {
@@ -94,9 +93,9 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
   const Group group = *job.group;
   const bool is_first = group.tile_begin == 0;
   constexpr int kColumns = kColorColumns<kTerms>;
-  const SharedRows<T, kColumns> colors(memory);
+  const SharedRows<T, kColumns> colors(memory), grad_colors(memory + SharedRows<T, kColumns>::kBytes);
   if (!group.rows_are_good) {
-    const RowGrad<T, kColumns> none{};
+    const RowGrad<T> none{};
     for (int64_t row = int64_t{blockIdx.x} * kBlock + threadIdx.x; row < s.n_rows; row += int64_t{gridDim.x} * kBlock) {
       none.store(grads, row);
       for (int i = 0; i < kColumns; ++i) grads.color[row * kColumns + i] = 0;
@@ -110,8 +109,12 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
     colors.load(s.color + rows.begin * kColumns, rows.count);
     const int64_t row = rows.inside ? rows.row : rows.begin;
     const Gaussian<T> gaussian(s, row);
-    RowGrad<T, kColumns> grad{};
-    if (!is_first) grad.load(grads, row);
+    RowGrad<T> grad{};
+    T* grad_color = grad_colors.mine();
+    if (is_first)
+      for (int i = 0; i < kColumns; ++i) grad_color[i] = 0;
+    else
+      grad.load(grads, row), grad_colors.load(grads.color + rows.begin * kColumns, rows.count);
     // What tells where an image's slots are is fetched while the image before is in work.
     int64_t next = rows.inside ? rows.first_image : kNoImage;
     PixelRect next_bounds{};
@@ -132,19 +135,18 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
       T viewmat[12] = {};
       if (!sum_slots(job, group, row, bounds, slot_begin, slots, sums, grads.features + row * s.n_features)) continue;
       if (group.finished)
-        project_vjp_of<T, kTerms>(view.camera, gaussian, colors.mine(), sums, grad, viewmat);
+        project_vjp_of<T, kTerms>(view.camera, gaussian, colors.mine(), sums, grad, grad_color, viewmat);
       else
         slots.unfinished[row] = sums;
     }
     if (rows.inside) grad.store(grads, row);
-    for (int i = 0; i < kColumns; ++i) colors.mine()[i] = grad.color[i];
-    colors.store(grads.color + rows.begin * kColumns, rows.count);
+    grad_colors.store(grads.color + rows.begin * kColumns, rows.count);
   }
 }
 
 // Sum over the threads of a block, in a fixed order; for thread 0.
 template <typename T, int kValues>
-__device__ void reduce_block(T (&values)[kValues], T (&shared)[kWarps][kValues]) {
+__device__ void reduce_block(T (&values)[kValues], T (&shared)[kWarp][kValues]) {
   for (int i = 0; i < kValues; ++i)
     for (int step = kWarp / 2; step > 0; step /= 2) values[i] += __shfl_down_sync(kFullWarp, values[i], step);
   __syncthreads();
@@ -153,13 +155,13 @@ __device__ void reduce_block(T (&values)[kValues], T (&shared)[kWarps][kValues])
   __syncthreads();
   if (threadIdx.x == 0)
     for (int i = 0; i < kValues; ++i)
-      for (int w = 1; w < kWarps; ++w) values[i] += shared[w][i];
+      for (int w = 1; w < static_cast<int>(blockDim.x) / kWarp; ++w) values[i] += shared[w][i];
 }
 
 // Gradients of the viewmats of the images that the group completes, one part of the rows a block.
 template <typename T, int kTerms>
 __device__ void gather_viewmats(const Job<T>& job, const Slots<T>& slots) {
-  __shared__ T shared[kWarps][12];
+  __shared__ T shared[kWarp][12];
   const RasterScene<T>& s = job.scene;
   const Group group = *job.group;
   if (!group.finished) return;
@@ -175,8 +177,9 @@ __device__ void gather_viewmats(const Job<T>& job, const Slots<T>& slots) {
       const int64_t pair = first_pair + row - view.row_begin;
       SlotSums<T> sums;
       if (!sum_slots<T>(job, group, row, job.bounds[pair], job.slot_begin[pair], slots, sums, nullptr)) continue;
-      RowGrad<T, kColumns> unused{};
-      project_vjp_of<T, kTerms>(view.camera, Gaussian<T>(s, row), s.color + row * kColumns, sums, unused, viewmat);
+      RowGrad<T> unused{};
+      project_vjp_of<T, kTerms>(view.camera, Gaussian<T>(s, row), s.color + row * kColumns, sums, unused,
+                                static_cast<T*>(nullptr), viewmat);
     }
     reduce_block(viewmat, shared);
     if (threadIdx.x == 0)
@@ -188,12 +191,12 @@ __device__ void gather_viewmats(const Job<T>& job, const Slots<T>& slots) {
 // rows.
 template <typename T>
 __device__ void gather_images(const Job<T>& job, const Slots<T>& slots, const RasterSceneGrads<T>& grads) {
-  __shared__ T shared[kWarps][3];
+  __shared__ T shared[kWarp][3];
   if (!job.group->finished) return;
   for (int64_t image = job.group->first + blockIdx.x; image < job.group->last; image += gridDim.x) {
     T sums[3] = {};
     const int64_t n = job.n_tiles * kQuarters;
-    for (int64_t i = threadIdx.x; i < n; i += kBlock)
+    for (int64_t i = threadIdx.x; i < n; i += blockDim.x)
       for (int c = 0; c < 3; ++c) sums[c] += slots.backgrounds[3 * (image * n + i) + c];
     reduce_block(sums, shared);
     if (threadIdx.x == 0)

@@ -112,7 +112,7 @@ void launch_together(void (*kernel)(Formal...), size_t shared_bytes, Stream stre
              kRaster);
 }
 
-// Dynamic shared memory of the phases that take rows: the colours.
+// Dynamic shared memory of rows of colours.
 template <typename T, int kTerms>
 constexpr size_t kRowBytes = SharedRows<T, kColorColumns<kTerms>>::kBytes;
 
