@@ -115,7 +115,7 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
   launch(kRaster, gather_images_kernel<T>, grid_for(scene.n_images, 1), kOneBlock, 0, stream, job, slots, grads);
   const auto rest = [&](auto fade) {
     launch_together(further_vjp_kernel<T, decltype(fade)::value>,
-                    std::max({kWarps * sizeof(BlendGradShared<T, true>), kSortRun * sizeof(Entry<T>),
+                    std::max({kWarps * sizeof(BlendGradShared<T, true>), kSortRun<T> * sizeof(Entry<T>),
                               2 * kRowBytes<T, 16>}),
                     stream, job, further, image_grads, slots, grads);
   };

@@ -8,32 +8,58 @@ namespace gsim3d::raster {
 
 constexpr int kViewmatParts = 16;  // blocks that share the rows of an image
 
-// Sums of a pair's slots in their order, over all groups that had some of them; false when it has none.
+// Sums of a pair's slots, over all groups that had some of them; false when it has none. All lanes of a warp take part:
+// a lane sums up few slots alone, one after the other; many are shared by the warp, in a fixed tree.
 template <typename T>
 __device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t row, const PixelRect& bounds,
-                          int64_t slot_begin, const Slots<T>& slots, SlotSums<T>& sums, T* features) {
-  if (bounds.x0 >= bounds.x1) return false;
-  const int n = group.n_slots(squares_of(bounds, kTile), squares_of(bounds, kQuarter));
-  const int64_t n_features = features ? job.scene.n_features : 0;
-  bool any = group.resumed;
-  sums = group.resumed ? slots.unfinished[row] : SlotSums<T>{};
-  constexpr int kAtOnce = 4;
-  for (int i = 0; i < n; i += kAtOnce) {
-    bool live[kAtOnce];
+                          uint32_t slot_begin, const Slots<T>& slots, SlotSums<T>& sums, T* features) {
+  constexpr int kAtOnce = 4, kAlone = 32;
+  const bool seen = bounds.x0 < bounds.x1;
+  const int n = seen ? group.n_slots(squares_of(bounds, kTile), squares_of(bounds, kQuarter)) : 0;
+  const int lane = threadIdx.x % kWarp;
+  const int64_t n_features = job.scene.n_features;
+  const unsigned char* live = slots.live + slot_begin;
+  bool any = seen && group.resumed;
+  sums = any ? slots.unfinished[row] : SlotSums<T>{};
+  for (int i = 0; i < n && n <= kAlone; i += kAtOnce) {
+    bool used[kAtOnce];
     SlotSums<T> some[kAtOnce];
 #pragma unroll
-    for (int k = 0; k < kAtOnce; ++k) live[k] = i + k < n && slots.live[slot_begin + i + k];
+    for (int k = 0; k < kAtOnce; ++k) used[k] = i + k < n && live[i + k];
 #pragma unroll
-    for (int k = 0; k < kAtOnce; ++k) some[k] = live[k] ? slots.sums[slot_begin + i + k] : SlotSums<T>{};
+    for (int k = 0; k < kAtOnce; ++k) some[k] = used[k] ? slots.sums[int64_t{slot_begin} + i + k] : SlotSums<T>{};
 #pragma unroll
     for (int k = 0; k < kAtOnce; ++k) {
-      any |= live[k];
+      any |= used[k];
       for (int c = 0; c < kSlotValues; ++c) sums.value[c] += some[k].value[c];
-      for (int64_t c = 0; live[k] && c < n_features; ++c)
-        features[c] += slots.features[(slot_begin + i + k) * n_features + c];
+      for (int64_t c = 0; used[k] && features && c < n_features; ++c)
+        features[c] += slots.features[(int64_t{slot_begin} + i + k) * n_features + c];
     }
   }
-  return any || !group.finished;
+  for (unsigned owners = __ballot_sync(kFullWarp, n > kAlone); owners; owners &= owners - 1) {
+    const int owner = __ffs(owners) - 1, n_shared = __shfl_sync(kFullWarp, n, owner);
+    const int64_t begin = __shfl_sync(kFullWarp, slot_begin, owner);
+    SlotSums<T> part{};
+    bool some = false;
+    for (int i = lane; i < n_shared; i += kWarp) {
+      if (!slots.live[begin + i]) continue;
+      some = true;
+      const SlotSums<T> slot = slots.sums[begin + i];
+      for (int c = 0; c < kSlotValues; ++c) part.value[c] += slot.value[c];
+    }
+    for (int step = kWarp / 2; step > 0; step /= 2)
+      for (int c = 0; c < kSlotValues; ++c) part.value[c] += __shfl_xor_sync(kFullWarp, part.value[c], step);
+    some = __any_sync(kFullWarp, some);
+    if (lane == owner) {
+      any |= some;
+      for (int c = 0; c < kSlotValues; ++c) sums.value[c] += part.value[c];
+    }
+    T* const to = reinterpret_cast<T*>(__shfl_sync(kFullWarp, reinterpret_cast<unsigned long long>(features), owner));
+    for (int64_t c = lane; to && some && c < n_features; c += kWarp)
+      for (int i = 0; i < n_shared; ++i)
+        if (slots.live[begin + i]) to[c] += slots.features[(begin + i) * n_features + c];
+  }
+  return seen && (any || !group.finished);
 }
 
 // Gradients of one row but its colour, summed over images one after the other.
@@ -116,11 +142,11 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
     else
       grad.load(grads, row), grad_colors.load(grads.color + rows.begin * kColumns, rows.count);
     // What tells where an image's slots are is fetched while the image before is in work.
-    int64_t next = rows.inside ? rows.first_image : kNoImage;
+    int64_t next = rows.first_image;
     PixelRect next_bounds{};
     uint32_t next_slot = 0;
     const auto fetch = [&] {
-      if (next >= group.last) return;
+      if (next >= group.last || !rows.inside) return;
       const int64_t pair = job.pair_begin[next] + row - job.views[next].row_begin;
       next_bounds = job.bounds[pair], next_slot = job.slot_begin[pair];
     };
@@ -128,7 +154,7 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
     while (next < group.last) {
       const View<T>& view = job.views[next];
       const PixelRect bounds = next_bounds;
-      const uint32_t slot_begin = next_slot;
+      const uint32_t slot_begin = bounds.x0 < bounds.x1 ? next_slot : 0;
       next = view.next;
       fetch();
       SlotSums<T> sums;
@@ -172,11 +198,14 @@ __device__ void gather_viewmats(const Job<T>& job, const Slots<T>& slots) {
     const View<T>& view = job.views[image];
     const int64_t first_pair = job.pair_begin[image];
     T viewmat[12] = {};
-    for (int64_t row = view.row_begin + (task % kViewmatParts) * kBlock + threadIdx.x; row < view.row_end;
-         row += kViewmatParts * kBlock) {
-      const int64_t pair = first_pair + row - view.row_begin;
+    for (int64_t begin = view.row_begin + task % kViewmatParts * kBlock; begin < view.row_end;
+         begin += kViewmatParts * kBlock) {
+      const int64_t row = begin + threadIdx.x, pair = first_pair + row - view.row_begin;
+      PixelRect bounds{};
+      if (row < view.row_end) bounds = job.bounds[pair];
+      const uint32_t slot_begin = bounds.x0 < bounds.x1 ? job.slot_begin[pair] : 0;
       SlotSums<T> sums;
-      if (!sum_slots<T>(job, group, row, job.bounds[pair], job.slot_begin[pair], slots, sums, nullptr)) continue;
+      if (!sum_slots<T>(job, group, row, bounds, slot_begin, slots, sums, nullptr)) continue;
       RowGrad<T> unused{};
       project_vjp_of<T, kTerms>(view.camera, Gaussian<T>(s, row), s.color + row * kColumns, sums, unused,
                                 static_cast<T*>(nullptr), viewmat);
