@@ -55,6 +55,7 @@ void take_group(Job<T>& job, Arena& kept, Arena& scratch) {
   job.list_cursor = job.slot_cursor + n_images;
   job.cursor = job.list_cursor + n_images;
   job.tile_begin = scratch.take<uint32_t>(n_tiles + 1);
+  job.depths = scratch.take<T>(job.limits.pairs);
   job.entries = scratch.take<Entry<T>>(job.limits.entries);
   job.spare = scratch.take<Entry<T>>(job.limits.entries);
 }

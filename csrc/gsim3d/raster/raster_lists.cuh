@@ -146,6 +146,7 @@ struct Job {
   Group* group;
   int32_t* pair_begin;     // [n_images] index of the first row's record
   PixelRect* bounds;       // [pairs]
+  T* depths;               // [pairs] z of the records
   Record<T>* records;      // [pairs]; unset where the bounds are empty
   uint32_t* slot_begin;    // [pairs] first of the pair's slots
   uint32_t* order;         // [n_images * n_tiles] tiles, counted from the group's first, long lists first
@@ -425,13 +426,14 @@ __device__ void project_rows(const Job<T>& job, unsigned char* memory) {
     const bool may_show = good && gaussian.opacity >= T(kMinAlpha);
     for (int64_t image = rows.first_image; image < last; image = job.views[image].next) {
       const View<T>& view = job.views[image];
+      const int64_t pair = job.pair_begin[image] + row - view.row_begin;
       PixelRect bounds{};
       if (may_show) {
         Record<T> record;
         bounds = make_record<T, kTerms>(s, view.camera, gaussian, coefficients, record);
-        if (bounds.x0 < bounds.x1) job.records[job.pair_begin[image] + row - view.row_begin] = record;
+        if (bounds.x0 < bounds.x1) job.records[pair] = record, job.depths[pair] = record.z;
       }
-      if (rows.inside) job.bounds[job.pair_begin[image] + row - view.row_begin] = bounds;
+      if (rows.inside) job.bounds[pair] = bounds;
       uint32_t* counts = job.cursor + image * job.n_tiles;
       for_tiles(squares_of(bounds, kTile), [&](int owner, int x, int y) {
         const uint32_t tile = owner < 0 ? ~0u : static_cast<uint32_t>(y * job.tiles_x + x);
@@ -547,12 +549,23 @@ __device__ void scatter_rows(const Job<T>& job) {
   const int lane = threadIdx.x % kWarp;
   for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
     const Rows rows(job, chunk);
-    for (int64_t image = rows.first_image; image < group.last; image = job.views[image].next) {
-      const int64_t pair = job.pair_begin[image] + rows.row - job.views[image].row_begin;
-      PixelRect bounds{};
-      if (rows.inside) bounds = job.bounds[pair];
+    // What is known of the next image's pair is fetched while this one's is scattered.
+    int64_t next = rows.first_image, next_pair = 0;
+    PixelRect next_bounds{};
+    T next_z = 0;
+    const auto fetch = [&] {
+      if (next >= group.last) return;
+      next_pair = job.pair_begin[next] + rows.row - job.views[next].row_begin;
+      if (rows.inside) next_bounds = job.bounds[next_pair], next_z = job.depths[next_pair];
+    };
+    fetch();
+    while (next < group.last) {
+      const int64_t image = next, pair = next_pair;
+      const PixelRect bounds = next_bounds;
+      const T z = next_z;
+      next = job.views[next].next;
+      fetch();
       const Squares tiles = squares_of(bounds, kTile), quarters = squares_of(bounds, kQuarter);
-      const T z = bounds.x0 < bounds.x1 ? job.records[pair].z : T(0);
       const int n = group.n_slots(tiles, quarters), end = warp_sum(n);
       if (__all_sync(kFullWarp, tiles.count() == 0)) continue;
       uint32_t slot = 0;
