@@ -21,7 +21,8 @@ __global__ void __launch_bounds__(kBlock, 4) gather_rows_kernel(Job<T> job, Slot
 }
 
 template <typename T>
-__global__ void __launch_bounds__(kOneBlock) gather_images_kernel(Job<T> job, Slots<T> slots, RasterSceneGrads<T> grads) {
+__global__ void __launch_bounds__(kOneBlock) gather_images_kernel(Job<T> job, Slots<T> slots,
+                                                                  RasterSceneGrads<T> grads) {
   gather_images(job, slots, grads);
 }
 

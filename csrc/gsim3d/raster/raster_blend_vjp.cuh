@@ -75,7 +75,7 @@ __device__ inline uint32_t in_front(int32_t last, int32_t base) {
   return n >= kWarp ? ~0u : n <= 0 ? 0u : (1u << n) - 1;
 }
 
-// <feature gradients of the lane's pixel, features of entry j>, for the entries in `mine`, into shared.shares[lane][j].v.
+// Into shared.shares[lane][j].v, for the entries j in `mine`: <feature gradients of the lane's pixel, features of j>.
 template <typename T>
 __device__ void dot_features(const RasterScene<T>& s, const RasterImageGrads<T>& grads, const T* entry_features,
                              int64_t pixel, uint32_t mine, int lane, BlendGradShared<T, true>& shared) {
@@ -97,8 +97,8 @@ __device__ void dot_features(const RasterScene<T>& s, const RasterImageGrads<T>&
 
 // Feature gradients of the lane's entry from the pixels of a half, written to or added to its slot.
 template <typename T>
-__device__ void sum_features(const RasterScene<T>& s, const RasterImageGrads<T>& grads, int64_t pixel, int lane, bool add,
-                             BlendGradShared<T, true>& shared, T* slot) {
+__device__ void sum_features(const RasterScene<T>& s, const RasterImageGrads<T>& grads, int64_t pixel, int lane,
+                             bool add, BlendGradShared<T, true>& shared, T* slot) {
   for (int64_t channel = 0; channel < s.n_features; channel += kFeatures) {
     const int n_channels = static_cast<int>(min(s.n_features - channel, int64_t{kFeatures}));
     __syncwarp();

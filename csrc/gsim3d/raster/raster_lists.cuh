@@ -153,7 +153,7 @@ struct Job {
   List* lists;             // [n_images * n_tiles, kQuarters]
   uint32_t* listed;        // [slots] pairs, list by list in order of depth
   uint32_t* cursor;        // [n_images * n_tiles] counts, then write positions
-  uint64_t* slot_count;    // [n_images] slots of all pairs, then those of the images before
+  unsigned long long* slot_count;  // [n_images] slots of all pairs, then those of the images before
   uint32_t* slot_cursor;   // [n_images] handed out
   uint32_t* tile_begin;    // [n_images * n_tiles + 1] into entries
   uint32_t* list_cursor;   // [n_images] places of `listed` handed out; an image has as many as slots
@@ -358,8 +358,8 @@ __device__ V warp_sum(V value) {
   return value;
 }
 
-// Shares the tiles of 32 records evenly among the lanes of their warp: calls f(lane that owns the record, x, y of a tile)
-// for all of them, 32 at a time; idle lanes have owner -1. All lanes take part.
+// Shares the tiles of 32 records evenly among the lanes of their warp: calls f(lane that owns the record, x, y of a
+// tile) for all of them, 32 at a time; idle lanes have owner -1. All lanes take part.
 template <typename F>
 __device__ void for_tiles(const Squares& mine, const F& f) {
   const int lane = threadIdx.x % kWarp, n = mine.count(), end = warp_sum(n);
@@ -389,16 +389,18 @@ class SharedRows {
 
   __device__ void load(const T* rows, int count) const {
     __syncthreads();
-    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) memory_[i / kColumns * kStride + i % kColumns] = rows[i];
+    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) at(i) = rows[i];
     __syncthreads();
   }
   __device__ void store(T* rows, int count) const {
     __syncthreads();
-    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) rows[i] = memory_[i / kColumns * kStride + i % kColumns];
+    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) rows[i] = at(i);
     __syncthreads();
   }
 
  private:
+  __device__ T& at(int i) const { return memory_[i / kColumns * kStride + i % kColumns]; }
+
   T* memory_;
 };
 
@@ -441,8 +443,7 @@ __device__ void project_rows(const Job<T>& job, unsigned char* memory) {
         if (owner >= 0 && __ffs(same) - 1 == lane) atomicAdd(counts + tile, static_cast<uint32_t>(__popc(same)));
       });
       const uint32_t slots = warp_sum<uint32_t>(squares_of(bounds, kQuarter).count());
-      if (lane == kWarp - 1 && slots)
-        atomicAdd(reinterpret_cast<unsigned long long*>(job.slot_count + image), static_cast<unsigned long long>(slots));
+      if (lane == kWarp - 1 && slots) atomicAdd(job.slot_count + image, static_cast<unsigned long long>(slots));
     }
   }
 }
@@ -471,7 +472,8 @@ __device__ void find_order(const Job<T>& job, int64_t begin, int64_t end) {
   constexpr int kBins = 64, kBinWidth = 64;
   __shared__ uint32_t bins[kBins];
   const auto bin_of = [&](int64_t tile) {
-    return kBins - 1 - min(job.tile_begin[tile + 1] - job.tile_begin[tile], uint32_t{kBins * kBinWidth - 1}) / kBinWidth;
+    const uint32_t length = job.tile_begin[tile + 1] - job.tile_begin[tile];
+    return kBins - 1 - min(length / kBinWidth, uint32_t{kBins - 1});
   };
   const int lane = threadIdx.x % kWarp;
   if (threadIdx.x < kBins) bins[threadIdx.x] = 0;
