@@ -90,3 +90,8 @@ def _combine(parts: tuple[Tensor, ...], n_channels: int) -> tuple[Tensor, Tensor
 def make_norm(kind: str, channels: int) -> nn.Module:
     """"layer" or "batch"."""
     return RowLayerNorm(channels) if kind == "layer" else RowBatchNorm(channels)
+
+
+def exact_convolutions():
+    """A context in which a GPU's dense convolutions are float32 proper (no TF32) and repeat bit by bit."""
+    return torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False)

@@ -9,7 +9,6 @@ import torch
 from gsim3d import presets
 from gsim3d.dynamics import last_steps
 from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, UnsupportedEffect
-from gsim3d.encoder import EncoderConfig
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
 from gsim3d.renderer import RendererConfig, render, render_as_published
@@ -18,27 +17,10 @@ from gsim3d.train.loop import deterministic
 from gsim3d.types import FROZEN, Cameras, Frames
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import TINY
+from tests.encoder.scenes import CONFIG as TINY_ENCODER
 
 SIZE = 16
-ENCODER = EncoderConfig(
-    feature_dim=8,
-    cnn_dims=(8, 8),
-    cnn_blocks=1,
-    transformer_layers=1,
-    transformer_mlp_ratio=1,
-    n_depths=6,
-    cost_unet_dim=8,
-    cost_unet_levels=2,
-    cost_unet_attention=(2,),
-    refine_unet_dim=8,
-    refine_unet_levels=2,
-    refine_unet_attention=(),
-    upsampled_dim=4,
-    disparity_dim=8,
-    dynamic_dim=4,
-    static_dim=3,
-    condition_dim=4,
-)
+ENCODER = dataclasses.replace(TINY_ENCODER, transformer_layers=1, upsampled_dim=4, dynamic_dim=4, static_dim=3)
 CONFIG = ModelConfig(
     ENCODER,
     dataclasses.replace(TINY, grid_size=0.1),

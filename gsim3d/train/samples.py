@@ -28,6 +28,9 @@ class Batch:
     n_context: int
     n_future: int
 
+    def to(self, device: str | torch.device) -> Batch:
+        return dataclasses.replace(self, context=self.context.to(device), targets=self.targets.to(device))
+
     def target_step(self) -> Tensor:
         """int64 [I], the step in its window that each target image shows."""
         return self.targets.cameras.image_cloud % (self.n_context + self.n_future)

@@ -76,20 +76,31 @@ __global__ void __launch_bounds__(kThreads) count_digits_kernel(Sort sort) {
   const uint64_t* keys = sort.rows.keys + row * sort.rows.room;
   for (int p = 0; p < kMaxPasses; ++p) counts[p][threadIdx.x] = 0;
   __syncthreads();
-  for (int64_t first = int64_t{blockIdx.x} * kThreads; first < n; first += int64_t{gridDim.x} * kThreads) {
-    const int64_t i = first + threadIdx.x;
-    const unsigned active = __ballot_sync(kFullWarp, i < n);
-    if (i >= n) continue;
-    const uint64_t key = ordered_key(sort.rows, row, keys[i]);
-    const uint32_t low = static_cast<uint32_t>(key), high = static_cast<uint32_t>(key >> 32);
-    const uint64_t differs = uint64_t{__reduce_or_sync(active, high) ^ __reduce_and_sync(active, high)} << 32 |
-                             (__reduce_or_sync(active, low) ^ __reduce_and_sync(active, low));
-    for (int p = 0; p < sort.n_passes; ++p) {
-      // Lanes that agree, as high digits mostly do, would wait for each other.
-      if (digit_of(differs, p) != 0)
-        atomicAdd(&counts[p][digit_of(key, p)], 1u);
-      else if (threadIdx.x % kWarp == __ffs(active) - 1)
-        atomicAdd(&counts[p][digit_of(key, p)], static_cast<uint32_t>(__popc(active)));
+  constexpr int kLoads = 4;  // keys of a thread in flight
+  const int64_t step = int64_t{gridDim.x} * kThreads;
+  for (int64_t first = int64_t{blockIdx.x} * kThreads; first < n; first += kLoads * step) {
+    uint64_t loaded[kLoads];
+#pragma unroll
+    for (int load = 0; load < kLoads; ++load) {
+      const int64_t i = first + load * step + threadIdx.x;
+      loaded[load] = i < n ? keys[i] : 0;
+    }
+#pragma unroll
+    for (int load = 0; load < kLoads; ++load) {
+      const bool valid = first + load * step + threadIdx.x < n;
+      const unsigned active = __ballot_sync(kFullWarp, valid);
+      if (!valid) continue;
+      const uint64_t key = ordered_key(sort.rows, row, loaded[load]);
+      const uint32_t low = static_cast<uint32_t>(key), high = static_cast<uint32_t>(key >> 32);
+      const uint64_t differs = uint64_t{__reduce_or_sync(active, high) ^ __reduce_and_sync(active, high)} << 32 |
+                               (__reduce_or_sync(active, low) ^ __reduce_and_sync(active, low));
+      for (int p = 0; p < sort.n_passes; ++p) {
+        // Lanes that agree, as high digits mostly do, would wait for each other.
+        if (digit_of(differs, p) != 0)
+          atomicAdd(&counts[p][digit_of(key, p)], 1u);
+        else if (threadIdx.x % kWarp == __ffs(active) - 1)
+          atomicAdd(&counts[p][digit_of(key, p)], static_cast<uint32_t>(__popc(active)));
+      }
     }
   }
   __syncthreads();
@@ -123,6 +134,15 @@ __global__ void __launch_bounds__(kThreads) plan_passes_kernel(Sort sort) {
   const uint32_t count = *total;
   *total = exclusive_block_sum(count, sums);
   if (__syncthreads_or(count > 0 && count < n) && threadIdx.x == 0) atomicOr(sort.passes + row, 1u << pass);
+}
+
+// The key with place i in the order.
+__device__ __forceinline__ void write_result(const SortRows& rows, int64_t row, int64_t i, uint64_t key, uint32_t index) {
+  const int64_t at = row * rows.room;
+  if (rows.sorted) rows.sorted[at + i] = rows.squeeze ? unsqueezed(key, rows.squeeze[row]) : key ^ rows.flip;
+  if (rows.index) rows.index[at + i] = index;
+  if (rows.order) rows.order[at + i] = index;
+  if (rows.inverse) rows.inverse[at + index] = i;
 }
 
 struct PassMemory {
@@ -229,32 +249,29 @@ __global__ void __launch_bounds__(kThreads, 4) move_keys_kernel(Sort sort, int p
     memory.index[to] = index[i];
   }
   __syncthreads();
+  const bool last = passes >> pass == 1;
   uint64_t* to_keys = sort.keys[moves % 2] + row * sort.rows.room;
   uint32_t* to_index = sort.index[moves % 2] + row * sort.rows.room;
 #pragma unroll 4
   for (int at = threadIdx.x; at < count; at += kThreads) {
     const uint64_t key = memory.keys[at];
-    const uint32_t to = memory.target[digit_of(key, pass)] + at;
-    to_keys[to] = key;
-    to_index[to] = memory.index[at];
+    const uint32_t to = memory.target[digit_of(key, pass)] + at, from_place = memory.index[at];
+    if (last) {
+      write_result(sort.rows, row, to, key, from_place);
+    } else {
+      to_keys[to] = key;
+      to_index[to] = from_place;
+    }
   }
 }
 
-__global__ void finish_kernel(Sort sort) {
-  const int64_t row = blockIdx.y, n = size_of(sort.rows, row), at = row * sort.rows.room;
-  const int64_t i = int64_t{blockIdx.x} * kThreads + threadIdx.x;
-  if (i >= n) return;
-  const int moves = __popc(sort.passes[row]);
-  const Keys keys = keys_after(sort, row, moves);
-  const uint32_t index = keys.index ? keys.index[i] : static_cast<uint32_t>(i);
-  if (sort.rows.sorted) {
-    uint64_t key = keys.keys[i];
-    if (moves > 0) key = sort.rows.squeeze ? unsqueezed(key, sort.rows.squeeze[row]) : key ^ sort.rows.flip;
-    sort.rows.sorted[at + i] = key;
-  }
-  if (sort.rows.index) sort.rows.index[at + i] = index;
-  if (sort.rows.order) sort.rows.order[at + i] = index;
-  if (sort.rows.inverse) sort.rows.inverse[at + index] = i;
+// Rows that no pass moves: they are in order.
+__global__ void copy_rows_kernel(Sort sort) {
+  const int64_t row = blockIdx.y, n = size_of(sort.rows, row);
+  if (sort.passes[row] != 0) return;
+  for (int64_t i = int64_t{blockIdx.x} * kThreads + threadIdx.x; i < n; i += int64_t{gridDim.x} * kThreads)
+    write_result(sort.rows, row, i, ordered_key(sort.rows, row, sort.rows.keys[row * sort.rows.room + i]),
+                 static_cast<uint32_t>(i));
 }
 
 }  // namespace
@@ -285,7 +302,8 @@ void sort_rows(const char* op, const SortRows& rows, const Workspace& workspace,
   for (int pass = 0; pass < sort.n_passes; ++pass)
     launch(op, move_keys_kernel, blocks_for(op, rows.n_rows * sort.tiles, 1), kThreads, sizeof(PassMemory), stream,
            sort, pass);
-  launch(op, finish_kernel, dim3(blocks_for(op, rows.room, kThreads), n_rows), kThreads, 0, stream, sort);
+  launch(op, copy_rows_kernel, dim3(static_cast<unsigned>(std::min<int64_t>(sort.tiles, 64)), n_rows), kThreads, 0,
+         stream, sort);
 }
 
 }  // namespace gsim3d::cuda

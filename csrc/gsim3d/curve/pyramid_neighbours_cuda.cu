@@ -48,23 +48,12 @@ __global__ void __launch_bounds__(kThreads) find_voxels_kernel(Build build) {
   }
 }
 
-// Search of one column of cells by the lanes of a warp, whose wanted keys ascend with the lane.
-struct Column {
-  const uint64_t* keys;
-  uint64_t* window;  // [kWindow], shared; the keys from `begin` on
-  int64_t n, begin;
-
-  __device__ __forceinline__ uint64_t at(int64_t q) const {
-    return q - begin < kWindow ? window[q - begin] : q < n ? keys[q] : ~uint64_t{0};
-  }
-};
-
 // The first of keys[0 .. end) that is not less than `low`; all lanes ask the same.
-__device__ __forceinline__ int64_t search_together(const uint64_t* __restrict__ keys, int64_t end, uint64_t low) {
+__device__ __forceinline__ int32_t search_together(const uint64_t* __restrict__ keys, int32_t end, uint64_t low) {
   const int lane = threadIdx.x % kWarp;
-  int64_t begin = 0;
+  int32_t begin = 0;
   while (end - begin > kWarp) {
-    const int64_t step = (end - begin + kWarp - 1) / kWarp, probe = begin + lane * step;
+    const int32_t step = (end - begin + kWarp - 1) / kWarp, probe = begin + lane * step;
     const int less = __popc(__ballot_sync(kFullWarp, probe < end && keys[probe] < low));
     if (less == 0) return begin;
     end = min(end, begin + less * step);
@@ -73,11 +62,12 @@ __device__ __forceinline__ int64_t search_together(const uint64_t* __restrict__ 
   return begin + __popc(__ballot_sync(kFullWarp, begin + lane < end && keys[begin + lane] < low));
 }
 
-// Calls f(tap, neighbour) for the taps before the centre, in order and by every lane of a warp; neighbour is n where
-// the cell is empty. Keys ascend and differ, so one search finds a column of cells.
+// Calls f(tap, hit, neighbour) for the taps before the centre, in order, by every lane of a warp, without those that no
+// lane hits. Keys ascend and differ: one search finds a column of cells, for all lanes near each other. Rows are fewer than
+// 2^29, so places fit 32 bits.
 template <typename F>
-__device__ __forceinline__ void for_first_half(const uint64_t* __restrict__ keys, int64_t n, int64_t p, int kernel_size,
-                                               uint64_t* window, const F& f) {
+__device__ __forceinline__ void for_first_half(const uint64_t* __restrict__ keys, int32_t n, int32_t p, int kernel_size,
+                                               uint64_t* window /* [kWindow], shared */, const F& f) {
   const int lane = threadIdx.x % kWarp, radius = kernel_size / 2, centre = radius * kernel_size + radius;
   const uint64_t key = p < n ? keys[p] : 0;
   const int x = static_cast<int>(key >> 32 & kAxisMask), y = static_cast<int>(key >> 16 & kAxisMask);
@@ -86,49 +76,50 @@ __device__ __forceinline__ void for_first_half(const uint64_t* __restrict__ keys
     const int dx = column / kernel_size - radius, dy = column % kernel_size - radius;
     const bool within = p < n && x + dx >= 0 && x + dx <= top && y + dy >= 0 && y + dy <= top;
     const unsigned asking = __ballot_sync(kFullWarp, within);
-    const int first = asking ? __ffs(asking) - 1 : 0;
+    if (!asking) continue;
+    const int first = __ffs(asking) - 1, end = column == centre ? radius : kernel_size;
     const uint64_t base = key - static_cast<uint64_t>(z) + (static_cast<uint64_t>(static_cast<int64_t>(dx)) << 32) +
                           (static_cast<uint64_t>(static_cast<int64_t>(dy)) << 16);
     const uint64_t low = base + static_cast<uint64_t>(max(z - radius, 0));
-    const int64_t before = p - lane + first;  // the voxel of the first lane that asks; its neighbours come earlier
-    Column at{keys, window, n, 0};
-    if (asking)
-      at.begin = column == centre ? max(before - radius, int64_t{0})
-                                  : search_together(keys, before, __shfl_sync(kFullWarp, low, first));
+    const int32_t before = p - lane + first;  // the voxel of the first lane that asks; its neighbours come earlier
+    const int32_t begin = column == centre ? max(before - radius, 0)
+                                           : search_together(keys, before, __shfl_sync(kFullWarp, low, first));
     __syncwarp();
-    for (int w = lane; w < kWindow; w += kWarp) window[w] = at.begin + w < n ? keys[at.begin + w] : ~uint64_t{0};
+    for (int w = lane; w < kWindow; w += kWarp) window[w] = begin + w < n ? keys[begin + w] : ~uint64_t{0};
     __syncwarp();
-    int64_t cursor = p;
+    const auto at = [&](int32_t q) { return q - begin < kWindow ? window[q - begin] : q < n ? keys[q] : ~uint64_t{0}; };
+    int32_t cursor = p;
+    uint64_t next = ~uint64_t{0};
     if (within) {
-      cursor = partition_point(at.begin, min(at.begin + kWindow, p), [&](int64_t q) { return at.at(q) < low; });
-      if (cursor == at.begin + kWindow) cursor = partition_point(cursor, p, [&](int64_t q) { return keys[q] < low; });
+      cursor = partition_point(begin, min(begin + kWindow, p), [&](int32_t q) { return window[q - begin] < low; });
+      if (cursor == begin + kWindow)
+        cursor = partition_point(cursor, p, [&](int32_t q) { return keys[q] < low; });
+      next = at(cursor);
     }
-    const int end = column == centre ? radius : kernel_size;
+    const int last = min(z - radius + end - 1, top);
+    if (!__any_sync(kFullWarp, within && last >= 0 && next <= base + static_cast<uint64_t>(last))) continue;
     for (int kz = 0; kz < end; ++kz) {
       const int wanted = z - radius + kz;
-      const bool hit = within && wanted >= 0 && wanted <= top && at.at(cursor) == base + static_cast<uint64_t>(wanted);
-      f(column * kernel_size + kz, hit ? cursor : n);
-      cursor += hit;
+      const bool hit = within && wanted >= 0 && wanted <= top && next == base + static_cast<uint64_t>(wanted);
+      f(column * kernel_size + kz, hit, cursor);
+      if (hit) next = at(++cursor);
     }
   }
 }
 
 GSIM3D_HD int64_t half_taps(int64_t kernel_size) { return kernel_size * kernel_size * kernel_size / 2; }
 
+// Fills counts that are not zero.
 __global__ void __launch_bounds__(kThreads) count_pairs_kernel(Build build) {
   __shared__ uint64_t windows[kThreads / kWarp][kWindow];
   const MapArrays map = build.maps[blockIdx.y];
-  const int64_t p = thread_index(), warp = p / kWarp, n = build.counts[count_at(map.stage, kVoxels)];
-  if (warp >= build.n_warps) return;
-  uint32_t* found = build.found + map.begin + warp;
-  if (warp * kWarp >= n) {
-    for (int64_t tap = threadIdx.x % kWarp; tap < half_taps(map.kernel_size); tap += kWarp)
-      found[tap * build.n_warps] = 0;
-    return;
-  }
+  const int32_t p = static_cast<int32_t>(thread_index());
+  const int32_t n = static_cast<int32_t>(build.counts[count_at(map.stage, kVoxels)]);
+  if (p / kWarp * kWarp >= n) return;
+  uint32_t* found = build.found + map.begin + p / kWarp;
   for_first_half(build.stages[map.stage].voxels, n, p, map.kernel_size, windows[threadIdx.x / kWarp],
-                 [&](int tap, int64_t q) {
-                   const unsigned hits = __ballot_sync(kFullWarp, q < n);
+                 [&](int tap, bool hit, int32_t) {
+                   const unsigned hits = __ballot_sync(kFullWarp, hit);
                    if (threadIdx.x % kWarp == 0) found[tap * build.n_warps] = __popc(hits);
                  });
 }
@@ -147,7 +138,8 @@ __global__ void __launch_bounds__(kThreads) write_pairs_kernel(Build build, cons
   __shared__ uint64_t windows[kThreads / kWarp][kWindow];
   const MapArrays map = build.maps[blockIdx.y];
   const MapResults to = results[blockIdx.y];
-  const int64_t p = thread_index(), n = build.counts[count_at(map.stage, kVoxels)];
+  const int32_t p = static_cast<int32_t>(thread_index());
+  const int32_t n = static_cast<int32_t>(build.counts[count_at(map.stage, kVoxels)]);
   const int64_t n_pairs = 2 * build.counts[pairs_at(build.n_stages, blockIdx.y)];
   const uint32_t* starts = build.starts + map.begin;
   const auto pairs_before = [&](int64_t tap) { return int64_t{starts[tap * build.n_warps] - starts[0]}; };
@@ -156,9 +148,9 @@ __global__ void __launch_bounds__(kThreads) write_pairs_kernel(Build build, cons
   if (p / kWarp * kWarp >= n) return;
   const unsigned lower = (1u << threadIdx.x % kWarp) - 1;
   for_first_half(build.stages[map.stage].voxels, n, p, map.kernel_size, windows[threadIdx.x / kWarp],
-                 [&](int tap, int64_t q) {
-                   const unsigned hits = __ballot_sync(kFullWarp, q < n);
-                   if (q >= n) return;
+                 [&](int tap, bool hit, int32_t q) {
+                   const unsigned hits = __ballot_sync(kFullWarp, hit);
+                   if (!hit) return;
                    const int64_t at = starts[tap * build.n_warps + p / kWarp] - starts[0] + __popc(hits & lower);
                    const int64_t mirrored = n_pairs - pairs_before(tap + 1) + at - pairs_before(tap);
                    to.tap_in[at] = q;
@@ -245,6 +237,7 @@ void find_voxels(const Build& build, const StageArrays* stages, int cloud_bits, 
 }
 
 void count_pairs(const Build& build, int64_t n_counts, const Workspace& workspace, Stream stream) {
+  fill_zero(kOp, build.found, n_counts, stream);
   launch(kOp, count_pairs_kernel, dim3(blocks_of(build.room), static_cast<unsigned>(build.n_maps)), kThreads, 0, stream,
          build);
   exclusive_sums(kOp, build.found, n_counts, build.starts, workspace, stream);

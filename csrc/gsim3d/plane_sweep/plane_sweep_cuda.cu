@@ -6,8 +6,9 @@ namespace {
 using namespace plane_sweep_math;
 
 constexpr int kMaxWarps = 8;
-constexpr int kGroup = 8;                           // lanes that share a dot product
-constexpr int kOwned = 8;                           // source pixels whose gradients one warp holds
+constexpr int kGroup = 16;                          // lanes that share a dot product
+constexpr int kPiece = 8, kOwned = 2 * kPiece;     // source pixels whose gradients a warp holds
+constexpr int kParts = 4, kTasks = kMaxWarps / kParts;  // warps that share them, and such groups of a block
 constexpr int64_t kListBytes = int64_t{512} << 20;  // lines kept at once in the backward pass; more run in pieces
 
 // kVectors elements of a feature, one load.
@@ -101,14 +102,14 @@ template <typename T>
 struct QuadMemory {
   uint8_t* touched;  // [n_words, 32]
   int32_t* list;     // [kRows]
-  T* scores;         // [kRows, kQuad]
+  T* scores;         // [kRows + 1, kQuad], the last 0
   uint32_t* bits;    // [n_words]
   uint16_t* before;  // [n_words]
 };
 
 template <typename T>
 GSIM3D_HD int64_t quad_bytes(const LineSizes& s) {
-  const int64_t flags = s.n_words * 32, rows = kRows * (sizeof(int32_t) + kQuad * sizeof(T));
+  const int64_t flags = s.n_words * 32, rows = kRows * sizeof(int32_t) + (kRows + 1) * kQuad * sizeof(T);
   return (flags > rows ? flags : rows) + aligned_bytes(s.n_words * sizeof(uint32_t)) +
          aligned_bytes(s.n_words * sizeof(uint16_t));
 }
@@ -118,7 +119,7 @@ __device__ __forceinline__ QuadMemory<T> carve_quad(char* at, const LineSizes& s
   QuadMemory<T> memory;
   char* end = at + quad_bytes<T>(s);
   memory.touched = reinterpret_cast<uint8_t*>(at);
-  memory.scores = carve<T>(at, kRows * kQuad);
+  memory.scores = carve<T>(at, (kRows + 1) * kQuad);
   memory.list = carve<int32_t>(at, kRows);
   at = end - aligned_bytes(s.n_words * sizeof(uint32_t)) - aligned_bytes(s.n_words * sizeof(uint16_t));
   memory.bits = carve<uint32_t>(at, s.n_words);
@@ -154,39 +155,57 @@ __device__ __forceinline__ int32_t mark(const Sample<T> (&samples)[kQuad], const
   return count;
 }
 
+// What a lane holds of 32 kVectors channels that kGroup lanes share.
+template <typename T, int kVectors>
+struct Share {
+  static constexpr int kWidth = kVectors == 1 ? 2 : 4, kPacks = 2 * kVectors / kWidth;
+  Pack<T, kWidth> packs[kPacks];
+
+  __device__ __forceinline__ void load(const T* __restrict__ from) {
+#pragma unroll
+    for (int e = 0; e < kPacks; ++e)
+      packs[e] = reinterpret_cast<const Pack<T, kWidth>*>(from)[threadIdx.x % kGroup + e * kGroup];
+  }
+};
+
 // scores[r, j] (+)= <own pixel j, source pixel list[r]> over 32 kVectors channels, which start at `source`.
 template <typename T, int kVectors>
-__device__ __forceinline__ void add_dots(const Pack<T, 4> (&own)[kQuad][kVectors], const T* __restrict__ source,
+__device__ __forceinline__ void add_dots(const Share<T, kVectors> (&own)[kQuad], const T* __restrict__ source,
                                          int32_t stride, const int32_t* list, int32_t count, bool first, T* scores) {
-  using Four = Pack<T, 4>;
+  using Part = Share<T, kVectors>;
   constexpr int kGroups = kWarp / kGroup;
-  const int lane = threadIdx.x % kWarp, group = lane / kGroup, at = lane % kGroup;
-  const bool lower_half = at & 4, odd_pair = at & 2;
-  for (int32_t r0 = 0; r0 < count; r0 += kGroups) {
-    const int32_t r = r0 + group;
-    const Four* from = reinterpret_cast<const Four*>(source + int64_t{list[min(r, count - 1)]} * stride) + at;
-    Four other[kVectors];
+  constexpr int kTogether = 4;  // source pixels of a group in flight
+  const int lane = threadIdx.x % kWarp, group = lane / kGroup;
+  const bool upper_half = lane & 8, odd_pair = lane & 4;
+  for (int32_t r0 = 0; r0 < count; r0 += kTogether * kGroups) {
+    Part other[kTogether];
 #pragma unroll
-    for (int v = 0; v < kVectors; ++v) other[v] = from[v * kGroup];
-    T sums[kQuad];
+    for (int t = 0; t < kTogether; ++t)
+      other[t].load(source + int64_t{list[min(r0 + t * kGroups + group, count - 1)]} * stride);
 #pragma unroll
-    for (int j = 0; j < kQuad; ++j) {
-      sums[j] = 0;
+    for (int t = 0; t < kTogether; ++t) {
+      T sums[kQuad];
 #pragma unroll
-      for (int v = 0; v < kVectors; ++v)
+      for (int j = 0; j < kQuad; ++j) {
+        sums[j] = 0;
 #pragma unroll
-        for (int e = 0; e < 4; ++e) sums[j] += own[j][v].v[e] * other[v].v[e];
-    }
-    // Lanes exchange halves of what they hold, so that each pair of lanes ends with one pixel's sum.
-    T a = lower_half ? sums[2] : sums[0], b = lower_half ? sums[3] : sums[1];
-    a += __shfl_xor_sync(kFullWarp, lower_half ? sums[0] : sums[2], 4);
-    b += __shfl_xor_sync(kFullWarp, lower_half ? sums[1] : sums[3], 4);
-    T sum = odd_pair ? b : a;
-    sum += __shfl_xor_sync(kFullWarp, odd_pair ? a : b, 2);
-    sum += __shfl_xor_sync(kFullWarp, sum, 1);
-    if (at % 2 == 0 && r < count) {
-      T& score = scores[r * kQuad + at / 2];
-      score = first ? sum : score + sum;
+        for (int e = 0; e < Part::kPacks; ++e)
+#pragma unroll
+          for (int c = 0; c < Part::kWidth; ++c) sums[j] += own[j].packs[e].v[c] * other[t].packs[e].v[c];
+      }
+      // Lanes exchange halves of what they hold, so that every four lanes end with one pixel's sum.
+      T a = upper_half ? sums[2] : sums[0], b = upper_half ? sums[3] : sums[1];
+      a += __shfl_xor_sync(kFullWarp, upper_half ? sums[0] : sums[2], 8);
+      b += __shfl_xor_sync(kFullWarp, upper_half ? sums[1] : sums[3], 8);
+      T sum = odd_pair ? b : a;
+      sum += __shfl_xor_sync(kFullWarp, odd_pair ? a : b, 4);
+      sum += __shfl_xor_sync(kFullWarp, sum, 2);
+      sum += __shfl_xor_sync(kFullWarp, sum, 1);
+      const int32_t r = r0 + t * kGroups + group;
+      if (lane % 4 == 0 && r < count) {
+        T& score = scores[r * kQuad + lane % kGroup / 4];
+        score = first ? sum : score + sum;
+      }
     }
   }
 }
@@ -194,7 +213,6 @@ __device__ __forceinline__ void add_dots(const Pack<T, 4> (&own)[kQuad][kVectors
 template <typename T, int kVectors>
 __global__ void __launch_bounds__(kMaxWarps* kWarp, 2)
     forward_kernel(Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s, int64_t quads, T* __restrict__ cost) {
-  using Four = Pack<T, 4>;
   extern __shared__ __align__(16) char shared[];
   const int lane = threadIdx.x % kWarp;
   const int64_t task = (int64_t{blockIdx.x} * blockDim.x + threadIdx.x) / kWarp;
@@ -203,7 +221,7 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, 2)
   const Quad quad(static_cast<int32_t>(task % quads), s);
   const QuadMemory<T> memory = carve_quad<T>(shared + threadIdx.x / kWarp * quad_bytes<T>(s), s);
 
-  Four own[kQuad][kVectors];
+  Share<T, kVectors> own[kQuad];
   int32_t held = -1;  // the block of channels in `own`
   const Range pairs = range_of(sweep.cu_src, image, sweep.n_pairs);
   const T scale = pairs.begin < pairs.end ? cost_scale<T>(pairs, sweep.channels) : T(0);
@@ -226,25 +244,25 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, 2)
       const int32_t count = mark(samples, s, memory);
       for (int32_t first = 0; first < count; first += kRows) {
         const int32_t rows = min(count - first, kRows);
-        const auto place = [&](int32_t q) {
-          const int32_t rank = memory.before[q >> 5] + __popc(memory.bits[q >> 5] & ((1u << (q & 31)) - 1));
-          return rank - first;
-        };
+        // Places in the list, 16 bits each; the last is that of a score that is 0.
+        uint2 places[kQuad];
 #pragma unroll
-        for (int j = 0; j < kQuad; ++j)
-          for_corners(samples[j], s, [&](int, int32_t q) {
-            const int32_t at = place(q);
-            if (at >= 0 && at < rows) memory.list[at] = q;
+        for (int j = 0; j < kQuad; ++j) {
+          uint32_t own_places[4] = {kRows, kRows, kRows, kRows};
+          for_corners(samples[j], s, [&](int side, int32_t q) {
+            const int32_t rank = memory.before[q >> 5] + __popc(memory.bits[q >> 5] & ((1u << (q & 31)) - 1)) - first;
+            if (rank < 0 || rank >= rows) return;
+            memory.list[rank] = q;
+            own_places[side] = rank;
           });
+          places[j] = make_uint2(own_places[0] | own_places[1] << 16, own_places[2] | own_places[3] << 16);
+        }
+        if (lane < kQuad) memory.scores[kRows * kQuad + lane] = 0;
         __syncwarp();
         for (int32_t c = 0; c < pixels.stride; c += kWarp * kVectors) {
           if (held != c) {
 #pragma unroll
-            for (int j = 0; j < kQuad; ++j) {
-              const Four* from = reinterpret_cast<const Four*>(pixels.at(s, image, quad.pixel(quad.holds(j) ? j : 0)) + c);
-#pragma unroll
-              for (int e = 0; e < kVectors; ++e) own[j][e] = from[lane % kGroup + e * kGroup];
-            }
+            for (int j = 0; j < kQuad; ++j) own[j].load(pixels.at(s, image, quad.pixel(quad.holds(j) ? j : 0)) + c);
             held = c;
           }
           add_dots<T, kVectors>(own, pixels.at(s, source, 0) + c, pixels.stride, memory.list, rows, c == 0,
@@ -253,12 +271,10 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, 2)
         __syncwarp();
 #pragma unroll
         for (int j = 0; j < kQuad; ++j) {
-          T corners[4] = {0, 0, 0, 0};
-          for_corners(samples[j], s, [&](int side, int32_t q) {
-            const int32_t at = place(q);
-            if (at >= 0 && at < rows) corners[side] = memory.scores[at * kQuad + j];
-          });
-          costs[j] += interpolate(corners[0], corners[1], corners[2], corners[3], samples[j].fx, samples[j].fy);
+          const T* scores = memory.scores + j;
+          const T top_left = scores[(places[j].x & 0xffff) * kQuad], top_right = scores[(places[j].x >> 16) * kQuad];
+          const T bottom_left = scores[(places[j].y & 0xffff) * kQuad], bottom_right = scores[(places[j].y >> 16) * kQuad];
+          costs[j] += interpolate(top_left, top_right, bottom_left, bottom_right, samples[j].fx, samples[j].fy);
         }
         __syncwarp();
       }
@@ -489,61 +505,81 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
   }
 }
 
-// The group of kOwned neighbouring source pixels of a task: the warps of a block take a square where rows hold whole
-// groups, for the sake of the first-level cache. -1: none.
-__device__ __forceinline__ int32_t group_of(int32_t task, const LineSizes& s) {
-  int32_t group = task;
-  if (s.width % kOwned == 0) {
-    const int32_t columns = s.width / kOwned, band = task / (columns * kMaxWarps), rest = task % (columns * kMaxWarps);
-    group = (band * kMaxWarps + rest % kMaxWarps) * columns + rest / kMaxWarps;
+// The source pixels of a task: two pieces of kPiece neighbours, one above the other where rows hold whole pieces. A piece
+// lies inside a word. -1: none.
+struct Pieces {
+  int32_t at[2];
+
+  __device__ __forceinline__ Pieces(int32_t task, const LineSizes& s) {
+    const int32_t n = (s.n_pixels + kPiece - 1) / kPiece, columns = s.width / kPiece;
+    const bool whole = s.width % kPiece == 0;
+    at[0] = whole ? task / columns * 2 * columns + task % columns : 2 * task;
+    at[1] = at[0] + (whole ? columns : 1);
+    if (at[1] >= n) at[1] = -1;
   }
-  return group * int64_t{kOwned} < s.n_pixels ? group : -1;
-}
+};
 
 int64_t n_tasks(const LineSizes& s) {
-  if (s.width % kOwned != 0) return (s.n_pixels + kOwned - 1) / kOwned;
-  return static_cast<int64_t>((s.height + kMaxWarps - 1) / kMaxWarps) * kMaxWarps * (s.width / kOwned);
+  if (s.width % kPiece == 0) return static_cast<int64_t>((s.height + 1) / 2) * (s.width / kPiece);
+  return ((s.n_pixels + kPiece - 1) / kPiece + 1) / 2;
 }
 
-// One warp owns 32 kVectors channels of kOwned pixels as sources and adds what every kept line gives them, by pairs,
-// then by pixels.
+// The image that owns a pair: the last whose pairs begin at or before it; -1 where the offsets say none.
+template <typename T>
+__device__ __forceinline__ int64_t owner_of(const PlaneSweep<T>& sweep, int64_t pair) {
+  int64_t image = 0, past = sweep.n_images;
+  while (past - image > 1) {
+    const int64_t middle = (image + past) / 2;
+    (sweep.cu_src[middle] <= pair ? image : past) = middle;
+  }
+  const Range owned = range_of(sweep.cu_src, image, sweep.n_pairs);
+  return pair >= owned.begin && pair < owned.end ? image : -1;
+}
+
+template <typename T, int kVectors>
+constexpr int64_t source_bytes() {
+  return int64_t{kTasks} * kOwned * kWarp * kVectors * sizeof(T);
+}
+
+// kParts warps own 32 kVectors channels of kOwned pixels as sources and add what every kept line gives them, by pairs, then
+// by pixels; each warp takes every kParts-th run of 32 pixels, and their sums are added in order.
 template <typename T, int kVectors>
 __global__ void __launch_bounds__(kMaxWarps* kWarp)
     source_kernel(Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s, Lines<T> lines, int64_t tasks_per_image,
                   Pixels<T> grad_pixels) {
   using Own = Pack<T, kVectors>;
-  const int lane = threadIdx.x % kWarp;
-  const int64_t at = (int64_t{blockIdx.x} * blockDim.x + threadIdx.x) / kWarp;
-  if (at >= sweep.n_images * tasks_per_image) return;
-  const int64_t source = at / tasks_per_image;
-  const int32_t group = group_of(static_cast<int32_t>(at % tasks_per_image), s);
-  if (group < 0) return;
-  const int32_t word = group * kOwned / 32, shift = group * kOwned % 32;
+  extern __shared__ __align__(16) char shared[];
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp, part = warp % kParts;
+  const int64_t at = int64_t{blockIdx.x} * kTasks + warp / kParts;
+  const bool works = at < sweep.n_images * tasks_per_image;
+  const int64_t source = works ? at / tasks_per_image : -1;
+  const Pieces pieces(works ? static_cast<int32_t>(at % tasks_per_image) : 0, s);
   const int32_t channel = (blockIdx.y * kWarp + lane) * kVectors;
 
   Own sums[kOwned] = {};
   for (int64_t pair = lines.first_pair; pair < lines.first_pair + lines.n_pairs; ++pair) {
     if (sweep.src_images[pair] != source) continue;
-    int64_t image = 0, past = sweep.n_images;  // the last image whose pairs begin at or before this one
-    while (past - image > 1) {
-      const int64_t middle = (image + past) / 2;
-      (sweep.cu_src[middle] <= pair ? image : past) = middle;
-    }
-    const Range owned = range_of(sweep.cu_src, image, sweep.n_pairs);
-    if (pair < owned.begin || pair >= owned.end) continue;
-    for (int32_t first = 0; first < lines.n_pixels; first += kWarp) {
+    const int64_t image = works ? owner_of(sweep, pair) : -1;
+    if (image < 0) continue;
+    for (int32_t first = part * kWarp; first < lines.n_pixels; first += kParts * kWarp) {
       const int32_t pixel = lines.first_pixel + first + lane;
       unsigned bits = 0;
       T weights[kOwned] = {};
-      if (first + lane < lines.n_pixels && *lines.words_of(s, pair, pixel, word / 32) >> word % 32 & 1) {
+      if (first + lane < lines.n_pixels) {
         const int64_t slot = lines.slot(pair, pixel);
-        const uint32_t all = lines.bits[slot * s.n_words + word];
-        bits = all >> shift & ((1u << kOwned) - 1);
-        if (bits) {
+#pragma unroll
+        for (int half = 0; half < 2; ++half) {
+          if (pieces.at[half] < 0) continue;
+          const int32_t word = pieces.at[half] * kPiece / 32, shift = pieces.at[half] * kPiece % 32;
+          if (!(*lines.words_of(s, pair, pixel, word / 32) >> word % 32 & 1)) continue;
+          const uint32_t all = lines.bits[slot * s.n_words + word];
+          const unsigned own = all >> shift & ((1u << kPiece) - 1);
+          if (!own) continue;
+          bits |= own << half * kPiece;
           int32_t rank = lines.before[slot * s.n_words + word] + __popc(all & ((1u << shift) - 1));
 #pragma unroll
-          for (int q = 0; q < kOwned; ++q)
-            if (bits >> q & 1 && rank < s.capacity) weights[q] = lines.weights[slot * s.capacity + rank++];
+          for (int q = 0; q < kPiece; ++q)
+            if (own >> q & 1 && rank < s.capacity) weights[half * kPiece + q] = lines.weights[slot * s.capacity + rank++];
         }
       }
       const T* from = pixels.at(s, image, lines.first_pixel + first) + channel;
@@ -569,14 +605,29 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
       }
     }
   }
+
+  Own* total = reinterpret_cast<Own*>(shared) + warp / kParts * kOwned * kWarp + lane;
+  for (int turn = 0; turn < kParts; ++turn) {
+    if (turn == part) {
 #pragma unroll
-  for (int q = 0; q < kOwned; ++q) {
-    if (group * kOwned + q >= s.n_pixels) break;
-    Own* to = reinterpret_cast<Own*>(grad_pixels.at(s, source, group * kOwned + q) + channel);
-    Own total = *to;
+      for (int q = 0; q < kOwned; ++q) {
+        Own sum = turn > 0 ? total[q * kWarp] : Own{};
 #pragma unroll
-    for (int v = 0; v < kVectors; ++v) total.v[v] += sums[q].v[v];
-    *to = total;
+        for (int v = 0; v < kVectors; ++v) sum.v[v] += sums[q].v[v];
+        total[q * kWarp] = sum;
+      }
+    }
+    __syncthreads();
+  }
+  if (!works) return;
+  for (int q = part; q < kOwned; q += kParts) {
+    const int32_t piece = pieces.at[q / kPiece], pixel = piece * kPiece + q % kPiece;
+    if (piece < 0 || pixel >= s.n_pixels) continue;
+    Own* to = reinterpret_cast<Own*>(grad_pixels.at(s, source, pixel) + channel);
+    Own sum = *to;
+#pragma unroll
+    for (int v = 0; v < kVectors; ++v) sum.v[v] += total[q * kWarp].v[v];
+    *to = sum;
   }
 }
 
@@ -680,8 +731,8 @@ void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& swee
                dim3(blocks_for(op, sweep.n_images * quads, kMaxWarps), blocks_of_channels), kMaxWarps * kWarp,
                kMaxWarps * gather_bytes<T>(), stream, pixels, sweep, s, lines, quads, !whole, grad_pixels);
         launch(op, source_kernel<T, kVectors>,
-               dim3(blocks_for(op, sweep.n_images * tasks, kMaxWarps), blocks_of_channels), kMaxWarps * kWarp, 0,
-               stream, pixels, sweep, s, lines, tasks, grad_pixels);
+               dim3(blocks_for(op, sweep.n_images * tasks, kTasks), blocks_of_channels), kMaxWarps * kWarp,
+               source_bytes<T, kVectors>(), stream, pixels, sweep, s, lines, tasks, grad_pixels);
       }
     }
     launch(op, to_planes_kernel<T>, transpose_grid(op, sweep.n_images, s.n_pixels, pixels.stride), dim3(32, 8), 0,
