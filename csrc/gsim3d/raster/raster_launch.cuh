@@ -124,7 +124,7 @@ void dispatch_blend(const RasterScene<T>& s, const F& f) {
   s.cutoff == RasterCutoff::kSmooth ? with(std::true_type{}) : with(std::false_type{});
 }
 
-extern __shared__ __align__(16) unsigned char dynamic_memory[];
+extern __shared__ __align__(32) unsigned char dynamic_memory[];
 
 // The part of the dynamic shared memory that belongs to the calling warp.
 template <typename Shared>
