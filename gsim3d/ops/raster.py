@@ -77,10 +77,14 @@ def rasterize_gaussians(
     Gradients: means, quats, scales, opacities, sh or colors, features, background, ``cameras.viewmats`` (its 12 upper
         entries taken as free numbers); once. A Gaussian gets none from a pixel where its alpha is cut to 0.99, and its
         colour none where it was clamped at 0.
-    Determinism: equal bits for any number of threads, forward and backward.
+    Determinism: equal bits for any number of threads, forward and backward; on a GPU from run to run.
+    GPU: nothing waits for the device. Its memory is made for Gaussians of a few pixels and clouds shown by equally many
+        images; what exceeds it is rendered in further groups of images, slower.
     Raises:
         HardCaseError: a number is not finite, an opacity outside [0, 1], a scale negative; names argument and row.
-        ValueError: a shape, dtype, offset or camera is not as above.
+            On a GPU such a row is left out, and its gradients are 0.
+        ValueError: a shape, dtype, offset or camera is not as above. On a GPU an image whose camera or cloud is not
+            shows its background, and a background that is not finite is black.
     Source: Zwicker et al. 2002 (EWA splatting), Kerbl et al. 2023 (3D Gaussian splatting); conventions of gsplat.
 
     Example:
@@ -146,8 +150,8 @@ def _tiles(n_images, width, height):
 
 
 def _sizes_of_state(means, n_images, n_clouds, width, height):
-    """(max_pairs, max_entries, max_slots): RasterLimits of csrc/gsim3d/raster/raster.h. Exact for clouds shown by equally
-    many images; about twice what Gaussians of a few pixels need."""
+    """(max_pairs, max_entries, max_slots): RasterLimits of csrc/gsim3d/raster/raster.h. Exact for clouds shown by
+    equally many images; about twice what Gaussians of a few pixels need."""
     if means.device.type != "cuda":
         return 0, 0, 0
     n, tiles = means.shape[0], _tiles(n_images, width, height)

@@ -1,5 +1,5 @@
-"""The rasterizer against a tile renderer in plain torch: 4 images of 128 x 128 px, 16k Gaussians of a pixel each; on a GPU
-against gsplat, where it is installed, on batches of scenes of a feed-forward model and on one large scene."""
+"""The rasterizer against a tile renderer in plain torch: 4 images of 128 x 128 px, 16k Gaussians of a pixel each; on a
+GPU against gsplat, where it is installed, on batches of scenes of a feed-forward model and on one large scene."""
 
 import math
 
@@ -181,9 +181,10 @@ def gpu_case(bench, peer, name, scene, sh, targets):
         if not max(error) < 0.05:
             raise AssertionError(f"raster, {name}: differs from gsplat: {error}")
     with torch.no_grad():
-        bench.gpu(f"{name}: fwd", "float32", lambda: ours(*leaves), {"gsplat": lambda: gsplat(*leaves)} if peer else {},
-                  tolerance=None, **targets[0])
-    bench.gpu(f"{name}: fwd+bwd", "float32", both(ours), {"gsplat": both(gsplat)} if peer else {}, tolerance=None, **targets[1])
+        peers = {"gsplat": lambda: gsplat(*leaves)} if peer else {}
+        bench.gpu(f"{name}: fwd", "float32", lambda: ours(*leaves), peers, tolerance=None, **targets[0])
+    peers = {"gsplat": both(gsplat)} if peer else {}
+    bench.gpu(f"{name}: fwd+bwd", "float32", both(ours), peers, tolerance=None, **targets[1])
 
 
 def gpu(bench):

@@ -138,7 +138,8 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
   given.check_all();
   const SceneTensors in = given.contiguous();
   const Tensor grad_color = rows_of(grad_color_), grad_alpha = rows_of(grad_alpha_), grad_depth = rows_of(grad_depth_);
-  const Tensor grad_features = rows_of(grad_features_), transmittance = rows_of(transmittance_), last = rows_of(last_), state = rows_of(state_);
+  const Tensor grad_features = rows_of(grad_features_), transmittance = rows_of(transmittance_);
+  const Tensor last = rows_of(last_), state = rows_of(state_);
   const int64_t n = in.n_images();
   check_shape(op, "grad_color", grad_color, {n, height, width, 3}, "[I, H, W, 3]");
   check_shape(op, "grad_alpha", grad_alpha, {n, height, width}, "[I, H, W]");

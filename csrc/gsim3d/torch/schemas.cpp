@@ -59,15 +59,15 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   m.def(
       "rasterize_gaussians(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, Tensor features, "
       "Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, int width, int height, "
-      "float near_plane, int cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots) -> (Tensor color, Tensor alpha, "
-      "Tensor depth, Tensor features, Tensor transmittance, Tensor last, Tensor state)");
+      "float near_plane, int cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots) -> (Tensor color, "
+      "Tensor alpha, Tensor depth, Tensor features, Tensor transmittance, Tensor last, Tensor state)");
   m.def(
       "rasterize_gaussians_backward(Tensor grad_color, Tensor grad_alpha, Tensor grad_depth, Tensor grad_features, "
       "Tensor transmittance, Tensor last, Tensor state, Tensor means, Tensor quats, Tensor scales, Tensor opacities, "
       "Tensor color, Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, "
       "int width, int height, float near_plane, int cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots, "
-      "bool viewmats_grad) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, Tensor features, Tensor background, "
-      "Tensor viewmats)");
+      "bool viewmats_grad) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
+      "Tensor features, Tensor background, Tensor viewmats)");
 }
 
 // The library is loaded by importing it; its contents are the registered ops.
