@@ -41,7 +41,7 @@ class Warp {
 
  public:
   __device__ __forceinline__ Warp(const Forward<T>& args, uint32_t keys, uint32_t values, const uint8_t* valid)
-      : weights_(args.slope), valid_(valid), keys_(keys), values_(values) {}
+      : slope_(args.slope), valid_(valid), keys_(keys), values_(values) {}
 
   __device__ __forceinline__ void load_queries(const Forward<T>& args, int64_t first, int64_t end, int64_t head) {
 #pragma unroll
@@ -73,13 +73,17 @@ class Warp {
       for (int h = 0; h < 2; ++h) {
         const float top = fmaxf(fmaxf(s[m][0][2 * h], s[m][0][2 * h + 1]), fmaxf(s[m][1][2 * h], s[m][1][2 * h + 1]));
         largest_[m][h] = largest_of_row(top);
-        shift_[m][h] = weights_.prepare(-largest_[m][h] * weights_.slope());
-        good = good && fabsf(shift_[m][h].shift) <= kLargestShift;
+        good = good && fabsf(largest_[m][h] * slope_) <= kLargestShift;
       }
     return __all_sync(kFullWarp, good);
   }
 
   __device__ __forceinline__ void fast_steps(int n_steps) {
+    float shift[M][2];
+#pragma unroll
+    for (int m = 0; m < M; ++m)
+#pragma unroll
+      for (int h = 0; h < 2; ++h) shift[m][h] = -largest_[m][h] * slope_;
 #pragma unroll 2
     for (int step = 0; step < n_steps; ++step) {
       float s[M][2][4];
@@ -90,7 +94,7 @@ class Warp {
 #pragma unroll
         for (int i = 0; i < 8; ++i) {
           float& x = s[m][i / 4][i % 4];
-          x = weights_.at(i, x, shift_[m][i % 4 / 2]);
+          x = fast_weight(x, slope_, shift[m][i % 4 / 2]);
         }
         pack_tile<T>(s[m], p[m]);
       }
@@ -115,13 +119,12 @@ class Warp {
           if (taken[i]) top = fmaxf(top, s[m][i / 2][2 * h + i % 2]);
         top = largest_of_row(top);
         const float shrink =
-            largest_[m][h] == -FLT_MAX ? 0.0f : careful_weight(largest_[m][h], top, weights_.slope(), 0.0f);
+            largest_[m][h] == -FLT_MAX ? 0.0f : careful_weight(largest_[m][h], top, slope_, 0.0f);
         largest_[m][h] = top;
-        shift_[m][h] = weights_.prepare(-top * weights_.slope());
 #pragma unroll
         for (int i = 0; i < 4; ++i) {
           float& x = s[m][i / 2][2 * h + i % 2];
-          x = taken[i] ? careful_weight(x, top, weights_.slope(), 0.0f) : 0.0f;
+          x = taken[i] ? careful_weight(x, top, slope_, 0.0f) : 0.0f;
         }
 #pragma unroll
         for (int i = 2 * h; i < 2 * h + 2; ++i) {
@@ -181,12 +184,11 @@ class Warp {
     for (int m = 0; m < M; ++m) mma<T>(sum_[m], p[m], kOnes, kOnes);
   }
 
-  FastWeights weights_;
+  float slope_;
   const uint8_t* valid_;
   uint32_t keys_, values_;
   uint32_t q_[M][D / 16][4];
   float out_[M][D / 8][4], sum_[M][4], largest_[M][2];
-  FastWeights::Shift shift_[M][2];
 };
 
 template <typename T, int D>
@@ -203,7 +205,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
     const int64_t n_keys = k_range.end - k_range.begin, n_tiles = (n_keys + S::kTileRows - 1) / S::kTileRows;
     if (n_tiles == 0) continue;
 
-    // Brings a tile to shared memory; whether all its keys take part and are finite.
+    // Brings a tile to shared memory; whether all its keys take part.
     const auto tile_size = [&](int64_t tile) {
       return static_cast<int>(min(n_keys - tile * S::kTileRows, int64_t{S::kTileRows}));
     };
@@ -214,7 +216,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
       const bool all_valid =
           copy_tiles<D, kThreads>({args.k, args.v}, rows, n, table.n_k, share.head, {keys, values}, valid);
       wait_for_copies();
-      return __syncthreads_and(all_valid && (kByPolynomial == 0 || finite_tile<T, D>(shared, n))) != 0;
+      return __syncthreads_and(all_valid) != 0;
     };
 
     bool loaded = false, plain = false;

@@ -44,6 +44,13 @@ __device__ __forceinline__ void load_matrices(uint32_t (&r)[4], uint32_t shared_
                  : "memory");
 }
 
+// An 8 x 8 matrix of 16-bit numbers, a pair of a row in each lane as above, becomes its transpose.
+__device__ __forceinline__ uint32_t transpose_matrix(uint32_t pair) {
+  uint32_t r;
+  asm volatile("movmatrix.sync.aligned.m8n8.trans.b16 %0, %1;" : "=r"(r) : "r"(pair));
+  return r;
+}
+
 __device__ __forceinline__ uint32_t shared_address(const void* at) {
   return static_cast<uint32_t>(__cvta_generic_to_shared(at));
 }

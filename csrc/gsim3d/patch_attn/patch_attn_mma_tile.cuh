@@ -57,21 +57,6 @@ __device__ __forceinline__ bool copy_tiles(const HeadRows<T> (&x)[2], const int6
   return all;
 }
 
-// Whether the numbers of a tile that this thread copied are all finite. Call after its copies have arrived.
-template <typename T, int D>
-__device__ __forceinline__ bool finite_tile(const uint4* tile, int n) {
-  constexpr uint32_t kExponent = std::is_same_v<T, __nv_bfloat16> ? 0x7f80u : 0x7c00u;
-  constexpr int kChunks = TileLayout<D>::kChunks;
-  const int padded = (n + kStep - 1) / kStep * kStep;
-  bool finite = true;
-  for (int i = threadIdx.x; i < padded * kChunks; i += blockDim.x) {
-    const uint4 x = tile[TileLayout<D>::chunk(i / kChunks, i % kChunks)];
-    for (uint32_t pair : {x.x, x.y, x.z, x.w})
-      finite = finite && (pair & kExponent) != kExponent && (pair >> 16 & kExponent) != kExponent;
-  }
-  return finite;
-}
-
 // Rows first .. first + 15 of listed rows as an A tile, 16 columns from column 16 s; rows outside become 0.
 template <typename T>
 struct RowPair {
