@@ -66,8 +66,12 @@ def test_cuda_skips_rows_out_of_range(devices, dim, heads, dtype):
     case = random_case(((70, 90), (20, 33)), heads=heads, dim=dim, n_keys=100, spare=0, dtype=dtype)
     q_rows, kv_rows, cu_q, cu_k = lists(case.table)
     bad_q, bad_k = torch.arange(90) % 7 == 3, torch.arange(123) % 5 == 2
-    kept = [offsets(part.sum() for part in (~bad).split(cu.diff().tolist())) for bad, cu in ((bad_q, cu_q), (bad_k, cu_k))]
-    short = dataclasses.replace(case, table=PatchTable(q_rows[~bad_q], kv_rows[~bad_k], *kept)).to(devices[1])
+
+    def kept(bad, cu):
+        return offsets(part.sum() for part in (~bad).split(cu.diff().tolist()))
+
+    table = PatchTable(q_rows[~bad_q], kv_rows[~bad_k], kept(bad_q, cu_q), kept(bad_k, cu_k))
+    short = dataclasses.replace(case, table=table).to(devices[1])
     wrong_q = torch.where(bad_q, torch.tensor([-1, 90, 2**40])[torch.arange(90) % 3], q_rows)
     wrong_k = torch.where(bad_k, torch.tensor([-(2**40), 100, -1])[torch.arange(123) % 3], kv_rows)
     wrong = dataclasses.replace(case, table=PatchTable(wrong_q, wrong_k, cu_q, cu_k)).to(devices[1])
@@ -144,14 +148,19 @@ def test_low_precision_poison_reaches_its_patch_alone(devices, heads, which, poi
         assert not torch.isfinite(dirty[0][reached, 1]).all(1).any()
 
 
+def shifted(x):
+    """Not aligned to 16 bytes."""
+    return torch.cat([x.flatten()[:1], x.flatten()])[1:].view(x.shape)
+
+
 @pytest.mark.parametrize("dtype", LOW_PRECISION, ids=LOW_PRECISION.values())
 def test_low_precision_views_of_one_tensor(devices, dtype):
     for dim in (16, 20):
         case = self_case((70, 30, 9), dim=dim, dtype=dtype).to(devices[1])
         expected = gradients(case.attend, case.inputs, cotangent_of(case))
-        shifted = lambda x: torch.cat([x.flatten()[:1], x.flatten()])[1:].view(x.shape)  # not aligned to 16 bytes
         for place in (lambda x: x, shifted):
-            results = gradients(lambda x: case.attend(*place(x).unbind(1)), [torch.stack(case.inputs, 1)], cotangent_of(case))
+            qkv = torch.stack(case.inputs, 1)
+            results = gradients(lambda x: case.attend(*place(x).unbind(1)), [qkv], cotangent_of(case))
             assert_close_relative_to_max(results[0], expected[0], 1e-2)
             assert_close_relative_to_max(results[1], torch.stack(expected[1:], 1), 1e-2)
 

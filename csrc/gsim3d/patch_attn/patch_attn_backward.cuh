@@ -33,7 +33,9 @@ struct Backward {
   KeyGradients<T> key_gradients;
 };
 
-// Head dim 16 in one kernel; takes as long for few patches and heads as for one on each multiprocessor.
+// Head dim 16 in one kernel; takes as long for few patches and heads as for one on each multiprocessor. Needs shared
+// memory that not every GPU has.
+bool fits_fused_backward(Stream stream);
 template <typename T>
 void fused_backward(Backward<T> args, const Workspace& workspace, Stream stream);
 
@@ -67,8 +69,8 @@ class KeyWarp {
     }
   }
 
-  // Takes 16 queries; `ds` becomes their slopes, keys x queries. `careful`: numbers of the queries of the tile in global
-  // memory, n of them; nullptr for the fast way.
+  // Takes 16 queries; `ds` becomes their slopes, keys x queries. `careful`: numbers of the queries of the tile in
+  // global memory, n of them; nullptr for the fast way.
   template <bool kFast>
   __device__ __forceinline__ void step(int step, const QueryNumbers* careful, int n, uint32_t (&ds)[M][4]) {
     const int t = threadIdx.x % 4;

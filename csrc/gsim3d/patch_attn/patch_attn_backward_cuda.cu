@@ -19,7 +19,7 @@ struct Shape {
   static constexpr size_t kKeySharedBytes = 2 * kTileBytes + kTileRows * 3 * sizeof(float);
 };
 
-// ---- queries ---------------------------------------------------------------------------------------------------------
+// ---- queries --------------------------------------------------------------------------------------------------------
 
 template <typename T, int D>
 class QueryWarp {
@@ -183,7 +183,7 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) query_kernel(Back
   }
 }
 
-// ---- keys ------------------------------------------------------------------------------------------------------------
+// ---- keys -----------------------------------------------------------------------------------------------------------
 
 template <typename T, int D>
 __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) key_kernel(Backward<T> args) {
@@ -255,7 +255,7 @@ template <typename T>
 bool pays_to_fuse(const Backward<T>& args, Stream stream) {
   const int64_t blocks = args.table.n_patches * args.size.heads, count = multiprocessors(kOp, stream);
   const int64_t rounds = (blocks + count - 1) / count;
-  return 5 * rounds * count <= 9 * blocks && reinterpret_cast<uintptr_t>(args.out.data) % 16 == 0;
+  return 5 * rounds * count <= 9 * blocks && fits_fused_backward(stream);
 }
 
 }  // namespace

@@ -1,5 +1,5 @@
-// Backward pass in 16-bit numbers for head dim 16, in one kernel that finds every weight once: a block owns one head of a
-// patch, a warp owns 32 of 512 keys, and the gradients of 1024 queries stay in shared memory.
+// Backward pass in 16-bit numbers for head dim 16, in one kernel that finds every weight once: a block owns one head of
+// a patch, a warp owns 32 of 512 keys, and the gradients of 1024 queries stay in shared memory.
 //
 // Warps add to the gradients of queries in turns: in a phase, each has a group of queries of its own, and a barrier
 // stands between phases. So the order of additions is fixed. Longer patches add up their queries' gradients in memory
@@ -190,6 +190,12 @@ __global__ void __launch_bounds__(kThreads, 1) fused_kernel(Backward<T> args, fl
 }
 
 }  // namespace
+
+bool fits_fused_backward(Stream stream) {
+  int most = 0;
+  check_cuda(cudaDeviceGetAttribute(&most, cudaDevAttrMaxSharedMemoryPerBlockOptin, stream.device), kOp);
+  return static_cast<size_t>(most) >= kSharedBytes;
+}
 
 template <typename T>
 void fused_backward(Backward<T> args, const Workspace& workspace, Stream stream) {

@@ -19,9 +19,9 @@ struct TileLayout {
     return row * kChunks + (c ^ (row / kRowsPerLine % kChunks));
   }
 
-  // Where lane `lane` finds its row for load_matrices of the chunks 2s and 2s + 1 of the first 16 rows; the next 16 rows
-  // are kBytesPerStep further. By rows: matrices (rows 0-7, chunk 2s), (rows 0-7, 2s + 1), (rows 8-15, 2s), (8-15, 2s + 1).
-  // Otherwise: (rows 0-7, 2s), (rows 8-15, 2s), (rows 0-7, 2s + 1), (rows 8-15, 2s + 1).
+  // Where lane `lane` finds its row for load_matrices of the chunks 2s and 2s + 1 of the first 16 rows; the next 16
+  // rows are kBytesPerStep further. The four matrices, by rows: (rows 0-7, chunk 2s), (0-7, 2s + 1), (8-15, 2s),
+  // (8-15, 2s + 1); otherwise: (0-7, 2s), (8-15, 2s), (0-7, 2s + 1), (8-15, 2s + 1).
   template <bool kByRows>
   __device__ __forceinline__ static int lane_offset(int lane, int s) {
     const int matrix = lane / 8;
