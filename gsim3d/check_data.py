@@ -64,10 +64,7 @@ def run(args: argparse.Namespace) -> int:
         os.replace(part, out)
     n_problems = sum(len(check.problems) for check in checks)
     n_bad = sum(bool(check.problems) for check in checks)
-    found = (
-        f"{n_problems} problems in {n_bad} of {len(checks)} scenes"
-        if n_problems
-        else f"{len(checks)} scenes, no problem"
-    )
-    print(f"{found}; " + (f"look at {out}" if scenes else "no scene could be drawn"))
+    read = f"{len(checks)} scene{'s' if len(checks) > 1 else ''} read"
+    found = f"{n_problems} problem{'s' if n_problems > 1 else ''} in {n_bad}" if n_problems else "no problem"
+    print(f"{read}, {found}; " + (f"look at {out}" if scenes else "no scene could be drawn"))
     return 1 if n_problems else 0

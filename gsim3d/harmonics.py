@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
@@ -37,8 +38,14 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 def degree_damping(degree: int, like: Tensor) -> Tensor:
     """[(degree + 1)^2]: 1 for the constant, then 0.1 / 4^l, so that colour starts almost independent of the view."""
+    return _damping(degree, like.dtype, like.device)
+
+
+@functools.lru_cache(maxsize=64)
+def _damping(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     values = [0.1 * 0.25**level if level else 1.0 for level in range(degree + 1) for _ in range(2 * level + 1)]
-    return torch.tensor(values, dtype=like.dtype, device=like.device)
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=dtype, device=device)
 
 
 def rotate_harmonics(sh: Tensor, rotations: Tensor) -> Tensor:
@@ -57,9 +64,8 @@ def rotate_harmonics(sh: Tensor, rotations: Tensor) -> Tensor:
     turned = [sh[:, :1]]
     for level in range(1, degree + 1):
         columns = slice(level**2, (level + 1) ** 2)
-        directions = _spiral(level)
-        read = torch.linalg.inv(sh_basis(directions, level)[:, columns]).T.to(sh)
-        values = sh_basis(directions.to(sh) @ rotations.mT, level)[..., columns]  # [N, 2 l + 1 directions, 2 l + 1]
+        directions, read = _reading(level, sh.dtype, sh.device)
+        values = sh_basis(directions @ rotations.mT, level)[..., columns]  # [N, 2 l + 1 directions, 2 l + 1]
         turned.append(values.mT @ (read @ sh[:, columns]))
     return torch.cat(turned, 1)
 
@@ -122,10 +128,22 @@ def published_axes(like: Tensor) -> Tensor:
     return torch.eye(3, dtype=like.dtype, device=like.device)[[2, 0, 1]]
 
 
+@functools.lru_cache(maxsize=64)
+def _reading(level: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The directions [2 l + 1, 3] on which a degree is read, and what turns their values into coefficients.
+
+    The same tensors at every call, so nothing is sent to the device: read them, never write to them.
+    """
+    with torch.inference_mode(False), torch.no_grad():
+        directions = _spiral(level)
+        read = torch.linalg.inv(sh_basis(directions, level)[:, level**2 :]).T
+        return directions.to(device, dtype), read.to(device, dtype)
+
+
 def _spiral(level: int) -> Tensor:
     """float64 [2 l + 1, 3] directions of the upper half sphere."""
     turn, start = SPIRALS[level]
-    i = torch.arange(2 * level + 1, dtype=torch.float64)
+    i = torch.arange(2 * level + 1, dtype=torch.float64, device="cpu")
     z = (i + start) / (2 * level + 1)
     radius = (1 - z * z).clamp(min=0).sqrt()
     return torch.stack([radius * torch.cos(turn * i), radius * torch.sin(turn * i), z], -1)

@@ -39,12 +39,13 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--out: {out} exists already; name another folder or remove it")
     if not out.absolute().parent.is_dir():
         raise InputError(f"--out: the folder {out.absolute().parent} does not exist")
-    settings = load_yaml(args.config)
+    source, settings = Path(args.checkpoint), load_yaml(args.config)
     try:
-        imported = import_released(args.checkpoint, settings)
+        imported = import_released(source, settings)
     except InputError as error:
-        # Messages about settings start with a dotted path; those about tensors with the checkpoint's name.
-        raise error if str(error).startswith(str(args.checkpoint)) else InputError(f"{args.config}: {error}") from None
+        # Messages about the file start with its name, those about shapes with "weights", those about settings with a key.
+        message = str(error).replace("weights:", f"{source}:", 1) if str(error).startswith("weights:") else str(error)
+        raise InputError(message if message.startswith(str(source)) else f"{args.config}: {message}") from None
     config, effects = imported.config, imported.config.effects
     checkpoint.write(
         out,
@@ -58,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
             state={
                 "step": imported.counts.get("global_step", 0),
                 "imported": {
-                    "file": Path(args.checkpoint).name,
+                    "file": source.name,
                     "untrained_blocks": imported.signs.blocks,
                     "notes": list(config.notes),
                 },

@@ -12,6 +12,8 @@ import torch.distributed.nn.functional
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from gsim3d.ops import row_norm
+
 MIN_ROWS = 16  # matrix products of fewer rows go through other code in BLAS, which rounds differently
 
 
@@ -26,10 +28,10 @@ class RowLinear(nn.Linear):
 
 
 class RowLayerNorm(nn.LayerNorm):
-    """``nn.LayerNorm`` of [N, C]; the gradients of its weights are plain sums, not torch's sums by thread."""
+    """``nn.LayerNorm`` of [N, C], and the residual sum behind it; see :func:`gsim3d.ops.row_norm`."""
 
-    def forward(self, x: Tensor) -> Tensor:
-        return F.layer_norm(x, self.normalized_shape, eps=self.eps) * self.weight + self.bias
+    def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
+        return row_norm(x, self.weight, self.bias, residual, eps=self.eps)
 
 
 class RowBatchNorm(nn.Module):
@@ -88,3 +90,8 @@ def _combine(parts: tuple[Tensor, ...], n_channels: int) -> tuple[Tensor, Tensor
 def make_norm(kind: str, channels: int) -> nn.Module:
     """"layer" or "batch"."""
     return RowLayerNorm(channels) if kind == "layer" else RowBatchNorm(channels)
+
+
+def exact_convolutions():
+    """A context in which a GPU's dense convolutions are float32 proper (no TF32) and repeat bit by bit."""
+    return torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False)

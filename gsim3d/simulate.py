@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", type=int, default=0, help="first input step (default: 0)")
     parser.add_argument("--cameras", type=int, nargs="+", metavar="CAM", help="cameras to show (default: up to 4 targets)")
     parser.add_argument("--context", type=int, nargs="+", metavar="CAM", help="input cameras (default: spread evenly)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -45,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--out: {out} exists already; name another folder or remove it")
     if not out.absolute().parent.is_dir():
         raise InputError(f"--out: the folder {out.absolute().parent} does not exist")
-    restored = restore(args.checkpoint)
+    restored = restore(args.checkpoint, args.device)
     scene = restored.open_scene(args.scene)
     context, target = default_views(restored, scene)
     cams = args.cameras or list(target[:4])

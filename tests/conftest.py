@@ -5,7 +5,10 @@ import os
 import pytest
 import torch
 
-import gsim3d.ops  # noqa: F401  (registers torch.ops.gsim3d)
+# A backward graph kept from an earlier run would hide that an op's backward has changed.
+os.environ.setdefault("TORCHINDUCTOR_AUTOGRAD_CACHE", "0")
+
+import gsim3d.ops  # noqa: E402, F401  (registers torch.ops.gsim3d)
 
 
 def cuda_problem() -> str | None:

@@ -12,6 +12,7 @@ import yaml
 
 from gsim3d.__main__ import COMMANDS, main
 from gsim3d.interop import read_ply
+from tests.conftest import cuda_problem
 from tests.tiny_scenes import write_scene, write_scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -102,6 +103,20 @@ def test_evaluate_takes_other_views_and_metrics_and_options_anywhere(capsys, wor
     assert list(metrics["by_step"])[:2] == ["psnr", "ssim"] and metrics["not_measured"] == {}
     for file in ("m.csv", "m.md", "m.png"):
         assert (tmp_path / file).stat().st_size > 100
+
+
+def test_both_devices_predict(capsys, work, tmp_path, device):
+    evaluate = ["evaluate", work / "run", work / "data", "--steps", "2", "--metrics", "psnr", "--out", tmp_path / "m.json"]
+    assert call(capsys, *evaluate, "--device", device)[0] == 0
+    simulate = ["simulate", work / "run", work / "data" / "ball" / "0000", "--out", tmp_path / "out", "--steps", "1"]
+    assert call(capsys, *simulate, "--device", device)[0] == 0
+    assert read_ply(tmp_path / "out" / "gaussians" / "step_0002.ply").means.isfinite().all()
+
+
+@pytest.mark.skipif(cuda_problem() is None, reason="there is a GPU that gsim3d can use")
+def test_a_gpu_that_is_not_there_is_named(capsys, work):
+    code, _, err = call(capsys, "evaluate", work / "run", work / "data", "--device", "cuda")
+    assert code == 2 and "--device cuda: " in err and len(err.splitlines()) == 1
 
 
 def test_simulate_writes_video_frames_and_gaussians(capsys, work, tmp_path):

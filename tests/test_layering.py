@@ -10,7 +10,8 @@ ROOT = Path(__file__).parent.parent
 ROOMS = [
     {"errors", "quirks"},
     {"types"},
-    {"ops", "effects", "harmonics", "layers"},
+    {"ops", "effects", "harmonics"},
+    {"layers"},
     {"encoder", "dynamics", "renderer"},
     {"presets"},
     {"simulator"},

@@ -306,6 +306,11 @@ def test_centered_principal_point(quirk):
     assert torch.equal(image.color, render(gaussians, cameras).color) == (not quirk)
 
 
+def assert_equal_gradients(a, b, leaf):
+    gradients = [torch.autograd.grad(value.sum(), leaf, retain_graph=True)[0] for value in (a, b)]
+    assert_close_relative_to_max(*gradients, 1e-9)
+
+
 @both_values
 def test_z_in_harmonic_14(quirk):
     """The value changes, and by that harmonic alone; the gradient is that of the true harmonic."""
@@ -314,17 +319,21 @@ def test_z_in_harmonic_14(quirk):
     sh[:, 9:] = 0.05 * random(n, 7, 3)
     sh.requires_grad_()
     gaussians = make_gaussians(2.0, n=n).map(lambda t: t.double() if t.is_floating_point() else t)
-    gaussians = dataclasses.replace(gaussians, sh=sh, means=gaussians.means + 0.5 * random(n, 3, seed=1))
+    means = (gaussians.means + 0.5 * random(n, 3, seed=1)).requires_grad_()
+    gaussians = dataclasses.replace(gaussians, sh=sh, means=means)
     camera = make_cameras()
     image = render_as_published(gaussians, camera, quirks=Quirks(z_in_harmonic_14=quirk)).color
     true = render(gaussians, camera).color
     assert torch.allclose(image, true, atol=1e-9) == (not quirk)
-    assert_close_relative_to_max(*(torch.autograd.grad(x.sum(), sh)[0] for x in (image, true)), 1e-9)
+    assert_equal_gradients(image, true, sh)
+    colors = colors_with_z(sh, means, camera)
+    directions = torch.nn.functional.normalize(means, dim=1)
+    true = torch.einsum("nk,nkc->nc", sh_basis(directions, 3), sh) + 0.5
+    assert_equal_gradients(colors, true, means)
 
-    axes = published_axes(sh).expand(n, 3, 3)
-    without = rotate_harmonics(sh.detach(), axes)
-    without[:, 14] = 0
-    without = rotate_harmonics(without, axes.mT)
-    directions = torch.nn.functional.normalize(gaussians.means, dim=1)
-    colors = torch.einsum("nk,nkc->nc", sh_basis(directions, 3), without) + 0.5
-    assert_close_relative_to_max(colors_with_z(without, gaussians.means, camera), colors, 1e-12)
+    one = torch.zeros(n, 16, 3, dtype=torch.float64)
+    one[:, 14] = 0.1
+    x, _, z = directions.detach().unbind(1)
+    expected = 0.5 + 0.1 * 1.445305721320277 * z * (z * z - x * x)
+    published = rotate_harmonics(one, published_axes(one).mT.expand(n, 3, 3))  # in the standard basis
+    assert_close_relative_to_max(colors_with_z(published, means, camera), expected[:, None].expand(n, 3), 1e-12)

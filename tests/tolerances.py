@@ -37,6 +37,8 @@ TOLERANCES = {
     "plane_sweep_large": Tolerance(1e-4, 3.2e-5, "NVIDIA H200, torch 2.11", "float32 places up to 256, CUDA rounds once in a product and sum"),
     "pool_float32": Tolerance(1e-6, 2e-7, EPYC, "float32 sums of up to 20 rows against float64"),
     "pool_float64": Tolerance(1e-14, 4e-16, EPYC, "float64 sums of up to 20 rows, another order of additions"),
+    "row_norm_float32": Tolerance(3e-6, 1e-6, EPYC, "float32 means of up to 1,000 channels against float64"),
+    "row_norm_float64": Tolerance(1e-14, 2e-15, EPYC, "as row_norm_float32, in float64"),
     "raster_float32": Tolerance(1e-5, 2.2e-6, EPYC, "float32 exponents and products of up to 60 layers against float64"),
     "raster_float64": Tolerance(2e-13, 1.5e-14, EPYC, "as raster_float32, in float64"),
     "raster_many_float32": Tolerance(1e-5, 6.5e-7, EPYC, "thousands of layers in one pixel"),

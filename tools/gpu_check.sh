@@ -13,7 +13,7 @@ set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PYTHON="${PYTHON:-python3}"
 STATE=build/gpu_check
-OPS=(curve sparse_conv patch_attn pool plane_sweep raster)
+OPS=(curve sparse_conv patch_attn pool row_norm plane_sweep raster)
 
 say() { printf '\033[1m%s\033[0m\n' "$*" >&2; }
 die() { say "$*"; exit 1; }
@@ -60,8 +60,8 @@ pytest_() {
 
 sanitize() {
   local tool="$1" file="$2"
-  GSIM3D_REQUIRE_CUDA=1 PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer --tool "$tool" --error-exitcode 9 \
-    "$PYTHON" -m pytest -q -p no:cacheprovider "$file" -k "cuda and not compile"
+  GSIM3D_REQUIRE_CUDA=1 PYTORCH_NO_CUDA_MEMORY_CACHING=1 OMP_NUM_THREADS=1 timeout 420 \
+    compute-sanitizer --tool "$tool" --error-exitcode 9 "$PYTHON" -m pytest -q -p no:cacheprovider "$file" -k "cuda and not compile"
 }
 
 run_build() { step build compile; }
@@ -74,9 +74,11 @@ run_test() {
 }
 run_sanitize() {
   command -v compute-sanitizer >/dev/null || die "compute-sanitizer was not found: it comes with the CUDA toolkit"
-  local failed=0 tool op pids=()
-  for tool in memcheck racecheck; do
-    for op in "${OPS[@]}"; do step "${tool}_$op" sanitize "$tool" "tests/ops/test_$op.py" & pids+=($!); done
+  local failed=0 tool file pids=()
+  for file in tests/ops/test_*.py; do
+    for tool in memcheck racecheck; do
+      step "${tool}_$(basename "$file" .py)" sanitize "$tool" "$file" & pids+=($!)
+    done
   done
   for pid in "${pids[@]}"; do wait "$pid" || failed=1; done
   return $failed

@@ -24,7 +24,7 @@ AXES = {"x": (60, 60, 255), "y": (70, 220, 70), "z": (255, 120, 60)}
 INK, PAPER, MISSING = (40, 40, 40), (255, 255, 255), (190, 190, 190)
 EDGE_POINTS = 24
 TEXT = 0.42  # size of letters, as OpenCV measures it
-HULL_GRID = 56  # points along each side of the bounds
+HULL_GRID = 24  # points along each side of a box that is searched for moving bodies
 HULL_STEPS = 3  # where the masks are compared in space
 EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1]
 
@@ -98,33 +98,41 @@ def _check_agreement(scene: Scene, problems: Problems) -> None:
 def moving_box(scene: Scene, step: int) -> tuple[np.ndarray | None, int]:
     """Box [2, 3] around the points that all cameras that see them see on a moving body, and how many cameras see one.
 
-    None where there is no such point. Points are tried on a grid in the scene's bounds, those that most cameras see;
-    masks are widened by half a cell.
+    None where there is no such point. Points are tried on a grid in the scene's bounds, those that most cameras see,
+    then on a finer one around those that were found; masks are widened by half a cell.
     """
+    labels = scene.segmentation(range(scene.n_cams), [step])[0].numpy()
+    seeing = np.flatnonzero((labels == MOVING).any((1, 2)))
+    coarse = _common_place(scene, step, labels, seeing, scene.bounds) if len(seeing) else None
+    fine = None if coarse is None else _common_place(scene, step, labels, seeing, coarse)
+    return (coarse if fine is None else fine), len(seeing)
+
+
+def _common_place(
+    scene: Scene, step: int, labels: np.ndarray, seeing: np.ndarray, box: np.ndarray
+) -> np.ndarray | None:
+    """Box around the grid points in ``box`` that lie on a moving body for the cameras ``seeing``."""
     import cv2
 
     recording = scene.recording
-    labels = scene.segmentation(range(scene.n_cams), [step])[0].numpy()
-    seeing = np.flatnonzero((labels == MOVING).any((1, 2)))
-    low, high = scene.bounds
-    cell = (high - low) / (HULL_GRID - 1)
-    points = low + np.stack(np.meshgrid(*[np.arange(HULL_GRID)] * 3, indexing="ij"), -1).reshape(-1, 3) * cell
+    viewmats, Ks = (values[step if len(values) > 1 else 0] for values in (recording.viewmats, recording.Ks))
+    cell = (box[1] - box[0]) / (HULL_GRID - 1)
+    points = box[0] + np.stack(np.meshgrid(*[np.arange(HULL_GRID)] * 3, indexing="ij"), -1).reshape(-1, 3) * cell
     inside, seen_by = np.ones(len(points), bool), np.zeros(len(points), int)
     for cam in seeing:
-        K = recording.Ks[step if len(recording.Ks) > 1 else 0, cam]
-        pixels, depth = project(points, recording.viewmats[step if len(recording.viewmats) > 1 else 0, cam], K)
+        pixels, depth = project(points, viewmats[cam], Ks[cam])
         width, height = recording.sizes[cam]
         place = np.floor(pixels.clip(-1, MAX_COORDINATE)).astype(int)
         seen = (depth > 0) & (place >= 0).all(1) & (place < [width, height]).all(1)
         if not seen.any():
             continue
-        radius = int(np.ceil(K[0, 0] * np.linalg.norm(cell) / 2 / np.median(depth[seen])))
+        radius = int(np.ceil(Ks[cam, 0, 0] * np.linalg.norm(cell) / 2 / np.median(depth[seen])))
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
         mask = cv2.dilate((labels[cam] == MOVING).astype(np.uint8), disc) > 0
         inside[seen] &= mask[place[seen, 1], place[seen, 0]]
         seen_by += seen
     body = points[inside & (seen_by >= max(1, 0.75 * len(seeing)))]
-    return (np.stack([body.min(0) - cell / 2, body.max(0) + cell / 2]) if len(body) else None), len(seeing)
+    return np.stack([body.min(0) - cell / 2, body.max(0) + cell / 2]) if len(body) else None
 
 
 def describe(scene: Scene) -> str:

@@ -80,7 +80,7 @@ def read(folder: Path, problems: Problems) -> Recording:
         problems.add(f"{source}: fps is needed" + (f": the videos have {sorted(rates)}" if rates else ""))
         rates = {1.0}
     unit = description.get("units", "m")
-    if unit not in UNITS:
+    if not isinstance(unit, str) or unit not in UNITS:
         raise InputError(f"{source}: units must be one of {', '.join(UNITS)}; got {unit!r}")
     cameras = [
         _camera(entry, name, size, len(numbers), description, source, problems)

@@ -175,7 +175,7 @@ class Scene:
         return self.recording.Ks[step if len(self.recording.Ks) > 1 else 0, cam]
 
     def filmed_as(self, read_images: ReadImages) -> Scene:
-        """The same scene with other images of the size ``filmed_sizes``, which are fitted and undistorted like its own."""
+        """The same scene with other images of sizes ``filmed_sizes``, which are fitted and undistorted like its own."""
         return Scene(self.path, dataclasses.replace(self._filmed, read_images=read_images), None, self._fitting)
 
     def _read_images(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:

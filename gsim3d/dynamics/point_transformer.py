@@ -37,7 +37,7 @@ class SparseConv(nn.Module):
 
 
 class PositionEncoding(nn.Module):
-    """What a row learns about its place from its neighbours: convolution, linear layer, norm."""
+    """What a row learns about its place from its neighbours, added to the row: convolution, linear layer, norm."""
 
     def __init__(self, channels: int, duplicates: str):
         super().__init__()
@@ -45,8 +45,8 @@ class PositionEncoding(nn.Module):
         self.linear = RowLinear(channels, channels)
         self.norm = RowLayerNorm(channels)
 
-    def forward(self, x: Tensor, stage: Stage) -> Tensor:
-        return self.norm(self.linear(self.conv(x, stage)))
+    def forward(self, x: Tensor, stage: Stage, residual: Tensor) -> Tensor:
+        return self.norm(self.linear(self.conv(x, stage)), residual)
 
 
 class Attention(nn.Module):
@@ -107,7 +107,7 @@ class Block(nn.Module):
         return self._compute(x, conv_input, stage, row, *keep)
 
     def _compute(self, x, conv_input, stage, row, keep_attention, keep_mlp):
-        x = x + self.position(conv_input, stage)
+        x = self.position(conv_input, stage, x)
         x = x + scaled(self.attention(self.norm1(x), stage.patches[row]), keep_attention)
         return x + scaled(self.mlp(self.norm2(x)), keep_mlp)
 

@@ -77,6 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--metrics", nargs="+", metavar="METRIC", help="what to measure (default: all whose weights are installed)"
     )
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
     parser.add_argument(
         "--out",
         metavar="FILE",
@@ -103,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--given: without a CHECKPOINT, say how many steps the other models were given, at least 1")
     if args.checkpoint is not None and args.given is not None:
         raise InputError("--given: with a CHECKPOINT it is the model's own history; leave the option out")
-    restored = None if args.checkpoint is None else restore(args.checkpoint)
+    restored = None if args.checkpoint is None else restore(args.checkpoint, args.device)
     others = [Predictions.open(given, args.data) for given in args.predictions]
     if len({other.name for other in others}) != len(others):
         raise InputError("--predictions: two have the same name; write NAME=DIR")

@@ -32,7 +32,7 @@ CURVE_COLORS = {"model": "#1f5fbf", "constant": "#c0504d", "copy": "#7f7f7f", "c
 
 def as_bytes(images: Tensor) -> np.ndarray:
     """Images in [0, 1] -> uint8."""
-    return (images * 255).round().to(torch.uint8).numpy()
+    return (images * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def true_images(scene: Scene, cams: Sequence[int], steps: Sequence[int]) -> np.ndarray:
@@ -68,7 +68,7 @@ def write_gaussians(folder: str | Path, restored: Restored, prediction: Predicti
     """One .ply a step into ``folder``: step_0000.ply, ..."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    gaussians = restored.simulator.renderer(prediction.particles)
+    gaussians = restored.simulator.renderer(prediction.particles).to("cpu")
     for step in range(prediction.n_steps):
         write_ply(folder / f"step_{step:04d}.ply", gaussians, step)
 
@@ -77,14 +77,15 @@ def write_gaussians(folder: str | Path, restored: Restored, prediction: Predicti
 def splat_picture(restored: Restored, prediction: Prediction, scene: Scene, cam: int, step: int) -> np.ndarray:
     """The Gaussians of one step, drawn smaller than they are, on white, at a higher resolution than the images."""
     zoom = SPLAT_SIZE / scene.height
-    camera = scene.cameras_at([cam], [step])
-    Ks = camera.Ks * torch.tensor([zoom, zoom, 1.0])[:, None]
+    device = prediction.particles.means.device
+    camera = scene.cameras_at([cam], [step]).to(device)
+    Ks = camera.Ks * torch.tensor([zoom, zoom, 1.0], device=device)[:, None]
     camera = Cameras(
         camera.viewmats, Ks, camera.near, camera.far, camera.image_cloud, round(scene.width * zoom), SPLAT_SIZE
     )
-    gaussians = restored.simulator.renderer(prediction.particles.select_clouds(torch.tensor([step])))
+    gaussians = restored.simulator.renderer(prediction.particles.select_clouds(torch.tensor([step], device=device)))
     gaussians = dataclasses.replace(gaussians, scales=gaussians.scales * SPLAT_SHRINK)
-    return as_bytes(render(gaussians, camera, torch.ones(3)).color[0].clamp(0, 1))
+    return as_bytes(render(gaussians, camera, torch.ones(3, device=device)).color[0].clamp(0, 1))
 
 
 def write_overview(

@@ -25,6 +25,7 @@ from gsim3d.dynamics import concatenate
 from gsim3d.errors import InputError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.scoring import PLAIN_METRICS, SceneScores, SceneTruth
+from gsim3d.layers import exact_convolutions
 from gsim3d.train.restore import Restored
 from gsim3d.train.samples import context_cameras, spread_views, thin_background
 from gsim3d.types import DYNAMIC, Particles
@@ -76,8 +77,10 @@ def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_fut
         raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
     masked = scene.has_segmentation()
     frames = make_frames([scene], [list(context_cams)], [range(start, start + n_encoded)], masked=masked)
-    encoded = restored.simulator.encode(thin_background(frames, restored.data.background_stride))
-    steps = restored.simulator.rollout(encoded, n_future, restored.plan)
+    frames = thin_background(frames, restored.data.background_stride).to(restored.device)
+    with exact_convolutions():
+        encoded = restored.simulator.encode(frames)
+        steps = restored.simulator.rollout(encoded, n_future, restored.plan)
     return Prediction(concatenate([encoded, *steps]), n_encoded, tuple(context_cams))
 
 
@@ -88,7 +91,7 @@ def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: S
     The first cloud is step ``start`` of the film, which matters where cameras move.
     """
     n_steps, n_views = particles.n_clouds, len(cams)
-    cameras = scene.cameras_at(cams, range(start, start + n_steps))
+    cameras = scene.cameras_at(cams, range(start, start + n_steps)).to(particles.means.device)
     images = restored.simulator.render(particles, cameras, plan=restored.plan).color
     return images.clamp(0, 1).unflatten(0, (n_steps, n_views))
 
@@ -100,8 +103,8 @@ def constant_velocity(prediction: Prediction) -> Particles:
     """
     encoded = prediction.particles
     last = prediction.n_encoded - 1
-    final = encoded.select_clouds(torch.tensor([last]))
-    centroids = [_moving_centroid(encoded.select_clouds(torch.tensor([q]))) for q in range(max(0, last - 1), last + 1)]
+    final = _cloud(encoded, last)
+    centroids = [_moving_centroid(_cloud(encoded, q)) for q in range(max(0, last - 1), last + 1)]
     velocity = torch.nan_to_num(centroids[-1] - centroids[0])
     moving = (final.activity == DYNAMIC).to(final.means.dtype)[:, None]
     steps = []
@@ -151,9 +154,12 @@ def score_scene(
         n_encoded = restored.data.history
     n_future = horizon(scene, n_encoded, n_future)
     cams, steps = list(target_cams), range(n_encoded + n_future)
-    images = scene.images(cams, steps).permute(0, 1, 3, 4, 2).float() / 255
-    labels = scene.segmentation(cams, steps) if scene.has_segmentation() else None
-    truth = SceneTruth(scene.name, images, labels, scene.valid(cams, steps), n_encoded, metrics)
+    device = torch.device("cpu") if restored is None else restored.device
+    images = scene.images(cams, steps).permute(0, 1, 3, 4, 2).to(device).float() / 255
+    labels = scene.segmentation(cams, steps).to(device) if scene.has_segmentation() else None
+    filmed = scene.valid(cams, steps)
+    filmed = None if filmed is None else filmed.to(device)
+    truth = SceneTruth(scene.name, images, labels, filmed, n_encoded, metrics)
 
     def methods() -> Iterator[tuple[str, Tensor]]:
         if restored is not None:
@@ -161,7 +167,7 @@ def score_scene(
             rendered = render_steps(restored, prediction.particles, scene, cams)
             yield "model", rendered
         for other in others:
-            predicted = other.images(scene, cams, n_encoded, n_future).float() / 255
+            predicted = other.images(scene, cams, n_encoded, n_future).to(device).float() / 255
             if scene.recording.is_film and labels is not None:  # the film's own background is black there
                 predicted *= (labels[n_encoded:] != BACKGROUND)[..., None]
             yield other.name, predicted
@@ -182,8 +188,12 @@ def _held(
     later = range(prediction.n_encoded, prediction.n_steps)
     if not scene.cameras_move:
         return rendered[step].expand(len(later), *rendered.shape[1:])
-    still = prediction.particles.select_clouds(torch.tensor([step]))
+    still = _cloud(prediction.particles, step)
     return torch.cat([render_steps(restored, still, scene, cams, seen) for seen in later])
+
+
+def _cloud(particles: Particles, step: int) -> Particles:
+    return particles.select_clouds(torch.tensor([step], device=particles.means.device))
 
 
 def _moving_centroid(cloud: Particles) -> Tensor:

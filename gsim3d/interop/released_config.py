@@ -399,7 +399,9 @@ def _data(settings: _Settings, history: int, size_multiple: int) -> tuple[dict[s
     if not with_seg:
         notes.append("dataset.with_seg is false: the model never saw which pixels may move, so every particle may move")
     if not settings.flag("dataset.with_mask", False):
-        notes.append("dataset.with_mask is false: it saw every pixel; here those that a scene labels 0 make no particle")
+        notes.append(
+            "dataset.with_mask is false: it saw every pixel; here those that a scene labels 0 make no particle"
+        )
     if settings.get("dataset.workspace_limits", None) is not None:
         notes.append("dataset.workspace_limits is set: published dynamics leave out what began outside, these do not")
     if any(settings.get("dataset.background_color", [0, 0, 0])):

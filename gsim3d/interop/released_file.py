@@ -45,7 +45,7 @@ _PLACEHOLDER_NAMES = {
 
 @dataclass(frozen=True)
 class StoredTensor:
-    """A tensor that is still in the file: elements of storage ``key`` from ``offset`` on, by ``shape`` and ``stride``."""
+    """A tensor still in the file: elements of storage ``key`` from ``offset`` on, by ``shape`` and ``stride``."""
 
     key: str
     dtype: torch.dtype

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +14,7 @@ CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
 
 
 def curve_encode(
-    grid: Tensor, cloud: Tensor | None, curve: str, *, depth: int = 16, shift: int | None = None
+    grid: Tensor, cloud: Tensor | None, curve: str | Sequence[str], *, depth: int = 16, shift: int | None = None
 ) -> Tensor:
     """Codes of cells along a space-filling curve, clouds above them.
 
@@ -24,25 +25,29 @@ def curve_encode(
     Args:
         grid: int64 [N, 3], cells in [0, 2^depth).
         cloud: int64 [N], in [0, 2^(63 - shift)); None: 0.
-        curve: "z", "z-trans", "hilbert" or "hilbert-trans".
+        curve: "z", "z-trans", "hilbert" or "hilbert-trans"; or R of them.
         depth: levels of the curve, 1 to 16. Hilbert codes depend on it.
         shift: position of the cloud's lowest bit, 3 depth to 62; default 3 depth.
     Returns:
-        int64 [N].
+        int64 [N], or [R, N] for R curves. On CUDA a row whose cell or cloud is out of range has code 0.
     Gradients: none. Determinism: integers.
     Raises:
-        ValueError: a cell, a cloud, depth or shift is out of range; the message names row and axis.
+        ValueError: depth or shift is out of range or, on the CPU, a cell or a cloud; the message names row and axis.
     Source: Morton order; Skilling, "Programming the Hilbert curve" (2004).
 
     Example:
         >>> curve_encode(torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1]]), None, "z")
         tensor([4, 2, 1])
     """
-    if curve not in CURVES:
-        raise ValueError(f"curve_encode: curve must be one of {', '.join(CURVES)}; got {curve!r}")
+    names = (curve,) if isinstance(curve, str) else curve
+    for name in names:
+        if name not in CURVES:
+            raise ValueError(f"curve_encode: curve must be one of {', '.join(CURVES)}; got {name!r}")
     if cloud is None:
         cloud = torch.zeros(grid.shape[:1], dtype=torch.int64, device=grid.device)
-    return torch.ops.gsim3d.curve_encode(grid, cloud, CURVES.index(curve), depth, 3 * depth if shift is None else shift)
+    curves = [CURVES.index(name) for name in names]
+    codes = torch.ops.gsim3d.curve_encode(grid, cloud, curves, depth, 3 * depth if shift is None else shift)
+    return codes[0] if isinstance(curve, str) else codes
 
 
 def curve_sort(codes: Tensor) -> tuple[Tensor, Tensor]:
@@ -54,7 +59,7 @@ def curve_sort(codes: Tensor) -> tuple[Tensor, Tensor]:
     Args:
         codes: int64 [R, N], N below 2^32.
     Returns:
-        order, inverse: int64 [R, N].
+        order, inverse: int64 [R, N]; on CUDA N is below 2^30.
     Gradients: none. Determinism: integers.
 
     Example:
@@ -275,8 +280,8 @@ def _assemble(arrays: list[Tensor], spec: PyramidSpec) -> Pyramid:
 
 
 @torch.library.register_fake("gsim3d::curve_encode")
-def _(grid, cloud, curve, depth, shift):
-    return grid.new_empty(grid.shape[0])
+def _(grid, cloud, curves, depth, shift):
+    return grid.new_empty(len(curves), grid.shape[0])
 
 
 @torch.library.register_fake("gsim3d::curve_sort")

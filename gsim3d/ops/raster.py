@@ -126,6 +126,7 @@ def rasterize_gaussians(
         cameras.height,
         near_plane,
         CUTOFFS[cutoff],
+        *_sizes_of_state(means, n_images, cu_rows.shape[0] - 1, cameras.width, cameras.height),
     )
     out = torch.ops.gsim3d.rasterize_gaussians(*args) if torch.compiler.is_compiling() else _named_errors(args)
     return Rendering(out[0], out[1], out[2], None if features is None else out[3])
@@ -140,10 +141,40 @@ def _named_errors(args):
         raise
 
 
+def _tiles(n_images, width, height):
+    return n_images * ((width + 15) // 16) * ((height + 15) // 16)
+
+
+def _sizes_of_state(means, n_images, n_clouds, width, height):
+    """(max_pairs, max_entries, max_slots): RasterLimits of csrc/gsim3d/raster/raster.h. Exact for clouds shown by equally
+    many images; about twice what Gaussians of a few pixels need."""
+    if means.device.type != "cuda":
+        return 0, 0, 0
+    n, tiles = means.shape[0], _tiles(n_images, width, height)
+    views = (n_images + n_clouds - 1) // max(1, n_clouds)
+    pairs = max(n, min(n * views, 2**25))
+    entries = min(pairs + pairs // 4 + 1024 * tiles, 2**30)
+    slots = min(pairs + pairs // 2 + 2048 * tiles, 2**30)
+    return pairs, max(n, entries), max(4 * n, slots)
+
+
+def _state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_slots):
+    """raster_state_bytes of csrc/gsim3d/raster/raster.h."""
+    if means.device.type != "cuda":
+        return 0
+    real = means.element_size()
+    view = 112 if real == 4 else 200
+    tiles = _tiles(n_images, width, height)
+    lists = (8 * max_pairs, 12 * real * max_pairs, 4 * max_pairs, 4 * tiles, 32 * tiles, 4 * max_slots)
+    return sum((n + 63) // 64 * 64 for n in (64, view * n_images, 16 * n_clouds, 4 * n_images, *lists))
+
+
 @torch.library.register_fake("gsim3d::rasterize_gaussians")
 def _(means, quats, scales, opacities, color, features, background, viewmats, *rest):
-    _, _, _, width, height, _, _ = rest  # Ks, image_cloud, cu_rows, width, height, near_plane, cutoff
-    shape = (viewmats.shape[0], height, width)
+    _, _, cu_rows, width, height, _, _, *sizes = rest  # Ks, image_cloud, near_plane and cutoff do not count here
+    n_images = viewmats.shape[0]
+    shape = (n_images, height, width)
+    state = _state_bytes(means, n_images, cu_rows.shape[0] - 1, width, height, sizes[0], sizes[2])
     return (
         means.new_empty(*shape, 3),
         means.new_empty(shape),
@@ -151,25 +182,29 @@ def _(means, quats, scales, opacities, color, features, background, viewmats, *r
         means.new_empty(*shape, features.shape[1]),
         means.new_empty(shape),
         means.new_empty(shape, dtype=torch.int32),
+        means.new_empty(state, dtype=torch.uint8),
     )
 
 
 @torch.library.register_fake("gsim3d::rasterize_gaussians_backward")
-def _(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, *inputs):
-    return tuple(torch.empty(x.shape, dtype=x.dtype, device=x.device) for x in inputs[:8])
+def _(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state, *inputs):
+    *inputs, viewmats_grad = inputs
+    shapes = [x.shape for x in inputs[:7]] + [(inputs[7].shape[0] if viewmats_grad else 0, 4, 4)]
+    return tuple(inputs[0].new_empty(shape) for shape in shapes)
 
 
 def _setup(ctx, inputs, output):
-    ctx.mark_non_differentiable(output[4], output[5])
-    ctx.save_for_backward(output[4], output[5], *inputs[:11])
+    ctx.mark_non_differentiable(*output[4:])
+    ctx.save_for_backward(*output[4:], *inputs[:11])
     ctx.options = inputs[11:]
 
 
-def _backward(ctx, grad_color, grad_alpha, grad_depth, grad_features, _grad_transmittance, _grad_last):
-    grads = torch.ops.gsim3d.rasterize_gaussians_backward(
-        grad_color, grad_alpha, grad_depth, grad_features, *ctx.saved_tensors, *ctx.options
+def _backward(ctx, grad_color, grad_alpha, grad_depth, grad_features, *_kept):
+    viewmats_grad = ctx.needs_input_grad[7]
+    *grads, viewmats = torch.ops.gsim3d.rasterize_gaussians_backward(
+        grad_color, grad_alpha, grad_depth, grad_features, *ctx.saved_tensors, *ctx.options, viewmats_grad
     )
-    return (*grads, None, None, None, None, None, None, None)
+    return (*grads, viewmats if viewmats_grad else None, *[None] * 10)
 
 
 torch.library.register_autograd("gsim3d::rasterize_gaussians", _backward, setup_context=_setup)

@@ -113,6 +113,14 @@ def _patch_attn(device: str) -> float:
     return _compare(device, lambda q, k, v: ops.patch_attention(q, k, v, table), reference, *inputs)
 
 
+def _row_norm(device: str) -> float:
+    def reference(x: Tensor, weight: Tensor, bias: Tensor, residual: Tensor) -> Tensor:
+        return torch.nn.functional.layer_norm(x, weight.shape, weight, bias) + residual
+
+    inputs = _random(30, 20), _random(20, seed=1), _random(20, seed=2), _random(30, 20, seed=3)
+    return _compare(device, ops.row_norm, reference, *inputs)
+
+
 def _pool(device: str) -> float:
     rows = torch.randperm(40, generator=torch.Generator().manual_seed(1))
     cu_rows = torch.tensor([0, 7, 8, 30, 40])
@@ -194,6 +202,7 @@ CHECKS: dict[str, Callable[[str], float]] = {
     "sparse_conv": _sparse_conv,
     "patch_attn": _patch_attn,
     "pool": _pool,
+    "row_norm": _row_norm,
     "plane_sweep": _plane_sweep,
     "raster": _raster,
 }

@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from gsim3d.layers import exact_convolutions
 from gsim3d.perceptual.weights import load
 
 # Mean and deviation of the classifier's training images, for inputs in [-1, 1].
@@ -126,4 +127,5 @@ def lpips(pred: Tensor, target: Tensor, network: str = "vgg") -> Tensor:
     module = load(f"lpips_{network}", lambda: LPIPS(network)).to(pred.device)
     pred, target = (images.permute(0, 3, 1, 2).float() for images in (pred, target))
     pairs = zip(pred.split(_CHUNK), target.split(_CHUNK), strict=True)
-    return torch.cat([module(a, b).double() for a, b in pairs] or [torch.zeros(0, dtype=torch.float64)])
+    with exact_convolutions():
+        return torch.cat([module(a, b).double() for a, b in pairs] or [torch.zeros(0, dtype=torch.float64)])

@@ -27,8 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Learns a simulator from multi-view video; writes checkpoints and a log into a run folder."
     parser.epilog = EPILOG
     parser.add_argument("config", metavar="CONFIG", nargs="?", help="YAML file with the run's settings")
-    parser.add_argument("--data", metavar="DIR", help="folder with scenes, as `gsim3d generate` makes")
+    parser.add_argument("--data", metavar="DIR", help="folder with scenes of any layout (docs/data.md)")
     parser.add_argument("--out", metavar="DIR", help="run folder; made if absent")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default: cpu)")
     parser.add_argument("--until", type=int, metavar="STEP", help="stop after this optimizer step (default: the last)")
     parser.add_argument("--export", metavar="FILE", help="also write the result as one .safetensors file")
     parser.add_argument("--print-config", action="store_true", help="print all settings with their defaults and exit")
@@ -61,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
     from gsim3d.train.loop import Trainer
 
-    trainer = Trainer(config, scenes, args.out)
+    trainer = Trainer(config, scenes, args.out, device=args.device)
     if trainer.step:
         print(f"going on from step {trainer.step} of {config.n_steps}")
     trainer.run(until=args.until)

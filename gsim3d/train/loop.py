@@ -26,7 +26,7 @@ from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
-from gsim3d.train.restore import build_simulator, describe, model_config
+from gsim3d.train.restore import build_simulator, check_device, describe, model_config
 from gsim3d.train.samples import Batch, check_scenes, draw_batch
 from gsim3d.train.schedule import one_cycle
 from gsim3d.train.settings import to_dict
@@ -44,18 +44,21 @@ class Trainer:
         config: the run. A folder that already has a checkpoint must have been started with the same one.
         scenes: to train on, in a fixed order.
         out: run folder, made if absent.
+        device: "cpu" or "cuda". A run may change it between two sittings; its numbers then change by rounding.
     """
 
-    def __init__(self, config: TrainConfig, scenes: Sequence[Scene], out: str | Path):
+    def __init__(self, config: TrainConfig, scenes: Sequence[Scene], out: str | Path, *, device: str = "cpu"):
+        check_device(device)
+        self.device = device
         check_scenes(scenes, config.data, config.stages)
         self.config, self.scenes, self.out = config, list(scenes), Path(out)
         self.plan_spec = EffectsSpec.from_dict(config.effects)
-        self.simulator = build_simulator(model_config(config), config.seed)
+        self.simulator = build_simulator(model_config(config), config.seed).to(device)
         self.plan = self.simulator.plan(self.plan_spec)
         _check_history(config, self.plan)
         if config.workers and self.simulator.config.dynamics.norm == "batch":
             raise InputError("workers: must be 0 for a model with batch normalisation, which needs all samples at once")
-        self.perceptual = load("lpips_vgg", partial(LPIPS, "vgg")) if config.loss.perceptual else None
+        self.perceptual = load("lpips_vgg", partial(LPIPS, "vgg")).to(device) if config.loss.perceptual else None
         self.parameters = dict(self.simulator.named_parameters())
         settings = config.optimizer
         self.optimizer = torch.optim.AdamW(
@@ -134,7 +137,7 @@ class Trainer:
         """Loss, errors by step, and the gradient of the loss for every parameter (None where it has no part)."""
         stage, _ = self.config.stage_of(self.step)
         batch = draw_batch(self.scenes, self.config.data, stage, self.config.seed, self.step, samples)
-        loss, errors = self.loss(batch, samples[0])
+        loss, errors = self.loss(batch.to(self.device), samples[0])
         return loss.detach(), errors, torch.autograd.grad(loss, list(self.parameters.values()), allow_unused=True)
 
     def loss(self, batch: Batch, sample: int = 0) -> tuple[Tensor, Tensor]:
@@ -202,11 +205,12 @@ class Trainer:
                 raise InputError(f"{self.out}: was started with another {name!r}; use the same or another folder")
         self.simulator.load_state_dict(saved.model)
         if self.average:
-            self.average = saved.ema
+            self.average = {name: value.to(self.device) for name, value in saved.ema.items()}
         for key, value in saved.optimizer.items():
             kind, name = key.split(".", 1)
             if name in self.parameters:
-                self.optimizer.state[self.parameters[name]][kind] = value
+                # AdamW counts its steps on the host.
+                self.optimizer.state[self.parameters[name]][kind] = value if kind == "step" else value.to(self.device)
         self.step, self.n_skipped = saved.state["step"], saved.state["n_skipped"]
         self.seconds, self.parent = saved.state["seconds"], saved.digest
         self._cut_log()

@@ -9,7 +9,6 @@ BALANCE = 0.5  # lambda of the paper: weight of the first simulated step; the en
 DISCOUNT = 0.87  # gamma of the paper: weight of a simulated step relative to the one before it
 
 
-
 def time_weights(n_past: int, n_future: int, *, balance: float = BALANCE, discount: float = DISCOUNT) -> Tensor:
     """Weight of each step: ``(1 - balance) / n_past`` for encoded ones, ``balance * discount^j`` for simulated ones.
 

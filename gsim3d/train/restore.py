@@ -12,6 +12,7 @@ from gsim3d import presets
 from gsim3d.data import Scene
 from gsim3d.effects import EffectsSpec, Plan
 from gsim3d.errors import InputError
+from gsim3d.ops import cuda_compiled
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
@@ -36,6 +37,11 @@ class Restored:
     image_size: tuple[int, int]
     plan: Plan
     checkpoint: checkpoint.Checkpoint
+
+    @property
+    def device(self) -> torch.device:
+        """Where the simulator's weights are, and where it predicts."""
+        return next(self.simulator.parameters()).device
 
     def open_scene(self, folder: str | Path) -> Scene:
         """The scene in ``folder`` as the model expects it. Raises InputError as :meth:`check_scene` and the reader."""
@@ -88,12 +94,21 @@ def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: Eff
     }
 
 
-def restore(path: str | Path) -> Restored:
-    """The simulator of a checkpoint (run folder, checkpoint folder or single file), ready to predict.
+def check_device(device: str) -> None:
+    """Raises InputError where nothing can be computed on ``device``, "cpu" or "cuda"."""
+    if device == "cuda" and not (cuda_compiled() and torch.cuda.is_available()):
+        reason = "torch finds no GPU" if cuda_compiled() else "gsim3d was built without CUDA"
+        raise InputError(f"--device cuda: {reason} (see gsim3d doctor)")
+
+
+def restore(path: str | Path, device: str = "cpu") -> Restored:
+    """The simulator of a checkpoint (run folder, checkpoint folder or single file), ready to predict on ``device``.
 
     Raises:
-        InputError: the checkpoint is broken or does not fit this version; the message names it.
+        InputError: the checkpoint is broken or does not fit this version, or ``device`` is "cuda" where gsim3d was built
+            without CUDA or torch finds no GPU; the message says which.
     """
+    check_device(device)
     saved = checkpoint.load(path)
     data = dict(saved.config["data"])
     image_size = tuple(data.pop("image_size", ()))
@@ -111,4 +126,4 @@ def restore(path: str | Path) -> Restored:
         simulator.load_state_dict(saved.weights)
     except RuntimeError as error:
         raise InputError(f"{path}: the weights do not fit the model: {str(error).splitlines()[-1].strip()}") from None
-    return Restored(simulator.eval(), settings, image_size, simulator.plan(spec), saved)
+    return Restored(simulator.eval().to(device), settings, image_size, simulator.plan(spec), saved)

@@ -28,6 +28,9 @@ class Batch:
     n_context: int
     n_future: int
 
+    def to(self, device: str | torch.device) -> Batch:
+        return dataclasses.replace(self, context=self.context.to(device), targets=self.targets.to(device))
+
     def target_step(self) -> Tensor:
         """int64 [I], the step in its window that each target image shows."""
         return self.targets.cameras.image_cloud % (self.n_context + self.n_future)
@@ -42,7 +45,7 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, stages: Sequence[Sta
         if (scene.width, scene.height) != (first.width, first.height):
             raise InputError(
                 f"{scene.path}: images of {scene.width}x{scene.height} pixels, those of {first.path} have "
-                f"{first.width}x{first.height}"
+                f"{first.width}x{first.height}; data.resize brings all to one size"
             )
         for stage in stages:
             n_steps = (stage.history or data.history) + stage.horizon

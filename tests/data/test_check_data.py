@@ -22,7 +22,7 @@ def test_sound_data(data, capsys):
     out = data.parent / "sheet.png"
     assert main(["check-data", str(data), "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "3 scenes, no problem" in printed and "problem:" not in printed
+    assert "3 scenes read, no problem" in printed and "problem:" not in printed
     for layout in ("genesis", "kubric", "films"):
         assert f"data/{layout}: {layout}, 4 steps at 12 a second, 3 cameras, 48x32 pixels" in printed
     assert [path.name for path in data.parent.iterdir() if path != data] == ["sheet.png"]

@@ -9,7 +9,7 @@ import pytest
 from gsim3d.data import Scene
 from gsim3d.data.check import check_scene
 from gsim3d.errors import InputError
-from tests.data.made_scenes import WRITERS, make_scene
+from tests.data.made_scenes import WRITERS, edit_json, make_scene
 
 JUNK = [
     None,
@@ -44,7 +44,14 @@ N_CASES = 60
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("scenes")
     made = make_scene(moving=True, width=16, height=16, n_steps=2, n_cams=2)
-    return {layout: WRITERS[layout](root / layout, made) for layout in FILES}
+    written = {layout: WRITERS[layout](root / layout, made) for layout in FILES}
+    optional = {
+        "films": {"units": "m", "pixel_center": 0.5, "masks": "subtract"},
+        "transforms": {"k1": 0.1, "p2": 0.01},
+    }
+    for layout, keys in optional.items():
+        edit_json(written[layout] / FILES[layout], lambda content: content.update(keys))
+    return written
 
 
 def places(content, path=()):

@@ -116,19 +116,16 @@ def test_lenses_are_undistorted(odd):
     assert np.mean(with_lens) > 0.9
 
 
-def test_undistortion_moves_a_point_to_its_pinhole_projection():
-    """A point drawn where the lens puts it is found where the pinhole puts it."""
+def test_undistorted_pixels_come_from_where_the_lens_puts_their_rays():
+    """An image that holds its own coordinates shows where each pixel of the result was taken."""
     K = np.array([[200.0, 0, 101.5], [0, 210.0, 76.0], [0, 0, 1]])
-    for point in ([0.3, 0.2, 1.0], [-0.4, 0.25, 1.0], [0.05, -0.3, 1.0]):
-        own = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-        x, y = cv2.projectPoints(np.array([point]), np.zeros(3), np.zeros(3), own, np.array(LENS))[0].ravel()
-        grid = np.mgrid[:160, :200]
-        image = (255 * np.exp(-((grid[1] - x) ** 2 + (grid[0] - y) ** 2) / 8)).astype(np.uint8)
-        flat = Undistorter(np.array(LENS), (200, 160))(image, K).astype(float)
-        found = [(flat * (grid[axis] + 0.5)).sum() / flat.sum() for axis in (1, 0)]
-        expected = (K @ point)[:2]
-        assert np.abs(np.array(found) - expected).max() < 0.1
-        assert np.hypot(x + 0.5 - expected[0], y + 0.5 - expected[1]) > 0.5
+    y, x = np.mgrid[:160, :200].astype(np.float32)
+    taken = Undistorter(np.array(LENS), (200, 160))(np.stack([x, y], -1), K)
+    for column, row in ((20, 15), (101, 76), (180, 30), (60, 140)):
+        ray = np.linalg.inv(K) @ [column + 0.5, row + 0.5, 1]  # through the centre of the pixel
+        in_lens = cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), K, np.array(LENS))[0].ravel()
+        assert np.abs(taken[row, column] + 0.5 - in_lens).max() < 0.03  # OpenCV interpolates in steps of 1/32
+        assert np.abs(in_lens - [column + 0.5, row + 0.5]).max() > 0.1 or (column, row) == (101, 76)
 
 
 def test_the_background_is_subtracted_and_painted_black(odd):
@@ -249,6 +246,27 @@ def test_a_video_that_is_cut_off_is_named(videos, tmp_path):
     ):
         Scene.open(folder).film([2], range(9))
     assert any("video_2" in problem for problem in check_scene(folder).problems)
+
+
+def test_images_that_are_cut_off_are_named(tmp_path):
+    """OpenCV fills the rest of a JPEG with grey; a thumbnail's end inside the header is not the end of the image."""
+    folder = write_films(tmp_path, make_scene())
+    for file in (folder / "cam_1").glob("*.png"):
+        cv2.imwrite(str(file.with_suffix(".jpg")), cv2.imread(str(file)))
+        file.unlink()
+    assert Scene.open(folder).film([1], [0]).float().mean() > 5
+    file = folder / "cam_1" / "004.jpg"
+    data = file.read_bytes()
+    thumbnail = b"\xff\xe1" + (2 + 400).to_bytes(2, "big") + b"\xff\xd8" + bytes(396) + b"\xff\xd9"
+    whole = data[:2] + thumbnail + data[2:]
+    file.write_bytes(whole)
+    assert Scene.open(folder).film([1], [2]).float().mean() > 5
+    for cut in (whole[: len(whole) * 3 // 4], whole[:-2]):
+        file.write_bytes(cut)
+        with pytest.raises(
+            InputError, match=r"004.jpg \(camera cam_1, frame 4\) cannot be decoded: its end is missing"
+        ):
+            Scene.open(folder).film([1], [2])
 
 
 def test_frame_numbers_are_times(tmp_path):

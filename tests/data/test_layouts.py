@@ -128,6 +128,18 @@ def test_a_single_kubric_camera_is_a_scene(tmp_path):
     np.testing.assert_array_equal(scene.images([0], STEPS)[:, 0].permute(0, 2, 3, 1), made.rgb[:, 1])
 
 
+def test_the_number_of_a_kubric_frame_is_that_of_its_pose(tmp_path):
+    made = make_scene(moving=True)
+    write_kubric(tmp_path, made)
+    for file in [*tmp_path.rglob("*_0.png"), *tmp_path.rglob("*_2.png")]:
+        file.unlink()
+    scene = Scene.open(tmp_path)
+    assert scene.n_steps == 2 and scene.fps == pytest.approx(FPS / 2)
+    cameras = scene.cameras_at(CAMS, [0, 1])
+    np.testing.assert_allclose(cameras.viewmats.unflatten(0, (2, N_CAMS)), made.viewmats[[1, 3]], atol=2e-6)
+    np.testing.assert_array_equal(scene.segmentation(CAMS, [0, 1]), made.labels[[1, 3]])
+
+
 def test_a_folder_without_any_layout_is_named(tmp_path):
     with pytest.raises(InputError, match="no metadata.json, transforms.json or cameras.json"):
         Scene.open(tmp_path)

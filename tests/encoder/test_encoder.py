@@ -12,7 +12,9 @@ from gsim3d.encoder.depth import Views, feature_intrinsics, upsample, upsampling
 from gsim3d.encoder.camera_frame import quat_multiply, rotation_to_quat
 from gsim3d.encoder.heads import PixelRays, explicit_gaussians
 from gsim3d.errors import HardCaseError, InputError
+from gsim3d.harmonics import rotate_harmonics
 from gsim3d.quirks import Quirks
+from gsim3d.renderer import rotation_matrices, unit_quats
 from gsim3d.types import DYNAMIC, FROZEN, Frames
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.encoder.scenes import ROW_FIELDS, SIZE, image_rows, make_encoder, make_frames, select
@@ -246,6 +248,23 @@ def test_explicit_variant(quirks):
 def rotations(n: int) -> torch.Tensor:
     q, _ = torch.linalg.qr(torch.randn(n, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
     return q * torch.linalg.det(q)[:, None, None]
+
+
+def test_explicit_particles_turn_with_the_scene():
+    """Cameras turn with the scene about the world's origin: so do places, orientations and colours."""
+    frames, turn = make_frames([0, 0]), rotations(1)[0]
+    viewmats = frames.cameras.viewmats.clone()
+    viewmats[:, :3, :3] = viewmats[:, :3, :3] @ turn.T
+    turned = dataclasses.replace(frames, cameras=dataclasses.replace(frames.cameras, viewmats=viewmats))
+    encoder = make_encoder(explicit=True, dynamic_dim=0, static_dim=0)
+    here, there = encoder(frames), encoder(turned)
+    turn = turn.float()
+    assert_close_relative_to_max(there.means, here.means @ turn.T, "encoder_order")
+    assert_close_relative_to_max(there.scales, here.scales, "encoder_order")
+    axes = [rotation_matrices(unit_quats(particles.quats)) for particles in (here, there)]
+    assert_close_relative_to_max(axes[1], turn @ axes[0], "encoder_order")
+    colors = rotate_harmonics(here.sh, turn.expand(len(here.sh), 3, 3))
+    assert_close_relative_to_max(there.sh[:, 1:], colors[:, 1:], "encoder_order")
 
 
 def test_quaternions_of_rotations():

@@ -1,5 +1,6 @@
 """The protocol: what the baselines show, how scores are averaged, and that reports hold no NaN."""
 
+import copy
 import dataclasses
 import json
 import math
@@ -47,6 +48,10 @@ def restored():
         simulator.dynamics.net.head.fc2.weight.normal_(0, 0.02, generator=torch.Generator().manual_seed(0))
     data = DataConfig(history=2, context_views=2, target_only_cameras=(3,), background_stride=2)
     return Restored(simulator, data, (32, 32), simulator.plan(EffectsSpec()), Checkpoint({}, {}))
+
+
+def moved_to(device, restored):
+    return dataclasses.replace(restored, simulator=copy.deepcopy(restored.simulator).to(device))
 
 
 def test_default_views(restored, scene):
@@ -188,6 +193,13 @@ def test_scores_by_hand(restored, scene):
     assert scores.values["constant"]["psnr"][:2].isnan().all()
 
 
+def test_scores_are_the_same_on_both_devices(restored, scene, devices):
+    cpu, cuda = (score_scene(moved_to(device, restored), scene).values for device in devices)
+    for method in METHODS:
+        for metric, values in cpu[method].items():
+            torch.testing.assert_close(cuda[method][metric], values, rtol=0, atol=0.01, equal_nan=True)
+
+
 def test_what_does_not_fit_is_named(restored, scene):
     with pytest.raises(InputError, match="the model was trained on 64x64"):
         predict(dataclasses.replace(restored, image_size=(64, 64)), scene, (0, 2), 1)
@@ -227,7 +239,8 @@ def test_values_that_do_not_exist_are_null(tmp_path):
     assert " - " in table(summary) + " "
 
 
-def test_pictures(restored, scene):
+def test_pictures(restored, scene, device):
+    restored = moved_to(device, restored)
     prediction = predict(restored, scene, (0, 2), 6)
     images = as_bytes(render_steps(restored, prediction.particles, scene, [3, 1]))
     truth = true_images(scene, [3, 1], range(8))

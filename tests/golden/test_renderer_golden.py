@@ -28,7 +28,6 @@ from tests.golden_files import golden
 from tests.tolerances import tolerance
 
 pytestmark = pytest.mark.golden
-SIZE = 48  # pixels; no array of the file says so
 
 
 def in_published_basis(sh):
@@ -131,10 +130,11 @@ def test_covariances_and_increments_of_rotation():
 
 
 def published_cameras(file) -> Cameras:
-    Ks = file["in/intrinsics"] * torch.tensor([SIZE, SIZE, 1.0])[:, None]
+    height, width = file["view0/image_float32"].shape[1:]
+    Ks = file["in/intrinsics"] * torch.tensor([width, height, 1.0])[:, None]
     n = len(Ks)
     viewmats = torch.linalg.inv(file["in/extrinsics"].double())
-    return Cameras(viewmats, Ks, file["in/near"], file["in/far"], torch.zeros(n, dtype=torch.int64), SIZE, SIZE)
+    return Cameras(viewmats, Ks, file["in/near"], file["in/far"], torch.zeros(n, dtype=torch.int64), width, height)
 
 
 def gaussians_of(file, rows=slice(None)) -> Gaussians:
@@ -181,13 +181,13 @@ def test_cameras_of_the_published_renderer():
     """It scales the scene by 1 / near and knows opening angles only."""
     file = golden("j_raster")
     given = published_cameras(file)
-    cameras = with_centered_principal_point(given)
+    cameras, size = with_centered_principal_point(given), torch.tensor([given.width, given.height])
     for view in range(len(given)):
         settings = file / f"view{view}" / "raster_settings"
         near, far = given.near[view].double(), given.far[view].double()
         tangents = torch.stack([settings["tanfovx"], settings["tanfovy"]]).double()
         close(
-            SIZE / (2 * cameras.Ks[view].diagonal()[:2]),
+            size / (2 * cameras.Ks[view].diagonal()[:2]),
             tangents,
             "tangents of half the opening angles",
             "golden_float32",

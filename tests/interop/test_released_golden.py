@@ -13,6 +13,8 @@ from gsim3d.dynamics import Dynamics
 from gsim3d.dynamics.point_transformer import Attention
 from gsim3d.encoder import Encoder
 from gsim3d.interop.released import dynamics_weights, encoder_weights, to_published
+from gsim3d.interop.released_config import read_config
+from gsim3d.interop.released_import import published_shapes
 from gsim3d.train.restore import restore
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames, Particles
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -73,6 +75,23 @@ def test_the_whole_model_is_named(import_model):
     for name, value in weights.items():
         if not name.endswith("num_batches_tracked"):
             assert torch.equal(back[name], value), name
+
+
+VARIANTS = ["full_latent_4_1_12_intended", "full_latent_4_1_12_literal_yaml", "small", "small_deep_dynamics"]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_resolved_settings_make_the_listed_tensors(variant):
+    listed = json.loads(golden_path("params_full.json").read_text())[variant]
+    shapes = {entry["name"]: tuple(entry["shape"]) for entry in listed["entries"]}
+    read = read_config(listed["resolved_config"], shapes)
+    assert published_shapes(read.model) == shapes
+    assert not any("but the weights have" in note for note in read.notes)
+    net = listed["resolved_config"]["model"]["dynamic_model"]["model"]
+    dynamics = read.model.dynamics
+    assert (dynamics.grid_size, list(dynamics.strides)) == (net["grid_size"], net["stride"])
+    assert list(dynamics.merge_windows) == net["merge_window_size"]
+    assert dynamics.history_bits == 2 and read.data["near_far"] == [1.0, 8.0]
 
 
 @pytest.mark.parametrize("case", ["T4_nomask", "T2_mask"])

@@ -84,6 +84,22 @@ def test_tensors_that_do_not_fit_are_named(capsys, tmp_path):
     assert not (tmp_path / "model").exists()
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda w, name: w.pop(name), "its tensors do not fit the configuration; 1 missing: {name}$"),
+        (lambda w, name: w.update({name: w[name][1:]}), r"configuration; 1 of another shape: {name} is \[11\] instead"),
+    ],
+)
+def test_one_tensor_that_does_not_fit_is_enough(tmp_path, change, message):
+    config = small_config()
+    weights, name = random_weights(config), "encoder.backbone.backbone.layer2.0.downsample.0.bias"
+    change(weights, name)
+    checkpoint, _ = write_release(tmp_path, weights, {})
+    with pytest.raises(InputError, match=message.format(name=name)):
+        import_released(checkpoint, settings_of(config))
+
+
 def test_tensors_that_the_model_has_not_are_listed(capsys, tmp_path):
     config = small_config()
     weights = random_weights(config)
@@ -125,7 +141,8 @@ def test_settings_that_no_weight_shows():
     assert read("model.state_adapter.gaussians.scale_max", 0.2).model.renderer.scale_max == 0.2
     assert read("dataset.n_step_state", 4).model.dynamics.history_bits == 2
     assert read("dataset.near", 0.5).data["near_far"] == [0.5, 4.0]
-    assert read("dataset.image_shape", [64, 96]).data["image_size"] == [96, 64]
+    wide = read("dataset.image_shape", [64, 96]).data
+    assert wide["image_size"] == wide["resize"] == [96, 64]
     assert read("dataset.make_baseline_1", True).data["unit_cameras"] is True
     assert read("dataset.with_seg", False).effects.dynamics.background == "dynamic"
     assert read(f"{net}.grid_size", "4e-3").model.dynamics.grid_size == 0.004  # as YAML 1.1 reads it
@@ -291,6 +308,16 @@ def test_the_imported_model_is_evaluated_at_its_own_size(capsys, tmp_path):
     assert main([str(argument) for argument in arguments]) == 0
     metrics = json.loads((tmp_path / "model" / "metrics.json").read_text())
     assert isinstance(metrics["future.psnr"], float)
+
+
+def test_the_file_that_is_wrong_is_named_however_it_was_written(capsys, tmp_path, monkeypatch):
+    config = small_config()
+    write_release(tmp_path, {"a": torch.ones(1)}, settings_of(config))
+    monkeypatch.chdir(tmp_path)
+    code, _, err = run_import(capsys, "./model.ckpt", "./model.yaml", "model")
+    assert code == 2 and err.startswith(
+        "gsim3d: error: model.ckpt: encoder.depth_predictor.to_gaussians.2.weight is missing"
+    )
 
 
 def test_what_was_found_is_kept_with_the_weights(tmp_path):

@@ -27,6 +27,18 @@ def test_codes(curve, depth):
     assert curve_encode(grid, None, curve, depth=depth).tolist() == expected
 
 
+def test_several_curves_at_once(device):
+    grid, cloud = random_cells(70, 11).to(device), (torch.arange(70) % 3).to(device)
+    names = ("hilbert", "z", "hilbert", "z-trans", "hilbert-trans")
+    codes = curve_encode(grid, cloud, names, depth=11)
+    assert codes.shape == (5, 70)
+    for row, name in zip(codes, names):
+        assert torch.equal(row, curve_encode(grid, cloud, name, depth=11))
+    assert curve_encode(grid, cloud, ()).shape == (0, 70)
+    with pytest.raises(ValueError, match="curve must be one of .* got 'peano'"):
+        curve_encode(grid, cloud, ("z", "peano"))
+
+
 def test_cloud_bits_lie_above_the_shift():
     grid, cloud = random_cells(50, 16), torch.arange(50) % 7
     space = curve_encode(grid, None, "hilbert")
@@ -114,7 +126,7 @@ def test_devices_raise_alike(devices):
 @pytest.mark.filterwarnings("error")
 def test_opcheck(device):
     grid = random_cells(10, 16).to(device)
-    torch.library.opcheck(torch.ops.gsim3d.curve_encode, (grid, torch.arange(10, device=device), 2, 16, 48))
+    torch.library.opcheck(torch.ops.gsim3d.curve_encode, (grid, torch.arange(10, device=device), [2, 0], 16, 48))
     torch.library.opcheck(torch.ops.gsim3d.curve_sort, (torch.stack([grid[:, 0], grid[:, 1]]),))
 
 

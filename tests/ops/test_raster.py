@@ -16,7 +16,8 @@ DTYPES = {torch.float32: "float32", torch.float64: "float64"}
 
 def operator_args(scene):
     leaves = [x.clone().requires_grad_() for x in scene.inputs]
-    return (*leaves, scene.Ks, scene.image_cloud, scene.cu_rows, scene.width, scene.height, 0.01, 0)
+    sizes = [factor * len(scene.means) if scene.means.is_cuda else 0 for factor in (2, 4, 8)]
+    return (*leaves, scene.Ks, scene.image_cloud, scene.cu_rows, scene.width, scene.height, 0.01, 0, *sizes)
 
 
 # ---- 1 forward against the oracle ----------------------------------------------------------------------------------
@@ -141,12 +142,92 @@ def test_devices_agree(devices, sh_terms):
         assert_close_relative_to_max(a, e, "raster_grad_float32", name)
 
 
+def test_same_bits_every_time_on_cuda(devices):
+    # Overlapping Gaussians, so that thousands of threads work on one tile and on one row.
+    scene = random_scene(n=20_000, width=64, height=48, sh_terms=4, dtype=torch.float32, seed=2).to(devices[1])
+    first = (*scene.render(), *gradients(scene.render, scene))
+    for _ in range(3):
+        for a, e in zip((*scene.render(), *gradients(scene.render, scene)), first, strict=True):
+            assert_same_bits(a, e)
+
+
+@pytest.mark.parametrize("limits", [(1, 1, 4), (2, 4, 8), (3, 10, 12)], ids=str)
+def test_any_limits_give_the_same_result_on_cuda(devices, limits):
+    """What exceeds the limits is done in further groups of images, down to parts of one image."""
+    scene = random_scene(n=2000, clouds=2, images=6, width=40, height=33, sh_terms=4, dtype=torch.float32, seed=8)
+    scene = scene.replace(opacities=0.01 + 0.02 * scene.opacities, scales=8 * scene.scales).to(devices[1])
+    leaves = [x.clone().requires_grad_() for x in scene.inputs]
+    args, cotangents = operator_args(scene)[8:-3], scene.cotangents()
+
+    def render(*limits):
+        limits = [factor * len(scene.means) for factor in limits]
+        out = torch.ops.gsim3d.rasterize_gaussians(*leaves, *args, *limits)[:4]
+        return (*out, *torch.autograd.grad(out, leaves, cotangents))
+
+    # Other kernels render what exceeds the limits: the compiler may fuse other products and sums.
+    for a, e in zip(render(*limits), render(6, 100, 400), strict=True):
+        assert_close_relative_to_max(a, e, "raster_grad_float32")
+
+
+def test_more_than_the_first_group_holds_on_cuda(devices):
+    # All images show the larger cloud: more pairs than where every cloud has as many images.
+    scene = random_scene(n=4000, clouds=2, images=6, width=40, height=33, sh_terms=4, dtype=torch.float32, seed=8)
+    scene = scene.replace(opacities=0.01 + 0.02 * scene.opacities, cu_rows=torch.tensor([0, 3900, 4000]))
+    cpu = scene.replace(image_cloud=torch.zeros(6, dtype=torch.int64))
+    cuda = cpu.to(devices[1])
+    for name, a, e in zip(OUTPUTS, cuda.render(), cpu.render(), strict=True):
+        assert_close_relative_to_max(a, e, "raster_many_float32", name)
+    for name, a, e in zip(Scene.NAMES, gradients(cuda.render, cuda), gradients(cpu.render, cpu), strict=True):
+        assert_close_relative_to_max(a, e, "raster_grad_float32", name)
+
+
+def test_gradient_of_the_viewmats_only_when_wanted_on_cuda(devices):
+    scene = random_scene(n=200, sh_terms=4, dtype=torch.float32).to(devices[1])
+    expected = gradients(scene.render, scene)[:7]
+    leaves = [x.clone().requires_grad_() for x in scene.inputs[:7]]
+    out = scene.render(*leaves, scene.viewmats)
+    for a, e in zip(torch.autograd.grad(out, leaves, scene.cotangents()), expected, strict=True):
+        assert_same_bits(a, e)
+
+
+def test_render_in_a_cuda_graph(devices):
+    scene = random_scene(n=300, sh_terms=4, dtype=torch.float32).to(devices[1])
+    leaves = [x.clone().requires_grad_() for x in scene.inputs]
+    cotangents, args = scene.cotangents(), operator_args(scene)[8:]
+
+    def run():
+        out = torch.ops.gsim3d.rasterize_gaussians(*leaves, *args)[:4]
+        return [*out, *torch.autograd.grad(out, leaves, cotangents)]
+
+    expected = [x.detach() for x in run()]  # a graph kept alive would tie its leaves to this stream
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        run()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = run()
+    for tensor in captured:
+        tensor.detach().fill_(float("nan"))
+    graph.replay()
+    for a, e in zip(captured, expected, strict=True):
+        assert_same_bits(a, e)
+
+
 # ---- 5 opcheck -----------------------------------------------------------------------------------------------------
 
 
-def test_opcheck(device):
-    args = operator_args(random_scene(n=8, images=2, clouds=2, width=9, height=7).to(device))
+def test_opcheck():
+    args = operator_args(random_scene(n=8, images=2, clouds=2, width=9, height=7))
     torch.library.opcheck(torch.ops.gsim3d.rasterize_gaussians, args)
+
+
+def test_opcheck_on_cuda(devices):
+    # Traced and eager outputs are not compared: what is kept for the backward pass has bytes that nobody sets.
+    args = operator_args(random_scene(n=8, images=2, clouds=2, width=9, height=7).to(devices[1]))
+    tests = ("test_schema", "test_autograd_registration", "test_faketensor")
+    torch.library.opcheck(torch.ops.gsim3d.rasterize_gaussians, args, test_utils=tests)
 
 
 def test_opcheck_backward(device):
@@ -155,7 +236,7 @@ def test_opcheck_backward(device):
     kept = torch.ops.gsim3d.rasterize_gaussians(*args)[4:]
     torch.library.opcheck(
         torch.ops.gsim3d.rasterize_gaussians_backward,
-        (*scene.cotangents(), *kept, *args),
+        (*scene.cotangents(), *kept, *args, True),
         test_utils=("test_schema", "test_faketensor"),
     )
 

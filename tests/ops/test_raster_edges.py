@@ -208,58 +208,116 @@ NAN, INF = float("nan"), float("inf")
 POISON = (0.0, -0.0, 1e-45, 1e-38, 1e-20, 1e-6, 1.0, 1e6, 1e20, 3e38, -1e-20, -1e20, INF, -INF, NAN)
 
 
-@pytest.mark.parametrize("name", Scene.NAMES)
-def test_poison_is_rendered_or_refused(device, name):
-    """Any number in any place: a finite result with finite gradients, or a ValueError; never a silent NaN."""
+def poisoned(name, device):
+    """(what was changed, scene) with every number of POISON in three places of an input."""
     scene = random_scene(n=6, clouds=1, images=1, width=20, height=18, sh_terms=4, dtype=torch.float32).to(device)
-    refused = 0
     for value, place in itertools.product(POISON, (0, 1, -1)):
-        poisoned = getattr(scene, name).clone()
-        poisoned.view(-1)[place] = value
+        tensor = getattr(scene, name).clone()
+        tensor.view(-1)[place] = value
+        yield value, f"{name} = {value} at {place}", scene.replace(**{name: tensor})
+
+
+def assert_no_silent_nan(value, what, scene):
+    out = scene.render()
+    if abs(value) <= 1e6:
+        assert all(torch.isfinite(x).all() for x in (*out, *gradients(scene.render, scene))), what
+    else:
+        assert not any(torch.isnan(x).any() for x in out), what
+
+
+@pytest.mark.parametrize("name", Scene.NAMES)
+def test_poison_is_rendered_or_refused(name):
+    """Any number in any place: a finite result with finite gradients, or a ValueError; never a silent NaN."""
+    refused = 0
+    for value, what, scene in poisoned(name, torch.device("cpu")):
         try:
-            out = scene.replace(**{name: poisoned}).render()
+            assert_no_silent_nan(value, what, scene)
         except ValueError as error:
             refused += 1
             assert str(error).startswith("rasterize_gaussians: ")
-            continue
-        if abs(value) <= 1e6:
-            assert all(torch.isfinite(x).all() for x in out), f"{name} = {value} at {place}"
-            grads = gradients(scene.render, scene.replace(**{name: poisoned}))
-            assert all(torch.isfinite(x).all() for x in grads), f"{name} = {value} at {place}"
-        else:
-            assert not any(torch.isnan(x).any() for x in out), f"{name} = {value} at {place}"
     assert refused >= 6  # inf, -inf and NaN in the first two places at least
 
 
-# ---- 8 error messages ----------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("name", Scene.NAMES)
+def test_poison_is_left_out_on_cuda(devices, name):
+    for value, what, scene in poisoned(name, devices[1]):
+        assert_no_silent_nan(value, what, scene)
 
 
-@pytest.mark.parametrize(
-    "name, value, message",
-    [
-        ("means", NAN, "means must be finite; got nan at row 2"),
-        ("quats", NAN, "quats must be finite; got nan at row 2"),
-        ("scales", float("inf"), "scales must be finite; got inf at row 2"),
-        ("scales", -1.0, "scales must not be negative; got -1 at row 2"),
-        ("scales", 1e30, "the projection overflows; scales or means are too large at row 2 for image 0"),
-        ("opacities", 1.5, r"opacities must be in \[0, 1\]; got 1.5 at row 2"),
-        ("opacities", NAN, r"opacities must be in \[0, 1\]; got nan at row 2"),
-        ("color", NAN, "colors must be finite; got nan at row 2"),
-        ("features", NAN, "features must be finite; got nan at row 2"),
-    ],
-)
-def test_bad_rows_are_named(device, name, value, message):
-    scene = facing([[0, 0, 2.0]] * 4, features=torch.zeros(4, 2))
-    bad = getattr(scene, name).clone()
-    bad[2] = value
-    with pytest.raises(HardCaseError, match="rasterize_gaussians: " + message):
-        scene.replace(**{name: bad}).to(device).render()
+BAD_ROWS = [
+    ("means", NAN, "means must be finite; got nan at row 2"),
+    ("quats", NAN, "quats must be finite; got nan at row 2"),
+    ("scales", INF, "scales must be finite; got inf at row 2"),
+    ("scales", -1.0, "scales must not be negative; got -1 at row 2"),
+    ("scales", 1e30, "the projection overflows; scales or means are too large at row 2 for image 0"),
+    ("opacities", 1.5, r"opacities must be in \[0, 1\]; got 1.5 at row 2"),
+    ("opacities", NAN, r"opacities must be in \[0, 1\]; got nan at row 2"),
+    ("color", NAN, "colors must be finite; got nan at row 2"),
+    ("features", NAN, "features must be finite; got nan at row 2"),
+]
+
+
+def four_rows():
+    return facing([[0, 0, 2.0]] * 4, features=torch.ones(4, 2))
 
 
 def change(scene, name, index, value):
     tensor = getattr(scene, name).clone()
     tensor[index] = value
     return scene.replace(**{name: tensor})
+
+
+@pytest.mark.parametrize("name, value, message", BAD_ROWS)
+def test_bad_rows_are_left_out_on_cuda(devices, name, value, message):
+    scene = change(four_rows(), name, 2, value).to(devices[1])
+    kept = torch.tensor([0, 1, 3])
+    rows = {field: getattr(four_rows(), field)[kept] for field in Scene.NAMES[:6]}
+    rest = four_rows().replace(**rows, cu_rows=torch.tensor([0, 3])).to(devices[1])
+    for a, e in zip(scene.render(), rest.render(), strict=True):
+        assert_same_bits(a, e)
+    for field, a, e in zip(Scene.NAMES, gradients(scene.render, scene), gradients(rest.render, rest), strict=True):
+        if field in rows:
+            assert a[2].abs().max() == 0, field
+            a = a[kept.to(a.device)]
+        assert_close_relative_to_max(a, e, 1e-6, field)  # viewmats: a sum over rows, of which one is gone
+
+
+BAD_DATA = [
+    (lambda s: s.replace(image_cloud=torch.tensor([1])), r"image_cloud must be in \[0, Q\) with Q=1; got 1 for"),
+    (lambda s: s.replace(image_cloud=torch.tensor([-1])), r"image_cloud must be in \[0, Q\) with Q=1; got -1"),
+    (lambda s: s.replace(cu_rows=torch.tensor([0, 3])), "cu_rows must run from 0 to N=4; got 0 .. 3"),
+    (lambda s: s.replace(cu_rows=torch.tensor([0, 5, 4])), "cu_rows must not descend; got 5 then 4 at 1"),
+    (lambda s: change(s, "Ks", (0, 0, 0), 0.0), "focal lengths in Ks must be positive; got 0 and 16 for image 0"),
+    (lambda s: change(s, "Ks", (0, 1, 0), 1.0), r"Ks must be \[\[fx, skew, cx\]"),
+    (lambda s: change(s, "Ks", (0, 0, 2), NAN), "Ks must be finite; got nan for image 0"),
+    (lambda s: change(s, "viewmats", (0, 1, 1), NAN), "viewmats must be finite; got nan for image 0"),
+    (lambda s: change(s, "background", (0, 1), NAN), "background must be finite; got nan for image 0"),
+]
+
+
+@pytest.mark.parametrize("broken", [broken for broken, _ in BAD_DATA[:-1]])
+def test_images_of_bad_cameras_and_clouds_are_empty_on_cuda(devices, broken):
+    scene = broken(four_rows().replace(background=torch.tensor([[0.1, 0.2, 0.3]]))).to(devices[1])
+    color, alpha, _, _ = scene.render()
+    assert alpha.abs().max() == 0
+    assert_same_bits(color, scene.background.expand(1, 16, 16, 3))
+    for name, grad in zip(Scene.NAMES, gradients(scene.render, scene), strict=True):
+        assert torch.isfinite(grad).all() and (name == "background" or grad.abs().max() == 0), name
+
+
+# ---- 8 error messages ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name, value, message", BAD_ROWS)
+def test_bad_rows_are_named(name, value, message):
+    with pytest.raises(HardCaseError, match="rasterize_gaussians: " + message):
+        change(four_rows(), name, 2, value).render()
+
+
+@pytest.mark.parametrize("broken, message", BAD_DATA)
+def test_bad_data_is_named(broken, message):
+    with pytest.raises(ValueError, match="rasterize_gaussians: " + message):
+        broken(four_rows()).render()
 
 
 @pytest.mark.parametrize(
@@ -278,17 +336,8 @@ def change(scene, name, index, value):
         (lambda s: s.replace(Ks=s.Ks[:, :2]), r"Ks must be \[I, 3, 3\]"),
         (lambda s: s.replace(quats=s.quats.double()), "quats must be float32; got float64"),
         (lambda s: s.replace(image_cloud=s.image_cloud.int()), "image_cloud must be int64; got int32"),
-        (lambda s: s.replace(image_cloud=torch.tensor([1])), r"image_cloud must be in \[0, Q\) with Q=1; got 1 for"),
-        (lambda s: s.replace(image_cloud=torch.tensor([-1])), r"image_cloud must be in \[0, Q\) with Q=1; got -1"),
-        (lambda s: s.replace(cu_rows=torch.tensor([0, 3])), "cu_rows must run from 0 to N=4; got 0 .. 3"),
-        (lambda s: s.replace(cu_rows=torch.tensor([0, 5, 4])), "cu_rows must not descend; got 5 then 4 at 1"),
         (lambda s: s.replace(width=0), r"width and height must be in \[1, 65535\]; got 0 and 16"),
         (lambda s: s.replace(height=-2), "width and height must be positive; got 16 and -2"),
-        (lambda s: change(s, "Ks", (0, 0, 0), 0.0), "focal lengths in Ks must be positive; got 0 and 16 for image 0"),
-        (lambda s: change(s, "Ks", (0, 1, 0), 1.0), r"Ks must be \[\[fx, skew, cx\]"),
-        (lambda s: change(s, "Ks", (0, 0, 2), NAN), "Ks must be finite; got nan for image 0"),
-        (lambda s: change(s, "viewmats", (0, 1, 1), NAN), "viewmats must be finite; got nan for image 0"),
-        (lambda s: change(s, "background", (0, 1), NAN), "background must be finite; got nan for image 0"),
     ],
 )
 def test_messages(device, broken, message):

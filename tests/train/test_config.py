@@ -38,7 +38,10 @@ def test_what_is_left_out_comes_from_the_base():
         ({"seed": 1.5}, r"^seed: must be a whole number; got 1.5"),
         ({"seed": True}, r"^seed: must be a whole number"),
         ({"seed": -1}, r"seed must be at least 0"),
-        ({"data": {"resize": [100, 128]}}, r"data\.resize: must be \[width, height\], multiples of 16; got \[100, 128\]"),
+        (
+            {"data": {"resize": [100, 128]}},
+            r"data\.resize: must be \[width, height\], multiples of 16; got \[100, 128\]",
+        ),
         ({"data": {"resize": [128]}}, r"data\.resize: must be \[width, height\]"),
         ({"data": {"near_far": [2, 1]}}, r"data\.near_far: must be two rising distances above 0; got \[2.0, 1.0\]"),
         ({"loss": {"perceptual": -1}}, r"perceptual must be at least 0"),

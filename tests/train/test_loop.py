@@ -60,6 +60,16 @@ def finished(folder, tmp_path_factory, one_thread):
     return out
 
 
+def test_training_on_a_device_repeats_and_resumes_bit_by_bit(folder, tmp_path, device):
+    for name, sittings in (("whole", [None]), ("again", [None]), ("parts", [2, 4, None])):
+        for until in sittings:
+            Trainer(CONFIG, scenes(folder), tmp_path / name, device=device.type).run(until=until, progress=False)
+    assert curve(tmp_path / "whole") == curve(tmp_path / "again") == curve(tmp_path / "parts")
+    whole, parts = (checkpoint.load(tmp_path / name).model for name in ("whole", "parts"))
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+
 def assert_same_checkpoint(a, b):
     a, b = checkpoint.load(a), checkpoint.load(b)
     for part in ("model", "ema", "optimizer"):

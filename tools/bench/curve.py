@@ -42,7 +42,7 @@ def plain_sort(codes):
 
 
 def ours(grid, cloud):
-    codes = torch.stack([curve_encode(grid, cloud, curve) for curve in CURVES])
+    codes = curve_encode(grid, cloud, CURVES)
     return codes, curve_sort(codes)
 
 

@@ -29,16 +29,6 @@ RECORDED = {  # (steps of history, masked) -> forward, forward and backward [ms]
 TARGET = {(4, False): (15, 50), (2, False): (10, 35), (4, True): (4, 12), (2, True): (3, 9)}
 
 
-def full_model(n_steps: int) -> presets.ModelConfig:
-    """64 dynamic and 64 static latents, as in the published checkpoints."""
-    model = presets.paper_latent(n_steps)
-    return presets.ModelConfig(
-        dataclasses.replace(model.encoder, dynamic_dim=64, static_dim=64),
-        dataclasses.replace(model.dynamics, dynamic_latents=64, static_latents=64),
-        dataclasses.replace(model.renderer, latents=128),
-    )
-
-
 def recorded_scene(n_steps: int, n: int, moving_share: float) -> torch.Tensor:
     """[T, n, 3] metres."""
     g = torch.Generator(device="cuda").manual_seed(0)
@@ -115,23 +105,23 @@ def peak_gib(f) -> float:
     return torch.cuda.max_memory_allocated() / 2**30
 
 
-def measure(bench: Bench, case: str, f, dtype: torch.dtype, **options) -> None:
-    def run():
-        with torch.autocast("cuda", dtype, enabled=dtype != torch.float32):
-            return f()
-
-    try:
-        memory = peak_gib(run)
-    except torch.cuda.OutOfMemoryError:
-        print(f"{case}: out of memory")
-        return
-    bench.gpu(f"{case}, {memory:.1f} GiB", str(dtype).removeprefix("torch."), run, options.pop("peers", {}),
-              tolerance=None, **options)  # fmt: skip
+def measure(bench: Bench, case: str, f, dtype: torch.dtype, *, peers=None, target_ratio=None) -> None:
+    """The autocast context stays open, as in a rollout: weights are rounded once."""
+    with torch.autocast("cuda", dtype, enabled=dtype != torch.float32):
+        memory = None
+        try:
+            memory = peak_gib(f)
+        except torch.cuda.OutOfMemoryError:
+            print(f"{case}: out of memory")
+        if memory is None:  # behind the handler, which keeps what the failed call made
+            return torch.cuda.empty_cache()
+        name = str(dtype).removeprefix("torch.")
+        bench.gpu(f"{case}, {memory:.1f} GiB", name, f, peers or {}, target_ratio=target_ratio, tolerance=None, capture=False)
 
 
 def dynamics(bench: Bench, n_steps: int, masked: bool, dtype: torch.dtype) -> None:
     torch.manual_seed(0)
-    model = Dynamics(full_model(n_steps).dynamics).cuda().eval()
+    model = Dynamics(presets.paper_latent(n_steps, 64).dynamics).cuda().eval()
     state = particles_at(recorded_scene(n_steps, 16384 if masked else 65536, 1.0 if masked else 0.2))
     parameters = list(model.parameters())
 
@@ -150,7 +140,7 @@ def dynamics(bench: Bench, n_steps: int, masked: bool, dtype: torch.dtype) -> No
 
 def whole(bench: Bench, dtype: torch.dtype) -> None:
     torch.manual_seed(0)
-    simulator = Simulator(full_model(4)).cuda().eval()
+    simulator = Simulator(presets.paper_latent(4, 64)).cuda().eval()
     frames, cameras = random_frames(1, 4, 4, 1.0), ring(9, 1)
 
     with torch.no_grad():
@@ -163,16 +153,20 @@ def whole(bench: Bench, dtype: torch.dtype) -> None:
 
 
 def training(bench: Bench, dtype: torch.dtype) -> None:
-    """4 past steps, 12 future ones fed back, 4 scenes, 4 input and 9 target views, a quarter of the pixels kept."""
+    """4 past steps, 12 future ones fed back, 4 scenes, 4 input and 9 target views, a quarter of the pixels kept; blocks are
+    computed again in the backward pass, as the authors do."""
     torch.manual_seed(0)
     n_scenes, n_past, n_future, n_views = 4, 4, 12, 9
-    simulator = Simulator(full_model(n_past)).cuda().train()
+    model = presets.paper_latent(n_past, 64)
+    model = dataclasses.replace(model, dynamics=dataclasses.replace(model.dynamics, checkpointing=True))
+    simulator = Simulator(model).cuda().train()
     optimizer = torch.optim.AdamW(simulator.parameters(), lr=1e-5)
     frames = random_frames(n_scenes, n_past, 4, 0.25)
     targets = ring(n_views, n_scenes)
     truth = torch.rand(n_scenes * n_views, SIZE, SIZE, 3, device="cuda")
 
     def step():
+        torch.clear_autocast_cache()  # the weights have changed
         optimizer.zero_grad(set_to_none=True)
         state = simulator.encode(frames)
         steps = simulator.rollout(state, n_future)

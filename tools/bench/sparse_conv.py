@@ -103,7 +103,9 @@ def tables_of(cells: torch.Tensor) -> tuple[Voxels, KernelMap]:
 
 
 def spconv_form(cells: torch.Tensor, channels: int, dtype: torch.dtype):
-    """spconv's SubMConv3d as a function of (x, weight, bias), its map cached; None where spconv is not installed."""
+    """spconv's SubMConv3d as a function of (x, weight, bias), its map cached; None where spconv cannot do it."""
+    if dtype == torch.bfloat16:
+        return None
     try:
         import spconv.pytorch as spconv
     except ImportError:

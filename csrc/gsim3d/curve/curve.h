@@ -46,8 +46,12 @@ void curve_sort(const int64_t* codes, int64_t rows, int64_t n, int64_t* order, i
 // The same functions on the device of `stream`. A row with a cell or cloud out of range has code 0.
 namespace cuda {
 
-void curve_encode(const int64_t* grid, const int64_t* cloud, int64_t n, int64_t curve, int64_t depth, int64_t shift,
-                  int64_t* codes, Stream stream);
+// Codes along several curves at once.
+void curve_encode(const int64_t* grid, const int64_t* cloud, int64_t n,
+                  const int64_t* curves,  // [n_curves]
+                  int64_t n_curves, int64_t depth, int64_t shift,
+                  int64_t* codes,  // [n_curves, n]
+                  Stream stream);
 
 void curve_sort(const int64_t* codes, int64_t rows, int64_t n, int64_t* order, int64_t* inverse,
                 const Workspace& workspace, Stream stream);

@@ -1,4 +1,4 @@
-#include <cub/device/device_radix_sort.cuh>
+#include <algorithm>
 #include <cub/device/device_scan.cuh>
 
 #include "gsim3d/core/cuda_utils.cuh"
@@ -10,70 +10,45 @@ namespace {
 
 constexpr int kThreads = 256;
 
+// The curves of one launch.
+constexpr int kTogether = 4;
+struct Curves {
+  int64_t id[kTogether];
+  int count;
+};
+
 // A cell or cloud that does not fit its bits has code 0.
-template <Curve kCurve>
-__global__ void encode_kernel(const int64_t* __restrict__ grid, const int64_t* __restrict__ cloud, int64_t n, int depth,
-                              int shift, int64_t* __restrict__ codes) {
+__global__ void encode_kernel(const int64_t* __restrict__ grid, const int64_t* __restrict__ cloud, int64_t n,
+                              Curves curves, int depth, int shift, int64_t* __restrict__ codes) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= n) return;
   const int64_t x = grid[3 * i], y = grid[3 * i + 1], z = grid[3 * i + 2], id = cloud[i];
   const bool fits = static_cast<uint64_t>(x | y | z) >> depth == 0 && static_cast<uint64_t>(id) >> (63 - shift) == 0;
-  const uint64_t code = curve_code(kCurve, static_cast<uint32_t>(x), static_cast<uint32_t>(y), static_cast<uint32_t>(z),
-                                   depth);
-  codes[i] = fits ? (id << shift) | static_cast<int64_t>(code) : 0;
-}
-
-__global__ void iota_kernel(int64_t n, uint32_t* __restrict__ index) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < n) index[i] = static_cast<uint32_t>(i);
-}
-
-// Unsigned order of the flipped codes is signed order of the codes.
-__global__ void flip_sign_kernel(const int64_t* __restrict__ codes, int64_t n, uint64_t* __restrict__ keys) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  if (i < n) keys[i] = static_cast<uint64_t>(codes[i]) ^ uint64_t{1} << 63;
-}
-
-__global__ void write_order_kernel(const uint32_t* __restrict__ index, int64_t n, int64_t total,
-                                   int64_t* __restrict__ order, int64_t* __restrict__ inverse) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= total) return;
-  const int64_t row = i / n * n;
-  order[i] = index[i];
-  inverse[row + index[i]] = i - row;
+#pragma unroll
+  for (int c = 0; c < kTogether; ++c) {
+    if (c >= curves.count) break;
+    // A constant depth unrolls the levels.
+    const auto code_at = [&](int levels) {
+      return curve_code(static_cast<Curve>(curves.id[c]), static_cast<uint32_t>(x), static_cast<uint32_t>(y),
+                        static_cast<uint32_t>(z), levels);
+    };
+    const uint64_t code = depth == kMaxDepth ? code_at(kMaxDepth) : code_at(depth);
+    codes[c * n + i] = fits ? (id << shift) | static_cast<int64_t>(code) : 0;
+  }
 }
 
 }  // namespace
 
-void curve_encode(const int64_t* grid, const int64_t* cloud, int64_t n, int64_t curve, int64_t depth, int64_t shift,
-                  int64_t* codes, Stream stream) {
-  cpu::check_curve(curve, depth, shift);
-  const auto run = [&](auto kernel) {
-    launch("curve_encode", kernel, blocks_for("curve_encode", n, kThreads), kThreads, 0, stream, grid, cloud, n, depth,
-           shift, codes);
-  };
-  switch (static_cast<Curve>(curve)) {
-    case Curve::kZ: return run(encode_kernel<Curve::kZ>);
-    case Curve::kZTrans: return run(encode_kernel<Curve::kZTrans>);
-    case Curve::kHilbert: return run(encode_kernel<Curve::kHilbert>);
-    case Curve::kHilbertTrans: return run(encode_kernel<Curve::kHilbertTrans>);
+void curve_encode(const int64_t* grid, const int64_t* cloud, int64_t n, const int64_t* curves, int64_t n_curves,
+                  int64_t depth, int64_t shift, int64_t* codes, Stream stream) {
+  const char* op = "curve_encode";
+  for (int64_t c = 0; c < n_curves; ++c) cpu::check_curve(curves[c], depth, shift);
+  for (int64_t first = 0; first < n_curves; first += kTogether) {
+    Curves own{{}, static_cast<int>(std::min<int64_t>(kTogether, n_curves - first))};
+    std::copy_n(curves + first, own.count, own.id);
+    launch(op, encode_kernel, blocks_for(op, n, kThreads), kThreads, 0, stream, grid, cloud, n, own, depth, shift,
+           codes + first * n);
   }
-}
-
-void sort_rows(const char* op, const uint64_t* keys, int64_t rows, int64_t n, int bits, uint64_t* sorted,
-               uint32_t* index, const Workspace& workspace, Stream stream) {
-  if (n == 0) return;
-  uint32_t* iota = workspace.take<uint32_t>(n);
-  launch(op, iota_kernel, blocks_for(op, n, kThreads), kThreads, 0, stream, n, iota);
-  size_t bytes = 0;
-  const auto sort = [&](void* scratch, int64_t r) {
-    check_cuda(cub::DeviceRadixSort::SortPairs(scratch, bytes, keys + r * n, sorted + r * n, iota, index + r * n, n, 0,
-                                               bits, native(stream)),
-               op);
-  };
-  sort(nullptr, 0);
-  void* scratch = workspace.take<char>(static_cast<int64_t>(bytes));
-  for (int64_t r = 0; r < rows; ++r) sort(scratch, r);
 }
 
 void exclusive_sums(const char* op, const uint32_t* values, int64_t n, uint32_t* sums, const Workspace& workspace,
@@ -86,16 +61,15 @@ void exclusive_sums(const char* op, const uint32_t* values, int64_t n, uint32_t*
 
 void curve_sort(const int64_t* codes, int64_t rows, int64_t n, int64_t* order, int64_t* inverse,
                 const Workspace& workspace, Stream stream) {
-  const char* op = "curve_sort";
-  check(n < int64_t{1} << 32, op, ": rows must have fewer than 2^32 codes; got ", n);
-  const int64_t total = rows * n;
-  if (total == 0) return;
-  uint64_t* keys = workspace.take<uint64_t>(total);
-  uint64_t* sorted = workspace.take<uint64_t>(total);
-  uint32_t* index = workspace.take<uint32_t>(total);
-  launch(op, flip_sign_kernel, blocks_for(op, total, kThreads), kThreads, 0, stream, codes, total, keys);
-  sort_rows(op, keys, rows, n, 64, sorted, index, workspace, stream);
-  launch(op, write_order_kernel, blocks_for(op, total, kThreads), kThreads, 0, stream, index, n, total, order, inverse);
+  sort_rows("curve_sort",
+            {.keys = reinterpret_cast<const uint64_t*>(codes),
+             .n_rows = rows,
+             .room = n,
+             .bits = 64,
+             .flip = uint64_t{1} << 63,  // unsigned order of the flipped codes is signed order of the codes
+             .order = order,
+             .inverse = inverse},
+            workspace, stream);
 }
 
 }  // namespace gsim3d::cuda

@@ -5,7 +5,8 @@
 namespace gsim3d::binding {
 namespace {
 
-Tensor curve_encode(const Tensor& grid_, const Tensor& cloud_, int64_t curve, int64_t depth, int64_t shift) {
+Tensor curve_encode(const Tensor& grid_, const Tensor& cloud_, std::vector<int64_t> curves, int64_t depth,
+                    int64_t shift) {
   const char* op = "curve_encode";
   check_dtype(op, "grid", grid_, ScalarType::Long);
   check_dtype(op, "cloud", cloud_, ScalarType::Long);
@@ -13,16 +14,18 @@ Tensor curve_encode(const Tensor& grid_, const Tensor& cloud_, int64_t curve, in
   check_shape(op, "cloud", cloud_, {grid_.size(0)}, "[N]");
   check_device(op, "cloud", cloud_, grid_);
   const Tensor grid = rows_of(grid_), cloud = rows_of(cloud_);
-  Tensor codes = empty(grid, {grid.size(0)});
+  const int64_t n = grid.size(0), n_curves = static_cast<int64_t>(curves.size());
+  Tensor codes = empty(grid, {n_curves, n});
   if constexpr (kWithCuda) {
     if (grid.is_cuda()) {
-      cuda::curve_encode(data<int64_t>(grid), data<int64_t>(cloud), grid.size(0), curve, depth, shift,
+      cuda::curve_encode(data<int64_t>(grid), data<int64_t>(cloud), n, curves.data(), n_curves, depth, shift,
                          mutable_data<int64_t>(codes), current_stream(grid));
       return codes;
     }
   }
-  cpu::curve_encode(data<int64_t>(grid), data<int64_t>(cloud), grid.size(0), curve, depth, shift,
-                    mutable_data<int64_t>(codes), torch_parallel());
+  for (int64_t c = 0; c < n_curves; ++c)
+    cpu::curve_encode(data<int64_t>(grid), data<int64_t>(cloud), n, curves[c], depth, shift,
+                      mutable_data<int64_t>(codes) + c * n, torch_parallel());
   return codes;
 }
 

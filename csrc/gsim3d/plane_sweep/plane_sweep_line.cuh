@@ -1,6 +1,6 @@
 // The line of samples that one pixel draws in a source image, traced by one warp in shared memory.
 //
-// Every source pixel that a sample touches sets a bit; its rank among the set bits is its place in the line's list. So
+// Every source pixel that a sample touches sets a flag; its rank among the flags is its place in the line's list. So
 // each source pixel is met once, and the order of the list depends on nothing but the geometry.
 #pragma once
 
@@ -20,16 +20,21 @@ struct LineSizes {
 template <typename T>
 LineSizes line_sizes(const PlaneSweep<T>& sweep) {
   const int64_t n_pixels = sweep.height * sweep.width;
-  return {static_cast<int32_t>(sweep.height),         static_cast<int32_t>(sweep.width),
-          static_cast<int32_t>(n_pixels),             static_cast<int32_t>(sweep.n_depths),
-          static_cast<int32_t>((n_pixels + 31) / 32), static_cast<int32_t>(std::min(4 * sweep.n_depths, n_pixels))};
+  return {static_cast<int32_t>(sweep.height),
+          static_cast<int32_t>(sweep.width),
+          static_cast<int32_t>(n_pixels),
+          static_cast<int32_t>(sweep.n_depths),
+          static_cast<int32_t>((n_pixels + 31) / 32),
+          static_cast<int32_t>(std::min(4 * sweep.n_depths, n_pixels))};
 }
 
 template <typename T>
 struct Line {
-  int32_t* corner;   // [n_depths], of each sample's cell in the table of plane_sweep_math.h
+  int32_t* code;     // [n_depths], of each sample's cell (see trace)
   T* fx;             // [n_depths]
   T* fy;             // [n_depths]
+  ushort4* places;   // [n_depths], places in the list of top left, top right, bottom left, bottom right; capacity: none
+  uint8_t* touched;  // [n_words, 32], zero between calls
   uint32_t* bits;    // [n_words], touched source pixels
   uint16_t* before;  // [n_words], how many are touched in the words before
   int32_t* list;     // [capacity], touched source pixels, ascending
@@ -40,8 +45,8 @@ GSIM3D_HD int64_t aligned_bytes(int64_t bytes) { return (bytes + 15) / 16 * 16; 
 template <typename T>
 GSIM3D_HD int64_t line_bytes(const LineSizes& s) {
   return aligned_bytes(s.n_depths * sizeof(int32_t)) + 2 * aligned_bytes(s.n_depths * sizeof(T)) +
-         aligned_bytes(s.n_words * sizeof(uint32_t)) + aligned_bytes(s.n_words * sizeof(uint16_t)) +
-         aligned_bytes(s.capacity * sizeof(int32_t));
+         aligned_bytes(s.n_depths * sizeof(ushort4)) + s.n_words * 32 + aligned_bytes(s.n_words * sizeof(uint32_t)) +
+         aligned_bytes(s.n_words * sizeof(uint16_t)) + aligned_bytes(s.capacity * sizeof(int32_t));
 }
 
 // Takes `count` elements from shared memory at `at`.
@@ -52,80 +57,115 @@ __device__ __forceinline__ U* carve(char*& at, int32_t count) {
   return here;
 }
 
+// Takes the memory of a line and clears its flags.
 template <typename T>
 __device__ __forceinline__ Line<T> carve_line(char*& at, const LineSizes& s) {
   Line<T> line;
-  line.corner = carve<int32_t>(at, s.n_depths);
+  line.code = carve<int32_t>(at, s.n_depths);
   line.fx = carve<T>(at, s.n_depths);
   line.fy = carve<T>(at, s.n_depths);
+  line.places = carve<ushort4>(at, s.n_depths);
+  line.touched = carve<uint8_t>(at, s.n_words * 32);
   line.bits = carve<uint32_t>(at, s.n_words);
   line.before = carve<uint16_t>(at, s.n_words);
   line.list = carve<int32_t>(at, s.capacity);
+  for (int32_t w = threadIdx.x % kWarp; w < 8 * s.n_words; w += kWarp) reinterpret_cast<uint32_t*>(line.touched)[w] = 0;
   return line;
 }
 
-// f(source pixel, side) for the corners of a cell that lie in the image; side: 1 right, 2 bottom, 3 both.
-template <typename F>
-__device__ __forceinline__ void for_corners(int32_t corner, const LineSizes& s, const F& f) {
-  const int32_t row = corner / (s.width + 2), x = corner - row * (s.width + 2) - 1, y = row - 1;
-#pragma unroll
-  for (int side = 0; side < 4; ++side) {
-    const int32_t cx = x + (side & 1), cy = y + (side >> 1);
-    if (cx >= 0 && cx < s.width && cy >= 0 && cy < s.height) f(cy * s.width + cx, side);
-  }
-}
+// Four flags, one a byte, as four bits.
+__device__ __forceinline__ uint32_t pack_flags(uint32_t flags) { return flags * 0x01020408u >> 24 & 15; }
+
+// Where one sample lies.
+template <typename T>
+struct Sample {
+  int32_t first;    // index of the top left corner
+  int32_t corners;  // bits of those that lie in the image: top left, top right, bottom left, bottom right
+  T fx, fy;
+};
 
 template <typename T>
-__device__ __forceinline__ int32_t rank_of(const Line<T>& line, int32_t pixel) {
-  return line.before[pixel >> 5] + __popc(line.bits[pixel >> 5] & ((1u << (pixel & 31)) - 1));
+__device__ __forceinline__ Sample<T> sample_at(const PlaneSweep<T>& sweep, const LineSizes& s, int64_t pair,
+                                               const plane_sweep_math::Ray<T>& ray, T depth) {
+  const T* at = sweep.translations + 3 * pair;
+  const T b[3] = {at[0], at[1], at[2]};
+  const plane_sweep_math::Place<T> place = plane_sweep_math::sample_place(ray, b, depth, s.height, s.width);
+  const int32_t columns = (place.x >= 0 ? 5 : 0) | (place.x + 1 < s.width ? 10 : 0);
+  const int32_t rows = (place.y >= 0 ? 3 : 0) | (place.y + 1 < s.height ? 12 : 0);
+  return {place.y * s.width + place.x, place.inside ? columns & rows : 0, place.fx, place.fy};
 }
 
-// Fills the line of a pixel and a pair of its image; returns the length of the list, the same in every lane. The caller
-// synchronises the warp between its last look at a line and the next call.
-template <typename T>
-__device__ int32_t trace(const PlaneSweep<T>& sweep, const LineSizes& s, int64_t image, int64_t pair, int32_t pixel,
-                         const Line<T>& line) {
-  using namespace plane_sweep_math;
+// Packs flags into bits and clears them; before[w]: how many are set in the words before w. Returns how many are set, the
+// same in every lane.
+__device__ __forceinline__ int32_t list_flags(uint8_t* touched, const LineSizes& s, uint32_t* all_bits,
+                                              uint16_t* before) {
   const int lane = threadIdx.x % kWarp;
-  const int32_t outside = static_cast<int32_t>(outside_corner(s.height, s.width));
-  const int32_t v = pixel / s.width;
-  const Ray<T> ray =
-      source_ray(sweep.homographies + 9 * pair, static_cast<T>(pixel - v * s.width), static_cast<T>(v));
-  const T b[3] = {sweep.translations[3 * pair], sweep.translations[3 * pair + 1], sweep.translations[3 * pair + 2]};
-  for (int32_t w = lane; w < s.n_words; w += kWarp) line.bits[w] = 0;
-  __syncwarp();
-  bool touches = false;
-  for (int32_t k = lane; k < s.n_depths; k += kWarp) {
-    const T depth = T(1) / sweep.inverse_depths[image * s.n_depths + k];
-    const Cell<T> cell = sample_cell(ray, b, depth, s.height, s.width);
-    line.corner[k] = cell.corner;
-    line.fx[k] = cell.fx;
-    line.fy[k] = cell.fy;
-    if (cell.corner == outside) continue;
-    touches = true;
-    for_corners(cell.corner, s, [&](int32_t q, int) { atomicOr(line.bits + (q >> 5), 1u << (q & 31)); });
-  }
-  if (!__any_sync(kFullWarp, touches)) {
-    return 0;
-  }
-  __syncwarp();
   int32_t count = 0;
-  for (int32_t first = 0; first < s.n_words; first += kWarp) {
-    const int32_t w = first + lane;
-    const int32_t own = w < s.n_words ? __popc(line.bits[w]) : 0;
+  for (int32_t begin = 0; begin < s.n_words; begin += kWarp) {
+    const int32_t w = begin + lane;
+    uint32_t bits = 0;
+    if (w < s.n_words) {
+      uint4* flags = reinterpret_cast<uint4*>(touched) + 2 * w;
+      const uint4 low = flags[0], high = flags[1];
+      flags[0] = flags[1] = make_uint4(0, 0, 0, 0);
+      bits = pack_flags(low.x) | pack_flags(low.y) << 4 | pack_flags(low.z) << 8 | pack_flags(low.w) << 12 |
+             pack_flags(high.x) << 16 | pack_flags(high.y) << 20 | pack_flags(high.z) << 24 | pack_flags(high.w) << 28;
+    }
+    const int32_t own = __popc(bits);
     int32_t sum = own;
 #pragma unroll
     for (int offset = 1; offset < kWarp; offset *= 2) {
       const int32_t from = __shfl_up_sync(kFullWarp, sum, offset);
       if (lane >= offset) sum += from;
     }
-    if (w < s.n_words) line.before[w] = static_cast<uint16_t>(count + sum - own);
+    if (w < s.n_words) {
+      all_bits[w] = bits;
+      before[w] = static_cast<uint16_t>(count + sum - own);
+    }
     count += __shfl_sync(kFullWarp, sum, kWarp - 1);
   }
+  return count;
+}
+
+// Fills the line of a pixel and a pair of its image; returns the length of the list, the same in every lane. Nothing
+// but that is filled where it is 0. The caller synchronises the warp between its last look at a line and the next call.
+template <typename T>
+__device__ int32_t trace(const PlaneSweep<T>& sweep, const LineSizes& s, int64_t image, int64_t pair, int32_t pixel,
+                         const Line<T>& line) {
+  using namespace plane_sweep_math;
+  const int lane = threadIdx.x % kWarp;
+  const int32_t v = pixel / s.width;
+  const Ray<T> ray = source_ray(sweep.homographies + 9 * pair, static_cast<T>(pixel - v * s.width), static_cast<T>(v));
+  bool touches = false;
+  for (int32_t k = lane; k < s.n_depths; k += kWarp) {
+    const Sample<T> at = sample_at(sweep, s, pair, ray, T(1) / sweep.inverse_depths[image * s.n_depths + k]);
+    line.fx[k] = at.fx;
+    line.fy[k] = at.fy;
+    const int32_t corners = at.corners, first = at.first;
+    // The corners lie below the index of the top left one, which is moved so that it is not negative.
+    line.code[k] = (first + s.width + 1) << 4 | corners;
+    touches |= corners != 0;
+    if (corners & 1) line.touched[first] = 1;
+    if (corners & 2) line.touched[first + 1] = 1;
+    if (corners & 4) line.touched[first + s.width] = 1;
+    if (corners & 8) line.touched[first + s.width + 1] = 1;
+  }
+  if (!__any_sync(kFullWarp, touches)) return 0;
   __syncwarp();
-  for (int32_t k = lane; k < s.n_depths; k += kWarp)
-    if (line.corner[k] != outside)
-      for_corners(line.corner[k], s, [&](int32_t q, int) { line.list[rank_of(line, q)] = q; });
+  const int32_t count = list_flags(line.touched, s, line.bits, line.before);
+  __syncwarp();
+  const uint16_t none = static_cast<uint16_t>(s.capacity);
+  for (int32_t k = lane; k < s.n_depths; k += kWarp) {
+    const int32_t code = line.code[k], first = (code >> 4) - s.width - 1;
+    const auto place = [&](int side, int32_t q) {
+      if (!(code >> side & 1)) return none;
+      const int32_t rank = line.before[q >> 5] + __popc(line.bits[q >> 5] & ((1u << (q & 31)) - 1));
+      line.list[rank] = q;
+      return static_cast<uint16_t>(rank);
+    };
+    line.places[k] =
+        make_ushort4(place(0, first), place(1, first + 1), place(2, first + s.width), place(3, first + s.width + 1));
+  }
   __syncwarp();
   return count;
 }

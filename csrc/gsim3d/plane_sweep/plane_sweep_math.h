@@ -36,17 +36,31 @@ GSIM3D_HD int64_t table_stride(int64_t width) { return width + 2; }
 GSIM3D_HD int64_t table_size(int64_t height, int64_t width) { return (height + 3) * (width + 2); }
 GSIM3D_HD int64_t outside_corner(int64_t height, int64_t width) { return (height + 1) * (width + 2); }
 
+// Where a sample lies: between columns x, x + 1 and rows y, y + 1.
+template <typename T>
+struct Place {
+  bool inside;
+  int32_t x, y;  // in [-1, width) and [-1, height) where inside
+  T fx, fy;      // in [0, 1)
+};
+
 // b: [3]. A NaN or infinite place counts as outside.
 template <typename T>
-GSIM3D_HD Cell<T> sample_cell(const Ray<T>& ray, const T* b, T depth, int32_t height, int32_t width) {
+GSIM3D_HD Place<T> sample_place(const Ray<T>& ray, const T* b, T depth, int32_t height, int32_t width) {
   const T z = ray.z * depth + b[2];
   const T inverse_z = T(1) / (z > kMinDepth<T> ? z : kMinDepth<T>);
   const T x = (ray.x * depth + b[0]) * inverse_z, y = (ray.y * depth + b[1]) * inverse_z;
   const bool inside = (x > T(-1)) & (x < T(width)) & (y > T(-1)) & (y < T(height));
   const T safe_x = inside ? x : T(0), safe_y = inside ? y : T(0);
   const T x0 = std::floor(safe_x), y0 = std::floor(safe_y);
-  const int32_t corner = (static_cast<int32_t>(y0) + 1) * (width + 2) + static_cast<int32_t>(x0) + 1;
-  return {inside ? corner : (height + 1) * (width + 2), safe_x - x0, safe_y - y0};
+  return {inside, static_cast<int32_t>(x0), static_cast<int32_t>(y0), safe_x - x0, safe_y - y0};
+}
+
+template <typename T>
+GSIM3D_HD Cell<T> sample_cell(const Ray<T>& ray, const T* b, T depth, int32_t height, int32_t width) {
+  const Place<T> at = sample_place(ray, b, depth, height, width);
+  const int32_t corner = (at.y + 1) * (width + 2) + at.x + 1;
+  return {at.inside ? corner : (height + 1) * (width + 2), at.fx, at.fy};
 }
 
 // s00: top left, s01: top right, s10: bottom left, s11: bottom right.

@@ -14,6 +14,7 @@
 #include <cstdint>
 
 #include "gsim3d/core/parallel.h"
+#include "gsim3d/core/stream.h"
 #include "gsim3d/core/workspace.h"
 
 namespace gsim3d {
@@ -73,7 +74,7 @@ struct RasterSceneGrads {
   T* color;
   T* features;
   T* background;
-  T* viewmats;  // of the 12 upper entries taken as free numbers; the last row is 0
+  T* viewmats;  // of the 12 upper entries taken as free numbers, the last row is 0; null: not wanted
 };
 
 namespace cpu {
@@ -90,4 +91,32 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
                      const RasterSceneGrads<T>& grads, const Workspace& workspace, const Parallel& parallel);
 
 }  // namespace cpu
+
+// The same functions on device memory. Nothing waits for the device, so its arrays are not checked: a row that the CPU
+// would refuse is left out, an image with a bad camera or cloud shows its background, a background that is not finite
+// counts as black, and gradients of all of these are 0. Same bits from run to run.
+namespace cuda {
+
+// How much one call holds at once. Of the images, as many as stay within all three are rendered together and kept in
+// `state` for the backward pass; the others are made where they are needed: slower, equal but for rounding.
+struct RasterLimits {
+  int64_t pairs;    // of a Gaussian and an image that shows its cloud; in [n_rows, 2^28]
+  int64_t entries;  // of a Gaussian and a tile of 16 x 16 pixels that its bounds touch; in [n_rows, 2^31)
+  int64_t slots;    // of a Gaussian and a quarter of a tile that its bounds touch; in [4 n_rows, 2^31)
+};
+
+// Device memory that the forward pass fills and the backward pass reads.
+template <typename T>
+int64_t raster_state_bytes(const RasterScene<T>& scene, const RasterLimits& limits);
+
+template <typename T>
+void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, const RasterLimits& limits, void* state,
+                    const Workspace& workspace, Stream stream);
+
+template <typename T>
+void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& image_grads,
+                     const RasterSceneGrads<T>& grads, const RasterLimits& limits, void* state,
+                     const Workspace& workspace, Stream stream);
+
+}  // namespace cuda
 }  // namespace gsim3d

@@ -114,8 +114,8 @@ void for_vectors(const Splat<T>& splat, int tile_x, int tile_y, const F& f) {
   alignas(32) T lane_centres[kL];
   for (int lane = 0; lane < kL; ++lane) lane_centres[lane] = T(lane) + T(0.5);
   const V centres = load<V>(lane_centres);
-  const int x0 = std::max(splat.x0 - tile_x, 0), x1 = std::min(splat.x1 - tile_x, kTile);
-  const int y0 = std::max(splat.y0 - tile_y, 0), y1 = std::min(splat.y1 - tile_y, kTile);
+  const int x0 = std::max(splat.bounds.x0 - tile_x, 0), x1 = std::min(splat.bounds.x1 - tile_x, kTile);
+  const int y0 = std::max(splat.bounds.y0 - tile_y, 0), y1 = std::min(splat.bounds.y1 - tile_y, kTile);
   for (int y = y0; y < y1; ++y) {
     const T dy = (T(tile_y + y) + T(0.5)) - splat.y;
     const T shift = splat.slope * dy, base = splat.loose * dy * dy;

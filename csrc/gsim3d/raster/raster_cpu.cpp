@@ -2,7 +2,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "gsim3d/core/check.h"
+#include "gsim3d/raster/raster_check.h"
 #include "gsim3d/raster/raster_tiles.h"
 
 namespace gsim3d::cpu {
@@ -11,17 +11,9 @@ namespace {
 using namespace raster;  // NOLINT: this file is its other half
 
 constexpr const char* kOp = "rasterize_gaussians";
-constexpr int64_t kMaxPixels = 65535;  // pixel bounds of a splat are 16-bit numbers
-
 template <typename T>
 void check_scene(const RasterScene<T>& s) {
-  check(s.width >= 1 && s.height >= 1 && s.width <= kMaxPixels && s.height <= kMaxPixels, kOp,
-        ": width and height must be in [1, ", kMaxPixels, "]; got ", s.width, " and ", s.height);
-  check(s.sh_terms == 0 || s.sh_terms == 1 || s.sh_terms == 4 || s.sh_terms == 9 || s.sh_terms == 16, kOp,
-        ": sh must have 1, 4, 9 or 16 coefficients (degree 0 to 3); got ", s.sh_terms);
-  check(std::isfinite(s.near_plane) && s.near_plane > 0, kOp, ": near_plane must be positive; got ", s.near_plane);
-  const auto cutoff = static_cast<int64_t>(s.cutoff);
-  check(cutoff >= 0 && cutoff <= 2, kOp, ": cutoff must be 0 (exact), 1 (tile3sigma) or 2 (smooth); got ", cutoff);
+  check_options(s);
   check(s.cu_rows[0] == 0 && s.cu_rows[s.n_clouds] == s.n_rows, kOp, ": cu_rows must run from 0 to N=", s.n_rows,
         "; got ", s.cu_rows[0], " .. ", s.cu_rows[s.n_clouds]);
   for (int64_t q = 0; q < s.n_clouds; ++q) {
@@ -169,7 +161,7 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
   std::fill_n(grads.color, n * std::max<int64_t>(1, scene.sh_terms) * 3, T(0));
   std::fill_n(grads.features, n * scene.n_features, T(0));
   std::fill_n(grads.background, scene.n_images * 3, T(0));
-  std::fill_n(grads.viewmats, scene.n_images * 16, T(0));
+  if (grads.viewmats) std::fill_n(grads.viewmats, scene.n_images * 16, T(0));
 
   Scratch scratch(workspace);
   Group<T> group;
@@ -186,7 +178,7 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
           project_chunk_vjp<T, decltype(terms)::value>(scene, group, group.chunks[c], slots, grads, viewmats + 12 * c);
         });
     });
-    for (size_t c = 0; c < group.chunks.size(); ++c)
+    for (size_t c = 0; c < group.chunks.size() && grads.viewmats; ++c)
       for (int i = 0; i < 12; ++i) grads.viewmats[16 * group.chunks[c].image + i] += viewmats[12 * c + i];
   }
 }

@@ -388,6 +388,63 @@ GSIM3D_HD void footprint_vjp(const Footprint<V>& shape, const Moments<V>& sums, 
   grad.yy = half * (b * b * sums.yy + c * c * sums.uu) - b * c * sums.uy;
 }
 
+// ---- pixels that may see a Gaussian; V is a scalar here -------------------------------------------------------------
+
+// Rounding of the exponent and of pixel coordinates, with room to spare: a bound may only err outwards.
+constexpr double kLevelSlack = 1e-3;
+constexpr double kPixelSlack = 0.01;
+constexpr double kLog2eHalf = 0.72134752044448170;  // alpha = opacity 2^(-kLog2eHalf d^T Sigma^-1 d)
+
+// [x0, x1) x [y0, y1)
+struct PixelRect {
+  uint16_t x0 = 0, x1 = 0, y0 = 0, y1 = 0;
+};
+
+// The exponent of 2 beyond which alpha < 1/255.
+template <typename T>
+GSIM3D_HD T level_of(T opacity) {
+  return std::log2(opacity * T(1 / kMinAlpha)) + T(kLevelSlack);
+}
+
+// First and last + 1 pixel whose centre lies in [low, high], within [0, size).
+template <typename T>
+GSIM3D_HD void pixel_range(T low, T high, int64_t size, uint16_t& begin, uint16_t& end) {
+  const T first = std::ceil(low - T(0.5) - T(kPixelSlack)), last = std::floor(high - T(0.5) + T(kPixelSlack));
+  begin = first > 0 ? static_cast<uint16_t>(min_of(first, T(size))) : 0;
+  end = last >= 0 ? static_cast<uint16_t>(min_of(last + 1, T(size))) : 0;
+}
+
+// The release's range of tiles around a centre, as a cut of the pixel range. Its coordinates count from the centre of
+// the first pixel.
+template <typename T>
+GSIM3D_HD void cut_to_tiles(T centre, T radius, uint16_t& begin, uint16_t& end) {
+  const T position = centre - T(0.5);
+  const T first = max_of(std::trunc((position - radius) / kTile), T(0)) * kTile;
+  const T last = max_of(std::trunc((position + radius + (kTile - 1)) / kTile), T(0)) * kTile;
+  begin = static_cast<uint16_t>(max_of(min_of(first, T(end)), T(begin)));
+  end = static_cast<uint16_t>(min_of(last, T(end)));
+}
+
+// Bounds of the ellipse of `level` around (x, y) with covariance (xx, yy), within width x height; `three_sigma` also
+// cuts it to the tiles of RasterCutoff::kTile3Sigma.
+template <typename T>
+GSIM3D_HD PixelRect pixel_bounds(T x, T y, T xx, T yy, T determinant, T level, int64_t width, int64_t height,
+                                 bool three_sigma) {
+  PixelRect rect;
+  const T spread = level / T(kLog2eHalf);
+  const T reach_x = std::sqrt(spread * xx), reach_y = std::sqrt(spread * yy);
+  pixel_range(x - reach_x, x + reach_x, width, rect.x0, rect.x1);
+  pixel_range(y - reach_y, y + reach_y, height, rect.y0, rect.y1);
+  if (three_sigma) {
+    const T middle = T(0.5) * (xx + yy);
+    const T largest = middle + std::sqrt(max_of(middle * middle - determinant, T(0.1)));
+    const T radius = std::ceil(3 * std::sqrt(largest));
+    cut_to_tiles(x, radius, rect.x0, rect.x1);
+    cut_to_tiles(y, radius, rect.y0, rect.y1);
+  }
+  return rect.x0 < rect.x1 && rect.y0 < rect.y1 ? rect : PixelRect{};
+}
+
 // ---- opacity of one Gaussian at one pixel -------------------------------------------------------------------------
 
 // alpha of RasterCutoff::kSmooth: 0 below kMinAlpha, untouched above twice that, a cubic step between.

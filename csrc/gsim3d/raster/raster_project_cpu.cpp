@@ -3,7 +3,7 @@
 #include <cmath>
 #include <limits>
 
-#include "gsim3d/core/check.h"
+#include "gsim3d/raster/raster_check.h"
 #include "gsim3d/raster/raster_tiles.h"
 
 namespace gsim3d::raster {
@@ -13,9 +13,6 @@ constexpr const char* kOp = "rasterize_gaussians";
 // Splats of one group should stay in the caches shared by the cores (64 bytes each in float32).
 constexpr int64_t kPairsPerGroup = 1 << 18;
 constexpr int64_t kRowsPerChunk = 2048;
-// Rounding of the exponent and of pixel coordinates, with room to spare: a bound may only err outwards.
-constexpr double kLevelSlack = 1e-3;
-constexpr double kPixelSlack = 0.01;
 
 template <typename T>
 void check_finite(const char* name, const T* values, int64_t row, int64_t width) {
@@ -44,36 +41,10 @@ void report_rows(const RasterScene<T>& scene, const int64_t* rows, int n, int64_
   }
 }
 
-// First and last + 1 pixel whose centre lies in [low, high], within [0, size).
-template <typename T>
-void pixel_range(T low, T high, int64_t size, uint16_t& begin, uint16_t& end) {
-  const T first = std::ceil(low - T(0.5) - T(kPixelSlack)), last = std::floor(high - T(0.5) + T(kPixelSlack));
-  begin = first > 0 ? static_cast<uint16_t>(std::min(first, T(size))) : 0;
-  end = last >= 0 ? static_cast<uint16_t>(std::min(last + 1, T(size))) : 0;
-}
-
-// The release's rectangle of tiles, as a cut of the pixel rectangle. Its coordinates count from the centre of the
-// first pixel.
-template <typename T>
-void cut_to_tiles(T x, T y, T xx, T yy, T determinant, Splat<T>& splat) {
-  const T middle = T(0.5) * (xx + yy);
-  const T largest = middle + std::sqrt(std::max(T(0.1), middle * middle - determinant));
-  const T radius = std::ceil(3 * std::sqrt(largest));
-  const auto cut = [radius](T centre, uint16_t& begin, uint16_t& end) {
-    const T position = centre - T(0.5);
-    const T first = std::max(T(0), std::trunc((position - radius) / kTile)) * kTile;
-    const T last = std::max(T(0), std::trunc((position + radius + (kTile - 1)) / kTile)) * kTile;
-    begin = static_cast<uint16_t>(std::max(T(begin), std::min(T(end), first)));
-    end = static_cast<uint16_t>(std::min(T(end), last));
-  };
-  cut(x, splat.x0, splat.x1);
-  cut(y, splat.y0, splat.y1);
-}
-
 template <typename T, int kTerms>
 void project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, const Chunk& chunk, Splat<T>* splats) {
   using V = Simd<T>;
-  const T log2e_half = T(0.72134752044448170);
+  const T log2e_half = T(kLog2eHalf);
   for_row_blocks<T>(chunk.begin, chunk.end, [&](const int64_t* rows, int n) {
     V mean[3], quat[4], scale[3];
     for (int i = 0; i < 3; ++i) mean[i] = gather(scene.means, rows, 3, i);
@@ -107,21 +78,16 @@ void project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, const C
     const Footprint<V> shape = footprint_of(p.xy, p.yy, p.determinant);
     for (int lane = 0; lane < n; ++lane) {
       Splat<T>& splat = splats[rows[lane] - chunk.begin];
-      splat.x0 = splat.x1 = splat.y0 = splat.y1 = 0;
+      splat.bounds = {};
       if (!in_front[lane] || !(opacity[lane] >= T(kMinAlpha))) continue;
       splat.x = p.x[lane], splat.y = p.y[lane], splat.z = p.z[lane];
       splat.slope = shape.slope[lane], splat.tight = shape.tight[lane] * log2e_half;
       splat.loose = shape.loose[lane] * log2e_half;
       splat.opacity = opacity[lane];
-      splat.level = std::log2(opacity[lane] * T(1 / kMinAlpha)) + T(kLevelSlack);
+      splat.level = level_of(opacity[lane]);
       for (int c = 0; c < 3; ++c) splat.color[c] = color[c][lane];
-      const T spread = splat.level / log2e_half;
-      const T reach_x = std::sqrt(spread * p.xx[lane]), reach_y = std::sqrt(spread * p.yy[lane]);
-      pixel_range(splat.x - reach_x, splat.x + reach_x, scene.width, splat.x0, splat.x1);
-      pixel_range(splat.y - reach_y, splat.y + reach_y, scene.height, splat.y0, splat.y1);
-      if (scene.cutoff == RasterCutoff::kTile3Sigma)
-        cut_to_tiles(splat.x, splat.y, p.xx[lane], p.yy[lane], p.determinant[lane], splat);
-      if (splat.x0 >= splat.x1 || splat.y0 >= splat.y1) splat.x0 = splat.x1 = splat.y0 = splat.y1 = 0;
+      splat.bounds = pixel_bounds(splat.x, splat.y, p.xx[lane], p.yy[lane], p.determinant[lane], splat.level,
+                                  scene.width, scene.height, scene.cutoff == RasterCutoff::kTile3Sigma);
     }
   });
 }
@@ -130,9 +96,9 @@ void project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, const C
 // between the leftmost and the rightmost point of the ellipse within it.
 template <typename T, typename F>
 void for_tiles(const Splat<T>& splat, int64_t tiles_x, const F& f) {
-  if (splat.x0 >= splat.x1) return;
-  const int64_t tx0 = splat.x0 / kTile, tx1 = (splat.x1 - 1) / kTile;
-  const int64_t ty0 = splat.y0 / kTile, ty1 = (splat.y1 - 1) / kTile;
+  if (splat.bounds.x0 >= splat.bounds.x1) return;
+  const int64_t tx0 = splat.bounds.x0 / kTile, tx1 = (splat.bounds.x1 - 1) / kTile;
+  const int64_t ty0 = splat.bounds.y0 / kTile, ty1 = (splat.bounds.y1 - 1) / kTile;
   if (tx0 == tx1 || ty0 == ty1) {
     for (int64_t ty = ty0; ty <= ty1; ++ty)
       for (int64_t tx = tx0; tx <= tx1; ++tx) f(ty * tiles_x + tx);
@@ -145,14 +111,14 @@ void for_tiles(const Splat<T>& splat, int64_t tiles_x, const F& f) {
     return std::sqrt(std::max(T(0), (splat.level - splat.loose * dy * dy) / splat.tight));
   };
   for (int64_t ty = ty0; ty <= ty1; ++ty) {
-    const T low = T(std::max<int64_t>(splat.y0, ty * kTile)) + T(0.5) - splat.y;
-    const T high = T(std::min<int64_t>(splat.y1, (ty + 1) * kTile)) - T(0.5) - splat.y;
+    const T low = T(std::max<int64_t>(splat.bounds.y0, ty * kTile)) + T(0.5) - splat.y;
+    const T high = T(std::min<int64_t>(splat.bounds.y1, (ty + 1) * kTile)) - T(0.5) - splat.y;
     const T at_right = std::clamp(rightmost, low, high), at_left = std::clamp(-rightmost, low, high);
     const T left = splat.x + splat.slope * at_left - half_width(at_left);
     const T right = splat.x + splat.slope * at_right + half_width(at_right);
     uint16_t begin, end;
-    pixel_range(left, right, splat.x1, begin, end);
-    begin = std::max(begin, splat.x0);
+    pixel_range(left, right, splat.bounds.x1, begin, end);
+    begin = std::max(begin, splat.bounds.x0);
     if (begin >= end) continue;
     for (int64_t tx = begin / kTile; tx <= (end - 1) / kTile; ++tx) f(ty * tiles_x + tx);
   }

@@ -19,7 +19,7 @@ struct alignas(64) Splat {
   T level;  // log2(255 opacity) and a little: the exponent beyond which alpha < 1/255
   T z;
   T color[3];
-  uint16_t x0, x1, y0, y1;  // pixels that may see it: [x0, x1) x [y0, y1); empty when it is left out
+  PixelRect bounds;  // pixels that may see it; empty when it is left out
 };
 
 // Sort key: bits of a positive depth, which ascend with it.
@@ -108,18 +108,6 @@ Simd<T> gather(const T* matrix, const int64_t* rows, int64_t width, int64_t colu
   alignas(32) T lanes[kLanes<T>];
   for (int lane = 0; lane < kLanes<T>; ++lane) lanes[lane] = matrix[rows[lane] * width + column];
   return load<Simd<T>>(lanes);
-}
-
-// Calls f(std::integral_constant<int, terms>) for the number of SH terms of the scene (0: given colours).
-template <typename F>
-void dispatch_sh(int64_t terms, const F& f) {
-  switch (terms) {
-    case 0: return f(std::integral_constant<int, 0>{});
-    case 1: return f(std::integral_constant<int, 1>{});
-    case 4: return f(std::integral_constant<int, 4>{});
-    case 9: return f(std::integral_constant<int, 9>{});
-    default: return f(std::integral_constant<int, 16>{});
-  }
 }
 
 // Next group of images after group.last: splats, lists, and with `backward` the way back from pairs to instances.

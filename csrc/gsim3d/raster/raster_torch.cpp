@@ -53,6 +53,11 @@ struct SceneTensors {
     check_dtype(op, "background", background, type);
     check_dtype(op, "viewmats", viewmats, type);
     check_dtype(op, "Ks", Ks, type);
+    for (const auto& [name, tensor] : std::initializer_list<std::pair<const char*, const Tensor&>>{
+             {"quats", quats}, {"scales", scales}, {"opacities", opacities}, {"color", color}, {"features", features},
+             {"background", background}, {"viewmats", viewmats}, {"Ks", Ks}, {"image_cloud", image_cloud},
+             {"cu_rows", cu_rows}})
+      check_device(op, name, tensor, means);
   }
 
   template <typename T>
@@ -80,12 +85,13 @@ struct SceneTensors {
   }
 };
 
-using Images = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Images = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
                            const Tensor& color, const Tensor& features, const Tensor& background,
                            const Tensor& viewmats, const Tensor& Ks, const Tensor& image_cloud, const Tensor& cu_rows,
-                           int64_t width, int64_t height, double near_plane, int64_t cutoff) {
+                           int64_t width, int64_t height, double near_plane, int64_t cutoff, int64_t max_pairs,
+                           int64_t max_entries, int64_t max_slots) {
   const SceneTensors given{"rasterize_gaussians", means, quats, scales, opacities, color, features, background,
                            viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff};
   given.check_all();
@@ -97,32 +103,42 @@ Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tenso
   Tensor out_features = empty(in.means, {n, height, width, in.features.size(1)});
   Tensor transmittance = empty(in.means, {n, height, width});
   Tensor last = empty(in.means, {n, height, width}, ScalarType::Int);
+  Tensor state = empty(in.means, {0}, ScalarType::Byte);
   TensorWorkspace workspace(in.means);
   dispatch_float(given.op, "means", in.means, [&]<typename T>() {
-    cpu::raster_forward<T>(in.scene<T>(),
-                           {mutable_data<T>(out_color), mutable_data<T>(alpha), mutable_data<T>(depth),
-                            mutable_data<T>(out_features), mutable_data<T>(transmittance), mutable_data<int32_t>(last)},
-                           workspace, torch_parallel());
+    const RasterImages<T> images{mutable_data<T>(out_color),     mutable_data<T>(alpha),
+                                 mutable_data<T>(depth),         mutable_data<T>(out_features),
+                                 mutable_data<T>(transmittance), mutable_data<int32_t>(last)};
+    if constexpr (kWithCuda)
+      if (in.means.is_cuda()) {
+        const RasterScene<T> scene = in.scene<T>();
+        const cuda::RasterLimits limits{max_pairs, max_entries, max_slots};
+        state = empty(in.means, {cuda::raster_state_bytes(scene, limits)}, ScalarType::Byte);
+        return cuda::raster_forward<T>(scene, images, limits, state.data_ptr(), workspace, current_stream(in.means));
+      }
+    cpu::raster_forward<T>(in.scene<T>(), images, workspace, torch_parallel());
   });
-  return {out_color, alpha, depth, out_features, transmittance, last};
+  return {out_color, alpha, depth, out_features, transmittance, last, state};
 }
 
 using SceneGrads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor& grad_alpha_, const Tensor& grad_depth_,
                                         const Tensor& grad_features_, const Tensor& transmittance_, const Tensor& last_,
+                                        const Tensor& state_,
                                         const Tensor& means, const Tensor& quats, const Tensor& scales,
                                         const Tensor& opacities, const Tensor& color, const Tensor& features,
                                         const Tensor& background, const Tensor& viewmats, const Tensor& Ks,
                                         const Tensor& image_cloud, const Tensor& cu_rows, int64_t width, int64_t height,
-                                        double near_plane, int64_t cutoff) {
+                                        double near_plane, int64_t cutoff, int64_t max_pairs, int64_t max_entries,
+                                        int64_t max_slots, bool viewmats_grad) {
   const char* op = "rasterize_gaussians_backward";
   const SceneTensors given{op, means, quats, scales, opacities, color, features, background,
                            viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff};
   given.check_all();
   const SceneTensors in = given.contiguous();
   const Tensor grad_color = rows_of(grad_color_), grad_alpha = rows_of(grad_alpha_), grad_depth = rows_of(grad_depth_);
-  const Tensor grad_features = rows_of(grad_features_), transmittance = rows_of(transmittance_), last = rows_of(last_);
+  const Tensor grad_features = rows_of(grad_features_), transmittance = rows_of(transmittance_), last = rows_of(last_), state = rows_of(state_);
   const int64_t n = in.n_images();
   check_shape(op, "grad_color", grad_color, {n, height, width, 3}, "[I, H, W, 3]");
   check_shape(op, "grad_alpha", grad_alpha, {n, height, width}, "[I, H, W]");
@@ -133,31 +149,45 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
   for (const Tensor* tensor : {&grad_color, &grad_alpha, &grad_depth, &grad_features, &transmittance})
     check_dtype(op, "image gradients", *tensor, in.means.scalar_type());
   check_dtype(op, "last", last, ScalarType::Int);
+  check_dtype(op, "state", state, ScalarType::Byte);
+  for (const Tensor* tensor : {&grad_color, &grad_alpha, &grad_depth, &grad_features, &transmittance, &last, &state})
+    check_device(op, "image gradients", *tensor, in.means);
 
   const auto like = [](const Tensor& tensor) { return torch::stable::new_empty(tensor, tensor.sizes()); };
   Tensor grad_means = like(in.means), grad_quats = like(in.quats), grad_scales = like(in.scales);
   Tensor grad_opacities = like(in.opacities), grad_in_color = like(in.color), grad_in_features = like(in.features);
-  Tensor grad_background = like(in.background), grad_viewmats = like(in.viewmats);
+  Tensor grad_background = like(in.background);
+  Tensor grad_viewmats = empty(in.viewmats, {viewmats_grad ? n : 0, 4, 4});
   TensorWorkspace workspace(in.means);
   dispatch_float(op, "means", in.means, [&]<typename T>() {
-    cpu::raster_backward<T>(
-        in.scene<T>(),
-        {data<T>(grad_color), data<T>(grad_alpha), data<T>(grad_depth), data<T>(grad_features), data<T>(transmittance),
-         data<int32_t>(last)},
-        {mutable_data<T>(grad_means), mutable_data<T>(grad_quats), mutable_data<T>(grad_scales),
-         mutable_data<T>(grad_opacities), mutable_data<T>(grad_in_color), mutable_data<T>(grad_in_features),
-         mutable_data<T>(grad_background), mutable_data<T>(grad_viewmats)},
-        workspace, torch_parallel());
+    const RasterImageGrads<T> image_grads{data<T>(grad_color),    data<T>(grad_alpha),    data<T>(grad_depth),
+                                          data<T>(grad_features), data<T>(transmittance), data<int32_t>(last)};
+    const RasterSceneGrads<T> grads{mutable_data<T>(grad_means),      mutable_data<T>(grad_quats),
+                                    mutable_data<T>(grad_scales),     mutable_data<T>(grad_opacities),
+                                    mutable_data<T>(grad_in_color),   mutable_data<T>(grad_in_features),
+                                    mutable_data<T>(grad_background), viewmats_grad ? mutable_data<T>(grad_viewmats)
+                                                                                    : nullptr};
+    if constexpr (kWithCuda)
+      if (in.means.is_cuda()) {
+        const RasterScene<T> scene = in.scene<T>();
+        const cuda::RasterLimits limits{max_pairs, max_entries, max_slots};
+        check_shape(op, "state", state, {cuda::raster_state_bytes(scene, limits)}, "[bytes]");
+        return cuda::raster_backward<T>(scene, image_grads, grads, limits, state.data_ptr(), workspace,
+                                        current_stream(in.means));
+      }
+    cpu::raster_backward<T>(in.scene<T>(), image_grads, grads, workspace, torch_parallel());
   });
   return {grad_means,    grad_quats,       grad_scales,     grad_opacities,
           grad_in_color, grad_in_features, grad_background, grad_viewmats};
 }
 
-}  // namespace
-
-STABLE_TORCH_LIBRARY_IMPL(gsim3d, CPU, m) {
+void kernels(auto& m) {
   m.impl("rasterize_gaussians", TORCH_BOX(&rasterize_gaussians));
   m.impl("rasterize_gaussians_backward", TORCH_BOX(&rasterize_gaussians_backward));
 }
+
+}  // namespace
+
+GSIM3D_REGISTER(kernels)
 
 }  // namespace gsim3d::binding

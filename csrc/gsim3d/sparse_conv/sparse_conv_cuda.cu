@@ -13,8 +13,9 @@ constexpr int64_t kMaxRows = int64_t{1} << 30;  // rows and slots together are c
 constexpr int64_t kMaxKernel = 39;              // taps are a dimension of a grid
 constexpr int64_t kBiasRows = 512;              // rows of one block of a bias gradient
 constexpr int64_t kAlignment = 16;              // bytes that the tensor-core kernels read at once
-// Blocks of a weight gradient: enough of them to fill a large GPU, few enough that adding them up stays cheap.
-constexpr int64_t kBlockPairsMin = 256, kBlockPairsMax = 2048, kWeightBlocks = 800;
+constexpr int64_t kWeightBlocks = 900;          // blocks of a weight gradient that fill a large GPU a few times
+constexpr int64_t kPairsPerBlock = 128;         // pairs on average that pay for adding up a block's result
+constexpr int64_t kChunkMin = 1024, kChunkMax = 16384;
 
 enum class VoxelValue { kMean, kSum };
 
@@ -60,95 +61,155 @@ __global__ void __launch_bounds__(kThreads)
   to[i] = c < channels ? from[row * channels + c] : E(0);
 }
 
-// The pairs that write each tile through each tap: a warp finds them by bisection, for `written` ascends inside a tap.
+// to[ci, tap, co] = from[co, tap, ci], with zeros for co up to `padded`.
+template <typename E>
+__global__ void __launch_bounds__(kThreads)
+    transpose_weights(const E* from, int32_t taps, int32_t c_in, int32_t c_out, int32_t padded, E* to) {
+  __shared__ E square[kWarp][kWarp + 2];
+  const int32_t ci0 = blockIdx.x * kWarp, co0 = blockIdx.y * kWarp, tap = blockIdx.z, lane = threadIdx.x % kWarp;
+  for (int r = threadIdx.x / kWarp; r < kWarp; r += kWarps) {
+    const int64_t co = co0 + r;
+    square[r][lane] = co < c_out && ci0 + lane < c_in ? from[(co * taps + tap) * c_in + ci0 + lane] : E(0);
+  }
+  __syncthreads();
+  for (int r = threadIdx.x / kWarp; r < kWarp; r += kWarps) {
+    const int64_t ci = ci0 + r;
+    if (ci < c_in && co0 + lane < padded) to[(ci * taps + tap) * padded + co0 + lane] = square[lane][r];
+  }
+}
+
+// The pairs that write each tile through each tap: `written` ascends inside a tap. One warp for a tile and a tap.
 __global__ void __launch_bounds__(kThreads)
     list_pairs(const int64_t* written, const int64_t* read, const int64_t* cu_taps, int32_t taps, int64_t n_pairs,
-               int64_t n_tiles, Sources sources, int64_t pitch, int32_t* list, uint8_t* places, int32_t* counts) {
+               int64_t n_tiles, Sources sources, int64_t pitch, int32_t* list, uint8_t* places, int32_t* counts,
+               int32_t* rows) {
+  constexpr int kAtOnce = 4;  // pairs of a lane whose loads are in flight together
   const int64_t unit = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / kWarp;
   if (unit >= n_tiles * taps) return;
   const int64_t tile = unit % n_tiles, v0 = tile * kTile;
   const int32_t tap = static_cast<int32_t>(unit / n_tiles), lane = threadIdx.x % kWarp;
-  const Range range = range_of(cu_taps, tap, n_pairs);
-  int64_t low = range.begin, high = range.end;
-  const int64_t wanted = v0 + (lane == 1 ? kTile : 0);
-  while (low < high) {
-    const int64_t middle = (low + high) / 2;
-    if (written[middle] < wanted)
-      low = middle + 1;
-    else
-      high = middle;
+  if (tap == taps / 2) {
+    const int64_t end = range_of(sources.cu_voxel_rows, min(v0 + kTile, sources.n_voxels) - 1, sources.n_rows).end;
+    for (int64_t i = range_of(sources.cu_voxel_rows, v0, sources.n_rows).begin + lane; i < end; i += kWarp)
+      rows[i] = inside(sources.voxel_rows[i], sources.n_rows) ? static_cast<int32_t>(sources.voxel_rows[i]) : -1;
+    if (lane == 0) counts[tile * taps + tap] = 0;
+    return;
   }
-  const int64_t begin = __shfl_sync(kFullWarp, low, 0), end = __shfl_sync(kFullWarp, low, 1);
+  const Range found_pairs = search_range(written, range_of(cu_taps, tap, n_pairs), v0, kTile);
+  const int64_t begin = found_pairs.begin, end = found_pairs.end;
   const int64_t at = tap * pitch + v0;
   int32_t count = 0;
-  for (int64_t i0 = begin; i0 < end && tap != taps / 2; i0 += kWarp) {
-    const int64_t i = i0 + lane;
-    int32_t source = -1;
-    int64_t place = -1;
-    if (i < end) {
-      place = written[i] - v0;
-      source = sources.of(read[i]);
+  for (int64_t i0 = begin; i0 < end && count < kTile; i0 += kAtOnce * kWarp) {
+    int64_t place[kAtOnce], voxel[kAtOnce];
+    int32_t source[kAtOnce];
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) {
+      const int64_t i = i0 + k * kWarp + lane;
+      place[k] = i < end ? written[i] - v0 : -1;
+      voxel[k] = i < end ? read[i] : -1;
     }
-    const bool good = source >= 0 && inside(place, kTile);
-    const unsigned found = __ballot_sync(kFullWarp, good);
-    const int32_t slot = count + __popc(found & ((1u << lane) - 1));
-    if (good && slot < kTile) {
-      list[at + slot] = source;
-      places[at + slot] = static_cast<uint8_t>(place);
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) source[k] = sources.of(voxel[k]);
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) {
+      const bool good = source[k] >= 0 && inside(place[k], kTile);
+      const unsigned found = __ballot_sync(kFullWarp, good);
+      const int32_t slot = count + __popc(found & ((1u << lane) - 1));
+      if (good && slot < kTile) {
+        list[at + slot] = source[k];
+        places[at + slot] = static_cast<uint8_t>(place[k]);
+      }
+      count = min(count + __popc(found), kTile);
     }
-    count = min(count + __popc(found), kTile);
-    if (count == kTile) break;
   }
   if (lane == 0) counts[tile * taps + tap] = count;
 }
 
-// partials[block, c] = sum over the rows of a block; threads of a column take every fourth row.
-template <typename E>
+template <typename E, int kVector>
+struct alignas(sizeof(E) * kVector) Vector {
+  E values[kVector];
+};
+
+// partials[block, c] = sum over the rows of a block. Eight threads lie side by side with kVector columns each, 32 take
+// turns at the rows; their sums are added in a tree.
+template <typename E, int kVector>
 __global__ void __launch_bounds__(kThreads)
     sum_rows(const E* grad, int64_t n_rows, int32_t channels, Sum<E>* partials) {
-  constexpr int kColumns = 64, kLanes = kThreads / kColumns;
-  __shared__ Sum<E> sums[kLanes][kColumns];
-  const int lane = threadIdx.x / kColumns, column = threadIdx.x % kColumns;
-  const int32_t c = blockIdx.y * kColumns + column;
+  constexpr int kAcross = 8, kRowsAtOnce = kThreads / kAcross;
+  __shared__ Sum<E> sums[kWarps][kAcross * kVector];
+  const int column = threadIdx.x % kAcross * kVector, lane = threadIdx.x / kAcross;
+  const int32_t c0 = blockIdx.y * kAcross * kVector, c = c0 + column;
   const int64_t begin = static_cast<int64_t>(blockIdx.x) * kBiasRows, end = min(n_rows, begin + kBiasRows);
-  Sum<E> sum = 0;
+  Sum<E> sum[kVector] = {};
   if (c < channels)
-    for (int64_t row = begin + lane; row < end; row += kLanes) sum += static_cast<Sum<E>>(grad[row * channels + c]);
-  sums[lane][column] = sum;
+    for (int64_t row = begin + lane; row < end; row += kRowsAtOnce) {
+      const auto values = *reinterpret_cast<const Vector<E, kVector>*>(grad + row * channels + c);
+#pragma unroll
+      for (int i = 0; i < kVector; ++i) sum[i] += static_cast<Sum<E>>(values.values[i]);
+    }
+#pragma unroll
+  for (int i = 0; i < kVector; ++i) {
+    sum[i] += __shfl_xor_sync(kFullWarp, sum[i], kAcross);
+    sum[i] += __shfl_xor_sync(kFullWarp, sum[i], 2 * kAcross);
+    if (threadIdx.x % kWarp < kAcross) sums[threadIdx.x / kWarp][column + i] = sum[i];
+  }
   __syncthreads();
-  if (lane == 0 && c < channels)
-    partials[static_cast<int64_t>(blockIdx.x) * channels + c] =
-        (sums[0][column] + sums[1][column]) + (sums[2][column] + sums[3][column]);
+  const int i = threadIdx.x;
+  if (i >= kAcross * kVector || c0 + i >= channels) return;
+  static_assert(kWarps == 8);
+  partials[static_cast<int64_t>(blockIdx.x) * channels + c0 + i] =
+      ((sums[0][i] + sums[1][i]) + (sums[2][i] + sums[3][i])) + ((sums[4][i] + sums[5][i]) + (sums[6][i] + sums[7][i]));
 }
 
-// Blocks are added in four chains, the chains in pairs.
-template <typename T>
-__device__ T add_blocks(const T* blocks, int64_t n, int64_t size) {
-  T sums[4] = {};
-  for (int64_t b = 0; b < n; b += 4)
-#pragma unroll
-    for (int i = 0; i < 4; ++i)
-      if (b + i < n) sums[i] += blocks[(b + i) * size];
-  return (sums[0] + sums[1]) + (sums[2] + sums[3]);
-}
+// Adding blocks up: kAdders threads take every kAdders-th block, then their sums are added in a tree. A thread has
+// kEach elements, kElements apart, whose loads are in flight together.
+constexpr int kAdders = 4, kElements = kThreads / kAdders, kEach = 4;
 
 // One tap (blockIdx.y), then the bias.
 template <typename E>
 __global__ void __launch_bounds__(kThreads)
-    add_partials(OuterProducts<E> products, int32_t c_out, int32_t c_in, const Sum<E>* bias_partials,
+    add_partials(OuterProducts<E> products, int64_t n_chunks, int32_t c_out, int32_t c_in, const Sum<E>* bias_partials,
                  int64_t bias_blocks, E* grad_weight, E* grad_bias) {
-  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  using T = Sum<E>;
+  __shared__ T sums[kAdders][kEach][kElements];
+  const int adder = threadIdx.x / kElements, element = threadIdx.x % kElements;
   const int32_t tap = blockIdx.y;
-  if (tap == products.taps) {
-    if (i < c_out) grad_bias[i] = static_cast<E>(add_blocks(bias_partials + i, bias_blocks, c_out));
-    return;
+  const bool bias = tap == products.taps;
+  const int32_t centre = products.taps / 2, parts_of_chunk = tap == centre ? products.centre_parts : 1;
+  const int32_t unit = tap == centre ? 0 : products.centre_parts + (tap < centre ? tap : tap - 1);
+  const int64_t size = bias ? c_out : static_cast<int64_t>(products.c_out) * products.c_in;
+  const int64_t blocks = bias ? bias_blocks : n_chunks * parts_of_chunk;
+  const int64_t count = bias ? c_out : static_cast<int64_t>(c_out) * c_in;
+  const int64_t first = static_cast<int64_t>(blockIdx.x) * kElements * kEach + element;
+  if (first - element >= count) return;
+
+  int64_t offset[kEach];
+#pragma unroll
+  for (int k = 0; k < kEach; ++k) {
+    const int64_t i = min(first + k * kElements, count - 1);
+    offset[k] = bias ? i : i / c_in * products.c_in + i % c_in;
   }
-  const PairBlock block =
-      find_block(products.cu_taps, products.taps, products.n_pairs, products.n_rows, products.block_pairs, -1, tap);
-  if (i >= static_cast<int64_t>(c_out) * c_in) return;
-  const int64_t size = static_cast<int64_t>(products.c_out) * products.c_in, co = i / c_in, ci = i % c_in;
-  const Sum<E>* from = products.partials + block.first * size + co * products.c_in + ci;
-  grad_weight[(co * products.taps + tap) * c_in + ci] = static_cast<E>(add_blocks(from, block.blocks, size));
+  T parts[kEach] = {};
+#pragma unroll 4
+  for (int64_t b = adder; b < blocks; b += kAdders) {
+    const int64_t block = bias ? b : b / parts_of_chunk * products.blocks_per_chunk() + unit + b % parts_of_chunk;
+    const T* from = (bias ? bias_partials : products.partials) + block * size;
+#pragma unroll
+    for (int k = 0; k < kEach; ++k) parts[k] += from[offset[k]];
+  }
+#pragma unroll
+  for (int k = 0; k < kEach; ++k) sums[adder][k][element] = parts[k];
+  __syncthreads();
+  // Each adder finishes one of the kEach elements.
+  static_assert(kAdders == kEach);
+  const T sum =
+      (sums[0][adder][element] + sums[1][adder][element]) + (sums[2][adder][element] + sums[3][adder][element]);
+  const int64_t i = first + adder * kElements;
+  if (i >= count) return;
+  if (bias)
+    grad_bias[i] = static_cast<E>(sum);
+  else
+    grad_weight[(i / c_in * products.taps + tap) * c_in + i % c_in] = static_cast<E>(sum);
 }
 
 template <typename E>
@@ -190,21 +251,33 @@ Values<E> values_of(const char* op, const E* x, const SparseConvMap& map, int64_
 TilePairs pairs_of(const char* op, const SparseConvMap& map, bool transposed, bool first, const Workspace& workspace,
                    Stream stream) {
   const int64_t taps = taps_of(map), n_tiles = tiles_of(map), pitch = n_tiles * kTile;
-  int32_t* sources = workspace.take<int32_t>(taps * pitch);
-  uint8_t* places = workspace.take<uint8_t>(taps * pitch);
-  int32_t* counts = workspace.take<int32_t>(taps * n_tiles);
+  int32_t* sources = workspace.take<int32_t>(taps * pitch + taps * pitch / 4 + taps * n_tiles + map.n_rows);
+  uint8_t* places = reinterpret_cast<uint8_t*>(sources + taps * pitch);  // at a multiple of 16 bytes, as it is read
+  int32_t* counts = sources + taps * pitch + taps * pitch / 4;
+  int32_t* rows = counts + taps * n_tiles;
   launch(op, list_pairs, blocks_for(op, n_tiles * taps, kWarps), kThreads, 0, stream,
          transposed ? map.tap_in : map.tap_out, transposed ? map.tap_out : map.tap_in, map.cu_taps, taps, map.n_pairs,
-         n_tiles, sources_of(map, first), pitch, sources, places, counts);
-  return {sources, places, counts, pitch};
+         n_tiles, sources_of(map, first), pitch, sources, places, counts, rows);
+  return {sources, places, counts, rows, static_cast<int32_t>(pitch)};
 }
 
-template <typename E>
-void convolve(const char* op, const Convolution<E>& convolution, int64_t n_tiles, bool transposed, Stream stream) {
-  if constexpr (kIsHalf<E>)
-    convolve_tensor(op, convolution, n_tiles, transposed, stream);
-  else
-    convolve_plain(op, convolution, n_tiles, transposed, stream);
+// How a weight gradient is cut: the same for the same sizes, whatever the GPU.
+struct WeightPlan {
+  int64_t chunk_voxels, n_chunks, centre_parts;
+};
+
+WeightPlan plan_of(const SparseConvMap& map, int64_t c_in, int64_t c_out) {
+  const int64_t others = taps_of(map) - 1, pairs = std::max<int64_t>(1, map.n_pairs);
+  const int64_t tiles = round_up(c_out, 128) * round_up(c_in, 128) / (128 * 128);
+  const int64_t ratio = map.n_rows * std::max<int64_t>(1, others) / pairs;  // of centre pairs to those of another tap
+  WeightPlan plan{kChunkMin, 0, 1};
+  const auto blocks = [&] { return map.n_voxels / plan.chunk_voxels * (others + ratio) * tiles; };
+  const auto pairs_per_block = [&] { return pairs * plan.chunk_voxels / std::max<int64_t>(1, map.n_voxels * others); };
+  while (plan.chunk_voxels < kChunkMax && (blocks() > kWeightBlocks || pairs_per_block() < kPairsPerBlock))
+    plan.chunk_voxels *= 2;
+  while (2 * plan.centre_parts <= ratio && plan.chunk_voxels / plan.centre_parts > kChunkMin) plan.centre_parts *= 2;
+  plan.n_chunks = (map.n_voxels + plan.chunk_voxels - 1) / plan.chunk_voxels;
+  return plan;
 }
 
 template <typename T>
@@ -234,7 +307,6 @@ void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap
                                    weights.data,
                                    bias == nullptr ? nullptr : native_data(bias),
                                    pairs,
-                                   map.voxel_rows,
                                    map.cu_voxel_rows,
                                    map.row_voxel,
                                    map.n_voxels,
@@ -245,7 +317,9 @@ void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap
                                    static_cast<int32_t>(weights.channels),
                                    Share::kWhole,
                                    native_data(out)};
-  convolve(op, convolution, tiles_of(map), false, stream);
+  if constexpr (kIsHalf<E>)
+    if (c_in > 0) return convolve_tensor(op, convolution, tiles_of(map), stream);
+  convolve_plain(op, convolution, tiles_of(map), false, stream);
 }
 
 template <typename T>
@@ -256,14 +330,20 @@ void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& 
   check_sizes(op, map, c_in, c_out);
   const int64_t taps = taps_of(map);
   const Padded<E> rows = padded(op, native_data(grad), map.n_rows, c_out, workspace, stream);
-  const Padded<E> weights = padded(op, native_data(weight), c_out * taps, c_in, workspace, stream);
+  const E* weights = native_data(weight);
+  if constexpr (kIsHalf<E>) {
+    E* transposed = workspace.take<E>(c_in * taps * rows.channels);
+    const dim3 squares(blocks_for(op, c_in, kWarp), blocks_for(op, rows.channels, kWarp), static_cast<unsigned>(taps));
+    launch(op, transpose_weights<E>, squares, kThreads, 0, stream, weights, taps, c_in, c_out, rows.channels,
+           transposed);
+    weights = transposed;
+  }
   const Values<E> values = values_of(op, rows.data, map, rows.channels, VoxelValue::kSum, false, workspace, stream);
   const TilePairs pairs = pairs_of(op, map, true, false, workspace, stream);
   const Convolution<E> convolution{values,
-                                   weights.data,
+                                   weights,
                                    nullptr,
                                    pairs,
-                                   map.voxel_rows,
                                    map.cu_voxel_rows,
                                    map.row_voxel,
                                    map.n_voxels,
@@ -271,10 +351,12 @@ void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& 
                                    static_cast<int32_t>(rows.channels),
                                    static_cast<int32_t>(c_in),
                                    static_cast<int32_t>(c_out),
-                                   static_cast<int32_t>(weights.channels),
+                                   static_cast<int32_t>(c_in),
                                    map.first ? Share::kFirstRow : Share::kEqualParts,
                                    native_data(grad_x)};
-  convolve(op, convolution, tiles_of(map), true, stream);
+  if constexpr (kIsHalf<E>)
+    if (c_out > 0) return convolve_tensor(op, convolution, tiles_of(map), stream);
+  convolve_plain(op, convolution, tiles_of(map), true, stream);
 }
 
 template <typename T>
@@ -289,13 +371,13 @@ void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map,
 
   const int64_t bias_blocks = (map.n_rows + kBiasRows - 1) / kBiasRows;
   Sum<E>* bias_partials = workspace.take<Sum<E>>(bias_blocks * c_out);
-  launch(op, sum_rows<E>, dim3(blocks_for(op, bias_blocks, 1), blocks_for(op, c_out, 64)), kThreads, 0, stream,
+  constexpr int kVector = kAlignment / sizeof(E);
+  const bool vectors = c_out % kVector == 0 && aligned(native_data(grad));
+  launch(op, vectors ? sum_rows<E, kVector> : sum_rows<E, 1>,
+         dim3(blocks_for(op, bias_blocks, 1), blocks_for(op, c_out, vectors ? 8 * kVector : 8)), kThreads, 0, stream,
          native_data(grad), map.n_rows, c_out, bias_partials);
 
-  const int64_t n_pairs = map.n_pairs + map.n_rows, tiles = round_up(c_out, 128) * round_up(c_in, 128) / (128 * 128);
-  const int64_t block_pairs =
-      std::clamp(round_up(n_pairs * tiles / kWeightBlocks, kPairStep), kBlockPairsMin, kBlockPairsMax);
-  const int64_t n_blocks = n_pairs / block_pairs + taps;
+  const WeightPlan plan = plan_of(map, c_in, c_out);
   const OuterProducts<E> products{
       values_of(op, left.data, map, left.channels, VoxelValue::kSum, false, workspace, stream),
       values_of(op, right.data, map, right.channels, VoxelValue::kMean, map.first, workspace, stream),
@@ -305,19 +387,21 @@ void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map,
       map.tap_out,
       map.cu_taps,
       map.n_pairs,
-      map.n_rows,
-      block_pairs,
+      plan.chunk_voxels,
       static_cast<int32_t>(taps),
+      static_cast<int32_t>(plan.centre_parts),
       static_cast<int32_t>(left.channels),
       static_cast<int32_t>(right.channels),
-      workspace.take<Sum<E>>(n_blocks * left.channels * right.channels)};
+      workspace.take<Sum<E>>(plan.n_chunks * (plan.centre_parts + taps - 1) * left.channels * right.channels)};
+  const int64_t n_blocks = plan.n_chunks * products.blocks_per_chunk();
   if constexpr (kIsHalf<E>)
     outer_products_tensor(op, products, n_blocks, stream);
   else
     outer_products_plain(op, products, n_blocks, stream);
-  const unsigned columns = std::max(blocks_for(op, c_out * c_in, kThreads), blocks_for(op, c_out, kThreads));
-  launch(op, add_partials<E>, dim3(columns, static_cast<unsigned>(taps + 1)), kThreads, 0, stream, products, c_out,
-         c_in, bias_partials, bias_blocks, native_data(grad_weight), native_data(grad_bias));
+  const unsigned columns =
+      std::max(blocks_for(op, c_out * c_in, kElements * kEach), blocks_for(op, c_out, kElements * kEach));
+  launch(op, add_partials<E>, dim3(columns, static_cast<unsigned>(taps + 1)), kThreads, 0, stream, products,
+         plan.n_chunks, c_out, c_in, bias_partials, bias_blocks, native_data(grad_weight), native_data(grad_bias));
 }
 
 #define GSIM3D_INSTANTIATE(T)                                                                                 \

@@ -46,10 +46,14 @@ struct Sources {
   bool first;  // the lowest row stands for the voxel
 
   __device__ int32_t of(int64_t voxel) const {  // -1: none
-    if (!inside(voxel, n_voxels)) return -1;
+    if (!inside(voxel, n_voxels) || voxel >= n_rows) return -1;
+    if (n_slots == 0) {  // no voxel is empty, hence every voxel has one row
+      const int64_t row = voxel_rows[voxel];
+      return inside(row, n_rows) ? static_cast<int32_t>(row) : -1;
+    }
     const Range rows = range_of(cu_voxel_rows, voxel, n_rows);
     if (rows.begin == rows.end) return -1;
-    if (first || n_slots == 0 || rows.end - rows.begin == 1) {
+    if (first || rows.end - rows.begin == 1) {
       const int64_t row = voxel_rows[rows.begin];
       return inside(row, n_rows) ? static_cast<int32_t>(row) : -1;
     }
@@ -57,6 +61,11 @@ struct Sources {
     return inside(slot, n_slots) ? static_cast<int32_t>(n_rows + slot) : -1;
   }
 };
+
+// A product of two numbers that are not negative, in one instruction.
+__device__ __forceinline__ int64_t wide_product(int32_t a, int32_t b) {
+  return static_cast<int64_t>(static_cast<uint64_t>(static_cast<uint32_t>(a)) * static_cast<uint32_t>(b));
+}
 
 // Rows of features, then the values of shared voxels; both with `channels` columns.
 template <typename E>
@@ -66,8 +75,8 @@ struct Values {
   int32_t n_rows, channels;
 
   __device__ const E* at(int32_t source) const {
-    return source < n_rows ? rows + static_cast<int64_t>(source) * channels
-                           : shared + static_cast<int64_t>(source - n_rows) * channels;
+    const bool alone = source < n_rows;
+    return (alone ? rows : shared) + wide_product(alone ? source : source - n_rows, channels);
   }
 };
 
@@ -76,20 +85,21 @@ struct TilePairs {
   const int32_t* sources;  // [taps, pitch]; those of tile b start at b * kTile
   const uint8_t* places;   // [taps, pitch], the written voxel of the tile
   const int32_t* counts;   // [tiles, taps]
-  int64_t pitch;           // tiles * kTile
+  const int32_t* rows;     // [n_rows], voxel_rows where they are in range, else -1
+  int32_t pitch;           // tiles * kTile
 };
 
 enum class Share { kWhole, kEqualParts, kFirstRow };  // what the rows of a voxel get of the voxel's sum
 
 // y[p] = bias + values[p] B_centre + share of (sum over pairs that write voxel v(p): values[source] B_tap), where
-// B_tap[k, n] is weight[n, tap, k], or weight[k, tap, n] for the gradient of the input.
+// B_tap[k, n] is weight[n, tap, k]; for the gradient of the input weight[k, tap, n] or, on tensor cores, the same of a
+// transposed copy of the weights.
 template <typename E>
 struct Convolution {
   Values<E> values;
   const E* weight;  // [c_out, taps, weight_row]
   const E* bias;    // [c_write] or null
   TilePairs pairs;
-  const int64_t* voxel_rows;
   const int64_t* cu_voxel_rows;
   const int64_t* row_voxel;
   int64_t n_voxels;
@@ -107,18 +117,42 @@ struct Part {
 
 template <typename E>
 __device__ Part part_of(const Convolution<E>& conv, int64_t i, int64_t v0) {
-  const int64_t n_rows = conv.values.n_rows, row = conv.voxel_rows[i];
-  if (!inside(row, n_rows)) return {-1, -1, 1};
-  const int64_t voxel = conv.row_voxel[row];
+  const int64_t n_rows = conv.values.n_rows, row = conv.pairs.rows[i];
+  if (row < 0) return {-1, -1, 1};
+  // Where there are as many voxels as rows every voxel has one.
+  const int64_t voxel = conv.n_voxels == n_rows ? i : conv.row_voxel[row];
   if (!inside(voxel, conv.n_voxels) || !inside(voxel - v0, kTile)) return {row, -1, 1};
   const int32_t place = static_cast<int32_t>(voxel - v0);
-  if (conv.share == Share::kWhole) return {row, place, 1};
+  if (conv.share == Share::kWhole || conv.n_voxels == n_rows) return {row, place, 1};
   const Range rows = range_of(conv.cu_voxel_rows, voxel, n_rows);
   if (conv.share == Share::kFirstRow) return {row, i == rows.begin ? place : -1, 1};
   return {row, place, static_cast<int32_t>(max(rows.end - rows.begin, int64_t{1}))};
 }
 
-// Outer products of pairs: grad_weight[:, tap, :] = sum over pairs of grads[out] inputs[in]^T.
+// The first of ascending values [low, high) that is not below `wanted`. The halves of a warp search for two values.
+__device__ inline int64_t search(const int64_t* values, int64_t low, int64_t high, int64_t wanted) {
+  constexpr int kProbes = 16;
+  const int lane = threadIdx.x % kWarp;
+  while (__any_sync(kFullWarp, low < high)) {
+    const int64_t begin = low, size = high - low;
+    const bool below = size > 0 && values[begin + size * (lane % kProbes + 1) / (kProbes + 1)] < wanted;
+    const int n_below = __popc(__ballot_sync(kFullWarp, below) >> (lane / kProbes * kProbes) & 0xffff);
+    if (size <= 0) continue;
+    if (n_below > 0) low = begin + size * n_below / (kProbes + 1) + 1;
+    if (n_below < kProbes) high = begin + size * (n_below + 1) / (kProbes + 1);
+  }
+  return low;
+}
+
+// The pairs of a tap whose values lie in [first, first + count). A whole warp calls it.
+__device__ inline Range search_range(const int64_t* values, Range range, int64_t first, int64_t count) {
+  const int64_t bound = search(values, range.begin, range.end, first + threadIdx.x % kWarp / 16 * count);
+  return {__shfl_sync(kFullWarp, bound, 0), __shfl_sync(kFullWarp, bound, kWarp - 1)};
+}
+
+// Outer products of pairs: grad_weight[:, tap, :] = sum over pairs of grads[out] inputs[in]^T. Voxels are cut into
+// chunks; a block sums the pairs of one tap that write a chunk, or of a part of a chunk's rows with themselves for the
+// centre tap, which has most pairs. The blocks of a chunk follow each other, since they read the same rows.
 template <typename E>
 struct OuterProducts {
   Values<E> grads, inputs;
@@ -126,64 +160,49 @@ struct OuterProducts {
   const int64_t* tap_in;
   const int64_t* tap_out;
   const int64_t* cu_taps;
-  int64_t n_pairs, n_rows, block_pairs;
-  int32_t taps, c_out, c_in;
-  Sum<E>* partials;  // [blocks, c_out, c_in]
+  int64_t n_pairs, chunk_voxels;
+  int32_t taps, centre_parts, c_out, c_in;
+  Sum<E>* partials;  // [chunks, centre_parts + taps - 1, c_out, c_in]
+
+  __host__ __device__ int32_t blocks_per_chunk() const { return centre_parts + taps - 1; }
 };
 
-// The pairs of one block of a weight gradient. Each tap is cut into equal blocks of at most block_pairs; the centre
-// tap pairs every row with itself.
 struct PairBlock {
-  int32_t tap;    // -1: there is no such block
-  int32_t first;  // first block of the tap
-  int32_t blocks;
-  int64_t begin, end;
+  int32_t tap;
+  Range pairs;  // for the centre tap: of voxel_rows
 };
 
-constexpr int kPairStep = 64;  // blocks start at multiples of it
-
-__device__ inline Range pairs_of_tap(const int64_t* cu_taps, int32_t tap, int32_t taps, int64_t n_pairs,
-                                     int64_t n_rows) {
-  return tap == taps / 2 ? Range{0, n_rows} : range_of(cu_taps, tap, n_pairs);
+// A whole warp calls it.
+template <typename E>
+__device__ PairBlock pair_block(const OuterProducts<E>& products, int64_t index) {
+  const int64_t first = index / products.blocks_per_chunk() * products.chunk_voxels;
+  const int32_t unit = static_cast<int32_t>(index % products.blocks_per_chunk()), centre = products.taps / 2;
+  const Sources& sources = products.grad_sources;
+  if (unit < products.centre_parts) {
+    const int64_t part = products.chunk_voxels / products.centre_parts, v = first + unit * part;
+    const int64_t begin = sources.cu_voxel_rows[min(v, sources.n_voxels)];
+    const int64_t end = sources.cu_voxel_rows[min(v + part, sources.n_voxels)];
+    const int64_t low = min(max(begin, int64_t{0}), sources.n_rows);
+    return {centre, {low, min(max(end, low), sources.n_rows)}};
+  }
+  const int32_t other = unit - products.centre_parts, tap = other < centre ? other : other + 1;
+  const Range range = range_of(products.cu_taps, tap, products.n_pairs);
+  return {tap, search_range(products.tap_out, range, first, products.chunk_voxels)};
 }
 
-// Called by a whole warp. Finds block `slot`, or with `slot` -1 the blocks of `tap`.
-__device__ inline PairBlock find_block(const int64_t* cu_taps, int32_t taps, int64_t n_pairs, int64_t n_rows,
-                                       int64_t block_pairs, int32_t slot, int32_t tap) {
-  const int lane = threadIdx.x % kWarp;
-  int32_t before = 0;
-  for (int32_t t0 = 0; t0 < taps; t0 += kWarp) {
-    const int32_t t = t0 + lane;
-    Range range{0, 0};
-    if (t < taps) range = pairs_of_tap(cu_taps, t, taps, n_pairs, n_rows);
-    const int64_t n = range.end - range.begin;
-    const int32_t blocks = static_cast<int32_t>((n + block_pairs - 1) / block_pairs);
-    int32_t through = blocks;
-    for (int step = 1; step < kWarp; step *= 2) {
-      const int32_t other = __shfl_up_sync(kFullWarp, through, step);
-      if (lane >= step) through += other;
-    }
-    const int32_t first = before + through - blocks;
-    const bool mine = t < taps && (slot < 0 ? t == tap : first <= slot && slot < before + through);
-    const unsigned found = __ballot_sync(kFullWarp, mine);
-    if (found != 0) {
-      PairBlock result{t, first, blocks, 0, 0};
-      if (blocks > 0) {
-        const int64_t length = ((n + blocks - 1) / blocks + kPairStep - 1) / kPairStep * kPairStep;
-        result.begin = min(range.end, range.begin + max(slot - first, 0) * length);
-        result.end = min(range.end, result.begin + length);
-      }
-      const int owner = __ffs(found) - 1;
-      result.tap = __shfl_sync(kFullWarp, result.tap, owner);
-      result.first = __shfl_sync(kFullWarp, result.first, owner);
-      result.blocks = __shfl_sync(kFullWarp, result.blocks, owner);
-      result.begin = __shfl_sync(kFullWarp, result.begin, owner);
-      result.end = __shfl_sync(kFullWarp, result.end, owner);
-      return result;
-    }
-    before += __shfl_sync(kFullWarp, through, kWarp - 1);
+// Rows of memory of one pair; -1, -1 where it is none.
+struct PairSources {
+  int32_t out, in;
+};
+template <typename E>
+__device__ PairSources pair_sources(const OuterProducts<E>& products, int32_t tap, int64_t i) {
+  if (tap == products.taps / 2) {
+    const int64_t row = products.grad_sources.voxel_rows[i];
+    const int32_t source = inside(row, products.grad_sources.n_rows) ? static_cast<int32_t>(row) : -1;
+    return {source, source};
   }
-  return {-1, 0, 0, 0, 0};
+  const int32_t out = products.grad_sources.of(products.tap_out[i]), in = products.input_sources.of(products.tap_in[i]);
+  return out < 0 || in < 0 ? PairSources{-1, -1} : PairSources{out, in};
 }
 
 // The products, by plain multiply-adds for any type and size, and by tensor cores for 16-bit types whose rows are
@@ -191,7 +210,7 @@ __device__ inline PairBlock find_block(const int64_t* cu_taps, int32_t taps, int
 template <typename E>
 void convolve_plain(const char* op, const Convolution<E>& conv, int64_t n_tiles, bool transposed, Stream stream);
 template <typename E>
-void convolve_tensor(const char* op, const Convolution<E>& conv, int64_t n_tiles, bool transposed, Stream stream);
+void convolve_tensor(const char* op, const Convolution<E>& conv, int64_t n_tiles, Stream stream);
 template <typename E>
 void outer_products_plain(const char* op, const OuterProducts<E>& products, int64_t n_blocks, Stream stream);
 template <typename E>

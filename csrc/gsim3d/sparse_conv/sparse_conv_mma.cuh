@@ -5,6 +5,7 @@
 #include <cuda_fp16.h>
 
 #include <cstdint>
+#include <type_traits>
 
 namespace gsim3d::cuda::conv {
 
@@ -55,6 +56,74 @@ __device__ __forceinline__ void multiply_add<__nv_bfloat16>(const uint32_t (&a)[
       : "+f"(sum[0]), "+f"(sum[1]), "+f"(sum[2]), "+f"(sum[3])
       : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
 }
+
+// Makes this thread's finished copies visible to the instructions of warp groups, which read memory on another way; the
+// others see them after a barrier.
+__device__ __forceinline__ void publish_copies() {
+#ifdef __CUDA_ARCH_FEAT_SM90_ALL
+  asm volatile("fence.proxy.async.shared::cta;" ::: "memory");
+#endif
+}
+
+#ifdef __CUDA_ARCH_FEAT_SM90_ALL
+// Products of a group of four warps (wgmma), 64 rows by 32 or 64 columns, with both factors in shared memory: rows of
+// 128 bytes whose chunks are permuted as in chunk_offset, from a multiple of 1024 bytes on. A row of memory holds 64
+// steps of the sum for a row (column) of the left (right) factor; with kTurned 64 rows (columns) for a step of the sum.
+__device__ __forceinline__ uint64_t rows_descriptor(uint32_t address) {
+  constexpr uint64_t kEightRows = 1024 / 16, kPermuted128 = 1;
+  return (address & 0x3ffff) / 16 | uint64_t{1} << 16 | kEightRows << 32 | kPermuted128 << 62;
+}
+__device__ __forceinline__ void start_group_products() { asm volatile("wgmma.fence.sync.aligned;" ::: "memory"); }
+__device__ __forceinline__ void close_group_products() {
+  asm volatile("wgmma.commit_group.sync.aligned;" ::: "memory");
+}
+__device__ __forceinline__ void wait_for_group_products() {
+  asm volatile("wgmma.wait_group.sync.aligned 0;" ::: "memory");
+}
+// Keeps the compiler from moving accesses of the sums across the products that are under way.
+template <int kGroups>
+__device__ __forceinline__ void fence_sums(float (&sums)[kGroups][4]) {
+#pragma unroll
+  for (int j = 0; j < kGroups; ++j)
+#pragma unroll
+    for (int e = 0; e < 4; ++e) asm volatile("" : "+f"(sums[j][e])::"memory");
+}
+
+#define GSIM3D_SUMS(j) "+f"(d[j][0]), "+f"(d[j][1]), "+f"(d[j][2]), "+f"(d[j][3])
+#define GSIM3D_GROUP_PRODUCT_32(TYPE)                                                           \
+  asm volatile(                                                                                 \
+      "{.reg .pred p; setp.ne.b32 p, %18, 0;\n"                                                 \
+      "wgmma.mma_async.sync.aligned.m64n32k16.f32." TYPE "." TYPE                               \
+      " {%0,%1,%2,%3,%4,%5,%6,%7,%8,%9,%10,%11,%12,%13,%14,%15}, %16, %17, p, 1, 1, %19, %19;}" \
+      : GSIM3D_SUMS(0), GSIM3D_SUMS(1), GSIM3D_SUMS(2), GSIM3D_SUMS(3)                          \
+      : "l"(a), "l"(b), "r"(static_cast<int>(add)), "n"(static_cast<int>(kTurned)))
+#define GSIM3D_GROUP_PRODUCT_64(TYPE)                                                                    \
+  asm volatile(                                                                                          \
+      "{.reg .pred p; setp.ne.b32 p, %34, 0;\n"                                                          \
+      "wgmma.mma_async.sync.aligned.m64n64k16.f32." TYPE "." TYPE                                        \
+      " {%0,%1,%2,%3,%4,%5,%6,%7,%8,%9,%10,%11,%12,%13,%14,%15,%16,%17,%18,%19,%20,%21,%22,%23,%24,%25," \
+      "%26,%27,%28,%29,%30,%31}, %32, %33, p, 1, 1, %35, %35;}"                                          \
+      : GSIM3D_SUMS(0), GSIM3D_SUMS(1), GSIM3D_SUMS(2), GSIM3D_SUMS(3), GSIM3D_SUMS(4), GSIM3D_SUMS(5),  \
+        GSIM3D_SUMS(6), GSIM3D_SUMS(7)                                                                   \
+      : "l"(a), "l"(b), "r"(static_cast<int>(add)), "n"(static_cast<int>(kTurned)))
+template <typename E, bool kTurned>
+__device__ __forceinline__ void multiply_add_group(uint64_t a, uint64_t b, bool add, float (&d)[4][4]) {
+  if constexpr (std::is_same_v<E, __half>)
+    GSIM3D_GROUP_PRODUCT_32("f16");
+  else
+    GSIM3D_GROUP_PRODUCT_32("bf16");
+}
+template <typename E, bool kTurned>
+__device__ __forceinline__ void multiply_add_group(uint64_t a, uint64_t b, bool add, float (&d)[8][4]) {
+  if constexpr (std::is_same_v<E, __half>)
+    GSIM3D_GROUP_PRODUCT_64("f16");
+  else
+    GSIM3D_GROUP_PRODUCT_64("bf16");
+}
+#undef GSIM3D_GROUP_PRODUCT_32
+#undef GSIM3D_GROUP_PRODUCT_64
+#undef GSIM3D_SUMS
+#endif
 
 // Offset in elements of 16-byte chunk `chunk` of row `row`: chunks are permuted so that the eight rows of a matrix lie
 // in different banks. Rows are whole multiples of 128 bytes.

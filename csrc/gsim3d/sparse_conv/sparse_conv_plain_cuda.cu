@@ -39,32 +39,52 @@ struct alignas(16) Stage {
   Sum<E> b[kDepth][kPitch];
 };
 
-// Adds the products of the thread's row (of kRows; null: zeros) with B_tap to sums. All threads call it.
+// Four neighbouring elements of which `left` exist; at once where `whole` says that all rows are groups of four.
+template <typename E>
+__device__ __forceinline__ void load_four(const E* from, int32_t left, bool whole, Sum<E> (&to)[4]) {
+  struct alignas(4 * sizeof(E)) Four {
+    E values[4];
+  };
+  Four four{};
+  if (whole && left > 0) {
+    four = *reinterpret_cast<const Four*>(from);
+  } else {
+#pragma unroll
+    for (int i = 0; i < 4; ++i)
+      if (i < left) four.values[i] = from[i];
+  }
+#pragma unroll
+  for (int i = 0; i < 4; ++i) to[i] = widen(four.values[i]);
+}
+
+// Adds the products of the thread's row (of kRows; null: zeros) with B_tap to sums. All threads call it. The loads of a
+// stage are in flight while the stage before is multiplied.
 template <typename E, bool kTransposed>
 __device__ __forceinline__ void multiply_rows(const Convolution<E>& conv, const E* row, int32_t tap, int32_t n0,
-                                              Stage<E>& stage, Sum<E> (&sums)[4][4]) {
+                                              bool whole, Stage<E>& stage, Sum<E> (&sums)[4][4]) {
   const int thread = threadIdx.x, r = thread / 4, kr = thread % 4 * 4;
+  const int bk = thread / 16, bn = thread % 16 * 4;  // of a transposed weight
+  Sum<E> left[4], right[4];
+  const auto load = [&](int32_t k0) {
+    load_four(row + k0 + kr, row != nullptr ? conv.c_read - k0 - kr : 0, whole, left);
+    const int32_t first = kTransposed ? k0 + bk : n0 + r, last = kTransposed ? n0 + bn : k0 + kr;
+    const int32_t columns = kTransposed ? conv.c_write : conv.c_read;
+    const E* from = conv.weight + (static_cast<int64_t>(first) * conv.taps + tap) * conv.weight_row + last;
+    load_four(from, first < conv.c_out ? columns - last : 0, whole, right);
+  };
+  load(0);
   for (int32_t k0 = 0; k0 < conv.c_read; k0 += kDepth) {
-    Sum<E> left[4], right[4];
-#pragma unroll
-    for (int i = 0; i < 4; ++i) {
-      left[i] = row != nullptr && k0 + kr + i < conv.c_read ? widen(row[k0 + kr + i]) : Sum<E>(0);
-      const int32_t k = kTransposed ? k0 + thread / 16 : k0 + kr + i;
-      const int32_t n = kTransposed ? n0 + thread % 16 * 4 + i : n0 + r;
-      const int64_t at = kTransposed ? (static_cast<int64_t>(k) * conv.taps + tap) * conv.weight_row + n
-                                     : (static_cast<int64_t>(n) * conv.taps + tap) * conv.weight_row + k;
-      right[i] = k < conv.c_read && n < conv.c_write ? widen(conv.weight[at]) : Sum<E>(0);
-    }
     __syncthreads();
 #pragma unroll
     for (int i = 0; i < 4; ++i) {
       stage.a[kr + i][r] = left[i];
       if constexpr (kTransposed)
-        stage.b[thread / 16][thread % 16 * 4 + i] = right[i];
+        stage.b[bk][bn + i] = right[i];
       else
         stage.b[kr + i][r] = right[i];
     }
     __syncthreads();
+    if (k0 + kDepth < conv.c_read) load(k0 + kDepth);
     multiply(stage.a, stage.b, thread / 16 * 4, thread % 16 * 4, sums);
   }
 }
@@ -72,7 +92,7 @@ __device__ __forceinline__ void multiply_rows(const Convolution<E>& conv, const 
 // One block: a tile of voxels, kColumns output channels. The sums of the tile's voxels lie in shared memory; a tap has
 // every voxel at most once, so each sum has one owner between two barriers.
 template <typename E, bool kTransposed>
-__global__ void __launch_bounds__(kThreads) convolve(Convolution<E> conv) {
+__global__ void __launch_bounds__(kThreads) convolve(Convolution<E> conv, bool whole) {
   using T = Sum<E>;
   extern __shared__ __align__(16) char memory[];
   Stage<E>& stage = *reinterpret_cast<Stage<E>*>(memory);
@@ -86,12 +106,12 @@ __global__ void __launch_bounds__(kThreads) convolve(Convolution<E> conv) {
   for (int32_t tap = 0; tap < conv.taps; ++tap) {
     if (tap == centre) continue;
     const int32_t count = conv.pairs.counts[static_cast<int64_t>(blockIdx.x) * conv.taps + tap];
-    const int64_t list = tap * conv.pairs.pitch + v0;
+    const int64_t list = wide_product(tap, conv.pairs.pitch) + v0;
     for (int32_t m0 = 0; m0 < count; m0 += kRows) {
       const int32_t mine = m0 + thread / 4;
       const E* row = mine < count ? conv.values.at(conv.pairs.sources[list + mine]) : nullptr;
       T sums[4][4] = {};
-      multiply_rows<E, kTransposed>(conv, row, tap, n0, stage, sums);
+      multiply_rows<E, kTransposed>(conv, row, tap, n0, whole, stage, sums);
 #pragma unroll
       for (int i = 0; i < 4; ++i)
         if (m0 + r + i < count) {
@@ -107,10 +127,10 @@ __global__ void __launch_bounds__(kThreads) convolve(Convolution<E> conv) {
   const int64_t begin = min(max(conv.cu_voxel_rows[v0], int64_t{0}), n_rows);
   const int64_t end = min(max(conv.cu_voxel_rows[min(v0 + kTile, conv.n_voxels)], begin), n_rows);
   for (int64_t m0 = begin; m0 < end; m0 += kRows) {
-    const int64_t mine = m0 + thread / 4, index = mine < end ? conv.voxel_rows[mine] : -1;
-    const E* row = inside(index, n_rows) ? conv.values.rows + index * conv.c_read : nullptr;
+    const int64_t mine = m0 + thread / 4, index = mine < end ? conv.pairs.rows[mine] : -1;
+    const E* row = index >= 0 ? conv.values.rows + index * conv.c_read : nullptr;
     T sums[4][4] = {};
-    multiply_rows<E, kTransposed>(conv, row, centre, n0, stage, sums);
+    multiply_rows<E, kTransposed>(conv, row, centre, n0, whole, stage, sums);
 #pragma unroll
     for (int i = 0; i < 4; ++i) {
       if (m0 + r + i >= end) continue;
@@ -134,28 +154,21 @@ template <typename E>
 __global__ void __launch_bounds__(kThreads) multiply_pairs(OuterProducts<E> products, int32_t column_tiles) {
   using T = Sum<E>;
   __shared__ Stage<E> stage;
-  const PairBlock block = find_block(products.cu_taps, products.taps, products.n_pairs, products.n_rows,
-                                     products.block_pairs, static_cast<int32_t>(blockIdx.x), -1);
-  if (block.tap < 0) return;
+  const PairBlock block = pair_block(products, blockIdx.x);
   const int thread = threadIdx.x, pair = thread / 16, from = thread % 16 * 4;
   const int32_t co = blockIdx.y / column_tiles * kRows, ci = blockIdx.y % column_tiles * kColumns;
   T sums[4][4] = {};
-  for (int64_t p0 = block.begin; p0 < block.end; p0 += kDepth) {
+  for (int64_t p0 = block.pairs.begin; p0 < block.pairs.end; p0 += kDepth) {
     const int64_t p = p0 + pair;
-    int32_t out = -1, in = -1;
-    if (p < block.end) {
-      const bool own = block.tap == products.taps / 2;
-      out = own ? static_cast<int32_t>(p) : products.grad_sources.of(products.tap_out[p]);
-      in = own ? static_cast<int32_t>(p) : products.input_sources.of(products.tap_in[p]);
-    }
-    const bool both = out >= 0 && in >= 0;
-    const E* left = both ? products.grads.at(out) : nullptr;
-    const E* right = both ? products.inputs.at(in) : nullptr;
+    const PairSources rows = p < block.pairs.end ? pair_sources(products, block.tap, p) : PairSources{-1, -1};
+    const bool real = rows.out >= 0;
+    const E* left = real ? products.grads.at(rows.out) : nullptr;
+    const E* right = real ? products.inputs.at(rows.in) : nullptr;
     __syncthreads();
 #pragma unroll
     for (int i = 0; i < 4; ++i) {
-      stage.a[pair][from + i] = both && co + from + i < products.c_out ? widen(left[co + from + i]) : T(0);
-      stage.b[pair][from + i] = both && ci + from + i < products.c_in ? widen(right[ci + from + i]) : T(0);
+      stage.a[pair][from + i] = real && co + from + i < products.c_out ? widen(left[co + from + i]) : T(0);
+      stage.b[pair][from + i] = real && ci + from + i < products.c_in ? widen(right[ci + from + i]) : T(0);
     }
     __syncthreads();
     multiply(stage.a, stage.b, thread / 16 * 4, thread % 16 * 4, sums);
@@ -175,8 +188,11 @@ __global__ void __launch_bounds__(kThreads) multiply_pairs(OuterProducts<E> prod
 template <typename E>
 void convolve_plain(const char* op, const Convolution<E>& conv, int64_t n_tiles, bool transposed, Stream stream) {
   const dim3 blocks(blocks_for(op, n_tiles, 1), blocks_for(op, conv.c_write, kColumns));
+  const auto fours = [](const E* data) { return reinterpret_cast<uintptr_t>(data) % (4 * sizeof(E)) == 0; };
+  const bool whole = conv.c_read % 4 == 0 && conv.weight_row % 4 == 0 && fours(conv.values.rows) &&
+                     fours(conv.values.shared) && fours(conv.weight);
   const size_t bytes = sizeof(Stage<E>) + sizeof(Sum<E>) * kTile * kColumns;
-  launch(op, transposed ? convolve<E, true> : convolve<E, false>, blocks, kThreads, bytes, stream, conv);
+  launch(op, transposed ? convolve<E, true> : convolve<E, false>, blocks, kThreads, bytes, stream, conv, whole);
 }
 
 template <typename E>

@@ -6,108 +6,152 @@ namespace gsim3d::cuda::conv {
 namespace {
 
 constexpr int kThreads = 256;
-constexpr int kWarps = kThreads / kWarp;
-constexpr int kDepth = kPairStep;  // pairs of one stage
+constexpr int kDepth = 64;     // pairs of one stage
+constexpr int kListed = 1024;  // pairs whose rows are looked up at a time
 constexpr int kStages = 3;
-constexpr int kWarpColumns = 32;
+constexpr int kHalf = 64;  // columns of a staged row: 128 bytes
+
+template <typename E>
+struct PairRows {
+  const E* out;  // null: no pair
+  const E* in;
+};
 
 template <typename E, int kSide>
-struct Memory {
-  E grads[kStages][kDepth * kSide];
-  E inputs[kStages][kDepth * kSide];
-  // then the sources of the block's pairs: grads[block_pairs], inputs[block_pairs]
+struct alignas(128) Memory {  // at a multiple of 1024 bytes
+  E grads[kStages][kSide / kHalf][kDepth * kHalf];
+  E inputs[kStages][kSide / kHalf][kDepth * kHalf];
+  PairRows<E> pairs[kListed];
 };
+
+// The sums of a warp, 16 outputs by kParts times 8 kGroups inputs, as the tensor cores lay them out. Of a wide block
+// each group of four warps has 64 outputs and all inputs, of a narrow one all outputs and 32 inputs.
+template <int kSide>
+struct Sums {
+  static constexpr int kParts = kSide / kHalf, kGroups = kSide == kHalf ? 4 : 8;
+  float values[kParts][kGroups][4];
+};
+
+// Queues sums += grads^T inputs over a stage at these addresses. The sums are there after finish_stage.
+template <typename E, int kSide>
+__device__ __forceinline__ void start_stage(uint32_t grads, uint32_t inputs, Sums<kSide>& sums) {
+  constexpr int kRowBytes = kHalf * sizeof(E), kHalfBytes = kDepth * kRowBytes;
+#ifdef __CUDA_ARCH_FEAT_SM90_ALL
+#pragma unroll
+  for (auto& part : sums.values) fence_sums(part);
+  start_group_products();
+#pragma unroll
+  for (int k = 0; k < kDepth; k += 16)
+#pragma unroll
+    for (int p = 0; p < Sums<kSide>::kParts; ++p)
+      multiply_add_group<E, true>(rows_descriptor(grads + k * kRowBytes),
+                                  rows_descriptor(inputs + p * kHalfBytes + k * kRowBytes), true, sums.values[p]);
+  close_group_products();
+#else
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp % 4;
+  const uint32_t a = grads + chunk_offset<kHalf>(lane / 16 * 8 + lane % 8, warp * 2 + lane / 8 % 2) * sizeof(E);
+  const uint32_t columns = inputs % kRowBytes;  // where the group's inputs start in a row
+  const uint32_t b =
+      (inputs - columns + chunk_offset<kHalf>(lane / 8 % 2 * 8 + lane % 8, lane / 16) * sizeof(E)) ^ columns;
+#pragma unroll
+  for (int k = 0; k < kDepth; k += 16) {
+    uint32_t left[4];
+    load_matrices_transposed(a + k * kRowBytes, left);
+#pragma unroll
+    for (int p = 0; p < Sums<kSide>::kParts; ++p)
+#pragma unroll
+      for (int j = 0; j < Sums<kSide>::kGroups; j += 2) {
+        uint32_t right[4];
+        load_matrices_transposed((b ^ (j * 16)) + p * kHalfBytes + k * kRowBytes, right);
+        multiply_add<E>(left, right[0], right[1], sums.values[p][j]);
+        multiply_add<E>(left, right[2], right[3], sums.values[p][j + 1]);
+      }
+  }
+#endif
+}
+
+template <int kSide>
+__device__ __forceinline__ void finish_stage(Sums<kSide>& sums) {
+#ifdef __CUDA_ARCH_FEAT_SM90_ALL
+  wait_for_group_products();
+#pragma unroll
+  for (auto& part : sums.values) fence_sums(part);
+#endif
+}
 
 // One block: kSide x kSide of the outer products of a block of pairs.
 template <typename E, int kSide>
-__global__ void __launch_bounds__(kThreads) multiply_pairs(OuterProducts<E> products, int32_t column_tiles) {
-  constexpr int kWarpsAcross = kSide / kWarpColumns, kWarpsDown = kWarps / kWarpsAcross;
-  constexpr int kBlocks = kSide / 16 / kWarpsDown;  // blocks of 16 outputs of one warp
+__global__ void __launch_bounds__(kThreads, 2) multiply_pairs(OuterProducts<E> products, int32_t column_tiles) {
   constexpr int kChunks = kSide / 8, kPairsApart = kThreads / kChunks;
+  constexpr uint32_t kRowBytes = kHalf * sizeof(E), kHalfBytes = kDepth * kRowBytes;
+  constexpr uint32_t kStageBytes = kSide / kHalf * kHalfBytes;
+  static_assert(kPairsApart % 8 == 0);  // the pairs of a thread have one permutation of chunks
 
-  const PairBlock block = find_block(products.cu_taps, products.taps, products.n_pairs, products.n_rows,
-                                     products.block_pairs, static_cast<int32_t>(blockIdx.x), -1);
-  if (block.tap < 0) return;
-  extern __shared__ __align__(128) char raw[];
+  extern __shared__ __align__(1024) char raw[];
   auto& memory = *reinterpret_cast<Memory<E, kSide>*>(raw);
-  int32_t* outs = reinterpret_cast<int32_t*>(raw + sizeof(memory));
-  int32_t* ins = outs + products.block_pairs;
-  const int thread = threadIdx.x, lane = thread % kWarp, warp = thread / kWarp;
-  const int warp_down = warp / kWarpsAcross, warp_across = warp % kWarpsAcross;
+  const int thread = threadIdx.x, lane = thread % kWarp, warp = thread / kWarp, group = warp / 4;
   const int32_t co = blockIdx.y / column_tiles * kSide, ci = blockIdx.y % column_tiles * kSide;
-  const int32_t n_pairs = static_cast<int32_t>(block.end - block.begin);
+  const PairBlock block = pair_block(products, blockIdx.x);
 
-  for (int32_t i = thread; i < n_pairs; i += kThreads) {
-    const int64_t p = block.begin + i;
-    const bool own = block.tap == products.taps / 2;
-    const int32_t out = own ? static_cast<int32_t>(p) : products.grad_sources.of(products.tap_out[p]);
-    const int32_t in = own ? static_cast<int32_t>(p) : products.input_sources.of(products.tap_in[p]);
-    outs[i] = in < 0 ? -1 : out;
-    ins[i] = out < 0 ? -1 : in;
-  }
-  __syncthreads();
+  // Where this thread copies 16 bytes of every kPairsApart-th pair to, and where its group's factors lie.
+  const int pair = thread / kChunks, chunk = thread % kChunks;
+  const uint32_t copied = chunk / 8 * kHalfBytes + chunk_offset<kHalf>(pair, chunk % 8) * sizeof(E);
+  const uint32_t grads = shared_address(memory.grads), inputs = shared_address(memory.inputs);
+  const bool left = co + chunk * 8 < products.c_out, right = ci + chunk * 8 < products.c_in;
+  const int32_t left_column = left ? co + chunk * 8 : 0, right_column = right ? ci + chunk * 8 : 0;
+  const uint32_t group_grads = grads + (kSide == kHalf ? 0 : group * kHalfBytes);
+  const uint32_t group_inputs = inputs + (kSide == kHalf ? group * kRowBytes / 2 : 0);
 
+  int32_t n_listed = 0;
   const auto copy_stage = [&](int32_t p0, int stage) {
-    if (p0 < n_pairs) {
-      const int chunk = thread % kChunks;
-      const bool left = co + chunk * 8 < products.c_out, right = ci + chunk * 8 < products.c_in;
+    if (p0 < n_listed) {
 #pragma unroll
       for (int i = 0; i < kDepth / kPairsApart; ++i) {
-        const int pair = thread / kChunks + i * kPairsApart;
-        const int32_t out = p0 + pair < n_pairs ? outs[p0 + pair] : -1, in = p0 + pair < n_pairs ? ins[p0 + pair] : -1;
-        const bool real_left = left && out >= 0, real_right = right && in >= 0;
-        copy_async(shared_address(memory.grads[stage] + chunk_offset<kSide>(pair, chunk)),
-                   real_left ? products.grads.at(out) + co + chunk * 8 : products.grads.rows, real_left);
-        copy_async(shared_address(memory.inputs[stage] + chunk_offset<kSide>(pair, chunk)),
-                   real_right ? products.inputs.at(in) + ci + chunk * 8 : products.inputs.rows, real_right);
+        const PairRows<E> rows = memory.pairs[p0 + pair + i * kPairsApart];  // the list ends with whole stages
+        const bool real = rows.out != nullptr;
+        const uint32_t to = copied + stage * kStageBytes + i * kPairsApart * kRowBytes;
+        copy_async(grads + to, (real ? rows.out : products.grads.rows) + left_column, real && left);
+        copy_async(inputs + to, (real ? rows.in : products.inputs.rows) + right_column, real && right);
       }
     }
     close_copies();
   };
 
-  float sums[kBlocks][kWarpColumns / 8][4] = {};
-  for (int stage = 0; stage < kStages - 1; ++stage) copy_stage(stage * kDepth, stage);
-  for (int32_t p0 = 0, stage = 0; p0 < n_pairs; p0 += kDepth, stage = (stage + 1) % kStages) {
-    wait_for_copies<kStages - 2>();
+  Sums<kSide> sums{};
+  for (int64_t begin = block.pairs.begin; begin < block.pairs.end; begin += kListed) {
+    n_listed = static_cast<int32_t>(min(block.pairs.end - begin, int64_t{kListed}));
     __syncthreads();
-    copy_stage(p0 + (kStages - 1) * kDepth, (stage + kStages - 1) % kStages);
-#pragma unroll
-    for (int k = 0; k < kDepth; k += 16) {
-      uint32_t b[kWarpColumns / 16][4];
-#pragma unroll
-      for (int j = 0; j < kWarpColumns / 16; ++j)
-        load_matrices_transposed(
-            shared_address(memory.inputs[stage] +
-                           chunk_offset<kSide>(k + lane / 8 % 2 * 8 + lane % 8,
-                                               warp_across * kWarpColumns / 8 + j * 2 + lane / 16)),
-            b[j]);
-#pragma unroll
-      for (int i = 0; i < kBlocks; ++i) {
-        uint32_t a[4];
-        load_matrices_transposed(
-            shared_address(memory.grads[stage] + chunk_offset<kSide>(k + lane / 16 * 8 + lane % 8,
-                                                                     (warp_down * kBlocks + i) * 2 + lane / 8 % 2)),
-            a);
-#pragma unroll
-        for (int j = 0; j < kWarpColumns / 8; ++j)
-          multiply_add<E>(a, b[j / 2][j % 2 * 2], b[j / 2][j % 2 * 2 + 1], sums[i][j]);
-      }
+    for (int32_t i = thread; i < (n_listed + kDepth - 1) / kDepth * kDepth; i += kThreads) {
+      const PairSources rows = i < n_listed ? pair_sources(products, block.tap, begin + i) : PairSources{-1, -1};
+      memory.pairs[i] = {rows.out < 0 ? nullptr : products.grads.at(rows.out),
+                         rows.out < 0 ? nullptr : products.inputs.at(rows.in)};
     }
+    __syncthreads();
+    for (int stage = 0; stage < kStages - 1; ++stage) copy_stage(stage * kDepth, stage);
+    for (int32_t p0 = 0, stage = 0; p0 < n_listed; p0 += kDepth, stage = stage + 1 == kStages ? 0 : stage + 1) {
+      wait_for_copies<kStages - 2>();
+      publish_copies();
+      __syncthreads();
+      start_stage<E, kSide>(group_grads + stage * kStageBytes, group_inputs + stage * kStageBytes, sums);
+      copy_stage(p0 + (kStages - 1) * kDepth, stage == 0 ? kStages - 1 : stage - 1);
+      finish_stage<kSide>(sums);
+    }
+    wait_for_copies<0>();
   }
-  wait_for_copies<0>();
 
   float* to = products.partials + static_cast<int64_t>(blockIdx.x) * products.c_out * products.c_in;
+  const int32_t first_out = co + (kSide == kHalf ? 0 : group * kHalf) + warp % 4 * 16 + lane / 4;
+  const int32_t first_in = ci + (kSide == kHalf ? group * kHalf / 2 : 0) + lane % 4 * 2;
 #pragma unroll
-  for (int i = 0; i < kBlocks; ++i)
+  for (int h = 0; h < 2; ++h)
 #pragma unroll
-    for (int h = 0; h < 2; ++h)
+    for (int p = 0; p < Sums<kSide>::kParts; ++p)
 #pragma unroll
-      for (int j = 0; j < kWarpColumns / 8; ++j) {
-        const int32_t o = co + (warp_down * kBlocks + i) * 16 + lane / 4 + h * 8;
-        const int32_t n = ci + warp_across * kWarpColumns + j * 8 + lane % 4 * 2;
+      for (int j = 0; j < Sums<kSide>::kGroups; ++j) {
+        const int32_t o = first_out + h * 8, n = first_in + p * kHalf + j * 8;
         if (o < products.c_out && n < products.c_in)  // c_in is even
           *reinterpret_cast<float2*>(to + static_cast<int64_t>(o) * products.c_in + n) =
-              float2{sums[i][j][2 * h], sums[i][j][2 * h + 1]};
+              float2{sums.values[p][j][2 * h], sums.values[p][j][2 * h + 1]};
       }
 }
 
@@ -118,8 +162,8 @@ void outer_products_tensor(const char* op, const OuterProducts<E>& products, int
   const auto queue = [&]<int kSide>() {
     const unsigned columns = blocks_for(op, products.c_in, kSide);
     const dim3 blocks(blocks_for(op, n_blocks, 1), blocks_for(op, products.c_out, kSide) * columns);
-    const size_t bytes = sizeof(Memory<E, kSide>) + 2 * sizeof(int32_t) * products.block_pairs;
-    launch(op, multiply_pairs<E, kSide>, blocks, kThreads, bytes, stream, products, static_cast<int32_t>(columns));
+    launch(op, multiply_pairs<E, kSide>, blocks, kThreads, sizeof(Memory<E, kSide>), stream, products,
+           static_cast<int32_t>(columns));
   };
   if (products.c_in > 64 || products.c_out > 64)
     queue.template operator()<128>();

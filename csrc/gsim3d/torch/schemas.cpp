@@ -5,7 +5,7 @@
 
 STABLE_TORCH_LIBRARY(gsim3d, m) {
   // curve: space-filling-curve codes, their order, and all geometry of a network call.
-  m.def("curve_encode(Tensor grid, Tensor cloud, int curve, int depth, int shift) -> Tensor");
+  m.def("curve_encode(Tensor grid, Tensor cloud, int[] curves, int depth, int shift) -> Tensor");
   m.def("curve_sort(Tensor codes) -> (Tensor order, Tensor inverse)");
   m.def(
       "build_pyramid(Tensor positions, Tensor cu_rows, Tensor cloud_scene, Tensor cloud_slot, Tensor origin, float grid_size, "
@@ -39,6 +39,13 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   m.def("unpool(Tensor x, Tensor rows, Tensor cu_rows, SymInt n_rows) -> Tensor");
   m.def("unpool_backward(Tensor grad, Tensor rows, Tensor cu_rows) -> Tensor");
 
+  // row_norm: layer normalisation of rows, and the residual sum behind it; stats [N, 2] are kept for the backward pass.
+  m.def(
+      "row_norm(Tensor x, Tensor weight, Tensor bias, Tensor? residual, float eps, ScalarType dtype) -> (Tensor out, "
+      "Tensor stats)");
+  m.def(
+      "row_norm_backward(Tensor grad, Tensor x, Tensor weight, Tensor stats) -> (Tensor x, Tensor weight, Tensor bias)");
+
   // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
   m.def(
       "plane_sweep(Tensor features, Tensor homographies, Tensor translations, Tensor inverse_depths, Tensor src_images, "
@@ -48,18 +55,19 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor src_images, Tensor cu_src) -> Tensor");
 
   // raster: 3D Gaussian projection and blending. color is [N, K, 3] SH coefficients or [N, 3]; cutoff 0 exact, 1 tile3sigma,
-  // 2 smooth; transmittance and last are kept for the backward pass.
+  // 2 smooth; transmittance, last and state are kept for the backward pass. max_* (CUDA) size the state.
   m.def(
       "rasterize_gaussians(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, Tensor features, "
       "Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, int width, int height, "
-      "float near_plane, int cutoff) -> (Tensor color, Tensor alpha, Tensor depth, Tensor features, Tensor transmittance, "
-      "Tensor last)");
+      "float near_plane, int cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots) -> (Tensor color, Tensor alpha, "
+      "Tensor depth, Tensor features, Tensor transmittance, Tensor last, Tensor state)");
   m.def(
       "rasterize_gaussians_backward(Tensor grad_color, Tensor grad_alpha, Tensor grad_depth, Tensor grad_features, "
-      "Tensor transmittance, Tensor last, Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
-      "Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, int width, "
-      "int height, float near_plane, int cutoff) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, "
-      "Tensor color, Tensor features, Tensor background, Tensor viewmats)");
+      "Tensor transmittance, Tensor last, Tensor state, Tensor means, Tensor quats, Tensor scales, Tensor opacities, "
+      "Tensor color, Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, "
+      "int width, int height, float near_plane, int cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots, "
+      "bool viewmats_grad) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, Tensor features, Tensor background, "
+      "Tensor viewmats)");
 }
 
 // The library is loaded by importing it; its contents are the registered ops.

@@ -129,7 +129,9 @@ inline void check_device(const char* op, const char* name, const Tensor& tensor,
 }
 
 // Contiguous, so that the core can read it by pointer.
-inline Tensor rows_of(const Tensor& tensor) { return torch::stable::contiguous(tensor); }
+inline Tensor rows_of(const Tensor& tensor) {
+  return tensor.is_contiguous() ? tensor : torch::stable::contiguous(tensor);
+}
 
 // Calls f.template operator()<T>() with T = float or double, by the dtype of `tensor`.
 template <typename F>

@@ -1,0 +1,227 @@
+// Inside of the CUDA rasterizer: blending of one quarter of a tile, 8 x 8 pixels, by one warp.
+//
+// The warp takes the quarter's list in batches of 32. Lane by entry, it finds which of the
+// 64 pixels each Gaussian may reach, as two words of bits; transposed, they tell each pixel its Gaussians. Lane by
+// pixel, it then visits those only. The backward pass transposes once more: lane by entry, each Gaussian sums over its
+// own pixels, so no value is ever added up across lanes.
+#pragma once
+
+#include "gsim3d/raster/raster_fast.cuh"
+#include "gsim3d/raster/raster_lists.cuh"
+
+namespace gsim3d::raster {
+
+constexpr int kWarps = kBlock / kWarp;
+static_assert(kWarps == kQuarters);  // a block blends a tile
+constexpr int kHalves = 2;           // pixels of a lane: of rows 0 to 3 of the quarter, and of rows 4 to 7
+constexpr int kHalfRows = kQuarter / kHalves;
+constexpr int kFeatures = 8;  // channels blended in one pass over a list
+
+// Bit b of the result of lane l is bit l of the value of lane b.
+__device__ inline uint32_t transpose_bits(uint32_t value, int lane) {
+  uint32_t keep = 0x0000ffffu;
+#pragma unroll
+  for (int step = 16; step > 0; step /= 2, keep ^= keep << step) {
+    const uint32_t other = __shfl_xor_sync(kFullWarp, value, step);
+    value = lane & step ? (value & ~keep) | ((other >> step) & keep) : (value & keep) | ((other << step) & ~keep);
+  }
+  return value;
+}
+
+// A warp's part of the images.
+struct Quarter {
+  int64_t image, index;  // index: of the quarter in all images
+  int32_t n;             // length of its list
+  int x0, y0;
+
+  template <typename T>
+  __device__ Quarter(const Job<T>& job, int64_t tile) : image(tile / job.n_tiles) {
+    const int part = threadIdx.x / kWarp;
+    const int64_t place = tile - image * job.n_tiles;
+    index = tile * kQuarters + part;
+    n = static_cast<int32_t>(job.lists[index].n);
+    x0 = static_cast<int>(place % job.tiles_x) * kTile + part % 2 * kQuarter;
+    y0 = static_cast<int>(place / job.tiles_x) * kTile + part / 2 * kQuarter;
+  }
+};
+
+// Index of the lane's pixel in the images, or -1 outside of them.
+template <typename T>
+__device__ int64_t pixel_of(const RasterScene<T>& s, const Quarter& quarter, int half, int lane) {
+  const int column = quarter.x0 + lane % kQuarter, row = quarter.y0 + lane / kQuarter + half * kHalfRows;
+  return column < s.width && row < s.height ? (quarter.image * s.height + row) * s.width + column : -1;
+}
+
+// Values of the batch, by entry. With x, y counted from the first pixel's centre, alpha = 2^(strength - u^2 - v^2),
+// u = ux x + uy y + u0, v = vy y + v0.
+enum Field { kUx, kUy, kU0, kVy, kV0, kStrength, kRed, kGreen, kBlue, kDepth, kFields };
+
+template <typename T>
+using Batch = T[kFields][kWarp];
+
+template <typename T>
+__device__ void put(const Record<T>& r, const Quarter& quarter, int lane, Batch<T>& batch) {
+  const T x = r.x - (T(quarter.x0) + T(0.5)), y = r.y - (T(quarter.y0) + T(0.5));
+  const T uy = -r.tight * r.slope;
+  batch[kUx][lane] = r.tight, batch[kUy][lane] = uy, batch[kU0][lane] = -(r.tight * x + uy * y);
+  batch[kVy][lane] = r.loose, batch[kV0][lane] = -r.loose * y, batch[kStrength][lane] = r.strength;
+  batch[kRed][lane] = r.red, batch[kGreen][lane] = r.green, batch[kBlue][lane] = r.blue, batch[kDepth][lane] = r.z;
+}
+
+// alpha of entry j at (x, y) before it is cut.
+template <typename T>
+__device__ __forceinline__ T alpha_at(const Batch<T>& batch, int j, T x, T y) {
+  const T u = batch[kUx][j] * x + (batch[kUy][j] * y + batch[kU0][j]), v = batch[kVy][j] * y + batch[kV0][j];
+  return fast_exp2(batch[kStrength][j] - u * u - v * v);
+}
+
+// Pixels of the quarter that the record may reach: bit 8 * row + column of the two halves. May err outwards only.
+template <typename T>
+__device__ void cover(const Record<T>& r, const Quarter& quarter, uint32_t (&bits)[kHalves]) {
+  const int x0 = max(r.x0 - quarter.x0, 0), x1 = min(r.x1 - quarter.x0, kQuarter);
+  const int y0 = max(r.y0 - quarter.y0, 0), y1 = min(r.y1 - quarter.y0, kQuarter);
+  const T x = r.x - (T(quarter.x0) + T(0.5)), y = r.y - (T(quarter.y0) + T(0.5));
+  constexpr double kLog2MaxRatio = 7.994353436858858;  // log2(255)
+  const T inverse = fast_reciprocal(r.tight * r.tight);
+  const T most = (r.strength + T(kLog2MaxRatio + kLevelSlack)) * inverse, decay = r.loose * r.loose * inverse;
+  bits[0] = bits[1] = 0;
+#pragma unroll
+  for (int row = 0; row < kQuarter; ++row) {
+    const T dy = T(row) - y, square = most - decay * dy * dy;
+    const T centre = x + r.slope * dy, reach = fast_sqrt(max_of(square, T(0))) + T(kPixelSlack);
+    const int from = max(ceil_to_int(centre - reach), x0), to = min(floor_to_int(centre + reach) + 1, x1);
+    if (row >= y0 && row < y1 && square >= 0 && from < to)
+      bits[row / kHalfRows] |= ((1u << to) - (1u << from)) << (8 * (row % kHalfRows));
+  }
+}
+
+template <typename T>
+__device__ inline T background_of(const RasterScene<T>& s, int64_t image, int channel) {
+  const T value = s.background[3 * image + channel];
+  return isfinite(value) ? value : T(0);
+}
+
+// Row of the features of a pair.
+template <typename T>
+__device__ inline const T* features_of(const Job<T>& job, int64_t image, uint32_t pair) {
+  const int64_t row = job.views[image].row_begin + pair - job.pair_begin[image];
+  return job.scene.features + row * job.scene.n_features;
+}
+
+template <typename T, bool kWithFeatures>
+struct BlendShared {
+  Batch<T> batch;
+  T features[kWithFeatures ? kFeatures : 1][kWarp];
+};
+
+template <typename T>
+struct Light {
+  T rest;        // transmittance
+  T sums[4];     // colour, depth
+  int32_t last;  // entries of the list in front of the pixel's end
+  bool ended;
+};
+
+// One pass over the list: colour and depth, or (kPass = true) the features from `channel` on.
+template <typename T, bool kFade, bool kPass, bool kWithFeatures>
+__device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, int64_t tile, int64_t channel,
+                              BlendShared<T, kWithFeatures>& shared) {
+  const RasterScene<T>& s = job.scene;
+  const int lane = threadIdx.x % kWarp;
+  const Quarter quarter(job, tile);
+  const uint32_t* pairs = job.listed + job.lists[quarter.index].begin;
+  const int n_channels = kPass ? static_cast<int>(min(s.n_features - channel, int64_t{kFeatures})) : 0;
+  Light<T> light[kHalves];
+  T features[kHalves][kFeatures];
+#pragma unroll
+  for (int half = 0; half < kHalves; ++half) {
+    light[half] = {T(1), {}, quarter.n, pixel_of(s, quarter, half, lane) < 0};
+    for (int c = 0; c < kFeatures; ++c) features[half][c] = 0;
+  }
+
+  // The records of a batch are fetched while the batch before is blended.
+  uint32_t pair = 0;
+  Record<T> record{};
+  const auto fetch = [&](int32_t base) {
+    if (base + lane < quarter.n) pair = pairs[base + lane], record = job.records[pair];
+  };
+  fetch(0);
+  for (int32_t base = 0; base < quarter.n; base += kWarp) {
+    if (__all_sync(kFullWarp, light[0].ended && light[1].ended)) break;
+    uint32_t bits[kHalves] = {};
+    __syncwarp();
+    if (base + lane < quarter.n) {
+      put(record, quarter, lane, shared.batch);
+      cover(record, quarter, bits);
+      if constexpr (kPass) {
+        const T* row = features_of(job, quarter.image, pair) + channel;
+        for (int c = 0; c < kFeatures; ++c) shared.features[c][lane] = c < n_channels ? row[c] : T(0);
+      }
+    }
+    __syncwarp();
+    fetch(base + kWarp);
+#pragma unroll
+    for (int half = 0; half < kHalves; ++half) {
+      const T x = T(lane % kQuarter), y = T(lane / kQuarter + half * kHalfRows);
+      Light<T>& at = light[half];
+      uint32_t mine = transpose_bits(bits[half], lane);
+      if (at.ended) mine = 0;
+      while (mine) {
+        const int j = __ffs(mine) - 1;
+        mine &= mine - 1;
+        T alpha = min_of(alpha_at(shared.batch, j, x, y), T(kMaxAlpha));
+        if constexpr (kFade)
+          alpha = fade(alpha);
+        else
+          alpha = alpha >= T(kMinAlpha) ? alpha : T(0);
+        const T weight = alpha * at.rest, rest = at.rest - weight;
+        if (rest < T(kMinTransmittance)) {
+          at.ended = true, at.last = base + j;
+          break;
+        }
+        at.rest = rest;
+        if constexpr (kPass) {
+          for (int c = 0; c < kFeatures; ++c) features[half][c] += weight * shared.features[c][j];
+        } else {
+          for (int c = 0; c < 4; ++c) at.sums[c] += weight * shared.batch[kRed + c][j];
+        }
+      }
+    }
+  }
+
+#pragma unroll
+  for (int half = 0; half < kHalves; ++half) {
+    const int64_t pixel = pixel_of(s, quarter, half, lane);
+    if (pixel < 0) continue;
+    if constexpr (kPass) {
+      T* to = images.features + pixel * s.n_features + channel;
+      for (int c = 0; c < kFeatures; ++c)
+        if (c < n_channels) to[c] = features[half][c];
+    } else {
+      const Light<T>& at = light[half];
+      for (int c = 0; c < 3; ++c)
+        images.color[3 * pixel + c] = at.sums[c] + at.rest * background_of(s, quarter.image, c);
+      images.alpha[pixel] = 1 - at.rest;
+      images.depth[pixel] = at.sums[3];
+      images.transmittance[pixel] = at.rest;
+      images.last[pixel] = at.last;
+    }
+  }
+}
+
+template <typename T, bool kFade, bool kWithFeatures>
+__device__ void blend_tiles(const Job<T>& job, const RasterImages<T>& images, BlendShared<T, kWithFeatures>& shared) {
+  const int64_t first = job.group->tile_begin, n_tiles = job.group->tile_end - first;
+  for (int64_t i = blockIdx.x; i < n_tiles; i += gridDim.x) {
+    const int64_t tile = first + job.order[i];
+    blend_quarter<T, kFade, false>(job, images, tile, 0, shared);
+    if constexpr (kWithFeatures)
+      for (int64_t channel = 0; channel < job.scene.n_features; channel += kFeatures) {
+        __syncwarp();
+        blend_quarter<T, kFade, true>(job, images, tile, channel, shared);
+      }
+    __syncwarp();
+  }
+}
+
+}  // namespace gsim3d::raster

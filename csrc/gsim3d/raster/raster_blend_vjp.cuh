@@ -1,0 +1,236 @@
+// Inside of the CUDA rasterizer: the backward pass of raster_blend.cuh. Every entry's gradients in a quarter go to a
+// slot of their own.
+#pragma once
+
+#include "gsim3d/raster/raster_blend.cuh"
+
+namespace gsim3d::raster {
+
+// Gradients of an entry: Moments (5), sum v, colour (3), depth.
+constexpr int kSlotValues = 10;
+template <typename T>
+struct alignas(2 * sizeof(T)) SlotSums {
+  T value[kSlotValues];
+};
+
+// What the gradients of a group are made of.
+template <typename T>
+struct Slots {
+  SlotSums<T>* sums;    // [slots], unset where not live
+  T* features;          // [slots, n_features], likewise
+  unsigned char* live;  // [slots] 1 where a pixel has seen the entry
+  SlotSums<T>* unfinished;  // [n_rows] sums of an image's tiles in earlier groups
+  T* backgrounds;       // [n_images * n_tiles * kQuarters, 3]
+  T* viewmats;          // [n_images, kViewmatParts, 12], or null when nobody asks for them
+};
+
+template <typename T, bool kWithFeatures>
+struct BlendGradShared {
+  Batch<T> batch;
+  T grad[4][kHalves * kWarp];  // of colour and depth, by pixel
+  T v[kWarp][kWarp];           // gradient of the exponent, by entry and pixel of a half
+  T weight[kWarp][kWarp];
+  T features[kWithFeatures ? kFeatures : 1][kWarp];       // by entry
+  T grad_features[kWithFeatures ? kFeatures : 1][kWarp];  // by pixel of a half
+};
+
+template <typename T>
+struct Behind {
+  T light;  // transmittance behind the entries still to come
+  T sum;    // <grad, what lies behind>, weighted
+  int32_t last;
+};
+
+// The bits of entries base .. base + 31 that are in front of `last`.
+__device__ inline uint32_t in_front(int32_t last, int32_t base) {
+  const int32_t n = last - base;
+  return n >= kWarp ? ~0u : n <= 0 ? 0u : (1u << n) - 1;
+}
+
+// <feature gradients of the lane's pixel, features of entry j>, for the entries in `mine`, into shared.v[j][lane].
+template <typename T>
+__device__ void dot_features(const RasterScene<T>& s, const RasterImageGrads<T>& grads, const T* entry_features,
+                             int64_t pixel, uint32_t mine, int lane, BlendGradShared<T, true>& shared) {
+  for (int64_t channel = 0; channel < s.n_features; channel += kFeatures) {
+    const int n_channels = static_cast<int>(min(s.n_features - channel, int64_t{kFeatures}));
+    T g[kFeatures];
+    __syncwarp();
+    for (int c = 0; c < kFeatures; ++c) {
+      g[c] = pixel >= 0 && c < n_channels ? grads.features[pixel * s.n_features + channel + c] : T(0);
+      shared.features[c][lane] = entry_features && c < n_channels ? entry_features[channel + c] : T(0);
+    }
+    __syncwarp();
+    for (uint32_t rest = mine; rest; rest &= rest - 1) {
+      const int j = __ffs(rest) - 1;
+      T sum = channel ? shared.v[j][lane] : T(0);
+      for (int c = 0; c < kFeatures; ++c) sum += g[c] * shared.features[c][j];
+      shared.v[j][lane] = sum;
+    }
+  }
+}
+
+// Feature gradients of the lane's entry from the pixels in `mine`, written to or added to its slot.
+template <typename T>
+__device__ void sum_features(const RasterScene<T>& s, const RasterImageGrads<T>& grads, int64_t pixel, uint32_t mine,
+                             int lane, bool add, BlendGradShared<T, true>& shared, T* slot) {
+  for (int64_t channel = 0; channel < s.n_features; channel += kFeatures) {
+    const int n_channels = static_cast<int>(min(s.n_features - channel, int64_t{kFeatures}));
+    __syncwarp();
+    for (int c = 0; c < kFeatures; ++c)
+      shared.grad_features[c][lane] =
+          pixel >= 0 && c < n_channels ? grads.features[pixel * s.n_features + channel + c] : T(0);
+    __syncwarp();
+    if (!slot) continue;
+    T sums[kFeatures] = {};
+    for (uint32_t rest = mine; rest; rest &= rest - 1) {
+      const int p = __ffs(rest) - 1;
+      for (int c = 0; c < kFeatures; ++c) sums[c] += shared.weight[lane][p] * shared.grad_features[c][p];
+    }
+    for (int c = 0; c < n_channels; ++c) {
+      T& to = slot[channel + c];
+      to = add ? to + sums[c] : sums[c];
+    }
+  }
+}
+
+// From back to front. With s = <grad, values of the entry> at a pixel and S the same sum over all that lies behind it,
+// weighted: grad_alpha = T s - S / (1 - alpha). T before an entry is T behind it / (1 - alpha).
+template <typename T, bool kFade, bool kWithFeatures>
+__device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& grads, int64_t tile,
+                                  const Slots<T>& slots, BlendGradShared<T, kWithFeatures>& shared) {
+  const RasterScene<T>& s = job.scene;
+  const int lane = threadIdx.x % kWarp;
+  const Quarter quarter(job, tile);
+  const uint32_t* pairs = job.listed + job.lists[quarter.index].begin;
+  Behind<T> behind[kHalves];
+  T background_sums[3] = {};
+  int32_t n_used = 0;
+#pragma unroll
+  for (int half = 0; half < kHalves; ++half) {
+    const int64_t pixel = pixel_of(s, quarter, half, lane);
+    Behind<T>& at = behind[half];
+    at = {T(1), T(0), 0};
+    T g[4] = {};
+    if (pixel >= 0) {
+      at.light = grads.transmittance[pixel];
+      at.last = min(grads.last[pixel], quarter.n);
+      T seen = -grads.alpha[pixel];
+      for (int c = 0; c < 3; ++c) {
+        g[c] = grads.color[3 * pixel + c];
+        seen += g[c] * background_of(s, quarter.image, c);
+        background_sums[c] += g[c] * at.light;
+      }
+      g[3] = grads.depth[pixel];
+      at.sum = at.light * seen;
+    }
+    for (int c = 0; c < 4; ++c) shared.grad[c][half * kWarp + lane] = g[c];
+    n_used = max(n_used, at.last);
+  }
+#pragma unroll
+  for (int step = kWarp / 2; step > 0; step /= 2) {
+    n_used = max(n_used, __shfl_xor_sync(kFullWarp, n_used, step));
+    for (int c = 0; c < 3; ++c) background_sums[c] += __shfl_xor_sync(kFullWarp, background_sums[c], step);
+  }
+  if (lane == 0)
+    for (int c = 0; c < 3; ++c) slots.backgrounds[3 * quarter.index + c] = background_sums[c];
+
+  // The records of a batch are fetched while the batch before is in work.
+  uint32_t pair = 0, slot_begin = 0;
+  Record<T> record{};
+  const auto fetch = [&](int32_t base) {
+    if (base < 0 || base + lane >= n_used) return;
+    pair = pairs[base + lane];
+    record = job.records[pair], slot_begin = job.slot_begin[pair];
+  };
+  int32_t base = (n_used - 1) / kWarp * kWarp;  // what is behind the last entry in use has no gradients
+  if (n_used > 0) fetch(base);
+  for (; base >= 0 && n_used > 0; base -= kWarp) {
+    const bool used = base + lane < n_used;
+    uint32_t bits[kHalves] = {};
+    if (used) {
+      put(record, quarter, lane, shared.batch);
+      cover(record, quarter, bits);
+    }
+    const T from_x = T(quarter.x0) + T(0.5) - record.x, from_y = T(quarter.y0) + T(0.5) - record.y;
+    const T slope = record.slope;
+    const T* entry_features = kWithFeatures && used ? features_of(job, quarter.image, pair) : nullptr;
+    int64_t slot = 0;
+    if (used) {
+      const PixelRect bounds{record.x0, record.x1, record.y0, record.y1};
+      slot = int64_t{slot_begin} + job.group->slot(squares_of(bounds, kTile), squares_of(bounds, kQuarter),
+                                                   quarter.x0 / kTile, quarter.y0 / kTile, quarter.index % kQuarters);
+    }
+    __syncwarp();
+    fetch(base - kWarp);
+
+    SlotSums<T> sums{};
+    uint32_t live = 0;
+#pragma unroll
+    for (int half = 0; half < kHalves; ++half) {
+      const T x = T(lane % kQuarter), y = T(lane / kQuarter + half * kHalfRows);
+      Behind<T>& at = behind[half];
+      uint32_t mine = transpose_bits(bits[half], lane) & in_front(at.last, base);
+      const int64_t pixel = kWithFeatures ? pixel_of(s, quarter, half, lane) : 0;
+      if constexpr (kWithFeatures) dot_features(s, grads, entry_features, pixel, mine, lane, shared);
+      T g[4];
+      for (int c = 0; c < 4; ++c) g[c] = shared.grad[c][half * kWarp + lane];
+      uint32_t seen = 0;
+      while (mine) {
+        const int j = kWarp - 1 - __clz(mine);
+        const uint32_t bit = 1u << j;
+        mine ^= bit;
+        const T raw = alpha_at(shared.batch, j, x, y);
+        T alpha = min_of(raw, T(kMaxAlpha));
+        T slope_of_alpha = raw <= T(kMaxAlpha) ? raw : T(0);
+        if constexpr (kFade)
+          slope_of_alpha *= fade_slope(alpha), alpha = fade(alpha);
+        else if (!(alpha >= T(kMinAlpha)))
+          continue;
+        const T inverse = fast_reciprocal(T(1) - alpha);
+        const T light = at.light * inverse, weight = alpha * light;
+        T total = kWithFeatures ? shared.v[j][lane] : T(0);
+        for (int c = 0; c < 4; ++c) total += g[c] * shared.batch[kRed + c][j];
+        shared.v[j][lane] = (light * total - at.sum * inverse) * slope_of_alpha;
+        shared.weight[j][lane] = weight;
+        at.light = light;
+        at.sum += weight * total;
+        seen |= bit;
+      }
+      seen = transpose_bits(seen, lane);
+      live |= seen;
+      __syncwarp();
+      for (uint32_t rest = seen; rest; rest &= rest - 1) {
+        const int p = __ffs(rest) - 1;
+        const T dy = from_y + T(p / kQuarter + half * kHalfRows), u = from_x + T(p % kQuarter) - slope * dy;
+        const T v = shared.v[lane][p], weight = shared.weight[lane][p], vu = v * u, vy = v * dy;
+        sums.value[0] += vu;
+        sums.value[1] += vy;
+        sums.value[2] += vu * u;
+        sums.value[3] += vu * dy;
+        sums.value[4] += vy * dy;
+        sums.value[5] += v;
+        for (int c = 0; c < 4; ++c) sums.value[6 + c] += weight * shared.grad[c][half * kWarp + p];
+      }
+      if constexpr (kWithFeatures)
+        sum_features(s, grads, pixel, seen, lane, half > 0, shared,
+                     used ? slots.features + slot * s.n_features : nullptr);
+      __syncwarp();
+    }
+    if (live) {
+      slots.sums[slot] = sums;
+      slots.live[slot] = 1;
+    }
+  }
+}
+
+template <typename T, bool kFade, bool kWithFeatures>
+__device__ void blend_tiles_vjp(const Job<T>& job, const RasterImageGrads<T>& grads, const Slots<T>& slots,
+                                BlendGradShared<T, kWithFeatures>& shared) {
+  const int64_t first = job.group->tile_begin, n_tiles = job.group->tile_end - first;
+  for (int64_t i = blockIdx.x; i < n_tiles; i += gridDim.x) {
+    blend_quarter_vjp<T, kFade>(job, grads, first + job.order[i], slots, shared);
+    __syncwarp();
+  }
+}
+
+}  // namespace gsim3d::raster

@@ -1,0 +1,34 @@
+// Hardware approximations, to one or two units in the last place, where nothing needs more; exact for double.
+#pragma once
+
+#include "gsim3d/core/cuda_utils.cuh"
+
+namespace gsim3d::raster {
+
+// Results below 2^-126 are 0.
+__device__ __forceinline__ float fast_exp2(float x) {
+  float y;
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+__device__ __forceinline__ float fast_sqrt(float x) {
+  float y;
+  asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+__device__ __forceinline__ float fast_reciprocal(float x) {
+  float y;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+__device__ __forceinline__ double fast_exp2(double x) { return exp2(x); }
+__device__ __forceinline__ double fast_sqrt(double x) { return sqrt(x); }
+__device__ __forceinline__ double fast_reciprocal(double x) { return 1 / x; }
+
+// Saturating; NaN gives 0 or the least integer.
+__device__ __forceinline__ int ceil_to_int(float x) { return __float2int_ru(x); }
+__device__ __forceinline__ int ceil_to_int(double x) { return __double2int_ru(x); }
+__device__ __forceinline__ int floor_to_int(float x) { return __float2int_rd(x); }
+__device__ __forceinline__ int floor_to_int(double x) { return __double2int_rd(x); }
+
+}  // namespace gsim3d::raster

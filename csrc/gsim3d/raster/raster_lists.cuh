@@ -1,0 +1,585 @@
+// Inside of the CUDA rasterizer: projection, and which Gaussians each tile of 16 x 16 pixels may see.
+//
+// Images are rendered in groups: whole images, as many as the scratch holds, or a run of the tiles of one large image.
+// What fits is decided on the device, so nothing waits for it. Every (row, image) pair of a group owns a Record; every
+// tile owns a run of entries, one for each record whose bounds touch it. Tiles of all images are numbered through. A
+// tile has four quarters of 8 x 8 pixels; for the backward pass a pair owns a slot for each quarter that its bounds
+// touch. A phase is a function that any number of blocks may share.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#include "gsim3d/core/cuda_utils.cuh"
+#include "gsim3d/raster/raster.h"
+#include "gsim3d/raster/raster_math.h"
+
+namespace gsim3d::raster {
+
+using cuda::kFullWarp;
+using cuda::kWarp;
+
+constexpr int kBlock = 128;  // threads of a block in the phases that many blocks share
+constexpr int kQuarter = 8;  // pixels
+constexpr int kQuarters = 4;
+constexpr int32_t kNoImage = INT32_MAX;
+
+// What a tile needs of one Gaussian in one image. alpha = 2^(strength - (tight u)^2 - (loose dy)^2), u = dx - slope dy.
+template <typename T>
+struct alignas(16) Record {
+  T x, y, slope, tight;  // pixels; tight and loose are square roots of Footprint's times log2(e) / 2
+  T loose, strength, z;
+  uint16_t x0, x1;  // PixelRect
+  T red, green, blue;
+  uint16_t y0, y1;
+};
+
+// Squares [x0, x1) x [y0, y1) of an image: tiles or quarters.
+struct Squares {
+  int x0, x1, y0, y1;
+  __device__ int count() const { return (x1 - x0) * (y1 - y0); }
+  // How many of them come before (x, y), row by row.
+  __device__ int before(int x, int y) const {
+    const int rows = min(max(y - y0, 0), y1 - y0), columns = min(max(x - x0, 0), x1 - x0);
+    return rows * (x1 - x0) + (y >= y0 && y < y1 ? columns : 0);
+  }
+};
+
+__device__ __forceinline__ Squares squares_of(const PixelRect& r, int side) {
+  if (r.x0 >= r.x1) return {0, 0, 0, 0};
+  return {r.x0 / side, (r.x1 + side - 1) / side, r.y0 / side, (r.y1 + side - 1) / side};
+}
+
+// The quarters of tile (x, y) that are among `quarters`: bit 2 * row + column.
+__device__ __forceinline__ uint32_t quarters_of_tile(const Squares& quarters, int x, int y) {
+  const uint32_t columns = (2 * x >= quarters.x0 ? 1u : 0u) | (2 * x + 1 < quarters.x1 ? 2u : 0u);
+  return (2 * y >= quarters.y0 ? columns : 0u) | (2 * y + 1 < quarters.y1 ? columns << 2 : 0u);
+}
+
+// What an entry says beside its depth: the pair, which ascends with the row, and the quarters that its bounds touch.
+__device__ __forceinline__ uint32_t word_of(uint32_t pair, uint32_t quarters) { return pair << kQuarters | quarters; }
+__device__ __forceinline__ uint32_t pair_of(uint32_t word) { return word >> kQuarters; }
+
+// Sorts by the bits of the positive depth, which ascend with it, then by pair.
+template <typename T>
+struct Entry;
+
+template <>
+struct Entry<float> {
+  uint64_t key;
+  __device__ static Entry make(float z, uint32_t word) { return {uint64_t{__float_as_uint(z)} << 32 | word}; }
+  __device__ static Entry last() { return {~uint64_t{0}}; }
+  __device__ uint32_t word() const { return static_cast<uint32_t>(key); }
+  __device__ bool operator<(const Entry& other) const { return key < other.key; }
+  __device__ Entry from_lane(int mask) const { return {__shfl_xor_sync(kFullWarp, key, mask)}; }
+};
+
+template <>
+struct alignas(16) Entry<double> {
+  uint64_t key, low;
+  __device__ static Entry make(double z, uint32_t word) {
+    return {static_cast<uint64_t>(__double_as_longlong(z)), word};
+  }
+  __device__ static Entry last() { return {~uint64_t{0}, ~uint64_t{0}}; }
+  __device__ uint32_t word() const { return static_cast<uint32_t>(low); }
+  __device__ bool operator<(const Entry& other) const {
+    return key < other.key || (key == other.key && low < other.low);
+  }
+  __device__ Entry from_lane(int mask) const {
+    return {__shfl_xor_sync(kFullWarp, key, mask), __shfl_xor_sync(kFullWarp, low, mask)};
+  }
+};
+
+struct Cloud {
+  int64_t chunk_begin;  // chunks of kBlock rows of all clouds before
+  int32_t first;        // first image that shows it, or kNoImage
+};
+
+template <typename T>
+struct View {
+  Camera<T> camera;
+  int64_t row_begin, row_end;  // empty when the camera or the cloud cannot be rendered
+  int32_t next;                // the next image of the same cloud, or kNoImage
+};
+static_assert(sizeof(View<float>) == 112 && sizeof(View<double>) == 200);  // gsim3d/ops/raster.py counts with them
+
+// The list of a quarter of a tile.
+struct List {
+  uint32_t begin, n;
+};
+
+// The group in work; on the device.
+struct Group {
+  int64_t first, last;           // images
+  int64_t tile_begin, tile_end;  // of all of these images, or a run of one image's
+  int x_begin, y_begin, x_end, y_end;  // places of tiles tile_begin and tile_end
+  bool in_parts;           // a run of tiles of an image that is too large for a group
+  bool resumed, finished;  // an earlier group has begun the image; this one completes it
+  bool rows_are_good;      // cu_rows runs from 0 to N without descending
+
+  __device__ bool has(int64_t tile) const { return tile >= tile_begin && tile < tile_end; }
+  // Slots of a pair in this group, tile by tile. Of whole images one for each of the quarters, else four for each tile.
+  __device__ int n_slots(const Squares& tiles, const Squares& quarters) const {
+    if (!in_parts) return quarters.count();
+    return kQuarters * ((finished ? tiles.count() : tiles.before(x_end, y_end)) -
+                        (resumed ? tiles.before(x_begin, y_begin) : 0));
+  }
+  // Which of them belongs to a quarter of tile (x, y).
+  __device__ int slot(const Squares& tiles, const Squares& quarters, int x, int y, int quarter) const {
+    if (in_parts) return kQuarters * (tiles.before(x, y) - (resumed ? tiles.before(x_begin, y_begin) : 0)) + quarter;
+    const int left = max(2 * x, quarters.x0), right = min(2 * x + 2, quarters.x1);
+    const int top = max(2 * y, quarters.y0), bottom = min(2 * y + 2, quarters.y1);
+    const int before = (top - quarters.y0) * (quarters.x1 - quarters.x0) + (bottom - top) * (left - quarters.x0);
+    return before + (2 * y + quarter / 2 - top) * (right - left) + 2 * x + quarter % 2 - left;
+  }
+};
+
+// Everything the phases read and write; passed to kernels by value. `views` and `clouds` are made once; the rest
+// belongs to the group in work.
+template <typename T>
+struct Job {
+  RasterScene<T> scene;
+  int64_t tiles_x, n_tiles;  // in a row of tiles, in an image
+  cuda::RasterLimits limits;  // what the arrays below hold
+  View<T>* views;            // [n_images]
+  Cloud* clouds;             // [n_clouds]
+  Group* group;
+  int32_t* pair_begin;     // [n_images] index of the first row's record
+  PixelRect* bounds;       // [pairs]
+  Record<T>* records;      // [pairs]; unset where the bounds are empty
+  uint32_t* slot_begin;    // [pairs] first of the pair's slots
+  uint32_t* order;         // [n_images * n_tiles] tiles, counted from the group's first, long lists first
+  List* lists;             // [n_images * n_tiles, kQuarters]
+  uint32_t* listed;        // [slots] pairs, list by list in order of depth
+  uint32_t* cursor;        // [n_images * n_tiles] counts, then write positions
+  uint64_t* slot_count;    // [n_images] slots of all pairs, then those of the images before
+  uint32_t* slot_cursor;   // [n_images] handed out
+  uint32_t* tile_begin;    // [n_images * n_tiles + 1] into entries
+  uint32_t* list_cursor;   // [n_images] places of `listed` handed out; an image has as many as slots
+  Entry<T>* entries;       // [entries]
+  Entry<T>* spare;         // [entries]
+
+  // Slots of an image begin behind those of the images before it in the group.
+  __device__ uint32_t first_slot(int64_t image, const Group& in) const {
+    return in.in_parts ? 0 : static_cast<uint32_t>(slot_count[image]);
+  }
+};
+
+// ---- plan: cameras and the images of each cloud; one block --------------------------------------------------------
+
+template <typename T>
+__device__ bool camera_is_good(const T* viewmat, const T* K) {
+  bool good = true;
+  for (int i = 0; i < 12; ++i) good &= isfinite(viewmat[i]);
+  for (int i = 0; i < 9; ++i) good &= isfinite(K[i]);
+  return good && K[0] > 0 && K[4] > 0 && K[3] == 0 && K[6] == 0 && K[7] == 0 && K[8] == 1;
+}
+
+// Inclusive sum over the threads of a block of up to 1024; `total` is the sum over all of them.
+__device__ inline uint64_t block_sum(uint64_t value, uint64_t& total) {
+  __shared__ uint64_t warp_sums[kWarp];
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
+  for (int step = 1; step < kWarp; step *= 2) {
+    const uint64_t other = __shfl_up_sync(kFullWarp, value, step);
+    if (lane >= step) value += other;
+  }
+  __syncthreads();
+  if (lane == kWarp - 1) warp_sums[warp] = value;
+  __syncthreads();
+  uint64_t before = 0;
+  total = 0;
+  for (int w = 0; w < static_cast<int>(blockDim.x) / kWarp; ++w) {
+    before += w < warp ? warp_sums[w] : 0;
+    total += warp_sums[w];
+  }
+  return value + before;
+}
+
+template <typename T>
+__device__ void plan(const Job<T>& job) {
+  const RasterScene<T>& s = job.scene;
+  bool good = s.cu_rows[0] == 0 && s.cu_rows[s.n_clouds] == s.n_rows;
+  for (int64_t q = threadIdx.x; q < s.n_clouds; q += blockDim.x) good &= s.cu_rows[q] <= s.cu_rows[q + 1];
+  good = __syncthreads_and(good);
+  if (threadIdx.x == 0) *job.group = Group{.rows_are_good = good};
+  uint64_t before = 0;
+  for (int64_t base = 0; base < s.n_clouds; base += blockDim.x) {
+    const int64_t q = base + threadIdx.x;
+    const uint64_t n = good && q < s.n_clouds ? (s.cu_rows[q + 1] - s.cu_rows[q] + kBlock - 1) / kBlock : 0;
+    uint64_t total;
+    const uint64_t end = before + block_sum(n, total);
+    if (q < s.n_clouds) job.clouds[q] = {static_cast<int64_t>(end - n), kNoImage};
+    before += total;
+  }
+  __syncthreads();
+  for (int64_t i = threadIdx.x; i < s.n_images; i += blockDim.x) {
+    View<T>& view = job.views[i];
+    view = {};
+    view.next = kNoImage;
+    const int64_t cloud = s.image_cloud[i];
+    if (!good || !cuda::inside(cloud, s.n_clouds) || !camera_is_good(s.viewmats + 16 * i, s.Ks + 9 * i)) continue;
+    view.camera = make_camera(s.viewmats + 16 * i, s.Ks + 9 * i, s.width, s.height, s.near_plane);
+    view.row_begin = s.cu_rows[cloud], view.row_end = s.cu_rows[cloud + 1];
+    atomicMin(&job.clouds[cloud].first, static_cast<int32_t>(i));
+  }
+  __syncthreads();
+  for (int64_t i = threadIdx.x; i < s.n_images; i += blockDim.x) {
+    View<T>& view = job.views[i];
+    if (view.row_begin == view.row_end) continue;
+    int64_t j = i + 1;
+    while (j < s.n_images && !(s.image_cloud[j] == s.image_cloud[i] && job.views[j].row_end > 0)) ++j;
+    if (j < s.n_images) view.next = static_cast<int32_t>(j);
+  }
+}
+
+// ---- choose: the images after the last group whose pairs fit; one block --------------------------------------------
+
+template <typename T>
+__device__ void choose_images(const Job<T>& job) {
+  const int64_t begin = job.group->tile_end, first = begin / job.n_tiles;
+  const bool resumed = begin % job.n_tiles != 0;
+  uint64_t pairs = 0;
+  int64_t last = first;
+  for (int64_t base = first; base < job.scene.n_images; base += blockDim.x) {
+    const int64_t i = base + threadIdx.x;
+    const bool inside = i < job.scene.n_images;
+    const uint64_t n = inside ? job.views[i].row_end - job.views[i].row_begin : 0;
+    uint64_t total;
+    const uint64_t end = pairs + block_sum(n, total);
+    const bool fits = inside && end <= static_cast<uint64_t>(job.limits.pairs);
+    if (fits) job.pair_begin[i] = static_cast<int32_t>(end - n);
+    const int n_fit = __syncthreads_count(fits);
+    last = base + n_fit;
+    if (n_fit < static_cast<int>(blockDim.x)) break;
+    pairs += total;
+  }
+  __syncthreads();
+  if (threadIdx.x != 0) return;
+  Group& group = *job.group;
+  group.first = first, group.last = resumed ? first + 1 : last;
+  group.tile_begin = begin;
+  group.x_begin = static_cast<int>(begin % job.n_tiles % job.tiles_x);
+  group.y_begin = static_cast<int>(begin % job.n_tiles / job.tiles_x);
+  group.resumed = resumed;
+}
+
+// ---- rows: a block takes a chunk of rows of one cloud, a thread a row ---------------------------------------------
+
+struct Rows {
+  int64_t begin;  // of the block
+  int count;
+  int64_t row;  // of the thread
+  bool inside;
+  int64_t first_image;  // of the group, that shows the cloud; kNoImage: none
+
+  template <typename T>
+  __device__ Rows(const Job<T>& job, int64_t chunk) {
+    const RasterScene<T>& s = job.scene;
+    int64_t low = 0, high = s.n_clouds;  // the last cloud that begins at or before the chunk
+    while (high - low > 1) {
+      const int64_t middle = (low + high) / 2;
+      if (job.clouds[middle].chunk_begin <= chunk)
+        low = middle;
+      else
+        high = middle;
+    }
+    begin = s.cu_rows[low] + (chunk - job.clouds[low].chunk_begin) * kBlock;
+    count = static_cast<int>(min(s.cu_rows[low + 1] - begin, int64_t{kBlock}));
+    row = begin + threadIdx.x;
+    inside = static_cast<int>(threadIdx.x) < count;
+    first_image = job.clouds[low].first;
+    while (first_image < job.group->first) first_image = job.views[first_image].next;
+  }
+};
+
+// Chunks of all clouds.
+template <typename T>
+__device__ int64_t count_chunks(const Job<T>& job) {
+  const int64_t last = job.scene.n_clouds - 1;
+  if (last < 0 || !job.group->rows_are_good) return 0;
+  return job.clouds[last].chunk_begin + (job.scene.n_rows - job.scene.cu_rows[last] + kBlock - 1) / kBlock;
+}
+
+// ---- project: records of all pairs, and the number of entries of every tile ---------------------------------------
+
+template <typename T>
+struct Gaussian {
+  T mean[3], quat[4], scale[3], opacity;
+
+  __device__ Gaussian(const RasterScene<T>& s, int64_t row) {
+    for (int i = 0; i < 3; ++i) mean[i] = s.means[3 * row + i];
+    for (int i = 0; i < 4; ++i) quat[i] = s.quats[4 * row + i];
+    for (int i = 0; i < 3; ++i) scale[i] = s.scales[3 * row + i];
+    opacity = s.opacities[row];
+  }
+
+  __device__ bool is_good() const {
+    bool good = opacity >= 0 && opacity <= 1;
+    for (int i = 0; i < 3; ++i) good &= isfinite(mean[i]) && isfinite(scale[i]) && scale[i] >= 0;
+    for (int i = 0; i < 4; ++i) good &= isfinite(quat[i]);
+    return good;
+  }
+};
+
+// Empty bounds where the Gaussian is not seen; the record is then unset. The CPU refuses rows that are not good; here
+// they are left out.
+template <typename T, int kTerms>
+__device__ PixelRect make_record(const RasterScene<T>& s, const Camera<T>& camera, const Gaussian<T>& gaussian,
+                                 const T* coefficients, Record<T>& record) {
+  const Projection<T> p = project(camera, gaussian.mean, gaussian.quat, gaussian.scale);
+  if (!(p.z > camera.near_plane) || !isfinite(p.determinant)) return {};
+  const PixelRect bounds = pixel_bounds(p.x, p.y, p.xx, p.yy, p.determinant, level_of(gaussian.opacity), s.width,
+                                        s.height, s.cutoff == RasterCutoff::kTile3Sigma);
+  if (bounds.x0 >= bounds.x1) return {};
+  const Footprint<T> shape = footprint_of(p.xy, p.yy, p.determinant);
+  record.x = p.x, record.y = p.y, record.z = p.z, record.slope = shape.slope;
+  record.tight = sqrt(shape.tight * T(kLog2eHalf)), record.loose = sqrt(shape.loose * T(kLog2eHalf));
+  record.strength = log2(gaussian.opacity);
+  record.x0 = bounds.x0, record.x1 = bounds.x1, record.y0 = bounds.y0, record.y1 = bounds.y1;
+  if constexpr (kTerms > 0) {
+    T basis[kTerms], color[3];
+    sh_basis<kTerms>(view_direction(camera, p.point).unit, basis);
+    sh_color<kTerms>(basis, coefficients, color);
+    record.red = color[0], record.green = color[1], record.blue = color[2];
+  } else {
+    record.red = coefficients[0], record.green = coefficients[1], record.blue = coefficients[2];
+  }
+  return bounds;
+}
+
+// Inclusive sum over the lanes of a warp.
+template <typename V>
+__device__ V warp_sum(V value) {
+  for (int step = 1; step < kWarp; step *= 2) {
+    const V other = __shfl_up_sync(kFullWarp, value, step);
+    if (static_cast<int>(threadIdx.x % kWarp) >= step) value += other;
+  }
+  return value;
+}
+
+// Shares the tiles of 32 records evenly among the lanes of their warp: calls f(lane that owns the record, x, y of a tile)
+// for all of them, 32 at a time; idle lanes have owner -1. All lanes take part.
+template <typename F>
+__device__ void for_tiles(const Squares& mine, const F& f) {
+  const int lane = threadIdx.x % kWarp, n = mine.count(), end = warp_sum(n);
+  const int total = __shfl_sync(kFullWarp, end, kWarp - 1);
+  for (int base = 0; base < total; base += kWarp) {
+    const int i = base + lane;
+    int owner = 0;  // the first lane whose sum exceeds i
+    for (int step = kWarp / 2; step > 0; step /= 2)
+      if (__shfl_sync(kFullWarp, end, owner + step - 1) <= i) owner += step;
+    const int begin = __shfl_sync(kFullWarp, end - n, owner), width = __shfl_sync(kFullWarp, mine.x1 - mine.x0, owner);
+    const int x0 = __shfl_sync(kFullWarp, mine.x0, owner), y0 = __shfl_sync(kFullWarp, mine.y0, owner);
+    const bool used = i < total;
+    const int place = used ? i - begin : 0, row = used ? place / width : 0;
+    f(used ? owner : -1, x0 + place - row * width, y0 + row);
+  }
+}
+
+// A chunk of rows of a matrix with kColumns columns in shared memory, read and written by the block as a whole.
+template <typename T, int kColumns>
+class SharedRows {
+ public:
+  static constexpr int kStride = kColumns | 1;  // odd: the same column of 32 rows lies in 32 banks
+  static constexpr size_t kBytes = sizeof(T) * kBlock * kStride;
+
+  __device__ explicit SharedRows(unsigned char* memory) : memory_(reinterpret_cast<T*>(memory)) {}
+  __device__ T* mine() const { return memory_ + threadIdx.x * kStride; }
+
+  __device__ void load(const T* rows, int count) const {
+    __syncthreads();
+    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) memory_[i / kColumns * kStride + i % kColumns] = rows[i];
+    __syncthreads();
+  }
+  __device__ void store(T* rows, int count) const {
+    __syncthreads();
+    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) rows[i] = memory_[i / kColumns * kStride + i % kColumns];
+    __syncthreads();
+  }
+
+ private:
+  T* memory_;
+};
+
+template <int kTerms>
+constexpr int kColorColumns = kTerms > 0 ? kTerms * 3 : 3;
+
+// `memory`: SharedRows of the colours.
+template <typename T, int kTerms>
+__device__ void project_rows(const Job<T>& job, unsigned char* memory) {
+  const RasterScene<T>& s = job.scene;
+  constexpr int kColumns = kColorColumns<kTerms>;
+  const SharedRows<T, kColumns> colors(memory);
+  const int64_t last = job.group->last, n_chunks = count_chunks(job);
+  const int lane = threadIdx.x % kWarp;
+  for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
+    const Rows rows(job, chunk);
+    if (rows.first_image >= last) continue;
+    colors.load(s.color + rows.begin * kColumns, rows.count);
+    const T* coefficients = colors.mine();
+    const int64_t row = rows.inside ? rows.row : rows.begin;
+    const Gaussian<T> gaussian(s, row);
+    bool good = rows.inside && gaussian.is_good();
+    for (int i = 0; i < kColumns && good; ++i) good &= isfinite(coefficients[i]);
+    for (int64_t i = 0; i < s.n_features; ++i) good &= isfinite(s.features[row * s.n_features + i]);
+    const bool may_show = good && gaussian.opacity >= T(kMinAlpha);
+    for (int64_t image = rows.first_image; image < last; image = job.views[image].next) {
+      const View<T>& view = job.views[image];
+      PixelRect bounds{};
+      if (may_show) {
+        Record<T> record;
+        bounds = make_record<T, kTerms>(s, view.camera, gaussian, coefficients, record);
+        if (bounds.x0 < bounds.x1) job.records[job.pair_begin[image] + row - view.row_begin] = record;
+      }
+      if (rows.inside) job.bounds[job.pair_begin[image] + row - view.row_begin] = bounds;
+      uint32_t* counts = job.cursor + image * job.n_tiles;
+      for_tiles(squares_of(bounds, kTile), [&](int owner, int x, int y) {
+        const uint32_t tile = owner < 0 ? ~0u : static_cast<uint32_t>(y * job.tiles_x + x);
+        const unsigned same = __match_any_sync(kFullWarp, tile);
+        if (owner >= 0 && __ffs(same) - 1 == lane) atomicAdd(counts + tile, static_cast<uint32_t>(__popc(same)));
+      });
+      const uint32_t slots = warp_sum<uint32_t>(squares_of(bounds, kQuarter).count());
+      if (lane == kWarp - 1 && slots)
+        atomicAdd(reinterpret_cast<unsigned long long*>(job.slot_count + image), static_cast<unsigned long long>(slots));
+    }
+  }
+}
+
+// ---- offsets: where each tile's list begins, and how many tiles fit; one block ------------------------------------
+
+// The images whose slots fit, as the end of their tiles.
+template <typename T>
+__device__ int64_t images_by_slots(const Job<T>& job, int64_t first, int64_t last) {
+  uint64_t slots = 0;
+  for (int64_t base = first; base < last; base += blockDim.x) {
+    const int64_t i = base + threadIdx.x;
+    uint64_t total;
+    const uint64_t n = i < last ? job.slot_count[i] : 0, end = slots + block_sum(n, total);
+    if (i < last) job.slot_count[i] = end - n;
+    const int n_fit = __syncthreads_count(i < last && end <= static_cast<uint64_t>(job.limits.slots));
+    if (n_fit < static_cast<int>(blockDim.x)) return (base + n_fit) * job.n_tiles;
+    slots += total;
+  }
+  return last * job.n_tiles;
+}
+
+// Long lists first, so that none of them is begun last. Lists of about equal length come in any order.
+template <typename T>
+__device__ void find_order(const Job<T>& job, int64_t begin, int64_t end) {
+  constexpr int kBins = 64, kBinWidth = 64;
+  __shared__ uint32_t bins[kBins];
+  const auto bin_of = [&](int64_t tile) {
+    return kBins - 1 - min(job.tile_begin[tile + 1] - job.tile_begin[tile], uint32_t{kBins * kBinWidth - 1}) / kBinWidth;
+  };
+  const int lane = threadIdx.x % kWarp;
+  if (threadIdx.x < kBins) bins[threadIdx.x] = 0;
+  for (const bool place : {false, true}) {
+    __syncthreads();
+    for (int64_t base = begin; base < end; base += blockDim.x) {
+      const int64_t tile = base + threadIdx.x;
+      const uint32_t bin = tile < end ? bin_of(tile) : kBins;
+      const unsigned same = __match_any_sync(kFullWarp, bin);
+      const int leader = __ffs(same) - 1;
+      uint32_t position = 0;
+      if (bin < kBins && lane == leader) position = atomicAdd(bins + bin, static_cast<uint32_t>(__popc(same)));
+      position = __shfl_sync(kFullWarp, position, leader) + __popc(same & ((1u << lane) - 1));
+      if (place && bin < kBins) job.order[position] = static_cast<uint32_t>(tile - begin);
+    }
+    __syncthreads();
+    if (place || threadIdx.x >= kWarp) continue;
+    const uint32_t a = bins[2 * lane], b = bins[2 * lane + 1], before = warp_sum(a + b) - a - b;
+    bins[2 * lane] = before, bins[2 * lane + 1] = before + a;
+  }
+}
+
+template <typename T>
+__device__ void find_offsets(const Job<T>& job) {
+  __shared__ unsigned long long images_fit, tiles_fit;  // ends of the tiles that fit: of whole images, of any
+  Group& group = *job.group;
+  const int64_t begin = group.tile_begin, end = group.last * job.n_tiles;  // read before thread 0 writes the group
+  const int64_t by_slots = group.resumed ? begin : images_by_slots(job, group.first, group.last);
+  const uint64_t max_of_part = min(job.limits.entries, job.limits.slots / kQuarters);
+  if (threadIdx.x == 0) images_fit = tiles_fit = begin;
+  uint64_t before = 0;
+  constexpr int kItems = 8;
+  for (int64_t base = begin; base < end; base += int64_t{blockDim.x} * kItems) {
+    const int64_t mine = base + int64_t{threadIdx.x} * kItems;
+    uint32_t counts[kItems];
+    uint64_t sum = 0, total;
+    for (int i = 0; i < kItems; ++i) {
+      counts[i] = mine + i < end ? job.cursor[mine + i] : 0;
+      sum += counts[i];
+    }
+    uint64_t position = before + block_sum(sum, total) - sum;
+    int64_t tile = begin, image = begin;
+    for (int i = 0; i < kItems; ++i) {
+      if (mine + i >= end) break;
+      job.tile_begin[mine + i] = job.cursor[mine + i] = static_cast<uint32_t>(position);
+      position += counts[i];
+      if (position <= max_of_part) tile = mine + i + 1;
+      if (position <= static_cast<uint64_t>(job.limits.entries) && (mine + i + 1) % job.n_tiles == 0)
+        image = mine + i + 1;
+    }
+    atomicMax(&tiles_fit, static_cast<unsigned long long>(tile));
+    atomicMax(&images_fit, static_cast<unsigned long long>(image));
+    before += total;
+    if (mine < end && mine + kItems >= end) job.tile_begin[end] = static_cast<uint32_t>(position);
+  }
+  __syncthreads();
+  const int64_t whole = min(static_cast<int64_t>(images_fit), by_slots);
+  const int64_t stop = whole > begin ? whole : min(static_cast<int64_t>(tiles_fit), (group.first + 1) * job.n_tiles);
+  find_order(job, begin, stop);
+  if (threadIdx.x != 0) return;
+  group.tile_end = stop;
+  group.last = (group.tile_end + job.n_tiles - 1) / job.n_tiles;
+  group.finished = group.tile_end % job.n_tiles == 0;
+  group.in_parts = whole <= begin;
+  group.x_end = static_cast<int>(group.tile_end % job.n_tiles % job.tiles_x);
+  group.y_end = static_cast<int>(group.tile_end % job.n_tiles / job.tiles_x);
+}
+
+// ---- scatter: every record writes its entries; their order is whatever it is --------------------------------------
+
+template <typename T>
+__device__ void scatter_rows(const Job<T>& job) {
+  const Group group = *job.group;
+  const int64_t n_chunks = count_chunks(job);
+  const int lane = threadIdx.x % kWarp;
+  for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
+    const Rows rows(job, chunk);
+    for (int64_t image = rows.first_image; image < group.last; image = job.views[image].next) {
+      const int64_t pair = job.pair_begin[image] + rows.row - job.views[image].row_begin;
+      PixelRect bounds{};
+      if (rows.inside) bounds = job.bounds[pair];
+      const Squares tiles = squares_of(bounds, kTile), quarters = squares_of(bounds, kQuarter);
+      const T z = bounds.x0 < bounds.x1 ? job.records[pair].z : T(0);
+      const int n = group.n_slots(tiles, quarters), end = warp_sum(n);
+      if (__all_sync(kFullWarp, tiles.count() == 0)) continue;
+      uint32_t slot = 0;
+      if (lane == kWarp - 1) {
+        slot = job.first_slot(image, group) + atomicAdd(job.slot_cursor + image, static_cast<uint32_t>(end));
+      }
+      slot = __shfl_sync(kFullWarp, slot, kWarp - 1);
+      if (n > 0) job.slot_begin[pair] = slot + end - n;
+      for_tiles(tiles, [&](int owner, int x, int y) {
+        const int64_t tile = image * job.n_tiles + y * job.tiles_x + x;
+        const bool used = owner >= 0 && group.has(tile);
+        const int from = max(owner, 0);
+        const uint32_t word = word_of(__shfl_sync(kFullWarp, static_cast<uint32_t>(pair), from), 0) |
+                              quarters_of_tile({__shfl_sync(kFullWarp, quarters.x0, from),
+                                                __shfl_sync(kFullWarp, quarters.x1, from),
+                                                __shfl_sync(kFullWarp, quarters.y0, from),
+                                                __shfl_sync(kFullWarp, quarters.y1, from)}, x, y);
+        const T depth = __shfl_sync(kFullWarp, z, from);
+        const unsigned same = __match_any_sync(kFullWarp, used ? static_cast<uint32_t>(y * job.tiles_x + x) : ~0u);
+        const int leader = __ffs(same) - 1;
+        uint32_t position = 0;
+        if (used && leader == lane) position = atomicAdd(job.cursor + tile, static_cast<uint32_t>(__popc(same)));
+        position = __shfl_sync(kFullWarp, position, leader) + __popc(same & ((1u << lane) - 1));
+        if (used) job.entries[position] = Entry<T>::make(depth, word);
+      });
+    }
+  }
+}
+
+}  // namespace gsim3d::raster
