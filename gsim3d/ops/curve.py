@@ -222,7 +222,7 @@ def build_pyramid(
         spec: the network's strides, windows, patch and kernel sizes.
         curves: per stage the curve (index into CURVES) of each of the four serialization rows; default (0, 1, 2, 3).
     Returns:
-        Pyramid; tensors int64 on the device of ``positions``.
+        Pyramid; tensors int64 on the device of ``positions``. On CUDA the call waits once, for the sizes.
     Gradients: none. Determinism: integers. The order of the rows of a cloud permutes the results only.
     Raises:
         ValueError: an argument is malformed; the message names it.

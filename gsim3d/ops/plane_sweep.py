@@ -72,6 +72,7 @@ def plane_sweep(
     Determinism: every output and gradient element has one owner that sums in a fixed order.
     Raises:
         ValueError: an argument has a wrong shape, dtype or range, or geometry is not finite; the message names it.
+            On CUDA values are not looked at: a source out of range sees nothing.
     Source: plane sweep of Collins (1996) as in MVSplat (Chen et al. 2024), with dot products interpolated.
 
     Example:

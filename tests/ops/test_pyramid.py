@@ -389,7 +389,7 @@ def test_release_couples_clouds_and_orders_ties_by_row(device):
 
 def test_release_does_not_pool_below_one_level(device):
     spec = PyramidSpec(1.0, 2, (4,), (1,), (8, 8), ((3,), (3,)), release=True)
-    pyramid = build_pyramid(**on(device, scene(extent=0.9)), spec=spec)  # one cell, so one level, less than the stride's two
+    pyramid = build_pyramid(**on(device, scene(extent=0.9)), spec=spec)  # one cell: one level, the stride takes two
     assert pyramid.stages[1].n_rows == 6
 
 
