@@ -139,14 +139,11 @@ __device__ __forceinline__ void for_corners(const Sample<T>& sample, const LineS
 template <typename T>
 __device__ __forceinline__ int32_t mark(const Sample<T> (&samples)[kQuad], const LineSizes& s,
                                         const QuadMemory<T>& memory) {
-  const int lane = threadIdx.x % kWarp;
   int32_t touches = 0;
 #pragma unroll
   for (int j = 0; j < kQuad; ++j) touches |= samples[j].corners;
   if (!__any_sync(kFullWarp, touches != 0)) return 0;
-  uint4* flags = reinterpret_cast<uint4*>(memory.touched);
-  for (int32_t w = lane; w < 2 * s.n_words; w += kWarp) flags[w] = make_uint4(0, 0, 0, 0);
-  __syncwarp();
+  clear_flags(memory.touched, s);
 #pragma unroll
   for (int j = 0; j < kQuad; ++j) for_corners(samples[j], s, [&](int, int32_t q) { memory.touched[q] = 1; });
   __syncwarp();
@@ -304,6 +301,12 @@ struct Lines {
   }
 };
 
+// Memory of score_gradients: it begins where the flags lie, which are done with by then.
+template <typename T>
+GSIM3D_HD int64_t gradient_bytes(const LineSizes& s) {
+  return 2 * aligned_bytes(s.capacity * sizeof(int32_t)) + aligned_bytes(s.capacity * sizeof(T));
+}
+
 __device__ __forceinline__ bool holds(const ushort4& places, uint16_t place) {
   return places.x == place || places.y == place || places.z == place || places.w == place;
 }
@@ -350,8 +353,7 @@ __device__ void score_gradients(const Line<T>& line, const LineSizes& s, int32_t
 
 template <typename T>
 GSIM3D_HD int64_t lines_bytes(const LineSizes& s) {
-  return line_bytes<T>(s) + 2 * aligned_bytes(s.capacity * sizeof(int32_t)) + aligned_bytes(s.capacity * sizeof(T)) +
-         aligned_bytes(s.n_depths * sizeof(T));
+  return line_bytes<T>(s, gradient_bytes<T>(s)) + aligned_bytes(s.n_depths * sizeof(T));
 }
 
 // One warp traces the lines of one pixel and keeps them with the gradients of their scores.
@@ -365,10 +367,11 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
   const int64_t image = at / lines.n_pixels;
   const int32_t pixel = lines.first_pixel + static_cast<int32_t>(at % lines.n_pixels);
   char* memory = shared + threadIdx.x / kWarp * lines_bytes<T>(s);
-  const Line<T> line = carve_line<T>(memory, s);
-  int32_t* low = carve<int32_t>(memory, s.capacity);
-  int32_t* high = carve<int32_t>(memory, s.capacity);
-  T* weights = carve<T>(memory, s.capacity);
+  const Line<T> line = carve_line<T>(memory, s, gradient_bytes<T>(s));
+  char* after_flags = reinterpret_cast<char*>(line.touched);
+  int32_t* low = carve<int32_t>(after_flags, s.capacity);
+  int32_t* high = carve<int32_t>(after_flags, s.capacity);
+  T* weights = carve<T>(after_flags, s.capacity);
   T* grads = carve<T>(memory, s.n_depths);
   for (int32_t k = lane; k < s.n_depths; k += kWarp) grads[k] = grad[(image * s.n_depths + k) * s.n_pixels + pixel];
 
@@ -406,7 +409,7 @@ GSIM3D_HD int64_t gather_bytes() {
 }
 
 template <typename T, int kVectors>
-__global__ void __launch_bounds__(kMaxWarps* kWarp)
+__global__ void __launch_bounds__(kMaxWarps* kWarp, sizeof(T) == 4 ? 3 : 2)
     gather_kernel(Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s, Lines<T> lines, int64_t quads, bool add,
                   Pixels<T> grad_pixels) {
   using Own = Pack<T, kVectors>;
@@ -565,22 +568,23 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
       const int32_t pixel = lines.first_pixel + first + lane;
       unsigned bits = 0;
       T weights[kOwned] = {};
-      if (first + lane < lines.n_pixels) {
-        const int64_t slot = lines.slot(pair, pixel);
+      const bool valid = first + lane < lines.n_pixels;
+      const int64_t slot = lines.slot(pair, pixel);
 #pragma unroll
-        for (int half = 0; half < 2; ++half) {
-          if (pieces.at[half] < 0) continue;
-          const int32_t word = pieces.at[half] * kPiece / 32, shift = pieces.at[half] * kPiece % 32;
-          if (!(*lines.words_of(s, pair, pixel, word / 32) >> word % 32 & 1)) continue;
-          const uint32_t all = lines.bits[slot * s.n_words + word];
-          const unsigned own = all >> shift & ((1u << kPiece) - 1);
-          if (!own) continue;
-          bits |= own << half * kPiece;
-          int32_t rank = lines.before[slot * s.n_words + word] + __popc(all & ((1u << shift) - 1));
+      for (int half = 0; half < 2; ++half) {
+        if (pieces.at[half] < 0) continue;
+        const int32_t word = pieces.at[half] * kPiece / 32, shift = pieces.at[half] * kPiece % 32;
+        const bool listed = valid && *lines.words_of(s, pair, pixel, word / 32) >> word % 32 & 1;
+        if (!__any_sync(kFullWarp, listed)) continue;
+        const uint32_t all = listed ? lines.bits[slot * s.n_words + word] : 0;
+        const unsigned own = all >> shift & ((1u << kPiece) - 1);
+        if (!__any_sync(kFullWarp, own != 0)) continue;
+        if (own == 0) continue;
+        bits |= own << half * kPiece;
+        int32_t rank = lines.before[slot * s.n_words + word] + __popc(all & ((1u << shift) - 1));
 #pragma unroll
-          for (int q = 0; q < kPiece; ++q)
-            if (own >> q & 1 && rank < s.capacity) weights[half * kPiece + q] = lines.weights[slot * s.capacity + rank++];
-        }
+        for (int q = 0; q < kPiece; ++q)
+          if (own >> q & 1 && rank < s.capacity) weights[half * kPiece + q] = lines.weights[slot * s.capacity + rank++];
       }
       const T* from = pixels.at(s, image, lines.first_pixel + first) + channel;
       // Two at a time, so that one load waits while the other's sums are formed.
@@ -592,11 +596,15 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
         const Own second_feature = *reinterpret_cast<const Own*>(from + int64_t{two} * pixels.stride);
         const auto add = [&](int hit, unsigned touched, const Own& feature) {
 #pragma unroll
-          for (int q = 0; q < kOwned; ++q) {
-            if (!(touched >> q & 1)) continue;
-            const T weight = __shfl_sync(kFullWarp, weights[q], hit);
+          for (int half = 0; half < 2; ++half) {
+            if (!(touched >> half * kPiece & ((1u << kPiece) - 1))) continue;
 #pragma unroll
-            for (int v = 0; v < kVectors; ++v) sums[q].v[v] += weight * feature.v[v];
+            for (int q = half * kPiece; q < (half + 1) * kPiece; ++q) {
+              if (!(touched >> q & 1)) continue;
+              const T weight = __shfl_sync(kFullWarp, weights[q], hit);
+#pragma unroll
+              for (int v = 0; v < kVectors; ++v) sums[q].v[v] += weight * feature.v[v];
+            }
           }
         };
         add(one, __shfl_sync(kFullWarp, bits, one), first_feature);
