@@ -54,7 +54,7 @@ class Restored:
         if (scene.width, scene.height) != self.image_size:
             raise InputError(
                 f"{scene.path}: images of {scene.width}x{scene.height} pixels; the model was trained on "
-                f"{self.image_size[0]}x{self.image_size[1]} (one trained with data: {{resize: [W, H]}} fits scenes to W x H)"
+                f"{self.image_size[0]}x{self.image_size[1]} (trained with data: {{resize: [W, H]}}, it would fit them)"
             )
 
 
