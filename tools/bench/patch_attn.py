@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Patch attention against torch's scaled_dot_product_attention (its flash kernel on the CPU; cuDNN's and flash on CUDA).
+"""Patch attention against torch's scaled_dot_product_attention: flash on the CPU, cuDNN's and flash on CUDA.
 
 "gather": both start from one qkv tensor in row order; torch gathers it into patches and scatters the result back.
 "ready": nothing has to move; torch's tensors lie as [3, patches, heads, rows, dim] and its result stays there.
@@ -92,7 +92,9 @@ def gpu_case(bench, n, heads, dim, dtype, gather, target_ratio, limits_ms):
     qkv = torch.randn(n, 3, heads, dim, generator=generator, device=bench.device).to(dtype)
     cotangent = torch.randn(n, heads, dim, generator=generator, device=bench.device).to(dtype)
     cu = torch.arange(n // PATCH + 1, device=bench.device) * PATCH
-    order = torch.randperm(n, generator=generator, device=bench.device) if gather else torch.arange(n, device=bench.device)
+    order = torch.arange(n, device=bench.device)
+    if gather:
+        order = torch.randperm(n, generator=generator, device=bench.device)
     inverse = order.argsort()
     table = PatchTable(order, order, cu, cu)
 

@@ -18,9 +18,18 @@ constexpr int kDigits = 1 << kDigitBits;
 constexpr int kMaxPasses = 64 / kDigitBits;
 constexpr int kThreads = kDigits;  // thread d looks after digit d
 constexpr int kWarps = kThreads / kWarp;
-constexpr int kItems = 8;  // keys a thread
-constexpr int kTile = kThreads * kItems;
 constexpr int kTogether = 16;  // counts of earlier tiles read at once
+
+// How a pass cuts rows: large tiles look back less, small ones fill the GPU with few keys.
+struct LargeTile {
+  static constexpr int kThreads = 512, kItems = 16, kBlocks = 1;  // kItems: keys a thread; kBlocks: of an SM
+};
+struct SmallTile {
+  static constexpr int kThreads = 256, kItems = 8, kBlocks = 4;
+};
+constexpr int64_t kManyKeys = 700000;
+template <typename Tile>
+constexpr int kKeys = Tile::kThreads * Tile::kItems;
 
 // A count that a tile has published: nothing yet, of the tile alone, or of all tiles up to it.
 constexpr uint32_t kOfTile = 1u << 30, kUpToTile = 2u << 30, kCountMask = kOfTile - 1;
@@ -109,8 +118,8 @@ __global__ void __launch_bounds__(kThreads) count_digits_kernel(Sort sort) {
       atomicAdd(sort.totals + (row * kMaxPasses + p) * kDigits + threadIdx.x, count);
 }
 
-// Sum over the threads before, for kThreads threads; the barriers also order the use of `sums`.
-__device__ __forceinline__ uint32_t exclusive_block_sum(uint32_t value, uint32_t* sums /* [kWarps], shared */) {
+// Sum over the threads before; the barriers also order the use of `sums`.
+__device__ __forceinline__ uint32_t exclusive_block_sum(uint32_t value, uint32_t* sums /* [warps], shared */) {
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
   uint32_t sum = value;
 #pragma unroll
@@ -145,9 +154,11 @@ __device__ __forceinline__ void write_result(const SortRows& rows, int64_t row, 
   if (rows.inverse) rows.inverse[at + index] = i;
 }
 
+template <typename Tile>
 struct PassMemory {
-  uint64_t keys[kTile];
-  uint32_t index[kTile];
+  static constexpr int kWarps = Tile::kThreads / kWarp;
+  uint64_t keys[kKeys<Tile>];
+  uint32_t index[kKeys<Tile>];
   uint32_t counts[kWarps][kDigits];
   uint32_t first[kDigits];   // place in the tile of each digit's first key
   uint32_t target[kDigits];  // place in the row of each digit's first key, less `first`
@@ -176,22 +187,24 @@ __device__ __forceinline__ uint32_t keys_before(const uint32_t* published, int64
   return sum;
 }
 
-__global__ void __launch_bounds__(kThreads, 4) move_keys_kernel(Sort sort, int pass) {
+template <typename Tile>
+__global__ void __launch_bounds__(Tile::kThreads, Tile::kBlocks) move_keys_kernel(Sort sort, int pass) {
+  constexpr int kItems = Tile::kItems;
   extern __shared__ __align__(16) char shared[];
-  PassMemory& memory = *reinterpret_cast<PassMemory*>(shared);
+  PassMemory<Tile>& memory = *reinterpret_cast<PassMemory<Tile>*>(shared);
   if (threadIdx.x == 0) memory.ticket = atomicAdd(sort.tickets + pass, 1u);
   __syncthreads();
   const int64_t row = memory.ticket / sort.tiles, tile = memory.ticket % sort.tiles;
-  const int64_t n = size_of(sort.rows, row), begin = tile * kTile;
+  const int64_t n = size_of(sort.rows, row), begin = tile * kKeys<Tile>;
   const uint32_t passes = sort.passes[row];
   if (!(passes >> pass & 1) || begin >= n) return;
   const int moves = __popc(passes & ((1u << pass) - 1));
   const Keys from = keys_after(sort, row, moves);
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
-  const int count = static_cast<int>(min(n - begin, int64_t{kTile}));
+  const int count = static_cast<int>(min(n - begin, int64_t{kKeys<Tile>}));
 
   // Ranks among the keys of a digit that come earlier in the warp's part of the tile.
-  for (int w = 0; w < kWarps; ++w) memory.counts[w][threadIdx.x] = 0;
+  for (int c = threadIdx.x; c < memory.kWarps * kDigits; c += Tile::kThreads) memory.counts[0][c] = 0;
   uint64_t keys[kItems];
   uint32_t index[kItems], rank[kItems];
 #pragma unroll
@@ -225,20 +238,25 @@ __global__ void __launch_bounds__(kThreads, 4) move_keys_kernel(Sort sort, int p
 
   // Thread d: the places of digit d.
   const int digit = threadIdx.x;
+  const bool counts = digit < kDigits;
   uint32_t own = 0;
-  for (int w = 0; w < kWarps; ++w) {
-    const uint32_t part = memory.counts[w][digit];
-    memory.counts[w][digit] = own;
-    own += part;
-  }
   uint32_t* published = sort.published + ((pass * sort.rows.n_rows + row) * sort.tiles) * kDigits + digit;
   volatile uint32_t* mine = published + tile * kDigits;
-  *mine = own | (tile == 0 ? kUpToTile : kOfTile);
+  if (counts) {
+    for (int w = 0; w < memory.kWarps; ++w) {
+      const uint32_t part = memory.counts[w][digit];
+      memory.counts[w][digit] = own;
+      own += part;
+    }
+    *mine = own | (tile == 0 ? kUpToTile : kOfTile);
+  }
   const uint32_t first = exclusive_block_sum(own, memory.sums);
-  const uint32_t before = keys_before(published, tile);
-  if (tile > 0) *mine = (before + own) | kUpToTile;
-  memory.first[digit] = first;
-  memory.target[digit] = sort.totals[(row * kMaxPasses + pass) * kDigits + digit] + before - first;
+  if (counts) {
+    const uint32_t before = keys_before(published, tile);
+    if (tile > 0) *mine = (before + own) | kUpToTile;
+    memory.first[digit] = first;
+    memory.target[digit] = sort.totals[(row * kMaxPasses + pass) * kDigits + digit] + before - first;
+  }
   __syncthreads();
 
 #pragma unroll
@@ -253,7 +271,7 @@ __global__ void __launch_bounds__(kThreads, 4) move_keys_kernel(Sort sort, int p
   uint64_t* to_keys = sort.keys[moves % 2] + row * sort.rows.room;
   uint32_t* to_index = sort.index[moves % 2] + row * sort.rows.room;
 #pragma unroll 4
-  for (int at = threadIdx.x; at < count; at += kThreads) {
+  for (int at = threadIdx.x; at < count; at += Tile::kThreads) {
     const uint64_t key = memory.keys[at];
     const uint32_t to = memory.target[digit_of(key, pass)] + at, from_place = memory.index[at];
     if (last) {
@@ -281,7 +299,9 @@ void sort_rows(const char* op, const SortRows& rows, const Workspace& workspace,
   check(rows.room < int64_t{1} << 30, op, ": rows must have fewer than 2^30 codes on CUDA; got ", rows.room);
   check(rows.n_rows < 1 << 16, op, ": there must be fewer than 2^16 rows on CUDA; got ", rows.n_rows);
   Sort sort{rows};
-  sort.tiles = (rows.room + kTile - 1) / kTile;
+  const bool large = rows.n_rows * rows.room >= kManyKeys;
+  const int64_t tile = large ? kKeys<LargeTile> : kKeys<SmallTile>;
+  sort.tiles = (rows.room + tile - 1) / tile;
   sort.n_passes = (rows.bits + kDigitBits - 1) / kDigitBits;
   const int64_t n_totals = rows.n_rows * kMaxPasses * kDigits,
                 n_published = sort.n_passes * rows.n_rows * sort.tiles * kDigits;
@@ -296,13 +316,15 @@ void sort_rows(const char* op, const SortRows& rows, const Workspace& workspace,
   }
   fill_zero(op, sort.totals, n_zeros, stream);
   const unsigned n_rows = static_cast<unsigned>(rows.n_rows);
-  launch(op, count_digits_kernel, dim3(static_cast<unsigned>(std::min<int64_t>(sort.tiles, 128)), n_rows), kThreads, 0,
+  launch(op, count_digits_kernel, dim3(static_cast<unsigned>(std::min<int64_t>((rows.room + 2047) / 2048, 128)), n_rows), kThreads, 0,
          stream, sort);
   launch(op, plan_passes_kernel, dim3(n_rows, sort.n_passes), kThreads, 0, stream, sort);
-  for (int pass = 0; pass < sort.n_passes; ++pass)
-    launch(op, move_keys_kernel, blocks_for(op, rows.n_rows * sort.tiles, 1), kThreads, sizeof(PassMemory), stream,
-           sort, pass);
-  launch(op, copy_rows_kernel, dim3(static_cast<unsigned>(std::min<int64_t>(sort.tiles, 64)), n_rows), kThreads, 0,
+  const auto move = [&]<typename Tile>(Tile, int pass) {
+    launch(op, move_keys_kernel<Tile>, blocks_for(op, rows.n_rows * sort.tiles, 1), Tile::kThreads,
+           sizeof(PassMemory<Tile>), stream, sort, pass);
+  };
+  for (int pass = 0; pass < sort.n_passes; ++pass) large ? move(LargeTile{}, pass) : move(SmallTile{}, pass);
+  launch(op, copy_rows_kernel, dim3(static_cast<unsigned>(std::min<int64_t>((rows.room + 2047) / 2048, 64)), n_rows), kThreads, 0,
          stream, sort);
 }
 

@@ -14,7 +14,7 @@ namespace gsim3d::cuda {
 
 // What the weights and slopes of a query need. A slot whose row is out of range has log_sum = inf: its weights are 0.
 struct alignas(16) QueryNumbers {
-  float largest, log_sum, delta, shift;  // shift: of FastWeights
+  float largest, log_sum, delta, shift;  // shift: of fast_weight
 
   __device__ __forceinline__ static QueryNumbers none() { return {0.0f, INFINITY, 0.0f, -INFINITY}; }
   __device__ __forceinline__ bool is_fast(float slope) const { return fabsf(largest * slope) <= kLargestShift; }
@@ -33,6 +33,12 @@ struct Backward {
   KeyGradients<T> key_gradients;
 };
 
+// Head dim 16 in one kernel; takes as long for few patches and heads as for one on each multiprocessor. Needs shared
+// memory that not every GPU has.
+bool fits_fused_backward(Stream stream);
+template <typename T>
+void fused_backward(Backward<T> args, const Workspace& workspace, Stream stream);
+
 // Numbers of the queries of a tile, in shared memory.
 struct TileNumbers {
   const float* shift;         // [rows]
@@ -45,7 +51,7 @@ class KeyWarp {
  public:
   __device__ __forceinline__ KeyWarp(const Backward<T>& args, uint32_t queries, uint32_t grads,
                                      const TileNumbers& numbers)
-      : weights_(args.slope), queries_(queries), grads_(grads), numbers_(numbers) {}
+      : slope_(args.slope), queries_(queries), grads_(grads), numbers_(numbers) {}
 
   __device__ __forceinline__ void load(const Backward<T>& args, int64_t first, int64_t end, int64_t head) {
     clear(grad_k_);
@@ -63,8 +69,8 @@ class KeyWarp {
     }
   }
 
-  // Takes 16 queries; `ds` becomes their slopes, keys x queries. `careful`: numbers of the queries of the tile in global
-  // memory, n of them; nullptr for the fast way.
+  // Takes 16 queries; `ds` becomes their slopes, keys x queries. `careful`: numbers of the queries of the tile in
+  // global memory, n of them; nullptr for the fast way.
   template <bool kFast>
   __device__ __forceinline__ void step(int step, const QueryNumbers* careful, int n, uint32_t (&ds)[M][4]) {
     const int t = threadIdx.x % 4;
@@ -84,13 +90,13 @@ class KeyWarp {
     }
     multiply_by_rows<T, D, M>(v_, grads_, step, slopes);
     uint32_t p[M][4];
-    FastWeights::Shift shift[4];
+    float shift[4];
     if constexpr (kFast) {
 #pragma unroll
       for (int j = 0; j < 2; ++j) {
         const float2 pair = *reinterpret_cast<const float2*>(numbers_.shift + step * kStep + 8 * j + 2 * t);
-        shift[2 * j] = FastWeights::prepare(pair.x);
-        shift[2 * j + 1] = FastWeights::prepare(pair.y);
+        shift[2 * j] = pair.x;
+        shift[2 * j + 1] = pair.y;
       }
     }
 #pragma unroll
@@ -107,8 +113,8 @@ class KeyWarp {
 #pragma unroll
           for (int h = 0; h < 2; ++h) {
             float& x = s[m][j][2 * h + i];
-            if constexpr (kFast) x = weights_.at(4 * j + 2 * h + i, x, shift[2 * j + i]);
-            else x = careful_weight(x, query.largest, weights_.slope(), -query.log_sum);
+            if constexpr (kFast) x = fast_weight(x, slope_, shift[2 * j + i]);
+            else x = careful_weight(x, query.largest, slope_, -query.log_sum);
             slopes[m][j][2 * h + i] *= x;
           }
       }
@@ -149,7 +155,7 @@ class KeyWarp {
   }
 
  private:
-  FastWeights weights_;
+  float slope_;
   uint32_t queries_, grads_;
   TileNumbers numbers_;
   uint32_t k_[M][D / 16][4], v_[M][D / 16][4];

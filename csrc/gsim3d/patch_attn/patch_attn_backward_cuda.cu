@@ -19,7 +19,7 @@ struct Shape {
   static constexpr size_t kKeySharedBytes = 2 * kTileBytes + kTileRows * 3 * sizeof(float);
 };
 
-// ---- queries ---------------------------------------------------------------------------------------------------------
+// ---- queries --------------------------------------------------------------------------------------------------------
 
 template <typename T, int D>
 class QueryWarp {
@@ -27,7 +27,7 @@ class QueryWarp {
 
  public:
   __device__ __forceinline__ QueryWarp(const Backward<T>& args, uint32_t keys, uint32_t values, const uint8_t* valid)
-      : weights_(args.slope), keys_(keys), values_(values), valid_(valid) {}
+      : slope_(args.slope), keys_(keys), values_(values), valid_(valid) {}
 
   // Reads the queries, and writes the numbers that the kernel of the keys needs. False where scores are so large that
   // the fast way loses accuracy.
@@ -69,7 +69,7 @@ class QueryWarp {
         if (i < end) args.numbers[head * args.table.n_q_listed + i] = x;  // all four lanes, so that each may read it
         fast = fast && x.is_fast(args.slope);
         minus_delta_[m][h] = -x.delta;
-        shift_[m][h] = FastWeights::prepare(x.shift);
+        shift_[m][h] = x.shift;
       }
     }
     numbers_ = args.numbers + head * args.table.n_q_listed + first;
@@ -93,7 +93,7 @@ class QueryWarp {
       if constexpr (kFast) {
 #pragma unroll
         for (int i = 0; i < 8; ++i)
-          slopes[m][i / 4][i % 4] *= weights_.at(i, s[m][i / 4][i % 4], shift_[m][i % 4 / 2]);
+          slopes[m][i / 4][i % 4] *= fast_weight(s[m][i / 4][i % 4], slope_, shift_[m][i % 4 / 2]);
       } else {
         const uint8_t* valid = valid_ + step * kStep + 2 * (threadIdx.x % 4);
 #pragma unroll
@@ -104,7 +104,7 @@ class QueryWarp {
           for (int i = 0; i < 4; ++i) {
             float& x = slopes[m][i / 2][2 * h + i % 2];
             const float p =
-                careful_weight(s[m][i / 2][2 * h + i % 2], query.largest, weights_.slope(), -query.log_sum);
+                careful_weight(s[m][i / 2][2 * h + i % 2], query.largest, slope_, -query.log_sum);
             x = valid[i / 2 * 8 + i % 2] ? x * p : 0.0f;
           }
         }
@@ -131,12 +131,11 @@ class QueryWarp {
   }
 
  private:
-  FastWeights weights_;
+  float slope_;
   uint32_t keys_, values_;
   const uint8_t* valid_;
   uint32_t q_[M][D / 16][4], grad_[M][D / 16][4];
-  float grad_q_[M][D / 8][4], minus_delta_[M][2];
-  FastWeights::Shift shift_[M][2];
+  float grad_q_[M][D / 8][4], minus_delta_[M][2], shift_[M][2];
   const QueryNumbers* numbers_;  // of the warp's queries, n_ of them
   int n_;
 };
@@ -168,7 +167,7 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) query_kernel(Back
           const bool all_valid =
               copy_tiles<D, kThreads>({args.k, args.v}, rows, n, table.n_k, share.head, {keys, values}, valid);
           wait_for_copies();
-          plain = __syncthreads_and(all_valid && (kByPolynomial == 0 || finite_tile<T, D>(shared, n))) != 0;
+          plain = __syncthreads_and(all_valid) != 0;
           loaded = true;
         }
         if (!active) continue;
@@ -184,7 +183,7 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) query_kernel(Back
   }
 }
 
-// ---- keys ------------------------------------------------------------------------------------------------------------
+// ---- keys -----------------------------------------------------------------------------------------------------------
 
 template <typename T, int D>
 __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) key_kernel(Backward<T> args) {
@@ -251,6 +250,14 @@ void run(Backward<T> args, Stream stream) {
   launch(kOp, key_kernel<T, D>, blocks_of(args.division), kThreads, S::kKeySharedBytes, stream, args);
 }
 
+// One kernel is 1.8 times as fast as two, if it fills the multiprocessors.
+template <typename T>
+bool pays_to_fuse(const Backward<T>& args, Stream stream) {
+  const int64_t blocks = args.table.n_patches * args.size.heads, count = multiprocessors(kOp, stream);
+  const int64_t rounds = (blocks + count - 1) / count;
+  return 5 * rounds * count <= 9 * blocks && fits_fused_backward(stream);
+}
+
 }  // namespace
 
 template <typename T>
@@ -262,7 +269,8 @@ void tensor_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRo
   const Backward<T> args{grad, q, k, v, out_rows, stats, table, size, {}, softmax.slope, softmax.sign,
                          static_cast<float>(size.scale),
                          workspace.take<QueryNumbers>(size.heads * table.n_q_listed), grad_q, key_gradients};
-  if (size.dim == 16) run<T, 16>(args, stream);
+  if (size.dim == 16 && pays_to_fuse(args, stream)) fused_backward(args, workspace, stream);
+  else if (size.dim == 16) run<T, 16>(args, stream);
   else if (size.dim == 32) run<T, 32>(args, stream);
   else run<T, 64>(args, stream);
 }

@@ -19,9 +19,9 @@ struct TileLayout {
     return row * kChunks + (c ^ (row / kRowsPerLine % kChunks));
   }
 
-  // Where lane `lane` finds its row for load_matrices of the chunks 2s and 2s + 1 of the first 16 rows; the next 16 rows
-  // are kBytesPerStep further. By rows: matrices (rows 0-7, chunk 2s), (rows 0-7, 2s + 1), (rows 8-15, 2s), (8-15, 2s + 1).
-  // Otherwise: (rows 0-7, 2s), (rows 8-15, 2s), (rows 0-7, 2s + 1), (rows 8-15, 2s + 1).
+  // Where lane `lane` finds its row for load_matrices of the chunks 2s and 2s + 1 of the first 16 rows; the next 16
+  // rows are kBytesPerStep further. The four matrices, by rows: (rows 0-7, chunk 2s), (0-7, 2s + 1), (8-15, 2s),
+  // (8-15, 2s + 1); otherwise: (0-7, 2s), (8-15, 2s), (0-7, 2s + 1), (8-15, 2s + 1).
   template <bool kByRows>
   __device__ __forceinline__ static int lane_offset(int lane, int s) {
     const int matrix = lane / 8;
@@ -30,7 +30,7 @@ struct TileLayout {
   }
 };
 
-// Queues copies of the listed rows of one head of two matrices into two tiles; rows beyond n up to the next multiple of
+// Queues a group of copies: the listed rows of one head of two matrices into two tiles; rows beyond n up to the next multiple of
 // kStep, and rows outside [0, n_rows), become 0. Where `valid` is given, it gets a byte for each row: whether it takes
 // part. Returns whether all n rows that this thread saw do.
 template <int D, int kThreads, typename T>
@@ -54,22 +54,8 @@ __device__ __forceinline__ bool copy_tiles(const HeadRows<T> (&x)[2], const int6
     all = all && (wanted || r >= n);
     to += kRowsAtOnce * D * sizeof(T);
   }
+  commit_copies();
   return all;
-}
-
-// Whether the numbers of a tile that this thread copied are all finite. Call after its copies have arrived.
-template <typename T, int D>
-__device__ __forceinline__ bool finite_tile(const uint4* tile, int n) {
-  constexpr uint32_t kExponent = std::is_same_v<T, __nv_bfloat16> ? 0x7f80u : 0x7c00u;
-  constexpr int kChunks = TileLayout<D>::kChunks;
-  const int padded = (n + kStep - 1) / kStep * kStep;
-  bool finite = true;
-  for (int i = threadIdx.x; i < padded * kChunks; i += blockDim.x) {
-    const uint4 x = tile[TileLayout<D>::chunk(i / kChunks, i % kChunks)];
-    for (uint32_t pair : {x.x, x.y, x.z, x.w})
-      finite = finite && (pair & kExponent) != kExponent && (pair >> 16 & kExponent) != kExponent;
-  }
-  return finite;
 }
 
 // Rows first .. first + 15 of listed rows as an A tile, 16 columns from column 16 s; rows outside become 0.

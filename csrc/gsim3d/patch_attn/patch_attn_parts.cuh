@@ -28,7 +28,7 @@ struct Division {
   }
 };
 
-// As few blocks as possible, for each reads the whole other side of its patch (an eighth of the work on a group, about),
+// As few blocks as possible, for each reads the whole other side of its patch (about an eighth of the work on a group),
 // but enough to keep the `resident` ones that the GPU runs at a time busy to the end.
 inline Division divide(int64_t n_patches, int64_t n_listed, int64_t group, int64_t heads, int64_t resident) {
   const int64_t groups = n_patches > 0 ? (n_listed + n_patches * group - 1) / (n_patches * group) : 1;

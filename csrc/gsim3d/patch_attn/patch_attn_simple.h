@@ -1,5 +1,5 @@
-// Patch attention with plain multiply-adds, for every dtype and head dim: exact float32, float64, and 16-bit numbers whose
-// head dim the tensor cores do not take. T is float, double, __nv_bfloat16 or __half.
+// Patch attention with plain multiply-adds, for every dtype and head dim: exact float32, float64, and 16-bit numbers
+// whose head dim the tensor cores do not take. T is float, double, __nv_bfloat16 or __half.
 #pragma once
 
 #include "gsim3d/patch_attn/patch_attn_parts.cuh"

@@ -1,6 +1,6 @@
-// A thread, or L neighbouring ones for head dims above 16, owns a few rows: queries in the forward pass and for their own
-// gradient, keys for theirs. It walks over the rows of the other side, which the block keeps in shared memory a tile at
-// a time, so all sums run in the order of the lists. Every block owns what it writes.
+// A thread, or L neighbouring ones for head dims above 16, owns a few rows: queries in the forward pass and for their
+// own gradient, keys for theirs. It walks over the rows of the other side, which the block keeps in shared memory a tile
+// at a time, so all sums run in the order of the lists. Every block owns what it writes.
 #include <utility>
 
 #include <cuda_bf16.h>

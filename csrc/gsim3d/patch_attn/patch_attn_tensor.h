@@ -1,5 +1,5 @@
-// Patch attention in 16-bit numbers on the tensor cores, for head dims 16, 32 and 64. Rows of q, k, v and the gradient of
-// the result start at multiples of 16 bytes. T is __nv_bfloat16 or __half.
+// Patch attention in 16-bit numbers on the tensor cores, for head dims 16, 32 and 64. Rows of q, k, v and the gradient
+// of the result start at multiples of 16 bytes. T is __nv_bfloat16 or __half.
 #pragma once
 
 #include "gsim3d/patch_attn/patch_attn_parts.cuh"

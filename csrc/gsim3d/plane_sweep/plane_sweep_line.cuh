@@ -34,19 +34,20 @@ struct Line {
   T* fx;             // [n_depths]
   T* fy;             // [n_depths]
   ushort4* places;   // [n_depths], places in the list of top left, top right, bottom left, bottom right; capacity: none
-  uint8_t* touched;  // [n_words, 32], zero between calls
+  uint8_t* touched;  // [n_words, 32], of use inside trace only
   uint32_t* bits;    // [n_words], touched source pixels
   uint16_t* before;  // [n_words], how many are touched in the words before
-  int32_t* list;     // [capacity], touched source pixels, ascending
 };
 
 GSIM3D_HD int64_t aligned_bytes(int64_t bytes) { return (bytes + 15) / 16 * 16; }
 
+// `shared_bytes`: how many the caller wants to use where the flags lie.
 template <typename T>
-GSIM3D_HD int64_t line_bytes(const LineSizes& s) {
+GSIM3D_HD int64_t line_bytes(const LineSizes& s, int64_t shared_bytes) {
+  const int64_t flags = s.n_words * 32;
   return aligned_bytes(s.n_depths * sizeof(int32_t)) + 2 * aligned_bytes(s.n_depths * sizeof(T)) +
-         aligned_bytes(s.n_depths * sizeof(ushort4)) + s.n_words * 32 + aligned_bytes(s.n_words * sizeof(uint32_t)) +
-         aligned_bytes(s.n_words * sizeof(uint16_t)) + aligned_bytes(s.capacity * sizeof(int32_t));
+         aligned_bytes(s.n_depths * sizeof(ushort4)) + (flags > shared_bytes ? flags : shared_bytes) +
+         aligned_bytes(s.n_words * sizeof(uint32_t)) + aligned_bytes(s.n_words * sizeof(uint16_t));
 }
 
 // Takes `count` elements from shared memory at `at`.
@@ -57,20 +58,26 @@ __device__ __forceinline__ U* carve(char*& at, int32_t count) {
   return here;
 }
 
-// Takes the memory of a line and clears its flags.
 template <typename T>
-__device__ __forceinline__ Line<T> carve_line(char*& at, const LineSizes& s) {
+__device__ __forceinline__ Line<T> carve_line(char*& at, const LineSizes& s, int64_t shared_bytes) {
   Line<T> line;
+  char* const end = at + line_bytes<T>(s, shared_bytes);
   line.code = carve<int32_t>(at, s.n_depths);
   line.fx = carve<T>(at, s.n_depths);
   line.fy = carve<T>(at, s.n_depths);
   line.places = carve<ushort4>(at, s.n_depths);
-  line.touched = carve<uint8_t>(at, s.n_words * 32);
   line.bits = carve<uint32_t>(at, s.n_words);
   line.before = carve<uint16_t>(at, s.n_words);
-  line.list = carve<int32_t>(at, s.capacity);
-  for (int32_t w = threadIdx.x % kWarp; w < 8 * s.n_words; w += kWarp) reinterpret_cast<uint32_t*>(line.touched)[w] = 0;
+  line.touched = reinterpret_cast<uint8_t*>(at);
+  at = end;
   return line;
+}
+
+// Clears the flags, by all lanes of a warp.
+__device__ __forceinline__ void clear_flags(uint8_t* touched, const LineSizes& s) {
+  uint4* flags = reinterpret_cast<uint4*>(touched);
+  for (int32_t w = threadIdx.x % kWarp; w < 2 * s.n_words; w += kWarp) flags[w] = make_uint4(0, 0, 0, 0);
+  __syncwarp();
 }
 
 // Four flags, one a byte, as four bits.
@@ -95,7 +102,7 @@ __device__ __forceinline__ Sample<T> sample_at(const PlaneSweep<T>& sweep, const
   return {place.y * s.width + place.x, place.inside ? columns & rows : 0, place.fx, place.fy};
 }
 
-// Packs flags into bits and clears them; before[w]: how many are set in the words before w. Returns how many are set, the
+// Packs flags into bits; before[w]: how many are set in the words before w. Returns how many are set, the
 // same in every lane.
 __device__ __forceinline__ int32_t list_flags(uint8_t* touched, const LineSizes& s, uint32_t* all_bits,
                                               uint16_t* before) {
@@ -105,9 +112,8 @@ __device__ __forceinline__ int32_t list_flags(uint8_t* touched, const LineSizes&
     const int32_t w = begin + lane;
     uint32_t bits = 0;
     if (w < s.n_words) {
-      uint4* flags = reinterpret_cast<uint4*>(touched) + 2 * w;
+      const uint4* flags = reinterpret_cast<const uint4*>(touched) + 2 * w;
       const uint4 low = flags[0], high = flags[1];
-      flags[0] = flags[1] = make_uint4(0, 0, 0, 0);
       bits = pack_flags(low.x) | pack_flags(low.y) << 4 | pack_flags(low.z) << 8 | pack_flags(low.w) << 12 |
              pack_flags(high.x) << 16 | pack_flags(high.y) << 20 | pack_flags(high.z) << 24 | pack_flags(high.w) << 28;
     }
@@ -137,6 +143,7 @@ __device__ int32_t trace(const PlaneSweep<T>& sweep, const LineSizes& s, int64_t
   const int32_t v = pixel / s.width;
   const Ray<T> ray = source_ray(sweep.homographies + 9 * pair, static_cast<T>(pixel - v * s.width), static_cast<T>(v));
   bool touches = false;
+  clear_flags(line.touched, s);
   for (int32_t k = lane; k < s.n_depths; k += kWarp) {
     const Sample<T> at = sample_at(sweep, s, pair, ray, T(1) / sweep.inverse_depths[image * s.n_depths + k]);
     line.fx[k] = at.fx;
@@ -160,7 +167,6 @@ __device__ int32_t trace(const PlaneSweep<T>& sweep, const LineSizes& s, int64_t
     const auto place = [&](int side, int32_t q) {
       if (!(code >> side & 1)) return none;
       const int32_t rank = line.before[q >> 5] + __popc(line.bits[q >> 5] & ((1u << (q & 31)) - 1));
-      line.list[rank] = q;
       return static_cast<uint16_t>(rank);
     };
     line.places[k] =

@@ -16,12 +16,13 @@ __global__ void __launch_bounds__(kBlock) gather_viewmats_kernel(Job<T> job, Slo
 }
 
 template <typename T, int kTerms>
-__global__ void __launch_bounds__(kBlock) gather_rows_kernel(Job<T> job, Slots<T> slots, RasterSceneGrads<T> grads) {
+__global__ void __launch_bounds__(kBlock, 4) gather_rows_kernel(Job<T> job, Slots<T> slots, RasterSceneGrads<T> grads) {
   gather_rows<T, kTerms>(job, slots, grads, dynamic_memory);
 }
 
 template <typename T>
-__global__ void __launch_bounds__(kBlock) gather_images_kernel(Job<T> job, Slots<T> slots, RasterSceneGrads<T> grads) {
+__global__ void __launch_bounds__(kOneBlock) gather_images_kernel(Job<T> job, Slots<T> slots,
+                                                                  RasterSceneGrads<T> grads) {
   gather_images(job, slots, grads);
 }
 
@@ -109,14 +110,14 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
     if (viewmats)
       launch(kRaster, gather_viewmats_kernel<T, kTerms>, grid_for(scene.n_images * kViewmatParts, 1), kBlock, 0, stream,
              job, slots);
-    launch(kRaster, gather_rows_kernel<T, kTerms>, grid_of_chunks(scene), kBlock, kRowBytes<T, kTerms>, stream, job,
-           slots, grads);
+    launch(kRaster, gather_rows_kernel<T, kTerms>, grid_of_chunks(scene), kBlock, 2 * kRowBytes<T, kTerms>, stream,
+           job, slots, grads);
   });
-  launch(kRaster, gather_images_kernel<T>, grid_for(scene.n_images, 1), kBlock, 0, stream, job, slots, grads);
+  launch(kRaster, gather_images_kernel<T>, grid_for(scene.n_images, 1), kOneBlock, 0, stream, job, slots, grads);
   const auto rest = [&](auto fade) {
     launch_together(further_vjp_kernel<T, decltype(fade)::value>,
-                    std::max({kWarps * sizeof(BlendGradShared<T, true>), kSortRun * sizeof(Entry<T>),
-                              kRowBytes<T, 16>}),
+                    std::max({kWarps * sizeof(BlendGradShared<T, true>), kSortRun<T> * sizeof(Entry<T>),
+                              2 * kRowBytes<T, 16>}),
                     stream, job, further, image_grads, slots, grads);
   };
   scene.cutoff == RasterCutoff::kSmooth ? rest(std::true_type{}) : rest(std::false_type{});

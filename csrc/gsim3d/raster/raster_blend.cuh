@@ -2,8 +2,8 @@
 //
 // The warp takes the quarter's list in batches of 32. Lane by entry, it finds which of the
 // 64 pixels each Gaussian may reach, as two words of bits; transposed, they tell each pixel its Gaussians. Lane by
-// pixel, it then visits those only. The backward pass transposes once more: lane by entry, each Gaussian sums over its
-// own pixels, so no value is ever added up across lanes.
+// pixel, it then visits those only. In the backward pass each entry's lane then sums over the pixels, so no value is
+// ever added up across lanes.
 #pragma once
 
 #include "gsim3d/raster/raster_fast.cuh"

@@ -24,14 +24,42 @@ struct Slots {
   T* viewmats;          // [n_images, kViewmatParts, 12], or null when nobody asks for them
 };
 
+// What one pixel tells one entry: the gradient v of the exponent, and the weight of the entry's values.
+template <typename T>
+struct alignas(2 * sizeof(T)) Share {
+  T v, weight;
+};
+template <typename T>
+struct alignas(4 * sizeof(T)) PixelGrad {
+  T value[4];  // of colour and depth
+};
+
 template <typename T, bool kWithFeatures>
 struct BlendGradShared {
   Batch<T> batch;
-  T grad[4][kHalves * kWarp];  // of colour and depth, by pixel
-  T v[kWarp][kWarp];           // gradient of the exponent, by entry and pixel of a half
-  T weight[kWarp][kWarp];
+  PixelGrad<T> grad[kHalves * kWarp];
+  // By pixel of a half and entry. One column more than entries: neither writing one entry's column nor reading one
+  // pixel's row has bank conflicts.
+  Share<T> shares[kWarp][kWarp + 1];
   T features[kWithFeatures ? kFeatures : 1][kWarp];       // by entry
   T grad_features[kWithFeatures ? kFeatures : 1][kWarp];  // by pixel of a half
+};
+
+// Sums of v over the pixels of a quarter, (x, y) counted from its centre.
+template <typename T>
+struct QuarterSums {
+  T one = 0, x = 0, y = 0, xx = 0, xy = 0, yy = 0;
+
+  // The same with u = x - slope y + u0 and y + y0 in place of x and y.
+  __device__ void finish(T u0, T y0, T slope, SlotSums<T>& to) const {
+    const T u = x - slope * y;  // before the shift
+    to.value[0] = u + u0 * one;
+    to.value[1] = y + y0 * one;
+    to.value[2] = (xx - slope * (T(2) * xy - slope * yy)) + u0 * (T(2) * u + u0 * one);
+    to.value[3] = (xy - slope * yy + u0 * y) + y0 * (u + u0 * one);
+    to.value[4] = yy + y0 * (T(2) * y + y0 * one);
+    to.value[5] = one;
+  }
 };
 
 template <typename T>
@@ -47,7 +75,7 @@ __device__ inline uint32_t in_front(int32_t last, int32_t base) {
   return n >= kWarp ? ~0u : n <= 0 ? 0u : (1u << n) - 1;
 }
 
-// <feature gradients of the lane's pixel, features of entry j>, for the entries in `mine`, into shared.v[j][lane].
+// Into shared.shares[lane][j].v, for the entries j in `mine`: <feature gradients of the lane's pixel, features of j>.
 template <typename T>
 __device__ void dot_features(const RasterScene<T>& s, const RasterImageGrads<T>& grads, const T* entry_features,
                              int64_t pixel, uint32_t mine, int lane, BlendGradShared<T, true>& shared) {
@@ -62,17 +90,15 @@ __device__ void dot_features(const RasterScene<T>& s, const RasterImageGrads<T>&
     __syncwarp();
     for (uint32_t rest = mine; rest; rest &= rest - 1) {
       const int j = __ffs(rest) - 1;
-      T sum = channel ? shared.v[j][lane] : T(0);
-      for (int c = 0; c < kFeatures; ++c) sum += g[c] * shared.features[c][j];
-      shared.v[j][lane] = sum;
+      for (int c = 0; c < kFeatures; ++c) shared.shares[lane][j].v += g[c] * shared.features[c][j];
     }
   }
 }
 
-// Feature gradients of the lane's entry from the pixels in `mine`, written to or added to its slot.
+// Feature gradients of the lane's entry from the pixels of a half, written to or added to its slot.
 template <typename T>
-__device__ void sum_features(const RasterScene<T>& s, const RasterImageGrads<T>& grads, int64_t pixel, uint32_t mine,
-                             int lane, bool add, BlendGradShared<T, true>& shared, T* slot) {
+__device__ void sum_features(const RasterScene<T>& s, const RasterImageGrads<T>& grads, int64_t pixel, int lane,
+                             bool add, BlendGradShared<T, true>& shared, T* slot) {
   for (int64_t channel = 0; channel < s.n_features; channel += kFeatures) {
     const int n_channels = static_cast<int>(min(s.n_features - channel, int64_t{kFeatures}));
     __syncwarp();
@@ -82,10 +108,8 @@ __device__ void sum_features(const RasterScene<T>& s, const RasterImageGrads<T>&
     __syncwarp();
     if (!slot) continue;
     T sums[kFeatures] = {};
-    for (uint32_t rest = mine; rest; rest &= rest - 1) {
-      const int p = __ffs(rest) - 1;
-      for (int c = 0; c < kFeatures; ++c) sums[c] += shared.weight[lane][p] * shared.grad_features[c][p];
-    }
+    for (int p = 0; p < kWarp; ++p)
+      for (int c = 0; c < kFeatures; ++c) sums[c] += shared.shares[p][lane].weight * shared.grad_features[c][p];
     for (int c = 0; c < n_channels; ++c) {
       T& to = slot[channel + c];
       to = add ? to + sums[c] : sums[c];
@@ -123,7 +147,7 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
       g[3] = grads.depth[pixel];
       at.sum = at.light * seen;
     }
-    for (int c = 0; c < 4; ++c) shared.grad[c][half * kWarp + lane] = g[c];
+    for (int c = 0; c < 4; ++c) shared.grad[half * kWarp + lane].value[c] = g[c];
     n_used = max(n_used, at.last);
   }
 #pragma unroll
@@ -151,7 +175,7 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
       put(record, quarter, lane, shared.batch);
       cover(record, quarter, bits);
     }
-    const T from_x = T(quarter.x0) + T(0.5) - record.x, from_y = T(quarter.y0) + T(0.5) - record.y;
+    const T from_x = T(quarter.x0 + kQuarter / 2) - record.x, from_y = T(quarter.y0 + kQuarter / 2) - record.y;
     const T slope = record.slope;
     const T* entry_features = kWithFeatures && used ? features_of(job, quarter.image, pair) : nullptr;
     int64_t slot = 0;
@@ -164,59 +188,68 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
     fetch(base - kWarp);
 
     SlotSums<T> sums{};
+    QuarterSums<T> moments;
     uint32_t live = 0;
 #pragma unroll
     for (int half = 0; half < kHalves; ++half) {
       const T x = T(lane % kQuarter), y = T(lane / kQuarter + half * kHalfRows);
       Behind<T>& at = behind[half];
+#pragma unroll 4
+      for (int p = 0; p < kWarp; ++p) shared.shares[p][lane] = {T(0), T(0)};
+      __syncwarp();
       uint32_t mine = transpose_bits(bits[half], lane) & in_front(at.last, base);
       const int64_t pixel = kWithFeatures ? pixel_of(s, quarter, half, lane) : 0;
       if constexpr (kWithFeatures) dot_features(s, grads, entry_features, pixel, mine, lane, shared);
-      T g[4];
-      for (int c = 0; c < 4; ++c) g[c] = shared.grad[c][half * kWarp + lane];
+      const PixelGrad<T> g = shared.grad[half * kWarp + lane];
       uint32_t seen = 0;
       while (mine) {
         const int j = kWarp - 1 - __clz(mine);
         const uint32_t bit = 1u << j;
         mine ^= bit;
+        Share<T>& share = shared.shares[lane][j];
         const T raw = alpha_at(shared.batch, j, x, y);
         T alpha = min_of(raw, T(kMaxAlpha));
         T slope_of_alpha = raw <= T(kMaxAlpha) ? raw : T(0);
-        if constexpr (kFade)
+        if constexpr (kFade) {
           slope_of_alpha *= fade_slope(alpha), alpha = fade(alpha);
-        else if (!(alpha >= T(kMinAlpha)))
+        } else if (!(alpha >= T(kMinAlpha))) {
+          if constexpr (kWithFeatures) share.v = 0;
           continue;
+        }
         const T inverse = fast_reciprocal(T(1) - alpha);
         const T light = at.light * inverse, weight = alpha * light;
-        T total = kWithFeatures ? shared.v[j][lane] : T(0);
-        for (int c = 0; c < 4; ++c) total += g[c] * shared.batch[kRed + c][j];
-        shared.v[j][lane] = (light * total - at.sum * inverse) * slope_of_alpha;
-        shared.weight[j][lane] = weight;
+        T total = kWithFeatures ? share.v : T(0);
+        for (int c = 0; c < 4; ++c) total += g.value[c] * shared.batch[kRed + c][j];
+        share = {(light * total - at.sum * inverse) * slope_of_alpha, weight};
         at.light = light;
         at.sum += weight * total;
         seen |= bit;
       }
-      seen = transpose_bits(seen, lane);
-      live |= seen;
+      live |= __reduce_or_sync(kFullWarp, seen);
       __syncwarp();
-      for (uint32_t rest = seen; rest; rest &= rest - 1) {
-        const int p = __ffs(rest) - 1;
-        const T dy = from_y + T(p / kQuarter + half * kHalfRows), u = from_x + T(p % kQuarter) - slope * dy;
-        const T v = shared.v[lane][p], weight = shared.weight[lane][p], vu = v * u, vy = v * dy;
-        sums.value[0] += vu;
-        sums.value[1] += vy;
-        sums.value[2] += vu * u;
-        sums.value[3] += vu * dy;
-        sums.value[4] += vy * dy;
-        sums.value[5] += v;
-        for (int c = 0; c < 4; ++c) sums.value[6 + c] += weight * shared.grad[c][half * kWarp + p];
+#pragma unroll
+      for (int row = 0; row < kHalfRows; ++row) {
+        T one = 0, vx = 0, vxx = 0;
+#pragma unroll
+        for (int column = 0; column < kQuarter; ++column) {
+          const int p = row * kQuarter + column;
+          const Share<T> share = shared.shares[p][lane];
+          const PixelGrad<T> grad = shared.grad[half * kWarp + p];
+          const T from_centre = T(column) - T(kQuarter - 1) / 2;
+          one += share.v, vx += share.v * from_centre, vxx += share.v * (from_centre * from_centre);
+          for (int c = 0; c < 4; ++c) sums.value[6 + c] += share.weight * grad.value[c];
+        }
+        const T from_centre = T(half * kHalfRows + row) - T(kQuarter - 1) / 2;
+        moments.one += one, moments.x += vx, moments.xx += vxx;
+        moments.y += one * from_centre, moments.xy += vx * from_centre, moments.yy += one * (from_centre * from_centre);
       }
       if constexpr (kWithFeatures)
-        sum_features(s, grads, pixel, seen, lane, half > 0, shared,
+        sum_features(s, grads, pixel, lane, half > 0, shared,
                      used ? slots.features + slot * s.n_features : nullptr);
       __syncwarp();
     }
-    if (live) {
+    if (live >> lane & 1) {
+      moments.finish(from_x - slope * from_y, from_y, slope, sums);
       slots.sums[slot] = sums;
       slots.live[slot] = 1;
     }

@@ -50,11 +50,12 @@ void take_group(Job<T>& job, Arena& kept, Arena& scratch) {
   job.order = kept.take<uint32_t>(n_tiles);
   job.lists = kept.take<List>(n_tiles * kQuarters);
   job.listed = kept.take<uint32_t>(job.limits.slots);
-  job.slot_count = scratch.take<uint64_t>(n_images + (2 * n_images + n_tiles + 1) / 2);
+  job.slot_count = scratch.take<unsigned long long>(n_images + (2 * n_images + n_tiles + 1) / 2);
   job.slot_cursor = reinterpret_cast<uint32_t*>(job.slot_count + n_images);
   job.list_cursor = job.slot_cursor + n_images;
   job.cursor = job.list_cursor + n_images;
   job.tile_begin = scratch.take<uint32_t>(n_tiles + 1);
+  job.depths = scratch.take<T>(job.limits.pairs);
   job.entries = scratch.take<Entry<T>>(job.limits.entries);
   job.spare = scratch.take<Entry<T>>(job.limits.entries);
 }
@@ -112,7 +113,7 @@ void launch_together(void (*kernel)(Formal...), size_t shared_bytes, Stream stre
              kRaster);
 }
 
-// Dynamic shared memory of the phases that take rows: the colours.
+// Dynamic shared memory of rows of colours.
 template <typename T, int kTerms>
 constexpr size_t kRowBytes = SharedRows<T, kColorColumns<kTerms>>::kBytes;
 
@@ -123,7 +124,7 @@ void dispatch_blend(const RasterScene<T>& s, const F& f) {
   s.cutoff == RasterCutoff::kSmooth ? with(std::true_type{}) : with(std::false_type{});
 }
 
-extern __shared__ __align__(16) unsigned char dynamic_memory[];
+extern __shared__ __align__(32) unsigned char dynamic_memory[];
 
 // The part of the dynamic shared memory that belongs to the calling warp.
 template <typename Shared>

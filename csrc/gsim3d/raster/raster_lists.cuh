@@ -146,13 +146,14 @@ struct Job {
   Group* group;
   int32_t* pair_begin;     // [n_images] index of the first row's record
   PixelRect* bounds;       // [pairs]
+  T* depths;               // [pairs] z of the records
   Record<T>* records;      // [pairs]; unset where the bounds are empty
   uint32_t* slot_begin;    // [pairs] first of the pair's slots
   uint32_t* order;         // [n_images * n_tiles] tiles, counted from the group's first, long lists first
   List* lists;             // [n_images * n_tiles, kQuarters]
   uint32_t* listed;        // [slots] pairs, list by list in order of depth
   uint32_t* cursor;        // [n_images * n_tiles] counts, then write positions
-  uint64_t* slot_count;    // [n_images] slots of all pairs, then those of the images before
+  unsigned long long* slot_count;  // [n_images] slots of all pairs, then those of the images before
   uint32_t* slot_cursor;   // [n_images] handed out
   uint32_t* tile_begin;    // [n_images * n_tiles + 1] into entries
   uint32_t* list_cursor;   // [n_images] places of `listed` handed out; an image has as many as slots
@@ -357,8 +358,8 @@ __device__ V warp_sum(V value) {
   return value;
 }
 
-// Shares the tiles of 32 records evenly among the lanes of their warp: calls f(lane that owns the record, x, y of a tile)
-// for all of them, 32 at a time; idle lanes have owner -1. All lanes take part.
+// Shares the tiles of 32 records evenly among the lanes of their warp: calls f(lane that owns the record, x, y of a
+// tile) for all of them, 32 at a time; idle lanes have owner -1. All lanes take part.
 template <typename F>
 __device__ void for_tiles(const Squares& mine, const F& f) {
   const int lane = threadIdx.x % kWarp, n = mine.count(), end = warp_sum(n);
@@ -388,16 +389,18 @@ class SharedRows {
 
   __device__ void load(const T* rows, int count) const {
     __syncthreads();
-    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) memory_[i / kColumns * kStride + i % kColumns] = rows[i];
+    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) at(i) = rows[i];
     __syncthreads();
   }
   __device__ void store(T* rows, int count) const {
     __syncthreads();
-    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) rows[i] = memory_[i / kColumns * kStride + i % kColumns];
+    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) rows[i] = at(i);
     __syncthreads();
   }
 
  private:
+  __device__ T& at(int i) const { return memory_[i / kColumns * kStride + i % kColumns]; }
+
   T* memory_;
 };
 
@@ -425,13 +428,14 @@ __device__ void project_rows(const Job<T>& job, unsigned char* memory) {
     const bool may_show = good && gaussian.opacity >= T(kMinAlpha);
     for (int64_t image = rows.first_image; image < last; image = job.views[image].next) {
       const View<T>& view = job.views[image];
+      const int64_t pair = job.pair_begin[image] + row - view.row_begin;
       PixelRect bounds{};
       if (may_show) {
         Record<T> record;
         bounds = make_record<T, kTerms>(s, view.camera, gaussian, coefficients, record);
-        if (bounds.x0 < bounds.x1) job.records[job.pair_begin[image] + row - view.row_begin] = record;
+        if (bounds.x0 < bounds.x1) job.records[pair] = record, job.depths[pair] = record.z;
       }
-      if (rows.inside) job.bounds[job.pair_begin[image] + row - view.row_begin] = bounds;
+      if (rows.inside) job.bounds[pair] = bounds;
       uint32_t* counts = job.cursor + image * job.n_tiles;
       for_tiles(squares_of(bounds, kTile), [&](int owner, int x, int y) {
         const uint32_t tile = owner < 0 ? ~0u : static_cast<uint32_t>(y * job.tiles_x + x);
@@ -439,8 +443,7 @@ __device__ void project_rows(const Job<T>& job, unsigned char* memory) {
         if (owner >= 0 && __ffs(same) - 1 == lane) atomicAdd(counts + tile, static_cast<uint32_t>(__popc(same)));
       });
       const uint32_t slots = warp_sum<uint32_t>(squares_of(bounds, kQuarter).count());
-      if (lane == kWarp - 1 && slots)
-        atomicAdd(reinterpret_cast<unsigned long long*>(job.slot_count + image), static_cast<unsigned long long>(slots));
+      if (lane == kWarp - 1 && slots) atomicAdd(job.slot_count + image, static_cast<unsigned long long>(slots));
     }
   }
 }
@@ -469,7 +472,8 @@ __device__ void find_order(const Job<T>& job, int64_t begin, int64_t end) {
   constexpr int kBins = 64, kBinWidth = 64;
   __shared__ uint32_t bins[kBins];
   const auto bin_of = [&](int64_t tile) {
-    return kBins - 1 - min(job.tile_begin[tile + 1] - job.tile_begin[tile], uint32_t{kBins * kBinWidth - 1}) / kBinWidth;
+    const uint32_t length = job.tile_begin[tile + 1] - job.tile_begin[tile];
+    return kBins - 1 - min(length / kBinWidth, uint32_t{kBins - 1});
   };
   const int lane = threadIdx.x % kWarp;
   if (threadIdx.x < kBins) bins[threadIdx.x] = 0;
@@ -547,12 +551,23 @@ __device__ void scatter_rows(const Job<T>& job) {
   const int lane = threadIdx.x % kWarp;
   for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
     const Rows rows(job, chunk);
-    for (int64_t image = rows.first_image; image < group.last; image = job.views[image].next) {
-      const int64_t pair = job.pair_begin[image] + rows.row - job.views[image].row_begin;
-      PixelRect bounds{};
-      if (rows.inside) bounds = job.bounds[pair];
+    // What is known of the next image's pair is fetched while this one's is scattered.
+    int64_t next = rows.first_image, next_pair = 0;
+    PixelRect next_bounds{};
+    T next_z = 0;
+    const auto fetch = [&] {
+      if (next >= group.last) return;
+      next_pair = job.pair_begin[next] + rows.row - job.views[next].row_begin;
+      if (rows.inside) next_bounds = job.bounds[next_pair], next_z = job.depths[next_pair];
+    };
+    fetch();
+    while (next < group.last) {
+      const int64_t image = next, pair = next_pair;
+      const PixelRect bounds = next_bounds;
+      const T z = next_z;
+      next = job.views[next].next;
+      fetch();
       const Squares tiles = squares_of(bounds, kTile), quarters = squares_of(bounds, kQuarter);
-      const T z = bounds.x0 < bounds.x1 ? job.records[pair].z : T(0);
       const int n = group.n_slots(tiles, quarters), end = warp_sum(n);
       if (__all_sync(kFullWarp, tiles.count() == 0)) continue;
       uint32_t slot = 0;

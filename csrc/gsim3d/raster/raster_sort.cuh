@@ -7,8 +7,10 @@
 
 namespace gsim3d::raster {
 
-constexpr int kSortItems = 16;                   // of a thread
-constexpr int kSortRun = kSortItems * kBlock;
+template <typename T>
+constexpr int kSortItems = 256 / sizeof(Entry<T>);  // of a thread
+template <typename T>
+constexpr int kSortRun = kSortItems<T> * kBlock;
 
 template <typename T>
 __device__ __forceinline__ void put_in_order(Entry<T>& a, Entry<T>& b, bool ascending) {
@@ -99,13 +101,13 @@ __device__ void merge_runs(const Entry<T>* from, Entry<T>* to, int64_t n, int64_
 // Leaves the sorted entries in `list` or in `other`; returns which.
 template <typename T>
 __device__ Entry<T>* sort_long(Entry<T>* list, Entry<T>* other, int64_t n, Entry<T>* shared) {
-  for (int64_t i = 0; i < n; i += kSortRun) {
+  for (int64_t i = 0; i < n; i += kSortRun<T>) {
     Entry<T>* run = list + i;
-    sort_run<kSortItems>(run, static_cast<int>(min(n - i, int64_t{kSortRun})), shared,
-                         [run](int place, const Entry<T>& entry) { run[place] = entry; });
+    sort_run<kSortItems<T>>(run, static_cast<int>(min(n - i, int64_t{kSortRun<T>})), shared,
+                            [run](int place, const Entry<T>& entry) { run[place] = entry; });
     __syncthreads();
   }
-  for (int64_t run = kSortRun; run < n; run *= 2) {
+  for (int64_t run = kSortRun<T>; run < n; run *= 2) {
     merge_runs<T>(list, other, n, run);
     Entry<T>* swapped = list;
     list = other, other = swapped;
@@ -145,17 +147,20 @@ __device__ void sort_lists(const Job<T>& job, Entry<T>* shared) {
     const int64_t tile = first + job.order[i];
     const int64_t begin = job.tile_begin[tile], n = job.tile_begin[tile + 1] - begin;
     Entry<T>* list = job.entries + begin;
-    const int length = static_cast<int>(min(n, int64_t{kSortRun} + 1));
-    if (length > kSortRun) {
+    constexpr int kItems = kSortItems<T>;
+    const int length = static_cast<int>(min(n, int64_t{kSortRun<T>} + 1));
+    if (length > kSortRun<T>) {
       const Entry<T>* sorted = sort_long(list, job.spare + begin, n, shared);
       list_quarter(job, tile, n, [sorted](int64_t i) { return sorted[i].word(); });
     } else {
-      if (length > kSortRun / 2)
-        sort_run<kSortItems>(list, length, shared, store);
-      else if (length > kSortRun / 4)
-        sort_run<kSortItems / 2>(list, length, shared, store);
+      if (length > kItems / 2 * kBlock)
+        sort_run<kItems>(list, length, shared, store);
+      else if (length > kItems / 4 * kBlock)
+        sort_run<kItems / 2>(list, length, shared, store);
+      else if (length > kItems / 8 * kBlock)
+        sort_run<kItems / 4>(list, length, shared, store);
       else
-        sort_run<kSortItems / 4>(list, length, shared, store);
+        sort_run<kItems / 8>(list, length, shared, store);
       __syncthreads();
       list_quarter(job, tile, n, [words](int64_t i) { return words[i]; });
     }

@@ -84,10 +84,9 @@ __global__ void __launch_bounds__(kThreads)
                int64_t n_tiles, Sources sources, int64_t pitch, int32_t* list, uint8_t* places, int32_t* counts,
                int32_t* rows) {
   constexpr int kAtOnce = 4;  // pairs of a lane whose loads are in flight together
-  const int64_t unit = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / kWarp;
-  if (unit >= n_tiles * taps) return;
-  const int64_t tile = unit % n_tiles, v0 = tile * kTile;
-  const int32_t tap = static_cast<int32_t>(unit / n_tiles), lane = threadIdx.x % kWarp;
+  const int64_t tile = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / kWarp, v0 = tile * kTile;
+  if (tile >= n_tiles) return;
+  const int32_t tap = blockIdx.y, lane = threadIdx.x % kWarp;
   if (tap == taps / 2) {
     const int64_t end = range_of(sources.cu_voxel_rows, min(v0 + kTile, sources.n_voxels) - 1, sources.n_rows).end;
     for (int64_t i = range_of(sources.cu_voxel_rows, v0, sources.n_rows).begin + lane; i < end; i += kWarp)
@@ -255,7 +254,7 @@ TilePairs pairs_of(const char* op, const SparseConvMap& map, bool transposed, bo
   uint8_t* places = reinterpret_cast<uint8_t*>(sources + taps * pitch);  // at a multiple of 16 bytes, as it is read
   int32_t* counts = sources + taps * pitch + taps * pitch / 4;
   int32_t* rows = counts + taps * n_tiles;
-  launch(op, list_pairs, blocks_for(op, n_tiles * taps, kWarps), kThreads, 0, stream,
+  launch(op, list_pairs, dim3(blocks_for(op, n_tiles, kWarps), static_cast<unsigned>(taps)), kThreads, 0, stream,
          transposed ? map.tap_in : map.tap_out, transposed ? map.tap_out : map.tap_in, map.cu_taps, taps, map.n_pairs,
          n_tiles, sources_of(map, first), pitch, sources, places, counts, rows);
   return {sources, places, counts, rows, static_cast<int32_t>(pitch)};

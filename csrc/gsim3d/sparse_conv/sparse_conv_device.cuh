@@ -134,12 +134,14 @@ __device__ inline int64_t search(const int64_t* values, int64_t low, int64_t hig
   constexpr int kProbes = 16;
   const int lane = threadIdx.x % kWarp;
   while (__any_sync(kFullWarp, low < high)) {
-    const int64_t begin = low, size = high - low;
-    const bool below = size > 0 && values[begin + size * (lane % kProbes + 1) / (kProbes + 1)] < wanted;
+    const int64_t size = high - low, step = (size + kProbes - 1) / kProbes;
+    const auto probe = [&](int i) { return min(low + step * (i + 1), high) - 1; };
+    const bool below = size > 0 && values[probe(lane % kProbes)] < wanted;
     const int n_below = __popc(__ballot_sync(kFullWarp, below) >> (lane / kProbes * kProbes) & 0xffff);
     if (size <= 0) continue;
-    if (n_below > 0) low = begin + size * n_below / (kProbes + 1) + 1;
-    if (n_below < kProbes) high = begin + size * (n_below + 1) / (kProbes + 1);
+    const int64_t begin = n_below > 0 ? probe(n_below - 1) + 1 : low;
+    if (n_below < kProbes) high = probe(n_below);
+    low = begin;
   }
   return low;
 }

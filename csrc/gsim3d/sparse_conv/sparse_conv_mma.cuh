@@ -65,14 +65,24 @@ __device__ __forceinline__ void publish_copies() {
 #endif
 }
 
+// A factor in shared memory: where it starts, in the way that the instructions at hand ask for.
+#ifdef __CUDA_ARCH_FEAT_SM90_ALL
+using Factor = uint64_t;
+__device__ __forceinline__ Factor factor_at(uint32_t address) {
+  constexpr uint64_t kEightRows = 1024 / 16, kPermuted128 = 1;
+  return address / 16 | uint64_t{1} << 16 | kEightRows << 32 | kPermuted128 << 62;
+}
+__device__ __forceinline__ Factor moved(Factor factor, uint32_t bytes) { return factor + bytes / 16; }
+#else
+using Factor = uint32_t;
+__device__ __forceinline__ Factor factor_at(uint32_t address) { return address; }
+__device__ __forceinline__ Factor moved(Factor factor, uint32_t bytes) { return factor + bytes; }
+#endif
+
 #ifdef __CUDA_ARCH_FEAT_SM90_ALL
 // Products of a group of four warps (wgmma), 64 rows by 32 or 64 columns, with both factors in shared memory: rows of
 // 128 bytes whose chunks are permuted as in chunk_offset, from a multiple of 1024 bytes on. A row of memory holds 64
 // steps of the sum for a row (column) of the left (right) factor; with kTurned 64 rows (columns) for a step of the sum.
-__device__ __forceinline__ uint64_t rows_descriptor(uint32_t address) {
-  constexpr uint64_t kEightRows = 1024 / 16, kPermuted128 = 1;
-  return (address & 0x3ffff) / 16 | uint64_t{1} << 16 | kEightRows << 32 | kPermuted128 << 62;
-}
 __device__ __forceinline__ void start_group_products() { asm volatile("wgmma.fence.sync.aligned;" ::: "memory"); }
 __device__ __forceinline__ void close_group_products() {
   asm volatile("wgmma.commit_group.sync.aligned;" ::: "memory");

@@ -76,16 +76,16 @@ template <int kColumns>
 using Sums = float[kColumns / kWarpsAcross / 8][4];
 
 // Queues sums (+)= a b over a stage, whose channels beyond the last are zeros; `first` starts from zero. a and b are
-// the addresses of the 64 rows of a group of four warps, whatever lies in rows that are not used, and of its columns.
+// the 64 rows of a group of four warps, whatever lies in rows that are not used, and its columns.
 // The sums are there after finish_stage.
 template <typename E, int kColumns>
-__device__ __forceinline__ void start_stage(uint32_t a, uint32_t b, bool first, Sums<kColumns>& sums) {
+__device__ __forceinline__ void start_stage(Factor a, Factor b, bool first, Sums<kColumns>& sums) {
 #ifdef __CUDA_ARCH_FEAT_SM90_ALL
   fence_sums(sums);
   start_group_products();
 #pragma unroll
   for (int k = 0; k < kDepth / 16; ++k)
-    multiply_add_group<E, false>(rows_descriptor(a + k * 32), rows_descriptor(b + k * 32), !first || k > 0, sums);
+    multiply_add_group<E, false>(moved(a, k * 32), moved(b, k * 32), !first || k > 0, sums);
   close_group_products();
 #else
   constexpr int kGroups = kColumns / kWarpsAcross / 8, kBytes = sizeof(E);
@@ -276,8 +276,8 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
     close_copies();
   };
 
-  const uint32_t from_a = shared_address(memory.a[0]) + group_row * kRowBytes;
-  const uint32_t from_b = shared_address(memory.b[0]) + column * kRowBytes;
+  const Factor from_a = factor_at(shared_address(memory.a[0]) + group_row * kRowBytes);
+  const Factor from_b = factor_at(shared_address(memory.b[0]) + column * kRowBytes);
   Sums<kColumns> sums;
   if (n_products > 0) look_up();
   for (int stage = 0; stage < kStages - 1; ++stage) copy_next(stage);
@@ -290,7 +290,7 @@ __global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColu
       wait_for_copies<kStages - 2>();
       publish_copies();
       __syncthreads();
-      start_stage<E, kColumns>(from_a + stage * kStageA, from_b + stage * kStageB, k0 == 0, sums);
+      start_stage<E, kColumns>(moved(from_a, stage * kStageA), moved(from_b, stage * kStageB), k0 == 0, sums);
       copy_next(stage == 0 ? kStages - 1 : stage - 1);
       finish_stage<kColumns>(sums);
       last_stage = stage;

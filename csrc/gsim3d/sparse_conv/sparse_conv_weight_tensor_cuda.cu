@@ -34,7 +34,7 @@ struct Sums {
 
 // Queues sums += grads^T inputs over a stage at these addresses. The sums are there after finish_stage.
 template <typename E, int kSide>
-__device__ __forceinline__ void start_stage(uint32_t grads, uint32_t inputs, Sums<kSide>& sums) {
+__device__ __forceinline__ void start_stage(Factor grads, Factor inputs, Sums<kSide>& sums) {
   constexpr int kRowBytes = kHalf * sizeof(E), kHalfBytes = kDepth * kRowBytes;
 #ifdef __CUDA_ARCH_FEAT_SM90_ALL
 #pragma unroll
@@ -44,8 +44,8 @@ __device__ __forceinline__ void start_stage(uint32_t grads, uint32_t inputs, Sum
   for (int k = 0; k < kDepth; k += 16)
 #pragma unroll
     for (int p = 0; p < Sums<kSide>::kParts; ++p)
-      multiply_add_group<E, true>(rows_descriptor(grads + k * kRowBytes),
-                                  rows_descriptor(inputs + p * kHalfBytes + k * kRowBytes), true, sums.values[p]);
+      multiply_add_group<E, true>(moved(grads, k * kRowBytes), moved(inputs, p * kHalfBytes + k * kRowBytes), true,
+                                  sums.values[p]);
   close_group_products();
 #else
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp % 4;
@@ -99,8 +99,8 @@ __global__ void __launch_bounds__(kThreads, 2) multiply_pairs(OuterProducts<E> p
   const uint32_t grads = shared_address(memory.grads), inputs = shared_address(memory.inputs);
   const bool left = co + chunk * 8 < products.c_out, right = ci + chunk * 8 < products.c_in;
   const int32_t left_column = left ? co + chunk * 8 : 0, right_column = right ? ci + chunk * 8 : 0;
-  const uint32_t group_grads = grads + (kSide == kHalf ? 0 : group * kHalfBytes);
-  const uint32_t group_inputs = inputs + (kSide == kHalf ? group * kRowBytes / 2 : 0);
+  const Factor group_grads = factor_at(grads + (kSide == kHalf ? 0 : group * kHalfBytes));
+  const Factor group_inputs = factor_at(inputs + (kSide == kHalf ? group * kRowBytes / 2 : 0));
 
   int32_t n_listed = 0;
   const auto copy_stage = [&](int32_t p0, int stage) {
@@ -132,7 +132,7 @@ __global__ void __launch_bounds__(kThreads, 2) multiply_pairs(OuterProducts<E> p
       wait_for_copies<kStages - 2>();
       publish_copies();
       __syncthreads();
-      start_stage<E, kSide>(group_grads + stage * kStageBytes, group_inputs + stage * kStageBytes, sums);
+      start_stage<E, kSide>(moved(group_grads, stage * kStageBytes), moved(group_inputs, stage * kStageBytes), sums);
       copy_stage(p0 + (kStages - 1) * kDepth, stage == 0 ? kStages - 1 : stage - 1);
       finish_stage<kSide>(sums);
     }
