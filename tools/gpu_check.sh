@@ -60,8 +60,9 @@ pytest_() {
 
 sanitize() {
   local tool="$1" file="$2"
-  GSIM3D_REQUIRE_CUDA=1 PYTORCH_NO_CUDA_MEMORY_CACHING=1 OMP_NUM_THREADS=1 timeout 420 \
-    compute-sanitizer --tool "$tool" --error-exitcode 9 "$PYTHON" -m pytest -q -p no:cacheprovider "$file" -k "cuda and not compile"
+  # Without torch's memory pool every tensor is an allocation that the tool watches; a graph cannot be captured so.
+  GSIM3D_REQUIRE_CUDA=1 PYTORCH_NO_CUDA_MEMORY_CACHING=1 OMP_NUM_THREADS=1 compute-sanitizer --tool "$tool" \
+    --error-exitcode 9 "$PYTHON" -m pytest -q -p no:cacheprovider "$file" -k "cuda and not compile and not graph"
 }
 
 run_build() { step build compile; }

@@ -105,8 +105,8 @@ def restore(path: str | Path, device: str = "cpu") -> Restored:
     """The simulator of a checkpoint (run folder, checkpoint folder or single file), ready to predict on ``device``.
 
     Raises:
-        InputError: the checkpoint is broken or does not fit this version, or ``device`` is "cuda" where gsim3d was built
-            without CUDA or torch finds no GPU; the message says which.
+        InputError: the checkpoint is broken or does not fit this version, or ``device`` is "cuda" where gsim3d was
+            built without CUDA or torch finds no GPU; the message says which.
     """
     check_device(device)
     saved = checkpoint.load(path)
@@ -117,7 +117,8 @@ def restore(path: str | Path, device: str = "cpu") -> Restored:
     if len(image_size) != 2 or not all(isinstance(size, int) for size in image_size):
         raise InputError(f"{path}: data.image_size must be [width, height]; got {list(image_size)}")
     try:
-        simulator = build_simulator(from_dict(ModelConfig, without_old_switches(saved.config["model"]), "model"), seed=0)
+        model = from_dict(ModelConfig, without_old_switches(saved.config["model"]), "model")
+        simulator = build_simulator(model, seed=0)
         settings = from_dict(DataConfig, data, "data")
         spec = EffectsSpec.from_dict(saved.config.get("effects", {}).get("spec"))
     except InputError as error:

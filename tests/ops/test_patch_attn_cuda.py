@@ -11,6 +11,7 @@ from tests.ops.test_patch_attn import DTYPES, RAGGED, cotangent_of, lists, offse
 
 LOW_PRECISION = {torch.bfloat16: "bfloat16", torch.float16: "float16"}
 # (queries, keys): ragged, and patches longer than what a block keeps in shared memory.
+FEW_HEADS, MANY_HEADS = 2, 96  # with many, blocks that own all of a head and a patch fill the GPU
 SHAPES = {"ragged": (RAGGED, 150), "patch": (((1024, 1024),) * 2, 1500), "long": (((1100, 70), (33, 1100)), 1100)}
 
 
@@ -32,13 +33,15 @@ def plain_attention(case, q, k, v):
 @pytest.mark.parametrize("dtype", LOW_PRECISION, ids=LOW_PRECISION.values())
 @pytest.mark.parametrize("scale", [None, -0.6, 4.0])
 @pytest.mark.parametrize(
-    "shape, dim",
-    [("ragged", 8), ("ragged", 16), ("ragged", 32), ("ragged", 48), ("ragged", 64), ("patch", 16), ("patch", 64)]
-    + [("long", dim) for dim in (16, 32, 64, 128)],
+    "shape, dim, heads",
+    [("ragged", dim, FEW_HEADS) for dim in (8, 16, 32, 48, 64)]
+    + [("patch", dim, FEW_HEADS) for dim in (16, 64)]
+    + [("long", dim, FEW_HEADS) for dim in (16, 32, 64, 128)]
+    + [(shape, 16, MANY_HEADS) for shape in SHAPES],
 )
-def test_low_precision_errs_no_more_than_torch(devices, shape, dim, scale, dtype):
+def test_low_precision_errs_no_more_than_torch(devices, shape, dim, heads, scale, dtype):
     """Against float64, at most twice the error of plain torch in the same dtype."""
-    case = low_precision_case(devices, shape, dim=dim, scale=scale, dtype=dtype)
+    case = low_precision_case(devices, shape, heads=heads, dim=dim, scale=scale, dtype=dtype)
     cotangent = cotangent_of(case).to(dtype)
     exact = gradients(lambda *x: plain_attention(case, *x), [x.double() for x in case.inputs], cotangent)
     plain = gradients(lambda *x: plain_attention(case, *x), case.inputs, cotangent)
@@ -47,9 +50,10 @@ def test_low_precision_errs_no_more_than_torch(devices, shape, dim, scale, dtype
 
 
 @pytest.mark.parametrize("dtype", [*DTYPES, *LOW_PRECISION], ids=[*DTYPES.values(), *LOW_PRECISION.values()])
+@pytest.mark.parametrize("heads", [FEW_HEADS, MANY_HEADS])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_cuda_gives_the_same_bits_in_every_run(devices, shape, dtype):
-    case = low_precision_case(devices, shape, dtype=dtype)
+def test_cuda_gives_the_same_bits_in_every_run(devices, shape, heads, dtype):
+    case = low_precision_case(devices, shape, heads=heads, dtype=dtype)
     first = gradients(case.attend, case.inputs, cotangent_of(case))
     for _ in range(3):
         for a, e in zip(gradients(case.attend, case.inputs, cotangent_of(case)), first, strict=True):
@@ -57,13 +61,17 @@ def test_cuda_gives_the_same_bits_in_every_run(devices, shape, dtype):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, *LOW_PRECISION], ids=["float32", *LOW_PRECISION.values()])
-@pytest.mark.parametrize("dim", [16, 32, 48])
-def test_cuda_skips_rows_out_of_range(devices, dim, dtype):
-    case = random_case(((70, 90), (20, 33)), dim=dim, n_keys=100, spare=0, dtype=dtype)
+@pytest.mark.parametrize("dim, heads", [(16, FEW_HEADS), (16, MANY_HEADS), (32, FEW_HEADS), (48, FEW_HEADS)])
+def test_cuda_skips_rows_out_of_range(devices, dim, heads, dtype):
+    case = random_case(((70, 90), (20, 33)), heads=heads, dim=dim, n_keys=100, spare=0, dtype=dtype)
     q_rows, kv_rows, cu_q, cu_k = lists(case.table)
     bad_q, bad_k = torch.arange(90) % 7 == 3, torch.arange(123) % 5 == 2
-    kept = [offsets(part.sum() for part in (~bad).split(cu.diff().tolist())) for bad, cu in ((bad_q, cu_q), (bad_k, cu_k))]
-    short = dataclasses.replace(case, table=PatchTable(q_rows[~bad_q], kv_rows[~bad_k], *kept)).to(devices[1])
+
+    def kept(bad, cu):
+        return offsets(part.sum() for part in (~bad).split(cu.diff().tolist()))
+
+    table = PatchTable(q_rows[~bad_q], kv_rows[~bad_k], kept(bad_q, cu_q), kept(bad_k, cu_k))
+    short = dataclasses.replace(case, table=table).to(devices[1])
     wrong_q = torch.where(bad_q, torch.tensor([-1, 90, 2**40])[torch.arange(90) % 3], q_rows)
     wrong_k = torch.where(bad_k, torch.tensor([-(2**40), 100, -1])[torch.arange(123) % 3], kv_rows)
     wrong = dataclasses.replace(case, table=PatchTable(wrong_q, wrong_k, cu_q, cu_k)).to(devices[1])
@@ -83,9 +91,10 @@ def test_cuda_stays_inside_its_memory_for_any_offsets(devices):
             assert torch.isfinite(out).all()
 
 
-def test_slots_that_no_patch_takes(devices):
+@pytest.mark.parametrize("heads", [FEW_HEADS, MANY_HEADS])
+def test_slots_that_no_patch_takes(devices, heads):
     """As with tables of fixed size: lists are longer than the patches, and all rows are listed."""
-    case = random_case(((70, 90), (20, 33)), n_keys=200, spare=10, dtype=torch.bfloat16)
+    case = random_case(((70, 90), (20, 33)), heads=heads, n_keys=200, spare=10, dtype=torch.bfloat16)
     unlisted = torch.tensor(sorted({*range(100)} - {*case.table.q_rows.tolist()}))
     q_rows, kv_rows = torch.cat([case.table.q_rows, unlisted]), torch.cat([case.table.kv_rows, torch.arange(200)])
     longer = dataclasses.replace(case, table=dataclasses.replace(case.table, q_rows=q_rows, kv_rows=kv_rows))
@@ -97,16 +106,20 @@ def test_slots_that_no_patch_takes(devices):
 
 
 @pytest.mark.parametrize("dtype", LOW_PRECISION, ids=LOW_PRECISION.values())
-@pytest.mark.parametrize("dim", [16, 32, 64])
-@pytest.mark.parametrize("factor", [30.0, 1e3, 1e4])
-def test_low_precision_with_huge_logits(devices, factor, dim, dtype):
+@pytest.mark.parametrize("dim, heads", [(16, FEW_HEADS), (16, MANY_HEADS), (32, FEW_HEADS), (64, FEW_HEADS)])
+@pytest.mark.parametrize("factor", [30.0, 1e3])
+def test_low_precision_with_huge_logits(devices, factor, dim, heads, dtype):
     """Sharp weights, up to one-hot: right where they are decided, finite everywhere."""
-    case = random_case(RAGGED + ((40, 600),), n_keys=600, dim=dim, dtype=dtype)
+    case = random_case(RAGGED + ((40, 600),), n_keys=600, heads=heads, dim=dim, dtype=dtype)
     case = dataclasses.replace(case, q=case.q * factor).to(devices[1])
-    results = gradients(case.attend, case.inputs, cotangent_of(case))
+    cotangent = cotangent_of(case).to(dtype)
+    results = gradients(case.attend, case.inputs, cotangent)
     assert all(torch.isfinite(x).all() for x in results)
-    exact = plain_attention(case, *(x.double() for x in case.inputs))
-    assert_close_relative_to_max(results[0], exact, {torch.bfloat16: 1e-2, torch.float16: 5e-3}[dtype])
+    exact = gradients(lambda *x: plain_attention(case, *x), [x.double() for x in case.inputs], cotangent)
+    for name, a, e in zip("oqkv", results, exact, strict=True):
+        # Differences of logits near 1e4 carry the rounding of float32 into the weights of near ties.
+        limit = {torch.bfloat16: 2e-2, torch.float16: 1e-2}[dtype] * (1 if name in "ov" else 10)
+        assert_close_relative_to_max(a, e, limit, name)
 
 
 def test_bfloat16_at_the_ends_of_its_range(devices):
@@ -119,8 +132,9 @@ def test_bfloat16_at_the_ends_of_its_range(devices):
 
 @pytest.mark.parametrize("poison", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("which", range(3), ids=("q", "k", "v"))
-def test_low_precision_poison_reaches_its_patch_alone(devices, which, poison):
-    case = self_case((70, 33, 66), dtype=torch.bfloat16).to(devices[1])
+@pytest.mark.parametrize("heads", [FEW_HEADS, MANY_HEADS])
+def test_low_precision_poison_reaches_its_patch_alone(devices, heads, which, poison):
+    case = self_case((70, 33, 66), heads=heads, dtype=torch.bfloat16).to(devices[1])
     clean = gradients(case.attend, case.inputs, cotangent_of(case))
     inputs = [x.clone() for x in case.inputs]
     inputs[which][case.table.q_rows[72], 1, 3] = poison
@@ -134,14 +148,19 @@ def test_low_precision_poison_reaches_its_patch_alone(devices, which, poison):
         assert not torch.isfinite(dirty[0][reached, 1]).all(1).any()
 
 
+def shifted(x):
+    """Not aligned to 16 bytes."""
+    return torch.cat([x.flatten()[:1], x.flatten()])[1:].view(x.shape)
+
+
 @pytest.mark.parametrize("dtype", LOW_PRECISION, ids=LOW_PRECISION.values())
 def test_low_precision_views_of_one_tensor(devices, dtype):
     for dim in (16, 20):
         case = self_case((70, 30, 9), dim=dim, dtype=dtype).to(devices[1])
         expected = gradients(case.attend, case.inputs, cotangent_of(case))
-        shifted = lambda x: torch.cat([x.flatten()[:1], x.flatten()])[1:].view(x.shape)  # not aligned to 16 bytes
         for place in (lambda x: x, shifted):
-            results = gradients(lambda x: case.attend(*place(x).unbind(1)), [torch.stack(case.inputs, 1)], cotangent_of(case))
+            qkv = torch.stack(case.inputs, 1)
+            results = gradients(lambda x: case.attend(*place(x).unbind(1)), [qkv], cotangent_of(case))
             assert_close_relative_to_max(results[0], expected[0], 1e-2)
             assert_close_relative_to_max(results[1], torch.stack(expected[1:], 1), 1e-2)
 

@@ -240,7 +240,7 @@ def test_what_does_not_fit_is_named(folder, tmp_path):
     with pytest.raises(InputError, match="too few cameras for 5 context views"):
         data = DataConfig(context_views=5, target_only_cameras=(0,))
         Trainer(TrainConfig(stages=CONFIG.stages, data=data), scenes(folder), tmp_path)
-    with pytest.raises(InputError, match="camera 77 does not exist"):
+    with pytest.raises(InputError, match="camera 77 of data.target_only_cameras does not exist"):
         data = DataConfig(context_views=1, target_only_cameras=(77,))
         Trainer(TrainConfig(stages=CONFIG.stages, data=data), scenes(folder), tmp_path)
     with pytest.raises(InputError, match="5 steps, but this model sees up to 2"):

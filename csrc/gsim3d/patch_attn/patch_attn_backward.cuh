@@ -33,6 +33,12 @@ struct Backward {
   KeyGradients<T> key_gradients;
 };
 
+// Head dim 16 in one kernel; takes as long for few patches and heads as for one on each multiprocessor. Needs shared
+// memory that not every GPU has.
+bool fits_fused_backward(Stream stream);
+template <typename T>
+void fused_backward(Backward<T> args, const Workspace& workspace, Stream stream);
+
 // Numbers of the queries of a tile, in shared memory.
 struct TileNumbers {
   const float* shift;         // [rows]

@@ -122,7 +122,7 @@ void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const He
                                           uses.count_less_one};
   bool done = false;
   if constexpr (sizeof(T) == 2)
-    if (fits_tensor_cores<T>(size, grad, q, k, v)) {
+    if (fits_tensor_cores<T>(size, grad, q, k, v, HeadRows<T>{out, size.heads * size.dim, size.dim})) {
       tensor_backward(device(grad), device(q), device(k), device(v), device(out), stats, table, size, device(grads[0]),
                       gradients, workspace, stream);
       done = true;

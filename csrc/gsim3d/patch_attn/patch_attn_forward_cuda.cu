@@ -22,6 +22,7 @@ struct Shape {
   static constexpr int kGroup = kWarps * 16 * kRowTiles;     // queries of a block at a time
   static constexpr int kTileRows = 16384 / D;                // keys in shared memory
   static constexpr int kTileBytes = kTileRows * D * 2;
+  static constexpr int kParts = 4, kPartRows = kTileRows / kParts;  // work starts when a part has arrived
   static constexpr size_t kSharedBytes = 2 * kTileBytes + kTileRows;
 };
 
@@ -78,14 +79,14 @@ class Warp {
     return __all_sync(kFullWarp, good);
   }
 
-  __device__ __forceinline__ void fast_steps(int n_steps) {
+  __device__ __forceinline__ void fast_steps(int begin, int end) {
     float shift[M][2];
 #pragma unroll
     for (int m = 0; m < M; ++m)
 #pragma unroll
       for (int h = 0; h < 2; ++h) shift[m][h] = -largest_[m][h] * slope_;
 #pragma unroll 2
-    for (int step = 0; step < n_steps; ++step) {
+    for (int step = begin; step < end; ++step) {
       float s[M][2][4];
       find_scores(step, s);
       uint32_t p[M][4];
@@ -205,17 +206,20 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
     const int64_t n_keys = k_range.end - k_range.begin, n_tiles = (n_keys + S::kTileRows - 1) / S::kTileRows;
     if (n_tiles == 0) continue;
 
-    // Brings a tile to shared memory; whether all its keys take part.
+    // Queues the copies of a tile; whether all its keys take part.
     const auto tile_size = [&](int64_t tile) {
       return static_cast<int>(min(n_keys - tile * S::kTileRows, int64_t{S::kTileRows}));
     };
     const auto load_tile = [&](int64_t tile) {
       const int64_t* rows = table.kv_rows + k_range.begin + tile * S::kTileRows;
       const int n = tile_size(tile);
+      bool all_valid = true;
       __syncthreads();
-      const bool all_valid =
-          copy_tiles<D, kThreads>({args.k, args.v}, rows, n, table.n_k, share.head, {keys, values}, valid);
-      wait_for_copies();
+      for (int r = 0; r < S::kTileRows; r += S::kPartRows) {
+        const uint32_t offset = r * D * sizeof(T);
+        all_valid &= copy_tiles<D, kThreads>({args.k, args.v}, rows + r, min(n - r, S::kPartRows), table.n_k,
+                                             share.head, {keys + offset, values + offset}, valid + r);
+      }
       return __syncthreads_and(all_valid) != 0;
     };
 
@@ -229,20 +233,30 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
       warp.reset();
       bool good = true;
       for (int64_t tile = 0; tile < n_tiles; ++tile) {
-        if (n_tiles > 1 || !loaded) plain = load_tile(tile);
+        const bool fresh = n_tiles > 1 || !loaded;
+        if (fresh) plain = load_tile(tile);
         loaded = true;
-        if (!active) continue;
-        const int n = tile_size(tile);
-        good = good && plain && (tile > 0 || n < kStep || warp.start_fast());
-        if (!good) continue;
-        warp.fast_steps(n / kStep);
-        if (n % kStep != 0) warp.careful_step(n / kStep);
+        const int n = tile_size(tile), part_steps = (fresh ? S::kPartRows : S::kTileRows) / kStep;
+        for (int part = 0; part < (fresh ? S::kParts : 1); ++part) {
+          if (fresh) {
+            wait_for_copies(S::kParts - 1 - part);
+            __syncthreads();
+          }
+          if (!active) continue;
+          if (part == 0) good = good && plain && (tile > 0 || n < kStep || warp.start_fast());
+          if (good) warp.fast_steps(part * part_steps, min((part + 1) * part_steps, n / kStep));
+        }
+        if (active && good && n % kStep != 0) warp.careful_step(n / kStep);
       }
       if (active) good = good && warp.is_good();
       if (n_tiles > 1 ? __syncthreads_or(!good) : !good) {
         if (!good) warp.reset();
         for (int64_t tile = 0; tile < n_tiles; ++tile) {
-          if (n_tiles > 1) load_tile(tile);
+          if (n_tiles > 1) {
+            load_tile(tile);
+            wait_for_copies();
+            __syncthreads();
+          }
           if (!good)
             for (int step = 0; step * kStep < tile_size(tile); ++step) warp.careful_step(step);
         }

@@ -44,6 +44,13 @@ __device__ __forceinline__ void load_matrices(uint32_t (&r)[4], uint32_t shared_
                  : "memory");
 }
 
+// An 8 x 8 matrix of 16-bit numbers, a pair of a row in each lane as above, becomes its transpose.
+__device__ __forceinline__ uint32_t transpose_matrix(uint32_t pair) {
+  uint32_t r;
+  asm volatile("movmatrix.sync.aligned.m8n8.trans.b16 %0, %1;" : "=r"(r) : "r"(pair));
+  return r;
+}
+
 __device__ __forceinline__ uint32_t shared_address(const void* at) {
   return static_cast<uint32_t>(__cvta_generic_to_shared(at));
 }
@@ -54,8 +61,14 @@ __device__ __forceinline__ void copy_async(uint32_t to, const void* from, bool w
                "r"(wanted ? 16 : 0)
                : "memory");
 }
-__device__ __forceinline__ void wait_for_copies() {
-  asm volatile("cp.async.commit_group;\ncp.async.wait_group 0;" ::: "memory");
+// Copies queued since the last call are one group; wait_for_copies waits until at most `left` groups (0 to 3) are on
+// their way.
+__device__ __forceinline__ void commit_copies() { asm volatile("cp.async.commit_group;" ::: "memory"); }
+__device__ __forceinline__ void wait_for_copies(int left = 0) {
+  if (left == 3) asm volatile("cp.async.wait_group 3;" ::: "memory");
+  else if (left == 2) asm volatile("cp.async.wait_group 2;" ::: "memory");
+  else if (left == 1) asm volatile("cp.async.wait_group 1;" ::: "memory");
+  else asm volatile("cp.async.wait_group 0;" ::: "memory");
 }
 
 // Two numbers rounded to T in one register, the first in the low half. What float16 cannot hold becomes infinite, or

@@ -30,7 +30,7 @@ struct TileLayout {
   }
 };
 
-// Queues copies of the listed rows of one head of two matrices into two tiles; rows beyond n up to the next multiple of
+// Queues a group of copies: the listed rows of one head of two matrices into two tiles; rows beyond n up to the next multiple of
 // kStep, and rows outside [0, n_rows), become 0. Where `valid` is given, it gets a byte for each row: whether it takes
 // part. Returns whether all n rows that this thread saw do.
 template <int D, int kThreads, typename T>
@@ -54,6 +54,7 @@ __device__ __forceinline__ bool copy_tiles(const HeadRows<T> (&x)[2], const int6
     all = all && (wanted || r >= n);
     to += kRowsAtOnce * D * sizeof(T);
   }
+  commit_copies();
   return all;
 }
 
