@@ -251,6 +251,10 @@ def test_malformed_arguments_of_unpool_raise():
         unpool(torch.zeros(3, 2), rows, cu_rows, 3)
     with pytest.raises(ValueError, match="unpool: rows must list each of the N=1 rows at most once"):
         unpool(torch.zeros(2, 2), rows, cu_rows, 1)
+    with pytest.raises(ValueError, match="unpool: rows must list a row at most once; got 1 again at 1"):
+        unpool(torch.zeros(2, 2), torch.tensor([1, 1]), cu_rows, 3)
+    with pytest.raises(ValueError, match=r"unpool: rows must be in \[0, N\) with N=3; got 7 at 0"):
+        unpool(torch.zeros(2, 2), torch.tensor([7, 1]), cu_rows, 3)
     with pytest.raises(ValueError, match="unpool: n_rows must not be negative; got -1"):
         unpool(torch.zeros(0, 2), rows[:0], cu_rows[:1], -1)
 
