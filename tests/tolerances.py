@@ -15,6 +15,7 @@ class Tolerance:
 
 
 EPYC = "AMD EPYC (Zen 4), torch 2.13 CPU"
+H200 = "NVIDIA H200, torch 2.11"
 
 TOLERANCES = {
     "generate_binding": Tolerance(1e-6, 1e-7, EPYC, "metres; MuJoCo stores the rest lattice in float32"),
@@ -43,13 +44,28 @@ TOLERANCES = {
     "raster_float64": Tolerance(2e-13, 1.5e-14, EPYC, "as raster_float32, in float64"),
     "raster_many_float32": Tolerance(1e-5, 6.5e-7, EPYC, "thousands of layers in one pixel"),
     "raster_many_float64": Tolerance(1e-13, 1.7e-15, EPYC, "thousands of layers in one pixel"),
+    "raster_many_grad_float32": Tolerance(5e-4, 1.3e-4, EPYC, "as raster_many_float32; all of it comes from two of the layers"),
+    "raster_many_grad_float64": Tolerance(1e-12, 1.9e-13, EPYC, "as raster_many_grad_float32, in float64"),
     "raster_needle_float32": Tolerance(1e-5, 1.6e-6, EPYC, "long thin Gaussians: the projected covariance is nearly singular"),
+    "raster_needle_float64": Tolerance(1e-11, 1.9e-12, EPYC, "as raster_needle_float32, in float64"),
+    "raster_needle_grad_float32": Tolerance(1e-2, 2e-3, EPYC, "30 m long, 1 um thick: the determinant is a difference"),
+    "raster_needle_grad_float64": Tolerance(3e-11, 5.9e-12, EPYC, "as raster_needle_grad_float32, in float64"),
     "raster_grad_float32": Tolerance(3e-5, 6.3e-6, EPYC, "gradients of up to 60 layers, float32 against float64"),
     "raster_golden": Tolerance(1e-5, 7.0e-7, EPYC, "float64 on both sides, some published camera constants float32"),
     "raster_golden_float32": Tolerance(1e-4, 8.2e-6, EPYC, "float32 on both sides, advised by the notes of the tensors"),
     "raster_grad_float64": Tolerance(2e-13, 1.1e-14, EPYC, "as raster_grad_float32, in float64"),
     "sparse_conv_float32": Tolerance(5e-6, 1.6e-6, EPYC, "float32 chains of up to 125 taps x 17 channels against float64"),
     "sparse_conv_float64": Tolerance(2e-14, 3.3e-15, EPYC, "float64 chains in another order than the oracle's"),
+    "sparse_conv_tf32": Tolerance(2e-3, 0.0, H200, "as sparse_conv_float32, products of 11 bits"),
+    "sparse_conv_bf16": Tolerance(2e-2, 0.0, H200, "as sparse_conv_float32, numbers of 8 bits"),
+    "network_float64": Tolerance(1e-13, 0.0, EPYC, "a step of the dynamics network against the same on the CPU in float64"),
+    "network_float32": Tolerance(1e-5, 0.0, EPYC, "as network_float64"),
+    "network_tf32": Tolerance(1e-2, 0.0, H200, "as network_float64"),
+    "network_bf16": Tolerance(5e-2, 0.0, H200, "as network_float64"),
+    "network_grad_float64": Tolerance(1e-13, 0.0, EPYC, "gradients of the same"),
+    "network_grad_float32": Tolerance(1e-4, 0.0, EPYC, "gradients of the same"),
+    "network_grad_tf32": Tolerance(5e-2, 0.0, H200, "gradients of the same"),
+    "network_grad_bf16": Tolerance(3e-1, 0.0, H200, "gradients of the same"),
     "golden_float32": Tolerance(1e-5, 1e-6, EPYC, "float32 against float32 of the published model, advised by its notes"),
     "half_attention_golden": Tolerance(5e-4, 1.4e-4, EPYC, "half precision against float32 as advised; either way where a value lies between halves"),
     "encoder_golden": Tolerance(1e-4, 9.2e-6, EPYC, "a deep float32 network; published runs differ by 1e-5 among themselves"),
