@@ -21,6 +21,7 @@ from gsim3d.harmonics import (
 from gsim3d.layers import RowLinear
 from gsim3d.ops.raster import Rendering
 from gsim3d.quirks import Quirks
+from gsim3d.stability import OnBad, StabilityReport
 from gsim3d.types import Cameras, Gaussians, Particles
 
 NEAR_PLANE = 0.01  # metres; what is nearer to a camera is not drawn
@@ -101,6 +102,8 @@ def render(
     *,
     near_plane: float = NEAR_PLANE,
     cutoff: str = "exact",
+    on_bad: OnBad = "raise",
+    report: StabilityReport | None = None,
 ) -> Rendering:
     """Images of ``cameras``; camera i shows cloud ``cameras.image_cloud[i]`` of ``gaussians``.
 
@@ -117,6 +120,8 @@ def render(
         cu_rows=gaussians.cu_rows,
         near_plane=near_plane,
         cutoff=cutoff,
+        on_bad=on_bad,
+        report=report,
     )
 
 

@@ -9,9 +9,9 @@ ROOT = Path(__file__).parent.parent
 # Each room may import the rooms before it (and its own), never one after it.
 ROOMS = [
     {"errors", "quirks"},
-    {"types"},
+    {"types", "stability"},
     {"ops", "effects", "harmonics"},
-    {"layers"},
+    {"layers", "guards"},
     {"encoder", "dynamics", "renderer"},
     {"presets"},
     {"simulator"},

@@ -10,7 +10,7 @@ from gsim3d.dynamics.clouds import concatenate, newest_clouds
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.point_transformer import PointTransformer
 from gsim3d.dynamics.state import StateLayout
-from gsim3d.types import CloudTable, Particles, constant, take_runs
+from gsim3d.types import ASLEEP, CloudTable, Particles, constant, take_runs
 
 
 class Dynamics(nn.Module):
@@ -18,8 +18,8 @@ class Dynamics(nn.Module):
 
     The network reads all steps of a history at once; each row of the newest step gets an increment. Steps are counted
     back from the newest, so one model serves any history of 1 to ``2 ** config.history_bits`` steps. Scenes do not change
-    each other (in training with ``norm="batch"`` they do). Rows outside the 2^16 cells from the scene's origin, or not
-    finite, sleep: they keep their state and nobody sees them.
+    each other (in training with ``norm="batch"`` they do). Rows that are asleep, outside the 2^16 cells from the scene's
+    origin, or at no finite place, keep their state and nobody sees them.
     """
 
     def __init__(self, config: DynamicsConfig):
@@ -45,7 +45,7 @@ class Dynamics(nn.Module):
         slots, history_bits = self._slots(clouds, newest)
         curves = self._draw_curves(generator) if self.training and self.config.shuffle_orders else None
         pyramid = ops.build_pyramid(
-            history.means,
+            _places(history),
             history.cu_rows,
             history.cloud_scene,
             constant(slots, history.cu_rows.device),
@@ -103,6 +103,11 @@ class Dynamics(nn.Module):
             tuple(torch.randperm(4, generator=generator, device=generator.device).tolist())
             for _ in range(self.config.n_stages)
         )
+
+
+def _places(particles: Particles) -> Tensor:
+    """[N, 3] positions of the rows that the network sees; NaN, which it leaves out, of those asleep."""
+    return torch.where((particles.activity == ASLEEP)[:, None], torch.nan, particles.means.detach())
 
 
 def take_rows(x: Tensor, rows: Tensor) -> Tensor:

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from gsim3d.errors import HardCaseError
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.stability import ACTIONS, Finding, OnBad, StabilityReport, check_on_bad
 from gsim3d.types import Cameras
 
+MAX = torch.finfo(torch.float32).max
 CUTOFFS = {"exact": 0, "tile3sigma": 1, "smooth": 2}
 _BAD_ROW = re.compile(r"must be finite|must be in \[0, 1\]|must not be negative|projection overflows")
 
@@ -45,6 +47,8 @@ def rasterize_gaussians(
     cu_rows: Tensor | None = None,
     near_plane: float = 0.01,
     cutoff: str = "exact",
+    on_bad: OnBad = "raise",
+    report: StabilityReport | None = None,
 ) -> Rendering:
     """Renders clouds of 3D Gaussians into pinhole images.
 
@@ -106,6 +110,12 @@ def rasterize_gaussians(
     if color.dim() != dims:
         name, wanted = ("sh", "[N, K, 3]") if colors is None else ("colors", "[N, 3]")
         raise ValueError(f"rasterize_gaussians: {name} must be {wanted}; got {list(color.shape)}")
+    check_on_bad(on_bad)
+    if on_bad != "raise":
+        rows = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "color": color}
+        rows = _mended(rows if features is None else {**rows, "features": features}, on_bad, report)
+        means, quats, scales, opacities, color = list(rows.values())[:5]
+        features = rows.get("features")
     n_images = cameras.viewmats.shape[0]
     real = torch.float64 if means.dtype == torch.float64 else torch.float32
     if background is None:
@@ -143,6 +153,27 @@ def _named_errors(args):
         if _BAD_ROW.search(str(error)):
             raise HardCaseError(str(error).splitlines()[0]) from None
         raise
+
+
+def _mended(rows: dict[str, Tensor], on_bad: OnBad, report: StabilityReport | None) -> dict[str, Tensor]:
+    mended, n = {}, rows["means"].shape[0]
+    bad = torch.zeros(n, dtype=torch.bool, device=rows["means"].device)
+    for name, value in rows.items():
+        low = 0.0 if name in ("opacities", "scales") else -MAX
+        high = 1.0 if name == "opacities" else MAX
+        good = (value >= low) & (value <= high)
+        wrong = ~good.reshape(n, -1).all(1)
+        bad |= wrong
+        neutral = torch.zeros_like(value)
+        if name == "quats":
+            neutral[:, 0] = 1
+        mended[name] = torch.where(good if on_bad == "clamp" else good.reshape(n, -1).all(1).reshape(-1, *[1] * (value.dim() - 1)), value, value.nan_to_num(0.0).clamp(low, high) if on_bad == "clamp" and name != "quats" else neutral)
+        if report is not None and bool(wrong.any()):
+            row = int(wrong.nonzero()[0])
+            report.add(Finding("cannot be used", "rasterize_gaussians", name, ACTIONS[on_bad], int(wrong.sum()), row))
+    if on_bad == "drop":
+        mended["opacities"] = torch.where(bad, 0.0, mended["opacities"])
+    return mended
 
 
 def _tiles(n_images, width, height):

@@ -1,7 +1,4 @@
 // Patch attention on a GPU: which kernels run, and gradients of rows that several slots list.
-#include <cuda_bf16.h>
-#include <cuda_fp16.h>
-
 #include "gsim3d/patch_attn/patch_attn_simple.h"
 #include "gsim3d/patch_attn/patch_attn_tensor.h"
 
@@ -11,31 +8,16 @@ namespace {
 constexpr int kThreads = 256;
 
 template <typename T>
-struct DeviceTypeOf {
-  using Type = T;
-};
-template <>
-struct DeviceTypeOf<Float16> {
-  using Type = __half;
-};
-template <>
-struct DeviceTypeOf<BFloat16> {
-  using Type = __nv_bfloat16;
-};
-template <typename T>
-using Device = typename DeviceTypeOf<T>::Type;
-
-template <typename T>
-HeadRows<Device<T>> device(const HeadRows<T>& x) {
-  return {reinterpret_cast<const Device<T>*>(x.data), x.row_stride, x.head_stride};
+HeadRows<Native<T>> device(const HeadRows<T>& x) {
+  return {reinterpret_cast<const Native<T>*>(x.data), x.row_stride, x.head_stride};
 }
 template <typename T>
-Device<T>* device(T* x) {
-  return reinterpret_cast<Device<T>*>(x);
+Native<T>* device(T* x) {
+  return reinterpret_cast<Native<T>*>(x);
 }
 template <typename T>
-const Device<T>* device(const T* x) {
-  return reinterpret_cast<const Device<T>*>(x);
+const Native<T>* device(const T* x) {
+  return reinterpret_cast<const Native<T>*>(x);
 }
 
 // Copies of 16 bytes need rows that start at multiples of it.
@@ -63,7 +45,7 @@ __global__ void uses_kernel(PatchTable table, RowUses uses) {
 // A warp looks at 32 rows and works on those that no slot or several slots list.
 template <typename T>
 __global__ void finish_kernel(PatchTable table, AttentionSize size, RowUses uses, KeyGradients<T> gradients) {
-  using C = Wide<T>;
+  using C = Sum<T>;
   const int lane = threadIdx.x % kWarp;
   const int64_t first = (static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x) / kWarp * kWarp;
   const int mine = first + lane < table.n_k ? uses.count_less_one[first + lane] : 0;
@@ -116,8 +98,8 @@ void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const He
   check_cuda(cudaMemsetAsync(use_memory, 0xff, use_bytes, native(stream)), op);
   launch(op, uses_kernel, blocks_for(op, table.n_k_listed, kThreads), kThreads, 0, stream, table, uses);
 
-  using C = Wide<Device<T>>;
-  const KeyGradients<Device<T>> gradients{device(grads[1]), device(grads[2]),
+  using C = Sum<Native<T>>;
+  const KeyGradients<Native<T>> gradients{device(grads[1]), device(grads[2]),
                                           workspace.take<C>(table.n_k_listed * size.heads * 2 * size.dim),
                                           uses.count_less_one};
   bool done = false;
@@ -130,7 +112,7 @@ void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const He
   if (!done)
     simple_backward(device(grad), device(q), device(k), device(v), device(out), stats, table, size, device(grads[0]),
                     gradients, workspace, stream);
-  launch(op, finish_kernel<Device<T>>, blocks_for(op, table.n_k, kThreads), kThreads, 0, stream, table, size, uses,
+  launch(op, finish_kernel<Native<T>>, blocks_for(op, table.n_k, kThreads), kThreads, 0, stream, table, size, uses,
          gradients);
 }
 

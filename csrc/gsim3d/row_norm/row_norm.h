@@ -43,25 +43,13 @@ void row_norm_vjp(const T* grad, const T* x, const T* weight, const T* stats, Ro
 // The same on the device of `stream`. In and Out are float or a 16-bit format, computed in float; or both double.
 namespace cuda {
 
-// The type that weights, stats and sums have.
-template <typename T>
-struct RowNormCompute {
-  using Type = float;
-};
-template <>
-struct RowNormCompute<double> {
-  using Type = double;
-};
-template <typename T>
-using RowNormSum = typename RowNormCompute<T>::Type;
+template <typename In, typename Out>
+void row_norm(const In* x, const Sum<In>* weight, const Sum<In>* bias, const Out* residual,
+              RowNormShape shape, double eps, Out* out, Sum<In>* stats, Stream stream);
 
 template <typename In, typename Out>
-void row_norm(const In* x, const RowNormSum<In>* weight, const RowNormSum<In>* bias, const Out* residual,
-              RowNormShape shape, double eps, Out* out, RowNormSum<In>* stats, Stream stream);
-
-template <typename In, typename Out>
-void row_norm_vjp(const Out* grad, const In* x, const RowNormSum<In>* weight, const RowNormSum<In>* stats,
-                  RowNormShape shape, In* grad_x, RowNormSum<In>* grad_weight, RowNormSum<In>* grad_bias,
+void row_norm_vjp(const Out* grad, const In* x, const Sum<In>* weight, const Sum<In>* stats,
+                  RowNormShape shape, In* grad_x, Sum<In>* grad_weight, Sum<In>* grad_bias,
                   const Workspace& workspace, Stream stream);
 
 }  // namespace cuda

@@ -83,10 +83,10 @@ __device__ __forceinline__ S group_sum(S x) {
 
 template <typename In, typename Out, int kGroup, int kPacks, bool kExact>
 __global__ void __launch_bounds__(kThreads)
-    forward_kernel(const In* __restrict__ x, const RowNormSum<In>* __restrict__ weight,
-                   const RowNormSum<In>* __restrict__ bias, const Out* __restrict__ residual, RowNormShape shape,
-                   RowNormSum<In> eps, Out* __restrict__ out, RowNormSum<In>* __restrict__ stats) {
-  using S = RowNormSum<In>;
+    forward_kernel(const In* __restrict__ x, const Sum<In>* __restrict__ weight,
+                   const Sum<In>* __restrict__ bias, const Out* __restrict__ residual, RowNormShape shape,
+                   Sum<In> eps, Out* __restrict__ out, Sum<In>* __restrict__ stats) {
+  using S = Sum<In>;
   using Rows = Layout<kGroup, kPacks, kExact>;
   const int lane = threadIdx.x % kGroup, channels = static_cast<int>(shape.channels);
   const int64_t owned = static_cast<int64_t>(blockIdx.x) * (kThreads / kGroup) + threadIdx.x / kGroup;
@@ -134,10 +134,10 @@ __global__ void __launch_bounds__(kThreads)
 // [blocks, 2, channels]: sums of this block's rows, groups added in order.
 template <typename In, typename Out, int kGroup, int kPacks, bool kExact>
 __global__ void __launch_bounds__(kThreads)
-    backward_kernel(const Out* __restrict__ grad, const In* __restrict__ x, const RowNormSum<In>* __restrict__ weight,
-                    const RowNormSum<In>* __restrict__ stats, RowNormShape shape, In* __restrict__ grad_x,
-                    RowNormSum<In>* __restrict__ partial) {
-  using S = RowNormSum<In>;
+    backward_kernel(const Out* __restrict__ grad, const In* __restrict__ x, const Sum<In>* __restrict__ weight,
+                    const Sum<In>* __restrict__ stats, RowNormShape shape, In* __restrict__ grad_x,
+                    Sum<In>* __restrict__ partial) {
+  using S = Sum<In>;
   using Rows = Layout<kGroup, kPacks, kExact>;
   constexpr int kGroups = kThreads / kGroup, kWidth = kGroup * kPacks * kVector;
   extern __shared__ __align__(16) unsigned char shared[];
@@ -234,8 +234,8 @@ bool aligned(const Pointers*... pointers) {
 }  // namespace
 
 template <typename In, typename Out>
-void row_norm(const In* x, const RowNormSum<In>* weight, const RowNormSum<In>* bias, const Out* residual,
-              RowNormShape shape, double eps, Out* out, RowNormSum<In>* stats, Stream stream) {
+void row_norm(const In* x, const Sum<In>* weight, const Sum<In>* bias, const Out* residual,
+              RowNormShape shape, double eps, Out* out, Sum<In>* stats, Stream stream) {
   const char* op = "row_norm";
   if (shape.n_rows == 0 || shape.channels == 0) return;
   by_shape(op, shape.channels, aligned(x, weight, bias, residual, out), [&]<int kGroup, int kPacks, bool kExact>() {
@@ -245,10 +245,10 @@ void row_norm(const In* x, const RowNormSum<In>* weight, const RowNormSum<In>* b
 }
 
 template <typename In, typename Out>
-void row_norm_vjp(const Out* grad, const In* x, const RowNormSum<In>* weight, const RowNormSum<In>* stats,
-                  RowNormShape shape, In* grad_x, RowNormSum<In>* grad_weight, RowNormSum<In>* grad_bias,
+void row_norm_vjp(const Out* grad, const In* x, const Sum<In>* weight, const Sum<In>* stats,
+                  RowNormShape shape, In* grad_x, Sum<In>* grad_weight, Sum<In>* grad_bias,
                   const Workspace& workspace, Stream stream) {
-  using S = RowNormSum<In>;
+  using S = Sum<In>;
   const char* op = "row_norm_backward";
   if (shape.channels == 0) return;
   if (shape.n_rows == 0) {
@@ -268,10 +268,10 @@ void row_norm_vjp(const Out* grad, const In* x, const RowNormSum<In>* weight, co
 }
 
 #define GSIM3D_INSTANTIATE(In, Out)                                                                                  \
-  template void row_norm<In, Out>(const In*, const RowNormSum<In>*, const RowNormSum<In>*, const Out*, RowNormShape, \
-                                  double, Out*, RowNormSum<In>*, Stream);                                            \
-  template void row_norm_vjp<In, Out>(const Out*, const In*, const RowNormSum<In>*, const RowNormSum<In>*,           \
-                                      RowNormShape, In*, RowNormSum<In>*, RowNormSum<In>*, const Workspace&, Stream);
+  template void row_norm<In, Out>(const In*, const Sum<In>*, const Sum<In>*, const Out*, RowNormShape, \
+                                  double, Out*, Sum<In>*, Stream);                                            \
+  template void row_norm_vjp<In, Out>(const Out*, const In*, const Sum<In>*, const Sum<In>*,           \
+                                      RowNormShape, In*, Sum<In>*, Sum<In>*, const Workspace&, Stream);
 GSIM3D_INSTANTIATE(float, float)
 GSIM3D_INSTANTIATE(float, Float16)
 GSIM3D_INSTANTIATE(float, BFloat16)

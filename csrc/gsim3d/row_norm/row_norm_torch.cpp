@@ -57,7 +57,7 @@ std::tuple<Tensor, Tensor> row_norm(const Tensor& x_, const Tensor& weight_, con
   }
   Tensor out = empty(x, {shape.n_rows, shape.channels}, dtype), stats = empty(x, {shape.n_rows, 2}, sum_type(x));
   dispatch(op, x, dtype, [&]<typename In, typename Out>() {
-    using S = cuda::RowNormSum<In>;
+    using S = Sum<In>;
     const Out* added = residual ? data<Out>(*residual) : nullptr;
     if constexpr (kWithCuda)
       if (x.is_cuda())
@@ -85,7 +85,7 @@ std::tuple<Tensor, Tensor, Tensor> row_norm_backward(const Tensor& grad_, const 
   Tensor grad_x = empty(x, {shape.n_rows, shape.channels}), grad_weight = empty(weight, {shape.channels}),
          grad_bias = empty(weight, {shape.channels});
   dispatch(op, x, grad.scalar_type(), [&]<typename In, typename Out>() {
-    using S = cuda::RowNormSum<In>;
+    using S = Sum<In>;
     if constexpr (kWithCuda)
       if (x.is_cuda())
         return cuda::row_norm_vjp<In, Out>(data<Out>(grad), data<In>(x), data<S>(weight), data<S>(stats), shape,
