@@ -18,7 +18,7 @@ from gsim3d.harmonics import (
     sh_basis,
     turn_predicted_harmonics,
 )
-from gsim3d.layers import RowLinear
+from gsim3d.layers import RowLinear, widened
 from gsim3d.ops.raster import Rendering
 from gsim3d.quirks import Quirks
 from gsim3d.stability import OnBad, StabilityReport
@@ -85,7 +85,7 @@ class GaussianHead(nn.Module):
         if self.config.latents == 0:
             return particles.sh[:, :n_harmonics], particles.quats, particles.scales
         latents = torch.cat([particles.dynamic_latents, particles.static_latents], 1)
-        raw = self.fc2(F.gelu(self.fc1(latents)))
+        raw = widened(self.fc2(F.gelu(self.fc1(latents))))
         sh, quats, scales = raw.split([raw.shape[1] - 7, 4, 3], 1)
         quats = unit_quats(quats.roll(1, 1))
         smallest, largest = self.config.scale_min, self.config.scale_max

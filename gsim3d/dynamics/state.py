@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.harmonics import degree_damping
+from gsim3d.layers import widened
 from gsim3d.types import FROZEN, Particles
 
 SCALE_STEP_SHARE = 1 / 6  # of the range of scales, the most that one step changes a scale
@@ -75,8 +76,8 @@ class StateLayout:
             awake: bool [N], rows that change at all; None: all.
         """
         widths = [n for _, n in self.outputs]
-        parts = prediction.unflatten(1, (self.config.steps_per_call, -1)).transpose(0, 1).split(widths, 2)
-        moves = (particles.activity != FROZEN)[:, None].to(prediction)
+        parts = widened(prediction).unflatten(1, (self.config.steps_per_call, -1)).transpose(0, 1).split(widths, 2)
+        moves = (particles.activity != FROZEN)[:, None].to(parts[0])
         everywhere = torch.ones_like(moves)
         if awake is not None:
             moves, everywhere = moves * awake[:, None], everywhere * awake[:, None]
