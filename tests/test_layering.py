@@ -15,6 +15,7 @@ ROOMS = [
     {"encoder", "dynamics", "renderer"},
     {"presets"},
     {"simulator"},
+    {"laws"},
     {"data", "interop", "perceptual"},
     {"generate"},
     {"train"},
