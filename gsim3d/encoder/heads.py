@@ -13,6 +13,7 @@ from gsim3d.encoder.config import EncoderConfig
 from gsim3d.encoder.depth import Depth, Views
 from gsim3d.harmonics import degree_damping, turn_predicted_harmonics
 from gsim3d.layers import widened
+from gsim3d.rotations import unit_quats
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ def explicit_gaussians(raw: Tensor, depth: Tensor, geometry: PixelRays, config: 
     scales = (smallest + (largest - smallest) * raw_scales.sigmoid()) * (_rows(depth) * 0.1 * pixel_size)
     rotations = geometry.rotations.to(raw.dtype)
     turn = camera_frame.rotation_to_quat(rotations)[:, None]
-    quats = camera_frame.quat_multiply(turn, F.normalize(raw_quats.roll(1, -1), dim=-1))  # raw: real part last
+    quats = camera_frame.quat_multiply(turn, unit_quats(raw_quats.roll(1, -1)))  # raw: real part last
     quats = camera_frame.with_positive_largest(quats)  # as those that the dynamics writes and reads
     damping = degree_damping(config.sh_degree, raw)
     in_camera = raw_sh.reshape(n_images, -1, 3, damping.shape[0]) * damping

@@ -16,8 +16,8 @@ _results = {}
 
 
 @pytest.fixture(params=NAMES)
-def setting(request) -> Setting:
-    """Runs the test once for each device and precision, with torch computing so."""
+def setting(request, one_thread) -> Setting:
+    """Runs the test once for each device and precision, with torch computing so; on one thread, tensors are tiny."""
     device, precision = request.param.split()
     here = Setting(cuda_device() if device == "cuda" else torch.device("cpu"), precision)
     with here.computing():
@@ -32,11 +32,6 @@ def measured(request) -> Measured:
     what = Measured()
     request.node.user_properties.append((PROPERTY, {"case": case, "column": column, "measured": vars(what)}))
     return what
-
-
-@pytest.fixture(autouse=True)
-def _one_thread(one_thread):
-    """All tensors here are tiny."""
 
 
 def pytest_runtest_logreport(report):

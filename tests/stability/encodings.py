@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsim3d.encoder import Encoder
+from gsim3d.train.loop import deterministic
 from gsim3d.types import Frames
 from tests.encoder.scenes import ROW_FIELDS, SIZE, make_encoder, make_frames
 from tests.stability.setting import Measured, Setting
@@ -30,10 +32,15 @@ def encode(setting: Setting, frames: Frames, *, prepare=None, **changes) -> Enco
         prepare(encoder)
     encoder, frames = setting.to(encoder), setting.to(frames)
     images = frames.images.clone().requires_grad_()
+    with deterministic():
+        return _encode(encoder, frames, images)
+
+
+def _encode(encoder: Encoder, frames: Frames, images: Tensor) -> Encoding:
     state = encoder(dataclasses.replace(frames, images=images))
     names = (*ROW_FIELDS, *(name for name in ("quats", "scales", "sh") if getattr(state, name) is not None))
     fields = {name: getattr(state, name) for name in names}
-    total = sum(value.float().sum() if value.dtype.itemsize < 4 else value.sum() for value in fields.values())
+    total = sum(value.sum() for value in fields.values())
     sources = {"images": images, **dict(encoder.named_parameters())}
     found = torch.autograd.grad(total, list(sources.values()), allow_unused=True)
     grads = {n: torch.zeros_like(s) if g is None else g for (n, s), g in zip(sources.items(), found, strict=True)}

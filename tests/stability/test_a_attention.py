@@ -109,7 +109,7 @@ def test_a27_weight_gradients_over_100_000_rows(setting, measured):
     sums = x.double().sum(0)
     measured.finite(*grads)
     measured.close(grads[0].reshape(16, 16), sums.expand(16, 16), f"many_rows_{setting.precision}", "grad weight")
-    measured.close(grads[1], torch.full((16,), float(MANY), dtype=torch.float64), f"many_rows_{setting.exact}", "bias")
+    measured.close(grads[1], torch.full((16,), float(MANY), dtype=torch.float64), f"many_rows_{setting.precision}", "bias")
     scale, shift = torch.ones(16), torch.zeros(16)
     few = x[:1000]
     ours = gradients(ops.row_norm, [setting.to(t) for t in (few.repeat(100, 1), scale, shift)], few.repeat(100, 1))

@@ -9,14 +9,16 @@ import torch
 from gsim3d import ops
 from gsim3d.ops import PyramidSpec, curve_encode, sparse_conv
 from gsim3d.simulator import Simulator
+from gsim3d.stability import StabilityReport
 from gsim3d.train.losses import image_errors
 from tests.asserts import gradients
-from tests.dynamics.scenes import TINY, batch, make_history, permute_rows
+from tests.dynamics.scenes import TINY, batch, float_fields, make_history, permute_rows
 from tests.ops.test_plane_sweep import make as make_sweep
 from tests.ops.test_pyramid import assert_matches_oracle
 from tests.ops.test_sparse_conv import geometry, parameters, random_cells
 from tests.oracle import curve as curve_oracle
 from tests.oracle import sparse_conv as conv_oracle
+from tests.stability.rollouts import make_simulator, ordinary, raised
 from tests.stability.setting import NAMES
 from tests.stability.steps import check_same_rows, check_step, simulate
 from tests.test_simulator import CONFIG, make_frames, target_cameras
@@ -62,6 +64,49 @@ def test_s16_particles_outside_the_grid_sleep(setting, measured, value):
     for name, before in (("means", hard.means), ("dynamic_latents", hard.dynamic_latents)):
         measured.same_bits(step.fields[name][odd[25:].to(setting.device)], setting.to(before[25:][odd[25:]]), name)
     measured.outcome("model: asleep, the others as without them")
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+def test_s17_places_that_are_none_are_dropped(setting, measured, value):
+    """As if the particles were not there; counted."""
+    history = make_history((25, 30))
+    odd = torch.zeros(55, dtype=torch.bool)
+    odd[[3, 30, 54]] = True
+    simulator, report = make_simulator(setting), StabilityReport()
+    states = [setting.to(batch([h, ordinary()])) for h in (displaced(history, odd, value), history.select_rows(~odd))]
+    means = states[0].means.clone().requires_grad_()
+    step = simulator.rollout(dataclasses.replace(states[0], means=means), 1, on_bad="drop", report=report)[0]
+    (grad,) = torch.autograd.grad(step.means.sum() + step.dynamic_latents.sum(), means)
+    measured.finite(*float_fields(step).values(), grad)
+    absent = simulator.rollout(states[1], 1, report=StabilityReport())[0]
+    rows = torch.cat([~odd[25:], torch.ones(9, dtype=torch.bool)]).to(setting.device)
+    for name, expected in float_fields(absent).items():
+        measured.unchanged(setting, float_fields(step)[name][rows], expected, name)
+    assert not grad[setting.to(odd.nonzero()[:, 0])].any()
+    assert [(f.tensor, f.scene, f.step, f.row, f.count) for f in report.findings] == [
+        ("particles.means", 0, 0, 3, 1),
+        ("particles.means", 0, 1, 30, 2),
+    ]
+    measured.outcome("dropped, counted")
+
+
+@pytest.mark.parametrize("value", [NAN, INF])
+def test_s17_places_that_are_none_are_an_error(setting, measured, value):
+    simulator, report = make_simulator(setting), StabilityReport()
+    state = setting.to(batch([ordinary(), displaced(make_history((25, 30)), 30, value)]))
+    error = raised(lambda: simulator.rollout(state, 1, report=report), report)
+    assert (error.tensor, error.scene, error.step, error.row) == ("particles.means", 1, 1, 21 + 30)
+    measured.outcome("HardCaseError names scene, step, row, tensor")
+
+
+@pytest.mark.parametrize("value", [NAN, INF])
+def test_s17_places_that_are_none_are_clamped(setting, measured, value):
+    simulator, report = make_simulator(setting), StabilityReport()
+    state = setting.to(batch([displaced(make_history((25, 30)), 30, value), ordinary()]))
+    step = simulator.rollout(state, 1, on_bad="clamp", report=report)[0]
+    measured.finite(*float_fields(step).values())
+    assert [(f.tensor, f.action, f.row) for f in report.findings if f.step == 1][:1] == [("particles.means", "clamped", 30)]
+    measured.outcome("clamped, counted")
 
 
 def test_s18_negative_coordinates(setting, measured):
