@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import re
 from pathlib import Path
 
@@ -45,7 +46,17 @@ def pytest_sessionfinish(session):
     file = os.environ.get("GSIM3D_STABILITY_JSON")
     if file and not hasattr(session.config, "workerinput"):
         Path(file).parent.mkdir(parents=True, exist_ok=True)
-        Path(file).write_text(json.dumps(_results, indent=1, sort_keys=True) + "\n")
+        columns = {name: {"machine": _machine(name), "torch": torch.__version__, "cases": c} for name, c in _results.items()}
+        Path(file).write_text(json.dumps(columns, indent=1, sort_keys=True) + "\n")
+
+
+def _machine(column: str) -> str:
+    if column.startswith("cuda"):
+        return torch.cuda.get_device_name()
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
 
 
 def _empty() -> dict:
