@@ -78,11 +78,11 @@ template <typename T>
 void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
                      const AttentionSize& size, T* out, StatsOf<T>* stats, Stream stream) {
   const char* op = "patch_attention";
-  fill_zero(op, out, table.n_q * size.heads * size.dim, stream);
-  fill_zero(op, stats, table.n_q * size.heads * 2, stream);
   if constexpr (sizeof(T) == 2)
     if (fits_tensor_cores<T>(size, q, k, v))
       return tensor_forward(device(q), device(k), device(v), table, size, device(out), stats, stream);
+  fill_zero(op, out, table.n_q * size.heads * size.dim, stream);
+  fill_zero(op, stats, table.n_q * size.heads * 2, stream);
   simple_forward(device(q), device(k), device(v), table, size, device(out), stats, stream);
 }
 
