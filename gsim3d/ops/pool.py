@@ -14,7 +14,7 @@ def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor) -> Tensor:
     Args:
         x: features [N, C], float32 or float64.
         rows: int64 [R], the rows of segment 0, then of segment 1, ...; each row at most once.
-        cu_rows: int64 [M + 1], ascending offsets into ``rows`` from 0 to R.
+        cu_rows: int64 [M + 1], ascending offsets into ``rows`` from 0 to at most R; rows listed behind are in no segment.
     Returns:
         [M, C], dtype of ``x``.
     Gradients: ``x``, once; of equal maxima the one listed first receives it.
