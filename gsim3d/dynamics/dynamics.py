@@ -114,9 +114,9 @@ def take_rows(x: Tensor, rows: Tensor) -> Tensor:
     """x[rows] for rows that are listed once. (The gradient of indexing uses atomics on CUDA.)"""
     if rows.shape[0] == x.shape[0]:
         return x
-    return ops.pool_mean(x, rows, torch.arange(rows.shape[0] + 1, device=rows.device))
+    return ops.pool_mean(x, rows, torch.arange(rows.shape[0] + 1, device=rows.device), check=False)
 
 
 def put_rows(x: Tensor, rows: Tensor, n_rows: int) -> Tensor:
     """[n_rows, C] with x at ``rows``, 0 elsewhere."""
-    return ops.unpool(x, rows, torch.arange(rows.shape[0] + 1, device=rows.device), n_rows)
+    return ops.unpool(x, rows, torch.arange(rows.shape[0] + 1, device=rows.device), n_rows, check=False)
