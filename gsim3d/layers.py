@@ -54,7 +54,7 @@ class RowBatchNorm(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         if not self.training:
             return self._normalise(x, self.running_mean, self.running_var)
-        mean, var, n_rows = _statistics(x.float() if x.dtype in (torch.float16, torch.bfloat16) else x)
+        mean, var, n_rows = _statistics(widened(x))
         with torch.no_grad():
             rate = self.MOMENTUM * (n_rows > 1).to(self.running_var)
             self.running_mean.lerp_(mean.to(self.running_mean), rate)
@@ -85,6 +85,11 @@ def _combine(parts: tuple[Tensor, ...], n_channels: int) -> tuple[Tensor, Tensor
     mean = sum(count * mean for count, mean in zip(counts, means, strict=True)) / n_rows
     between = sum(count * (part - mean).square() for count, part in zip(counts, means, strict=True))
     return sum(counts)[0], mean, sum(spreads) + between
+
+
+def widened(x: Tensor) -> Tensor:
+    """What 16-bit layers computed, as float32: positions, depths and all that is added up over steps are never 16-bit."""
+    return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
 
 
 def make_norm(kind: str, channels: int) -> nn.Module:

@@ -10,7 +10,7 @@ ROOT = Path(__file__).parent.parent
 ROOMS = [
     {"errors", "quirks"},
     {"types", "stability"},
-    {"ops", "effects", "harmonics"},
+    {"ops", "effects", "harmonics", "rotations"},
     {"layers", "guards"},
     {"encoder", "dynamics", "renderer"},
     {"presets"},

@@ -18,6 +18,7 @@ from gsim3d.layers import RowLayerNorm, RowLinear, make_norm
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
 TIME_EMBEDDING_STD = 0.02
+HALF_MAX = torch.finfo(torch.float16).max  # beyond it half precision has infinity, and attention NaN
 
 
 class SparseConv(nn.Module):
@@ -65,7 +66,7 @@ class Attention(nn.Module):
         return self.proj(self._rounded(ops.patch_attention(q, k, v, patches, check=False).flatten(1)))
 
     def _rounded(self, x: Tensor) -> Tensor:
-        return x.half().to(x.dtype) if self.rounded_to_half else x
+        return x.clamp(-HALF_MAX, HALF_MAX).half().to(x.dtype) if self.rounded_to_half else x
 
 
 class MLP(nn.Module):

@@ -23,7 +23,8 @@ def patch_attention(
             float32); D a multiple of 4 from 4 to 128, fastest 16, 32 and 64. Under ``torch.autocast`` CUDA computes in
             its dtype and the CPU in float32.
         k, v: keys and values [Nk, H, D]. The three may be views of one qkv tensor; they are read in place.
-        table: patches; a row at most once in ``q_rows``, any number of times in ``kv_rows``.
+        table: patches; a row at most once in ``q_rows``, any number of times in ``kv_rows``. What the lists hold behind
+            the last offsets is in no patch.
         scale: factor of the dot products; default ``D ** -0.5``.
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:

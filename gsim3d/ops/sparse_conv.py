@@ -30,8 +30,10 @@ def sparse_conv(
             ``torch.autocast`` the CPU computes in float32, CUDA in autocast's dtype.
         weight: [C_out, K, K, K, C_in], K odd; axes 1 to 3 walk x, y, z.
         bias: [C_out] or None.
-        voxels: which rows share a voxel (``Stage.voxels`` of :func:`gsim3d.ops.build_pyramid`).
-        kernel_map: pairs of neighbouring voxels for K (``Stage.kernel_maps[K]``).
+        voxels: which rows share a voxel (``Stage.voxels`` of :func:`gsim3d.ops.build_pyramid`). Where there are more
+            voxels than rows, the last ones are empty.
+        kernel_map: pairs of neighbouring voxels for K (``Stage.kernel_maps[K]``); those behind the last offset take no
+            part.
         duplicates: "mean", or "first" for the lowest row, which depends on the order of the rows.
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:

@@ -74,6 +74,7 @@ class Trainer:
         self.parent = None
         if checkpoint.exists(self.out):
             self._resume()
+        self._cut_log()
 
     def run(self, *, until: int | None = None, progress: bool = True) -> None:
         """Trains to the end of the configuration, or to optimizer step ``until``, and saves there."""
@@ -213,10 +214,9 @@ class Trainer:
                 self.optimizer.state[self.parameters[name]][kind] = value if kind == "step" else value.to(self.device)
         self.step, self.n_skipped = saved.state["step"], saved.state["n_skipped"]
         self.seconds, self.parent = saved.state["seconds"], saved.digest
-        self._cut_log()
 
     def _cut_log(self) -> None:
-        """Drops what was logged after the checkpoint: those steps will be repeated."""
+        """Drops what was logged after the last checkpoint, if there is one: those steps will be repeated."""
         file = self.out / LOG
         if file.exists():
             lines = file.read_text().splitlines()

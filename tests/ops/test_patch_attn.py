@@ -434,7 +434,7 @@ WRONG = {
     "kv_rows must be in [0, N) with N=3 from k; got -1 at 0": dict(kv_rows=rows(-1, 0, 1)),
     "cu_q must be": dict(cu_q=rows()),
     "cu_k must be": dict(cu_k=rows(0, 3)),
-    "cu_q must run from 0": dict(cu_q=rows(0, 1, 2)),
+    "cu_q must run from 0 to at most the number of listed rows, 3; got 0 .. 4": dict(cu_q=rows(0, 1, 4)),
     "cu_k must run from 0": dict(cu_k=rows(1, 1, 3)),
     "cu_k must not descend; got 4 then 3 at 1": dict(cu_k=rows(0, 4, 3)),
     "scale must be finite, at most 1e30 in size; got nan": dict(scale=float("nan")),

@@ -450,6 +450,8 @@ TAP_12, TAP_14 = [0] * 13 + [1] * 2, [2] * 13  # the pairs of two_neighbours: on
         (dict(cu_rows=[0, 2]), "cu_voxel_rows must run from 0 to N=3; got 0 .. 2"),
         (dict(cu_rows=[0, 0, 3]), "cu_voxel_rows must ascend, no voxel is empty; got 0 then 0 at 0"),
         (dict(cu_rows=[0, 9, 3]), "cu_voxel_rows must ascend, no voxel is empty; got 0 then 9 at 0"),
+        (dict(cu_rows=[0, 2, 3, 2, 3]), "cu_voxel_rows must stay at N=3 behind the last row; got 2 at 3"),
+        (dict(cu_taps=TAP_12 + [3] * 13), r"cu_taps must run from 0 to at most len\(tap_in\)=2; got 0 .. 3"),
         (dict(tap_in=[1]), r"tap_out must be \[L\] like tap_in"),
         (dict(tap_in=[0, 2]), r"tap_in must be in \[0, V\) with V=2; got 2 at 1"),
         (dict(tap_out=[-1, 1]), r"tap_out must be in \[0, V\) with V=2; got -1 at 0"),

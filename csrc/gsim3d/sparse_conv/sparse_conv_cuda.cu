@@ -25,7 +25,10 @@ void check_sizes(const char* op, const SparseConvMap& map, int64_t c_in, int64_t
   check(map.kernel_size <= kMaxKernel, op, ": CUDA takes kernels up to ", kMaxKernel, "; got ", map.kernel_size);
 }
 
-int64_t slots_of(const SparseConvMap& map) { return std::max<int64_t>(0, map.n_rows - map.n_voxels); }
+// Where some voxels are empty, any number of the others may be shared.
+int64_t slots_of(const SparseConvMap& map) {
+  return map.n_voxels > map.n_rows ? map.n_rows : map.n_rows - map.n_voxels;
+}
 
 Sources sources_of(const SparseConvMap& map, bool first) {
   return {map.voxel_rows, map.cu_voxel_rows, map.n_rows, map.n_voxels, slots_of(map), first};
