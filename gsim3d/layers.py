@@ -60,7 +60,7 @@ class RowLayerNorm(nn.LayerNorm):
     """``nn.LayerNorm`` of [N, C], and the residual sum behind it; see :func:`gsim3d.ops.row_norm`."""
 
     def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
-        return row_norm(x, self.weight, self.bias, residual, eps=self.eps)
+        return row_norm(x, self.weight, self.bias, residual, eps=self.eps, check=False)
 
 
 class RowBatchNorm(nn.Module):

@@ -35,7 +35,9 @@ class SparseConv(nn.Module):
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
         kernel_map = stage.kernel_maps[self.kernel_size]
-        return ops.sparse_conv(x, self.weight, self.bias, stage.voxels, kernel_map, duplicates=self.duplicates)
+        return ops.sparse_conv(
+            x, self.weight, self.bias, stage.voxels, kernel_map, duplicates=self.duplicates, check=False
+        )
 
 
 class PositionEncoding(nn.Module):
@@ -62,7 +64,7 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor, patches: PatchTable) -> Tensor:
         q, k, v = self._rounded(self.qkv(x)).unflatten(1, (3, self.heads, -1)).unbind(1)
-        return self.proj(self._rounded(ops.patch_attention(q, k, v, patches).flatten(1)))
+        return self.proj(self._rounded(ops.patch_attention(q, k, v, patches, check=False).flatten(1)))
 
     def _rounded(self, x: Tensor) -> Tensor:
         return x.clamp(-HALF_MAX, HALF_MAX).half().to(x.dtype) if self.rounded_to_half else x
@@ -186,7 +188,8 @@ class Pool(nn.Module):
         self.norm = make_norm(norm, out_channels)
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
-        return F.gelu(self.norm(ops.pool_max(self.proj(x), stage.cluster.rows, stage.cluster.cu_rows)))
+        cluster = stage.cluster
+        return F.gelu(self.norm(ops.pool_max(self.proj(x), cluster.rows, cluster.cu_rows, check=False)))
 
 
 class Merge(nn.Module):
@@ -237,7 +240,8 @@ class Unpool(nn.Module):
         """Both together, and the skip branch alone."""
         below = F.gelu(self.proj_norm(self.proj(x)))
         skip = F.gelu(self.skip_norm(self.skip(skip)))
-        return skip + ops.unpool(below, coarse.cluster.rows, coarse.cluster.cu_rows, skip.shape[0]), skip
+        cluster = coarse.cluster
+        return skip + ops.unpool(below, cluster.rows, cluster.cu_rows, skip.shape[0], check=False), skip
 
 
 class DecoderStage(nn.Module):

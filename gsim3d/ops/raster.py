@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
-from gsim3d.stability import ACTIONS, LARGEST, Finding, OnBad, Reading, StabilityReport, check_on_bad
+from gsim3d.ops._arguments import check_real, check_tensors, check_whole, within_memory
+from gsim3d.stability import LARGEST, Finding, OnBad, Reading, StabilityReport, check_on_bad
 from gsim3d.types import Cameras
 
 OP = "rasterize_gaussians"
@@ -117,9 +118,13 @@ def rasterize_gaussians(
         >>> image.color.shape, bool(image.alpha[0, 4, 4] > 0.7)
         (torch.Size([1, 8, 8, 3]), True)
     """
+    if not torch.compiler.is_compiling():
+        optional = {"sh": sh, "colors": colors, "features": features, "background": background, "cu_rows": cu_rows}
+        tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+        _check_arguments(tensors, {k: v for k, v in optional.items() if v is not None}, cameras, near_plane)
     if (sh is None) == (colors is None):
         raise ValueError("rasterize_gaussians: give one of sh and colors")
-    if cutoff not in CUTOFFS:
+    if not isinstance(cutoff, str) or cutoff not in CUTOFFS:
         raise ValueError(f"rasterize_gaussians: cutoff must be one of {', '.join(CUTOFFS)}; got {cutoff!r}")
     color = sh if colors is None else colors
     dims = 3 if colors is None else 2
@@ -132,6 +137,7 @@ def rasterize_gaussians(
     names = ("means", "quats", "scales", "opacities", color_name, "features")
     rows = (means, quats, scales, opacities, color, features_given)
     if on_bad == "clamp":
+        _check_rows(dict(zip(names, rows, strict=True)))
         rows = _clamped(dict(zip(names, rows, strict=True)), report).values()
     n_images = cameras.viewmats.shape[0]
     real = torch.float64 if means.dtype == torch.float64 else torch.float32
@@ -156,7 +162,11 @@ def rasterize_gaussians(
     )
     raises = on_bad == "raise" and means.device.type == "cpu"
     watch = (raises or report is not None) and not torch.compiler.is_compiling()
-    out = torch.ops.gsim3d.rasterize_gaussians(*args, watch)
+    if torch.compiler.is_compiling():
+        out = torch.ops.gsim3d.rasterize_gaussians(*args, watch)
+    else:
+        size = f"cameras.width={cameras.width}, cameras.height={cameras.height}"
+        out = within_memory(OP, size, torch.ops.gsim3d.rasterize_gaussians, *args, watch)
     if watch:
         action = "error" if on_bad == "raise" else "dropped"
         read = partial(_unusable, names=(*names, "scales", "scales", "cameras"), action=action)
@@ -184,7 +194,7 @@ def _clamped(rows: dict[str, Tensor], report: StabilityReport | None) -> dict[st
         if name == "quats":
             neutral[:, 0] = 1
         bounded[name] = torch.where(value.isnan(), neutral, value).clamp(*bounds.get(name, (-LARGEST, LARGEST)))
-        bad.append((bounded[name] != value.detach()).reshape(value.shape[0], -1).any(1))
+        bad.append((bounded[name] != value.detach())[..., None].flatten(1).any(1))
     if report is not None and not torch.compiler.is_compiling():
         counts = torch.stack(bad).sum(1)
         report.record(counts, partial(_counted, names=list(rows)))
@@ -195,6 +205,32 @@ def _counted(counts: Tensor, names: list[str]) -> Reading:
     return Reading(
         [Finding("not finite or out of range", OP, name, "clamped", n) for name, n in zip(names, counts.tolist()) if n], {}
     )
+
+
+def _check_arguments(rows: dict[str, Tensor], optional: dict[str, Tensor], cameras: Cameras, near_plane: float) -> None:
+    """Types, and the shapes that are read before the kernel checks them."""
+    if not isinstance(cameras, Cameras):
+        raise TypeError(f"rasterize_gaussians: cameras must be gsim3d.Cameras; got {type(cameras).__name__}")
+    of_cameras = {f"cameras.{name}": getattr(cameras, name) for name in ("viewmats", "Ks", "image_cloud")}
+    check_tensors("rasterize_gaussians", **rows, **optional, **of_cameras)
+    check_whole("rasterize_gaussians", **{f"cameras.{name}": getattr(cameras, name) for name in ("width", "height")})
+    check_real("rasterize_gaussians", near_plane=near_plane)
+    shapes = {"means": "[N, 3]", "cameras.viewmats": "[I, 4, 4]", "cameras.Ks": "[I, 3, 3]", "cu_rows": "[Q + 1]"}
+    for name, shape in shapes.items():
+        value = rows.get(name, of_cameras.get(name, optional.get(name)))
+        if value is not None and value.dim() != shape.count(",") + 1:
+            raise ValueError(f"rasterize_gaussians: {name} must be {shape}; got {list(value.shape)}")
+
+
+def _check_rows(rows: dict[str, Tensor]) -> None:
+    """Numbers that policies may change must be numbers, and rows of ``means``."""
+    n = rows["means"].shape[0]
+    wanted = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+    for name, value in rows.items():
+        if not value.is_floating_point():
+            raise ValueError(f"rasterize_gaussians: {name} must be float32 or float64; got {value.dtype}")
+        if value.shape != wanted.get(name, (n, *value.shape[1:])):
+            raise ValueError(f"rasterize_gaussians: {name} must have N={n} rows as means; got {list(value.shape)}")
 
 
 def _tiles(n_images, width, height):

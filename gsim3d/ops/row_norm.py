@@ -4,9 +4,18 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._arguments import check_numbers, check_real, check_tensors
 
 
-def row_norm(x: Tensor, weight: Tensor, bias: Tensor, residual: Tensor | None = None, *, eps: float = 1e-5) -> Tensor:
+def row_norm(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    residual: Tensor | None = None,
+    *,
+    eps: float = 1e-5,
+    check: bool = True,
+) -> Tensor:
     """Normalises every row over its channels, scales, shifts and adds ``residual``.
 
     ``out = (x - mean(x)) / sqrt(var(x) + eps) * weight + bias + residual``, mean and variance over a row. A row's result
@@ -17,18 +26,25 @@ def row_norm(x: Tensor, weight: Tensor, bias: Tensor, residual: Tensor | None = 
         weight, bias: [C], float32; float64 with float64 rows.
         residual: [N, C] or None.
         eps: positive, keeps rows of equal values finite.
+        check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [N, C], dtype of ``residual``, else of ``x``. Under ``torch.autocast`` CUDA returns autocast's dtype where there is
         no residual, ready for the matrix product that follows; the CPU computes in float32.
     Gradients: ``x``, ``weight``, ``bias``, ``residual``, once; sums over rows have one order.
     Raises:
-        ValueError: a shape or dtype does not fit; the message names the argument.
+        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        ValueError, TypeError: an argument is malformed; the message names it.
     Source: Ba et al. 2016, Layer Normalization.
 
     Example:
         >>> row_norm(torch.tensor([[1.0, 3.0]]), torch.ones(2), torch.zeros(2), torch.ones(1, 2)).round(decimals=3)
         tensor([[0., 2.]])
     """
+    if check:
+        tensors = {"x": x, "weight": weight, "bias": bias} | ({} if residual is None else {"residual": residual})
+        check_tensors("row_norm", **tensors)
+        check_real("row_norm", eps=eps)
+        check_numbers("row_norm", **tensors)
     dtype = x.dtype if residual is None else residual.dtype
     return torch.ops.gsim3d.row_norm(x, weight, bias, residual, eps, dtype)[0]
 
