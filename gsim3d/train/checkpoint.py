@@ -22,10 +22,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import safetensors
+import safetensors.torch
 import torch
 import yaml
-from safetensors.torch import load_file, save
+from safetensors.torch import load_file
 from torch import Tensor
 
 from gsim3d import __version__
@@ -156,7 +156,7 @@ def export(checkpoint: Checkpoint, path: str | Path) -> None:
 
 def _bytes_of(tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:
     """A .safetensors file. (Its own writer makes files that nobody else may read.)"""
-    return save({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, metadata)
+    return safetensors.torch.save({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, metadata)
 
 
 def _load_single(path: Path) -> Checkpoint:
