@@ -265,6 +265,7 @@ def test_d47_numbers_that_are_none_are_dropped(setting, measured, name):
     absent = batch([hard.select_rows(kept), ordinary()])
     expected = simulator.rollout(setting.to(absent), 3, on_bad="drop", report=StabilityReport())
     rows = torch.cat([kept[14:], torch.ones(9, dtype=torch.bool)]).to(setting.device)
+    assert all(step.opacities[3] == 0 and step.activity[3] == ASLEEP for step in steps)
     for step, other in zip(steps, expected, strict=True):
         for field, value in float_fields(other).items():
             measured.unchanged(setting, float_fields(step)[field][rows], value, field)
