@@ -171,8 +171,8 @@ struct Job {
 template <typename T>
 __device__ bool camera_is_good(const T* viewmat, const T* K) {
   bool good = true;
-  for (int i = 0; i < 12; ++i) good &= isfinite(viewmat[i]);
-  for (int i = 0; i < 9; ++i) good &= isfinite(K[i]);
+  for (int i = 0; i < 12; ++i) good &= usable(viewmat[i]);
+  for (int i = 0; i < 9; ++i) good &= usable(K[i]);
   return good && K[0] > 0 && K[4] > 0 && K[3] == 0 && K[6] == 0 && K[7] == 0 && K[8] == 1;
 }
 
@@ -316,7 +316,7 @@ struct Gaussian {
 
   __device__ bool is_good() const {
     bool good = opacity >= 0 && opacity <= 1;
-    for (int i = 0; i < 3; ++i) good &= isfinite(mean[i]) && isfinite(scale[i]) && scale[i] >= 0;
+    for (int i = 0; i < 3; ++i) good &= usable(mean[i]) && usable(scale[i]) && scale[i] >= 0;
     for (int i = 0; i < 4; ++i) good &= isfinite(quat[i]);
     return good;
   }
@@ -423,8 +423,8 @@ __device__ void project_rows(const Job<T>& job, unsigned char* memory) {
     const int64_t row = rows.inside ? rows.row : rows.begin;
     const Gaussian<T> gaussian(s, row);
     bool good = rows.inside && gaussian.is_good();
-    for (int i = 0; i < kColumns && good; ++i) good &= isfinite(coefficients[i]);
-    for (int64_t i = 0; i < s.n_features; ++i) good &= isfinite(s.features[row * s.n_features + i]);
+    for (int i = 0; i < kColumns && good; ++i) good &= usable(coefficients[i]);
+    for (int64_t i = 0; i < s.n_features; ++i) good &= usable(s.features[row * s.n_features + i]);
     const bool may_show = good && gaussian.opacity >= T(kMinAlpha);
     for (int64_t image = rows.first_image; image < last; image = job.views[image].next) {
       const View<T>& view = job.views[image];
