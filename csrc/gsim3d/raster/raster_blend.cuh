@@ -149,8 +149,8 @@ struct Light {
 };
 constexpr double kClosed = 2;
 
-// One pass over the list: colour and depth, or (kPass = true) the features from `channel` on. A lane has two pixels, one
-// above the other, and visits the entries that either of them sees.
+// One pass over the list: colour and depth, or (kPass = true) the features from `channel` on. A lane has two pixels,
+// one above the other, and visits the entries that either of them sees.
 template <typename T, bool kFade, bool kPass, bool kWithFeatures>
 __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, int64_t index, int64_t channel,
                               BlendShared<T, kWithFeatures>& shared) {

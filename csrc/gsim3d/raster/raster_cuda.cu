@@ -33,7 +33,7 @@ __global__ void __launch_bounds__(kSortBlock, 4) sort_kernel(Job<T> job) {
 }
 
 template <typename T, bool kFade, bool kWithFeatures>
-__global__ void __launch_bounds__(kWarp) blend_kernel(Job<T> job, RasterImages<T> images) {
+__global__ void __launch_bounds__(kWarp, 32) blend_kernel(Job<T> job, RasterImages<T> images) {
   blend_tiles<T, kFade>(job, images, of_warp<BlendShared<T, kWithFeatures>>());
 }
 
@@ -77,7 +77,8 @@ void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, 
     launch(kRaster, project_kernel<T, kTerms>, grid_of_chunks(scene), kBlock, kRowBytes<T, kTerms>, stream, job);
   });
   launch(kRaster, offsets_kernel<T>, 1, kOneBlock, 0, stream, job);
-  launch(kRaster, scatter_kernel<T>, grid_of_chunks(scene), kBlock, 0, stream, job);
+  // It also puts tiles in order, which their kernels need when there are no rows, too.
+  launch(kRaster, scatter_kernel<T>, std::max(1u, grid_of_chunks(scene)), kBlock, 0, stream, job);
   launch(kRaster, sort_kernel<T>, grid_for(n_tiles, 1), kSortBlock, kSortBytes<T, kSortBlock>, stream, job);
   dispatch_blend(scene, [&](auto fade, auto with_features) {
     constexpr bool kFade = decltype(fade)::value, kWithFeatures = decltype(with_features)::value;

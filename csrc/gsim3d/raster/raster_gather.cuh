@@ -62,8 +62,8 @@ __device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t row, co
   return seen && (any || !group.finished);
 }
 
-// Gradients of one row but its colour, summed over images one after the other. Those of the exponent and the axes become
-// gradients of opacity, quaternion and scale at the end.
+// Gradients of one row but its colour, summed over images one after the other. Those of the exponent and the axes
+// become gradients of opacity, quaternion and scale at the end.
 template <typename T>
 struct RowGrad {
   T mean[3], quat[4], scale[3], opacity;

@@ -1,6 +1,8 @@
 // Inside of the CUDA rasterizer: where the list of each tile begins, and the entries put there.
 #pragma once
 
+#include <type_traits>
+
 #include "gsim3d/raster/raster_project.cuh"
 
 namespace gsim3d::raster {
@@ -142,13 +144,14 @@ __device__ void scatter_rows(const Job<T>& job) {
       if (lane == kWarp - 1)
         slot = job.first_slot(image, group) + atomicAdd(job.slot_cursor + image, static_cast<uint32_t>(end));
       uint32_t* const cursor = job.cursor + image * job.n_tiles;
-      for (int base = 0; base < shared.total; base += kAtOnce * kWarp) {
-        Entry<T> entry[kAtOnce];
-        uint32_t position[kAtOnce] = {};
-        unsigned same[kAtOnce] = {};  // lanes with an entry of the same tile
+      // Entries base .. base + kCount * 32 - 1 of the warp.
+      const auto put = [&](int base, auto count) {
+        constexpr int kCount = decltype(count)::value;
+        Entry<T> entry[kCount];
+        uint32_t position[kCount] = {};
+        unsigned same[kCount];  // lanes with an entry of the same tile
 #pragma unroll
-        for (int k = 0; k < kAtOnce; ++k) {
-          if (base + k * kWarp >= shared.total) break;
+        for (int k = 0; k < kCount; ++k) {
           const auto [owner, x, y] = shared.at(base + k * kWarp + lane);
           const int from = max(owner, 0);
           const uint32_t word = word_of(__shfl_sync(kFullWarp, static_cast<uint32_t>(pair), from), 0) |
@@ -160,18 +163,20 @@ __device__ void scatter_rows(const Job<T>& job) {
           const auto tile = static_cast<uint32_t>(y * job.tiles_x + x);
           const bool used = owner >= 0 && group.has(image * job.n_tiles + tile);
           same[k] = __match_any_sync(kFullWarp, used ? tile : ~0u);
-          if (!used)
-            same[k] = 0;
-          else if (__ffs(same[k]) - 1 == lane)
+          if (!used) same[k] = 0;
+          if (__ffs(same[k]) - 1 == lane)
             position[k] = atomicAdd(cursor + tile, static_cast<uint32_t>(__popc(same[k])));
         }
 #pragma unroll
-        for (int k = 0; k < kAtOnce; ++k) {
-          if (base + k * kWarp >= shared.total) break;
+        for (int k = 0; k < kCount; ++k) {
           const uint32_t first = __shfl_sync(kFullWarp, position[k], max(__ffs(same[k]) - 1, 0));
           if (same[k]) job.entries[first + __popc(same[k] & ((1u << lane) - 1))] = entry[k];
         }
-      }
+      };
+      int base = 0;
+      for (; base + kAtOnce * kWarp <= shared.total; base += kAtOnce * kWarp)
+        put(base, std::integral_constant<int, kAtOnce>{});
+      for (; base < shared.total; base += kWarp) put(base, std::integral_constant<int, 1>{});
       slot = __shfl_sync(kFullWarp, slot, kWarp - 1);
       if (n > 0) job.slot_begin[pair] = slot + end - n;
     }

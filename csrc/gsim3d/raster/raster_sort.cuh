@@ -38,46 +38,70 @@ __device__ void sort_by_network(Entry<T>* shared, int n) {
   }
 }
 
-struct KeyRange {
-  uint64_t low, high;
+// What entries are told apart by first: the highest bits of their keys, or where those are equal the lowest.
+__device__ __forceinline__ uint32_t digit_of(const Entry<float>& entry, bool equal) {
+  return static_cast<uint32_t>(equal ? entry.key : entry.key >> 32);
+}
+__device__ __forceinline__ uint32_t digit_of(const Entry<double>& entry, bool) {
+  return static_cast<uint32_t>(entry.key >> 32);
+}
+
+struct DigitRange {
+  uint32_t low, high;
 };
 
-// Of the keys of all threads of the block.
+// Of all threads of the block.
 template <int kThreads>
-__device__ KeyRange block_range(KeyRange range) {
-  __shared__ KeyRange of_warps[kThreads / kWarp];
-  for (int step = kWarp / 2; step > 0; step /= 2) {
-    range.low = min(range.low, __shfl_xor_sync(kFullWarp, range.low, step));
-    range.high = max(range.high, __shfl_xor_sync(kFullWarp, range.high, step));
-  }
+__device__ DigitRange block_range(uint32_t low, uint32_t high) {
+  __shared__ DigitRange of_warps[kThreads / kWarp];
+  const int lane = threadIdx.x % kWarp;
+  low = __reduce_min_sync(kFullWarp, low), high = __reduce_max_sync(kFullWarp, high);
   __syncthreads();
-  if (threadIdx.x % kWarp == 0) of_warps[threadIdx.x / kWarp] = range;
+  if (lane == 0) of_warps[threadIdx.x / kWarp] = {low, high};
   __syncthreads();
-  for (const KeyRange& other : of_warps) range.low = min(range.low, other.low), range.high = max(range.high, other.high);
-  return range;
+  const DigitRange other = of_warps[lane % (kThreads / kWarp)];
+  return {__reduce_min_sync(kFullWarp, other.low), __reduce_max_sync(kFullWarp, other.high)};
+}
+
+// Sum over the threads of the block in front of the calling one.
+template <int kThreads>
+__device__ uint32_t sum_before(uint32_t value) {
+  __shared__ uint32_t of_warps[kThreads / kWarp];
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
+  const uint32_t end = warp_sum(value);
+  __syncthreads();
+  if (lane == kWarp - 1) of_warps[warp] = end;
+  __syncthreads();
+  return __reduce_add_sync(kFullWarp, lane < warp ? of_warps[lane] : 0) + end - value;
 }
 
 // Sorts n <= kItems * kThreads entries, of which thread t holds entry i * kThreads + t, and hands them to
 // store(place, entry). Does nothing and returns false when too many keys are of one bucket.
 template <int kItems, int kThreads, typename T, typename F>
 __device__ bool sort_by_buckets(const Entry<T> (&mine)[kItems], int n, Entry<T>* shared, const F& store) {
-  constexpr int kMine = kItems < kSortItems<T> ? kItems : kItems / 2, kBuckets = kMine * kThreads;  // of a thread, of all
+  constexpr int kMine = kItems < kSortItems<T> ? kItems : kItems / 2;  // buckets of a thread
+  constexpr int kBuckets = kMine * kThreads;
   auto* const begins = reinterpret_cast<uint32_t*>(shared + kSortRun<T, kThreads>);
   // The buckets of one thread, which are neighbours, lie in one bank.
   const auto begin_of = [begins](uint32_t bucket) -> uint32_t& {
     return begins[bucket % kMine * kThreads + bucket / kMine];
   };
   const int thread = threadIdx.x;
-  KeyRange range{~uint64_t{0}, 0};
-#pragma unroll
-  for (int i = 0; i < kItems; ++i)
-    if (i * kThreads + thread < n) range.low = min(range.low, mine[i].key), range.high = max(range.high, mine[i].key);
 #pragma unroll
   for (int i = 0; i < kMine; ++i) begins[i * kThreads + thread] = 0;
-  range = block_range<kThreads>(range);
-  const int bits = 64 - __clzll(static_cast<long long>(range.high - range.low));
-  const int shift = max(0, bits - (31 - __clz(kBuckets)));
-  const auto bucket_of = [&](const Entry<T>& entry) { return static_cast<uint32_t>((entry.key - range.low) >> shift); };
+  const auto find_range = [&](bool equal) {
+    uint32_t low = ~0u, high = 0;
+#pragma unroll
+    for (int i = 0; i < kItems; ++i)
+      if (i * kThreads + thread < n)
+        low = min(low, digit_of(mine[i], equal)), high = max(high, digit_of(mine[i], equal));
+    return block_range<kThreads>(low, high);
+  };
+  DigitRange range = find_range(false);
+  const bool equal = range.low >= range.high;
+  if (equal) range = find_range(true);
+  const int shift = max(0, 32 - __clz(static_cast<int>(range.high - range.low)) - (31 - __clz(kBuckets)));
+  const auto bucket_of = [&](const Entry<T>& entry) { return (digit_of(entry, equal) - range.low) >> shift; };
 
   uint32_t within[kItems];
 #pragma unroll
@@ -91,8 +115,7 @@ __device__ bool sort_by_buckets(const Entry<T> (&mine)[kItems], int n, Entry<T>*
     sum += counts[i], most = max(most, counts[i]);
   }
   if (__syncthreads_or(most > kCrowd)) return false;
-  uint64_t total;
-  auto begin = static_cast<uint32_t>(block_sum(sum, total)) - sum;
+  uint32_t begin = sum_before<kThreads>(sum);
 #pragma unroll
   for (int i = 0; i < kMine; ++i) {
     begins[i * kThreads + thread] = begin;
