@@ -69,6 +69,23 @@ __global__ void __launch_bounds__(kThreads)
   to[i] = c < channels ? from[row * channels + c] : E(0);
 }
 
+// to[ci, tap, co] = from[co, tap, ci], with zeros for co up to `padded`.
+template <typename E>
+__global__ void __launch_bounds__(kThreads)
+    transpose_weights(const E* from, int32_t taps, int32_t c_in, int32_t c_out, int32_t padded, E* to) {
+  __shared__ E square[kWarp][kWarp + 2];
+  const int32_t ci0 = blockIdx.x * kWarp, co0 = blockIdx.y * kWarp, tap = blockIdx.z, lane = threadIdx.x % kWarp;
+  for (int r = threadIdx.x / kWarp; r < kWarp; r += kWarps) {
+    const int64_t co = co0 + r;
+    square[r][lane] = co < c_out && ci0 + lane < c_in ? from[(co * taps + tap) * c_in + ci0 + lane] : E(0);
+  }
+  __syncthreads();
+  for (int r = threadIdx.x / kWarp; r < kWarp; r += kWarps) {
+    const int64_t ci = ci0 + r;
+    if (ci < c_in && co0 + lane < padded) to[(ci * taps + tap) * padded + co0 + lane] = square[lane][r];
+  }
+}
+
 // The pairs that write each tile through each tap: `written` ascends inside a tap. One warp for a tile and a tap.
 __global__ void __launch_bounds__(kThreads)
     list_pairs(const int64_t* written, const int64_t* read, const int64_t* cu_taps, int32_t taps, int64_t n_pairs,
@@ -285,7 +302,8 @@ void convolve(const char* op, const E* x, const E* weight, const E* bias, const 
   check_sizes(op, map, c_in, c_out);
   const int64_t taps = taps_of(map);
   const Padded<E> rows = padded(op, x, map.n_rows, kGradient ? c_out : c_in, workspace, stream);
-  const Padded<E> weights = padded(op, weight, c_out * taps, c_in, workspace, stream);
+  const Padded<E> weights =
+      kGradient ? Padded<E>{weight, c_in} : padded(op, weight, c_out * taps, c_in, workspace, stream);
   const VoxelValue kind = kGradient ? VoxelValue::kSum : map.first ? VoxelValue::kFirst : VoxelValue::kMean;
   const bool whole = !kGradient || slots_of(map) == 0;
   Convolution<E> conv{values_of(op, rows.data, map, rows.channels, kind, workspace, stream),
@@ -312,8 +330,18 @@ void convolve(const char* op, const E* x, const E* weight, const E* bias, const 
         make_row_plan(op, map, kGradient, own, workspace, stream);
         plan = own;
       }
-      conv.plan = row_plan_in(plan, map.n_rows, taps, kGradient && map.plan != nullptr);
-      if (convolve_tensor(op, conv, kGradient, workspace, stream)) return;
+      Convolution<E> tensor = conv;
+      tensor.plan = row_plan_in(plan, map.n_rows, taps, kGradient && map.plan != nullptr);
+      if constexpr (kGradient) {
+        E* transposed = workspace.take<E>(c_in * taps * rows.channels);
+        const dim3 squares(blocks_for(op, c_in, kWarp), blocks_for(op, rows.channels, kWarp),
+                           static_cast<unsigned>(taps));
+        launch(op, transpose_weights<E>, squares, kThreads, 0, stream, weight, taps, c_in, c_out, rows.channels,
+               transposed);
+        tensor.weight = transposed;
+        tensor.weight_row = static_cast<int32_t>(rows.channels);
+      }
+      if (convolve_tensor(op, tensor, workspace, stream)) return;
     }
   conv.pairs = pairs_of(op, map, kGradient, workspace, stream);
   convolve_plain(op, conv, tiles_of(map), kGradient, stream);

@@ -91,7 +91,8 @@ struct TilePairs {
 enum class Share { kWhole, kEqualParts, kFirstRow };  // what the rows of a voxel get of the voxel's sum
 
 // y[p] = bias + values[p] B_centre + share of (sum over pairs that write voxel v(p): values[source] B_tap), where
-// B_tap[k, n] is weight[n, tap, k]; for the gradient of the input weight[k, tap, n].
+// B_tap[k, n] is weight[n, tap, k]; for the gradient of the input weight[k, tap, n] or, on tensor cores, the same of a
+// transposed copy of the weights.
 template <typename E>
 struct Convolution {
   Values<E> values;
@@ -196,8 +197,7 @@ template <typename E>
 void convolve_plain(const char* op, const Convolution<E>& conv, int64_t n_tiles, bool transposed, Stream stream);
 // False, and nothing is queued, where the tables of so many taps find no room.
 template <typename E>
-bool convolve_tensor(const char* op, const Convolution<E>& conv, bool turned, const Workspace& workspace,
-                     Stream stream);
+bool convolve_tensor(const char* op, const Convolution<E>& conv, const Workspace& workspace, Stream stream);
 template <typename E>
 void outer_products_plain(const char* op, const OuterProducts<E>& products, int64_t n_blocks, Stream stream);
 template <typename E>

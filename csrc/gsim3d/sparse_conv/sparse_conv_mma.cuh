@@ -88,18 +88,17 @@ __device__ __forceinline__ void wait_for_phase(uint32_t barrier, uint32_t parity
 #undef GSIM3D_WAIT
 }
 
-// A factor in shared memory: where it starts, in the way that the instructions at hand ask for. `next_columns` is the
-// distance in bytes of groups of 64 columns of a turned factor.
+// A factor in shared memory: where it starts, in the way that the instructions at hand ask for.
 #ifdef __CUDA_ARCH_FEAT_SM90_ALL
 using Factor = uint64_t;
-__device__ __forceinline__ Factor factor_at(uint32_t address, uint32_t next_columns = 16) {
+__device__ __forceinline__ Factor factor_at(uint32_t address) {
   constexpr uint64_t kEightRows = 1024 / 16, kPermuted128 = 1;
-  return address / 16 | uint64_t{next_columns / 16} << 16 | kEightRows << 32 | kPermuted128 << 62;
+  return address / 16 | uint64_t{1} << 16 | kEightRows << 32 | kPermuted128 << 62;
 }
 __device__ __forceinline__ Factor moved(Factor factor, uint32_t bytes) { return factor + bytes / 16; }
 #else
 using Factor = uint32_t;
-__device__ __forceinline__ Factor factor_at(uint32_t address, uint32_t = 0) { return address; }
+__device__ __forceinline__ Factor factor_at(uint32_t address) { return address; }
 __device__ __forceinline__ Factor moved(Factor factor, uint32_t bytes) { return factor + bytes; }
 #endif
 
@@ -126,16 +125,16 @@ __device__ __forceinline__ void fence_sums(float (&sums)[kGroups][4]) {
 
 #define GSIM3D_SUMS(j) "+f"(d[j][0]), "+f"(d[j][1]), "+f"(d[j][2]), "+f"(d[j][3])
 #define GSIM3D_SUMS_4(j) GSIM3D_SUMS(j), GSIM3D_SUMS(j + 1), GSIM3D_SUMS(j + 2), GSIM3D_SUMS(j + 3)
-#define GSIM3D_FACTORS "l"(a), "l"(b), "n"(static_cast<int>(kTurnedA)), "n"(static_cast<int>(kTurnedB))
+#define GSIM3D_FACTORS "l"(a), "l"(b), "n"(static_cast<int>(kTurned))
 #define GSIM3D_GROUP_PRODUCT_32(TYPE)                                                      \
   asm volatile("wgmma.mma_async.sync.aligned.m64n32k16.f32." TYPE "." TYPE                 \
-               " {%0,%1,%2,%3,%4,%5,%6,%7,%8,%9,%10,%11,%12,%13,%14,%15}, %16, %17, 1, 1, 1, %18, %19;" \
+               " {%0,%1,%2,%3,%4,%5,%6,%7,%8,%9,%10,%11,%12,%13,%14,%15}, %16, %17, 1, 1, 1, %18, %18;" \
                : GSIM3D_SUMS_4(0)                                                          \
                : GSIM3D_FACTORS)
 #define GSIM3D_GROUP_PRODUCT_64(TYPE)                                                                      \
   asm volatile("wgmma.mma_async.sync.aligned.m64n64k16.f32." TYPE "." TYPE                                 \
                " {%0,%1,%2,%3,%4,%5,%6,%7,%8,%9,%10,%11,%12,%13,%14,%15,%16,%17,%18,%19,%20,%21,%22,%23,"  \
-               "%24,%25,%26,%27,%28,%29,%30,%31}, %32, %33, 1, 1, 1, %34, %35;"                            \
+               "%24,%25,%26,%27,%28,%29,%30,%31}, %32, %33, 1, 1, 1, %34, %34;"                            \
                : GSIM3D_SUMS_4(0), GSIM3D_SUMS_4(4)                                                        \
                : GSIM3D_FACTORS)
 #define GSIM3D_GROUP_PRODUCT_128(TYPE)                                                                     \
@@ -143,11 +142,11 @@ __device__ __forceinline__ void fence_sums(float (&sums)[kGroups][4]) {
                " {%0,%1,%2,%3,%4,%5,%6,%7,%8,%9,%10,%11,%12,%13,%14,%15,%16,%17,%18,%19,%20,%21,%22,%23,"  \
                "%24,%25,%26,%27,%28,%29,%30,%31,%32,%33,%34,%35,%36,%37,%38,%39,%40,%41,%42,%43,%44,%45,"  \
                "%46,%47,%48,%49,%50,%51,%52,%53,%54,%55,%56,%57,%58,%59,%60,%61,%62,%63}, %64, %65, 1, 1," \
-               " 1, %66, %67;"                                                                             \
+               " 1, %66, %66;"                                                                             \
                : GSIM3D_SUMS_4(0), GSIM3D_SUMS_4(4), GSIM3D_SUMS_4(8), GSIM3D_SUMS_4(12)                   \
                : GSIM3D_FACTORS)
 #define GSIM3D_GROUP_PRODUCT(COLUMNS)                                                         \
-  template <typename E, bool kTurnedA, bool kTurnedB>                                         \
+  template <typename E, bool kTurned>                                         \
   __device__ __forceinline__ void multiply_add_group(Factor a, Factor b, float (&d)[COLUMNS / 8][4]) { \
     if constexpr (std::is_same_v<E, __half>)                                                  \
       GSIM3D_GROUP_PRODUCT_##COLUMNS("f16");                                                  \

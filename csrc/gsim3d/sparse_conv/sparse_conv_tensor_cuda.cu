@@ -1,5 +1,5 @@
 // The convolution on tensor cores. A block owns a tile of rows, in the order of the plan, and kColumns output channels,
-// whose sums stay in registers. Four warps copy what the tile's taps read, stage by stage; each group of four further
+// whose sums stay in registers. Some warps copy what the tile's taps read, stage by stage; each group of four further
 // warps multiplies 64 rows, and leaves out the taps that none of its rows has. Where there are few tiles the stages of a
 // tile are shared by several blocks, whose sums are added in a fixed order.
 #include <algorithm>
@@ -14,7 +14,6 @@ constexpr int kDepth = 64;  // channels of one stage: rows of 128 bytes, in 8 ch
 constexpr int kChunk = 8;   // channels of 16 bytes
 constexpr int kRowBytes = 128, kRowChunks = 8;
 constexpr int kGroupRows = kConvGroupRows;
-constexpr int kCopying = 128;      // threads that copy
 constexpr int64_t kEnough = 128;   // blocks that nearly fill a large GPU
 constexpr int64_t kMaxSplits = 16;
 constexpr int kAdders = 256;
@@ -22,8 +21,10 @@ constexpr int kAdders = 256;
 template <int kGroups_, int kColumns_>
 struct Shape {
   static constexpr int kGroups = kGroups_, kColumns = kColumns_, kRows = kGroupRows * kGroups;
-  static constexpr int kThreads = kCopying + 128 * kGroups, kBlocksOnSm = kGroups == 4 ? 1 : 2;
-  static constexpr int kStages = kGroups == 1 ? 6 : 4;
+  static constexpr int kCopying = kGroups == 1 ? 128 : 256;  // threads that copy
+  static constexpr int kThreads = kCopying + 128 * kGroups, kBlocksOnSm = kColumns == 128 ? 1 : 2;
+  static constexpr int kStages = kGroups == 1 ? 6 : kGroups == 2 ? 4 : 5;
+  static constexpr int kApart = kCopying / 8;  // rows between those of a thread that copies
   static constexpr int kBytesA = kRows * kRowBytes, kBytesB = kColumns * kRowBytes;
 };
 
@@ -124,68 +125,71 @@ struct Tile {
   __device__ uint32_t empty(int slot) const { return shared_address(memory.empty + slot); }
 };
 
-// The rows of the left factor, one chunk of kEach rows a thread.
+// The rows of the left factor, one chunk of kEach rows a thread. What they are is looked up two stages ahead.
 template <typename E, typename S>
 struct RowCopy {
-  static constexpr int kEach = S::kRows / (kCopying / kRowChunks);
+  static constexpr int kEach = S::kRows / S::kApart;
+  struct Lookup {
+    uint32_t source;
+    int32_t rows[kEach];
+  };
   const Tile<E, S>& tile;
-  const int chunk, first_row;
+  const int chunk, row;
   const uint32_t to;
-  int32_t rows[kEach], upcoming[kEach];
-  uint32_t tap = kNoTap + 1;  // of rows
-  uint32_t next;
+  Lookup now, next, later;
 
   __device__ RowCopy(const Tile<E, S>& tile, int thread)
       : tile(tile),
         chunk(thread % kRowChunks),
-        first_row(thread / kRowChunks * kEach),
-        to(shared_address(tile.memory.a[0]) + first_row * kRowBytes) {}
-
-  __device__ void look_up(int32_t stage) {
-    next = tile.tables.sources[stage * kRowChunks + chunk];
-    if (tap_of(next) == tap) return;
-    const RowPlan& plan = tile.conv.plan;
-    const bool centre = tap_of(next) == tile.conv.taps / 2;
-    const int32_t* from = centre ? plan.order : plan.sources + wide_product(tap_of(next), plan.pitch);
+        row(thread / kRowChunks),
+        to(shared_address(tile.memory.a[0]) + row * kRowBytes + ((chunk ^ (row & 7)) << 4)) {
+    later.source = packed_source(kNoTap, 0);
 #pragma unroll
-    for (int i = 0; i < kEach; i += 4) {
-      int4 four{-1, -1, -1, -1};
-      if (tap_of(next) != kNoTap) four = *reinterpret_cast<const int4*>(from + tile.first_place + first_row + i);
-      upcoming[i] = four.x;
-      upcoming[i + 1] = four.y;
-      upcoming[i + 2] = four.z;
-      upcoming[i + 3] = four.w;
-    }
+    for (int i = 0; i < kEach; ++i) later.rows[i] = -1;
+    next = later;
+    look_up(tile.stages.begin);
+    advance(tile.stages.begin + 1);
+    advance(tile.stages.begin + 2);
   }
 
-  // Queues the chunk of a stage that was looked up; then looks up the next.
+  __device__ void look_up(int32_t stage) {
+    if (stage >= tile.stages.end) return;
+    later.source = tile.tables.sources[stage * kRowChunks + chunk];
+    const uint32_t tap = tap_of(later.source);
+    if (tap == tap_of(next.source)) return;
+    const RowPlan& plan = tile.conv.plan;
+    const int32_t* from = tap == tile.conv.taps / 2 ? plan.order : plan.sources + wide_product(tap, plan.pitch);
+#pragma unroll
+    for (int i = 0; i < kEach; ++i) later.rows[i] = tap == kNoTap ? -1 : from[tile.first_place + row + i * S::kApart];
+  }
+
+  __device__ void advance(int32_t stage) {
+    now = next;
+    next = later;
+    look_up(stage);
+  }
+
+  // Queues the chunk of a stage.
   __device__ void copy(int32_t stage, int slot) {
     const Values<E>& values = tile.conv.values;
-    if (tap_of(next) != tap) {
-      tap = tap_of(next);
+    const uint32_t groups = tile.tables.groups[stage], stage_to = to + slot * S::kBytesA;
+    const int32_t column = tap_of(now.source) == kNoTap ? 0 : chunk_of(now.source) * kChunk;
+    const bool alone = values.n_sources == values.n_rows;
 #pragma unroll
-      for (int i = 0; i < kEach; ++i) rows[i] = upcoming[i];
+    for (int i = 0; i < kEach; ++i) {
+      if ((groups >> (i * S::kApart / kGroupRows) & 1) == 0) continue;
+      const bool real = static_cast<uint32_t>(now.rows[i]) < static_cast<uint32_t>(values.n_sources);
+      const int32_t source = real ? now.rows[i] : 0;
+      const E* from = alone ? values.rows + wide_product(source, values.channels) : values.at(source);
+      copy_async(stage_to + i * S::kApart * kRowBytes, from + column, real);
     }
-    if (tile.tables.groups[stage] >> (first_row / kGroupRows) & 1) {
-      const int32_t column = tap == kNoTap ? 0 : chunk_of(next) * kChunk;
-      const uint32_t stage_to = to + slot * S::kBytesA;
-      const bool alone = values.n_sources == values.n_rows;
-#pragma unroll
-      for (int i = 0; i < kEach; ++i) {
-        const bool real = static_cast<uint32_t>(rows[i]) < static_cast<uint32_t>(values.n_sources);
-        const int32_t row = real ? rows[i] : 0;
-        const E* from = alone ? values.rows + wide_product(row, values.channels) : values.at(row);
-        copy_async(stage_to + i * kRowBytes + ((chunk ^ ((first_row + i) & 7)) << 4), from + column, real);
-      }
-    }
-    if (stage + 1 < tile.stages.end) look_up(stage + 1);
+    advance(stage + 3);
   }
 };
 
 // The right factor: rows of kDepth input channels for each output channel.
 template <typename E, typename S>
 struct WeightCopy {
-  static constexpr int kApart = kCopying / kRowChunks;
   const Tile<E, S>& tile;
   const int chunk, row;
   const E* from;
@@ -196,7 +200,7 @@ struct WeightCopy {
       : tile(tile), chunk(thread % kRowChunks), row(thread / kRowChunks) {
     const int64_t row_step = wide_product(tile.conv.taps, tile.conv.weight_row);
     from = tile.conv.weight + (tile.n0 + row) * row_step;
-    step = kApart * row_step;
+    step = S::kApart * row_step;
     to = shared_address(tile.memory.b[0]) + row * kRowBytes + ((chunk ^ (row & 7)) << 4);
   }
 
@@ -207,53 +211,18 @@ struct WeightCopy {
     const int32_t tap = conv.weight_tap(tap_of(source));
     const E* here = from + wide_product(tap, conv.weight_row) + chunk_of(source) * kChunk;
 #pragma unroll
-    for (int i = 0; i < S::kColumns / kApart; ++i, here += step) {
-      const bool real = listed && tile.n0 + row + i * kApart < conv.c_write;
-      copy_async(to + slot * S::kBytesB + i * kApart * kRowBytes, real ? here : conv.weight, real);
+    for (int i = 0; i < S::kColumns / S::kApart; ++i, here += step) {
+      const bool real = listed && tile.n0 + row + i * S::kApart < conv.c_write;
+      copy_async(to + slot * S::kBytesB + i * S::kApart * kRowBytes, real ? here : conv.weight, real);
     }
   }
 };
 
-// The same for the gradient of the input: rows of output channels for each step of the sum, in groups of 64 columns.
 template <typename E, typename S>
-struct TurnedWeightCopy {
-  static constexpr int kAcross = S::kColumns / kChunk, kApart = kCopying / kAcross;  // 8 or 16 rows
-  const Tile<E, S>& tile;
-  const int row;
-  const E* from;
-  bool inside_row;
-  uint32_t to;
-
-  __device__ TurnedWeightCopy(const Tile<E, S>& tile, int thread) : tile(tile), row(thread / kAcross) {
-    const Convolution<E>& conv = tile.conv;
-    const int chunk = thread % kAcross;
-    const int32_t column = tile.n0 + chunk * kChunk;
-    inside_row = column < conv.weight_row;
-    from = conv.weight + wide_product(row % kChunk * conv.taps, conv.weight_row) + (inside_row ? column : 0);
-    to = shared_address(tile.memory.b[0]) + chunk / kRowChunks * (kDepth * kRowBytes) + row * kRowBytes +
-         ((chunk % kRowChunks ^ (row & 7)) << 4);
-  }
-
-  __device__ void copy(int32_t stage, int slot) const {
-    const Convolution<E>& conv = tile.conv;
-    const uint32_t* sources = tile.tables.sources + stage * kRowChunks + row / kChunk;
-#pragma unroll
-    for (int i = 0; i < kDepth / kApart; ++i) {
-      const uint32_t source = sources[i * kApart / kChunk];
-      const int32_t channel = chunk_of(source) * kChunk;
-      const bool real = inside_row && tap_of(source) != kNoTap && channel + row % kChunk < conv.c_out;
-      const E* here = from + wide_product(channel * conv.taps + conv.weight_tap(tap_of(source)), conv.weight_row);
-      copy_async(to + slot * S::kBytesB + i * kApart * kRowBytes, real ? here : conv.weight, real);
-    }
-  }
-};
-
-template <typename E, bool kTurned, typename S>
 __device__ void copy_tile(const Tile<E, S>& tile, int thread) {
   if (tile.stages.begin >= tile.stages.end) return;
   RowCopy<E, S> rows(tile, thread);
-  const std::conditional_t<kTurned, TurnedWeightCopy<E, S>, WeightCopy<E, S>> weights(tile, thread);
-  rows.look_up(tile.stages.begin);
+  const WeightCopy<E, S> weights(tile, thread);
   int slot = 0;
   uint32_t parity = 1;  // the first round finds all slots empty
   for (int32_t stage = tile.stages.begin; stage < tile.stages.end; ++stage) {
@@ -274,22 +243,21 @@ template <int kColumns>
 using Sums = float[kColumns / 8][4];
 
 // sums += a b over a stage.
-template <typename E, bool kTurned, int kColumns>
+template <typename E, int kColumns>
 __device__ __forceinline__ void multiply_stage(Factor a, Factor b, Sums<kColumns>& sums) {
 #ifdef __CUDA_ARCH_FEAT_SM90_ALL
   fence_sums(sums);
   start_group_products();
 #pragma unroll
   for (int k = 0; k < kDepth / 16; ++k)
-    multiply_add_group<E, false, kTurned>(moved(a, k * 32), moved(b, k * (kTurned ? 16 * kRowBytes : 32)), sums);
+    multiply_add_group<E, false>(moved(a, k * 32), moved(b, k * 32), sums);
   close_group_products();
   wait_for_group_products<0>();
   fence_sums(sums);
 #else
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp % 4;
   a += chunk_offset<kDepth>(warp * 16 + lane % 16, lane / 16) * sizeof(E);
-  b += kTurned ? chunk_offset<kDepth>(lane / 8 % 2 * 8 + lane % 8, lane / 16) * sizeof(E)
-               : chunk_offset<kDepth>(lane / 16 * 8 + lane % 8, lane / 8 % 2) * sizeof(E);
+  b += chunk_offset<kDepth>(lane / 16 * 8 + lane % 8, lane / 8 % 2) * sizeof(E);
 #pragma unroll
   for (int k = 0; k < kDepth / 16; ++k) {
     uint32_t left[4];
@@ -297,10 +265,7 @@ __device__ __forceinline__ void multiply_stage(Factor a, Factor b, Sums<kColumns
 #pragma unroll
     for (int j = 0; j < kColumns / 8; j += 2) {
       uint32_t right[4];
-      if constexpr (kTurned)
-        load_matrices_transposed((b ^ (j % 8 * 16)) + j / 8 * kDepth * kRowBytes + k * 16 * kRowBytes, right);
-      else
-        load_matrices((b ^ (k * 32)) + j * 8 * kRowBytes, right);
+      load_matrices((b ^ (k * 32)) + j * 8 * kRowBytes, right);
       multiply_add<E>(left, right[0], right[1], sums[j]);
       multiply_add<E>(left, right[2], right[3], sums[j + 1]);
     }
@@ -408,7 +373,7 @@ __device__ void write_partials(const Sums<kColumns>& sums, float* to, int64_t co
       *reinterpret_cast<float2*>(to + h * 8 * columns + j * 8) = float2{sums[j][2 * h], sums[j][2 * h + 1]};
 }
 
-template <typename E, bool kTurned, typename S>
+template <typename E, typename S>
 __device__ void multiply_tile(const Tile<E, S>& tile, int group, int64_t columns, float* partials) {
   constexpr int kColumns = S::kColumns;
   const Convolution<E>& conv = tile.conv;
@@ -421,7 +386,7 @@ __device__ void multiply_tile(const Tile<E, S>& tile, int group, int64_t columns
     for (int h = 0; h < 2; ++h) shares[h] = share_of(conv, rows[h]);
   }
   const Factor a = factor_at(shared_address(tile.memory.a[0]) + group * (kGroupRows * kRowBytes));
-  const Factor b = factor_at(shared_address(tile.memory.b[0]), kTurned ? kDepth * kRowBytes : 16);
+  const Factor b = factor_at(shared_address(tile.memory.b[0]));
 
   Sums<kColumns> sums{};
   int slot = 0;
@@ -431,7 +396,7 @@ __device__ void multiply_tile(const Tile<E, S>& tile, int group, int64_t columns
       wait_for_phase(tile.full(slot), parity);
       if (tile.tables.groups[stage] >> group & 1) {
         publish_copies();
-        multiply_stage<E, kTurned, kColumns>(moved(a, slot * S::kBytesA), moved(b, slot * S::kBytesB), sums);
+        multiply_stage<E, kColumns>(moved(a, slot * S::kBytesA), moved(b, slot * S::kBytesB), sums);
       }
       __syncwarp();
       if (lane == 0) arrive(tile.empty(slot));
@@ -452,7 +417,7 @@ __device__ void multiply_tile(const Tile<E, S>& tile, int group, int64_t columns
     write_sums<E, kColumns>(conv, sums, rows, tile.n0);
 }
 
-template <typename E, bool kTurned, typename S>
+template <typename E, typename S>
 __global__ void __launch_bounds__(S::kThreads, S::kBlocksOnSm)
     convolve(Convolution<E> conv, int32_t column_blocks, float* partials) {
   extern __shared__ __align__(1024) char raw[];
@@ -466,7 +431,7 @@ __global__ void __launch_bounds__(S::kThreads, S::kBlocksOnSm)
     if (threadIdx.x == 0) {
       memory.n_others = n;
       for (int i = 0; i < S::kStages; ++i) {
-        start_barrier(shared_address(memory.full + i), kCopying);
+        start_barrier(shared_address(memory.full + i), S::kCopying);
         start_barrier(shared_address(memory.empty + i), 4 * S::kGroups);
       }
     }
@@ -492,10 +457,10 @@ __global__ void __launch_bounds__(S::kThreads, S::kBlocksOnSm)
   __syncthreads();
   const Tile<E, S> tile{conv, memory, tables, walk, stages, index * S::kRows, n0};
   const int group = threadIdx.x / 128;
-  if (group == S::kGroups)
-    copy_tile<E, kTurned, S>(tile, threadIdx.x % 128);
+  if (group < S::kGroups)
+    multiply_tile<E, S>(tile, group, int64_t{column_blocks} * S::kColumns, partials);
   else
-    multiply_tile<E, kTurned, S>(tile, group, int64_t{column_blocks} * S::kColumns, partials);
+    copy_tile<E, S>(tile, threadIdx.x - 128 * S::kGroups);
 }
 
 // y[order[place], c] = bias + the sums of all parts.
@@ -524,8 +489,7 @@ __global__ void __launch_bounds__(kAdders)
 }  // namespace
 
 template <typename E>
-bool convolve_tensor(const char* op, const Convolution<E>& conv, bool turned, const Workspace& workspace,
-                     Stream stream) {
+bool convolve_tensor(const char* op, const Convolution<E>& conv, const Workspace& workspace, Stream stream) {
   int shared_bytes = 0;
   check_cuda(cudaDeviceGetAttribute(&shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, stream.device), op);
   const auto bytes_of = [&]<typename S>() { return Memory<S>::bytes(conv.taps, conv.c_read / kChunk); };
@@ -541,13 +505,13 @@ bool convolve_tensor(const char* op, const Convolution<E>& conv, bool turned, co
     const int64_t splits = n_blocks >= kEnough ? 1 : std::min(kMaxSplits, 2 * kEnough / n_blocks);
     float* partials = splits > 1 ? workspace.take<float>(splits * conv.plan.pitch * columns) : nullptr;
     const dim3 grid(blocks_for(op, n_blocks, 1), static_cast<unsigned>(splits));
-    launch(op, turned ? convolve<E, true, S> : convolve<E, false, S>, grid, S::kThreads,
+    launch(op, convolve<E, S>, grid, S::kThreads,
            bytes_of.template operator()<S>(), stream, conv, across, partials);
     if (splits > 1)
       launch(op, add_parts<E>, blocks_for(op, conv.plan.pitch * columns, 4 * kAdders), kAdders, 0, stream, conv,
              partials, static_cast<int32_t>(splits), columns);
   };
-  using Wide = Shape<4, 128>;
+  using Wide = Shape<3, 128>;
   using Narrow = Shape<2, 64>;
   using Small = Shape<1, 64>;
   const bool suits = round_up(conv.c_write, 128) * 4 <= round_up(conv.c_write, 64) * 5;  // few columns beyond the last
@@ -562,8 +526,7 @@ bool convolve_tensor(const char* op, const Convolution<E>& conv, bool turned, co
   return true;
 }
 
-template bool convolve_tensor<__half>(const char*, const Convolution<__half>&, bool, const Workspace&, Stream);
-template bool convolve_tensor<__nv_bfloat16>(const char*, const Convolution<__nv_bfloat16>&, bool, const Workspace&,
-                                             Stream);
+template bool convolve_tensor<__half>(const char*, const Convolution<__half>&, const Workspace&, Stream);
+template bool convolve_tensor<__nv_bfloat16>(const char*, const Convolution<__nv_bfloat16>&, const Workspace&, Stream);
 
 }  // namespace gsim3d::cuda::conv

@@ -44,8 +44,8 @@ __device__ __forceinline__ void start_stage(Factor grads, Factor inputs, Sums<kS
   for (int k = 0; k < kDepth; k += 16)
 #pragma unroll
     for (int p = 0; p < Sums<kSide>::kParts; ++p)
-      multiply_add_group<E, true, true>(moved(grads, k * kRowBytes), moved(inputs, p * kHalfBytes + k * kRowBytes),
-                                        sums.values[p]);
+      multiply_add_group<E, true>(moved(grads, k * kRowBytes), moved(inputs, p * kHalfBytes + k * kRowBytes),
+                                  sums.values[p]);
   close_group_products();
 #else
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp % 4;
