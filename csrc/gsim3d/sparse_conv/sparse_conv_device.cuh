@@ -1,7 +1,6 @@
 // What the kernels of sparse convolution share: types, and where the value of a voxel lies.
 #pragma once
 
-#include <algorithm>
 #include <type_traits>
 
 #include "gsim3d/core/cuda_utils.cuh"
@@ -18,7 +17,10 @@ constexpr bool kIsHalf = std::is_same_v<E, __half> || std::is_same_v<E, __nv_bfl
 inline int64_t taps_of(const SparseConvMap& map) { return map.kernel_size * map.kernel_size * map.kernel_size; }
 inline int64_t tiles_of(const SparseConvMap& map) { return (map.n_voxels + kTile - 1) / kTile; }
 inline int64_t round_up(int64_t n, int64_t step) { return (n + step - 1) / step * step; }
-inline int64_t slots_of(const SparseConvMap& map) { return std::max<int64_t>(0, map.n_rows - map.n_voxels); }
+// Where some voxels are empty, any number of the others may be shared.
+inline int64_t slots_of(const SparseConvMap& map) {
+  return map.n_voxels > map.n_rows ? map.n_rows : map.n_rows - map.n_voxels;
+}
 
 // One value a voxel, without copying those of voxels with one row. A source below n_rows is a row; the others count
 // voxels of several rows: voxel v has the slot "rows before it" - v, which is below n_rows - n_voxels.
