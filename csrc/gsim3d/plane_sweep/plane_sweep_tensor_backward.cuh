@@ -9,10 +9,11 @@ namespace {
 constexpr int kScored = 560;  // source pixels with scores, or gradients of them, in shared memory
 static_assert(kScored % 16 == 0);
 constexpr int kScoreStride = kTile + 4;  // spreads a warp's accesses over the banks
+
 constexpr int kRun = 8;   // source pixels side by side
 constexpr int kRuns = 4;  // of a block, one below the other
 constexpr int kTotalStride = kRun * kRuns + 4;
-constexpr int kCapacity = 832;
+constexpr int kCapacity = 832;  // of a tile, for all pixels that most tiles touch
 constexpr int64_t kKeptBytes = int64_t{768} << 20;
 
 // Gradients of the scores of tiles [first_tile, first_tile + n_tiles) of every image with the sources of pairs
@@ -25,9 +26,7 @@ struct KeptScores {
   int64_t first_pair, n_pairs;
   int32_t first_tile, n_tiles, first_rank, capacity;
 
-  __device__ __forceinline__ bool over() const {
-    return first_rank > 0 && *longest <= first_rank;
-  }
+  __device__ __forceinline__ bool over() const { return first_rank > 0 && *longest <= first_rank; }
   __device__ __forceinline__ __half* rows_of(int64_t pair, int32_t tile) const {
     return rows + ((pair - first_pair) * n_tiles + tile - first_tile) * capacity * 2 * kTile;
   }
@@ -164,13 +163,13 @@ __device__ __forceinline__ void gather_features(const __half* __restrict__ sourc
     const auto first_of = [](uint32_t a, uint32_t b) { return __byte_perm(a, b, 0x5410); };
     const auto second_of = [](uint32_t a, uint32_t b) { return __byte_perm(a, b, 0x7632); };
     const uint4 a_high[2] = {{first_of(high[0].x, high[1].x), second_of(high[0].x, high[1].x),
-                                    first_of(high[2].x, high[3].x), second_of(high[2].x, high[3].x)},
-                                   {first_of(high[0].y, high[1].y), second_of(high[0].y, high[1].y),
-                                    first_of(high[2].y, high[3].y), second_of(high[2].y, high[3].y)}};
+                              first_of(high[2].x, high[3].x), second_of(high[2].x, high[3].x)},
+                             {first_of(high[0].y, high[1].y), second_of(high[0].y, high[1].y),
+                              first_of(high[2].y, high[3].y), second_of(high[2].y, high[3].y)}};
     const uint4 a_low[2] = {{first_of(low[0].x, low[1].x), second_of(low[0].x, low[1].x),
-                                   first_of(low[2].x, low[3].x), second_of(low[2].x, low[3].x)},
-                                  {first_of(low[0].y, low[1].y), second_of(low[0].y, low[1].y),
-                                   first_of(low[2].y, low[3].y), second_of(low[2].y, low[3].y)}};
+                             first_of(low[2].x, low[3].x), second_of(low[2].x, low[3].x)},
+                            {first_of(low[0].y, low[1].y), second_of(low[0].y, low[1].y),
+                             first_of(low[2].y, low[3].y), second_of(low[2].y, low[3].y)}};
     const uint32_t* pairs = reinterpret_cast<const uint32_t*>(grads) + (r + 2 * t) * kScoreStride + g;
 #pragma unroll
     for (int n = 0; n < 4; ++n) {
@@ -282,7 +281,7 @@ __global__ void __launch_bounds__(kTileThreads, 2)
 }
 
 // A block owns kRuns runs of source pixels and adds what the kept scores give them, by pairs, then by tiles. A warp
-// takes 16 channels and every `ways`-th tile.
+// takes 32 channels and every `ways`-th tile.
 __global__ void __launch_bounds__(kTileThreads, 2)
     source_gradients_kernel(const uint32_t* __restrict__ largest_grad, SweepHalves halves, PlaneSweep<float> sweep,
                             TileSizes s, KeptScores kept, int32_t blocks_per_image, float* __restrict__ grad_features) {
@@ -292,10 +291,10 @@ __global__ void __launch_bounds__(kTileThreads, 2)
   const int32_t block = blockIdx.x % blocks_per_image, column = block % s.columns, top = block / s.columns * kRuns;
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp, g = lane / 4, t = lane % 4;
   const int32_t first_channel = blockIdx.y * kChannels;
-  const int groups = min(s.channels - first_channel, kChannels) / 16, ways = kTileWarps / groups;
-  const int32_t channel = first_channel + warp % groups * 16;
+  const int groups = min(s.channels - first_channel, kChannels) / 32, ways = kTileWarps / groups;
+  const int32_t channel = first_channel + warp % groups * 32;
   const int way = warp / groups;
-  float sums[kRuns][4] = {};
+  float sums[2][kRuns][4] = {};
   int turn = 0;
   for (int64_t begin = kept.first_pair; begin < kept.first_pair + kept.n_pairs; begin += kWarp) {
     const bool ours = begin + lane < kept.first_pair + kept.n_pairs && sweep.src_images[begin + lane] == image;
@@ -318,7 +317,11 @@ __global__ void __launch_bounds__(kTileThreads, 2)
           const int32_t tile = kept.first_tile + first + hit;
           const uint4* own = reinterpret_cast<const uint4*>(halves.tiles) +
                              ((owner * s.n_tiles + tile) * s.channels + channel) / 16 * 4 * kWarp + lane;
-          const uint4 high0 = own[0], high1 = own[kWarp], low0 = own[2 * kWarp], low1 = own[3 * kWarp];
+          uint4 fragments[2][4];  // of each sixteen channels: two high, two low
+#pragma unroll
+          for (int m = 0; m < 2; ++m)
+#pragma unroll
+            for (int f = 0; f < 4; ++f) fragments[m][f] = own[(m * 4 + f) * kWarp];
           const __half* rows = kept.rows_of(pair, tile) + 8 * t;
           // All runs at once, so that their loads wait together.
           uint4 high[kRuns], low[kRuns];
@@ -337,8 +340,11 @@ __global__ void __launch_bounds__(kTileThreads, 2)
 #pragma unroll
           for (int i = 0; i < kRuns; ++i) {
             if (!touched[i]) continue;
-            multiply_add(sums[i], high0, low0, {high[i].x, high[i].y}, {low[i].x, low[i].y});
-            multiply_add(sums[i], high1, low1, {high[i].z, high[i].w}, {low[i].z, low[i].w});
+#pragma unroll
+            for (int m = 0; m < 2; ++m) {
+              multiply_add(sums[m][i], fragments[m][0], fragments[m][2], {high[i].x, high[i].y}, {low[i].x, low[i].y});
+              multiply_add(sums[m][i], fragments[m][1], fragments[m][3], {high[i].z, high[i].w}, {low[i].z, low[i].w});
+            }
           }
         }
       }
@@ -348,18 +354,21 @@ __global__ void __launch_bounds__(kTileThreads, 2)
   for (int w = 0; w < ways; ++w) {
     if (way == w) {
 #pragma unroll
-      for (int i = 0; i < kRuns; ++i)
+      for (int m = 0; m < 2; ++m)
 #pragma unroll
-        for (int e = 0; e < 4; ++e) {
-          float& sum = total[(warp % groups * 16 + g + e / 2 * 8) * kTotalStride + i * kRun + 2 * t + e % 2];
-          sum = w > 0 ? sum + sums[i][e] : sums[i][e];
-        }
+        for (int i = 0; i < kRuns; ++i)
+#pragma unroll
+          for (int e = 0; e < 4; ++e) {
+            const int c = warp % groups * 32 + m * 16 + e / 2 * 8 + g;
+            float& sum = total[c * kTotalStride + i * kRun + 2 * t + e % 2];
+            sum = w > 0 ? sum + sums[m][i][e] : sums[m][i][e];
+          }
     }
     __syncthreads();
   }
   const float grad_scale = score_gradient_scale(largest_grad, sweep).inverse;
   const float feature_scale = HalfScale(largest_of(halves.largest)).inverse;
-  for (int32_t i = threadIdx.x; i < groups * 16 * kRuns * kRun; i += kTileThreads) {
+  for (int32_t i = threadIdx.x; i < groups * 32 * kRuns * kRun; i += kTileThreads) {
     const int32_t c = i / (kRuns * kRun), at = i % (kRuns * kRun), x = column * kRun + at % kRun, y = top + at / kRun;
     if (x >= s.width || y >= s.height || first_channel + c >= sweep.channels) continue;
     grad_features[(image * sweep.channels + first_channel + c) * s.n_pixels + y * s.width + x] +=

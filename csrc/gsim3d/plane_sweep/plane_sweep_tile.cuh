@@ -151,19 +151,19 @@ __device__ __forceinline__ int32_t mark_lines(const TileLines& lines, const floa
 // list[r - first] = the pixel q with rank r of [first, first + rows); in the border -1 - q for the pixel beside it.
 __device__ __forceinline__ void list_pixels(const Word* words, const TileSizes& s, int32_t first, int32_t rows,
                                             int32_t* list) {
-  const int lane = threadIdx.x % kWarp;
-  const float per_row = 1.0f / static_cast<float>(s.stride);
-  for (int32_t w = threadIdx.x / kWarp; w < s.n_words; w += kTileWarps) {
+  for (int32_t w = threadIdx.x; w < s.n_words; w += kTileThreads) {
     const Word word = words[w];
-    if (!(word.bits >> lane & 1)) continue;
-    const int32_t rank = static_cast<int32_t>(word.before) + __popc(word.bits & ((1u << lane) - 1)) - first;
-    if (static_cast<uint32_t>(rank) >= static_cast<uint32_t>(rows)) continue;
-    // Exact: places are below 2^20, and halves away from a whole row.
-    const int32_t at = w * 32 + lane, row = static_cast<int32_t>((static_cast<float>(at) + 0.5f) * per_row);
-    const int32_t y = row - 1, x = at - row * s.stride - 1;
-    const int32_t near_y = min(max(y, 0), s.height - 1), near_x = min(max(x, 0), s.width - 1);
-    const int32_t pixel = near_y * s.width + near_x;
-    list[rank] = x == near_x && y == near_y ? pixel : -1 - pixel;
+    int32_t rank = static_cast<int32_t>(word.before) - first;
+    if (word.bits == 0 || rank >= rows || rank + 32 <= 0) continue;
+    int32_t y = w * 32 / s.stride, x = w * 32 - y * s.stride, at = 0;
+    for (uint32_t rest = word.bits; rest; rest &= rest - 1, ++rank) {
+      const int32_t bit = __ffs(rest) - 1;
+      for (x += bit - at, at = bit; x >= s.stride; x -= s.stride) ++y;
+      if (static_cast<uint32_t>(rank) >= static_cast<uint32_t>(rows)) continue;
+      const int32_t near_y = min(max(y - 1, 0), s.height - 1), near_x = min(max(x - 1, 0), s.width - 1);
+      const int32_t pixel = near_y * s.width + near_x;
+      list[rank] = x - 1 == near_x && y - 1 == near_y ? pixel : -1 - pixel;
+    }
   }
 }
 
