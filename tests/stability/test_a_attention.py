@@ -109,7 +109,9 @@ def test_a27_weight_gradients_over_100_000_rows(setting, measured):
     sums = x.double().sum(0)
     measured.finite(*grads)
     measured.close(grads[0].reshape(16, 16), sums.expand(16, 16), f"many_rows_{setting.precision}", "grad weight")
-    measured.close(grads[1], torch.full((16,), float(MANY), dtype=torch.float64), f"many_rows_{setting.precision}", "bias")
+    measured.close(
+        grads[1], torch.full((16,), float(MANY), dtype=torch.float64), f"many_rows_{setting.precision}", "bias"
+    )
     scale, shift = torch.ones(16), torch.zeros(16)
     few = x[:1000]
     ours = gradients(ops.row_norm, [setting.to(t) for t in (few.repeat(100, 1), scale, shift)], few.repeat(100, 1))
@@ -207,7 +209,7 @@ def test_a28_depth_keeps_its_digits_under_autocast_on_the_cpu(setting, measured)
 
 
 def test_a28_inverse_calibration_is_float64(setting, measured):
-    """A camera 10 km from zero: its rays keep their directions to float64's digits, whatever the network computes in."""
+    """A camera 10 km from zero is where it is to float64's digits, whatever the network computes in."""
     frames = make_frames([0, 0])
     viewmats = frames.cameras.viewmats.clone()
     viewmats[:, :3, 3] -= (viewmats[:, :3, :3] @ torch.full((3, 1), 1e4, dtype=torch.float64))[..., 0]
