@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from gsim3d import ops
+from gsim3d.dynamics.point_transformer import Attention
 from gsim3d.encoder.heads import PixelRays
 from gsim3d.layers import RowBatchNorm, RowLayerNorm
 from gsim3d.quirks import Quirks
@@ -48,8 +49,10 @@ def large_queries(dynamics):
             parameter.data.mul_(1e6)
 
 
-@pytest.mark.parametrize("quirks", [Quirks(), Quirks(half_attention=True)], ids=["", "half"])
-def test_a25_a_network_with_such_logits(setting, measured, quirks):
+QUIRKS = pytest.mark.parametrize("quirks", [Quirks(), Quirks(half_attention=True)], ids=["", "half"])
+
+
+def check_huge_network(setting, measured, quirks) -> None:
     config = dataclasses.replace(TINY, quirks=quirks)
     histories = make_history((30, 20)), ordinary(config)
     step = simulate(setting, batch(histories), config, prepare=large_queries)
@@ -58,6 +61,33 @@ def test_a25_a_network_with_such_logits(setting, measured, quirks):
     measured.finite(*alone.tensors)
     for name, value in alone.fields.items():
         measured.unchanged(setting, step.fields[name][20:], value, name)
+
+
+@QUIRKS
+def test_a25_a_network_with_such_logits(setting, measured, quirks):
+    check_huge_network(setting, measured, quirks)
+
+
+@QUIRKS
+@pytest.mark.parametrize("setting", NAMES[1:2], indirect=True)
+def test_a25_a_network_with_such_logits_under_autocast_on_the_cpu(setting, measured, quirks):
+    half = Setting(setting.device, "bf16")
+    with half.computing():
+        check_huge_network(half, measured, quirks)
+
+
+def test_a25_gradients_beyond_half_precision(setting, measured):
+    """Where attention imitates half precision: its gradients keep their range, and digits."""
+    torch.manual_seed(0)
+    attention = setting.to(Attention(32, 2, rounded_to_half=True))
+    x, cotangent = setting.to(torch.randn(16, 32)), setting.to(torch.randn(16, 32))
+    rows, whole = (torch.tensor(values, device=setting.device) for values in (range(16), (0, 16)))
+    table = ops.PatchTable(rows, rows, whole, whole)
+    grads, small = (
+        torch.autograd.grad((f * cotangent * attention(x, table)).sum(), attention.qkv.weight)[0] for f in (2.0**30, 1)
+    )
+    measured.finite(grads)
+    measured.same_bits(grads, 2.0**30 * small, "gradient of the weights")
 
 
 @pytest.mark.parametrize("sizes", [RAGGED, ((0, 0),), ((0, 3), (3, 0), (1, 1)), ((5, 16), (16, 16), (16, 16))])

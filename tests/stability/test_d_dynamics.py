@@ -365,7 +365,7 @@ class Killed(BaseException):
 def test_d50_resume_after_kill(setting, measured, scenes, tmp_path, when, monkeypatch):
     """Killed once in every step, before or while its checkpoint is written: the curve of a run that never was."""
     Trainer(TRAINING, scenes, tmp_path / "whole", device=setting.device.type).run(progress=False)
-    victim = {"in the step": (Trainer, "_update_average"), "in the checkpoint": (checkpoint, "save_file")}[when]
+    victim = {"in the step": (Trainer, "_update_average"), "in the checkpoint": (checkpoint, "_sync")}[when]
     original = getattr(*victim)
     for step in range(TRAINING.n_steps):
         trainer = Trainer(TRAINING, scenes, tmp_path / "killed", device=setting.device.type)
