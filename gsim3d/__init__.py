@@ -17,6 +17,7 @@ _HOME = {
     "InputError": "gsim3d.errors",
     "Particles": "gsim3d.types",
     "Simulator": "gsim3d.simulator",
+    "StabilityReport": "gsim3d.stability",
 }
 
 __all__ = ["__version__", *_HOME]

@@ -6,4 +6,21 @@ class InputError(ValueError):
 
 
 class HardCaseError(ValueError):
-    """Numbers that no op can use (NaN, Inf, out of range); the message names scene, step, row and tensor."""
+    """Numbers that no op can use (NaN, Inf, out of range); the message names where they are and what to do.
+
+    tensor: name of the tensor. scene, step: of the particle's cloud. row: of the packed rows of the call.
+    camera: image of the call. None where it is not known.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        tensor: str | None = None,
+        scene: int | None = None,
+        step: int | None = None,
+        row: int | None = None,
+        camera: int | None = None,
+    ):
+        super().__init__(message)
+        self.tensor, self.scene, self.step, self.row, self.camera = tensor, scene, step, row, camera

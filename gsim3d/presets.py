@@ -7,15 +7,17 @@ from dataclasses import dataclass, field
 from gsim3d.dynamics import DynamicsConfig
 from gsim3d.encoder import EncoderConfig
 from gsim3d.renderer import RendererConfig
+from gsim3d.stability import StabilityConfig
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The three parts of a simulator; they must agree on the particles that pass between them."""
+    """The three parts of a simulator, which must agree on the particles that pass between them, and their limits."""
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
     renderer: RendererConfig = field(default_factory=RendererConfig)
+    stability: StabilityConfig = field(default_factory=StabilityConfig)
 
     def __post_init__(self):
         encoder, dynamics, renderer = self.encoder, self.dynamics, self.renderer

@@ -18,15 +18,16 @@ from gsim3d.harmonics import (
     sh_basis,
     turn_predicted_harmonics,
 )
-from gsim3d.layers import RowLinear
+from gsim3d.layers import RowLinear, widened
 from gsim3d.ops.raster import Rendering
 from gsim3d.quirks import Quirks
+from gsim3d.rotations import rotation_matrices, unit_quats
+from gsim3d.stability import OnBad, StabilityReport
 from gsim3d.types import Cameras, Gaussians, Particles
 
 NEAR_PLANE = 0.01  # metres; what is nearer to a camera is not drawn
 RELEASED_NEAR_SHARE = 0.2  # of the cameras' near bound
 HARMONIC_14 = 1.445305721320277  # its factor
-MIN_QUAT_NORM = 1e-6  # a shorter quaternion has no direction worth a gradient
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class GaussianHead(nn.Module):
         if self.config.latents == 0:
             return particles.sh[:, :n_harmonics], particles.quats, particles.scales
         latents = torch.cat([particles.dynamic_latents, particles.static_latents], 1)
-        raw = self.fc2(F.gelu(self.fc1(latents)))
+        raw = widened(self.fc2(F.gelu(self.fc1(latents))))
         sh, quats, scales = raw.split([raw.shape[1] - 7, 4, 3], 1)
         quats = unit_quats(quats.roll(1, 1))
         smallest, largest = self.config.scale_min, self.config.scale_max
@@ -101,6 +102,8 @@ def render(
     *,
     near_plane: float = NEAR_PLANE,
     cutoff: str = "exact",
+    on_bad: OnBad = "raise",
+    report: StabilityReport | None = None,
 ) -> Rendering:
     """Images of ``cameras``; camera i shows cloud ``cameras.image_cloud[i]`` of ``gaussians``.
 
@@ -117,6 +120,8 @@ def render(
         cu_rows=gaussians.cu_rows,
         near_plane=near_plane,
         cutoff=cutoff,
+        on_bad=on_bad,
+        report=report,
     )
 
 
@@ -180,22 +185,3 @@ def colors_with_z(sh: Tensor, means: Tensor, camera: Cameras) -> Tensor:
         weight = HARMONIC_14 * (z - y) * (z * z - x * x)
         colors = colors + weight[:, None] * rotate_harmonics(sh.detach(), axes.expand(sh.shape[0], 3, 3))[:, 14]
     return colors.clamp(min=0)
-
-
-def unit_quats(quats: Tensor) -> Tensor:
-    """[N, 4] normalised; the identity, without a gradient, where shorter than 1e-6."""
-    short = quats.detach().norm(dim=1, keepdim=True) < MIN_QUAT_NORM
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
-    quats = torch.where(short, identity, quats)
-    return quats / quats.norm(dim=1, keepdim=True)
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """Unit quaternions [N, 4] (w, x, y, z) -> [N, 3, 3]."""
-    w, x, y, z = quats.unbind(1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, 1).unflatten(1, (3, 3))

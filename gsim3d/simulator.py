@@ -8,11 +8,15 @@
 
 A state holds the last steps of each scene (:class:`gsim3d.types.Particles`, clouds sorted by scene and step). Scenes
 are packed, not padded: particle counts, numbers of views and lengths of history may all differ.
+
+Every call takes ``on_bad``, the policy for numbers that cannot be used (:mod:`gsim3d.stability`; default the model's), and
+``report``, which counts them (default ``simulator.report``).
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -21,15 +25,20 @@ from torch import Tensor, nn
 from gsim3d.dynamics import Dynamics, append_step, concatenate, last_steps, rollout
 from gsim3d.effects import EffectsSpec, Plan, make_plan
 from gsim3d.encoder import Encoder
+from gsim3d.guards import guard_particles
 from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
 from gsim3d.renderer import GaussianHead, render, render_as_published
+from gsim3d.stability import OnBad, StabilityReport, check_on_bad
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames, Particles
 
 
 class Simulator(nn.Module):
-    """Encoder, dynamics and renderer of one model."""
+    """Encoder, dynamics and renderer of one model.
+
+    report: StabilityReport of the calls that were given no other.
+    """
 
     def __init__(self, config: ModelConfig):
         super().__init__()
@@ -37,10 +46,14 @@ class Simulator(nn.Module):
         self.encoder = Encoder(config.encoder)
         self.dynamics = Dynamics(config.dynamics)
         self.renderer = GaussianHead(config.renderer)
+        self.report = StabilityReport()
 
-    def encode(self, frames: Frames) -> Particles:
+    def encode(
+        self, frames: Frames, *, on_bad: OnBad | None = None, report: StabilityReport | None = None
+    ) -> Particles:
         """Particles of all clouds of ``frames``: each pixel that the masks keep becomes one."""
-        return self.encoder(frames)
+        guard = self._guard("encode", on_bad, report)
+        return guard(self.encoder(frames))
 
     def plan(self, spec: EffectsSpec = EffectsSpec()) -> Plan:
         """What will be computed for ``spec``, and what will not.
@@ -64,7 +77,13 @@ class Simulator(nn.Module):
         return dataclasses.replace(plan, unused=tuple(unused))
 
     def step(
-        self, state: Particles, plan: Plan | None = None, *, generator: torch.Generator | None = None
+        self,
+        state: Particles,
+        plan: Plan | None = None,
+        *,
+        generator: torch.Generator | None = None,
+        on_bad: OnBad | None = None,
+        report: StabilityReport | None = None,
     ) -> Particles:
         """The state one call of the dynamics later: each scene's oldest steps leave once the history is full.
 
@@ -73,9 +92,9 @@ class Simulator(nn.Module):
             plan: what to compute; default everything the model can.
             generator: randomness of training (drop path, curve shuffling); None: none.
         """
-        plan = plan or self.plan()
-        state = last_steps(self._prepare(state, plan), plan.history)
-        return append_step(state, self._predict(state, plan, generator), plan.history)
+        plan, guard = plan or self.plan(), self._guard("step", on_bad, report)
+        state = guard(last_steps(self._prepare(state, plan), plan.history))
+        return append_step(state, self._predict(state, plan, generator, guard), plan.history)
 
     def rollout(
         self,
@@ -84,15 +103,18 @@ class Simulator(nn.Module):
         plan: Plan | None = None,
         *,
         generator: torch.Generator | None = None,
+        on_bad: OnBad | None = None,
+        report: StabilityReport | None = None,
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
 
         Rows are those of the newest step of ``state`` throughout. Gradients flow through all steps. Arguments as
         :meth:`step`.
         """
-        plan = plan or self.plan()
-        predict = partial(self._predict, plan=plan, generator=generator)
-        return rollout(predict, self._prepare(state, plan), n_steps, plan.history)
+        plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
+        state = guard(last_steps(self._prepare(state, plan), plan.history))
+        predict = partial(self._predict, plan=plan, generator=generator, guard=guard)
+        return rollout(predict, state, n_steps, plan.history)
 
     def render(
         self,
@@ -102,6 +124,8 @@ class Simulator(nn.Module):
         plan: Plan | None = None,
         *,
         cutoff: str = "exact",
+        on_bad: OnBad | None = None,
+        report: StabilityReport | None = None,
     ) -> Rendering:
         """Images of ``cameras``; camera i shows cloud ``cameras.image_cloud[i]`` of ``particles``.
 
@@ -112,22 +136,45 @@ class Simulator(nn.Module):
             plan: limits the degree of view-dependent colour; default the model's.
             cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
         """
+        on_bad, report = on_bad or self.config.stability.on_bad, self.report if report is None else report
+        particles = self._guard("render", on_bad, report, in_workspace=False)(particles)
         gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None)
         quirks = self.config.renderer.quirks
         if quirks != Quirks():
             return render_as_published(gaussians, cameras, background, quirks=quirks)
-        return render(gaussians, cameras, background, cutoff=cutoff)
+        return render(gaussians, cameras, background, cutoff=cutoff, on_bad=on_bad, report=report)
+
+    def _guard(
+        self, where: str, on_bad: OnBad | None, report: StabilityReport | None, in_workspace: bool = True
+    ) -> Callable[..., Particles]:
+        """guard_particles with the limits of this model."""
+        limits, dynamics = self.config.stability, self.config.dynamics
+        if on_bad is not None:
+            check_on_bad(on_bad)
+            limits = dataclasses.replace(limits, on_bad=on_bad)
+        report = self.report if report is None else report
+        report.poll()
+        return partial(
+            guard_particles,
+            config=limits,
+            report=report,
+            where=where,
+            grid_size=dynamics.grid_size if in_workspace and dynamics.origin_of_scene else 0.0,
+            max_opacity=dynamics.max_opacity,
+        )
 
     def _prepare(self, state: Particles, plan: Plan) -> Particles:
         """``state`` with the background as the plan wants it."""
         if plan.spec.dynamics.background == "masked_out":
             return state.select_rows(state.activity == DYNAMIC)
         if plan.spec.dynamics.background == "dynamic":
-            return dataclasses.replace(state, activity=torch.full_like(state.activity, DYNAMIC))
+            return dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
         return state
 
-    def _predict(self, state: Particles, plan: Plan, generator: torch.Generator | None) -> Particles:
-        """The next steps of every scene, without the changes that the plan leaves out."""
+    def _predict(
+        self, state: Particles, plan: Plan, generator: torch.Generator | None, guard: Callable[..., Particles]
+    ) -> Particles:
+        """The next steps of every scene, guarded, without the changes that the plan leaves out."""
         step = self.dynamics(state, generator=generator)
         appearance = plan.spec.appearance
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
@@ -139,4 +186,4 @@ class Simulator(nn.Module):
                 step = dataclasses.replace(step, sh=torch.where(held[:, None, None], newest.sh, step.sh))
         if appearance.opacity_changes is False:
             step = dataclasses.replace(step, opacities=newest.opacities)
-        return step
+        return guard(step, previous=newest)

@@ -16,7 +16,7 @@ from itertools import accumulate, groupby
 import torch
 from torch import Tensor
 
-DYNAMIC, FROZEN = 0, 1  # values of Particles.activity
+DYNAMIC, FROZEN, ASLEEP = 0, 1, 2  # values of Particles.activity
 
 
 class _Tensors:
@@ -164,7 +164,8 @@ class Particles(_Tensors):
     dynamic_latents: [N, Fd], change with time.   static_latents: [N, Fs], do not.
     cu_rows: int64 [Q + 1]; rows of cloud q are cu_rows[q] .. cu_rows[q + 1].
     cloud_scene, cloud_step: int64 [Q], sorted by (scene, step).
-    activity: uint8 [N], 0 dynamic, 1 frozen (never moves). A masked-out particle is absent.
+    activity: uint8 [N], 0 dynamic, 1 frozen (never moves), 2 asleep (never changes, and the dynamics does not see it;
+        see gsim3d.stability). A masked-out particle is absent.
     origin: float64 [B, 3] metres, lower corner of each scene's workspace.
     quats [N, 4] (w, x, y, z), scales [N, 3] metres, sh [N, K, 3]: only in explicit models.
 

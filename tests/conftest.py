@@ -18,7 +18,8 @@ def cuda_problem() -> str | None:
     return None if torch.cuda.is_available() else "no CUDA GPU"
 
 
-def _cuda() -> torch.device:
+def cuda_device() -> torch.device:
+    """The GPU; skips the test, or fails it with GSIM3D_REQUIRE_CUDA=1, without one."""
     problem = cuda_problem()
     if problem and os.environ.get("GSIM3D_REQUIRE_CUDA") == "1":
         pytest.fail(f"GSIM3D_REQUIRE_CUDA=1, but: {problem}")
@@ -30,13 +31,13 @@ def _cuda() -> torch.device:
 @pytest.fixture(params=["cpu", "cuda"])
 def device(request) -> torch.device:
     """Runs the test once for each device."""
-    return _cuda() if request.param == "cuda" else torch.device("cpu")
+    return cuda_device() if request.param == "cuda" else torch.device("cpu")
 
 
 @pytest.fixture
 def devices() -> tuple[torch.device, torch.device]:
     """(cpu, cuda), for tests that compare both; skipped, or failed with GSIM3D_REQUIRE_CUDA=1, without CUDA."""
-    return torch.device("cpu"), _cuda()
+    return torch.device("cpu"), cuda_device()
 
 
 @pytest.fixture(scope="module")

@@ -9,16 +9,18 @@ ROOT = Path(__file__).parent.parent
 # Each room may import the rooms before it (and its own), never one after it.
 ROOMS = [
     {"errors", "quirks"},
-    {"types"},
-    {"ops", "effects", "harmonics"},
-    {"layers"},
+    {"types", "stability"},
+    {"ops", "effects", "harmonics", "rotations"},
+    {"layers", "guards"},
     {"encoder", "dynamics", "renderer"},
     {"presets"},
     {"simulator"},
+    {"laws"},
+    {"endurance"},
     {"data", "interop", "perceptual"},
     {"generate"},
     {"train"},
-    {"evaluate"},
+    {"evaluate", "check_stability"},
     {"simulate", "check_data", "import_released", "demo", "doctor"},
     {"__main__"},
 ]

@@ -10,7 +10,8 @@ from gsim3d.dynamics.clouds import concatenate, newest_clouds
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.point_transformer import PointTransformer
 from gsim3d.dynamics.state import StateLayout
-from gsim3d.types import CloudTable, Particles, constant, take_runs
+from gsim3d.ops.curve import Pyramid, PyramidCapacity
+from gsim3d.types import ASLEEP, CloudTable, Particles, constant, take_runs
 
 
 class Dynamics(nn.Module):
@@ -18,8 +19,8 @@ class Dynamics(nn.Module):
 
     The network reads all steps of a history at once; each row of the newest step gets an increment. Steps are counted
     back from the newest, so one model serves any history of 1 to ``2 ** config.history_bits`` steps. Scenes do not change
-    each other (in training with ``norm="batch"`` they do). Rows outside the 2^16 cells from the scene's origin, or not
-    finite, sleep: they keep their state and nobody sees them.
+    each other (in training with ``norm="batch"`` they do). Rows that are asleep, outside the 2^16 cells from the scene's
+    origin, or at no finite place, keep their state and nobody sees them.
     """
 
     def __init__(self, config: DynamicsConfig):
@@ -28,39 +29,71 @@ class Dynamics(nn.Module):
         self.layout = StateLayout.of(config)
         self.net = PointTransformer(self.layout.in_channels, self.layout.out_channels, config)
 
-    def forward(self, history: Particles, *, generator: torch.Generator | None = None) -> Particles:
-        """The next step of every scene, or the next ``config.steps_per_call`` steps.
+    def geometry(
+        self,
+        history: Particles,
+        *,
+        generator: torch.Generator | None = None,
+        capacity: PyramidCapacity | None = None,
+    ) -> Pyramid:
+        """All that the network reads of the positions, as integers.
 
         Args:
-            history: clouds sorted by (scene, step); steps may have different numbers of rows, and gaps are fine.
-            generator: of drop path and of the curves' shuffling, both in training only; None: neither happens.
-        Returns:
-            One cloud a scene and step, each with the rows of the scene's newest step.
-        Gradients: features and positions of ``history``, parameters. Cells are constants.
-        Raises:
-            ValueError: clouds are not sorted, or a history is longer than the model's.
+            history, generator: as :meth:`forward`.
+            capacity: sizes of the result, so that nothing waits for the device; None: what the positions need.
         """
         clouds = history.clouds
-        newest = newest_clouds(clouds)
-        slots, history_bits = self._slots(clouds, newest)
-        curves = self._draw_curves(generator) if self.training and self.config.shuffle_orders else None
-        pyramid = ops.build_pyramid(
-            history.means,
+        slots, history_bits = self._slots(clouds, newest_clouds(clouds))
+        return ops.build_pyramid(
+            _places(history),
             history.cu_rows,
             history.cloud_scene,
             constant(slots, history.cu_rows.device),
             history.origin,
             self.config.pyramid_spec(history_bits),
-            curves=curves,
+            curves=self._draw_curves(generator) if self.training and self.config.shuffle_orders else None,
+            capacity=capacity,
         )
-        features = take_rows(self.layout.pack(history), pyramid.rows)
+
+    def forward(
+        self, history: Particles, *, generator: torch.Generator | None = None, pyramid: Pyramid | None = None
+    ) -> Particles:
+        """The next step of every scene, or the next ``config.steps_per_call`` steps.
+
+        Args:
+            history: clouds sorted by (scene, step); steps may have different numbers of rows, and gaps are fine.
+            generator: of drop path and of the curves' shuffling, both in training only; None: neither happens.
+            pyramid: ``geometry(history)``; None: made here. With one of a given capacity nothing waits for the device,
+                and the result has the same values as long as ``pyramid.found`` fits the capacity.
+        Returns:
+            One cloud a scene and step, each with the rows of the scene's newest step.
+        Gradients: features and positions of ``history``, parameters. Cells are constants.
+        Raises:
+            ValueError: clouds are not sorted, a history is longer than the model's, or a model with ``norm="batch"`` is
+                trained on a pyramid of given capacity: its statistics would count rows that are none.
+        """
+        clouds = history.clouds
+        newest = newest_clouds(clouds)
+        if pyramid is None:
+            pyramid = self.geometry(history, generator=generator)
+        if pyramid.found is not None and self.training and self.config.norm == "batch":
+            raise ValueError('Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"')
+        features, is_awake = self.layout.pack(history), None
+        everyone = pyramid.found is None and pyramid.rows.shape[0] == history.n_rows
+        if not everyone:  # rows of the pyramid <-> rows of the history; those that sleep become 0
+            features = ops.pool_mean(features, pyramid.rows, pyramid.cu_rows, check=False)
         features = self.net(features, pyramid, generator=generator if self.training else None)
+        if not everyone:
+            one = features.new_ones(features.shape[0], 1)
+            features, is_awake = (
+                ops.unpool(x, pyramid.rows, pyramid.cu_rows, history.n_rows, check=False) for x in (features, one)
+            )
+        runs = clouds.row_runs(newest)
+        prediction = self.net.head(take_runs(features, runs))
+        if is_awake is not None:
+            is_awake = take_runs(is_awake, runs)[:, 0] > 0
 
         state = history.select_clouds(newest)
-        if pyramid.rows.shape[0] == history.n_rows:
-            prediction, is_awake = self.net.head(take_runs(features, clouds.row_runs(newest))), None
-        else:
-            prediction, is_awake = self._predict_awake(features, pyramid.rows, history, newest, state.n_rows)
         table = state.clouds
         counts = [table.count(q) for q in range(len(table))]
         steps = [
@@ -68,19 +101,6 @@ class Dynamics(nn.Module):
             for i, step in enumerate(self.layout.advance(state, prediction, is_awake))
         ]
         return steps[0] if len(steps) == 1 else concatenate(steps)
-
-    def _predict_awake(
-        self, features: Tensor, rows: Tensor, history: Particles, newest: list[int], n_rows: int
-    ) -> tuple[Tensor, Tensor]:
-        """(prediction [n_rows, .] of the newest clouds' rows, 0 for those that sleep; who is awake). ``rows``: awake
-        rows of ``history``."""
-        is_newest = torch.zeros(history.n_clouds, dtype=torch.bool, device=rows.device)
-        is_newest = is_newest.index_fill(0, constant(tuple(newest), rows.device), True)[history.row_cloud()]
-        row_of_state = torch.cumsum(is_newest, 0) - 1
-        awake = is_newest[rows].nonzero()[:, 0]
-        places = row_of_state[rows[awake]]
-        prediction = put_rows(self.net.head(take_rows(features, awake)), places, n_rows)
-        return prediction, torch.zeros(n_rows, dtype=torch.bool, device=rows.device).index_fill(0, places, True)
 
     def _slots(self, clouds: CloudTable, newest: list[int]) -> tuple[tuple[int, ...], int]:
         """Time slot of each cloud, and the bits they are counted in."""
@@ -105,13 +125,6 @@ class Dynamics(nn.Module):
         )
 
 
-def take_rows(x: Tensor, rows: Tensor) -> Tensor:
-    """x[rows] for rows that are listed once. (The gradient of indexing uses atomics on CUDA.)"""
-    if rows.shape[0] == x.shape[0]:
-        return x
-    return ops.pool_mean(x, rows, torch.arange(rows.shape[0] + 1, device=rows.device))
-
-
-def put_rows(x: Tensor, rows: Tensor, n_rows: int) -> Tensor:
-    """[n_rows, C] with x at ``rows``, 0 elsewhere."""
-    return ops.unpool(x, rows, torch.arange(rows.shape[0] + 1, device=rows.device), n_rows)
+def _places(particles: Particles) -> Tensor:
+    """[N, 3] positions of the rows that the network sees; NaN, which it leaves out, of those asleep."""
+    return torch.where((particles.activity == ASLEEP)[:, None], torch.nan, particles.means.detach())

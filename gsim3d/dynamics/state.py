@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.harmonics import degree_damping
+from gsim3d.layers import widened
+from gsim3d.rotations import unit_quats
 from gsim3d.types import FROZEN, Particles
 
 SCALE_STEP_SHARE = 1 / 6  # of the range of scales, the most that one step changes a scale
@@ -75,8 +76,8 @@ class StateLayout:
             awake: bool [N], rows that change at all; None: all.
         """
         widths = [n for _, n in self.outputs]
-        parts = prediction.unflatten(1, (self.config.steps_per_call, -1)).transpose(0, 1).split(widths, 2)
-        moves = (particles.activity != FROZEN)[:, None].to(prediction)
+        parts = widened(prediction).unflatten(1, (self.config.steps_per_call, -1)).transpose(0, 1).split(widths, 2)
+        moves = (particles.activity != FROZEN)[:, None].to(parts[0])
         everywhere = torch.ones_like(moves)
         if awake is not None:
             moves, everywhere = moves * awake[:, None], everywhere * awake[:, None]
@@ -141,14 +142,14 @@ class StateLayout:
         if name == "scales":
             return value.clamp(self.config.scale_min, self.config.scale_max)
         if name == "opacities":
-            return value.clamp(0, None if self.config.quirks.unbounded_opacity else 1)
+            return value.clamp(0, self.config.max_opacity)
         return value
 
     def _later_quats(self, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
         """As :meth:`later_values`, of rotations: unit quaternions, except where nothing changes."""
         if self._absolute:
             target = predicted.roll(1, 2)
-            return hold(share, newest, F.normalize(newest + share * (target - newest), dim=2))
+            return hold(share, newest, unit_quats(newest + share * (target - newest)))
         later, before = [], newest
         for vectors in (share * predicted).unbind(0):
             later.append(rotate_left(before, vectors))
@@ -162,7 +163,7 @@ def _flat(name: str, value: Tensor) -> Tensor:
         return value.mT.flatten(1)
     if name == "quats":
         return value.roll(-1, 1)
-    return value.reshape(value.shape[0], -1) if value.numel() else value.reshape(value.shape[0], 1)
+    return value.flatten(1) if value.dim() > 1 else value[:, None]
 
 
 def _unflat(name: str, value: Tensor) -> Tensor:
@@ -198,7 +199,7 @@ def rotate_left(quats: Tensor, rotation_vectors: Tensor) -> Tensor:
     quaternions, and should see one rotation as one.
 
     Args:
-        quats: [N, 4] (w, x, y, z), not zero, any length.
+        quats: [N, 4] (w, x, y, z), any length; shorter than 1e-6 counts as the identity and has no gradient.
         rotation_vectors: [N, 3] radians, world axes.
     """
     angle_squared = rotation_vectors.square().sum(1, keepdim=True)
@@ -208,7 +209,8 @@ def rotate_left(quats: Tensor, rotation_vectors: Tensor) -> Tensor:
     ratio = torch.where(small, 0.5 - angle_squared / 48, torch.sin(angle / 2) / angle)
     w = torch.where(small, 1 - angle_squared / 8, torch.cos(angle / 2))
     v = ratio * rotation_vectors
+    quats = unit_quats(quats)
     qw, qv = quats[:, :1], quats[:, 1:]
     turned = torch.cat([w * qw - (v * qv).sum(1, keepdim=True), w * qv + qw * v + torch.linalg.cross(v, qv)], 1)
     largest = turned.detach().gather(1, turned.detach().abs().argmax(1, keepdim=True))
-    return turned / (turned.norm(dim=1, keepdim=True) * torch.where(largest < 0, -1, 1))
+    return torch.where(largest < 0, -turned, turned)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from gsim3d import ops
 from gsim3d.encoder.config import EncoderConfig
 from gsim3d.encoder.unet import UNet, repeat_pixels
+from gsim3d.layers import widened
 from gsim3d.quirks import Quirks
 
 INITIAL_OPACITY = 0.5  # of an untrained encoder: views of the same surface blend, and gradients reach what lies behind
@@ -109,14 +110,16 @@ class CostVolume(nn.Module):
         Ks = feature_intrinsics(views.Ks, self.factor, self.quirks)
         target = Ks.repeat_interleave(views.n_views - 1, 0) if self.quirks.reference_intrinsics else Ks[src_images]
         geometry = ops.sweep_geometry(Ks, views.viewmats, src_images, cu_src, Ks_target=target)
-        return ops.plane_sweep(features, *(g.to(features.dtype) for g in geometry), disparities, src_images, cu_src)
+        geometry = (g.to(features.dtype) for g in geometry)
+        return ops.plane_sweep(features, *geometry, disparities, src_images, cu_src, check=False)
 
     def forward(self, features: Tensor, views: Views) -> tuple[Tensor, Tensor]:
         """[I, C, h, w] -> expected disparity and largest probability, both [I, 1, h, w]."""
+        features = widened(features)
         disparities = self.disparities(views, features)
         x = torch.cat([self.correlation(features, views, disparities), features], 1)
         scores = self.refine_out(self.unet(self.refine_in(x), views.n_views)) + self.residual(x)
-        probability = self.head(scores).softmax(1)
+        probability = widened(self.head(scores)).softmax(1)
         expected = (probability * disparities[:, :, None, None]).sum(1, keepdim=True)
         return expected, probability.amax(1, keepdim=True)
 
@@ -143,12 +146,14 @@ class DepthPredictor(nn.Module):
     def forward(self, view_features: Tensor, cnn_features: Tensor, views: Views) -> Depth:
         """view_features and cnn_features: [I, C, h, w], with and without knowledge of the other views."""
         coarse, confidence = self.cost_volume(view_features, views)
-        coarse, confidence = upsample(coarse, self.factor, self.quirks), repeat_pixels(confidence, self.factor)
+        # In float64, which neither autocast nor TF32 shortens: half a permille of depth is millimetres.
+        coarse = upsample(coarse.double(), self.factor, self.quirks).to(coarse.dtype)
+        confidence = repeat_pixels(confidence, self.factor)
         fine = self.upsampler(torch.cat([view_features, cnn_features], 1))
         fine = F.gelu(upsample(fine, self.factor, self.quirks))
         x = self.refine_in(torch.cat([views.images, self.proj_feature(fine), coarse, confidence], 1))
         x = self.refine_unet(x, views.n_views)
-        correction, opacity_logit = self.to_disparity(x).split(1, 1)
+        correction, opacity_logit = widened(self.to_disparity(x)).split(1, 1)
         lowest, highest = (1 / bound.to(x.dtype)[:, None, None, None] for bound in (views.far, views.near))
         disparity = (coarse + correction).clamp(lowest, highest)
         return Depth(1 / disparity, opacity_logit, torch.cat([x, views.images, fine], 1))

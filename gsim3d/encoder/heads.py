@@ -12,6 +12,8 @@ from gsim3d.encoder import camera_frame
 from gsim3d.encoder.config import EncoderConfig
 from gsim3d.encoder.depth import Depth, Views
 from gsim3d.harmonics import degree_damping, turn_predicted_harmonics
+from gsim3d.layers import widened
+from gsim3d.rotations import unit_quats
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ class ParticleHeads(nn.Module):
     def forward(self, depth: Depth, views: Views, origin: Tensor) -> PixelParticles:
         """origin: [I, 3] world point from which the moments of viewing rays are taken."""
         geometry = PixelRays.of(views)
-        raw = self.to_gaussians(depth.features)
+        raw = widened(self.to_gaussians(depth.features))
         raw_offset = raw[:, :2]
         means = geometry.centers.to(raw.dtype)[:, :, None, None] + depth.depth * self._rays(geometry, raw_offset)
         latents = self._latents(depth, raw_offset, geometry, geometry.centers - origin)
@@ -118,7 +120,7 @@ class ParticleHeads(nn.Module):
         central = geometry.directions(height, width, raw_offset.new_zeros(1, 2, height, width))
         rays = pluecker(centers, central)
         features = self.conditioning(depth.features, depth.depth, depth.opacity_logit, raw_offset, rays)
-        return _rows(self.to_latents(features))
+        return _rows(widened(self.to_latents(features)))
 
     def _rays(self, geometry: PixelRays, raw_offset: Tensor) -> Tensor:
         directions = geometry.directions(*raw_offset.shape[-2:], raw_offset.sigmoid() - 0.5)
@@ -139,7 +141,7 @@ def explicit_gaussians(raw: Tensor, depth: Tensor, geometry: PixelRays, config: 
     scales = (smallest + (largest - smallest) * raw_scales.sigmoid()) * (_rows(depth) * 0.1 * pixel_size)
     rotations = geometry.rotations.to(raw.dtype)
     turn = camera_frame.rotation_to_quat(rotations)[:, None]
-    quats = camera_frame.quat_multiply(turn, F.normalize(raw_quats.roll(1, -1), dim=-1))  # raw: real part last
+    quats = camera_frame.quat_multiply(turn, unit_quats(raw_quats.roll(1, -1)))  # raw: real part last
     quats = camera_frame.with_positive_largest(quats)  # as those that the dynamics writes and reads
     damping = degree_damping(config.sh_degree, raw)
     in_camera = raw_sh.reshape(n_images, -1, 3, damping.shape[0]) * damping

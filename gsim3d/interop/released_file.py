@@ -65,7 +65,7 @@ class StoredTensor:
         return self.offset + sum((n - 1) * step for n, step in zip(self.shape, self.stride, strict=True)) + 1
 
 
-class Placeholder:
+class Ignored:
     """Stands for an object that is not needed; takes whatever it is given and keeps nothing."""
 
     def __new__(cls, *args, **kwargs):
@@ -113,7 +113,7 @@ class _Unpickler(pickle.Unpickler):
         if module == "torch" and name in _DTYPES:
             return _DTYPES[name]
         if full in _PLACEHOLDER_NAMES or module.split(".")[0] in _PLACEHOLDER_PACKAGES:
-            return Placeholder
+            return Ignored
         raise InputError(
             f"{self.path}: refused, it asks for {full}, which is no part of a checkpoint's weights and could run code; "
             "do not load this file with other programs either unless you trust where it comes from"

@@ -10,6 +10,7 @@ from gsim3d.ops.curve import (
     KernelMap,
     PatchTable,
     Pyramid,
+    PyramidCapacity,
     PyramidSpec,
     Segments,
     Stage,
@@ -22,7 +23,8 @@ from gsim3d.ops.patch_attn import patch_attention
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
 from gsim3d.ops.raster import Rendering, rasterize_gaussians
-from gsim3d.ops.row_norm import row_norm
+from gsim3d.ops.row_norm import residual_norm, row_norm
+from gsim3d.ops.sentinel import Watched, watch_rows
 from gsim3d.ops.sparse_conv import sparse_conv
 
 __all__ = [
@@ -30,11 +32,13 @@ __all__ = [
     "KernelMap",
     "PatchTable",
     "Pyramid",
+    "PyramidCapacity",
     "PyramidSpec",
     "Rendering",
     "Segments",
     "Stage",
     "Voxels",
+    "Watched",
     "build_pyramid",
     "cuda_compiled",
     "curve_encode",
@@ -44,8 +48,10 @@ __all__ = [
     "pool_max",
     "pool_mean",
     "rasterize_gaussians",
+    "residual_norm",
     "row_norm",
     "sparse_conv",
     "sweep_geometry",
     "unpool",
+    "watch_rows",
 ]

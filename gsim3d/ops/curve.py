@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._arguments import check_real, check_tensors, check_whole
 
 CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
 
@@ -39,7 +41,13 @@ def curve_encode(
         >>> curve_encode(torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1]]), None, "z")
         tensor([4, 2, 1])
     """
+    check_tensors("curve_encode", grid=grid, **({} if cloud is None else {"cloud": cloud}))
+    check_whole("curve_encode", depth=depth, **({} if shift is None else {"shift": shift}))
+    if not torch.compiler.is_compiling() and not 1 <= depth <= 16:
+        raise ValueError(f"curve_encode: depth must be in [1, 16]; got {depth}")
     names = (curve,) if isinstance(curve, str) else curve
+    if not isinstance(names, Sequence):
+        raise TypeError(f"curve_encode: curve must be a name or several; got {curve!r}")
     for name in names:
         if name not in CURVES:
             raise ValueError(f"curve_encode: curve must be one of {', '.join(CURVES)}; got {name!r}")
@@ -66,6 +74,7 @@ def curve_sort(codes: Tensor) -> tuple[Tensor, Tensor]:
         >>> curve_sort(torch.tensor([[30, 10, 20]]))
         (tensor([[1, 2, 0]]), tensor([[2, 0, 1]]))
     """
+    check_tensors("curve_sort", codes=codes)
     return torch.ops.gsim3d.curve_sort(codes)
 
 
@@ -188,10 +197,70 @@ class Stage:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """rows: int64 [N0], the input rows that take part, ascending (stage 0 has these rows); stages: finest first."""
+    """rows: int64 [N0], the input rows that take part, ascending; cu_rows: int64 [N0 + 1], row i of stage 0 is input row
+    rows[cu_rows[i]]; stages: finest first.
+
+    found: of a pyramid of given capacity, int64: 0 where it fits (see :meth:`PyramidCapacity.fits`), then the counts that
+    the data has. Sizes are then those of the capacity. Behind the data follow rows that nothing reads: no cluster, patch
+    or pair lists them, each is a voxel of its own, pooled to 0; ``rows`` lists those that sleep. Everything is such a row
+    where a count exceeds its capacity.
+    """
 
     rows: Tensor
+    cu_rows: Tensor
     stages: tuple[Stage, ...]
+    found: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class PyramidCapacity:
+    """How large the results of :func:`build_pyramid` are whatever the data, so that nothing waits for their sizes.
+
+    sizes: rows, clouds, patches and keys of every stage, then the pairs of every kernel map. Stage 0 has room for all
+    input rows.
+    """
+
+    n_stages: int
+    sizes: tuple[int, ...]
+
+    COUNTS = ("rows", "clouds", "patches", "keys")  # of a stage
+    MALFORMED, TOO_LARGE = 7, 8  # bits of Pyramid.found[0]
+
+    @classmethod
+    def of(cls, pyramid: Pyramid, n_rows: int, factor: float = 1.25) -> PyramidCapacity:
+        """Room for ``factor`` times what ``pyramid``, made of ``n_rows`` input rows, holds."""
+        counts = []
+        for stage in pyramid.stages:
+            table = stage.patches[0]
+            counts += [stage.n_rows, stage.n_clouds, table.cu_q.shape[0] - 1, table.kv_rows.shape[0]]
+        counts += [m.tap_in.shape[0] for stage in pyramid.stages for m in stage.kernel_maps.values()]
+        return cls(len(pyramid.stages), (n_rows,) + (0,) * (len(counts) - 1)).grown((0, *counts), factor)
+
+    def grown(self, found: Sequence[int], factor: float = 1.25) -> PyramidCapacity:
+        """This capacity, and room for ``factor`` times what was found where that is more.
+
+        Args:
+            found: numbers of ``Pyramid.found``.
+            factor: 1 or more.
+        """
+        wanted = [math.ceil(factor * count) for count in found[1:]]
+        for rows in range(0, self.n_stages * len(self.COUNTS), len(self.COUNTS)):
+            wanted[rows] = min(wanted[rows], self.sizes[0])  # no stage has more rows than go in
+        return PyramidCapacity(self.n_stages, tuple(max(a, b) for a, b in zip(self.sizes, wanted, strict=True)))
+
+    def fits(self, found: Sequence[int]) -> bool:
+        """Whether the data of a call fitted.
+
+        Args:
+            found: numbers of ``Pyramid.found``.
+        Raises:
+            ValueError: the clouds of the call were malformed, which on CUDA is known only now.
+        """
+        if found[0] & self.MALFORMED:
+            raise ValueError(
+                "build_pyramid: cu_rows, cloud_scene, cloud_slot or origin is malformed; a call without capacity names it"
+            )
+        return not found[0] & self.TOO_LARGE
 
 
 def build_pyramid(
@@ -203,6 +272,7 @@ def build_pyramid(
     spec: PyramidSpec,
     *,
     curves: tuple[tuple[int, ...], ...] | None = None,
+    capacity: PyramidCapacity | None = None,
 ) -> Pyramid:
     """All geometry of a call of the dynamics network.
 
@@ -221,11 +291,14 @@ def build_pyramid(
         origin: float64 [B, 3] metres, lower corner of each scene.
         spec: the network's strides, windows, patch and kernel sizes.
         curves: per stage the curve (index into CURVES) of each of the four serialization rows; default (0, 1, 2, 3).
+        capacity: sizes of the results; None: what the data needs.
     Returns:
-        Pyramid; tensors int64 on the device of ``positions``. On CUDA the call waits once, for the sizes.
+        Pyramid; tensors int64 on the device of ``positions``. On CUDA the call waits once, for the sizes; with
+        ``capacity`` never: a CUDA graph can capture it, and ``Pyramid.found`` tells later whether the data fitted.
     Gradients: none. Determinism: integers. The order of the rows of a cloud permutes the results only.
     Raises:
-        ValueError: an argument is malformed; the message names it.
+        ValueError: an argument is malformed; the message names it. With ``capacity`` on CUDA, malformed clouds give an
+            empty pyramid instead, see :meth:`PyramidCapacity.fits`.
     Source: grid pooling and serialization of Point Transformer V3 (Wu et al. 2024), time merging of 3DGSim.
 
     Example:
@@ -238,6 +311,12 @@ def build_pyramid(
         tensor([[0, 0, 0],
                 [2, 0, 0]])
     """
+    if not torch.compiler.is_compiling():
+        names = {"positions": positions, "cu_rows": cu_rows, "cloud_scene": cloud_scene, "cloud_slot": cloud_slot}
+        check_tensors("build_pyramid", **names, origin=origin)
+        _check_spec(spec, curves)
+        if not (capacity is None or isinstance(capacity, PyramidCapacity)):
+            raise TypeError(f"build_pyramid: capacity must be a PyramidCapacity; got {type(capacity).__name__}")
     if curves is None:
         curves = ((0, 1, 2, 3),) * spec.n_stages
     cu_kernels = [0]
@@ -258,16 +337,40 @@ def build_pyramid(
         [size for sizes in spec.kernel_sizes for size in sizes],
         cu_kernels,
         spec.release,
+        () if capacity is None else capacity.sizes,
     )
-    return _assemble(arrays, spec)
+    return _assemble(arrays, spec, capacity is not None)
 
 
-def _assemble(arrays: list[Tensor], spec: PyramidSpec) -> Pyramid:
+def _check_spec(spec: PyramidSpec, curves: tuple[tuple[int, ...], ...] | None) -> None:
+    check_real("build_pyramid", grid_size=spec.grid_size)
+    check_whole("build_pyramid", slot_bits=spec.slot_bits)
+    if not isinstance(spec.release, bool):
+        raise TypeError(f"build_pyramid: release must be true or false; got {spec.release!r}")
+    for name in ("strides", "merge_windows", "patch_sizes"):
+        _check_whole_numbers(name, getattr(spec, name))
+    for name, rows in {"kernel_sizes": spec.kernel_sizes, "curves": curves or ()}.items():
+        if not isinstance(rows, (tuple, list)):
+            raise TypeError(f"build_pyramid: {name} must be a tuple with one entry a stage; got {rows!r}")
+        if name == "kernel_sizes" and len(rows) != spec.n_stages:
+            raise ValueError(f"build_pyramid: kernel_sizes must have {spec.n_stages} entries; got {len(rows)}")
+        for row in rows:
+            _check_whole_numbers(name, row)
+
+
+def _check_whole_numbers(name: str, values: tuple[int, ...]) -> None:
+    if not isinstance(values, (tuple, list)):
+        raise TypeError(f"build_pyramid: {name} must be a tuple of whole numbers; got {values!r}")
+    for value in values:
+        check_whole("build_pyramid", **{name: value})
+
+
+def _assemble(arrays: list[Tensor], spec: PyramidSpec, has_found: bool) -> Pyramid:
     """Names the flat results, in the order that csrc/gsim3d/curve/pyramid.h states."""
     left = list(arrays)
     left.reverse()
     take = left.pop
-    rows, stages = take(), []
+    rows, cu_rows, stages = take(), take(), []
     for sizes, merged in zip(spec.kernel_sizes, spec.merged_bits(), strict=True):
         cluster = Segments(stages[-1].order[0], take()) if stages else None
         time_index = take() if merged else None
@@ -276,7 +379,7 @@ def _assemble(arrays: list[Tensor], spec: PyramidSpec) -> Pyramid:
         voxels = Voxels(take(), take(), take())
         kernel_maps = {size: KernelMap(size, take(), take(), take()) for size in sizes}
         stages.append(Stage(grid, cloud, cu_clouds, order, patches, voxels, kernel_maps, cluster, time_index))
-    return Pyramid(rows, tuple(stages))
+    return Pyramid(rows, cu_rows, tuple(stages), take() if has_found else None)
 
 
 @torch.library.register_fake("gsim3d::curve_encode")
@@ -305,10 +408,20 @@ def _(
     kernel_sizes,
     cu_kernels,
     release,
+    capacity,
 ):
-    size = torch.library.get_ctx().new_dynamic_size
+    given = iter(capacity)
+    new_size = torch.library.get_ctx().new_dynamic_size if not capacity else None
+
+    def size():
+        return next(given) if capacity else new_size()
+
+    def size_and_one():  # one symbol: an unbacked size must be the whole size of some result
+        return next(given) + 1 if capacity else new_size(min=1)
+
+    pairs = iter(capacity[len(PyramidCapacity.COUNTS) * len(patch_sizes) :])
     n = size()
-    arrays = [(n,)]
+    arrays = [(n,), (n + 1,)]
     for s in range(len(patch_sizes)):
         if s > 0:
             n = size()
@@ -316,10 +429,11 @@ def _(
             merged = min(merge_windows[s - 1].bit_length() - 1, slot_bits)
             slot_bits -= merged
             arrays += [(n,)] if merged else []
-        offsets = size(min=1)  # P + 1 as one symbol: an unbacked size must be the whole size of some result
-        arrays += [(n, 3), (n,), (size(min=1),), (4, n), (offsets,), (offsets,), (4, size())]
-        arrays += [(n,), (n,), (size(min=1),)]
+        clouds, patches, keys = size_and_one(), size_and_one(), size()
+        arrays += [(n, 3), (n,), (clouds,), (4, n), (patches,), (patches,), (4, keys)]
+        arrays += [(n,), (n,), (n + 2 if capacity else new_size(min=1),)]
         for kernel_size in kernel_sizes[cu_kernels[s] : cu_kernels[s + 1]]:
-            n_pairs = size()
+            n_pairs = next(pairs) if capacity else new_size()
             arrays += [(n_pairs,), (n_pairs,), (kernel_size**3 + 1,)]
+    arrays += [(1 + len(capacity),)] if capacity else []
     return [cu_rows.new_empty(shape) for shape in arrays]

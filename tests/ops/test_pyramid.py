@@ -38,7 +38,7 @@ def scene(sizes=(40, 25, 30, 35, 1, 0, 20), seed=0, dtype=torch.float32, extent=
 
 def flat(pyramid):
     """Every tensor of a pyramid."""
-    result = [pyramid.rows]
+    result = [pyramid.rows, pyramid.cu_rows]
     for stage in pyramid.stages:
         result += [stage.grid, stage.cloud, stage.cu_clouds, stage.order]
         result += [t for table in stage.patches for t in (table.q_rows, table.kv_rows, table.cu_q, table.cu_k)]
@@ -46,7 +46,7 @@ def flat(pyramid):
         result += [t for m in stage.kernel_maps.values() for t in (m.tap_in, m.tap_out, m.cu_taps)]
         result += [stage.cluster.rows, stage.cluster.cu_rows] if stage.cluster else []
         result += [stage.time_index] if stage.time_index is not None else []
-    return result
+    return result + ([] if pyramid.found is None else [pyramid.found])
 
 
 def split(values, offsets):
@@ -63,7 +63,7 @@ def assert_matches_oracle(arguments, spec, curves=None, device="cpu"):
     pyramid = build_pyramid(**on(device, arguments), spec=spec, curves=curves)
     lists = [t.tolist() for t in arguments.values()]
     rows, stages = oracle.build_pyramid(*lists, spec, curves or ((0, 1, 2, 3),) * spec.n_stages)
-    assert pyramid.rows.tolist() == rows
+    assert pyramid.rows.tolist() == rows and pyramid.cu_rows.tolist() == list(range(len(rows) + 1))
     assert len(pyramid.stages) == len(stages)
     for stage, expected in zip(pyramid.stages, stages):
         assert [tuple(cell) for cell in stage.grid.tolist()] == expected["grid"]
@@ -202,7 +202,8 @@ def test_other_streams(devices):
 @pytest.mark.filterwarnings("error")
 def test_opcheck(device):
     arguments = (*on(device, scene()).values(), 0.1, 2, [2], [2], [8, 8], [0, 1, 2, 3] * 2, [5, 3, 3], [0, 2, 3], False)
-    torch.library.opcheck(torch.ops.gsim3d.build_pyramid, arguments)
+    for capacity in ([], [151, 9, 99, 999, 160, 9, 99, 999, 5000, 3000, 2000]):
+        torch.library.opcheck(torch.ops.gsim3d.build_pyramid, (*arguments, capacity))
 
 
 # 6 compile

@@ -7,6 +7,7 @@ import sys
 import pytest
 import torch
 
+from gsim3d.errors import HardCaseError
 from gsim3d.ops import KernelMap, PyramidSpec, Voxels, build_pyramid, sparse_conv
 from tests.asserts import (
     assert_close_relative_to_max,
@@ -355,8 +356,18 @@ def test_nan_reaches_the_neighbours_only(device):
     cells = torch.tensor([[0, 0, 0, 0], [0, 1, 0, 0], [0, 5, 5, 5]])
     x, weight, bias, _ = (t.to(device) for t in parameters(3, 3, 2, 3, torch.float32))
     x[0] = float("nan")
-    out = convolution(*geometry(cells, 3, device))(x, weight, bias)
+    out = sparse_conv(x, weight, bias, *geometry(cells, 3, device), check=False)
     assert out[:2].isnan().all() and torch.isfinite(out[2]).all()
+
+
+@pytest.mark.parametrize("which", ["x", "weight", "bias"])
+def test_poison_is_refused_on_the_cpu(which):
+    x, weight, bias, _ = parameters(3, 3, 2, 3, torch.float32)
+    arguments = {"x": x, "weight": weight, "bias": bias}
+    arguments[which][1] = float("nan")
+    voxels, kernel_map = geometry(torch.tensor([[0, 0, 0, 0], [0, 1, 0, 0], [0, 5, 5, 5]]), 3)
+    with pytest.raises(HardCaseError, match=f"sparse_conv: {which} must be finite .* got nan in row 1"):
+        sparse_conv(**arguments, voxels=voxels, kernel_map=kernel_map)
 
 
 def test_non_contiguous_inputs(device):
@@ -439,6 +450,8 @@ TAP_12, TAP_14 = [0] * 13 + [1] * 2, [2] * 13  # the pairs of two_neighbours: on
         (dict(cu_rows=[0, 2]), "cu_voxel_rows must run from 0 to N=3; got 0 .. 2"),
         (dict(cu_rows=[0, 0, 3]), "cu_voxel_rows must ascend, no voxel is empty; got 0 then 0 at 0"),
         (dict(cu_rows=[0, 9, 3]), "cu_voxel_rows must ascend, no voxel is empty; got 0 then 9 at 0"),
+        (dict(cu_rows=[0, 2, 3, 2, 3]), "cu_voxel_rows must stay at N=3 behind the last row; got 2 at 3"),
+        (dict(cu_taps=TAP_12 + [3] * 13), r"cu_taps must run from 0 to at most len\(tap_in\)=2; got 0 .. 3"),
         (dict(tap_in=[1]), r"tap_out must be \[L\] like tap_in"),
         (dict(tap_in=[0, 2]), r"tap_in must be in \[0, V\) with V=2; got 2 at 1"),
         (dict(tap_out=[-1, 1]), r"tap_out must be in \[0, V\) with V=2; got -1 at 0"),

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <type_traits>
 
 namespace gsim3d {
 
@@ -11,5 +12,9 @@ struct Float16 {
 struct BFloat16 {
   uint16_t bits;
 };
+
+// What numbers of type T are added in.
+template <typename T>
+using Sum = std::conditional_t<std::is_same_v<T, double>, double, float>;
 
 }  // namespace gsim3d

@@ -66,7 +66,8 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
                                   const Tensor& cloud_slot_, const Tensor& origin_, double grid_size, int64_t slot_bits,
                                   std::vector<int64_t> strides, std::vector<int64_t> merge_windows,
                                   std::vector<int64_t> patch_sizes, std::vector<int64_t> curves,
-                                  std::vector<int64_t> kernel_sizes, std::vector<int64_t> cu_kernels, bool release) {
+                                  std::vector<int64_t> kernel_sizes, std::vector<int64_t> cu_kernels, bool release,
+                                  std::vector<int64_t> capacity) {
   const char* op = "build_pyramid";
   const int64_t n_stages = static_cast<int64_t>(patch_sizes.size());
   const auto check_length = [&](const char* name, const std::vector<int64_t>& list, int64_t length) {
@@ -81,6 +82,7 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
   check(cu_kernels.front() == 0 && cu_kernels.back() == static_cast<int64_t>(kernel_sizes.size()) &&
             std::is_sorted(cu_kernels.begin(), cu_kernels.end()),
         op, ": cu_kernels must ascend from 0 to len(kernel_sizes)=", kernel_sizes.size());
+  if (!capacity.empty()) check_length("capacity", capacity, capacity_of_pairs(n_stages, cu_kernels.back()));
 
   check_shape(op, "positions", positions_, {-1, 3}, "[N, 3]");
   check_dtype(op, "cu_rows", cu_rows_, ScalarType::Long);
@@ -100,7 +102,8 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
   const Tensor positions = rows_of(positions_), cu_rows = rows_of(cu_rows_), cloud_scene = rows_of(cloud_scene_);
   const Tensor cloud_slot = rows_of(cloud_slot_), origin = rows_of(origin_);
   const PyramidSpec spec{grid_size,     slot_bits,           n_stages,          strides.data(), merge_windows.data(),
-                         patch_sizes.data(), curves.data(), kernel_sizes.data(), cu_kernels.data(), release};
+                         patch_sizes.data(), curves.data(), kernel_sizes.data(), cu_kernels.data(), release,
+                         capacity.empty() ? nullptr : capacity.data()};
   TensorArrays arrays{cu_rows, {}};
   TensorWorkspace workspace(cu_rows);
   dispatch_float(op, "positions", positions, [&]<typename T>() {

@@ -42,7 +42,21 @@ struct PyramidSpec {
   const int64_t* kernel_sizes;    // odd; those of stage s lie between cu_kernels[s] and cu_kernels[s + 1]
   const int64_t* cu_kernels;      // [n_stages + 1]
   bool release;  // as published: cells truncated from the minimum over all clouds, depth from the extent, ties by row
+  // Null: arrays fit what they hold. Else their sizes, known before the data: capacity_at of every count.
+  const int64_t* capacity = nullptr;
 };
+
+// What `capacity` and `found` count: rows, clouds, patches and keys of every stage, then the pairs of every kernel map.
+enum class Counted { kRows, kClouds, kPatches, kKeys, kPerStage };
+constexpr int64_t capacity_at(int64_t stage, Counted what) {
+  return stage * static_cast<int64_t>(Counted::kPerStage) + static_cast<int64_t>(what);
+}
+constexpr int64_t capacity_of_pairs(int64_t n_stages, int64_t kernel) {
+  return capacity_at(n_stages, Counted::kRows) + kernel;
+}
+
+// Reasons why a pyramid of given sizes is empty: bits of found[0].
+enum PyramidProblem : int64_t { kBadClouds = 1, kTooManyClouds = 2, kTooWide = 4, kTooLarge = 8 };
 
 // The clouds of a call: rows cu_rows[q] .. cu_rows[q + 1] - 1 are cloud q.
 template <typename T>
@@ -59,6 +73,7 @@ namespace cpu {
 
 // Appends, in this order:
 //   rows [N0]: input rows that take part, ascending; the others are not finite or outside [0, 2^16) cells of the origin
+//   cu_rows [N0 + 1]: row i of stage 0 is input row rows[cu_rows[i]]
 //   for every stage, N rows in C clouds and V voxels:
 //     cu_cluster [N + 1]    except at stage 0: row i pools rows order[0, cu_cluster[i]:cu_cluster[i + 1]] of stage s - 1
 //     time_index [N]        only where slots merge: slot inside the merged window
@@ -69,13 +84,24 @@ namespace cpu {
 //     row_voxel [N], voxel_rows [N], cu_voxel_rows [V + 1]: rows of equal (cloud, cell); voxels by (cloud, x, y, z)
 //     for every kernel size K: tap_in [L], tap_out [L], cu_taps [K^3 + 1]: voxel tap_in lies at (kx, ky, kz) - K / 2
 //                           cells from tap_out, tap = (kx K + ky) K + kz; both ascend inside a tap; centre empty
+// and with spec.capacity at last found [1 + counts]: problems, then the counts that the data has. Then N, C, P, M, L are
+// those of the capacity (N0 = n_rows), V is N + 1, and behind what the data has follow rows that nothing reads: in orders
+// they stay at their places, each is a voxel of its own, `rows` lists those that sleep; the last voxels, patches, clouds
+// and clusters are empty (offsets stay at the end), other entries are 0. Where a count exceeds its capacity, there are
+// such rows only.
 // T is float or double. Throws ArgumentError where clouds or spec are malformed.
 template <typename T>
 void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,
                    const Workspace& workspace, const Parallel& parallel);
 
+// build_pyramid with spec.capacity.
+template <typename T>
+void build_given(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,
+                 const Workspace& workspace, const Parallel& parallel);
+
 // Throw ArgumentError where a part of the input is malformed.
 void check_spec(const PyramidSpec& spec);
+void check_capacity(const PyramidSpec& spec, int64_t n_rows);
 template <typename T>
 void check_clouds(const PyramidClouds<T>& clouds, const PyramidSpec& spec);
 // With `release`: the corners [3] of all positions.
@@ -105,7 +131,7 @@ void append_patches(const int64_t* cu_clouds, int64_t n_clouds, const int64_t* o
 namespace cuda {
 
 // The same results on the device of `stream`, in arrays on that device. Waits for the stream once, for the counts that
-// size the arrays.
+// size the arrays; with spec.capacity never: then malformed clouds give an empty pyramid, and found[0] says so.
 template <typename T>
 void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,
                    const Workspace& workspace, Stream stream);

@@ -5,6 +5,7 @@
 #include <bit>
 #include <cmath>
 #include <limits>
+#include <numeric>
 #include <utility>
 #include <vector>
 
@@ -117,6 +118,8 @@ Stage first_stage(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const
   }
 
   int64_t* rows = arrays.append({stage.n});
+  int64_t* cu_rows = arrays.append({stage.n + 1});
+  std::iota(cu_rows, cu_rows + stage.n + 1, int64_t{0});
   stage.grid = arrays.append({stage.n, 3});
   stage.cloud = arrays.append({stage.n});
   parallel.range(clouds.n_rows, kRowGrain, [&](int64_t begin, int64_t end) {
@@ -296,6 +299,7 @@ void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, cons
                    const Workspace& workspace, const Parallel& parallel) {
   check_spec(spec);
   check_clouds(clouds, spec);
+  if (spec.capacity) return build_given(clouds, spec, arrays, workspace, parallel);
   int64_t slot_bits = spec.slot_bits;
   const int64_t* rows = nullptr;
   Stage stage = first_stage(clouds, spec, &rows, arrays, workspace, parallel);

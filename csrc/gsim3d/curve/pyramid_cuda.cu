@@ -3,6 +3,7 @@
 // merging clouds in time interleaves runs that are sorted already.
 #include <algorithm>
 #include <bit>
+#include <cstring>
 #include <utility>
 #include <vector>
 
@@ -146,26 +147,58 @@ __global__ void merge_kernel(Build build, int64_t s, const uint64_t* __restrict_
   stage.rows[list + to] = row;
 }
 
+// In capacity mode: what was found; where it does not fit, or the call is malformed, the pyramid becomes empty.
+__global__ void settle_counts_kernel(Build build, const int64_t* __restrict__ capacity, int64_t* __restrict__ found) {
+  const int64_t n_stages = build.n_stages, pairs = capacity_of_pairs(n_stages, 0), n = pairs + build.n_maps;
+  bool too_large = false;
+  for (int64_t i = threadIdx.x; i < n; i += kThreads) {
+    constexpr int64_t kEach = capacity_at(1, Counted::kRows);
+    const int64_t count = i < pairs ? build.counts[count_at(i / kEach, static_cast<Count>(i % kEach))]
+                                    : 2 * build.counts[pairs_at(n_stages, i - pairs)];
+    found[1 + i] = count;
+    too_large |= count > capacity[i];
+  }
+  const int64_t problems = build.counts[0] | (__syncthreads_or(too_large) ? kTooLarge : 0);
+  if (threadIdx.x == 0) found[0] = problems;
+  if (problems == 0) return;
+  for (int64_t i = 1 + threadIdx.x; i < pairs_at(n_stages, build.n_maps); i += kThreads) build.counts[i] = 0;
+}
+
+// The input rows that sleep, behind those that take part.
+__global__ void write_sleepers_kernel(Build build, Intake intake, int64_t n, const int64_t* __restrict__ found,
+                                      int64_t* __restrict__ rows) {
+  const int64_t i = thread_index();
+  if (i >= n) return;
+  if (found[0] != 0)
+    rows[i] = i;
+  else if (intake.cells[i] == ~uint64_t{0})
+    rows[build.counts[count_at(0, kRows)] + i - intake.start[i]] = i;
+}
+
 __global__ void write_rows_kernel(Build build, const StageResults* results) {
   const int64_t i = thread_index(), s = blockIdx.y, room = build.room;
   const StageArrays& stage = build.stages[s];
   const StageResults& to = results[s];
   const int64_t* own = build.counts + count_at(s, kRows);
-  const int64_t n = own[kRows];
-  if (to.cu_cluster && i <= n) to.cu_cluster[i] = stage.cu_cluster[i];
-  if (i <= own[kVoxels]) to.cu_voxel_rows[i] = stage.cu_voxels[i];
-  if (i >= n) return;
-  if (to.input_rows) to.input_rows[i] = build.input_rows[i];
-  if (to.time_index) to.time_index[i] = stage.time_index[i];
-  const uint64_t cell = stage.cells[i];
+  const int64_t n = own[kRows], n_voxels = own[kVoxels];
+  if (to.cu_input_rows && i <= to.n_rows) to.cu_input_rows[i] = min(i, n);
+  if (to.cu_cluster && i <= to.n_rows) to.cu_cluster[i] = stage.cu_cluster[min(i, n)];
+  if (i <= to.n_voxels)
+    to.cu_voxel_rows[i] = i <= n_voxels ? int64_t{stage.cu_voxels[i]} : min(n + i - n_voxels, to.n_rows);
+  if (i >= to.n_rows) return;
+  const bool real = i < n;
+  if (to.input_rows && real) to.input_rows[i] = build.input_rows[i];
+  if (to.time_index) to.time_index[i] = real ? stage.time_index[i] : 0;
+  const uint64_t cell = real ? stage.cells[i] : 0;
   to.cloud[i] = static_cast<int64_t>(cell >> 48);
   to.grid[3 * i] = static_cast<int64_t>(cell >> 32 & kAxisMask);
   to.grid[3 * i + 1] = static_cast<int64_t>(cell >> 16 & kAxisMask);
   to.grid[3 * i + 2] = static_cast<int64_t>(cell & kAxisMask);
 #pragma unroll
-  for (int r = 0; r < kSerializations; ++r) to.order[r * n + i] = stage.rows[stage.curves[r] * room + i];
-  to.row_voxel[i] = stage.row_voxel[i];
-  to.voxel_rows[i] = stage.voxel_rows[i];
+  for (int r = 0; r < kSerializations; ++r)
+    to.order[r * to.n_rows + i] = real ? int64_t{stage.rows[stage.curves[r] * room + i]} : i;
+  to.row_voxel[i] = real ? int64_t{stage.row_voxel[i]} : n_voxels + i - n;
+  to.voxel_rows[i] = real ? int64_t{stage.voxel_rows[i]} : i;
 }
 
 // Hands out one block of device memory in pieces: measured first, then taken.
@@ -199,6 +232,8 @@ struct Scratch {
   uint32_t* run_rows;   // [4, room]
   uint32_t* cluster_of_row;
   int64_t n_map_counts, zeros;  // bytes to clear from build.counts on
+  char *tables, *results;       // where the tables of the first kernels begin, and those of the last
+  int64_t* capacity;
   StageResults* stage_results;
   MapResults* map_results;
 };
@@ -215,9 +250,14 @@ void lay_out(const PyramidSpec& spec, int64_t n_clouds, Pieces& pieces, Scratch&
   build.published = pieces.take<uint32_t>(n_lists * tiles);
   scratch.zeros = pieces.size() - begin;
   build.depth = pieces.take<int32_t>(n_stages);
+  scratch.tables = pieces.take<char>(0);
   build.drop = pieces.take<int32_t>(n_stages);
   build.stages = pieces.take<StageArrays>(n_stages);
   build.maps = pieces.take<MapArrays>(build.n_maps);
+  scratch.capacity = pieces.take<int64_t>(capacity_of_pairs(n_stages, build.n_maps));
+  scratch.results = pieces.take<char>(0);
+  scratch.stage_results = pieces.take<StageResults>(n_stages);
+  scratch.map_results = pieces.take<MapResults>(build.n_maps);
   build.found = pieces.take<uint32_t>(scratch.n_map_counts);
   build.starts = pieces.take<uint32_t>(scratch.n_map_counts);
   build.input_rows = pieces.take<uint32_t>(room);
@@ -228,8 +268,6 @@ void lay_out(const PyramidSpec& spec, int64_t n_clouds, Pieces& pieces, Scratch&
   scratch.run_codes = pieces.take<uint64_t>(kCurves * room);
   scratch.run_rows = pieces.take<uint32_t>(kCurves * room);
   scratch.cluster_of_row = pieces.take<uint32_t>(room);
-  scratch.stage_results = pieces.take<StageResults>(n_stages);
-  scratch.map_results = pieces.take<MapResults>(build.n_maps);
   uint64_t* cells = pieces.take<uint64_t>(n_stages * room);
   uint64_t* sorted = pieces.take<uint64_t>(n_stages * room);
   uint32_t* voxel_rows = pieces.take<uint32_t>(n_stages * room);
@@ -286,22 +324,67 @@ Scratch make_scratch(const PyramidSpec& spec, int64_t room, int64_t n_clouds, co
   return scratch;
 }
 
-template <typename T>
-void upload(const std::vector<T>& from, const T* to, Stream stream) {
-  if (from.empty()) return;
-  check_cuda(
-      cudaMemcpyAsync(const_cast<T*>(to), from.data(), from.size() * sizeof(T), cudaMemcpyHostToDevice, native(stream)),
-      kOp);
+// A kernel's arguments as a way to the device: a copy from host memory would read it again in every replay of a graph.
+struct Parcel {
+  static constexpr size_t kBytes = 3968;  // arguments hold 4 KB
+  uint32_t words[kBytes / sizeof(uint32_t)];
+};
+__global__ void unpack_kernel(const __grid_constant__ Parcel parcel, uint32_t n_words, uint32_t* to) {
+  for (uint32_t i = threadIdx.x; i < n_words; i += kThreads) to[i] = parcel.words[i];
 }
 
-// Makes the arrays of the results, in the order that pyramid.h states.
-void append_results(const PyramidSpec& spec, const int64_t* found, const Scratch& scratch, const Arrays& arrays,
-                    std::vector<StageResults>& stages, std::vector<MapResults>& maps) {
+// Tables made on the host, on their way to neighbouring places in device memory.
+class Tables {
+ public:
+  explicit Tables(char* begin) : begin_(begin) {}
+
+  template <typename T>
+  void add(const std::vector<T>& from, const T* to) {
+    const size_t at = reinterpret_cast<const char*>(to) - begin_, size = from.size() * sizeof(T);
+    bytes_.resize(at + (size + 7) / 8 * 8);
+    if (size > 0) std::memcpy(bytes_.data() + at, from.data(), size);
+  }
+
+  void send(Stream stream) const {
+    for (size_t at = 0; at < bytes_.size(); at += Parcel::kBytes) {
+      Parcel parcel;
+      const size_t size = std::min(Parcel::kBytes, bytes_.size() - at);
+      std::memcpy(parcel.words, bytes_.data() + at, size);
+      launch(kOp, unpack_kernel, 1, kThreads, 0, stream, parcel, static_cast<uint32_t>(size / sizeof(uint32_t)),
+             reinterpret_cast<uint32_t*>(begin_ + at));
+    }
+  }
+
+ private:
+  char* begin_;
+  std::vector<char> bytes_;
+};
+
+// The arrays of the results, in the order that pyramid.h states.
+struct Results {
+  std::vector<StageResults> stages;
+  std::vector<MapResults> maps;
+  int64_t* found = nullptr;
+  int64_t most = 0;  // threads that reach every element of every array but those of pairs
+};
+
+// `counts`: what the arrays hold, in the order of spec.capacity; `n_voxels` of every stage.
+Results append_results(const PyramidSpec& spec, const int64_t* counts, const int64_t* n_voxels, const Scratch& scratch,
+                       const Arrays& arrays) {
+  Results results;
   for (int64_t s = 0; s < spec.n_stages; ++s) {
-    const int64_t* own = found + count_at(s, kRows);
+    const int64_t* own = counts + capacity_at(s, Counted::kRows);
     const int64_t n = own[kRows];
     StageResults to{};
-    if (s == 0) to.input_rows = arrays.append({n});
+    to.n_rows = n;
+    to.n_clouds = own[kClouds];
+    to.n_patches = own[kPatches];
+    to.n_keys = own[kKeys];
+    to.n_voxels = n_voxels[s];
+    if (s == 0) {
+      to.input_rows = arrays.append({n});
+      to.cu_input_rows = arrays.append({n + 1});
+    }
     if (s > 0) to.cu_cluster = arrays.append({n + 1});
     if (scratch.stages[s].time_index) to.time_index = arrays.append({n});
     to.grid = arrays.append({n, 3});
@@ -313,15 +396,54 @@ void append_results(const PyramidSpec& spec, const int64_t* found, const Scratch
     to.kv_rows = arrays.append({kSerializations, own[kKeys]});
     to.row_voxel = arrays.append({n});
     to.voxel_rows = arrays.append({n});
-    to.cu_voxel_rows = arrays.append({own[kVoxels] + 1});
-    stages.push_back(to);
+    to.cu_voxel_rows = arrays.append({to.n_voxels + 1});
+    results.stages.push_back(to);
+    results.most = std::max({results.most, n + 1, to.n_clouds + 1, to.n_patches + 1, to.n_keys, to.n_voxels + 1});
     for (int64_t k = spec.cu_kernels[s]; k < spec.cu_kernels[s + 1]; ++k) {
-      const int64_t size = spec.kernel_sizes[k], n_pairs = 2 * found[pairs_at(spec.n_stages, k)];
+      const int64_t n_taps = spec.kernel_sizes[k] * spec.kernel_sizes[k] * spec.kernel_sizes[k];
+      const int64_t n_pairs = counts[capacity_of_pairs(spec.n_stages, k)];
       int64_t* tap_in = arrays.append({n_pairs});
       int64_t* tap_out = arrays.append({n_pairs});
-      maps.push_back({tap_in, tap_out, arrays.append({size * size * size + 1})});
+      results.maps.push_back({tap_in, tap_out, arrays.append({n_taps + 1}), n_pairs});
+      results.most = std::max(results.most, n_taps + 1);
     }
   }
+  if (spec.capacity) results.found = arrays.append({1 + capacity_of_pairs(spec.n_stages, spec.cu_kernels[spec.n_stages])});
+  return results;
+}
+
+// Arrays of the sizes that the device has counted, which it is asked for.
+template <typename T>
+Results append_counted(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Scratch& scratch,
+                       const Arrays& arrays, Stream stream) {
+  const int64_t n_stages = spec.n_stages, n_maps = scratch.build.n_maps;
+  std::vector<int64_t> found(static_cast<size_t>(pairs_at(n_stages, n_maps)));
+  check_cuda(cudaMemcpyAsync(found.data(), scratch.build.counts, found.size() * sizeof(int64_t), cudaMemcpyDeviceToHost,
+                             native(stream)),
+             kOp);
+  check_cuda(cudaStreamSynchronize(native(stream)), kOp);
+  if (found[0] != 0) raise_status(found[0], clouds, spec, scratch.intake, stream);
+  std::vector<int64_t> counts, n_voxels;
+  for (int64_t s = 0; s < n_stages; ++s) {
+    const int64_t* own = found.data() + count_at(s, kRows);
+    counts.insert(counts.end(), own, own + capacity_at(1, Counted::kRows));
+    n_voxels.push_back(own[kVoxels]);
+  }
+  for (int64_t k = 0; k < n_maps; ++k) counts.push_back(2 * found[pairs_at(n_stages, k)]);
+  return append_results(spec, counts.data(), n_voxels.data(), scratch, arrays);
+}
+
+// Arrays of the sizes that the caller has given, and a pyramid that fits them.
+template <typename T>
+Results append_given(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Scratch& scratch,
+                     const Arrays& arrays, Stream stream) {
+  std::vector<int64_t> n_voxels;
+  for (int64_t s = 0; s < spec.n_stages; ++s) n_voxels.push_back(spec.capacity[capacity_at(s, Counted::kRows)] + 1);
+  Results results = append_results(spec, spec.capacity, n_voxels.data(), scratch, arrays);
+  launch(kOp, settle_counts_kernel, 1, kThreads, 0, stream, scratch.build, scratch.capacity, results.found);
+  launch(kOp, write_sleepers_kernel, blocks_of(clouds.n_rows), kThreads, 0, stream, scratch.build, scratch.intake,
+         clouds.n_rows, results.found, results.stages[0].input_rows);
+  return results;
 }
 
 }  // namespace
@@ -330,6 +452,7 @@ template <typename T>
 void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,
                    const Workspace& workspace, Stream stream) {
   cpu::check_spec(spec);
+  cpu::check_capacity(spec, clouds.n_rows);
   const int64_t n = clouds.n_rows, room = std::max<int64_t>(n, 1), n_stages = spec.n_stages;
   check(n < int64_t{1} << 29, kOp, ": positions must have fewer than 2^29 rows; got ", n);
   const int cloud_bits = std::bit_width(static_cast<uint64_t>(std::clamp<int64_t>(clouds.n_clouds - 1, 0, 65535)));
@@ -339,9 +462,13 @@ void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, cons
   if (clouds.n_clouds == 0 && n > 0) raise_status(kBadClouds, clouds, spec, intake, stream);
 
   fill_zero(kOp, reinterpret_cast<char*>(build.counts), scratch.zeros, stream);
-  upload(scratch.stages, build.stages, stream);
-  upload(scratch.maps, build.maps, stream);
-  upload(scratch.drop, build.drop, stream);
+  Tables tables(scratch.tables);
+  tables.add(scratch.drop, build.drop);
+  tables.add(scratch.stages, build.stages);
+  tables.add(scratch.maps, build.maps);
+  if (spec.capacity)
+    tables.add(std::vector(spec.capacity, spec.capacity + capacity_of_pairs(n_stages, build.n_maps)), scratch.capacity);
+  tables.send(stream);
   // Every scan has its own ticket and published counts.
   const auto next_scan = [&](int64_t lists) {
     ++build.tickets;
@@ -379,22 +506,16 @@ void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, cons
   count_pairs(build, scratch.n_map_counts, workspace, stream);
   count_patches(build, stream);
 
-  std::vector<int64_t> found(static_cast<size_t>(pairs_at(n_stages, build.n_maps)));
-  check_cuda(cudaMemcpyAsync(found.data(), build.counts, found.size() * sizeof(int64_t), cudaMemcpyDeviceToHost,
-                             native(stream)),
-             kOp);
-  check_cuda(cudaStreamSynchronize(native(stream)), kOp);
-  if (found[0] != 0) raise_status(found[0], clouds, spec, intake, stream);
-
-  std::vector<StageResults> stage_results;
-  std::vector<MapResults> map_results;
-  append_results(spec, found.data(), scratch, arrays, stage_results, map_results);
-  upload(stage_results, scratch.stage_results, stream);
-  upload(map_results, scratch.map_results, stream);
-  launch(kOp, write_rows_kernel, dim3(blocks_of(room + 1), static_cast<unsigned>(n_stages)), kThreads, 0, stream, build,
-         scratch.stage_results);
-  write_patches(build, found.data(), scratch.stage_results, stream);
-  write_pairs(build, scratch.maps.data(), found.data(), scratch.map_results, stream);
+  const Results results = spec.capacity ? append_given(clouds, spec, scratch, arrays, stream)
+                                         : append_counted(clouds, spec, scratch, arrays, stream);
+  Tables places(scratch.results);
+  places.add(results.stages, scratch.stage_results);
+  places.add(results.maps, scratch.map_results);
+  places.send(stream);
+  launch(kOp, write_rows_kernel, dim3(blocks_of(results.most), static_cast<unsigned>(n_stages)), kThreads, 0, stream,
+         build, scratch.stage_results);
+  write_patches(build, scratch.stage_results, results.most, stream);
+  write_pairs(build, scratch.map_results, results.most, stream);
 }
 
 template void build_pyramid<float>(const PyramidClouds<float>&, const PyramidSpec&, const Arrays&, const Workspace&,

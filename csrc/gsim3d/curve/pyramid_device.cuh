@@ -16,9 +16,8 @@ constexpr int64_t kSerializations = 4;
 constexpr uint64_t kCellMask = (uint64_t{1} << 48) - 1;
 constexpr uint32_t kAxisMask = 0xffff;
 
-// The count vector: status, then for every stage rows, clouds, patches, keys and voxels, then half the pairs of every
+// The count vector: problems, then for every stage rows, clouds, patches, keys and voxels, then half the pairs of every
 // kernel map.
-enum Status : int64_t { kBadClouds = 1, kTooManyClouds = 2, kTooWide = 4 };
 enum Count : int { kRows, kClouds, kPatches, kKeys, kVoxels, kStageCounts };
 GSIM3D_HD int64_t count_at(int64_t stage, Count what) { return 1 + stage * kStageCounts + what; }
 GSIM3D_HD int64_t pairs_at(int64_t n_stages, int64_t kernel) { return 1 + n_stages * kStageCounts + kernel; }
@@ -58,13 +57,15 @@ struct MapArrays {
   int32_t stage, kernel_size;
 };
 
-// Where the results of a stage go; null where it has none of a kind.
+// Where the results of a stage go, null where it has none of a kind, and how large they are.
 struct StageResults {
-  int64_t *input_rows, *cu_cluster, *time_index, *grid, *cloud, *cu_clouds, *order, *cu_q, *cu_k, *kv_rows, *row_voxel,
+  int64_t *input_rows, *cu_input_rows, *cu_cluster, *time_index, *grid, *cloud, *cu_clouds, *order, *cu_q, *cu_k, *kv_rows, *row_voxel,
       *voxel_rows, *cu_voxel_rows;
+  int64_t n_rows, n_clouds, n_patches, n_keys, n_voxels;
 };
 struct MapResults {
   int64_t *tap_in, *tap_out, *cu_taps;
+  int64_t n_pairs;
 };
 
 // Everything, for kernels that serve all stages (blockIdx.y) or maps at once. Pointers are to device memory.
@@ -204,9 +205,8 @@ void find_voxels(const Build& build, const StageArrays* stages, int cloud_bits, 
 void count_pairs(const Build& build, int64_t n_counts, const Workspace& workspace, Stream stream);
 void count_patches(const Build& build, Stream stream);
 
-// `found`: the count vector on the host.
-void write_patches(const Build& build, const int64_t* found, const StageResults* results, Stream stream);
-void write_pairs(const Build& build, const MapArrays* maps, const int64_t* found, const MapResults* results,
-                 Stream stream);
+// `results` on the device; `most`: the size of the largest array, and of the largest cu_taps.
+void write_patches(const Build& build, const StageResults* results, int64_t most, Stream stream);
+void write_pairs(const Build& build, const MapResults* results, int64_t most, Stream stream);
 
 }  // namespace gsim3d::cuda

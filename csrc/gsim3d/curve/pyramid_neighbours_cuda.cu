@@ -144,7 +144,9 @@ __global__ void __launch_bounds__(kThreads) write_pairs_kernel(Build build, cons
   const uint32_t* starts = build.starts + map.begin;
   const auto pairs_before = [&](int64_t tap) { return int64_t{starts[tap * build.n_warps] - starts[0]}; };
   const int64_t n_taps = int64_t{map.kernel_size} * map.kernel_size * map.kernel_size;
-  if (p <= n_taps) to.cu_taps[p] = p <= n_taps / 2 ? pairs_before(p) : n_pairs - pairs_before(n_taps - p);
+  if (p <= n_taps)
+    to.cu_taps[p] = n_pairs == 0 ? 0 : p <= n_taps / 2 ? pairs_before(p) : n_pairs - pairs_before(n_taps - p);
+  for (int64_t i = n_pairs + p; i < to.n_pairs; i += int64_t{gridDim.x} * kThreads) to.tap_in[i] = to.tap_out[i] = 0;
   if (p / kWarp * kWarp >= n) return;
   const unsigned lower = (1u << threadIdx.x % kWarp) - 1;
   for_first_half(build.stages[map.stage].voxels, n, p, map.kernel_size, windows[threadIdx.x / kWarp],
@@ -200,21 +202,27 @@ __global__ void __launch_bounds__(kThreads) write_patches_kernel(Build build, co
   const StageResults& to = results[blockIdx.y];
   const int64_t* own = build.counts + count_at(blockIdx.y, kRows);
   const int64_t n_clouds = own[kClouds], n_keys = own[kKeys], patch_size = stage.patch_size, i = thread_index();
-  if (i <= n_clouds) to.cu_clouds[i] = stage.cu_clouds[i];
+  if (i <= to.n_clouds) to.cu_clouds[i] = stage.cu_clouds[min(i, n_clouds)];
   if (i == 0) to.cu_q[0] = to.cu_k[0] = 0;
   if (i < own[kPatches]) {
     const int64_t c = segment_of(stage.cu_patches, n_clouds, i), end = (i - stage.cu_patches[c] + 1) * patch_size;
     to.cu_q[i + 1] = min(stage.cu_clouds[c] + end, int64_t{stage.cu_clouds[c + 1]});
     to.cu_k[i + 1] = min(stage.cu_keys[c] + end, int64_t{stage.cu_keys[c + 1]});
+  } else if (i < to.n_patches) {
+    to.cu_q[i + 1] = own[kRows];
+    to.cu_k[i + 1] = n_keys;
   }
-  if (i >= n_keys) return;
+  if (i >= n_keys) {
+    for (int r = 0; r < kSerializations && i < to.n_keys; ++r) to.kv_rows[r * to.n_keys + i] = 0;
+    return;
+  }
   const int64_t c = segment_of(stage.cu_keys, n_clouds, i), begin = stage.cu_clouds[c];
   const int64_t size = stage.cu_clouds[c + 1] - begin, local = i - stage.cu_keys[c],
                 from = local / patch_size * patch_size;
   const int64_t place = begin + min(from, max(size - patch_size, int64_t{0})) + local - from;
 #pragma unroll
   for (int r = 0; r < kSerializations; ++r)
-    to.kv_rows[r * n_keys + i] = stage.rows[stage.curves[r] * build.room + place];
+    to.kv_rows[r * to.n_keys + i] = stage.rows[stage.curves[r] * build.room + place];
 }
 
 }  // namespace
@@ -248,19 +256,12 @@ void count_patches(const Build& build, Stream stream) {
   launch(kOp, count_patches_kernel, static_cast<unsigned>(build.n_stages), kThreads, 0, stream, build);
 }
 
-void write_patches(const Build& build, const int64_t* found, const StageResults* results, Stream stream) {
-  int64_t most = 0;
-  for (int64_t s = 0; s < build.n_stages; ++s)
-    for (const Count what : {kClouds, kPatches, kKeys}) most = std::max(most, found[count_at(s, what)]);
-  launch(kOp, write_patches_kernel, dim3(blocks_of(most + 1), static_cast<unsigned>(build.n_stages)), kThreads, 0,
-         stream, build, results);
+void write_patches(const Build& build, const StageResults* results, int64_t most, Stream stream) {
+  launch(kOp, write_patches_kernel, dim3(blocks_of(most), static_cast<unsigned>(build.n_stages)), kThreads, 0, stream,
+         build, results);
 }
 
-void write_pairs(const Build& build, const MapArrays* maps, const int64_t* found, const MapResults* results,
-                 Stream stream) {
-  int64_t most = 0;
-  for (int64_t k = 0; k < build.n_maps; ++k)
-    most = std::max({most, found[count_at(maps[k].stage, kVoxels)], 2 * half_taps(maps[k].kernel_size) + 2});
+void write_pairs(const Build& build, const MapResults* results, int64_t most, Stream stream) {
   launch(kOp, write_pairs_kernel, dim3(blocks_of(most), static_cast<unsigned>(build.n_maps)), kThreads, 0, stream,
          build, results);
 }

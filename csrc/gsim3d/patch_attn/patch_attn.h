@@ -24,8 +24,8 @@ namespace gsim3d {
 struct PatchTable {
   const int64_t* q_rows;   // [n_q_listed], each in [0, n_q), none twice
   const int64_t* kv_rows;  // [n_k_listed], each in [0, n_k); a row may be listed by several patches
-  const int64_t* cu_q;     // [n_patches + 1], ascending from 0 to n_q_listed
-  const int64_t* cu_k;     // [n_patches + 1], ascending from 0 to n_k_listed
+  const int64_t* cu_q;     // [n_patches + 1], ascending from 0 to at most n_q_listed; rows behind are in no patch
+  const int64_t* cu_k;     // [n_patches + 1], ascending from 0 to at most n_k_listed
   int64_t n_patches;
   int64_t n_q_listed, n_k_listed;
   int64_t n_q, n_k;  // rows of the query matrix, rows of the key and value matrices

@@ -108,16 +108,17 @@ void clear(T* x, int64_t n, const Parallel& parallel) {
 struct RowSlots {
   std::vector<int64_t> cu, slots;
 
-  explicit RowSlots(const PatchTable& table) : cu(table.n_k + 2, 0), slots(table.n_k_listed) {
-    for (int64_t i = 0; i < table.n_k_listed; ++i) ++cu[table.kv_rows[i] + 2];
+  explicit RowSlots(const PatchTable& table) : cu(table.n_k + 2, 0), slots(table.cu_k[table.n_patches]) {
+    const int64_t n_listed = table.cu_k[table.n_patches];
+    for (int64_t i = 0; i < n_listed; ++i) ++cu[table.kv_rows[i] + 2];
     for (int64_t r = 0; r < table.n_k; ++r) cu[r + 2] += cu[r + 1];
-    for (int64_t i = 0; i < table.n_k_listed; ++i) slots[cu[table.kv_rows[i] + 1]++] = i;
+    for (int64_t i = 0; i < n_listed; ++i) slots[cu[table.kv_rows[i] + 1]++] = i;
   }
 };
 
 void check_offsets(const char* op, const char* name, const int64_t* cu, int64_t n_patches, int64_t n_listed) {
-  check(cu[0] == 0 && cu[n_patches] == n_listed, op, ": ", name, " must run from 0 to the number of listed rows, ",
-        n_listed, "; got ", cu[0], " .. ", cu[n_patches]);
+  check(cu[0] == 0 && cu[n_patches] <= n_listed, op, ": ", name,
+        " must run from 0 to at most the number of listed rows, ", n_listed, "; got ", cu[0], " .. ", cu[n_patches]);
   for (int64_t p = 0; p < n_patches; ++p)
     check(cu[p] <= cu[p + 1], op, ": ", name, " must not descend; got ", cu[p], " then ", cu[p + 1], " at ", p);
 }
@@ -149,7 +150,7 @@ void check_attention_size(const char* op, const AttentionSize& size) {
 template <typename T>
 void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
                      const AttentionSize& size, T* out, T* stats, const Parallel& parallel) {
-  if (table.n_q_listed < table.n_q) {
+  if (table.cu_q[table.n_patches] < table.n_q) {
     clear(out, table.n_q * size.heads * size.dim, parallel);
     clear(stats, table.n_q * size.heads * 2, parallel);
   }
@@ -167,7 +168,7 @@ void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const He
   const int64_t dim = size.dim, heads = size.heads, wide = baseline::Backward<T>::padded(dim);
   T* key_slots = workspace.take<T>(heads * table.n_k_listed * wide);
   T* value_slots = workspace.take<T>(heads * table.n_k_listed * wide);
-  if (table.n_q_listed < table.n_q) clear(grads[0], table.n_q * heads * dim, parallel);
+  if (table.cu_q[table.n_patches] < table.n_q) clear(grads[0], table.n_q * heads * dim, parallel);
   if (simd::use_avx512())
     run_tasks(avx512::Backward<T>{grad, q, k, v, out, stats, table, size, grads[0], key_slots, value_slots},
               kWholePatch, parallel);

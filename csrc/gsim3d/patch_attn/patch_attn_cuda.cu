@@ -1,7 +1,4 @@
 // Patch attention on a GPU: which kernels run, and gradients of rows that several slots list.
-#include <cuda_bf16.h>
-#include <cuda_fp16.h>
-
 #include "gsim3d/patch_attn/patch_attn_simple.h"
 #include "gsim3d/patch_attn/patch_attn_tensor.h"
 
@@ -11,31 +8,16 @@ namespace {
 constexpr int kThreads = 256;
 
 template <typename T>
-struct DeviceTypeOf {
-  using Type = T;
-};
-template <>
-struct DeviceTypeOf<Float16> {
-  using Type = __half;
-};
-template <>
-struct DeviceTypeOf<BFloat16> {
-  using Type = __nv_bfloat16;
-};
-template <typename T>
-using Device = typename DeviceTypeOf<T>::Type;
-
-template <typename T>
-HeadRows<Device<T>> device(const HeadRows<T>& x) {
-  return {reinterpret_cast<const Device<T>*>(x.data), x.row_stride, x.head_stride};
+HeadRows<Native<T>> device(const HeadRows<T>& x) {
+  return {reinterpret_cast<const Native<T>*>(x.data), x.row_stride, x.head_stride};
 }
 template <typename T>
-Device<T>* device(T* x) {
-  return reinterpret_cast<Device<T>*>(x);
+Native<T>* device(T* x) {
+  return reinterpret_cast<Native<T>*>(x);
 }
 template <typename T>
-const Device<T>* device(const T* x) {
-  return reinterpret_cast<const Device<T>*>(x);
+const Native<T>* device(const T* x) {
+  return reinterpret_cast<const Native<T>*>(x);
 }
 
 // Copies of 16 bytes need rows that start at multiples of it.
@@ -60,22 +42,26 @@ __global__ void uses_kernel(PatchTable table, RowUses uses) {
   atomicAdd(uses.count_less_one + row, 1);
 }
 
-// A warp looks at 32 rows and works on those that no slot or several slots list.
+constexpr int kRowsPerWarp = 4;  // rows listed several times lie side by side: few a warp, so that many warps share them
+
+// A warp looks at kRowsPerWarp rows and works on those that no slot or several slots list.
 template <typename T>
 __global__ void finish_kernel(PatchTable table, AttentionSize size, RowUses uses, KeyGradients<T> gradients) {
-  using C = Wide<T>;
+  using C = Sum<T>;
   const int lane = threadIdx.x % kWarp;
-  const int64_t first = (static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x) / kWarp * kWarp;
-  const int mine = first + lane < table.n_k ? uses.count_less_one[first + lane] : 0;
+  const int64_t first = (static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x) / kWarp * kRowsPerWarp;
+  const int mine = lane < kRowsPerWarp && first + lane < table.n_k ? uses.count_less_one[first + lane] : 0;
   const int64_t width = size.heads * size.dim;
   for (unsigned left = __ballot_sync(kFullWarp, mine != 0); left != 0; left &= left - 1) {
     const int64_t row = first + __ffs(static_cast<int>(left)) - 1;
     const int count = uses.count_less_one[row] + 1;
     const int64_t begin = static_cast<int64_t>(uses.first[row]), last = static_cast<int64_t>(~uses.minus_last[row]);
+#pragma unroll 2
     for (int64_t i = lane; i < width; i += kWarp) {
+      const int64_t head = i / size.dim;
       C k = 0, v = 0;
       const auto add = [&](int64_t slot) {
-        const C* from = gradients.slot(slot, i / size.dim, size) + i % size.dim;
+        const C* from = gradients.slot(slot, head, size) + (i - head * size.dim);
         k += from[0];
         v += from[size.dim];
       };
@@ -96,11 +82,11 @@ template <typename T>
 void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
                      const AttentionSize& size, T* out, StatsOf<T>* stats, Stream stream) {
   const char* op = "patch_attention";
-  fill_zero(op, out, table.n_q * size.heads * size.dim, stream);
-  fill_zero(op, stats, table.n_q * size.heads * 2, stream);
   if constexpr (sizeof(T) == 2)
     if (fits_tensor_cores<T>(size, q, k, v))
       return tensor_forward(device(q), device(k), device(v), table, size, device(out), stats, stream);
+  fill_zero(op, out, table.n_q * size.heads * size.dim, stream);
+  fill_zero(op, stats, table.n_q * size.heads * 2, stream);
   simple_forward(device(q), device(k), device(v), table, size, device(out), stats, stream);
 }
 
@@ -116,8 +102,8 @@ void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const He
   check_cuda(cudaMemsetAsync(use_memory, 0xff, use_bytes, native(stream)), op);
   launch(op, uses_kernel, blocks_for(op, table.n_k_listed, kThreads), kThreads, 0, stream, table, uses);
 
-  using C = Wide<Device<T>>;
-  const KeyGradients<Device<T>> gradients{device(grads[1]), device(grads[2]),
+  using C = Sum<Native<T>>;
+  const KeyGradients<Native<T>> gradients{device(grads[1]), device(grads[2]),
                                           workspace.take<C>(table.n_k_listed * size.heads * 2 * size.dim),
                                           uses.count_less_one};
   bool done = false;
@@ -130,8 +116,8 @@ void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const He
   if (!done)
     simple_backward(device(grad), device(q), device(k), device(v), device(out), stats, table, size, device(grads[0]),
                     gradients, workspace, stream);
-  launch(op, finish_kernel<Device<T>>, blocks_for(op, table.n_k, kThreads), kThreads, 0, stream, table, size, uses,
-         gradients);
+  launch(op, finish_kernel<Native<T>>, blocks_for(op, table.n_k, kThreads / kWarp * kRowsPerWarp), kThreads, 0, stream,
+         table, size, uses, gradients);
 }
 
 #define GSIM3D_INSTANTIATE(T)                                                                                         \

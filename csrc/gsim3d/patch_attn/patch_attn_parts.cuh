@@ -3,17 +3,13 @@
 
 #include <cstdint>
 #include <limits>
-#include <type_traits>
 
 #include "gsim3d/core/cuda_utils.cuh"
+#include "gsim3d/core/half.cuh"
 #include "gsim3d/patch_attn/patch_attn.h"
 #include "gsim3d/patch_attn/patch_attn_math.h"
 
 namespace gsim3d::cuda {
-
-// Numbers are computed in float32, float64 ones in float64.
-template <typename T>
-using Wide = std::conditional_t<std::is_same_v<T, double>, double, float>;
 
 // A block computes one head of some rows of one patch: of its `splits` blocks, block s takes groups s, s + splits, ...
 // of `group` rows. Heads are neighbours, so that blocks in flight read the same lines of memory.
@@ -65,11 +61,11 @@ template <typename T>
 struct KeyGradients {
   T* k;                  // [n_k, H, D]
   T* v;                  // [n_k, H, D]
-  Wide<T>* slots;        // [n_k_listed, H, 2, D], only slots of rows listed more than once are written
+  Sum<T>* slots;        // [n_k_listed, H, 2, D], only slots of rows listed more than once are written
   const int* count_less_one;
 
   __device__ __forceinline__ bool at_once(int64_t row) const { return count_less_one[row] == 0; }
-  __device__ __forceinline__ Wide<T>* slot(int64_t slot, int64_t head, const AttentionSize& size) const {
+  __device__ __forceinline__ Sum<T>* slot(int64_t slot, int64_t head, const AttentionSize& size) const {
     return slots + (slot * size.heads + head) * 2 * size.dim;
   }
 };

@@ -133,10 +133,10 @@ struct Work {
   PatchTable table;
   AttentionSize size;
   Division division;
-  patch_attn::Softmax<Wide<T>> softmax;
+  patch_attn::Softmax<Sum<T>> softmax;
   T* out;  // or the gradient of q
-  Wide<T>* stats;
-  Wide<T>* deltas;  // [H, n_q_listed]
+  Sum<T>* stats;
+  Sum<T>* deltas;  // [H, n_q_listed]
   KeyGradients<T> key_gradients;
 };
 
@@ -151,7 +151,7 @@ __device__ __forceinline__ Slots slots_of(const Range& range, const Share& share
 
 template <typename T, int L>
 __global__ void __launch_bounds__(kThreads) forward_kernel(Work<T> work) {
-  using C = Wide<T>;
+  using C = Sum<T>;
   using S = Shape<C, L>;
   constexpr int R = S::kRows;
   extern __shared__ uint4 shared[];
@@ -233,7 +233,7 @@ __global__ void __launch_bounds__(kThreads) forward_kernel(Work<T> work) {
 // Gradients are divided by the sum of weights, so that the weights need not be; delta = <out, that gradient>.
 template <typename T, int L>
 __global__ void __launch_bounds__(kThreads) query_kernel(Work<T> work) {
-  using C = Wide<T>;
+  using C = Sum<T>;
   using S = Shape<C, L>;
   constexpr int R = S::kRows;
   extern __shared__ uint4 shared[];
@@ -296,7 +296,7 @@ __global__ void __launch_bounds__(kThreads) query_kernel(Work<T> work) {
 
 template <typename T, int L>
 __global__ void __launch_bounds__(kThreads) key_kernel(Work<T> work) {
-  using C = Wide<T>;
+  using C = Sum<T>;
   using S = Shape<C, L>;
   extern __shared__ uint4 shared[];
   const Tile<C, L> tile(shared);
@@ -363,28 +363,28 @@ void with_lanes(int64_t dim, const F& f) {
 
 template <typename T>
 void simple_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
-                    const AttentionSize& size, T* out, Wide<T>* stats, Stream stream) {
+                    const AttentionSize& size, T* out, Sum<T>* stats, Stream stream) {
   const char* op = "patch_attention";
   with_lanes(size.dim, [&]<int L>() {
-    using S = Shape<Wide<T>, L>;
+    using S = Shape<Sum<T>, L>;
     const Division division = divide(table.n_patches, table.n_q_listed, S::kGroup, size.heads,
                                      4 * multiprocessors(op, stream));
-    const Work<T> work{{}, q, k, v, {}, table, size, division, patch_attn::Softmax<Wide<T>>(size.scale), out, stats};
+    const Work<T> work{{}, q, k, v, {}, table, size, division, patch_attn::Softmax<Sum<T>>(size.scale), out, stats};
     launch(op, forward_kernel<T, L>, blocks_of(division), kThreads, S::kSharedBytes, stream, work);
   });
 }
 
 template <typename T>
 void simple_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v,
-                     const T* out, const Wide<T>* stats, const PatchTable& table, const AttentionSize& size, T* grad_q,
+                     const T* out, const Sum<T>* stats, const PatchTable& table, const AttentionSize& size, T* grad_q,
                      const KeyGradients<T>& key_gradients, const Workspace& workspace, Stream stream) {
   const char* op = "patch_attention_backward";
   const HeadRows<T> out_rows{out, size.heads * size.dim, size.dim};
   const int64_t resident = 4 * multiprocessors(op, stream);
-  Work<T> work{grad, q, k, v, out_rows, table, size, {}, patch_attn::Softmax<Wide<T>>(size.scale), grad_q,
-               const_cast<Wide<T>*>(stats), workspace.take<Wide<T>>(size.heads * table.n_q_listed), key_gradients};
+  Work<T> work{grad, q, k, v, out_rows, table, size, {}, patch_attn::Softmax<Sum<T>>(size.scale), grad_q,
+               const_cast<Sum<T>*>(stats), workspace.take<Sum<T>>(size.heads * table.n_q_listed), key_gradients};
   with_lanes(size.dim, [&]<int L>() {
-    using S = Shape<Wide<T>, L>;
+    using S = Shape<Sum<T>, L>;
     work.division = divide(table.n_patches, table.n_q_listed, S::kGroup, size.heads, resident);
     launch(op, query_kernel<T, L>, blocks_of(work.division), kThreads, S::kSharedBytes, stream, work);
     work.division = divide(table.n_patches, table.n_k_listed, kThreads / L, size.heads, resident);
@@ -394,9 +394,9 @@ void simple_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRo
 
 #define GSIM3D_INSTANTIATE(T)                                                                                        \
   template void simple_forward<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const PatchTable&,     \
-                                  const AttentionSize&, T*, Wide<T>*, Stream);                                       \
+                                  const AttentionSize&, T*, Sum<T>*, Stream);                                       \
   template void simple_backward<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&,   \
-                                   const T*, const Wide<T>*, const PatchTable&, const AttentionSize&, T*,            \
+                                   const T*, const Sum<T>*, const PatchTable&, const AttentionSize&, T*,            \
                                    const KeyGradients<T>&, const Workspace&, Stream);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)

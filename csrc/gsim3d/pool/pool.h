@@ -14,7 +14,7 @@ namespace gsim3d {
 
 struct Segments {
   const int64_t* rows;     // [R], each in [0, n_rows), none twice
-  const int64_t* cu_rows;  // [n_segments + 1], ascending from 0 to R
+  const int64_t* cu_rows;  // [n_segments + 1], ascending from 0 to at most R; rows listed behind are in no segment
   int64_t n_segments;
   int64_t n_listed;  // R
   int64_t n_rows;    // rows of the feature matrix

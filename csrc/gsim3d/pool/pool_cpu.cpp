@@ -29,7 +29,7 @@ void for_segments(const Segments& segments, int64_t channels, const Parallel& pa
 // What check_segments asks, without messages and many times faster.
 bool well_formed(const Segments& segments) {
   const auto& [rows, cu, n_segments, n_listed, n_rows] = segments;
-  bool good = n_listed <= n_rows && cu[0] == 0 && cu[n_segments] == n_listed;
+  bool good = n_listed <= n_rows && cu[0] == 0 && cu[n_segments] <= n_listed;
   for (int64_t s = 0; s < n_segments; ++s) good &= cu[s] <= cu[s + 1];
   for (int64_t i = 0; i < n_listed; ++i) good &= static_cast<uint64_t>(rows[i]) < static_cast<uint64_t>(n_rows);
   if (!good) return false;
@@ -90,8 +90,8 @@ void check_segments(const char* op, const Segments& segments) {
   if (well_formed(segments)) return;
   check(n_listed <= n_rows, op, ": rows must list each of the N=", n_rows, " rows at most once; got ", n_listed,
         " entries");
-  check(cu[0] == 0 && cu[n_segments] == n_listed, op, ": cu_rows must run from 0 to len(rows)=", n_listed, "; got ",
-        cu[0], " .. ", cu[n_segments]);
+  check(cu[0] == 0 && cu[n_segments] <= n_listed, op, ": cu_rows must run from 0 to at most len(rows)=", n_listed,
+        "; got ", cu[0], " .. ", cu[n_segments]);
   for (int64_t s = 0; s < n_segments; ++s)
     check(cu[s] <= cu[s + 1], op, ": cu_rows must not descend; got ", cu[s], " then ", cu[s + 1], " at ", s);
   std::vector<char> seen(static_cast<size_t>(n_rows), 0);
@@ -172,7 +172,7 @@ void pool_mean(const T* x, const Segments& segments, int64_t channels, T* out, c
 
 template <typename T>
 void pool_mean_vjp(const T* grad, const Segments& segments, int64_t channels, T* grad_x, const Parallel& parallel) {
-  if (segments.n_listed < segments.n_rows)
+  if (segments.cu_rows[segments.n_segments] < segments.n_rows)
     parallel.range(segments.n_rows, grain(segments.n_rows, segments.n_rows, channels), [&](int64_t begin, int64_t end) {
       std::fill(grad_x + begin * channels, grad_x + end * channels, T(0));
     });
@@ -193,7 +193,7 @@ template <typename T>
 void unpool(const T* x, const Segments& segments, int64_t channels, T* out, const Parallel& parallel) {
   const auto& [rows, cu, n_segments, n_listed, n_rows] = segments;
   check(n_segments <= std::numeric_limits<int32_t>::max(), "unpool: x must have fewer than 2^31 rows; got ", n_segments);
-  bool good = n_rows >= 0 && n_listed <= n_rows && cu[0] == 0 && cu[n_segments] == n_listed;
+  bool good = n_rows >= 0 && n_listed <= n_rows && cu[0] == 0 && cu[n_segments] <= n_listed;
   std::vector<int32_t> owner(good ? static_cast<size_t>(n_rows) : 0, -1);
   for (int64_t s = 0; good && s < n_segments; ++s) {
     const int64_t end = cu[s + 1];
@@ -203,6 +203,8 @@ void unpool(const T* x, const Segments& segments, int64_t channels, T* out, cons
       if (good) owner[rows[i]] = static_cast<int32_t>(s);
     }
   }
+  for (int64_t i = good ? cu[n_segments] : n_listed; good && i < n_listed; ++i)
+    good = static_cast<uint64_t>(rows[i]) < static_cast<uint64_t>(n_rows) && owner[rows[i]] < 0;
   if (!good) check_segments("unpool", segments);
   parallel.range(n_rows, grain(n_rows, n_rows, channels), [&](int64_t begin, int64_t end) {
     for (int64_t row = begin; row < end; ++row) {

@@ -20,10 +20,11 @@ namespace gsim3d {
 struct SparseConvMap {
   const int64_t* row_voxel;      // [n_rows], the voxel of each row
   const int64_t* voxel_rows;     // [n_rows], rows of voxel 0, of voxel 1, ...; ascending inside a voxel
-  const int64_t* cu_voxel_rows;  // [n_voxels + 1], from 0 to n_rows; no voxel is empty
+  const int64_t* cu_voxel_rows;  // [n_voxels + 1], from 0 to n_rows; no voxel is empty but, where there are more voxels
+                                 // than rows, the last ones
   const int64_t* tap_in;         // [n_pairs]; ascending inside a tap, as voxels are ordered by their cells
   const int64_t* tap_out;        // [n_pairs]; ascending inside a tap
-  const int64_t* cu_taps;        // [K^3 + 1]; the centre tap has no pairs
+  const int64_t* cu_taps;        // [K^3 + 1], from 0 to at most n_pairs; the centre tap has no pairs
   int64_t n_rows, n_voxels, n_pairs, kernel_size;
   bool first;  // taps read the lowest row of a voxel instead of the mean of its rows
 };

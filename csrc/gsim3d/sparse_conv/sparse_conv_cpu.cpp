@@ -56,6 +56,14 @@ constexpr int64_t kRowPad = 24;
 int64_t round_up(int64_t n, int64_t step) { return (n + step - 1) / step * step; }
 int64_t taps_of(const SparseConvMap& map) { return map.kernel_size * map.kernel_size * map.kernel_size; }
 
+// The map without empty voxels and pairs of no tap, which its lists may end with.
+SparseConvMap filled_part(SparseConvMap map) {
+  const int64_t* cu = map.cu_voxel_rows;
+  if (map.n_voxels > map.n_rows) map.n_voxels = std::find(cu, cu + map.n_voxels, map.n_rows) - cu;
+  map.n_pairs = map.cu_taps[taps_of(map)];
+  return map;
+}
+
 enum class VoxelValue { kMean, kSum, kFirst };
 enum class Share { kWhole, kEqualParts, kFirstRow };  // what the rows of a voxel get of the voxel's sum
 
@@ -276,7 +284,11 @@ void check_sparse_conv_map(const char* op, const SparseConvMap& map, const Paral
   const int64_t *cu = map.cu_voxel_rows, *cu_taps = map.cu_taps, taps = taps_of(map), centre = taps / 2;
   check(cu[0] == 0 && cu[map.n_voxels] == map.n_rows, op, ": cu_voxel_rows must run from 0 to N=", map.n_rows, "; got ",
         cu[0], " .. ", cu[map.n_voxels]);
-  for (int64_t v = 0; v < map.n_voxels; ++v) {
+  const int64_t n_filled = filled_part(map).n_voxels;
+  for (int64_t v = n_filled; v < map.n_voxels; ++v)
+    check(cu[v + 1] == map.n_rows, op, ": cu_voxel_rows must stay at N=", map.n_rows, " behind the last row; got ",
+          cu[v + 1], " at ", v + 1);
+  for (int64_t v = 0; v < n_filled; ++v) {
     check(cu[v] < cu[v + 1] && cu[v + 1] <= map.n_rows, op, ": cu_voxel_rows must ascend, no voxel is empty; got ",
           cu[v], " then ", cu[v + 1], " at ", v);
     for (int64_t i = cu[v]; i < cu[v + 1]; ++i) {
@@ -289,8 +301,8 @@ void check_sparse_conv_map(const char* op, const SparseConvMap& map, const Paral
             map.voxel_rows[i - 1], " then ", row);
     }
   }
-  check(cu_taps[0] == 0 && cu_taps[taps] == map.n_pairs, op, ": cu_taps must run from 0 to len(tap_in)=", map.n_pairs,
-        "; got ", cu_taps[0], " .. ", cu_taps[taps]);
+  check(cu_taps[0] == 0 && cu_taps[taps] <= map.n_pairs, op, ": cu_taps must run from 0 to at most len(tap_in)=",
+        map.n_pairs, "; got ", cu_taps[0], " .. ", cu_taps[taps]);
   for (int64_t t = 0; t < taps; ++t)
     check(cu_taps[t] <= cu_taps[t + 1], op, ": cu_taps must not descend; got ", cu_taps[t], " then ", cu_taps[t + 1],
           " at ", t);
@@ -318,8 +330,9 @@ void check_sparse_conv_map(const char* op, const SparseConvMap& map, const Paral
 }
 
 template <typename T>
-void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap& map, int64_t c_in, int64_t c_out,
+void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap& whole, int64_t c_in, int64_t c_out,
                  T* out, const Workspace& workspace, const Parallel& parallel) {
+  const SparseConvMap map = filled_part(whole);
   const int64_t matrix = c_in * round_up(c_out, kColumnPad<T>);
   const T* panels = pack_weights(weight, map, c_in, c_out, matrix, products<T>().pack_by_output, workspace, parallel);
   const auto kind = map.first ? VoxelValue::kFirst : VoxelValue::kMean;
@@ -330,8 +343,9 @@ void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap
 }
 
 template <typename T>
-void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& map, int64_t c_in, int64_t c_out,
+void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& whole, int64_t c_in, int64_t c_out,
                            T* grad_x, const Workspace& workspace, const Parallel& parallel) {
+  const SparseConvMap map = filled_part(whole);
   const int64_t matrix = c_out * round_up(c_in, kColumnPad<T>);
   const T* panels = pack_weights(weight, map, c_in, c_out, matrix, products<T>().pack_by_input, workspace, parallel);
   const T** values = voxel_values(grad, map, c_out, VoxelValue::kSum, workspace, parallel);
@@ -342,8 +356,9 @@ void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& 
 }
 
 template <typename T>
-void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map, int64_t c_in, int64_t c_out,
+void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& whole, int64_t c_in, int64_t c_out,
                             T* grad_weight, T* grad_bias, const Workspace& workspace, const Parallel& parallel) {
+  const SparseConvMap map = filled_part(whole);
   bias_vjp(grad, map.n_rows, c_out, grad_bias, workspace, parallel);
   const T** inputs =
       voxel_values(x, map, c_in, map.first ? VoxelValue::kFirst : VoxelValue::kMean, workspace, parallel);

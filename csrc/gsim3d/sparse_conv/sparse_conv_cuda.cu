@@ -25,7 +25,10 @@ void check_sizes(const char* op, const SparseConvMap& map, int64_t c_in, int64_t
   check(map.kernel_size <= kMaxKernel, op, ": CUDA takes kernels up to ", kMaxKernel, "; got ", map.kernel_size);
 }
 
-int64_t slots_of(const SparseConvMap& map) { return std::max<int64_t>(0, map.n_rows - map.n_voxels); }
+// Where some voxels are empty, any number of the others may be shared.
+int64_t slots_of(const SparseConvMap& map) {
+  return map.n_voxels > map.n_rows ? map.n_rows : map.n_rows - map.n_voxels;
+}
 
 Sources sources_of(const SparseConvMap& map, bool first) {
   return {map.voxel_rows, map.cu_voxel_rows, map.n_rows, map.n_voxels, slots_of(map), first};
@@ -281,11 +284,11 @@ WeightPlan plan_of(const SparseConvMap& map, int64_t c_in, int64_t c_out) {
 
 template <typename T>
 const auto* native_data(const T* data) {
-  return reinterpret_cast<const typename Native<T>::Type*>(data);
+  return reinterpret_cast<const Native<T>*>(data);
 }
 template <typename T>
 auto* native_data(T* data) {
-  return reinterpret_cast<typename Native<T>::Type*>(data);
+  return reinterpret_cast<Native<T>*>(data);
 }
 
 }  // namespace
@@ -293,7 +296,7 @@ auto* native_data(T* data) {
 template <typename T>
 void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap& map, int64_t c_in, int64_t c_out,
                  T* out, const Workspace& workspace, Stream stream) {
-  using E = typename Native<T>::Type;
+  using E = Native<T>;
   const char* op = "sparse_conv";
   check_sizes(op, map, c_in, c_out);
   const int64_t taps = taps_of(map);
@@ -324,7 +327,7 @@ void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap
 template <typename T>
 void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& map, int64_t c_in, int64_t c_out,
                            T* grad_x, const Workspace& workspace, Stream stream) {
-  using E = typename Native<T>::Type;
+  using E = Native<T>;
   const char* op = "sparse_conv_grad_input";
   check_sizes(op, map, c_in, c_out);
   const int64_t taps = taps_of(map);
@@ -361,7 +364,7 @@ void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& 
 template <typename T>
 void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map, int64_t c_in, int64_t c_out,
                             T* grad_weight, T* grad_bias, const Workspace& workspace, Stream stream) {
-  using E = typename Native<T>::Type;
+  using E = Native<T>;
   const char* op = "sparse_conv_grad_weight";
   check_sizes(op, map, c_in, c_out);
   const int64_t taps = taps_of(map);

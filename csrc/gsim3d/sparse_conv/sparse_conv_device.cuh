@@ -1,34 +1,15 @@
 // What the kernels of sparse convolution share: types, and where the value of a voxel lies.
 #pragma once
 
-#include <cuda_bf16.h>
-#include <cuda_fp16.h>
-
 #include <type_traits>
 
 #include "gsim3d/core/cuda_utils.cuh"
-#include "gsim3d/core/half.h"
+#include "gsim3d/core/half.cuh"
 #include "gsim3d/sparse_conv/sparse_conv.h"
 
 namespace gsim3d::cuda::conv {
 
 constexpr int kTile = 256;  // voxels of one block of a convolution
-
-// The format a kernel computes with, and the one it adds in.
-template <typename T>
-struct Native {
-  using Type = T;
-};
-template <>
-struct Native<Float16> {
-  using Type = __half;
-};
-template <>
-struct Native<BFloat16> {
-  using Type = __nv_bfloat16;
-};
-template <typename E>
-using Sum = std::conditional_t<std::is_same_v<E, double>, double, float>;
 
 template <typename E>
 constexpr bool kIsHalf = std::is_same_v<E, __half> || std::is_same_v<E, __nv_bfloat16>;

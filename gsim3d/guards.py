@@ -1,0 +1,142 @@
+"""Where data enters the simulator or leaves a step: what cannot be used is found, counted and handled by the policy."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from gsim3d.ops.sentinel import CELLS, FAST, OUTSIDE, SUMS, watch_rows
+from gsim3d.stability import ACTIONS, LARGEST, Finding, Reading, Sentinels, StabilityConfig, StabilityReport
+from gsim3d.types import ASLEEP, CloudTable, Particles
+
+BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
+
+
+def guard_particles(
+    particles: Particles,
+    config: StabilityConfig,
+    report: StabilityReport,
+    where: str,
+    *,
+    grid_size: float = 0.0,
+    previous: Particles | None = None,
+    max_opacity: float = 1.0,
+) -> Particles:
+    """``particles`` with finite, bounded numbers only; rows that had others are handled by ``config.on_bad``.
+
+    Args:
+        particles: any clouds.
+        config: policy and limits.
+        report: is told of every such row and, with ``previous``, of the sentinels of every cloud.
+        where: what the report calls this place.
+        grid_size: metres, cells in which the dynamics sees them: a row outside the 2^16 cells from its scene's origin
+            falls asleep; 0: there is no such limit.
+        previous: the same rows one step before: a row that moved further than ``config.max_speed`` falls asleep, and
+            rows that cannot be used return to it.
+        max_opacity: larger ones count as out of range.
+    Gradients: through all rows that stay as they are.
+    Raises:
+        HardCaseError: ``config.on_bad`` is "raise", on the CPU.
+    """
+    fields = particles.row_fields()
+    activity = fields.pop("activity")
+    limits = {
+        "means": (-LARGEST, LARGEST),
+        "opacities": (0.0, max_opacity),
+        "quats": (-LARGEST, LARGEST),
+        "scales": (0.0, LARGEST),
+    }
+    bounds = [limits.get(name, (-config.max_latent, config.max_latent)) for name in fields]
+    watched = watch_rows(
+        list(fields.values()),
+        bounds,
+        particles.cu_rows,
+        cloud_scene=particles.cloud_scene,
+        origin=particles.origin,
+        activity=activity,
+        grid_size=grid_size,
+        previous=None if previous is None else previous.means,
+        max_step=config.max_speed,
+    )
+    if not torch.compiler.is_compiling():
+        names = [f"particles.{name}" for name in fields]
+        whats = [BOUNDED.get(name) or _what(high) for name, (_, high) in zip(fields, bounds)]
+        read = partial(_read, particles.clouds, where, names, whats, config.on_bad, previous is not None)
+        report.record(watched.record, read)
+        if watched.status.device.type == "cpu" and not bool(watched.status.any()):
+            return particles
+    mend = _clamp if config.on_bad == "clamp" else _put_to_sleep
+    return mend(particles, fields, bounds, watched.status, config, grid_size, previous)
+
+
+def _what(high: float) -> str:
+    return "not finite" if high == LARGEST else f"not finite or beyond {high:g}"
+
+
+def _read(
+    clouds: CloudTable, where: str, names: list[str], whats: list[str], on_bad: str, moved: bool, record: Tensor
+) -> Reading:
+    """What a record of watch_rows says."""
+    by_rule = "clamped" if on_bad == "clamp" else "asleep"
+    kinds = [(name, what, ACTIONS[on_bad]) for name, what in zip(names, whats, strict=True)]
+    kinds += [("particles.means", "outside the workspace", by_rule), ("particles.means", "speed limit", by_rule)]
+    findings, sentinels = [], {}
+    for q, numbers in enumerate(record.tolist()):
+        scene, step = clouds.scenes[q], clouds.steps[q]
+        for k, (name, what, action) in enumerate(kinds):
+            count, row = (int(number) for number in numbers[2 * k : 2 * k + 2])
+            if count:
+                findings.append(Finding(what, where, name, action, count, row, scene, step))
+        if moved:
+            sums = dict(zip(SUMS, numbers[2 * len(kinds) :], strict=True))
+            sides = [sums[f"high_{axis}"] - sums[f"low_{axis}"] for axis in "xyz"] if sums["awake"] else [0.0]
+            sentinels[scene, step] = Sentinels(
+                int(sums["awake"]), sums["kinetic_energy"], sums["opacity_mass"], math.hypot(*sides)
+            )
+    return Reading(findings, sentinels)
+
+
+def _neutral(name: str, particles: Particles) -> Tensor:
+    """What stands in for a value that nobody knows."""
+    value = getattr(particles, name)
+    if name == "means":
+        return particles.origin[particles.cloud_scene[particles.row_cloud()]].to(value)
+    neutral = torch.zeros_like(value)
+    if name == "quats":
+        neutral[:, 0] = 1
+    return neutral
+
+
+def _put_to_sleep(particles, fields, bounds, status, config, grid_size, previous) -> Particles:
+    unusable, stays = status & (OUTSIDE - 1) != 0, status & (OUTSIDE - 1 | FAST) == 0
+    mended = {}
+    for name, value in fields.items():
+        before = _neutral(name, particles) if previous is None else getattr(previous, name)
+        if before is not value:
+            mended[name] = torch.where(stays.reshape(-1, *[1] * (value.dim() - 1)), value, before)
+    opacities = mended.get("opacities", particles.opacities)
+    mended["opacities"] = torch.where(unusable, 0.0, opacities)
+    mended["activity"] = torch.where(status == 0, particles.activity, ASLEEP)
+    return dataclasses.replace(particles, **mended)
+
+
+def _clamp(particles, fields, bounds, status, config, grid_size, previous) -> Particles:
+    mended = {}
+    for (name, value), (low, high) in zip(fields.items(), bounds, strict=True):
+        before = _neutral(name, particles) if previous is None else getattr(previous, name)
+        mended[name] = torch.where(value.isnan(), before, value).clamp(low, high)
+    if previous is not None:
+        step = mended["means"] - previous.means
+        length = step.double().norm(dim=1, keepdim=True)
+        share = (config.max_speed / length.clamp(min=config.max_speed)).to(step)
+        mended["means"] = torch.where(status[:, None] & FAST != 0, previous.means + share * step, mended["means"])
+    if grid_size > 0:
+        origin = particles.origin[particles.cloud_scene[particles.row_cloud()]]
+        inside = (mended["means"].double() - origin).clamp(0, (CELLS - 0.5) * grid_size)
+        outside = status[:, None] & (OUTSIDE | FAST | 1) != 0
+        mended["means"] = torch.where(outside, (origin + inside).to(mended["means"]), mended["means"])
+    return dataclasses.replace(particles, **mended)

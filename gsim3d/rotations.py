@@ -1,0 +1,26 @@
+"""Rotations as quaternions (w, x, y, z) and as matrices."""
+
+import torch
+from torch import Tensor
+
+MIN_QUAT_NORM = 1e-6  # a shorter quaternion has no direction worth a gradient
+
+
+def unit_quats(quats: Tensor) -> Tensor:
+    """[..., 4] normalised; the identity, without a gradient, where shorter than 1e-6."""
+    short = quats.detach().norm(dim=-1, keepdim=True) < MIN_QUAT_NORM
+    identity = torch.zeros_like(quats)
+    identity[..., 0] = 1
+    quats = torch.where(short, identity, quats)
+    return quats / quats.norm(dim=-1, keepdim=True)
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Unit quaternions [N, 4] (w, x, y, z) -> [N, 3, 3]."""
+    w, x, y, z = quats.unbind(1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, 1).unflatten(1, (3, 3))

@@ -1,0 +1,269 @@
+"""What happens to numbers that cannot be used, and how one learns of it.
+
+For every input, the simulator and every op return finite outputs and finite gradients, or raise a
+:class:`gsim3d.HardCaseError` that names scene, step, particle or camera and tensor. A policy says which:
+
+- ``"raise"`` (default): an error. The CPU raises at once. On a GPU nothing waits for the device: the row sleeps as
+  under "drop", and the error comes from the next call that finds the flag, or from :meth:`StabilityReport.check`.
+- ``"drop"``: the row sleeps. It stays in its place, is not seen by the network, not drawn, and has no gradient.
+- ``"clamp"``: the number is bounded: NaN becomes the value before it, or 0 (a rotation the identity); the row goes on.
+
+Under every policy a particle that leaves the workspace, or moves further in a step than ``max_speed``, falls asleep by
+rule ("clamp": is held at the limit); that is counted and no error. Nothing of this changes another scene by one bit.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from torch import Tensor
+
+from gsim3d.errors import HardCaseError, InputError
+
+OnBad = Literal["raise", "drop", "clamp"]
+LARGEST = torch.finfo(torch.float32).max
+ACTIONS = {"raise": "error", "drop": "dropped", "clamp": "clamped"}
+ADVICE = 'on_bad="drop" goes on without such rows, on_bad="clamp" bounds them'
+MAX_FINDINGS = 1000  # of a report, then only its total goes on counting
+
+
+def check_on_bad(on_bad: str) -> None:
+    """Raises InputError where it is no policy."""
+    if on_bad not in get_args(OnBad):
+        raise InputError(f"on_bad must be one of {', '.join(get_args(OnBad))}; got {on_bad!r}")
+
+
+@dataclass(frozen=True)
+class StabilityConfig:
+    """Limits that a model's particles keep, and what happens where one does not.
+
+    on_bad: "raise", "drop" or "clamp": the policy where a call names no other.
+    max_speed: metres a step. A particle that moves further falls asleep where it was. Less than a model's own
+        ``max_step`` stops motion that was learned; far more lets a runaway drag others along before it leaves.
+    max_latent: largest size of a latent or colour coefficient. Beyond it a value counts as not finite: from about 6e4
+        half precision overflows, from 1e19 a squared norm in float32.
+    """
+
+    on_bad: OnBad = "raise"
+    max_speed: float = 10.0
+    max_latent: float = 1e4
+
+    def __post_init__(self):
+        check_on_bad(self.on_bad)
+        for name in ("max_speed", "max_latent"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise InputError(f"{name} must be positive and finite; got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Rows of one tensor in one place that could not be used as they were.
+
+    what: what is wrong, such as "not finite", "outside the workspace", "speed limit".
+    where: the call, such as "encode" or "rollout". tensor: what holds the numbers.
+    scene, step: of the particles' cloud; camera: image of the call; None where none is meant.
+    row: the first such row, of the packed rows of the call. count: how many.
+    action: "error", "dropped", "clamped", "asleep" (by rule) or "noted".
+    """
+
+    what: str
+    where: str
+    tensor: str
+    action: str
+    count: int
+    row: int | None = None
+    scene: int | None = None
+    step: int | None = None
+    camera: int | None = None
+
+    def __str__(self) -> str:
+        place = [f"{name} {value}" for name in ("scene", "step", "camera") if (value := getattr(self, name)) is not None]
+        place = f" ({', '.join(place)})" if place else ""
+        row = "" if self.row is None else f" at row {self.row}"
+        more = f" and {self.count - 1} more" if self.count > 1 else ""
+        return f"{self.where}: {self.tensor}: {self.what}{row}{place}{more}"
+
+    def error(self) -> HardCaseError:
+        """As the error that names it and says what to do."""
+        return HardCaseError(
+            f"{self}; {ADVICE}", tensor=self.tensor, scene=self.scene, step=self.step, row=self.row, camera=self.camera
+        )
+
+
+class Sentinels(NamedTuple):
+    """Sums over the particles of one scene at one step.
+
+    awake: particles that may still change. kinetic_energy: metres^2 a step^2, sum of half the squared displacement in
+    the step, for unit masses. opacity_mass: sum of opacities. extent: metres, diagonal of the awake particles' bounds.
+    """
+
+    awake: int
+    kinetic_energy: float
+    opacity_mass: float
+    extent: float
+
+
+class Reading(NamedTuple):
+    """What a record of a device says once the host can read it."""
+
+    findings: Iterable[Finding]
+    sentinels: dict[tuple[int, int], Sentinels]
+
+
+@dataclass
+class _Pending:
+    """A record on its way to the host: the copy is complete when the event is."""
+
+    numbers: Tensor
+    read: Callable[[Tensor], Reading]
+    event: torch.cuda.Event
+
+
+class StabilityReport:
+    """What was raised, dropped, clamped or put to sleep: where, and how often. Calls that share it add to it.
+
+    On a GPU a call adds a small record that is copied while the device works on; reading the report waits for it. In a
+    CUDA graph records are overwritten by every replay: :meth:`replayed` fetches them. A region of ``torch.compile``
+    records nothing; its rows sleep all the same.
+
+    Example:
+        >>> report = StabilityReport()
+        >>> report.total, bool(report.findings)
+        (0, False)
+        >>> report.check()
+    """
+
+    def __init__(self):
+        self._lock = threading.Lock()
+        self.clear()
+
+    def __reduce__(self):
+        return StabilityReport, ()  # a copy of a model starts with an empty report
+
+    def clear(self) -> None:
+        """Forgets everything."""
+        self._found: dict[tuple, Finding] = {}
+        self._total, self._raised = 0, 0
+        self._errors: list[Finding] = []
+        self._sentinels: dict[tuple[int, int], Sentinels] = {}
+        self._pending: deque[_Pending] = deque()
+        self._captured: list[tuple[Tensor, Callable[[Tensor], Reading]]] = []
+
+    # ---- writing ----
+
+    def add(self, finding: Finding) -> None:
+        """Counts a finding; those of the same kind and place become one."""
+        place = (finding.what, finding.where, finding.tensor, finding.action)
+        place += (finding.scene, finding.step, finding.camera)
+        with self._lock:
+            self._total += finding.count
+            known = self._found.get(place)
+            if known is not None:
+                finding = Finding(*place[:4], known.count + finding.count, known.row, *place[4:])
+            if known is not None or len(self._found) < MAX_FINDINGS:
+                self._found[place] = finding
+            if finding.action == "error":
+                self._errors.append(finding)
+
+    def record(self, numbers: Tensor, read: Callable[[Tensor], Reading]) -> None:
+        """Takes what a guard counted: at once on the CPU, which also raises; on a GPU when its copy has arrived.
+
+        Args:
+            numbers: any small tensor.
+            read: what it says, from a copy on the host.
+        """
+        if numbers.device.type != "cuda":
+            self._take(read(numbers))
+            self.poll()
+        elif torch.cuda.is_current_stream_capturing():
+            self._captured.append((numbers, read))
+        else:
+            self._send(numbers, read)
+
+    def replayed(self) -> None:
+        """Fetches the records of the CUDA graphs captured with this report, without waiting; call it after a replay."""
+        for numbers, read in self._captured:
+            self._send(numbers, read)
+
+    def _send(self, numbers: Tensor, read: Callable[[Tensor], Reading]) -> None:
+        copy = torch.empty(numbers.shape, dtype=numbers.dtype, pin_memory=True)
+        copy.copy_(numbers, non_blocking=True)
+        event = torch.cuda.Event()
+        event.record()
+        self._pending.append(_Pending(copy, read, event))
+
+    def _take(self, reading: Reading) -> None:
+        for finding in reading.findings:
+            self.add(finding)
+        self._sentinels.update(reading.sentinels)
+
+    def _collect(self, wait: bool) -> None:
+        while self._pending:
+            if wait:
+                self._pending[0].event.synchronize()
+            elif not self._pending[0].event.query():
+                return
+            arrived = self._pending.popleft()
+            self._take(arrived.read(arrived.numbers))
+
+    # ---- reading ----
+
+    def poll(self) -> None:
+        """Raises the first error that has arrived and was not raised yet; waits for nothing."""
+        if self._pending and not torch.cuda.is_current_stream_capturing():
+            self._collect(wait=False)
+        with self._lock:
+            new, self._errors = self._errors, []
+        if new:
+            raise new[0].error()
+
+    def check(self) -> None:
+        """Waits for the device and raises the first error of the report.
+
+        Raises:
+            HardCaseError: naming scene, step, row or camera and tensor, and what to do.
+        """
+        for finding in self.findings:
+            if finding.action == "error":
+                self._errors = []
+                raise finding.error()
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """All findings, in the order in which they came; the first 1000."""
+        self._collect(wait=True)
+        return tuple(self._found.values())
+
+    @property
+    def total(self) -> int:
+        """Rows of all findings together."""
+        self._collect(wait=True)
+        return self._total
+
+    @property
+    def sentinels(self) -> dict[tuple[int, int], Sentinels]:
+        """The sentinels of every (scene, step) that was simulated."""
+        self._collect(wait=True)
+        return dict(sorted(self._sentinels.items()))
+
+    def to_dict(self) -> dict:
+        """Plain data: total and findings."""
+        return {"total": self.total, "findings": [vars(finding) for finding in self.findings]}
+
+    def __str__(self) -> str:
+        """A table, one line a finding."""
+        findings = self.findings
+        if not findings:
+            return "nothing was raised, dropped, clamped or put to sleep"
+        names = ("where", "tensor", "what", "action", "scene", "step", "camera", "row", "count")
+        rows = [names] + [
+            tuple("-" if (value := getattr(f, name)) is None else str(value) for name in names) for f in findings
+        ]
+        widths = [max(len(row[c]) for row in rows) for c in range(len(names))]
+        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
+        return "\n".join([*lines, f"total {self.total}"])

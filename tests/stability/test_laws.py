@@ -1,0 +1,100 @@
+"""Laws of the simulator (gsim3d/laws.py): the same scene told otherwise has the same future."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gsim3d import laws
+from gsim3d.effects import DynamicsEffects, EffectsSpec
+from gsim3d.laws import LAWS, Sample, take_scenes
+from gsim3d.simulator import Simulator
+from tests.dynamics.scenes import EXPLICIT
+from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+HISTORIES = (2, 3, 1)
+EXPLICIT_CONFIG = dataclasses.replace(
+    CONFIG,
+    encoder=dataclasses.replace(CONFIG.encoder, explicit=True, sh_degree=1, dynamic_dim=4, static_dim=3),
+    dynamics=dataclasses.replace(EXPLICIT, grid_size=0.1),
+    renderer=dataclasses.replace(CONFIG.renderer, latents=0),
+)
+CONFIGS = {"latent": CONFIG, "explicit": EXPLICIT_CONFIG}
+
+
+def make_sample(device, dtype=torch.float32, n_steps=3, plan=None):
+    frames = make_frames(HISTORIES).to(device)
+    frames = dataclasses.replace(frames, images=frames.images.to(dtype))
+    return Sample(frames, target_cameras(frames, len(HISTORIES)).to(device), n_steps, plan)
+
+
+@pytest.fixture(scope="module")
+def simulators():
+    """Weights of which none is zero, by model and dtype."""
+    return {
+        (name, dtype): awake(make_simulator(config)).to(dtype)
+        for name, config in CONFIGS.items()
+        for dtype in (torch.float32, torch.float64)
+    }
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize("model", CONFIGS)
+@pytest.mark.parametrize("law", LAWS)
+def test_law(law, model, dtype, device, simulators):
+    deviations = list(LAWS[law](simulators[model, dtype].to(device), make_sample(device, dtype)))
+    assert deviations
+    broken = [str(deviation) for deviation in deviations if not deviation.holds]
+    assert not broken, "\n".join(broken)
+
+
+@pytest.mark.parametrize("background", ["masked_out", "dynamic"])
+@pytest.mark.parametrize("law", ["permute scenes", "split the batch", "append a far particle"])
+def test_laws_hold_for_every_background(law, background, device, simulators):
+    simulator = simulators["latent", torch.float32].to(device)
+    plan = simulator.plan(EffectsSpec(dynamics=DynamicsEffects(background=background)))
+    assert all(deviation.holds for deviation in LAWS[law](simulator, make_sample(device, plan=plan)))
+
+
+class Broken(Simulator):
+    """Breaks every law a little: particles look at batch mates, at their row and at absolute places."""
+
+    def _predict(self, *args, **kwargs):
+        step = super()._predict(*args, **kwargs)
+        row = torch.arange(step.n_rows, device=step.means.device)[:, None]
+        touched = step.dynamic_latents + 1e-2 * (step.means.sum() + 0.01 * row)
+        return dataclasses.replace(step, dynamic_latents=touched + 1e-2 * torch.rand_like(touched))
+
+    def encode(self, *args, **kwargs):
+        state = super().encode(*args, **kwargs)
+        row = torch.arange(state.n_rows, device=state.means.device)[:, None]
+        return dataclasses.replace(state, means=state.means + 0.01 * state.means.square() + 1e-4 * row)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_law_notices_a_simulator_that_breaks_it(law):
+    torch.manual_seed(0)
+    broken = [d for d in LAWS[law](awake(Broken(CONFIG).eval()), make_sample("cpu")) if not d.holds]
+    assert broken and all(":" in str(deviation) for deviation in broken)
+
+
+def test_a_deviation_names_the_worst_row_and_takes_nothing_that_is_not_finite():
+    simulator = make_simulator()
+    state = simulator.encode(make_frames((1, 2)))
+    other = state.means.clone()
+    row = int(state.cu_rows[2]) + 5
+    other[row, 1] = float("nan")
+    (found,) = laws.compare_particles("encode", dataclasses.replace(state, means=other), state, 1e-3, ["means"])
+    assert not found.holds and found.where == "scene 1, step 1, particle 5"
+    both = dataclasses.replace(state, means=other)
+    assert not next(laws.compare_particles("encode", both, both, 0, ["means"])).holds
+
+
+def test_scenes_are_taken_in_any_order_and_more_than_once():
+    frames = make_frames((2, 1))
+    taken = take_scenes(frames, [1, 0, 1])
+    assert taken.cloud_scene.tolist() == [0, 1, 1, 2] and taken.cloud_step.tolist() == [0, 0, 1, 0]
+    assert torch.equal(taken.images[:2], frames.images[4:]) and torch.equal(taken.images[2:6], frames.images[:4])
+    assert taken.cameras.image_cloud.tolist() == [0, 0, 1, 1, 2, 2, 3, 3] and len(taken.origin) == 3

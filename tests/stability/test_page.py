@@ -1,0 +1,65 @@
+"""docs/stability.md is what the tests measured: every case, nothing that fails, nothing written by hand."""
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.stability.cases import CASES, GROUPS
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent.parent
+CASES_OF_THE_LIST = 50
+
+
+@pytest.fixture(scope="module")
+def tool():
+    spec = importlib.util.spec_from_file_location("stability_tool", ROOT / "tools" / "stability.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def columns():
+    return json.loads((ROOT / "docs" / "stability.json").read_text())
+
+
+def cases_with_tests() -> set[str]:
+    names = (re.findall(r"^def test_([a-z]\d\d)_", file.read_text(), re.MULTILINE) for file in HERE.glob("test_?_*.py"))
+    return {name.upper() for found in names for name in found}
+
+
+def test_every_case_has_a_test_and_every_test_a_case():
+    assert cases_with_tests() == set(CASES)
+    assert {int(case[1:]) for case in CASES} >= set(range(1, CASES_OF_THE_LIST + 1))
+    assert {case[0] for case in CASES} == set(GROUPS)
+
+
+def test_the_page_is_what_was_measured(tool, columns):
+    assert (ROOT / "docs" / "stability.md").read_text() == tool.page(columns)
+    for case in CASES:
+        assert f"| {case} {CASES[case].words} |" in tool.page(columns)
+
+
+def test_every_case_was_measured_and_holds(columns):
+    everywhere = set(columns["host"]["cases"])
+    for name in ("cpu float64", "cpu float32"):
+        missing = set(CASES) - everywhere - set(columns[name]["cases"])
+        assert missing <= ({"D50"} if name == "cpu float64" else set()), f"{name}: {missing}"
+    for name, column in columns.items():
+        for case, record in column["cases"].items():
+            assert case in CASES and record["tests"] > 0 and record["failed"] == 0, f"{case} on {name}"
+            assert record["error"] is None or record["error"] <= record["bound"], f"{case} on {name}"
+            assert record["error"] is not None or record["outcomes"], f"{case} on {name}"
+
+
+def test_new_results_replace_old_ones_of_the_same_column_only(tool):
+    def column(machine, **cases):
+        return {"machine": machine, "torch": "2", "cases": cases}
+
+    old = {"cpu float32": column("a", R01=1, R02=2), "cuda float32": column("b", R01=3)}
+    merged = tool.add(old, {"cpu float32": column("c", R02=4)})
+    assert merged == {"cpu float32": column("c", R01=1, R02=4), "cuda float32": column("b", R01=3)}

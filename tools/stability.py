@@ -1,0 +1,122 @@
+#!/usr/bin/env python
+"""Runs the hard cases and writes docs/stability.md (and docs/stability.json, the numbers behind it).
+
+python tools/stability.py                   run all cases here: CPU, and CUDA where there is a GPU
+python tools/stability.py --add FILE        add what another machine measured: stability.json of tools/gpu_check.sh, or
+                                            GSIM3D_STABILITY_JSON=FILE pytest tests/stability
+python tools/stability.py --page            only write the page again
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+from tests.stability.cases import CASES, GROUPS  # noqa: E402
+from tests.stability.setting import NAMES  # noqa: E402
+
+NUMBERS, PAGE = ROOT / "docs" / "stability.json", ROOT / "docs" / "stability.md"
+INTRODUCTION = """# Stability
+
+Written by `python tools/stability.py` from the tests in `tests/stability`; do not edit.
+
+**For every input, every op and the whole simulator either return finite outputs and finite gradients, or raise a typed
+`gsim3d.HardCaseError` that names scene, step, particle or camera and tensor, and says what to do. Never a silent NaN,
+never an abort of the process, never a changed result for another member of the batch.**
+
+What happens to a number that cannot be used is a policy, of a model or of a call: `on_bad="raise"` (default), `"drop"`
+or `"clamp"`; a `StabilityReport` counts what, where and how many. `gsim3d/stability.py` has the rules.
+
+Every case below is a test that is named after it (`test_r01_...`), forward and backward. Most of them run beside an
+ordinary scene in the same call, which must not notice: its rows have equal bits in float32 on the CPU, and everywhere
+as long as the sizes of the call are the same. (In float64 and on a GPU, BLAS rounds a product by its number of rows:
+rows in calls of different sizes are equal to rounding.)
+
+The measured cells hold the largest error, relative to the largest expected value, against a float64 reference that
+knows nothing of gsim3d, or against the same computation in float64 on the CPU; in brackets the bound that the test
+sets. tf32: float32 with TF32 products allowed; bf16: under `torch.autocast`; the rasterizer, the geometry and the plane
+sweep compute in float32 under both. "held": what is expected holds bit by bit, or as an error that is raised; there is
+no number to compare.
+
+Each guard behind these cases is shown to matter: `python tools/mutants.py guards guards_core` takes them away one by
+one, and for each a test of this page must fail.
+
+What the published release does was seen on the CPU or read in its code; of other packages, public issues
+(`name#number`), pull requests and commits are quoted.
+
+"""
+
+
+def cell(record: dict | None) -> str:
+    if record is None:
+        return "-"
+    if record["failed"]:
+        return "**fails**"
+    if record["error"] is None:
+        return "held"
+    return f"{record['error']:.0e} ({record['bound']:.0e})"
+
+
+def rows_of(columns: dict, group: str) -> str:
+    text = (
+        f"\n## {GROUPS[group]}\n\n| case | expected | {' | '.join(NAMES)} | others |\n"
+        f"| --- | --- | {' | '.join('---' for _ in NAMES)} | --- |\n"
+    )
+    for case, what in CASES.items():
+        if case[0] == group:
+            text += f"| {case} {what.words} | {what.expected} | {measured(columns, case)} | {what.others or '-'} |\n"
+    return text
+
+
+def measured(columns: dict, case: str) -> str:
+    """Its cells; a case of files has the same result everywhere."""
+    host = columns.get("host", {}).get("cases", {}).get(case)
+    return " | ".join(cell(host if host else columns.get(name, {}).get("cases", {}).get(case)) for name in NAMES)
+
+
+def page(columns: dict) -> str:
+    text = INTRODUCTION
+    for name in [*NAMES, "host"]:
+        if name in columns:
+            column, what = columns[name], "files and their readers" if name == "host" else name
+            n_cases, n_tests = len(column["cases"]), sum(record["tests"] for record in column["cases"].values())
+            text += f"- {what}: {column['machine']}, torch {column['torch']}, {n_tests} tests of {n_cases} cases.\n"
+    return text + "".join(rows_of(columns, group) for group in GROUPS)
+
+
+def add(columns: dict, measured: dict) -> dict:
+    """What was measured replaces the same cases of the same columns."""
+    merged = {name: {**column, "cases": dict(column["cases"])} for name, column in columns.items()}
+    for name, column in measured.items():
+        known = merged.get(name, {"cases": {}})["cases"]
+        merged[name] = {**column, "cases": dict(sorted({**known, **column["cases"]}.items()))}
+    return merged
+
+
+def run() -> dict:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "stability.json"
+        env = {**os.environ, "PYTHONPATH": str(ROOT), "GSIM3D_STABILITY_JSON": str(file)}
+        subprocess.run([sys.executable, "-m", "pytest", "tests/stability"], cwd=ROOT, env=env, check=True)
+        return json.loads(file.read_text())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--add", metavar="FILE", help="run nothing, add these results")
+    parser.add_argument("--page", action="store_true", help="run nothing, write the page from the stored numbers")
+    args = parser.parse_args()
+    columns = json.loads(NUMBERS.read_text()) if NUMBERS.exists() else {}
+    if not args.page:
+        columns = add(columns, json.loads(Path(args.add).read_text()) if args.add else run())
+        NUMBERS.write_text(json.dumps(columns, indent=1, sort_keys=True) + "\n")
+    PAGE.write_text(page(columns))
+
+
+if __name__ == "__main__":
+    main()
