@@ -317,7 +317,8 @@ def test_a_gpu_raises_where_the_report_is_read(devices):
 def test_rows_are_counted_in_every_image(device):
     """Row 1 is in two images, row 3 in another."""
     scene = facing([[0, 0, 2.0]] * 4)
-    cameras = {name: getattr(scene, name).repeat(3, *[1] * (getattr(scene, name).dim() - 1)) for name in ("viewmats", "Ks", "background")}
+    cameras = {name: getattr(scene, name) for name in ("viewmats", "Ks", "background")}
+    cameras = {name: value.repeat(3, *[1] * (value.dim() - 1)) for name, value in cameras.items()}
     scene = scene.replace(cu_rows=torch.tensor([0, 3, 4]), image_cloud=torch.tensor([0, 1, 0]), **cameras)
     scene = change(change(scene, "opacities", 1, 2.0), "scales", 3, 1e30).to(device)
     report = StabilityReport()

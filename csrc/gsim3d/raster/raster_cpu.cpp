@@ -56,7 +56,8 @@ void project_chunk_vjp(const RasterScene<T>& scene, const Group<T>& group, const
   V viewmat_sums[12] = {};
   for_row_blocks<T>(chunk.begin, chunk.end, [&](const int64_t* rows, int n) {
     alignas(32) T sums[kSlotFixed][kLanes<T>] = {};
-    int64_t seen[kLanes<T>];  // rows with a gradient; where there is none, another that has: a bad row's numbers stay out
+    // Rows with a gradient; where there is none, another that has: a bad row's numbers stay out.
+    int64_t seen[kLanes<T>];
     std::fill_n(seen, kLanes<T>, int64_t{-1});
     int64_t any_seen = -1;
     for (int lane = 0; lane < n; ++lane) {
