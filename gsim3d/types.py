@@ -7,6 +7,7 @@ Units are metres and pixels; axes are OpenCV's (x right, y down, z forward); qua
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
@@ -97,13 +98,35 @@ class Frames(_Tensors):
 
 
 @functools.lru_cache(maxsize=512)
+def _recent_constant(values: tuple[int, ...], device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=torch.int64, device=device)
+
+
+_stores: list[dict[tuple, Tensor]] = []
+
+
 def constant(values: tuple[int, ...], device: torch.device) -> Tensor:
     """int64 tensor of ``values``, the same object at every call: read it, never write to it.
 
     A step that repeats sends nothing to the device, and can be captured in a CUDA graph.
     """
-    with torch.inference_mode(False):
-        return torch.tensor(values, dtype=torch.int64, device=device)
+    if not _stores:
+        return _recent_constant(values, device)
+    key = values, torch.device(device)
+    if key not in _stores[-1]:
+        _stores[-1][key] = _recent_constant(values, device)
+    return _stores[-1][key]
+
+
+@contextlib.contextmanager
+def keeping_constants(store: dict[tuple, Tensor]):
+    """Keeps in ``store`` every constant that is asked for: a captured graph reads them at each replay."""
+    _stores.append(store)
+    try:
+        yield
+    finally:
+        _stores.pop()
 
 
 @dataclass(frozen=True, eq=False)
