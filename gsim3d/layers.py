@@ -17,21 +17,50 @@ from gsim3d.ops import row_norm
 MIN_ROWS = 16  # matrix products of fewer rows go through other code in BLAS, which rounds differently
 
 
+def row_linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """``F.linear`` of [N, C]."""
+    n_rows = x.shape[0]
+    if n_rows >= MIN_ROWS:
+        return F.linear(x, weight, bias)
+    return F.linear(F.pad(x, (0, 0, 0, MIN_ROWS - n_rows)), weight, bias)[:n_rows]
+
+
 class RowLinear(nn.Linear):
     """``nn.Linear`` of [N, C]."""
 
     def forward(self, x: Tensor) -> Tensor:
-        n_rows = x.shape[0]
-        if n_rows >= MIN_ROWS:
-            return F.linear(x, self.weight, self.bias)
-        return F.linear(F.pad(x, (0, 0, 0, MIN_ROWS - n_rows)), self.weight, self.bias)[:n_rows]
+        return row_linear(x, self.weight, self.bias)
+
+
+def rounded_weights(module: nn.Module, dtype: torch.dtype) -> tuple[Tensor, ...]:
+    """``module.weight`` and ``module.bias`` in ``dtype``, without gradients.
+
+    The copies are kept and made again, in the same memory, once a weight has changed: a simulation rounds its weights
+    once. Changes are noticed as autograd notices them, so not those made through ``weight.data``.
+    """
+    tensors = module.weight, module.bias
+    if module.weight.dtype == dtype:
+        return tensors
+    key = (dtype, *(key for t in tensors for key in (t.data_ptr(), t._version)))
+    known, copies = module.__dict__.get("_rounded", (None, ()))
+    if known == key:
+        return copies
+    if module.weight.is_cuda and torch.cuda.is_current_stream_capturing():
+        return tuple(t.detach().to(dtype) for t in tensors)  # part of the graph: made at each replay
+    with torch.inference_mode(False), torch.no_grad():
+        if known is not None and known[0] == dtype and copies[0].device == module.weight.device:
+            torch._foreach_copy_(copies, tensors)
+        else:
+            copies = tuple(t.to(dtype) for t in tensors)
+    module.__dict__["_rounded"] = key, copies
+    return copies
 
 
 class RowLayerNorm(nn.LayerNorm):
     """``nn.LayerNorm`` of [N, C], and the residual sum behind it; see :func:`gsim3d.ops.row_norm`."""
 
     def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
-        return row_norm(x, self.weight, self.bias, residual, eps=self.eps)
+        return row_norm(x, self.weight, self.bias, residual, eps=self.eps, check=False)
 
 
 class RowBatchNorm(nn.Module):

@@ -125,6 +125,8 @@ TOLERANCES = {
     "encoder_golden": Tolerance(1e-4, 9.2e-6, EPYC, "a deep float32 network; published runs differ by 1e-5 among themselves"),
     "encoder_order": Tolerance(2e-5, 1.8e-6, EPYC, "float32 sums in another order through a deep network"),
     "film_golden": Tolerance(5e-6, 4.1e-7, EPYC, "float32 on both sides"),
+    "fused_block_float64": Tolerance(2e-14, 3e-15, EPYC, "a block in float64, sums over rows in another order"),
+    "fused_network_float32": Tolerance(2e-5, 1e-6, EPYC, "float32 gradients of a network, sums over rows in another order"),
     "dynamics_order": Tolerance(1e-5, 1e-6, EPYC, "float32 sums over rows in another order through a network"),
     "dynamics_golden": Tolerance(1e-5, 5.7e-6, EPYC, "float32 networks of up to 14 blocks, another order of additions"),
 }

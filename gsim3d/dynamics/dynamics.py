@@ -81,12 +81,12 @@ class Dynamics(nn.Module):
         features, is_awake = self.layout.pack(history), None
         everyone = pyramid.found is None and pyramid.rows.shape[0] == history.n_rows
         if not everyone:  # rows of the pyramid <-> rows of the history; those that sleep become 0
-            features = ops.pool_mean(features, pyramid.rows, pyramid.cu_rows)
+            features = ops.pool_mean(features, pyramid.rows, pyramid.cu_rows, check=False)
         features = self.net(features, pyramid, generator=generator if self.training else None)
         if not everyone:
             one = features.new_ones(features.shape[0], 1)
             features, is_awake = (
-                ops.unpool(x, pyramid.rows, pyramid.cu_rows, history.n_rows) for x in (features, one)
+                ops.unpool(x, pyramid.rows, pyramid.cu_rows, history.n_rows, check=False) for x in (features, one)
             )
         runs = clouds.row_runs(newest)
         prediction = self.net.head(take_runs(features, runs))

@@ -14,6 +14,7 @@ from torch.utils.checkpoint import checkpoint
 
 from gsim3d import ops
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
+from gsim3d.dynamics.fused_block import product_dtype, run_block
 from gsim3d.layers import RowLayerNorm, RowLinear, make_norm
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
@@ -34,7 +35,9 @@ class SparseConv(nn.Module):
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
         kernel_map = stage.kernel_maps[self.kernel_size]
-        return ops.sparse_conv(x, self.weight, self.bias, stage.voxels, kernel_map, duplicates=self.duplicates)
+        return ops.sparse_conv(
+            x, self.weight, self.bias, stage.voxels, kernel_map, duplicates=self.duplicates, check=False
+        )
 
 
 class PositionEncoding(nn.Module):
@@ -61,7 +64,7 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor, patches: PatchTable) -> Tensor:
         q, k, v = self._rounded(self.qkv(x)).unflatten(1, (3, self.heads, -1)).unbind(1)
-        return self.proj(self._rounded(ops.patch_attention(q, k, v, patches).flatten(1)))
+        return self.proj(self._rounded(ops.patch_attention(q, k, v, patches, check=False).flatten(1)))
 
     def _rounded(self, x: Tensor) -> Tensor:
         return x.clamp(-HALF_MAX, HALF_MAX).half().to(x.dtype) if self.rounded_to_half else x
@@ -78,11 +81,14 @@ class MLP(nn.Module):
 
 
 class Block(nn.Module):
-    """Position encoding, attention and MLP, each added to what came in."""
+    """Position encoding, attention and MLP, each added to what came in.
+
+    ``fused``: computed by :mod:`gsim3d.dynamics.fused_block` instead of the modules; None: on a GPU.
+    """
 
     def __init__(self, channels: int, heads: int, drop_path: float, config: DynamicsConfig):
         super().__init__()
-        self.drop_path, self.checkpointing = drop_path, config.checkpointing
+        self.drop_path, self.checkpointing, self.fused = drop_path, config.checkpointing, None
         self.position = PositionEncoding(channels, duplicates_rule(config))
         self.norm1 = RowLayerNorm(channels)
         self.attention = Attention(channels, heads, rounded_to_half=config.quirks.half_attention)
@@ -100,24 +106,43 @@ class Block(nn.Module):
     ) -> Tensor:
         """x [N, C] with attention along serialization ``row``. ``conv_input``: read by the convolution, default x."""
         conv_input = x if conv_input is None else conv_input
-        # Drawn here: a generator does not repeat itself when the block is computed again in the backward pass.
-        keep = [self._draw_keep(x, generator) for _ in range(2)]
-        if self.checkpointing and self.training and torch.is_grad_enabled():
+        if self.is_fused(x):
+            return self.advance(x, conv_input, stage, row, generator)[0]
+        keep = self._draw_keep(x, generator)
+        if self._recomputes():
             arguments = (x, conv_input, stage, row, *keep)
             return checkpoint(self._compute, *arguments, use_reentrant=False, preserve_rng_state=False)
         return self._compute(x, conv_input, stage, row, *keep)
+
+    def is_fused(self, x: Tensor) -> bool:
+        if torch.compiler.is_compiling() or self.attention.rounded_to_half:
+            return False
+        return x.is_cuda if self.fused is None else self.fused
+
+    def advance(
+        self, x: Tensor, conv_input: Tensor, stage: Stage, row: int, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """What :meth:`forward` returns where the block is fused, and the same in the dtype that convolutions read."""
+        keep = self._draw_keep(x, generator)
+        return run_block(self, x, conv_input.to(product_dtype(x)), stage, row, keep, self._recomputes())
+
+    def _recomputes(self) -> bool:
+        return self.checkpointing and self.training and torch.is_grad_enabled()
 
     def _compute(self, x, conv_input, stage, row, keep_attention, keep_mlp):
         x = self.position(conv_input, stage, x)
         x = x + scaled(self.attention(self.norm1(x), stage.patches[row]), keep_attention)
         return x + scaled(self.mlp(self.norm2(x)), keep_mlp)
 
-    def _draw_keep(self, x: Tensor, generator: torch.Generator | None) -> Tensor | None:
-        """[N, 1]: 0 for rows that skip a branch, 1 / share kept for the others; None: nobody skips."""
+    def _draw_keep(self, x: Tensor, generator: torch.Generator | None) -> list[Tensor | None]:
+        """Of both branches [N, 1]: 0 for rows that skip it, 1 / share kept for the others; None: nobody skips.
+
+        Drawn before anything is computed: a generator does not repeat itself when the block is computed again.
+        """
         if not self.training or generator is None or self.drop_path == 0:
-            return None
-        draws = torch.rand(x.shape[0], 1, generator=generator, device=generator.device)
-        return (draws >= self.drop_path).to(x) / (1 - self.drop_path)
+            return [None, None]
+        draws = [torch.rand(x.shape[0], 1, generator=generator, device=generator.device) for _ in range(2)]
+        return [(draw >= self.drop_path).to(x) / (1 - self.drop_path) for draw in draws]
 
 
 def scaled(x: Tensor, keep: Tensor | None) -> Tensor:
@@ -126,6 +151,19 @@ def scaled(x: Tensor, keep: Tensor | None) -> Tensor:
 
 def duplicates_rule(config: DynamicsConfig) -> str:
     return "first" if config.quirks.first_of_voxel else "mean"
+
+
+def run_blocks(
+    blocks: nn.ModuleList, x: Tensor, conv_input: Tensor, stage: Stage, generator: torch.Generator | None
+) -> Tensor:
+    """x behind ``blocks``; the first convolution reads ``conv_input``, the others what the block before them made."""
+    for i, block in enumerate(blocks):
+        row = i % len(stage.patches)
+        if block.is_fused(x):
+            x, conv_input = block.advance(x, conv_input, stage, row, generator)
+        else:
+            x = conv_input = block(x, stage, row, conv_input=conv_input, generator=generator)
+    return x
 
 
 class Stem(nn.Module):
@@ -150,7 +188,8 @@ class Pool(nn.Module):
         self.norm = make_norm(norm, out_channels)
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
-        return F.gelu(self.norm(ops.pool_max(self.proj(x), stage.cluster.rows, stage.cluster.cu_rows)))
+        cluster = stage.cluster
+        return F.gelu(self.norm(ops.pool_max(self.proj(x), cluster.rows, cluster.cu_rows, check=False)))
 
 
 class Merge(nn.Module):
@@ -184,9 +223,7 @@ class EncoderStage(nn.Module):
             x = self.pool(x, stage)
         if self.merge is not None:
             x = self.merge(x, stage)
-        for i, block in enumerate(self.blocks):
-            x = block(x, stage, i % len(stage.patches), generator=generator)
-        return x
+        return run_blocks(self.blocks, x, x, stage, generator)
 
 
 class Unpool(nn.Module):
@@ -203,7 +240,8 @@ class Unpool(nn.Module):
         """Both together, and the skip branch alone."""
         below = F.gelu(self.proj_norm(self.proj(x)))
         skip = F.gelu(self.skip_norm(self.skip(skip)))
-        return skip + ops.unpool(below, coarse.cluster.rows, coarse.cluster.cu_rows, skip.shape[0]), skip
+        cluster = coarse.cluster
+        return skip + ops.unpool(below, cluster.rows, cluster.cu_rows, skip.shape[0], check=False), skip
 
 
 class DecoderStage(nn.Module):
@@ -221,10 +259,7 @@ class DecoderStage(nn.Module):
         self, x: Tensor, skip: Tensor, stage: Stage, coarse: Stage, generator: torch.Generator | None
     ) -> Tensor:
         x, skip = self.unpool(x, skip, coarse)
-        for i, block in enumerate(self.blocks):
-            conv_input = skip if self.stale_conv and i == 0 else x
-            x = block(x, stage, i % len(stage.patches), conv_input=conv_input, generator=generator)
-        return x
+        return run_blocks(self.blocks, x, skip if self.stale_conv else x, stage, generator)
 
 
 class Head(nn.Module):

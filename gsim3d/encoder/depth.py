@@ -110,7 +110,8 @@ class CostVolume(nn.Module):
         Ks = feature_intrinsics(views.Ks, self.factor, self.quirks)
         target = Ks.repeat_interleave(views.n_views - 1, 0) if self.quirks.reference_intrinsics else Ks[src_images]
         geometry = ops.sweep_geometry(Ks, views.viewmats, src_images, cu_src, Ks_target=target)
-        return ops.plane_sweep(features, *(g.to(features.dtype) for g in geometry), disparities, src_images, cu_src)
+        geometry = (g.to(features.dtype) for g in geometry)
+        return ops.plane_sweep(features, *geometry, disparities, src_images, cu_src, check=False)
 
     def forward(self, features: Tensor, views: Views) -> tuple[Tensor, Tensor]:
         """[I, C, h, w] -> expected disparity and largest probability, both [I, 1, h, w]."""

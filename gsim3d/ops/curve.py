@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._arguments import check_real, check_tensors, check_whole
 
 CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
 
@@ -40,7 +41,13 @@ def curve_encode(
         >>> curve_encode(torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1]]), None, "z")
         tensor([4, 2, 1])
     """
+    check_tensors("curve_encode", grid=grid, **({} if cloud is None else {"cloud": cloud}))
+    check_whole("curve_encode", depth=depth, **({} if shift is None else {"shift": shift}))
+    if not torch.compiler.is_compiling() and not 1 <= depth <= 16:
+        raise ValueError(f"curve_encode: depth must be in [1, 16]; got {depth}")
     names = (curve,) if isinstance(curve, str) else curve
+    if not isinstance(names, Sequence):
+        raise TypeError(f"curve_encode: curve must be a name or several; got {curve!r}")
     for name in names:
         if name not in CURVES:
             raise ValueError(f"curve_encode: curve must be one of {', '.join(CURVES)}; got {name!r}")
@@ -67,6 +74,7 @@ def curve_sort(codes: Tensor) -> tuple[Tensor, Tensor]:
         >>> curve_sort(torch.tensor([[30, 10, 20]]))
         (tensor([[1, 2, 0]]), tensor([[2, 0, 1]]))
     """
+    check_tensors("curve_sort", codes=codes)
     return torch.ops.gsim3d.curve_sort(codes)
 
 
@@ -303,6 +311,12 @@ def build_pyramid(
         tensor([[0, 0, 0],
                 [2, 0, 0]])
     """
+    if not torch.compiler.is_compiling():
+        names = {"positions": positions, "cu_rows": cu_rows, "cloud_scene": cloud_scene, "cloud_slot": cloud_slot}
+        check_tensors("build_pyramid", **names, origin=origin)
+        _check_spec(spec, curves)
+        if not (capacity is None or isinstance(capacity, PyramidCapacity)):
+            raise TypeError(f"build_pyramid: capacity must be a PyramidCapacity; got {type(capacity).__name__}")
     if curves is None:
         curves = ((0, 1, 2, 3),) * spec.n_stages
     cu_kernels = [0]
@@ -326,6 +340,27 @@ def build_pyramid(
         () if capacity is None else capacity.sizes,
     )
     return _assemble(arrays, spec, capacity is not None)
+
+
+def _check_spec(spec: PyramidSpec, curves: tuple[tuple[int, ...], ...] | None) -> None:
+    check_real("build_pyramid", grid_size=spec.grid_size)
+    check_whole("build_pyramid", slot_bits=spec.slot_bits)
+    if not isinstance(spec.release, bool):
+        raise TypeError(f"build_pyramid: release must be true or false; got {spec.release!r}")
+    for name in ("strides", "merge_windows", "patch_sizes"):
+        _check_whole_numbers(name, getattr(spec, name))
+    for name, rows in {"kernel_sizes": spec.kernel_sizes, "curves": curves or ()}.items():
+        if not isinstance(rows, (tuple, list)):
+            raise TypeError(f"build_pyramid: {name} must be a tuple with one entry a stage; got {rows!r}")
+        for row in rows:
+            _check_whole_numbers(name, row)
+
+
+def _check_whole_numbers(name: str, values: tuple[int, ...]) -> None:
+    if not isinstance(values, (tuple, list)):
+        raise TypeError(f"build_pyramid: {name} must be a tuple of whole numbers; got {values!r}")
+    for value in values:
+        check_whole("build_pyramid", **{name: value})
 
 
 def _assemble(arrays: list[Tensor], spec: PyramidSpec, has_found: bool) -> Pyramid:

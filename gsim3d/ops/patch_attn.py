@@ -4,11 +4,14 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._arguments import check_numbers, check_real, check_tensors
 from gsim3d.ops._autocast import follow_autocast
 from gsim3d.ops.curve import PatchTable
 
 
-def patch_attention(q: Tensor, k: Tensor, v: Tensor, table: PatchTable, *, scale: float | None = None) -> Tensor:
+def patch_attention(
+    q: Tensor, k: Tensor, v: Tensor, table: PatchTable, *, scale: float | None = None, check: bool = True
+) -> Tensor:
     """Softmax attention of every query row over the key rows of its patch.
 
     ``out[i] = sum_j softmax_j(scale * <q[i], k[j]>) v[j]`` for each head, over the keys ``j`` in
@@ -23,13 +26,15 @@ def patch_attention(q: Tensor, k: Tensor, v: Tensor, table: PatchTable, *, scale
         table: patches; a row at most once in ``q_rows``, any number of times in ``kv_rows``. What the lists hold behind
             the last offsets is in no patch.
         scale: factor of the dot products; default ``D ** -0.5``.
+        check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [Nq, H, D], dtype of ``q``.
     Gradients: ``q``, ``k`` and ``v``, once.
     Determinism: equal bits for any number of threads, with AVX2 and AVX-512, on one GPU in every run, for any numbering
         of the rows, and with any other patches beside; only the order of the keys inside a patch rounds differently.
     Raises:
-        ValueError: a shape, dtype, head dim, scale or table is malformed; the message names the argument.
+        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        ValueError, TypeError: a shape, dtype, head dim, scale or table is malformed; the message names the argument.
     Source: Dao et al. 2022 (FlashAttention), applied to the patches of Point Transformer V3 (Wu et al. 2024).
 
     Example:
@@ -39,8 +44,13 @@ def patch_attention(q: Tensor, k: Tensor, v: Tensor, table: PatchTable, *, scale
         >>> patch_attention(x, x, torch.arange(12.0).view(3, 1, 4), PatchTable(rows, rows, cu, cu))[:, 0, 0]
         tensor([0., 6., 6.])
     """
+    if check:
+        lists = {name: getattr(table, name) for name in ("q_rows", "kv_rows", "cu_q", "cu_k")}
+        check_tensors("patch_attention", q=q, k=k, v=v, **lists)
+        check_real("patch_attention", **({} if scale is None else {"scale": scale}))
+        check_numbers("patch_attention", q=q, k=k, v=v)
     if scale is None:
-        scale = q.shape[-1] ** -0.5
+        scale = q.shape[-1] ** -0.5 if q.dim() and q.shape[-1] else 1.0
     return torch.ops.gsim3d.patch_attention(
         q, k, v, table.q_rows, table.kv_rows, table.cu_q, table.cu_k, float(scale)
     )[0]

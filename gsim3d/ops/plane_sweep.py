@@ -3,7 +3,9 @@
 import torch
 from torch import Tensor
 
+from gsim3d.errors import HardCaseError
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._arguments import check_numbers, check_tensors
 
 
 def sweep_geometry(
@@ -24,6 +26,9 @@ def sweep_geometry(
     Returns:
         homographies [P, 3, 3] and translations [P, 3] (metres), dtype of ``Ks``.
     Gradients: none.
+    Raises:
+        HardCaseError: a matrix is not finite or cannot be inverted; CPU only.
+        ValueError, TypeError: an argument has a wrong shape, dtype or range; the message names it.
 
     Example:
         >>> A, b = sweep_geometry(torch.eye(3).expand(2, 3, 3), torch.eye(4).expand(2, 4, 4),
@@ -31,6 +36,8 @@ def sweep_geometry(
         >>> A.shape, b.shape
         (torch.Size([2, 3, 3]), torch.Size([2, 3]))
     """
+    if not torch.compiler.is_compiling():
+        _check_geometry(Ks, viewmats, src_images, cu_src, Ks_target)
     with torch.no_grad():
         own = torch.repeat_interleave(
             torch.arange(Ks.shape[0], device=Ks.device), cu_src[1:] - cu_src[:-1], output_size=src_images.shape[0]
@@ -39,11 +46,43 @@ def sweep_geometry(
         target = intrinsics[src_images] if Ks_target is None else Ks_target.double()
         half_pixel = torch.eye(3, dtype=torch.float64, device=Ks.device)
         half_pixel[:2, 2] = 0.5
-        relative = poses[src_images] @ torch.linalg.inv(poses)[own]
+        relative = poses[src_images] @ _inverse("viewmats", poses)[own]
         to_index = torch.linalg.inv(half_pixel) @ target
-        homographies = to_index @ relative[:, :3, :3] @ (torch.linalg.inv(intrinsics) @ half_pixel)[own]
+        homographies = to_index @ relative[:, :3, :3] @ (_inverse("Ks", intrinsics) @ half_pixel)[own]
         translations = (to_index @ relative[:, :3, 3:])[..., 0]
-        return homographies.to(Ks.dtype), translations.to(Ks.dtype)
+        homographies, translations = homographies.to(Ks.dtype), translations.to(Ks.dtype)
+    check_numbers("sweep_geometry: of Ks and viewmats", homographies=homographies, translations=translations)
+    return homographies, translations
+
+
+def _inverse(name: str, matrices: Tensor) -> Tensor:
+    try:
+        return torch.linalg.inv(matrices)
+    except torch.linalg.LinAlgError:
+        image = int((torch.linalg.inv_ex(matrices).info != 0).nonzero()[0])
+        raise HardCaseError(f"sweep_geometry: {name} cannot be inverted for image {image}", camera=image) from None
+
+
+def _check_geometry(Ks: Tensor, viewmats: Tensor, src_images: Tensor, cu_src: Tensor, Ks_target: Tensor | None) -> None:
+    op, matrices = "sweep_geometry", {"Ks": Ks, "viewmats": viewmats}
+    matrices |= {} if Ks_target is None else {"Ks_target": Ks_target}
+    check_tensors(op, **matrices, src_images=src_images, cu_src=cu_src)
+    n, n_pairs = (x.shape[0] if x.dim() else 0 for x in (Ks, src_images))
+    for name, shape in {"Ks": (n, 3, 3), "viewmats": (n, 4, 4), "Ks_target": (n_pairs, 3, 3)}.items():
+        value = matrices.get(name)
+        if value is not None and (value.shape != shape or value.dtype not in (torch.float32, torch.float64)):
+            got = f"{value.dtype} {list(value.shape)}"
+            raise ValueError(f"{op}: {name} must be float32 or float64 {list(shape)}; got {got}")
+    for name, value, shape in (("src_images", src_images, (n_pairs,)), ("cu_src", cu_src, (n + 1,))):
+        if value.dtype != torch.int64 or value.shape != shape:
+            raise ValueError(f"{op}: {name} must be int64 {list(shape)}; got {value.dtype} {list(value.shape)}")
+    if Ks.device.type != "cpu":
+        return
+    check_numbers(op, **matrices)
+    if n_pairs and not (int(src_images.min()) >= 0 and int(src_images.max()) < n):
+        raise ValueError(f"{op}: src_images must be in [0, {n})")
+    if int(cu_src[0]) != 0 or int(cu_src[-1]) != n_pairs or bool((cu_src.diff() < 0).any()):
+        raise ValueError(f"{op}: cu_src must ascend from 0 to {n_pairs}")
 
 
 def plane_sweep(
@@ -53,6 +92,8 @@ def plane_sweep(
     inverse_depths: Tensor,
     src_images: Tensor,
     cu_src: Tensor,
+    *,
+    check: bool = True,
 ) -> Tensor:
     """Mean correlation of each pixel's feature with its sources' features at each candidate depth.
 
@@ -66,13 +107,15 @@ def plane_sweep(
         inverse_depths: [I, D], 1 / metres, positive.
         src_images: int64 [P], sources of image 0, then of image 1, ...
         cu_src: int64 [I + 1], offsets into ``src_images``; an image without sources costs 0.
+        check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [I, D, h, w], dtype of ``features``.
     Gradients: ``features``, once.
     Determinism: every output and gradient element has one owner that sums in a fixed order.
     Raises:
-        ValueError: an argument has a wrong shape, dtype or range, or geometry is not finite; the message names it.
-            On CUDA values are not looked at: a source out of range sees nothing.
+        HardCaseError: a feature is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        ValueError, TypeError: an argument has a wrong shape, dtype or range, or geometry is not finite; the message
+            names it. On CUDA values are not looked at: a source out of range sees nothing.
     Source: plane sweep of Collins (1996) as in MVSplat (Chen et al. 2024), with dot products interpolated.
 
     Example:
@@ -82,6 +125,10 @@ def plane_sweep(
         >>> plane_sweep(features, A, b, inverse_depths, torch.tensor([1, 0]), torch.tensor([0, 1, 2]))[0]
         tensor([[[2.]]])
     """
+    if check:
+        geometry = {"homographies": homographies, "translations": translations, "inverse_depths": inverse_depths}
+        check_tensors("plane_sweep", features=features, **geometry, src_images=src_images, cu_src=cu_src)
+        check_numbers("plane_sweep", features=features)
     return torch.ops.gsim3d.plane_sweep(features, homographies, translations, inverse_depths, src_images, cu_src)
 
 

@@ -4,9 +4,10 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole, within_memory
 
 
-def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor) -> Tensor:
+def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -> Tensor:
     """Channelwise maximum over segments of rows.
 
     ``out[s, c] = max(x[rows[i], c] for i in range(cu_rows[s], cu_rows[s + 1]))``; 0 where a segment is empty.
@@ -15,11 +16,13 @@ def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor) -> Tensor:
         x: features [N, C], float32 or float64.
         rows: int64 [R], the rows of segment 0, then of segment 1, ...; each row at most once.
         cu_rows: int64 [M + 1], ascending offsets into ``rows`` from 0 to at most R; rows listed behind are in no segment.
+        check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [M, C], dtype of ``x``.
     Gradients: ``x``, once; of equal maxima the one listed first receives it.
     Raises:
-        ValueError: ``rows`` or ``cu_rows`` is malformed; the message names the argument.
+        HardCaseError: a number of ``x`` is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        ValueError, TypeError: an argument is malformed; the message names it.
     Source: grid pooling of Point Transformer V2/V3 (Wu et al. 2022, 2024).
 
     Example:
@@ -28,25 +31,31 @@ def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor) -> Tensor:
         tensor([[5.],
                 [3.]])
     """
+    if check:
+        check_tensors("pool_max", x=x, rows=rows, cu_rows=cu_rows)
+        check_numbers("pool_max", x=x)
     return torch.ops.gsim3d.pool_max(x, rows, cu_rows)[0]
 
 
-def pool_mean(x: Tensor, rows: Tensor, cu_rows: Tensor) -> Tensor:
+def pool_mean(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -> Tensor:
     """Mean over segments of rows; 0 where a segment is empty. Arguments and errors as :func:`pool_max`.
 
     Example:
         >>> pool_mean(torch.tensor([[1.0], [5.0]]), torch.tensor([0, 1]), torch.tensor([0, 2]))
         tensor([[3.]])
     """
+    if check:
+        check_tensors("pool_mean", x=x, rows=rows, cu_rows=cu_rows)
+        check_numbers("pool_mean", x=x)
     return torch.ops.gsim3d.pool_mean(x, rows, cu_rows)
 
 
-def unpool(x: Tensor, rows: Tensor, cu_rows: Tensor, n_rows: int) -> Tensor:
+def unpool(x: Tensor, rows: Tensor, cu_rows: Tensor, n_rows: int, *, check: bool = True) -> Tensor:
     """Copies each segment's features to the segment's rows: the adjoint of a segment sum.
 
     Args:
         x: features [M, C] of the segments.
-        rows, cu_rows: as in :func:`pool_max`.
+        rows, cu_rows, check: as in :func:`pool_max`.
         n_rows: N, rows of the result.
     Returns:
         [N, C]; rows that no segment lists are 0.
@@ -58,7 +67,12 @@ def unpool(x: Tensor, rows: Tensor, cu_rows: Tensor, n_rows: int) -> Tensor:
                 [7.],
                 [0.]])
     """
-    return torch.ops.gsim3d.unpool(x, rows, cu_rows, n_rows)
+    if check:
+        check_tensors("unpool", x=x, rows=rows, cu_rows=cu_rows)
+        check_whole("unpool", n_rows=n_rows)
+        check_numbers("unpool", x=x)
+    kernel = torch.ops.gsim3d.unpool
+    return within_memory("unpool", f"n_rows={n_rows}", kernel, x, rows, cu_rows, n_rows)
 
 
 @torch.library.register_fake("gsim3d::pool_max")

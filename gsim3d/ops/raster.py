@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsim3d.errors import HardCaseError
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._arguments import check_real, check_tensors, check_whole, within_memory
 from gsim3d.stability import ACTIONS, Finding, OnBad, StabilityReport, check_on_bad
 from gsim3d.types import Cameras
 
@@ -101,9 +102,13 @@ def rasterize_gaussians(
         >>> image.color.shape, bool(image.alpha[0, 4, 4] > 0.7)
         (torch.Size([1, 8, 8, 3]), True)
     """
+    if not torch.compiler.is_compiling():
+        optional = {"sh": sh, "colors": colors, "features": features, "background": background, "cu_rows": cu_rows}
+        tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+        _check_arguments(tensors, {k: v for k, v in optional.items() if v is not None}, cameras, near_plane)
     if (sh is None) == (colors is None):
         raise ValueError("rasterize_gaussians: give one of sh and colors")
-    if cutoff not in CUTOFFS:
+    if not isinstance(cutoff, str) or cutoff not in CUTOFFS:
         raise ValueError(f"rasterize_gaussians: cutoff must be one of {', '.join(CUTOFFS)}; got {cutoff!r}")
     color = sh if colors is None else colors
     dims = 3 if colors is None else 2
@@ -113,7 +118,9 @@ def rasterize_gaussians(
     check_on_bad(on_bad)
     if on_bad != "raise":
         rows = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "color": color}
-        rows = _mended(rows if features is None else {**rows, "features": features}, on_bad, report)
+        rows = rows if features is None else {**rows, "features": features}
+        _check_rows(rows)
+        rows = _mended(rows, on_bad, report)
         means, quats, scales, opacities, color = list(rows.values())[:5]
         features = rows.get("features")
     n_images = cameras.viewmats.shape[0]
@@ -147,8 +154,9 @@ def rasterize_gaussians(
 
 
 def _named_errors(args):
+    size = f"cameras.width={args[11]}, cameras.height={args[12]}"
     try:
-        return torch.ops.gsim3d.rasterize_gaussians(*args)
+        return within_memory("rasterize_gaussians", size, torch.ops.gsim3d.rasterize_gaussians, *args)
     except (ValueError, RuntimeError) as error:
         if _BAD_ROW.search(str(error)):
             raise HardCaseError(str(error).splitlines()[0]) from None
@@ -162,18 +170,44 @@ def _mended(rows: dict[str, Tensor], on_bad: OnBad, report: StabilityReport | No
         low = 0.0 if name in ("opacities", "scales") else -MAX
         high = 1.0 if name == "opacities" else MAX
         good = (value >= low) & (value <= high)
-        wrong = ~good.reshape(n, -1).all(1)
+        wrong = ~good[..., None].flatten(1).all(1)
         bad |= wrong
         neutral = torch.zeros_like(value)
         if name == "quats":
             neutral[:, 0] = 1
-        mended[name] = torch.where(good if on_bad == "clamp" else good.reshape(n, -1).all(1).reshape(-1, *[1] * (value.dim() - 1)), value, value.nan_to_num(0.0).clamp(low, high) if on_bad == "clamp" and name != "quats" else neutral)
+        mended[name] = torch.where(good if on_bad == "clamp" else good[..., None].flatten(1).all(1).reshape(-1, *[1] * (value.dim() - 1)), value, value.nan_to_num(0.0).clamp(low, high) if on_bad == "clamp" and name != "quats" else neutral)
         if report is not None and bool(wrong.any()):
             row = int(wrong.nonzero()[0])
             report.add(Finding("cannot be used", "rasterize_gaussians", name, ACTIONS[on_bad], int(wrong.sum()), row))
     if on_bad == "drop":
         mended["opacities"] = torch.where(bad, 0.0, mended["opacities"])
     return mended
+
+
+def _check_arguments(rows: dict[str, Tensor], optional: dict[str, Tensor], cameras: Cameras, near_plane: float) -> None:
+    """Types, and the shapes that are read before the kernel checks them."""
+    if not isinstance(cameras, Cameras):
+        raise TypeError(f"rasterize_gaussians: cameras must be gsim3d.Cameras; got {type(cameras).__name__}")
+    of_cameras = {f"cameras.{name}": getattr(cameras, name) for name in ("viewmats", "Ks", "image_cloud")}
+    check_tensors("rasterize_gaussians", **rows, **optional, **of_cameras)
+    check_whole("rasterize_gaussians", **{f"cameras.{name}": getattr(cameras, name) for name in ("width", "height")})
+    check_real("rasterize_gaussians", near_plane=near_plane)
+    shapes = {"means": "[N, 3]", "cameras.viewmats": "[I, 4, 4]", "cameras.Ks": "[I, 3, 3]", "cu_rows": "[Q + 1]"}
+    for name, shape in shapes.items():
+        value = rows.get(name, of_cameras.get(name, optional.get(name)))
+        if value is not None and value.dim() != shape.count(",") + 1:
+            raise ValueError(f"rasterize_gaussians: {name} must be {shape}; got {list(value.shape)}")
+
+
+def _check_rows(rows: dict[str, Tensor]) -> None:
+    """Numbers that policies may change must be numbers, and rows of ``means``."""
+    n = rows["means"].shape[0]
+    wanted = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+    for name, value in rows.items():
+        if not value.is_floating_point():
+            raise ValueError(f"rasterize_gaussians: {name} must be float32 or float64; got {value.dtype}")
+        if value.shape != wanted.get(name, (n, *value.shape[1:])):
+            raise ValueError(f"rasterize_gaussians: {name} must have N={n} rows as means; got {list(value.shape)}")
 
 
 def _tiles(n_images, width, height):

@@ -1,12 +1,21 @@
-"""Layer normalisation of packed rows, with the residual sum that follows it."""
+"""Layer normalisation of packed rows, with the residual sums around it."""
 
 import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._arguments import check_numbers, check_real, check_tensors
 
 
-def row_norm(x: Tensor, weight: Tensor, bias: Tensor, residual: Tensor | None = None, *, eps: float = 1e-5) -> Tensor:
+def row_norm(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor,
+    residual: Tensor | None = None,
+    *,
+    eps: float = 1e-5,
+    check: bool = True,
+) -> Tensor:
     """Normalises every row over its channels, scales, shifts and adds ``residual``.
 
     ``out = (x - mean(x)) / sqrt(var(x) + eps) * weight + bias + residual``, mean and variance over a row. A row's result
@@ -17,20 +26,63 @@ def row_norm(x: Tensor, weight: Tensor, bias: Tensor, residual: Tensor | None = 
         weight, bias: [C], float32; float64 with float64 rows.
         residual: [N, C] or None.
         eps: positive, keeps rows of equal values finite.
+        check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [N, C], dtype of ``residual``, else of ``x``. Under ``torch.autocast`` CUDA returns autocast's dtype where there is
         no residual, ready for the matrix product that follows; the CPU computes in float32.
     Gradients: ``x``, ``weight``, ``bias``, ``residual``, once; sums over rows have one order.
     Raises:
-        ValueError: a shape or dtype does not fit; the message names the argument.
+        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        ValueError, TypeError: an argument is malformed; the message names it.
     Source: Ba et al. 2016, Layer Normalization.
 
     Example:
         >>> row_norm(torch.tensor([[1.0, 3.0]]), torch.ones(2), torch.zeros(2), torch.ones(1, 2)).round(decimals=3)
         tensor([[0., 2.]])
     """
+    if check:
+        tensors = {"x": x, "weight": weight, "bias": bias} | ({} if residual is None else {"residual": residual})
+        check_tensors("row_norm", **tensors)
+        check_real("row_norm", eps=eps)
+        check_numbers("row_norm", **tensors)
     dtype = x.dtype if residual is None else residual.dtype
     return torch.ops.gsim3d.row_norm(x, weight, bias, residual, eps, dtype)[0]
+
+
+def residual_norm(
+    x: Tensor,
+    branch: Tensor,
+    *,
+    keep: Tensor | None = None,
+    branch_norm: tuple[Tensor, Tensor] | None = None,
+    norm: tuple[Tensor, Tensor] | None = None,
+    eps: float = 1e-5,
+) -> tuple[Tensor, Tensor]:
+    """The next value of a residual stream, and what the layer behind it reads.
+
+    ``sum = x + keep * N(branch)`` and ``out = N(sum)``, where ``N`` is the layer normalisation of :func:`row_norm` with
+    the weight and bias given, and nothing where there are none. All in one pass over the rows.
+
+    Args:
+        x: [N, C], float32 or float64.
+        branch: [N, C], dtype of ``x``; with float32 rows on CUDA also float16 and bfloat16, and then C at most 1024.
+            Under ``torch.autocast`` CUDA takes it in autocast's dtype and the CPU in float32.
+        keep: [N, 1], dtype of ``x``, a factor of each row's branch; None: 1.
+        branch_norm, norm: weight and bias [C] each, dtype of ``x``.
+        eps: as in :func:`row_norm`.
+    Returns:
+        sum [N, C], dtype of ``x``; out [N, C], dtype of ``branch``.
+    Gradients: ``x``, ``branch``, weights and biases, once; sums over rows have one order.
+    Raises:
+        ValueError: a shape or dtype does not fit; the message names the argument.
+
+    Example:
+        >>> total, out = residual_norm(torch.ones(1, 2), torch.tensor([[1.0, 3.0]]), norm=(torch.ones(2), torch.zeros(2)))
+        >>> total, out.round(decimals=3)
+        (tensor([[2., 4.]]), tensor([[-1.,  1.]]))
+    """
+    weights = *(branch_norm or (None, None)), *(norm or (None, None))
+    return torch.ops.gsim3d.residual_norm(x, branch, keep, *weights, eps)[:2]
 
 
 @torch.library.register_fake("gsim3d::row_norm")
@@ -56,6 +108,43 @@ def _backward(ctx, grad, _grad_stats):
 
 
 torch.library.register_autograd("gsim3d::row_norm", _backward, setup_context=_setup)
+
+
+@torch.library.register_fake("gsim3d::residual_norm")
+def _(x, branch, keep, branch_weight, branch_bias, weight, bias, eps):
+    stats = [x.new_empty(x.shape[0] if w is not None else 0, 2) for w in (branch_weight, weight)]
+    return x.new_empty(x.shape), branch.new_empty(x.shape), *stats
+
+
+@torch.library.register_fake("gsim3d::residual_norm_backward")
+def _(grad_sum, grad_out, branch, sum, keep, branch_weight, weight, branch_stats, stats):
+    channels = sum.shape[1]
+    of_norms = [sum.new_empty(channels if w is not None else 0) for w in (branch_weight, branch_weight, weight, weight)]
+    return sum.new_empty(sum.shape), branch.new_empty(sum.shape), sum.new_empty(channels), *of_norms
+
+
+@torch.library.register_fake("gsim3d::linear_grad_bias")
+def _(grad):
+    return grad.new_empty(grad.shape[1], dtype=torch.promote_types(grad.dtype, torch.float32))
+
+
+def _residual_setup(ctx, inputs, output):
+    _, branch, keep, branch_weight, _, weight, _, _ = inputs
+    ctx.set_materialize_grads(False)
+    ctx.mark_non_differentiable(*output[2:])
+    ctx.save_for_backward(branch, output[0], keep, branch_weight, weight, *output[2:])
+
+
+def _residual_backward(ctx, grad_sum, grad_out, *_):
+    if grad_sum is None and grad_out is None:
+        return (None,) * 8
+    branch_weight, weight = ctx.saved_tensors[3:5]
+    x, branch, _, *of_norms = torch.ops.gsim3d.residual_norm_backward(grad_sum, grad_out, *ctx.saved_tensors)
+    given = [w is not None for w in (branch_weight, branch_weight, weight, weight)]
+    return x, branch, None, *(g if has else None for g, has in zip(of_norms, given, strict=True)), None
+
+
+torch.library.register_autograd("gsim3d::residual_norm", _residual_backward, setup_context=_residual_setup)
 _library = torch.library.Library("gsim3d", "FRAGMENT")
 
 
@@ -75,5 +164,19 @@ def _autocast(device: str):
     return rule
 
 
+def _residual_autocast(device: str):
+    keys = torch._C.DispatchKeySet(getattr(torch._C.DispatchKey, f"Autocast{device.upper()}"))
+
+    def rule(x, branch, *others):
+        if branch.dtype != torch.float64:
+            branch = branch.to(torch.get_autocast_dtype("cuda") if device == "cuda" else torch.float32)
+            x, *others = (t.float() if isinstance(t, Tensor) else t for t in (x, *others))
+        with torch._C._ExcludeDispatchKeyGuard(keys):
+            return torch.ops.gsim3d.residual_norm(x, branch, *others)
+
+    return rule
+
+
 for _device in ("cpu", "cuda"):
     _library.impl("row_norm", _autocast(_device), f"Autocast{_device.upper()}")
+    _library.impl("residual_norm", _residual_autocast(_device), f"Autocast{_device.upper()}")

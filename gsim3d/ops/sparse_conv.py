@@ -4,12 +4,20 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole
 from gsim3d.ops._autocast import follow_autocast
 from gsim3d.ops.curve import KernelMap, Voxels
 
 
 def sparse_conv(
-    x: Tensor, weight: Tensor, bias: Tensor | None, voxels: Voxels, kernel_map: KernelMap, *, duplicates: str = "mean"
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    voxels: Voxels,
+    kernel_map: KernelMap,
+    *,
+    duplicates: str = "mean",
+    check: bool = True,
 ) -> Tensor:
     """Convolution over the occupied voxels, with one output a row.
 
@@ -27,13 +35,15 @@ def sparse_conv(
         kernel_map: pairs of neighbouring voxels for K (``Stage.kernel_maps[K]``); those behind the last offset take no
             part.
         duplicates: "mean", or "first" for the lowest row, which depends on the order of the rows.
+        check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [N, C_out], dtype of ``x``.
     Gradients: ``x``, ``weight``, ``bias``, once.
     Determinism: the same bits for any number of threads, and in every run on CUDA. On the CPU an output is one chain of
         sums in the order of taps.
     Raises:
-        ValueError: shapes, dtypes, ``voxels`` or ``kernel_map`` are malformed; the message names the argument.
+        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        ValueError, TypeError: shapes, dtypes, ``voxels`` or ``kernel_map`` are malformed; the message names it.
             CUDA does not look into the index lists: pairs and rows out of range take no part.
     Source: Graham et al., "3D semantic segmentation with submanifold sparse convolutional networks", 2018.
 
@@ -48,6 +58,13 @@ def sparse_conv(
     """
     if duplicates not in ("mean", "first"):
         raise ValueError(f'sparse_conv: duplicates must be "mean" or "first"; got {duplicates!r}')
+    if check:
+        floats = {"x": x, "weight": weight} | ({} if bias is None else {"bias": bias})
+        lists = {name: getattr(voxels, name) for name in ("row_voxel", "rows", "cu_rows")}
+        taps = {name: getattr(kernel_map, name) for name in ("tap_in", "tap_out", "cu_taps")}
+        check_tensors("sparse_conv", **floats, **lists, **taps)
+        check_whole("sparse_conv", kernel_size=kernel_map.kernel_size)
+        check_numbers("sparse_conv", **floats)
     kernel_size = kernel_map.kernel_size
     if weight.dim() == 5 and weight.shape[1] != kernel_size:
         raise ValueError(

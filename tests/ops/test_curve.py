@@ -89,7 +89,7 @@ def test_devices_agree(devices):
 
 
 @pytest.mark.parametrize("n", [1, 2, 33, 4095, 4097, 300001])
-@pytest.mark.parametrize("values", ["any", "few", "sorted", "equal", "extremes"])
+@pytest.mark.parametrize("values", ["any", "few", "sorted", "equal", "extremes", "crowds"])
 def test_sort_on_cuda(n, values, devices):
     generator = torch.Generator().manual_seed(n)
     high = 2**63 - 1
@@ -99,6 +99,12 @@ def test_sort_on_cuda(n, values, devices):
         "sorted": torch.arange(5 * n).reshape(5, n),
         "equal": torch.full((5, n), -5),
         "extremes": torch.where(torch.rand(5, n, generator=generator) < 0.5, -(2**63), high),
+        # Most keys differ in their high digits; two in a thousand differ in low digits only, and stand together in the order.
+        "crowds": torch.where(
+            torch.rand(5, n, generator=generator) < 0.002,
+            torch.randint(0, 90, (5, n), generator=generator) << torch.arange(0, 10, 2)[:, None],
+            torch.randint(-high, high, (5, n), generator=generator),
+        ),
     }[values]
     order, inverse = curve_sort(codes.to(devices[1]))
     assert torch.equal(order.cpu(), torch.argsort(codes, dim=1, stable=True))

@@ -1,6 +1,7 @@
 """patch_attention against a dense float64 softmax."""
 
 import dataclasses
+import functools
 import hashlib
 import os
 import subprocess
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from gsim3d.errors import HardCaseError
 from gsim3d.ops import PatchTable, patch_attention
 from tests.asserts import (
     assert_close_relative_to_max,
@@ -286,12 +288,25 @@ def test_poison_stays_in_its_patches(device, which, poison):
     clean = gradients(case.attend, case.inputs, cotangent_of(case))
     inputs = [x.clone() for x in case.inputs]
     inputs[which][case.table.q_rows[72], 1, 3] = poison
-    dirty = gradients(case.attend, inputs, cotangent_of(case))
+    unchecked = functools.partial(patch_attention, table=case.table, scale=case.scale, check=False)
+    dirty = gradients(unchecked, inputs, cotangent_of(case))
     other = torch.cat([case.table.q_rows[:70], case.table.q_rows[75:]])
     for a, e in zip(dirty, clean, strict=True):
         assert_same_bits(a[other], e[other])
         assert_same_bits(a[:, 0], e[:, 0])
     assert not torch.isfinite(dirty[0]).all()
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf"), 1e30])
+@pytest.mark.parametrize("which", ["q", "k", "v"])
+def test_poison_is_refused_on_the_cpu(which, poison):
+    case = random_case(dtype=torch.float32)
+    inputs = {"q": case.q, "k": case.k, "v": case.v}
+    inputs[which] = inputs[which].clone()
+    inputs[which][5, 1, 3] = poison
+    with pytest.raises(HardCaseError, match=f"patch_attention: {which} must be finite .* in row 5") as caught:
+        patch_attention(**inputs, table=case.table)
+    assert caught.value.tensor == which and caught.value.row == 5
 
 
 def test_non_contiguous(device):

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from gsim3d.errors import HardCaseError
 from gsim3d.ops import pool_max, pool_mean, unpool
 from tests.asserts import (
     assert_close_relative_to_max,
@@ -171,9 +172,36 @@ def test_nan_and_infinity_pass_through(bad_row, channels, device):
     x[bad_row] = float("nan")
     out, argmax = torch.ops.gsim3d.pool_max(x, rows, cu_rows)
     assert out[0].isnan().all() and (argmax[0] == bad_row).all() and not out[1].isnan().any()
-    assert pool_mean(x, rows, cu_rows)[0].isnan().all()
+    assert pool_mean(x, rows, cu_rows, check=False)[0].isnan().all()
     x[bad_row] = float("-inf")
-    assert torch.isfinite(pool_max(x, rows, cu_rows)).all()
+    assert torch.isfinite(pool_max(x, rows, cu_rows, check=False)).all()
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("-inf"), -1e30])
+def test_poison_is_refused_on_the_cpu(poison):
+    rows, cu_rows = torch.tensor([0, 1, 2, 3]), torch.tensor([0, 3, 4])
+    x = features(4, 3, dtype=torch.float32)
+    x[2, 1] = poison
+    for name, call in {
+        "pool_max": lambda: pool_max(x, rows, cu_rows),
+        "pool_mean": lambda: pool_mean(x, rows, cu_rows),
+        "unpool": lambda: unpool(x, rows, torch.arange(5), 4),
+    }.items():
+        with pytest.raises(HardCaseError, match=f"{name}: x must be finite .* in row 2"):
+            call()
+
+
+def test_a_result_that_finds_no_room_is_named():
+    with pytest.raises(MemoryError, match="unpool: there is no memory for the result of n_rows=4611686018427387904"):
+        unpool(torch.ones(1, 1), torch.tensor([0]), torch.tensor([0, 1]), 2**62)
+
+
+@pytest.mark.parametrize("what", [None, "3", [1.0], torch.ones(3).to_sparse()])
+def test_what_is_no_dense_tensor_is_named(what):
+    with pytest.raises(TypeError, match="pool_max: rows must be a (dense )?tensor; got"):
+        pool_max(torch.ones(3, 1), what, torch.tensor([0, 3]))
+    with pytest.raises(TypeError, match="n_rows must be a whole number"):
+        unpool(torch.ones(1, 1), torch.tensor([0]), torch.tensor([0, 1]), what)
 
 
 def test_non_contiguous_inputs(device):

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from gsim3d.errors import HardCaseError
 from gsim3d.ops import row_norm
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads, gradients
 from tests.oracle import row_norm as oracle
@@ -150,7 +151,14 @@ def test_a_row_does_not_depend_on_the_rows_it_is_packed_with(device):
     alone = row_norm(x[77:78], weight, bias, residual[77:78])
     assert_same_bits(row_norm(x, weight, bias, residual)[77:78], alone)
     x[3] = float("nan")
-    assert_same_bits(row_norm(x, weight, bias, residual)[77:78], alone)
+    assert_same_bits(row_norm(x, weight, bias, residual, check=False)[77:78], alone)
+
+
+def test_poison_is_refused_on_the_cpu():
+    x, weight, bias, residual = inputs(130, 48, dtype=torch.float32)
+    x[3, 7] = float("nan")
+    with pytest.raises(HardCaseError, match="row_norm: x must be finite .* got nan in row 3"):
+        row_norm(x, weight, bias, residual)
 
 
 def test_non_contiguous_and_unaligned_inputs(device):
@@ -165,7 +173,7 @@ def test_non_contiguous_and_unaligned_inputs(device):
 def test_large_values_stay_finite(device):
     x, weight, bias = (t.to(device) for t in inputs(10, 32, dtype=torch.float32, residual=False))
     x = (x * 1e15).requires_grad_()
-    out = row_norm(x, weight, bias)
+    out = row_norm(x, weight, bias, check=False)
     assert torch.isfinite(out).all() and torch.isfinite(torch.autograd.grad(out.sum(), x)[0]).all()
 
 

@@ -7,6 +7,7 @@ import sys
 import pytest
 import torch
 
+from gsim3d.errors import HardCaseError
 from gsim3d.ops import KernelMap, PyramidSpec, Voxels, build_pyramid, sparse_conv
 from tests.asserts import (
     assert_close_relative_to_max,
@@ -355,8 +356,18 @@ def test_nan_reaches_the_neighbours_only(device):
     cells = torch.tensor([[0, 0, 0, 0], [0, 1, 0, 0], [0, 5, 5, 5]])
     x, weight, bias, _ = (t.to(device) for t in parameters(3, 3, 2, 3, torch.float32))
     x[0] = float("nan")
-    out = convolution(*geometry(cells, 3, device))(x, weight, bias)
+    out = sparse_conv(x, weight, bias, *geometry(cells, 3, device), check=False)
     assert out[:2].isnan().all() and torch.isfinite(out[2]).all()
+
+
+@pytest.mark.parametrize("which", ["x", "weight", "bias"])
+def test_poison_is_refused_on_the_cpu(which):
+    x, weight, bias, _ = parameters(3, 3, 2, 3, torch.float32)
+    arguments = {"x": x, "weight": weight, "bias": bias}
+    arguments[which][1] = float("nan")
+    voxels, kernel_map = geometry(torch.tensor([[0, 0, 0, 0], [0, 1, 0, 0], [0, 5, 5, 5]]), 3)
+    with pytest.raises(HardCaseError, match=f"sparse_conv: {which} must be finite .* got nan in row 1"):
+        sparse_conv(**arguments, voxels=voxels, kernel_map=kernel_map)
 
 
 def test_non_contiguous_inputs(device):

@@ -307,7 +307,7 @@ def test_pooling_knows_rows_by_their_segments_only(pool, dtype, device):
     other, other_grad = gradients(lambda x: pool(x, renamed, cu_rows), [x[order]], cotangent)
     assert_same_bits(other, out)
     assert_same_bits(other_grad, grad[order])
-    grown = torch.cat([x, torch.full((1, 5), 1e30, dtype=dtype, device=device)])
+    grown = torch.cat([x, torch.full((1, 5), 1e10, dtype=dtype, device=device)])
     other, other_grad = gradients(lambda x: pool(x, rows, cu_rows), [grown], cotangent)
     assert_same_bits(other, out)
     assert_same_bits(other_grad, torch.cat([grad, torch.zeros_like(grad[:1])]))

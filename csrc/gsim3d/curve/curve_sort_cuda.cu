@@ -2,6 +2,9 @@
 // rows fill the GPU together; a digit in which all keys of a row agree costs that row no pass; how many keys a row has
 // may be known on the device only.
 //
+// Low digits get no pass where the digits above tell nearly all keys of a row apart: in the end every key counts the few
+// that agree with it in those and belong on its other side. Whether they are few is judged by a sample of the row's keys.
+//
 // A pass takes each tile of a row through shared memory: ranks by digit inside the tile, then the tile's first place
 // for each digit, which is the sum over the tiles before it. Tiles publish their counts and look back over those of the
 // tiles before them (Merrill and Garland 2016; Adinets and Merrill 2022).
@@ -37,7 +40,7 @@ constexpr uint32_t kOfTile = 1u << 30, kUpToTile = 2u << 30, kCountMask = kOfTil
 struct Sort {
   SortRows rows;
   uint32_t* totals;     // [rows, kMaxPasses, kDigits]: keys of each digit, then the first place of each digit
-  uint32_t* passes;     // [rows], bit p: pass p moves keys
+  uint32_t* alike;      // [rows, kMaxPasses]: 0: all keys agree in digit p; else 1 + pairs of the sample that agree from it up
   uint32_t* published;  // [kMaxPasses, rows, tiles, kDigits]
   uint32_t* tickets;    // [kMaxPasses]
   uint64_t* keys[2];    // [rows, room] each
@@ -62,6 +65,30 @@ __device__ __forceinline__ uint64_t unsqueezed(uint64_t key, int bits) {
 // A key as the caller gave it, as the passes order it.
 __device__ __forceinline__ uint64_t ordered_key(const SortRows& rows, int64_t row, uint64_t key) {
   return rows.squeeze ? squeezed(key, rows.squeeze[row]) : key ^ rows.flip;
+}
+
+// Bit p: pass p moves keys of the row.
+struct Passes {
+  uint32_t kept;
+  bool rest;  // keys differ below the last of them
+};
+constexpr uint32_t kFewAlike = 2;  // of kThreads^2 pairs, in both orders
+constexpr int64_t kLongRow = 1 << 21;
+__device__ __forceinline__ Passes passes_of(const Sort& sort, int64_t row) {
+  const uint32_t* alike = sort.alike + row * kMaxPasses;
+  Passes passes{0, false};
+  bool enough = false;
+#pragma unroll
+  for (int p = kMaxPasses - 1; p >= 0; --p) {
+    const uint32_t pairs = alike[p];
+    if (pairs == 0) continue;
+    if (enough)
+      passes.rest = true;
+    else
+      passes.kept |= 1u << p;
+    enough = enough || pairs - 1 <= kFewAlike;
+  }
+  return passes;
 }
 
 __device__ __forceinline__ uint32_t digit_of(uint64_t key, int pass) {
@@ -135,14 +162,36 @@ __device__ __forceinline__ uint32_t exclusive_block_sum(uint32_t value, uint32_t
   return before + sum - value;
 }
 
+// Places of the sample: scattered, since equal steps may keep step with how a cloud was made.
+__device__ __forceinline__ int64_t sampled_place(uint32_t i, int64_t n) {
+  uint32_t hash = (i + 1) * 0x9e3779b9u;
+  hash = (hash ^ hash >> 16) * 0x85ebca6bu;
+  hash = (hash ^ hash >> 13) * 0xc2b2ae35u;
+  return static_cast<int64_t>(static_cast<uint64_t>(hash ^ hash >> 16) * static_cast<uint64_t>(n) >> 32);
+}
+
 __global__ void __launch_bounds__(kThreads) plan_passes_kernel(Sort sort) {
   __shared__ uint32_t sums[kWarps];
+  __shared__ uint64_t sample[kThreads];
+  __shared__ uint32_t pairs;
   const int64_t row = blockIdx.x, n = size_of(sort.rows, row);
   const int pass = blockIdx.y;
+  const uint64_t key = n > 0 ? sort.rows.keys[row * sort.rows.room + sampled_place(threadIdx.x, n)] : 0;
+  const uint64_t prefix = n > 0 ? ordered_key(sort.rows, row, key) >> (pass * kDigitBits) : 0;
+  sample[threadIdx.x] = prefix;
+  if (threadIdx.x == 0) pairs = 0;
   uint32_t* total = sort.totals + (row * kMaxPasses + pass) * kDigits + threadIdx.x;
   const uint32_t count = *total;
   *total = exclusive_block_sum(count, sums);
-  if (__syncthreads_or(count > 0 && count < n) && threadIdx.x == 0) atomicOr(sort.passes + row, 1u << pass);
+  if (!__syncthreads_or(count > 0 && count < n)) return;
+  uint32_t same = 0;
+#pragma unroll 8
+  for (int i = 0; i < kThreads; ++i) same += sample[i] == prefix;
+  same = __reduce_add_sync(kFullWarp, same - 1);
+  if (threadIdx.x % kWarp == 0) atomicAdd(&pairs, same);
+  __syncthreads();
+  // In long rows few pairs of the sample are still many keys.
+  if (threadIdx.x == 0) sort.alike[row * kMaxPasses + pass] = 1 + (n < kLongRow ? pairs : kThreads);
 }
 
 // The key with place i in the order.
@@ -196,9 +245,9 @@ __global__ void __launch_bounds__(Tile::kThreads, Tile::kBlocks) move_keys_kerne
   __syncthreads();
   const int64_t row = memory.ticket / sort.tiles, tile = memory.ticket % sort.tiles;
   const int64_t n = size_of(sort.rows, row), begin = tile * kKeys<Tile>;
-  const uint32_t passes = sort.passes[row];
-  if (!(passes >> pass & 1) || begin >= n) return;
-  const int moves = __popc(passes & ((1u << pass) - 1));
+  const Passes passes = passes_of(sort, row);
+  if (!(passes.kept >> pass & 1) || begin >= n) return;
+  const int moves = __popc(passes.kept & ((1u << pass) - 1));
   const Keys from = keys_after(sort, row, moves);
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
   const int count = static_cast<int>(min(n - begin, int64_t{kKeys<Tile>}));
@@ -267,7 +316,7 @@ __global__ void __launch_bounds__(Tile::kThreads, Tile::kBlocks) move_keys_kerne
     memory.index[to] = index[i];
   }
   __syncthreads();
-  const bool last = passes >> pass == 1;
+  const bool last = passes.kept >> pass == 1 && !passes.rest;
   uint64_t* to_keys = sort.keys[moves % 2] + row * sort.rows.room;
   uint32_t* to_index = sort.index[moves % 2] + row * sort.rows.room;
 #pragma unroll 4
@@ -283,13 +332,45 @@ __global__ void __launch_bounds__(Tile::kThreads, Tile::kBlocks) move_keys_kerne
   }
 }
 
-// Rows that no pass moves: they are in order.
-__global__ void copy_rows_kernel(Sort sort) {
-  const int64_t row = blockIdx.y, n = size_of(sort.rows, row);
-  if (sort.passes[row] != 0) return;
-  for (int64_t i = int64_t{blockIdx.x} * kThreads + threadIdx.x; i < n; i += int64_t{gridDim.x} * kThreads)
-    write_result(sort.rows, row, i, ordered_key(sort.rows, row, sort.rows.keys[row * sort.rows.room + i]),
-                 static_cast<uint32_t>(i));
+// Ends what the passes left: rows that no pass moved are in order, and keys that agree in all moved digits stand side by
+// side, in the order of the caller.
+constexpr int kFinishItems = 4, kFinished = kThreads * kFinishItems;
+constexpr int kAround = 64;  // keys before and after those of a block that it holds too
+
+__global__ void __launch_bounds__(kThreads) finish_rows_kernel(Sort sort) {
+  __shared__ uint64_t held[kFinished + 2 * kAround];
+  const int64_t row = blockIdx.y, n = size_of(sort.rows, row), begin = int64_t{blockIdx.x} * kFinished;
+  const Passes passes = passes_of(sort, row);
+  if (begin >= n || (passes.kept != 0 && !passes.rest)) return;
+  const Keys from = keys_after(sort, row, __popc(passes.kept));
+  if (passes.kept == 0) {
+    for (int64_t i = begin + threadIdx.x; i < min(begin + kFinished, n); i += kThreads)
+      write_result(sort.rows, row, i, ordered_key(sort.rows, row, from.keys[i]), static_cast<uint32_t>(i));
+    return;
+  }
+  const int64_t first = max(begin - kAround, int64_t{0}), last = min(begin + kFinished + kAround, n);
+  for (int64_t i = first + threadIdx.x; i < last; i += kThreads) held[i - first] = from.keys[i];
+  __syncthreads();
+  const auto key_at = [&](int64_t i) { return i >= first && i < last ? held[i - first] : from.keys[i]; };
+  const int shift = kDigitBits * (__ffs(passes.kept) - 1);
+#pragma unroll
+  for (int item = 0; item < kFinishItems; ++item) {
+    const int64_t i = begin + item * kThreads + threadIdx.x;
+    if (i >= n) continue;
+    const uint64_t key = held[i - first];
+    int64_t place = i;
+    for (int64_t j = i - 1; j >= 0; --j) {
+      const uint64_t other = key_at(j);
+      if ((other ^ key) >> shift != 0) break;
+      place -= other > key;
+    }
+    for (int64_t j = i + 1; j < n; ++j) {
+      const uint64_t other = key_at(j);
+      if ((other ^ key) >> shift != 0) break;
+      place += other < key;
+    }
+    write_result(sort.rows, row, place, key, from.index[i]);
+  }
 }
 
 }  // namespace
@@ -305,11 +386,11 @@ void sort_rows(const char* op, const SortRows& rows, const Workspace& workspace,
   sort.n_passes = (rows.bits + kDigitBits - 1) / kDigitBits;
   const int64_t n_totals = rows.n_rows * kMaxPasses * kDigits,
                 n_published = sort.n_passes * rows.n_rows * sort.tiles * kDigits;
-  const int64_t n_zeros = n_totals + kMaxPasses + rows.n_rows + n_published;
+  const int64_t n_alike = rows.n_rows * kMaxPasses, n_zeros = n_totals + kMaxPasses + n_alike + n_published;
   sort.totals = workspace.take<uint32_t>(n_zeros);
   sort.tickets = sort.totals + n_totals;
-  sort.passes = sort.tickets + kMaxPasses;
-  sort.published = sort.passes + rows.n_rows;
+  sort.alike = sort.tickets + kMaxPasses;
+  sort.published = sort.alike + n_alike;
   for (int i = 0; i < 2; ++i) {
     sort.keys[i] = workspace.take<uint64_t>(rows.n_rows * rows.room);
     sort.index[i] = workspace.take<uint32_t>(rows.n_rows * rows.room);
@@ -324,7 +405,7 @@ void sort_rows(const char* op, const SortRows& rows, const Workspace& workspace,
            sizeof(PassMemory<Tile>), stream, sort, pass);
   };
   for (int pass = 0; pass < sort.n_passes; ++pass) large ? move(LargeTile{}, pass) : move(SmallTile{}, pass);
-  launch(op, copy_rows_kernel, dim3(static_cast<unsigned>(std::min<int64_t>((rows.room + 2047) / 2048, 64)), n_rows), kThreads, 0,
+  launch(op, finish_rows_kernel, dim3(static_cast<unsigned>((rows.room + kFinished - 1) / kFinished), n_rows), kThreads, 0,
          stream, sort);
 }
 

@@ -42,22 +42,26 @@ __global__ void uses_kernel(PatchTable table, RowUses uses) {
   atomicAdd(uses.count_less_one + row, 1);
 }
 
-// A warp looks at 32 rows and works on those that no slot or several slots list.
+constexpr int kRowsPerWarp = 4;  // rows listed several times lie side by side: few a warp, so that many warps share them
+
+// A warp looks at kRowsPerWarp rows and works on those that no slot or several slots list.
 template <typename T>
 __global__ void finish_kernel(PatchTable table, AttentionSize size, RowUses uses, KeyGradients<T> gradients) {
   using C = Sum<T>;
   const int lane = threadIdx.x % kWarp;
-  const int64_t first = (static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x) / kWarp * kWarp;
-  const int mine = first + lane < table.n_k ? uses.count_less_one[first + lane] : 0;
+  const int64_t first = (static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x) / kWarp * kRowsPerWarp;
+  const int mine = lane < kRowsPerWarp && first + lane < table.n_k ? uses.count_less_one[first + lane] : 0;
   const int64_t width = size.heads * size.dim;
   for (unsigned left = __ballot_sync(kFullWarp, mine != 0); left != 0; left &= left - 1) {
     const int64_t row = first + __ffs(static_cast<int>(left)) - 1;
     const int count = uses.count_less_one[row] + 1;
     const int64_t begin = static_cast<int64_t>(uses.first[row]), last = static_cast<int64_t>(~uses.minus_last[row]);
+#pragma unroll 2
     for (int64_t i = lane; i < width; i += kWarp) {
+      const int64_t head = i / size.dim;
       C k = 0, v = 0;
       const auto add = [&](int64_t slot) {
-        const C* from = gradients.slot(slot, i / size.dim, size) + i % size.dim;
+        const C* from = gradients.slot(slot, head, size) + (i - head * size.dim);
         k += from[0];
         v += from[size.dim];
       };
@@ -78,11 +82,11 @@ template <typename T>
 void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
                      const AttentionSize& size, T* out, StatsOf<T>* stats, Stream stream) {
   const char* op = "patch_attention";
-  fill_zero(op, out, table.n_q * size.heads * size.dim, stream);
-  fill_zero(op, stats, table.n_q * size.heads * 2, stream);
   if constexpr (sizeof(T) == 2)
     if (fits_tensor_cores<T>(size, q, k, v))
       return tensor_forward(device(q), device(k), device(v), table, size, device(out), stats, stream);
+  fill_zero(op, out, table.n_q * size.heads * size.dim, stream);
+  fill_zero(op, stats, table.n_q * size.heads * 2, stream);
   simple_forward(device(q), device(k), device(v), table, size, device(out), stats, stream);
 }
 
@@ -112,8 +116,8 @@ void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const He
   if (!done)
     simple_backward(device(grad), device(q), device(k), device(v), device(out), stats, table, size, device(grads[0]),
                     gradients, workspace, stream);
-  launch(op, finish_kernel<Native<T>>, blocks_for(op, table.n_k, kThreads), kThreads, 0, stream, table, size, uses,
-         gradients);
+  launch(op, finish_kernel<Native<T>>, blocks_for(op, table.n_k, kThreads / kWarp * kRowsPerWarp), kThreads, 0, stream,
+         table, size, uses, gradients);
 }
 
 #define GSIM3D_INSTANTIATE(T)                                                                                         \

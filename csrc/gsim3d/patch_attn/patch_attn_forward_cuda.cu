@@ -5,6 +5,7 @@
 // column of ones in the product with the values gives the sum of weights. In place of a running maximum it starts with
 // the largest score of the first 16 keys: weights may then exceed 1, which float32 and bfloat16 can hold. Where the sum
 // shows that they went too far, the warp starts again with a running maximum.
+#include "gsim3d/core/overlap.cuh"
 #include "gsim3d/patch_attn/patch_attn_mma_tile.cuh"
 #include "gsim3d/patch_attn/patch_attn_softmax.cuh"
 #include "gsim3d/patch_attn/patch_attn_tensor.h"
@@ -38,7 +39,8 @@ struct Forward {
 
 template <typename T, int D>
 class Warp {
-  static constexpr int M = Shape<D>::kRowTiles;
+  static constexpr int M = Shape<D>::kRowTiles, kUnroll = D == 16 ? 4 : 2;
+  static constexpr bool kMultiplies = D == 16;  // wider heads wait for the tensor cores, not for exponentials
 
  public:
   __device__ __forceinline__ Warp(const Forward<T>& args, uint32_t keys, uint32_t values, const uint8_t* valid)
@@ -80,12 +82,16 @@ class Warp {
   }
 
   __device__ __forceinline__ void fast_steps(int begin, int end) {
-    float shift[M][2];
+    const float slope = slope_ / kMultipliedRange;
+    float shift[M][2], multiplied_shift[M][2];
 #pragma unroll
     for (int m = 0; m < M; ++m)
 #pragma unroll
-      for (int h = 0; h < 2; ++h) shift[m][h] = -largest_[m][h] * slope_;
-#pragma unroll 2
+      for (int h = 0; h < 2; ++h) {
+        shift[m][h] = -largest_[m][h] * slope_;
+        multiplied_shift[m][h] = (shift[m][h] - kMultipliedLow) / kMultipliedRange;
+      }
+#pragma unroll kUnroll
     for (int step = begin; step < end; ++step) {
       float s[M][2][4];
       find_scores(step, s);
@@ -95,7 +101,8 @@ class Warp {
 #pragma unroll
         for (int i = 0; i < 8; ++i) {
           float& x = s[m][i / 4][i % 4];
-          x = fast_weight(x, slope_, shift[m][i % 4 / 2]);
+          x = kMultiplies && i == 7 ? multiplied_weight(x, slope, multiplied_shift[m][i % 4 / 2])
+                                    : fast_weight(x, slope_, shift[m][i % 4 / 2]);
         }
         pack_tile<T>(s[m], p[m]);
       }
@@ -204,7 +211,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
     const Range q_range = range_of(table.cu_q, share.patch, table.n_q_listed);
     const Range k_range = range_of(table.cu_k, share.patch, table.n_k_listed);
     const int64_t n_keys = k_range.end - k_range.begin, n_tiles = (n_keys + S::kTileRows - 1) / S::kTileRows;
-    if (n_tiles == 0) continue;
+    if (n_tiles == 0 || q_range.begin + share.split * S::kGroup >= q_range.end) continue;
 
     // Queues the copies of a tile; whether all its keys take part.
     const auto tile_size = [&](int64_t tile) {
@@ -223,7 +230,8 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
       return __syncthreads_and(all_valid) != 0;
     };
 
-    bool loaded = false, plain = false;
+    // The one tile of a patch is on its way while the first queries are read, and then stays.
+    bool arriving = n_tiles == 1, plain = arriving && load_tile(0);
     for (int64_t group = q_range.begin + share.split * S::kGroup; group < q_range.end;
          group += args.division.splits * S::kGroup) {
       const int64_t first = group + threadIdx.x / kWarp * 16 * S::kRowTiles;
@@ -233,12 +241,13 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
       warp.reset();
       bool good = true;
       for (int64_t tile = 0; tile < n_tiles; ++tile) {
-        const bool fresh = n_tiles > 1 || !loaded;
-        if (fresh) plain = load_tile(tile);
-        loaded = true;
-        const int n = tile_size(tile), part_steps = (fresh ? S::kPartRows : S::kTileRows) / kStep;
-        for (int part = 0; part < (fresh ? S::kParts : 1); ++part) {
-          if (fresh) {
+        if (n_tiles > 1) {
+          plain = load_tile(tile);
+          arriving = true;
+        }
+        const int n = tile_size(tile), parts = arriving ? S::kParts : 1, part_steps = S::kTileRows / kStep / parts;
+        for (int part = 0; part < parts; ++part) {
+          if (arriving) {
             wait_for_copies(S::kParts - 1 - part);
             __syncthreads();
           }
@@ -246,6 +255,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
           if (part == 0) good = good && plain && (tile > 0 || n < kStep || warp.start_fast());
           if (good) warp.fast_steps(part * part_steps, min((part + 1) * part_steps, n / kStep));
         }
+        arriving = false;
         if (active && good && n % kStep != 0) warp.careful_step(n / kStep);
       }
       if (active) good = good && warp.is_good();
@@ -261,16 +271,32 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
             for (int step = 0; step * kStep < tile_size(tile); ++step) warp.careful_step(step);
         }
       }
+      wait_for_previous();  // rows that no patch lists are being set to 0
       if (active) warp.store(args, first, q_range.end, share.head);
     }
   }
+  wait_for_previous();
+}
+
+// Few blocks, so that those of the next kernel find room at once.
+__global__ void __launch_bounds__(kThreads) clear_kernel(uint2* out, int64_t n_out, uint2* stats, int64_t n_stats) {
+  let_next_begin();
+  const int64_t first = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t step = static_cast<int64_t>(gridDim.x) * kThreads;
+#pragma unroll 4
+  for (int64_t i = first; i < n_out; i += step) out[i] = {0, 0};
+  for (int64_t i = first; i < n_stats; i += step) stats[i] = {0, 0};
 }
 
 template <typename T, int D>
 void run(Forward<T> args, int64_t heads, Stream stream) {
   args.division = divide(args.table.n_patches, args.table.n_q_listed, Shape<D>::kGroup, heads,
                          kBlocks * multiprocessors(kOp, stream));
-  launch(kOp, forward_kernel<T, D>, blocks_of(args.division), kThreads, Shape<D>::kSharedBytes, stream, args);
+  const int64_t n_stats = args.table.n_q * heads, n_out = n_stats * D * sizeof(T) / sizeof(uint2);
+  launch(kOp, clear_kernel, multiprocessors(kOp, stream), kThreads, 0, stream, reinterpret_cast<uint2*>(args.out),
+         n_out, reinterpret_cast<uint2*>(args.stats), n_stats);
+  launch_overlapping(kOp, forward_kernel<T, D>, blocks_of(args.division), kThreads, Shape<D>::kSharedBytes, stream,
+                     args);
 }
 
 }  // namespace

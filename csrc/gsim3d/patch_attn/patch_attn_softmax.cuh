@@ -14,6 +14,18 @@ __device__ __forceinline__ float fast_weight(float s, float slope, float shift) 
   return exp2_unit(fmaf(s, slope, shift));
 }
 
+// 2^(252 x - 126) with x = slope s + shift held within [0, 1], by multiplications: for a share of the weights, as the
+// special function unit takes eight cycles a warp. Relative error 1e-4, a fifth of a float16's last place.
+constexpr float kMultipliedRange = 252.0f, kMultipliedLow = -126.0f;
+__device__ __forceinline__ float multiplied_weight(float s, float slope, float shift) {
+  constexpr float kRound = 12582912.0f + kMultipliedLow;  // beside 1.5 * 2^23 the fraction of a sum rounds away
+  const float x = __saturatef(fmaf(s, slope, shift));
+  const float rounded = fmaf(x, kMultipliedRange, kRound);
+  const float f = fmaf(x, kMultipliedRange, kRound - rounded);
+  const float y = fmaf(fmaf(fmaf(f, 0.05517166f, 0.24261112f), f, 0.69326099f), f, 0.99992807f);
+  return __int_as_float(__float_as_int(y) + (__float_as_int(rounded) << 23));
+}
+
 // 2^(slope (s - reference) + shift), at most 1: exact where s is the reference, however large both are.
 __device__ __forceinline__ float careful_weight(float s, float reference, float slope, float shift) {
   const float x = fmaf(s - reference, slope, shift);

@@ -6,7 +6,7 @@
 
 namespace gsim3d::cuda {
 
-// Writes the rows of `out` and `stats` that some patch with keys lists.
+// Rows of `out` and `stats` that no patch with keys lists become 0.
 template <typename T>
 void tensor_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
                     const AttentionSize& size, T* out, float* stats, Stream stream);

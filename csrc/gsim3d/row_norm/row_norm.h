@@ -17,6 +17,16 @@ struct RowNormShape {
   int64_t n_rows, channels;
 };
 
+// Weight and bias of one normalisation, [channels] each; nullptr: there is none.
+template <typename S>
+struct NormWeights {
+  const S *weight = nullptr, *bias = nullptr;
+};
+template <typename S>
+struct NormGrads {
+  S *weight = nullptr, *bias = nullptr;
+};
+
 namespace cpu {
 
 // out = normalised(x) * weight + bias (+ residual). T is float or double.
@@ -38,6 +48,34 @@ void row_norm_vjp(const T* grad, const T* x, const T* weight, const T* stats, Ro
                   T* grad_bias,    // [channels]
                   const Parallel& parallel);
 
+// One residual sum and the normalisations around it: sum = x + keep * norm(branch); out = norm(sum).
+template <typename T>
+void residual_norm(const T* x,                 // [n_rows, channels]
+                   const T* branch,            // [n_rows, channels]
+                   const T* keep,              // [n_rows], or nullptr: 1
+                   NormWeights<T> branch_norm, NormWeights<T> norm, RowNormShape shape, double eps,
+                   T* sum,           // [n_rows, channels]
+                   T* out,           // [n_rows, channels]
+                   T* branch_stats,  // [n_rows, 2] where branch_norm is given
+                   T* stats,         // [n_rows, 2] where norm is given
+                   const Parallel& parallel);
+
+// Gradients of x, branch and the weights that are given; branch_sum is the sum over rows of the branch's gradient, that of
+// a bias of the linear layer before.
+template <typename T>
+void residual_norm_vjp(const T* grad_sum,  // [n_rows, channels], or nullptr: 0
+                       const T* grad_out,  // [n_rows, channels], or nullptr: 0
+                       const T* branch, const T* sum, const T* keep, const T* branch_weight, const T* weight,
+                       const T* branch_stats, const T* stats, RowNormShape shape,
+                       T* grad_x,       // [n_rows, channels]
+                       T* grad_branch,  // [n_rows, channels]
+                       T* branch_sum,   // [channels]
+                       NormGrads<T> branch_grads, NormGrads<T> grads, const Parallel& parallel);
+
+// out[c] = sum over rows of x[row, c].
+template <typename T>
+void sum_rows(const T* x, RowNormShape shape, T* out, const Parallel& parallel);
+
 }  // namespace cpu
 
 // The same on the device of `stream`. In and Out are float or a 16-bit format, computed in float; or both double.
@@ -51,6 +89,22 @@ template <typename In, typename Out>
 void row_norm_vjp(const Out* grad, const In* x, const Sum<In>* weight, const Sum<In>* stats,
                   RowNormShape shape, In* grad_x, Sum<In>* grad_weight, Sum<In>* grad_bias,
                   const Workspace& workspace, Stream stream);
+
+// T is float or a 16-bit format, and the residual stream float; or all are double.
+template <typename T>
+void residual_norm(const Sum<T>* x, const T* branch, const Sum<T>* keep, NormWeights<Sum<T>> branch_norm,
+                   NormWeights<Sum<T>> norm, RowNormShape shape, double eps, Sum<T>* sum, T* out, Sum<T>* branch_stats,
+                   Sum<T>* stats, Stream stream);
+
+template <typename T>
+void residual_norm_vjp(const Sum<T>* grad_sum, const T* grad_out, const T* branch, const Sum<T>* sum, const Sum<T>* keep,
+                       const Sum<T>* branch_weight, const Sum<T>* weight, const Sum<T>* branch_stats,
+                       const Sum<T>* stats, RowNormShape shape, Sum<T>* grad_x, T* grad_branch, Sum<T>* branch_sum,
+                       NormGrads<Sum<T>> branch_grads, NormGrads<Sum<T>> grads, const Workspace& workspace,
+                       Stream stream);
+
+template <typename T>
+void sum_rows(const T* x, RowNormShape shape, Sum<T>* out, const Workspace& workspace, Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

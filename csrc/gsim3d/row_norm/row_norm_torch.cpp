@@ -1,4 +1,6 @@
+#include <initializer_list>
 #include <optional>
+#include <tuple>
 #include <type_traits>
 
 #include "gsim3d/row_norm/row_norm.h"
@@ -99,9 +101,155 @@ std::tuple<Tensor, Tensor, Tensor> row_norm_backward(const Tensor& grad_, const 
   return {grad_x, grad_weight, grad_bias};
 }
 
+// A tensor that may be absent, contiguous and checked.
+class Optional {
+ public:
+  Optional(const char* op, const char* name, const std::optional<Tensor>& tensor, const Tensor& like, ScalarType type,
+           std::initializer_list<int64_t> sizes, const char* wanted) {
+    if (!tensor) return;
+    value_ = rows_of(*tensor);
+    check_shape(op, name, *value_, sizes, wanted);
+    check_dtype(op, name, *value_, type);
+    check_device(op, name, *value_, like);
+  }
+  explicit operator bool() const { return value_.has_value(); }
+  template <typename T>
+  const T* pointer() const {
+    return value_ ? data<T>(*value_) : nullptr;
+  }
+
+ private:
+  std::optional<Tensor> value_;
+};
+
+// Calls f.template operator()<T>() for the dtype of the branch; x has the dtype that its sums have.
+template <typename F>
+void dispatch_branch(const char* op, const Tensor& branch, const F& f) {
+  if constexpr (kWithCuda) {
+    if (branch.is_cuda() && branch.scalar_type() == ScalarType::Half) return f.template operator()<Float16>();
+    if (branch.is_cuda() && branch.scalar_type() == ScalarType::BFloat16) return f.template operator()<BFloat16>();
+  }
+  dispatch_float(op, "branch", branch, f);
+}
+
+template <typename T>
+constexpr bool kOnCpu = std::is_floating_point_v<T>;
+
+std::tuple<Tensor, Tensor, Tensor, Tensor> residual_norm(const Tensor& x_, const Tensor& branch_,
+                                                         const std::optional<Tensor>& keep_,
+                                                         const std::optional<Tensor>& branch_weight_,
+                                                         const std::optional<Tensor>& branch_bias_,
+                                                         const std::optional<Tensor>& weight_,
+                                                         const std::optional<Tensor>& bias_, double eps) {
+  const char* op = "residual_norm";
+  check_shape(op, "x", x_, {-1, -1}, "[N, C]");
+  const int64_t n = x_.size(0), c = x_.size(1);
+  check_shape(op, "branch", branch_, {n, c}, "[N, C] like x");
+  const Tensor x = rows_of(x_), branch = rows_of(branch_);
+  const ScalarType type = sum_type(branch);
+  check_dtype(op, "x", x, type);
+  check_device(op, "branch", branch, x);
+  check(branch_weight_.has_value() == branch_bias_.has_value() && weight_.has_value() == bias_.has_value(), op,
+        ": a norm needs both a weight and a bias");
+  check(eps > 0, op, ": eps must be positive; got ", eps);
+  const Optional keep(op, "keep", keep_, x, type, {n, 1}, "[N, 1]");
+  const Optional branch_weight(op, "branch_weight", branch_weight_, x, type, {c}, "[C]");
+  const Optional branch_bias(op, "branch_bias", branch_bias_, x, type, {c}, "[C]");
+  const Optional weight(op, "weight", weight_, x, type, {c}, "[C]"), bias(op, "bias", bias_, x, type, {c}, "[C]");
+  const RowNormShape shape{n, c};
+  Tensor sum = empty(x, {n, c}), out = empty(branch, {n, c});
+  Tensor branch_stats = empty(x, {branch_weight ? n : 0, 2}), stats = empty(x, {weight ? n : 0, 2});
+  dispatch_branch(op, branch, [&]<typename T>() {
+    using S = Sum<T>;
+    const NormWeights<S> branch_norm{branch_weight.pointer<S>(), branch_bias.pointer<S>()},
+        norm{weight.pointer<S>(), bias.pointer<S>()};
+    if constexpr (kWithCuda)
+      if (x.is_cuda())
+        return cuda::residual_norm<T>(data<S>(x), data<T>(branch), keep.pointer<S>(), branch_norm, norm, shape, eps,
+                                      mutable_data<S>(sum), mutable_data<T>(out), mutable_data<S>(branch_stats),
+                                      mutable_data<S>(stats), current_stream(x));
+    if constexpr (kOnCpu<T>)
+      cpu::residual_norm<T>(data<T>(x), data<T>(branch), keep.pointer<T>(), branch_norm, norm, shape, eps,
+                            mutable_data<T>(sum), mutable_data<T>(out), mutable_data<T>(branch_stats),
+                            mutable_data<T>(stats), torch_parallel());
+  });
+  return {sum, out, branch_stats, stats};
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> residual_norm_backward(
+    const std::optional<Tensor>& grad_sum_, const std::optional<Tensor>& grad_out_, const Tensor& branch_,
+    const Tensor& sum_, const std::optional<Tensor>& keep_, const std::optional<Tensor>& branch_weight_,
+    const std::optional<Tensor>& weight_, const Tensor& branch_stats_, const Tensor& stats_) {
+  const char* op = "residual_norm_backward";
+  check_shape(op, "sum", sum_, {-1, -1}, "[N, C]");
+  const int64_t n = sum_.size(0), c = sum_.size(1);
+  check_shape(op, "branch", branch_, {n, c}, "[N, C] like sum");
+  const Tensor sum = rows_of(sum_), branch = rows_of(branch_), branch_stats = rows_of(branch_stats_),
+               stats = rows_of(stats_);
+  const ScalarType type = sum_type(branch);
+  check_dtype(op, "sum", sum, type);
+  check_device(op, "branch", branch, sum);
+  const Optional grad_sum(op, "grad_sum", grad_sum_, sum, type, {n, c}, "[N, C] like sum");
+  const Optional grad_out(op, "grad_out", grad_out_, sum, branch.scalar_type(), {n, c}, "[N, C] like sum");
+  const Optional keep(op, "keep", keep_, sum, type, {n, 1}, "[N, 1]");
+  const Optional branch_weight(op, "branch_weight", branch_weight_, sum, type, {c}, "[C]");
+  const Optional weight(op, "weight", weight_, sum, type, {c}, "[C]");
+  check_shape(op, "branch_stats", branch_stats, {branch_weight ? n : 0, 2}, "[N, 2]");
+  check_shape(op, "stats", stats, {weight ? n : 0, 2}, "[N, 2]");
+  check_dtype(op, "branch_stats", branch_stats, type);
+  check_dtype(op, "stats", stats, type);
+  check_device(op, "branch_stats", branch_stats, sum);
+  check_device(op, "stats", stats, sum);
+  Tensor grad_x = empty(sum, {n, c}), grad_branch = empty(branch, {n, c}), branch_sum = empty(sum, {c});
+  const int64_t c_branch = branch_weight ? c : 0, c_norm = weight ? c : 0;
+  Tensor of_branch_weight = empty(sum, {c_branch}), of_branch_bias = empty(sum, {c_branch}),
+         of_weight = empty(sum, {c_norm}), of_bias = empty(sum, {c_norm});
+  dispatch_branch(op, branch, [&]<typename T>() {
+    using S = Sum<T>;
+    const NormGrads<S> branch_grads = branch_weight
+        ? NormGrads<S>{mutable_data<S>(of_branch_weight), mutable_data<S>(of_branch_bias)} : NormGrads<S>{};
+    const NormGrads<S> grads =
+        weight ? NormGrads<S>{mutable_data<S>(of_weight), mutable_data<S>(of_bias)} : NormGrads<S>{};
+    const RowNormShape shape{n, c};
+    if constexpr (kWithCuda)
+      if (sum.is_cuda())
+        return cuda::residual_norm_vjp<T>(
+            grad_sum.pointer<S>(), grad_out.pointer<T>(), data<T>(branch), data<S>(sum), keep.pointer<S>(),
+            branch_weight.pointer<S>(), weight.pointer<S>(), data<S>(branch_stats), data<S>(stats), shape,
+            mutable_data<S>(grad_x), mutable_data<T>(grad_branch), mutable_data<S>(branch_sum), branch_grads, grads,
+            TensorWorkspace(sum), current_stream(sum));
+    if constexpr (kOnCpu<T>)
+      cpu::residual_norm_vjp<T>(grad_sum.pointer<T>(), grad_out.pointer<T>(), data<T>(branch), data<T>(sum),
+                                keep.pointer<T>(), branch_weight.pointer<T>(), weight.pointer<T>(),
+                                data<T>(branch_stats), data<T>(stats), shape, mutable_data<T>(grad_x),
+                                mutable_data<T>(grad_branch), mutable_data<T>(branch_sum), branch_grads, grads,
+                                torch_parallel());
+  });
+  return {grad_x, grad_branch, branch_sum, of_branch_weight, of_branch_bias, of_weight, of_bias};
+}
+
+Tensor linear_grad_bias(const Tensor& grad_) {
+  const char* op = "linear_grad_bias";
+  check_shape(op, "grad", grad_, {-1, -1}, "[N, C]");
+  const Tensor grad = rows_of(grad_);
+  Tensor out = empty(grad, {grad.size(1)}, sum_type(grad));
+  dispatch_branch(op, grad, [&]<typename T>() {
+    const RowNormShape shape{grad.size(0), grad.size(1)};
+    if constexpr (kWithCuda)
+      if (grad.is_cuda())
+        return cuda::sum_rows<T>(data<T>(grad), shape, mutable_data<Sum<T>>(out), TensorWorkspace(grad),
+                                 current_stream(grad));
+    if constexpr (kOnCpu<T>) cpu::sum_rows<T>(data<T>(grad), shape, mutable_data<T>(out), torch_parallel());
+  });
+  return out;
+}
+
 void kernels(auto& m) {
   m.impl("row_norm", TORCH_BOX(&row_norm));
   m.impl("row_norm_backward", TORCH_BOX(&row_norm_backward));
+  m.impl("residual_norm", TORCH_BOX(&residual_norm));
+  m.impl("residual_norm_backward", TORCH_BOX(&residual_norm_backward));
+  m.impl("linear_grad_bias", TORCH_BOX(&linear_grad_bias));
 }
 
 }  // namespace

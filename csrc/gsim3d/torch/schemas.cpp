@@ -46,6 +46,17 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   m.def(
       "row_norm_backward(Tensor grad, Tensor x, Tensor weight, Tensor stats) -> (Tensor x, Tensor weight, Tensor bias)");
 
+  // residual_norm: sum = x + keep * norm(branch), out = norm(sum) in the dtype of branch; a norm without weight is left out.
+  // Of the gradient, branch_sum is that of a bias of the layer that made the branch.
+  m.def(
+      "residual_norm(Tensor x, Tensor branch, Tensor? keep, Tensor? branch_weight, Tensor? branch_bias, Tensor? weight, "
+      "Tensor? bias, float eps) -> (Tensor sum, Tensor out, Tensor branch_stats, Tensor stats)");
+  m.def(
+      "residual_norm_backward(Tensor? grad_sum, Tensor? grad_out, Tensor branch, Tensor sum, Tensor? keep, "
+      "Tensor? branch_weight, Tensor? weight, Tensor branch_stats, Tensor stats) -> (Tensor x, Tensor branch, "
+      "Tensor branch_sum, Tensor branch_weight, Tensor branch_bias, Tensor weight, Tensor bias)");
+  m.def("linear_grad_bias(Tensor grad) -> Tensor");
+
   // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
   m.def(
       "plane_sweep(Tensor features, Tensor homographies, Tensor translations, Tensor inverse_depths, Tensor src_images, "

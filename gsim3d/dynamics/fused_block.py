@@ -1,0 +1,206 @@
+"""A block of the network for GPUs: the same numbers as its modules, in few launches and with one node of autograd.
+
+The residual stream is float32; what matrix products, convolution and attention read has the dtype of ``torch.autocast``.
+Everything between them is done by ``residual_norm`` in one pass over the rows. Gradients are written out below, for a
+backward pass in as few launches.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
+
+from gsim3d.layers import rounded_weights, row_linear
+from gsim3d.ops.curve import PatchTable, Stage
+
+_ops = torch.ops.gsim3d
+_autocast = torch._C.DispatchKeySet(torch._C.DispatchKey.AutocastCUDA) | torch._C.DispatchKeySet(
+    torch._C.DispatchKey.AutocastCPU
+)
+
+
+class Plan(NamedTuple):
+    """What a block is told besides tensors that have gradients."""
+
+    stage: Stage
+    patches: PatchTable
+    kernel_size: int
+    reads_lowest: bool
+    heads: int
+    eps: float
+    recompute: bool
+
+    def geometry(self) -> tuple:
+        voxels, taps = self.stage.voxels, self.stage.kernel_maps[self.kernel_size]
+        return (voxels.row_voxel, voxels.rows, voxels.cu_rows, taps.tap_in, taps.tap_out, taps.cu_taps, self.reads_lowest)
+
+    def table(self) -> tuple[Tensor, ...]:
+        return self.patches.q_rows, self.patches.kv_rows, self.patches.cu_q, self.patches.cu_k
+
+
+class Weights(NamedTuple):
+    conv: Tensor
+    conv_bias: Tensor
+    linear: Tensor
+    linear_bias: Tensor
+    qkv: Tensor
+    qkv_bias: Tensor
+    proj: Tensor
+    proj_bias: Tensor
+    fc1: Tensor
+    fc1_bias: Tensor
+    fc2: Tensor
+    fc2_bias: Tensor
+    position_norm: Tensor
+    position_norm_bias: Tensor
+    norm1: Tensor
+    norm1_bias: Tensor
+    norm2: Tensor
+    norm2_bias: Tensor
+
+
+N_ROUNDED = 12  # of the weights are read in the dtype of the products
+
+
+class Kept(NamedTuple):
+    """What the backward pass reads."""
+
+    place: Tensor  # of the convolution
+    position: Tensor  # of the linear layer behind it
+    sum1: Tensor
+    normed1: Tensor
+    position_stats: Tensor
+    stats1: Tensor
+    qkv: Tensor
+    attended: Tensor
+    attention_stats: Tensor
+    sum2: Tensor
+    normed2: Tensor
+    stats2: Tensor
+    hidden: Tensor
+    activated: Tensor
+
+
+def product_dtype(x: Tensor) -> torch.dtype:
+    """The dtype of matrix products of ``x``."""
+    follows = x.is_cuda and x.dtype != torch.float64 and torch.is_autocast_enabled("cuda")
+    return torch.get_autocast_dtype("cuda") if follows else x.dtype
+
+
+def run_block(block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keeps: list, recompute: bool):
+    """(x, what the next convolution reads) behind a ``point_transformer.Block``.
+
+    x [N, C]; conv_input [N, C] in the dtype of the products; keeps: factors [N, 1] of the rows' branches or None.
+    """
+    conv, attention, mlp, position = block.position.conv, block.attention, block.mlp, block.position
+    plan = Plan(stage, stage.patches[row], conv.kernel_size, conv.duplicates == "first", attention.heads, block.norm1.eps,
+                recompute)  # fmt: skip
+    layers = (conv, position.linear, attention.qkv, attention.proj, mlp.fc1, mlp.fc2)
+    norms = (position.norm, block.norm1, block.norm2)
+    rounded = [t for layer in layers for t in rounded_weights(layer, conv_input.dtype)]
+    of_norms = [t for norm in norms for t in (norm.weight, norm.bias)]
+    if torch.is_grad_enabled():
+        weights = [t for layer in layers for t in (layer.weight, layer.bias)]
+        out = _Block.apply(plan, Weights(*rounded, *of_norms), x, conv_input, *keeps, *weights, *of_norms)
+    else:
+        with torch._C._AutoDispatchBelowAutograd(), torch._C._ExcludeDispatchKeyGuard(_autocast):
+            out = _forward(plan, Weights(*rounded, *of_norms), x, conv_input, *keeps)[0]
+    return out if len(out) == 2 else (out[0], out[0])
+
+
+def _forward(plan: Plan, w: Weights, x: Tensor, conv_input: Tensor, keep_attention, keep_mlp):
+    """(sum,) or (sum, sum in the dtype of the products); Kept."""
+    place = _ops.sparse_conv.default(conv_input, w.conv, w.conv_bias, *plan.geometry())
+    position = row_linear(place, w.linear, w.linear_bias)
+    norm, norm1, norm2 = (w.position_norm, w.position_norm_bias), (w.norm1, w.norm1_bias), (w.norm2, w.norm2_bias)
+    sum1, normed1, position_stats, stats1 = _ops.residual_norm.default(x, position, None, *norm, *norm1, plan.eps)
+    qkv = row_linear(normed1, w.qkv, w.qkv_bias)
+    q, k, v = _heads(qkv, plan.heads)
+    attended, attention_stats = _ops.patch_attention.default(q, k, v, *plan.table(), q.shape[-1] ** -0.5)
+    branch = row_linear(attended.flatten(1), w.proj, w.proj_bias)
+    sum2, normed2, _, stats2 = _ops.residual_norm.default(sum1, branch, keep_attention, None, None, *norm2, plan.eps)
+    hidden = row_linear(normed2, w.fc1, w.fc1_bias)
+    activated = F.gelu(hidden)
+    branch = row_linear(activated, w.fc2, w.fc2_bias)
+    if branch.dtype == x.dtype:
+        out = (sum2 + (branch if keep_mlp is None else branch * keep_mlp),)
+    else:
+        out = _ops.residual_norm.default(sum2, branch, keep_mlp, None, None, None, None, plan.eps)[:2]
+    return out, Kept(place, position, sum1, normed1, position_stats, stats1, qkv, attended, attention_stats, sum2, normed2,
+                     stats2, hidden, activated)  # fmt: skip
+
+
+def _heads(qkv: Tensor, heads: int) -> tuple[Tensor, ...]:
+    return qkv.view(qkv.shape[0], 3, heads, -1).unbind(1)
+
+
+def _linear_grads(grad: Tensor, x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of input and weight of ``x @ weight.T``; the second in the dtype of sums."""
+    wide = torch.promote_types(grad.dtype, torch.float32)
+    if wide == grad.dtype:
+        return grad @ weight, grad.t() @ x
+    return grad @ weight, torch.mm(grad.t(), x, out_dtype=wide)
+
+
+def _backward(plan: Plan, w: Weights, kept: Kept, conv_input: Tensor, keep_attention, keep_mlp, grad_sum, grad_out):
+    """Gradients of x, conv_input and all weights, in their order."""
+    # Without a norm of the branch the op reads only the dtype of the branch: any tensor like it will do.
+    grad2, grad_branch, fc2_bias, *_ = _ops.residual_norm_backward.default(
+        grad_sum, grad_out, kept.normed2, kept.sum2, keep_mlp, None, None, kept.stats2[:0], kept.stats2[:0]
+    )
+    grad_activated, fc2 = _linear_grads(grad_branch, kept.activated, w.fc2)
+    grad_hidden = torch.ops.aten.gelu_backward.default(grad_activated, kept.hidden)
+    grad_normed, fc1 = _linear_grads(grad_hidden, kept.normed2, w.fc1)
+    fc1_bias = _ops.linear_grad_bias.default(grad_hidden)
+
+    grad1, grad_branch, proj_bias, _, _, norm2, norm2_bias = _ops.residual_norm_backward.default(
+        grad2, grad_normed, kept.normed2, kept.sum2, keep_attention, None, w.norm2, kept.stats2[:0], kept.stats2
+    )
+    grad_attended, proj = _linear_grads(grad_branch, kept.attended.flatten(1), w.proj)
+    q, k, v = _heads(kept.qkv, plan.heads)
+    grads = _ops.patch_attention_backward.default(
+        grad_attended.view(q.shape), q, k, v, kept.attended, kept.attention_stats, *plan.table(), q.shape[-1] ** -0.5
+    )
+    grad_qkv = torch.stack(grads, 1).flatten(1)
+    grad_normed, qkv = _linear_grads(grad_qkv, kept.normed1, w.qkv)
+    qkv_bias = _ops.linear_grad_bias.default(grad_qkv)
+
+    grad_x, grad_position, linear_bias, *of_norms = _ops.residual_norm_backward.default(
+        grad1, grad_normed, kept.position, kept.sum1, None, w.position_norm, w.norm1, kept.position_stats, kept.stats1
+    )
+    grad_place, linear = _linear_grads(grad_position, kept.place, w.linear)
+    grad_input = _ops.sparse_conv_grad_input.default(grad_place, w.conv, *plan.geometry())
+    conv, conv_bias = _ops.sparse_conv_grad_weight.default(grad_place, conv_input, plan.kernel_size, *plan.geometry())
+    wide = grad_x.dtype
+    of_layers = conv.to(wide), conv_bias.to(wide), linear, linear_bias, qkv, qkv_bias, proj, proj_bias, fc1, fc1_bias, fc2
+    return grad_x, grad_input, *of_layers, fc2_bias, *of_norms, norm2, norm2_bias
+
+
+class _Block(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, plan, weights, x, conv_input, keep_attention, keep_mlp, *parameters):
+        with torch._C._AutoDispatchBelowAutograd(), torch._C._ExcludeDispatchKeyGuard(_autocast):
+            out, kept = _forward(plan, weights, x, conv_input, keep_attention, keep_mlp)
+        ctx.plan, ctx.weights = plan, weights
+        ctx.set_materialize_grads(False)
+        # The parameters are saved for torch to notice if they change before the backward pass.
+        ctx.save_for_backward(x, conv_input, keep_attention, keep_mlp, *(() if plan.recompute else kept), *parameters)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad_sum, grad_out=None):
+        x, conv_input, keep_attention, keep_mlp, *saved = ctx.saved_tensors
+        with torch._C._AutoDispatchBelowAutograd(), torch._C._ExcludeDispatchKeyGuard(_autocast):
+            if ctx.plan.recompute:
+                kept = _forward(ctx.plan, ctx.weights, x, conv_input, keep_attention, keep_mlp)[1]
+            else:
+                kept = Kept(*saved[: len(Kept._fields)])
+            grads = _backward(
+                ctx.plan, ctx.weights, kept, conv_input, keep_attention, keep_mlp, grad_sum, grad_out
+            )
+        return None, None, *grads[:2], None, None, *grads[2:]

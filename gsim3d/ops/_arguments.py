@@ -1,0 +1,87 @@
+"""What an op asks of its arguments before its kernel sees them.
+
+The kernels check shapes, dtypes and index lists. Here it is made sure that tensors are tensors of one device, and on
+the CPU that features and weights are numbers that an op can use; looking for those on a GPU would wait for it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsim3d.errors import HardCaseError
+
+# Sums of products of so large numbers are finite, forward and backward, for any size of a tensor.
+LARGEST = {torch.float32: 1e15, torch.float64: 1e150, torch.float16: 65504.0, torch.bfloat16: 1e15}
+
+
+def check_tensors(op: str, **tensors: Any) -> None:
+    """Raises TypeError, naming the argument, unless all are dense tensors on one device."""
+    if torch.compiler.is_compiling():
+        return
+    first = None
+    for name, value in tensors.items():
+        if not isinstance(value, Tensor):
+            raise TypeError(f"{op}: {name} must be a tensor; got {type(value).__name__}")
+        if value.layout != torch.strided:
+            raise TypeError(f"{op}: {name} must be a dense tensor; got {value.layout}")
+        first = first or (name, value.device)
+        if value.device != first[1]:
+            raise TypeError(f"{op}: {name} is on {value.device}, but {first[0]} on {first[1]}")
+
+
+def check_numbers(op: str, **tensors: Tensor | None) -> None:
+    """Raises HardCaseError, naming the argument and its row, where a number is not finite or too large.
+
+    None and tensors without numbers, or on a GPU, are passed over.
+    """
+    if torch.compiler.is_compiling():
+        return
+    for name, value in tensors.items():
+        if value is None or value.device.type != "cpu" or value.dtype not in LARGEST or value.numel() == 0:
+            continue
+        largest = LARGEST[value.dtype]
+        low, high = torch.aminmax(value.detach())
+        if not (low >= -largest and high <= largest):  # NaN is in neither range
+            _refuse(op, name, value.detach(), largest)
+
+
+def _refuse(op: str, name: str, value: Tensor, largest: float) -> None:
+    bad = ~(value.abs() <= largest)
+    row = int(bad.reshape(len(value), -1).any(1).nonzero()[0]) if value.dim() else 0
+    first = float(value[bad][0])
+    raise HardCaseError(
+        f"{op}: {name} must be finite and at most {largest:g} in size; got {first:g} in row {row}", tensor=name, row=row
+    )
+
+
+def within_memory(op: str, what: str, kernel, *arguments):
+    """``kernel(*arguments)``. Raises MemoryError, naming the argument ``what``, where its result finds no room."""
+    try:
+        return kernel(*arguments)
+    except RuntimeError as error:
+        if "new_empty" in str(error) and not torch.compiler.is_compiling():  # torch's allocator, which says no more
+            raise MemoryError(f"{op}: there is no memory for the result of {what}") from None
+        raise
+
+
+def check_whole(op: str, **numbers: Any) -> None:
+    """Raises TypeError or ValueError, naming the argument, unless all are whole numbers that 64 bits hold."""
+    if torch.compiler.is_compiling():
+        return
+    for name, value in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, (int, torch.SymInt)):
+            raise TypeError(f"{op}: {name} must be a whole number; got {value!r}")
+        if isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise ValueError(f"{op}: {name} must fit into 64 bits; got {value}")
+
+
+def check_real(op: str, **numbers: Any) -> None:
+    """Raises TypeError, naming the argument, unless all are numbers."""
+    if torch.compiler.is_compiling():
+        return
+    for name, value in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, (int, float, torch.SymInt, torch.SymFloat)):
+            raise TypeError(f"{op}: {name} must be a number; got {value!r}")

@@ -1,0 +1,305 @@
+"""Every op: good arguments of random sizes, of which up to three are mutated."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import random
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsim3d import ops
+from gsim3d.types import Cameras
+from tests.stability.fuzz.engine import Failure, Target, finite
+from tests.stability.fuzz.poison import mutate, tensor
+
+EXPECTED = (ValueError, TypeError, MemoryError)
+Arguments = dict[str, Any]
+STRUCTURES = ("cameras", "voxels", "kernel_map", "table", "spec")  # arguments that hold the others
+
+
+def _size(rng: random.Random, most: int = 12) -> int:
+    return rng.choice((0, 1, 1, 2, 3, 5, 8, most))
+
+
+def _dtype(rng: random.Random) -> torch.dtype:
+    return rng.choice((torch.float32, torch.float32, torch.float64))
+
+
+def _offsets(rng: random.Random, total: int, parts: int) -> Tensor:
+    """[parts + 1] from 0 to ``total``, ascending."""
+    cuts = sorted(rng.randint(0, total) for _ in range(max(0, parts - 1)))
+    return torch.tensor([0, *cuts, total] if parts else [0])
+
+
+def _permutation(rng: random.Random, n: int) -> Tensor:
+    return torch.tensor(rng.sample(range(n), n), dtype=torch.int64)
+
+
+def _curve_encode(rng: random.Random) -> Arguments:
+    n = _size(rng)
+    grid = torch.tensor([[rng.randrange(2**16) for _ in range(3)] for _ in range(n)], dtype=torch.int64).reshape(n, 3)
+    cloud = torch.tensor([rng.randrange(8) for _ in range(n)], dtype=torch.int64)
+    curve = rng.choice((*ops.CURVES, ("z", "hilbert")))
+    return {
+        "grid": grid,
+        "cloud": rng.choice((cloud, None)),
+        "curve": curve,
+        "depth": 16,
+        "shift": rng.choice((None, 48)),
+    }
+
+
+def _curve_sort(rng: random.Random) -> Arguments:
+    n, rows = rng.choice((0, 1, 9)), rng.choice((0, 1, 3))
+    codes = [rng.randrange(2 ** rng.choice((2, 20, 62))) for _ in range(rows * n)]
+    return {"codes": torch.tensor(codes, dtype=torch.int64).reshape(rows, n)}
+
+
+def _pyramid(rng: random.Random) -> Arguments:
+    n, clouds, bits = _size(rng, 40), rng.choice((1, 2, 4)), 2
+    scenes = torch.arange(clouds) // 2
+    return {
+        "positions": tensor(rng, n, 3, dtype=_dtype(rng)).abs(),
+        "cu_rows": _offsets(rng, n, clouds),
+        "cloud_scene": scenes,
+        "cloud_slot": torch.arange(clouds) % 2 + 2,
+        "origin": torch.zeros((clouds + 1) // 2, 3, dtype=torch.float64),
+        "grid_size": 0.1,
+        "slot_bits": bits,
+        "strides": (2, 4),
+        "merge_windows": (2, 2),
+        "patch_sizes": (16, 8, 4),
+        "kernel_sizes": ((5, 3), (3,), (3,)),
+        "release": rng.random() < 0.2,
+        "curves": rng.choice((None, ((0, 1, 2, 3),) * 3, ((3, 2, 1, 0),) * 3)),
+    }
+
+
+def _call_pyramid(a: Arguments):
+    spec = ops.PyramidSpec(**{f.name: a[f.name] for f in dataclasses.fields(ops.PyramidSpec)})
+    first = [a[name] for name in ("positions", "cu_rows", "cloud_scene", "cloud_slot", "origin")]
+    return ops.build_pyramid(*first, spec, curves=a["curves"])
+
+
+def _geometry(rng: random.Random, n: int, kernel_size: int) -> tuple[ops.Voxels, ops.KernelMap]:
+    sizes = ops.PyramidSpec(0.5, 0, (), (), (8,), ((kernel_size,),))
+    zero, origin = torch.zeros(1, dtype=torch.int64), torch.zeros(1, 3, dtype=torch.float64)
+    stage = ops.build_pyramid(tensor(rng, n, 3).abs(), torch.tensor([0, n]), zero, zero, origin, sizes).stages[0]
+    return stage.voxels, stage.kernel_maps[kernel_size]
+
+
+def _sparse_conv(rng: random.Random) -> Arguments:
+    n, k, c_in, c_out, dtype = (
+        _size(rng),
+        rng.choice((1, 3, 3, 5)),
+        rng.choice((1, 3, 8)),
+        rng.choice((1, 4)),
+        _dtype(rng),
+    )
+    voxels, kernel_map = _geometry(rng, n, k)
+    return {
+        "x": tensor(rng, n, c_in, dtype=dtype),
+        "weight": tensor(rng, c_out, k, k, k, c_in, dtype=dtype),
+        "bias": rng.choice((tensor(rng, c_out, dtype=dtype), None)),
+        **{name: getattr(voxels, name) for name in ("row_voxel", "rows", "cu_rows")},
+        **{name: getattr(kernel_map, name) for name in ("kernel_size", "tap_in", "tap_out", "cu_taps")},
+        "duplicates": rng.choice(("mean", "first")),
+    }
+
+
+def _call_sparse_conv(a: Arguments):
+    voxels = ops.Voxels(a["row_voxel"], a["rows"], a["cu_rows"])
+    kernel_map = ops.KernelMap(a["kernel_size"], a["tap_in"], a["tap_out"], a["cu_taps"])
+    return ops.sparse_conv(a["x"], a["weight"], a["bias"], voxels, kernel_map, duplicates=a["duplicates"])
+
+
+def _patch_attention(rng: random.Random) -> Arguments:
+    n_q, n_k, heads, dim, dtype = _size(rng), _size(rng), rng.choice((1, 2)), rng.choice((4, 16, 20)), _dtype(rng)
+    patches, n_list = rng.choice((1, 2, 5)), rng.choice((0, 1, 9)) if n_k else 0
+    return {
+        "q": tensor(rng, n_q, heads, dim, dtype=dtype),
+        "k": tensor(rng, n_k, heads, dim, dtype=dtype),
+        "v": tensor(rng, n_k, heads, dim, dtype=dtype),
+        "q_rows": _permutation(rng, n_q),
+        "kv_rows": torch.tensor([rng.randrange(n_k) for _ in range(n_list)], dtype=torch.int64),
+        "cu_q": _offsets(rng, n_q, patches),
+        "cu_k": _offsets(rng, n_list, patches),
+        "scale": rng.choice((None, 1.0, 0.1)),
+    }
+
+
+def _call_patch_attention(a: Arguments):
+    table = ops.PatchTable(a["q_rows"], a["kv_rows"], a["cu_q"], a["cu_k"])
+    return ops.patch_attention(a["q"], a["k"], a["v"], table, scale=a["scale"])
+
+
+def _pool(rng: random.Random) -> Arguments:
+    n, segments = _size(rng), rng.choice((0, 1, 3))
+    rows = _permutation(rng, n)[: n if segments else 0]
+    return {
+        "x": tensor(rng, n, rng.choice((1, 3, 17)), dtype=_dtype(rng)),
+        "rows": rows,
+        "cu_rows": _offsets(rng, len(rows), segments),
+    }
+
+
+def _unpool(rng: random.Random) -> Arguments:
+    arguments = _pool(rng)
+    n, segments = len(arguments["x"]), len(arguments["cu_rows"]) - 1
+    return {**arguments, "x": tensor(rng, segments, 5, dtype=_dtype(rng)), "n_rows": n}
+
+
+def _row_norm(rng: random.Random) -> Arguments:
+    n, channels, dtype = _size(rng), rng.choice((1, 4, 33)), _dtype(rng)
+    return {
+        "x": tensor(rng, n, channels, dtype=dtype),
+        "weight": tensor(rng, channels, dtype=dtype),
+        "bias": tensor(rng, channels, dtype=dtype),
+        "residual": rng.choice((None, tensor(rng, n, channels, dtype=dtype))),
+        "eps": 1e-5,
+    }
+
+
+def _cameras(rng: random.Random, images: int) -> dict[str, Tensor]:
+    viewmats = torch.eye(4).repeat(images, 1, 1)
+    viewmats[:, :3, 3] = tensor(rng, images, 3, scale=0.1)
+    viewmats[:, 2, 3] += 2
+    K = torch.tensor([[10.0, 0.0, 5.0], [0.0, 11.0, 4.0], [0.0, 0.0, 1.0]])
+    return {"viewmats": viewmats, "Ks": K.repeat(images, 1, 1)}
+
+
+def _sources(rng: random.Random, images: int) -> dict[str, Tensor]:
+    pairs = [[j for j in range(images) if rng.random() < 0.6] for _ in range(images)]
+    return {
+        "src_images": torch.tensor([j for own in pairs for j in own], dtype=torch.int64),
+        "cu_src": torch.tensor([0, *(len(own) for own in pairs)]).cumsum(0),
+    }
+
+
+def _sweep_geometry(rng: random.Random) -> Arguments:
+    images = rng.choice((0, 1, 2, 3))
+    return {**_cameras(rng, images), **_sources(rng, images), "Ks_target": None}
+
+
+def _plane_sweep(rng: random.Random) -> Arguments:
+    geometry = {name: value for name, value in _sweep_geometry(rng).items() if name != "Ks_target"}
+    homographies, translations = ops.sweep_geometry(**geometry)
+    images, depths, dtype = len(geometry["Ks"]), rng.choice((1, 4)), _dtype(rng)
+    return {
+        "features": tensor(rng, images, rng.choice((1, 5)), rng.choice((1, 4)), rng.choice((1, 6)), dtype=dtype),
+        "homographies": homographies.to(dtype),
+        "translations": translations.to(dtype),
+        "inverse_depths": tensor(rng, images, depths, dtype=dtype).abs() + 0.1,
+        "src_images": geometry["src_images"],
+        "cu_src": geometry["cu_src"],
+    }
+
+
+def _raster(rng: random.Random) -> Arguments:
+    n, images, clouds, dtype = _size(rng), rng.choice((0, 1, 2)), rng.choice((1, 2)), _dtype(rng)
+    degree = rng.choice((None, 0, 1, 3))
+    return {
+        "means": tensor(rng, n, 3, dtype=dtype, scale=0.5),
+        "quats": tensor(rng, n, 4, dtype=dtype),
+        "scales": tensor(rng, n, 3, dtype=dtype, scale=0.2).abs(),
+        "opacities": tensor(rng, n, dtype=dtype).sigmoid(),
+        **_cameras(rng, images),
+        "near": torch.full((images,), 0.1),
+        "far": torch.full((images,), 10.0),
+        "image_cloud": torch.tensor([rng.randrange(clouds) for _ in range(images)], dtype=torch.int64),
+        "width": rng.choice((1, 10, 17)),
+        "height": rng.choice((1, 8)),
+        "sh": None if degree is None else tensor(rng, n, (degree + 1) ** 2, 3, dtype=dtype, scale=0.3),
+        "colors": tensor(rng, n, 3, dtype=dtype).sigmoid() if degree is None else None,
+        "features": rng.choice((None, tensor(rng, n, 2, dtype=dtype))),
+        "background": rng.choice((None, torch.ones(3, dtype=dtype))),
+        "cu_rows": _offsets(rng, n, clouds),
+        "near_plane": 0.01,
+        "cutoff": rng.choice(("exact", "exact", "tile3sigma", "smooth")),
+        "on_bad": rng.choice(("raise", "raise", "drop", "clamp")),
+    }
+
+
+CAMERA = ("viewmats", "Ks", "near", "far", "image_cloud", "width", "height")
+
+
+def _call_raster(a: Arguments):
+    cameras = Cameras(**{name: a[name] for name in CAMERA})
+    first = [a[name] for name in ("means", "quats", "scales", "opacities")]
+    options = {
+        name: value for name, value in a.items() if name not in (*CAMERA, "means", "quats", "scales", "opacities")
+    }
+    return tuple(ops.rasterize_gaussians(*first, cameras, **options))
+
+
+# op -> (good arguments, the call)
+OPS: dict[str, tuple[Callable[[random.Random], Arguments], Callable[[Arguments], Any]]] = {
+    "curve_encode": (_curve_encode, lambda a: ops.curve_encode(**a)),
+    "curve_sort": (_curve_sort, lambda a: ops.curve_sort(**a)),
+    "build_pyramid": (_pyramid, _call_pyramid),
+    "sparse_conv": (_sparse_conv, _call_sparse_conv),
+    "patch_attention": (_patch_attention, _call_patch_attention),
+    "pool_max": (_pool, lambda a: ops.pool_max(**a)),
+    "pool_mean": (_pool, lambda a: ops.pool_mean(**a)),
+    "unpool": (_unpool, lambda a: ops.unpool(**a)),
+    "row_norm": (_row_norm, lambda a: ops.row_norm(**a)),
+    "plane_sweep": (_plane_sweep, lambda a: ops.plane_sweep(**a)),
+    "sweep_geometry": (_sweep_geometry, lambda a: ops.sweep_geometry(**a)),
+    "rasterize_gaussians": (_raster, _call_raster),
+}
+
+
+def _make(name: str, rng: random.Random, folder: Path) -> Arguments:
+    arguments = OPS[name][0](rng)
+    for argument in rng.sample(sorted(arguments), min(len(arguments), rng.choice((0, 1, 1, 1, 2, 3)))):
+        arguments[argument] = mutate(arguments[argument], rng)
+    return arguments
+
+
+def _call(name: str, arguments: Arguments, folder: Path) -> None:
+    """Forward and backward; both must be finite where no error comes."""
+    leaves = {}
+    for argument, value in arguments.items():
+        is_leaf = isinstance(value, Tensor) and value.is_floating_point() and value.layout == torch.strided
+        leaves[argument] = value.detach().requires_grad_() if is_leaf else value
+    result = OPS[name][1](leaves)
+    finite(result)
+    outputs = [t for t in _tensors(result) if t.requires_grad and not t.is_meta]
+    if not outputs:
+        return
+    inputs = {name: t for name, t in leaves.items() if isinstance(t, Tensor) and t.requires_grad and not t.is_meta}
+    g = torch.Generator().manual_seed(0)
+    cotangents = [torch.randn(t.shape, generator=g, dtype=torch.float64).to(t) for t in outputs]
+    grads = torch.autograd.grad(outputs, list(inputs.values()), cotangents, allow_unused=True)
+    for (argument, value), grad in zip(inputs.items(), grads, strict=True):
+        if grad is not None:
+            finite(grad, f"gradient of {argument}")
+            if grad.shape != value.shape:
+                raise Failure(f"gradient of {argument} has shape {list(grad.shape)}, not {list(value.shape)}")
+
+
+def _tensors(value: Any) -> list[Tensor]:
+    if isinstance(value, Tensor):
+        return [value]
+    if isinstance(value, (tuple, list)):
+        return [t for item in value for t in _tensors(item)]
+    return []
+
+
+def _named(name: str, error: Exception, arguments: Arguments) -> bool:
+    """Whether the message names an argument."""
+    return any(argument in str(error) for argument in (*arguments, *STRUCTURES))
+
+
+def public_ops() -> set[str]:
+    """Names of the functions that gsim3d.ops exports and that compute something."""
+    return {name for name in ops.__all__ if inspect.isfunction(getattr(ops, name))} - {"cuda_compiled"}
+
+
+TARGETS = [Target(name, partial(_make, name), partial(_call, name), EXPECTED, partial(_named, name)) for name in OPS]

@@ -1,0 +1,75 @@
+"""Fuzzing (tests/stability/fuzz): no input may crash, hang, take memory without end or give a silent NaN."""
+
+import json
+import re
+
+import pytest
+
+from tests.stability.fuzz.engine import Outcome, make_case, replay, run, targets
+from tests.stability.fuzz.ops import OPS, public_ops
+
+FEW, PER_OP = 25, 2000  # inputs of each target in the fast tests, and in the full ones
+
+
+def assert_all_answered(outcomes: list[Outcome], count: int) -> None:
+    failed = [outcome for outcome in outcomes if outcome.failures]
+    assert not failed, "\n".join(map(str, failed))
+    for outcome in outcomes:
+        assert outcome.count == count == sum(outcome.answers.values()), outcome
+        # Inputs that are all refused, or all computed, test nothing.
+        assert 0.03 * count < outcome.answers.get("ok", 0) < 0.97 * count, outcome
+
+
+def test_every_public_op_is_fuzzed():
+    assert set(OPS) == public_ops() and set(OPS) <= set(targets())
+
+
+def test_ops_answer_a_few_inputs(tmp_path):
+    assert_all_answered(run(list(OPS), FEW, seed=1, out=tmp_path), FEW)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("half", [0, 1])
+def test_ops_answer_thousands_of_inputs(half, tmp_path):
+    assert_all_answered(run(sorted(OPS)[half::2], PER_OP, out=tmp_path), PER_OP)
+
+
+MISBEHAVIOUR = {
+    "_crash": "ended by SIGABRT",
+    "_hang": "hangs: no answer within 1 s",
+    "_memory": "RuntimeError at misbehaving.py.*allocate",
+    "_nan": r"result.x\[0\] is not finite",
+    "_unnamed": "ValueError does not say what is wrong",
+    "_untyped": "KeyError at misbehaving.py",
+}
+
+
+@pytest.fixture(scope="module")
+def misbehaved(tmp_path_factory):
+    outcomes = run(list(MISBEHAVIOUR), 6, out=tmp_path_factory.mktemp("misbehaved"), patience=1.0)
+    return {outcome.target: outcome for outcome in outcomes}
+
+
+@pytest.mark.parametrize("target", MISBEHAVIOUR)
+def test_the_engine_finds_what_must_not_happen_and_keeps_it(target, misbehaved):
+    outcome = misbehaved[target]
+    assert outcome.count == 6 and outcome.answers["ok"] >= 3
+    text, kept = outcome.failures[0]
+    assert re.search(MISBEHAVIOUR[target], text) and text.startswith("input 3:")
+    description = json.loads((kept / "case.json").read_text())
+    assert description["target"] == target and description["index"] == 3 and description["problem"] in text
+    assert (kept / "input" / "note.txt").read_text() == "a file of the input"
+    assert f"python -m tests.stability.fuzz --replay {kept}" in str(outcome)
+
+
+def test_a_kept_input_can_be_run_again(misbehaved):
+    kept = misbehaved["_unnamed"].failures[0][1]
+    answers = [replay(kept)[0] for _ in range(4)]
+    # A fresh process is good for three inputs; a replay tells what happens now.
+    assert answers == ["ok", "ok", "ok", "ValueError"]
+
+
+def test_inputs_are_a_function_of_seed_and_number(tmp_path):
+    target = targets()["_good"]
+    cases = [make_case(target, seed, index, tmp_path) for seed, index in ((7, 0), (7, 0), (8, 0), (7, 1))]
+    assert cases[0] == cases[1] and len(set(cases)) == 3
