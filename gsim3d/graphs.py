@@ -90,15 +90,17 @@ class CapturedRollout:
         self._simulator, self._n_steps, self._factor, self._copies = simulator, n_steps, factor, copies
         self._plan = plan or simulator.plan()
         self._report = simulator.report if report is None else report
+        self._report.poll()
         self._background = background
         prepared = simulator.prepare(state, self._plan)
         self._table = prepared.clouds
         self._state = prepared.with_clouds(self._table, **_clones(prepared.row_fields()), origin=prepared.origin.clone())
         self._cameras = None if cameras is None else cameras.map(torch.clone)
         self._device = prepared.means.device
-        dtype = torch.get_autocast_dtype("cuda") if torch.is_autocast_enabled("cuda") else None
-        self._dtype = dtype if self._device.type == "cuda" else None
-        self._model = simulator if self._dtype is None else _rounded(simulator, self._dtype)
+        kind = self._device.type
+        self._dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else None
+        rounds = self._dtype is not None and kind == "cuda"
+        self._model = _rounded(simulator, self._dtype) if rounds else simulator
         self.captures = 0
         self._launched = False
         self._prepare(self._observed())
@@ -117,6 +119,7 @@ class CapturedRollout:
 
     def launch(self, state: Particles, cameras: Cameras | None = None) -> None:
         """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background)."""
+        self._report.poll()
         state = self._simulator.prepare(state, self._plan)
         self._check(state)
         for name, value in self._state.row_fields().items():
@@ -141,7 +144,7 @@ class CapturedRollout:
 
     def reload(self) -> None:
         """Reads the weights of the simulator again."""
-        if self._dtype is not None:
+        if self._model is not self._simulator:
             with torch.no_grad():
                 for own, given in zip(_weights(self._model), _weights(self._simulator), strict=True):
                     own.copy_(given)
@@ -151,7 +154,8 @@ class CapturedRollout:
     def _rollout(self, geometry, report: StabilityReport) -> Predicted:
         """The rollout of the graph's own state."""
         plan = _with_background_as_it_is(self._plan)
-        autocast = torch.autocast("cuda", self._dtype, enabled=self._dtype is not None, cache_enabled=False)
+        enabled = self._dtype is not None
+        autocast = torch.autocast(self._device.type, self._dtype, enabled=enabled, cache_enabled=False)
         with torch.no_grad(), autocast:
             steps = self._model.rollout(self._state, self._n_steps, plan, geometry=geometry, report=report)
             renderings = []
@@ -207,7 +211,7 @@ class CapturedRollout:
     def _replay(self) -> None:
         if self._device.type != "cuda":
             self._records = StabilityReport()
-            self._predicted, self._found_on_host = self._given(self._report)
+            self._predicted, self._found_on_host = self._given(self._records)
             return
         with torch.cuda.device(self._device):
             self._graph.replay()

@@ -184,10 +184,17 @@ class StabilityReport:
         else:
             self._send(numbers, read)
 
-    def replayed(self) -> None:
-        """Fetches the records of the CUDA graphs captured with this report, without waiting; call it after a replay."""
+    def replayed(self, to: StabilityReport | None = None) -> None:
+        """Fetches the records of the CUDA graphs captured with this report, without waiting; call it after a replay.
+
+        Args:
+            to: report that is told of them, and of what this one has found so far; None: this one.
+        """
+        target = self if to is None else to
         for numbers, read in self._captured:
-            self._send(numbers, read)
+            target._send(numbers, read)
+        if to is not None:
+            to._take(Reading(self._found.values(), self._sentinels))
 
     def _send(self, numbers: Tensor, read: Callable[[Tensor], Reading]) -> None:
         copy = torch.empty(numbers.shape, dtype=numbers.dtype, pin_memory=True)
