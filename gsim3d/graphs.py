@@ -1,4 +1,4 @@
-"""A rollout as one CUDA graph: the device runs all its kernels back to back, without Python and without waiting.
+"""CUDA graphs: a GPU runs all kernels of a rollout back to back, without Python and without waiting.
 
     with torch.autocast("cuda", torch.bfloat16):
         captured = CapturedRollout(simulator, state, 12, plan, cameras=cameras)
@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -30,6 +31,55 @@ from gsim3d.stability import StabilityReport
 from gsim3d.types import Cameras, CloudTable, Particles, keeping_constants
 
 FACTOR = 1.25  # room over what was observed
+
+
+class Captured:
+    """A function without arguments as a CUDA graph; calling it runs the graph and returns the same tensors each time.
+
+    The function reads and writes the same memory in every replay: inputs are copied to where it reads them, results are
+    overwritten by the next call. It must not wait for the device, so the dynamics in it gets geometry of given sizes; a
+    backward pass (``torch.autograd.grad``) may be part of it. Autocast rounds weights anew in every replay.
+
+    Args:
+        function: is called twice before it is captured.
+        device: of all that it does.
+    Raises:
+        CaptureError: it cannot be captured; the message repeats CUDA's.
+    """
+
+    def __init__(self, function: Callable[[], Any], device: torch.device | str = "cuda"):
+        self._device, self._constants = torch.device(device), {}
+        if self._device.type != "cuda":
+            raise CaptureError(f"Captured: device must be a GPU; got {device}")
+        cached = torch.is_autocast_cache_enabled()
+        torch.set_autocast_cache_enabled(False)
+        try:
+            with torch.cuda.device(self._device), keeping_constants(self._constants):
+                self._capture(function)
+        except RuntimeError as error:
+            raise CaptureError(f"Captured: {str(error).splitlines()[0]}") from error
+        finally:
+            torch.set_autocast_cache_enabled(cached)
+
+    def _capture(self, function: Callable[[], Any]) -> None:
+        side = torch.cuda.Stream()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            for _ in range(2):  # kernels are loaded and constants made before the capture
+                function()
+        torch.cuda.current_stream().wait_stream(side)
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph):
+            self.result = function()
+
+    def __call__(self) -> Any:
+        with torch.cuda.device(self._device):
+            self._graph.replay()
+        return self.result
+
+
+class CaptureError(RuntimeError):
+    """Something cannot be made a CUDA graph."""
 
 
 class Predicted(NamedTuple):
@@ -99,8 +149,11 @@ class CapturedRollout:
         self._device = prepared.means.device
         kind = self._device.type
         self._dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else None
-        rounds = self._dtype is not None and kind == "cuda"
-        self._model = _rounded(simulator, self._dtype) if rounds else simulator
+        self._model = simulator
+        if self._dtype is not None and kind == "cuda":
+            self._model = copy.copy(simulator)
+            rooms = {name: rounded(room, self._dtype) for name, room in _rooms(simulator).items()}
+            self._model.__dict__["_modules"] = {**simulator._modules, **rooms}
         self.captures = 0
         self._launched = False
         self._prepare(self._observed())
@@ -146,8 +199,9 @@ class CapturedRollout:
         """Reads the weights of the simulator again."""
         if self._model is not self._simulator:
             with torch.no_grad():
-                for own, given in zip(_weights(self._model), _weights(self._simulator), strict=True):
-                    own.copy_(given)
+                for own, given in zip(_rooms(self._model).values(), _rooms(self._simulator).values(), strict=True):
+                    for name, value in given.state_dict().items():
+                        own.state_dict()[name].copy_(value)
 
     # ---- what runs ----
 
@@ -194,17 +248,8 @@ class CapturedRollout:
         if self._device.type != "cuda":
             return
         self._graph = self._predicted = self._found = None  # their memory goes back before the next graph takes its own
-        self._constants: dict[tuple, Tensor] = {}
-        with torch.cuda.device(self._device), keeping_constants(self._constants):
-            side = torch.cuda.Stream()
-            side.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(side):
-                self._given(StabilityReport())  # kernels are loaded and constants made before the capture
-            torch.cuda.current_stream().wait_stream(side)
-            graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph):
-                self._predicted, self._found = self._given(self._records)
-        self._graph = graph
+        self._graph = Captured(lambda: self._given(self._records), self._device)
+        self._predicted, self._found = self._graph.result
         self._found_on_host = torch.empty(self._found.shape, dtype=self._found.dtype, pin_memory=True)
         self._arrived = torch.cuda.Event()
 
@@ -214,7 +259,7 @@ class CapturedRollout:
             self._predicted, self._found_on_host = self._given(self._records)
             return
         with torch.cuda.device(self._device):
-            self._graph.replay()
+            self._graph()
             self._found_on_host.copy_(self._found, non_blocking=True)
             self._arrived.record()
 
@@ -292,20 +337,20 @@ def _with_background_as_it_is(plan: Plan) -> Plan:
     return dataclasses.replace(plan, spec=dataclasses.replace(plan.spec, dynamics=dynamics))
 
 
-def _weights(simulator: Simulator) -> list[Tensor]:
-    """All that dynamics and renderer read."""
-    rooms = (simulator.dynamics, simulator.renderer)
-    return [tensor for room in rooms for tensor in (*room.parameters(), *room.buffers())]
+def _rooms(simulator: Simulator) -> dict[str, nn.Module]:
+    """What a rollout reads."""
+    return {"dynamics": simulator.dynamics, "renderer": simulator.renderer}
 
 
-def _rounded(simulator: Simulator, dtype: torch.dtype) -> Simulator:
-    """A copy, except of the encoder, whose matrix products and convolutions hold what autocast would round them to."""
-    model = copy.deepcopy(simulator, {id(simulator.encoder): simulator.encoder})
-    for room in (model.dynamics, model.renderer):
-        for module in room.modules():
-            rounds = isinstance(module, (nn.Linear, SparseConv))
-            for parameter in module.parameters(recurse=False):
-                parameter.requires_grad_(False)
-                if rounds and parameter.dtype == torch.float32:
+def rounded(module: nn.Module, dtype: torch.dtype) -> nn.Module:
+    """A copy without gradients whose matrix products and convolutions hold what ``torch.autocast`` would round them to.
+
+    Under autocast it computes the same numbers, and rounds no weights.
+    """
+    module = copy.deepcopy(module).requires_grad_(False)
+    for part in module.modules():
+        if isinstance(part, (nn.Linear, SparseConv)):
+            for parameter in part.parameters(recurse=False):
+                if parameter.dtype == torch.float32:
                     parameter.data = parameter.data.to(dtype)
-    return model
+    return module

@@ -41,12 +41,12 @@ def rounded_weights(module: nn.Module, dtype: torch.dtype) -> tuple[Tensor, ...]
     tensors = module.weight, module.bias
     if module.weight.dtype == dtype:
         return tensors
+    if module.weight.is_cuda and torch.cuda.is_current_stream_capturing():
+        return tuple(t.detach().to(dtype) for t in tensors)  # part of the graph: made at each replay
     key = (dtype, *(key for t in tensors for key in (t.data_ptr(), t._version)))
     known, copies = module.__dict__.get("_rounded", (None, ()))
     if known == key:
         return copies
-    if module.weight.is_cuda and torch.cuda.is_current_stream_capturing():
-        return tuple(t.detach().to(dtype) for t in tensors)  # part of the graph: made at each replay
     with torch.inference_mode(False), torch.no_grad():
         if known is not None and known[0] == dtype and copies[0].device == module.weight.device:
             torch._foreach_copy_(copies, tensors)

@@ -221,6 +221,8 @@ class StabilityReport:
 
     def poll(self) -> None:
         """Raises the first error that has arrived and was not raised yet; waits for nothing."""
+        if torch.compiler.is_compiling():
+            return
         if self._pending and not torch.cuda.is_current_stream_capturing():
             self._collect(wait=False)
         with self._lock:

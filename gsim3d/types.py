@@ -12,7 +12,7 @@ import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, groupby
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -111,6 +111,8 @@ def constant(values: tuple[int, ...], device: torch.device) -> Tensor:
 
     A step that repeats sends nothing to the device, and can be captured in a CUDA graph.
     """
+    if torch.compiler.is_compiling():
+        return torch.tensor(values, dtype=torch.int64, device=device)
     if not _stores:
         return _recent_constant(values, device)
     key = values, torch.device(device)
@@ -164,10 +166,11 @@ class CloudTable:
 
     def row_runs(self, clouds: Sequence[int]) -> list[tuple[int, int]]:
         """(first row, one behind the last) of ``clouds``; clouds that follow each other share a run."""
-        runs = []
-        for _, group in groupby(enumerate(clouds), lambda pair: pair[1] - pair[0]):
-            members = [cloud for _, cloud in group]
-            runs.append((self.starts[members[0]], self.starts[members[-1] + 1]))
+        runs, before = [], None
+        for cloud in clouds:
+            begin = runs.pop()[0] if before is not None and cloud == before + 1 else self.starts[cloud]
+            runs.append((begin, self.starts[cloud + 1]))
+            before = cloud
         return runs
 
 

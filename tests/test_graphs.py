@@ -1,13 +1,15 @@
 """Rollouts replayed from a CUDA graph, and on the CPU the same steps with the same sizes."""
 
 import dataclasses
+import functools
 
 import pytest
 import torch
 
 from gsim3d.effects import DynamicsEffects, EffectsSpec
 from gsim3d.errors import HardCaseError, InputError
-from gsim3d.graphs import CapturedRollout
+from gsim3d.graphs import Captured, CapturedRollout, CaptureError
+from gsim3d.ops import PyramidCapacity
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityConfig, StabilityReport
@@ -187,6 +189,88 @@ def test_a_graph_under_autocast_reads_the_weights_it_was_told_to(dtype, devices)
         anew = CapturedRollout(simulator, state, 2)
     assert_same_bits(captured(state).steps[1].dynamic_latents, anew(state).steps[1].dynamic_latents)
     assert not torch.equal(anew(state).steps[1].dynamic_latents, before[1].dynamic_latents)
+
+
+def test_a_graph_of_gradients(devices):
+    simulator = make_simulator(devices[1]).train()
+    history = make_state(device=devices[1])
+    history = history.with_clouds(history.clouds)
+    dynamics, parameters = simulator.dynamics, list(simulator.dynamics.parameters())
+    capacity = PyramidCapacity.of(dynamics.geometry(history), history.n_rows, 3)
+
+    def gradients(pyramid=None):
+        step = dynamics(history, pyramid=pyramid or dynamics.geometry(history, capacity=capacity))
+        return torch.autograd.grad(step.means.square().sum() + step.dynamic_latents.square().sum(), parameters)
+
+    captured = Captured(gradients, devices[1])
+    optimizer = torch.optim.SGD(parameters, lr=1e-3)
+    for seed in (0, 1, 2):
+        history.means.copy_(make_state(seed, devices[1]).means)
+        for actual, expected in zip(captured(), gradients(dynamics.geometry(history)), strict=True):
+            assert expected.any()
+            assert_close_relative_to_max(actual, expected, 1e-10)
+        for parameter, grad in zip(parameters, captured.result, strict=True):
+            parameter.grad = grad
+        optimizer.step()  # the next replay reads other weights
+
+
+def test_a_graph_of_gradients_rounds_weights_that_have_changed(devices):
+    simulator = make_simulator(devices[1], torch.float32).train()
+    history = make_state(device=devices[1], dtype=torch.float32)
+    history = history.with_clouds(history.clouds)
+    dynamics, parameters = simulator.dynamics, list(simulator.dynamics.parameters())
+    capacity = PyramidCapacity.of(dynamics.geometry(history), history.n_rows, 2)
+
+    def gradients():
+        with torch.autocast("cuda", torch.bfloat16):
+            step = dynamics(history, pyramid=dynamics.geometry(history, capacity=capacity))
+            return torch.autograd.grad(step.dynamic_latents.square().sum(), parameters)
+
+    captured = Captured(gradients, devices[1])
+    for _ in range(2):
+        for actual, expected in zip(captured(), gradients(), strict=True):
+            assert_same_bits(actual, expected)
+        with torch.no_grad():
+            for parameter in parameters:
+                parameter.mul_(1.2)
+
+
+def test_what_waits_for_the_device_is_no_graph(devices):
+    x = torch.ones(3, device=devices[1])
+    with pytest.raises(CaptureError, match="Captured: .*captur"):
+        Captured(lambda: x.sum().item(), devices[1])
+    torch.cuda.synchronize()
+    assert Captured(lambda: 2 * x, devices[1])().tolist() == [2, 2, 2]
+
+
+def test_only_a_gpu_has_graphs():
+    with pytest.raises(CaptureError, match="device must be a GPU; got cpu"):
+        Captured(lambda: None, "cpu")
+
+
+def test_compile_of_a_rollout(device):
+    simulator, state = make_simulator(device, torch.float32), make_state(device=device, dtype=torch.float32, sizes=((9, 8),))
+    state, plan, sizes = state.with_clouds(state.clouds), simulator.plan(), []
+
+    def observe(history):
+        pyramid = simulator.dynamics.geometry(history)
+        sizes.append(PyramidCapacity.of(pyramid, history.n_rows))
+        return pyramid
+
+    with torch.no_grad():
+        (expected,) = simulator.rollout(state, 1, plan, geometry=observe)
+
+    def step(means, latents):
+        history = dataclasses.replace(state, means=means, dynamic_latents=latents)
+        geometry = functools.partial(simulator.dynamics.geometry, capacity=sizes[0])
+        (later,) = simulator.rollout(history, 1, plan, geometry=geometry)
+        return later.means, later.dynamic_latents
+
+    backend = "aot_eager" if device.type == "cpu" else "inductor"
+    with torch.no_grad():
+        means, latents = torch.compile(step, fullgraph=True, backend=backend)(state.means, state.dynamic_latents)
+    assert_close_relative_to_max(means, expected.means, "dynamics_order")
+    assert_close_relative_to_max(latents, expected.dynamic_latents, "dynamics_order")
 
 
 def test_a_graph_keeps_the_constants_it_reads(devices):
