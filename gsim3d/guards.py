@@ -9,11 +9,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gsim3d.ops.sentinel import CELLS, FAST, LARGEST, OUTSIDE, SUMS, watch_rows
-from gsim3d.stability import ACTIONS, Finding, Reading, Sentinels, StabilityConfig, StabilityReport
+from gsim3d.ops.sentinel import CELLS, FAST, OUTSIDE, SUMS, watch_rows
+from gsim3d.stability import ACTIONS, LARGEST, Finding, Reading, Sentinels, StabilityConfig, StabilityReport
 from gsim3d.types import ASLEEP, CloudTable, Particles
 
-BOUNDED = {"opacities": "is outside [0, 1]", "scales": "is negative or not finite"}
+BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
 
 
 def guard_particles(
@@ -57,7 +57,7 @@ def guard_particles(
         particles.cu_rows,
         cloud_scene=particles.cloud_scene,
         origin=particles.origin,
-        asleep=activity == ASLEEP,
+        activity=activity,
         grid_size=grid_size,
         previous=None if previous is None else previous.means,
         max_step=config.max_speed,
@@ -74,7 +74,7 @@ def guard_particles(
 
 
 def _what(high: float) -> str:
-    return "is not finite" if high == LARGEST else f"is not finite or beyond {high:g}"
+    return "not finite" if high == LARGEST else f"not finite or beyond {high:g}"
 
 
 def _read(
@@ -83,7 +83,7 @@ def _read(
     """What a record of watch_rows says."""
     by_rule = "clamped" if on_bad == "clamp" else "asleep"
     kinds = [(name, what, ACTIONS[on_bad]) for name, what in zip(names, whats, strict=True)]
-    kinds += [("particles.means", "left the workspace", by_rule), ("particles.means", "is beyond the speed limit", by_rule)]
+    kinds += [("particles.means", "outside the workspace", by_rule), ("particles.means", "speed limit", by_rule)]
     findings, sentinels = [], {}
     for q, numbers in enumerate(record.tolist()):
         scene, step = clouds.scenes[q], clouds.steps[q]

@@ -28,11 +28,10 @@ from gsim3d.encoder import Encoder
 from gsim3d.guards import guard_particles
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
-from gsim3d.ops.sentinel import LARGEST
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
 from gsim3d.renderer import GaussianHead, render, render_as_published
-from gsim3d.stability import OnBad, StabilityReport, check_on_bad
+from gsim3d.stability import LARGEST, OnBad, StabilityReport, check_on_bad
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames, Particles
 
 

@@ -26,6 +26,7 @@ from torch import Tensor
 from gsim3d.errors import HardCaseError, InputError
 
 OnBad = Literal["raise", "drop", "clamp"]
+LARGEST = torch.finfo(torch.float32).max
 ACTIONS = {"raise": "error", "drop": "dropped", "clamp": "clamped"}
 ADVICE = 'on_bad="drop" goes on without such rows, on_bad="clamp" bounds them'
 MAX_FINDINGS = 1000  # of a report, then only its total goes on counting
@@ -63,7 +64,7 @@ class StabilityConfig:
 class Finding:
     """Rows of one tensor in one place that could not be used as they were.
 
-    what: what is wrong, such as "is not finite", "left the workspace".
+    what: what is wrong, such as "not finite", "outside the workspace", "speed limit".
     where: the call, such as "encode" or "rollout". tensor: what holds the numbers.
     scene, step: of the particles' cloud; camera: image of the call; None where none is meant.
     row: the first such row, of the packed rows of the call. count: how many.
@@ -85,7 +86,7 @@ class Finding:
         place = f" ({', '.join(place)})" if place else ""
         row = "" if self.row is None else f" at row {self.row}"
         more = f" and {self.count - 1} more" if self.count > 1 else ""
-        return f"{self.where}: {self.tensor} {self.what}{row}{place}{more}"
+        return f"{self.where}: {self.tensor}: {self.what}{row}{place}{more}"
 
     def error(self) -> HardCaseError:
         """As the error that names it and says what to do."""

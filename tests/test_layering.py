@@ -16,6 +16,7 @@ ROOMS = [
     {"presets"},
     {"simulator"},
     {"laws", "graphs"},
+    {"endurance"},
     {"data", "interop", "perceptual"},
     {"generate"},
     {"train"},

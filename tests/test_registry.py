@@ -6,7 +6,7 @@ import torch
 import gsim3d.ops  # noqa: F401
 
 OPS = sorted({name.split(".")[0] for name in torch._C._dispatch_get_all_op_names() if name.startswith("gsim3d::")})
-INTEGER_OPS = ("gsim3d::curve_", "gsim3d::build_pyramid")  # positions in, integers out: nothing to differentiate
+INTEGER_OPS = ("gsim3d::curve_", "gsim3d::build_pyramid", "gsim3d::watch_rows")  # nothing to differentiate
 
 
 def has_kernel(op: str, key: str) -> bool:

@@ -1,8 +1,9 @@
 #!/usr/bin/env python
-"""Do the tests notice a wrong kernel? Changes one line of csrc at a time, rebuilds, and runs the test that should fail.
+"""Do the tests notice a wrong kernel, or a guard that is gone? Changes one place at a time and runs the test that should fail.
 
     python tools/mutants.py                 all mutants of tests/mutants/*.json
     python tools/mutants.py raster pool     those of some ops
+    python tools/mutants.py guards          guards of hard cases written in Python (nothing is compiled); guards_core: in C++
     python tools/mutants.py --list
 
 Each mutant is {"file", "old", "new", "test"}: `old` must occur exactly once in `file`; `test` is a pytest node. The work
@@ -51,7 +52,7 @@ def judge(tree: Path, mutant: dict) -> str:
         return f"`old` occurs {text.count(mutant['old'])} times"
     path.write_text(text.replace(mutant["old"], mutant["new"]))
     try:
-        if not build(tree):
+        if path.suffix != ".py" and not build(tree):
             return "does not compile"
         code = pytest(tree, [mutant["test"]]).returncode
         # 1: a test failed. Anything else (0 passed, 2-5 no such test, ...) proves nothing; a crash is a negative code.
@@ -62,7 +63,7 @@ def judge(tree: Path, mutant: dict) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ops", nargs="*", help="op folders; default: all")
+    parser.add_argument("ops", nargs="*", help="files of tests/mutants; default: all")
     parser.add_argument("--list", action="store_true", help="print the mutants and stop")
     args = parser.parse_args()
     mutants = load(args.ops)

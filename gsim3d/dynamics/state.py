@@ -163,7 +163,7 @@ def _flat(name: str, value: Tensor) -> Tensor:
         return value.mT.flatten(1)
     if name == "quats":
         return value.roll(-1, 1)
-    return value.reshape(value.shape[0], -1) if value.numel() else value.reshape(value.shape[0], 1)
+    return value.flatten(1) if value.dim() > 1 else value[:, None]
 
 
 def _unflat(name: str, value: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from gsim3d.errors import InputError
+from gsim3d.rotations import unit_quats
 from gsim3d.types import Gaussians
 
 SMALLEST_SCALE = 1e-9  # metres; keeps the logarithm finite and is far below a pixel
@@ -52,7 +53,7 @@ def write_ply(path: str | Path, gaussians: Gaussians, cloud: int | None = None) 
         rows["sh"][:, 1:].transpose(1, 2).flatten(1),
         torch.logit(opacities).float()[:, None],
         torch.log(rows["scales"].clamp(min=SMALLEST_SCALE)),
-        torch.nn.functional.normalize(rows["quats"], dim=1),
+        unit_quats(rows["quats"]),
     ]
     table = torch.cat(columns, 1).numpy().astype("<f4")
     names = _property_names(rows["sh"].shape[1] - 1)
@@ -94,7 +95,7 @@ def read_ply(path: str | Path) -> Gaussians:
         sh = torch.cat([sh, stack(names[9 : 9 + n_rest]).reshape(-1, 3, n_rest // 3).transpose(1, 2)], 1)
     gaussians = Gaussians(
         means=stack(["x", "y", "z"]),
-        quats=torch.nn.functional.normalize(stack(names[-4:]), dim=1),
+        quats=unit_quats(stack(names[-4:])),
         scales=torch.exp(stack(names[-7:-4])),
         opacities=torch.sigmoid(stack(["opacity"])[:, 0]),
         sh=sh.contiguous(),

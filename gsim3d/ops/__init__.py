@@ -24,6 +24,7 @@ from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
 from gsim3d.ops.raster import Rendering, rasterize_gaussians
 from gsim3d.ops.row_norm import residual_norm, row_norm
+from gsim3d.ops.sentinel import Watched, watch_rows
 from gsim3d.ops.sparse_conv import sparse_conv
 
 __all__ = [
@@ -37,6 +38,7 @@ __all__ = [
     "Segments",
     "Stage",
     "Voxels",
+    "Watched",
     "build_pyramid",
     "cuda_compiled",
     "curve_encode",
@@ -51,4 +53,5 @@ __all__ = [
     "sparse_conv",
     "sweep_geometry",
     "unpool",
+    "watch_rows",
 ]

@@ -352,6 +352,8 @@ def _check_spec(spec: PyramidSpec, curves: tuple[tuple[int, ...], ...] | None) -
     for name, rows in {"kernel_sizes": spec.kernel_sizes, "curves": curves or ()}.items():
         if not isinstance(rows, (tuple, list)):
             raise TypeError(f"build_pyramid: {name} must be a tuple with one entry a stage; got {rows!r}")
+        if name == "kernel_sizes" and len(rows) != spec.n_stages:
+            raise ValueError(f"build_pyramid: kernel_sizes must have {spec.n_stages} entries; got {len(rows)}")
         for row in rows:
             _check_whole_numbers(name, row)
 

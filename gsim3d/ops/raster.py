@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
-import re
+from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gsim3d.errors import HardCaseError
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_real, check_tensors, check_whole, within_memory
-from gsim3d.stability import ACTIONS, Finding, OnBad, StabilityReport, check_on_bad
+from gsim3d.stability import LARGEST, Finding, OnBad, Reading, StabilityReport, check_on_bad
 from gsim3d.types import Cameras
 
-MAX = torch.finfo(torch.float32).max
+OP = "rasterize_gaussians"
 CUTOFFS = {"exact": 0, "tile3sigma": 1, "smooth": 2}
-_BAD_ROW = re.compile(r"must be finite|must be in \[0, 1\]|must not be negative|projection overflows")
+# RasterFault of csrc/gsim3d/raster/raster.h
+FAULTS = (
+    "not finite",
+    "not finite",
+    "negative or not finite",
+    "outside [0, 1]",
+    "not finite",
+    "not finite",
+    "too large, the projection overflows",
+    "too large, together they touch 2^31 tiles or more",
+    "not a camera, or it shows no cloud",
+)
+FAULT_BITS, OF_ROWS = 9, 7  # the first faults are of rows
 
 
 class Rendering(NamedTuple):
@@ -77,6 +89,10 @@ def rasterize_gaussians(
         cutoff: "exact"; "tile3sigma" also drops pixels outside the 16 x 16 tiles that a square of 3 standard deviations
             touches, as the published model's renderer does; "smooth" fades alpha between 2/255 and 1/255, so that the
             result is differentiable everywhere: for tests of gradients.
+        on_bad: what happens to a row that cannot be used (:mod:`gsim3d.stability`). "raise": an error on the CPU, left
+            out on a GPU; "drop": left out, its gradients are 0; "clamp": bounded, NaN counts as 0 (a rotation: identity).
+        report: counts such rows by image; on a GPU its ``check()`` raises what "raise" could not. Without one a GPU
+            does not count.
     Returns:
         Rendering, dtype of ``means``.
     Gradients: means, quats, scales, opacities, sh or colors, features, background, ``cameras.viewmats`` (its 12 upper
@@ -86,8 +102,8 @@ def rasterize_gaussians(
     GPU: nothing waits for the device. Its memory is made for Gaussians of a few pixels and clouds shown by equally many
         images; what exceeds it is rendered in further groups of images, slower.
     Raises:
-        HardCaseError: a number is not finite, an opacity outside [0, 1], a scale negative; names argument and row.
-            On a GPU such a row is left out, and its gradients are 0.
+        HardCaseError: ``on_bad`` is "raise" on the CPU, and a number is not finite, an opacity outside [0, 1], a scale
+            negative, or a projection overflows; names argument, row and camera.
         ValueError: a shape, dtype, offset or camera is not as above. On a GPU an image whose camera or cloud is not
             shows its background, and a background that is not finite is black.
     Source: Zwicker et al. 2002 (EWA splatting), Kerbl et al. 2023 (3D Gaussian splatting); conventions of gsplat.
@@ -116,13 +132,13 @@ def rasterize_gaussians(
         name, wanted = ("sh", "[N, K, 3]") if colors is None else ("colors", "[N, 3]")
         raise ValueError(f"rasterize_gaussians: {name} must be {wanted}; got {list(color.shape)}")
     check_on_bad(on_bad)
-    if on_bad != "raise":
-        rows = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "color": color}
-        rows = rows if features is None else {**rows, "features": features}
-        _check_rows(rows)
-        rows = _mended(rows, on_bad, report)
-        means, quats, scales, opacities, color = list(rows.values())[:5]
-        features = rows.get("features")
+    features_given = means.new_empty(means.shape[0], 0) if features is None else features
+    color_name = "sh" if colors is None else "colors"
+    names = ("means", "quats", "scales", "opacities", color_name, "features")
+    rows = (means, quats, scales, opacities, color, features_given)
+    if on_bad == "clamp":
+        _check_rows(dict(zip(names, rows, strict=True)))
+        rows = _clamped(dict(zip(names, rows, strict=True)), report).values()
     n_images = cameras.viewmats.shape[0]
     real = torch.float64 if means.dtype == torch.float64 else torch.float32
     if background is None:
@@ -132,12 +148,7 @@ def rasterize_gaussians(
     if cu_rows is None:
         cu_rows = torch.tensor([0, means.shape[0]], device=means.device)
     args = (
-        means,
-        quats,
-        scales,
-        opacities,
-        color,
-        means.new_empty(means.shape[0], 0) if features is None else features,
+        *rows,
         background,
         cameras.viewmats.to(real),
         cameras.Ks.to(real),
@@ -149,39 +160,51 @@ def rasterize_gaussians(
         CUTOFFS[cutoff],
         *_sizes_of_state(means, n_images, cu_rows.shape[0] - 1, cameras.width, cameras.height),
     )
-    out = torch.ops.gsim3d.rasterize_gaussians(*args) if torch.compiler.is_compiling() else _named_errors(args)
+    raises = on_bad == "raise" and means.device.type == "cpu"
+    watch = (raises or report is not None) and not torch.compiler.is_compiling()
+    if torch.compiler.is_compiling():
+        out = torch.ops.gsim3d.rasterize_gaussians(*args, watch)
+    else:
+        size = f"cameras.width={cameras.width}, cameras.height={cameras.height}"
+        out = within_memory(OP, size, torch.ops.gsim3d.rasterize_gaussians, *args, watch)
+    if watch:
+        action = "error" if on_bad == "raise" else "dropped"
+        read = partial(_unusable, names=(*names, "scales", "scales", "cameras"), action=action)
+        (StabilityReport() if report is None else report).record(out[7], read)
     return Rendering(out[0], out[1], out[2], None if features is None else out[3])
 
 
-def _named_errors(args):
-    size = f"cameras.width={args[11]}, cameras.height={args[12]}"
-    try:
-        return within_memory("rasterize_gaussians", size, torch.ops.gsim3d.rasterize_gaussians, *args)
-    except (ValueError, RuntimeError) as error:
-        if _BAD_ROW.search(str(error)):
-            raise HardCaseError(str(error).splitlines()[0]) from None
-        raise
+def _unusable(numbers: Tensor, names: Sequence[str], action: str) -> Reading:
+    """What the op's last output says: of every image, how many rows were left out, and the first with its faults."""
+    findings = []
+    for camera, (count, first) in enumerate(numbers.tolist()):
+        if count:
+            fault = next(k for k in range(len(FAULTS)) if first >> k & 1)
+            row = first >> FAULT_BITS if fault < OF_ROWS else None
+            findings.append(Finding(FAULTS[fault], OP, names[fault], action, count, row, camera=camera))
+    return Reading(findings, {})
 
 
-def _mended(rows: dict[str, Tensor], on_bad: OnBad, report: StabilityReport | None) -> dict[str, Tensor]:
-    mended, n = {}, rows["means"].shape[0]
-    bad = torch.zeros(n, dtype=torch.bool, device=rows["means"].device)
+def _clamped(rows: dict[str, Tensor], report: StabilityReport | None) -> dict[str, Tensor]:
+    """Rows with finite numbers in range, counted."""
+    bounds = {"opacities": (0.0, 1.0), "scales": (0.0, LARGEST)}
+    bounded, bad = {}, []
     for name, value in rows.items():
-        low = 0.0 if name in ("opacities", "scales") else -MAX
-        high = 1.0 if name == "opacities" else MAX
-        good = (value >= low) & (value <= high)
-        wrong = ~good[..., None].flatten(1).all(1)
-        bad |= wrong
         neutral = torch.zeros_like(value)
         if name == "quats":
             neutral[:, 0] = 1
-        mended[name] = torch.where(good if on_bad == "clamp" else good[..., None].flatten(1).all(1).reshape(-1, *[1] * (value.dim() - 1)), value, value.nan_to_num(0.0).clamp(low, high) if on_bad == "clamp" and name != "quats" else neutral)
-        if report is not None and bool(wrong.any()):
-            row = int(wrong.nonzero()[0])
-            report.add(Finding("cannot be used", "rasterize_gaussians", name, ACTIONS[on_bad], int(wrong.sum()), row))
-    if on_bad == "drop":
-        mended["opacities"] = torch.where(bad, 0.0, mended["opacities"])
-    return mended
+        bounded[name] = torch.where(value.isnan(), neutral, value).clamp(*bounds.get(name, (-LARGEST, LARGEST)))
+        bad.append((bounded[name] != value.detach())[..., None].flatten(1).any(1))
+    if report is not None and not torch.compiler.is_compiling():
+        counts = torch.stack(bad).sum(1)
+        report.record(counts, partial(_counted, names=list(rows)))
+    return bounded
+
+
+def _counted(counts: Tensor, names: list[str]) -> Reading:
+    return Reading(
+        [Finding("not finite or out of range", OP, name, "clamped", n) for name, n in zip(names, counts.tolist()) if n], {}
+    )
 
 
 def _check_arguments(rows: dict[str, Tensor], optional: dict[str, Tensor], cameras: Cameras, near_plane: float) -> None:
@@ -240,7 +263,7 @@ def _state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_slots)
 
 @torch.library.register_fake("gsim3d::rasterize_gaussians")
 def _(means, quats, scales, opacities, color, features, background, viewmats, *rest):
-    _, _, cu_rows, width, height, _, _, *sizes = rest  # Ks, image_cloud, near_plane and cutoff do not count here
+    _, _, cu_rows, width, height, _, _, *sizes, watch = rest  # Ks, image_cloud, near_plane and cutoff do not count
     n_images = viewmats.shape[0]
     shape = (n_images, height, width)
     state = _state_bytes(means, n_images, cu_rows.shape[0] - 1, width, height, sizes[0], sizes[2])
@@ -252,6 +275,7 @@ def _(means, quats, scales, opacities, color, features, background, viewmats, *r
         means.new_empty(shape),
         means.new_empty(shape, dtype=torch.int32),
         means.new_empty(state, dtype=torch.uint8),
+        means.new_empty(n_images if watch else 0, 2, dtype=torch.int64),
     )
 
 
@@ -264,8 +288,8 @@ def _(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, st
 
 def _setup(ctx, inputs, output):
     ctx.mark_non_differentiable(*output[4:])
-    ctx.save_for_backward(*output[4:], *inputs[:11])
-    ctx.options = inputs[11:]
+    ctx.save_for_backward(*output[4:7], *inputs[:11])
+    ctx.options = inputs[11:18]
 
 
 def _backward(ctx, grad_color, grad_alpha, grad_depth, grad_features, *_kept):
@@ -273,7 +297,7 @@ def _backward(ctx, grad_color, grad_alpha, grad_depth, grad_features, *_kept):
     *grads, viewmats = torch.ops.gsim3d.rasterize_gaussians_backward(
         grad_color, grad_alpha, grad_depth, grad_features, *ctx.saved_tensors, *ctx.options, viewmats_grad
     )
-    return (*grads, viewmats if viewmats_grad else None, *[None] * 10)
+    return (*grads, viewmats if viewmats_grad else None, *[None] * 11)
 
 
 torch.library.register_autograd("gsim3d::rasterize_gaussians", _backward, setup_context=_setup)

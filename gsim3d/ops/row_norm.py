@@ -57,6 +57,7 @@ def residual_norm(
     branch_norm: tuple[Tensor, Tensor] | None = None,
     norm: tuple[Tensor, Tensor] | None = None,
     eps: float = 1e-5,
+    check: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """The next value of a residual stream, and what the layer behind it reads.
 
@@ -69,18 +70,28 @@ def residual_norm(
             Under ``torch.autocast`` CUDA takes it in autocast's dtype and the CPU in float32.
         keep: [N, 1], dtype of ``x``, a factor of each row's branch; None: 1.
         branch_norm, norm: weight and bias [C] each, dtype of ``x``.
-        eps: as in :func:`row_norm`.
+        eps, check: as in :func:`row_norm`.
     Returns:
         sum [N, C], dtype of ``x``; out [N, C], dtype of ``branch``.
     Gradients: ``x``, ``branch``, weights and biases, once; sums over rows have one order.
     Raises:
-        ValueError: a shape or dtype does not fit; the message names the argument.
+        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        ValueError, TypeError: an argument is malformed; the message names it.
 
     Example:
         >>> total, out = residual_norm(torch.ones(1, 2), torch.tensor([[1.0, 3.0]]), norm=(torch.ones(2), torch.zeros(2)))
         >>> total, out.round(decimals=3)
         (tensor([[2., 4.]]), tensor([[-1.,  1.]]))
     """
+    if check:
+        tensors = {"x": x, "branch": branch} | ({} if keep is None else {"keep": keep})
+        for name, pair in {"branch_norm": branch_norm, "norm": norm}.items():
+            if pair is not None and (not isinstance(pair, (tuple, list)) or len(pair) != 2):
+                raise TypeError(f"residual_norm: {name} must be a pair (weight, bias); got {type(pair).__name__}")
+            tensors |= {} if pair is None else {f"{name}[0]": pair[0], f"{name}[1]": pair[1]}
+        check_tensors("residual_norm", **tensors)
+        check_real("residual_norm", eps=eps)
+        check_numbers("residual_norm", **tensors)
     weights = *(branch_norm or (None, None)), *(norm or (None, None))
     return torch.ops.gsim3d.residual_norm(x, branch, keep, *weights, eps)[:2]
 

@@ -1,4 +1,4 @@
-"""Are rows usable, and how do their sums stand: one look at a state, read without waiting for the device."""
+"""Which rows of a state cannot be used, and how its sums stand: one look, read without waiting for the device."""
 
 from __future__ import annotations
 
@@ -8,18 +8,25 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-LARGEST = torch.finfo(torch.float32).max
+from gsim3d.ops import _load  # noqa: F401
+from gsim3d.stability import LARGEST
+
+# As in csrc/gsim3d/sentinel/sentinel.h
 CELLS = 2**16  # of a workspace along each axis
 OUTSIDE, FAST = 1 << 29, 1 << 30  # bits of a status
+MAX_FIELDS = 8
 SUMS = ("awake", "kinetic_energy", "opacity_mass", "low_x", "low_y", "low_z", "high_x", "high_y", "high_z")
 
 
 @dataclass(frozen=True)
 class Watched:
-    """status: int32 [N], 0 where a row is usable; bit f: field f is out of its bounds; OUTSIDE, FAST.
-    record: float64 [Q, 2 (F + 2) + 9]: of every cloud, count and first row (-1: none) of each of the F fields, of
-    OUTSIDE and of FAST; then SUMS over its usable rows that are not asleep, but ``opacity_mass`` over all whose opacity
-    is in bounds."""
+    """What watch_rows saw.
+
+    status: int32 [N], 0 where a row can be used; bit f: field f is out of its bounds; OUTSIDE; FAST.
+    record: float64 [Q, 2 (F + 2) + 9], of every cloud: count and first row (-1: none) of each of the F fields, of
+        OUTSIDE and of FAST; then SUMS over its awake rows of status 0 (bounds: 3.4e38 and -3.4e38 where there are
+        none), but ``opacity_mass`` over all rows whose opacity is in bounds.
+    """
 
     status: Tensor
     record: Tensor
@@ -32,47 +39,55 @@ def watch_rows(
     *,
     cloud_scene: Tensor,
     origin: Tensor,
-    asleep: Tensor,
-    grid_size: float,
+    activity: Tensor,
+    grid_size: float = 0.0,
     previous: Tensor | None = None,
     max_step: float = LARGEST,
 ) -> Watched:
-    with torch.no_grad():
-        means, opacities = fields[0], fields[1]
-        n, n_clouds = means.shape[0], cu_rows.shape[0] - 1
-        status = torch.zeros(n, dtype=torch.int32, device=means.device)
-        for f, (field, (low, high)) in enumerate(zip(fields, bounds, strict=True)):
-            good = ((field >= low) & (field <= high)).reshape(n, -1).all(1)
-            status |= (~good).to(torch.int32) << f
-        finite = status & 1 == 0
-        counts = cu_rows[1:] - cu_rows[:-1]
-        cloud = torch.repeat_interleave(torch.arange(n_clouds, device=means.device), counts, output_size=n)
-        if grid_size > 0:
-            cells = (means.double() - origin[cloud_scene[cloud]]) / grid_size
-            inside = ((cells >= 0) & (cells < CELLS)).all(1)
-            status |= torch.where(finite & ~inside, OUTSIDE, 0).to(torch.int32)
-        squared = torch.zeros(n, dtype=torch.float64, device=means.device)
-        if previous is not None:
-            squared = (means.double() - previous.double()).square().sum(1)
-            status |= torch.where(finite & (squared > max_step**2), FAST, 0).to(torch.int32)
-        status = torch.where(asleep, 0, status)
-        record = torch.zeros(n_clouds, 2 * (len(fields) + 2) + len(SUMS), dtype=torch.float64, device=means.device)
-        for k, bit in enumerate([*(1 << f for f in range(len(fields))), OUTSIDE, FAST]):
-            bad = status & bit != 0
-            record[:, 2 * k].index_add_(0, cloud, bad.double())
-            first = torch.full((n_clouds,), float(n), dtype=torch.float64, device=means.device)
-            rows = torch.where(bad, torch.arange(n, device=means.device), n).double()
-            first = first.scatter_reduce(0, cloud, rows, "amin")
-            record[:, 2 * k + 1] = torch.where(first < n, first, -1.0)
-        sums = record[:, 2 * (len(fields) + 2) :]
-        usable = (status == 0) & ~asleep
-        sums[:, 0].index_add_(0, cloud, usable.double())
-        sums[:, 1].index_add_(0, cloud, torch.where(usable, squared / 2, 0.0))
-        shown = status & 2 == 0
-        sums[:, 2].index_add_(0, cloud, torch.where(shown, opacities.double(), 0.0))
-        for axis in range(3):
-            for column, rest, reduce in ((3, LARGEST, "amin"), (6, -LARGEST, "amax")):
-                values = torch.where(usable, means[:, axis].double(), rest)
-                start = torch.full((n_clouds,), rest, dtype=torch.float64, device=means.device)
-                sums[:, column + axis] = start.scatter_reduce(0, cloud, values, reduce)
-        return Watched(status, record)
+    """Looks once at all rows of packed clouds.
+
+    Row n is out of the bounds of field f unless ``low_f <= x <= high_f`` for all its values (NaN never is). It is
+    OUTSIDE unless ``0 <= (means - origin) / grid_size < 2^16`` on all axes, and FAST if it moved further than
+    ``max_step`` from ``previous``; both only where its position is in bounds.
+
+    Args:
+        fields: 2 to 8 tensors with N rows, float32 or float64: positions [N, 3], opacities [N], and others of any shape.
+        bounds: lowest and highest value of each.
+        cu_rows: int64 [Q + 1], rows of cloud q are cu_rows[q] .. cu_rows[q + 1].
+        cloud_scene: int64 [Q] in [0, B).
+        origin: float64 [B, 3] metres, lower corner of each scene's workspace.
+        activity: uint8 [N] as in Particles; rows of 2 are asleep and not looked at: their status is 0.
+        grid_size: metres, edge of a cell; 0: no row is OUTSIDE.
+        previous: [N, 3] positions one step before; None: no row is FAST, and the kinetic energy is 0.
+        max_step: metres.
+    Returns:
+        Watched, on the device of the rows.
+    Gradients: none. Determinism: equal bits for any number of threads; on a GPU from run to run.
+    Raises:
+        ValueError: an argument is malformed; the message names it. On a GPU offsets are not looked at.
+
+    Example:
+        >>> means, zero = torch.tensor([[0.5, 0.5, 0.5], [0.5, float("nan"), 0.5]]), torch.zeros(1, dtype=torch.int64)
+        >>> watched = watch_rows([means, torch.ones(2)], [(-9, 9), (0, 1)], torch.tensor([0, 2]), cloud_scene=zero,
+        ...                      origin=torch.zeros(1, 3, dtype=torch.float64), activity=torch.zeros(2, dtype=torch.uint8))
+        >>> watched.status.tolist(), watched.record[0, :2].tolist()
+        ([0, 1], [1.0, 1.0])
+    """
+    low, high = zip(*bounds)
+    fields = [field.detach() for field in fields]
+    previous = None if previous is None else previous.detach()
+    return Watched(
+        *torch.ops.gsim3d.watch_rows(
+            fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_size, max_step
+        )
+    )
+
+
+@torch.library.register_fake("gsim3d::watch_rows")
+def _(fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_size, max_step):
+    columns = 2 * (len(fields) + 2) + len(SUMS)
+    n_rows, n_clouds = fields[0].shape[0], cu_rows.shape[0] - 1
+    return (
+        fields[0].new_empty(n_rows, dtype=torch.int32),
+        fields[0].new_empty(n_clouds, columns, dtype=torch.float64),
+    )

@@ -264,3 +264,9 @@ def test_errors_name_the_argument(change, message):
 def test_config_errors(change, message):
     with pytest.raises(ValueError, match=message):
         DynamicsConfig(**{**dataclasses.asdict(TINY), "quirks": TINY.quirks, **change})
+
+
+@pytest.mark.parametrize("config", [TINY, EXPLICIT])
+def test_a_history_without_any_particle_stays_empty(config):
+    step = make_dynamics(config)(make_history((0, 0), config=config))
+    assert step.n_rows == 0 and step.cloud_step.tolist() == [2]

@@ -86,7 +86,7 @@ def test_gradients_where_pixels_end(device):
     # Nearly opaque layers: most pixels end before their list does, each after another number of entries.
     scene = random_scene(n=80, clouds=2, images=2, width=20, height=18, sh_terms=0, seed=7, spread=0.2)
     scene = scene.replace(opacities=0.9 + 0.08 * scene.opacities, scales=4 * scene.scales)
-    kept = torch.ops.gsim3d.rasterize_gaussians(*operator_args(scene))
+    kept = torch.ops.gsim3d.rasterize_gaussians(*operator_args(scene), False)
     assert (kept[4] < 1e-3).double().mean() > 0.2 and len(kept[5].unique()) > 20
     expected = gradients(scene.render_oracle, scene)
     moved = scene.to(device)
@@ -161,7 +161,7 @@ def test_any_limits_give_the_same_result_on_cuda(devices, limits):
 
     def render(*limits):
         limits = [factor * len(scene.means) for factor in limits]
-        out = torch.ops.gsim3d.rasterize_gaussians(*leaves, *args, *limits)[:4]
+        out = torch.ops.gsim3d.rasterize_gaussians(*leaves, *args, *limits, False)[:4]
         return (*out, *torch.autograd.grad(out, leaves, cotangents))
 
     # Other kernels render what exceeds the limits: the compiler may fuse other products and sums.
@@ -196,7 +196,7 @@ def test_render_in_a_cuda_graph(devices):
     cotangents, args = scene.cotangents(), operator_args(scene)[8:]
 
     def run():
-        out = torch.ops.gsim3d.rasterize_gaussians(*leaves, *args)[:4]
+        out = torch.ops.gsim3d.rasterize_gaussians(*leaves, *args, True)[:4]
         return [*out, *torch.autograd.grad(out, leaves, cotangents)]
 
     expected = [x.detach() for x in run()]  # a graph kept alive would tie its leaves to this stream
@@ -219,13 +219,13 @@ def test_render_in_a_cuda_graph(devices):
 
 
 def test_opcheck():
-    args = operator_args(random_scene(n=8, images=2, clouds=2, width=9, height=7))
+    args = (*operator_args(random_scene(n=8, images=2, clouds=2, width=9, height=7)), True)
     torch.library.opcheck(torch.ops.gsim3d.rasterize_gaussians, args)
 
 
 def test_opcheck_on_cuda(devices):
     # Traced and eager outputs are not compared: what is kept for the backward pass has bytes that nobody sets.
-    args = operator_args(random_scene(n=8, images=2, clouds=2, width=9, height=7).to(devices[1]))
+    args = (*operator_args(random_scene(n=8, images=2, clouds=2, width=9, height=7).to(devices[1])), True)
     tests = ("test_schema", "test_autograd_registration", "test_faketensor")
     torch.library.opcheck(torch.ops.gsim3d.rasterize_gaussians, args, test_utils=tests)
 
@@ -233,7 +233,7 @@ def test_opcheck_on_cuda(devices):
 def test_opcheck_backward(device):
     scene = random_scene(n=8, images=2, clouds=2, width=9, height=7).to(device)
     args = [x.detach() if isinstance(x, torch.Tensor) else x for x in operator_args(scene)]
-    kept = torch.ops.gsim3d.rasterize_gaussians(*args)[4:]
+    kept = torch.ops.gsim3d.rasterize_gaussians(*args, False)[4:7]
     torch.library.opcheck(
         torch.ops.gsim3d.rasterize_gaussians_backward,
         (*scene.cotangents(), *kept, *args, True),

@@ -1,12 +1,14 @@
 """Edge cases and error messages of rasterize_gaussians."""
 
 import itertools
+from functools import partial
 
 import pytest
 import torch
 
 from gsim3d.errors import HardCaseError
 from gsim3d.ops import rasterize_gaussians
+from gsim3d.stability import StabilityReport
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.ops.raster_scene import Scene, facing, gradients, random_scene
 
@@ -245,15 +247,15 @@ def test_poison_is_left_out_on_cuda(devices, name):
 
 
 BAD_ROWS = [
-    ("means", NAN, "means must be finite; got nan at row 2"),
-    ("quats", NAN, "quats must be finite; got nan at row 2"),
-    ("scales", INF, "scales must be finite; got inf at row 2"),
-    ("scales", -1.0, "scales must not be negative; got -1 at row 2"),
-    ("scales", 1e30, "the projection overflows; scales or means are too large at row 2 for image 0"),
-    ("opacities", 1.5, r"opacities must be in \[0, 1\]; got 1.5 at row 2"),
-    ("opacities", NAN, r"opacities must be in \[0, 1\]; got nan at row 2"),
-    ("color", NAN, "colors must be finite; got nan at row 2"),
-    ("features", NAN, "features must be finite; got nan at row 2"),
+    ("means", NAN, "means: not finite"),
+    ("quats", NAN, "quats: not finite"),
+    ("scales", INF, "scales: negative or not finite"),
+    ("scales", -1.0, "scales: negative or not finite"),
+    ("scales", 1e30, "scales: too large, the projection overflows"),
+    ("opacities", 1.5, r"opacities: outside \[0, 1\]"),
+    ("opacities", NAN, r"opacities: outside \[0, 1\]"),
+    ("color", NAN, "colors: not finite"),
+    ("features", NAN, "features: not finite"),
 ]
 
 
@@ -268,18 +270,55 @@ def change(scene, name, index, value):
 
 
 @pytest.mark.parametrize("name, value, message", BAD_ROWS)
-def test_bad_rows_are_left_out_on_cuda(devices, name, value, message):
-    scene = change(four_rows(), name, 2, value).to(devices[1])
+def test_bad_rows_are_left_out_and_counted(device, name, value, message):
+    scene = change(four_rows(), name, 2, value).to(device)
     kept = torch.tensor([0, 1, 3])
     rows = {field: getattr(four_rows(), field)[kept] for field in Scene.NAMES[:6]}
-    rest = four_rows().replace(**rows, cu_rows=torch.tensor([0, 3])).to(devices[1])
-    for a, e in zip(scene.render(), rest.render(), strict=True):
+    rest = four_rows().replace(**rows, cu_rows=torch.tensor([0, 3])).to(device)
+    report = StabilityReport()
+    for a, e in zip(scene.render(on_bad="drop", report=report), rest.render(), strict=True):
         assert_same_bits(a, e)
-    for field, a, e in zip(Scene.NAMES, gradients(scene.render, scene), gradients(rest.render, rest), strict=True):
+    render = partial(scene.render, on_bad="drop")
+    for field, a, e in zip(Scene.NAMES, gradients(render, scene), gradients(rest.render, rest), strict=True):
         if field in rows:
             assert a[2].abs().max() == 0, field
             a = a[kept.to(a.device)]
         assert_close_relative_to_max(a, e, 1e-6, field)  # viewmats: a sum over rows, of which one is gone
+    (finding,) = report.findings
+    assert (f"{finding.tensor}: {finding.what}", finding.count, finding.row) == (message.replace("\\", ""), 1, 2)
+    assert (finding.camera, finding.action) == (0, "dropped")
+    report.check()  # nothing to raise
+
+
+@pytest.mark.parametrize("name, value, message", BAD_ROWS)
+def test_bad_rows_are_bounded(device, name, value, message):
+    scene, report = change(four_rows(), name, 2, value).to(device), StabilityReport()
+    render = partial(scene.render, on_bad="clamp")
+    for x in (*render(report=report), *gradients(render, scene)):
+        assert torch.isfinite(x).all()
+    assert {finding.tensor for finding in report.findings} == {message.split(":")[0]}
+
+
+def test_a_gpu_raises_where_the_report_is_read(devices):
+    report = StabilityReport()
+    change(four_rows(), "means", 2, NAN).to(devices[1]).render(report=report)
+    with pytest.raises(HardCaseError, match=r"rasterize_gaussians: means: not finite at row 2 \(camera 0\)"):
+        report.check()
+
+
+def test_rows_are_counted_in_every_image(device):
+    """Row 1 is in two images, row 3 in another."""
+    scene = facing([[0, 0, 2.0]] * 4)
+    cameras = {name: getattr(scene, name).repeat(3, *[1] * (getattr(scene, name).dim() - 1)) for name in ("viewmats", "Ks", "background")}
+    scene = scene.replace(cu_rows=torch.tensor([0, 3, 4]), image_cloud=torch.tensor([0, 1, 0]), **cameras)
+    scene = change(change(scene, "opacities", 1, 2.0), "scales", 3, 1e30).to(device)
+    report = StabilityReport()
+    scene.render(on_bad="drop", report=report)
+    assert [(f.camera, f.tensor, f.row, f.count) for f in report.findings] == [
+        (0, "opacities", 1, 1),
+        (1, "scales", 3, 1),
+        (2, "opacities", 1, 1),
+    ]
 
 
 BAD_DATA = [
@@ -310,8 +349,9 @@ def test_images_of_bad_cameras_and_clouds_are_empty_on_cuda(devices, broken):
 
 @pytest.mark.parametrize("name, value, message", BAD_ROWS)
 def test_bad_rows_are_named(name, value, message):
-    with pytest.raises(HardCaseError, match="rasterize_gaussians: " + message):
+    with pytest.raises(HardCaseError, match="rasterize_gaussians: " + message + r" at row 2 \(camera 0\)") as caught:
         change(four_rows(), name, 2, value).render()
+    assert (caught.value.tensor, caught.value.row, caught.value.camera) == (message.split(":")[0], 2, 0)
 
 
 @pytest.mark.parametrize("broken, message", BAD_DATA)

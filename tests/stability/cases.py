@@ -250,5 +250,6 @@ CASES = {
     ),
     "D50": Case("killed in any step, or while its checkpoint is written", "the curve and the weights of a run that was not"),
     "E51": Case("images or cameras that are no numbers", "an error that names the image, its scene and step"),
+    "E52": Case("a .ply of opacities 0 and 1, scales of 0, rotations without a direction", "finite, read as written"),
     "D51": Case("rotations without a direction", "the identity, without a gradient"),
 }

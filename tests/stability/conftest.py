@@ -42,6 +42,7 @@ def pytest_runtest_logreport(report):
             _add(cell, value["measured"], report.passed)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_sessionfinish(session):
     file = os.environ.get("GSIM3D_STABILITY_JSON")
     if file and not hasattr(session.config, "workerinput"):

@@ -12,6 +12,8 @@ import torch
 from gsim3d import ops
 from gsim3d.data import Scene
 from gsim3d.errors import HardCaseError, InputError
+from gsim3d.interop.ply import read_ply, write_ply
+from gsim3d.types import Gaussians
 from tests.data.made_scenes import WRITERS, edit_json, make_scene
 from tests.encoder.scenes import SIZE, make_encoder, make_frames
 from tests.ops.test_plane_sweep import make as make_sweep
@@ -263,3 +265,17 @@ def test_e51_images_and_cameras_that_are_no_numbers(setting, measured, what, val
     with pytest.raises(HardCaseError, match=f"{what} must be finite; image 2 .scene 0, step 1. is not"):
         setting.to(make_encoder())(setting.to(frames))
     measured.outcome("HardCaseError names the image")
+
+
+def test_e52_ply_of_extreme_gaussians(tmp_path, measured):
+    """Opacities 0 and 1, scales of 0, a rotation without a direction: written as numbers, read as what they were."""
+    quats = torch.tensor([[0.0, 0, 0, 0], [1, 0, 0, 0], [0, 3, 0, 0]])
+    scales, opacities = torch.tensor([[0.0, 1e-9, 1e3]]).repeat(3, 1), torch.tensor([0.0, 1.0, 0.5])
+    means, sh = torch.tensor([[0.0, 1e6, -1e-30]]).repeat(3, 1), torch.full((3, 4, 3), -1e4)
+    write_ply(tmp_path / "scene.ply", Gaussians(means, quats, scales, opacities, sh, torch.tensor([0, 3])))
+    read = read_ply(tmp_path / "scene.ply")
+    measured.finite(read.means, read.quats, read.scales, read.opacities, read.sh)
+    measured.close(read.opacities, opacities, 1e-4, "opacities")
+    measured.close(read.scales, scales, 1e-5, "scales")
+    assert torch.equal(read.means, means) and torch.equal(read.sh, sh)
+    assert read.quats.tolist() == [[1, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0]]

@@ -17,6 +17,7 @@ from gsim3d.ops import (
     plane_sweep,
     pool_max,
     pool_mean,
+    residual_norm,
     row_norm,
     sparse_conv,
     sweep_geometry,
@@ -346,6 +347,22 @@ def test_rows_are_normalised_alone_and_forget_shift_and_scale(dtype, device):
     permuted = row_norm(x[:, channels], weight[channels], bias[channels], residual[:, channels])
     assert_close_relative_to_max(permuted, out[:, channels], BOUNDS[dtype])
     assert_close_relative_to_max(row_norm(3 * x + 5, weight, bias, residual, eps=9e-5), out, BOUNDS[dtype])
+
+
+@DTYPES
+def test_a_residual_and_its_norm_know_their_row_only(dtype, device):
+    shapes = [(50, 24), (50, 24), (24,), (24,), (24,), (24,)]
+    x, branch, *weights = to(device, *(normal(*shape, dtype=dtype, seed=i) for i, shape in enumerate(shapes)))
+
+    def both(x, branch):
+        return torch.cat(residual_norm(x, branch, branch_norm=tuple(weights[:2]), norm=tuple(weights[2:])), 1)
+
+    cotangent = normal(50, 48, dtype=dtype, seed=7).to(device)
+    expected = gradients(both, [x, branch], cotangent)
+    order = torch.randperm(50, generator=generator(3)).to(device)
+    for actual, value in zip(gradients(both, [x[order], branch[order]], cotangent[order]), expected, strict=True):
+        assert_same_bits(actual, value[order])
+    assert_same_bits(torch.cat([both(x[p], branch[p]) for p in (slice(0, 1), slice(1, None))]), expected[0])
 
 
 # plane_sweep

@@ -205,8 +205,12 @@ py::dict rasterize_gaussians(const Array<T>& means, const Array<T>& quats, const
                                        depth.mutable_data(),
                                        nullptr,
                                        workspace.take<T>(n_images * height * width),
-                                       workspace.take<int32_t>(n_images * height * width)};
+                                       workspace.take<int32_t>(n_images * height * width),
+                                       workspace.take<int64_t>(n_images * 2)};
   gsim3d::cpu::raster_forward(scene, images, workspace, gsim3d::thread_pool());
+  for (int64_t i = 0; i < n_images; ++i)
+    gsim3d::check(images.unusable[2 * i] == 0, op, ": ", images.unusable[2 * i], " rows of image ", i,
+                  " are not finite or out of range, the first is ", images.unusable[2 * i + 1] >> gsim3d::kFaultBits);
   py::dict result;
   result["color"] = color;
   result["alpha"] = alpha;

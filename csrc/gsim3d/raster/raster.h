@@ -45,6 +45,20 @@ struct RasterScene {
   RasterCutoff cutoff;
 };
 
+// What makes a row unusable; bits. Such a row is left out of the images, and its gradients are 0.
+enum RasterFault : int64_t {
+  kFaultMeans = 1,        // not finite
+  kFaultQuats = 2,        // not finite
+  kFaultScales = 4,       // not finite, or negative
+  kFaultOpacities = 8,    // not in [0, 1]
+  kFaultColor = 16,       // not finite
+  kFaultFeatures = 32,    // not finite
+  kFaultProjection = 64,  // in front of the camera, but its projection overflows
+  kFaultTiles = 128,      // not of a row: all Gaussians of the image together touch 2^31 tiles or more; none is drawn
+  kFaultCamera = 256,     // not of a row: camera or cloud of the image is none (CUDA; the CPU throws)
+};
+constexpr int kFaultBits = 9;
+
 template <typename T>
 struct RasterImages {
   T* color;          // [n_images, height, width, 3]
@@ -53,6 +67,8 @@ struct RasterImages {
   T* features;       // [n_images, height, width, n_features]
   T* transmittance;  // [n_images, height, width] T_end, kept for the backward pass
   int32_t* last;     // [n_images, height, width] entries of the tile's list in front of the pixel's end; kept likewise
+  int64_t* unusable;  // [n_images, 2] how many rows were left out, and row << 9 | faults of the first, -1: none. Null:
+                      // not wanted
 };
 
 template <typename T>
@@ -79,7 +95,7 @@ struct RasterSceneGrads {
 
 namespace cpu {
 
-// Throws ArgumentError for cameras, offsets or rows that cannot be rendered; the message names argument and row.
+// Throws ArgumentError for cameras and offsets that cannot be rendered. Rows that cannot are left out and counted.
 template <typename T>
 void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, const Workspace& workspace,
                     const Parallel& parallel);
@@ -92,9 +108,9 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
 
 }  // namespace cpu
 
-// The same functions on device memory. Nothing waits for the device, so its arrays are not checked: a row that the CPU
-// would refuse is left out, an image with a bad camera or cloud shows its background, a background that is not finite
-// counts as black, and gradients of all of these are 0. Same bits from run to run.
+// The same functions on device memory. Nothing waits for the device, so its arrays are not checked: an image with a bad
+// camera or cloud shows its background, a background that is not finite counts as black, and gradients of both are 0.
+// Rows that cannot be rendered are left out; raster_watch counts them. Same bits from run to run.
 namespace cuda {
 
 // How much one call holds at once. Of the images, as many as stay within all three are rendered together and kept in
@@ -112,6 +128,10 @@ int64_t raster_state_bytes(const RasterScene<T>& scene, const RasterLimits& limi
 template <typename T>
 void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, const RasterLimits& limits, void* state,
                     const Workspace& workspace, Stream stream);
+
+// RasterImages::unusable, which raster_forward does not touch here. One look at every row and its projections.
+template <typename T>
+void raster_watch(const RasterScene<T>& scene, int64_t* unusable, Stream stream);
 
 template <typename T>
 void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& image_grads,

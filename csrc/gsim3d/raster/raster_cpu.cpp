@@ -39,18 +39,6 @@ void check_scene(const RasterScene<T>& s) {
   }
 }
 
-template <typename T>
-void check_features(const RasterScene<T>& s, const Parallel& parallel) {
-  parallel.range(s.n_rows * s.n_features, 1 << 16, [&](int64_t begin, int64_t end) {
-    T zero = 0;
-    for (int64_t i = begin; i < end; ++i) zero += s.features[i] - s.features[i];
-    if (zero == 0) return;
-    for (int64_t i = begin; i < end; ++i)
-      check(std::isfinite(s.features[i]), kOp, ": features must be finite; got ", s.features[i], " at row ",
-            i / s.n_features);
-  });
-}
-
 // Adds lanes [0, n) of `value` to column `column` of the listed rows.
 template <typename T>
 void scatter_add(Simd<T> value, const int64_t* rows, int n, int64_t width, int64_t column, T* matrix) {
@@ -68,7 +56,9 @@ void project_chunk_vjp(const RasterScene<T>& scene, const Group<T>& group, const
   V viewmat_sums[12] = {};
   for_row_blocks<T>(chunk.begin, chunk.end, [&](const int64_t* rows, int n) {
     alignas(32) T sums[kSlotFixed][kLanes<T>] = {};
-    bool seen = false;
+    int64_t seen[kLanes<T>];  // rows with a gradient; where there is none, another that has: a bad row's numbers stay out
+    std::fill_n(seen, kLanes<T>, int64_t{-1});
+    int64_t any_seen = -1;
     for (int lane = 0; lane < n; ++lane) {
       const int64_t pair = chunk.pair + rows[lane] - chunk.begin;
       for (int64_t i = group.pair_begin[pair]; i < group.pair_begin[pair + 1]; ++i) {
@@ -76,31 +66,31 @@ void project_chunk_vjp(const RasterScene<T>& scene, const Group<T>& group, const
         for (int c = 0; c < kSlotFixed; ++c) sums[c][lane] += slot[c];
         for (int64_t c = 0; c < scene.n_features; ++c)
           grads.features[rows[lane] * scene.n_features + c] += slot[kSlotFixed + c];
-        seen = true;
+        seen[lane] = any_seen = rows[lane];
       }
     }
-    if (!seen) return;
+    if (any_seen < 0) return;
+    std::replace(seen, seen + kLanes<T>, int64_t{-1}, any_seen);
     V sum[kSlotFixed];
     for (int c = 0; c < kSlotFixed; ++c) sum[c] = load<V>(sums[c]);
 
     V mean[3], quat[4], scale[3];
-    for (int i = 0; i < 3; ++i) mean[i] = gather(scene.means, rows, 3, i);
-    for (int i = 0; i < 4; ++i) quat[i] = gather(scene.quats, rows, 4, i);
-    for (int i = 0; i < 3; ++i) scale[i] = gather(scene.scales, rows, 3, i);
-    const V opacity = gather(scene.opacities, rows, 1, 0);
+    for (int i = 0; i < 3; ++i) mean[i] = gather(scene.means, seen, 3, i);
+    for (int i = 0; i < 4; ++i) quat[i] = gather(scene.quats, seen, 4, i);
+    for (int i = 0; i < 3; ++i) scale[i] = gather(scene.scales, seen, 3, i);
+    const V opacity = gather(scene.opacities, seen, 1, 0);
     const Projection<V> p = project(camera, mean, quat, scale);
     ProjectionGrad<V> grad{};
     footprint_vjp(footprint_of(p.xy, p.yy, p.determinant), Moments<V>{sum[0], sum[1], sum[2], sum[3], sum[4]}, grad);
     grad.z = sum[9];
-    // alpha = opacity e^exponent: its gradient is that of the exponent over the opacity. Unseen rows have neither.
-    const V one = Lanes<V>::splat(1);
-    scatter_add<T>(sum[5] / (opacity > V{} ? opacity : one), rows, n, 1, 0, grads.opacities);
+    // alpha = opacity e^exponent: its gradient is that of the exponent over the opacity.
+    scatter_add<T>(sum[5] / opacity, rows, n, 1, 0, grads.opacities);
 
     if constexpr (kTerms > 0) {
       const Direction<V> direction = view_direction(camera, p.point);
       V coefficients[kTerms * 3], grad_coefficients[kTerms * 3], color[3];
       V basis[kTerms], grad_basis[kTerms], grad_unit[3];
-      for (int i = 0; i < kTerms * 3; ++i) coefficients[i] = gather(scene.color, rows, kTerms * 3, i);
+      for (int i = 0; i < kTerms * 3; ++i) coefficients[i] = gather(scene.color, seen, kTerms * 3, i);
       sh_basis<kTerms>(direction.unit, basis);
       sh_color<kTerms>(basis, coefficients, color);
       sh_color_vjp<kTerms>(basis, coefficients, color, sum + 6, grad_basis, grad_coefficients);
@@ -143,10 +133,15 @@ template <typename T>
 void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, const Workspace& workspace,
                     const Parallel& parallel) {
   check_scene(scene);
-  check_features(scene, parallel);
   Scratch scratch(workspace);
   Group<T> group;
-  while (next_group(scene, false, scratch, parallel, group)) blend_group(scene, group, images, parallel);
+  while (next_group(scene, false, scratch, parallel, group)) {
+    blend_group(scene, group, images, parallel);
+    for (int64_t image = group.first; image < group.last && images.unusable; ++image) {
+      const Unusable& unusable = group.unusable[image - group.first];
+      images.unusable[2 * image] = unusable.count, images.unusable[2 * image + 1] = unusable.first;
+    }
+  }
 }
 
 template <typename T>

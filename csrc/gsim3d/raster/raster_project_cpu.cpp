@@ -9,41 +9,43 @@
 namespace gsim3d::raster {
 namespace {
 
-constexpr const char* kOp = "rasterize_gaussians";
 // Splats of one group should stay in the caches shared by the cores (64 bytes each in float32).
 constexpr int64_t kPairsPerGroup = 1 << 18;
 constexpr int64_t kRowsPerChunk = 2048;
+// A list of a tile is counted in 32 bits; an image with more is left out.
+constexpr int64_t kMaxInstances = std::numeric_limits<int32_t>::max();
+// Bounds the memory of groups of several images: at 16 bytes an instance, and 40 more in the backward pass.
+constexpr int64_t kInstancesPerGroup = 1 << 26;
 
-template <typename T>
-void check_finite(const char* name, const T* values, int64_t row, int64_t width) {
-  for (int64_t i = 0; i < width; ++i)
-    check(std::isfinite(values[row * width + i]), kOp, ": ", name, " must be finite; got ", values[row * width + i],
-          " at row ", row);
+bool all_finite(const auto* values, int64_t count) {
+  return std::all_of(values, values + count, [](auto value) { return std::isfinite(value); });
 }
 
-// Names the first bad number of the rows of a block. Called only when there is one.
+// Counts the bad rows of a block; called only when there is one.
 template <typename T>
-void report_rows(const RasterScene<T>& scene, const int64_t* rows, int n, int64_t image, const Projection<Simd<T>>& p) {
+void note_faults(const RasterScene<T>& scene, const int64_t* rows, int n, const Projection<Simd<T>>& p,
+                 Unusable& unusable) {
   const int64_t color_width = std::max<int64_t>(1, scene.sh_terms) * 3;
   for (int lane = 0; lane < n; ++lane) {
     const int64_t row = rows[lane];
-    check_finite("means", scene.means, row, 3);
-    check_finite("quats", scene.quats, row, 4);
-    check_finite("scales", scene.scales, row, 3);
-    check_finite(scene.sh_terms ? "sh" : "colors", scene.color, row, color_width);
-    for (int i = 0; i < 3; ++i)
-      check(scene.scales[row * 3 + i] >= 0, kOp, ": scales must not be negative; got ", scene.scales[row * 3 + i],
-            " at row ", row);
-    check(scene.opacities[row] >= 0 && scene.opacities[row] <= 1, kOp, ": opacities must be in [0, 1]; got ",
-          scene.opacities[row], " at row ", row);
-    check(!(p.z[lane] > scene.near_plane) || std::isfinite(p.determinant[lane]), kOp,
-          ": the projection overflows; scales or means are too large at row ", row, " for image ", image);
+    const T* scales = scene.scales + row * 3;
+    int64_t faults = 0;
+    if (!all_finite(scene.means + row * 3, 3)) faults |= kFaultMeans;
+    if (!all_finite(scene.quats + row * 4, 4)) faults |= kFaultQuats;
+    if (!all_finite(scales, 3) || std::any_of(scales, scales + 3, [](T x) { return x < 0; })) faults |= kFaultScales;
+    if (!(scene.opacities[row] >= 0 && scene.opacities[row] <= 1)) faults |= kFaultOpacities;
+    if (!all_finite(scene.color + row * color_width, color_width)) faults |= kFaultColor;
+    if (!all_finite(scene.features + row * scene.n_features, scene.n_features)) faults |= kFaultFeatures;
+    if (!faults && p.z[lane] > scene.near_plane && !std::isfinite(p.determinant[lane])) faults |= kFaultProjection;
+    if (!faults) continue;
+    if (unusable.count++ == 0) unusable.first = row << kFaultBits | faults;
   }
 }
 
 template <typename T, int kTerms>
-void project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, const Chunk& chunk, Splat<T>* splats) {
+Unusable project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, const Chunk& chunk, Splat<T>* splats) {
   using V = Simd<T>;
+  Unusable unusable;
   const T log2e_half = T(kLog2eHalf);
   for_row_blocks<T>(chunk.begin, chunk.end, [&](const int64_t* rows, int n) {
     V mean[3], quat[4], scale[3];
@@ -70,16 +72,20 @@ void project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, const C
     for (int i = 0; i < 3; ++i) zero += (mean[i] - mean[i]) + (scale[i] - scale[i]);
     for (int i = 0; i < 4; ++i) zero += quat[i] - quat[i];
     for (int i = 0; i < kColumns; ++i) zero += coefficients[i] - coefficients[i];
+    for (int64_t i = 0; i < scene.n_features; ++i) {
+      const V feature = gather(scene.features, rows, scene.n_features, i);
+      zero += feature - feature;
+    }
     zero += in_front ? p.determinant - p.determinant : V{};
     auto good = (zero == V{}) & (opacity >= V{}) & (opacity <= V{} + T(1));
     for (int i = 0; i < 3; ++i) good &= scale[i] >= V{};
-    if (any(~good)) report_rows(scene, rows, n, chunk.image, p);
+    if (any(~good)) note_faults(scene, rows, n, p, unusable);
 
     const Footprint<V> shape = footprint_of(p.xy, p.yy, p.determinant);
     for (int lane = 0; lane < n; ++lane) {
       Splat<T>& splat = splats[rows[lane] - chunk.begin];
       splat.bounds = {};
-      if (!in_front[lane] || !(opacity[lane] >= T(kMinAlpha))) continue;
+      if (!good[lane] || !in_front[lane] || !(opacity[lane] >= T(kMinAlpha))) continue;
       splat.x = p.x[lane], splat.y = p.y[lane], splat.z = p.z[lane];
       splat.slope = shape.slope[lane], splat.tight = shape.tight[lane] * log2e_half;
       splat.loose = shape.loose[lane] * log2e_half;
@@ -90,6 +96,7 @@ void project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, const C
                                   scene.width, scene.height, scene.cutoff == RasterCutoff::kTile3Sigma);
     }
   });
+  return unusable;
 }
 
 // Calls f(tile) for every tile with a pixel that may see the splat, row by row. A row of tiles is cut to the columns
@@ -147,6 +154,15 @@ void choose_images(const RasterScene<T>& scene, Group<T>& group) {
   }
 }
 
+// Draws nothing into an image of the group.
+template <typename T>
+void leave_out(Group<T>& group, int64_t image, bool backward) {
+  for (int64_t pair = group.image_pair[image]; pair < group.image_pair[image + 1]; ++pair) {
+    group.splats[pair].bounds = {};
+    if (backward) group.pair_begin[pair + 1] = 0;
+  }
+}
+
 }  // namespace
 
 template <typename T>
@@ -162,11 +178,13 @@ bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, co
   group.tile_begin = scratch.take<int64_t>(kTileBegin, n_images * n_tiles + 1);
   if (backward) group.pair_begin = scratch.take<int64_t>(kPairBegin, group.n_pairs() + 1);
 
+  std::vector<Unusable> unusable(static_cast<size_t>(n_chunks));
   parallel.chunks(n_chunks, [&](int64_t c) {
     const Chunk& chunk = group.chunks[c];
     Splat<T>* splats = group.splats + chunk.pair;
     dispatch_sh(scene.sh_terms, [&](auto terms) {
-      project_chunk<T, decltype(terms)::value>(scene, group.cameras[chunk.image - group.first], chunk, splats);
+      unusable[c] = project_chunk<T, decltype(terms)::value>(scene, group.cameras[chunk.image - group.first], chunk,
+                                                             splats);
     });
     int64_t* counts = group.cursor + c * n_tiles;
     std::fill_n(counts, n_tiles, int64_t{0});
@@ -177,8 +195,10 @@ bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, co
     }
   });
 
+  group.unusable.assign(static_cast<size_t>(n_images), {});
   int64_t total = 0;
-  for (int64_t image = 0; image < n_images; ++image)
+  for (int64_t image = 0; image < group.last - group.first; ++image) {
+    const int64_t begin = total;
     for (int64_t tile = 0; tile < n_tiles; ++tile) {
       group.tile_begin[image * n_tiles + tile] = total;
       for (int64_t c = group.image_chunk[image]; c < group.image_chunk[image + 1]; ++c) {
@@ -187,9 +207,22 @@ bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, co
         total += count;
       }
     }
-  group.tile_begin[n_images * n_tiles] = group.n_instances = total;
-  check(total <= std::numeric_limits<int32_t>::max(), kOp, ": the Gaussians touch ", total,
-        " tiles together, more than 2^31; scales are too large");
+    Unusable& of_image = group.unusable[image];
+    for (int64_t c = group.image_chunk[image]; c < group.image_chunk[image + 1]; ++c) {
+      if (of_image.count == 0) of_image.first = unusable[c].first;
+      of_image.count += unusable[c].count;
+    }
+    if (total - begin > kMaxInstances) {
+      of_image = {total - begin, kFaultTiles};
+      leave_out(group, image, backward);
+      std::fill_n(group.tile_begin + image * n_tiles, n_tiles, begin);
+      total = begin;
+    } else if (image > 0 && total > kInstancesPerGroup) {
+      group.cut(image);
+      total = begin;
+    }
+  }
+  group.tile_begin[(group.last - group.first) * n_tiles] = group.n_instances = total;
   group.instances = scratch.take<Instance<T>>(kInstances, total);
   if (backward) {
     group.positions = scratch.take<int64_t>(kPositions, total);
@@ -197,7 +230,7 @@ bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, co
     for (int64_t pair = 0; pair < group.n_pairs(); ++pair) group.pair_begin[pair + 1] += group.pair_begin[pair];
   }
 
-  parallel.chunks(n_chunks, [&](int64_t c) {
+  parallel.chunks(static_cast<int64_t>(group.chunks.size()), [&](int64_t c) {
     const Chunk& chunk = group.chunks[c];
     int64_t* cursor = group.cursor + c * n_tiles;
     const int64_t first_pair = group.image_pair[chunk.image - group.first];

@@ -47,6 +47,11 @@ struct Chunk {
   int64_t pair;        // index of the first row's splat in the group
 };
 
+// Rows of an image that were left out; see RasterImages::unusable.
+struct Unusable {
+  int64_t count = 0, first = -1;
+};
+
 // A group: images [first, last) and scratch for them, reused from group to group.
 template <typename T>
 struct Group {
@@ -56,6 +61,7 @@ struct Group {
   std::vector<int64_t> image_chunk;  // [last - first + 1] first chunk of each image
   std::vector<int64_t> image_pair;   // [last - first + 1] first pair of each image
   std::vector<Camera<T>> cameras;    // [last - first]
+  std::vector<Unusable> unusable;    // [last - first]
   Splat<T>* splats = nullptr;        // [pairs]
   int64_t* cursor = nullptr;         // [chunks, tiles] counts, then write positions
   int64_t* tile_begin = nullptr;     // [images * tiles + 1] into instances
@@ -64,6 +70,16 @@ struct Group {
   int64_t* pair_begin = nullptr;  // [pairs + 1] into positions
   int64_t* positions = nullptr;   // index into instances
   int64_t n_instances = 0;
+
+  // Ends the group in front of its image number `image`, which begins the next group.
+  void cut(int64_t image) {
+    last = first + image;
+    chunks.resize(static_cast<size_t>(image_chunk[image]));
+    image_chunk.resize(static_cast<size_t>(image) + 1);
+    image_pair.resize(static_cast<size_t>(image) + 1);
+    cameras.resize(static_cast<size_t>(image));
+    unusable.resize(static_cast<size_t>(image));
+  }
 
   int64_t n_tiles() const { return tiles_x * tiles_y; }
   int64_t n_pairs() const { return image_pair.back(); }

@@ -85,13 +85,13 @@ struct SceneTensors {
   }
 };
 
-using Images = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using Images = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
                            const Tensor& color, const Tensor& features, const Tensor& background,
                            const Tensor& viewmats, const Tensor& Ks, const Tensor& image_cloud, const Tensor& cu_rows,
                            int64_t width, int64_t height, double near_plane, int64_t cutoff, int64_t max_pairs,
-                           int64_t max_entries, int64_t max_slots) {
+                           int64_t max_entries, int64_t max_slots, bool watch) {
   const SceneTensors given{"rasterize_gaussians", means, quats, scales, opacities, color, features, background,
                            viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff};
   given.check_all();
@@ -104,21 +104,26 @@ Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tenso
   Tensor transmittance = empty(in.means, {n, height, width});
   Tensor last = empty(in.means, {n, height, width}, ScalarType::Int);
   Tensor state = empty(in.means, {0}, ScalarType::Byte);
+  Tensor unusable = empty(in.means, {watch ? n : 0, 2}, ScalarType::Long);
   TensorWorkspace workspace(in.means);
   dispatch_float(given.op, "means", in.means, [&]<typename T>() {
     const RasterImages<T> images{mutable_data<T>(out_color),     mutable_data<T>(alpha),
                                  mutable_data<T>(depth),         mutable_data<T>(out_features),
-                                 mutable_data<T>(transmittance), mutable_data<int32_t>(last)};
+                                 mutable_data<T>(transmittance), mutable_data<int32_t>(last),
+                                 watch ? mutable_data<int64_t>(unusable) : nullptr};
     if constexpr (kWithCuda)
       if (in.means.is_cuda()) {
         const RasterScene<T> scene = in.scene<T>();
         const cuda::RasterLimits limits{max_pairs, max_entries, max_slots};
         state = empty(in.means, {cuda::raster_state_bytes(scene, limits)}, ScalarType::Byte);
-        return cuda::raster_forward<T>(scene, images, limits, state.data_ptr(), workspace, current_stream(in.means));
+        const CurrentStream stream = current_stream(in.means);
+        cuda::raster_forward<T>(scene, images, limits, state.data_ptr(), workspace, stream);
+        if (watch) cuda::raster_watch<T>(scene, images.unusable, stream);
+        return;
       }
     cpu::raster_forward<T>(in.scene<T>(), images, workspace, torch_parallel());
   });
-  return {out_color, alpha, depth, out_features, transmittance, last, state};
+  return {out_color, alpha, depth, out_features, transmittance, last, state, unusable};
 }
 
 using SceneGrads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;

@@ -57,6 +57,11 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor branch_sum, Tensor branch_weight, Tensor branch_bias, Tensor weight, Tensor bias)");
   m.def("linear_grad_bias(Tensor grad) -> Tensor");
 
+  // sentinel: which rows cannot be used, and sums over clouds.
+  m.def(
+      "watch_rows(Tensor[] fields, float[] low, float[] high, Tensor cu_rows, Tensor cloud_scene, Tensor origin, "
+      "Tensor activity, Tensor? previous, float grid_size, float max_step) -> (Tensor status, Tensor record)");
+
   // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
   m.def(
       "plane_sweep(Tensor features, Tensor homographies, Tensor translations, Tensor inverse_depths, Tensor src_images, "
@@ -66,12 +71,14 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor src_images, Tensor cu_src) -> Tensor");
 
   // raster: 3D Gaussian projection and blending. color is [N, K, 3] SH coefficients or [N, 3]; cutoff 0 exact, 1 tile3sigma,
-  // 2 smooth; transmittance, last and state are kept for the backward pass. max_* (CUDA) size the state.
+  // 2 smooth; transmittance, last and state are kept for the backward pass. max_* (CUDA) size the state. unusable [I, 2]
+  // counts the rows that were left out, [0, 2] unless `watch`.
   m.def(
       "rasterize_gaussians(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, Tensor features, "
       "Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, int width, int height, "
-      "float near_plane, int cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots) -> (Tensor color, "
-      "Tensor alpha, Tensor depth, Tensor features, Tensor transmittance, Tensor last, Tensor state)");
+      "float near_plane, int cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots, bool watch) -> "
+      "(Tensor color, Tensor alpha, Tensor depth, Tensor features, Tensor transmittance, Tensor last, Tensor state, "
+      "Tensor unusable)");
   m.def(
       "rasterize_gaussians_backward(Tensor grad_color, Tensor grad_alpha, Tensor grad_depth, Tensor grad_features, "
       "Tensor transmittance, Tensor last, Tensor state, Tensor means, Tensor quats, Tensor scales, Tensor opacities, "

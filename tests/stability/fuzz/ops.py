@@ -166,6 +166,25 @@ def _row_norm(rng: random.Random) -> Arguments:
     }
 
 
+def _residual_norm(rng: random.Random) -> Arguments:
+    n, channels, dtype = _size(rng), rng.choice((1, 4, 33)), _dtype(rng)
+    pairs = {
+        name: tensor(rng, channels, dtype=dtype) for name in ("branch_norm_0", "branch_norm_1", "norm_0", "norm_1")
+    }
+    return {
+        "x": tensor(rng, n, channels, dtype=dtype),
+        "branch": tensor(rng, n, channels, dtype=dtype),
+        "keep": rng.choice((None, tensor(rng, n, 1, dtype=dtype))),
+        **pairs,
+        "eps": 1e-5,
+    }
+
+
+def _call_residual_norm(a: Arguments):
+    pairs = {name: (a[f"{name}_0"], a[f"{name}_1"]) for name in ("branch_norm", "norm")}
+    return ops.residual_norm(a["x"], a["branch"], keep=a["keep"], **pairs, eps=a["eps"])
+
+
 def _cameras(rng: random.Random, images: int) -> dict[str, Tensor]:
     viewmats = torch.eye(4).repeat(images, 1, 1)
     viewmats[:, :3, 3] = tensor(rng, images, 3, scale=0.1)
@@ -249,6 +268,7 @@ OPS: dict[str, tuple[Callable[[random.Random], Arguments], Callable[[Arguments],
     "pool_mean": (_pool, lambda a: ops.pool_mean(**a)),
     "unpool": (_unpool, lambda a: ops.unpool(**a)),
     "row_norm": (_row_norm, lambda a: ops.row_norm(**a)),
+    "residual_norm": (_residual_norm, _call_residual_norm),
     "plane_sweep": (_plane_sweep, lambda a: ops.plane_sweep(**a)),
     "sweep_geometry": (_sweep_geometry, lambda a: ops.sweep_geometry(**a)),
     "rasterize_gaussians": (_raster, _call_raster),
@@ -294,7 +314,7 @@ def _tensors(value: Any) -> list[Tensor]:
 
 def _named(name: str, error: Exception, arguments: Arguments) -> bool:
     """Whether the message names an argument."""
-    return any(argument in str(error) for argument in (*arguments, *STRUCTURES))
+    return any(argument in str(error) for argument in (*arguments, *STRUCTURES, "weight", "bias", "norm[0]", "norm[1]"))
 
 
 def public_ops() -> set[str]:

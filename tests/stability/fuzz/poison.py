@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 NUMBERS = (
-    math.nan, math.inf, -math.inf, 0.0, -0.0, 5e-324, 1e-45, 1e-38, -1e-38, 1e-30, 1e-12, -1.0, 2.0, 1e6, -1e6, 1e9, 1e12,
-    1e15, -1e15, 1e18, 1e30, -1e30, 3.4e38, -3.4e38, 1e300, -1e300,
+    math.nan, math.inf, -math.inf, 0.0, -0.0, 5e-324, 1e-45, 1e-38, -1e-38, 1e-30, 1e-12, -1.0, 2.0, 1e6, -1e6, 1e9,
+    1e12, 1e15, -1e15, 1e18, 1e30, -1e30, 3.4e38, -3.4e38, 1e300, -1e300,
 )  # fmt: skip
 WHOLE = (
     0,

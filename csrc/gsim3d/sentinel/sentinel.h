@@ -1,0 +1,60 @@
+// One look at the rows of a state: which of them cannot be used, and sums over each cloud.
+//
+// A row's status has bit f where a value of field f is below low[f], above high[f] or NaN; kOutside where its position
+// is in no cell [0, 2^16) of its scene's workspace, kFast where it moved further than max_step. Field 0 is the
+// position, field 1 the opacity; rows that are asleep have status 0. Sums are of float64, over fixed pieces of rows in
+// order: the same bits for any number of threads.
+#pragma once
+
+#include <cstdint>
+
+#include "gsim3d/core/parallel.h"
+#include "gsim3d/core/stream.h"
+#include "gsim3d/core/workspace.h"
+
+namespace gsim3d {
+
+constexpr int kMaxWatchedFields = 8;
+constexpr int32_t kOutside = 1 << 29, kFast = 1 << 30;
+constexpr uint8_t kAsleep = 2;         // Particles.activity of gsim3d/types.py
+constexpr double kWatchedCells = 65536;  // of a workspace along each axis: codes have 16 bits
+// Columns of a record: count and first row (-1: none) of every field, of kOutside and of kFast; then how many rows are
+// usable and awake, half their squared displacements, the opacities of all rows that have one in bounds, and the lowest
+// and highest positions of the awake.
+constexpr int kWatchedSums = 9;
+constexpr int watched_columns(int n_fields) { return 2 * (n_fields + 2) + kWatchedSums; }
+
+template <typename T>
+struct WatchedRows {
+  const T* fields[kMaxWatchedFields];  // [n_rows, width[f]]
+  int64_t width[kMaxWatchedFields];    // 3, 1, ...
+  T low[kMaxWatchedFields], high[kMaxWatchedFields];
+  int n_fields;               // 2 to kMaxWatchedFields
+  const T* previous;          // [n_rows, 3] positions one step before, or null
+  const uint8_t* activity;    // [n_rows]
+  const int64_t* cu_rows;     // [n_clouds + 1]
+  const int64_t* cloud_scene;  // [n_clouds] in [0, n_scenes)
+  const double* origin;       // [n_scenes, 3] metres
+  int64_t n_rows, n_clouds, n_scenes;
+  double grid_size;  // metres, edge of a cell; 0: no workspace
+  double max_step;   // metres
+};
+
+namespace cpu {
+
+template <typename T>
+void watch_rows(const WatchedRows<T>& rows,
+                int32_t* status,  // [n_rows]
+                double* record,   // [n_clouds, watched_columns(n_fields)]
+                const Workspace& workspace, const Parallel& parallel);
+
+}  // namespace cpu
+
+// Offsets and scenes are not checked; none is read out of bounds.
+namespace cuda {
+
+template <typename T>
+void watch_rows(const WatchedRows<T>& rows, int32_t* status, double* record, const Workspace& workspace, Stream stream);
+
+}  // namespace cuda
+}  // namespace gsim3d

@@ -1,0 +1,108 @@
+// Pieces of rows are looked at in parallel; a piece that holds rows of several clouds has a partial record of each.
+#include <algorithm>
+#include <type_traits>
+
+#include "gsim3d/core/check.h"
+#include "gsim3d/sentinel/sentinel_math.h"
+
+namespace gsim3d::cpu {
+namespace {
+
+using namespace sentinel;  // NOLINT: this file is its other half
+
+constexpr int64_t kPiece = 1024;  // rows
+
+template <typename T>
+void check_rows(const WatchedRows<T>& r) {
+  constexpr const char* kOp = "watch_rows";
+  check(r.cu_rows[0] == 0 && r.cu_rows[r.n_clouds] == r.n_rows, kOp, ": cu_rows must run from 0 to N=", r.n_rows,
+        "; got ", r.cu_rows[0], " .. ", r.cu_rows[r.n_clouds]);
+  for (int64_t q = 0; q < r.n_clouds; ++q) {
+    check(r.cu_rows[q] <= r.cu_rows[q + 1], kOp, ": cu_rows must not descend; got ", r.cu_rows[q], " then ",
+          r.cu_rows[q + 1], " at ", q);
+    check(r.cloud_scene[q] >= 0 && r.cloud_scene[q] < r.n_scenes, kOp, ": cloud_scene must be in [0, B) with B=",
+          r.n_scenes, "; got ", r.cloud_scene[q], " at ", q);
+  }
+}
+
+// Whether every value of rows [begin, end) is in bounds; quick, as it nearly always is.
+template <typename T>
+bool all_in_bounds(const WatchedRows<T>& rows, int64_t begin, int64_t end) {
+  using Mask = std::conditional_t<sizeof(T) == 4, int32_t, int64_t>;
+  Mask out = 0;
+  for (int f = 0; f < rows.n_fields; ++f) {
+    const T *values = rows.fields[f] + begin * rows.width[f], low = rows.low[f], high = rows.high[f];
+    const int64_t n = (end - begin) * rows.width[f];
+#pragma omp simd reduction(| : out)
+    for (int64_t i = 0; i < n; ++i) out |= (values[i] >= low ? Mask{0} : Mask{1}) | (values[i] <= high ? Mask{0} : Mask{1});
+  }
+  return out == 0;
+}
+
+template <typename T>
+void look_at_rows(const WatchedRows<T>& rows, int64_t cloud, int64_t begin, int64_t end, int32_t* status,
+                  double* record) {
+  const int n_kinds = rows.n_fields + 2, columns = watched_columns(rows.n_fields);
+  for (int c = 0; c < columns; ++c) record[c] = start_of(c, rows.n_fields, rows.n_rows);
+  double* sums = record + 2 * n_kinds;
+  const double* origin = rows.origin + 3 * rows.cloud_scene[cloud];
+  const bool clean = all_in_bounds(rows, begin, end);
+  for (int64_t row = begin; row < end; ++row) {
+    const RowState state = look_at_row(rows, row, clean ? 0 : faults_of_fields(rows, row), origin);
+    const bool asleep = rows.activity[row] == kAsleep;
+    status[row] = asleep ? 0 : state.status;
+    if (!(state.status & 2)) sums[2] += static_cast<double>(rows.fields[1][row]);
+    if (asleep) continue;
+    if (state.status == 0) {
+      sums[0] += 1;
+      sums[1] += state.energy;
+      for (int i = 0; i < 3; ++i) {
+        const auto position = static_cast<double>(rows.fields[0][row * 3 + i]);
+        sums[3 + i] = std::min(sums[3 + i], position), sums[6 + i] = std::max(sums[6 + i], position);
+      }
+      continue;
+    }
+    for (int k = 0; k < n_kinds; ++k)
+      if (state.status & bit_of(k, rows.n_fields)) {
+        record[2 * k] += 1;
+        record[2 * k + 1] = std::min(record[2 * k + 1], static_cast<double>(row));
+      }
+  }
+}
+
+}  // namespace
+
+template <typename T>
+void watch_rows(const WatchedRows<T>& rows, int32_t* status, double* record, const Workspace& workspace,
+                const Parallel& parallel) {
+  check_rows(rows);
+  const int columns = watched_columns(rows.n_fields);
+  const int64_t n_pieces = (rows.n_rows + kPiece - 1) / kPiece;
+  // (piece, cloud) pairs that share rows ascend in one and never descend in the other: their sum names each.
+  double* partial = workspace.take<double>((n_pieces + rows.n_clouds) * columns);
+  parallel.chunks(n_pieces, [&](int64_t piece) {
+    const int64_t begin = piece * kPiece, end = std::min(rows.n_rows, begin + kPiece);
+    int64_t cloud = std::upper_bound(rows.cu_rows, rows.cu_rows + rows.n_clouds + 1, begin) - rows.cu_rows - 1;
+    for (; cloud < rows.n_clouds && rows.cu_rows[cloud] < end; ++cloud) {
+      const int64_t from = std::max(begin, rows.cu_rows[cloud]), to = std::min(end, rows.cu_rows[cloud + 1]);
+      if (from < to) look_at_rows(rows, cloud, from, to, status, partial + (piece + cloud) * columns);
+    }
+  });
+  for (int64_t q = 0; q < rows.n_clouds; ++q) {
+    const int64_t begin = rows.cu_rows[q], end = rows.cu_rows[q + 1];
+    for (int c = 0; c < columns; ++c) {
+      double value = start_of(c, rows.n_fields, rows.n_rows);
+      for (int64_t piece = begin / kPiece; begin < end && piece <= (end - 1) / kPiece; ++piece)
+        value = join(join_of(c, rows.n_fields), value, partial[(piece + q) * columns + c]);
+      record[q * columns + c] = finished(c, rows.n_fields, rows.n_rows, value);
+    }
+  }
+}
+
+#define GSIM3D_INSTANTIATE(T) \
+  template void watch_rows<T>(const WatchedRows<T>&, int32_t*, double*, const Workspace&, const Parallel&);
+GSIM3D_INSTANTIATE(float)
+GSIM3D_INSTANTIATE(double)
+#undef GSIM3D_INSTANTIATE
+
+}  // namespace gsim3d::cpu

@@ -1,0 +1,88 @@
+// What is wrong with one row, and how columns of records are joined. For host and device.
+#pragma once
+
+#include <cmath>
+
+#include "gsim3d/core/platform.h"
+#include "gsim3d/sentinel/sentinel.h"
+
+namespace gsim3d::sentinel {
+
+constexpr double kLargest = 3.4028234663852886e38;  // of float32
+
+struct RowState {
+  int32_t status;
+  double energy;  // half the squared displacement
+};
+
+// Bits of the fields that are out of bounds.
+template <typename T>
+GSIM3D_HD int32_t faults_of_fields(const WatchedRows<T>& rows, int64_t row) {
+  int32_t faults = 0;
+  for (int f = 0; f < rows.n_fields; ++f) {
+    const int64_t width = rows.width[f];
+    const T* values = rows.fields[f] + row * width;
+    bool good = true;
+    for (int64_t i = 0; i < width; ++i) good &= values[i] >= rows.low[f] && values[i] <= rows.high[f];
+    faults |= good ? 0 : 1 << f;
+  }
+  return faults;
+}
+
+// `faults`: those of its fields. `origin`: of the row's scene; null: there is none, and no workspace.
+template <typename T>
+GSIM3D_HD RowState look_at_row(const WatchedRows<T>& rows, int64_t row, int32_t faults, const double* origin) {
+  RowState state{faults, 0};
+  if (faults & 1) return state;
+  const T* position = rows.fields[0] + row * 3;
+  if (origin != nullptr && rows.grid_size > 0) {
+    bool within = true;
+    for (int i = 0; i < 3; ++i) {
+      const double cell = (static_cast<double>(position[i]) - origin[i]) / rows.grid_size;
+      within &= cell >= 0 && cell < kWatchedCells;
+    }
+    state.status |= within ? 0 : kOutside;
+  }
+  if (rows.previous != nullptr) {
+    double squared = 0;
+    for (int i = 0; i < 3; ++i) {
+      const double step = static_cast<double>(position[i]) - static_cast<double>(rows.previous[row * 3 + i]);
+      squared += step * step;
+    }
+    state.status |= squared > rows.max_step * rows.max_step ? kFast : 0;
+    state.energy = squared / 2;
+  }
+  return state;
+}
+
+// The bit of kind k: the fields, kOutside, kFast.
+GSIM3D_HD int32_t bit_of(int kind, int n_fields) {
+  return kind < n_fields ? 1 << kind : kind == n_fields ? kOutside : kFast;
+}
+
+enum class Join { kSum, kLeast, kLargest };
+
+GSIM3D_HD Join join_of(int column, int n_fields) {
+  const int sums = 2 * (n_fields + 2);
+  if (column < sums) return column % 2 ? Join::kLeast : Join::kSum;
+  return column < sums + 3 ? Join::kSum : column < sums + 6 ? Join::kLeast : Join::kLargest;
+}
+
+// The value of a column where there are no rows. The first row is n_rows for none, until the record is complete.
+GSIM3D_HD double start_of(int column, int n_fields, int64_t n_rows) {
+  if (column < 2 * (n_fields + 2)) return column % 2 ? static_cast<double>(n_rows) : 0;
+  const Join join = join_of(column, n_fields);
+  return join == Join::kSum ? 0 : join == Join::kLeast ? kLargest : -kLargest;
+}
+
+GSIM3D_HD double join(Join how, double a, double b) {
+  if (how == Join::kSum) return a + b;
+  return how == Join::kLeast ? (b < a ? b : a) : (b > a ? b : a);
+}
+
+GSIM3D_HD double finished(int column, int n_fields, int64_t n_rows, double value) {
+  const bool is_first = column < 2 * (n_fields + 2) && column % 2;
+  return is_first && value >= static_cast<double>(n_rows) ? -1 : value;
+}
+
+}  // namespace gsim3d::sentinel

@@ -1,0 +1,210 @@
+"""One look at the rows of a state, in the sections that an op without gradients has."""
+
+import pytest
+import torch
+
+from gsim3d.ops import watch_rows
+from gsim3d.ops.sentinel import FAST, OUTSIDE, SUMS
+from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
+from tests.oracle import sentinel as oracle
+
+DTYPES = [torch.float32, torch.float64]
+BOUNDS = [(-3e38, 3e38), (0.0, 1.0), (-3.5, 3.5), (0.0, 1.0), (-4.0, 4.0)]
+CLOUDS = [0, 0, 7, 2500, 2500, 5000]
+
+
+def state(clouds=CLOUDS, dtype=torch.float32, seed=0, device="cpu"):
+    """(fields, bounds, cu_rows, options) of rows of which some are out of every bound, and some asleep."""
+    g = torch.Generator().manual_seed(seed)
+    n, n_clouds = clouds[-1], len(clouds) - 1
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    fields = [4 * torch.rand(n, 3, generator=g) - 0.2, 1.02 * torch.rand(n, generator=g), normal(n, 5), normal(n, 0)]
+    fields = [field.to(dtype) for field in (*fields, normal(n, 4, 3))]
+    for place, value in ((11, float("nan")), (n // 2, float("inf")), (n - 1, -float("inf"))):
+        if 2 <= place < n:
+            fields[0][place, place % 3] = fields[2][place - 1, 4] = fields[4][place - 2, 1, 1] = value
+    options = {
+        "cloud_scene": torch.arange(n_clouds) % 2,
+        "origin": torch.zeros(2, 3, dtype=torch.float64),
+        "activity": torch.randint(0, 3, (n,), generator=g).to(torch.uint8),
+        "grid_size": 3.6 / 2**16,
+        "previous": (fields[0] + 0.1 * normal(n, 3)).to(dtype),
+        "max_step": 0.3,
+    }
+    options = {k: v.to(device) if isinstance(v, torch.Tensor) else v for k, v in options.items()}
+    return [field.to(device) for field in fields], BOUNDS, torch.tensor(clouds, device=device), options
+
+
+def look(arguments):
+    fields, bounds, cu_rows, options = arguments
+    watched = watch_rows(fields, bounds, cu_rows, **options)
+    return watched.status, watched.record
+
+
+def assert_same_record(actual, expected, n_fields):
+    """Counts, rows and bounds are the same; sums of energy and opacity but for the order of their terms."""
+    summed = torch.zeros(expected.shape[1], dtype=torch.bool)
+    summed[2 * (n_fields + 2) + 1 : 2 * (n_fields + 2) + 3] = True
+    assert_same_bits(actual.cpu()[:, ~summed], expected[:, ~summed])
+    assert_close_relative_to_max(actual.cpu()[:, summed], expected[:, summed], 1e-13)
+
+
+# 1 forward against the oracle
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("clouds", [CLOUDS, [0, 1], [0, 1024, 2048], [0, *range(1, 40), 1030, 1030, 2047, 4100]])
+def test_equals_the_oracle(clouds, dtype, device):
+    fields, bounds, cu_rows, options = state(clouds, dtype)
+    expected_status, expected = oracle.watch_rows(fields, bounds, cu_rows, **options)
+    status, record = look(state(clouds, dtype, device=device))
+    assert_same_bits(status.cpu(), expected_status)
+    assert_same_record(record, expected, len(fields))
+
+
+def test_what_is_counted():
+    means = torch.tensor([[0.5, 0.5, 0.5], [0.5, float("nan"), 0.5], [-0.1, 0.5, 0.5], [0.9, 0.5, 0.5], [3.0, 0.5, 0.5]])
+    opacities = torch.tensor([0.25, 0.5, 0.5, 1.0, 2.0])
+    watched = watch_rows(
+        [means, opacities],
+        [(-9.0, 9.0), (0.0, 1.0)],
+        torch.tensor([0, 5]),
+        cloud_scene=torch.zeros(1, dtype=torch.int64),
+        origin=torch.zeros(1, 3, dtype=torch.float64),
+        activity=torch.tensor([0, 0, 1, 0, 2], dtype=torch.uint8),
+        grid_size=1.0,
+        previous=torch.tensor([[0.5, 0.5, 0.1]] + [[0.5, 0.5, 0.5]] * 4),
+        max_step=0.7,
+    )
+    assert watched.status.tolist() == [0, 1, OUTSIDE, 0, 0]
+    record = watched.record[0].tolist()
+    assert record[:8] == [1, 1, 0, -1, 1, 2, 0, -1]
+    sums = dict(zip(SUMS, record[8:], strict=True))
+    assert sums["awake"] == 2 and sums["opacity_mass"] == 2.25  # all but the row whose opacity is 2
+    assert sums["kinetic_energy"] == pytest.approx((0.4**2 + 0.4**2) / 2, rel=1e-6)
+    assert (sums["low_x"], sums["high_x"]) == pytest.approx((0.5, 0.9))
+    fast = watch_rows(
+        [means, opacities],
+        [(-9.0, 9.0), (0.0, 1.0)],
+        torch.tensor([0, 5]),
+        cloud_scene=torch.zeros(1, dtype=torch.int64),
+        origin=torch.zeros(1, 3, dtype=torch.float64),
+        activity=torch.zeros(5, dtype=torch.uint8),
+        previous=torch.full((5, 3), 0.5),
+        max_step=0.5,
+    )
+    assert fast.status.tolist() == [0, 1, FAST, 0, FAST | 2]
+
+
+# 4 CPU against CUDA: section 1 compares both with the oracle; here bits, from run to run
+
+
+def test_repeats_bit_by_bit(device):
+    first = look(state(device=device))
+    for a, b in zip(look(state(device=device)), first, strict=True):
+        assert_same_bits(a, b)
+
+
+def test_waits_for_nothing_on_cuda(devices):
+    arguments = state(device=devices[1])
+    look(arguments)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        look(arguments)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+def test_any_offsets_stay_in_bounds_on_cuda(devices):
+    fields, bounds, cu_rows, options = state(device=devices[1])
+    for offsets in ([0, -5, 9999, 3, 5000, 4000], [5000, 0, 0, 0, 0, 5000], [2**60] * 6):
+        look((fields, bounds, torch.tensor(offsets, device=devices[1]), options))
+    options["cloud_scene"] = options["cloud_scene"] + 2**40
+    status, _ = look((fields, bounds, cu_rows, options))
+    assert not bool((status & OUTSIDE).any())
+
+
+# 5 opcheck
+
+
+def test_opcheck(device):
+    fields, bounds, cu_rows, options = state([0, 3, 9], device=device)
+    low, high = map(list, zip(*bounds))
+    names = ("cloud_scene", "origin", "activity", "previous", "grid_size", "max_step")
+    arguments = (fields, low, high, cu_rows, *(options[name] for name in names))
+    torch.library.opcheck(torch.ops.gsim3d.watch_rows, arguments)
+
+
+# 6 torch.compile
+
+
+def test_compiles(device):
+    fields, bounds, cu_rows, options = state([0, 3, 9], device=device)
+
+    def f(means):
+        return watch_rows([means, *fields[1:]], bounds, cu_rows, **options).status + 0
+
+    assert_same_bits(torch.compile(f, fullgraph=True)(fields[0]), f(fields[0]))
+
+
+# 7 edges
+
+
+def test_any_number_of_threads():
+    arguments = state([0, 10, 9000])
+    assert_same_bits_for_any_threads(lambda: look(arguments))
+
+
+@pytest.mark.parametrize("clouds", [[0], [0, 0], [0, 0, 0]])
+def test_no_rows(clouds, device):
+    status, record = look(state(clouds, device=device))
+    assert status.shape == (0,) and record.shape == (len(clouds) - 1, 2 * 7 + 9)
+    assert bool((record[:, 0:14:2] == 0).all()) and bool((record[:, 1:14:2] == -1).all())
+
+
+def test_a_strided_field(device):
+    fields, bounds, cu_rows, options = state(device=device)
+    strided = [torch.stack([field, field], 1)[:, 0] for field in fields]
+    assert not strided[0].is_contiguous()
+    for a, b in zip(look((strided, bounds, cu_rows, options)), look((fields, bounds, cu_rows, options)), strict=True):
+        assert_same_bits(a, b)
+
+
+def test_gradients_pass_by():
+    fields, bounds, cu_rows, options = state()
+    watched = watch_rows([field.requires_grad_() for field in fields], bounds, cu_rows, **options)
+    assert not watched.record.requires_grad
+
+
+# 8 error messages
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f, o: (f[:1], o), "fields must be 2 to 8 tensors, positions and opacities first; got 1"),
+        (lambda f, o: ([f[0][:, :2], *f[1:]], o), r"fields\[0\] must be \[N, 3\]"),
+        (lambda f, o: ([f[0], f[1][:3], *f[2:]], o), r"fields\[1\] must be \[N\]"),
+        (lambda f, o: ([*f[:2], f[2].double(), *f[3:]], o), "fields must be float32; got float64"),
+        (lambda f, o: ([*f[:2], f[2][:4], *f[3:]], o), r"fields must have N=5000 rows; got \[4, 5\]"),
+        (lambda f, o: (f, o | {"origin": o["origin"].float()}), "origin must be float64; got float32"),
+        (lambda f, o: (f, o | {"activity": o["activity"].long()}), "activity must be uint8; got int64"),
+        (lambda f, o: (f, o | {"previous": o["previous"][:9]}), r"previous must be \[N, 3\]"),
+        (lambda f, o: (f, o | {"cloud_scene": o["cloud_scene"] + 1}), r"cloud_scene must be in \[0, B\) with B=2; got 2"),
+    ],
+)
+def test_errors_name_what_is_wrong(change, message):
+    fields, bounds, cu_rows, options = state()
+    fields, options = change(fields, options)
+    with pytest.raises(ValueError, match="watch_rows: .*" + message):
+        watch_rows(fields, bounds[: len(fields)], cu_rows, **options)
+
+
+def test_offsets_that_do_not_fit():
+    fields, bounds, _, options = state()
+    for offsets in ([0, 0, 7, 2500, 2500, 4999], [0, 9, 7, 2500, 2500, 5000]):
+        with pytest.raises(ValueError, match="watch_rows: cu_rows must"):
+            watch_rows(fields, bounds, torch.tensor(offsets), **options)
