@@ -2,7 +2,8 @@
 """Runs the hard cases and writes docs/stability.md (and docs/stability.json, the numbers behind it).
 
     python tools/stability.py                   run all cases here: CPU, and CUDA where there is a GPU
-    python tools/stability.py --add FILE        add what another machine measured (GSIM3D_STABILITY_JSON=FILE pytest tests/stability)
+    python tools/stability.py --add FILE        add what another machine measured: stability.json of tools/gpu_check.sh, or
+                                                GSIM3D_STABILITY_JSON=FILE pytest tests/stability
     python tools/stability.py --page            only write the page again
 """
 
@@ -39,6 +40,9 @@ against a float64 reference that knows nothing of gsim3d, or against the same co
 the bound that the test sets. tf32: float32 with TF32 products allowed; bf16: under `torch.autocast`; the rasterizer, the
 geometry and the plane sweep compute in float32 under both. "held": what is expected holds bit by bit, or as an error that is
 raised; there is no number to compare.
+
+Each guard behind these cases is shown to matter: `python tools/mutants.py guards guards_core` takes them away one by one, and
+for each a test of this page must fail.
 """
 OTHERS = """
 What the published release does was seen on the CPU or read in its code; of other packages, public issues (`name#number`),

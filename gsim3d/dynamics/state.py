@@ -213,4 +213,4 @@ def rotate_left(quats: Tensor, rotation_vectors: Tensor) -> Tensor:
     qw, qv = quats[:, :1], quats[:, 1:]
     turned = torch.cat([w * qw - (v * qv).sum(1, keepdim=True), w * qv + qw * v + torch.linalg.cross(v, qv)], 1)
     largest = turned.detach().gather(1, turned.detach().abs().argmax(1, keepdim=True))
-    return turned / (turned.norm(dim=1, keepdim=True) * torch.where(largest < 0, -1, 1))
+    return torch.where(largest < 0, -turned, turned)

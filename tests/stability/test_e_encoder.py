@@ -273,6 +273,8 @@ def test_e52_ply_of_extreme_gaussians(tmp_path, measured):
     scales, opacities = torch.tensor([[0.0, 1e-9, 1e3]]).repeat(3, 1), torch.tensor([0.0, 1.0, 0.5])
     means, sh = torch.tensor([[0.0, 1e6, -1e-30]]).repeat(3, 1), torch.full((3, 4, 3), -1e4)
     write_ply(tmp_path / "scene.ply", Gaussians(means, quats, scales, opacities, sh, torch.tensor([0, 3])))
+    body = (tmp_path / "scene.ply").read_bytes().partition(b"end_header\n")[2]
+    assert np.isfinite(np.frombuffer(body, "<f4")).all()
     read = read_ply(tmp_path / "scene.ply")
     measured.finite(read.means, read.quats, read.scales, read.opacities, read.sh)
     measured.close(read.opacities, opacities, 1e-4, "opacities")

@@ -118,3 +118,12 @@ def test_single_file_holds_the_averaged_weights_and_the_config(tmp_path):
     assert after.config == before.config and after.state["step"] == 10
     assert after.state["parent"] == checkpoint.load(tmp_path).digest
     assert all(torch.equal(value, before.ema[name]) for name, value in after.weights.items())
+
+
+def test_others_may_read_what_the_umask_lets_them_read(tmp_path):
+    folder = checkpoint.save(tmp_path, example())
+    checkpoint.export(example(), tmp_path / "model.safetensors")
+    plain = tmp_path / "plain"
+    plain.touch()
+    modes = {path.name: path.stat().st_mode for path in [*folder.iterdir(), tmp_path / "model.safetensors"]}
+    assert set(modes.values()) == {plain.stat().st_mode}, modes
