@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 from gsim3d import ops
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
 from gsim3d.dynamics.fused_block import product_dtype, run_block
-from gsim3d.layers import RowLayerNorm, RowLinear, make_norm
+from gsim3d.layers import RowLayerNorm, RowLinear, make_norm, widened
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
 TIME_EMBEDDING_STD = 0.02
@@ -157,6 +157,7 @@ def run_blocks(
     blocks: nn.ModuleList, x: Tensor, conv_input: Tensor, stage: Stage, generator: torch.Generator | None
 ) -> Tensor:
     """x behind ``blocks``; the first convolution reads ``conv_input``, the others what the block before them made."""
+    x = widened(x)
     for i, block in enumerate(blocks):
         row = i % len(stage.patches)
         if block.is_fused(x):
