@@ -115,7 +115,7 @@ def test_a_graph_renders_every_step(device):
     assert_same_bits(captured(state).renderings[1].color, rendering.color)
 
 
-def test_what_needs_more_room_is_captured_again(device):
+def test_a_graph_without_room_is_captured_again(device):
     simulator, state = make_simulator(device), make_state(device=device)
     small = dataclasses.replace(state, means=0.5 + 0.02 * state.means)
     captured = CapturedRollout(simulator, small, 3)
@@ -154,7 +154,7 @@ def test_a_graph_tells_the_report(device):
     assert_same_steps(steps, rolled_out(simulator, bad, 2))
 
 
-def test_bad_numbers_raise_where_the_policy_says_so(device):
+def test_bad_numbers_raise_behind_a_graph(device):
     simulator, state = make_simulator(device), make_state(device=device)
     captured = CapturedRollout(simulator, state, 1)
     means = state.means.clone()
