@@ -156,7 +156,7 @@ class CapturedRollout:
             self._model.__dict__["_modules"] = {**simulator._modules, **rooms}
         self.captures = 0
         self._launched = False
-        self._prepare(self._observed())
+        self._make_room(self._observed())
 
     def __call__(self, state: Particles, cameras: Cameras | None = None) -> Predicted:
         """The rollout of ``state``, which has as many rows, scenes and steps as the first one.
@@ -190,7 +190,7 @@ class CapturedRollout:
             raise InputError("CapturedRollout: finish() must follow launch()")
         self._launched = False
         while not self._fits():
-            self._prepare([a.grown((0, *b.sizes)) for a, b in zip(self._grown(), self._observed(), strict=True)])
+            self._make_room([a.grown((0, *b.sizes)) for a, b in zip(self._grown(), self._observed(), strict=True)])
             self._replay()
         self._records.replayed(self._report)
         return self._results()
@@ -241,17 +241,20 @@ class CapturedRollout:
         predicted = self._rollout(geometry, report)
         return predicted, torch.stack([pyramid.found for pyramid in found])
 
-    def _prepare(self, capacities: list[PyramidCapacity]) -> None:
-        """Makes room of ``capacities`` and, on a GPU, the graph."""
+    def _make_room(self, capacities: list[PyramidCapacity]) -> None:
+        """Takes ``capacities`` as sizes and, on a GPU, makes the graph."""
         self._capacities, self._records = capacities, StabilityReport()
         self.captures += 1
         if self._device.type != "cuda":
             return
         self._graph = self._predicted = self._found = None  # their memory goes back before the next graph takes its own
-        self._graph = Captured(lambda: self._given(self._records), self._device)
+        self._graph = Captured(self._capture, self._device)
         self._predicted, self._found = self._graph.result
         self._found_on_host = torch.empty(self._found.shape, dtype=self._found.dtype, pin_memory=True)
         self._arrived = torch.cuda.Event()
+
+    def _capture(self) -> tuple[Predicted, Tensor]:
+        return self._given(self._records if torch.cuda.is_current_stream_capturing() else StabilityReport())
 
     def _replay(self) -> None:
         if self._device.type != "cuda":
