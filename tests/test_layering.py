@@ -20,7 +20,7 @@ ROOMS = [
     {"data", "interop", "perceptual"},
     {"generate"},
     {"train"},
-    {"evaluate"},
+    {"evaluate", "check_stability"},
     {"simulate", "check_data", "import_released", "demo", "doctor"},
     {"__main__"},
 ]

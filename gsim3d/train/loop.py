@@ -19,7 +19,7 @@ from tqdm import tqdm
 from gsim3d.data import Scene, generator
 from gsim3d.dynamics import concatenate
 from gsim3d.effects import EffectsSpec, Plan
-from gsim3d.errors import InputError
+from gsim3d.errors import HardCaseError, InputError
 from gsim3d.perceptual.lpips import LPIPS
 from gsim3d.perceptual.weights import load
 from gsim3d.simulator import Simulator
@@ -30,11 +30,14 @@ from gsim3d.train.restore import build_simulator, check_device, describe, model_
 from gsim3d.train.samples import Batch, check_scenes, draw_batch
 from gsim3d.train.schedule import one_cycle
 from gsim3d.train.settings import to_dict
+from gsim3d.train.watch import StepWatch, first_not_finite, mean_of_norms, norms_by_module
 
 LOG = "metrics.jsonl"
 EMA_WARM_UP = 10  # the average forgets its first values: decay is at most (1 + step) / (10 + step)
 # May change between two sittings of one run without changing the curve; so may the number of workers, if there are any.
 FREE_SETTINGS = ("checkpoint_every", "keep_checkpoints", "log_every")
+# May change as well, so that a run which diverged can go on; the curve is another one from there on.
+FREE_OF_OPTIMIZER, FREE_OF_STAGES = ("clip_norm", "max_skipped"), ("learning_rate", "warm_up")
 
 
 class Trainer:
@@ -69,7 +72,7 @@ class Trainer:
             weight_decay=settings.weight_decay,
         )
         self.average = {k: v.clone() for k, v in self.simulator.state_dict().items()} if settings.ema_decay else {}
-        self.step = self.n_skipped = 0
+        self.step = self.n_skipped = self.n_skipped_in_a_row = 0
         self.seconds = 0.0
         self.parent = None
         if checkpoint.exists(self.out):
@@ -77,7 +80,11 @@ class Trainer:
         self._cut_log()
 
     def run(self, *, until: int | None = None, progress: bool = True) -> None:
-        """Trains to the end of the configuration, or to optimizer step ``until``, and saves there."""
+        """Trains to the end of the configuration, or to optimizer step ``until``, and saves there.
+
+        Raises:
+            HardCaseError: ``optimizer.max_skipped`` steps in a row were skipped; the message says what to do.
+        """
         until = self.config.n_steps if until is None else min(until, self.config.n_steps)
         self.out.mkdir(parents=True, exist_ok=True)
         self.simulator.train()
@@ -90,37 +97,87 @@ class Trainer:
                 if entry["step"] % self.config.log_every == 0 or "skipped" in entry or self.step == self.config.n_steps:
                     log.write(json.dumps({**entry, "seconds": round(self.seconds, 2)}) + "\n")
                     log.flush()
+                self._stop_if_diverged(entry)
                 bar.set_postfix_str(_postfix(entry), refresh=False)
                 bar.update()
                 if self.step % self.config.checkpoint_every == 0 or self.step == until:
                     self.save()
 
     def train_step(self) -> dict:
-        """One optimizer step; what to log of it. Weights stay as they are where loss or gradient is not finite."""
+        """One optimizer step; what to log of it.
+
+        Where loss or gradient is not finite, or a number cannot be used, the step is skipped: weights, moments, averages
+        and statistics stay as they are.
+        """
         stage, place = self.config.stage_of(self.step)
         rate = one_cycle(place, stage.steps, stage.learning_rate, stage.warm_up)
         groups = [[sample] for sample in range(stage.batch)] if self.config.workers else [list(range(stage.batch))]
-        loss, errors, gradients = _mean(self._map(self._gradients, groups))
-        for parameter, gradient in zip(self.parameters.values(), gradients, strict=True):
-            parameter.grad = gradient
-        entry = {"step": self.step, "loss": loss.item(), "learning_rate": rate}
-        entry["grad_norm"] = torch.nn.utils.clip_grad_norm_(
-            self.parameters.values(), self.config.optimizer.clip_norm or math.inf
-        ).item()
-        if math.isfinite(entry["loss"]) and math.isfinite(entry["grad_norm"]):
+        statistics = [(buffer, buffer.clone()) for buffer in self.simulator.buffers()]
+        entry = {"step": self.step, "loss": math.nan, "learning_rate": rate, "grad_norm": math.nan}
+        n_context = stage.history or self.config.data.history
+        errors = torch.full((n_context + stage.horizon,), math.nan)
+        try:
+            results = self._map(self._gradients, groups)
+            loss, errors, gradients = _mean([result[:3] for result in results])
+            problem = self._look_at(entry, loss, gradients, [watch for *_, watch in results])
+        except HardCaseError as error:
+            problem = str(error)
+        if problem is None:
             for group in self.optimizer.param_groups:
                 group["lr"] = rate
             self.optimizer.step()
             self._update_average()
+            self.n_skipped_in_a_row = 0
         else:
+            with torch.no_grad():
+                for buffer, before in statistics:
+                    buffer.copy_(before)
             self.n_skipped += 1
-            entry["skipped"] = "the loss or its gradient is not finite"
-        n_context = stage.history or self.config.data.history
+            self.n_skipped_in_a_row += 1
+            entry["skipped"] = problem
         entry["past_psnr"] = _psnr(errors[:n_context])
         if stage.horizon:
             entry["future_psnr"] = _psnr(errors[n_context:])
         self.step += 1
         return {name: _plain(value) for name, value in entry.items()}
+
+    def _look_at(
+        self, entry: dict, loss: Tensor, gradients: list[Tensor | None], watches: list[StepWatch]
+    ) -> str | None:
+        """Hands the gradients to the optimizer, clipped, and fills in ``entry``; why they cannot be used, or None."""
+        named = dict(zip(self.parameters, gradients, strict=True))
+        for name, parameter in self.parameters.items():
+            parameter.grad = named[name]
+        is_logged = self.step % self.config.log_every == 0
+        if is_logged:
+            entry["grad_norm_by_module"] = norms_by_module(named)
+        entry["loss"] = loss.item()
+        entry["grad_norm"] = torch.nn.utils.clip_grad_norm_(
+            self.parameters.values(), self.config.optimizer.clip_norm or math.inf
+        ).item()
+        if is_logged and (by_step := mean_of_norms([watch.norms() for watch in watches])):
+            entry["grad_norm_by_step"] = by_step
+        if total := sum(watch.report.total for watch in watches):
+            entry["unusable_rows"] = total
+        for watch in watches:
+            watch.report.check()
+        if not math.isfinite(entry["loss"]):
+            return "the loss is not finite"
+        if not math.isfinite(entry["grad_norm"]):
+            return f"the gradient is not finite, first that of {first_not_finite(named.items())}"
+        return None
+
+    def _stop_if_diverged(self, entry: dict) -> None:
+        n, limit = self.n_skipped_in_a_row, self.config.optimizer.max_skipped
+        if n < limit:
+            return
+        found = checkpoint.exists(self.out)
+        good = f"its last checkpoint in {self.out}" if found else "its start: no checkpoint was written yet"
+        raise HardCaseError(
+            f"training: {n} steps in a row were skipped up to step {entry['step']}, the last because {entry['skipped']}; "
+            f"lower stages.learning_rate or optimizer.clip_norm and train again: the run goes on from {good}",
+            step=entry["step"],
+        )
 
     def _map(self, f: Callable, groups: list) -> list:
         """f of every group, in order; with workers, several at a time."""
@@ -134,23 +191,30 @@ class Trainer:
         finally:
             torch.set_num_threads(n_threads)
 
-    def _gradients(self, samples: list[int]) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...]]:
-        """Loss, errors by step, and the gradient of the loss for every parameter (None where it has no part)."""
+    def _gradients(self, samples: list[int]) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...], StepWatch]:
+        """Loss, errors by step, the gradient of the loss for every parameter (None where it has no part), and what was
+        seen on the way."""
         stage, _ = self.config.stage_of(self.step)
+        watch = StepWatch()
         batch = draw_batch(self.scenes, self.config.data, stage, self.config.seed, self.step, samples)
-        loss, errors = self.loss(batch.to(self.device), samples[0])
-        return loss.detach(), errors, torch.autograd.grad(loss, list(self.parameters.values()), allow_unused=True)
+        loss, errors = self.loss(batch.to(self.device), samples[0], watch)
+        gradients = torch.autograd.grad(loss, list(self.parameters.values()), allow_unused=True)
+        return loss.detach(), errors, gradients, watch
 
-    def loss(self, batch: Batch, sample: int = 0) -> tuple[Tensor, Tensor]:
+    def loss(self, batch: Batch, sample: int = 0, watch: StepWatch | None = None) -> tuple[Tensor, Tensor]:
         """The loss of a batch, and the unweighted mean squared error of each step; ``sample`` numbers the randomness."""
+        watch = watch or StepWatch()
         loss_config, targets = self.config.loss, batch.targets
         rng = generator(self.config.seed, self.step, sample, "dynamics")
         noise = torch.Generator().manual_seed(int(rng.integers(2**63)))
-        particles = self.simulator.encode(batch.context)
+        particles = self.simulator.encode(batch.context, report=watch.report)
         if batch.n_future:
-            steps = self.simulator.rollout(particles, batch.n_future, self.plan, generator=noise)
+            steps = self.simulator.rollout(
+                particles, batch.n_future, self.plan, generator=noise, report=watch.report
+            )
+            watch.follow(steps)
             particles = concatenate([particles, *steps])
-        images = self.simulator.render(particles, targets.cameras, plan=self.plan).color
+        images = self.simulator.render(particles, targets.cameras, plan=self.plan, report=watch.report).color
         truth = targets.images.permute(0, 2, 3, 1)
         weighted = loss_config.body_weight and targets.dynamic is not None
         weight = 1 + loss_config.body_weight * targets.dynamic if weighted else None
@@ -180,6 +244,7 @@ class Trainer:
             "step": self.step,
             "next_sample": self.step,
             "n_skipped": self.n_skipped,
+            "n_skipped_in_a_row": self.n_skipped_in_a_row,
             "seconds": self.seconds,
             "parent": self.parent,
         }
@@ -200,7 +265,7 @@ class Trainer:
     def _resume(self) -> None:
         saved = checkpoint.load(self.out)
         before, now = dict(saved.config.get("train", {})), to_dict(self.config)
-        before["workers"], now["workers"] = bool(before.get("workers")), bool(now["workers"])
+        before, now = _fixed_settings(before), _fixed_settings(now)
         for name in now:
             if name not in FREE_SETTINGS and before.get(name) != now[name]:
                 raise InputError(f"{self.out}: was started with another {name!r}; use the same or another folder")
@@ -213,6 +278,7 @@ class Trainer:
                 # AdamW counts its steps on the host.
                 self.optimizer.state[self.parameters[name]][kind] = value if kind == "step" else value.to(self.device)
         self.step, self.n_skipped = saved.state["step"], saved.state["n_skipped"]
+        self.n_skipped_in_a_row = saved.state.get("n_skipped_in_a_row", 0)
         self.seconds, self.parent = saved.state["seconds"], saved.digest
 
     def _cut_log(self) -> None:
@@ -235,6 +301,16 @@ class Trainer:
                         self.average[name].lerp_(value, 1 - decay)
                     else:
                         self.average[name].copy_(value)
+
+
+def _fixed_settings(settings: dict) -> dict:
+    """Of a run's settings those that must stay, as far as parts of them may change."""
+    fixed = {**settings, "workers": bool(settings.get("workers"))}
+    for name, free in (("optimizer", FREE_OF_OPTIMIZER), ("stages", FREE_OF_STAGES)):
+        parts = settings.get(name) or []
+        kept = [{k: v for k, v in part.items() if k not in free} for part in ([parts] if name == "optimizer" else parts)]
+        fixed[name] = kept
+    return fixed
 
 
 @contextmanager
@@ -282,6 +358,10 @@ def _psnr(errors: Tensor) -> float:
 
 def _plain(value):
     """JSON has no NaN: what is not finite is logged as text."""
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -26,7 +26,7 @@ def watch_rows(fields, bounds, cu_rows, cloud_scene, origin, activity, grid_size
         squared = torch.zeros(n, dtype=torch.float64, device=means.device)
         if previous is not None:
             squared = (means.double() - previous.double()).square().sum(1)
-            status |= torch.where(finite & (squared > max_step**2), FAST, 0).to(torch.int32)
+            status |= torch.where(finite & ~(squared <= max_step**2), FAST, 0).to(torch.int32)
         shown = status & 2 == 0
         status = torch.where(is_asleep, 0, status)
         record = torch.zeros(n_clouds, 2 * (len(fields) + 2) + 9, dtype=torch.float64, device=means.device)

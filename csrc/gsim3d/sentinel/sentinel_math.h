@@ -49,7 +49,7 @@ GSIM3D_HD RowState look_at_row(const WatchedRows<T>& rows, int64_t row, int32_t 
       const double step = static_cast<double>(position[i]) - static_cast<double>(rows.previous[row * 3 + i]);
       squared += step * step;
     }
-    state.status |= squared > rows.max_step * rows.max_step ? kFast : 0;
+    state.status |= squared <= rows.max_step * rows.max_step ? 0 : kFast;
     state.energy = squared / 2;
   }
   return state;

@@ -1,0 +1,333 @@
+"""raise, drop and clamp at every door of the simulator: what is refused, what sleeps, what is bounded, who is told."""
+
+import copy
+import dataclasses
+import pickle
+
+import pytest
+import torch
+
+from gsim3d import presets
+from gsim3d.dynamics import last_steps
+from gsim3d.errors import HardCaseError, InputError
+from gsim3d.ops import rasterize_gaussians
+from gsim3d.stability import StabilityConfig, StabilityReport
+from gsim3d.types import ASLEEP
+from tests.asserts import assert_same_bits
+from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
+
+NAN, INF = float("nan"), float("inf")
+SCENES = (2, 3)  # steps of each
+
+
+@pytest.fixture
+def simulator(device):
+    return awake(make_simulator()).to(device)
+
+
+@pytest.fixture
+def state(simulator, device):
+    with torch.no_grad():
+        return simulator.encode(make_frames(SCENES).to(device))
+
+
+def with_value(particles, name, row, value):
+    changed = getattr(particles, name).clone()
+    changed[row] = value
+    return dataclasses.replace(particles, **{name: changed})
+
+
+def rows_of_scene(particles, scene):
+    return particles.cloud_scene[particles.row_cloud()] == scene
+
+
+def assert_finite(particles):
+    for name, value in particles.row_fields().items():
+        assert bool(torch.isfinite(value).all()), name
+
+
+BAD = [
+    ("means", NAN, "not finite"),
+    ("means", -INF, "not finite"),
+    ("opacities", 1.5, "outside [0, 1]"),
+    ("opacities", NAN, "outside [0, 1]"),
+    ("dynamic_latents", INF, "not finite or beyond 10000"),
+    ("static_latents", 3e4, "not finite or beyond 10000"),
+]
+
+
+@pytest.mark.parametrize("name, value, what", BAD)
+def test_raise_names_scene_step_row_and_tensor(name, value, what, simulator, state):
+    row = int(state.cu_rows[-2]) + 4  # of the last step of scene 1
+    bad = with_value(state, name, row, value)
+    with pytest.raises(HardCaseError) as caught:
+        simulator.rollout(bad, 1)
+        simulator.report.check()  # a GPU raises here, the CPU before
+    error = caught.value
+    assert str(error).startswith(f"rollout: particles.{name}: {what} at row {row} (scene 1, step 2)")
+    assert 'on_bad="drop"' in str(error) and "\n" not in str(error)
+    assert (error.tensor, error.scene, error.step, error.row) == (f"particles.{name}", 1, 2, row)
+    assert pickle.loads(pickle.dumps(error)).row == row
+
+
+@pytest.mark.parametrize("on_bad", ["drop", "clamp"])
+@pytest.mark.parametrize("name, value, what", BAD)
+def test_the_other_scene_keeps_its_bits(name, value, what, on_bad, simulator, state):
+    row, report = int(state.cu_rows[-2]) + 4, StabilityReport()
+    with torch.no_grad():
+        good = simulator.rollout(state, 3)
+        steps = simulator.rollout(with_value(state, name, row, value), 3, on_bad=on_bad, report=report)
+    for before, after in zip(good, steps, strict=True):
+        assert_finite(after)
+        other = rows_of_scene(after, 0)
+        assert_same_bits(after.means[other], before.means[other])
+        assert_same_bits(after.dynamic_latents[other], before.dynamic_latents[other])
+    first = report.findings[0]
+    assert (first.what, first.tensor, first.row, first.scene, first.step) == (what, f"particles.{name}", row, 1, 2)
+    assert first.action == {"drop": "dropped", "clamp": "clamped"}[on_bad]
+    report.check()
+    assert int((steps[-1].activity == ASLEEP).sum()) == (on_bad == "drop")
+
+
+@pytest.mark.parametrize("name, value, what", BAD)
+def test_a_dropped_row_is_as_if_it_were_absent(name, value, what, simulator, state):
+    """What it held changes nobody: not its scene, not the images."""
+    row = int(state.cu_rows[-2]) + 4
+    kept = torch.arange(state.n_rows, device=state.means.device) != row
+    with torch.no_grad():
+        dropped = simulator.rollout(with_value(state, name, row, value), 2, on_bad="drop")[-1]
+        absent = simulator.rollout(state.select_rows(kept), 2)[-1]
+        cameras = target_cameras(make_frames(SCENES).to(state.means.device), 2)
+        images = [simulator.render(particles, cameras).color for particles in (dropped, absent)]
+    place = int(row - state.cu_rows[-2] + (dropped.cu_rows[1]))
+    others = torch.arange(dropped.n_rows, device=kept.device) != place
+    assert bool(dropped.activity[place] == ASLEEP) and float(dropped.opacities[place]) == 0
+    assert_same_bits(dropped.means[others], absent.means)
+    assert_same_bits(dropped.dynamic_latents[others], absent.dynamic_latents)
+    assert_same_bits(images[0], images[1])
+
+
+def test_gradients_of_dropped_rows_are_zero_and_of_all_others_finite(simulator, state):
+    latents = state.dynamic_latents.clone()
+    latents[-1, 0] = NAN
+    latents.requires_grad_()
+    steps = simulator.rollout(dataclasses.replace(state, dynamic_latents=latents), 2, on_bad="drop")
+    cameras = target_cameras(make_frames(SCENES).to(latents.device), 2)
+    image = simulator.render(steps[-1], cameras, on_bad="drop").color
+    parameters = list(simulator.dynamics.parameters())
+    grad, *others = torch.autograd.grad(image.square().sum(), [latents, *parameters], allow_unused=True)
+    assert grad[-1].abs().max() == 0 and bool(torch.isfinite(grad).all()) and grad.abs().max() > 0
+    assert all(bool(torch.isfinite(other).all()) for other in others if other is not None)
+
+
+def kick_row(simulator, row, call, kick):
+    """At that call of the dynamics, ``kick`` is added to the position of one row of the result."""
+    calls = []
+
+    def hook(module, arguments, predicted):
+        calls.append(1)
+        if len(calls) != call:
+            return None
+        means = predicted.means.clone()
+        means[row] += kick
+        return dataclasses.replace(predicted, means=means)
+
+    simulator.dynamics.register_forward_hook(hook)
+
+
+@pytest.mark.parametrize(
+    ("kick", "what", "stays"),
+    [(50.0, "speed limit", True), (7000.0, "outside the workspace", False), (NAN, "not finite", True)],
+)
+def test_a_runaway_sleeps_and_the_rest_go_on(kick, what, stays, simulator, state):
+    """From the step on at which it runs away nobody sees it; the other scene keeps its bits."""
+    with torch.no_grad():
+        good = simulator.rollout(state, 4)
+        kick_row(simulator, 3, 2, kick)
+        limits = StabilityConfig(max_speed=10.0 if stays else 1e5)
+        simulator.config = dataclasses.replace(simulator.config, stability=limits)
+        report = StabilityReport()
+        steps = simulator.rollout(state, 4, on_bad="drop", report=report)
+    (finding,) = report.findings
+    assert (finding.what, finding.scene, finding.step, finding.row) == (what, 0, 3, 3)
+    assert finding.action == ("dropped" if what == "not finite" else "asleep")
+    assert bool(steps[0].activity[3] != ASLEEP) and all(bool(step.activity[3] == ASLEEP) for step in steps[1:])
+    for step in steps[2:]:
+        assert_same_bits(step.means[3], steps[1].means[3])
+    if stays:
+        assert_same_bits(steps[1].means[3], steps[0].means[3])
+    for before, after in zip(good, steps, strict=True):
+        assert_finite(after)
+        other = rows_of_scene(after, 1)
+        assert_same_bits(after.means[other], before.means[other])
+    sentinels = report.sentinels
+    assert sentinels[0, 2].awake - sentinels[0, 3].awake == 1
+    assert sentinels[1, 4].awake == sentinels[1, 3].awake
+
+
+def test_leaving_the_workspace_is_no_error(simulator, state):
+    report = StabilityReport()
+    far = with_value(state, "means", -1, 1e6)
+    steps = simulator.rollout(far, 2, report=report)  # on_bad is "raise"
+    report.check()
+    assert [(f.what, f.action, f.count) for f in report.findings] == [("outside the workspace", "asleep", 1)]
+    assert_same_bits(steps[-1].means[-1], far.means[-1])
+
+
+def test_clamped_particles_stay_inside_and_below_the_speed_limit(simulator, state):
+    kick_row(simulator, 3, 1, torch.tensor([50.0, -1e9, 0.0], device=state.means.device))
+    simulator.config = dataclasses.replace(simulator.config, stability=StabilityConfig("clamp", max_speed=2.0))
+    with torch.no_grad():
+        step = simulator.rollout(state, 1)[0]
+    newest = last_steps(state, 1)
+    assert float((step.means - newest.means).double().norm(dim=1)[3]) <= 2.0 * (1 + 1e-6)
+    inside = (step.means.double() - state.origin[0]) / CONFIG.dynamics.grid_size
+    assert bool(((inside >= 0) & (inside < 2**16)).all()) and not bool((step.activity == ASLEEP).any())
+
+
+def test_a_good_state_is_left_as_it_is(simulator, state):
+    report = StabilityReport()
+    with torch.no_grad():
+        for on_bad in ("raise", "drop", "clamp"):
+            step = simulator.rollout(state, 1, on_bad=on_bad, report=report)[0]
+            assert_same_bits(step.means, simulator.dynamics(state).means)
+    assert report.total == 0 and str(report).startswith("nothing was")
+    assert sorted(report.sentinels) == [(0, 2), (1, 3)]
+
+
+def test_sentinels_are_the_sums_that_they_say(simulator, state):
+    report = StabilityReport()
+    with torch.no_grad():
+        step = simulator.rollout(state, 1, report=report)[0]
+    newest, rows = last_steps(state, 1), rows_of_scene(step, 1)
+    now, before = step.means[rows].double(), newest.means[rows].double()
+    sums = report.sentinels[1, 3]
+    assert sums.awake == int(rows.sum())
+    assert sums.kinetic_energy == pytest.approx(float((now - before).square().sum() / 2), rel=1e-9)
+    assert sums.opacity_mass == pytest.approx(float(step.opacities[rows].double().sum()), rel=1e-9)
+    assert sums.extent == pytest.approx(float((now.amax(0) - now.amin(0)).norm()), rel=1e-9)
+
+
+def test_the_model_s_policy_holds_where_a_call_names_none(simulator, state):
+    bad = with_value(state, "opacities", 0, -0.5)
+    simulator.config = dataclasses.replace(simulator.config, stability=StabilityConfig("drop"))
+    simulator.step(bad)
+    assert simulator.report.total == 1
+    with pytest.raises(HardCaseError):
+        simulator.step(bad, on_bad="raise")
+        simulator.report.check()
+    simulator.report.clear()
+    assert simulator.report.total == 0
+
+
+def test_an_error_is_raised_once(simulator, state):
+    """The next good call on the same report does not fail for the bad one; check() still tells."""
+    with pytest.raises(HardCaseError):
+        simulator.step(with_value(state, "opacities", 0, -0.5))
+        simulator.report.findings  # a GPU: waits for the flag
+        simulator.step(state)
+    simulator.step(state)
+    with pytest.raises(HardCaseError):
+        simulator.report.check()
+
+
+def test_nothing_waits_for_the_device_in_a_guard(devices):
+    simulator = make_simulator().to(devices[1])
+    with torch.no_grad():
+        state = simulator.encode(make_frames(SCENES).to(devices[1]))
+        guard = simulator._guard("rollout", None, StabilityReport())
+        newest = last_steps(state, 1)
+        torch.cuda.synchronize()
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            guard(state)
+            guard(newest, previous=newest)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+
+
+def test_a_captured_guard_counts_at_every_replay(devices):
+    simulator = make_simulator().to(devices[1])
+    with torch.no_grad():
+        state = last_steps(simulator.encode(make_frames(SCENES).to(devices[1])), 1)
+        report = StabilityReport()
+        guard = simulator._guard("rollout", "drop", report)
+        guard(state, previous=state)
+        report.clear()
+        moved = dataclasses.replace(state, means=state.means.clone())
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            out = guard(moved, previous=state)
+        assert report.total == 0
+        for count in (1, 2):
+            moved.means[count] = NAN
+            graph.replay()
+            report.replayed()
+            assert int((out.activity == ASLEEP).sum()) == count
+    assert report.total == 1 + 2 and report.findings[0].what == "not finite"
+
+
+def test_a_guard_compiles():
+    simulator = make_simulator()
+    with torch.no_grad():
+        state = last_steps(simulator.encode(make_frames(SCENES)), 1)
+        guard = simulator._guard("rollout", "drop", StabilityReport())
+
+        def f(means):
+            mended = guard(dataclasses.replace(state, means=means), previous=state)
+            return mended.means, mended.opacities, mended.activity
+
+        bad = with_value(state, "means", 1, NAN).means
+        for a, b in zip(torch.compile(f, fullgraph=True)(bad), f(bad), strict=True):
+            assert_same_bits(a, b)
+
+
+# ---- the report ------------------------------------------------------------------------------------------------------
+
+
+def test_a_report_is_a_table_plain_data_and_forgets(simulator, state):
+    report = StabilityReport()
+    simulator.step(with_value(state, "opacities", slice(0, 3), 2.0), on_bad="drop", report=report)
+    header, line, total = str(report).splitlines()
+    assert header.split() == ["where", "tensor", "what", "action", "scene", "step", "camera", "row", "count"]
+    assert line.split() == ["step", "particles.opacities", "outside", "[0,", "1]", "dropped", "0", "0", "-", "0", "3"]
+    assert total == "total 3"
+    assert report.to_dict()["findings"][0]["count"] == report.to_dict()["total"] == 3
+    report.clear()
+    assert report.findings == () and report.sentinels == {}
+
+
+def test_a_copied_model_has_a_report_of_its_own(simulator, state):
+    simulator.step(with_value(state, "opacities", 0, 2.0), on_bad="drop")
+    other = copy.deepcopy(simulator)
+    assert other.report is not simulator.report and other.report.total == 0 and simulator.report.total == 1
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: StabilityConfig("ignore"), "on_bad must be one of raise, drop, clamp; got 'ignore'"),
+        (lambda: StabilityConfig(max_speed=0.0), "max_speed must be positive and finite"),
+        (lambda: StabilityConfig(max_latent=INF), "max_latent must be positive and finite"),
+        (lambda: make_simulator().step(None, on_bad="sleep"), "on_bad must be one of"),
+    ],
+)
+def test_what_is_no_policy_or_limit(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_every_preset_has_the_default_policy():
+    for preset in (presets.tiny, presets.small, presets.paper_latent, presets.paper_explicit):
+        assert preset().stability == StabilityConfig() and preset().stability.on_bad == "raise"
+
+
+def test_one_bad_gaussian_in_one_camera_is_named():
+    frames = make_frames((1,))
+    n = 3
+    means = torch.zeros(n, 3)
+    arguments = means, torch.tensor([[1.0, 0, 0, 0]] * n), torch.full((n, 3), 0.1), torch.tensor([0.5, NAN, 0.5])
+    cameras = frames.cameras.select(torch.tensor([0, 1]), torch.tensor([0, 0]))
+    with pytest.raises(HardCaseError, match=r"opacities: outside \[0, 1\] at row 1 \(camera 0\)") as caught:
+        rasterize_gaussians(*arguments, cameras, colors=torch.ones(n, 3))
+    assert (caught.value.camera, caught.value.row) == (0, 1)
