@@ -29,14 +29,14 @@ class Plan(NamedTuple):
     stage: Stage
     patches: PatchTable
     kernel_size: int
-    first_of_voxel: bool
+    reads_lowest: bool
     heads: int
     eps: float
     recompute: bool
 
     def geometry(self) -> tuple:
         voxels, taps = self.stage.voxels, self.stage.kernel_maps[self.kernel_size]
-        return (voxels.row_voxel, voxels.rows, voxels.cu_rows, taps.tap_in, taps.tap_out, taps.cu_taps, self.first_of_voxel)
+        return (voxels.row_voxel, voxels.rows, voxels.cu_rows, taps.tap_in, taps.tap_out, taps.cu_taps, self.reads_lowest)
 
     def table(self) -> tuple[Tensor, ...]:
         return self.patches.q_rows, self.patches.kv_rows, self.patches.cu_q, self.patches.cu_k

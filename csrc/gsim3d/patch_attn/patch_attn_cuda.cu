@@ -58,7 +58,7 @@ __global__ void finish_kernel(PatchTable table, AttentionSize size, RowUses uses
     const int64_t begin = static_cast<int64_t>(uses.first[row]), last = static_cast<int64_t>(~uses.minus_last[row]);
 #pragma unroll 2
     for (int64_t i = lane; i < width; i += kWarp) {
-      const int64_t head = static_cast<unsigned>(i) / static_cast<unsigned>(size.dim);
+      const int64_t head = i / size.dim;
       C k = 0, v = 0;
       const auto add = [&](int64_t slot) {
         const C* from = gradients.slot(slot, head, size) + (i - head * size.dim);
