@@ -57,6 +57,12 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor branch_sum, Tensor branch_weight, Tensor branch_bias, Tensor weight, Tensor bias)");
   m.def("linear_grad_bias(Tensor grad) -> Tensor");
 
+  // norm_gelu: gelu((x - mean) * scale + bias), one mean, scale and bias a channel; batch normalisation and its activation.
+  m.def("norm_gelu(Tensor x, Tensor mean, Tensor scale, Tensor bias, ScalarType dtype) -> Tensor");
+  m.def(
+      "norm_gelu_backward(Tensor grad, Tensor x, Tensor mean, Tensor scale, Tensor bias) -> (Tensor x, Tensor scale, "
+      "Tensor bias)");
+
   // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
   m.def(
       "plane_sweep(Tensor features, Tensor homographies, Tensor translations, Tensor inverse_depths, Tensor src_images, "
