@@ -14,8 +14,8 @@ from torch.utils.checkpoint import checkpoint
 
 from gsim3d import ops
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
-from gsim3d.dynamics.fused_block import product_dtype, run_block
-from gsim3d.layers import RowLayerNorm, RowLinear, make_norm
+from gsim3d.dynamics.fused_block import run_block
+from gsim3d.layers import RowLayerNorm, RowLinear, make_norm, product_dtype, rounded_weights
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
 TIME_EMBEDDING_STD = 0.02
@@ -34,8 +34,10 @@ class SparseConv(nn.Module):
         self.bias = nn.Parameter(torch.empty(out_channels).uniform_(-bound, bound)) if bias else None
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
-        kernel_map = stage.kernel_maps[self.kernel_size]
-        return ops.sparse_conv(x, self.weight, self.bias, stage.voxels, kernel_map, duplicates=self.duplicates)
+        kernel_map, weight, bias = stage.kernel_maps[self.kernel_size], self.weight, self.bias
+        if x.is_cuda and not torch.is_grad_enabled() and not torch.compiler.is_compiling():
+            weight, bias = rounded_weights(self, product_dtype(x))
+        return ops.sparse_conv(x, weight, bias, stage.voxels, kernel_map, duplicates=self.duplicates)
 
 
 class PositionEncoding(nn.Module):
@@ -174,7 +176,7 @@ class Stem(nn.Module):
         self.norm = make_norm(config.norm, channels)
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
-        return F.gelu(self.norm(self.conv(x, stage)))
+        return self.norm.activated(self.conv(x, stage))
 
 
 class Pool(nn.Module):
@@ -186,7 +188,7 @@ class Pool(nn.Module):
         self.norm = make_norm(norm, out_channels)
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
-        return F.gelu(self.norm(ops.pool_max(self.proj(x), stage.cluster.rows, stage.cluster.cu_rows)))
+        return self.norm.activated(ops.pool_max(self.proj(x), stage.cluster.rows, stage.cluster.cu_rows))
 
 
 class Merge(nn.Module):
@@ -235,8 +237,8 @@ class Unpool(nn.Module):
 
     def forward(self, x: Tensor, skip: Tensor, coarse: Stage) -> tuple[Tensor, Tensor]:
         """Both together, and the skip branch alone."""
-        below = F.gelu(self.proj_norm(self.proj(x)))
-        skip = F.gelu(self.skip_norm(self.skip(skip)))
+        below = self.proj_norm.activated(self.proj(x))
+        skip = self.skip_norm.activated(self.skip(skip))
         return skip + ops.unpool(below, coarse.cluster.rows, coarse.cluster.cu_rows, skip.shape[0]), skip
 
 

@@ -5,9 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import Dynamics, fused_block
+from gsim3d.dynamics import Dynamics
 from gsim3d.dynamics.point_transformer import Block
-from gsim3d.layers import RowLinear, rounded_weights
 from gsim3d.ops import PyramidSpec, build_pyramid
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, make_history
@@ -128,27 +127,3 @@ def test_the_whole_network_equals_its_modules_on_a_gpu(devices):
         results.append([step.means, *torch.autograd.grad(step.means.sum() + step.dynamic_latents.square().sum(), parameters)])
     for a, b in zip(*results, strict=True):
         assert_close_relative_to_max(a, b, "fused_network_float32")
-
-
-def test_rounded_weights_follow_the_weights():
-    layer = RowLinear(4, 3)
-    before = rounded_weights(layer, torch.bfloat16)
-    assert rounded_weights(layer, torch.bfloat16)[0] is before[0]
-    assert rounded_weights(layer, torch.float32)[0] is layer.weight
-    with torch.no_grad():
-        layer.weight.mul_(2)
-    after = rounded_weights(layer, torch.bfloat16)
-    assert after[0] is before[0]  # the same memory: a captured graph reads the new values
-    assert_same_bits(after[0], layer.weight.detach().bfloat16())
-    layer.load_state_dict(RowLinear(4, 3).state_dict())
-    assert_same_bits(rounded_weights(layer, torch.bfloat16)[0], layer.weight.detach().bfloat16())
-    assert_same_bits(rounded_weights(layer, torch.float16)[0], layer.weight.detach().half())
-    with torch.inference_mode():
-        assert_same_bits(rounded_weights(layer, torch.bfloat16)[0], layer.weight.detach().bfloat16())
-
-
-def test_products_follow_autocast_on_cuda_only():
-    x = torch.ones(2, 2)
-    with torch.autocast("cpu", torch.bfloat16):
-        assert fused_block.product_dtype(x) == torch.float32
-    assert fused_block.product_dtype(x.double()) == torch.float64
