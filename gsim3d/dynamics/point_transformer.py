@@ -67,7 +67,11 @@ class Attention(nn.Module):
         return self.proj(self._rounded(ops.patch_attention(q, k, v, patches, check=False).flatten(1)))
 
     def _rounded(self, x: Tensor) -> Tensor:
-        return x.clamp(-HALF_MAX, HALF_MAX).half().to(x.dtype) if self.rounded_to_half else x
+        if not self.rounded_to_half:
+            return x
+        wide = widened(x).clamp(-HALF_MAX, HALF_MAX)  # bfloat16 would round the bound up
+        # Gradients are not rounded: those beyond the range would become infinite.
+        return (wide + (wide.half().to(wide) - wide).detach()).to(x.dtype)
 
 
 class MLP(nn.Module):
