@@ -30,6 +30,7 @@ from torch import Tensor
 
 from gsim3d import __version__
 from gsim3d.errors import InputError
+from gsim3d.files import MAX_TEXT, read_file
 from gsim3d.train.settings import load_yaml
 
 FORMAT = 1
@@ -114,20 +115,26 @@ def load(path: str | Path) -> Checkpoint:
     Raises:
         InputError: it is none of these, or a file is missing, truncated or changed; the message names it.
     """
-    path = Path(path)
+    try:
+        return _load(Path(path))
+    except (OSError, MemoryError) as error:
+        raise InputError(f"{path}: the checkpoint cannot be read: {error or 'no memory'}") from None
+
+
+def _load(path: Path) -> Checkpoint:
     if not path.exists():
         raise InputError(f"{path}: no such checkpoint")
     if path.is_file():
         return _load_single(path)
     pointer = path / "checkpoints" / "last"
     if pointer.is_file():
-        path = path / "checkpoints" / pointer.read_text().strip()
+        path = path / "checkpoints" / Path(read_file(pointer, MAX_TEXT).decode().strip()).name
     if not (path / STATE).is_file():
         raise InputError(f"{path}: not a checkpoint (a run folder, a folder with {STATE}, or a .safetensors file)")
     try:
-        state = json.loads((path / STATE).read_bytes())
+        state = json.loads(read_file(path / STATE, MAX_TEXT))
         hashes = dict(state["sha256"])
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise InputError(f"{path / STATE}: not a checkpoint's state, the checkpoint is broken") from None
     for name, expected in hashes.items():
         file = path / Path(name).name
