@@ -165,8 +165,7 @@ def _backward(plan: Plan, w: Weights, kept: Kept, conv_input: Tensor, keep_atten
     grad_place, linear = linear_grads(grad_position, kept.place, w.linear)
     grad_input = _ops.sparse_conv_grad_input.default(grad_place, w.conv, *plan.geometry(), plan.conv_plan())
     conv, conv_bias = _ops.sparse_conv_grad_weight.default(grad_place, conv_input, plan.kernel_size, *plan.geometry())
-    wide = grad_x.dtype
-    of_layers = conv.to(wide), conv_bias.to(wide), linear, linear_bias, qkv, qkv_bias, proj, proj_bias, fc1, fc1_bias, fc2
+    of_layers = conv, conv_bias, linear, linear_bias, qkv, qkv_bias, proj, proj_bias, fc1, fc1_bias, fc2
     return grad_x, grad_input, *of_layers, fc2_bias, *of_norms, norm2, norm2_bias
 
 
