@@ -105,15 +105,20 @@ class Simulator(nn.Module):
         generator: torch.Generator | None = None,
         on_bad: OnBad | None = None,
         report: StabilityReport | None = None,
+        wrap: Callable[[Callable], Callable] | None = None,
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
 
         Rows are those of the newest step of ``state`` throughout. Gradients flow through all steps. Arguments as
         :meth:`step`.
+
+        Args:
+            wrap: the function that predicts the next steps from a history -> the one to call instead.
         """
         plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
         state = guard(last_steps(self._prepare(state, plan), plan.history))
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard)
+        predict = predict if wrap is None else wrap(predict)
         return rollout(predict, state, n_steps, plan.history)
 
     def render(
