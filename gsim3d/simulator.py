@@ -26,11 +26,12 @@ from gsim3d.dynamics import Dynamics, append_step, concatenate, last_steps, roll
 from gsim3d.effects import EffectsSpec, Plan, make_plan
 from gsim3d.encoder import Encoder
 from gsim3d.guards import guard_particles
+from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
 from gsim3d.renderer import GaussianHead, render, render_as_published
-from gsim3d.stability import LARGEST, OnBad, StabilityReport, check_on_bad
+from gsim3d.stability import OnBad, StabilityReport, check_on_bad
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames, Particles
 
 
@@ -93,7 +94,7 @@ class Simulator(nn.Module):
             generator: randomness of training (drop path, curve shuffling); None: none.
         """
         plan, guard = plan or self.plan(), self._guard("step", on_bad, report)
-        state = guard(last_steps(self._prepare(state, plan), plan.history))
+        state = guard(self.prepare(state, plan))
         return append_step(state, self._predict(state, plan, generator, guard), plan.history)
 
     def rollout(
@@ -105,6 +106,7 @@ class Simulator(nn.Module):
         generator: torch.Generator | None = None,
         on_bad: OnBad | None = None,
         report: StabilityReport | None = None,
+        geometry: Callable[[Particles], Pyramid] | None = None,
         wrap: Callable[[Callable], Callable] | None = None,
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
@@ -113,13 +115,22 @@ class Simulator(nn.Module):
         :meth:`step`.
 
         Args:
-            wrap: the function that predicts the next steps from a history -> the one to call instead.
+            geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
+            wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
         """
         plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
-        state = guard(last_steps(self._prepare(state, plan), plan.history))
-        predict = partial(self._predict, plan=plan, generator=generator, guard=guard)
+        predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
         predict = predict if wrap is None else wrap(predict)
-        return rollout(predict, state, n_steps, plan.history)
+        return rollout(predict, guard(self.prepare(state, plan)), n_steps, plan.history)
+
+    def prepare(self, state: Particles, plan: Plan) -> Particles:
+        """What the dynamics reads of ``state``: its last steps, with the background as the plan wants it."""
+        background = plan.spec.dynamics.background
+        if background == "masked_out":
+            state = state.select_rows(state.activity == DYNAMIC)
+        if background == "dynamic":
+            state = dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
+        return last_steps(state, plan.history)
 
     def render(
         self,
@@ -164,23 +175,20 @@ class Simulator(nn.Module):
             config=limits,
             report=report,
             where=where,
-            grid_size=dynamics.grid_size if in_workspace and not dynamics.quirks.anchor_at_minimum else 0.0,
-            max_opacity=LARGEST if dynamics.quirks.unbounded_opacity else 1.0,
+            grid_size=dynamics.grid_size if in_workspace and dynamics.origin_of_scene else 0.0,
+            max_opacity=dynamics.max_opacity,
         )
 
-    def _prepare(self, state: Particles, plan: Plan) -> Particles:
-        """``state`` with the background as the plan wants it."""
-        if plan.spec.dynamics.background == "masked_out":
-            return state.select_rows(state.activity == DYNAMIC)
-        if plan.spec.dynamics.background == "dynamic":
-            return dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
-        return state
-
     def _predict(
-        self, state: Particles, plan: Plan, generator: torch.Generator | None, guard: Callable[..., Particles]
+        self,
+        state: Particles,
+        plan: Plan,
+        generator: torch.Generator | None,
+        guard: Callable[..., Particles],
+        geometry: Callable[[Particles], Pyramid] | None = None,
     ) -> Particles:
         """The next steps of every scene, guarded, without the changes that the plan leaves out."""
-        step = self.dynamics(state, generator=generator)
+        step = self.dynamics(state, generator=generator, pyramid=None if geometry is None else geometry(state))
         appearance = plan.spec.appearance
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
         if appearance.changing != "all":

@@ -185,6 +185,12 @@ def _call_residual_norm(a: Arguments):
     return ops.residual_norm(a["x"], a["branch"], keep=a["keep"], **pairs, eps=a["eps"])
 
 
+def _norm_gelu(rng: random.Random) -> Arguments:
+    channels, dtype = rng.choice((1, 4, 33)), _dtype(rng)
+    columns = {name: tensor(rng, channels, dtype=dtype) for name in ("mean", "scale", "bias")}
+    return {"x": tensor(rng, _size(rng), channels, dtype=dtype), **columns}
+
+
 def _cameras(rng: random.Random, images: int) -> dict[str, Tensor]:
     viewmats = torch.eye(4).repeat(images, 1, 1)
     viewmats[:, :3, 3] = tensor(rng, images, 3, scale=0.1)
@@ -269,6 +275,7 @@ OPS: dict[str, tuple[Callable[[random.Random], Arguments], Callable[[Arguments],
     "unpool": (_unpool, lambda a: ops.unpool(**a)),
     "row_norm": (_row_norm, lambda a: ops.row_norm(**a)),
     "residual_norm": (_residual_norm, _call_residual_norm),
+    "norm_gelu": (_norm_gelu, lambda a: ops.norm_gelu(**a)),
     "plane_sweep": (_plane_sweep, lambda a: ops.plane_sweep(**a)),
     "sweep_geometry": (_sweep_geometry, lambda a: ops.sweep_geometry(**a)),
     "rasterize_gaussians": (_raster, _call_raster),
