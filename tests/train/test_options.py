@@ -11,7 +11,7 @@ import torch
 from gsim3d.errors import InputError
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig
-from gsim3d.train.loop import Trainer
+from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.precision import STEPS_TO_DOUBLE, LossScale, PrecisionConfig
 from gsim3d.train.samples import draw_batch
 from gsim3d.train.settings import from_dict
@@ -27,24 +27,28 @@ def folder(tmp_path_factory):
     return write_scenes(tmp_path_factory.mktemp("scenes"), 2)
 
 
-def trainer_at(folder, out, step=LATER, **settings):
-    trainer = Trainer(dataclasses.replace(CONFIG, **settings), scenes(folder), out)
+def trainer_at(folder, out, step=LATER, device="cpu", **settings):
+    trainer = Trainer(dataclasses.replace(CONFIG, **settings), scenes(folder), out, device=str(device))
     trainer.simulator.train()
     trainer.step = step
     return trainer
 
 
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @pytest.mark.parametrize("norm", ["layer", "batch"])
-def test_recomputing_changes_no_bit(folder, tmp_path, norm):
+def test_recomputing_changes_no_bit(folder, tmp_path, norm, precision, device):
     """Gradients, statistics and what is drawn, each part alone and all together."""
     model = {"dynamics": {"norm": norm, "drop_path": 0.3, "shuffle_orders": True, "zero_init": False}}
+    precision = PrecisionConfig(precision, precision, precision)
     known = None
     for recompute in ((), ("encoder",), ("steps",), ("images",), ("encoder", "steps", "images")):
-        trainer = trainer_at(folder, tmp_path, model=model, recompute=recompute)
+        settings = {"model": model, "recompute": recompute, "precision": precision}
+        trainer = trainer_at(folder, tmp_path, device=device, **settings)
         calls = []
         for part, name in (("encoder", "encoder"), ("dynamics", "steps"), ("renderer", "images")):
             getattr(trainer.simulator, part).register_forward_pre_hook(lambda *_, name=name: calls.append(name))
-        loss, errors, gradients, watch = trainer._gradients([0])
+        with deterministic():
+            loss, errors, gradients, watch = trainer._gradients([0])
         result = [loss, errors, *gradients, *trainer.simulator.buffers()]
         assert watch.seen(1.0).n_rows > 0 and len(watch.seen(1.0).norms) == 2
         for name, once in (("encoder", 1), ("steps", 2), ("images", 1)):
@@ -78,8 +82,10 @@ def test_a_part_in_another_precision(folder, tmp_path, part, precision, error):
     assert torch.cosine_similarity(a, b, 0) > 0.9
 
 
-def test_scaling_the_loss_leaves_gradients_and_an_overflow_halves_it(folder, tmp_path):
-    trainers = [trainer_at(folder, tmp_path, precision=PrecisionConfig(dynamics=p)) for p in ("fp16", "fp16")]
+def test_scaling_the_loss_leaves_gradients_and_an_overflow_halves_it(folder, tmp_path, device):
+    trainers = [
+        trainer_at(folder, tmp_path, device=device, precision=PrecisionConfig(dynamics=p)) for p in ("fp16", "fp16")
+    ]
     trainers[1].scale = LossScale(2.0**10)
     entries = [trainer.train_step() for trainer in trainers]
     assert [entry["loss_scale"] for entry in entries] == [2.0**16, 2.0**10]
