@@ -25,7 +25,7 @@ def row_norm(
         x: [N, C], float32 or float64, on CUDA also float16 and bfloat16 (computed in float32) and then C at most 1024.
         weight, bias: [C], float32; float64 with float64 rows.
         residual: [N, C] or None.
-        eps: positive, keeps rows of equal values finite.
+        eps: at least 1e-30, keeps rows of equal values finite.
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [N, C], dtype of ``residual``, else of ``x``. Under ``torch.autocast`` CUDA returns autocast's dtype where there is

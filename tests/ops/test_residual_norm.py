@@ -277,7 +277,7 @@ def test_autocast_on_the_cpu_computes_in_float32():
         (dict(norm=(torch.ones(4), torch.ones(5))), r"bias must be \[C\] = \[4\]; got \[5\]"),
         (dict(branch_norm=(torch.ones(4), None)), r"branch_norm\[1\] must be a tensor; got NoneType"),
         (dict(norm=torch.ones(2, 4)), r"norm must be a pair \(weight, bias\); got Tensor"),
-        (dict(eps=0.0), "eps must be positive; got 0"),
+        (dict(eps=0.0), "eps must be at least 1e-30; got 0"),
     ],
 )
 def test_malformed_arguments_raise(wrong, message):

@@ -9,6 +9,8 @@
 namespace gsim3d::binding {
 namespace {
 
+constexpr double kMinEps = 1e-30;
+
 // Calls f.template operator()<In, Out>() for the dtypes of the two tensors.
 template <typename F>
 void dispatch(const char* op, const Tensor& x, ScalarType out, const F& f) {
@@ -41,6 +43,11 @@ void check_channels(const char* op, const char* name, const Tensor& tensor, cons
   check_shape(op, name, tensor, {x.size(1)}, "[C]");
 }
 
+// Of smaller numbers the inverse root, or its products with weights and gradients, leave the range of float32.
+void check_eps(const char* op, double eps) {
+  check(eps >= kMinEps, op, ": eps must be at least ", kMinEps, "; got ", eps);
+}
+
 std::tuple<Tensor, Tensor> row_norm(const Tensor& x_, const Tensor& weight_, const Tensor& bias_,
                                     const std::optional<Tensor>& residual_, double eps, ScalarType dtype) {
   const char* op = "row_norm";
@@ -48,7 +55,7 @@ std::tuple<Tensor, Tensor> row_norm(const Tensor& x_, const Tensor& weight_, con
   const Tensor x = rows_of(x_), weight = rows_of(weight_), bias = rows_of(bias_);
   check_channels(op, "weight", weight, x);
   check_channels(op, "bias", bias, x);
-  check(eps > 0, op, ": eps must be positive; got ", eps);
+  check_eps(op, eps);
   const RowNormShape shape{x.size(0), x.size(1)};
   std::optional<Tensor> residual;
   if (residual_) {
@@ -151,7 +158,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> residual_norm(const Tensor& x_, const
   check_device(op, "branch", branch, x);
   check(branch_weight_.has_value() == branch_bias_.has_value() && weight_.has_value() == bias_.has_value(), op,
         ": a norm needs both a weight and a bias");
-  check(eps > 0, op, ": eps must be positive; got ", eps);
+  check_eps(op, eps);
   const Optional keep(op, "keep", keep_, x, type, {n, 1}, "[N, 1]");
   const Optional branch_weight(op, "branch_weight", branch_weight_, x, type, {c}, "[C]");
   const Optional branch_bias(op, "branch_bias", branch_bias_, x, type, {c}, "[C]");
