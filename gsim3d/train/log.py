@@ -62,8 +62,13 @@ class Log:
         """Args: entry: what follows from the configuration; machine: time and memory, which do not."""
         if self._stream is not None:
             rounded = {name: round(value, 4) for name, value in machine.items()}
-            self._stream.write(json.dumps({**entry, "machine": rounded}) + "\n")
-            self._stream.flush()
+            try:
+                self._stream.write(json.dumps({**entry, "machine": rounded}) + "\n")
+                self._stream.flush()
+            except OSError as error:
+                raise InputError(
+                    f"{self.file}: cannot be written: {error.strerror}; make room and train again"
+                ) from None
             if self.board is not None:
                 self.board.scalars({**entry, **machine}, entry["step"])
 
