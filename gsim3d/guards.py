@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Collection
 from functools import partial
 
 import torch
@@ -24,6 +25,7 @@ def guard_particles(
     *,
     grid_size: float = 0.0,
     previous: Particles | None = None,
+    changed: Collection[str] | None = None,
     max_opacity: float = 1.0,
 ) -> Particles:
     """``particles`` with finite, bounded numbers only; rows that had others are handled by ``config.on_bad``.
@@ -37,13 +39,14 @@ def guard_particles(
             falls asleep; 0: there is no such limit.
         previous: the same rows one step before: a row that moved further than ``config.max_speed`` falls asleep, and
             rows that cannot be used return to it.
+        changed: fields that differ from ``previous``; others are not looked at again. None: all.
         max_opacity: larger ones count as out of range.
     Gradients: through all rows that stay as they are.
     Raises:
         HardCaseError: ``config.on_bad`` is "raise", on the CPU.
     """
-    fields = particles.row_fields()
-    activity = fields.pop("activity")
+    looked_at = {"means", "opacities", *(particles.ROW_FIELDS if changed is None else changed)} - {"activity"}
+    fields = {name: value for name, value in particles.row_fields().items() if name in looked_at}
     limits = {
         "means": (-LARGEST, LARGEST),
         "opacities": (0.0, max_opacity),
@@ -57,7 +60,7 @@ def guard_particles(
         particles.cu_rows,
         cloud_scene=particles.cloud_scene,
         origin=particles.origin,
-        activity=activity,
+        activity=particles.activity,
         grid_size=grid_size,
         previous=None if previous is None else previous.means,
         max_step=config.max_speed,

@@ -186,4 +186,4 @@ class Simulator(nn.Module):
                 step = dataclasses.replace(step, sh=torch.where(held[:, None, None], newest.sh, step.sh))
         if appearance.opacity_changes is False:
             step = dataclasses.replace(step, opacities=newest.opacities)
-        return guard(step, previous=newest)
+        return guard(step, previous=newest, changed=self.dynamics.layout.changing)
