@@ -178,7 +178,7 @@ def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     )
     steps = simulator.rollout(bad, sample.n_steps, sample.plan, on_bad="drop", report=StabilityReport())
     yield from _finite(f"on_bad='drop' with {name} no number: rollout's", steps[-1])
-    if sample.n_scenes > 1 and not simulator.config.dynamics.quirks.anchor_at_minimum:
+    if sample.n_scenes > 1 and simulator.config.dynamics.origin_of_scene:
         clean = simulator.rollout(state, sample.n_steps, sample.plan)
         for step, expected in zip(steps, clean, strict=True):
             others = range(scene)

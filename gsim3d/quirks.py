@@ -22,7 +22,8 @@ class Quirks:
             where the strided convolutions took them.
         world_moments: moments of viewing rays are taken about the world's origin instead of the scene's.
     Dynamics:
-        half_attention: queries, keys, values and results of attention are rounded to half precision.
+        half_attention: queries, keys, values and results of attention are rounded to half precision (beyond its range
+            to its largest number, where the published model has infinity).
         stale_decoder_conv: the first convolution of each decoder stage reads the skip branch before the features from
             below are added to it.
         first_of_voxel: where rows share a cell, a convolution reads the lowest row of a neighbour cell, not the mean.

@@ -30,7 +30,7 @@ from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
 from gsim3d.renderer import GaussianHead, render, render_as_published
-from gsim3d.stability import LARGEST, OnBad, StabilityReport, check_on_bad
+from gsim3d.stability import OnBad, StabilityReport, check_on_bad
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames, Particles
 
 
@@ -161,8 +161,8 @@ class Simulator(nn.Module):
             config=limits,
             report=report,
             where=where,
-            grid_size=dynamics.grid_size if in_workspace and not dynamics.quirks.anchor_at_minimum else 0.0,
-            max_opacity=LARGEST if dynamics.quirks.unbounded_opacity else 1.0,
+            grid_size=dynamics.grid_size if in_workspace and dynamics.origin_of_scene else 0.0,
+            max_opacity=dynamics.max_opacity,
         )
 
     def _prepare(self, state: Particles, plan: Plan) -> Particles:

@@ -1,9 +1,9 @@
 #!/usr/bin/env python
-"""Do the tests notice a wrong kernel, or a guard that is gone? Changes one place at a time and runs the test that should fail.
+"""Do the tests notice a wrong kernel, or a guard that is gone? Changes one place at a time and runs the test for it.
 
     python tools/mutants.py                 all mutants of tests/mutants/*.json
     python tools/mutants.py raster pool     those of some ops
-    python tools/mutants.py guards          guards of hard cases written in Python (nothing is compiled); guards_core: in C++
+    python tools/mutants.py guards          guards of hard cases in Python: nothing is compiled (guards_core: in C++)
     python tools/mutants.py --list
 
 Each mutant is {"file", "old", "new", "test"}: `old` must occur exactly once in `file`; `test` is a pytest node. The work

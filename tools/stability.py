@@ -1,10 +1,10 @@
 #!/usr/bin/env python
 """Runs the hard cases and writes docs/stability.md (and docs/stability.json, the numbers behind it).
 
-    python tools/stability.py                   run all cases here: CPU, and CUDA where there is a GPU
-    python tools/stability.py --add FILE        add what another machine measured: stability.json of tools/gpu_check.sh, or
-                                                GSIM3D_STABILITY_JSON=FILE pytest tests/stability
-    python tools/stability.py --page            only write the page again
+python tools/stability.py                   run all cases here: CPU, and CUDA where there is a GPU
+python tools/stability.py --add FILE        add what another machine measured: stability.json of tools/gpu_check.sh, or
+                                            GSIM3D_STABILITY_JSON=FILE pytest tests/stability
+python tools/stability.py --page            only write the page again
 """
 
 import argparse
@@ -26,27 +26,29 @@ INTRODUCTION = """# Stability
 Written by `python tools/stability.py` from the tests in `tests/stability`; do not edit.
 
 **For every input, every op and the whole simulator either return finite outputs and finite gradients, or raise a typed
-`gsim3d.HardCaseError` that names scene, step, particle or camera and tensor, and says what to do. Never a silent NaN, never an
-abort of the process, never a changed result for another member of the batch.**
+`gsim3d.HardCaseError` that names scene, step, particle or camera and tensor, and says what to do. Never a silent NaN,
+never an abort of the process, never a changed result for another member of the batch.**
 
-What happens to a number that cannot be used is a policy, of a model or of a call: `on_bad="raise"` (default), `"drop"` or
-`"clamp"`; a `StabilityReport` counts what, where and how many. `gsim3d/stability.py` has the rules.
+What happens to a number that cannot be used is a policy, of a model or of a call: `on_bad="raise"` (default), `"drop"`
+or `"clamp"`; a `StabilityReport` counts what, where and how many. `gsim3d/stability.py` has the rules.
 
-Every case below is a test that is named after it (`test_r01_...`), forward and backward. Most of them run beside an ordinary
-scene in the same call, which must not notice: its rows have equal bits in float32 on the CPU, and everywhere as long as the
-sizes of the call are the same. (In float64 and on a GPU, BLAS rounds a product by its number of rows: rows in calls of
-different sizes are equal to rounding.) The measured cells hold the largest error, relative to the largest expected value,
-against a float64 reference that knows nothing of gsim3d, or against the same computation in float64 on the CPU; in brackets
-the bound that the test sets. tf32: float32 with TF32 products allowed; bf16: under `torch.autocast`; the rasterizer, the
-geometry and the plane sweep compute in float32 under both. "held": what is expected holds bit by bit, or as an error that is
-raised; there is no number to compare.
+Every case below is a test that is named after it (`test_r01_...`), forward and backward. Most of them run beside an
+ordinary scene in the same call, which must not notice: its rows have equal bits in float32 on the CPU, and everywhere
+as long as the sizes of the call are the same. (In float64 and on a GPU, BLAS rounds a product by its number of rows:
+rows in calls of different sizes are equal to rounding.)
 
-Each guard behind these cases is shown to matter: `python tools/mutants.py guards guards_core` takes them away one by one, and
-for each a test of this page must fail.
-"""
-OTHERS = """
-What the published release does was seen on the CPU or read in its code; of other packages, public issues (`name#number`),
-pull requests and commits are quoted.
+The measured cells hold the largest error, relative to the largest expected value, against a float64 reference that
+knows nothing of gsim3d, or against the same computation in float64 on the CPU; in brackets the bound that the test
+sets. tf32: float32 with TF32 products allowed; bf16: under `torch.autocast`; the rasterizer, the geometry and the plane
+sweep compute in float32 under both. "held": what is expected holds bit by bit, or as an error that is raised; there is
+no number to compare.
+
+Each guard behind these cases is shown to matter: `python tools/mutants.py guards guards_core` takes them away one by
+one, and for each a test of this page must fail.
+
+What the published release does was seen on the CPU or read in its code; of other packages, public issues
+(`name#number`), pull requests and commits are quoted.
+
 """
 
 
@@ -74,19 +76,16 @@ def rows_of(columns: dict, group: str) -> str:
 def measured(columns: dict, case: str) -> str:
     """Its cells; a case of files has the same result everywhere."""
     host = columns.get("host", {}).get("cases", {}).get(case)
-    return " | ".join(
-        cell(host if host else columns.get(name, {}).get("cases", {}).get(case)) for name in NAMES
-    )
+    return " | ".join(cell(host if host else columns.get(name, {}).get("cases", {}).get(case)) for name in NAMES)
 
 
 def page(columns: dict) -> str:
-    text = INTRODUCTION + OTHERS + "\n"
+    text = INTRODUCTION
     for name in [*NAMES, "host"]:
         if name in columns:
-            column = columns[name]
-            n_tests = sum(record["tests"] for record in column["cases"].values())
-            what = "files and their readers" if name == "host" else name
-            text += f"- {what}: {column['machine']}, torch {column['torch']}, {n_tests} tests of {len(column['cases'])} cases.\n"
+            column, what = columns[name], "files and their readers" if name == "host" else name
+            n_cases, n_tests = len(column["cases"]), sum(record["tests"] for record in column["cases"].values())
+            text += f"- {what}: {column['machine']}, torch {column['torch']}, {n_tests} tests of {n_cases} cases.\n"
     return text + "".join(rows_of(columns, group) for group in GROUPS)
 
 

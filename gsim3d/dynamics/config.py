@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from gsim3d.ops.curve import PyramidSpec
 from gsim3d.quirks import Quirks
+from gsim3d.stability import LARGEST
 
 PREDICTS = ("from_newest", "from_previous", "absolute")
 STEM_KERNEL, BLOCK_KERNEL = 5, 3  # edges of the convolutions, in cells
@@ -106,6 +107,16 @@ class DynamicsConfig:
     def n_stages(self) -> int:
         return len(self.encoder_channels)
 
+    @property
+    def origin_of_scene(self) -> bool:
+        """Whether cells are counted from the origin of a scene, so that scenes do not see each other."""
+        return not self.quirks.anchor_at_minimum
+
+    @property
+    def max_opacity(self) -> float:
+        """The largest opacity of a particle."""
+        return LARGEST if self.quirks.unbounded_opacity else 1.0
+
     def pyramid_spec(self, history_bits: int) -> PyramidSpec:
         """What the geometry op needs to know, for a history of up to 2^history_bits steps."""
         return PyramidSpec(
@@ -115,5 +126,5 @@ class DynamicsConfig:
             merge_windows=tuple(self.merge_windows),
             patch_sizes=tuple(self.patch_sizes),
             kernel_sizes=((STEM_KERNEL, BLOCK_KERNEL),) + ((BLOCK_KERNEL,),) * (self.n_stages - 1),
-            release=self.quirks.anchor_at_minimum,
+            release=not self.origin_of_scene,
         )

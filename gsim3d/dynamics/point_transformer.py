@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 from gsim3d import ops
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
 from gsim3d.dynamics.fused_block import product_dtype, run_block
-from gsim3d.layers import RowLayerNorm, RowLinear, make_norm
+from gsim3d.layers import RowLayerNorm, RowLinear, make_norm, widened
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
 TIME_EMBEDDING_STD = 0.02
@@ -67,7 +67,11 @@ class Attention(nn.Module):
         return self.proj(self._rounded(ops.patch_attention(q, k, v, patches, check=False).flatten(1)))
 
     def _rounded(self, x: Tensor) -> Tensor:
-        return x.clamp(-HALF_MAX, HALF_MAX).half().to(x.dtype) if self.rounded_to_half else x
+        if not self.rounded_to_half:
+            return x
+        wide = widened(x).clamp(-HALF_MAX, HALF_MAX)  # bfloat16 would round the bound up
+        # Gradients are not rounded: those beyond the range would become infinite.
+        return (wide + (wide.half().to(wide) - wide).detach()).to(x.dtype)
 
 
 class MLP(nn.Module):

@@ -147,7 +147,7 @@ class StateLayout:
         if name == "scales":
             return value.clamp(self.config.scale_min, self.config.scale_max)
         if name == "opacities":
-            return value.clamp(0, None if self.config.quirks.unbounded_opacity else 1)
+            return value.clamp(0, self.config.max_opacity)
         return value
 
     def _later_quats(self, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:

@@ -118,7 +118,7 @@ def test_batch_norm_in_training(file, device):
 def test_network_with_the_duplicate_rules_of_spconv(file, rule, monkeypatch):
     """Everything around the convolutions is right for any rule; these two are races in the release, so not imitated."""
 
-    def conv(x, weight, bias, voxels, kernel_map, *, duplicates):
+    def conv(x, weight, bias, voxels, kernel_map, *, duplicates, check):
         return racing_conv(x, weight, bias, voxels, kernel_map, rule)
 
     g, net, config = load(file)

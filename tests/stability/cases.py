@@ -14,7 +14,7 @@ GROUPS = {
 
 @dataclass(frozen=True)
 class Case:
-    """words: the case.   expected: of gsim3d.   others: the published release and other packages; "" where not known."""
+    """words: the case.   expected: of gsim3d.   others: the published release and other packages; "" if not known."""
 
     words: str
     expected: str
@@ -55,7 +55,7 @@ CASES = {
     ),
     "R07": Case(
         "scales that cover the screen, and beyond the number range",
-        "rendered in bounded memory; beyond the range an error that names row and image, on a GPU left out",
+        "rendered in bounded memory; beyond the range an error that names row and camera, or left out, by policy",
         "32-bit overflow in gaussian-splatting#28, ROCm/gsplat PR#10, LiteGS#21; 2.2e9 intersections, 50 GiB, in "
         "LichtFeld PR#2185; fvdb counts in 64 bits since PR#708",
     ),
@@ -72,7 +72,8 @@ CASES = {
     "R10": Case("camera inside an object", "finite; equal bits in every run", "artefacts in UnityGS#147"),
     "R11": Case(
         "quaternion of 0, very short or long, or no number",
-        "0 is the identity without a gradient; any other length is normalised; no number is an error, on a GPU left out",
+        "0 is the identity without a gradient; any other length is normalised; NaN is an error that names the row, or "
+        "left out, by policy",
         "release: gradients of 1e8 at zero; SpacetimeGaussians#96: half of all quaternions were zero; splat-transform "
         "PR#288; fast math made it the identity in gsplat's UT kernel, which now skips it",
     ),
@@ -99,8 +100,8 @@ CASES = {
     ),
     "S17": Case(
         "coordinates that are no numbers",
-        'an error that names scene, step, row and tensor; with `on_bad="drop"` the particle sleeps and is counted; with '
-        '`"clamp"` it goes on',
+        'an error that names scene, step, row and tensor; with `on_bad="drop"` the particle sleeps and is counted; '
+        'with `"clamp"` it goes on',
         "release: goes on silently; PTv3#32: a grid of 9.2e18 cells",
     ),
     "S18": Case(
@@ -248,7 +249,9 @@ CASES = {
         "100 dB; left out of the mean; a loss over no pixel is 0",
         "release: infinity and NaN",
     ),
-    "D50": Case("killed in any step, or while its checkpoint is written", "the curve and the weights of a run that was not"),
+    "D50": Case(
+        "killed in any step, or while its checkpoint is written", "the curve and the weights of a run that was not"
+    ),
     "E51": Case("images or cameras that are no numbers", "an error that names the image, its scene and step"),
     "E52": Case("a .ply of opacities 0 and 1, scales of 0, rotations without a direction", "finite, read as written"),
     "D51": Case("rotations without a direction", "the identity, without a gradient"),

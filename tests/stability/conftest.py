@@ -47,7 +47,9 @@ def pytest_sessionfinish(session):
     file = os.environ.get("GSIM3D_STABILITY_JSON")
     if file and not hasattr(session.config, "workerinput"):
         Path(file).parent.mkdir(parents=True, exist_ok=True)
-        columns = {name: {"machine": _machine(name), "torch": torch.__version__, "cases": c} for name, c in _results.items()}
+        columns = {
+            name: {"machine": _machine(name), "torch": torch.__version__, "cases": c} for name, c in _results.items()
+        }
         Path(file).write_text(json.dumps(columns, indent=1, sort_keys=True) + "\n")
 
 

@@ -59,7 +59,7 @@ def with_cameras(frames: Frames, **changes) -> Frames:
 def check_encoding(
     setting: Setting, measured: Measured, frames: Frames, *, bound: str = "encoder", prepare=None, **changes
 ) -> Encoding:
-    """Finite forward and backward, near float64's; the ordinary cloud 1 has the bits it has beside an ordinary cloud 0."""
+    """Finite forward and backward, near float64's; cloud 1 has the bits it has beside an ordinary cloud 0."""
     options = {"prepare": prepare, **changes}
     result, exact = (encode(where, frames, **options) for where in (setting, EXACT))
     measured.finite(*result.fields.values(), *result.grads.values())

@@ -51,7 +51,7 @@ class Setting:
                 flag.allow_tf32 = value
 
     def to(self, x):
-        """On the device, and in the dtype: a tensor, particles, frames (their calibration stays as it is) or a module."""
+        """On the device and in the dtype: a tensor, particles, frames (their calibration stays as it is), a module."""
         if isinstance(x, Tensor):
             return x.to(self.device, self.dtype) if x.is_floating_point() else x.to(self.device)
         if isinstance(x, Particles):

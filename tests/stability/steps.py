@@ -80,7 +80,9 @@ def check_step(
     for kind in ("fields", "grads"):
         for name, expected in getattr(alone, kind).items():
             both = getattr(together, kind)[name]
-            measured.unchanged(setting, both[len(both) - len(expected) :], expected, f"{kind} {name} of the other scene")
+            measured.unchanged(
+                setting, both[len(both) - len(expected) :], expected, f"{kind} {name} of the other scene"
+            )
     n_new, n_old = (len(x.means) for x in (last(hard), hard))
     return Step(
         {name: value[:n_new] for name, value in together.fields.items()},

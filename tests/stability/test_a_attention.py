@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from gsim3d import ops
+from gsim3d.dynamics.point_transformer import Attention
 from gsim3d.encoder.heads import PixelRays
 from gsim3d.layers import RowBatchNorm, RowLayerNorm
 from gsim3d.quirks import Quirks
@@ -48,8 +49,10 @@ def large_queries(dynamics):
             parameter.data.mul_(1e6)
 
 
-@pytest.mark.parametrize("quirks", [Quirks(), Quirks(half_attention=True)], ids=["", "half"])
-def test_a25_a_network_with_such_logits(setting, measured, quirks):
+QUIRKS = pytest.mark.parametrize("quirks", [Quirks(), Quirks(half_attention=True)], ids=["", "half"])
+
+
+def check_huge_network(setting, measured, quirks) -> None:
     config = dataclasses.replace(TINY, quirks=quirks)
     histories = make_history((30, 20)), ordinary(config)
     step = simulate(setting, batch(histories), config, prepare=large_queries)
@@ -58,6 +61,33 @@ def test_a25_a_network_with_such_logits(setting, measured, quirks):
     measured.finite(*alone.tensors)
     for name, value in alone.fields.items():
         measured.unchanged(setting, step.fields[name][20:], value, name)
+
+
+@QUIRKS
+def test_a25_a_network_with_such_logits(setting, measured, quirks):
+    check_huge_network(setting, measured, quirks)
+
+
+@QUIRKS
+@pytest.mark.parametrize("setting", NAMES[1:2], indirect=True)
+def test_a25_a_network_with_such_logits_under_autocast_on_the_cpu(setting, measured, quirks):
+    half = Setting(setting.device, "bf16")
+    with half.computing():
+        check_huge_network(half, measured, quirks)
+
+
+def test_a25_gradients_beyond_half_precision(setting, measured):
+    """Where attention imitates half precision: its gradients keep their range, and digits."""
+    torch.manual_seed(0)
+    attention = setting.to(Attention(32, 2, rounded_to_half=True))
+    x, cotangent = setting.to(torch.randn(16, 32)), setting.to(torch.randn(16, 32))
+    rows, whole = (torch.tensor(values, device=setting.device) for values in (range(16), (0, 16)))
+    table = ops.PatchTable(rows, rows, whole, whole)
+    grads, small = (
+        torch.autograd.grad((f * cotangent * attention(x, table)).sum(), attention.qkv.weight)[0] for f in (2.0**30, 1)
+    )
+    measured.finite(grads)
+    measured.same_bits(grads, 2.0**30 * small, "gradient of the weights")
 
 
 @pytest.mark.parametrize("sizes", [RAGGED, ((0, 0),), ((0, 3), (3, 0), (1, 1)), ((5, 16), (16, 16), (16, 16))])
@@ -109,7 +139,9 @@ def test_a27_weight_gradients_over_100_000_rows(setting, measured):
     sums = x.double().sum(0)
     measured.finite(*grads)
     measured.close(grads[0].reshape(16, 16), sums.expand(16, 16), f"many_rows_{setting.precision}", "grad weight")
-    measured.close(grads[1], torch.full((16,), float(MANY), dtype=torch.float64), f"many_rows_{setting.precision}", "bias")
+    measured.close(
+        grads[1], torch.full((16,), float(MANY), dtype=torch.float64), f"many_rows_{setting.precision}", "bias"
+    )
     scale, shift = torch.ones(16), torch.zeros(16)
     few = x[:1000]
     ours = gradients(ops.row_norm, [setting.to(t) for t in (few.repeat(100, 1), scale, shift)], few.repeat(100, 1))
@@ -207,7 +239,7 @@ def test_a28_depth_keeps_its_digits_under_autocast_on_the_cpu(setting, measured)
 
 
 def test_a28_inverse_calibration_is_float64(setting, measured):
-    """A camera 10 km from zero: its rays keep their directions to float64's digits, whatever the network computes in."""
+    """A camera 10 km from zero is where it is to float64's digits, whatever the network computes in."""
     frames = make_frames([0, 0])
     viewmats = frames.cameras.viewmats.clone()
     viewmats[:, :3, 3] -= (viewmats[:, :3, :3] @ torch.full((3, 1), 1e4, dtype=torch.float64))[..., 0]

@@ -10,7 +10,6 @@ import torch
 from gsim3d.data import Scene, find_scenes
 from gsim3d.dynamics.state import rotate_left
 from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr, ssim
-from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, OptimizerConfig, StageConfig, TrainConfig
@@ -21,7 +20,7 @@ from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_hist
 from tests.stability.rollouts import finite, make_simulator, of_scene, ordinary, raised
 from tests.stability.setting import NAMES
 from tests.stability.steps import EXACT, check_step, simulate
-from tests.test_simulator import CONFIG, make_frames, target_cameras
+from tests.test_simulator import CONFIG, make_frames
 from tests.tiny_scenes import write_scenes
 
 NAN, INF = float("nan"), float("inf")
@@ -366,7 +365,7 @@ class Killed(BaseException):
 def test_d50_resume_after_kill(setting, measured, scenes, tmp_path, when, monkeypatch):
     """Killed once in every step, before or while its checkpoint is written: the curve of a run that never was."""
     Trainer(TRAINING, scenes, tmp_path / "whole", device=setting.device.type).run(progress=False)
-    victim = {"in the step": (Trainer, "_update_average"), "in the checkpoint": (checkpoint, "save_file")}[when]
+    victim = {"in the step": (Trainer, "_update_average"), "in the checkpoint": (checkpoint, "_sync")}[when]
     original = getattr(*victim)
     for step in range(TRAINING.n_steps):
         trainer = Trainer(TRAINING, scenes, tmp_path / "killed", device=setting.device.type)

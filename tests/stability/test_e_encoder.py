@@ -1,7 +1,6 @@
 """Hard cases of the encoder and of data."""
 
 import dataclasses
-import json
 import shutil
 
 import cv2
@@ -14,12 +13,12 @@ from gsim3d.data import Scene
 from gsim3d.errors import HardCaseError, InputError
 from gsim3d.interop.ply import read_ply, write_ply
 from gsim3d.types import Gaussians
+from tests.asserts import gradients
 from tests.data.made_scenes import WRITERS, edit_json, make_scene
-from tests.encoder.scenes import SIZE, make_encoder, make_frames
+from tests.encoder.scenes import SIZE, make_encoder
 from tests.ops.test_plane_sweep import make as make_sweep
 from tests.oracle import plane_sweep as sweep_oracle
-from tests.asserts import gradients
-from tests.stability.encodings import HARD, check_encoding, encode, ordinary, with_cameras
+from tests.stability.encodings import check_encoding, encode, ordinary, with_cameras
 
 NAN, INF = float("nan"), float("inf")
 TURNED = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))  # half a turn about the camera's y
@@ -231,7 +230,9 @@ def test_e41_calibration_in_float64(setting, measured):
     measured.finite(*there.fields.values(), *there.grads.values())
     for name in ("opacities", "dynamic_latents", "static_latents"):
         measured.close(there.fields[name], here.fields[name], f"encoder_moved_{setting.precision}", name)
-    measured.close(there.fields["means"], here.fields["means"].double().cpu() + shift, f"geometry_{setting.exact}", "means")
+    measured.close(
+        there.fields["means"], here.fields["means"].double().cpu() + shift, f"geometry_{setting.exact}", "means"
+    )
 
 
 BAD_CAMERAS = {

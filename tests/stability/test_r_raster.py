@@ -109,7 +109,9 @@ def check_refused(setting, measured, name: str, value: float) -> None:
     assert (error.tensor, error.row, error.camera) == (name, 4, 1)
     measured.outcome("HardCaseError names tensor, row and camera")
     report = StabilityReport()
-    check_left_out(setting, measured, change(three().to(setting.dtype), name, 1, value), [1], on_bad="drop", report=report)
+    check_left_out(
+        setting, measured, change(three().to(setting.dtype), name, 1, value), [1], on_bad="drop", report=report
+    )
     assert {(f.tensor, f.action, f.row, f.camera) for f in report.findings} == {(name, "dropped", 1, 0)}
 
 
@@ -159,7 +161,9 @@ def test_r10_camera_inside_an_object(setting, measured):
 
 def test_r11_zero_quaternion_is_the_identity(setting, measured):
     zero, identity = (change(three(), "quats", 1, torch.tensor([w, 0, 0, 0])) for w in (0.0, 1.0))
-    result, expected = (f(setting, measured, s) for f, s in ((render_beside_another, zero), (check_against_oracle, identity)))
+    result, expected = (
+        f(setting, measured, s) for f, s in ((render_beside_another, zero), (check_against_oracle, identity))
+    )
     measured.same_bits(result.color, expected.color)
     assert not result.grads["quats"][1].any() and result.grads["scales"][1].any()
     measured.outcome("identity, no gradient")

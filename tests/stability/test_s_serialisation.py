@@ -105,7 +105,9 @@ def test_s17_places_that_are_none_are_clamped(setting, measured, value):
     state = setting.to(batch([displaced(make_history((25, 30)), 30, value), ordinary()]))
     step = simulator.rollout(state, 1, on_bad="clamp", report=report)[0]
     measured.finite(*float_fields(step).values())
-    assert [(f.tensor, f.action, f.row) for f in report.findings if f.step == 1][:1] == [("particles.means", "clamped", 30)]
+    assert [(f.tensor, f.action, f.row) for f in report.findings if f.step == 1][:1] == [
+        ("particles.means", "clamped", 30)
+    ]
     measured.outcome("clamped, counted")
 
 

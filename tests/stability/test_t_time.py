@@ -70,7 +70,10 @@ def test_t33_unsorted_clouds(setting, measured, what):
     changes, message = BROKEN[what]
     history = make_history((5, 4, 5, 6))
     history = dataclasses.replace(
-        history, cloud_scene=torch.tensor([0, 0, 1, 1]), cloud_step=torch.tensor([0, 1, 0, 1]), origin=torch.zeros(2, 3).double()
+        history,
+        cloud_scene=torch.tensor([0, 0, 1, 1]),
+        cloud_step=torch.tensor([0, 1, 0, 1]),
+        origin=torch.zeros(2, 3).double(),
     )
     dynamics = setting.to(make_dynamics())
     assert torch.isfinite(dynamics(setting.to(history)).means).all()

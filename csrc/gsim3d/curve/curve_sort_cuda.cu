@@ -163,22 +163,25 @@ __device__ __forceinline__ uint32_t exclusive_block_sum(uint32_t value, uint32_t
 }
 
 // Places of the sample: scattered, since equal steps may keep step with how a cloud was made.
-__device__ __forceinline__ int64_t sampled_place(uint32_t i, int64_t n) {
+__device__ __forceinline__ uint32_t sampled_place(uint32_t i, int64_t n /* < 2^30 */) {
   uint32_t hash = (i + 1) * 0x9e3779b9u;
   hash = (hash ^ hash >> 16) * 0x85ebca6bu;
   hash = (hash ^ hash >> 13) * 0xc2b2ae35u;
-  return static_cast<int64_t>(static_cast<uint64_t>(hash ^ hash >> 16) * static_cast<uint64_t>(n) >> 32);
+  return static_cast<uint32_t>(static_cast<uint64_t>(hash ^ hash >> 16) * static_cast<uint64_t>(n) >> 32);
 }
 
 __global__ void __launch_bounds__(kThreads) plan_passes_kernel(Sort sort) {
   __shared__ uint32_t sums[kWarps];
   __shared__ uint64_t sample[kThreads];
+  __shared__ uint32_t places[kThreads];
   __shared__ uint32_t pairs;
   const int64_t row = blockIdx.x, n = size_of(sort.rows, row);
   const int pass = blockIdx.y;
-  const uint64_t key = n > 0 ? sort.rows.keys[row * sort.rows.room + sampled_place(threadIdx.x, n)] : 0;
+  const uint32_t place = sampled_place(threadIdx.x, n);
+  const uint64_t key = n > 0 ? sort.rows.keys[row * sort.rows.room + place] : 0;
   const uint64_t prefix = n > 0 ? ordered_key(sort.rows, row, key) >> (pass * kDigitBits) : 0;
   sample[threadIdx.x] = prefix;
+  places[threadIdx.x] = place;
   if (threadIdx.x == 0) pairs = 0;
   uint32_t* total = sort.totals + (row * kMaxPasses + pass) * kDigits + threadIdx.x;
   const uint32_t count = *total;
@@ -186,8 +189,8 @@ __global__ void __launch_bounds__(kThreads) plan_passes_kernel(Sort sort) {
   if (!__syncthreads_or(count > 0 && count < n)) return;
   uint32_t same = 0;
 #pragma unroll 8
-  for (int i = 0; i < kThreads; ++i) same += sample[i] == prefix;
-  same = __reduce_add_sync(kFullWarp, same - 1);
+  for (int i = 0; i < kThreads; ++i) same += sample[i] == prefix && places[i] != place;
+  same = __reduce_add_sync(kFullWarp, same);
   if (threadIdx.x % kWarp == 0) atomicAdd(&pairs, same);
   __syncthreads();
   // In long rows few pairs of the sample are still many keys.

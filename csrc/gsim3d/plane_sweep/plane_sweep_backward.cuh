@@ -251,18 +251,6 @@ int64_t n_tasks(const LineSizes& s) {
   return ((s.n_pixels + kPiece - 1) / kPiece + 1) / 2;
 }
 
-// The image that owns a pair: the last whose pairs begin at or before it; -1 where the offsets say none.
-template <typename T>
-__device__ __forceinline__ int64_t owner_of(const PlaneSweep<T>& sweep, int64_t pair) {
-  int64_t image = 0, past = sweep.n_images;
-  while (past - image > 1) {
-    const int64_t middle = (image + past) / 2;
-    (sweep.cu_src[middle] <= pair ? image : past) = middle;
-  }
-  const Range owned = range_of(sweep.cu_src, image, sweep.n_pairs);
-  return pair >= owned.begin && pair < owned.end ? image : -1;
-}
-
 template <typename T, int kVectors>
 constexpr int64_t source_bytes() {
   return int64_t{kTasks} * kOwned * kWarp * kVectors * sizeof(T);

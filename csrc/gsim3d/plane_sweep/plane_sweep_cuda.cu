@@ -1,4 +1,8 @@
+// Dispatch, and the float64 sweep: lines of pixels in plain arithmetic.
+#include <type_traits>
+
 #include "gsim3d/plane_sweep/plane_sweep_backward.cuh"
+#include "gsim3d/plane_sweep/plane_sweep_tensor.h"
 
 namespace gsim3d::cuda {
 namespace {
@@ -79,23 +83,20 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, 2)
 }
 
 // Warps of a block whose lines fit in shared memory together.
-int64_t warps_for(const char* op, int64_t bytes, const LineSizes& s, Stream stream) {
-  int limit = 0;
-  check_cuda(cudaDeviceGetAttribute(&limit, cudaDevAttrMaxSharedMemoryPerBlockOptin, stream.device), op);
-  check(bytes <= limit, op, ": features and depths must be small enough for one pixel's line to fit ", limit,
-        " bytes of shared memory; got ", s.height, " x ", s.width, " pixels and ", s.n_depths, " depths");
-  return std::min<int64_t>(kMaxWarps, limit / bytes);
+template <typename T>
+int64_t warps_for(const char* op, int64_t bytes, const PlaneSweep<T>& sweep, Stream stream) {
+  return std::min<int64_t>(kMaxWarps, check_shared_bytes(op, bytes, sweep, stream) / bytes);
 }
 
 template <typename T>
-void check_lines(const char* op, const PlaneSweep<T>& sweep) {
+void check_depths(const char* op, const PlaneSweep<T>& sweep) {
   check_sizes(op, sweep);
   check(sweep.n_depths < 1 << 14, op, ": inverse_depths must have fewer than 2^14 depths; got ", sweep.n_depths);
 }
 
 template <typename T>
-Pixels<T> take_pixels(const PlaneSweep<T>& sweep, int vectors, const Workspace& workspace) {
-  const int64_t block = kWarp * vectors, stride = (sweep.channels + block - 1) / block * block;
+Pixels<T> take_pixels(const PlaneSweep<T>& sweep, const Workspace& workspace) {
+  const int64_t stride = (sweep.channels + kWarp - 1) / kWarp * kWarp;
   return {workspace.take<T>(sweep.n_images * sweep.height * sweep.width * stride), static_cast<int32_t>(stride)};
 }
 
@@ -104,54 +105,32 @@ dim3 transpose_grid(const char* op, int64_t n_images, int64_t n_pixels, int64_t 
 }
 
 template <typename T>
-Pixels<const T> make_pixels(const char* op, const T* features, const PlaneSweep<T>& sweep, int vectors,
+Pixels<const T> make_pixels(const char* op, const T* features, const PlaneSweep<T>& sweep,
                             const Workspace& workspace, Stream stream) {
-  const Pixels<T> pixels = take_pixels(sweep, vectors, workspace);
+  const Pixels<T> pixels = take_pixels(sweep, workspace);
   const int64_t n_pixels = sweep.height * sweep.width;
   launch(op, to_pixels_kernel<T>, transpose_grid(op, sweep.n_images, n_pixels, pixels.stride), dim3(32, 8), 0, stream,
          features, sweep.channels, n_pixels, pixels.stride, (n_pixels + 31) / 32, pixels.data);
   return {pixels.data, pixels.stride};
 }
 
-// f with kVectors = 1, 2 or 4 as a constant: a warp's packs should not be wider than the features, or than registers hold.
-template <typename T, typename F>
-void for_vectors(int64_t channels, const F& f) {
-  if constexpr (sizeof(T) > 4) {
-    f.template operator()<1>();
-  } else {
-    if (channels <= kWarp) return f.template operator()<1>();
-    if (channels <= 2 * kWarp) return f.template operator()<2>();
-    f.template operator()<4>();
-  }
+constexpr int kVectors = 1;  // doubles of a lane; more would not fit its registers
+
+void line_sweep(const char* op, const double* features, const PlaneSweep<double>& sweep, double* cost,
+                const Workspace& workspace, Stream stream) {
+  using T = double;
+  const LineSizes s = line_sizes(sweep);
+  const int64_t bytes = quad_bytes<T>(s), warps = warps_for(op, bytes, sweep, stream), quads = quads_of(s);
+  const Pixels<const T> pixels = make_pixels(op, features, sweep, workspace, stream);
+  launch(op, forward_kernel<T, kVectors>, blocks_for(op, sweep.n_images * quads, warps),
+         static_cast<unsigned>(warps * kWarp), warps * bytes, stream, pixels, sweep, s, quads, cost);
 }
 
-}  // namespace
-
-template <typename T>
-void plane_sweep(const T* features, const PlaneSweep<T>& sweep, T* cost, const Workspace& workspace, Stream stream) {
-  const char* op = "plane_sweep";
-  check_lines(op, sweep);
+void line_sweep_vjp(const char* op, const double* grad, const double* features, const PlaneSweep<double>& sweep,
+                    double* grad_features, const Workspace& workspace, Stream stream) {
+  using T = double;
   const LineSizes s = line_sizes(sweep);
-  if (sweep.n_images * s.n_pixels * s.n_depths == 0) return;
-  const int64_t bytes = quad_bytes<T>(s), warps = warps_for(op, bytes, s, stream);
-  const int64_t quads = quads_of(s);
-  for_vectors<T>(sweep.channels, [&]<int kVectors>() {
-    const Pixels<const T> pixels = make_pixels(op, features, sweep, kVectors, workspace, stream);
-    launch(op, forward_kernel<T, kVectors>, blocks_for(op, sweep.n_images * quads, warps),
-           static_cast<unsigned>(warps * kWarp), warps * bytes, stream, pixels, sweep, s, quads, cost);
-  });
-}
-
-template <typename T>
-void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& sweep, T* grad_features,
-                     const Workspace& workspace, Stream stream) {
-  const char* op = "plane_sweep_backward";
-  check_lines(op, sweep);
-  const LineSizes s = line_sizes(sweep);
-  if (sweep.n_pairs == 0 || s.n_depths == 0)
-    return fill_zero(op, grad_features, sweep.n_images * sweep.channels * s.n_pixels, stream);
-  if (sweep.n_images * s.n_pixels == 0) return;
-  const int64_t bytes = lines_bytes<T>(s), warps = warps_for(op, bytes, s, stream), quads = quads_of(s);
+  const int64_t bytes = lines_bytes<T>(s), warps = warps_for(op, bytes, sweep, stream), quads = quads_of(s);
   const int64_t summary = (s.n_words + 31) / 32;
   const int64_t line =
       s.n_words * (sizeof(uint32_t) + sizeof(uint16_t)) + summary * sizeof(uint32_t) + s.capacity * sizeof(T);
@@ -162,29 +141,55 @@ void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& swee
   Lines<T> lines{
       workspace.take<uint32_t>(pairs * per_pair * s.n_words), workspace.take<uint16_t>(pairs * per_pair * s.n_words),
       workspace.take<uint32_t>(pairs * per_pair * summary), workspace.take<T>(pairs * per_pair * s.capacity)};
-  for_vectors<T>(sweep.channels, [&]<int kVectors>() {
-    const Pixels<const T> pixels = make_pixels(op, features, sweep, kVectors, workspace, stream);
-    const Pixels<T> grad_pixels = take_pixels(sweep, kVectors, workspace);
-    const unsigned blocks_of_channels = pixels.stride / (kWarp * kVectors);
-    if (!whole) fill_zero(op, grad_pixels.data, sweep.n_images * s.n_pixels * pixels.stride, stream);
-    for (lines.first_pair = 0; lines.first_pair < sweep.n_pairs; lines.first_pair += pairs) {
-      lines.n_pairs = std::min(pairs, sweep.n_pairs - lines.first_pair);
-      for (int64_t pixel = 0; pixel < s.n_pixels; pixel += per_pair) {
-        lines.first_pixel = static_cast<int32_t>(pixel);
-        lines.n_pixels = static_cast<int32_t>(std::min(per_pair, s.n_pixels - pixel));
-        launch(op, lines_kernel<T>, blocks_for(op, sweep.n_images * lines.n_pixels, warps),
-               static_cast<unsigned>(warps * kWarp), warps * bytes, stream, grad, sweep, s, lines);
-        launch(op, gather_kernel<T, kVectors>,
-               dim3(blocks_for(op, sweep.n_images * quads, kMaxWarps), blocks_of_channels), kMaxWarps * kWarp,
-               kMaxWarps * gather_bytes<T>(), stream, pixels, sweep, s, lines, quads, !whole, grad_pixels);
-        launch(op, source_kernel<T, kVectors>,
-               dim3(blocks_for(op, sweep.n_images * tasks, kTasks), blocks_of_channels), kMaxWarps * kWarp,
-               source_bytes<T, kVectors>(), stream, pixels, sweep, s, lines, tasks, grad_pixels);
-      }
+  const Pixels<const T> pixels = make_pixels(op, features, sweep, workspace, stream);
+  const Pixels<T> grad_pixels = take_pixels(sweep, workspace);
+  const unsigned blocks_of_channels = pixels.stride / (kWarp * kVectors);
+  if (!whole) fill_zero(op, grad_pixels.data, sweep.n_images * s.n_pixels * pixels.stride, stream);
+  for (lines.first_pair = 0; lines.first_pair < sweep.n_pairs; lines.first_pair += pairs) {
+    lines.n_pairs = std::min(pairs, sweep.n_pairs - lines.first_pair);
+    for (int64_t pixel = 0; pixel < s.n_pixels; pixel += per_pair) {
+      lines.first_pixel = static_cast<int32_t>(pixel);
+      lines.n_pixels = static_cast<int32_t>(std::min(per_pair, s.n_pixels - pixel));
+      launch(op, lines_kernel<T>, blocks_for(op, sweep.n_images * lines.n_pixels, warps),
+             static_cast<unsigned>(warps * kWarp), warps * bytes, stream, grad, sweep, s, lines);
+      launch(op, gather_kernel<T, kVectors>,
+             dim3(blocks_for(op, sweep.n_images * quads, kMaxWarps), blocks_of_channels), kMaxWarps * kWarp,
+             kMaxWarps * gather_bytes<T>(), stream, pixels, sweep, s, lines, quads, !whole, grad_pixels);
+      launch(op, source_kernel<T, kVectors>,
+             dim3(blocks_for(op, sweep.n_images * tasks, kTasks), blocks_of_channels), kMaxWarps * kWarp,
+             source_bytes<T, kVectors>(), stream, pixels, sweep, s, lines, tasks, grad_pixels);
     }
-    launch(op, to_planes_kernel<T>, transpose_grid(op, sweep.n_images, s.n_pixels, pixels.stride), dim3(32, 8), 0,
-           stream, grad_pixels.data, sweep.channels, s.n_pixels, pixels.stride, (s.n_pixels + 31) / 32, grad_features);
-  });
+  }
+  launch(op, to_planes_kernel<T>, transpose_grid(op, sweep.n_images, s.n_pixels, pixels.stride), dim3(32, 8), 0,
+         stream, grad_pixels.data, sweep.channels, s.n_pixels, pixels.stride, (s.n_pixels + 31) / 32, grad_features);
+}
+
+}  // namespace
+
+template <typename T>
+void plane_sweep(const T* features, const PlaneSweep<T>& sweep, T* cost, const Workspace& workspace, Stream stream) {
+  const char* op = "plane_sweep";
+  check_depths(op, sweep);
+  if (sweep.n_images * sweep.height * sweep.width * sweep.n_depths == 0) return;
+  if constexpr (std::is_same_v<T, float>)
+    tensor_sweep(op, features, sweep, cost, workspace, stream);
+  else
+    line_sweep(op, features, sweep, cost, workspace, stream);
+}
+
+template <typename T>
+void plane_sweep_vjp(const T* grad, const T* features, const PlaneSweep<T>& sweep, T* grad_features,
+                     const Workspace& workspace, Stream stream) {
+  const char* op = "plane_sweep_backward";
+  check_depths(op, sweep);
+  const int64_t n_pixels = sweep.n_images * sweep.height * sweep.width;
+  if (sweep.n_pairs == 0 || sweep.n_depths == 0)
+    return fill_zero(op, grad_features, n_pixels * sweep.channels, stream);
+  if (n_pixels == 0) return;
+  if constexpr (std::is_same_v<T, float>)
+    tensor_sweep_vjp(op, grad, features, sweep, grad_features, workspace, stream);
+  else
+    line_sweep_vjp(op, grad, features, sweep, grad_features, workspace, stream);
 }
 
 #define GSIM3D_INSTANTIATE(T)                                                                 \

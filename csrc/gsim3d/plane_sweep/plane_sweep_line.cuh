@@ -28,6 +28,34 @@ LineSizes line_sizes(const PlaneSweep<T>& sweep) {
           static_cast<int32_t>(std::min(4 * sweep.n_depths, n_pixels))};
 }
 
+// The shared memory of a block, in bytes, which `bytes` must fit.
+template <typename T>
+int64_t check_shared_bytes(const char* op, int64_t bytes, const PlaneSweep<T>& sweep, Stream stream) {
+  int limit = 0;
+  check_cuda(cudaDeviceGetAttribute(&limit, cudaDevAttrMaxSharedMemoryPerBlockOptin, stream.device), op);
+  check(bytes <= limit, op, ": features and depths must be small enough for one pixel's line to fit ", limit,
+        " bytes of shared memory; got ", sweep.height, " x ", sweep.width, " pixels and ", sweep.n_depths, " depths");
+  return limit;
+}
+
+// 1 / (number of sources * sqrt(C)).
+template <typename T>
+__device__ __forceinline__ T cost_scale(const Range& pairs, int64_t channels) {
+  return T(1) / (static_cast<T>(pairs.end - pairs.begin) * sqrt(static_cast<T>(channels)));
+}
+
+// The image that owns a pair: the last whose pairs begin at or before it; -1 where the offsets say none.
+template <typename T>
+__device__ __forceinline__ int64_t owner_of(const PlaneSweep<T>& sweep, int64_t pair) {
+  int64_t image = 0, past = sweep.n_images;
+  while (past - image > 1) {
+    const int64_t middle = (image + past) / 2;
+    (sweep.cu_src[middle] <= pair ? image : past) = middle;
+  }
+  const Range owned = range_of(sweep.cu_src, image, sweep.n_pairs);
+  return pair >= owned.begin && pair < owned.end ? image : -1;
+}
+
 template <typename T>
 struct Line {
   int32_t* code;     // [n_depths], of each sample's cell (see trace)

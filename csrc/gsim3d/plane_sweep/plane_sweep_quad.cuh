@@ -65,12 +65,6 @@ __global__ void to_planes_kernel(const T* __restrict__ pixels, int64_t rows, int
   }
 }
 
-// 1 / (number of sources * sqrt(C)).
-template <typename T>
-__device__ __forceinline__ T cost_scale(const Range& pairs, int64_t channels) {
-  return T(1) / (static_cast<T>(pairs.end - pairs.begin) * sqrt(static_cast<T>(channels)));
-}
-
 // The forward pass gives a warp four neighbouring pixels: their lines run close to each other, so that a source pixel is
 // loaded once for most of them. A lane holds one depth of each.
 constexpr int kQuad = 4;
