@@ -53,7 +53,7 @@ class Simulator(nn.Module):
     ) -> Particles:
         """Particles of all clouds of ``frames``: each pixel that the masks keep becomes one."""
         guard = self._guard("encode", on_bad, report)
-        frames, spoiled = guard_frames(frames, **{name: guard.keywords[name] for name in ("config", "report", "where")})
+        frames, spoiled = guard_frames(frames, guard.keywords["config"], guard.keywords["report"], "encode")
         particles = self.encoder(frames)
         return guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled)))
 

@@ -294,7 +294,9 @@ def spoiled_frames(device, value=NAN):
 
 def test_a_pixel_that_is_no_number(simulator, device):
     frames, row = spoiled_frames(device)
-    with pytest.raises(HardCaseError, match=r"images must be finite; image 1 \(scene 0, step 0\) is not; on_bad=\"drop\"") as caught:
+    with pytest.raises(
+        HardCaseError, match=r"images must be finite; image 1 \(scene 0, step 0\) is not; on_bad=\"drop\""
+    ) as caught:
         simulator.encode(frames)
     assert (caught.value.tensor, caught.value.camera) == ("images", 1)
     black = dataclasses.replace(frames, images=frames.images.nan_to_num(0.0))
@@ -328,7 +330,9 @@ def test_a_camera_that_cannot_see_raises_under_every_policy(simulator, device, o
     near = frames.cameras.near.clone()
     near[1] = 0
     frames = dataclasses.replace(frames, cameras=dataclasses.replace(frames.cameras, near=near))
-    with pytest.raises(HardCaseError, match="cameras.near must be positive; image 1 .*; mend its calibration") as caught:
+    with pytest.raises(
+        HardCaseError, match="cameras.near must be positive; image 1 .*; mend its calibration"
+    ) as caught:
         simulator.encode(frames, on_bad=on_bad)
     assert (caught.value.tensor, caught.value.camera, caught.value.scene) == ("cameras.near", 1, 0)
 

@@ -119,7 +119,14 @@ def look(bench: Bench):
 
     def ours():
         watched = ops.watch_rows(
-            fields, bounds, cu_rows, cloud_scene=zero, origin=origin, activity=activity, grid_size=0.01, previous=previous
+            fields,
+            bounds,
+            cu_rows,
+            cloud_scene=zero,
+            origin=origin,
+            activity=activity,
+            grid_size=0.01,
+            previous=previous,
         )
         return watched.record[0, 12:15].float()
 
