@@ -6,7 +6,8 @@ import torch
 import gsim3d.ops  # noqa: F401
 
 OPS = sorted({name.split(".")[0] for name in torch._C._dispatch_get_all_op_names() if name.startswith("gsim3d::")})
-INTEGER_OPS = ("gsim3d::curve_", "gsim3d::build_pyramid", "gsim3d::watch_rows")  # nothing to differentiate
+# positions or indices in, integers out, or nothing at all: nothing to differentiate
+INTEGER_OPS = ("gsim3d::curve_", "gsim3d::build_pyramid", "gsim3d::sparse_conv_plan", "gsim3d::watch_rows")
 
 
 def has_kernel(op: str, key: str) -> bool:

@@ -38,6 +38,9 @@ class Plan(NamedTuple):
         voxels, taps = self.stage.voxels, self.stage.kernel_maps[self.kernel_size]
         return (voxels.row_voxel, voxels.rows, voxels.cu_rows, taps.tap_in, taps.tap_out, taps.cu_taps, self.reads_lowest)
 
+    def conv_plan(self) -> Tensor | None:
+        return self.stage.kernel_maps[self.kernel_size].plan
+
     def table(self) -> tuple[Tensor, ...]:
         return self.patches.q_rows, self.patches.kv_rows, self.patches.cu_q, self.patches.cu_k
 
@@ -114,7 +117,7 @@ def run_block(block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keep
 
 def _forward(plan: Plan, w: Weights, x: Tensor, conv_input: Tensor, keep_attention, keep_mlp):
     """(sum,) or (sum, sum in the dtype of the products); Kept."""
-    place = _ops.sparse_conv.default(conv_input, w.conv, w.conv_bias, *plan.geometry())
+    place = _ops.sparse_conv.default(conv_input, w.conv, w.conv_bias, *plan.geometry(), plan.conv_plan())
     position = row_linear(place, w.linear, w.linear_bias)
     norm, norm1, norm2 = (w.position_norm, w.position_norm_bias), (w.norm1, w.norm1_bias), (w.norm2, w.norm2_bias)
     sum1, normed1, position_stats, stats1 = _ops.residual_norm.default(x, position, None, *norm, *norm1, plan.eps)
@@ -173,7 +176,7 @@ def _backward(plan: Plan, w: Weights, kept: Kept, conv_input: Tensor, keep_atten
         grad1, grad_normed, kept.position, kept.sum1, None, w.position_norm, w.norm1, kept.position_stats, kept.stats1
     )
     grad_place, linear = _linear_grads(grad_position, kept.place, w.linear)
-    grad_input = _ops.sparse_conv_grad_input.default(grad_place, w.conv, *plan.geometry())
+    grad_input = _ops.sparse_conv_grad_input.default(grad_place, w.conv, *plan.geometry(), plan.conv_plan())
     conv, conv_bias = _ops.sparse_conv_grad_weight.default(grad_place, conv_input, plan.kernel_size, *plan.geometry())
     wide = grad_x.dtype
     of_layers = conv.to(wide), conv_bias.to(wide), linear, linear_bias, qkv, qkv_bias, proj, proj_bias, fc1, fc1_bias, fc2

@@ -141,12 +141,14 @@ class KernelMap:
     Pairs cu_taps[t] .. cu_taps[t + 1] - 1 belong to tap t = (kx K + ky) K + kz: voxel tap_in lies at the offset
     (kx, ky, kz) - K // 2 cells from voxel tap_out. The centre tap is empty: it reads the row itself.
     tap_in, tap_out: int64 [L].   cu_taps: int64 [K^3 + 1].
+    plan: int32, what 16-bit convolutions on CUDA derive from the pairs, made once; they make it anew where it is None.
     """
 
     kernel_size: int
     tap_in: Tensor
     tap_out: Tensor
     cu_taps: Tensor
+    plan: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -365,6 +367,16 @@ def _check_whole_numbers(name: str, values: tuple[int, ...]) -> None:
         check_whole("build_pyramid", **{name: value})
 
 
+def _kernel_map(size: int, voxels: Voxels, tap_in: Tensor, tap_out: Tensor, cu_taps: Tensor) -> KernelMap:
+    """Larger kernels have one convolution a network call and tables of K^3 entries a row: no plan is kept."""
+    plan = None
+    if tap_in.is_cuda and size == 3:
+        plan = torch.ops.gsim3d.sparse_conv_plan(
+            voxels.row_voxel, voxels.rows, voxels.cu_rows, tap_in, tap_out, cu_taps, size
+        )
+    return KernelMap(size, tap_in, tap_out, cu_taps, plan)
+
+
 def _assemble(arrays: list[Tensor], spec: PyramidSpec, has_found: bool) -> Pyramid:
     """Names the flat results, in the order that csrc/gsim3d/curve/pyramid.h states."""
     left = list(arrays)
@@ -377,7 +389,7 @@ def _assemble(arrays: list[Tensor], spec: PyramidSpec, has_found: bool) -> Pyram
         grid, cloud, cu_clouds, order, cu_q, cu_k, kv_rows = [take() for _ in range(7)]
         patches = tuple(PatchTable(order[r], kv_rows[r], cu_q, cu_k) for r in range(4))
         voxels = Voxels(take(), take(), take())
-        kernel_maps = {size: KernelMap(size, take(), take(), take()) for size in sizes}
+        kernel_maps = {size: _kernel_map(size, voxels, take(), take(), take()) for size in sizes}
         stages.append(Stage(grid, cloud, cu_clouds, order, patches, voxels, kernel_maps, cluster, time_index))
     return Pyramid(rows, cu_rows, tuple(stages), take() if has_found else None)
 

@@ -287,15 +287,22 @@ def _(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, st
 
 
 def _setup(ctx, inputs, output):
+    ctx.set_materialize_grads(False)  # else what is kept for the backward pass gets a gradient of zeros as large
     ctx.mark_non_differentiable(*output[4:])
     ctx.save_for_backward(*output[4:7], *inputs[:11])
     ctx.options = inputs[11:18]
 
 
-def _backward(ctx, grad_color, grad_alpha, grad_depth, grad_features, *_kept):
+def _backward(ctx, *grads):
+    transmittance, features = ctx.saved_tensors[0], ctx.saved_tensors[8]
+    sizes = ((3,), (), (), features.shape[1:])  # of color, alpha, depth, features
+    images = [
+        transmittance.new_zeros(*transmittance.shape, *size) if grad is None else grad
+        for grad, size in zip(grads, sizes, strict=False)
+    ]
     viewmats_grad = ctx.needs_input_grad[7]
     *grads, viewmats = torch.ops.gsim3d.rasterize_gaussians_backward(
-        grad_color, grad_alpha, grad_depth, grad_features, *ctx.saved_tensors, *ctx.options, viewmats_grad
+        *images, *ctx.saved_tensors, *ctx.options, viewmats_grad
     )
     return (*grads, viewmats if viewmats_grad else None, *[None] * 11)
 

@@ -81,16 +81,23 @@ def sparse_conv(
         kernel_map.tap_out,
         kernel_map.cu_taps,
         duplicates == "first",
+        kernel_map.plan,
     )
 
 
+@torch.library.register_fake("gsim3d::sparse_conv_plan")
+def _(row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, kernel_size):
+    taps, groups = kernel_size**3, (row_voxel.shape[0] + 383) // 384 * 6
+    return row_voxel.new_empty(groups * (64 * (taps + 1) + (taps + 31) // 32), dtype=torch.int32)
+
+
 @torch.library.register_fake("gsim3d::sparse_conv")
-def _(x, weight, bias, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first):
+def _(x, weight, bias, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first, plan=None):
     return x.new_empty(x.shape[0], weight.shape[0])
 
 
 @torch.library.register_fake("gsim3d::sparse_conv_grad_input")
-def _(grad, weight, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first):
+def _(grad, weight, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first, plan=None):
     return grad.new_empty(grad.shape[0], weight.shape[4])
 
 
@@ -101,23 +108,23 @@ def _(grad, x, kernel_size, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_ou
 
 
 def _setup(ctx, inputs, output):
-    x, weight, bias, *geometry, first = inputs
-    ctx.save_for_backward(x, weight, *geometry)
+    x, weight, bias, *geometry, first, plan = inputs
+    ctx.save_for_backward(x, weight, plan, *geometry)
     ctx.first = first
     ctx.has_bias = bias is not None
 
 
 def _backward(ctx, grad):
-    x, weight, *geometry = ctx.saved_tensors
+    x, weight, plan, *geometry = ctx.saved_tensors
     needs_x, needs_weight, needs_bias = ctx.needs_input_grad[:3]
     grad_x = grad_weight = grad_bias = None
     if needs_x:
-        grad_x = torch.ops.gsim3d.sparse_conv_grad_input(grad, weight, *geometry, ctx.first)
+        grad_x = torch.ops.gsim3d.sparse_conv_grad_input(grad, weight, *geometry, ctx.first, plan)
     if needs_weight or needs_bias:
         grad_weight, grad_bias = torch.ops.gsim3d.sparse_conv_grad_weight(
             grad, x, weight.shape[1], *geometry, ctx.first
         )
-    return grad_x, grad_weight, grad_bias if ctx.has_bias else None, *[None] * 7
+    return grad_x, grad_weight, grad_bias if ctx.has_bias else None, *[None] * 8
 
 
 torch.library.register_autograd("gsim3d::sparse_conv", _backward, setup_context=_setup)

@@ -45,6 +45,11 @@ def convolution(voxels, kernel_map, duplicates="mean"):
     return lambda x, w, b=None: sparse_conv(x, w, b, voxels, kernel_map, duplicates=duplicates)
 
 
+def with_plan(voxels, kernel_map):
+    plan = torch.ops.gsim3d.sparse_conv_plan(*raw_arguments(voxels, kernel_map), kernel_map.kernel_size)
+    return voxels, replaced(kernel_map, plan=plan)
+
+
 def raw_arguments(voxels, kernel_map):
     return voxels.row_voxel, voxels.rows, voxels.cu_rows, kernel_map.tap_in, kernel_map.tap_out, kernel_map.cu_taps
 
@@ -147,6 +152,7 @@ def gathered_convolution(voxels, kernel_map, duplicates):
     return plain
 
 
+@pytest.mark.parametrize("planned", [False, True])
 @pytest.mark.parametrize("dtype", LOW_PRECISION)
 @pytest.mark.parametrize("duplicates", RULES)
 @pytest.mark.parametrize(
@@ -159,11 +165,14 @@ def gathered_convolution(voxels, kernel_map, duplicates):
         (300, 5, 5, 129, 40),  # rows that are no multiples of 16 bytes
         (300, 5, 3, 16, 33),
         (200, 4, 1, 8, 130),
+        (9000, 24, 3, 40, 64),  # tiles that no other block shares
+        (33000, 60, 3, 64, 72),  # large tiles
     ],
 )
-def test_low_precision_errs_no_more_than_torch(n, side, kernel_size, c_in, c_out, duplicates, dtype, devices):
+def test_low_precision_errs_no_more_than_torch(n, side, kernel_size, c_in, c_out, duplicates, dtype, planned, devices):
     """Against float64, at most twice the error of plain torch in the same dtype."""
     tables = geometry(random_cells(n, side), kernel_size, devices[1])
+    tables = with_plan(*tables) if planned else tables
     inputs = [t.to(devices[1]) for t in parameters(n, c_in, c_out, kernel_size, dtype)]
     inputs[1] /= (c_in * kernel_size**3) ** 0.5
     *inputs, cotangent = inputs
@@ -178,12 +187,33 @@ def test_low_precision_errs_no_more_than_torch(n, side, kernel_size, c_in, c_out
 def test_cuda_gives_the_same_bits_in_every_run(dtype, devices):
     inputs = [t.to(devices[1]) for t in parameters(4000, 72, 136, 3, dtype)]
     *inputs, cotangent = inputs
+    tables = geometry(random_cells(4000, 14), 3, devices[1])
+    planned = with_plan(*tables)
     for duplicates in RULES:
-        ours = convolution(*geometry(random_cells(4000, 14), 3, devices[1]), duplicates)
-        first = gradients(ours, inputs, cotangent)
-        for _ in range(3):
-            for a, b in zip(gradients(ours, inputs, cotangent), first):
-                assert_same_bits(a, b)
+        for chosen in (tables, planned):
+            ours = convolution(*chosen, duplicates)
+            first = gradients(ours, inputs, cotangent)
+            for _ in range(3):
+                for a, b in zip(gradients(ours, inputs, cotangent), first):
+                    assert_same_bits(a, b)
+    assert_same_bits(with_plan(*tables)[1].plan, planned[1].plan)
+    assert_same_bits(convolution(*planned)(*inputs), convolution(*tables)(*inputs))
+
+
+def test_pairs_without_mirror_images_on_cuda(devices):
+    """Without a plan nothing is taken for granted about the pairs."""
+    voxels, whole = geometry(random_cells(2000, 9), 3, devices[1])
+    keep = whole.tap_out % 3 == 0
+    counts = torch.zeros_like(whole.cu_taps)
+    tap = torch.repeat_interleave(torch.arange(27, device=keep.device), whole.cu_taps.diff())
+    counts[1:] = torch.cumsum(torch.bincount(tap[keep], minlength=27), 0)
+    kernel_map = KernelMap(3, whole.tap_in[keep], whole.tap_out[keep], counts)
+    x, weight, bias, cotangent = (t.to(devices[1]) for t in parameters(2000, 32, 64, 3, torch.float16))
+    plain = gathered_convolution(voxels, kernel_map, "mean")
+    exact = gradients(plain, [t.double() for t in (x, weight, bias)], cotangent.double())
+    actual = gradients(convolution(voxels, kernel_map), [x, weight, bias], cotangent)
+    for a, b in zip(actual, exact):
+        assert relative_to_max(a, b) < 2e-3
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
@@ -211,6 +241,10 @@ def test_cuda_skips_indices_out_of_range(dtype, devices):
             (Voxels(voxels.row_voxel, lists[1], voxels.cu_rows), kernel_map),
         ):
             gradients(convolution(*broken), [x, weight, bias], cotangent)
+            gradients(convolution(*with_plan(*broken)), [x, weight, bias], cotangent)
+    for far in (-(2**31), 2**31 - 1, 10**6):
+        plan = torch.full_like(with_plan(voxels, kernel_map)[1].plan, far)
+        gradients(convolution(voxels, replaced(kernel_map, plan=plan)), [x, weight, bias], cotangent)
     torch.cuda.synchronize()
     assert_same_bits(convolution(voxels, fewer)(x, weight, bias), expected)
 

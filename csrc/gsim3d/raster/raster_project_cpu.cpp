@@ -53,7 +53,7 @@ Unusable project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, con
     for (int i = 0; i < 4; ++i) quat[i] = gather(scene.quats, rows, 4, i);
     for (int i = 0; i < 3; ++i) scale[i] = gather(scene.scales, rows, 3, i);
     const V opacity = gather(scene.opacities, rows, 1, 0);
-    const Projection<V> p = project(camera, mean, quat, scale);
+    const Projection<V> p = project(camera, mean, axes_of(quat, scale));
     const auto in_front = p.z > V{} + camera.near_plane;
 
     constexpr int kColumns = std::max(1, kTerms) * 3;

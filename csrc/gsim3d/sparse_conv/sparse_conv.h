@@ -27,7 +27,19 @@ struct SparseConvMap {
   const int64_t* cu_taps;        // [K^3 + 1], from 0 to at most n_pairs; the centre tap has no pairs
   int64_t n_rows, n_voxels, n_pairs, kernel_size;
   bool first;  // taps read the lowest row of a voxel instead of the mean of its rows
+  // What cuda::sparse_conv_plan wrote, or null. Only for lists in which every pair has its mirror image: tap t connects
+  // voxels a, b exactly where tap K^3 - 1 - t connects b, a.
+  const int32_t* plan = nullptr;
 };
+
+// Rows in the order in which the tensor cores take them, where each tap of each row reads, and which taps every group
+// of rows has.
+constexpr int64_t kConvGroupRows = 64, kConvPlanStep = 384;
+inline int64_t sparse_conv_plan_size(int64_t n_rows, int64_t kernel_size) {
+  const int64_t taps = kernel_size * kernel_size * kernel_size;
+  const int64_t pitch = (n_rows + kConvPlanStep - 1) / kConvPlanStep * kConvPlanStep;
+  return pitch * (taps + 1) + pitch / kConvGroupRows * ((taps + 31) / 32);
+}
 
 namespace cpu {
 
@@ -65,6 +77,10 @@ void sparse_conv_vjp_weight(const T* grad,  // [n_rows, c_out]
 
 // As on the CPU, with device memory and on a stream. Indices are not checked: pairs and rows out of range take no part.
 namespace cuda {
+
+// The tables of a map for 16-bit convolutions, which make them anew where the map has none.
+void sparse_conv_plan(const SparseConvMap& map, int32_t* plan /* [sparse_conv_plan_size()] */,
+                      const Workspace& workspace, Stream stream);
 
 template <typename T>
 void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap& map, int64_t c_in, int64_t c_out,

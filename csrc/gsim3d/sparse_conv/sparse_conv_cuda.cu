@@ -12,12 +12,14 @@ constexpr int kWarps = kThreads / kWarp;
 constexpr int64_t kMaxRows = int64_t{1} << 30;  // rows and slots together are counted in 32 bits
 constexpr int64_t kMaxKernel = 39;              // taps are a dimension of a grid
 constexpr int64_t kBiasRows = 512;              // rows of one block of a bias gradient
+constexpr int64_t kMaxPlanTaps = 1024;          // whose sources are listed for every row
+constexpr int64_t kMaxPlanChannels = 1 << 18;   // numbers of taps and chunks fit 16 bits, their products 31
 constexpr int64_t kAlignment = 16;              // bytes that the tensor-core kernels read at once
 constexpr int64_t kWeightBlocks = 900;          // blocks of a weight gradient that fill a large GPU a few times
 constexpr int64_t kPairsPerBlock = 128;         // pairs on average that pay for adding up a block's result
 constexpr int64_t kChunkMin = 1024, kChunkMax = 16384;
 
-enum class VoxelValue { kMean, kSum };
+enum class VoxelValue { kMean, kSum, kFirst };
 
 void check_sizes(const char* op, const SparseConvMap& map, int64_t c_in, int64_t c_out) {
   check(map.n_rows < kMaxRows && map.n_voxels < kMaxRows, op, ": CUDA takes fewer than 2^30 rows; got ", map.n_rows);
@@ -25,33 +27,36 @@ void check_sizes(const char* op, const SparseConvMap& map, int64_t c_in, int64_t
   check(map.kernel_size <= kMaxKernel, op, ": CUDA takes kernels up to ", kMaxKernel, "; got ", map.kernel_size);
 }
 
-// Where some voxels are empty, any number of the others may be shared.
-int64_t slots_of(const SparseConvMap& map) {
-  return map.n_voxels > map.n_rows ? map.n_rows : map.n_rows - map.n_voxels;
-}
+template <typename E, int kVector>
+struct alignas(sizeof(E) * kVector) Vector {
+  E values[kVector];
+};
 
-Sources sources_of(const SparseConvMap& map, bool first) {
-  return {map.voxel_rows, map.cu_voxel_rows, map.n_rows, map.n_voxels, slots_of(map), first};
-}
-
-// A warp sums the rows of a voxel, in order.
-template <typename E>
+// One value for each voxel of several rows; a thread has kVector columns of a voxel and takes its rows in order.
+template <typename E, int kVector>
 __global__ void __launch_bounds__(kThreads)
-    combine_rows(const E* x, Sources sources, int32_t channels, bool mean, E* shared) {
-  const int64_t voxel = static_cast<int64_t>(blockIdx.x) * kWarps + threadIdx.x / kWarp;
+    combine_rows(const E* x, Sources sources, int32_t channels, VoxelValue kind, E* shared) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x, across = channels / kVector;
+  const int64_t voxel = i / across, c = i % across * kVector;
   if (voxel >= sources.n_voxels) return;
   const int32_t source = sources.of(voxel);
   if (source < sources.n_rows) return;
-  const Range rows = range_of(sources.cu_voxel_rows, voxel, sources.n_rows);
-  E* to = shared + (source - sources.n_rows) * channels;
-  for (int32_t c = threadIdx.x % kWarp; c < channels; c += kWarp) {
-    Sum<E> sum = 0;
-    for (int64_t i = rows.begin; i < rows.end; ++i) {
-      const int64_t row = sources.voxel_rows[i];
-      if (inside(row, sources.n_rows)) sum += static_cast<Sum<E>>(x[row * channels + c]);
-    }
-    to[c] = static_cast<E>(mean ? sum / static_cast<Sum<E>>(rows.end - rows.begin) : sum);
+  Range rows = range_of(sources.cu_voxel_rows, voxel, sources.n_rows);
+  if (kind == VoxelValue::kFirst) rows.end = rows.begin + 1;
+  Sum<E> sums[kVector] = {};
+#pragma unroll 2
+  for (int64_t j = rows.begin; j < rows.end; ++j) {
+    const int64_t row = sources.voxel_rows[j];
+    if (!inside(row, sources.n_rows)) continue;
+    const auto values = *reinterpret_cast<const Vector<E, kVector>*>(x + row * channels + c);
+#pragma unroll
+    for (int k = 0; k < kVector; ++k) sums[k] += static_cast<Sum<E>>(values.values[k]);
   }
+  const Sum<E> count = kind == VoxelValue::kMean ? static_cast<Sum<E>>(rows.end - rows.begin) : Sum<E>(1);
+  Vector<E, kVector> result;
+#pragma unroll
+  for (int k = 0; k < kVector; ++k) result.values[k] = static_cast<E>(sums[k] / count);
+  *reinterpret_cast<Vector<E, kVector>*>(shared + wide_product(source - sources.n_rows, channels) + c) = result;
 }
 
 // Rows of `channels` columns, with zeros up to `padded`.
@@ -127,11 +132,6 @@ __global__ void __launch_bounds__(kThreads)
   if (lane == 0) counts[tile * taps + tap] = count;
 }
 
-template <typename E, int kVector>
-struct alignas(sizeof(E) * kVector) Vector {
-  E values[kVector];
-};
-
 // partials[block, c] = sum over the rows of a block. Eight threads lie side by side with kVector columns each, 32 take
 // turns at the rows; their sums are added in a tree.
 template <typename E, int kVector>
@@ -167,15 +167,15 @@ __global__ void __launch_bounds__(kThreads)
 // kEach elements, kElements apart, whose loads are in flight together.
 constexpr int kAdders = 4, kElements = kThreads / kAdders, kEach = 4;
 
-// One tap (blockIdx.y), then the bias.
+// One tap (first_tap + blockIdx.y), behind the taps the bias.
 template <typename E>
 __global__ void __launch_bounds__(kThreads)
-    add_partials(OuterProducts<E> products, int64_t n_chunks, int32_t c_out, int32_t c_in, const Sum<E>* bias_partials,
-                 int64_t bias_blocks, E* grad_weight, E* grad_bias) {
+    add_partials(OuterProducts<E> products, int32_t first_tap, int64_t n_chunks, int32_t c_out, int32_t c_in,
+                 const Sum<E>* bias_partials, int64_t bias_blocks, E* grad_weight, E* grad_bias) {
   using T = Sum<E>;
   __shared__ T sums[kAdders][kEach][kElements];
   const int adder = threadIdx.x / kElements, element = threadIdx.x % kElements;
-  const int32_t tap = blockIdx.y;
+  const int32_t tap = first_tap + static_cast<int32_t>(blockIdx.y);
   const bool bias = tap == products.taps;
   const int32_t centre = products.taps / 2, parts_of_chunk = tap == centre ? products.centre_parts : 1;
   const int32_t unit = tap == centre ? 0 : products.centre_parts + (tap < centre ? tap : tap - 1);
@@ -236,21 +236,25 @@ Padded<E> padded(const char* op, const E* data, int64_t n, int64_t channels, con
   return {copy, wanted};
 }
 
-// Values of the voxels; rows of `channels` columns.
+// Rows of `channels` columns, and for voxels of several rows one value each.
 template <typename E>
-Values<E> values_of(const char* op, const E* x, const SparseConvMap& map, int64_t channels, VoxelValue kind, bool first,
+Values<E> values_of(const char* op, const E* x, const SparseConvMap& map, int64_t channels, VoxelValue kind,
                     const Workspace& workspace, Stream stream) {
   const int64_t n_slots = slots_of(map);
   E* shared = nullptr;
-  if (n_slots > 0 && !first) {
+  if (n_slots > 0 && channels > 0) {
     shared = workspace.take<E>(n_slots * channels);
-    launch(op, combine_rows<E>, blocks_for(op, map.n_voxels, kWarps), kThreads, 0, stream, x, sources_of(map, first),
-           channels, kind == VoxelValue::kMean, shared);
+    constexpr int kVector = kAlignment / sizeof(E);
+    const bool vectors = channels % kVector == 0 && aligned(x);
+    launch(op, vectors ? combine_rows<E, kVector> : combine_rows<E, 1>,
+           blocks_for(op, map.n_voxels * (vectors ? channels / kVector : channels), kThreads), kThreads, 0, stream, x,
+           sources_of(map), channels, kind, shared);
   }
-  return {x, shared, static_cast<int32_t>(map.n_rows), static_cast<int32_t>(channels)};
+  return {x, shared, static_cast<int32_t>(map.n_rows), static_cast<int32_t>(map.n_rows + n_slots),
+          static_cast<int32_t>(channels)};
 }
 
-TilePairs pairs_of(const char* op, const SparseConvMap& map, bool transposed, bool first, const Workspace& workspace,
+TilePairs pairs_of(const char* op, const SparseConvMap& map, bool transposed, const Workspace& workspace,
                    Stream stream) {
   const int64_t taps = taps_of(map), n_tiles = tiles_of(map), pitch = n_tiles * kTile;
   int32_t* sources = workspace.take<int32_t>(taps * pitch + taps * pitch / 4 + taps * n_tiles + map.n_rows);
@@ -259,7 +263,7 @@ TilePairs pairs_of(const char* op, const SparseConvMap& map, bool transposed, bo
   int32_t* rows = counts + taps * n_tiles;
   launch(op, list_pairs, dim3(blocks_for(op, n_tiles, kWarps), static_cast<unsigned>(taps)), kThreads, 0, stream,
          transposed ? map.tap_in : map.tap_out, transposed ? map.tap_out : map.tap_in, map.cu_taps, taps, map.n_pairs,
-         n_tiles, sources_of(map, first), pitch, sources, places, counts, rows);
+         n_tiles, sources_of(map), pitch, sources, places, counts, rows);
   return {sources, places, counts, rows, static_cast<int32_t>(pitch)};
 }
 
@@ -291,74 +295,73 @@ auto* native_data(T* data) {
   return reinterpret_cast<Native<T>*>(data);
 }
 
+// The convolution, or the gradient of its input from that of its output.
+template <typename E, bool kGradient>
+void convolve(const char* op, const E* x, const E* weight, const E* bias, const SparseConvMap& map, int64_t c_in,
+              int64_t c_out, E* y, const Workspace& workspace, Stream stream) {
+  check_sizes(op, map, c_in, c_out);
+  const int64_t taps = taps_of(map);
+  const Padded<E> rows = padded(op, x, map.n_rows, kGradient ? c_out : c_in, workspace, stream);
+  const Padded<E> weights =
+      kGradient ? Padded<E>{weight, c_in} : padded(op, weight, c_out * taps, c_in, workspace, stream);
+  const VoxelValue kind = kGradient ? VoxelValue::kSum : map.first ? VoxelValue::kFirst : VoxelValue::kMean;
+  const bool whole = !kGradient || slots_of(map) == 0;
+  Convolution<E> conv{values_of(op, rows.data, map, rows.channels, kind, workspace, stream),
+                      weights.data,
+                      bias,
+                      map.row_voxel,
+                      map.voxel_rows,
+                      map.cu_voxel_rows,
+                      map.n_voxels,
+                      static_cast<int32_t>(taps),
+                      static_cast<int32_t>(rows.channels),
+                      static_cast<int32_t>(kGradient ? c_in : c_out),
+                      static_cast<int32_t>(c_out),
+                      static_cast<int32_t>(weights.channels),
+                      whole ? Share::kWhole : map.first ? Share::kFirstRow : Share::kEqualParts,
+                      y,
+                      {},
+                      {}};
+  if constexpr (kIsHalf<E>)
+    if (rows.channels > 0 && taps <= kMaxPlanTaps && std::max(c_in, c_out) <= kMaxPlanChannels) {
+      const int32_t* plan = map.plan;
+      if (plan == nullptr) {
+        int32_t* own = workspace.take<int32_t>(sparse_conv_plan_size(map.n_rows, map.kernel_size));
+        make_row_plan(op, map, kGradient, own, workspace, stream);
+        plan = own;
+      }
+      Convolution<E> tensor = conv;
+      tensor.plan = row_plan_in(plan, map.n_rows, taps, kGradient && map.plan != nullptr);
+      if constexpr (kGradient) {
+        E* transposed = workspace.take<E>(c_in * taps * rows.channels);
+        const dim3 squares(blocks_for(op, c_in, kWarp), blocks_for(op, rows.channels, kWarp),
+                           static_cast<unsigned>(taps));
+        launch(op, transpose_weights<E>, squares, kThreads, 0, stream, weight, taps, c_in, c_out, rows.channels,
+               transposed);
+        tensor.weight = transposed;
+        tensor.weight_row = static_cast<int32_t>(rows.channels);
+      }
+      if (convolve_tensor(op, tensor, workspace, stream)) return;
+    }
+  conv.pairs = pairs_of(op, map, kGradient, workspace, stream);
+  convolve_plain(op, conv, tiles_of(map), kGradient, stream);
+}
+
 }  // namespace
 
 template <typename T>
 void sparse_conv(const T* x, const T* weight, const T* bias, const SparseConvMap& map, int64_t c_in, int64_t c_out,
                  T* out, const Workspace& workspace, Stream stream) {
-  using E = Native<T>;
-  const char* op = "sparse_conv";
-  check_sizes(op, map, c_in, c_out);
-  const int64_t taps = taps_of(map);
-  const Padded<E> rows = padded(op, native_data(x), map.n_rows, c_in, workspace, stream);
-  const Padded<E> weights = padded(op, native_data(weight), c_out * taps, c_in, workspace, stream);
-  const Values<E> values =
-      values_of(op, rows.data, map, rows.channels, VoxelValue::kMean, map.first, workspace, stream);
-  const TilePairs pairs = pairs_of(op, map, false, map.first, workspace, stream);
-  const Convolution<E> convolution{values,
-                                   weights.data,
-                                   bias == nullptr ? nullptr : native_data(bias),
-                                   pairs,
-                                   map.cu_voxel_rows,
-                                   map.row_voxel,
-                                   map.n_voxels,
-                                   static_cast<int32_t>(taps),
-                                   static_cast<int32_t>(rows.channels),
-                                   static_cast<int32_t>(c_out),
-                                   static_cast<int32_t>(c_out),
-                                   static_cast<int32_t>(weights.channels),
-                                   Share::kWhole,
-                                   native_data(out)};
-  if constexpr (kIsHalf<E>)
-    if (c_in > 0) return convolve_tensor(op, convolution, tiles_of(map), stream);
-  convolve_plain(op, convolution, tiles_of(map), false, stream);
+  convolve<Native<T>, false>("sparse_conv", native_data(x), native_data(weight),
+                             bias == nullptr ? nullptr : native_data(bias), map, c_in, c_out, native_data(out),
+                             workspace, stream);
 }
 
 template <typename T>
 void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& map, int64_t c_in, int64_t c_out,
                            T* grad_x, const Workspace& workspace, Stream stream) {
-  using E = Native<T>;
-  const char* op = "sparse_conv_grad_input";
-  check_sizes(op, map, c_in, c_out);
-  const int64_t taps = taps_of(map);
-  const Padded<E> rows = padded(op, native_data(grad), map.n_rows, c_out, workspace, stream);
-  const E* weights = native_data(weight);
-  if constexpr (kIsHalf<E>) {
-    E* transposed = workspace.take<E>(c_in * taps * rows.channels);
-    const dim3 squares(blocks_for(op, c_in, kWarp), blocks_for(op, rows.channels, kWarp), static_cast<unsigned>(taps));
-    launch(op, transpose_weights<E>, squares, kThreads, 0, stream, weights, taps, c_in, c_out, rows.channels,
-           transposed);
-    weights = transposed;
-  }
-  const Values<E> values = values_of(op, rows.data, map, rows.channels, VoxelValue::kSum, false, workspace, stream);
-  const TilePairs pairs = pairs_of(op, map, true, false, workspace, stream);
-  const Convolution<E> convolution{values,
-                                   weights,
-                                   nullptr,
-                                   pairs,
-                                   map.cu_voxel_rows,
-                                   map.row_voxel,
-                                   map.n_voxels,
-                                   static_cast<int32_t>(taps),
-                                   static_cast<int32_t>(rows.channels),
-                                   static_cast<int32_t>(c_in),
-                                   static_cast<int32_t>(c_out),
-                                   static_cast<int32_t>(c_in),
-                                   map.first ? Share::kFirstRow : Share::kEqualParts,
-                                   native_data(grad_x)};
-  if constexpr (kIsHalf<E>)
-    if (c_out > 0) return convolve_tensor(op, convolution, tiles_of(map), stream);
-  convolve_plain(op, convolution, tiles_of(map), true, stream);
+  convolve<Native<T>, true>("sparse_conv_grad_input", native_data(grad), native_data(weight), nullptr, map, c_in, c_out,
+                            native_data(grad_x), workspace, stream);
 }
 
 template <typename T>
@@ -380,11 +383,13 @@ void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map,
          native_data(grad), map.n_rows, c_out, bias_partials);
 
   const WeightPlan plan = plan_of(map, c_in, c_out);
+  const bool direct = kIsHalf<E> && plan.n_chunks * plan.centre_parts == 1 && right.channels == c_in;
+  const int64_t n_blocks = plan.n_chunks * (plan.centre_parts + taps - 1);
   const OuterProducts<E> products{
-      values_of(op, left.data, map, left.channels, VoxelValue::kSum, false, workspace, stream),
-      values_of(op, right.data, map, right.channels, VoxelValue::kMean, map.first, workspace, stream),
-      sources_of(map, false),
-      sources_of(map, map.first),
+      values_of(op, left.data, map, left.channels, VoxelValue::kSum, workspace, stream),
+      values_of(op, right.data, map, right.channels, map.first ? VoxelValue::kFirst : VoxelValue::kMean, workspace,
+                stream),
+      sources_of(map),
       map.tap_in,
       map.tap_out,
       map.cu_taps,
@@ -394,16 +399,17 @@ void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map,
       static_cast<int32_t>(plan.centre_parts),
       static_cast<int32_t>(left.channels),
       static_cast<int32_t>(right.channels),
-      workspace.take<Sum<E>>(plan.n_chunks * (plan.centre_parts + taps - 1) * left.channels * right.channels)};
-  const int64_t n_blocks = plan.n_chunks * products.blocks_per_chunk();
+      direct ? nullptr : workspace.take<Sum<E>>(n_blocks * left.channels * right.channels),
+      native_data(grad_weight),
+      static_cast<int32_t>(c_out)};
   if constexpr (kIsHalf<E>)
     outer_products_tensor(op, products, n_blocks, stream);
   else
     outer_products_plain(op, products, n_blocks, stream);
-  const unsigned columns =
-      std::max(blocks_for(op, c_out * c_in, kElements * kEach), blocks_for(op, c_out, kElements * kEach));
-  launch(op, add_partials<E>, dim3(columns, static_cast<unsigned>(taps + 1)), kThreads, 0, stream, products,
-         plan.n_chunks, c_out, c_in, bias_partials, bias_blocks, native_data(grad_weight), native_data(grad_bias));
+  const unsigned columns = blocks_for(op, direct ? c_out : std::max(c_out * c_in, c_out), kElements * kEach);
+  launch(op, add_partials<E>, dim3(columns, direct ? 1 : static_cast<unsigned>(taps + 1)), kThreads, 0, stream,
+         products, direct ? taps : 0, plan.n_chunks, c_out, c_in, bias_partials, bias_blocks, native_data(grad_weight),
+         native_data(grad_bias));
 }
 
 #define GSIM3D_INSTANTIATE(T)                                                                                 \

@@ -17,6 +17,10 @@ constexpr bool kIsHalf = std::is_same_v<E, __half> || std::is_same_v<E, __nv_bfl
 inline int64_t taps_of(const SparseConvMap& map) { return map.kernel_size * map.kernel_size * map.kernel_size; }
 inline int64_t tiles_of(const SparseConvMap& map) { return (map.n_voxels + kTile - 1) / kTile; }
 inline int64_t round_up(int64_t n, int64_t step) { return (n + step - 1) / step * step; }
+// Where some voxels are empty, any number of the others may be shared.
+inline int64_t slots_of(const SparseConvMap& map) {
+  return map.n_voxels > map.n_rows ? map.n_rows : map.n_rows - map.n_voxels;
+}
 
 // One value a voxel, without copying those of voxels with one row. A source below n_rows is a row; the others count
 // voxels of several rows: voxel v has the slot "rows before it" - v, which is below n_rows - n_voxels.
@@ -24,7 +28,6 @@ struct Sources {
   const int64_t* voxel_rows;
   const int64_t* cu_voxel_rows;
   int64_t n_rows, n_voxels, n_slots;
-  bool first;  // the lowest row stands for the voxel
 
   __device__ int32_t of(int64_t voxel) const {  // -1: none
     if (!inside(voxel, n_voxels) || voxel >= n_rows) return -1;
@@ -34,7 +37,7 @@ struct Sources {
     }
     const Range rows = range_of(cu_voxel_rows, voxel, n_rows);
     if (rows.begin == rows.end) return -1;
-    if (first || rows.end - rows.begin == 1) {
+    if (rows.end - rows.begin == 1) {
       const int64_t row = voxel_rows[rows.begin];
       return inside(row, n_rows) ? static_cast<int32_t>(row) : -1;
     }
@@ -42,6 +45,10 @@ struct Sources {
     return inside(slot, n_slots) ? static_cast<int32_t>(n_rows + slot) : -1;
   }
 };
+
+inline Sources sources_of(const SparseConvMap& map) {
+  return {map.voxel_rows, map.cu_voxel_rows, map.n_rows, map.n_voxels, slots_of(map)};
+}
 
 // A product of two numbers that are not negative, in one instruction.
 __device__ __forceinline__ int64_t wide_product(int32_t a, int32_t b) {
@@ -53,13 +60,26 @@ template <typename E>
 struct Values {
   const E* rows;
   const E* shared;
-  int32_t n_rows, channels;
+  int32_t n_rows, n_sources, channels;
 
   __device__ const E* at(int32_t source) const {
     const bool alone = source < n_rows;
     return (alone ? rows : shared) + wide_product(alone ? source : source - n_rows, channels);
   }
 };
+
+// Rows in the order in which tiles take them, and where the taps of each read.
+struct RowPlan {
+  const int32_t* order;    // [pitch], the row at each place; -1: none
+  const int32_t* sources;  // [taps, pitch], -1: none; the centre's are not listed
+  const uint32_t* active;  // [pitch / kConvGroupRows, words], by bit the taps that a group of places has
+  int32_t pitch;           // a multiple of kConvPlanStep
+  int32_t words;
+  bool mirrored;  // tap t of the plan is tap taps - 1 - t of the weights
+};
+RowPlan row_plan_in(const int32_t* memory, int64_t n_rows, int64_t taps, bool mirrored);
+void make_row_plan(const char* op, const SparseConvMap& map, bool transposed, int32_t* memory,
+                   const Workspace& workspace, Stream stream);
 
 // The pairs that write a tile of voxels through a tap, packed.
 struct TilePairs {
@@ -80,35 +100,18 @@ struct Convolution {
   Values<E> values;
   const E* weight;  // [c_out, taps, weight_row]
   const E* bias;    // [c_write] or null
-  TilePairs pairs;
-  const int64_t* cu_voxel_rows;
   const int64_t* row_voxel;
+  const int64_t* voxel_rows;
+  const int64_t* cu_voxel_rows;
   int64_t n_voxels;
   int32_t taps, c_read, c_write, c_out, weight_row;
   Share share;
   E* y;
-};
+  TilePairs pairs;  // for plain products
+  RowPlan plan;     // for tensor cores
 
-// What the row at voxel_rows[i] gets of its voxel's sum, and where that sum is.
-struct Part {
-  int64_t row;    // -1: nothing is written
-  int32_t place;  // -1: no sum
-  int32_t parts;  // that share the sum
+  __device__ int32_t weight_tap(int32_t tap) const { return plan.mirrored ? taps - 1 - tap : tap; }
 };
-
-template <typename E>
-__device__ Part part_of(const Convolution<E>& conv, int64_t i, int64_t v0) {
-  const int64_t n_rows = conv.values.n_rows, row = conv.pairs.rows[i];
-  if (row < 0) return {-1, -1, 1};
-  // Where there are as many voxels as rows every voxel has one.
-  const int64_t voxel = conv.n_voxels == n_rows ? i : conv.row_voxel[row];
-  if (!inside(voxel, conv.n_voxels) || !inside(voxel - v0, kTile)) return {row, -1, 1};
-  const int32_t place = static_cast<int32_t>(voxel - v0);
-  if (conv.share == Share::kWhole || conv.n_voxels == n_rows) return {row, place, 1};
-  const Range rows = range_of(conv.cu_voxel_rows, voxel, n_rows);
-  if (conv.share == Share::kFirstRow) return {row, i == rows.begin ? place : -1, 1};
-  return {row, place, static_cast<int32_t>(max(rows.end - rows.begin, int64_t{1}))};
-}
 
 // The first of ascending values [low, high) that is not below `wanted`. The halves of a warp search for two values.
 __device__ inline int64_t search(const int64_t* values, int64_t low, int64_t high, int64_t wanted) {
@@ -139,13 +142,15 @@ __device__ inline Range search_range(const int64_t* values, Range range, int64_t
 template <typename E>
 struct OuterProducts {
   Values<E> grads, inputs;
-  Sources grad_sources, input_sources;
+  Sources sources;
   const int64_t* tap_in;
   const int64_t* tap_out;
   const int64_t* cu_taps;
   int64_t n_pairs, chunk_voxels;
   int32_t taps, centre_parts, c_out, c_in;
-  Sum<E>* partials;  // [chunks, centre_parts + taps - 1, c_out, c_in]
+  Sum<E>* partials;  // [chunks, centre_parts + taps - 1, c_out, c_in]; or null:
+  E* result;         // [result_rows, taps, c_in], where one block has all pairs of a tap
+  int32_t result_rows;
 
   __host__ __device__ int32_t blocks_per_chunk() const { return centre_parts + taps - 1; }
 };
@@ -160,7 +165,7 @@ template <typename E>
 __device__ PairBlock pair_block(const OuterProducts<E>& products, int64_t index) {
   const int64_t first = index / products.blocks_per_chunk() * products.chunk_voxels;
   const int32_t unit = static_cast<int32_t>(index % products.blocks_per_chunk()), centre = products.taps / 2;
-  const Sources& sources = products.grad_sources;
+  const Sources& sources = products.sources;
   if (unit < products.centre_parts) {
     const int64_t part = products.chunk_voxels / products.centre_parts, v = first + unit * part;
     const int64_t begin = sources.cu_voxel_rows[min(v, sources.n_voxels)];
@@ -180,11 +185,11 @@ struct PairSources {
 template <typename E>
 __device__ PairSources pair_sources(const OuterProducts<E>& products, int32_t tap, int64_t i) {
   if (tap == products.taps / 2) {
-    const int64_t row = products.grad_sources.voxel_rows[i];
-    const int32_t source = inside(row, products.grad_sources.n_rows) ? static_cast<int32_t>(row) : -1;
+    const int64_t row = products.sources.voxel_rows[i];
+    const int32_t source = inside(row, products.sources.n_rows) ? static_cast<int32_t>(row) : -1;
     return {source, source};
   }
-  const int32_t out = products.grad_sources.of(products.tap_out[i]), in = products.input_sources.of(products.tap_in[i]);
+  const int32_t out = products.sources.of(products.tap_out[i]), in = products.sources.of(products.tap_in[i]);
   return out < 0 || in < 0 ? PairSources{-1, -1} : PairSources{out, in};
 }
 
@@ -192,8 +197,9 @@ __device__ PairSources pair_sources(const OuterProducts<E>& products, int32_t ta
 // multiples of 16 bytes.
 template <typename E>
 void convolve_plain(const char* op, const Convolution<E>& conv, int64_t n_tiles, bool transposed, Stream stream);
+// False, and nothing is queued, where the tables of so many taps find no room.
 template <typename E>
-void convolve_tensor(const char* op, const Convolution<E>& conv, int64_t n_tiles, Stream stream);
+bool convolve_tensor(const char* op, const Convolution<E>& conv, const Workspace& workspace, Stream stream);
 template <typename E>
 void outer_products_plain(const char* op, const OuterProducts<E>& products, int64_t n_blocks, Stream stream);
 template <typename E>

@@ -89,6 +89,27 @@ __device__ __forceinline__ void multiply_rows(const Convolution<E>& conv, const 
   }
 }
 
+// What the row at voxel_rows[i] gets of its voxel's sum, and where that sum is.
+struct Part {
+  int64_t row;    // -1: nothing is written
+  int32_t place;  // -1: no sum
+  int32_t parts;  // that share the sum
+};
+
+template <typename E>
+__device__ Part part_of(const Convolution<E>& conv, int64_t i, int64_t v0) {
+  const int64_t n_rows = conv.values.n_rows, row = conv.pairs.rows[i];
+  if (row < 0) return {-1, -1, 1};
+  // Where there are as many voxels as rows every voxel has one.
+  const int64_t voxel = conv.n_voxels == n_rows ? i : conv.row_voxel[row];
+  if (!inside(voxel, conv.n_voxels) || !inside(voxel - v0, kTile)) return {row, -1, 1};
+  const int32_t place = static_cast<int32_t>(voxel - v0);
+  if (conv.share == Share::kWhole || conv.n_voxels == n_rows) return {row, place, 1};
+  const Range rows = range_of(conv.cu_voxel_rows, voxel, n_rows);
+  if (conv.share == Share::kFirstRow) return {row, i == rows.begin ? place : -1, 1};
+  return {row, place, static_cast<int32_t>(max(rows.end - rows.begin, int64_t{1}))};
+}
+
 // One block: a tile of voxels, kColumns output channels. The sums of the tile's voxels lie in shared memory; a tap has
 // every voxel at most once, so each sum has one owner between two barriers.
 template <typename E, bool kTransposed>

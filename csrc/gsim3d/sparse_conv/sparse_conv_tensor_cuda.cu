@@ -1,108 +1,271 @@
-// The convolution on tensor cores. A block owns a tile of voxels and kColumns output channels; the sums of its voxels
-// lie in shared memory. For each tap the pairs of the tile, packed, are one dense product (rows gathered, the tap's
-// weights), so that no work is spent on absent neighbours; its rows are then added to the sums of the voxels they
-// write. A tap has a voxel at most once, hence every sum has one owner between two barriers and the order of additions
-// is fixed.
+// The convolution on tensor cores. A block owns a tile of rows, in the order of the plan, and kColumns output channels,
+// whose sums stay in registers. Some warps copy what the tile's taps read, stage by stage; each group of four further
+// warps multiplies 64 rows, and leaves out the taps that none of its rows has. Where there are few tiles the stages of a
+// tile are shared by several blocks, whose sums are added in a fixed order.
+#include <algorithm>
+
 #include "gsim3d/sparse_conv/sparse_conv_device.cuh"
 #include "gsim3d/sparse_conv/sparse_conv_mma.cuh"
 
 namespace gsim3d::cuda::conv {
 namespace {
 
-constexpr int kDepth = 64;  // channels of one stage
-constexpr int kStages = 3;
-constexpr int kWarpsAcross = 2;  // groups of columns
+constexpr int kDepth = 64;  // channels of one stage: rows of 128 bytes, in 8 chunks
+constexpr int kChunk = 8;   // channels of 16 bytes
+constexpr int kRowBytes = 128, kRowChunks = 8;
+constexpr int kGroupRows = kConvGroupRows;
+constexpr int64_t kEnough = 128;   // blocks that nearly fill a large GPU
+constexpr int64_t kMaxSplits = 16;
+constexpr int kAdders = 256;
 
-template <typename E, int kColumns>
-struct alignas(128) Memory {               // at a multiple of 1024 bytes
-  static constexpr int kChunk = kColumns;  // pairs of one product
-  // 16 warps an SM: one wide block, or two narrow ones.
-  static constexpr int kThreads = 4 * kColumns, kBlocksOnSm = kColumns == 64 ? 2 : 1;
-  E a[kStages][kChunk * kDepth];
-  E b[kStages][kColumns * kDepth];
-  float sums[kTile * kColumns];
-  uint8_t places[kStages][kChunk];
-  int32_t n_listed;
-  // then the list of products
-
-  static size_t bytes(int32_t taps) { return sizeof(Memory) + sizeof(uint32_t) * taps * (kTile / kChunk); }
+template <int kGroups_, int kColumns_>
+struct Shape {
+  static constexpr int kGroups = kGroups_, kColumns = kColumns_, kRows = kGroupRows * kGroups;
+  static constexpr int kCopying = kGroups == 1 ? 128 : 256;  // threads that copy
+  static constexpr int kThreads = kCopying + 128 * kGroups, kBlocksOnSm = kColumns == 128 ? 1 : 2;
+  static constexpr int kStages = kGroups == 1 ? 6 : kGroups == 2 ? 4 : 5;
+  static constexpr int kApart = kCopying / 8;  // rows between those of a thread that copies
+  static constexpr int kBytesA = kRows * kRowBytes, kBytesB = kColumns * kRowBytes;
 };
 
-// Neighbouring voxels start at different banks.
-template <int kColumns>
-__device__ __forceinline__ int sum_offset(int place, int column) {
-  return place * kColumns + (column ^ ((place & 1) << 4));
-}
+template <typename S>
+struct alignas(128) Memory {  // at a multiple of 1024 bytes
+  char a[S::kStages][S::kBytesA];
+  char b[S::kStages][S::kBytesB];
+  uint64_t full[S::kStages], empty[S::kStages];
+  int32_t n_others;
+  // then Tables
 
-// The output column that row `row` of the staged weights holds. A thread gets columns 2 t, 2 t + 1 of every eight rows
-// from the tensor cores; in this order those of two neighbouring groups are four columns side by side.
-__device__ __forceinline__ int column_of(int row) {
-  return (row & ~15) | (row >> 1 & 3) << 2 | (row >> 3 & 1) << 1 | (row & 1);
-}
-
-// One product of a block: `rows` pairs of a tap from pair m0 of its list on.
-struct Product {
-  int32_t tap, m0, rows;
-
-  __device__ uint32_t packed() const { return static_cast<uint32_t>(tap) << 12 | m0 / 64 << 8 | rows; }
-  __device__ static Product unpacked(uint32_t bits) {
-    return {static_cast<int32_t>(bits >> 12), static_cast<int32_t>(bits >> 8 & 15) * 64,
-            static_cast<int32_t>(bits & 255)};
+  static size_t bytes(int64_t taps, int64_t chunks) {
+    const int64_t stages = (taps * chunks + 2 * kRowChunks) / kRowChunks;
+    return sizeof(Memory) + stages * (kRowChunks * sizeof(uint32_t) + 1) + taps * sizeof(uint32_t) + 16;
   }
 };
 
-// Lists the products of a tile, taps in order, without the centre's; returns their number. A whole warp calls it.
-__device__ int32_t list_products(const int32_t* counts, int32_t taps, int32_t chunk, uint32_t* list) {
-  const int lane = threadIdx.x % kWarp;
-  int32_t before = 0;
-  for (int32_t t0 = 0; t0 < taps; t0 += kWarp) {
-    const int32_t tap = t0 + lane, count = tap < taps && tap != taps / 2 ? min(counts[tap], kTile) : 0;
-    const int32_t products = (count + chunk - 1) / chunk;
-    int32_t through = products;
-#pragma unroll
-    for (int step = 1; step < kWarp; step *= 2) {
-      const int32_t other = __shfl_up_sync(kFullWarp, through, step);
-      if (lane >= step) through += other;
+// The channels that a tile reads, in chunks: those of its taps one after another, then, from a new stage on, the
+// centre's.
+struct Walk {
+  int32_t chunks;  // of a row
+  int32_t n_others, other_stages, n_stages;
+
+  __device__ Walk(int32_t channels, int32_t n_others)
+      : chunks(channels / kChunk),
+        n_others(n_others),
+        other_stages((n_others * chunks + kRowChunks - 1) / kRowChunks),
+        n_stages(other_stages + (chunks + kRowChunks - 1) / kRowChunks) {}
+
+  // A chunk of a stage: which of the tile's taps it belongs to (n_others: the centre; -1: none), and which of its row.
+  __device__ int2 at(int32_t stage, int32_t chunk) const {
+    if (stage >= other_stages) {
+      const int32_t q = (stage - other_stages) * kRowChunks + chunk;
+      return {q < chunks ? n_others : -1, q};
     }
-    for (int32_t i = 0; i < products; ++i)
-      list[before + through - products + i] = Product{tap, i * chunk, min(chunk, count - i * chunk)}.packed();
-    before += __shfl_sync(kFullWarp, through, kWarp - 1);
+    const uint32_t q = stage * kRowChunks + chunk, entry = q / static_cast<uint32_t>(chunks);
+    return {static_cast<int32_t>(entry) < n_others ? static_cast<int32_t>(entry) : -1,
+            static_cast<int32_t>(q - entry * chunks)};
   }
-  return before;
+};
+
+// What a chunk of a stage reads, in 32 bits: a tap, and a chunk of its row.
+constexpr uint32_t kNoTap = 0xffff;
+__device__ __forceinline__ uint32_t packed_source(uint32_t tap, uint32_t chunk) { return tap << 16 | chunk; }
+__device__ __forceinline__ uint32_t tap_of(uint32_t source) { return source >> 16; }
+__device__ __forceinline__ uint32_t chunk_of(uint32_t source) { return source & 0xffff; }
+
+// What a block looks up in shared memory.
+struct Tables {
+  uint32_t* sources;  // [stages, kRowChunks]
+  uint32_t* taps;     // [n_others + 1]
+  uint8_t* groups;    // [stages], by bit the groups that multiply
+};
+
+// A tap of a tile and, by bit, the groups that have it.
+__device__ __forceinline__ uint32_t packed_tap(int32_t tap, uint32_t groups) { return tap << 4 | groups; }
+__device__ __forceinline__ uint32_t listed_tap(uint32_t packed) { return packed >> 4; }
+__device__ __forceinline__ uint32_t groups_of(uint32_t packed) { return packed & 15; }
+
+// Lists the taps of a tile, the centre last; returns the number of the others. A whole warp calls it.
+template <int kGroups>
+__device__ int32_t list_taps(const RowPlan& plan, int64_t tile, int32_t taps, uint32_t* list) {
+  const int lane = threadIdx.x % kWarp;
+  int32_t n = 0;
+  for (int32_t w = 0; w < plan.words; ++w) {
+    uint32_t groups = 0;
+#pragma unroll
+    for (int g = 0; g < kGroups; ++g)
+      groups |= (plan.active[(tile * kGroups + g) * plan.words + w] >> lane & 1) << g;
+    const int32_t tap = w * 32 + lane;
+    const bool listed = groups != 0 && tap < taps && tap != taps / 2;
+    const unsigned found = __ballot_sync(kFullWarp, listed);
+    if (listed) list[n + __popc(found & ((1u << lane) - 1))] = packed_tap(tap, groups);
+    n += __popc(found);
+  }
+  if (lane == 0) list[n] = packed_tap(taps / 2, (1u << kGroups) - 1);
+  return n;
 }
 
-// The sums of a warp: rows lane / 4 and lane / 4 + 8 of its 16, for groups of eight columns.
-template <int kColumns>
-using Sums = float[kColumns / kWarpsAcross / 8][4];
+__device__ __forceinline__ int32_t round_up_to_four(int32_t n) { return (n + 3) & ~3; }
 
-// Queues sums (+)= a b over a stage, whose channels beyond the last are zeros; `first` starts from zero. a and b are
-// the 64 rows of a group of four warps, whatever lies in rows that are not used, and its columns.
-// The sums are there after finish_stage.
+// The stages of one block.
+struct Stages {
+  int32_t begin, end;
+};
+
+template <typename E, typename S>
+struct Tile {
+  const Convolution<E>& conv;
+  Memory<S>& memory;
+  const Tables tables;
+  const Walk walk;
+  const Stages stages;
+  int64_t first_place;
+  int32_t n0;
+
+  __device__ uint32_t full(int slot) const { return shared_address(memory.full + slot); }
+  __device__ uint32_t empty(int slot) const { return shared_address(memory.empty + slot); }
+};
+
+// The rows of the left factor, one chunk of kEach rows a thread. What they are is looked up two stages ahead.
+template <typename E, typename S>
+struct RowCopy {
+  static constexpr int kEach = S::kRows / S::kApart;
+  struct Lookup {
+    uint32_t source;
+    int32_t rows[kEach];
+  };
+  const Tile<E, S>& tile;
+  const int chunk, row;
+  const uint32_t to;
+  Lookup now, next, later;
+
+  __device__ RowCopy(const Tile<E, S>& tile, int thread)
+      : tile(tile),
+        chunk(thread % kRowChunks),
+        row(thread / kRowChunks),
+        to(shared_address(tile.memory.a[0]) + row * kRowBytes + ((chunk ^ (row & 7)) << 4)) {
+    later.source = packed_source(kNoTap, 0);
+#pragma unroll
+    for (int i = 0; i < kEach; ++i) later.rows[i] = -1;
+    next = later;
+    look_up(tile.stages.begin);
+    advance(tile.stages.begin + 1);
+    advance(tile.stages.begin + 2);
+  }
+
+  __device__ void look_up(int32_t stage) {
+    if (stage >= tile.stages.end) return;
+    later.source = tile.tables.sources[stage * kRowChunks + chunk];
+    const uint32_t tap = tap_of(later.source);
+    if (tap == tap_of(next.source)) return;
+    const RowPlan& plan = tile.conv.plan;
+    const int32_t* from = tap == tile.conv.taps / 2 ? plan.order : plan.sources + wide_product(tap, plan.pitch);
+#pragma unroll
+    for (int i = 0; i < kEach; ++i) later.rows[i] = tap == kNoTap ? -1 : from[tile.first_place + row + i * S::kApart];
+  }
+
+  __device__ void advance(int32_t stage) {
+    now = next;
+    next = later;
+    look_up(stage);
+  }
+
+  // Queues the chunk of a stage.
+  __device__ void copy(int32_t stage, int slot) {
+    const Values<E>& values = tile.conv.values;
+    const uint32_t groups = tile.tables.groups[stage], stage_to = to + slot * S::kBytesA;
+    const int32_t column = tap_of(now.source) == kNoTap ? 0 : chunk_of(now.source) * kChunk;
+    const bool alone = values.n_sources == values.n_rows;
+#pragma unroll
+    for (int i = 0; i < kEach; ++i) {
+      if ((groups >> (i * S::kApart / kGroupRows) & 1) == 0) continue;
+      const bool real = static_cast<uint32_t>(now.rows[i]) < static_cast<uint32_t>(values.n_sources);
+      const int32_t source = real ? now.rows[i] : 0;
+      const E* from = alone ? values.rows + wide_product(source, values.channels) : values.at(source);
+      copy_async(stage_to + i * S::kApart * kRowBytes, from + column, real);
+    }
+    advance(stage + 3);
+  }
+};
+
+// The right factor: rows of kDepth input channels for each output channel.
+template <typename E, typename S>
+struct WeightCopy {
+  const Tile<E, S>& tile;
+  const int chunk, row;
+  const E* from;
+  int64_t step;
+  uint32_t to;
+
+  __device__ WeightCopy(const Tile<E, S>& tile, int thread)
+      : tile(tile), chunk(thread % kRowChunks), row(thread / kRowChunks) {
+    const int64_t row_step = wide_product(tile.conv.taps, tile.conv.weight_row);
+    from = tile.conv.weight + (tile.n0 + row) * row_step;
+    step = S::kApart * row_step;
+    to = shared_address(tile.memory.b[0]) + row * kRowBytes + ((chunk ^ (row & 7)) << 4);
+  }
+
+  __device__ void copy(int32_t stage, int slot) const {
+    const Convolution<E>& conv = tile.conv;
+    const uint32_t source = tile.tables.sources[stage * kRowChunks + chunk];
+    const bool listed = tap_of(source) != kNoTap;
+    const int32_t tap = conv.weight_tap(tap_of(source));
+    const E* here = from + wide_product(tap, conv.weight_row) + chunk_of(source) * kChunk;
+#pragma unroll
+    for (int i = 0; i < S::kColumns / S::kApart; ++i, here += step) {
+      const bool real = listed && tile.n0 + row + i * S::kApart < conv.c_write;
+      copy_async(to + slot * S::kBytesB + i * S::kApart * kRowBytes, real ? here : conv.weight, real);
+    }
+  }
+};
+
+template <typename E, typename S>
+__device__ void copy_tile(const Tile<E, S>& tile, int thread) {
+  if (tile.stages.begin >= tile.stages.end) return;
+  RowCopy<E, S> rows(tile, thread);
+  const WeightCopy<E, S> weights(tile, thread);
+  int slot = 0;
+  uint32_t parity = 1;  // the first round finds all slots empty
+  for (int32_t stage = tile.stages.begin; stage < tile.stages.end; ++stage) {
+    wait_for_phase(tile.empty(slot), parity);
+    weights.copy(stage, slot);
+    rows.copy(stage, slot);
+    arrive_behind_copies(tile.full(slot));
+    if (++slot == S::kStages) {
+      slot = 0;
+      parity ^= 1;
+    }
+  }
+  wait_for_copies<0>();
+}
+
+// The sums of a warp: rows lane / 4 and lane / 4 + 8 of its 16, columns 2 (lane % 4) and the next of every eight.
+template <int kColumns>
+using Sums = float[kColumns / 8][4];
+
+// sums += a b over a stage.
 template <typename E, int kColumns>
-__device__ __forceinline__ void start_stage(Factor a, Factor b, bool first, Sums<kColumns>& sums) {
+__device__ __forceinline__ void multiply_stage(Factor a, Factor b, Sums<kColumns>& sums) {
 #ifdef __CUDA_ARCH_FEAT_SM90_ALL
   fence_sums(sums);
   start_group_products();
 #pragma unroll
   for (int k = 0; k < kDepth / 16; ++k)
-    multiply_add_group<E, false>(moved(a, k * 32), moved(b, k * 32), !first || k > 0, sums);
+    multiply_add_group<E, false>(moved(a, k * 32), moved(b, k * 32), sums);
   close_group_products();
+  wait_for_group_products<0>();
+  fence_sums(sums);
 #else
-  constexpr int kGroups = kColumns / kWarpsAcross / 8, kBytes = sizeof(E);
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp % 4;
-  if (first)
-#pragma unroll
-    for (int j = 0; j < kGroups; ++j) sums[j][0] = sums[j][1] = sums[j][2] = sums[j][3] = 0;
-  a += chunk_offset<kDepth>(warp * 16 + lane % 16, lane / 16) * kBytes;
-  b += chunk_offset<kDepth>(lane / 16 * 8 + lane % 8, lane / 8 % 2) * kBytes;
+  a += chunk_offset<kDepth>(warp * 16 + lane % 16, lane / 16) * sizeof(E);
+  b += chunk_offset<kDepth>(lane / 16 * 8 + lane % 8, lane / 8 % 2) * sizeof(E);
 #pragma unroll
   for (int k = 0; k < kDepth / 16; ++k) {
     uint32_t left[4];
     load_matrices(a ^ (k * 32), left);
 #pragma unroll
-    for (int j = 0; j < kGroups; j += 2) {
+    for (int j = 0; j < kColumns / 8; j += 2) {
       uint32_t right[4];
-      load_matrices((b ^ (k * 32)) + j * 8 * kDepth * kBytes, right);
+      load_matrices((b ^ (k * 32)) + j * 8 * kRowBytes, right);
       multiply_add<E>(left, right[0], right[1], sums[j]);
       multiply_add<E>(left, right[2], right[3], sums[j + 1]);
     }
@@ -110,218 +273,260 @@ __device__ __forceinline__ void start_stage(Factor a, Factor b, bool first, Sums
 #endif
 }
 
-template <int kColumns>
-__device__ __forceinline__ void finish_stage(Sums<kColumns>& sums) {
-#ifdef __CUDA_ARCH_FEAT_SM90_ALL
-  wait_for_group_products();
-  fence_sums(sums);
-#endif
+// The row at a place; -1: none.
+template <typename E>
+__device__ __forceinline__ int32_t row_at(const Convolution<E>& conv, int64_t place) {
+  const int32_t row = conv.plan.order[place];
+  return inside(row, conv.values.n_rows) ? row : -1;
 }
 
-// Adds the products of a tap's pairs to the sums of the voxels they write. `column` is the warp's first.
-template <int kColumns>
-__device__ __forceinline__ void add_to_voxels(const Sums<kColumns>& products, int first_row, int column, int rows,
-                                              const uint8_t* places, float* sums) {
-  const int lane = threadIdx.x % kWarp;
-#pragma unroll
-  for (int h = 0; h < 2; ++h) {
-    const int row = first_row + lane / 4 + h * 8;
-    if (row >= rows) continue;
-    const int offset = sum_offset<kColumns>(places[row], column + lane % 4 * 4);
-#pragma unroll
-    for (int j = 0; j < kColumns / kWarpsAcross / 16; ++j) {
-      float4& sum = *reinterpret_cast<float4*>(sums + (offset ^ (j * 16)));
-      const float *low = products[2 * j] + 2 * h, *high = products[2 * j + 1] + 2 * h;
-      sum = float4{sum.x + low[0], sum.y + low[1], sum.z + high[0], sum.w + high[1]};
-    }
-  }
+// What a row gets of its voxel's sum.
+template <typename E>
+__device__ float share_of(const Convolution<E>& conv, int32_t row) {
+  const int64_t n_rows = conv.values.n_rows;
+  if (row < 0) return 0;
+  const int64_t voxel = conv.row_voxel[row];
+  if (!inside(voxel, conv.n_voxels)) return 0;
+  const Range rows = range_of(conv.cu_voxel_rows, voxel, n_rows);
+  if (conv.share == Share::kFirstRow) return rows.begin < rows.end && conv.voxel_rows[rows.begin] == row ? 1.0f : 0.0f;
+  return 1.0f / static_cast<float>(max(rows.end - rows.begin, int64_t{1}));
 }
 
-// Writes rows voxel_rows[i0 + row]: products of the centre tap and the voxel's share.
-template <typename E, int kColumns>
-__device__ __forceinline__ void write_rows(const Convolution<E>& conv, const Sums<kColumns>& products, int first_row,
-                                           int column, int rows, int64_t i0, int64_t v0, int32_t n0,
-                                           const float* sums) {
-  struct alignas(4 * sizeof(E)) Four {
-    E values[4];
+template <int kColumns>
+__device__ __forceinline__ void scale(Sums<kColumns>& sums, const float (&shares)[2]) {
+#pragma unroll
+  for (auto& sum : sums)
+#pragma unroll
+    for (int e = 0; e < 4; ++e) sum[e] *= shares[e / 2];
+}
+
+// Lane t of four holds columns 2 t and 2 t + 1 of four groups of eight; afterwards it holds group t.
+__device__ __forceinline__ void exchange(uint32_t (&x)[4]) {
+  const auto swap = [](uint32_t& a, uint32_t& b, bool really) {
+    const uint32_t old = a;
+    a = really ? b : a;
+    b = really ? old : b;
   };
-  const int lane = threadIdx.x % kWarp;
-  const bool whole = conv.c_write % 4 == 0;  // rows of whole groups of four columns
+  const bool odd = threadIdx.x & 1, high = threadIdx.x & 2;
+  swap(x[0], x[1], odd);
+  swap(x[2], x[3], odd);
+  x[1] = __shfl_xor_sync(kFullWarp, x[1], 1);
+  x[3] = __shfl_xor_sync(kFullWarp, x[3], 1);
+  swap(x[0], x[1], odd);
+  swap(x[2], x[3], odd);
+  swap(x[0], x[2], high);
+  swap(x[1], x[3], high);
+  x[2] = __shfl_xor_sync(kFullWarp, x[2], 2);
+  x[3] = __shfl_xor_sync(kFullWarp, x[3], 2);
+  swap(x[0], x[2], high);
+  swap(x[1], x[3], high);
+}
+
+template <typename E, int kColumns>
+__device__ void write_sums(const Convolution<E>& conv, Sums<kColumns>& sums, const int32_t (&rows)[2], int32_t n0) {
+  const int t = threadIdx.x % 4;
+  if (conv.bias != nullptr)
+#pragma unroll
+    for (int j = 0; j < kColumns / 8; ++j)
+#pragma unroll
+      for (int e = 0; e < 2; ++e) {
+        const int32_t n = n0 + j * 8 + t * 2 + e;
+        const float bias = n < conv.c_write ? static_cast<float>(conv.bias[n]) : 0.0f;
+        sums[j][e] += bias;
+        sums[j][2 + e] += bias;
+      }
+  const bool whole = conv.c_write % kChunk == 0;
 #pragma unroll
   for (int h = 0; h < 2; ++h) {
-    const int row = first_row + lane / 4 + h * 8;
-    if (row >= rows) continue;
-    const Part part = part_of(conv, i0 + row, v0);
-    if (part.row < 0) continue;
-    const float share = part.parts == 1 ? 1.0f : 1.0f / static_cast<float>(part.parts);
-    E* to = conv.y + part.row * conv.c_write + n0;
+    E* to = conv.y + wide_product(max(rows[h], 0), conv.c_write) + n0;
 #pragma unroll
-    for (int j = 0; j < kColumns / kWarpsAcross / 16; ++j) {
-      const int c = column + j * 16 + lane % 4 * 4;
-      float4 sum{0, 0, 0, 0};
-      if (part.place >= 0) sum = *reinterpret_cast<const float4*>(sums + sum_offset<kColumns>(part.place, c));
-      const float *low = products[2 * j] + 2 * h, *high = products[2 * j + 1] + 2 * h;
-      const Four four{static_cast<E>(low[0] + share * sum.x), static_cast<E>(low[1] + share * sum.y),
-                      static_cast<E>(high[0] + share * sum.z), static_cast<E>(high[1] + share * sum.w)};
+    for (int j = 0; j < kColumns / 8; j += 4) {
       if (whole) {
-        if (n0 + c < conv.c_write) *reinterpret_cast<Four*>(to + c) = four;
+        uint32_t x[4];
+#pragma unroll
+        for (int i = 0; i < 4; ++i) x[i] = pair_of<E>(sums[j + i][2 * h], sums[j + i][2 * h + 1]);
+        exchange(x);
+        const int column = (j + t) * 8;
+        if (rows[h] >= 0 && n0 + column < conv.c_write)
+          *reinterpret_cast<uint4*>(to + column) = uint4{x[0], x[1], x[2], x[3]};
       } else {
 #pragma unroll
-        for (int e = 0; e < 4; ++e)
-          if (n0 + c + e < conv.c_write) to[c + e] = four.values[e];
+        for (int i = 0; i < 4; ++i)
+#pragma unroll
+          for (int e = 0; e < 2; ++e) {
+            const int column = (j + i) * 8 + t * 2 + e;
+            if (rows[h] >= 0 && n0 + column < conv.c_write)
+              to[column] = static_cast<E>(sums[j + i][2 * h + e]);
+          }
       }
     }
   }
 }
 
-template <typename E, int kColumns>
-__global__ void __launch_bounds__(Memory<E, kColumns>::kThreads, Memory<E, kColumns>::kBlocksOnSm)
-    convolve(Convolution<E> conv, int32_t column_blocks) {
-  using Shared = Memory<E, kColumns>;
-  constexpr int kChunk = Shared::kChunk, kThreads = Shared::kThreads;
-  constexpr int kRowBytes = kDepth * sizeof(E), kWarpColumns = kColumns / kWarpsAcross;
-  // A thread copies 16 bytes of every kRowsApart-th pair and of every kRowsApart-th row of weights.
-  constexpr int kRowsApart = kThreads / (kDepth / 8), kCopied = kColumns / kRowsApart;
-  static_assert(kRowsApart % 16 == 0 && kChunk == kColumns);
-  constexpr uint32_t kStageA = sizeof(Shared::a) / kStages, kStageB = sizeof(Shared::b) / kStages;
+// Sums of a part of the stages, as floats: [splits, pitch, columns].
+template <int kColumns>
+__device__ void write_partials(const Sums<kColumns>& sums, float* to, int64_t columns) {
+#pragma unroll
+  for (int h = 0; h < 2; ++h)
+#pragma unroll
+    for (int j = 0; j < kColumns / 8; ++j)
+      *reinterpret_cast<float2*>(to + h * 8 * columns + j * 8) = float2{sums[j][2 * h], sums[j][2 * h + 1]};
+}
 
-  extern __shared__ __align__(1024) char raw[];
-  auto& memory = *reinterpret_cast<Shared*>(raw);
-  uint32_t* listed = reinterpret_cast<uint32_t*>(raw + sizeof(Shared));
-  const int thread = threadIdx.x, lane = thread % kWarp, warp = thread / kWarp;
-  // Four warps in a row work on 64 rows and the same columns.
-  const int group_row = warp / (4 * kWarpsAcross) * 64, first_row = group_row + warp % 4 * 16;
-  const int column = warp / 4 % kWarpsAcross * kWarpColumns;
-  const int64_t tile = blockIdx.x / column_blocks, v0 = tile * kTile;
-  const int32_t n0 = blockIdx.x % column_blocks * kColumns, centre = conv.taps / 2;
-  const int64_t n_rows = conv.values.n_rows;
-  const int64_t begin = min(max(conv.cu_voxel_rows[v0], int64_t{0}), n_rows);
-  const int64_t end = min(max(conv.cu_voxel_rows[min(v0 + kTile, conv.n_voxels)], begin), n_rows);
-
-  if (warp == 0) {
-    const int32_t n = list_products(conv.pairs.counts + tile * conv.taps, conv.taps, kChunk, listed);
-    if (lane == 0) memory.n_listed = n;
+template <typename E, typename S>
+__device__ void multiply_tile(const Tile<E, S>& tile, int group, int64_t columns, float* partials) {
+  constexpr int kColumns = S::kColumns;
+  const Convolution<E>& conv = tile.conv;
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp % 4;
+  const int64_t place = tile.first_place + group * kGroupRows + warp * 16 + lane / 4;
+  const int32_t rows[2] = {row_at(conv, place), row_at(conv, place + 8)};
+  float shares[2] = {1, 1};
+  if (conv.share != Share::kWhole) {
+#pragma unroll
+    for (int h = 0; h < 2; ++h) shares[h] = share_of(conv, rows[h]);
   }
-  static_assert(kThreads * 4 / kColumns % 2 == 0);  // a thread starts the same columns of each of its voxels
-  float start[4];
-#pragma unroll
-  for (int e = 0; e < 4; ++e) {
-    const int32_t n = n0 + sum_offset<kColumns>(thread * 4 / kColumns, thread * 4 % kColumns + e) % kColumns;
-    start[e] = conv.bias != nullptr && n < conv.c_write ? static_cast<float>(conv.bias[n]) : 0.0f;
-  }
-  for (int i = thread * 4; i < kTile * kColumns; i += kThreads * 4)
-    *reinterpret_cast<float4*>(memory.sums + i) = float4{start[0], start[1], start[2], start[3]};
-  __syncthreads();
-  const int32_t n_listed = memory.n_listed;
-  const int32_t n_products = n_listed + static_cast<int32_t>((end - begin + kChunk - 1) / kChunk);
-  const auto product_at = [&](int32_t i) {
-    if (i < n_listed) return Product::unpacked(listed[i]);
-    const int32_t m0 = (i - n_listed) * kChunk;
-    return Product{centre, m0, static_cast<int32_t>(min(end - begin - m0, int64_t{kChunk}))};
-  };
+  const Factor a = factor_at(shared_address(tile.memory.a[0]) + group * (kGroupRows * kRowBytes));
+  const Factor b = factor_at(shared_address(tile.memory.b[0]));
 
-  // Where this thread copies to, and from where. Sources are looked up one product ahead.
-  const int row = thread / (kDepth / 8), chunk = thread % (kDepth / 8);
-  const uint32_t to_a = shared_address(memory.a[0] + chunk_offset<kDepth>(row, chunk));
-  const uint32_t to_b = shared_address(memory.b[0] + chunk_offset<kDepth>(row, chunk));
-  const int64_t weight_step = static_cast<int64_t>(conv.taps) * conv.c_read;
-  const E* weights[kCopied];  // columns beyond the last repeat it and are never written
-#pragma unroll
-  for (int i = 0; i < kCopied; ++i)
-    weights[i] = conv.weight + min(n0 + column_of(row + i * kRowsApart), conv.c_write - 1) * weight_step + chunk * 8;
-  Product copied{}, next = product_at(0);
-  int32_t copied_index = 0, copied_k = 0, sources[kCopied];
-  const E* rows_from[kCopied];
-  bool real_rows[kCopied];
-  int64_t copied_list = 0, next_list = 0;  // where the product's pairs are listed
-  const auto look_up = [&] {
-    const bool own = next.tap == centre;
-    next_list = own ? begin + next.m0 : wide_product(next.tap, conv.pairs.pitch) + v0 + next.m0;
-    const int32_t* from = (own ? conv.pairs.rows : conv.pairs.sources) + next_list + row;
-#pragma unroll
-    for (int i = 0; i < kCopied; ++i) sources[i] = row + i * kRowsApart < next.rows ? from[i * kRowsApart] : -1;
-  };
-  const auto copy_next = [&](int stage) {
-    if (copied_index < n_products) {
-      if (copied_k == 0) {
-        copied = next;
-        copied_list = next_list;
-#pragma unroll
-        for (int i = 0; i < kCopied; ++i) {
-          real_rows[i] = sources[i] >= 0;
-          rows_from[i] = conv.values.at(max(sources[i], 0)) + chunk * 8;
-        }
-        if (copied_index + 1 < n_products) {
-          next = product_at(copied_index + 1);
-          look_up();
-        }
+  Sums<kColumns> sums{};
+  int slot = 0;
+  uint32_t parity = 0;
+  const auto multiply = [&](int32_t begin, int32_t end) {
+    for (int32_t stage = begin; stage < end; ++stage) {
+      wait_for_phase(tile.full(slot), parity);
+      if (tile.tables.groups[stage] >> group & 1) {
+        publish_copies();
+        multiply_stage<E, kColumns>(moved(a, slot * S::kBytesA), moved(b, slot * S::kBytesB), sums);
       }
-      const bool inside_row = copied_k + chunk * 8 < conv.c_read;
-      const int32_t k = inside_row ? copied_k : 0;
-#pragma unroll
-      for (int i = 0; i < kCopied; ++i)
-        if (row + i * kRowsApart < (copied.rows + 15 & ~15))
-          copy_async(to_a + stage * kStageA + i * kRowsApart * kRowBytes, rows_from[i] + k, inside_row && real_rows[i]);
-      const int64_t weights_at = wide_product(copied.tap, conv.c_read) + k;
-#pragma unroll
-      for (int i = 0; i < kCopied; ++i)
-        copy_async(to_b + stage * kStageB + i * kRowsApart * kRowBytes, weights[i] + weights_at, inside_row);
-      const bool last = copied_k + kDepth >= conv.c_read;
-      if (last && thread < kChunk / 16 && copied.tap != centre)
-        copy_async(shared_address(memory.places[stage] + thread * 16), conv.pairs.places + copied_list + thread * 16,
-                   true);
-      copied_k = last ? 0 : copied_k + kDepth;
-      copied_index += last;
+      __syncwarp();
+      if (lane == 0) arrive(tile.empty(slot));
+      if (++slot == S::kStages) {
+        slot = 0;
+        parity ^= 1;
+      }
     }
-    close_copies();
   };
+  const int32_t middle = min(max(tile.walk.other_stages, tile.stages.begin), tile.stages.end);
+  multiply(tile.stages.begin, middle);
+  if (conv.share != Share::kWhole) scale<kColumns>(sums, shares);
+  multiply(middle, tile.stages.end);
+  if (partials != nullptr)
+    write_partials<kColumns>(
+        sums, partials + (blockIdx.y * int64_t{conv.plan.pitch} + place) * columns + tile.n0 + lane % 4 * 2, columns);
+  else
+    write_sums<E, kColumns>(conv, sums, rows, tile.n0);
+}
 
-  const Factor from_a = factor_at(shared_address(memory.a[0]) + group_row * kRowBytes);
-  const Factor from_b = factor_at(shared_address(memory.b[0]) + column * kRowBytes);
-  Sums<kColumns> sums;
-  if (n_products > 0) look_up();
-  for (int stage = 0; stage < kStages - 1; ++stage) copy_next(stage);
-
-  int stage = 0;
-  for (int32_t index = 0; index < n_products; ++index) {
-    const Product product = product_at(index);
-    int last_stage = 0;
-    for (int32_t k0 = 0; k0 < conv.c_read; k0 += kDepth, stage = stage + 1 == kStages ? 0 : stage + 1) {
-      wait_for_copies<kStages - 2>();
-      publish_copies();
-      __syncthreads();
-      start_stage<E, kColumns>(moved(from_a, stage * kStageA), moved(from_b, stage * kStageB), k0 == 0, sums);
-      copy_next(stage == 0 ? kStages - 1 : stage - 1);
-      finish_stage<kColumns>(sums);
-      last_stage = stage;
+template <typename E, typename S>
+__global__ void __launch_bounds__(S::kThreads, S::kBlocksOnSm)
+    convolve(Convolution<E> conv, int32_t column_blocks, float* partials) {
+  extern __shared__ __align__(1024) char raw[];
+  auto& memory = *reinterpret_cast<Memory<S>*>(raw);
+  auto* room = reinterpret_cast<uint32_t*>(&memory + 1);
+  // Tiles with more taps lie behind those with few and are begun first.
+  const int64_t n_tiles = gridDim.x / column_blocks, index = n_tiles - 1 - blockIdx.x / column_blocks;
+  const int32_t n0 = blockIdx.x % column_blocks * S::kColumns;
+  if (threadIdx.x < kWarp) {
+    const int32_t n = list_taps<S::kGroups>(conv.plan, index, conv.taps, room);
+    if (threadIdx.x == 0) {
+      memory.n_others = n;
+      for (int i = 0; i < S::kStages; ++i) {
+        start_barrier(shared_address(memory.full + i), S::kCopying);
+        start_barrier(shared_address(memory.empty + i), 4 * S::kGroups);
+      }
     }
-    if (index >= n_listed)
-      write_rows<E, kColumns>(conv, sums, first_row, column, product.rows, begin + product.m0, v0, n0, memory.sums);
-    else
-      add_to_voxels<kColumns>(sums, first_row, column, product.rows, memory.places[last_stage], memory.sums);
   }
-  wait_for_copies<0>();
+  __syncthreads();
+  const Walk walk(conv.c_read, memory.n_others);
+  const int64_t splits = gridDim.y, split = blockIdx.y;
+  const Stages stages{static_cast<int32_t>(walk.n_stages * split / splits),
+                      static_cast<int32_t>(walk.n_stages * (split + 1) / splits)};
+  uint32_t* sources = room + round_up_to_four(conv.taps);
+  const Tables tables{sources, room, reinterpret_cast<uint8_t*>(sources + walk.n_stages * kRowChunks)};
+  for (int32_t i = stages.begin * kRowChunks + threadIdx.x; i < stages.end * kRowChunks; i += S::kThreads) {
+    const int2 at = walk.at(i / kRowChunks, i % kRowChunks);
+    sources[i] = at.x < 0 ? packed_source(kNoTap, 0) : packed_source(listed_tap(tables.taps[at.x]), at.y);
+  }
+  for (int32_t s = stages.begin + threadIdx.x; s < stages.end; s += S::kThreads) {
+    const int32_t first = walk.at(s, 0).x;
+    uint32_t groups = groups_of(tables.taps[first]);
+    for (int32_t e = first + 1; e < walk.n_others && e * walk.chunks < (s + 1) * kRowChunks; ++e)
+      groups |= groups_of(tables.taps[e]);
+    tables.groups[s] = static_cast<uint8_t>(groups);
+  }
+  __syncthreads();
+  const Tile<E, S> tile{conv, memory, tables, walk, stages, index * S::kRows, n0};
+  const int group = threadIdx.x / 128;
+  if (group < S::kGroups)
+    multiply_tile<E, S>(tile, group, int64_t{column_blocks} * S::kColumns, partials);
+  else
+    copy_tile<E, S>(tile, threadIdx.x - 128 * S::kGroups);
+}
+
+// y[order[place], c] = bias + the sums of all parts.
+template <typename E>
+__global__ void __launch_bounds__(kAdders)
+    add_parts(Convolution<E> conv, const float* partials, int32_t splits, int64_t columns) {
+  const int64_t i = (static_cast<int64_t>(blockIdx.x) * kAdders + threadIdx.x) * 4, place = i / columns;
+  if (place >= conv.plan.pitch) return;
+  const int32_t row = row_at(conv, place), c = static_cast<int32_t>(i % columns);
+  if (row < 0 || c >= conv.c_write) return;
+  float4 sum{0, 0, 0, 0};
+  const int64_t step = int64_t{conv.plan.pitch} * columns;
+#pragma unroll 4
+  for (int32_t s = 0; s < splits; ++s) {
+    const float4 part = *reinterpret_cast<const float4*>(partials + s * step + i);
+    sum = float4{sum.x + part.x, sum.y + part.y, sum.z + part.z, sum.w + part.w};
+  }
+  const float four[4] = {sum.x, sum.y, sum.z, sum.w};
+#pragma unroll
+  for (int e = 0; e < 4; ++e)
+    if (c + e < conv.c_write)
+      conv.y[wide_product(row, conv.c_write) + c + e] =
+          static_cast<E>(four[e] + (conv.bias != nullptr ? static_cast<float>(conv.bias[c + e]) : 0.0f));
 }
 
 }  // namespace
 
 template <typename E>
-void convolve_tensor(const char* op, const Convolution<E>& conv, int64_t n_tiles, Stream stream) {
-  const auto queue = [&]<int kColumns>() {
-    const int64_t column_blocks = blocks_for(op, conv.c_write, kColumns);
-    launch(op, convolve<E, kColumns>, blocks_for(op, n_tiles * column_blocks, 1), Memory<E, kColumns>::kThreads,
-           Memory<E, kColumns>::bytes(conv.taps), stream, conv, column_blocks);
-  };
+bool convolve_tensor(const char* op, const Convolution<E>& conv, const Workspace& workspace, Stream stream) {
   int shared_bytes = 0;
   check_cuda(cudaDeviceGetAttribute(&shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, stream.device), op);
-  const bool wide = Memory<E, 128>::bytes(conv.taps) <= static_cast<size_t>(shared_bytes);
-  if (conv.c_write > 64 && wide)
-    queue.template operator()<128>();
+  const auto bytes_of = [&]<typename S>() { return Memory<S>::bytes(conv.taps, conv.c_read / kChunk); };
+  const auto fits = [&]<typename S>() { return bytes_of.template operator()<S>() <= static_cast<size_t>(shared_bytes); };
+  const auto column_blocks = [&]<typename S>() { return (conv.c_write + S::kColumns - 1) / S::kColumns; };
+  const auto blocks = [&]<typename S>() {
+    return (conv.plan.pitch + S::kRows - 1) / S::kRows * int64_t{column_blocks.template operator()<S>()};
+  };
+  const auto queue = [&]<typename S>() {
+    const int32_t across = column_blocks.template operator()<S>();
+    const int64_t n_blocks = blocks.template operator()<S>(), columns = int64_t{across} * S::kColumns;
+    if (n_blocks == 0) return;
+    const int64_t splits = n_blocks >= kEnough ? 1 : std::min(kMaxSplits, 2 * kEnough / n_blocks);
+    float* partials = splits > 1 ? workspace.take<float>(splits * conv.plan.pitch * columns) : nullptr;
+    const dim3 grid(blocks_for(op, n_blocks, 1), static_cast<unsigned>(splits));
+    launch(op, convolve<E, S>, grid, S::kThreads,
+           bytes_of.template operator()<S>(), stream, conv, across, partials);
+    if (splits > 1)
+      launch(op, add_parts<E>, blocks_for(op, conv.plan.pitch * columns, 4 * kAdders), kAdders, 0, stream, conv,
+             partials, static_cast<int32_t>(splits), columns);
+  };
+  using Wide = Shape<3, 128>;
+  using Narrow = Shape<2, 64>;
+  using Small = Shape<1, 64>;
+  const bool suits = round_up(conv.c_write, 128) * 4 <= round_up(conv.c_write, 64) * 5;  // few columns beyond the last
+  if (suits && fits.template operator()<Wide>() && blocks.template operator()<Wide>() >= kEnough)
+    queue.template operator()<Wide>();
+  else if (fits.template operator()<Narrow>() && blocks.template operator()<Narrow>() >= kEnough)
+    queue.template operator()<Narrow>();
+  else if (fits.template operator()<Small>())
+    queue.template operator()<Small>();
   else
-    queue.template operator()<64>();
+    return false;
+  return true;
 }
 
-template void convolve_tensor<__half>(const char*, const Convolution<__half>&, int64_t, Stream);
-template void convolve_tensor<__nv_bfloat16>(const char*, const Convolution<__nv_bfloat16>&, int64_t, Stream);
+template bool convolve_tensor<__half>(const char*, const Convolution<__half>&, const Workspace&, Stream);
+template bool convolve_tensor<__nv_bfloat16>(const char*, const Convolution<__nv_bfloat16>&, const Workspace&, Stream);
 
 }  // namespace gsim3d::cuda::conv

@@ -15,7 +15,7 @@ struct Geometry {
 
   Geometry(const char* op, const Tensor& x, int64_t kernel_size, bool first, const Tensor& row_voxel_,
            const Tensor& voxel_rows_, const Tensor& cu_voxel_rows_, const Tensor& tap_in_, const Tensor& tap_out_,
-           const Tensor& cu_taps_)
+           const Tensor& cu_taps_, const std::optional<Tensor>& plan = std::nullopt)
       : row_voxel(rows_of(row_voxel_)),
         voxel_rows(rows_of(voxel_rows_)),
         cu_voxel_rows(rows_of(cu_voxel_rows_)),
@@ -51,6 +51,13 @@ struct Geometry {
            tap_in.size(0),
            kernel_size,
            first};
+    if (plan) {
+      check_dtype(op, "plan", *plan, ScalarType::Int);
+      check_device(op, "plan", *plan, x);
+      check_shape(op, "plan", *plan, {sparse_conv_plan_size(n_rows, kernel_size)}, "that of sparse_conv_plan");
+      check(plan->is_contiguous(), op, ": plan must be contiguous");
+      map.plan = data<int32_t>(*plan);
+    }
     // On a GPU the lists stay where they are: kernels skip what is out of range.
     if (!x.is_cuda()) cpu::check_sparse_conv_map(op, map, torch_parallel());
   }
@@ -77,7 +84,7 @@ void check_weight(const char* op, const Tensor& weight) {
 
 Tensor sparse_conv(const Tensor& x_, const Tensor& weight_, const std::optional<Tensor>& bias_, const Tensor& row_voxel,
                    const Tensor& voxel_rows, const Tensor& cu_voxel_rows, const Tensor& tap_in, const Tensor& tap_out,
-                   const Tensor& cu_taps, bool first) {
+                   const Tensor& cu_taps, bool first, const std::optional<Tensor>& plan) {
   const char* op = "sparse_conv";
   check_shape(op, "x", x_, {-1, -1}, "[N, C_in]");
   check_weight(op, weight_);
@@ -93,7 +100,7 @@ Tensor sparse_conv(const Tensor& x_, const Tensor& weight_, const std::optional<
     check_device(op, "bias", bias, x);
   }
   const Geometry geometry(op, x, weight.size(1), first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out,
-                          cu_taps);
+                          cu_taps, plan);
   Tensor out = empty(x, {x.size(0), c_out});
   dispatch(op, "x", x, [&]<typename T>() {
     TensorWorkspace workspace(x);
@@ -111,7 +118,7 @@ Tensor sparse_conv(const Tensor& x_, const Tensor& weight_, const std::optional<
 
 Tensor sparse_conv_grad_input(const Tensor& grad_, const Tensor& weight_, const Tensor& row_voxel,
                               const Tensor& voxel_rows, const Tensor& cu_voxel_rows, const Tensor& tap_in,
-                              const Tensor& tap_out, const Tensor& cu_taps, bool first) {
+                              const Tensor& tap_out, const Tensor& cu_taps, bool first, const std::optional<Tensor>& plan) {
   const char* op = "sparse_conv_grad_input";
   check_weight(op, weight_);
   check_shape(op, "grad", grad_, {-1, weight_.size(0)}, "[N, C_out]");
@@ -120,7 +127,7 @@ Tensor sparse_conv_grad_input(const Tensor& grad_, const Tensor& weight_, const 
   const Tensor grad = rows_of(grad_), weight = rows_of(weight_);
   const int64_t n_rows = grad.size(0), c_in = weight.size(4);
   const Geometry geometry(op, grad, weight.size(1), first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out,
-                          cu_taps);
+                          cu_taps, plan);
   Tensor grad_x = empty(grad, {n_rows, c_in});
   dispatch(op, "grad", grad, [&]<typename T>() {
     TensorWorkspace workspace(grad);
@@ -165,7 +172,24 @@ std::tuple<Tensor, Tensor> sparse_conv_grad_weight(const Tensor& grad_, const Te
   return {grad_weight, grad_bias};
 }
 
+Tensor sparse_conv_plan(const Tensor& row_voxel, const Tensor& voxel_rows, const Tensor& cu_voxel_rows,
+                        const Tensor& tap_in, const Tensor& tap_out, const Tensor& cu_taps, int64_t kernel_size) {
+  const char* op = "sparse_conv_plan";
+  cpu::check_sparse_conv_kernel(op, kernel_size);
+  check(row_voxel.dim() == 1, op, ": row_voxel must be [N]; got ", shape_of(row_voxel));
+  const Geometry geometry(op, row_voxel, kernel_size, false, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out,
+                          cu_taps);
+  check(row_voxel.is_cuda(), op, ": only convolutions on CUDA have a plan; got tensors on ", device_of(row_voxel));
+  Tensor plan = empty(row_voxel, {sparse_conv_plan_size(row_voxel.size(0), kernel_size)}, ScalarType::Int);
+  if constexpr (kWithCuda) {
+    TensorWorkspace workspace(row_voxel);
+    cuda::sparse_conv_plan(geometry.map, mutable_data<int32_t>(plan), workspace, current_stream(row_voxel));
+  }
+  return plan;
+}
+
 void kernels(auto& m) {
+  m.impl("sparse_conv_plan", TORCH_BOX(&sparse_conv_plan));
   m.impl("sparse_conv", TORCH_BOX(&sparse_conv));
   m.impl("sparse_conv_grad_input", TORCH_BOX(&sparse_conv_grad_input));
   m.impl("sparse_conv_grad_weight", TORCH_BOX(&sparse_conv_grad_weight));

@@ -44,7 +44,7 @@ __device__ __forceinline__ void start_stage(Factor grads, Factor inputs, Sums<kS
   for (int k = 0; k < kDepth; k += 16)
 #pragma unroll
     for (int p = 0; p < Sums<kSide>::kParts; ++p)
-      multiply_add_group<E, true>(moved(grads, k * kRowBytes), moved(inputs, p * kHalfBytes + k * kRowBytes), true,
+      multiply_add_group<E, true>(moved(grads, k * kRowBytes), moved(inputs, p * kHalfBytes + k * kRowBytes),
                                   sums.values[p]);
   close_group_products();
 #else
@@ -73,7 +73,7 @@ __device__ __forceinline__ void start_stage(Factor grads, Factor inputs, Sums<kS
 template <int kSide>
 __device__ __forceinline__ void finish_stage(Sums<kSide>& sums) {
 #ifdef __CUDA_ARCH_FEAT_SM90_ALL
-  wait_for_group_products();
+  wait_for_group_products<0>();
 #pragma unroll
   for (auto& part : sums.values) fence_sums(part);
 #endif
@@ -139,7 +139,9 @@ __global__ void __launch_bounds__(kThreads, 2) multiply_pairs(OuterProducts<E> p
     wait_for_copies<0>();
   }
 
-  float* to = products.partials + static_cast<int64_t>(blockIdx.x) * products.c_out * products.c_in;
+  const bool direct = products.partials == nullptr;
+  float* to = direct ? nullptr : products.partials + static_cast<int64_t>(blockIdx.x) * products.c_out * products.c_in;
+  const int32_t n_rows = direct ? products.result_rows : products.c_out;
   const int32_t first_out = co + (kSide == kHalf ? 0 : group * kHalf) + warp % 4 * 16 + lane / 4;
   const int32_t first_in = ci + (kSide == kHalf ? group * kHalf / 2 : 0) + lane % 4 * 2;
 #pragma unroll
@@ -149,9 +151,14 @@ __global__ void __launch_bounds__(kThreads, 2) multiply_pairs(OuterProducts<E> p
 #pragma unroll
       for (int j = 0; j < Sums<kSide>::kGroups; ++j) {
         const int32_t o = first_out + h * 8, n = first_in + p * kHalf + j * 8;
-        if (o < products.c_out && n < products.c_in)  // c_in is even
-          *reinterpret_cast<float2*>(to + static_cast<int64_t>(o) * products.c_in + n) =
-              float2{sums.values[p][j][2 * h], sums.values[p][j][2 * h + 1]};
+        const float low = sums.values[p][j][2 * h], high = sums.values[p][j][2 * h + 1];
+        if (o >= n_rows || n >= products.c_in) continue;  // c_in is even
+        if (direct)
+          *reinterpret_cast<uint32_t*>(products.result +
+                                       (static_cast<int64_t>(o) * products.taps + block.tap) * products.c_in + n) =
+              pair_of<E>(low, high);
+        else
+          *reinterpret_cast<float2*>(to + static_cast<int64_t>(o) * products.c_in + n) = float2{low, high};
       }
 }
 

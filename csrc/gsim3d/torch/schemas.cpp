@@ -12,13 +12,17 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "int slot_bits, int[] strides, int[] merge_windows, int[] patch_sizes, int[] curves, int[] kernel_sizes, "
       "int[] cu_kernels, bool release, int[] capacity) -> Tensor[]");
 
-  // sparse_conv: submanifold convolution over voxels; weight [C_out, K, K, K, C_in].
+  // sparse_conv: submanifold convolution over voxels; weight [C_out, K, K, K, C_in]. A plan is the order of rows and the
+  // sources of their taps on CUDA, made once for all convolutions with a map.
+  m.def(
+      "sparse_conv_plan(Tensor row_voxel, Tensor voxel_rows, Tensor cu_voxel_rows, Tensor tap_in, Tensor tap_out, "
+      "Tensor cu_taps, int kernel_size) -> Tensor");
   m.def(
       "sparse_conv(Tensor x, Tensor weight, Tensor? bias, Tensor row_voxel, Tensor voxel_rows, Tensor cu_voxel_rows, "
-      "Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first) -> Tensor");
+      "Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first, Tensor? plan=None) -> Tensor");
   m.def(
       "sparse_conv_grad_input(Tensor grad, Tensor weight, Tensor row_voxel, Tensor voxel_rows, Tensor cu_voxel_rows, "
-      "Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first) -> Tensor");
+      "Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first, Tensor? plan=None) -> Tensor");
   m.def(
       "sparse_conv_grad_weight(Tensor grad, Tensor x, int kernel_size, Tensor row_voxel, Tensor voxel_rows, "
       "Tensor cu_voxel_rows, Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first) -> (Tensor weight, Tensor bias)");
