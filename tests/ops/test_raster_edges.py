@@ -255,15 +255,15 @@ def test_poison_is_left_out_on_cuda(devices, name):
 
 
 BAD_ROWS = [
-    ("means", NAN, "means: not finite"),
+    ("means", NAN, "means: not finite or beyond 1e15"),
     ("quats", NAN, "quats: not finite"),
-    ("scales", INF, "scales: negative or not finite"),
-    ("scales", -1.0, "scales: negative or not finite"),
-    ("scales", 1e30, "scales: too large, the projection overflows"),
+    ("scales", INF, "scales: negative, not finite or beyond 1e15"),
+    ("scales", -1.0, "scales: negative, not finite or beyond 1e15"),
+    ("scales", 1e12, "scales: too large, the projection overflows"),
     ("opacities", 1.5, r"opacities: outside \[0, 1\]"),
     ("opacities", NAN, r"opacities: outside \[0, 1\]"),
-    ("color", NAN, "colors: not finite"),
-    ("features", NAN, "features: not finite"),
+    ("color", NAN, "colors: not finite or beyond 1e15"),
+    ("features", NAN, "features: not finite or beyond 1e15"),
 ]
 
 
@@ -310,7 +310,7 @@ def test_bad_rows_are_bounded(device, name, value, message):
 def test_a_gpu_raises_where_the_report_is_read(devices):
     report = StabilityReport()
     change(four_rows(), "means", 2, NAN).to(devices[1]).render(report=report)
-    with pytest.raises(HardCaseError, match=r"rasterize_gaussians: means: not finite at row 2 \(camera 0\)"):
+    with pytest.raises(HardCaseError, match=r"rasterize_gaussians: means: not finite or beyond 1e15 at row 2 \(camera 0\)"):
         report.check()
 
 
@@ -337,9 +337,9 @@ BAD_DATA = [
     (lambda s: s.replace(cu_rows=torch.tensor([0, 5, 4])), "cu_rows must not descend; got 5 then 4 at 1"),
     (lambda s: change(s, "Ks", (0, 0, 0), 0.0), "focal lengths in Ks must be positive; got 0 and 16 for image 0"),
     (lambda s: change(s, "Ks", (0, 1, 0), 1.0), r"Ks must be \[\[fx, skew, cx\]"),
-    (lambda s: change(s, "Ks", (0, 0, 2), NAN), "Ks must be finite; got nan for image 0"),
-    (lambda s: change(s, "viewmats", (0, 1, 1), NAN), "viewmats must be finite; got nan for image 0"),
-    (lambda s: change(s, "background", (0, 1), NAN), "background must be finite; got nan for image 0"),
+    (lambda s: change(s, "Ks", (0, 0, 2), NAN), "Ks must be finite and at most 1e15; got nan for image 0"),
+    (lambda s: change(s, "viewmats", (0, 1, 1), NAN), "viewmats must be finite and at most 1e15; got nan for image 0"),
+    (lambda s: change(s, "background", (0, 1), NAN), "background must be finite and at most 1e15; got nan for image 0"),
 ]
 
 

@@ -123,7 +123,7 @@ __device__ void cover(const Record<T>& r, const Quarter& quarter, const F& put) 
 template <typename T>
 __device__ inline T background_of(const RasterScene<T>& s, int64_t image, int channel) {
   const T value = s.background[3 * image + channel];
-  return isfinite(value) ? value : T(0);
+  return usable(value) ? value : T(0);
 }
 
 // Row of the features of a pair.

@@ -241,7 +241,7 @@ __device__ void gather_images(const Job<T>& job, const Slots<T>& slots, const Ra
     reduce_block(sums, shared);
     if (threadIdx.x == 0)
       for (int c = 0; c < 3; ++c)
-        grads.background[3 * image + c] = isfinite(job.scene.background[3 * image + c]) ? sums[c] : T(0);
+        grads.background[3 * image + c] = usable(job.scene.background[3 * image + c]) ? sums[c] : T(0);
     if (slots.viewmats == nullptr || threadIdx.x >= 16) continue;
     T sum = 0;
     for (int part = 0; part < kViewmatParts && threadIdx.x < 12; ++part)

@@ -169,8 +169,8 @@ struct Job {
 template <typename T>
 __device__ bool camera_is_good(const T* viewmat, const T* K) {
   bool good = true;
-  for (int i = 0; i < 12; ++i) good &= isfinite(viewmat[i]);
-  for (int i = 0; i < 9; ++i) good &= isfinite(K[i]);
+  for (int i = 0; i < 12; ++i) good &= usable(viewmat[i]);
+  for (int i = 0; i < 9; ++i) good &= usable(K[i]);
   return good && K[0] > 0 && K[4] > 0 && K[3] == 0 && K[6] == 0 && K[7] == 0 && K[8] == 1;
 }
 

@@ -14,6 +14,7 @@ constexpr double kMaxAlpha = 0.99;            // keeps 1 / (1 - alpha) in the ba
 constexpr double kMinTransmittance = 1e-4;    // a pixel ends before falling below it; what is behind is invisible
 constexpr double kDilation = 0.3;             // px^2, added to both variances: no Gaussian falls between pixels
 constexpr double kFieldMargin = 0.15;         // the Jacobian is taken at most this part of the image outside of it
+constexpr double kLargest = 1e15;              // beyond it a number is not used: products and squares stay finite
 constexpr double kMinQuat = 1e-6;             // shorter quaternions have no direction: identity, no gradient
 constexpr int kTile = 16;                     // pixels; part of the meaning of RasterCutoff::kTile3Sigma
 
@@ -40,6 +41,12 @@ GSIM3D_HD V min_of(V a, V b) {
 template <typename V>
 GSIM3D_HD V abs_of(V a) {
   return a < V{} ? -a : a;
+}
+
+// Finite, and small enough for the products of this file.
+template <typename S>
+GSIM3D_HD bool usable(S x) {
+  return x >= S(-kLargest) && x <= S(kLargest);
 }
 
 template <typename S>

@@ -21,7 +21,7 @@ struct Gaussian {
 
   __device__ bool is_good() const {
     bool good = opacity >= 0 && opacity <= 1;
-    for (int i = 0; i < 3; ++i) good &= isfinite(mean[i]) && isfinite(scale[i]) && scale[i] >= 0;
+    for (int i = 0; i < 3; ++i) good &= usable(mean[i]) && usable(scale[i]) && scale[i] >= 0;
     for (int i = 0; i < 4; ++i) good &= isfinite(quat[i]);
     return good;
   }
@@ -135,8 +135,8 @@ __device__ void project_rows(const Job<T>& job, unsigned char* memory) {
     const int64_t row = rows.inside ? rows.row : rows.begin;
     const Gaussian<T> gaussian(s, row);
     bool good = rows.inside && gaussian.is_good();
-    for (int i = 0; i < kColumns && good; ++i) good &= isfinite(coefficients[i]);
-    for (int64_t i = 0; i < s.n_features; ++i) good &= isfinite(s.features[row * s.n_features + i]);
+    for (int i = 0; i < kColumns && good; ++i) good &= usable(coefficients[i]);
+    for (int64_t i = 0; i < s.n_features; ++i) good &= usable(s.features[row * s.n_features + i]);
     const bool may_show = good && gaussian.opacity >= T(kMinAlpha);
     const T level = level_of(gaussian.opacity), strength = log2(gaussian.opacity);
     for (int64_t image = rows.first_image; image < last; image = job.views[image].next) {
