@@ -15,6 +15,8 @@ from harness import Bench
 import gsim3d.guards
 import gsim3d.simulator
 from gsim3d import Simulator, ops, presets
+from gsim3d.graphs import CapturedRollout
+from gsim3d.presets import ModelConfig
 from gsim3d.stability import StabilityReport
 from gsim3d.types import Cameras, Particles
 
@@ -85,21 +87,42 @@ def without_guards(f):
     return run
 
 
+def captured(bench: Bench, config: ModelConfig, n: int, case: str):
+    """The same as run_of as CUDA graphs in bfloat16, one with guards and one that was made without them."""
+    simulator = Simulator(config).to(bench.device).eval()
+    state, cameras = state_of(simulator, n, bench.device), camera(bench.device)
+    with torch.autocast("cuda", torch.bfloat16):
+        ours = CapturedRollout(simulator, state, STEPS, cameras=cameras, copies=False, report=StabilityReport())
+        with no_guards():
+            plain = CapturedRollout(simulator, state, STEPS, cameras=cameras, copies=False, report=StabilityReport())
+
+    def replay_of(graph: CapturedRollout):
+        def run():
+            steps, images = graph(state)
+            return [step.means for step in steps] + [images[-1].color]
+
+        return run
+
+    bench.gpu(case, "bfloat16", replay_of(ours), {"no guards": replay_of(plain)}, tolerance=0.0, capture=False)
+
+
 def main():
     bench = Bench("stability")
+    on_gpu = bench.device.type == "cuda"
     cases = [("tiny", presets.tiny(), 4000), ("small", presets.small(), 4000)]
-    if bench.device.type == "cuda":
-        cases = [("small", presets.small(), 16384), ("paper_latent", presets.paper_latent(4, 64), 16384)]
-        cases += [("paper_latent", presets.paper_latent(4, 64), 65536)]
+    if on_gpu:
+        paper = presets.paper_latent(4, 64)
+        cases = [("small", presets.small(), 16384), ("paper_latent", paper, 16384), ("paper_latent", paper, 65536)]
     for name, config, n in cases:
         torch.manual_seed(0)
         simulator = Simulator(config).to(bench.device).eval()
         run = run_of(simulator, state_of(simulator, n, bench.device), camera(bench.device))
-        case = f"{name}, {n} particles: {STEPS} steps, 1 image"
-        if bench.device.type == "cuda":
-            bench.gpu(case, "float32", run, {"no guards": without_guards(run)}, tolerance=0.0, capture=False)
-        else:
-            bench.compare(case, run, without_guards(run), tolerance=0.0)
+        case = f"{name}, {n} particles: {STEPS} steps"
+        if not on_gpu:
+            bench.compare(case + ", 1 image", run, without_guards(run), tolerance=0.0)
+            continue
+        bench.gpu(case + ", 1 image", "float32", run, {"no guards": without_guards(run)}, tolerance=0.0, capture=False)
+        captured(bench, config, n, case + f", {STEPS} images, captured")
     look(bench)
     bench.finish()
 
