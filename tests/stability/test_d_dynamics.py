@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsim3d.data import Scene, find_scenes
-from gsim3d.dynamics.state import rotate_left
+from gsim3d.dynamics.state import SCALE_STEP_SHARE, rotate_left
 from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr, ssim
 from gsim3d.stability import StabilityReport
 from gsim3d.train import checkpoint
@@ -157,20 +157,40 @@ def test_d44_gradients_are_clipped(setting, measured, scenes, tmp_path):
     measured.outcome("clipped, norm logged")
 
 
-def steep_opacity(sign):
+OPACITY = EXPLICIT.dynamic_latents + 3 * (EXPLICIT.sh_degree + 1) ** 2 + 3  # among the channels that are predicted
+SCALES = OPACITY + 4
+
+
+def steep(first, count, value):
     def prepare(dynamics):
-        start = EXPLICIT.dynamic_latents + 3 * (EXPLICIT.sh_degree + 1) ** 2 + 3
-        dynamics.net.head.fc2.bias.data[start] = 5.0 * sign
+        dynamics.net.head.fc2.bias.data[first : first + count] = value
 
     return prepare
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_d45_opacities_stay_between_0_and_1(setting, measured, sign):
-    step = check_step(setting, measured, make_history((20, 25), config=EXPLICIT), EXPLICIT, prepare=steep_opacity(sign))
+    step = check_step(setting, measured, make_history((20, 25), config=EXPLICIT), EXPLICIT, prepare=steep(OPACITY, 1, 5.0 * sign))
     moved = make_history((20, 25), config=EXPLICIT).activity[20:] == 0
     assert (step.fields["opacities"][moved.to(setting.device)] == (sign > 0)).all()
     measured.outcome("clamped to [0, 1]")
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_d45_scales_stay_in_their_range(setting, measured, sign):
+    """The prediction drives all scales beyond a limit; half of them lie there already."""
+    low, high = EXPLICIT.scale_min, EXPLICIT.scale_max
+    history = make_history((20, 25), config=EXPLICIT)
+    scales = torch.full_like(history.scales, (low + high) / 2)
+    scales[::2] = high if sign > 0 else low
+    history = dataclasses.replace(history, scales=scales)
+    step = check_step(setting, measured, history, EXPLICIT, prepare=steep(SCALES, 3, 50.0 * sign))
+    moved = (history.activity[20:] == 0).to(setting.device)
+    found, before = step.fields["scales"][moved], setting.to(scales[20:])[moved]
+    assert found.min() >= before.new_tensor(low) and found.max() <= before.new_tensor(high)
+    largest = 1.001 * SCALE_STEP_SHARE * (high - low)
+    assert (found - before).abs().max() <= largest and (found != before).any()
+    measured.outcome("scales clamped, their steps bounded")
 
 
 def test_d46_a_thousand_turns(setting, measured):

@@ -123,6 +123,21 @@ def test_e37_probabilities_of_exactly_zero(setting, measured):
     check_encoding(setting, measured, ordinary(), prepare=be_sure)
 
 
+@pytest.mark.parametrize("correction", [-1e4, 1e4])
+def test_e37_depths_stay_between_their_bounds(setting, measured, correction):
+    """Whatever is added to the disparity."""
+
+    def overshoot(encoder):
+        encoder.depth.to_disparity[2].bias.data[0] = correction
+
+    result = check_encoding(setting, measured, ordinary(), prepare=overshoot)
+    cameras = ordinary().cameras
+    points = result.fields["means"].double().cpu().reshape(len(cameras), -1, 3)
+    depth = (points @ cameras.viewmats[:, 2, :3, None])[..., 0] + cameras.viewmats[:, 2, 3, None]
+    bound = cameras.far if correction < 0 else cameras.near
+    measured.close(depth, bound.double()[:, None].expand_as(depth), f"geometry_{setting.exact}", "depth")
+
+
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
 def test_e38_constant_images(setting, measured, value):
     images = ordinary().images.clone()
