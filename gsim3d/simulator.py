@@ -109,6 +109,7 @@ class Simulator(nn.Module):
         on_bad: OnBad | None = None,
         report: StabilityReport | None = None,
         geometry: Callable[[Particles], Pyramid] | None = None,
+        wrap: Callable[[Callable], Callable] | None = None,
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
 
@@ -117,9 +118,11 @@ class Simulator(nn.Module):
 
         Args:
             geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
+            wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
         """
         plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
+        predict = predict if wrap is None else wrap(predict)
         return rollout(predict, guard(self.prepare(state, plan)), n_steps, plan.history)
 
     def prepare(self, state: Particles, plan: Plan) -> Particles:
