@@ -46,6 +46,7 @@ from gsim3d.train.schedule import one_cycle
 from gsim3d.train.settings import from_dict, to_dict
 from gsim3d.train.watch import Seen, StepWatch, first_not_finite, mean_of_norms, norms_by_module
 
+READERS = 2  # threads that read batches; so many steps are read ahead
 EMA_WARM_UP = 10  # the average forgets its first values: decay is at most (1 + step) / (10 + step)
 # May change between two sittings of one run without changing the curve; so may the number of workers, if there are any.
 FREE_SETTINGS = ("checkpoint_every", "keep_checkpoints", "log_every", "recompute")
@@ -102,7 +103,7 @@ class Trainer:
         self.parent = None
         self.same_scenes = True
         self._ahead: dict[tuple, Future] = {}
-        self._reader = ThreadPoolExecutor(1)
+        self._reader = ThreadPoolExecutor(READERS)
         if checkpoint.exists(self.out):
             self._resume()
         self.log = Log(self.out, writes=self.processes.is_first)
@@ -302,11 +303,15 @@ class Trainer:
         return loss.detach(), errors, gradients, watch, len(samples), error
 
     def _batch(self, samples: list[int]) -> Batch:
-        """The samples of this step; those of the next one are read meanwhile."""
-        now, later = ((step, tuple(samples)) for step in (self.step, self.step + 1))
+        """The samples of this step; those of the next ones are read meanwhile."""
+        now, *later = ((step, tuple(samples)) for step in range(self.step, self.step + 1 + READERS))
         known = self._ahead.pop(now, None)
-        if later[0] < self.config.n_steps:
-            self._ahead[later] = self._reader.submit(self._draw, *later)
+        for key in list(self._ahead):
+            if key[0] < self.step:  # read in vain: the next stage has other batches
+                self._ahead.pop(key, None)
+        for key in later:
+            if key[0] < self.config.n_steps and key not in self._ahead:
+                self._ahead[key] = self._reader.submit(self._draw, *key)
         return (self._draw(*now) if known is None else known.result()).to(self.device)
 
     def _draw(self, step: int, samples: Sequence[int]) -> Batch:
