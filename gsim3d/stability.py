@@ -82,7 +82,9 @@ class Finding:
     camera: int | None = None
 
     def __str__(self) -> str:
-        place = [f"{name} {value}" for name in ("scene", "step", "camera") if (value := getattr(self, name)) is not None]
+        place = [
+            f"{name} {value}" for name in ("scene", "step", "camera") if (value := getattr(self, name)) is not None
+        ]
         place = f" ({', '.join(place)})" if place else ""
         row = "" if self.row is None else f" at row {self.row}"
         more = f" and {self.count - 1} more" if self.count > 1 else ""
