@@ -53,6 +53,7 @@ class Captured:
             raise CaptureError(f"Captured: device must be a GPU; got {device}")
         cached = torch.is_autocast_cache_enabled()
         torch.set_autocast_cache_enabled(False)
+        torch.clear_autocast_cache()  # what it holds was made on another stream, for which a backward pass would wait
         try:
             with torch.cuda.device(self._device), keeping_constants(self._constants):
                 self._capture(function)
