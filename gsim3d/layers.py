@@ -6,13 +6,18 @@ splits the rows of a matrix product over threads is its own affair.
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
+from collections.abc import Sequence
+
 import torch
 import torch.distributed
 import torch.distributed.nn.functional
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from gsim3d.ops import row_norm
+from gsim3d.ops import norm_gelu, row_norm
 
 MIN_ROWS = 16  # matrix products of fewer rows go through other code in BLAS, which rounds differently
 
@@ -25,35 +30,96 @@ def row_linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     return F.linear(F.pad(x, (0, 0, 0, MIN_ROWS - n_rows)), weight, bias)[:n_rows]
 
 
+def linear_grads(grad: Tensor, x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of x and weight of ``x @ weight.T``; the second is float32 or wider."""
+    wide = torch.promote_types(grad.dtype, torch.float32)
+    if wide == grad.dtype:
+        return grad @ weight, grad.t() @ x
+    return grad @ weight, torch.mm(grad.t(), x, out_dtype=wide)
+
+
 class RowLinear(nn.Linear):
     """``nn.Linear`` of [N, C]."""
 
     def forward(self, x: Tensor) -> Tensor:
-        return row_linear(x, self.weight, self.bias)
+        if not x.is_cuda or torch.compiler.is_compiling() or self.bias is None:
+            return row_linear(x, self.weight, self.bias)
+        x = x.to(product_dtype(x))
+        return _RowLinear.apply(x, self.weight, self.bias, *rounded_weights(self, x.dtype))
 
 
-def rounded_weights(module: nn.Module, dtype: torch.dtype) -> tuple[Tensor, ...]:
+class _RowLinear(torch.autograd.Function):
+    """On a GPU torch would sum the gradients of biases slowly, and those of weights in 16 bits."""
+
+    @staticmethod
+    def forward(ctx, x, weight, bias, rounded_weight, rounded_bias):
+        ctx.save_for_backward(x, weight)  # the weight is saved for torch to notice if it changes
+        ctx.rounded_weight = rounded_weight
+        return row_linear(x, rounded_weight, rounded_bias)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        x, _ = ctx.saved_tensors
+        grad = grad.contiguous()
+        return *linear_grads(grad, x, ctx.rounded_weight), torch.ops.gsim3d.linear_grad_bias(grad), None, None
+
+
+def product_dtype(x: Tensor) -> torch.dtype:
+    """The dtype in which products of ``x`` are formed: that of ``torch.autocast`` on a GPU, else its own."""
+    follows = x.is_cuda and x.dtype != torch.float64 and torch.is_autocast_enabled("cuda")
+    return torch.get_autocast_dtype("cuda") if follows else x.dtype
+
+
+def rounded_weights(module: nn.Module, dtype: torch.dtype) -> tuple[Tensor | None, ...]:
     """``module.weight`` and ``module.bias`` in ``dtype``, without gradients.
 
     The copies are kept and made again, in the same memory, once a weight has changed: a simulation rounds its weights
     once. Changes are noticed as autograd notices them, so not those made through ``weight.data``.
     """
-    tensors = module.weight, module.bias
     if module.weight.dtype == dtype:
-        return tensors
-    key = (dtype, *(key for t in tensors for key in (t.data_ptr(), t._version)))
-    known, copies = module.__dict__.get("_rounded", (None, ()))
-    if known == key:
-        return copies
-    if module.weight.is_cuda and torch.cuda.is_current_stream_capturing():
-        return tuple(t.detach().to(dtype) for t in tensors)  # part of the graph: made at each replay
-    with torch.inference_mode(False), torch.no_grad():
-        if known is not None and known[0] == dtype and copies[0].device == module.weight.device:
-            torch._foreach_copy_(copies, tensors)
+        return module.weight, module.bias
+    ready = _ready.get().get(id(module))
+    weight, *bias = ready or _rounded([module], dtype)[0]
+    return weight, bias[0] if bias else None
+
+
+@contextlib.contextmanager
+def rounded_at_once(modules: Sequence[nn.Module], dtype: torch.dtype):
+    """A context in which :func:`rounded_weights` of ``modules`` are at hand: made in a few launches, not two a layer."""
+    modules = [module for module in modules if module.weight.dtype != dtype]
+    token = _ready.set(dict(zip(map(id, modules), _rounded(modules, dtype), strict=True)))
+    try:
+        yield
+    finally:
+        _ready.reset(token)
+
+
+_ready: contextvars.ContextVar[dict[int, Sequence[Tensor]]] = contextvars.ContextVar("ready", default={})
+
+
+@torch.inference_mode(False)
+@torch.no_grad()
+def _rounded(modules: Sequence[nn.Module], dtype: torch.dtype) -> list[Sequence[Tensor]]:
+    """Weights and biases of ``modules`` in ``dtype``; all that is not known is rounded by one operation."""
+    results, sources, targets = [], [], []
+    for module in modules:
+        tensors = [t for t in (module.weight, module.bias) if t is not None]
+        if module.weight.is_cuda and torch.cuda.is_current_stream_capturing():
+            copies = [torch.empty_like(t, dtype=dtype) for t in tensors]  # part of the graph: made at each replay
+            sources, targets = sources + tensors, targets + copies
         else:
-            copies = tuple(t.to(dtype) for t in tensors)
-    module.__dict__["_rounded"] = key, copies
-    return copies
+            key = (dtype, *(key for t in tensors for key in (t.data_ptr(), t._version)))
+            known, copies = module.__dict__.get("_rounded", (None, ()))
+            if known != key:
+                if known is None or known[0] != dtype or copies[0].device != module.weight.device:
+                    copies = [torch.empty_like(t, dtype=dtype) for t in tensors]
+                sources, targets = sources + tensors, targets + list(copies)
+                module.__dict__["_rounded"] = key, copies
+        results.append(copies)
+    if sources:
+        torch._foreach_copy_(targets, sources)
+    return results
 
 
 class RowLayerNorm(nn.LayerNorm):
@@ -61,6 +127,9 @@ class RowLayerNorm(nn.LayerNorm):
 
     def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
         return row_norm(x, self.weight, self.bias, residual, eps=self.eps, check=False)
+
+    def activated(self, x: Tensor) -> Tensor:
+        return F.gelu(self(x))
 
 
 class RowBatchNorm(nn.Module):
@@ -81,19 +150,25 @@ class RowBatchNorm(nn.Module):
         self.register_buffer("running_var", torch.ones(channels))
 
     def forward(self, x: Tensor) -> Tensor:
+        mean, scale = self._mean_and_scale(x)
+        return (x - mean) * scale + self.bias
+
+    def activated(self, x: Tensor) -> Tensor:
+        """``F.gelu(self(x))``, on a GPU in one pass over the rows."""
+        if not x.is_cuda or torch.compiler.is_compiling():
+            return F.gelu(self(x))
+        return norm_gelu(x, *self._mean_and_scale(x), self.bias, check=False)
+
+    def _mean_and_scale(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if not self.training:
-            return self._normalise(x, self.running_mean, self.running_var)
+            return self.running_mean, self.weight * torch.rsqrt(self.running_var + self.EPS)
         mean, var, n_rows = _statistics(widened(x))
         with torch.no_grad():
             rate = self.MOMENTUM * (n_rows > 1).to(self.running_var)
             self.running_mean.lerp_(mean.to(self.running_mean), rate)
             unbiased = var * n_rows / (n_rows - 1).clamp(min=1)
             self.running_var.lerp_(unbiased.to(self.running_var), rate)
-        return self._normalise(x, mean, var)
-
-    def _normalise(self, x: Tensor, mean: Tensor, var: Tensor) -> Tensor:
-        scale = self.weight * torch.rsqrt(var + self.EPS)
-        return (x - mean) * scale + self.bias
+        return mean, self.weight * torch.rsqrt(var + self.EPS)
 
 
 def _statistics(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -24,8 +24,9 @@ from torch import Tensor, nn
 
 from gsim3d.dynamics import Dynamics, append_step, concatenate, last_steps, rollout
 from gsim3d.effects import EffectsSpec, Plan, make_plan
-from gsim3d.encoder import Encoder
-from gsim3d.guards import guard_particles
+from gsim3d.encoder import Encoder, pixel_rows
+from gsim3d.guards import drop_rows, guard_frames, guard_particles
+from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
@@ -53,7 +54,9 @@ class Simulator(nn.Module):
     ) -> Particles:
         """Particles of all clouds of ``frames``: each pixel that the masks keep becomes one."""
         guard = self._guard("encode", on_bad, report)
-        return guard(self.encoder(frames))
+        frames, spoiled = guard_frames(frames, guard.keywords["config"], guard.keywords["report"], "encode")
+        particles = self.encoder(frames)
+        return guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled)))
 
     def plan(self, spec: EffectsSpec = EffectsSpec()) -> Plan:
         """What will be computed for ``spec``, and what will not.
@@ -93,7 +96,7 @@ class Simulator(nn.Module):
             generator: randomness of training (drop path, curve shuffling); None: none.
         """
         plan, guard = plan or self.plan(), self._guard("step", on_bad, report)
-        state = guard(last_steps(self._prepare(state, plan), plan.history))
+        state = guard(self.prepare(state, plan))
         return append_step(state, self._predict(state, plan, generator, guard), plan.history)
 
     def rollout(
@@ -105,16 +108,31 @@ class Simulator(nn.Module):
         generator: torch.Generator | None = None,
         on_bad: OnBad | None = None,
         report: StabilityReport | None = None,
+        geometry: Callable[[Particles], Pyramid] | None = None,
+        wrap: Callable[[Callable], Callable] | None = None,
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
 
         Rows are those of the newest step of ``state`` throughout. Gradients flow through all steps. Arguments as
         :meth:`step`.
+
+        Args:
+            geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
+            wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
         """
         plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
-        state = guard(last_steps(self._prepare(state, plan), plan.history))
-        predict = partial(self._predict, plan=plan, generator=generator, guard=guard)
-        return rollout(predict, state, n_steps, plan.history)
+        predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
+        predict = predict if wrap is None else wrap(predict)
+        return rollout(predict, guard(self.prepare(state, plan)), n_steps, plan.history)
+
+    def prepare(self, state: Particles, plan: Plan) -> Particles:
+        """What the dynamics reads of ``state``: its last steps, with the background as the plan wants it."""
+        background = plan.spec.dynamics.background
+        if background == "masked_out":
+            state = state.select_rows(state.activity == DYNAMIC)
+        if background == "dynamic":
+            state = dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
+        return last_steps(state, plan.history)
 
     def render(
         self,
@@ -146,7 +164,7 @@ class Simulator(nn.Module):
 
     def _guard(
         self, where: str, on_bad: OnBad | None, report: StabilityReport | None, in_workspace: bool = True
-    ) -> Callable[..., Particles]:
+    ) -> partial[Particles]:
         """guard_particles with the limits of this model."""
         limits, dynamics = self.config.stability, self.config.dynamics
         if on_bad is not None:
@@ -163,19 +181,16 @@ class Simulator(nn.Module):
             max_opacity=dynamics.max_opacity,
         )
 
-    def _prepare(self, state: Particles, plan: Plan) -> Particles:
-        """``state`` with the background as the plan wants it."""
-        if plan.spec.dynamics.background == "masked_out":
-            return state.select_rows(state.activity == DYNAMIC)
-        if plan.spec.dynamics.background == "dynamic":
-            return dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
-        return state
-
     def _predict(
-        self, state: Particles, plan: Plan, generator: torch.Generator | None, guard: Callable[..., Particles]
+        self,
+        state: Particles,
+        plan: Plan,
+        generator: torch.Generator | None,
+        guard: Callable[..., Particles],
+        geometry: Callable[[Particles], Pyramid] | None = None,
     ) -> Particles:
         """The next steps of every scene, guarded, without the changes that the plan leaves out."""
-        step = self.dynamics(state, generator=generator)
+        step = self.dynamics(state, generator=generator, pyramid=None if geometry is None else geometry(state))
         appearance = plan.spec.appearance
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
         if appearance.changing != "all":
@@ -186,4 +201,4 @@ class Simulator(nn.Module):
                 step = dataclasses.replace(step, sh=torch.where(held[:, None, None], newest.sh, step.sh))
         if appearance.opacity_changes is False:
             step = dataclasses.replace(step, opacities=newest.opacities)
-        return guard(step, previous=newest)
+        return guard(step, previous=newest, changed=self.dynamics.layout.changing)

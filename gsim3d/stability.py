@@ -82,7 +82,9 @@ class Finding:
     camera: int | None = None
 
     def __str__(self) -> str:
-        place = [f"{name} {value}" for name in ("scene", "step", "camera") if (value := getattr(self, name)) is not None]
+        place = [
+            f"{name} {value}" for name in ("scene", "step", "camera") if (value := getattr(self, name)) is not None
+        ]
         place = f" ({', '.join(place)})" if place else ""
         row = "" if self.row is None else f" at row {self.row}"
         more = f" and {self.count - 1} more" if self.count > 1 else ""
@@ -185,10 +187,17 @@ class StabilityReport:
         else:
             self._send(numbers, read)
 
-    def replayed(self) -> None:
-        """Fetches the records of the CUDA graphs captured with this report, without waiting; call it after a replay."""
+    def replayed(self, to: StabilityReport | None = None) -> None:
+        """Fetches the records of the CUDA graphs captured with this report, without waiting; call it after a replay.
+
+        Args:
+            to: report that is told of them, and of what this one has found so far; None: this one.
+        """
+        target = self if to is None else to
         for numbers, read in self._captured:
-            self._send(numbers, read)
+            target._send(numbers, read)
+        if to is not None:
+            to._take(Reading(self._found.values(), self._sentinels))
 
     def _send(self, numbers: Tensor, read: Callable[[Tensor], Reading]) -> None:
         copy = torch.empty(numbers.shape, dtype=numbers.dtype, pin_memory=True)
@@ -215,6 +224,8 @@ class StabilityReport:
 
     def poll(self) -> None:
         """Raises the first error that has arrived and was not raised yet; waits for nothing."""
+        if torch.compiler.is_compiling():
+            return
         if self._pending and not torch.cuda.is_current_stream_capturing():
             self._collect(wait=False)
         with self._lock:

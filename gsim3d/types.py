@@ -7,11 +7,12 @@ Units are metres and pixels; axes are OpenCV's (x right, y down, z forward); qua
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, groupby
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -97,13 +98,37 @@ class Frames(_Tensors):
 
 
 @functools.lru_cache(maxsize=512)
+def _recent_constant(values: tuple[int, ...], device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=torch.int64, device=device)
+
+
+_stores: list[dict[tuple, Tensor]] = []
+
+
 def constant(values: tuple[int, ...], device: torch.device) -> Tensor:
     """int64 tensor of ``values``, the same object at every call: read it, never write to it.
 
     A step that repeats sends nothing to the device, and can be captured in a CUDA graph.
     """
-    with torch.inference_mode(False):
+    if torch.compiler.is_compiling():
         return torch.tensor(values, dtype=torch.int64, device=device)
+    if not _stores:
+        return _recent_constant(values, device)
+    key = values, torch.device(device)
+    if key not in _stores[-1]:
+        _stores[-1][key] = _recent_constant(values, device)
+    return _stores[-1][key]
+
+
+@contextlib.contextmanager
+def keeping_constants(store: dict[tuple, Tensor]):
+    """Keeps in ``store`` every constant that is asked for: a captured graph reads them at each replay."""
+    _stores.append(store)
+    try:
+        yield
+    finally:
+        _stores.pop()
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,10 +166,11 @@ class CloudTable:
 
     def row_runs(self, clouds: Sequence[int]) -> list[tuple[int, int]]:
         """(first row, one behind the last) of ``clouds``; clouds that follow each other share a run."""
-        runs = []
-        for _, group in groupby(enumerate(clouds), lambda pair: pair[1] - pair[0]):
-            members = [cloud for _, cloud in group]
-            runs.append((self.starts[members[0]], self.starts[members[-1] + 1]))
+        runs, before = [], None
+        for cloud in clouds:
+            begin = runs.pop()[0] if before is not None and cloud == before + 1 else self.starts[cloud]
+            runs.append((begin, self.starts[cloud + 1]))
+            before = cloud
         return runs
 
 

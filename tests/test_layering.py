@@ -15,7 +15,7 @@ ROOMS = [
     {"encoder", "dynamics", "renderer"},
     {"presets"},
     {"simulator"},
-    {"laws"},
+    {"laws", "graphs"},
     {"endurance"},
     {"data", "interop", "perceptual"},
     {"generate"},

@@ -3,7 +3,16 @@
 import pytest
 import torch
 
-from gsim3d.layers import RowBatchNorm, RowLayerNorm, RowLinear, _combine, _statistics
+from gsim3d.layers import (
+    RowBatchNorm,
+    RowLayerNorm,
+    RowLinear,
+    _combine,
+    _statistics,
+    product_dtype,
+    rounded_at_once,
+    rounded_weights,
+)
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 
 
@@ -77,3 +86,93 @@ def test_batch_norm_gradients():
     x = rows(5, 3, dtype=torch.float64).requires_grad_()
     layer = RowBatchNorm(3).double()
     assert torch.autograd.gradcheck(layer, x)
+
+
+def test_rounded_weights_follow_the_weights():
+    layer = RowLinear(4, 3)
+    before = rounded_weights(layer, torch.bfloat16)
+    assert rounded_weights(layer, torch.bfloat16)[0] is before[0]
+    assert rounded_weights(layer, torch.float32)[0] is layer.weight
+    with torch.no_grad():
+        layer.weight.mul_(2)
+    after = rounded_weights(layer, torch.bfloat16)
+    assert after[0] is before[0]  # the same memory: a captured graph reads the new values
+    assert_same_bits(after[0], layer.weight.detach().bfloat16())
+    layer.load_state_dict(RowLinear(4, 3).state_dict())
+    assert_same_bits(rounded_weights(layer, torch.bfloat16)[0], layer.weight.detach().bfloat16())
+    assert_same_bits(rounded_weights(layer, torch.float16)[0], layer.weight.detach().half())
+    with torch.inference_mode():
+        assert_same_bits(rounded_weights(layer, torch.bfloat16)[0], layer.weight.detach().bfloat16())
+    assert set(layer.state_dict()) == {"weight", "bias"}
+
+
+def test_weights_are_rounded_at_once(device, monkeypatch):
+    layers = [RowLinear(4, 3).to(device), RowLinear(3, 5, bias=False).to(device), RowLinear(2, 2).to(device)]
+    rounded_weights(layers[2], torch.bfloat16)
+    calls, copy = [], torch._foreach_copy_
+    monkeypatch.setattr(torch, "_foreach_copy_", lambda to, of: (calls.append(len(to)), copy(to, of)))
+    for expected in ([3], [3, 3]):
+        with rounded_at_once(layers, torch.bfloat16):
+            for layer in layers:
+                weight, bias = rounded_weights(layer, torch.bfloat16)
+                assert_same_bits(weight, layer.weight.detach().bfloat16())
+                assert bias is None if layer.bias is None else torch.equal(bias, layer.bias.bfloat16())
+        assert calls == expected
+        with torch.no_grad():
+            layers[0].weight.mul_(2), layers[1].weight.mul_(2), layers[0].bias.add_(1)
+    assert_same_bits(rounded_weights(layers[0], torch.bfloat16)[0], layers[0].weight.detach().bfloat16())
+    with rounded_at_once(layers, torch.float32):
+        assert rounded_weights(layers[0], torch.float32)[0] is layers[0].weight
+
+
+def test_products_follow_autocast_on_cuda_only():
+    with torch.autocast("cpu", torch.bfloat16):
+        assert product_dtype(torch.ones(2, 2)) == torch.float32
+    assert product_dtype(torch.ones(2, 2, dtype=torch.float64)) == torch.float64
+
+
+@pytest.mark.parametrize("n", [3, 100])
+def test_a_linear_layer_has_the_gradients_of_torchs(n, device):
+    torch.manual_seed(0)
+    layer = RowLinear(24, 7).double().to(device)
+    x = rows(n, dtype=torch.float64).to(device).requires_grad_()
+    results = []
+    for f in (layer, lambda x: torch.nn.functional.linear(x, layer.weight, layer.bias)):
+        out = f(x)
+        results.append([out, *torch.autograd.grad(out.sin().sum(), [x, layer.weight, layer.bias])])
+    for a, b in zip(*results, strict=True):
+        assert_close_relative_to_max(a, b, 1e-13)
+
+
+@pytest.mark.parametrize("training", [False, True])
+def test_activation_behind_batch_norm(training, device):
+    torch.manual_seed(0)
+    layer = RowBatchNorm(24).double().to(device).train(training)
+    torch.nn.init.normal_(layer.weight), torch.nn.init.normal_(layer.bias)
+    x = rows(60, dtype=torch.float64).to(device).requires_grad_()
+    results = []
+    for f in (layer.activated, lambda x: torch.nn.functional.gelu(layer(x))):
+        out = f(x)
+        results.append([out, *torch.autograd.grad(out.sin().sum(), [x, layer.weight, layer.bias])])
+    for a, b in zip(*results, strict=True):
+        assert_close_relative_to_max(a, b, 1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_layers_under_autocast_err_no_more_than_torchs(dtype, devices):
+    torch.manual_seed(0)
+    linear, norm = RowLinear(24, 40).to(devices[1]), RowBatchNorm(40).to(devices[1])
+    x = rows(200).to(devices[1]).requires_grad_()
+    inputs = [x, linear.weight, linear.bias, norm.weight, norm.bias]
+
+    def run(f):
+        out = f(x)
+        return [out, *torch.autograd.grad(out.float().square().sum(), inputs)]
+
+    exact = run(lambda x: torch.nn.functional.gelu(norm(torch.nn.functional.linear(x, linear.weight, linear.bias))))
+    with torch.autocast("cuda", dtype):
+        ours = run(lambda x: norm.activated(linear(x)))
+        torchs = run(lambda x: torch.nn.functional.gelu(norm(torch.nn.functional.linear(x, linear.weight, linear.bias))))
+    for a, b, truth in zip(ours, torchs, exact, strict=True):
+        error, allowed = ((t.float() - truth).abs().max().item() for t in (a, b))
+        assert error <= 2 * allowed + 1e-3 * truth.abs().max().item()

@@ -7,6 +7,7 @@ backward pass in as few launches.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from gsim3d.layers import rounded_weights, row_linear
+from gsim3d.layers import linear_grads, rounded_weights, row_linear
 from gsim3d.ops.curve import PatchTable, Stage
 
 _ops = torch.ops.gsim3d
@@ -88,12 +89,6 @@ class Kept(NamedTuple):
     activated: Tensor
 
 
-def product_dtype(x: Tensor) -> torch.dtype:
-    """The dtype of matrix products of ``x``."""
-    follows = x.is_cuda and x.dtype != torch.float64 and torch.is_autocast_enabled("cuda")
-    return torch.get_autocast_dtype("cuda") if follows else x.dtype
-
-
 def run_block(block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keeps: list, recompute: bool):
     """(x, what the next convolution reads) behind a ``point_transformer.Block``.
 
@@ -138,15 +133,7 @@ def _forward(plan: Plan, w: Weights, x: Tensor, conv_input: Tensor, keep_attenti
 
 
 def _heads(qkv: Tensor, heads: int) -> tuple[Tensor, ...]:
-    return qkv.view(qkv.shape[0], 3, heads, -1).unbind(1)
-
-
-def _linear_grads(grad: Tensor, x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of input and weight of ``x @ weight.T``; the second in the dtype of sums."""
-    wide = torch.promote_types(grad.dtype, torch.float32)
-    if wide == grad.dtype:
-        return grad @ weight, grad.t() @ x
-    return grad @ weight, torch.mm(grad.t(), x, out_dtype=wide)
+    return qkv.view(qkv.shape[0], 3, heads, qkv.shape[1] // (3 * heads)).unbind(1)
 
 
 def _backward(plan: Plan, w: Weights, kept: Kept, conv_input: Tensor, keep_attention, keep_mlp, grad_sum, grad_out):
@@ -155,32 +142,37 @@ def _backward(plan: Plan, w: Weights, kept: Kept, conv_input: Tensor, keep_atten
     grad2, grad_branch, fc2_bias, *_ = _ops.residual_norm_backward.default(
         grad_sum, grad_out, kept.normed2, kept.sum2, keep_mlp, None, None, kept.stats2[:0], kept.stats2[:0]
     )
-    grad_activated, fc2 = _linear_grads(grad_branch, kept.activated, w.fc2)
-    grad_hidden = torch.ops.aten.gelu_backward.default(grad_activated, kept.hidden)
-    grad_normed, fc1 = _linear_grads(grad_hidden, kept.normed2, w.fc1)
-    fc1_bias = _ops.linear_grad_bias.default(grad_hidden)
+    grad_activated, fc2 = linear_grads(grad_branch, kept.activated, w.fc2)
+    zero, one = _zeros_and_ones(w.fc1.shape[0], grad2.dtype, grad2.device)
+    grad_hidden, _, fc1_bias = _ops.norm_gelu_backward.default(grad_activated, kept.hidden, zero, one, zero)
+    grad_normed, fc1 = linear_grads(grad_hidden, kept.normed2, w.fc1)
 
     grad1, grad_branch, proj_bias, _, _, norm2, norm2_bias = _ops.residual_norm_backward.default(
         grad2, grad_normed, kept.normed2, kept.sum2, keep_attention, None, w.norm2, kept.stats2[:0], kept.stats2
     )
-    grad_attended, proj = _linear_grads(grad_branch, kept.attended.flatten(1), w.proj)
+    grad_attended, proj = linear_grads(grad_branch, kept.attended.flatten(1), w.proj)
     q, k, v = _heads(kept.qkv, plan.heads)
     grads = _ops.patch_attention_backward.default(
         grad_attended.view(q.shape), q, k, v, kept.attended, kept.attention_stats, *plan.table(), q.shape[-1] ** -0.5
     )
     grad_qkv = torch.stack(grads, 1).flatten(1)
-    grad_normed, qkv = _linear_grads(grad_qkv, kept.normed1, w.qkv)
+    grad_normed, qkv = linear_grads(grad_qkv, kept.normed1, w.qkv)
     qkv_bias = _ops.linear_grad_bias.default(grad_qkv)
 
     grad_x, grad_position, linear_bias, *of_norms = _ops.residual_norm_backward.default(
         grad1, grad_normed, kept.position, kept.sum1, None, w.position_norm, w.norm1, kept.position_stats, kept.stats1
     )
-    grad_place, linear = _linear_grads(grad_position, kept.place, w.linear)
+    grad_place, linear = linear_grads(grad_position, kept.place, w.linear)
     grad_input = _ops.sparse_conv_grad_input.default(grad_place, w.conv, *plan.geometry(), plan.conv_plan())
     conv, conv_bias = _ops.sparse_conv_grad_weight.default(grad_place, conv_input, plan.kernel_size, *plan.geometry())
-    wide = grad_x.dtype
-    of_layers = conv.to(wide), conv_bias.to(wide), linear, linear_bias, qkv, qkv_bias, proj, proj_bias, fc1, fc1_bias, fc2
+    of_layers = conv, conv_bias, linear, linear_bias, qkv, qkv_bias, proj, proj_bias, fc1, fc1_bias, fc2
     return grad_x, grad_input, *of_layers, fc2_bias, *of_norms, norm2, norm2_bias
+
+
+@functools.lru_cache(maxsize=None)
+def _zeros_and_ones(n: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Mean and scale of a normalisation that changes nothing."""
+    return torch.zeros(n, dtype=dtype, device=device), torch.ones(n, dtype=dtype, device=device)
 
 
 class _Block(torch.autograd.Function):

@@ -14,8 +14,8 @@ from torch.utils.checkpoint import checkpoint
 
 from gsim3d import ops
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
-from gsim3d.dynamics.fused_block import product_dtype, run_block
-from gsim3d.layers import RowLayerNorm, RowLinear, make_norm, widened
+from gsim3d.dynamics.fused_block import run_block
+from gsim3d.layers import RowLayerNorm, RowLinear, make_norm, product_dtype, rounded_at_once, rounded_weights, widened
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
 TIME_EMBEDDING_STD = 0.02
@@ -34,10 +34,10 @@ class SparseConv(nn.Module):
         self.bias = nn.Parameter(torch.empty(out_channels).uniform_(-bound, bound)) if bias else None
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
-        kernel_map = stage.kernel_maps[self.kernel_size]
-        return ops.sparse_conv(
-            x, self.weight, self.bias, stage.voxels, kernel_map, duplicates=self.duplicates, check=False
-        )
+        kernel_map, weight, bias = stage.kernel_maps[self.kernel_size], self.weight, self.bias
+        if x.is_cuda and not torch.is_grad_enabled() and not torch.compiler.is_compiling():
+            weight, bias = rounded_weights(self, product_dtype(x))
+        return ops.sparse_conv(x, weight, bias, stage.voxels, kernel_map, duplicates=self.duplicates, check=False)
 
 
 class PositionEncoding(nn.Module):
@@ -161,6 +161,7 @@ def run_blocks(
     blocks: nn.ModuleList, x: Tensor, conv_input: Tensor, stage: Stage, generator: torch.Generator | None
 ) -> Tensor:
     """x behind ``blocks``; the first convolution reads ``conv_input``, the others what the block before them made."""
+    x = widened(x)
     for i, block in enumerate(blocks):
         row = i % len(stage.patches)
         if block.is_fused(x):
@@ -180,7 +181,7 @@ class Stem(nn.Module):
         self.norm = make_norm(config.norm, channels)
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
-        return F.gelu(self.norm(self.conv(x, stage)))
+        return self.norm.activated(self.conv(x, stage))
 
 
 class Pool(nn.Module):
@@ -193,7 +194,7 @@ class Pool(nn.Module):
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
         cluster = stage.cluster
-        return F.gelu(self.norm(ops.pool_max(self.proj(x), cluster.rows, cluster.cu_rows, check=False)))
+        return self.norm.activated(ops.pool_max(self.proj(x), cluster.rows, cluster.cu_rows, check=False))
 
 
 class Merge(nn.Module):
@@ -242,8 +243,8 @@ class Unpool(nn.Module):
 
     def forward(self, x: Tensor, skip: Tensor, coarse: Stage) -> tuple[Tensor, Tensor]:
         """Both together, and the skip branch alone."""
-        below = F.gelu(self.proj_norm(self.proj(x)))
-        skip = F.gelu(self.skip_norm(self.skip(skip)))
+        below = self.proj_norm.activated(self.proj(x))
+        skip = self.skip_norm.activated(self.skip(skip))
         cluster = coarse.cluster
         return skip + ops.unpool(below, cluster.rows, cluster.cu_rows, skip.shape[0], check=False), skip
 
@@ -297,8 +298,16 @@ class PointTransformer(nn.Module):
         rates = linear_rates(config.drop_path, config.decoder_depths)
         self.decoder = nn.ModuleList(DecoderStage(s, rates[s][::-1], config) for s in range(config.n_stages - 1))
         self.head = Head((*config.decoder_channels, config.encoder_channels[-1])[0], out_channels, config.zero_init)
+        parts = (self.encoder, self.decoder)
+        self._products = [m for part in parts for m in part.modules() if isinstance(m, (RowLinear, SparseConv))]
 
     def forward(self, x: Tensor, pyramid: Pyramid, *, generator: torch.Generator | None = None) -> Tensor:
+        if not x.is_cuda or torch.compiler.is_compiling():
+            return self._compute(x, pyramid, generator)
+        with rounded_at_once(self._products, product_dtype(x)):
+            return self._compute(x, pyramid, generator)
+
+    def _compute(self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None) -> Tensor:
         stages = pyramid.stages
         x = self.stem(x, stages[0])
         skips = []

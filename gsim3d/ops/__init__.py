@@ -23,7 +23,7 @@ from gsim3d.ops.patch_attn import patch_attention
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
 from gsim3d.ops.raster import Rendering, rasterize_gaussians
-from gsim3d.ops.row_norm import residual_norm, row_norm
+from gsim3d.ops.row_norm import norm_gelu, residual_norm, row_norm
 from gsim3d.ops.sentinel import Watched, watch_rows
 from gsim3d.ops.sparse_conv import sparse_conv
 
@@ -43,6 +43,7 @@ __all__ = [
     "cuda_compiled",
     "curve_encode",
     "curve_sort",
+    "norm_gelu",
     "patch_attention",
     "plane_sweep",
     "pool_max",

@@ -61,6 +61,8 @@ def within_memory(op: str, what: str, kernel, *arguments):
     """``kernel(*arguments)``. Raises MemoryError, naming the argument ``what``, where its result finds no room."""
     try:
         return kernel(*arguments)
+    except MemoryError:  # of a list that the kernel makes
+        raise MemoryError(f"{op}: there is no memory for the result of {what}") from None
     except RuntimeError as error:
         if "new_empty" in str(error) and not torch.compiler.is_compiling():  # torch's allocator, which says no more
             raise MemoryError(f"{op}: there is no memory for the result of {what}") from None

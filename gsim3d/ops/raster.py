@@ -11,19 +11,20 @@ from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_real, check_tensors, check_whole, within_memory
-from gsim3d.stability import LARGEST, Finding, OnBad, Reading, StabilityReport, check_on_bad
+from gsim3d.stability import Finding, OnBad, Reading, StabilityReport, check_on_bad
 from gsim3d.types import Cameras
 
 OP = "rasterize_gaussians"
+LARGEST = 1e15  # kLargest of csrc/gsim3d/raster/raster_math.h
 CUTOFFS = {"exact": 0, "tile3sigma": 1, "smooth": 2}
 # RasterFault of csrc/gsim3d/raster/raster.h
 FAULTS = (
+    "not finite or beyond 1e15",
     "not finite",
-    "not finite",
-    "negative or not finite",
+    "negative, not finite or beyond 1e15",
     "outside [0, 1]",
-    "not finite",
-    "not finite",
+    "not finite or beyond 1e15",
+    "not finite or beyond 1e15",
     "too large, the projection overflows",
     "too large, together they touch 2^31 tiles or more",
     "not a camera, or it shows no cloud",
@@ -102,8 +103,8 @@ def rasterize_gaussians(
     GPU: nothing waits for the device. Its memory is made for Gaussians of a few pixels and clouds shown by equally many
         images; what exceeds it is rendered in further groups of images, slower.
     Raises:
-        HardCaseError: ``on_bad`` is "raise" on the CPU, and a number is not finite, an opacity outside [0, 1], a scale
-            negative, or a projection overflows; names argument, row and camera.
+        HardCaseError: ``on_bad`` is "raise" on the CPU, and a number is not finite or beyond 1e15 (rotations: of any
+            length), an opacity outside [0, 1], a scale negative, or a projection overflows; names argument, row and camera.
         ValueError: a shape, dtype, offset or camera is not as above. On a GPU an image whose camera or cloud is not
             shows its background, and a background that is not finite is black.
     Source: Zwicker et al. 2002 (EWA splatting), Kerbl et al. 2023 (3D Gaussian splatting); conventions of gsplat.
@@ -187,13 +188,14 @@ def _unusable(numbers: Tensor, names: Sequence[str], action: str) -> Reading:
 
 def _clamped(rows: dict[str, Tensor], report: StabilityReport | None) -> dict[str, Tensor]:
     """Rows with finite numbers in range, counted."""
-    bounds = {"opacities": (0.0, 1.0), "scales": (0.0, LARGEST)}
     bounded, bad = {}, []
     for name, value in rows.items():
+        largest = min(LARGEST, torch.finfo(value.dtype).max)
         neutral = torch.zeros_like(value)
         if name == "quats":
             neutral[:, 0] = 1
-        bounded[name] = torch.where(value.isnan(), neutral, value).clamp(*bounds.get(name, (-LARGEST, LARGEST)))
+        bounds = {"opacities": (0.0, 1.0), "scales": (0.0, largest)}
+        bounded[name] = torch.where(value.isnan(), neutral, value).clamp(*bounds.get(name, (-largest, largest)))
         bad.append((bounded[name] != value.detach())[..., None].flatten(1).any(1))
     if report is not None and not torch.compiler.is_compiling():
         counts = torch.stack(bad).sum(1)
@@ -287,15 +289,23 @@ def _(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, st
 
 
 def _setup(ctx, inputs, output):
+    ctx.set_materialize_grads(False)  # else what is kept for the backward pass gets a gradient of zeros as large
     ctx.mark_non_differentiable(*output[4:])
     ctx.save_for_backward(*output[4:7], *inputs[:11])
     ctx.options = inputs[11:18]
 
 
-def _backward(ctx, grad_color, grad_alpha, grad_depth, grad_features, *_kept):
+def _backward(ctx, *grads):
+    saved = ctx.saved_tensors  # read once: a checkpoint gives them once
+    transmittance, features = saved[0], saved[8]
+    sizes = ((3,), (), (), features.shape[1:])  # of color, alpha, depth, features
+    images = [
+        transmittance.new_zeros(*transmittance.shape, *size) if grad is None else grad
+        for grad, size in zip(grads, sizes, strict=False)
+    ]
     viewmats_grad = ctx.needs_input_grad[7]
     *grads, viewmats = torch.ops.gsim3d.rasterize_gaussians_backward(
-        grad_color, grad_alpha, grad_depth, grad_features, *ctx.saved_tensors, *ctx.options, viewmats_grad
+        *images, *saved, *ctx.options, viewmats_grad
     )
     return (*grads, viewmats if viewmats_grad else None, *[None] * 11)
 

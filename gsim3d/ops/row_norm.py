@@ -1,4 +1,4 @@
-"""Layer normalisation of packed rows, with the residual sums around it."""
+"""Normalisations of packed rows, with the residual sums and activations around them."""
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ def row_norm(
         x: [N, C], float32 or float64, on CUDA also float16 and bfloat16 (computed in float32) and then C at most 1024.
         weight, bias: [C], float32; float64 with float64 rows.
         residual: [N, C] or None.
-        eps: positive, keeps rows of equal values finite.
+        eps: at least 1e-30, keeps rows of equal values finite.
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [N, C], dtype of ``residual``, else of ``x``. Under ``torch.autocast`` CUDA returns autocast's dtype where there is
@@ -149,8 +149,9 @@ def _residual_setup(ctx, inputs, output):
 def _residual_backward(ctx, grad_sum, grad_out, *_):
     if grad_sum is None and grad_out is None:
         return (None,) * 8
-    branch_weight, weight = ctx.saved_tensors[3:5]
-    x, branch, _, *of_norms = torch.ops.gsim3d.residual_norm_backward(grad_sum, grad_out, *ctx.saved_tensors)
+    saved = ctx.saved_tensors  # read once: a checkpoint gives them once
+    branch_weight, weight = saved[3:5]
+    x, branch, _, *of_norms = torch.ops.gsim3d.residual_norm_backward(grad_sum, grad_out, *saved)
     given = [w is not None for w in (branch_weight, branch_weight, weight, weight)]
     return x, branch, None, *(g if has else None for g, has in zip(of_norms, given, strict=True)), None
 
@@ -175,6 +176,68 @@ def _autocast(device: str):
     return rule
 
 
+def norm_gelu(x: Tensor, mean: Tensor, scale: Tensor, bias: Tensor, *, check: bool = True) -> Tensor:
+    """Normalises the channels by values given and applies the activation: ``gelu((x - mean) * scale + bias)``.
+
+    Args:
+        x: [N, C], float32 or float64, on CUDA also float16 and bfloat16 (computed in float32).
+        mean, scale, bias: [C], float32; float64 with float64 rows.
+        check: as in :func:`row_norm`.
+    Returns:
+        [N, C], float32; float64 with float64 rows.
+    Gradients: all arguments, once; sums over rows have one order.
+    Raises:
+        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        ValueError, TypeError: an argument is malformed; the message names it.
+    Source: Ioffe & Szegedy 2015, Batch Normalization; Hendrycks & Gimpel 2016, GELU (the exact one).
+
+    Example:
+        >>> norm_gelu(torch.tensor([[3.0]]), torch.tensor([1.0]), torch.tensor([0.5]), torch.zeros(1)).round(decimals=3)
+        tensor([[0.8410]])
+    """
+    if check:
+        tensors = {"x": x, "mean": mean, "scale": scale, "bias": bias}
+        check_tensors("norm_gelu", **tensors)
+        check_numbers("norm_gelu", **tensors)
+    return torch.ops.gsim3d.norm_gelu(x, mean, scale, bias, scale.dtype)
+
+
+@torch.library.register_fake("gsim3d::norm_gelu")
+def _(x, mean, scale, bias, dtype):
+    return x.new_empty(x.shape, dtype=dtype)
+
+
+@torch.library.register_fake("gsim3d::norm_gelu_backward")
+def _(grad, x, mean, scale, bias):
+    return x.new_empty(x.shape), scale.new_empty(scale.shape), scale.new_empty(scale.shape)
+
+
+def _gelu_setup(ctx, inputs, output):
+    ctx.save_for_backward(*inputs[:4])
+
+
+def _gelu_backward(ctx, grad):
+    saved = ctx.saved_tensors
+    x, scale, bias = torch.ops.gsim3d.norm_gelu_backward(grad, *saved)
+    return x, -saved[2] * bias, scale, bias, None
+
+
+torch.library.register_autograd("gsim3d::norm_gelu", _gelu_backward, setup_context=_gelu_setup)
+
+
+def _gelu_autocast(device: str):
+    keys = torch._C.DispatchKeySet(getattr(torch._C.DispatchKey, f"Autocast{device.upper()}"))
+
+    def rule(x, *others):
+        if x.dtype != torch.float64:
+            x = x.float() if device == "cpu" else x
+            others = [t.float() if isinstance(t, Tensor) else t for t in others]
+        with torch._C._ExcludeDispatchKeyGuard(keys):
+            return torch.ops.gsim3d.norm_gelu(x, *others)
+
+    return rule
+
+
 def _residual_autocast(device: str):
     keys = torch._C.DispatchKeySet(getattr(torch._C.DispatchKey, f"Autocast{device.upper()}"))
 
@@ -191,3 +254,4 @@ def _residual_autocast(device: str):
 for _device in ("cpu", "cuda"):
     _library.impl("row_norm", _autocast(_device), f"Autocast{_device.upper()}")
     _library.impl("residual_norm", _residual_autocast(_device), f"Autocast{_device.upper()}")
+    _library.impl("norm_gelu", _gelu_autocast(_device), f"Autocast{_device.upper()}")

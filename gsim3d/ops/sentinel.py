@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._arguments import check_real, check_tensors
 from gsim3d.stability import LARGEST
 
 # As in csrc/gsim3d/sentinel/sentinel.h
@@ -64,7 +65,7 @@ def watch_rows(
         Watched, on the device of the rows.
     Gradients: none. Determinism: equal bits for any number of threads; on a GPU from run to run.
     Raises:
-        ValueError: an argument is malformed; the message names it. On a GPU offsets are not looked at.
+        ValueError, TypeError: an argument is malformed; the message names it. On a GPU offsets are not looked at.
 
     Example:
         >>> means, zero = torch.tensor([[0.5, 0.5, 0.5], [0.5, float("nan"), 0.5]]), torch.zeros(1, dtype=torch.int64)
@@ -73,7 +74,11 @@ def watch_rows(
         >>> watched.status.tolist(), watched.record[0, :2].tolist()
         ([0, 1], [1.0, 1.0])
     """
-    low, high = zip(*bounds)
+    clouds = {"cu_rows": cu_rows, "cloud_scene": cloud_scene, "origin": origin, "activity": activity}
+    if not torch.compiler.is_compiling():
+        _check_arguments(fields, bounds, clouds if previous is None else {**clouds, "previous": previous})
+        check_real("watch_rows", grid_size=grid_size, max_step=max_step)
+    low, high = ([pair[end] for pair in bounds] for end in (0, 1))
     fields = [field.detach() for field in fields]
     previous = None if previous is None else previous.detach()
     return Watched(
@@ -81,6 +86,20 @@ def watch_rows(
             fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_size, max_step
         )
     )
+
+
+def _check_arguments(fields: Sequence[Tensor], bounds: Sequence[tuple[float, float]], others: dict[str, Tensor]) -> None:
+    """Types, and the number of bounds; shapes and dtypes are the kernel's."""
+    for name, value in {"fields": fields, "bounds": bounds}.items():
+        if not isinstance(value, (tuple, list)):
+            raise TypeError(f"watch_rows: {name} must be a tuple or a list; got {type(value).__name__}")
+    check_tensors("watch_rows", **{f"fields[{f}]": field for f, field in enumerate(fields)}, **others)
+    if len(bounds) != len(fields):
+        raise ValueError(f"watch_rows: bounds must be one pair for each of {len(fields)} fields; got {len(bounds)}")
+    for f, pair in enumerate(bounds):
+        if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+            raise TypeError(f"watch_rows: bounds[{f}] must be a pair (lowest, highest); got {pair!r}")
+        check_real("watch_rows", **{f"bounds[{f}][{end}]": value for end, value in enumerate(pair)})
 
 
 @torch.library.register_fake("gsim3d::watch_rows")

@@ -5,9 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import Dynamics, fused_block
-from gsim3d.dynamics.point_transformer import Block
-from gsim3d.layers import RowLinear, rounded_weights
+from gsim3d.dynamics import Dynamics
+from gsim3d.dynamics.point_transformer import Block, run_blocks
 from gsim3d.ops import PyramidSpec, build_pyramid
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, make_history
@@ -63,6 +62,17 @@ def test_equals_the_modules(n_rows, own_conv_input, drop, device):
     plain, fused = (run(block, way, stage, drop=drop, own_conv_input=own_conv_input) for way in (False, True))
     for name, a, b in zip(names(block), fused, plain, strict=True):
         assert_close_relative_to_max(a, b, "fused_block_float64", name)
+
+
+@pytest.mark.parametrize("checkpointing", [False, True])
+def test_no_rows_at_all(checkpointing, device):
+    block, stage = block_of(device=device, checkpointing=checkpointing), stage_of(0, device)
+    out, *grads = run(block, True, stage, drop=True)
+    assert out.shape == (0, CHANNELS) and grads[0].shape == (0, CHANNELS)
+    for name, grad in zip(names(block)[2:], grads[1:], strict=True):
+        assert not grad.any(), name
+    with torch.no_grad():
+        assert block(out, stage, 0).shape == (0, CHANNELS)
 
 
 def test_computing_again_changes_no_bit(device):
@@ -130,25 +140,40 @@ def test_the_whole_network_equals_its_modules_on_a_gpu(devices):
         assert_close_relative_to_max(a, b, "fused_network_float32")
 
 
-def test_rounded_weights_follow_the_weights():
-    layer = RowLinear(4, 3)
-    before = rounded_weights(layer, torch.bfloat16)
-    assert rounded_weights(layer, torch.bfloat16)[0] is before[0]
-    assert rounded_weights(layer, torch.float32)[0] is layer.weight
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("norm", ["layer", "batch"])
+@pytest.mark.parametrize("sizes", [(60, 50), (0, 50), (0, 0)])
+def test_the_residual_stream_is_float32_under_autocast(sizes, norm, dtype, device):
+    """Whatever dtype the layers before the first block compute in."""
+    history = make_history(sizes).to(device)
+    torch.manual_seed(0)
+    model = Dynamics(dataclasses.replace(TINY, norm=norm)).to(device).eval()
+    seen = []
+    for module in model.modules():
+        if isinstance(module, Block):
+            module.fused = True
+            module.norm1.register_forward_pre_hook(lambda *_: pytest.fail("not fused"))
+    for pool in [encoder.pool for encoder in model.net.encoder if encoder.pool is not None]:
+        pool.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].dtype))
+    exact = model(history)
+    with torch.autocast(device.type, dtype):
+        step = model(history)
+    assert seen and set(seen) == {torch.float32}
+    assert step.means.dtype == step.dynamic_latents.dtype == torch.float32
+    assert_close_relative_to_max(step.dynamic_latents, exact.dynamic_latents, 0.1)
+    for grad in torch.autograd.grad(step.means.sum() + step.dynamic_latents.square().sum(), list(model.parameters())):
+        assert grad.dtype == torch.float32 and torch.isfinite(grad).all()
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_blocks_take_rows_in_16_bits(fused, device):
+    """As layers without a norm in float32 before them leave them."""
+    block, stage = block_of(torch.float32, device), stage_of(device=device)
+    block.fused = fused
+    x = torch.randn(stage.n_rows, CHANNELS, generator=torch.Generator().manual_seed(1)).to(device)
     with torch.no_grad():
-        layer.weight.mul_(2)
-    after = rounded_weights(layer, torch.bfloat16)
-    assert after[0] is before[0]  # the same memory: a captured graph reads the new values
-    assert_same_bits(after[0], layer.weight.detach().bfloat16())
-    layer.load_state_dict(RowLinear(4, 3).state_dict())
-    assert_same_bits(rounded_weights(layer, torch.bfloat16)[0], layer.weight.detach().bfloat16())
-    assert_same_bits(rounded_weights(layer, torch.float16)[0], layer.weight.detach().half())
-    with torch.inference_mode():
-        assert_same_bits(rounded_weights(layer, torch.bfloat16)[0], layer.weight.detach().bfloat16())
-
-
-def test_products_follow_autocast_on_cuda_only():
-    x = torch.ones(2, 2)
-    with torch.autocast("cpu", torch.bfloat16):
-        assert fused_block.product_dtype(x) == torch.float32
-    assert fused_block.product_dtype(x.double()) == torch.float64
+        expected = run_blocks([block], x.bfloat16().float(), x.bfloat16().float(), stage, None)
+        with torch.autocast(device.type, torch.bfloat16):
+            out = run_blocks([block], x.bfloat16(), x.bfloat16(), stage, None)
+    assert out.dtype == torch.float32
+    assert_close_relative_to_max(out, expected, 0.05)

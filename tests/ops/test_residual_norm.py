@@ -5,6 +5,7 @@ import itertools
 import pytest
 import torch
 
+from gsim3d.errors import HardCaseError
 from gsim3d.ops import residual_norm
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
 from tests.oracle import row_norm as oracle
@@ -217,15 +218,25 @@ def test_no_rows_no_channels_and_one_value(shape, parts, device):
         assert shape[0] or not result.any()
 
 
-def test_a_row_does_not_depend_on_the_rows_it_is_packed_with(device):
-    x, branch, keep, *weights = (t.to(device) for t in inputs(130, 48, dtype=torch.float32))
-    run = lambda rows: residual_norm(  # noqa: E731
-        x[rows], branch[rows], keep=keep[rows], branch_norm=weights[:2], norm=weights[2:]
+@pytest.mark.parametrize("channels", [48, 19])
+def test_a_row_does_not_depend_on_the_rows_it_is_packed_with(channels, device):
+    x, branch, keep, *weights = (t.to(device) for t in inputs(130, channels, dtype=torch.float32))
+    run = lambda rows, **kw: residual_norm(  # noqa: E731
+        x[rows], branch[rows], keep=keep[rows], branch_norm=weights[:2], norm=weights[2:], **kw
     )
     alone = run(slice(77, 78))
-    x[3] = float("nan")
     for a, b in zip(run(slice(None)), alone, strict=True):
         assert_same_bits(a[77:78], b)
+    x[3] = float("nan")
+    for a, b in zip(run(slice(None), check=False), alone, strict=True):
+        assert_same_bits(a[77:78], b)
+
+
+def test_poison_is_refused_on_the_cpu():
+    x, branch = inputs(dtype=torch.float32, parts=(False,) * 3)
+    branch[5, 2] = float("inf")
+    with pytest.raises(HardCaseError, match="residual_norm: branch must be finite .* got inf in row 5"):
+        residual_norm(x, branch)
 
 
 def test_non_contiguous_and_unaligned_inputs(device):
@@ -264,11 +275,12 @@ def test_autocast_on_the_cpu_computes_in_float32():
         (dict(branch=torch.zeros(3, 4, dtype=torch.float64)), "x must be float64; got float32"),
         (dict(keep=torch.zeros(3)), r"keep must be \[N, 1\] = \[3, 1\]; got \[3\]"),
         (dict(norm=(torch.ones(4), torch.ones(5))), r"bias must be \[C\] = \[4\]; got \[5\]"),
-        (dict(branch_norm=(torch.ones(4), None)), "needs both a weight and a bias"),
-        (dict(eps=0.0), "eps must be positive; got 0"),
+        (dict(branch_norm=(torch.ones(4), None)), r"branch_norm\[1\] must be a tensor; got NoneType"),
+        (dict(norm=torch.ones(2, 4)), r"norm must be a pair \(weight, bias\); got Tensor"),
+        (dict(eps=0.0), "eps must be at least 1e-30; got 0"),
     ],
 )
 def test_malformed_arguments_raise(wrong, message):
     good = dict(x=torch.zeros(3, 4), branch=torch.zeros(3, 4))
-    with pytest.raises(ValueError, match=f"residual_norm: .*{message}"):
+    with pytest.raises((ValueError, TypeError), match=f"residual_norm: .*{message}"):
         residual_norm(**(good | wrong))

@@ -198,7 +198,7 @@ def test_autocast_on_the_cpu_computes_in_float32():
         (dict(weight=torch.ones(5)), r"weight must be \[C\] = \[4\]; got \[5\]"),
         (dict(bias=torch.ones(4, dtype=torch.float64)), "bias must be float32; got float64"),
         (dict(residual=torch.zeros(2, 4)), r"residual must be \[N, C\] like x = \[3, 4\]; got \[2, 4\]"),
-        (dict(eps=0.0), "eps must be positive; got 0"),
+        (dict(eps=0.0), "eps must be at least 1e-30; got 0"),
         (dict(residual=torch.zeros(3, 4, dtype=torch.float64)), "must be float32 or float64; got float32 and float64"),
     ],
 )

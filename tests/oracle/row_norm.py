@@ -17,3 +17,8 @@ def residual_norm(x, branch, keep, branch_norm, norm, eps=1e-5):
     branch = branch if branch_norm is None else row_norm(branch, *branch_norm, eps=eps)
     total = x + (branch if keep is None else keep * branch)
     return total, total if norm is None else row_norm(total, *norm, eps=eps)
+
+
+def norm_gelu(x, mean, scale, bias):
+    y = (x - mean) * scale + bias
+    return y * (1 + torch.erf(y / 2**0.5)) / 2

@@ -282,6 +282,61 @@ def test_a_guard_compiles():
             assert_same_bits(a, b)
 
 
+def spoiled_frames(device, value=NAN):
+    """Two scenes; one pixel of the last image of the first step of scene 0, which becomes a particle, is no number."""
+    frames = make_frames(SCENES)
+    kept = frames.masks[1].nonzero()[3]
+    images = frames.images.clone()
+    images[1, 1, kept[0], kept[1]] = value
+    row = int(frames.masks[0].sum()) + 3
+    return dataclasses.replace(frames, images=images).to(device), row
+
+
+def test_a_pixel_that_is_no_number(simulator, device):
+    frames, row = spoiled_frames(device)
+    with pytest.raises(
+        HardCaseError, match=r"images must be finite; image 1 \(scene 0, step 0\) is not; on_bad=\"drop\""
+    ) as caught:
+        simulator.encode(frames)
+    assert (caught.value.tensor, caught.value.camera) == ("images", 1)
+    black = dataclasses.replace(frames, images=frames.images.nan_to_num(0.0))
+    with torch.no_grad():
+        expected = simulator.encode(black)
+        report = StabilityReport()
+        dropped = simulator.encode(frames, on_bad="drop", report=report)
+        clamped = simulator.encode(frames, on_bad="clamp", report=report)
+    assert [(f.tensor, f.action, f.count, f.scene, f.step, f.camera) for f in report.findings] == [
+        ("frames.images", action, 1, 0, 0, 1) for action in ("dropped", "clamped")
+    ]
+    assert_same_bits(clamped.dynamic_latents, expected.dynamic_latents)
+    assert_same_bits(clamped.activity, expected.activity)
+    assert_same_bits(dropped.means, expected.means)
+    assert (dropped.activity == ASLEEP).nonzero()[:, 0].tolist() == [row] and float(dropped.opacities[row]) == 0
+
+
+@pytest.mark.parametrize("on_bad", ["drop", "clamp"])
+def test_gradients_of_spoiled_images_are_finite(simulator, device, on_bad):
+    frames, _ = spoiled_frames(device, INF)
+    images = frames.images.clone().requires_grad_()
+    particles = simulator.encode(dataclasses.replace(frames, images=images), on_bad=on_bad)
+    total = sum(value.float().sum() for name, value in particles.row_fields().items() if name != "activity")
+    for grad in torch.autograd.grad(total, [images, *simulator.encoder.parameters()], allow_unused=True):
+        assert grad is None or bool(torch.isfinite(grad).all())
+
+
+@pytest.mark.parametrize("on_bad", ["raise", "drop", "clamp"])
+def test_a_camera_that_cannot_see_raises_under_every_policy(simulator, device, on_bad):
+    frames = make_frames((1,)).to(device)
+    near = frames.cameras.near.clone()
+    near[1] = 0
+    frames = dataclasses.replace(frames, cameras=dataclasses.replace(frames.cameras, near=near))
+    with pytest.raises(
+        HardCaseError, match="cameras.near must be positive; image 1 .*; mend its calibration"
+    ) as caught:
+        simulator.encode(frames, on_bad=on_bad)
+    assert (caught.value.tensor, caught.value.camera, caught.value.scene) == ("cameras.near", 1, 0)
+
+
 # ---- the report ------------------------------------------------------------------------------------------------------
 
 

@@ -2,6 +2,9 @@
 
     python tools/bench/end_to_end.py --device cuda
 
+"captured" rows are replays of a CUDA graph of the same call, geometry included, with sizes 1.25 times those needed; the others
+are the calls as Python makes them.
+
 The dynamics read the scene of which the authors' release was once recorded on an H200 (its own network code, spconv 2.3.8,
 random weights, 129 input and 67 output channels, voxels of 4 mm): a ground disc and an ellipsoid that sinks 4 cm a step;
 masked means the ellipsoid alone.
@@ -9,12 +12,15 @@ masked means the ellipsoid alone.
 
 import dataclasses
 import math
+from functools import partial
 
 import torch
 from harness import Bench
 
 from gsim3d import presets
 from gsim3d.dynamics import Dynamics
+from gsim3d.graphs import Captured, CapturedRollout, rounded
+from gsim3d.ops import PyramidCapacity
 from gsim3d.simulator import Simulator
 from gsim3d.types import Cameras, Frames, Particles
 
@@ -52,7 +58,7 @@ def particles_at(means: torch.Tensor, latents: int = 64) -> Particles:
     dynamic, opacity, static = features.split([latents, 1, latents], 1)
     return Particles(
         means=means.reshape(-1, 3),
-        opacities=opacity[:, 0],
+        opacities=opacity[:, 0].sigmoid(),
         dynamic_latents=dynamic,
         static_latents=static,
         cu_rows=torch.arange(0, (n_steps + 1) * n, n, device="cuda"),
@@ -123,19 +129,28 @@ def dynamics(bench: Bench, n_steps: int, masked: bool, dtype: torch.dtype) -> No
     torch.manual_seed(0)
     model = Dynamics(presets.paper_latent(n_steps, 64).dynamics).cuda().eval()
     state = particles_at(recorded_scene(n_steps, 16384 if masked else 65536, 1.0 if masked else 0.2))
-    parameters = list(model.parameters())
+    state = state.with_clouds(state.clouds)
+    inference = model if dtype == torch.float32 else rounded(model, dtype)
+    capacity = PyramidCapacity.of(model.geometry(state), state.n_rows)
 
-    def forward():
+    def forward(model=model, capacity=None):
         with torch.no_grad():
-            return model(state).means
+            return model(state, pyramid=model.geometry(state, capacity=capacity)).means
 
-    def both():
-        out = model(state)
-        return torch.autograd.grad(out.means.sum() + out.dynamic_latents.sum(), parameters, allow_unused=True)
+    def both(capacity=None):
+        out = model(state, pyramid=model.geometry(state, capacity=capacity))
+        return torch.autograd.grad(out.means.sum() + out.dynamic_latents.sum(), list(model.parameters()), allow_unused=True)
 
     name = f"dynamics T={n_steps}, {'16k masked' if masked else '65k'} points a step"
-    for what, f, recorded, target in zip(("fwd", "fwd+bwd"), (forward, both), RECORDED[n_steps, masked], TARGET[n_steps, masked]):
-        measure(bench, f"{name}: {what}", f, dtype, peers={RELEASE: recorded}, target_ratio=round(recorded / target, 1))
+    graphs = partial(forward, inference, capacity), partial(both, capacity)
+    calls = zip(("fwd", "fwd+bwd"), (forward, both), graphs, RECORDED[n_steps, masked], TARGET[n_steps, masked])
+    for what, call, to_capture, recorded, target in calls:
+        numbers = {"peers": {RELEASE: recorded}, "target_ratio": round(recorded / target, 1)}
+        measure(bench, f"{name}: {what}", call, dtype, **numbers)
+        with torch.autocast("cuda", dtype, enabled=dtype != torch.float32):
+            captured = Captured(to_capture)
+        measure(bench, f"{name}: {what}, captured", captured, dtype, **numbers)
+        del captured
 
 
 def whole(bench: Bench, dtype: torch.dtype) -> None:
@@ -148,8 +163,13 @@ def whole(bench: Bench, dtype: torch.dtype) -> None:
         state = simulator.encode(frames)
         newest = simulator.rollout(state, 1)[0]
         measure(bench, "render 9 views of 65k particles, 128 px", lambda: simulator.render(newest, cameras).color, dtype)
+        view = ring(1, 1)
         measure(bench, "step + one 128 px view, 65k particles a step",
-                lambda: simulator.render(simulator.rollout(state, 1)[0], ring(1, 1)).color, dtype)  # fmt: skip
+                lambda: simulator.render(simulator.rollout(state, 1)[0], view).color, dtype)  # fmt: skip
+        for n_steps in (1, 12):
+            with torch.autocast("cuda", dtype):
+                captured = CapturedRollout(simulator, state, n_steps, cameras=view, copies=False)
+            measure(bench, f"{n_steps} x (step + one 128 px view), captured", lambda: captured(state), dtype)
 
 
 def training(bench: Bench, dtype: torch.dtype) -> None:

@@ -91,6 +91,23 @@ __global__ void sum_kernel(const T* __restrict__ x, Segments segments, int64_t c
   store(out + at.segment * channels + at.channel, sum);
 }
 
+// The same sums where channels come one at a time: a warp owns a segment, and looks up its rows once.
+template <typename T, bool kMean>
+__global__ void sum_by_warp_kernel(const T* __restrict__ x, Segments segments, int64_t channels, T* __restrict__ out) {
+  const int64_t segment = (static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x) / kWarp;
+  if (segment >= segments.n_segments) return;
+  const Range range = range_of(segments.cu_rows, segment, segments.n_listed);
+  for (int64_t c = threadIdx.x % kWarp; c < channels; c += kWarp) {
+    T sum = 0;
+    for (int64_t i = range.begin; i < range.end; ++i) {
+      const int64_t row = segments.rows[i];
+      if (inside(row, segments.n_rows)) sum += x[row * channels + c];
+    }
+    if (kMean && range.end - range.begin > 1) sum /= static_cast<T>(range.end - range.begin);
+    out[segment * channels + c] = sum;
+  }
+}
+
 // Every row of a segment gets the segment's value, divided by its size for the mean; rows listed behind the last segment
 // get 0.
 template <typename T, int N, bool kMean>
@@ -126,6 +143,9 @@ void by_width(int64_t channels, const void* a, const void* b, const F& f) {
 template <typename T, bool kMean>
 void add_up(const char* op, const T* x, const Segments& segments, int64_t channels, T* out, Stream stream) {
   by_width<T>(channels, x, out, [&]<int N>() {
+    if (N == 1 && channels >= kWarp)
+      return launch(op, sum_by_warp_kernel<T, kMean>, blocks_for(op, segments.n_segments, kThreads / kWarp), kThreads, 0,
+                    stream, x, segments, channels, out);
     launch(op, sum_kernel<T, N, kMean>, blocks_for(op, segments.n_segments * (channels / N), kThreads), kThreads, 0,
            stream, x, segments, channels, out);
   });

@@ -47,12 +47,12 @@ struct RasterScene {
 
 // What makes a row unusable; bits. Such a row is left out of the images, and its gradients are 0.
 enum RasterFault : int64_t {
-  kFaultMeans = 1,        // not finite
+  kFaultMeans = 1,        // not finite, or beyond kLargest
   kFaultQuats = 2,        // not finite
-  kFaultScales = 4,       // not finite, or negative
+  kFaultScales = 4,       // likewise, or negative
   kFaultOpacities = 8,    // not in [0, 1]
-  kFaultColor = 16,       // not finite
-  kFaultFeatures = 32,    // not finite
+  kFaultColor = 16,       // not finite, or beyond kLargest
+  kFaultFeatures = 32,    // not finite, or beyond kLargest
   kFaultProjection = 64,  // in front of the camera, but its projection overflows
   kFaultTiles = 128,      // not of a row: all Gaussians of the image together touch 2^31 tiles or more; none is drawn
   kFaultCamera = 256,     // not of a row: camera or cloud of the image is none (CUDA; the CPU throws)

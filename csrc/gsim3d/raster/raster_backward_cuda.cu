@@ -6,7 +6,7 @@ namespace gsim3d::cuda {
 namespace {
 
 template <typename T, bool kFade, bool kWithFeatures>
-__global__ void __launch_bounds__(kBlock) blend_vjp_kernel(Job<T> job, RasterImageGrads<T> grads, Slots<T> slots) {
+__global__ void __launch_bounds__(kWarp) blend_vjp_kernel(Job<T> job, RasterImageGrads<T> grads, Slots<T> slots) {
   blend_tiles_vjp<T, kFade>(job, grads, slots, of_warp<BlendGradShared<T, kWithFeatures>>());
 }
 
@@ -102,8 +102,8 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
   fill_zero(kRaster, slots.live, limits.slots, stream);
   dispatch_blend(scene, [&](auto fade, auto with_features) {
     constexpr bool kFade = decltype(fade)::value, kWithFeatures = decltype(with_features)::value;
-    launch(kRaster, blend_vjp_kernel<T, kFade, kWithFeatures>, grid_for(scene.n_images * job.n_tiles, 1), kBlock,
-           kWarps * sizeof(BlendGradShared<T, kWithFeatures>), stream, job, image_grads, slots);
+    launch(kRaster, blend_vjp_kernel<T, kFade, kWithFeatures>, grid_for(scene.n_images * job.n_tiles * kQuarters, 1),
+           kWarp, sizeof(BlendGradShared<T, kWithFeatures>), stream, job, image_grads, slots);
   });
   dispatch_sh(scene.sh_terms, [&](auto terms) {
     constexpr int kTerms = decltype(terms)::value;
@@ -116,7 +116,7 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
   launch(kRaster, gather_images_kernel<T>, grid_for(scene.n_images, 1), kOneBlock, 0, stream, job, slots, grads);
   const auto rest = [&](auto fade) {
     launch_together(further_vjp_kernel<T, decltype(fade)::value>,
-                    std::max({kWarps * sizeof(BlendGradShared<T, true>), kSortRun<T> * sizeof(Entry<T>),
+                    std::max({kWarps * sizeof(BlendGradShared<T, true>), kSortBytes<T, kBlock>,
                               2 * kRowBytes<T, 16>}),
                     stream, job, further, image_grads, slots, grads);
   };

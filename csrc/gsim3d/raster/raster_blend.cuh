@@ -1,20 +1,17 @@
 // Inside of the CUDA rasterizer: blending of one quarter of a tile, 8 x 8 pixels, by one warp.
 //
 // The warp takes the quarter's list in batches of 32. Lane by entry, it finds which of the
-// 64 pixels each Gaussian may reach, as two words of bits; transposed, they tell each pixel its Gaussians. Lane by
+// 64 pixels each Gaussian may reach, as words of bits; transposed, they tell each pixel its Gaussians. Lane by
 // pixel, it then visits those only. In the backward pass each entry's lane then sums over the pixels, so no value is
 // ever added up across lanes.
 #pragma once
 
-#include "gsim3d/raster/raster_fast.cuh"
-#include "gsim3d/raster/raster_lists.cuh"
+#include "gsim3d/raster/raster_project.cuh"
 
 namespace gsim3d::raster {
 
 constexpr int kWarps = kBlock / kWarp;
-static_assert(kWarps == kQuarters);  // a block blends a tile
-constexpr int kHalves = 2;           // pixels of a lane: of rows 0 to 3 of the quarter, and of rows 4 to 7
-constexpr int kHalfRows = kQuarter / kHalves;
+constexpr int kPixels = 2;    // of a lane
 constexpr int kFeatures = 8;  // channels blended in one pass over a list
 
 // Bit b of the result of lane l is bit l of the value of lane b.
@@ -35,21 +32,44 @@ struct Quarter {
   int x0, y0;
 
   template <typename T>
-  __device__ Quarter(const Job<T>& job, int64_t tile) : image(tile / job.n_tiles) {
-    const int part = threadIdx.x / kWarp;
+  __device__ Quarter(const Job<T>& job, int64_t number) : index(number) {
+    const int part = static_cast<int>(index % kQuarters);
+    const int64_t tile = index / kQuarters;
+    image = tile / job.n_tiles;
     const int64_t place = tile - image * job.n_tiles;
-    index = tile * kQuarters + part;
     n = static_cast<int32_t>(job.lists[index].n);
     x0 = static_cast<int>(place % job.tiles_x) * kTile + part % 2 * kQuarter;
     y0 = static_cast<int>(place / job.tiles_x) * kTile + part / 2 * kQuarter;
   }
 };
 
-// Index of the lane's pixel in the images, or -1 outside of them.
+// The quarters of the group that fall to the calling warp: for (WarpQuarters q(job); q.more(); q.next()).
 template <typename T>
-__device__ int64_t pixel_of(const RasterScene<T>& s, const Quarter& quarter, int half, int lane) {
-  const int column = quarter.x0 + lane % kQuarter, row = quarter.y0 + lane / kQuarter + half * kHalfRows;
-  return column < s.width && row < s.height ? (quarter.image * s.height + row) * s.width + column : -1;
+class WarpQuarters {
+ public:
+  __device__ explicit WarpQuarters(const Job<T>& job)
+      : order_(job.order), first_(job.group->tile_begin), n_((job.group->tile_end - first_) * kQuarters) {
+    const int64_t warps = blockDim.x / kWarp;
+    i_ = blockIdx.x * warps + threadIdx.x / kWarp, step_ = gridDim.x * warps;
+  }
+  __device__ bool more() const { return i_ < n_; }
+  __device__ void next() {
+    i_ += step_;
+    __syncwarp();
+  }
+  // In all images.
+  __device__ int64_t index() const { return (first_ + order_[i_ / kQuarters]) * kQuarters + i_ % kQuarters; }
+
+ private:
+  const uint32_t* order_;
+  int64_t first_, n_, i_, step_;
+};
+
+// Index of a pixel of the quarter in the images, or -1 outside of them.
+template <typename T>
+__device__ int64_t pixel_of(const RasterScene<T>& s, const Quarter& quarter, int column, int row) {
+  const int x = quarter.x0 + column, y = quarter.y0 + row;
+  return x < s.width && y < s.height ? (quarter.image * s.height + y) * s.width + x : -1;
 }
 
 // Values of the batch, by entry. With x, y counted from the first pixel's centre, alpha = 2^(strength - u^2 - v^2),
@@ -68,6 +88,12 @@ __device__ void put(const Record<T>& r, const Quarter& quarter, int lane, Batch<
   batch[kRed][lane] = r.red, batch[kGreen][lane] = r.green, batch[kBlue][lane] = r.blue, batch[kDepth][lane] = r.z;
 }
 
+// The same value, which the compiler would otherwise find anew for every entry. All lanes take part.
+template <typename T>
+__device__ __forceinline__ T in_register(T value) {
+  return __shfl_sync(kFullWarp, value, threadIdx.x % kWarp);
+}
+
 // alpha of entry j at (x, y) before it is cut.
 template <typename T>
 __device__ __forceinline__ T alpha_at(const Batch<T>& batch, int j, T x, T y) {
@@ -75,30 +101,29 @@ __device__ __forceinline__ T alpha_at(const Batch<T>& batch, int j, T x, T y) {
   return fast_exp2(batch[kStrength][j] - u * u - v * v);
 }
 
-// Pixels of the quarter that the record may reach: bit 8 * row + column of the two halves. May err outwards only.
-template <typename T>
-__device__ void cover(const Record<T>& r, const Quarter& quarter, uint32_t (&bits)[kHalves]) {
+// Pixels of the quarter that the record may reach: calls put(row, bits of the columns). May err outwards only.
+template <typename T, typename F>
+__device__ void cover(const Record<T>& r, const Quarter& quarter, const F& put) {
   const int x0 = max(r.x0 - quarter.x0, 0), x1 = min(r.x1 - quarter.x0, kQuarter);
   const int y0 = max(r.y0 - quarter.y0, 0), y1 = min(r.y1 - quarter.y0, kQuarter);
   const T x = r.x - (T(quarter.x0) + T(0.5)), y = r.y - (T(quarter.y0) + T(0.5));
   constexpr double kLog2MaxRatio = 7.994353436858858;  // log2(255)
   const T inverse = fast_reciprocal(r.tight * r.tight);
   const T most = (r.strength + T(kLog2MaxRatio + kLevelSlack)) * inverse, decay = r.loose * r.loose * inverse;
-  bits[0] = bits[1] = 0;
 #pragma unroll
   for (int row = 0; row < kQuarter; ++row) {
     const T dy = T(row) - y, square = most - decay * dy * dy;
     const T centre = x + r.slope * dy, reach = fast_sqrt(max_of(square, T(0))) + T(kPixelSlack);
     const int from = max(ceil_to_int(centre - reach), x0), to = min(floor_to_int(centre + reach) + 1, x1);
     if (row >= y0 && row < y1 && square >= 0 && from < to)
-      bits[row / kHalfRows] |= ((1u << to) - (1u << from)) << (8 * (row % kHalfRows));
+      put(row, (1u << to) - (1u << from));
   }
 }
 
 template <typename T>
 __device__ inline T background_of(const RasterScene<T>& s, int64_t image, int channel) {
   const T value = s.background[3 * image + channel];
-  return isfinite(value) ? value : T(0);
+  return usable(value) ? value : T(0);
 }
 
 // Row of the features of a pair.
@@ -114,45 +139,52 @@ struct BlendShared {
   T features[kWithFeatures ? kFeatures : 1][kWarp];
 };
 
+// A pixel on its way through the list.
 template <typename T>
 struct Light {
   T rest;        // transmittance
+  T floor;       // alpha that counts: kMinAlpha, or kClosed when the pixel has ended
   T sums[4];     // colour, depth
   int32_t last;  // entries of the list in front of the pixel's end
-  bool ended;
 };
+constexpr double kClosed = 2;
 
-// One pass over the list: colour and depth, or (kPass = true) the features from `channel` on.
+// One pass over the list: colour and depth, or (kPass = true) the features from `channel` on. A lane has two pixels,
+// one above the other, and visits the entries that either of them sees.
 template <typename T, bool kFade, bool kPass, bool kWithFeatures>
-__device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, int64_t tile, int64_t channel,
+__device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, int64_t index, int64_t channel,
                               BlendShared<T, kWithFeatures>& shared) {
   const RasterScene<T>& s = job.scene;
-  const int lane = threadIdx.x % kWarp;
-  const Quarter quarter(job, tile);
+  const int lane = threadIdx.x % kWarp, column = lane % kQuarter, row = lane / kQuarter * kPixels;
+  const Quarter quarter(job, index);
   const uint32_t* pairs = job.listed + job.lists[quarter.index].begin;
   const int n_channels = kPass ? static_cast<int>(min(s.n_features - channel, int64_t{kFeatures})) : 0;
-  Light<T> light[kHalves];
-  T features[kHalves][kFeatures];
+  Light<T> light[kPixels];
+  T features[kPixels][kFeatures];
 #pragma unroll
-  for (int half = 0; half < kHalves; ++half) {
-    light[half] = {T(1), {}, quarter.n, pixel_of(s, quarter, half, lane) < 0};
-    for (int c = 0; c < kFeatures; ++c) features[half][c] = 0;
+  for (int k = 0; k < kPixels; ++k) {
+    light[k] = {T(1), T(pixel_of(s, quarter, column, row + k) < 0 ? kClosed : kMinAlpha), {}, quarter.n};
+    for (int c = 0; c < kFeatures; ++c) features[k][c] = 0;
   }
 
-  // The records of a batch are fetched while the batch before is blended.
-  uint32_t pair = 0;
+  // The records of a batch are fetched while the batch before is blended, their numbers another batch earlier.
+  uint32_t pair = 0, next_pair = lane < quarter.n ? pairs[lane] : 0;
   Record<T> record{};
   const auto fetch = [&](int32_t base) {
-    if (base + lane < quarter.n) pair = pairs[base + lane], record = job.records[pair];
+    pair = next_pair;
+    if (base + lane < quarter.n) record = job.records[pair];
+    if (base + kWarp + lane < quarter.n) next_pair = pairs[base + kWarp + lane];
   };
   fetch(0);
+  const T x = in_register(T(column)), y[kPixels] = {in_register(T(row)), in_register(T(row + 1))};
   for (int32_t base = 0; base < quarter.n; base += kWarp) {
-    if (__all_sync(kFullWarp, light[0].ended && light[1].ended)) break;
-    uint32_t bits[kHalves] = {};
+    const bool closed = light[0].floor > 1 && light[1].floor > 1;
+    if (__all_sync(kFullWarp, closed)) break;
+    uint32_t bits = 0;
     __syncwarp();
     if (base + lane < quarter.n) {
       put(record, quarter, lane, shared.batch);
-      cover(record, quarter, bits);
+      cover(record, quarter, [&](int row, uint32_t span) { bits |= span << (row / kPixels * kQuarter); });
       if constexpr (kPass) {
         const T* row = features_of(job, quarter.image, pair) + channel;
         for (int c = 0; c < kFeatures; ++c) shared.features[c][lane] = c < n_channels ? row[c] : T(0);
@@ -160,45 +192,51 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
     }
     __syncwarp();
     fetch(base + kWarp);
+    uint32_t mine = transpose_bits(bits, lane);
+    if (closed) mine = 0;
+    while (mine) {
+      const int j = __ffs(mine) - 1;
+      mine &= mine - 1;
+      const Batch<T>& batch = shared.batch;
+      T weight[kPixels];
+      bool ends = false;
 #pragma unroll
-    for (int half = 0; half < kHalves; ++half) {
-      const T x = T(lane % kQuarter), y = T(lane / kQuarter + half * kHalfRows);
-      Light<T>& at = light[half];
-      uint32_t mine = transpose_bits(bits[half], lane);
-      if (at.ended) mine = 0;
-      while (mine) {
-        const int j = __ffs(mine) - 1;
-        mine &= mine - 1;
-        T alpha = min_of(alpha_at(shared.batch, j, x, y), T(kMaxAlpha));
-        if constexpr (kFade)
-          alpha = fade(alpha);
-        else
-          alpha = alpha >= T(kMinAlpha) ? alpha : T(0);
-        const T weight = alpha * at.rest, rest = at.rest - weight;
-        if (rest < T(kMinTransmittance)) {
-          at.ended = true, at.last = base + j;
-          break;
+      for (int k = 0; k < kPixels; ++k) {
+        const T raw = min_of(alpha_at(batch, j, x, y[k]), T(kMaxAlpha));
+        const T alpha = kFade ? fade(raw) : raw;
+        weight[k] = (kFade ? light[k].floor < 1 : raw >= light[k].floor) ? alpha * light[k].rest : T(0);
+        ends |= light[k].rest - weight[k] < T(kMinTransmittance);
+      }
+      if (ends) {
+#pragma unroll
+        for (int k = 0; k < kPixels; ++k) {
+          if (light[k].rest - weight[k] >= T(kMinTransmittance)) continue;
+          light[k].floor = kClosed, light[k].last = base + j, weight[k] = 0;
         }
-        at.rest = rest;
+        if (light[0].floor > 1 && light[1].floor > 1) mine = 0;
+      }
+#pragma unroll
+      for (int k = 0; k < kPixels; ++k) {
+        light[k].rest -= weight[k];
         if constexpr (kPass) {
-          for (int c = 0; c < kFeatures; ++c) features[half][c] += weight * shared.features[c][j];
+          for (int c = 0; c < kFeatures; ++c) features[k][c] += weight[k] * shared.features[c][j];
         } else {
-          for (int c = 0; c < 4; ++c) at.sums[c] += weight * shared.batch[kRed + c][j];
+          for (int c = 0; c < 4; ++c) light[k].sums[c] += weight[k] * batch[kRed + c][j];
         }
       }
     }
   }
 
 #pragma unroll
-  for (int half = 0; half < kHalves; ++half) {
-    const int64_t pixel = pixel_of(s, quarter, half, lane);
+  for (int k = 0; k < kPixels; ++k) {
+    const int64_t pixel = pixel_of(s, quarter, column, row + k);
     if (pixel < 0) continue;
     if constexpr (kPass) {
       T* to = images.features + pixel * s.n_features + channel;
       for (int c = 0; c < kFeatures; ++c)
-        if (c < n_channels) to[c] = features[half][c];
+        if (c < n_channels) to[c] = features[k][c];
     } else {
-      const Light<T>& at = light[half];
+      const Light<T>& at = light[k];
       for (int c = 0; c < 3; ++c)
         images.color[3 * pixel + c] = at.sums[c] + at.rest * background_of(s, quarter.image, c);
       images.alpha[pixel] = 1 - at.rest;
@@ -211,16 +249,14 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
 
 template <typename T, bool kFade, bool kWithFeatures>
 __device__ void blend_tiles(const Job<T>& job, const RasterImages<T>& images, BlendShared<T, kWithFeatures>& shared) {
-  const int64_t first = job.group->tile_begin, n_tiles = job.group->tile_end - first;
-  for (int64_t i = blockIdx.x; i < n_tiles; i += gridDim.x) {
-    const int64_t tile = first + job.order[i];
-    blend_quarter<T, kFade, false>(job, images, tile, 0, shared);
-    if constexpr (kWithFeatures)
+  for (WarpQuarters quarters(job); quarters.more(); quarters.next()) {
+    blend_quarter<T, kFade, false>(job, images, quarters.index(), 0, shared);
+    if constexpr (kWithFeatures) {
       for (int64_t channel = 0; channel < job.scene.n_features; channel += kFeatures) {
         __syncwarp();
-        blend_quarter<T, kFade, true>(job, images, tile, channel, shared);
+        blend_quarter<T, kFade, true>(job, images, quarters.index(), channel, shared);
       }
-    __syncwarp();
+    }
   }
 }
 

@@ -6,6 +6,9 @@
 
 namespace gsim3d::raster {
 
+constexpr int kHalves = 2;  // of a quarter: rows 0 to 3 and 4 to 7
+constexpr int kHalfRows = kQuarter / kHalves;
+
 // Gradients of an entry: Moments (5), sum v, colour (3), depth.
 constexpr int kSlotValues = 10;
 template <typename T>
@@ -79,6 +82,7 @@ __device__ inline uint32_t in_front(int32_t last, int32_t base) {
 template <typename T>
 __device__ void dot_features(const RasterScene<T>& s, const RasterImageGrads<T>& grads, const T* entry_features,
                              int64_t pixel, uint32_t mine, int lane, BlendGradShared<T, true>& shared) {
+  for (uint32_t rest = mine; rest; rest &= rest - 1) shared.shares[lane][__ffs(rest) - 1].v = 0;
   for (int64_t channel = 0; channel < s.n_features; channel += kFeatures) {
     const int n_channels = static_cast<int>(min(s.n_features - channel, int64_t{kFeatures}));
     T g[kFeatures];
@@ -98,7 +102,7 @@ __device__ void dot_features(const RasterScene<T>& s, const RasterImageGrads<T>&
 // Feature gradients of the lane's entry from the pixels of a half, written to or added to its slot.
 template <typename T>
 __device__ void sum_features(const RasterScene<T>& s, const RasterImageGrads<T>& grads, int64_t pixel, int lane,
-                             bool add, BlendGradShared<T, true>& shared, T* slot) {
+                             uint32_t seen_by, bool add, BlendGradShared<T, true>& shared, T* slot) {
   for (int64_t channel = 0; channel < s.n_features; channel += kFeatures) {
     const int n_channels = static_cast<int>(min(s.n_features - channel, int64_t{kFeatures}));
     __syncwarp();
@@ -108,8 +112,10 @@ __device__ void sum_features(const RasterScene<T>& s, const RasterImageGrads<T>&
     __syncwarp();
     if (!slot) continue;
     T sums[kFeatures] = {};
-    for (int p = 0; p < kWarp; ++p)
+    for (uint32_t rest = seen_by; rest; rest &= rest - 1) {
+      const int p = __ffs(rest) - 1;
       for (int c = 0; c < kFeatures; ++c) sums[c] += shared.shares[p][lane].weight * shared.grad_features[c][p];
+    }
     for (int c = 0; c < n_channels; ++c) {
       T& to = slot[channel + c];
       to = add ? to + sums[c] : sums[c];
@@ -120,18 +126,18 @@ __device__ void sum_features(const RasterScene<T>& s, const RasterImageGrads<T>&
 // From back to front. With s = <grad, values of the entry> at a pixel and S the same sum over all that lies behind it,
 // weighted: grad_alpha = T s - S / (1 - alpha). T before an entry is T behind it / (1 - alpha).
 template <typename T, bool kFade, bool kWithFeatures>
-__device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& grads, int64_t tile,
+__device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& grads, int64_t index,
                                   const Slots<T>& slots, BlendGradShared<T, kWithFeatures>& shared) {
   const RasterScene<T>& s = job.scene;
   const int lane = threadIdx.x % kWarp;
-  const Quarter quarter(job, tile);
+  const Quarter quarter(job, index);
   const uint32_t* pairs = job.listed + job.lists[quarter.index].begin;
   Behind<T> behind[kHalves];
   T background_sums[3] = {};
   int32_t n_used = 0;
 #pragma unroll
   for (int half = 0; half < kHalves; ++half) {
-    const int64_t pixel = pixel_of(s, quarter, half, lane);
+    const int64_t pixel = pixel_of(s, quarter, lane % kQuarter, lane / kQuarter + half * kHalfRows);
     Behind<T>& at = behind[half];
     at = {T(1), T(0), 0};
     T g[4] = {};
@@ -158,22 +164,26 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
   if (lane == 0)
     for (int c = 0; c < 3; ++c) slots.backgrounds[3 * quarter.index + c] = background_sums[c];
 
-  // The records of a batch are fetched while the batch before is in work.
-  uint32_t pair = 0, slot_begin = 0;
+  // The records of a batch are fetched while the batch before is in work, their numbers another batch earlier.
+  int32_t base = (n_used - 1) / kWarp * kWarp;  // what is behind the last entry in use has no gradients
+  uint32_t pair = 0, next_pair = base + lane < n_used ? pairs[base + lane] : 0, slot_begin = 0;
   Record<T> record{};
   const auto fetch = [&](int32_t base) {
-    if (base < 0 || base + lane >= n_used) return;
-    pair = pairs[base + lane];
-    record = job.records[pair], slot_begin = job.slot_begin[pair];
+    pair = next_pair;
+    if (base >= 0 && base + lane < n_used) record = job.records[pair], slot_begin = job.slot_begin[pair];
+    if (base >= kWarp) next_pair = pairs[base - kWarp + lane];
   };
-  int32_t base = (n_used - 1) / kWarp * kWarp;  // what is behind the last entry in use has no gradients
-  if (n_used > 0) fetch(base);
+  fetch(base);
+  const Group group = *job.group;
+  const T x = in_register(T(lane % kQuarter));
   for (; base >= 0 && n_used > 0; base -= kWarp) {
     const bool used = base + lane < n_used;
     uint32_t bits[kHalves] = {};
     if (used) {
       put(record, quarter, lane, shared.batch);
-      cover(record, quarter, bits);
+      cover(record, quarter, [&](int row, uint32_t span) {
+        bits[row / kHalfRows] |= span << (row % kHalfRows * kQuarter);
+      });
     }
     const T from_x = T(quarter.x0 + kQuarter / 2) - record.x, from_y = T(quarter.y0 + kQuarter / 2) - record.y;
     const T slope = record.slope;
@@ -181,24 +191,22 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
     int64_t slot = 0;
     if (used) {
       const PixelRect bounds{record.x0, record.x1, record.y0, record.y1};
-      slot = int64_t{slot_begin} + job.group->slot(squares_of(bounds, kTile), squares_of(bounds, kQuarter),
-                                                   quarter.x0 / kTile, quarter.y0 / kTile, quarter.index % kQuarters);
+      slot = int64_t{slot_begin} + group.slot(squares_of(bounds, kTile), squares_of(bounds, kQuarter),
+                                              quarter.x0 / kTile, quarter.y0 / kTile, quarter.index % kQuarters);
     }
     __syncwarp();
     fetch(base - kWarp);
 
     SlotSums<T> sums{};
     QuarterSums<T> moments;
-    uint32_t live = 0;
+    uint32_t live = 0;  // not 0: a pixel has seen the entry
 #pragma unroll
     for (int half = 0; half < kHalves; ++half) {
-      const T x = T(lane % kQuarter), y = T(lane / kQuarter + half * kHalfRows);
+      const T y = T(lane / kQuarter + half * kHalfRows);
       Behind<T>& at = behind[half];
-#pragma unroll 4
-      for (int p = 0; p < kWarp; ++p) shared.shares[p][lane] = {T(0), T(0)};
-      __syncwarp();
       uint32_t mine = transpose_bits(bits[half], lane) & in_front(at.last, base);
-      const int64_t pixel = kWithFeatures ? pixel_of(s, quarter, half, lane) : 0;
+      const int64_t pixel =
+          kWithFeatures ? pixel_of(s, quarter, lane % kQuarter, lane / kQuarter + half * kHalfRows) : 0;
       if constexpr (kWithFeatures) dot_features(s, grads, entry_features, pixel, mine, lane, shared);
       const PixelGrad<T> g = shared.grad[half * kWarp + lane];
       uint32_t seen = 0;
@@ -213,7 +221,6 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
         if constexpr (kFade) {
           slope_of_alpha *= fade_slope(alpha), alpha = fade(alpha);
         } else if (!(alpha >= T(kMinAlpha))) {
-          if constexpr (kWithFeatures) share.v = 0;
           continue;
         }
         const T inverse = fast_reciprocal(T(1) - alpha);
@@ -225,7 +232,8 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
         at.sum += weight * total;
         seen |= bit;
       }
-      live |= __reduce_or_sync(kFullWarp, seen);
+      const uint32_t seen_by = transpose_bits(seen, lane);  // pixels that have seen the lane's entry
+      live |= seen_by;
       __syncwarp();
 #pragma unroll
       for (int row = 0; row < kHalfRows; ++row) {
@@ -233,7 +241,7 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
 #pragma unroll
         for (int column = 0; column < kQuarter; ++column) {
           const int p = row * kQuarter + column;
-          const Share<T> share = shared.shares[p][lane];
+          const Share<T> share = seen_by >> p & 1 ? shared.shares[p][lane] : Share<T>{};
           const PixelGrad<T> grad = shared.grad[half * kWarp + p];
           const T from_centre = T(column) - T(kQuarter - 1) / 2;
           one += share.v, vx += share.v * from_centre, vxx += share.v * (from_centre * from_centre);
@@ -244,11 +252,11 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
         moments.y += one * from_centre, moments.xy += vx * from_centre, moments.yy += one * (from_centre * from_centre);
       }
       if constexpr (kWithFeatures)
-        sum_features(s, grads, pixel, lane, half > 0, shared,
+        sum_features(s, grads, pixel, lane, seen_by, half > 0, shared,
                      used ? slots.features + slot * s.n_features : nullptr);
       __syncwarp();
     }
-    if (live >> lane & 1) {
+    if (live) {
       moments.finish(from_x - slope * from_y, from_y, slope, sums);
       slots.sums[slot] = sums;
       slots.live[slot] = 1;
@@ -259,11 +267,8 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
 template <typename T, bool kFade, bool kWithFeatures>
 __device__ void blend_tiles_vjp(const Job<T>& job, const RasterImageGrads<T>& grads, const Slots<T>& slots,
                                 BlendGradShared<T, kWithFeatures>& shared) {
-  const int64_t first = job.group->tile_begin, n_tiles = job.group->tile_end - first;
-  for (int64_t i = blockIdx.x; i < n_tiles; i += gridDim.x) {
-    blend_quarter_vjp<T, kFade>(job, grads, first + job.order[i], slots, shared);
-    __syncwarp();
-  }
+  for (WarpQuarters quarters(job); quarters.more(); quarters.next())
+    blend_quarter_vjp<T, kFade>(job, grads, quarters.index(), slots, shared);
 }
 
 }  // namespace gsim3d::raster

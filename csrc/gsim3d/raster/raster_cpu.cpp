@@ -25,17 +25,17 @@ void check_scene(const RasterScene<T>& s) {
     check(s.image_cloud[i] >= 0 && s.image_cloud[i] < s.n_clouds, kOp,
           ": image_cloud must be in [0, Q) with Q=", s.n_clouds, "; got ", s.image_cloud[i], " for image ", i);
     for (int j = 0; j < 12; ++j)
-      check(std::isfinite(s.viewmats[16 * i + j]), kOp, ": viewmats must be finite; got ", s.viewmats[16 * i + j],
+      check(usable(s.viewmats[16 * i + j]), kOp, ": viewmats must be finite and at most 1e15; got ", s.viewmats[16 * i + j],
             " for image ", i);
     const T* K = s.Ks + 9 * i;
-    for (int j = 0; j < 9; ++j) check(std::isfinite(K[j]), kOp, ": Ks must be finite; got ", K[j], " for image ", i);
+    for (int j = 0; j < 9; ++j) check(usable(K[j]), kOp, ": Ks must be finite and at most 1e15; got ", K[j], " for image ", i);
     check(K[0] > 0 && K[4] > 0, kOp, ": focal lengths in Ks must be positive; got ", K[0], " and ", K[4],
           " for image ", i);
     check(K[3] == 0 && K[6] == 0 && K[7] == 0 && K[8] == 1, kOp,
           ": Ks must be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]; got another pattern for image ", i);
     for (int c = 0; c < 3; ++c)
-      check(std::isfinite(s.background[3 * i + c]), kOp, ": background must be finite; got ", s.background[3 * i + c],
-            " for image ", i);
+      check(usable(s.background[3 * i + c]), kOp, ": background must be finite and at most 1e15; got ",
+            s.background[3 * i + c], " for image ", i);
   }
 }
 
@@ -56,7 +56,8 @@ void project_chunk_vjp(const RasterScene<T>& scene, const Group<T>& group, const
   V viewmat_sums[12] = {};
   for_row_blocks<T>(chunk.begin, chunk.end, [&](const int64_t* rows, int n) {
     alignas(32) T sums[kSlotFixed][kLanes<T>] = {};
-    int64_t seen[kLanes<T>];  // rows with a gradient; where there is none, another that has: a bad row's numbers stay out
+    // Rows with a gradient; where there is none, another that has: a bad row's numbers stay out.
+    int64_t seen[kLanes<T>];
     std::fill_n(seen, kLanes<T>, int64_t{-1});
     int64_t any_seen = -1;
     for (int lane = 0; lane < n; ++lane) {
@@ -79,7 +80,8 @@ void project_chunk_vjp(const RasterScene<T>& scene, const Group<T>& group, const
     for (int i = 0; i < 4; ++i) quat[i] = gather(scene.quats, seen, 4, i);
     for (int i = 0; i < 3; ++i) scale[i] = gather(scene.scales, seen, 3, i);
     const V opacity = gather(scene.opacities, seen, 1, 0);
-    const Projection<V> p = project(camera, mean, quat, scale);
+    const Axes<V> axes = axes_of(quat, scale);
+    const Projection<V> p = project(camera, mean, axes);
     ProjectionGrad<V> grad{};
     footprint_vjp(footprint_of(p.xy, p.yy, p.determinant), Moments<V>{sum[0], sum[1], sum[2], sum[3], sum[4]}, grad);
     grad.z = sum[9];
@@ -100,8 +102,9 @@ void project_chunk_vjp(const RasterScene<T>& scene, const Group<T>& group, const
     } else {
       for (int c = 0; c < 3; ++c) scatter_add<T>(sum[6 + c], rows, n, 3, c, grads.color);
     }
-    V grad_mean[3], grad_quat[4], grad_scale[3];
-    project_vjp(camera, mean, scale, p, grad, grad_mean, grad_quat, grad_scale, viewmat_sums);
+    V grad_mean[3], grad_axes[9], grad_quat[4], grad_scale[3];
+    project_vjp(camera, mean, axes, p, grad, grad_mean, grad_axes, viewmat_sums);
+    axes_vjp(axes, scale, grad_axes, grad_quat, grad_scale);
     for (int i = 0; i < 3; ++i) scatter_add<T>(grad_mean[i], rows, n, 3, i, grads.means);
     for (int i = 0; i < 4; ++i) scatter_add<T>(grad_quat[i], rows, n, 4, i, grads.quats);
     for (int i = 0; i < 3; ++i) scatter_add<T>(grad_scale[i], rows, n, 3, i, grads.scales);

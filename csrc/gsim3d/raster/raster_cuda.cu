@@ -23,16 +23,17 @@ __global__ void __launch_bounds__(kOneBlock) offsets_kernel(Job<T> job) {
 
 template <typename T>
 __global__ void __launch_bounds__(kBlock) scatter_kernel(Job<T> job) {
+  find_order(job);
   scatter_rows(job);
 }
 
 template <typename T>
-__global__ void __launch_bounds__(kBlock, 4) sort_kernel(Job<T> job) {
-  sort_lists(job, reinterpret_cast<Entry<T>*>(dynamic_memory));
+__global__ void __launch_bounds__(kSortBlock, 4) sort_kernel(Job<T> job) {
+  sort_lists<kSortBlock>(job, reinterpret_cast<Entry<T>*>(dynamic_memory));
 }
 
 template <typename T, bool kFade, bool kWithFeatures>
-__global__ void __launch_bounds__(kBlock) blend_kernel(Job<T> job, RasterImages<T> images) {
+__global__ void __launch_bounds__(kWarp, 32) blend_kernel(Job<T> job, RasterImages<T> images) {
   blend_tiles<T, kFade>(job, images, of_warp<BlendShared<T, kWithFeatures>>());
 }
 
@@ -76,14 +77,15 @@ void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, 
     launch(kRaster, project_kernel<T, kTerms>, grid_of_chunks(scene), kBlock, kRowBytes<T, kTerms>, stream, job);
   });
   launch(kRaster, offsets_kernel<T>, 1, kOneBlock, 0, stream, job);
-  launch(kRaster, scatter_kernel<T>, grid_of_chunks(scene), kBlock, 0, stream, job);
-  launch(kRaster, sort_kernel<T>, grid_for(n_tiles, 1), kBlock, kSortRun<T> * sizeof(Entry<T>), stream, job);
+  // It also puts tiles in order, which their kernels need when there are no rows, too.
+  launch(kRaster, scatter_kernel<T>, std::max(1u, grid_of_chunks(scene)), kBlock, 0, stream, job);
+  launch(kRaster, sort_kernel<T>, grid_for(n_tiles, 1), kSortBlock, kSortBytes<T, kSortBlock>, stream, job);
   dispatch_blend(scene, [&](auto fade, auto with_features) {
     constexpr bool kFade = decltype(fade)::value, kWithFeatures = decltype(with_features)::value;
-    launch(kRaster, blend_kernel<T, kFade, kWithFeatures>, grid_for(n_tiles, 1), kBlock,
-           kWarps * sizeof(BlendShared<T, kWithFeatures>), stream, job, images);
+    launch(kRaster, blend_kernel<T, kFade, kWithFeatures>, grid_for(n_tiles * kQuarters, 1), kWarp,
+           sizeof(BlendShared<T, kWithFeatures>), stream, job, images);
     launch_together(further_kernel<T, kFade>,
-                    std::max({kWarps * sizeof(BlendShared<T, true>), kSortRun<T> * sizeof(Entry<T>), kRowBytes<T, 16>}),
+                    std::max({kWarps * sizeof(BlendShared<T, true>), kSortBytes<T, kBlock>, kRowBytes<T, 16>}),
                     stream, job, further, images);
   });
 }

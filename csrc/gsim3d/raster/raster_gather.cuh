@@ -62,15 +62,25 @@ __device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t row, co
   return seen && (any || !group.finished);
 }
 
-// Gradients of one row but its colour, summed over images one after the other.
+// Gradients of one row but its colour, summed over images one after the other. Those of the exponent and the axes
+// become gradients of opacity, quaternion and scale at the end.
 template <typename T>
 struct RowGrad {
   T mean[3], quat[4], scale[3], opacity;
+  T exponent;  // alpha = opacity e^exponent
+  T axes[9];
 
   __device__ void load(const RasterSceneGrads<T>& from, int64_t row) {
     for (int i = 0; i < 3; ++i) mean[i] = from.means[3 * row + i], scale[i] = from.scales[3 * row + i];
     for (int i = 0; i < 4; ++i) quat[i] = from.quats[4 * row + i];
     opacity = from.opacities[row];
+  }
+  __device__ void finish(const Gaussian<T>& gaussian) {
+    T grad_quat[4], grad_scale[3];
+    axes_vjp(gaussian.axes, gaussian.scale, axes, grad_quat, grad_scale);
+    for (int i = 0; i < 4; ++i) quat[i] += grad_quat[i];
+    for (int i = 0; i < 3; ++i) scale[i] += grad_scale[i];
+    opacity += exponent / gaussian.opacity;
   }
   __device__ void store(const RasterSceneGrads<T>& to, int64_t row) const {
     for (int i = 0; i < 3; ++i) to.means[3 * row + i] = mean[i], to.scales[3 * row + i] = scale[i];
@@ -84,12 +94,11 @@ template <typename T, int kTerms>
 __device__ void project_vjp_of(const Camera<T>& camera, const Gaussian<T>& gaussian, const T* coefficients,
                                const SlotSums<T>& slot, RowGrad<T>& row, T* grad_color, T (&viewmat)[12]) {
   const T* sums = slot.value;
-  const Projection<T> p = project(camera, gaussian.mean, gaussian.quat, gaussian.scale);
+  const Projection<T> p = project(camera, gaussian.mean, gaussian.axes);
   ProjectionGrad<T> grad{};
   footprint_vjp(footprint_of(p.xy, p.yy, p.determinant), Moments<T>{sums[0], sums[1], sums[2], sums[3], sums[4]}, grad);
   grad.z = sums[9];
-  // alpha = opacity e^exponent: its gradient is that of the exponent over the opacity.
-  row.opacity += sums[5] / gaussian.opacity;
+  row.exponent += sums[5];
   if constexpr (kTerms > 0) {
     const Direction<T> direction = view_direction(camera, p.point);
     T basis[kTerms], grad_basis[kTerms], grad_coefficients[kTerms * 3], color[3], grad_unit[3];
@@ -104,10 +113,10 @@ __device__ void project_vjp_of(const Camera<T>& camera, const Gaussian<T>& gauss
   } else {
     for (int c = 0; c < 3 && grad_color; ++c) grad_color[c] += sums[6 + c];
   }
-  T grad_mean[3], grad_quat[4], grad_scale[3];
-  project_vjp(camera, gaussian.mean, gaussian.scale, p, grad, grad_mean, grad_quat, grad_scale, viewmat);
-  for (int i = 0; i < 3; ++i) row.mean[i] += grad_mean[i], row.scale[i] += grad_scale[i];
-  for (int i = 0; i < 4; ++i) row.quat[i] += grad_quat[i];
+  T grad_mean[3], grad_axes[9];
+  project_vjp(camera, gaussian.mean, gaussian.axes, p, grad, grad_mean, grad_axes, viewmat);
+  for (int i = 0; i < 3; ++i) row.mean[i] += grad_mean[i];
+  for (int i = 0; i < 9; ++i) row.axes[i] += grad_axes[i];
 }
 
 // Writes the gradients of the rows in the first group, and adds to them in later ones. `memory`: SharedRows of the
@@ -143,6 +152,7 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
       grad.load(grads, row), grad_colors.load(grads.color + rows.begin * kColumns, rows.count);
     // What tells where an image's slots are is fetched while the image before is in work.
     int64_t next = rows.first_image;
+    bool shown = false;
     PixelRect next_bounds{};
     uint32_t next_slot = 0;
     const auto fetch = [&] {
@@ -161,10 +171,11 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
       T viewmat[12] = {};
       if (!sum_slots(job, group, row, bounds, slot_begin, slots, sums, grads.features + row * s.n_features)) continue;
       if (group.finished)
-        project_vjp_of<T, kTerms>(view.camera, gaussian, colors.mine(), sums, grad, grad_color, viewmat);
+        project_vjp_of<T, kTerms>(view.camera, gaussian, colors.mine(), sums, grad, grad_color, viewmat), shown = true;
       else
         slots.unfinished[row] = sums;
     }
+    if (shown) grad.finish(gaussian);
     if (rows.inside) grad.store(grads, row);
     grad_colors.store(grads.color + rows.begin * kColumns, rows.count);
   }
@@ -230,7 +241,7 @@ __device__ void gather_images(const Job<T>& job, const Slots<T>& slots, const Ra
     reduce_block(sums, shared);
     if (threadIdx.x == 0)
       for (int c = 0; c < 3; ++c)
-        grads.background[3 * image + c] = isfinite(job.scene.background[3 * image + c]) ? sums[c] : T(0);
+        grads.background[3 * image + c] = usable(job.scene.background[3 * image + c]) ? sums[c] : T(0);
     if (slots.viewmats == nullptr || threadIdx.x >= 16) continue;
     T sum = 0;
     for (int part = 0; part < kViewmatParts && threadIdx.x < 12; ++part)

@@ -54,6 +54,7 @@ void take_group(Job<T>& job, Arena& kept, Arena& scratch) {
   job.slot_cursor = reinterpret_cast<uint32_t*>(job.slot_count + n_images);
   job.list_cursor = job.slot_cursor + n_images;
   job.cursor = job.list_cursor + n_images;
+  job.bins = scratch.take<uint32_t>(kBins);
   job.tile_begin = scratch.take<uint32_t>(n_tiles + 1);
   job.depths = scratch.take<T>(job.limits.pairs);
   job.entries = scratch.take<Entry<T>>(job.limits.entries);
@@ -170,9 +171,10 @@ __device__ bool next_group(const Job<T>& job) {
   grid.sync();
   if (blockIdx.x == 0) find_offsets(job);
   grid.sync();
+  find_order(job);
   scatter_rows(job);
   grid.sync();
-  sort_lists(job, reinterpret_cast<Entry<T>*>(dynamic_memory));
+  sort_lists<kBlock>(job, reinterpret_cast<Entry<T>*>(dynamic_memory));
   grid.sync();
   return true;
 }

@@ -22,6 +22,7 @@ using cuda::kWarp;
 constexpr int kBlock = 128;  // threads of a block in the phases that many blocks share
 constexpr int kQuarter = 8;  // pixels
 constexpr int kQuarters = 4;
+constexpr int kBins = 64;  // of tiles by the lengths of their lists
 constexpr int32_t kNoImage = INT32_MAX;
 
 // What a tile needs of one Gaussian in one image. alpha = 2^(strength - (tight u)^2 - (loose dy)^2), u = dx - slope dy.
@@ -71,7 +72,6 @@ struct Entry<float> {
   __device__ static Entry last() { return {~uint64_t{0}}; }
   __device__ uint32_t word() const { return static_cast<uint32_t>(key); }
   __device__ bool operator<(const Entry& other) const { return key < other.key; }
-  __device__ Entry from_lane(int mask) const { return {__shfl_xor_sync(kFullWarp, key, mask)}; }
 };
 
 template <>
@@ -84,9 +84,6 @@ struct alignas(16) Entry<double> {
   __device__ uint32_t word() const { return static_cast<uint32_t>(low); }
   __device__ bool operator<(const Entry& other) const {
     return key < other.key || (key == other.key && low < other.low);
-  }
-  __device__ Entry from_lane(int mask) const {
-    return {__shfl_xor_sync(kFullWarp, key, mask), __shfl_xor_sync(kFullWarp, low, mask)};
   }
 };
 
@@ -149,6 +146,7 @@ struct Job {
   T* depths;               // [pairs] z of the records
   Record<T>* records;      // [pairs]; unset where the bounds are empty
   uint32_t* slot_begin;    // [pairs] first of the pair's slots
+  uint32_t* bins;          // [kBins] tiles in bins of longer lists, then places handed out
   uint32_t* order;         // [n_images * n_tiles] tiles, counted from the group's first, long lists first
   List* lists;             // [n_images * n_tiles, kQuarters]
   uint32_t* listed;        // [slots] pairs, list by list in order of depth
@@ -171,8 +169,8 @@ struct Job {
 template <typename T>
 __device__ bool camera_is_good(const T* viewmat, const T* K) {
   bool good = true;
-  for (int i = 0; i < 12; ++i) good &= isfinite(viewmat[i]);
-  for (int i = 0; i < 9; ++i) good &= isfinite(K[i]);
+  for (int i = 0; i < 12; ++i) good &= usable(viewmat[i]);
+  for (int i = 0; i < 9; ++i) good &= usable(K[i]);
   return good && K[0] > 0 && K[4] > 0 && K[3] == 0 && K[6] == 0 && K[7] == 0 && K[8] == 1;
 }
 
@@ -299,302 +297,6 @@ __device__ int64_t count_chunks(const Job<T>& job) {
   const int64_t last = job.scene.n_clouds - 1;
   if (last < 0 || !job.group->rows_are_good) return 0;
   return job.clouds[last].chunk_begin + (job.scene.n_rows - job.scene.cu_rows[last] + kBlock - 1) / kBlock;
-}
-
-// ---- project: records of all pairs, and the number of entries of every tile ---------------------------------------
-
-template <typename T>
-struct Gaussian {
-  T mean[3], quat[4], scale[3], opacity;
-
-  __device__ Gaussian(const RasterScene<T>& s, int64_t row) {
-    for (int i = 0; i < 3; ++i) mean[i] = s.means[3 * row + i];
-    for (int i = 0; i < 4; ++i) quat[i] = s.quats[4 * row + i];
-    for (int i = 0; i < 3; ++i) scale[i] = s.scales[3 * row + i];
-    opacity = s.opacities[row];
-  }
-
-  __device__ bool is_good() const {
-    bool good = opacity >= 0 && opacity <= 1;
-    for (int i = 0; i < 3; ++i) good &= isfinite(mean[i]) && isfinite(scale[i]) && scale[i] >= 0;
-    for (int i = 0; i < 4; ++i) good &= isfinite(quat[i]);
-    return good;
-  }
-};
-
-// Empty bounds where the Gaussian is not seen; the record is then unset. The CPU refuses rows that are not good; here
-// they are left out.
-template <typename T, int kTerms>
-__device__ PixelRect make_record(const RasterScene<T>& s, const Camera<T>& camera, const Gaussian<T>& gaussian,
-                                 const T* coefficients, Record<T>& record) {
-  const Projection<T> p = project(camera, gaussian.mean, gaussian.quat, gaussian.scale);
-  if (!(p.z > camera.near_plane) || !isfinite(p.determinant)) return {};
-  const PixelRect bounds = pixel_bounds(p.x, p.y, p.xx, p.yy, p.determinant, level_of(gaussian.opacity), s.width,
-                                        s.height, s.cutoff == RasterCutoff::kTile3Sigma);
-  if (bounds.x0 >= bounds.x1) return {};
-  const Footprint<T> shape = footprint_of(p.xy, p.yy, p.determinant);
-  record.x = p.x, record.y = p.y, record.z = p.z, record.slope = shape.slope;
-  record.tight = sqrt(shape.tight * T(kLog2eHalf)), record.loose = sqrt(shape.loose * T(kLog2eHalf));
-  record.strength = log2(gaussian.opacity);
-  record.x0 = bounds.x0, record.x1 = bounds.x1, record.y0 = bounds.y0, record.y1 = bounds.y1;
-  if constexpr (kTerms > 0) {
-    T basis[kTerms], color[3];
-    sh_basis<kTerms>(view_direction(camera, p.point).unit, basis);
-    sh_color<kTerms>(basis, coefficients, color);
-    record.red = color[0], record.green = color[1], record.blue = color[2];
-  } else {
-    record.red = coefficients[0], record.green = coefficients[1], record.blue = coefficients[2];
-  }
-  return bounds;
-}
-
-// Inclusive sum over the lanes of a warp.
-template <typename V>
-__device__ V warp_sum(V value) {
-  for (int step = 1; step < kWarp; step *= 2) {
-    const V other = __shfl_up_sync(kFullWarp, value, step);
-    if (static_cast<int>(threadIdx.x % kWarp) >= step) value += other;
-  }
-  return value;
-}
-
-// Shares the tiles of 32 records evenly among the lanes of their warp: calls f(lane that owns the record, x, y of a
-// tile) for all of them, 32 at a time; idle lanes have owner -1. All lanes take part.
-template <typename F>
-__device__ void for_tiles(const Squares& mine, const F& f) {
-  const int lane = threadIdx.x % kWarp, n = mine.count(), end = warp_sum(n);
-  const int total = __shfl_sync(kFullWarp, end, kWarp - 1);
-  for (int base = 0; base < total; base += kWarp) {
-    const int i = base + lane;
-    int owner = 0;  // the first lane whose sum exceeds i
-    for (int step = kWarp / 2; step > 0; step /= 2)
-      if (__shfl_sync(kFullWarp, end, owner + step - 1) <= i) owner += step;
-    const int begin = __shfl_sync(kFullWarp, end - n, owner), width = __shfl_sync(kFullWarp, mine.x1 - mine.x0, owner);
-    const int x0 = __shfl_sync(kFullWarp, mine.x0, owner), y0 = __shfl_sync(kFullWarp, mine.y0, owner);
-    const bool used = i < total;
-    const int place = used ? i - begin : 0, row = used ? place / width : 0;
-    f(used ? owner : -1, x0 + place - row * width, y0 + row);
-  }
-}
-
-// A chunk of rows of a matrix with kColumns columns in shared memory, read and written by the block as a whole.
-template <typename T, int kColumns>
-class SharedRows {
- public:
-  static constexpr int kStride = kColumns | 1;  // odd: the same column of 32 rows lies in 32 banks
-  static constexpr size_t kBytes = sizeof(T) * kBlock * kStride;
-
-  __device__ explicit SharedRows(unsigned char* memory) : memory_(reinterpret_cast<T*>(memory)) {}
-  __device__ T* mine() const { return memory_ + threadIdx.x * kStride; }
-
-  __device__ void load(const T* rows, int count) const {
-    __syncthreads();
-    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) at(i) = rows[i];
-    __syncthreads();
-  }
-  __device__ void store(T* rows, int count) const {
-    __syncthreads();
-    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) rows[i] = at(i);
-    __syncthreads();
-  }
-
- private:
-  __device__ T& at(int i) const { return memory_[i / kColumns * kStride + i % kColumns]; }
-
-  T* memory_;
-};
-
-template <int kTerms>
-constexpr int kColorColumns = kTerms > 0 ? kTerms * 3 : 3;
-
-// `memory`: SharedRows of the colours.
-template <typename T, int kTerms>
-__device__ void project_rows(const Job<T>& job, unsigned char* memory) {
-  const RasterScene<T>& s = job.scene;
-  constexpr int kColumns = kColorColumns<kTerms>;
-  const SharedRows<T, kColumns> colors(memory);
-  const int64_t last = job.group->last, n_chunks = count_chunks(job);
-  const int lane = threadIdx.x % kWarp;
-  for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
-    const Rows rows(job, chunk);
-    if (rows.first_image >= last) continue;
-    colors.load(s.color + rows.begin * kColumns, rows.count);
-    const T* coefficients = colors.mine();
-    const int64_t row = rows.inside ? rows.row : rows.begin;
-    const Gaussian<T> gaussian(s, row);
-    bool good = rows.inside && gaussian.is_good();
-    for (int i = 0; i < kColumns && good; ++i) good &= isfinite(coefficients[i]);
-    for (int64_t i = 0; i < s.n_features; ++i) good &= isfinite(s.features[row * s.n_features + i]);
-    const bool may_show = good && gaussian.opacity >= T(kMinAlpha);
-    for (int64_t image = rows.first_image; image < last; image = job.views[image].next) {
-      const View<T>& view = job.views[image];
-      const int64_t pair = job.pair_begin[image] + row - view.row_begin;
-      PixelRect bounds{};
-      if (may_show) {
-        Record<T> record;
-        bounds = make_record<T, kTerms>(s, view.camera, gaussian, coefficients, record);
-        if (bounds.x0 < bounds.x1) job.records[pair] = record, job.depths[pair] = record.z;
-      }
-      if (rows.inside) job.bounds[pair] = bounds;
-      uint32_t* counts = job.cursor + image * job.n_tiles;
-      for_tiles(squares_of(bounds, kTile), [&](int owner, int x, int y) {
-        const uint32_t tile = owner < 0 ? ~0u : static_cast<uint32_t>(y * job.tiles_x + x);
-        const unsigned same = __match_any_sync(kFullWarp, tile);
-        if (owner >= 0 && __ffs(same) - 1 == lane) atomicAdd(counts + tile, static_cast<uint32_t>(__popc(same)));
-      });
-      const uint32_t slots = warp_sum<uint32_t>(squares_of(bounds, kQuarter).count());
-      if (lane == kWarp - 1 && slots) atomicAdd(job.slot_count + image, static_cast<unsigned long long>(slots));
-    }
-  }
-}
-
-// ---- offsets: where each tile's list begins, and how many tiles fit; one block ------------------------------------
-
-// The images whose slots fit, as the end of their tiles.
-template <typename T>
-__device__ int64_t images_by_slots(const Job<T>& job, int64_t first, int64_t last) {
-  uint64_t slots = 0;
-  for (int64_t base = first; base < last; base += blockDim.x) {
-    const int64_t i = base + threadIdx.x;
-    uint64_t total;
-    const uint64_t n = i < last ? job.slot_count[i] : 0, end = slots + block_sum(n, total);
-    if (i < last) job.slot_count[i] = end - n;
-    const int n_fit = __syncthreads_count(i < last && end <= static_cast<uint64_t>(job.limits.slots));
-    if (n_fit < static_cast<int>(blockDim.x)) return (base + n_fit) * job.n_tiles;
-    slots += total;
-  }
-  return last * job.n_tiles;
-}
-
-// Long lists first, so that none of them is begun last. Lists of about equal length come in any order.
-template <typename T>
-__device__ void find_order(const Job<T>& job, int64_t begin, int64_t end) {
-  constexpr int kBins = 64, kBinWidth = 64;
-  __shared__ uint32_t bins[kBins];
-  const auto bin_of = [&](int64_t tile) {
-    const uint32_t length = job.tile_begin[tile + 1] - job.tile_begin[tile];
-    return kBins - 1 - min(length / kBinWidth, uint32_t{kBins - 1});
-  };
-  const int lane = threadIdx.x % kWarp;
-  if (threadIdx.x < kBins) bins[threadIdx.x] = 0;
-  for (const bool place : {false, true}) {
-    __syncthreads();
-    for (int64_t base = begin; base < end; base += blockDim.x) {
-      const int64_t tile = base + threadIdx.x;
-      const uint32_t bin = tile < end ? bin_of(tile) : kBins;
-      const unsigned same = __match_any_sync(kFullWarp, bin);
-      const int leader = __ffs(same) - 1;
-      uint32_t position = 0;
-      if (bin < kBins && lane == leader) position = atomicAdd(bins + bin, static_cast<uint32_t>(__popc(same)));
-      position = __shfl_sync(kFullWarp, position, leader) + __popc(same & ((1u << lane) - 1));
-      if (place && bin < kBins) job.order[position] = static_cast<uint32_t>(tile - begin);
-    }
-    __syncthreads();
-    if (place || threadIdx.x >= kWarp) continue;
-    const uint32_t a = bins[2 * lane], b = bins[2 * lane + 1], before = warp_sum(a + b) - a - b;
-    bins[2 * lane] = before, bins[2 * lane + 1] = before + a;
-  }
-}
-
-template <typename T>
-__device__ void find_offsets(const Job<T>& job) {
-  __shared__ unsigned long long images_fit, tiles_fit;  // ends of the tiles that fit: of whole images, of any
-  Group& group = *job.group;
-  const int64_t begin = group.tile_begin, end = group.last * job.n_tiles;  // read before thread 0 writes the group
-  const int64_t by_slots = group.resumed ? begin : images_by_slots(job, group.first, group.last);
-  const uint64_t max_of_part = min(job.limits.entries, job.limits.slots / kQuarters);
-  if (threadIdx.x == 0) images_fit = tiles_fit = begin;
-  uint64_t before = 0;
-  constexpr int kItems = 8;
-  for (int64_t base = begin; base < end; base += int64_t{blockDim.x} * kItems) {
-    const int64_t mine = base + int64_t{threadIdx.x} * kItems;
-    uint32_t counts[kItems];
-    uint64_t sum = 0, total;
-    for (int i = 0; i < kItems; ++i) {
-      counts[i] = mine + i < end ? job.cursor[mine + i] : 0;
-      sum += counts[i];
-    }
-    uint64_t position = before + block_sum(sum, total) - sum;
-    int64_t tile = begin, image = begin;
-    for (int i = 0; i < kItems; ++i) {
-      if (mine + i >= end) break;
-      job.tile_begin[mine + i] = job.cursor[mine + i] = static_cast<uint32_t>(position);
-      position += counts[i];
-      if (position <= max_of_part) tile = mine + i + 1;
-      if (position <= static_cast<uint64_t>(job.limits.entries) && (mine + i + 1) % job.n_tiles == 0)
-        image = mine + i + 1;
-    }
-    atomicMax(&tiles_fit, static_cast<unsigned long long>(tile));
-    atomicMax(&images_fit, static_cast<unsigned long long>(image));
-    before += total;
-    if (mine < end && mine + kItems >= end) job.tile_begin[end] = static_cast<uint32_t>(position);
-  }
-  __syncthreads();
-  const int64_t whole = min(static_cast<int64_t>(images_fit), by_slots);
-  const int64_t stop = whole > begin ? whole : min(static_cast<int64_t>(tiles_fit), (group.first + 1) * job.n_tiles);
-  find_order(job, begin, stop);
-  if (threadIdx.x != 0) return;
-  group.tile_end = stop;
-  group.last = (group.tile_end + job.n_tiles - 1) / job.n_tiles;
-  group.finished = group.tile_end % job.n_tiles == 0;
-  group.in_parts = whole <= begin;
-  group.x_end = static_cast<int>(group.tile_end % job.n_tiles % job.tiles_x);
-  group.y_end = static_cast<int>(group.tile_end % job.n_tiles / job.tiles_x);
-}
-
-// ---- scatter: every record writes its entries; their order is whatever it is --------------------------------------
-
-template <typename T>
-__device__ void scatter_rows(const Job<T>& job) {
-  const Group group = *job.group;
-  const int64_t n_chunks = count_chunks(job);
-  const int lane = threadIdx.x % kWarp;
-  for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
-    const Rows rows(job, chunk);
-    // What is known of the next image's pair is fetched while this one's is scattered.
-    int64_t next = rows.first_image, next_pair = 0;
-    PixelRect next_bounds{};
-    T next_z = 0;
-    const auto fetch = [&] {
-      if (next >= group.last) return;
-      next_pair = job.pair_begin[next] + rows.row - job.views[next].row_begin;
-      if (rows.inside) next_bounds = job.bounds[next_pair], next_z = job.depths[next_pair];
-    };
-    fetch();
-    while (next < group.last) {
-      const int64_t image = next, pair = next_pair;
-      const PixelRect bounds = next_bounds;
-      const T z = next_z;
-      next = job.views[next].next;
-      fetch();
-      const Squares tiles = squares_of(bounds, kTile), quarters = squares_of(bounds, kQuarter);
-      const int n = group.n_slots(tiles, quarters), end = warp_sum(n);
-      if (__all_sync(kFullWarp, tiles.count() == 0)) continue;
-      uint32_t slot = 0;
-      if (lane == kWarp - 1) {
-        slot = job.first_slot(image, group) + atomicAdd(job.slot_cursor + image, static_cast<uint32_t>(end));
-      }
-      slot = __shfl_sync(kFullWarp, slot, kWarp - 1);
-      if (n > 0) job.slot_begin[pair] = slot + end - n;
-      for_tiles(tiles, [&](int owner, int x, int y) {
-        const int64_t tile = image * job.n_tiles + y * job.tiles_x + x;
-        const bool used = owner >= 0 && group.has(tile);
-        const int from = max(owner, 0);
-        const uint32_t word = word_of(__shfl_sync(kFullWarp, static_cast<uint32_t>(pair), from), 0) |
-                              quarters_of_tile({__shfl_sync(kFullWarp, quarters.x0, from),
-                                                __shfl_sync(kFullWarp, quarters.x1, from),
-                                                __shfl_sync(kFullWarp, quarters.y0, from),
-                                                __shfl_sync(kFullWarp, quarters.y1, from)}, x, y);
-        const T depth = __shfl_sync(kFullWarp, z, from);
-        const unsigned same = __match_any_sync(kFullWarp, used ? static_cast<uint32_t>(y * job.tiles_x + x) : ~0u);
-        const int leader = __ffs(same) - 1;
-        uint32_t position = 0;
-        if (used && leader == lane) position = atomicAdd(job.cursor + tile, static_cast<uint32_t>(__popc(same)));
-        position = __shfl_sync(kFullWarp, position, leader) + __popc(same & ((1u << lane) - 1));
-        if (used) job.entries[position] = Entry<T>::make(depth, word);
-      });
-    }
-  }
 }
 
 }  // namespace gsim3d::raster

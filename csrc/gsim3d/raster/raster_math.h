@@ -14,6 +14,7 @@ constexpr double kMaxAlpha = 0.99;            // keeps 1 / (1 - alpha) in the ba
 constexpr double kMinTransmittance = 1e-4;    // a pixel ends before falling below it; what is behind is invisible
 constexpr double kDilation = 0.3;             // px^2, added to both variances: no Gaussian falls between pixels
 constexpr double kFieldMargin = 0.15;         // the Jacobian is taken at most this part of the image outside of it
+constexpr double kLargest = 1e15;              // beyond it a number is not used: products and squares stay finite
 constexpr double kMinQuat = 1e-6;             // shorter quaternions have no direction: identity, no gradient
 constexpr int kTile = 16;                     // pixels; part of the meaning of RasterCutoff::kTile3Sigma
 
@@ -40,6 +41,12 @@ GSIM3D_HD V min_of(V a, V b) {
 template <typename V>
 GSIM3D_HD V abs_of(V a) {
   return a < V{} ? -a : a;
+}
+
+// Finite, and small enough for the products of this file.
+template <typename S>
+GSIM3D_HD bool usable(S x) {
+  return x >= S(-kLargest) && x <= S(kLargest);
 }
 
 template <typename S>
@@ -112,6 +119,33 @@ GSIM3D_HD void rotation_of_vjp(const Rotation<V>& out, const V g[9], V grad_quat
   for (int i = 0; i < 4; ++i) grad_quat[i] = (u[i] - out.unit[i] * along) * out.inverse_norm;
 }
 
+// ---- axes of the Gaussian, which all images share ------------------------------------------------------------------
+
+template <typename V>
+struct Axes {
+  Rotation<V> rotation;
+  V a[9];  // R diag(scale)
+};
+
+template <typename V>
+GSIM3D_HD Axes<V> axes_of(const V quat[4], const V scale[3]) {
+  Axes<V> out;
+  out.rotation = rotation_of(quat);
+  for (int i = 0; i < 9; ++i) out.a[i] = out.rotation.r[i] * scale[i % 3];
+  return out;
+}
+
+template <typename V>
+GSIM3D_HD void axes_vjp(const Axes<V>& axes, const V scale[3], const V grad_axes[9], V grad_quat[4], V grad_scale[3]) {
+  V grad_r[9];
+  for (int i = 0; i < 3; ++i) grad_scale[i] = V{};
+  for (int i = 0; i < 9; ++i) {
+    grad_scale[i % 3] += grad_axes[i] * axes.rotation.r[i];
+    grad_r[i] = grad_axes[i] * scale[i % 3];
+  }
+  rotation_of_vjp(axes.rotation, grad_r, grad_quat);
+}
+
 // ---- Gaussian -> image: mean, depth and covariance in pixels ------------------------------------------------------
 
 template <typename V>
@@ -122,14 +156,12 @@ struct Projection {
   V point[3];        // camera frame
   V inverse_z, ratio_x, ratio_y;  // ratios as the Jacobian sees them: clamped
   V free_x, free_y;               // 1, or 0 where clamped
-  Rotation<V> rotation;
-  V axes[9];      // R diag(scale)
   V jw[6];        // J W
   V half[6];      // J W R diag(scale): covariance = half half^T + dilation
 };
 
 template <typename V, typename S>
-GSIM3D_HD Projection<V> project(const Camera<S>& camera, const V mean[3], const V quat[4], const V scale[3]) {
+GSIM3D_HD Projection<V> project(const Camera<S>& camera, const V mean[3], const Axes<V>& axes) {
   const V one = Lanes<V>::splat(1);
   const S* w = camera.rotation;
   Projection<V> out;
@@ -152,12 +184,10 @@ GSIM3D_HD Projection<V> project(const Camera<S>& camera, const V mean[3], const 
     out.jw[i] = jx * (w[i] + camera.skew * w[3 + i] - out.ratio_x * w[6 + i]);
     out.jw[3 + i] = jy * (w[3 + i] - out.ratio_y * w[6 + i]);
   }
-  out.rotation = rotation_of(quat);
-  for (int i = 0; i < 9; ++i) out.axes[i] = out.rotation.r[i] * scale[i % 3];
   for (int row = 0; row < 2; ++row)
     for (int i = 0; i < 3; ++i)
-      out.half[row * 3 + i] = out.jw[row * 3] * out.axes[i] + out.jw[row * 3 + 1] * out.axes[3 + i] +
-                              out.jw[row * 3 + 2] * out.axes[6 + i];
+      out.half[row * 3 + i] =
+          out.jw[row * 3] * axes.a[i] + out.jw[row * 3 + 1] * axes.a[3 + i] + out.jw[row * 3 + 2] * axes.a[6 + i];
   const V* a = out.half;
   const V* b = out.half + 3;
   const S dilation = S(kDilation);
@@ -181,8 +211,8 @@ struct ProjectionGrad {
 // With H = J W A, A = R diag(scale), Sigma = H H^T: grad_H = (G + G^T) H, grad_A = (J W)^T grad_H, grad_{JW} = grad_H
 // A^T.
 template <typename V, typename S>
-GSIM3D_HD void project_vjp(const Camera<S>& camera, const V mean[3], const V scale[3], const Projection<V>& out,
-                           const ProjectionGrad<V>& grad, V grad_mean[3], V grad_quat[4], V grad_scale[3],
+GSIM3D_HD void project_vjp(const Camera<S>& camera, const V mean[3], const Axes<V>& axes, const Projection<V>& out,
+                           const ProjectionGrad<V>& grad, V grad_mean[3], V grad_axes[9],
                            V grad_viewmat[12]) {  // [3, 4], added to
   const S* w = camera.rotation;
   const S two = 2;
@@ -191,18 +221,12 @@ GSIM3D_HD void project_vjp(const Camera<S>& camera, const V mean[3], const V sca
     grad_half[i] = two * grad.xx * out.half[i] + grad.xy * out.half[3 + i];
     grad_half[3 + i] = grad.xy * out.half[i] + two * grad.yy * out.half[3 + i];
   }
-  V grad_r[9];
-  for (int i = 0; i < 3; ++i) grad_scale[i] = V{};
-  for (int i = 0; i < 9; ++i) {
-    const V grad_axis = out.jw[i / 3] * grad_half[i % 3] + out.jw[3 + i / 3] * grad_half[3 + i % 3];
-    grad_scale[i % 3] += grad_axis * out.rotation.r[i];
-    grad_r[i] = grad_axis * scale[i % 3];
-  }
-  rotation_of_vjp(out.rotation, grad_r, grad_quat);
+  for (int i = 0; i < 9; ++i)
+    grad_axes[i] = out.jw[i / 3] * grad_half[i % 3] + out.jw[3 + i / 3] * grad_half[3 + i % 3];
 
   V grad_jw[6];
   for (int i = 0; i < 6; ++i) {
-    const V* axis = out.axes + 3 * (i % 3);
+    const V* axis = axes.a + 3 * (i % 3);
     const V* half = grad_half + 3 * (i / 3);
     grad_jw[i] = half[0] * axis[0] + half[1] * axis[1] + half[2] * axis[2];
   }
@@ -406,6 +430,21 @@ GSIM3D_HD T level_of(T opacity) {
   return std::log2(opacity * T(1 / kMinAlpha)) + T(kLevelSlack);
 }
 
+// For bounds that err outwards by more than its error.
+template <typename T>
+GSIM3D_HD T rough_sqrt(T value) {
+  return std::sqrt(value);
+}
+template <>
+GSIM3D_HD float rough_sqrt(float value) {
+#ifdef __CUDA_ARCH__
+  asm("sqrt.approx.ftz.f32 %0, %0;" : "+f"(value));
+  return value;
+#else
+  return std::sqrt(value);
+#endif
+}
+
 // First and last + 1 pixel whose centre lies in [low, high], within [0, size).
 template <typename T>
 GSIM3D_HD void pixel_range(T low, T high, int64_t size, uint16_t& begin, uint16_t& end) {
@@ -431,8 +470,8 @@ template <typename T>
 GSIM3D_HD PixelRect pixel_bounds(T x, T y, T xx, T yy, T determinant, T level, int64_t width, int64_t height,
                                  bool three_sigma) {
   PixelRect rect;
-  const T spread = level / T(kLog2eHalf);
-  const T reach_x = std::sqrt(spread * xx), reach_y = std::sqrt(spread * yy);
+  const T spread = level * T(1 / kLog2eHalf);
+  const T reach_x = rough_sqrt(spread * xx), reach_y = rough_sqrt(spread * yy);
   pixel_range(x - reach_x, x + reach_x, width, rect.x0, rect.x1);
   pixel_range(y - reach_y, y + reach_y, height, rect.y0, rect.y1);
   if (three_sigma) {

@@ -21,6 +21,10 @@ bool all_finite(const auto* values, int64_t count) {
   return std::all_of(values, values + count, [](auto value) { return std::isfinite(value); });
 }
 
+bool all_usable(const auto* values, int64_t count) {
+  return std::all_of(values, values + count, [](auto value) { return usable(value); });
+}
+
 // Counts the bad rows of a block; called only when there is one.
 template <typename T>
 void note_faults(const RasterScene<T>& scene, const int64_t* rows, int n, const Projection<Simd<T>>& p,
@@ -30,12 +34,12 @@ void note_faults(const RasterScene<T>& scene, const int64_t* rows, int n, const 
     const int64_t row = rows[lane];
     const T* scales = scene.scales + row * 3;
     int64_t faults = 0;
-    if (!all_finite(scene.means + row * 3, 3)) faults |= kFaultMeans;
+    if (!all_usable(scene.means + row * 3, 3)) faults |= kFaultMeans;
     if (!all_finite(scene.quats + row * 4, 4)) faults |= kFaultQuats;
-    if (!all_finite(scales, 3) || std::any_of(scales, scales + 3, [](T x) { return x < 0; })) faults |= kFaultScales;
+    if (!all_usable(scales, 3) || std::any_of(scales, scales + 3, [](T x) { return x < 0; })) faults |= kFaultScales;
     if (!(scene.opacities[row] >= 0 && scene.opacities[row] <= 1)) faults |= kFaultOpacities;
-    if (!all_finite(scene.color + row * color_width, color_width)) faults |= kFaultColor;
-    if (!all_finite(scene.features + row * scene.n_features, scene.n_features)) faults |= kFaultFeatures;
+    if (!all_usable(scene.color + row * color_width, color_width)) faults |= kFaultColor;
+    if (!all_usable(scene.features + row * scene.n_features, scene.n_features)) faults |= kFaultFeatures;
     if (!faults && p.z[lane] > scene.near_plane && !std::isfinite(p.determinant[lane])) faults |= kFaultProjection;
     if (!faults) continue;
     if (unusable.count++ == 0) unusable.first = row << kFaultBits | faults;
@@ -53,7 +57,7 @@ Unusable project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, con
     for (int i = 0; i < 4; ++i) quat[i] = gather(scene.quats, rows, 4, i);
     for (int i = 0; i < 3; ++i) scale[i] = gather(scene.scales, rows, 3, i);
     const V opacity = gather(scene.opacities, rows, 1, 0);
-    const Projection<V> p = project(camera, mean, quat, scale);
+    const Projection<V> p = project(camera, mean, axes_of(quat, scale));
     const auto in_front = p.z > V{} + camera.near_plane;
 
     constexpr int kColumns = std::max(1, kTerms) * 3;
@@ -67,18 +71,14 @@ Unusable project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, con
       for (int c = 0; c < 3; ++c) color[c] = coefficients[c];
     }
 
-    // x - x is 0 for a finite x only; the sum of such zeros stays 0.
-    V zero = V{};
-    for (int i = 0; i < 3; ++i) zero += (mean[i] - mean[i]) + (scale[i] - scale[i]);
-    for (int i = 0; i < 4; ++i) zero += quat[i] - quat[i];
-    for (int i = 0; i < kColumns; ++i) zero += coefficients[i] - coefficients[i];
-    for (int64_t i = 0; i < scene.n_features; ++i) {
-      const V feature = gather(scene.features, rows, scene.n_features, i);
-      zero += feature - feature;
-    }
-    zero += in_front ? p.determinant - p.determinant : V{};
-    auto good = (zero == V{}) & (opacity >= V{}) & (opacity <= V{} + T(1));
-    for (int i = 0; i < 3; ++i) good &= scale[i] >= V{};
+    auto good = (opacity >= V{}) & (opacity <= V{} + T(1));
+    const auto want_usable = [&](V value) { good &= abs_of(value) <= V{} + T(kLargest); };
+    for (int i = 0; i < 3; ++i) want_usable(mean[i]), want_usable(scale[i]), good &= scale[i] >= V{};
+    // x - x is 0 for a finite x only. Quaternions are scaled before they are squared: any length will do.
+    for (int i = 0; i < 4; ++i) good &= quat[i] - quat[i] == V{};
+    for (int i = 0; i < kColumns; ++i) want_usable(coefficients[i]);
+    for (int64_t i = 0; i < scene.n_features; ++i) want_usable(gather(scene.features, rows, scene.n_features, i));
+    good &= (in_front ? p.determinant - p.determinant : V{}) == V{};
     if (any(~good)) note_faults(scene, rows, n, p, unusable);
 
     const Footprint<V> shape = footprint_of(p.xy, p.yy, p.determinant);

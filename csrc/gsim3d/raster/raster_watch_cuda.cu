@@ -14,9 +14,9 @@ constexpr const char* kWatch = "rasterize_gaussians";
 constexpr int kThreads = 128;
 
 template <typename T>
-__device__ bool all_finite(const T* values, int64_t count) {
+__device__ bool all_usable(const T* values, int64_t count) {
   bool good = true;
-  for (int64_t i = 0; i < count; ++i) good &= isfinite(values[i]);
+  for (int64_t i = 0; i < count; ++i) good &= usable(values[i]);
   return good;
 }
 
@@ -25,12 +25,14 @@ __device__ int64_t faults_of_row(const RasterScene<T>& s, int64_t row) {
   const int64_t color_width = (s.sh_terms > 0 ? s.sh_terms : 1) * 3;
   const T* scales = s.scales + row * 3;
   int64_t faults = 0;
-  if (!all_finite(s.means + row * 3, 3)) faults |= kFaultMeans;
-  if (!all_finite(s.quats + row * 4, 4)) faults |= kFaultQuats;
-  if (!all_finite(scales, 3) || scales[0] < 0 || scales[1] < 0 || scales[2] < 0) faults |= kFaultScales;
+  bool finite = true;
+  if (!all_usable(s.means + row * 3, 3)) faults |= kFaultMeans;
+  for (int i = 0; i < 4; ++i) finite &= isfinite(s.quats[row * 4 + i]);
+  if (!finite) faults |= kFaultQuats;
+  if (!all_usable(scales, 3) || scales[0] < 0 || scales[1] < 0 || scales[2] < 0) faults |= kFaultScales;
   if (!(s.opacities[row] >= 0 && s.opacities[row] <= 1)) faults |= kFaultOpacities;
-  if (!all_finite(s.color + row * color_width, color_width)) faults |= kFaultColor;
-  if (!all_finite(s.features + row * s.n_features, s.n_features)) faults |= kFaultFeatures;
+  if (!all_usable(s.color + row * color_width, color_width)) faults |= kFaultColor;
+  if (!all_usable(s.features + row * s.n_features, s.n_features)) faults |= kFaultFeatures;
   return faults;
 }
 
@@ -42,7 +44,7 @@ __device__ bool overflows(const RasterScene<T>& s, int64_t row, int64_t image) {
   for (int i = 0; i < 3; ++i) scale[i] = s.scales[3 * row + i];
   const Camera<T> camera =
       make_camera(s.viewmats + 16 * image, s.Ks + 9 * image, s.width, s.height, s.near_plane);
-  const Projection<T> p = project(camera, mean, quat, scale);
+  const Projection<T> p = project(camera, mean, axes_of(quat, scale));
   return p.z > camera.near_plane && !isfinite(p.determinant);
 }
 

@@ -76,6 +76,17 @@ void residual_norm_vjp(const T* grad_sum,  // [n_rows, channels], or nullptr: 0
 template <typename T>
 void sum_rows(const T* x, RowNormShape shape, T* out, const Parallel& parallel);
 
+// One normalisation of channels and the activation behind it: out = gelu((x - mean) * scale + bias), mean, scale and bias
+// one value a channel.
+template <typename T>
+void norm_gelu(const T* x,  // [n_rows, channels]
+               const T* mean, const T* scale, const T* bias, RowNormShape shape, T* out, const Parallel& parallel);
+
+// The gradient of mean is -scale * grad_bias.
+template <typename T>
+void norm_gelu_vjp(const T* grad, const T* x, const T* mean, const T* scale, const T* bias, RowNormShape shape, T* grad_x,
+                   T* grad_scale, T* grad_bias, const Parallel& parallel);
+
 }  // namespace cpu
 
 // The same on the device of `stream`. In and Out are float or a 16-bit format, computed in float; or both double.
@@ -105,6 +116,16 @@ void residual_norm_vjp(const Sum<T>* grad_sum, const T* grad_out, const T* branc
 
 template <typename T>
 void sum_rows(const T* x, RowNormShape shape, Sum<T>* out, const Workspace& workspace, Stream stream);
+
+// In and Out as for row_norm.
+template <typename In, typename Out>
+void norm_gelu(const In* x, const Sum<In>* mean, const Sum<In>* scale, const Sum<In>* bias, RowNormShape shape, Out* out,
+               Stream stream);
+
+template <typename In, typename Out>
+void norm_gelu_vjp(const Out* grad, const In* x, const Sum<In>* mean, const Sum<In>* scale, const Sum<In>* bias,
+                   RowNormShape shape, In* grad_x, Sum<In>* grad_scale, Sum<In>* grad_bias, const Workspace& workspace,
+                   Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

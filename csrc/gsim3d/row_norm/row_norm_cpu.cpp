@@ -186,6 +186,35 @@ void sum_rows(const T* x, RowNormShape shape, T* out, const Parallel& parallel) 
   });
 }
 
+template <typename T>
+void norm_gelu(const T* x, const T* mean, const T* scale, const T* bias, RowNormShape shape, T* out,
+               const Parallel& parallel) {
+  const int64_t channels = shape.channels;
+  parallel.range(shape.n_rows, rows_per_chunk(channels), [&](int64_t begin, int64_t end) {
+    for (int64_t row = begin; row < end; ++row)
+      for (int64_t c = 0; c < channels; ++c) {
+        const int64_t at = row * channels + c;
+        out[at] = gelu((x[at] - mean[c]) * scale[c] + bias[c]);
+      }
+  });
+}
+
+template <typename T>
+void norm_gelu_vjp(const T* grad, const T* x, const T* mean, const T* scale, const T* bias, RowNormShape shape, T* grad_x,
+                   T* grad_scale, T* grad_bias, const Parallel& parallel) {
+  const int64_t channels = shape.channels;
+  sum_over_rows<T>(shape, {grad_scale, grad_bias}, parallel, [&](int64_t begin, int64_t end, T* sums) {
+    for (int64_t row = begin; row < end; ++row)
+      for (int64_t c = 0; c < channels; ++c) {
+        const int64_t at = row * channels + c;
+        const T centered = x[at] - mean[c], g = gelu_vjp(grad[at], centered * scale[c] + bias[c]);
+        grad_x[at] = g * scale[c];
+        sums[c] += g * centered;
+        sums[channels + c] += g;
+      }
+  });
+}
+
 #define GSIM3D_INSTANTIATE(T)                                                                                       \
   template void row_norm<T>(const T*, const T*, const T*, const T*, RowNormShape, double, T*, T*, const Parallel&); \
   template void row_norm_vjp<T>(const T*, const T*, const T*, const T*, RowNormShape, T*, T*, T*, const Parallel&); \
@@ -194,7 +223,10 @@ void sum_rows(const T* x, RowNormShape shape, T* out, const Parallel& parallel) 
   template void residual_norm_vjp<T>(const T*, const T*, const T*, const T*, const T*, const T*, const T*,          \
                                      const T*, const T*, RowNormShape, T*, T*, T*, NormGrads<T>, NormGrads<T>,      \
                                      const Parallel&);                                                              \
-  template void sum_rows<T>(const T*, RowNormShape, T*, const Parallel&);
+  template void sum_rows<T>(const T*, RowNormShape, T*, const Parallel&);                                           \
+  template void norm_gelu<T>(const T*, const T*, const T*, const T*, RowNormShape, T*, const Parallel&);            \
+  template void norm_gelu_vjp<T>(const T*, const T*, const T*, const T*, const T*, RowNormShape, T*, T*, T*,        \
+                                 const Parallel&);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 #undef GSIM3D_INSTANTIATE

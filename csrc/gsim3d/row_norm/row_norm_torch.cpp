@@ -9,6 +9,8 @@
 namespace gsim3d::binding {
 namespace {
 
+constexpr double kMinEps = 1e-30;
+
 // Calls f.template operator()<In, Out>() for the dtypes of the two tensors.
 template <typename F>
 void dispatch(const char* op, const Tensor& x, ScalarType out, const F& f) {
@@ -41,6 +43,11 @@ void check_channels(const char* op, const char* name, const Tensor& tensor, cons
   check_shape(op, name, tensor, {x.size(1)}, "[C]");
 }
 
+// Of smaller numbers the inverse root, or its products with weights and gradients, leave the range of float32.
+void check_eps(const char* op, double eps) {
+  check(eps >= kMinEps, op, ": eps must be at least ", kMinEps, "; got ", eps);
+}
+
 std::tuple<Tensor, Tensor> row_norm(const Tensor& x_, const Tensor& weight_, const Tensor& bias_,
                                     const std::optional<Tensor>& residual_, double eps, ScalarType dtype) {
   const char* op = "row_norm";
@@ -48,7 +55,7 @@ std::tuple<Tensor, Tensor> row_norm(const Tensor& x_, const Tensor& weight_, con
   const Tensor x = rows_of(x_), weight = rows_of(weight_), bias = rows_of(bias_);
   check_channels(op, "weight", weight, x);
   check_channels(op, "bias", bias, x);
-  check(eps > 0, op, ": eps must be positive; got ", eps);
+  check_eps(op, eps);
   const RowNormShape shape{x.size(0), x.size(1)};
   std::optional<Tensor> residual;
   if (residual_) {
@@ -151,7 +158,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> residual_norm(const Tensor& x_, const
   check_device(op, "branch", branch, x);
   check(branch_weight_.has_value() == branch_bias_.has_value() && weight_.has_value() == bias_.has_value(), op,
         ": a norm needs both a weight and a bias");
-  check(eps > 0, op, ": eps must be positive; got ", eps);
+  check_eps(op, eps);
   const Optional keep(op, "keep", keep_, x, type, {n, 1}, "[N, 1]");
   const Optional branch_weight(op, "branch_weight", branch_weight_, x, type, {c}, "[C]");
   const Optional branch_bias(op, "branch_bias", branch_bias_, x, type, {c}, "[C]");
@@ -244,12 +251,66 @@ Tensor linear_grad_bias(const Tensor& grad_) {
   return out;
 }
 
+void check_columns(const char* op, const Tensor& x, const Tensor& mean, const Tensor& scale, const Tensor& bias) {
+  check_shape(op, "x", x, {-1, -1}, "[N, C]");
+  check_channels(op, "mean", mean, x);
+  check_channels(op, "scale", scale, x);
+  check_channels(op, "bias", bias, x);
+}
+
+Tensor norm_gelu(const Tensor& x_, const Tensor& mean_, const Tensor& scale_, const Tensor& bias_, ScalarType dtype) {
+  const char* op = "norm_gelu";
+  const Tensor x = rows_of(x_), mean = rows_of(mean_), scale = rows_of(scale_), bias = rows_of(bias_);
+  check_columns(op, x, mean, scale, bias);
+  const RowNormShape shape{x.size(0), x.size(1)};
+  Tensor out = empty(x, {shape.n_rows, shape.channels}, dtype);
+  dispatch(op, x, dtype, [&]<typename In, typename Out>() {
+    using S = Sum<In>;
+    if constexpr (kWithCuda)
+      if (x.is_cuda())
+        return cuda::norm_gelu<In, Out>(data<In>(x), data<S>(mean), data<S>(scale), data<S>(bias), shape,
+                                        mutable_data<Out>(out), current_stream(x));
+    if constexpr (std::is_same_v<In, Out> && kOnCpu<In>)
+      cpu::norm_gelu<In>(data<In>(x), data<In>(mean), data<In>(scale), data<In>(bias), shape, mutable_data<In>(out),
+                         torch_parallel());
+  });
+  return out;
+}
+
+std::tuple<Tensor, Tensor, Tensor> norm_gelu_backward(const Tensor& grad_, const Tensor& x_, const Tensor& mean_,
+                                                      const Tensor& scale_, const Tensor& bias_) {
+  const char* op = "norm_gelu_backward";
+  const Tensor grad = rows_of(grad_), x = rows_of(x_), mean = rows_of(mean_), scale = rows_of(scale_),
+               bias = rows_of(bias_);
+  check_columns(op, x, mean, scale, bias);
+  const RowNormShape shape{x.size(0), x.size(1)};
+  check_shape(op, "grad", grad, {shape.n_rows, shape.channels}, "[N, C] like x");
+  check_device(op, "grad", grad, x);
+  Tensor grad_x = empty(x, {shape.n_rows, shape.channels}), grad_scale = empty(scale, {shape.channels}),
+         grad_bias = empty(scale, {shape.channels});
+  dispatch(op, x, grad.scalar_type(), [&]<typename In, typename Out>() {
+    using S = Sum<In>;
+    if constexpr (kWithCuda)
+      if (x.is_cuda())
+        return cuda::norm_gelu_vjp<In, Out>(data<Out>(grad), data<In>(x), data<S>(mean), data<S>(scale), data<S>(bias),
+                                            shape, mutable_data<In>(grad_x), mutable_data<S>(grad_scale),
+                                            mutable_data<S>(grad_bias), TensorWorkspace(x), current_stream(x));
+    if constexpr (std::is_same_v<In, Out> && kOnCpu<In>)
+      cpu::norm_gelu_vjp<In>(data<In>(grad), data<In>(x), data<In>(mean), data<In>(scale), data<In>(bias), shape,
+                             mutable_data<In>(grad_x), mutable_data<In>(grad_scale), mutable_data<In>(grad_bias),
+                             torch_parallel());
+  });
+  return {grad_x, grad_scale, grad_bias};
+}
+
 void kernels(auto& m) {
   m.impl("row_norm", TORCH_BOX(&row_norm));
   m.impl("row_norm_backward", TORCH_BOX(&row_norm_backward));
   m.impl("residual_norm", TORCH_BOX(&residual_norm));
   m.impl("residual_norm_backward", TORCH_BOX(&residual_norm_backward));
   m.impl("linear_grad_bias", TORCH_BOX(&linear_grad_bias));
+  m.impl("norm_gelu", TORCH_BOX(&norm_gelu));
+  m.impl("norm_gelu_backward", TORCH_BOX(&norm_gelu_backward));
 }
 
 }  // namespace

@@ -61,6 +61,12 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor branch_sum, Tensor branch_weight, Tensor branch_bias, Tensor weight, Tensor bias)");
   m.def("linear_grad_bias(Tensor grad) -> Tensor");
 
+  // norm_gelu: gelu((x - mean) * scale + bias), one mean, scale and bias a channel; batch normalisation and its activation.
+  m.def("norm_gelu(Tensor x, Tensor mean, Tensor scale, Tensor bias, ScalarType dtype) -> Tensor");
+  m.def(
+      "norm_gelu_backward(Tensor grad, Tensor x, Tensor mean, Tensor scale, Tensor bias) -> (Tensor x, Tensor scale, "
+      "Tensor bias)");
+
   // sentinel: which rows cannot be used, and sums over clouds.
   m.def(
       "watch_rows(Tensor[] fields, float[] low, float[] high, Tensor cu_rows, Tensor cloud_scene, Tensor origin, "

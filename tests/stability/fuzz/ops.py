@@ -20,7 +20,7 @@ from tests.stability.fuzz.poison import mutate, tensor
 
 EXPECTED = (ValueError, TypeError, MemoryError)
 Arguments = dict[str, Any]
-STRUCTURES = ("cameras", "voxels", "kernel_map", "table", "spec")  # arguments that hold the others
+STRUCTURES = ("cameras", "voxels", "kernel_map", "table", "spec", "fields")  # arguments that hold the others
 
 
 def _size(rng: random.Random, most: int = 12) -> int:
@@ -185,6 +185,36 @@ def _call_residual_norm(a: Arguments):
     return ops.residual_norm(a["x"], a["branch"], keep=a["keep"], **pairs, eps=a["eps"])
 
 
+def _watch_rows(rng: random.Random) -> Arguments:
+    n, clouds, dtype = _size(rng), rng.choice((0, 1, 2, 3)), _dtype(rng)
+    n = n if clouds else 0
+    previous = tensor(rng, n, 3, dtype=dtype)
+    return {
+        "fields[0]": tensor(rng, n, 3, dtype=dtype).abs(),
+        "fields[1]": tensor(rng, n, dtype=dtype).sigmoid(),
+        "fields[2]": tensor(rng, n, *rng.choice(((), (2,), (0,), (2, 3))), dtype=dtype),
+        "bounds": ((-10.0, 10.0), (0.0, 1.0), (-9.0, 9.0)),
+        "cu_rows": _offsets(rng, n, clouds),
+        "cloud_scene": torch.arange(clouds) // 2,
+        "origin": torch.zeros((clouds + 1) // 2, 3, dtype=torch.float64),
+        "activity": torch.tensor([rng.randrange(3) for _ in range(n)], dtype=torch.uint8),
+        "grid_size": rng.choice((0.0, 0.1)),
+        "previous": rng.choice((None, previous)),
+        "max_step": 1.0,
+    }
+
+
+def _call_watch_rows(a: Arguments):
+    fields = [a[f"fields[{f}]"] for f in range(3)]
+    return ops.watch_rows(fields, **{name: value for name, value in a.items() if not name.startswith("fields")})
+
+
+def _norm_gelu(rng: random.Random) -> Arguments:
+    channels, dtype = rng.choice((1, 4, 33)), _dtype(rng)
+    columns = {name: tensor(rng, channels, dtype=dtype) for name in ("mean", "scale", "bias")}
+    return {"x": tensor(rng, _size(rng), channels, dtype=dtype), **columns}
+
+
 def _cameras(rng: random.Random, images: int) -> dict[str, Tensor]:
     viewmats = torch.eye(4).repeat(images, 1, 1)
     viewmats[:, :3, 3] = tensor(rng, images, 3, scale=0.1)
@@ -269,6 +299,8 @@ OPS: dict[str, tuple[Callable[[random.Random], Arguments], Callable[[Arguments],
     "unpool": (_unpool, lambda a: ops.unpool(**a)),
     "row_norm": (_row_norm, lambda a: ops.row_norm(**a)),
     "residual_norm": (_residual_norm, _call_residual_norm),
+    "watch_rows": (_watch_rows, _call_watch_rows),
+    "norm_gelu": (_norm_gelu, lambda a: ops.norm_gelu(**a)),
     "plane_sweep": (_plane_sweep, lambda a: ops.plane_sweep(**a)),
     "sweep_geometry": (_sweep_geometry, lambda a: ops.sweep_geometry(**a)),
     "rasterize_gaussians": (_raster, _call_raster),

@@ -1,0 +1,166 @@
+// Inside of the CUDA rasterizer: records of all pairs, and the number of entries of every tile.
+#pragma once
+
+#include "gsim3d/raster/raster_fast.cuh"
+#include "gsim3d/raster/raster_lists.cuh"
+
+namespace gsim3d::raster {
+
+template <typename T>
+struct Gaussian {
+  T mean[3], quat[4], scale[3], opacity;
+  Axes<T> axes;
+
+  __device__ Gaussian(const RasterScene<T>& s, int64_t row) {
+    for (int i = 0; i < 3; ++i) mean[i] = s.means[3 * row + i];
+    for (int i = 0; i < 4; ++i) quat[i] = s.quats[4 * row + i];
+    for (int i = 0; i < 3; ++i) scale[i] = s.scales[3 * row + i];
+    opacity = s.opacities[row];
+    axes = axes_of(quat, scale);
+  }
+
+  __device__ bool is_good() const {
+    bool good = opacity >= 0 && opacity <= 1;
+    for (int i = 0; i < 3; ++i) good &= usable(mean[i]) && usable(scale[i]) && scale[i] >= 0;
+    for (int i = 0; i < 4; ++i) good &= isfinite(quat[i]);
+    return good;
+  }
+};
+
+// Empty bounds where the Gaussian is not seen; the record is then unset. The CPU refuses rows that are not good; here
+// they are left out.
+template <typename T, int kTerms>
+__device__ PixelRect make_record(const RasterScene<T>& s, const Camera<T>& camera, const Gaussian<T>& gaussian,
+                                 T level, T strength, const T* coefficients, Record<T>& record) {
+  const Projection<T> p = project(camera, gaussian.mean, gaussian.axes);
+  if (!(p.z > camera.near_plane) || !isfinite(p.determinant)) return {};
+  const PixelRect bounds = pixel_bounds(p.x, p.y, p.xx, p.yy, p.determinant, level, s.width, s.height,
+                                        s.cutoff == RasterCutoff::kTile3Sigma);
+  if (bounds.x0 >= bounds.x1) return {};
+  const T inverse = fast_reciprocal(p.yy);  // as footprint_of, but for rounding
+  record.x = p.x, record.y = p.y, record.z = p.z, record.slope = p.xy * inverse;
+  record.tight = fast_sqrt(p.yy / p.determinant * T(kLog2eHalf)), record.loose = fast_sqrt(inverse * T(kLog2eHalf));
+  record.strength = strength;
+  record.x0 = bounds.x0, record.x1 = bounds.x1, record.y0 = bounds.y0, record.y1 = bounds.y1;
+  if constexpr (kTerms > 0) {
+    T basis[kTerms], color[3];
+    sh_basis<kTerms>(view_direction(camera, p.point).unit, basis);
+    sh_color<kTerms>(basis, coefficients, color);
+    record.red = color[0], record.green = color[1], record.blue = color[2];
+  } else {
+    record.red = coefficients[0], record.green = coefficients[1], record.blue = coefficients[2];
+  }
+  return bounds;
+}
+
+// Inclusive sum over the lanes of a warp.
+template <typename V>
+__device__ V warp_sum(V value) {
+  for (int step = 1; step < kWarp; step *= 2) {
+    const V other = __shfl_up_sync(kFullWarp, value, step);
+    if (static_cast<int>(threadIdx.x % kWarp) >= step) value += other;
+  }
+  return value;
+}
+
+// The tiles of 32 records, shared evenly among the lanes of their warp. All lanes take part.
+struct WarpTiles {
+  Squares mine;
+  int n, end;  // tiles of the lane's record, and of all records up to it
+  int total;
+
+  __device__ explicit WarpTiles(const Squares& squares) : mine(squares), n(squares.count()), end(warp_sum(n)) {
+    total = __shfl_sync(kFullWarp, end, kWarp - 1);
+  }
+
+  struct Place {
+    int owner;  // lane of the record, or -1
+    int x, y;
+  };
+  __device__ Place at(int i) const {
+    int owner = 0;  // the first lane whose sum exceeds i
+    for (int step = kWarp / 2; step > 0; step /= 2)
+      if (__shfl_sync(kFullWarp, end, owner + step - 1) <= i) owner += step;
+    const int begin = __shfl_sync(kFullWarp, end - n, owner), width = __shfl_sync(kFullWarp, mine.x1 - mine.x0, owner);
+    const int x0 = __shfl_sync(kFullWarp, mine.x0, owner), y0 = __shfl_sync(kFullWarp, mine.y0, owner);
+    const bool used = i < total;
+    const int place = used ? i - begin : 0, row = used ? place / width : 0;
+    return {used ? owner : -1, x0 + place - row * width, y0 + row};
+  }
+};
+
+// A chunk of rows of a matrix with kColumns columns in shared memory, read and written by the block as a whole.
+template <typename T, int kColumns>
+class SharedRows {
+ public:
+  static constexpr int kStride = kColumns | 1;  // odd: the same column of 32 rows lies in 32 banks
+  static constexpr size_t kBytes = sizeof(T) * kBlock * kStride;
+
+  __device__ explicit SharedRows(unsigned char* memory) : memory_(reinterpret_cast<T*>(memory)) {}
+  __device__ T* mine() const { return memory_ + threadIdx.x * kStride; }
+
+  __device__ void load(const T* rows, int count) const {
+    __syncthreads();
+    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) at(i) = rows[i];
+    __syncthreads();
+  }
+  __device__ void store(T* rows, int count) const {
+    __syncthreads();
+    for (int i = threadIdx.x; i < count * kColumns; i += kBlock) rows[i] = at(i);
+    __syncthreads();
+  }
+
+ private:
+  __device__ T& at(int i) const { return memory_[i / kColumns * kStride + i % kColumns]; }
+
+  T* memory_;
+};
+
+template <int kTerms>
+constexpr int kColorColumns = kTerms > 0 ? kTerms * 3 : 3;
+
+// `memory`: SharedRows of the colours.
+template <typename T, int kTerms>
+__device__ void project_rows(const Job<T>& job, unsigned char* memory) {
+  const RasterScene<T>& s = job.scene;
+  constexpr int kColumns = kColorColumns<kTerms>;
+  const SharedRows<T, kColumns> colors(memory);
+  const int64_t last = job.group->last, n_chunks = count_chunks(job);
+  const int lane = threadIdx.x % kWarp;
+  for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
+    const Rows rows(job, chunk);
+    if (rows.first_image >= last) continue;
+    colors.load(s.color + rows.begin * kColumns, rows.count);
+    const T* coefficients = colors.mine();
+    const int64_t row = rows.inside ? rows.row : rows.begin;
+    const Gaussian<T> gaussian(s, row);
+    bool good = rows.inside && gaussian.is_good();
+    for (int i = 0; i < kColumns && good; ++i) good &= usable(coefficients[i]);
+    for (int64_t i = 0; i < s.n_features; ++i) good &= usable(s.features[row * s.n_features + i]);
+    const bool may_show = good && gaussian.opacity >= T(kMinAlpha);
+    const T level = level_of(gaussian.opacity), strength = log2(gaussian.opacity);
+    for (int64_t image = rows.first_image; image < last; image = job.views[image].next) {
+      const View<T>& view = job.views[image];
+      const int64_t pair = job.pair_begin[image] + row - view.row_begin;
+      PixelRect bounds{};
+      if (may_show) {
+        Record<T> record;
+        bounds = make_record<T, kTerms>(s, view.camera, gaussian, level, strength, coefficients, record);
+        if (bounds.x0 < bounds.x1) job.records[pair] = record, job.depths[pair] = record.z;
+      }
+      if (rows.inside) job.bounds[pair] = bounds;
+      uint32_t* counts = job.cursor + image * job.n_tiles;
+      const WarpTiles shared(squares_of(bounds, kTile));
+      for (int base = 0; base < shared.total; base += kWarp) {
+        const auto [owner, x, y] = shared.at(base + lane);
+        const uint32_t tile = owner < 0 ? ~0u : static_cast<uint32_t>(y * job.tiles_x + x);
+        const unsigned same = __match_any_sync(kFullWarp, tile);
+        if (owner >= 0 && __ffs(same) - 1 == lane) atomicAdd(counts + tile, static_cast<uint32_t>(__popc(same)));
+      }
+      const uint32_t slots = warp_sum<uint32_t>(squares_of(bounds, kQuarter).count());
+      if (lane == kWarp - 1 && slots) atomicAdd(job.slot_count + image, static_cast<unsigned long long>(slots));
+    }
+  }
+}
+
+}  // namespace gsim3d::raster

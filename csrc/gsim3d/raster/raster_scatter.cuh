@@ -1,0 +1,186 @@
+// Inside of the CUDA rasterizer: where the list of each tile begins, and the entries put there.
+#pragma once
+
+#include <type_traits>
+
+#include "gsim3d/raster/raster_project.cuh"
+
+namespace gsim3d::raster {
+
+// ---- offsets: where each tile's list begins, and how many tiles fit; one block ------------------------------------
+
+// The images whose slots fit, as the end of their tiles.
+template <typename T>
+__device__ int64_t images_by_slots(const Job<T>& job, int64_t first, int64_t last) {
+  uint64_t slots = 0;
+  for (int64_t base = first; base < last; base += blockDim.x) {
+    const int64_t i = base + threadIdx.x;
+    uint64_t total;
+    const uint64_t n = i < last ? job.slot_count[i] : 0, end = slots + block_sum(n, total);
+    if (i < last) job.slot_count[i] = end - n;
+    const int n_fit = __syncthreads_count(i < last && end <= static_cast<uint64_t>(job.limits.slots));
+    if (n_fit < static_cast<int>(blockDim.x)) return (base + n_fit) * job.n_tiles;
+    slots += total;
+  }
+  return last * job.n_tiles;
+}
+
+// The bin of a tile by the length of its list; long lists come first.
+template <typename T>
+__device__ uint32_t bin_of(const Job<T>& job, int64_t tile) {
+  constexpr uint32_t kBinWidth = 64;
+  const uint32_t length = job.tile_begin[tile + 1] - job.tile_begin[tile];
+  return kBins - 1 - min(length / kBinWidth, uint32_t{kBins - 1});
+}
+
+template <typename T>
+__device__ void find_offsets(const Job<T>& job) {
+  Group& group = *job.group;
+  const int64_t begin = group.tile_begin, end = group.last * job.n_tiles;  // read before thread 0 writes the group
+  const int64_t by_slots = group.resumed ? begin : images_by_slots(job, group.first, group.last);
+  const uint64_t max_of_images = job.limits.entries;
+  const uint64_t max_of_part = min(job.limits.entries, job.limits.slots / kQuarters);
+  uint64_t before = 0, images_fit = 0, tiles_fit = 0;
+  constexpr int kItems = 8;
+  for (int64_t base = begin; base < end; base += int64_t{blockDim.x} * kItems) {
+    const int64_t mine = base + int64_t{threadIdx.x} * kItems;
+    uint32_t counts[kItems];
+    uint64_t sum = 0, total;
+    for (int i = 0; i < kItems; ++i) {
+      counts[i] = mine + i < end ? job.cursor[mine + i] : 0;
+      sum += counts[i];
+    }
+    uint64_t position = before + block_sum(sum, total) - sum;
+    for (int i = 0; i < kItems; ++i) {
+      if (mine + i >= end) break;
+      job.tile_begin[mine + i] = job.cursor[mine + i] = static_cast<uint32_t>(position);
+      position += counts[i];
+      tiles_fit += position <= max_of_part ? 1 : 0;
+      images_fit += position <= max_of_images && (mine + i + 1) % job.n_tiles == 0 ? 1 : 0;
+    }
+    before += total;
+    if (mine < end && mine + kItems >= end) job.tile_begin[end] = static_cast<uint32_t>(position);
+  }
+  block_sum(tiles_fit, tiles_fit);
+  block_sum(images_fit, images_fit);
+  const int64_t whole = min((group.first + static_cast<int64_t>(images_fit)) * job.n_tiles, by_slots);
+  const int64_t stop =
+      whole > begin ? whole : min(begin + static_cast<int64_t>(tiles_fit), (group.first + 1) * job.n_tiles);
+
+  __shared__ uint32_t bins[kBins];
+  if (threadIdx.x < kBins) bins[threadIdx.x] = 0;
+  __syncthreads();
+  for (int64_t base = begin; base < stop; base += blockDim.x) {
+    const int64_t tile = base + threadIdx.x;
+    const uint32_t bin = tile < stop ? bin_of(job, tile) : kBins;
+    const unsigned same = __match_any_sync(kFullWarp, bin);
+    if (bin < kBins && __ffs(same) - 1 == static_cast<int>(threadIdx.x % kWarp))
+      atomicAdd(bins + bin, static_cast<uint32_t>(__popc(same)));
+  }
+  __syncthreads();
+  if (threadIdx.x < kWarp) {
+    const int lane = threadIdx.x;
+    const uint32_t a = bins[2 * lane], b = bins[2 * lane + 1], earlier = warp_sum(a + b) - a - b;
+    job.bins[2 * lane] = earlier, job.bins[2 * lane + 1] = earlier + a;
+  }
+  if (threadIdx.x != 0) return;
+  group.tile_end = stop;
+  group.last = (group.tile_end + job.n_tiles - 1) / job.n_tiles;
+  group.finished = group.tile_end % job.n_tiles == 0;
+  group.in_parts = whole <= begin;
+  group.x_end = static_cast<int>(group.tile_end % job.n_tiles % job.tiles_x);
+  group.y_end = static_cast<int>(group.tile_end % job.n_tiles / job.tiles_x);
+}
+
+// ---- order: long lists first, so that none of them is begun last; within a bin they come in any order ---------------
+
+template <typename T>
+__device__ void find_order(const Job<T>& job) {
+  const int64_t begin = job.group->tile_begin, end = job.group->tile_end;
+  const int lane = threadIdx.x % kWarp;
+  for (int64_t base = begin + int64_t{blockIdx.x} * kBlock; base < end; base += int64_t{gridDim.x} * kBlock) {
+    const int64_t tile = base + threadIdx.x;
+    const uint32_t bin = tile < end ? bin_of(job, tile) : kBins;
+    const unsigned same = __match_any_sync(kFullWarp, bin);
+    const int leader = __ffs(same) - 1;
+    uint32_t position = 0;
+    if (bin < kBins && lane == leader) position = atomicAdd(job.bins + bin, static_cast<uint32_t>(__popc(same)));
+    position = __shfl_sync(kFullWarp, position, leader) + __popc(same & ((1u << lane) - 1));
+    if (bin < kBins) job.order[position] = static_cast<uint32_t>(tile - begin);
+  }
+}
+
+// ---- scatter: every record writes its entries; their order is whatever it is --------------------------------------
+
+template <typename T>
+__device__ void scatter_rows(const Job<T>& job) {
+  constexpr int kAtOnce = 4;  // entries of a lane that wait for their places together
+  const Group group = *job.group;
+  const int64_t n_chunks = count_chunks(job);
+  const int lane = threadIdx.x % kWarp;
+  for (int64_t chunk = blockIdx.x; chunk < n_chunks; chunk += gridDim.x) {
+    const Rows rows(job, chunk);
+    // What is known of the next image's pair is fetched while this one's is scattered.
+    int64_t next = rows.first_image, next_pair = 0;
+    PixelRect next_bounds{};
+    T next_z = 0;
+    const auto fetch = [&] {
+      if (next >= group.last) return;
+      next_pair = job.pair_begin[next] + rows.row - job.views[next].row_begin;
+      if (rows.inside) next_bounds = job.bounds[next_pair], next_z = job.depths[next_pair];
+    };
+    fetch();
+    while (next < group.last) {
+      const int64_t image = next, pair = next_pair;
+      const PixelRect bounds = next_bounds;
+      const T z = next_z;
+      next = job.views[next].next;
+      fetch();
+      const Squares tiles = squares_of(bounds, kTile), quarters = squares_of(bounds, kQuarter);
+      const int n = group.n_slots(tiles, quarters), end = warp_sum(n);
+      const WarpTiles shared(tiles);
+      if (shared.total == 0) continue;
+      uint32_t slot = 0;
+      if (lane == kWarp - 1)
+        slot = job.first_slot(image, group) + atomicAdd(job.slot_cursor + image, static_cast<uint32_t>(end));
+      uint32_t* const cursor = job.cursor + image * job.n_tiles;
+      // Entries base .. base + kCount * 32 - 1 of the warp.
+      const auto put = [&](int base, auto count) {
+        constexpr int kCount = decltype(count)::value;
+        Entry<T> entry[kCount];
+        uint32_t position[kCount] = {};
+        unsigned same[kCount];  // lanes with an entry of the same tile
+#pragma unroll
+        for (int k = 0; k < kCount; ++k) {
+          const auto [owner, x, y] = shared.at(base + k * kWarp + lane);
+          const int from = max(owner, 0);
+          const uint32_t word = word_of(__shfl_sync(kFullWarp, static_cast<uint32_t>(pair), from), 0) |
+                                quarters_of_tile({__shfl_sync(kFullWarp, quarters.x0, from),
+                                                  __shfl_sync(kFullWarp, quarters.x1, from),
+                                                  __shfl_sync(kFullWarp, quarters.y0, from),
+                                                  __shfl_sync(kFullWarp, quarters.y1, from)}, x, y);
+          entry[k] = Entry<T>::make(__shfl_sync(kFullWarp, z, from), word);
+          const auto tile = static_cast<uint32_t>(y * job.tiles_x + x);
+          const bool used = owner >= 0 && group.has(image * job.n_tiles + tile);
+          same[k] = __match_any_sync(kFullWarp, used ? tile : ~0u);
+          if (!used) same[k] = 0;
+          if (__ffs(same[k]) - 1 == lane)
+            position[k] = atomicAdd(cursor + tile, static_cast<uint32_t>(__popc(same[k])));
+        }
+#pragma unroll
+        for (int k = 0; k < kCount; ++k) {
+          const uint32_t first = __shfl_sync(kFullWarp, position[k], max(__ffs(same[k]) - 1, 0));
+          if (same[k]) job.entries[first + __popc(same[k] & ((1u << lane) - 1))] = entry[k];
+        }
+      };
+      int base = 0;
+      for (; base + kAtOnce * kWarp <= shared.total; base += kAtOnce * kWarp)
+        put(base, std::integral_constant<int, kAtOnce>{});
+      for (; base < shared.total; base += kWarp) put(base, std::integral_constant<int, 1>{});
+      slot = __shfl_sync(kFullWarp, slot, kWarp - 1);
+      if (n > 0) job.slot_begin[pair] = slot + end - n;
+    }
+  }
+}
+
+}  // namespace gsim3d::raster
