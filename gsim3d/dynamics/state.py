@@ -52,6 +52,11 @@ class StateLayout:
         return sum(n for _, n in self.inputs) + POSITION_CHANNELS * self.config.position_features
 
     @property
+    def changing(self) -> tuple[str, ...]:
+        """Fields of Particles that a step may change."""
+        return tuple(name for name, _ in self.outputs)
+
+    @property
     def out_channels(self) -> int:
         return self.config.steps_per_call * sum(n for _, n in self.outputs)
 

@@ -10,7 +10,8 @@ import torch
 from gsim3d.data import Scene, find_scenes
 from gsim3d.dynamics.state import SCALE_STEP_SHARE, rotate_left
 from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr, ssim
-from gsim3d.stability import StabilityReport
+from gsim3d.guards import guard_particles
+from gsim3d.stability import StabilityConfig, StabilityReport
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer
@@ -85,6 +86,24 @@ def test_d43_free_fall_out_of_the_workspace(setting, measured):
         for name, value in of_scene(expected, 0).items():
             measured.unchanged(setting, of_scene(step, 1)[name], value, name)
     measured.outcome("asleep, counted")
+
+
+@pytest.mark.parametrize("cell", [-40.0, 2.0**16 + 40])
+def test_d43_clamped_at_the_border(setting, measured, cell):
+    """With "clamp" a particle that is outside is held at the border and goes on."""
+    newest, size = setting.to(make_history((15,))), CONFIG.dynamics.grid_size
+    means = newest.means.clone()
+    means[3, 1] = cell * size
+    report = StabilityReport()
+    held = guard_particles(
+        dataclasses.replace(newest, means=means), StabilityConfig("clamp"), report, "encode", grid_size=size
+    )
+    cells = (held.means.double() - newest.origin) / size
+    assert ((cells >= 0) & (cells < 2**16)).all() and not (held.activity == ASLEEP).any()
+    others = torch.arange(15, device=setting.device) != 3
+    measured.same_bits(held.means[others], newest.means[others], "the others")
+    assert [(f.what, f.action, f.count) for f in report.findings] == [("outside the workspace", "clamped", 1)]
+    measured.outcome("clamped, counted")
 
 
 def rollout_gradients(setting, n_steps, config=CONFIG):
@@ -288,6 +307,25 @@ def test_d47_numbers_that_are_none_are_dropped(setting, measured, name):
     for step, other in zip(steps, expected, strict=True):
         for field, value in float_fields(other).items():
             measured.unchanged(setting, float_fields(step)[field][rows], value, field)
+    assert [(f.tensor, f.action, f.count) for f in report.findings] == [(f"particles.{name}", "dropped", 1)]
+    measured.outcome("dropped, counted")
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_d47_numbers_that_a_step_made_are_dropped(setting, measured, name):
+    """The row falls asleep where it was, and is not drawn; the others have the bits they have without it."""
+    before = setting.to(make_history((15,)))
+    values = getattr(before, name).clone()
+    values[3] = FIELDS[name]
+    report = StabilityReport()
+    after = guard_particles(
+        dataclasses.replace(before, **{name: values}), StabilityConfig("drop"), report, "rollout", previous=before
+    )
+    assert after.opacities[3] == 0 and after.activity[3] == ASLEEP
+    measured.same_bits(after.means, before.means, "places")
+    others = torch.arange(15, device=setting.device) != 3
+    for field, value in float_fields(before).items():
+        measured.same_bits(float_fields(after)[field][others], value[others], field)
     assert [(f.tensor, f.action, f.count) for f in report.findings] == [(f"particles.{name}", "dropped", 1)]
     measured.outcome("dropped, counted")
 

@@ -9,6 +9,7 @@
 
 #include <cstdint>
 
+#include "gsim3d/core/half.h"
 #include "gsim3d/core/parallel.h"
 #include "gsim3d/core/stream.h"
 #include "gsim3d/core/workspace.h"
@@ -92,7 +93,7 @@ void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& 
 
 template <typename T>
 void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map, int64_t c_in, int64_t c_out,
-                            T* grad_weight, T* grad_bias, const Workspace& workspace, Stream stream);
+                            Sum<T>* grad_weight, Sum<T>* grad_bias, const Workspace& workspace, Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

@@ -156,15 +156,16 @@ std::tuple<Tensor, Tensor> sparse_conv_grad_weight(const Tensor& grad_, const Te
   const int64_t c_in = x.size(1), c_out = grad.size(1);
   const Geometry geometry(op, x, kernel_size, first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out,
                           cu_taps);
-  Tensor grad_weight = empty(grad, {c_out, kernel_size, kernel_size, kernel_size, c_in});
-  Tensor grad_bias = empty(grad, {c_out});
+  const ScalarType wide = grad.scalar_type() == ScalarType::Double ? ScalarType::Double : ScalarType::Float;
+  Tensor grad_weight = empty(grad, {c_out, kernel_size, kernel_size, kernel_size, c_in}, wide);
+  Tensor grad_bias = empty(grad, {c_out}, wide);
   dispatch(op, "grad", grad, [&]<typename T>() {
     TensorWorkspace workspace(grad);
     if constexpr (kWithCuda)
       if (grad.is_cuda())
         return cuda::sparse_conv_vjp_weight(data<T>(grad), data<T>(x), geometry.map, c_in, c_out,
-                                            mutable_data<T>(grad_weight), mutable_data<T>(grad_bias), workspace,
-                                            current_stream(grad));
+                                            mutable_data<Sum<T>>(grad_weight), mutable_data<Sum<T>>(grad_bias),
+                                            workspace, current_stream(grad));
     if constexpr (kOnCpu<T>)
       cpu::sparse_conv_vjp_weight(data<T>(grad), data<T>(x), geometry.map, c_in, c_out, mutable_data<T>(grad_weight),
                                   mutable_data<T>(grad_bias), workspace, torch_parallel());
