@@ -216,7 +216,7 @@ class CapturedRollout:
             renderings = []
             if self._cameras is not None:
                 for step in steps:
-                    renderings.append(self._model.render(step, self._cameras, self._background, plan, report=report))
+                    renderings.append(self._model.draw(step, self._cameras, self._background, plan, report=report))
         return Predicted(steps, renderings)
 
     def _observed(self) -> list[PyramidCapacity]:
