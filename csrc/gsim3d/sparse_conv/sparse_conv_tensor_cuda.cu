@@ -1,7 +1,7 @@
 // The convolution on tensor cores. A block owns a tile of rows, in the order of the plan, and kColumns output channels,
 // whose sums stay in registers. Some warps copy what the tile's taps read, stage by stage; each group of four further
-// warps multiplies 64 rows, and leaves out the taps that none of its rows has. Where there are few tiles the stages of a
-// tile are shared by several blocks, whose sums are added in a fixed order.
+// warps multiplies 64 rows, and leaves out the taps that none of its rows has. Where there are few tiles the stages of
+// a tile are shared by several blocks, whose sums are added in a fixed order.
 #include <algorithm>
 
 #include "gsim3d/sparse_conv/sparse_conv_device.cuh"
@@ -493,7 +493,9 @@ bool convolve_tensor(const char* op, const Convolution<E>& conv, const Workspace
   int shared_bytes = 0;
   check_cuda(cudaDeviceGetAttribute(&shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, stream.device), op);
   const auto bytes_of = [&]<typename S>() { return Memory<S>::bytes(conv.taps, conv.c_read / kChunk); };
-  const auto fits = [&]<typename S>() { return bytes_of.template operator()<S>() <= static_cast<size_t>(shared_bytes); };
+  const auto fits = [&]<typename S>() {
+    return bytes_of.template operator()<S>() <= static_cast<size_t>(shared_bytes);
+  };
   const auto column_blocks = [&]<typename S>() { return (conv.c_write + S::kColumns - 1) / S::kColumns; };
   const auto blocks = [&]<typename S>() {
     return (conv.plan.pitch + S::kRows - 1) / S::kRows * int64_t{column_blocks.template operator()<S>()};

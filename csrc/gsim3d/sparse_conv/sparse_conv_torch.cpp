@@ -118,7 +118,8 @@ Tensor sparse_conv(const Tensor& x_, const Tensor& weight_, const std::optional<
 
 Tensor sparse_conv_grad_input(const Tensor& grad_, const Tensor& weight_, const Tensor& row_voxel,
                               const Tensor& voxel_rows, const Tensor& cu_voxel_rows, const Tensor& tap_in,
-                              const Tensor& tap_out, const Tensor& cu_taps, bool first, const std::optional<Tensor>& plan) {
+                              const Tensor& tap_out, const Tensor& cu_taps, bool first,
+                              const std::optional<Tensor>& plan) {
   const char* op = "sparse_conv_grad_input";
   check_weight(op, weight_);
   check_shape(op, "grad", grad_, {-1, weight_.size(0)}, "[N, C_out]");
