@@ -22,7 +22,7 @@ MATERIALS = {
     "jelly": ((5e3, 9e3), 0.01, None),
     "rubber": ((1.5e4, 2.5e4), 0.002, None),
     "foam": ((5e3, 8e3), 0.04, None),
-    "clay": ((7e3, 1.2e4), 0.015, (0.02, 0.05)),
+    "clay": ((8e3, 1.2e4), 0.04, (0.02, 0.05)),
 }
 
 
@@ -110,20 +110,20 @@ class Rigid(World):
     n_bodies: tuple[int, int] = (1, 3)
     n_frames: int = 16
     fps: float = 12.0
-    body_size: tuple[float, float] = (0.36, 0.56)
-    drop_height: tuple[float, float] = (0.3, 0.8)
-    speed: float = 1.0
-    lift: tuple[float, float] = (0.0, 1.0)
+    body_size: tuple[float, float] = (0.38, 0.58)
+    drop_height: tuple[float, float] = (0.3, 0.7)
+    speed: float = 0.8
+    lift: tuple[float, float] = (0.0, 0.8)
     spin: float = 5.0
     spread: float = 0.3
     friction: tuple[float, float] = (0.4, 0.9)
     bounce: tuple[float, float] = (0.1, 0.7)
     max_timestep: float = 1 / 960
-    distance: float = 3.9
+    distance: float = 3.4
     target_height: float = 0.55
-    ground_radius: float = 1.5
-    near: float = 1.8
-    far: float = 6.0
+    ground_radius: float = 1.3
+    near: float = 1.6
+    far: float = 5.2
 
     name = "rigid"
     engines = ("mujoco",)
@@ -176,7 +176,7 @@ HELD_OUT = {
     "unseen": {"elastic": _UNSEEN, "rigid": _UNSEEN, "cloth": _UNSEEN},
     "several": {
         "elastic": {"n_bodies": (2, 3), "body_size": (0.38, 0.5), "spread": 0.25},
-        "rigid": {"n_bodies": (4, 5), "body_size": (0.32, 0.46)},
+        "rigid": {"n_bodies": (4, 5), "body_size": (0.26, 0.38), "spread": 0.5},
         "cloth": {"n_bodies": (2, 2), "body_size": (0.3, 0.4), "spread": 0.25},
     },
     "no-ground": {
@@ -189,7 +189,7 @@ HELD_OUT = {
     },
     "higher": {
         "elastic": {"drop_height": (1.05, 1.2)},
-        "rigid": {"drop_height": (0.9, 1.2), "lift": (1.0, 1.6)},
+        "rigid": {"drop_height": (0.8, 1.0), "lift": (0.8, 1.2)},
         "cloth": {"drop_height": (0.45, 0.6)},
     },
 }

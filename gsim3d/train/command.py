@@ -30,6 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     parser.add_argument("config", metavar="CONFIG", nargs="?", help="YAML file with the run's settings")
     parser.add_argument("--data", metavar="DIR", help="folder with scenes of any layout (docs/data.md)")
+    parser.add_argument(
+        "--cache", metavar="DIR", help="keep decoded images in files here, for sets larger than the memory"
+    )
     parser.add_argument("--out", metavar="DIR", help="run folder; made if absent")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default: cpu)")
     parser.add_argument("--until", type=int, metavar="STEP", help="stop after this optimizer step (default: the last)")
@@ -62,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     if args.export and (not args.export.endswith(".safetensors") or not Path(args.export).absolute().parent.is_dir()):
         raise InputError(f"--export must name a .safetensors file in a folder that exists; got {args.export}")
     folders, _ = split_scenes(find_scenes(args.data))
-    scenes = [Scene.open(folder, fitting=config.data.fitting) for folder in folders]
+    scenes = [Scene.open(folder, cache_dir=args.cache, fitting=config.data.fitting) for folder in folders]
 
     from gsim3d.train.loop import Trainer
     from gsim3d.train.processes import joined
@@ -71,7 +74,8 @@ def run(args: argparse.Namespace) -> int:
         say = print if processes.is_first else lambda *_: None
         trainer = Trainer(config, scenes, args.out, device=args.device, processes=processes)
         if trainer.step:
-            say(f"going on from step {trainer.step} of {config.n_steps}")
+            came = "" if trainer.same_scenes else "; with scenes that came since, so not as it would have gone on without them"
+            say(f"going on from step {trainer.step} of {config.n_steps}{came}")
         trainer.run(until=args.until, tensorboard=args.tensorboard, profile=args.profile)
         say(f"trained to step {trainer.step} of {config.n_steps}: {args.out}")
         if args.export and processes.is_first:

@@ -46,6 +46,7 @@ from gsim3d.train.schedule import one_cycle
 from gsim3d.train.settings import from_dict, to_dict
 from gsim3d.train.watch import Seen, StepWatch, first_not_finite, mean_of_norms, norms_by_module
 
+READERS = 2  # threads that read batches; so many steps are read ahead
 EMA_WARM_UP = 10  # the average forgets its first values: decay is at most (1 + step) / (10 + step)
 # May change between two sittings of one run without changing the curve; so may the number of workers, if there are any.
 FREE_SETTINGS = ("checkpoint_every", "keep_checkpoints", "log_every", "recompute")
@@ -58,7 +59,8 @@ class Trainer:
 
     Args:
         config: the run. A folder that already has a checkpoint must have been started with the same one.
-        scenes: to train on, in a fixed order.
+        scenes: to train on, in a fixed order. More may come between two sittings, none may go; ``same_scenes`` says whether
+            some came, for then the curve goes on as another one.
         out: run folder, made if absent.
         device: "cpu" or "cuda". A run may change it between two sittings; its numbers then change by rounding.
         processes: those that train together, see :func:`gsim3d.train.processes.joined`; each has a Trainer of its own, and
@@ -99,8 +101,9 @@ class Trainer:
         self.step = self.n_skipped = self.n_skipped_in_a_row = 0
         self.seconds = 0.0
         self.parent = None
+        self.same_scenes = True
         self._ahead: dict[tuple, Future] = {}
-        self._reader = ThreadPoolExecutor(1)
+        self._reader = ThreadPoolExecutor(READERS)
         if checkpoint.exists(self.out):
             self._resume()
         self.log = Log(self.out, writes=self.processes.is_first)
@@ -300,11 +303,15 @@ class Trainer:
         return loss.detach(), errors, gradients, watch, len(samples), error
 
     def _batch(self, samples: list[int]) -> Batch:
-        """The samples of this step; those of the next one are read meanwhile."""
-        now, later = ((step, tuple(samples)) for step in (self.step, self.step + 1))
+        """The samples of this step; those of the next ones are read meanwhile."""
+        now, *later = ((step, tuple(samples)) for step in range(self.step, self.step + 1 + READERS))
         known = self._ahead.pop(now, None)
-        if later[0] < self.config.n_steps:
-            self._ahead[later] = self._reader.submit(self._draw, *later)
+        for key in list(self._ahead):
+            if key[0] < self.step:  # read in vain: the next stage has other batches
+                self._ahead.pop(key, None)
+        for key in later:
+            if key[0] < self.config.n_steps and key not in self._ahead:
+                self._ahead[key] = self._reader.submit(self._draw, *key)
         return (self._draw(*now) if known is None else known.result()).to(self.device)
 
     def _draw(self, step: int, samples: Sequence[int]) -> Batch:
@@ -405,6 +412,7 @@ class Trainer:
             "seconds": self.seconds,
             "parent": self.parent,
             "loss_scale": [self.scale.value, self.scale.n_good],
+            "scenes": [scene.name for scene in self.scenes],
         }
         folder = checkpoint.save(
             self.out,
@@ -427,6 +435,14 @@ class Trainer:
         for name in now:
             if name not in FREE_SETTINGS and before.get(name) != now[name]:
                 raise InputError(f"{self.out}: was started with another {name!r}; use the same or another folder")
+        names = [scene.name for scene in self.scenes]
+        known = saved.state.get("scenes", names)
+        if missing := sorted(set(known) - set(names)):
+            raise InputError(
+                f"{self.out}: was trained on {len(missing)} scenes that are not given now, such as {missing[0]}; give the same "
+                "ones, or more, or use another folder"
+            )
+        self.same_scenes = known == names
         self.simulator.load_state_dict(saved.model)
         if self.average:
             self.average = {name: value.to(self.device) for name, value in saved.ema.items()}
