@@ -87,7 +87,7 @@ def sparse_conv(
 
 @torch.library.register_fake("gsim3d::sparse_conv_plan")
 def _(row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, kernel_size):
-    taps, groups = kernel_size**3, (row_voxel.shape[0] + 383) // 384 * 6
+    taps, groups = kernel_size**3, (row_voxel.shape[0] + 255) // 256 * 4
     return row_voxel.new_empty(groups * (64 * (taps + 1) + (taps + 31) // 32), dtype=torch.int32)
 
 

@@ -35,7 +35,7 @@ struct SparseConvMap {
 
 // Rows in the order in which the tensor cores take them, where each tap of each row reads, and which taps every group
 // of rows has.
-constexpr int64_t kConvGroupRows = 64, kConvPlanStep = 384;
+constexpr int64_t kConvGroupRows = 64, kConvPlanStep = 256;
 inline int64_t sparse_conv_plan_size(int64_t n_rows, int64_t kernel_size) {
   const int64_t taps = kernel_size * kernel_size * kernel_size;
   const int64_t pitch = (n_rows + kConvPlanStep - 1) / kConvPlanStep * kConvPlanStep;

@@ -57,6 +57,7 @@ struct Geometry {
       check_shape(op, "plan", *plan, {sparse_conv_plan_size(n_rows, kernel_size)}, "that of sparse_conv_plan");
       check(plan->is_contiguous(), op, ": plan must be contiguous");
       map.plan = data<int32_t>(*plan);
+      check(reinterpret_cast<uintptr_t>(map.plan) % 16 == 0, op, ": plan must begin at a multiple of 16 bytes");
     }
     // On a GPU the lists stay where they are: kernels skip what is out of range.
     if (!x.is_cuda()) cpu::check_sparse_conv_map(op, map, torch_parallel());
@@ -118,7 +119,8 @@ Tensor sparse_conv(const Tensor& x_, const Tensor& weight_, const std::optional<
 
 Tensor sparse_conv_grad_input(const Tensor& grad_, const Tensor& weight_, const Tensor& row_voxel,
                               const Tensor& voxel_rows, const Tensor& cu_voxel_rows, const Tensor& tap_in,
-                              const Tensor& tap_out, const Tensor& cu_taps, bool first, const std::optional<Tensor>& plan) {
+                              const Tensor& tap_out, const Tensor& cu_taps, bool first,
+                              const std::optional<Tensor>& plan) {
   const char* op = "sparse_conv_grad_input";
   check_weight(op, weight_);
   check_shape(op, "grad", grad_, {-1, weight_.size(0)}, "[N, C_out]");
