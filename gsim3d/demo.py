@@ -39,7 +39,7 @@ _stage = partial(StageConfig, batch=2, target_views=2, warm_up=0.1)
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """data: options of gsim3d.generate's preset "demo" to change.   train: the training."""
+    """data: options of gsim3d.generate's preset "mini" to change.   train: the training."""
 
     data: dict[str, Any] = field(default_factory=lambda: {"n_frames": 18, "fps": 16.0})
     train: TrainConfig = TrainConfig(
@@ -91,7 +91,7 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, *, progress: boo
     pyplot()
     print("1/4 multi-view video of bodies that fall", flush=True)
     with seconds.measure("data"):
-        folders = generate(out / "data", preset="demo", progress=progress, **config.data).folders
+        folders = generate(out / "data", preset="mini", progress=progress, **config.data).folders
     train_folders, test_folders = split_scenes(folders)
     test = [Scene.open(folder) for folder in test_folders]
     print(f"2/4 training on {len(train_folders)} scenes; {len(test)} are held out", flush=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Collection
 from functools import partial
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from gsim3d.ops.sentinel import CELLS, FAST, OUTSIDE, SUMS, watch_rows
 from gsim3d.stability import ACTIONS, LARGEST, Finding, Reading, Sentinels, StabilityConfig, StabilityReport
-from gsim3d.types import ASLEEP, CloudTable, Particles
+from gsim3d.types import ASLEEP, CloudTable, Frames, Particles
 
 BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
 
@@ -24,6 +25,7 @@ def guard_particles(
     *,
     grid_size: float = 0.0,
     previous: Particles | None = None,
+    changed: Collection[str] | None = None,
     max_opacity: float = 1.0,
 ) -> Particles:
     """``particles`` with finite, bounded numbers only; rows that had others are handled by ``config.on_bad``.
@@ -37,13 +39,14 @@ def guard_particles(
             falls asleep; 0: there is no such limit.
         previous: the same rows one step before: a row that moved further than ``config.max_speed`` falls asleep, and
             rows that cannot be used return to it.
+        changed: fields that differ from ``previous``; others are not looked at again. None: all.
         max_opacity: larger ones count as out of range.
     Gradients: through all rows that stay as they are.
     Raises:
         HardCaseError: ``config.on_bad`` is "raise", on the CPU.
     """
-    fields = particles.row_fields()
-    activity = fields.pop("activity")
+    looked_at = {"means", "opacities", *(particles.ROW_FIELDS if changed is None else changed)} - {"activity"}
+    fields = {name: value for name, value in particles.row_fields().items() if name in looked_at}
     limits = {
         "means": (-LARGEST, LARGEST),
         "opacities": (0.0, max_opacity),
@@ -57,7 +60,7 @@ def guard_particles(
         particles.cu_rows,
         cloud_scene=particles.cloud_scene,
         origin=particles.origin,
-        activity=activity,
+        activity=particles.activity,
         grid_size=grid_size,
         previous=None if previous is None else previous.means,
         max_step=config.max_speed,
@@ -71,6 +74,42 @@ def guard_particles(
             return particles
     mend = _clamp if config.on_bad == "clamp" else _put_to_sleep
     return mend(particles, fields, bounds, watched.status, config, grid_size, previous)
+
+
+def guard_frames(
+    frames: Frames, config: StabilityConfig, report: StabilityReport, where: str
+) -> tuple[Frames, Tensor | None]:
+    """``frames`` with finite pixels, and bool [I, H, W]: those that must not become particles (None: all may).
+
+    Pixels that are not finite are black, where the policy is "clamp" also 1 for infinity, and then particles like any
+    other. "raise" leaves them to the encoder, as every policy does with cameras that cannot see: these raise always.
+    """
+    images = frames.images
+    if config.on_bad == "raise" or images.dim() != 4 or not images.is_floating_point():
+        return frames, None
+    bad = (~images.isfinite()).any(1)
+    report.record(bad.sum((1, 2)), partial(_read_images, frames, where, ACTIONS[config.on_bad]))
+    images = images.nan_to_num(0.0, 1.0 if config.on_bad == "clamp" else 0.0, 0.0)
+    return dataclasses.replace(frames, images=images), bad if config.on_bad == "drop" else None
+
+
+def drop_rows(particles: Particles, rows: Tensor) -> Particles:
+    """``particles`` of which ``rows`` (bool [N]) sleep and are not drawn."""
+    return dataclasses.replace(
+        particles,
+        opacities=torch.where(rows, 0.0, particles.opacities),
+        activity=torch.where(rows, ASLEEP, particles.activity),
+    )
+
+
+def _read_images(frames: Frames, where: str, action: str, counts: Tensor) -> Reading:
+    findings = []
+    for image, count in enumerate(counts.tolist()):
+        if count:
+            cloud = int(frames.cameras.image_cloud[image])
+            scene, step = int(frames.cloud_scene[cloud]), int(frames.cloud_step[cloud])
+            findings.append(Finding("not finite", where, "frames.images", action, count, None, scene, step, image))
+    return Reading(findings, {})
 
 
 def _what(high: float) -> str:

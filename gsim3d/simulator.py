@@ -24,8 +24,8 @@ from torch import Tensor, nn
 
 from gsim3d.dynamics import Dynamics, append_step, concatenate, last_steps, rollout
 from gsim3d.effects import EffectsSpec, Plan, make_plan
-from gsim3d.encoder import Encoder
-from gsim3d.guards import guard_particles
+from gsim3d.encoder import Encoder, pixel_rows
+from gsim3d.guards import drop_rows, guard_frames, guard_particles
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
@@ -54,7 +54,9 @@ class Simulator(nn.Module):
     ) -> Particles:
         """Particles of all clouds of ``frames``: each pixel that the masks keep becomes one."""
         guard = self._guard("encode", on_bad, report)
-        return guard(self.encoder(frames))
+        frames, spoiled = guard_frames(frames, guard.keywords["config"], guard.keywords["report"], "encode")
+        particles = self.encoder(frames)
+        return guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled)))
 
     def plan(self, spec: EffectsSpec = EffectsSpec()) -> Plan:
         """What will be computed for ``spec``, and what will not.
@@ -107,6 +109,7 @@ class Simulator(nn.Module):
         on_bad: OnBad | None = None,
         report: StabilityReport | None = None,
         geometry: Callable[[Particles], Pyramid] | None = None,
+        wrap: Callable[[Callable], Callable] | None = None,
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
 
@@ -115,9 +118,11 @@ class Simulator(nn.Module):
 
         Args:
             geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
+            wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
         """
         plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
+        predict = predict if wrap is None else wrap(predict)
         return rollout(predict, guard(self.prepare(state, plan)), n_steps, plan.history)
 
     def prepare(self, state: Particles, plan: Plan) -> Particles:
@@ -149,8 +154,22 @@ class Simulator(nn.Module):
             plan: limits the degree of view-dependent colour; default the model's.
             cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
         """
-        on_bad, report = on_bad or self.config.stability.on_bad, self.report if report is None else report
         particles = self._guard("render", on_bad, report, in_workspace=False)(particles)
+        return self.draw(particles, cameras, background, plan, cutoff=cutoff, on_bad=on_bad, report=report)
+
+    def draw(
+        self,
+        particles: Particles,
+        cameras: Cameras,
+        background: Tensor | None = None,
+        plan: Plan | None = None,
+        *,
+        cutoff: str = "exact",
+        on_bad: OnBad | None = None,
+        report: StabilityReport | None = None,
+    ) -> Rendering:
+        """As :meth:`render`, of particles as :meth:`rollout` returned them: their numbers are not looked at again."""
+        on_bad, report = on_bad or self.config.stability.on_bad, self.report if report is None else report
         gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None)
         quirks = self.config.renderer.quirks
         if quirks != Quirks():
@@ -159,7 +178,7 @@ class Simulator(nn.Module):
 
     def _guard(
         self, where: str, on_bad: OnBad | None, report: StabilityReport | None, in_workspace: bool = True
-    ) -> Callable[..., Particles]:
+    ) -> partial[Particles]:
         """guard_particles with the limits of this model."""
         limits, dynamics = self.config.stability, self.config.dynamics
         if on_bad is not None:
@@ -196,4 +215,4 @@ class Simulator(nn.Module):
                 step = dataclasses.replace(step, sh=torch.where(held[:, None, None], newest.sh, step.sh))
         if appearance.opacity_changes is False:
             step = dataclasses.replace(step, opacities=newest.opacities)
-        return guard(step, previous=newest)
+        return guard(step, previous=newest, changed=self.dynamics.layout.changing)

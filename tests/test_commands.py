@@ -69,6 +69,17 @@ def test_train_writes_checkpoint_log_and_export(capsys, work):
     assert code == 0 and "going on from step 2 of 2" in out
 
 
+def test_train_with_decoded_files_learns_the_same(capsys, work, tmp_path):
+    options = ["--data", work / "data", "--out", tmp_path / "run", "--cache", tmp_path / "cache"]
+    assert call(capsys, "train", work / "train.yaml", *options)[0] == 0
+    assert len(list((tmp_path / "cache").iterdir())) >= 2
+    losses = [
+        [json.loads(line)["loss"] for line in (run / "metrics.jsonl").read_text().splitlines()]
+        for run in (work / "run", tmp_path / "run")
+    ]
+    assert len(losses[0]) == 2 and losses[0] == losses[1]
+
+
 def test_printed_configuration_can_be_read_again(capsys, work, tmp_path):
     code, out, _ = call(capsys, "train", work / "train.yaml", "--print-config")
     assert code == 0 and yaml.safe_load(out)["data"]["target_only_cameras"] == [3]
@@ -147,7 +158,7 @@ BAD = {
     "unknown command": (["trian"], "unknown command 'trian'"),
     "unknown option": (["train", "--speed", "9"], "unrecognized arguments: --speed"),
     "no configuration": (["train", "--data", "{data}", "--out", "{new}"], "CONFIG is needed"),
-    "configuration is missing": (["train", "no.yaml", "--data", "{data}", "--out", "{new}"], "no.yaml: cannot read"),
+    "configuration is missing": (["train", "no.yaml", "--data", "{data}", "--out", "{new}"], "no.yaml cannot be read"),
     "data is missing": (["train", "{config}", "--data", "{new}/data", "--out", "{new}"], "data"),
     "no scene": (["train", "{config}", "--data", "{empty}", "--out", "{new}"], "holds no scene"),
     "bad step": (["train", "{config}", "--data", "{data}", "--out", "{new}", "--until", "0"], "--until"),

@@ -81,7 +81,7 @@ def test_the_real_settings_are_what_the_demo_promises():
     from gsim3d.generate.worlds import build_world
 
     config = DemoConfig()
-    world = build_world("elastic", "demo", config.data)
+    world = build_world("elastic", "mini", config.data)
     assert world.n_cams == 12 and world.image_size == 64 and world.fps >= 12 and world.n_trajectories >= 28
     assert world.n_frames - config.train.data.history >= 16
     assert len(config.train.data.target_only_cameras) == 2 and isinstance(config.train, TrainConfig)

@@ -18,9 +18,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 from tests.stability.cases import CASES, GROUPS  # noqa: E402
+from tests.stability.constants import CONSTANTS  # noqa: E402
 from tests.stability.setting import NAMES  # noqa: E402
 
 NUMBERS, PAGE = ROOT / "docs" / "stability.json", ROOT / "docs" / "stability.md"
+GUARDS = ("guards", "guards_core")  # of tests/mutants
 INTRODUCTION = """# Stability
 
 Written by `python tools/stability.py` from the tests in `tests/stability`; do not edit.
@@ -42,9 +44,6 @@ knows nothing of gsim3d, or against the same computation in float64 on the CPU; 
 sets. tf32: float32 with TF32 products allowed; bf16: under `torch.autocast`; the rasterizer, the geometry and the plane
 sweep compute in float32 under both. "held": what is expected holds bit by bit, or as an error that is raised; there is
 no number to compare.
-
-Each guard behind these cases is shown to matter: `python tools/mutants.py guards guards_core` takes them away one by
-one, and for each a test of this page must fail.
 
 What the published release does was seen on the CPU or read in its code; of other packages, public issues
 (`name#number`), pull requests and commits are quoted.
@@ -86,7 +85,36 @@ def page(columns: dict) -> str:
             column, what = columns[name], "files and their readers" if name == "host" else name
             n_cases, n_tests = len(column["cases"]), sum(record["tests"] for record in column["cases"].values())
             text += f"- {what}: {column['machine']}, torch {column['torch']}, {n_tests} tests of {n_cases} cases.\n"
-    return text + "".join(rows_of(columns, group) for group in GROUPS)
+    return text + "".join(rows_of(columns, group) for group in GROUPS) + bounds()
+
+
+def bounds() -> str:
+    """The constants that keep numbers bounded, and the guards with the tests that need them."""
+    text = """
+## Bounded insides
+
+Between what goes in and what comes out these constants keep numbers bounded. Positions and everything of the
+rasterizer are float32 or wider in every setting; sums are added in float32 or wider.
+
+| constant | value | unit | consequence |
+| --- | --- | --- | --- |
+"""
+    for c in CONSTANTS:
+        text += f"| `{c.name}` ([{Path(c.file).name}](../{c.file})) | `{c.value}` | {c.unit} | {c.consequence} |\n"
+    text += """
+## Guards
+
+Each guard is shown to matter: `python tools/mutants.py guards guards_core` takes them away one by one, and each time
+the test beside it must fail.
+
+| guard | in | test that fails without it |
+| --- | --- | --- |
+"""
+    for name in GUARDS:
+        for mutant in json.loads((ROOT / "tests" / "mutants" / f"{name}.json").read_text()):
+            file, test = mutant["file"], mutant["test"].split("::")[1]
+            text += f"| {mutant['guard']} | [{Path(file).name}](../{file}) | `{test}` |\n"
+    return text
 
 
 def add(columns: dict, measured: dict) -> dict:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gsim3d.data.recording import BACKGROUND, MOVING
 from gsim3d.data.scene import Scene
@@ -84,10 +85,7 @@ def make_frames(
             images.append(scene.images(chosen, [step])[0])
             if masked:
                 labels.append(scene.segmentation(chosen, [step])[0])
-            filmed = scene.valid(chosen, [step])
-            valid.append(
-                torch.ones(images[-1].shape[:1] + images[-1].shape[2:]).bool() if filmed is None else filmed[0]
-            )
+            valid.append(scene.valid(chosen, [step]))
             cameras.append(scene.cameras_at(chosen, [step]))
             image_cloud += [len(cloud_scene)] * len(chosen)
             cloud_scene.append(number)
@@ -95,10 +93,9 @@ def make_frames(
     if not images:
         raise InputError("make_frames needs at least one step")
     labels = torch.cat(labels) if masked else None
-    valid = torch.cat(valid)
-    valid = None if bool(valid.all()) else valid
+    valid = _join_valid(valid, images)
     return Frames(
-        images=torch.cat(images).float() / 255,
+        images=torch.cat(images).float().div_(255),
         cameras=_join_cameras(cameras, image_cloud),
         cloud_scene=torch.tensor(cloud_scene, dtype=torch.int64),
         cloud_step=torch.tensor(cloud_step, dtype=torch.int64),
@@ -107,6 +104,19 @@ def make_frames(
         dynamic=labels == MOVING if masked else None,
         valid=valid,
     )
+
+
+def _join_valid(valid: list[Tensor | None], images: list[Tensor]) -> Tensor | None:
+    """bool [I, H, W], pixels that were filmed; None where that is all of them."""
+    if all(filmed is None for filmed in valid):
+        return None
+    joint = torch.cat(
+        [
+            torch.ones(stack[:, 0].shape, dtype=torch.bool) if filmed is None else filmed[0]
+            for filmed, stack in zip(valid, images)
+        ]
+    )
+    return None if bool(joint.all()) else joint
 
 
 def _check_size(scene: Scene, first: Scene) -> None:

@@ -114,12 +114,13 @@ def is_marked(image: np.ndarray) -> np.ndarray:
 
 
 class ImageCache:
-    """Images of one kind of one scene, uint8 [H, W, 3] or [H, W], kept as they are asked for.
+    """Images of one kind of one scene, uint8 [H, W, 3] or [H, W], decoded once.
 
     Args:
         shape: [T, V, H, W, ...] of all of them; memory is taken for what was asked for only.
         read: (cam, steps) -> the images of one camera, in the order of ``steps``.
-        cache_dir: where to keep the whole decoded array as a memory-mapped .npy file; None: in memory.
+        cache_dir: where to keep all of them decoded, a .npy file of which single images are read; None: in memory.
+            A file is open while it is read only, so a set may have any number of scenes.
         key: tells this scene, kind and state of its files from any other.
     """
 
@@ -129,15 +130,16 @@ class ImageCache:
         if cache_dir is not None:
             name = hashlib.sha256(repr((*key, self._shape)).encode()).hexdigest()[:32]
             self._file = Path(cache_dir) / f"{name}.npy"
-        self._mapped = None
+        self._start: int | None = None  # where the pixels of the file begin, once it was seen to be ours
         self._images: dict[tuple[int, int], np.ndarray] = {}
         self._lock = threading.Lock()  # samples of a training step are read side by side
 
     def get(self, steps: Sequence[int], cams: Sequence[int]) -> np.ndarray:
         """A copy of the images at ``steps`` x ``cams``."""
-        if self._file is not None:
-            return self._map()[np.ix_(steps, cams)]
         images = np.empty((len(steps), len(cams), *self._shape[2:]), np.uint8)
+        if self._file is not None:
+            self._fetch(steps, cams, images)
+            return images
         with self._lock:
             for cam in set(cams):
                 missing = sorted({step for step in steps if (step, cam) not in self._images})
@@ -148,16 +150,33 @@ class ImageCache:
                 images[i, j] = self._images[step, cam]
         return images
 
-    def _map(self) -> np.ndarray:
+    def _fetch(self, steps: Sequence[int], cams: Sequence[int], images: np.ndarray) -> None:
+        """Reads from the file, which is made if it is missing; the kernel's page cache keeps what is read often."""
         with self._lock:
-            if self._mapped is None:
+            if self._start is None:
                 if not self._file.is_file():
                     self._write()
-                mapped = np.load(self._file, mmap_mode="r")
-                if mapped.shape != self._shape or mapped.dtype != np.uint8:
-                    raise InputError(f"{self._file} is no cache of this scene; remove it")
-                self._mapped = mapped
-            return self._mapped
+                self._start = self._checked_start()
+        n_bytes = images[0, 0].nbytes if images.size else 0
+        with open(self._file, "rb", buffering=0) as file:
+            for i, step in enumerate(steps):
+                for j, cam in enumerate(cams):
+                    place = self._start + (step * self._shape[1] + cam) * n_bytes
+                    if os.preadv(file.fileno(), [memoryview(images[i, j]).cast("B")], place) != n_bytes:
+                        raise InputError(f"{self._file} has become shorter; remove it")
+
+    def _checked_start(self) -> int:
+        with open(self._file, "rb") as file:
+            try:
+                if np.lib.format.read_magic(file) != (1, 0):
+                    raise ValueError("another version of the format")
+                shape, by_column, dtype = np.lib.format.read_array_header_1_0(file)
+            except ValueError as error:
+                raise InputError(f"{self._file} is no cache of this scene ({error}); remove it") from error
+            whole = self._file.stat().st_size == file.tell() + int(np.prod(self._shape, dtype=object))
+            if shape != self._shape or by_column or dtype != np.uint8 or not whole:
+                raise InputError(f"{self._file} is no cache of this scene; remove it")
+            return file.tell()
 
     def _write(self) -> None:
         """Decodes everything into the file, which appears whole or not at all."""

@@ -16,6 +16,7 @@ from gsim3d.types import FROZEN, Particles
 
 SCALE_STEP_SHARE = 1 / 6  # of the range of scales, the most that one step changes a scale
 POSITION_CHANNELS = 6
+SMALL_ANGLE_SQUARED = 1e-8  # radians^2; smaller rotations are their series: a square root has no gradient at 0
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,11 @@ class StateLayout:
     @property
     def in_channels(self) -> int:
         return sum(n for _, n in self.inputs) + POSITION_CHANNELS * self.config.position_features
+
+    @property
+    def changing(self) -> tuple[str, ...]:
+        """Fields of Particles that a step may change."""
+        return tuple(name for name, _ in self.outputs)
 
     @property
     def out_channels(self) -> int:
@@ -203,7 +209,7 @@ def rotate_left(quats: Tensor, rotation_vectors: Tensor) -> Tensor:
         rotation_vectors: [N, 3] radians, world axes.
     """
     angle_squared = rotation_vectors.square().sum(1, keepdim=True)
-    small = angle_squared < 1e-8
+    small = angle_squared < SMALL_ANGLE_SQUARED
     angle = torch.where(small, 1.0, angle_squared).sqrt()
     # sin(angle / 2) / angle and cos(angle / 2), by their series where the quotient would lose its gradient
     ratio = torch.where(small, 0.5 - angle_squared / 48, torch.sin(angle / 2) / angle)

@@ -1,6 +1,6 @@
 """Images of calibrated cameras -> particles: multi-view features, cost volume, depth, view-independent latents."""
 
 from gsim3d.encoder.config import EncoderConfig
-from gsim3d.encoder.encoder import Encoder
+from gsim3d.encoder.encoder import Encoder, pixel_rows
 
-__all__ = ["Encoder", "EncoderConfig"]
+__all__ = ["Encoder", "EncoderConfig", "pixel_rows"]

@@ -4,6 +4,7 @@ import torch
 
 from gsim3d.encoder.config import EncoderConfig
 from gsim3d.errors import HardCaseError, InputError
+from gsim3d.stability import ADVICE
 from gsim3d.types import Frames
 
 
@@ -35,20 +36,33 @@ def check_frames(frames: Frames, config: EncoderConfig) -> None:
                 f"encoder: {name} must be bool {[n_images, height, width]}; got {value.dtype} {list(value.shape)}"
             )
     n_clouds = frames.cloud_scene.shape[0]
-    if int(cameras.image_cloud.min()) < 0 or int(cameras.image_cloud.max()) >= n_clouds:
-        raise InputError(f"encoder: cameras.image_cloud must be in [0, {n_clouds}), the number of clouds")
-    finite = {"images": images, "cameras.viewmats": cameras.viewmats, "cameras.Ks": cameras.Ks}
-    for name, value in finite.items():
-        _check_rows(frames, name, value.detach().flatten(1).isfinite().all(1), "must be finite")
-    _check_rows(frames, "cameras.near", cameras.near > 0, "must be positive")
-    bounded = (cameras.far > cameras.near) & cameras.far.isfinite()
-    _check_rows(frames, "cameras.far", bounded, "must be finite and larger than near")
+    near, far = cameras.near, cameras.far
+    wanted = {
+        ("cameras.image_cloud", ""): (cameras.image_cloud >= 0) & (cameras.image_cloud < n_clouds),
+        ("images", "must be finite"): _finite(images),
+        ("cameras.viewmats", "must be finite"): _finite(cameras.viewmats),
+        ("cameras.Ks", "must be finite"): _finite(cameras.Ks),
+        ("cameras.near", "must be positive"): near > 0,
+        ("cameras.far", "must be finite and larger than near"): (far > near) & far.isfinite(),
+    }
+    good = torch.stack(list(wanted.values()))
+    if not bool(good.all()):  # the device is waited for once
+        check, image = good.logical_not().nonzero()[0].tolist()
+        tensor, what = list(wanted)[check]
+        if tensor == "cameras.image_cloud":
+            raise InputError(f"encoder: {tensor} must be in [0, {n_clouds}), the number of clouds")
+        cloud = int(cameras.image_cloud[image])
+        scene, step = int(frames.cloud_scene[cloud]), int(frames.cloud_step[cloud])
+        advice = ADVICE.replace("rows", "pixels") if tensor == "images" else "mend its calibration or leave it out"
+        raise HardCaseError(
+            f"encoder: {tensor} {what}; image {image} (scene {scene}, step {step}) is not; {advice}",
+            tensor=tensor,
+            scene=scene,
+            step=step,
+            camera=image,
+        )
 
 
-def _check_rows(frames: Frames, name: str, ok: torch.Tensor, wanted: str) -> None:
-    if bool(ok.all()):
-        return
-    image = int((~ok).nonzero()[0])
-    cloud = int(frames.cameras.image_cloud[image])
-    scene, step = int(frames.cloud_scene[cloud]), int(frames.cloud_step[cloud])
-    raise HardCaseError(f"encoder: {name} {wanted}; image {image} (scene {scene}, step {step}) is not")
+def _finite(values: torch.Tensor) -> torch.Tensor:
+    """bool [I], of each image."""
+    return values.detach().flatten(1).isfinite().all(1)

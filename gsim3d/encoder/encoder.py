@@ -14,6 +14,13 @@ from gsim3d.encoder.transformer import MultiViewTransformer
 from gsim3d.types import DYNAMIC, FROZEN, Frames, Particles
 
 
+def pixel_rows(frames: Frames, values: Tensor) -> Tensor:
+    """``values`` [I, H, W] of the pixels that become particles, in the order of their rows."""
+    order = torch.argsort(frames.cameras.image_cloud, stable=True)
+    flat = values[order].flatten()
+    return flat if frames.masks is None else flat[frames.masks[order].flatten()]
+
+
 class Encoder(nn.Module):
     """Multi-view features, a plane sweep, depth refinement and view-independent latents: one particle a pixel.
 

@@ -5,18 +5,32 @@ from __future__ import annotations
 import argparse
 
 EPILOG = """\
+worlds:
+  elastic   soft bodies, from rubber to clay, fall on a round ground
+  rigid     one to three rigid bodies are thrown on it
+  cloth     soft bodies fall on a cloth that hangs from its four corners
+
 examples:
-  gsim3d generate elastic --out data/demo                      34 short scenes at 64 pixels, a minute on 2 cores
-  gsim3d generate elastic --out data/set --size 128 --trajectories 200 --objects ball,star
+  gsim3d generate elastic --out data/mini                      34 short scenes at 64 pixels, a minute on 2 cores
+  gsim3d generate cloth --preset paper --out data/cloth        1200 trajectories of 84 frames at 128 pixels
+  gsim3d generate rigid --preset paper --set higher --trajectories 100 --out data/rigid-higher
   gsim3d generate elastic --out data/cow --mesh cow.obj --objects none --seed 7
-  gsim3d generate elastic --out data/full --preset paper       1200 trajectories of 84 frames at 128 pixels
+
+sets (--set), with the preset's cameras:
+  train     what models learn from
+  unseen    shapes that no training set has: cross, dumbbell, knot, pyramid
+  several   two or three bodies (rigid: four or five; cloth: two)
+  no-ground bodies are thrown up and fall freely, filmed for 0.7 s (elastic, rigid)
+  raised    the ground lies 15 to 30 cm higher (elastic, rigid)
+  higher    from greater heights
 
 layout:
   DIR/<object>/<sample>/metadata.json                  cameras (world-to-camera, pixels), fps, near, far, origin
   DIR/<object>/<sample>/cam_<j>/rgb_<step>.png         colour
-                               /seg_<step>.png         0 background, 1 ground, 3 body
-                               /inst_<step>.png        0 background, 1 ground, 2 body
-  DIR/<object>/<sample>/states.npy                     control lattice of the body at every step, metres
+                               /seg_<step>.png         0 background, 1 ground, 3 bodies and cloth
+                               /inst_<step>.png        0 background, 1 ground, 2 and more: each body, the cloth last
+                               /depth_<step>.png       16 bits, 0.1 mm along the camera's axis, 0: nothing (--depth)
+  DIR/<object>/<sample>/states.npz                     what carries each body and the cloth at every step, metres
   DIR/manifest.json                                    options, hashes, rejected draws, machine, versions
 
 The same options give the same bytes for any number of processes. It may be killed at any time: run it again and
@@ -24,6 +38,7 @@ it goes on where it stopped. A larger --trajectories adds scenes to a finished s
 """
 
 _OPTIONS = {
+    "set": "subset",
     "size": "image_size",
     "frames": "n_frames",
     "fps": "fps",
@@ -35,29 +50,35 @@ _OPTIONS = {
     "drop": "drop_height",
     "body_size": "body_size",
     "background": "background",
+    "depth": "depth",
+    "engine": "engine",
 }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the options of `gsim3d generate` to ``parser``."""
-    parser.description = "Simulate soft bodies that fall and film them with calibrated cameras on two rings."
+    parser.description = "Simulate bodies that fall and film them with calibrated cameras on two rings."
     parser.epilog = EPILOG
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("world", metavar="WORLD", help="what is simulated: elastic")
+    parser.add_argument("world", metavar="WORLD", help="what is simulated: elastic, rigid or cloth")
     parser.add_argument(
         "--out", metavar="DIR", required=True, help="folder of the data set; made if absent, continued if unfinished"
     )
-    parser.add_argument("--preset", default="demo", help="options to start from: demo (default) or paper")
+    parser.add_argument("--preset", default="mini", help="options to start from: mini (default) or paper")
+    parser.add_argument("--set", metavar="NAME", help="train (default), or a held-out set, see below")
     parser.add_argument("--size", type=int, metavar="PX", help="width and height of the images")
     parser.add_argument("--frames", type=int, metavar="N", help="steps of a trajectory")
     parser.add_argument("--fps", type=float, help="steps a second")
     parser.add_argument("--trajectories", type=int, metavar="N", help="number of scenes, dealt to the objects in turn")
     parser.add_argument("--seed", type=int, help="another seed gives other trajectories (default 0)")
     parser.add_argument(
-        "--objects", type=_names, metavar="A,B", help="ball,blob,box,capsule,ellipsoid,star,torus (all), or none"
+        "--objects",
+        type=_names,
+        metavar="A,B",
+        help="ball,blob,box,capsule,ellipsoid,star,torus (all; rigid also cone,cylinder), or none",
     )
     parser.add_argument(
-        "--mesh", action="append", metavar="FILE", help="a mesh file as a further object, with its texture; repeatable"
+        "--mesh", action="append", metavar="FILE", help="a closed mesh as one more object, with its texture; repeatable"
     )
     parser.add_argument("--mesh-up", choices=("y", "z"), help="which axis of mesh files points up (default y)")
     parser.add_argument("--drop", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of drop heights, metres")
@@ -65,6 +86,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--body-size", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of body diameters, metres"
     )
     parser.add_argument("--background", choices=("black", "white"), help="colour behind the ground (default black)")
+    parser.add_argument("--depth", action="store_true", default=None, help="also write depth images")
+    parser.add_argument(
+        "--engine", help="mujoco (default), or genesis: the paper's MPM and PBD (pip install 'gsim3d[genesis]')"
+    )
     parser.add_argument("--processes", type=int, metavar="N", help="default: one a core")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 

@@ -11,13 +11,14 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 from gsim3d.errors import InputError
 from gsim3d.generate import writer
 from gsim3d.generate.worlds import build_world
 
-NEEDED = {"mujoco": "mujoco-core==4.0.0", "embreex": "embreex", "trimesh": "trimesh", "PIL": "pillow"}
+NEEDED = {"embreex": "embreex", "trimesh": "trimesh", "PIL": "pillow"}
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ def generate(
     out: str | Path,
     world: str = "elastic",
     *,
-    preset: str = "demo",
+    preset: str = "mini",
     processes: int | None = None,
     progress: bool = True,
     **changes,
@@ -57,8 +58,9 @@ def generate(
 
     Raises: InputError for impossible options, missing packages, and folders that hold something else.
     """
-    _require_packages()
+    _require_packages(NEEDED)
     settings = build_world(world, preset, changes)
+    _require_engine(settings.engine)
     if processes is not None and processes < 1:
         raise InputError(f"processes must be 1 or more; got {processes}")
     out = Path(out)
@@ -70,9 +72,7 @@ def generate(
         fingerprints = {name: settings.fingerprint(name) for name in settings.object_names()}
         folders = [writer.scene_folder(out, *scene) for scene in scenes]
         missing = [
-            scene
-            for scene, folder in zip(scenes, folders)
-            if not writer.is_finished(folder, fingerprints[scene[0]])
+            scene for scene, folder in zip(scenes, folders) if not writer.is_finished(folder, fingerprints[scene[0]])
         ]
         _make_all(settings, out, missing, processes or len(os.sched_getaffinity(0)), progress)
         manifest = writer.write_manifest(out, folders, {"world": world, **dataclasses.asdict(settings)})
@@ -83,12 +83,22 @@ def generate(
     return Report(ordered, len(missing), manifest["rejected"])
 
 
-def _require_packages() -> None:
-    for module, package in NEEDED.items():
+def _require_packages(needed: dict[str, str]) -> None:
+    for module, package in needed.items():
         try:
             __import__(module)
         except ImportError as error:
             raise InputError(f"generate needs {package}: pip install 'gsim3d[generate]' ({error})") from error
+
+
+def _require_engine(engine: str) -> None:
+    if engine == "mujoco":
+        _require_packages({"mujoco": "mujoco-core==4.0.0"})
+    elif find_spec(engine) is None:
+        raise InputError(
+            f"engine {engine} needs the package genesis-world, 4 GB with what it needs: "
+            "pip install 'gsim3d[genesis]'; leave --engine out to simulate with MuJoCo"
+        )
 
 
 @contextmanager

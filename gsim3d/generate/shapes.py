@@ -6,7 +6,6 @@ A body is centred on its bounding box and scaled to fit a sphere of diameter 1; 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Callable
 
 import numpy as np
@@ -16,7 +15,8 @@ from gsim3d.errors import InputError
 FINE_LEVEL = 4  # icosphere subdivisions of the drawn mesh: 2562 vertices, smooth outlines at 256 pixels
 COARSE_LEVEL = 2  # of the mesh that collides: 162 vertices, each a possible contact
 TORUS_RINGS = {FINE_LEVEL: (64, 32), COARSE_LEVEL: (20, 9)}  # corners around the hole and around the tube
-COLLISION_VERTICES = 300  # a mesh file is clustered to at most about so many vertices for contacts
+KNOT_RINGS = {FINE_LEVEL: (160, 20), COARSE_LEVEL: (42, 6)}  # along the tube and around it
+TURNED_SIDES = {FINE_LEVEL: 64, COARSE_LEVEL: 24}
 
 PALETTE = np.array(
     [
@@ -102,11 +102,73 @@ def _torus(level):
     b = 2 * np.pi * np.arange(n_tube)[None, :] / n_tube
     reach = 1 + 0.5 * np.cos(b)
     vertices = np.stack([reach * np.cos(a), reach * np.sin(a), np.broadcast_to(0.5 * np.sin(b), (n_ring, n_tube))], -1)
+    return vertices.reshape(-1, 3), _tube_faces(n_ring, n_tube)
+
+
+def _cross(d):
+    # Six arms along the axes.
+    return 0.52 + 0.62 * np.exp((np.abs(d).max(1) - 1) * 9)
+
+
+def _pyramid(d):
+    # A tetrahedron with rounded edges: the nearest of four planes, softened.
+    planes = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
+    return (np.maximum((d[:, None] * planes).sum(-1), 0) ** 7).sum(1) ** (-1 / 7)
+
+
+def _dumbbell(level):
+    directions, faces = icosphere(level)
+    along = directions[:, :1]
+    return np.concatenate([1.35 * along, directions[:, 1:] * (0.36 + 0.62 * along**2)], 1), faces
+
+
+def _knot(level):
+    """A tube along a trefoil knot."""
+    n_ring, n_tube = KNOT_RINGS[level]
+    t = 2 * np.pi * np.arange(n_ring)[:, None] / n_ring
+    line = np.concatenate([np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t), -1.4 * np.sin(3 * t)], 1)
+    ahead = np.concatenate([np.cos(t) + 4 * np.cos(2 * t), -np.sin(t) + 4 * np.sin(2 * t), -4.2 * np.cos(3 * t)], 1)
+    bend = np.concatenate([-np.sin(t) - 8 * np.sin(2 * t), -np.cos(t) + 8 * np.cos(2 * t), 12.6 * np.sin(3 * t)], 1)
+    side = np.cross(ahead, bend)
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    other = np.cross(side, ahead)
+    other /= np.linalg.norm(other, axis=1, keepdims=True)
+    around = 2 * np.pi * np.arange(n_tube) / n_tube
+    offsets = np.cos(around)[:, None] * side[:, None] + np.sin(around)[:, None] * other[:, None]
+    return (line[:, None] + 0.72 * offsets).reshape(-1, 3), _tube_faces(n_ring, n_tube)
+
+
+def _turned(corners: list[tuple[float, float]]):
+    """A surface of revolution about z with sharp edges: (radius, height) of its profile from top to bottom."""
+
+    def build(level):
+        n = TURNED_SIDES[level]
+        angle = 2 * np.pi * np.arange(n) / n
+        circle = np.stack([np.cos(angle), np.sin(angle)], 1)
+        rings = [np.concatenate([r * circle, np.full((n, 1), z)], 1) for r, z in corners if r]
+        top, bottom = ([0.0, 0.0, corners[k][1]] for k in (0, -1))
+        vertices = np.concatenate([*rings, [top, bottom]])
+        i, j = np.arange(n), (np.arange(n) + 1) % n
+        first, last = len(vertices) - 2, len(vertices) - 1
+        faces = [np.stack([np.full(n, first), i, j], 1)]
+        for ring in range(len(rings) - 1):
+            a, b = ring * n, (ring + 1) * n
+            faces += [np.stack([a + i, b + i, b + j], 1), np.stack([a + i, b + j, a + j], 1)]
+        a = (len(rings) - 1) * n
+        faces.append(np.stack([a + j, a + i, np.full(n, last)], 1))
+        faces = np.concatenate(faces)
+        if level == FINE_LEVEL:  # a vertex for each corner of a face, so that edges are drawn sharp
+            return vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
+        return vertices, faces
+
+    return build
+
+
+def _tube_faces(n_ring: int, n_tube: int) -> np.ndarray:
     i, j = np.meshgrid(np.arange(n_ring), np.arange(n_tube), indexing="ij")
     next_i, next_j = (i + 1) % n_ring, (j + 1) % n_tube
     p, q, r, s = i * n_tube + j, next_i * n_tube + j, next_i * n_tube + next_j, i * n_tube + next_j
-    faces = np.stack([np.stack([p, q, r], -1), np.stack([p, r, s], -1)], 2).reshape(-1, 3)
-    return vertices.reshape(-1, 3), faces
+    return np.stack([np.stack([p, q, r], -1), np.stack([p, r, s], -1)], 2).reshape(-1, 3)
 
 
 SHAPES = {
@@ -117,7 +179,16 @@ SHAPES = {
     "ellipsoid": _radial(_ellipsoid),
     "star": _radial(_star),
     "torus": _torus,
+    "cone": _turned([(0.0, 0.6), (0.62, -0.5)]),
+    "cylinder": _turned([(0.0, 0.55), (0.5, 0.55), (0.5, -0.55), (0.0, -0.55)]),
+    "cross": _radial(_cross),
+    "dumbbell": _dumbbell,
+    "knot": _knot,
+    "pyramid": _radial(_pyramid),
 }
+SOFT_SHAPES = ("ball", "blob", "box", "capsule", "ellipsoid", "star", "torus")
+RIGID_SHAPES = (*SOFT_SHAPES, "cone", "cylinder")
+UNSEEN_SHAPES = ("cross", "dumbbell", "knot", "pyramid")  # of held-out sets only
 
 
 def _stripes(p, colors):
@@ -143,7 +214,7 @@ def _patches(p, colors):
 PATTERNS = {"checker": _checker, "dots": _dots, "patches": _patches, "stripes": _stripes}
 
 
-def _normalise(vertices: np.ndarray) -> tuple[np.ndarray, float]:
+def normalise(vertices: np.ndarray) -> tuple[np.ndarray, float]:
     """Centre [3] of the bounding box of ``vertices``, and the diameter of the sphere around it that holds them."""
     centre = (vertices.min(0) + vertices.max(0)) / 2
     return centre, 2 * float(np.linalg.norm(vertices - centre, axis=1).max())
@@ -155,88 +226,13 @@ def procedural_body(name: str, rng: np.random.Generator) -> Body:
         raise InputError(f"object {name!r} is not known; choose from {', '.join(SHAPES)} or give a mesh file")
     vertices, faces = SHAPES[name](FINE_LEVEL)
     light_vertices, light_faces = SHAPES[name](COARSE_LEVEL)
-    centre, diameter = _normalise(vertices)
+    centre, diameter = normalise(vertices)
     vertices, light_vertices = (vertices - centre) / diameter, (light_vertices - centre) / diameter
+    return Body(name, vertices, faces, light_vertices, light_faces, vertices[faces], random_paint(rng))
+
+
+def random_paint(rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+    """Colours [N, 3] of points [N, 3] of a unit body: a random pattern of three random colours."""
     pattern = PATTERNS[sorted(PATTERNS)[rng.integers(len(PATTERNS))]]
     colors = PALETTE[rng.permutation(len(PALETTE))[:3]]
-    return Body(name, vertices, faces, light_vertices, light_faces, vertices[faces], lambda p: pattern(p, colors))
-
-
-def _cluster(vertices: np.ndarray, faces: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
-    """Merges vertices that share a cell of a grid, the finest that leaves at most ``limit`` of them."""
-    for n_cells in range(64, 1, -2):
-        cells = np.floor((vertices + 0.5) * n_cells).astype(np.int64)
-        _, first, label = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-        label = label.reshape(-1)
-        if len(first) <= limit:
-            break
-    count = np.bincount(label)
-    merged = np.stack([np.bincount(label, vertices[:, a]) / count for a in range(3)], 1)
-    light = label[faces]
-    proper = (light[:, 0] != light[:, 1]) & (light[:, 1] != light[:, 2]) & (light[:, 2] != light[:, 0])
-    light = light[proper]
-    used, light = np.unique(light, return_inverse=True)
-    return merged[used], light.reshape(-1, 3)
-
-
-def _texture_lookup(image: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Bilinear, repeating texture; v counts from the bottom row, as in .obj files."""
-    texels = image.astype(np.float64) / 255
-    height, width = texels.shape[:2]
-
-    def paint(uv):
-        x = (uv[:, 0] % 1) * width - 0.5
-        y = (1 - uv[:, 1] % 1) * height - 0.5
-        x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-        fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-        top = texels[y0 % height, x0 % width] * (1 - fx) + texels[y0 % height, (x0 + 1) % width] * fx
-        low = texels[(y0 + 1) % height, x0 % width] * (1 - fx) + texels[(y0 + 1) % height, (x0 + 1) % width] * fx
-        return top * (1 - fy) + low * fy
-
-    return paint
-
-
-def load_body(path: str | Path, up: str = "y") -> Body:
-    """A body from a mesh file (anything that trimesh reads), with its texture or vertex colours where it has any.
-
-    Args:
-        path: mesh file; a texture named by its material must lie beside it.
-        up: "y" (usual for .obj and .glb) or "z", the axis that points up in the file.
-
-    Raises InputError when the file cannot be read, or holds no surface.
-    """
-    import trimesh
-
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"mesh {path} is not a file")
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:  # trimesh raises whatever its parsers raise
-        raise InputError(f"mesh {path} cannot be read: {error}") from error
-    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-    if len(faces) < 4 or not np.isfinite(vertices).all():
-        raise InputError(f"mesh {path} must be a closed surface with finite vertices; got {len(faces)} faces")
-    if up == "y":
-        vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
-    centre, diameter = _normalise(vertices)
-    if not diameter > 0:
-        raise InputError(f"mesh {path} has no size: all vertices coincide")
-    vertices = (vertices - centre) / diameter
-    corners, paint = _mesh_paint(mesh, vertices, faces)
-    # One vertex for each position: copies along texture seams would tear the shading and collide twice.
-    positions, label = np.unique(vertices, axis=0, return_inverse=True)
-    faces = label.reshape(-1)[faces]
-    return Body(path.stem, positions, faces, *_cluster(positions, faces, COLLISION_VERTICES), corners, paint)
-
-
-def _mesh_paint(mesh, vertices, faces):
-    visual = mesh.visual
-    image = getattr(getattr(visual, "material", None), "image", None)
-    if getattr(visual, "uv", None) is not None and image is not None:
-        texture = _texture_lookup(np.asarray(image.convert("RGB")))
-        return np.asarray(visual.uv, dtype=np.float64)[faces], texture
-    if getattr(visual, "kind", None) == "vertex":
-        return np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3][faces] / 255, lambda c: c
-    colors = PALETTE[[5, 8, 1]]
-    return vertices[faces], lambda p: _patches(p, colors)
+    return lambda points: pattern(points, colors)

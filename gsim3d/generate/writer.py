@@ -1,6 +1,6 @@
 """Scene folders and the manifest of a generated data set.
 
-Layout: OUT/<object>/<sample>/metadata.json, cam_<j>/{rgb,seg,inst}_<step>.png, states.npy; OUT/manifest.json.
+Layout: OUT/<object>/<sample>/metadata.json, cam_<j>/{rgb,seg,inst,depth}_<step>.png, states.npz; OUT/manifest.json.
 A scene is written to a hidden folder beside its place and renamed when it is whole.
 """
 
@@ -21,23 +21,27 @@ from gsim3d.errors import InputError
 from gsim3d.generate.cameras import Rig, workspace_origin
 from gsim3d.generate.render import View
 
-GENERATOR_VERSION = 1  # raise it whenever the same options would give other bytes
+GENERATOR_VERSION = 2  # raise it whenever the same options would give other bytes
 FILE_TEMPLATE = "cam_{cam_ix}/{img_type}_{n_step:04d}"
 PNG_COMPRESSION = 3
+DEPTH_UNIT = 1e-4  # metres a count of the 16-bit depth images
+MAX_DEPTH = 6.5  # metres that fit
 PACKAGES = ("numpy", "mujoco-core", "embreex", "trimesh", "opencv-contrib-python-headless")
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One filmed trajectory, ready to be written. ``states`` float32 [T, c+1, c+1, c+1, 3]: control lattice, metres."""
+    """One filmed trajectory, ready to be written.
+
+    states: float32 [T, ..., 3] by name: what carries each body (lattice nodes, axes, particles) and the cloth, metres.
+    """
 
     object: str
     sample: int
     fps: float
     rig: Rig
     views: list[View]
-    states: np.ndarray
-    body_height: float
+    states: dict[str, np.ndarray]
     extras: dict
     fingerprint: str
 
@@ -71,21 +75,30 @@ def write_scene(out: Path, scene: Scene) -> Path:
         if leftover.exists():
             shutil.rmtree(leftover)
     unfinished.mkdir(parents=True)
-    images_hash = hashlib.sha256()
+    images_hash, states_hash = hashlib.sha256(), hashlib.sha256()
     for cam in range(scene.rig.n_cams):
         (unfinished / f"cam_{cam}").mkdir()
     for step, view in enumerate(scene.views):
-        for image_type, images in (("rgb", view.rgb[..., ::-1]), ("seg", view.segmentation), ("inst", view.instances)):
+        for image_type, images in _images(view):
             images_hash.update(np.ascontiguousarray(images).tobytes())
             for cam, image in enumerate(images):
                 file = FILE_TEMPLATE.format(cam_ix=cam, img_type=image_type, n_step=step) + ".png"
                 (unfinished / file).write_bytes(_png(image))
-    np.save(unfinished / "states.npy", scene.states)
-    hashes = {"states_sha256": hashlib.sha256(scene.states.tobytes()).hexdigest()}
-    hashes["images_sha256"] = images_hash.hexdigest()
+    for name, nodes in scene.states.items():
+        states_hash.update(name.encode() + nodes.tobytes())
+    np.savez(unfinished / "states.npz", **scene.states)
+    hashes = {"states_sha256": states_hash.hexdigest(), "images_sha256": images_hash.hexdigest()}
     _write_json(unfinished / "metadata.json", {**_metadata(scene), **hashes})
     os.replace(unfinished, folder)
     return folder
+
+
+def _images(view: View) -> list[tuple[str, np.ndarray]]:
+    """Type and pixels [V, H, W, ...] of the images of one step, in the order in which they are hashed."""
+    images = [("rgb", view.rgb[..., ::-1]), ("seg", view.segmentation), ("inst", view.instances)]
+    if view.depth is not None:
+        images.append(("depth", np.rint(view.depth / DEPTH_UNIT).astype(np.uint16)))
+    return images
 
 
 def _png(image: np.ndarray) -> bytes:
@@ -117,9 +130,9 @@ def _metadata(scene: Scene) -> dict:
         "origin": workspace_origin(rig).tolist(),
         "object": scene.object,
         "sample": scene.sample,
-        "body_height": scene.body_height,
         "generator_version": GENERATOR_VERSION,
         "fingerprint": scene.fingerprint,
+        **({} if scene.views[0].depth is None else {"depth_unit": DEPTH_UNIT}),
         **scene.extras,
         **cams,
     }

@@ -296,7 +296,8 @@ def _setup(ctx, inputs, output):
 
 
 def _backward(ctx, *grads):
-    transmittance, features = ctx.saved_tensors[0], ctx.saved_tensors[8]
+    saved = ctx.saved_tensors  # read once: a checkpoint gives them once
+    transmittance, features = saved[0], saved[8]
     sizes = ((3,), (), (), features.shape[1:])  # of color, alpha, depth, features
     images = [
         transmittance.new_zeros(*transmittance.shape, *size) if grad is None else grad
@@ -304,7 +305,7 @@ def _backward(ctx, *grads):
     ]
     viewmats_grad = ctx.needs_input_grad[7]
     *grads, viewmats = torch.ops.gsim3d.rasterize_gaussians_backward(
-        *images, *ctx.saved_tensors, *ctx.options, viewmats_grad
+        *images, *saved, *ctx.options, viewmats_grad
     )
     return (*grads, viewmats if viewmats_grad else None, *[None] * 11)
 

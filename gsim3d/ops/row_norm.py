@@ -149,8 +149,9 @@ def _residual_setup(ctx, inputs, output):
 def _residual_backward(ctx, grad_sum, grad_out, *_):
     if grad_sum is None and grad_out is None:
         return (None,) * 8
-    branch_weight, weight = ctx.saved_tensors[3:5]
-    x, branch, _, *of_norms = torch.ops.gsim3d.residual_norm_backward(grad_sum, grad_out, *ctx.saved_tensors)
+    saved = ctx.saved_tensors  # read once: a checkpoint gives them once
+    branch_weight, weight = saved[3:5]
+    x, branch, _, *of_norms = torch.ops.gsim3d.residual_norm_backward(grad_sum, grad_out, *saved)
     given = [w is not None for w in (branch_weight, branch_weight, weight, weight)]
     return x, branch, None, *(g if has else None for g, has in zip(of_norms, given, strict=True)), None
 
@@ -216,8 +217,9 @@ def _gelu_setup(ctx, inputs, output):
 
 
 def _gelu_backward(ctx, grad):
-    x, scale, bias = torch.ops.gsim3d.norm_gelu_backward(grad, *ctx.saved_tensors)
-    return x, -ctx.saved_tensors[2] * bias, scale, bias, None
+    saved = ctx.saved_tensors
+    x, scale, bias = torch.ops.gsim3d.norm_gelu_backward(grad, *saved)
+    return x, -saved[2] * bias, scale, bias, None
 
 
 torch.library.register_autograd("gsim3d::norm_gelu", _gelu_backward, setup_context=_gelu_setup)

@@ -30,10 +30,11 @@ from torch import Tensor
 
 from gsim3d import __version__
 from gsim3d.errors import InputError
+from gsim3d.files import MAX_TEXT, read_file
 from gsim3d.train.settings import load_yaml
 
 FORMAT = 1
-STATE, CONFIG = "state.json", "config.yaml"
+STATE, CONFIG, POINTER = "state.json", "config.yaml", "last"
 _WEIGHTS = {"model": "model.safetensors", "ema": "ema.safetensors", "optimizer": "optimizer.safetensors"}
 
 
@@ -64,11 +65,21 @@ def save(run: str | Path, checkpoint: Checkpoint, keep: int = 2) -> Path:
     """Writes the checkpoint into the run folder, points to it, and removes all but the ``keep`` newest.
 
     A process that is killed at any moment leaves the previous checkpoint good and pointed to.
+
+    Raises:
+        InputError: the disk is full, or the folder cannot be written; the previous checkpoint stays as well.
     """
     root = Path(run) / "checkpoints"
-    root.mkdir(parents=True, exist_ok=True)
-    folder = write(root / f"step_{checkpoint.state['step']:06d}", checkpoint)
-    _write_text(root / "last", folder.name)
+    folder = root / f"step_{checkpoint.state['step']:06d}"
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        write(folder, checkpoint)
+        _write_text(root / POINTER, folder.name)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot be written: {error.strerror}; checkpoints before it are untouched: make room and train "
+            "again, it goes on from the last one"
+        ) from None
     for old in sorted(root.glob("step_*"))[:-keep]:
         if old != folder:
             shutil.rmtree(old, ignore_errors=True)
@@ -79,6 +90,17 @@ def write(folder: Path, checkpoint: Checkpoint) -> Path:
     """Writes a checkpoint folder, whole or not at all; one that is there is replaced."""
     part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)
+    try:
+        _write_files(part, checkpoint)
+    except OSError:
+        shutil.rmtree(part, ignore_errors=True)  # it may be what fills the disk
+        raise
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(part, folder)
+    return folder
+
+
+def _write_files(part: Path, checkpoint: Checkpoint) -> None:
     part.mkdir()
     for name, file in _WEIGHTS.items():
         tensors = getattr(checkpoint, name)
@@ -93,14 +115,11 @@ def write(folder: Path, checkpoint: Checkpoint) -> Path:
     (part / STATE).write_text(json.dumps(state, indent=1))
     for path in [*part.iterdir(), part]:
         _sync(path)
-    shutil.rmtree(folder, ignore_errors=True)
-    os.replace(part, folder)
-    return folder
 
 
 def exists(run: str | Path) -> bool:
     """Whether the run folder has a checkpoint to go on from."""
-    return (Path(run) / "checkpoints" / "last").is_file()
+    return (Path(run) / "checkpoints" / POINTER).is_file()
 
 
 def digest_of(folder: Path) -> str:
@@ -112,27 +131,53 @@ def load(path: str | Path) -> Checkpoint:
     """Reads a run folder (its last good checkpoint), a checkpoint folder, or a single exported file.
 
     Raises:
-        InputError: it is none of these, or a file is missing, truncated or changed; the message names it.
+        InputError: it is none of these, or a file is missing, truncated or changed; the message names it, and of a run
+            folder the newest checkpoint that is whole.
     """
-    path = Path(path)
+    try:
+        return _load(Path(path))
+    except (OSError, MemoryError) as error:
+        raise InputError(f"{path}: the checkpoint cannot be read: {error or 'no memory'}") from None
+
+
+def _load(path: Path) -> Checkpoint:
     if not path.exists():
         raise InputError(f"{path}: no such checkpoint")
     if path.is_file():
         return _load_single(path)
-    pointer = path / "checkpoints" / "last"
-    if pointer.is_file():
-        path = path / "checkpoints" / pointer.read_text().strip()
+    pointer = path / "checkpoints" / POINTER
+    if not pointer.is_file():
+        return _load_folder(path)
+    try:
+        return _load_folder(pointer.parent / Path(read_file(pointer, MAX_TEXT).decode(errors="replace").strip()).name)
+    except InputError as error:
+        for older in sorted(pointer.parent.glob("step_*"), reverse=True):
+            if _is_whole(older):
+                advice = f"{older.name} beside it is whole: write this name into {pointer} to go on from there"
+                raise InputError(f"{error}; {advice}") from None
+        raise
+
+
+def _is_whole(folder: Path) -> bool:
+    try:
+        _load_folder(folder)
+    except InputError:
+        return False
+    return True
+
+
+def _load_folder(path: Path) -> Checkpoint:
     if not (path / STATE).is_file():
         raise InputError(f"{path}: not a checkpoint (a run folder, a folder with {STATE}, or a .safetensors file)")
     try:
-        state = json.loads((path / STATE).read_bytes())
+        state = json.loads(read_file(path / STATE, MAX_TEXT))
         hashes = dict(state["sha256"])
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise InputError(f"{path / STATE}: not a checkpoint's state, the checkpoint is broken") from None
     for name, expected in hashes.items():
         file = path / Path(name).name
         if not file.is_file() or _sha256(file) != expected:
-            raise InputError(f"{file}: missing, truncated or changed since it was written; use another checkpoint")
+            raise InputError(f"{file}: missing, truncated or changed since it was written")
     if not {CONFIG, _WEIGHTS["model"]} <= set(hashes):
         raise InputError(f"{path}: the checkpoint holds no {CONFIG} or no {_WEIGHTS['model']}")
     config = _known_format(load_yaml(path / CONFIG), path / CONFIG)
@@ -193,6 +238,7 @@ def _sha256(path: Path) -> str:
 def _write_text(path: Path, text: str) -> None:
     part = path.with_name(f".{path.name}.part")
     part.write_text(text)
+    _sync(part)
     os.replace(part, path)
 
 

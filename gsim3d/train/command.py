@@ -15,11 +15,13 @@ CONFIG is a YAML file; what it leaves out has a default, what it does not know i
 
 Scenes that `gsim3d evaluate` measures by default are left out (every 8th or so; see gsim3d.data.split_scenes).
 Called again, it goes on from the last checkpoint and repeats the same numbers as a run that was never stopped.
+Several processes, on one machine or many (tools/slurm/train.sbatch), share the samples of every step.
 
 examples:
   gsim3d train --print-config > train.yaml
   gsim3d train train.yaml --data runs/data --out runs/model
   gsim3d train train.yaml --data runs/data --out runs/model --export model.safetensors
+  torchrun --nproc-per-node 4 -m gsim3d train train.yaml --data runs/data --out runs/model --device cuda
 """
 
 
@@ -28,10 +30,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     parser.add_argument("config", metavar="CONFIG", nargs="?", help="YAML file with the run's settings")
     parser.add_argument("--data", metavar="DIR", help="folder with scenes of any layout (docs/data.md)")
+    parser.add_argument(
+        "--cache", metavar="DIR", help="keep decoded images in files here, for sets larger than the memory"
+    )
     parser.add_argument("--out", metavar="DIR", help="run folder; made if absent")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default: cpu)")
     parser.add_argument("--until", type=int, metavar="STEP", help="stop after this optimizer step (default: the last)")
     parser.add_argument("--export", metavar="FILE", help="also write the result as one .safetensors file")
+    parser.add_argument("--tensorboard", action="store_true", help="also log to OUT/tensorboard, with sample videos")
+    parser.add_argument("--profile", action="store_true", help="write a trace of two steps to OUT/profile, then go on")
     parser.add_argument("--print-config", action="store_true", help="print all settings with their defaults and exit")
 
 
@@ -58,16 +65,20 @@ def run(args: argparse.Namespace) -> int:
     if args.export and (not args.export.endswith(".safetensors") or not Path(args.export).absolute().parent.is_dir()):
         raise InputError(f"--export must name a .safetensors file in a folder that exists; got {args.export}")
     folders, _ = split_scenes(find_scenes(args.data))
-    scenes = [Scene.open(folder, fitting=config.data.fitting) for folder in folders]
+    scenes = [Scene.open(folder, cache_dir=args.cache, fitting=config.data.fitting) for folder in folders]
 
     from gsim3d.train.loop import Trainer
+    from gsim3d.train.processes import joined
 
-    trainer = Trainer(config, scenes, args.out, device=args.device)
-    if trainer.step:
-        print(f"going on from step {trainer.step} of {config.n_steps}")
-    trainer.run(until=args.until)
-    print(f"trained to step {trainer.step} of {config.n_steps}: {args.out}")
-    if args.export:
-        checkpoint.export(checkpoint.load(args.out), args.export)
-        print(f"written: {args.export}")
+    with joined(args.device) as processes:
+        say = print if processes.is_first else lambda *_: None
+        trainer = Trainer(config, scenes, args.out, device=args.device, processes=processes)
+        if trainer.step:
+            came = "" if trainer.same_scenes else "; with scenes that came since, so not as it would have gone on without them"
+            say(f"going on from step {trainer.step} of {config.n_steps}{came}")
+        trainer.run(until=args.until, tensorboard=args.tensorboard, profile=args.profile)
+        say(f"trained to step {trainer.step} of {config.n_steps}: {args.out}")
+        if args.export and processes.is_first:
+            checkpoint.export(checkpoint.load(args.out), args.export)
+            say(f"written: {args.export}")
     return 0

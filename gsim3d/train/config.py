@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from gsim3d.data import Fitting
 from gsim3d.data.scene import SIZE_MULTIPLE
 from gsim3d.errors import InputError
 from gsim3d.train.losses import BALANCE, DISCOUNT
+from gsim3d.train.precision import PrecisionConfig
 
 
 def _at_least(config: Any, **bounds: float) -> None:
@@ -25,7 +26,7 @@ class StageConfig:
     steps: optimizer steps.
     horizon: simulated steps after the encoded ones; 0 trains encoder and renderer alone.
     history: encoded steps; 0: as many as the data section says.
-    batch: scenes a step.
+    batch: scenes a step, of all processes together.
     target_views: images of each step that the loss compares.
     from_start: share of the windows that begin at a scene's first step; the others begin anywhere.
     learning_rate: peak, reached after ``warm_up`` of the stage's steps, then falling (one cycle a stage).
@@ -51,7 +52,10 @@ class DataConfig:
     """Which frames and views a sample shows.
 
     history: T, encoded steps.
+    shortest_history: every optimizer step draws its number of encoded steps from here to ``history``, so that one model
+        serves them all; 0: always ``history``. A stage with a history of its own keeps that.
     context_views: input images of each step.
+    fewest_views: every optimizer step draws its number of input images from here to ``context_views``; 0: always as many.
     context_cameras: the cameras they come from; empty: all but ``target_only_cameras``.
     target_only_cameras: cameras that are never an input; a loss may look at them.
     background_stride: of pixels that show what never moves, those on every n-th row and column become particles.
@@ -61,7 +65,9 @@ class DataConfig:
     """
 
     history: int = 2
+    shortest_history: int = 0
     context_views: int = 4
+    fewest_views: int = 0
     context_cameras: tuple[int, ...] = ()
     target_only_cameras: tuple[int, ...] = ()
     background_stride: int = 1
@@ -70,7 +76,12 @@ class DataConfig:
     unit_cameras: bool = False
 
     def __post_init__(self):
-        _at_least(self, history=1, context_views=1, background_stride=1)
+        _at_least(self, history=1, shortest_history=0, context_views=1, fewest_views=0, background_stride=1)
+        for least, most in (("shortest_history", "history"), ("fewest_views", "context_views")):
+            if getattr(self, least) > getattr(self, most):
+                raise InputError(
+                    f"data.{least}: must be at most data.{most}, {getattr(self, most)}; got {getattr(self, least)}"
+                )
         if self.resize and (len(self.resize) != 2 or any(side < 1 or side % SIZE_MULTIPLE for side in self.resize)):
             wanted = f"must be [width, height], multiples of {SIZE_MULTIPLE}"
             raise InputError(f"data.resize: {wanted}; got {list(self.resize)}")
@@ -135,6 +146,10 @@ class TrainConfig:
     model: changes of the preset, nested like the model section of a checkpoint's config.yaml.
     effects: what a scene calls for, as :class:`gsim3d.effects.EffectsSpec` reads it.
     stages: run one after another.
+    precision: "fp32", "bf16" or "fp16" for each part of the model.
+    recompute: parts of a step that the backward pass computes again instead of keeping them, which saves memory and
+        changes no bit: "encoder", "steps" (all of a simulated step), "images". Beside "steps",
+        ``model.dynamics.checkpointing`` halves what one simulated step holds and costs another pass.
     seed: all randomness follows from it and from the step.
     workers: samples of a step that are computed at the same time, each on its share of the CPU threads; the numbers are
         the same for any count above 0. 0: a step's samples form one batch, as a GPU and batch normalisation want it.
@@ -149,6 +164,8 @@ class TrainConfig:
     data: DataConfig = DataConfig()
     loss: LossConfig = LossConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
+    precision: PrecisionConfig = PrecisionConfig()
+    recompute: tuple[Literal["encoder", "steps", "images"], ...] = ()
     seed: int = 0
     workers: int = 0
     checkpoint_every: int = 500

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
-from gsim3d.data import Scene, generator
+from gsim3d.data import Scene, generator, make_frames
 from gsim3d.dynamics import concatenate
 from gsim3d.effects import EffectsSpec, Plan
 from gsim3d.errors import HardCaseError, InputError
@@ -25,17 +26,30 @@ from gsim3d.perceptual.weights import load
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.config import TrainConfig
+from gsim3d.train.log import Log, memory_gib, plain, progress_note
 from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
+from gsim3d.train.precision import FIRST_SCALE, LossScale
+from gsim3d.train.processes import Processes
+from gsim3d.train.profile import check_profile, profiler
+from gsim3d.train.recompute import recomputed
 from gsim3d.train.restore import build_simulator, check_device, describe, model_config
-from gsim3d.train.samples import Batch, check_scenes, draw_batch
+from gsim3d.train.samples import (
+    Batch,
+    check_scenes,
+    context_cameras,
+    draw_batch,
+    history_at,
+    spread_views,
+    thin_background,
+)
 from gsim3d.train.schedule import one_cycle
-from gsim3d.train.settings import to_dict
-from gsim3d.train.watch import StepWatch, first_not_finite, mean_of_norms, norms_by_module
+from gsim3d.train.settings import from_dict, to_dict
+from gsim3d.train.watch import Seen, StepWatch, first_not_finite, mean_of_norms, norms_by_module
 
-LOG = "metrics.jsonl"
+READERS = 2  # threads that read batches; so many steps are read ahead
 EMA_WARM_UP = 10  # the average forgets its first values: decay is at most (1 + step) / (10 + step)
 # May change between two sittings of one run without changing the curve; so may the number of workers, if there are any.
-FREE_SETTINGS = ("checkpoint_every", "keep_checkpoints", "log_every")
+FREE_SETTINGS = ("checkpoint_every", "keep_checkpoints", "log_every", "recompute")
 # May change as well, so that a run which diverged can go on; the curve is another one from there on.
 FREE_OF_OPTIMIZER, FREE_OF_STAGES = ("clip_norm", "max_skipped"), ("learning_rate", "warm_up")
 
@@ -45,22 +59,33 @@ class Trainer:
 
     Args:
         config: the run. A folder that already has a checkpoint must have been started with the same one.
-        scenes: to train on, in a fixed order.
+        scenes: to train on, in a fixed order. More may come between two sittings, none may go; ``same_scenes`` says whether
+            some came, for then the curve goes on as another one.
         out: run folder, made if absent.
         device: "cpu" or "cuda". A run may change it between two sittings; its numbers then change by rounding.
+        processes: those that train together, see :func:`gsim3d.train.processes.joined`; each has a Trainer of its own, and
+            the first one writes. Another number of them changes numbers by rounding, and what is drawn for drop path and
+            shuffled curves; batch normalisation counts the rows of all.
     """
 
-    def __init__(self, config: TrainConfig, scenes: Sequence[Scene], out: str | Path, *, device: str = "cpu"):
+    def __init__(
+        self,
+        config: TrainConfig,
+        scenes: Sequence[Scene],
+        out: str | Path,
+        *,
+        device: str = "cpu",
+        processes: Processes | None = None,
+    ):
         check_device(device)
-        self.device = device
+        self.device, self.processes = device, processes or Processes()
         check_scenes(scenes, config.data, config.stages)
         self.config, self.scenes, self.out = config, list(scenes), Path(out)
         self.plan_spec = EffectsSpec.from_dict(config.effects)
         self.simulator = build_simulator(model_config(config), config.seed).to(device)
         self.plan = self.simulator.plan(self.plan_spec)
         _check_history(config, self.plan)
-        if config.workers and self.simulator.config.dynamics.norm == "batch":
-            raise InputError("workers: must be 0 for a model with batch normalisation, which needs all samples at once")
+        _check_sharing(config, self.processes.count, self.simulator.config.dynamics.norm)
         self.perceptual = load("lpips_vgg", partial(LPIPS, "vgg")).to(device) if config.loss.perceptual else None
         self.parameters = dict(self.simulator.named_parameters())
         settings = config.optimizer
@@ -72,36 +97,72 @@ class Trainer:
             weight_decay=settings.weight_decay,
         )
         self.average = {k: v.clone() for k, v in self.simulator.state_dict().items()} if settings.ema_decay else {}
+        self.scale = LossScale(FIRST_SCALE if config.precision.scales_loss else 1.0)
         self.step = self.n_skipped = self.n_skipped_in_a_row = 0
         self.seconds = 0.0
         self.parent = None
+        self.same_scenes = True
+        self._ahead: dict[tuple, Future] = {}
+        self._reader = ThreadPoolExecutor(READERS)
         if checkpoint.exists(self.out):
             self._resume()
-        self._cut_log()
+        self.log = Log(self.out, writes=self.processes.is_first)
+        self.log.cut(self.step)
+        self.shared = self._share() if self.processes.count > 1 else None
 
-    def run(self, *, until: int | None = None, progress: bool = True) -> None:
+    def _share(self) -> DistributedDataParallel:
+        """The loss of this process's samples; going back from it gives every process the gradient of all samples."""
+        self.processes.check_agreement(
+            **{"CONFIG": self.config, "--out": (self.step, self.parent), "--data": [s.name for s in self.scenes]}
+        )
+        # Parts without gradients (the dynamics, in a stage that simulates nothing) are searched for in each step. Then torch
+        # also leaves its buckets as they are: it would order them anew after the first step, and a resumed run would add in
+        # another order. A group of its own, because batch normalisation talks at the same time.
+        group = torch.distributed.new_group()
+        # What torch 2.13 warns about has no other name in 2.11.
+        with warnings.catch_warnings(category=FutureWarning, action="ignore"):
+            return DistributedDataParallel(
+                _Loss(self), broadcast_buffers=False, find_unused_parameters=True, process_group=group
+            )
+
+    def run(
+        self, *, until: int | None = None, progress: bool = True, tensorboard: bool = False, profile: bool = False
+    ) -> None:
         """Trains to the end of the configuration, or to optimizer step ``until``, and saves there.
 
+        Args:
+            tensorboard: also log for TensorBoard, with a sample video at each checkpoint.
+            profile: write a trace of two steps.
         Raises:
             HardCaseError: ``optimizer.max_skipped`` steps in a row were skipped; the message says what to do.
         """
         until = self.config.n_steps if until is None else min(until, self.config.n_steps)
         self.out.mkdir(parents=True, exist_ok=True)
         self.simulator.train()
-        bar = tqdm(total=until, initial=self.step, desc="training", unit="step", disable=not progress)
-        with bar, deterministic(), open(self.out / LOG, "a") as log:
+        shows = progress and self.processes.is_first
+        bar = tqdm(total=until, initial=self.step, desc="training", unit="step", disable=not shows)
+        if profile:
+            check_profile(until - self.step)
+        tracer = profiler(self.out, self.processes.rank) if profile else nullcontext()
+        with bar, deterministic(), self.log.opened(tensorboard=tensorboard), tracer:
             while self.step < until:
                 start = time.perf_counter()
                 entry = self.train_step()
-                self.seconds += time.perf_counter() - start
+                spent = time.perf_counter() - start
+                self.seconds += spent
+                machine = {"seconds": self.seconds, "step_seconds": spent, "memory_gib": memory_gib(self.device)}
                 if entry["step"] % self.config.log_every == 0 or "skipped" in entry or self.step == self.config.n_steps:
-                    log.write(json.dumps({**entry, "seconds": round(self.seconds, 2)}) + "\n")
-                    log.flush()
+                    self.log.write(entry, machine)
                 self._stop_if_diverged(entry)
-                bar.set_postfix_str(_postfix(entry), refresh=False)
+                bar.set_postfix_str(progress_note(entry, machine), refresh=False)
                 bar.update()
+                if profile:
+                    tracer.step()
                 if self.step % self.config.checkpoint_every == 0 or self.step == until:
                     self.save()
+                    if self.log.board is not None:
+                        self.log.board.video(self.sample_video(), self.step)
+        self.processes.gather(None)  # nobody goes on before the first one has saved
 
     def train_step(self) -> dict:
         """One optimizer step; what to log of it.
@@ -111,15 +172,13 @@ class Trainer:
         """
         stage, place = self.config.stage_of(self.step)
         rate = one_cycle(place, stage.steps, stage.learning_rate, stage.warm_up)
-        groups = [[sample] for sample in range(stage.batch)] if self.config.workers else [list(range(stage.batch))]
         statistics = [(buffer, buffer.clone()) for buffer in self.simulator.buffers()]
         entry = {"step": self.step, "loss": math.nan, "learning_rate": rate, "grad_norm": math.nan}
-        n_context = stage.history or self.config.data.history
+        n_context = history_at(self.config.data, stage, self.config.seed, self.step)
         errors = torch.full((n_context + stage.horizon,), math.nan)
         try:
-            results = self._map(self._gradients, groups)
-            loss, errors, gradients = _mean([result[:3] for result in results])
-            problem = self._look_at(entry, loss, gradients, [watch for *_, watch in results])
+            loss, errors, gradients, seen = self._whole_batch(stage.batch)
+            problem = self._look_at(entry, loss, gradients, seen)
         except HardCaseError as error:
             problem = str(error)
         if problem is None:
@@ -135,15 +194,41 @@ class Trainer:
             self.n_skipped += 1
             self.n_skipped_in_a_row += 1
             entry["skipped"] = problem
+        if self.config.precision.scales_loss and math.isfinite(entry["loss"]):
+            entry["loss_scale"] = self.scale.value
+            self.scale.update(math.isfinite(entry["grad_norm"]))
         entry["past_psnr"] = _psnr(errors[:n_context])
         if stage.horizon:
             entry["future_psnr"] = _psnr(errors[n_context:])
         self.step += 1
-        return {name: _plain(value) for name, value in entry.items()}
+        return {name: plain(value) for name, value in entry.items()}
 
-    def _look_at(
-        self, entry: dict, loss: Tensor, gradients: list[Tensor | None], watches: list[StepWatch]
-    ) -> str | None:
+    def _whole_batch(self, batch: int) -> tuple[float, Tensor, list[Tensor | None], list[Seen]]:
+        """Loss, errors by step and gradients of the whole batch; what was seen in each of its parts."""
+        scale = self.scale.value
+        norms_scale = scale if self.step % self.config.log_every == 0 else None
+        if self.shared is not None:
+            parts = self._shared_gradients(self.processes.share(batch))
+            loss, errors, gradients, watch, n_samples, error = parts
+            seen = Seen(error=error) if error else watch.seen(norms_scale)
+            parts = self.processes.gather((loss.item(), errors.cpu(), n_samples / batch, seen))
+            losses, errors, shares, seen = zip(*parts, strict=True)
+            for rank, part in enumerate(seen):
+                if part.error:
+                    raise HardCaseError(f"process {rank}: {part.error}")
+            loss = sum(loss * share for loss, share in zip(losses, shares, strict=True))
+            errors = sum(values * share for values, share in zip(errors, shares, strict=True))
+        else:
+            samples = list(range(batch))
+            groups = [[sample] for sample in samples] if self.config.workers else [samples]
+            results = self._map(self._gradients, groups)
+            loss, errors, gradients = _mean([result[:3] for result in results])
+            loss, seen = loss.item(), [watch.seen(norms_scale) for *_, watch in results]
+        if scale != 1:
+            gradients = [None if gradient is None else gradient / scale for gradient in gradients]
+        return loss, errors, gradients, list(seen)
+
+    def _look_at(self, entry: dict, loss: float, gradients: list[Tensor | None], seen: list[Seen]) -> str | None:
         """Hands the gradients to the optimizer, clipped, and fills in ``entry``; why they cannot be used, or None."""
         named = dict(zip(self.parameters, gradients, strict=True))
         for name, parameter in self.parameters.items():
@@ -151,16 +236,17 @@ class Trainer:
         is_logged = self.step % self.config.log_every == 0
         if is_logged:
             entry["grad_norm_by_module"] = norms_by_module(named)
-        entry["loss"] = loss.item()
+        entry["loss"] = loss
         entry["grad_norm"] = torch.nn.utils.clip_grad_norm_(
             self.parameters.values(), self.config.optimizer.clip_norm or math.inf
         ).item()
-        if is_logged and (by_step := mean_of_norms([watch.norms() for watch in watches])):
+        if is_logged and (by_step := mean_of_norms([part.norms for part in seen])):
             entry["grad_norm_by_step"] = by_step
-        if total := sum(watch.report.total for watch in watches):
+        entry["particles"] = sum(part.n_rows for part in seen) / max(1, sum(part.n_clouds for part in seen))
+        if total := sum(part.n_unusable for part in seen):
             entry["unusable_rows"] = total
-        for watch in watches:
-            watch.report.check()
+        if errors := [part.error for part in seen if part.error]:
+            return errors[0]
         if not math.isfinite(entry["loss"]):
             return "the loss is not finite"
         if not math.isfinite(entry["grad_norm"]):
@@ -194,27 +280,49 @@ class Trainer:
     def _gradients(self, samples: list[int]) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...], StepWatch]:
         """Loss, errors by step, the gradient of the loss for every parameter (None where it has no part), and what was
         seen on the way."""
-        stage, _ = self.config.stage_of(self.step)
         watch = StepWatch()
-        batch = draw_batch(self.scenes, self.config.data, stage, self.config.seed, self.step, samples)
-        loss, errors = self.loss(batch.to(self.device), samples[0], watch)
-        gradients = torch.autograd.grad(loss, list(self.parameters.values()), allow_unused=True)
+        loss, errors = self.loss(self._batch(samples), samples[0], watch)
+        gradients = torch.autograd.grad(loss * self.scale.value, list(self.parameters.values()), allow_unused=True)
         return loss.detach(), errors, gradients, watch
+
+    def _shared_gradients(self, samples: list[int]) -> tuple:
+        """As :meth:`_gradients`, but gradients are those of the samples of all processes; and how many samples are this
+        one's, and what is wrong with them, or None."""
+        stage, _ = self.config.stage_of(self.step)
+        # One that raises in the middle of a step leaves the others waiting: what cannot be used is dropped, and told behind.
+        watch, error = StepWatch(strict=self.simulator.config.stability.on_bad == "raise"), None
+        try:
+            loss, errors = self.shared(self._batch(samples), samples[0], watch)
+        except HardCaseError as found:  # the others wait for gradients all the same
+            error = str(found)
+            loss, errors = self.shared()
+        for parameter in self.parameters.values():
+            parameter.grad = None
+        (loss * (self.scale.value * len(samples) * self.processes.count / stage.batch)).backward()
+        gradients = [parameter.grad for parameter in self.parameters.values()]
+        return loss.detach(), errors, gradients, watch, len(samples), error
+
+    def _batch(self, samples: list[int]) -> Batch:
+        """The samples of this step; those of the next ones are read meanwhile."""
+        now, *later = ((step, tuple(samples)) for step in range(self.step, self.step + 1 + READERS))
+        known = self._ahead.pop(now, None)
+        for key in list(self._ahead):
+            if key[0] < self.step:  # read in vain: the next stage has other batches
+                self._ahead.pop(key, None)
+        for key in later:
+            if key[0] < self.config.n_steps and key not in self._ahead:
+                self._ahead[key] = self._reader.submit(self._draw, *key)
+        return (self._draw(*now) if known is None else known.result()).to(self.device)
+
+    def _draw(self, step: int, samples: Sequence[int]) -> Batch:
+        stage, _ = self.config.stage_of(step)
+        return draw_batch(self.scenes, self.config.data, stage, self.config.seed, step, samples)
 
     def loss(self, batch: Batch, sample: int = 0, watch: StepWatch | None = None) -> tuple[Tensor, Tensor]:
         """The loss of a batch, and the unweighted mean squared error of each step; ``sample`` numbers the randomness."""
         watch = watch or StepWatch()
         loss_config, targets = self.config.loss, batch.targets
-        rng = generator(self.config.seed, self.step, sample, "dynamics")
-        noise = torch.Generator().manual_seed(int(rng.integers(2**63)))
-        particles = self.simulator.encode(batch.context, report=watch.report)
-        if batch.n_future:
-            steps = self.simulator.rollout(
-                particles, batch.n_future, self.plan, generator=noise, report=watch.report
-            )
-            watch.follow(steps)
-            particles = concatenate([particles, *steps])
-        images = self.simulator.render(particles, targets.cameras, plan=self.plan, report=watch.report).color
+        images = self._images(batch, sample, watch)
         truth = targets.images.permute(0, 2, 3, 1)
         weighted = loss_config.body_weight and targets.dynamic is not None
         weight = 1 + loss_config.body_weight * targets.dynamic if weighted else None
@@ -234,8 +342,64 @@ class Trainer:
             errors = mean_by_step(image_errors(images, truth, targets.valid), step, batch.n_context + batch.n_future)
         return loss, errors
 
-    def save(self) -> Path:
-        """Writes a checkpoint of this step into the run folder."""
+    def _images(self, batch: Batch, sample: int, watch: StepWatch) -> Tensor:
+        """What the target cameras of a batch should have seen; each part of the model in its precision."""
+        simulator, precision, recompute = self.simulator, self.config.precision, self.config.recompute
+        options = {"report": watch.report, "on_bad": "drop" if watch.strict else None}
+        rng = generator(self.config.seed, self.step, sample, "dynamics")
+        noise = torch.Generator().manual_seed(int(rng.integers(2**63)))
+
+        def again(part: str, generator: torch.Generator | None = None) -> Callable[[Callable], Callable]:
+            return recomputed(simulator, generator) if part in recompute else (lambda f: f)
+
+        with precision.of("encoder", self.device):
+            particles = again("encoder")(lambda context: simulator.encode(context, **options))(batch.context)
+        watch.count(particles)
+        if batch.n_future:
+            with precision.of("dynamics", self.device):
+                steps = simulator.rollout(
+                    particles, batch.n_future, self.plan, generator=noise, wrap=again("steps", noise), **options
+                )
+            watch.follow(steps)
+            particles = concatenate([particles, *steps])
+        with precision.of("renderer", self.device):
+            render = again("images")(
+                lambda p: simulator.render(p, batch.targets.cameras, plan=self.plan, **options).color
+            )
+            images = render(particles)
+        if recompute:
+            watch.close()
+        return images
+
+    @torch.no_grad()
+    def sample_video(self) -> Tensor:
+        """uint8 [T, H, 2 W, 3]: the first window of the first scene seen by one camera, filmed and predicted."""
+        stage, _ = self.config.stage_of(min(self.step, self.config.n_steps) - 1)
+        data, scene = self.config.data, self.scenes[0]
+        n_past = stage.history or data.history
+        steps, cams = range(n_past + stage.horizon), context_cameras(scene, data)
+        masked = scene.has_segmentation()
+        frames = make_frames(
+            [scene], [spread_views(cams, data.context_views, 0)], [list(steps[:n_past])], masked=masked
+        )
+        self.simulator.eval()
+        try:
+            frames = thin_background(frames, data.background_stride).to(self.device)
+            state = self.simulator.encode(frames, on_bad="drop")
+            if stage.horizon:
+                later = self.simulator.rollout(state, stage.horizon, self.plan, on_bad="drop")
+                state = concatenate([state, *later])
+            cameras = scene.cameras_at(cams[:1], steps).to(self.device)
+            predicted = self.simulator.render(state, cameras, plan=self.plan, on_bad="drop").color
+        finally:
+            self.simulator.train()
+        filmed = scene.images(cams[:1], steps)[:, 0].permute(0, 2, 3, 1)
+        return torch.cat([filmed, (predicted.clamp(0, 1) * 255).round().to(torch.uint8).cpu()], 2)
+
+    def save(self) -> Path | None:
+        """Writes a checkpoint of this step into the run folder; None where another process does."""
+        if not self.processes.is_first:
+            return None
         moments = {}
         for name, parameter in self.parameters.items():
             for kind, value in self.optimizer.state[parameter].items():
@@ -247,6 +411,8 @@ class Trainer:
             "n_skipped_in_a_row": self.n_skipped_in_a_row,
             "seconds": self.seconds,
             "parent": self.parent,
+            "loss_scale": [self.scale.value, self.scale.n_good],
+            "scenes": [scene.name for scene in self.scenes],
         }
         folder = checkpoint.save(
             self.out,
@@ -264,11 +430,19 @@ class Trainer:
 
     def _resume(self) -> None:
         saved = checkpoint.load(self.out)
-        before, now = dict(saved.config.get("train", {})), to_dict(self.config)
-        before, now = _fixed_settings(before), _fixed_settings(now)
+        before = to_dict(from_dict(TrainConfig, dict(saved.config.get("train", {})), base=self.config))
+        before, now = _fixed_settings(before), _fixed_settings(to_dict(self.config))
         for name in now:
             if name not in FREE_SETTINGS and before.get(name) != now[name]:
                 raise InputError(f"{self.out}: was started with another {name!r}; use the same or another folder")
+        names = [scene.name for scene in self.scenes]
+        known = saved.state.get("scenes", names)
+        if missing := sorted(set(known) - set(names)):
+            raise InputError(
+                f"{self.out}: was trained on {len(missing)} scenes that are not given now, such as {missing[0]}; give the same "
+                "ones, or more, or use another folder"
+            )
+        self.same_scenes = known == names
         self.simulator.load_state_dict(saved.model)
         if self.average:
             self.average = {name: value.to(self.device) for name, value in saved.ema.items()}
@@ -280,17 +454,7 @@ class Trainer:
         self.step, self.n_skipped = saved.state["step"], saved.state["n_skipped"]
         self.n_skipped_in_a_row = saved.state.get("n_skipped_in_a_row", 0)
         self.seconds, self.parent = saved.state["seconds"], saved.digest
-
-    def _cut_log(self) -> None:
-        """Drops what was logged after the last checkpoint, if there is one: those steps will be repeated."""
-        file = self.out / LOG
-        if file.exists():
-            lines = file.read_text().splitlines()
-            kept = [line for line in lines if _step_of(line) < self.step]
-            if kept != lines:
-                part = file.with_name(f".{file.name}.part")
-                part.write_text("".join(line + "\n" for line in kept))
-                os.replace(part, file)
+        self.scale = LossScale(*saved.state.get("loss_scale", (self.scale.value, 0)))
 
     def _update_average(self) -> None:
         decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (EMA_WARM_UP + self.step))
@@ -303,12 +467,28 @@ class Trainer:
                         self.average[name].copy_(value)
 
 
+class _Loss(nn.Module):
+    """The loss as a module that holds the model, as torch wants it; without a batch a zero in which all weights have a part."""
+
+    def __init__(self, trainer: Trainer):
+        super().__init__()
+        self.simulator, self._trainer = trainer.simulator, trainer
+
+    def forward(self, *arguments) -> tuple[Tensor, Tensor]:
+        if arguments:
+            return self._trainer.loss(*arguments)
+        zero = sum(parameter.sum() * 0 for parameter in self.simulator.parameters())
+        return zero, zero.detach()
+
+
 def _fixed_settings(settings: dict) -> dict:
     """Of a run's settings those that must stay, as far as parts of them may change."""
     fixed = {**settings, "workers": bool(settings.get("workers"))}
     for name, free in (("optimizer", FREE_OF_OPTIMIZER), ("stages", FREE_OF_STAGES)):
         parts = settings.get(name) or []
-        kept = [{k: v for k, v in part.items() if k not in free} for part in ([parts] if name == "optimizer" else parts)]
+        kept = [
+            {k: v for k, v in part.items() if k not in free} for part in ([parts] if name == "optimizer" else parts)
+        ]
         fixed[name] = kept
     return fixed
 
@@ -346,6 +526,16 @@ def _mean(results: list) -> tuple[Tensor, Tensor, list[Tensor | None]]:
     return sum(losses) / len(results), sum(errors) / len(results), means
 
 
+def _check_sharing(config: TrainConfig, n_processes: int, norm: str) -> None:
+    if config.workers and norm == "batch":
+        raise InputError("workers: must be 0 for a model with batch normalisation, which needs all samples at once")
+    if config.workers and n_processes > 1:
+        raise InputError(f"workers: must be 0 in {n_processes} processes, which share the samples of a step themselves")
+    for i, stage in enumerate(config.stages):
+        if stage.batch < n_processes:
+            raise InputError(f"stages[{i}].batch: {stage.batch} samples are too few for {n_processes} processes")
+
+
 def _check_history(config: TrainConfig, plan: Plan) -> None:
     for history in {config.data.history, *(stage.history for stage in config.stages if stage.horizon)}:
         if history > plan.history:
@@ -354,24 +544,3 @@ def _check_history(config: TrainConfig, plan: Plan) -> None:
 
 def _psnr(errors: Tensor) -> float:
     return -10 * math.log10(max(1e-10, errors.mean().item())) if bool(errors.isfinite().all()) else math.nan
-
-
-def _plain(value):
-    """JSON has no NaN: what is not finite is logged as text."""
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _step_of(line: str) -> float:
-    try:
-        return json.loads(line)["step"]
-    except (ValueError, KeyError, TypeError):
-        return math.inf  # the last line of a killed process
-
-
-def _postfix(entry: dict) -> str:
-    values = {name: entry.get(f"{name}_psnr") for name in ("past", "future")}
-    return ", ".join(f"{name} {value:.1f} dB" for name, value in values.items() if isinstance(value, float))

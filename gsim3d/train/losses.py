@@ -7,6 +7,7 @@ from torch import Tensor
 
 BALANCE = 0.5  # lambda of the paper: weight of the first simulated step; the encoded ones share the rest
 DISCOUNT = 0.87  # gamma of the paper: weight of a simulated step relative to the one before it
+LEAST_WEIGHT = 1e-12  # of an image's pixels together: one without any has an error of 0
 
 
 def time_weights(n_past: int, n_future: int, *, balance: float = BALANCE, discount: float = DISCOUNT) -> Tensor:
@@ -31,7 +32,7 @@ def image_errors(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> 
     errors = (pred - target).square().mean(-1)
     if weight is None:
         return errors.mean((1, 2))
-    return (errors * weight).sum((1, 2)) / weight.sum((1, 2)).clamp(min=1e-12)
+    return (errors * weight).sum((1, 2)) / weight.sum((1, 2)).clamp(min=LEAST_WEIGHT)
 
 
 def mean_by_step(values: Tensor, step: Tensor, n_steps: int) -> Tensor:

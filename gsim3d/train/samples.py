@@ -76,7 +76,8 @@ def draw_batch(
     Context views are spread evenly around the list of allowed cameras, turned at random, the same at all steps of a
     window; target views are any cameras, drawn afresh at every step.
     """
-    n_context = stage.history or data.history
+    n_context = history_at(data, stage, seed, step)
+    data = dataclasses.replace(data, context_views=_drawn(data.fewest_views, data.context_views, seed, step, "views"))
     windows = [_draw_window(scenes, data, stage, n_context, seed, step, sample) for sample in samples]
     chosen = [window.scene for window in windows]
     steps = [list(window.steps) for window in windows]
@@ -85,6 +86,16 @@ def draw_batch(
     context = make_frames(chosen, context_cams, [s[:n_context] for s in steps], masked=masked)
     targets = make_frames(chosen, [window.target_cams for window in windows], steps, masked=masked)
     return Batch(thin_background(context, data.background_stride), targets, n_context, stage.horizon)
+
+
+def history_at(data: DataConfig, stage: StageConfig, seed: int, step: int) -> int:
+    """Encoded steps of all samples of an optimizer step."""
+    return stage.history or _drawn(data.shortest_history, data.history, seed, step, "history")
+
+
+def _drawn(least: int, most: int, seed: int, step: int, purpose: str) -> int:
+    """Any whole number from ``least`` to ``most``, the same for all samples of a step; ``most`` where least is 0."""
+    return int(generator(seed, step, 0, f"number of {purpose}").integers(least, most + 1)) if least else most
 
 
 def thin_background(frames: Frames, stride: int) -> Frames:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -13,15 +14,50 @@ from gsim3d.stability import StabilityReport
 from gsim3d.types import Particles
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What was seen in one call of the loss, as plain values.
+
+    n_rows, n_clouds: particles that the encoder made, and in how many clouds.   n_unusable: findings of the report.
+    norms: of the gradients that reached each simulated step.   error: of a number that could not be used, or None.
+    """
+
+    n_rows: int = 0
+    n_clouds: int = 0
+    n_unusable: int = 0
+    norms: tuple[float, ...] = ()
+    error: str | None = None
+
+
 class StepWatch:
     """Goes along with the samples that one call of the loss sees.
 
     report: of that call.
+    strict: a row that was dropped counts as a number that could not be used.
     """
 
-    def __init__(self):
+    def __init__(self, *, strict: bool = False):
+        self.strict = strict
         self.report = StabilityReport()
+        self._n_rows = self._n_clouds = 0
+        self._n_unusable: int | None = None
         self._squares: list[list[Tensor]] = []
+
+    def count(self, encoded: Particles) -> None:
+        """Notes how many particles the samples have."""
+        self._n_rows, self._n_clouds = encoded.n_rows, encoded.n_clouds
+
+    def close(self) -> None:
+        """Counts no further findings: what the backward pass computes again would be counted twice."""
+        self._n_unusable = self.report.total
+
+    def seen(self, scale: float | None) -> Seen:
+        """After the backward pass of a loss that was multiplied with ``scale``; None: without the gradients' norms."""
+        wrong = ("error", "dropped") if self.strict else ("error",)
+        error = next((str(finding.error()) for finding in self.report.findings if finding.action in wrong), None)
+        n_unusable = self.report.total if self._n_unusable is None else self._n_unusable
+        norms = () if scale is None else tuple(norm / scale for norm in self.norms())
+        return Seen(self._n_rows, self._n_clouds, n_unusable, norms, error)
 
     def follow(self, steps: Sequence[Particles]) -> None:
         """Notes the gradients that will reach the particles of each step of a rollout."""
@@ -40,7 +76,7 @@ def _note(squares: list[Tensor], gradient: Tensor) -> None:
     squares.append(gradient.detach().double().square().sum())
 
 
-def mean_of_norms(parts: Sequence[list[float]]) -> list[float]:
+def mean_of_norms(parts: Sequence[Sequence[float]]) -> list[float]:
     """Norms for the mean of several losses, each of other samples, from the norms for each loss."""
     return [math.sqrt(sum(norm**2 for norm in norms)) / len(parts) for norms in zip(*parts, strict=True)]
 

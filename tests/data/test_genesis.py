@@ -2,6 +2,7 @@
 
 import json
 import os
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -83,7 +84,7 @@ def test_labels_and_colours_are_never_shifted(tmp_path):
     assert (scene.images([0], [0]) == 7).all()
 
 
-def test_memory_mapped_cache_gives_the_same_and_leaves_one_file_a_kind(tmp_path):
+def test_decoded_files_give_the_same_and_are_one_a_kind(tmp_path):
     written = write_scene(tmp_path / "scene")
     cache = tmp_path / "cache"
     for _ in range(2):
@@ -97,6 +98,35 @@ def test_memory_mapped_cache_gives_the_same_and_leaves_one_file_a_kind(tmp_path)
     with pytest.raises(InputError, match="missing"):
         Scene.open(tmp_path / "scene", cache_dir=cache).images([1], [2])
     assert len(os.listdir(cache)) == 2
+
+
+def test_decoded_files_that_are_not_ours_are_named(tmp_path):
+    write_scene(tmp_path / "scene")
+    Scene.open(tmp_path / "scene", cache_dir=tmp_path / "cache").images([0], [0])
+    (file,) = (tmp_path / "cache").iterdir()
+    whole = file.read_bytes()
+    for spoiled in (whole[:-1], b"", whole.replace(b"|u1", b"<f2"), whole[:6] + b"\x07" + whole[7:]):
+        file.write_bytes(spoiled)
+        with pytest.raises(InputError, match=f"{file.name} is no cache of this scene"):
+            Scene.open(tmp_path / "scene", cache_dir=tmp_path / "cache").images([0], [0])
+    file.write_bytes(whole)
+    scene = Scene.open(tmp_path / "scene", cache_dir=tmp_path / "cache")
+    scene.images([0], [0])
+    os.truncate(file, len(whole) - 1)
+    with pytest.raises(InputError, match="shorter"):
+        scene.images([-1 + scene.n_cams], [scene.n_steps - 1])
+
+
+@pytest.mark.parametrize("cached", [True, False])
+def test_reading_leaves_no_file_open_from_any_thread(tmp_path, cached):
+    write_scene(tmp_path / "scene", n_steps=6, n_cams=5)
+    expected = Scene.open(tmp_path / "scene").images(range(5), range(6))
+    scenes = [Scene.open(tmp_path / "scene", cache_dir=tmp_path / "cache" if cached else None) for _ in range(30)]
+    before = len(os.listdir("/proc/self/fd"))
+    with ThreadPoolExecutor(4) as pool:
+        stacks = list(pool.map(lambda scene: scene.images(range(5), range(6)), [*scenes, *scenes]))
+    assert len(os.listdir("/proc/self/fd")) <= before
+    assert all(torch.equal(stack, expected) for stack in stacks)
 
 
 def test_images_are_decoded_once(tmp_path):

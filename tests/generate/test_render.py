@@ -17,10 +17,10 @@ def rig():
 
 def draw(rig, vertices, faces, *, samples=2, background=(0, 0, 0)):
     white = lambda corners: np.ones((len(corners), 3))  # noqa: E731
-    renderer = render.Renderer(
-        rig, faces, vertices[faces], white, ground_radius=0.85, background=background, samples=samples
-    )  # fmt: skip
-    return renderer.draw(vertices)
+    surface = render.Surface(faces, vertices[faces], white)
+    ground = render.Ground(0.85, 0.0)
+    renderer = render.Renderer(rig, [surface], ground=ground, background=background, samples=samples)
+    return renderer.draw([vertices])
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from gsim3d.errors import InputError
-from gsim3d.generate import shapes
+from gsim3d.generate import meshes, shapes
 
 CUBE = """v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 2\nv 1 0 2\nv 1 1 2\nv 0 1 2
 f 1 3 2\nf 1 4 3\nf 5 6 7\nf 5 7 8\nf 1 2 6\nf 1 6 5\nf 2 3 7\nf 2 7 6\nf 3 4 8\nf 3 8 7\nf 4 1 5\nf 4 5 8\n"""
@@ -21,7 +21,8 @@ def body_of(name, seed=0):
 def test_procedural_bodies_are_closed_and_face_outwards(name):
     body = body_of(name)
     for vertices, faces in ((body.vertices, body.faces), (body.collision_vertices, body.collision_faces)):
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        positions, label = np.unique(vertices, axis=0, return_inverse=True)
+        mesh = trimesh.Trimesh(positions, label.reshape(-1)[faces], process=False)
         assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
     radius = np.linalg.norm(body.vertices, axis=1).max()
     np.testing.assert_allclose(radius, 0.5, atol=1e-12)
@@ -52,7 +53,7 @@ def test_unknown_object():
 def test_mesh_file_is_turned_upright_and_scaled(tmp_path):
     (tmp_path / "tower.obj").write_text(CUBE)
     for up, axis in (("z", 2), ("y", 1)):
-        body = shapes.load_body(tmp_path / "tower.obj", up)
+        body = meshes.load_body(tmp_path / "tower.obj", up)
         size = np.ptp(body.vertices, axis=0)
         np.testing.assert_allclose(size[axis] / np.delete(size, axis), 2, rtol=1e-12)
         assert trimesh.Trimesh(body.vertices, body.faces).volume > 0
@@ -72,7 +73,7 @@ def test_mesh_texture_is_looked_up_at_the_corner(tmp_path):
     text = "mtllib skin.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
     text += "vt .25 .25\nvt .75 .75\nvt .25 .75\nvt .75 .25\nusemtl skin\n" + faces
     (tmp_path / "skin.obj").write_text(text)
-    body = shapes.load_body(tmp_path / "skin.obj", "z")
+    body = meshes.load_body(tmp_path / "skin.obj", "z")
     assert body.corners.shape == (4, 3, 2)
     colours = body.paint(np.array([[0.25, 0.25], [0.75, 0.75], [0.25, 0.75], [1.25, -0.75]]))
     np.testing.assert_allclose(colours, [[1, 0, 0], [0, 0, 1], [0, 0, 0], [1, 0, 0]], atol=1e-12)
@@ -85,9 +86,9 @@ def test_mesh_texture_is_looked_up_at_the_corner(tmp_path):
 
 def test_large_mesh_collides_with_few_vertices(tmp_path):
     trimesh.creation.icosphere(subdivisions=4).export(tmp_path / "fine.ply")
-    body = shapes.load_body(tmp_path / "fine.ply", "z")
+    body = meshes.load_body(tmp_path / "fine.ply", "z")
     assert len(body.vertices) == 2562
-    assert 50 < len(body.collision_vertices) <= shapes.COLLISION_VERTICES
+    assert 50 < len(body.collision_vertices) <= meshes.COLLISION_VERTICES
     np.testing.assert_allclose(np.ptp(body.collision_vertices, axis=0), 1, atol=0.1)
 
 
@@ -97,4 +98,4 @@ def test_mesh_that_cannot_be_used(tmp_path, text):
     if text is not None:
         path.write_text(text)
     with pytest.raises(InputError, match="bad.obj"):
-        shapes.load_body(path)
+        meshes.load_body(path)

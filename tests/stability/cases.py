@@ -191,8 +191,8 @@ CASES = {
         "depthsplat#19: crash in grid_sampler",
     ),
     "E37": Case(
-        "opacities and probabilities of exactly 0 and 1",
-        "finite gradients: no power of a probability is taken",
+        "opacities and probabilities of exactly 0 and 1, depths driven beyond their bounds",
+        "finite gradients: no power of a probability is taken; depths between near and far",
         "release: infinite gradient at 0 for any exponent but 1, its default",
     ),
     "E38": Case("constant and saturated images", "finite"),
@@ -229,8 +229,8 @@ CASES = {
         "warp#471, #650",
     ),
     "D45": Case(
-        "opacity that grows or shrinks on",
-        "clamped to [0, 1]",
+        "opacity and scales that grow or shrink on",
+        "clamped to [0, 1], and to the range of scales",
         "release: clamped at 0 only",
     ),
     "D46": Case(

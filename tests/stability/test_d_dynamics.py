@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from gsim3d.data import Scene, find_scenes
-from gsim3d.dynamics.state import rotate_left
+from gsim3d.dynamics.state import SCALE_STEP_SHARE, rotate_left
 from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr, ssim
-from gsim3d.stability import StabilityReport
+from gsim3d.guards import guard_particles
+from gsim3d.stability import StabilityConfig, StabilityReport
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer
@@ -87,6 +88,24 @@ def test_d43_free_fall_out_of_the_workspace(setting, measured):
     measured.outcome("asleep, counted")
 
 
+@pytest.mark.parametrize("cell", [-40.0, 2.0**16 + 40])
+def test_d43_clamped_at_the_border(setting, measured, cell):
+    """With "clamp" a particle that is outside is held at the border and goes on."""
+    newest, size = setting.to(make_history((15,))), CONFIG.dynamics.grid_size
+    means = newest.means.clone()
+    means[3, 1] = cell * size
+    report = StabilityReport()
+    held = guard_particles(
+        dataclasses.replace(newest, means=means), StabilityConfig("clamp"), report, "encode", grid_size=size
+    )
+    cells = (held.means.double() - newest.origin) / size
+    assert ((cells >= 0) & (cells < 2**16)).all() and not (held.activity == ASLEEP).any()
+    others = torch.arange(15, device=setting.device) != 3
+    measured.same_bits(held.means[others], newest.means[others], "the others")
+    assert [(f.what, f.action, f.count) for f in report.findings] == [("outside the workspace", "clamped", 1)]
+    measured.outcome("clamped, counted")
+
+
 def rollout_gradients(setting, n_steps, config=CONFIG):
     simulator = make_simulator(setting, config=config)
     state = setting.to(batch([make_history((14, 12)), ordinary()]))
@@ -157,20 +176,40 @@ def test_d44_gradients_are_clipped(setting, measured, scenes, tmp_path):
     measured.outcome("clipped, norm logged")
 
 
-def steep_opacity(sign):
+OPACITY = EXPLICIT.dynamic_latents + 3 * (EXPLICIT.sh_degree + 1) ** 2 + 3  # among the channels that are predicted
+SCALES = OPACITY + 4
+
+
+def steep(first, count, value):
     def prepare(dynamics):
-        start = EXPLICIT.dynamic_latents + 3 * (EXPLICIT.sh_degree + 1) ** 2 + 3
-        dynamics.net.head.fc2.bias.data[start] = 5.0 * sign
+        dynamics.net.head.fc2.bias.data[first : first + count] = value
 
     return prepare
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_d45_opacities_stay_between_0_and_1(setting, measured, sign):
-    step = check_step(setting, measured, make_history((20, 25), config=EXPLICIT), EXPLICIT, prepare=steep_opacity(sign))
+    step = check_step(setting, measured, make_history((20, 25), config=EXPLICIT), EXPLICIT, prepare=steep(OPACITY, 1, 5.0 * sign))
     moved = make_history((20, 25), config=EXPLICIT).activity[20:] == 0
     assert (step.fields["opacities"][moved.to(setting.device)] == (sign > 0)).all()
     measured.outcome("clamped to [0, 1]")
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_d45_scales_stay_in_their_range(setting, measured, sign):
+    """The prediction drives all scales beyond a limit; half of them lie there already."""
+    low, high = EXPLICIT.scale_min, EXPLICIT.scale_max
+    history = make_history((20, 25), config=EXPLICIT)
+    scales = torch.full_like(history.scales, (low + high) / 2)
+    scales[::2] = high if sign > 0 else low
+    history = dataclasses.replace(history, scales=scales)
+    step = check_step(setting, measured, history, EXPLICIT, prepare=steep(SCALES, 3, 50.0 * sign))
+    moved = (history.activity[20:] == 0).to(setting.device)
+    found, before = step.fields["scales"][moved], setting.to(scales[20:])[moved]
+    assert found.min() >= before.new_tensor(low) and found.max() <= before.new_tensor(high)
+    largest = 1.001 * SCALE_STEP_SHARE * (high - low)
+    assert (found - before).abs().max() <= largest and (found != before).any()
+    measured.outcome("scales clamped, their steps bounded")
 
 
 def test_d46_a_thousand_turns(setting, measured):
@@ -272,6 +311,25 @@ def test_d47_numbers_that_are_none_are_dropped(setting, measured, name):
     measured.outcome("dropped, counted")
 
 
+@pytest.mark.parametrize("name", FIELDS)
+def test_d47_numbers_that_a_step_made_are_dropped(setting, measured, name):
+    """The row falls asleep where it was, and is not drawn; the others have the bits they have without it."""
+    before = setting.to(make_history((15,)))
+    values = getattr(before, name).clone()
+    values[3] = FIELDS[name]
+    report = StabilityReport()
+    after = guard_particles(
+        dataclasses.replace(before, **{name: values}), StabilityConfig("drop"), report, "rollout", previous=before
+    )
+    assert after.opacities[3] == 0 and after.activity[3] == ASLEEP
+    measured.same_bits(after.means, before.means, "places")
+    others = torch.arange(15, device=setting.device) != 3
+    for field, value in float_fields(before).items():
+        measured.same_bits(float_fields(after)[field][others], value[others], field)
+    assert [(f.tensor, f.action, f.count) for f in report.findings] == [(f"particles.{name}", "dropped", 1)]
+    measured.outcome("dropped, counted")
+
+
 @pytest.mark.parametrize("value", [0.0, 1.0, 9e3])
 def test_d47_what_a_scene_holds_never_reaches_another(setting, measured, value):
     """Two calls of equal sizes: whatever the first scene's particles carry, the second one has equal bits."""
@@ -353,7 +411,7 @@ def test_d49_perfect_and_empty_images(setting, measured):
 
 def curve(run):
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    return [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
+    return [{k: v for k, v in line.items() if k != "machine"} for line in lines]
 
 
 class Killed(BaseException):

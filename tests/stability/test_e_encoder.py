@@ -18,7 +18,7 @@ from tests.data.made_scenes import WRITERS, edit_json, make_scene
 from tests.encoder.scenes import SIZE, make_encoder
 from tests.ops.test_plane_sweep import make as make_sweep
 from tests.oracle import plane_sweep as sweep_oracle
-from tests.stability.encodings import check_encoding, encode, ordinary, with_cameras
+from tests.stability.beside import check_encoding, encode, ordinary, with_cameras
 
 NAN, INF = float("nan"), float("inf")
 TURNED = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))  # half a turn about the camera's y
@@ -121,6 +121,21 @@ def test_e37_probabilities_of_exactly_zero(setting, measured):
         last.bias.data.copy_(torch.tensor([0.0, 0.0, 5e3, 0.0, 0.0, 0.0]))
 
     check_encoding(setting, measured, ordinary(), prepare=be_sure)
+
+
+@pytest.mark.parametrize("correction", [-1e4, 1e4])
+def test_e37_depths_stay_between_their_bounds(setting, measured, correction):
+    """Whatever is added to the disparity."""
+
+    def overshoot(encoder):
+        encoder.depth.to_disparity[2].bias.data[0] = correction
+
+    result = check_encoding(setting, measured, ordinary(), prepare=overshoot)
+    cameras = ordinary().cameras
+    points = result.fields["means"].double().cpu().reshape(len(cameras), -1, 3)
+    depth = (points @ cameras.viewmats[:, 2, :3, None])[..., 0] + cameras.viewmats[:, 2, 3, None]
+    bound = cameras.far if correction < 0 else cameras.near
+    measured.close(depth, bound.double()[:, None].expand_as(depth), f"geometry_{setting.exact}", "depth")
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.stability.cases import CASES, GROUPS
+from tests.stability.constants import CONSTANTS
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
@@ -54,6 +55,23 @@ def test_every_case_was_measured_and_holds(columns):
             assert case in CASES and record["tests"] > 0 and record["failed"] == 0, f"{case} on {name}"
             assert record["error"] is None or record["error"] <= record["bound"], f"{case} on {name}"
             assert record["error"] is not None or record["outcomes"], f"{case} on {name}"
+
+
+def test_constants_are_those_of_the_code():
+    for c in CONSTANTS:
+        text = (ROOT / c.file).read_text()
+        assert re.search(rf"\b{c.name}\b[^\n]*?=[\s(]*{re.escape(c.value)}", text), f"{c.name} in {c.file}"
+
+
+def test_every_constant_and_guard_has_a_mutant_and_a_test(tool):
+    guarded = set()
+    for name in tool.GUARDS:
+        for mutant in json.loads((ROOT / "tests" / "mutants" / f"{name}.json").read_text()):
+            guarded.update(re.findall(r"\w+", mutant["guard"].partition(":")[0]) if ":" in mutant["guard"] else ())
+            assert (ROOT / mutant["file"]).read_text().count(mutant["old"]) == 1, mutant["guard"]
+            file, _, test = mutant["test"].partition("::")
+            assert re.search(rf"^def {test}\(", (ROOT / file).read_text(), re.MULTILINE), mutant["test"]
+    assert guarded >= {c.name for c in CONSTANTS}
 
 
 def test_new_results_replace_old_ones_of_the_same_column_only(tool):

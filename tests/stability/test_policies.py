@@ -11,7 +11,7 @@ from gsim3d import presets
 from gsim3d.dynamics import last_steps
 from gsim3d.errors import HardCaseError, InputError
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.stability import StabilityConfig, StabilityReport
+from gsim3d.stability import StabilityConfig, StabilityReport, pack, unpack
 from gsim3d.types import ASLEEP
 from tests.asserts import assert_same_bits
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
@@ -282,6 +282,61 @@ def test_a_guard_compiles():
             assert_same_bits(a, b)
 
 
+def spoiled_frames(device, value=NAN):
+    """Two scenes; one pixel of the last image of the first step of scene 0, which becomes a particle, is no number."""
+    frames = make_frames(SCENES)
+    kept = frames.masks[1].nonzero()[3]
+    images = frames.images.clone()
+    images[1, 1, kept[0], kept[1]] = value
+    row = int(frames.masks[0].sum()) + 3
+    return dataclasses.replace(frames, images=images).to(device), row
+
+
+def test_a_pixel_that_is_no_number(simulator, device):
+    frames, row = spoiled_frames(device)
+    with pytest.raises(
+        HardCaseError, match=r"images must be finite; image 1 \(scene 0, step 0\) is not; on_bad=\"drop\""
+    ) as caught:
+        simulator.encode(frames)
+    assert (caught.value.tensor, caught.value.camera) == ("images", 1)
+    black = dataclasses.replace(frames, images=frames.images.nan_to_num(0.0))
+    with torch.no_grad():
+        expected = simulator.encode(black)
+        report = StabilityReport()
+        dropped = simulator.encode(frames, on_bad="drop", report=report)
+        clamped = simulator.encode(frames, on_bad="clamp", report=report)
+    assert [(f.tensor, f.action, f.count, f.scene, f.step, f.camera) for f in report.findings] == [
+        ("frames.images", action, 1, 0, 0, 1) for action in ("dropped", "clamped")
+    ]
+    assert_same_bits(clamped.dynamic_latents, expected.dynamic_latents)
+    assert_same_bits(clamped.activity, expected.activity)
+    assert_same_bits(dropped.means, expected.means)
+    assert (dropped.activity == ASLEEP).nonzero()[:, 0].tolist() == [row] and float(dropped.opacities[row]) == 0
+
+
+@pytest.mark.parametrize("on_bad", ["drop", "clamp"])
+def test_gradients_of_spoiled_images_are_finite(simulator, device, on_bad):
+    frames, _ = spoiled_frames(device, INF)
+    images = frames.images.clone().requires_grad_()
+    particles = simulator.encode(dataclasses.replace(frames, images=images), on_bad=on_bad)
+    total = sum(value.float().sum() for name, value in particles.row_fields().items() if name != "activity")
+    for grad in torch.autograd.grad(total, [images, *simulator.encoder.parameters()], allow_unused=True):
+        assert grad is None or bool(torch.isfinite(grad).all())
+
+
+@pytest.mark.parametrize("on_bad", ["raise", "drop", "clamp"])
+def test_a_camera_that_cannot_see_raises_under_every_policy(simulator, device, on_bad):
+    frames = make_frames((1,)).to(device)
+    near = frames.cameras.near.clone()
+    near[1] = 0
+    frames = dataclasses.replace(frames, cameras=dataclasses.replace(frames.cameras, near=near))
+    with pytest.raises(
+        HardCaseError, match="cameras.near must be positive; image 1 .*; mend its calibration"
+    ) as caught:
+        simulator.encode(frames, on_bad=on_bad)
+    assert (caught.value.tensor, caught.value.camera, caught.value.scene) == ("cameras.near", 1, 0)
+
+
 # ---- the report ------------------------------------------------------------------------------------------------------
 
 
@@ -295,6 +350,28 @@ def test_a_report_is_a_table_plain_data_and_forgets(simulator, state):
     assert report.to_dict()["findings"][0]["count"] == report.to_dict()["total"] == 3
     report.clear()
     assert report.findings == () and report.sentinels == {}
+
+
+def test_records_travel_as_one():
+    generator = torch.Generator().manual_seed(0)
+    counts, sums = torch.arange(6).reshape(3, 2), torch.randn(2, 5, generator=generator, dtype=torch.float64)
+    sums[1, 2] = INF
+    for records in ([counts, sums, torch.empty(0, 2, dtype=torch.int64), -counts], [sums]):
+        for a, b in zip(unpack(pack(records).clone(), records), records, strict=True):
+            assert_same_bits(a, b)
+
+
+def test_drawing_is_rendering_without_a_look(simulator, state):
+    report = StabilityReport()
+    with torch.no_grad():
+        (step,) = simulator.rollout(with_value(state, "means", 1, NAN), 1, on_bad="drop", report=report)
+        found = report.total
+        cameras = make_frames(SCENES).cameras
+        cameras = dataclasses.replace(cameras, image_cloud=cameras.image_cloud % len(SCENES)).to(step.means.device)
+        drawn = simulator.draw(step, cameras, on_bad="drop", report=report)
+        rendered = simulator.render(step, cameras, on_bad="drop", report=report)
+    assert_same_bits(drawn.color, rendered.color)
+    assert found == report.total > 0 and float(drawn.alpha.max()) > 0
 
 
 def test_a_copied_model_has_a_report_of_its_own(simulator, state):

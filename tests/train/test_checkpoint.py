@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -81,6 +82,44 @@ def test_a_truncated_changed_or_missing_file_is_named(tmp_path, file):
             checkpoint.load(tmp_path)
         (folder / file).write_bytes(content)
     checkpoint.load(tmp_path)
+
+
+def test_a_broken_one_names_the_newest_that_is_whole(tmp_path):
+    for step in (5, 10, 15):
+        checkpoint.save(tmp_path, example(step), keep=3)
+    for step in (10, 15):
+        file = tmp_path / "checkpoints" / f"step_0000{step}" / "model.safetensors"
+        file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(
+        InputError, match=r"step_000015/model.safetensors: .*truncated.*; step_000005 beside it is whole"
+    ):
+        checkpoint.load(tmp_path)
+    pointer = tmp_path / "checkpoints" / "last"
+    pointer.write_text("step_000005")
+    assert checkpoint.load(tmp_path).state["step"] == 5
+    pointer.write_text("")
+    with pytest.raises(InputError, match="step_000005 beside it is whole"):
+        checkpoint.load(tmp_path)
+
+
+@pytest.mark.parametrize("room", [0, 100, 400])
+def test_a_full_disk_is_told_and_leaves_the_last_one_good(tmp_path, room):
+    """Files may not grow beyond ``room`` bytes."""
+    checkpoint.save(tmp_path, example(5))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
+    try:
+        with pytest.raises(
+            InputError, match="step_000010: cannot be written: File too large; checkpoints before it"
+        ) as told:
+            checkpoint.save(tmp_path, example(10))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert "make room" in str(told.value)
+    assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["last", "step_000005"]
+    assert checkpoint.load(tmp_path).state["step"] == 5
+    checkpoint.save(tmp_path, example(10))
+    assert checkpoint.load(tmp_path).state["step"] == 10
 
 
 def test_what_is_not_a_checkpoint_is_refused(tmp_path):

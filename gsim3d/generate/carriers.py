@@ -1,0 +1,144 @@
+"""What carries a surface through time: nodes that an engine moves, and points that are tied to them at rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+NEIGHBOURS = 12  # particles that carry a point; four that span space are enough for an affine motion
+
+
+@dataclass(frozen=True)
+class Binding:
+    """Points as weighted sums of nodes.
+
+    corners: int64 [N, K], rows of the flattened nodes.
+    weights: [N, K]; each row adds up to 1, outside of what the nodes span some are negative.
+    """
+
+    corners: np.ndarray
+    weights: np.ndarray
+
+    def move(self, nodes: np.ndarray) -> np.ndarray:
+        """Where the points [N, 3] go when the nodes [..., 3] have moved."""
+        nodes = nodes.reshape(-1, 3)
+        points = np.zeros((len(self.corners), 3))
+        for corner in range(self.corners.shape[1]):
+            points += self.weights[:, corner, None] * nodes[self.corners[:, corner]]
+        return points
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Control lattice of a soft body.
+
+    nodes [T, c+1, c+1, c+1, 3]: metres, world; frame 0 is an axis-aligned box of equal cells.
+    occupied bool [c, c, c]: cells that hold collision vertices and whose corners all move with the body; nodes of no
+        such cell drift freely or stay behind.
+    """
+
+    nodes: np.ndarray
+    occupied: np.ndarray
+
+    def bind(self, points: np.ndarray) -> Binding:
+        """Ties ``points`` [N, 3] at frame 0 to the nearest occupied cell each.
+
+        Weights extrapolate where a point lies outside, so a rigid motion of the lattice moves every point rigidly.
+        """
+        rest = self.nodes[0]
+        n = rest.shape[0] - 1
+        low, high = rest[0, 0, 0], rest[-1, -1, -1]
+        place = (points - low) / (high - low) * n
+        cells = np.argwhere(self.occupied)
+        outside = np.maximum(np.abs(place[:, None] - (cells[None] + 0.5)) - 0.5, 0)
+        cell = cells[(outside**2).sum(-1).argmin(1)]
+        part = place - cell
+        corners, weights = [], []
+        for step in np.ndindex(2, 2, 2):
+            corner = cell + np.array(step)
+            corners.append((corner[:, 0] * (n + 1) + corner[:, 1]) * (n + 1) + corner[:, 2])
+            weights.append(np.where(np.array(step) == 1, part, 1 - part).prod(1))
+        return Binding(np.stack(corners, 1), np.stack(weights, 1))
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rigid body: nodes [T, 4, 3], its origin and the tips of its three unit axes, metres, world."""
+
+    nodes: np.ndarray
+
+    def bind(self, points: np.ndarray) -> Binding:
+        """Ties ``points`` [N, 3] at frame 0 to the axes."""
+        axes = self.nodes[0, 1:] - self.nodes[0, 0]
+        local = ((points - self.nodes[0, 0])[:, None] * axes).sum(-1)
+        corners = np.broadcast_to(np.arange(4), (len(points), 4))
+        return Binding(corners, np.concatenate([1 - local.sum(1, keepdims=True), local], 1))
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A cloth: nodes [T, n, n, 3] of a square grid, metres, world."""
+
+    nodes: np.ndarray
+
+    def refine(self, times: int) -> Binding:
+        """``times`` x finer grid, smooth and through all nodes (Catmull-Rom along both axes), row by row."""
+        n = self.nodes.shape[1]
+        rows = _catmull_rom(n, times)
+        m = len(rows)
+        dense = np.einsum("ia,jb->ijab", rows, rows).reshape(m * m, n * n)
+        corners = np.argsort(dense == 0, axis=1, kind="stable")[:, : int((dense != 0).sum(1).max())]
+        return Binding(corners, np.take_along_axis(dense, corners, 1))
+
+
+def _catmull_rom(n: int, times: int) -> np.ndarray:
+    """Weights [(n - 1) * times + 1, n] of a curve through n equal knots; past its ends it goes on straight."""
+    place = np.arange((n - 1) * times + 1) / times
+    first = np.minimum(place.astype(np.int64), n - 2)
+    t = place - first
+    basis = np.stack(
+        [(-t + 2 * t**2 - t**3) / 2, (2 - 5 * t**2 + 3 * t**3) / 2, (t + 4 * t**2 - 3 * t**3) / 2, (t**3 - t**2) / 2], 1
+    )
+    padded = np.zeros((len(place), n + 2))
+    np.put_along_axis(padded, first[:, None] + np.arange(4), basis, 1)
+    weights = padded[:, 1:-1].copy()
+    weights[:, :2] += padded[:, :1] * [2, -1]
+    weights[:, -2:] += padded[:, -1:] * [-1, 2]
+    return weights
+
+
+def grid_faces(n: int) -> np.ndarray:
+    """Triangles [2 (n-1)^2, 3] of a grid of n x n vertices, facing +z where rows run along x and columns along y."""
+    i, j = (a.reshape(-1) for a in np.meshgrid(np.arange(n - 1), np.arange(n - 1), indexing="ij"))
+    a, b, c, d = i * n + j, (i + 1) * n + j, (i + 1) * n + j + 1, i * n + j + 1
+    return np.stack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)], 1).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Particles of a body: nodes [T, P, 3], metres, world."""
+
+    nodes: np.ndarray
+
+    def bind(self, points: np.ndarray) -> Binding:
+        """Ties ``points`` [N, 3] at frame 0 to the nearest particles, near ones weighing most.
+
+        The weights reproduce every affine motion of the particles exactly, rigid ones too.
+        """
+        rest = self.nodes[0]
+        count = min(NEIGHBOURS, len(rest))
+        corners = np.stack([_nearest(rest, point, count) for point in points])
+        arms = rest[corners] - points[:, None]
+        near = 1 / ((arms**2).sum(-1) + 1e-12 + (arms**2).sum(-1).mean(1, keepdims=True) / count)
+        design = np.concatenate([np.ones((*arms.shape[:2], 1)), arms], 2)
+        # Smallest weights, measured by distance, that add up to 1 and to the point itself.
+        normal = np.einsum("nki,nk,nkj->nij", design, near, design)
+        multiplier = np.einsum("nij,j->ni", np.linalg.pinv(normal, hermitian=True), [1.0, 0, 0, 0])
+        return Binding(corners, near * np.einsum("nki,ni->nk", design, multiplier))
+
+
+def _nearest(nodes: np.ndarray, point: np.ndarray, count: int) -> np.ndarray:
+    distance = ((nodes - point) ** 2).sum(1)
+    chosen = np.argpartition(distance, count - 1)[:count]
+    return np.sort(chosen)

@@ -1,0 +1,146 @@
+"""What a run tells while it goes on: a line of JSON for each logged step, TensorBoard, the progress bar."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import resource
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsim3d.errors import InputError
+
+LOG, BOARD = "metrics.jsonl", "tensorboard"
+VIDEO_MS = 80  # that a frame of a sample video is shown
+
+
+class Log:
+    """The log of a run folder.
+
+    writes: whether this process is the one that writes.    board: TensorBoard while it is open, or None.
+    """
+
+    def __init__(self, out: Path, *, writes: bool = True):
+        self.file, self.writes = out / LOG, writes
+        self.board: Board | None = None
+        self._stream = None
+
+    def cut(self, step: int) -> None:
+        """Drops what was logged from ``step`` on: those steps will be repeated."""
+        if self.writes and self.file.exists():
+            lines = self.file.read_text().splitlines()
+            kept = [line for line in lines if _step_of(line) < step]
+            if kept != lines:
+                part = self.file.with_name(f".{self.file.name}.part")
+                part.write_text("".join(line + "\n" for line in kept))
+                os.replace(part, self.file)
+
+    @contextmanager
+    def opened(self, *, tensorboard: bool) -> Iterator[None]:
+        """Within it steps are written. Args: tensorboard: for it as well."""
+        if not self.writes:
+            yield
+            return
+        with open(self.file, "a") as self._stream:
+            self.board = Board(self.file.parent / BOARD) if tensorboard else None
+            try:
+                yield
+            finally:
+                if self.board is not None:
+                    self.board.close()
+                self.board = self._stream = None
+
+    def write(self, entry: dict, machine: dict) -> None:
+        """Args: entry: what follows from the configuration; machine: time and memory, which do not."""
+        if self._stream is not None:
+            rounded = {name: round(value, 4) for name, value in machine.items()}
+            try:
+                self._stream.write(json.dumps({**entry, "machine": rounded}) + "\n")
+                self._stream.flush()
+            except OSError as error:
+                raise InputError(
+                    f"{self.file}: cannot be written: {error.strerror}; make room and train again"
+                ) from None
+            if self.board is not None:
+                self.board.scalars({**entry, **machine}, entry["step"])
+
+
+class Board:
+    """TensorBoard's files in ``folder``.
+
+    Raises: InputError where the package is not installed.
+    """
+
+    def __init__(self, folder: Path):
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            raise InputError("--tensorboard needs the package tensorboard: pip install 'gsim3d[tensorboard]'") from None
+        self._writer = SummaryWriter(str(folder))
+
+    def scalars(self, values: dict, step: int, prefix: str = "train") -> None:
+        """All numbers of ``values``, nested ones and those of lists under their own names."""
+        for name, value in values.items():
+            if isinstance(value, list):
+                value = {str(i + 1): item for i, item in enumerate(value)}
+            if isinstance(value, dict):
+                self.scalars(value, step, f"{prefix}/{name}")
+            elif isinstance(value, (int, float)) and name != "step":
+                self._writer.add_scalar(f"{prefix}/{name}", value, step)
+
+    def video(self, frames: Tensor, step: int) -> None:
+        """Args: frames: uint8 [T, H, W, 3]."""
+        from PIL import Image
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        first, *others = (Image.fromarray(frame.numpy()) for frame in frames)
+        gif = io.BytesIO()
+        first.save(gif, "gif", save_all=True, append_images=others, duration=VIDEO_MS, loop=0)
+        image = Summary.Image(
+            height=frames.shape[1], width=frames.shape[2], colorspace=3, encoded_image_string=gif.getvalue()
+        )
+        summary = Summary(value=[Summary.Value(tag="sample/filmed, predicted", image=image)])
+        self._writer._get_file_writer().add_summary(summary, step)
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+def memory_gib(device: str) -> float:
+    """The most memory that was ever in use: tensors on a GPU, the whole process on a CPU."""
+    if device == "cuda":
+        return torch.cuda.max_memory_allocated() / 2**30
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
+
+
+def progress_note(entry: dict, machine: dict) -> str:
+    """What the progress bar says beside the steps, their rate and the time left."""
+    values = {name: entry.get(f"{name}_psnr") for name in ("past", "future")}
+    parts = [f"{name} {value:.1f} dB" for name, value in values.items() if isinstance(value, float)]
+    parts += [f"{machine['step_seconds']:.2f} s a step", f"{machine['memory_gib']:.1f} GiB"]
+    return ", ".join(parts + ["skipped"] * ("skipped" in entry))
+
+
+def plain(value: Any) -> Any:
+    """JSON has no NaN: what is not finite is logged as text."""
+    if isinstance(value, dict):
+        return {name: plain(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [plain(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _step_of(line: str) -> float:
+    try:
+        return json.loads(line)["step"]
+    except (ValueError, KeyError, TypeError):
+        return math.inf  # the last line of a killed process

@@ -1,0 +1,71 @@
+"""Training in several processes: who computes which samples, and what they tell each other."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+from gsim3d.errors import InputError
+
+
+class Processes:
+    """The processes of one training run; each has a replica of the model and computes its share of every batch.
+
+    rank: number of this one, from 0.    count: how many there are.
+    """
+
+    def __init__(self, rank: int = 0, count: int = 1):
+        self.rank, self.count = rank, count
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this is the one that writes files and shows progress."""
+        return self.rank == 0
+
+    def share(self, batch: int) -> list[int]:
+        """The samples of a batch that this process computes: neighbours; counts differ by one at most."""
+        return list(range(self.rank * batch // self.count, (self.rank + 1) * batch // self.count))
+
+    def gather(self, value: Any) -> list[Any]:
+        """``value`` of every process, in the order of their ranks. Every process must call it."""
+        if self.count == 1:
+            return [value]
+        values = [None] * self.count
+        dist.all_gather_object(values, value)
+        return values
+
+    def check_agreement(self, **values: Any) -> None:
+        """Raises InputError, in every process, where one of ``values`` is not the same in all of them."""
+        first, *others = self.gather(values)
+        for name in first:
+            if any(other[name] != first[name] for other in others):
+                raise InputError(f"{name}: not the same in all processes of this run; do they see the same files?")
+
+
+@contextmanager
+def joined(device: str) -> Iterator[Processes]:
+    """Within it the processes that torchrun started know each other; alone where none did.
+
+    Args:
+        device: "cpu" (gloo) or "cuda" (NCCL; each process takes the GPU of its local rank).
+    """
+    count = int(os.environ.get("WORLD_SIZE", "1"))
+    if count == 1:
+        yield Processes()
+        return
+    if device == "cuda":
+        local = int(os.environ.get("LOCAL_RANK", "0"))
+        if local >= torch.cuda.device_count():
+            raise InputError(
+                f"--nproc-per-node: process {local} of this node has no GPU; {torch.cuda.device_count()} found"
+            )
+        torch.cuda.set_device(local)
+    # Small Python values travel over gloo in both cases.
+    dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
+    yield Processes(dist.get_rank(), dist.get_world_size())
+    dist.destroy_process_group()  # not after an error: others may wait for this process, and torchrun ends them

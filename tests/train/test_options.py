@@ -1,0 +1,190 @@
+"""Precision, recomputation, drawn histories, TensorBoard, traces."""
+
+import dataclasses
+import json
+import math
+import sys
+
+import pytest
+import torch
+
+from gsim3d.errors import InputError
+from gsim3d.train import checkpoint
+from gsim3d.train.config import DataConfig
+from gsim3d.train.loop import Trainer, deterministic
+from gsim3d.train.precision import STEPS_TO_DOUBLE, LossScale, PrecisionConfig
+from gsim3d.train.samples import draw_batch
+from gsim3d.train.settings import from_dict
+from gsim3d.train.watch import StepWatch
+from tests.train.test_loop import CONFIG, curve, scenes
+from tests.tiny_scenes import write_scenes
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+LATER = 4  # a step of the second stage, which rolls out
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_scenes(tmp_path_factory.mktemp("scenes"), 2)
+
+
+def trainer_at(folder, out, step=LATER, device="cpu", **settings):
+    trainer = Trainer(dataclasses.replace(CONFIG, **settings), scenes(folder), out, device=str(device))
+    trainer.simulator.train()
+    trainer.step = step
+    return trainer
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("norm", ["layer", "batch"])
+def test_recomputing_changes_no_bit(folder, tmp_path, norm, precision, device):
+    """Gradients, statistics and what is drawn, each part alone and all together."""
+    model = {"dynamics": {"norm": norm, "drop_path": 0.3, "shuffle_orders": True, "zero_init": False}}
+    precision = PrecisionConfig(precision, precision, precision)
+    known = None
+    for recompute in ((), ("encoder",), ("steps",), ("images",), ("encoder", "steps", "images")):
+        settings = {"model": model, "recompute": recompute, "precision": precision}
+        trainer = trainer_at(folder, tmp_path, device=device, **settings)
+        calls = []
+        for part, name in (("encoder", "encoder"), ("dynamics", "steps"), ("renderer", "images")):
+            getattr(trainer.simulator, part).register_forward_pre_hook(lambda *_, name=name: calls.append(name))
+        with deterministic():
+            loss, errors, gradients, watch = trainer._gradients([0])
+        result = [loss, errors, *gradients, *trainer.simulator.buffers()]
+        assert watch.seen(1.0).n_rows > 0 and len(watch.seen(1.0).norms) == 2
+        for name, once in (("encoder", 1), ("steps", 2), ("images", 1)):
+            assert calls.count(name) == (2 * once if name in recompute else once)
+        known = known or result
+        for before, now in zip(known, result, strict=True):
+            assert (before is None) == (now is None) and (now is None or torch.equal(before, now)), recompute
+    buffers = list(trainer.simulator.buffers())
+    assert (norm == "batch") == any(bool((b != b.round()).any()) for b in buffers)
+
+
+@pytest.mark.parametrize("part", ["encoder", "dynamics", "renderer"])
+@pytest.mark.parametrize("precision, error", [("bf16", 0.05), ("fp16", 0.01)])
+def test_a_part_in_another_precision(folder, tmp_path, part, precision, error):
+    """Products of that part are rounded and those of no other; losses, particles and gradients stay float32."""
+    model = {"dynamics": {"zero_init": False}}
+    exact = trainer_at(folder, tmp_path, model=model)
+    rounded = trainer_at(folder, tmp_path, model=model, precision=from_dict(PrecisionConfig, {part: precision}))
+    seen = {}
+    for name in ("encoder", "dynamics", "renderer"):
+        for module in getattr(rounded.simulator, name).modules():
+            if isinstance(module, (torch.nn.Linear, torch.nn.Conv2d)):
+                module.register_forward_hook(lambda m, i, o, name=name: seen.setdefault(name, set()).add(o.dtype))
+    (loss, _, expected, _), (low, _, gradients, _) = exact._gradients([0]), rounded._gradients([0])
+    dtype = {"bf16": torch.bfloat16, "fp16": torch.float16}[precision]
+    assert (dtype in seen[part]) and all(types == {torch.float32} for name, types in seen.items() if name != part)
+    assert low.dtype == torch.float32 and low != loss and low.item() == pytest.approx(loss.item(), rel=error)
+    assert all(g is None or g.dtype == torch.float32 for g in gradients)
+    pairs = [(a, b) for a, b in zip(expected, gradients, strict=True) if a is not None]
+    a, b = (torch.cat([g.flatten() for g in side]) for side in zip(*pairs, strict=True))
+    assert torch.cosine_similarity(a, b, 0) > 0.9
+
+
+@pytest.mark.parametrize("precision", ["bf16", "fp16"])
+def test_states_and_images_stay_float32(folder, tmp_path, precision, device):
+    precision = PrecisionConfig(precision, precision, precision)
+    trainer = trainer_at(folder, tmp_path, device=device, precision=precision)
+    render, seen = trainer.simulator.render, []
+    trainer.simulator.render = lambda p, *given, **options: seen.append(p) or render(p, *given, **options)
+    images = trainer._images(trainer._batch([0]), 0, StepWatch())
+    (particles,) = seen
+    floats = [value for value in particles.row_fields().values() if value.is_floating_point()]
+    assert len(floats) == 4 and particles.n_clouds == 4
+    assert all(value.dtype == torch.float32 for value in [images, *floats, *trainer.simulator.state_dict().values()])
+
+
+def test_scaling_the_loss_leaves_gradients_and_an_overflow_halves_it(folder, tmp_path, device):
+    trainers = [
+        trainer_at(folder, tmp_path, device=device, precision=PrecisionConfig(dynamics=p)) for p in ("fp16", "fp16")
+    ]
+    assert trainers[0].scale.value == 2.0**16
+    for trainer, scale in zip(trainers, (2.0**12, 2.0**10), strict=True):
+        trainer.scale = LossScale(scale)
+    entries = [trainer.train_step() for trainer in trainers]
+    assert [entry["loss_scale"] for entry in entries] == [2.0**12, 2.0**10]
+    for name in ("grad_norm", "grad_norm_by_step"):
+        assert entries[0][name] == pytest.approx(entries[1][name], rel=0.02)
+    trainer = trainers[0]
+    trainer.scale = LossScale(2.0**126)
+    assert "not finite" in trainer.train_step()["skipped"] and trainer.scale.value == 2.0**125
+    trainer.out.mkdir(exist_ok=True)
+    trainer.save()
+    assert trainer_at(folder, tmp_path, precision=PrecisionConfig(dynamics="fp16")).scale.value == 2.0**125
+    scale = LossScale(4.0)
+    for _ in range(STEPS_TO_DOUBLE):
+        scale.update(True)
+    assert (scale.value, scale.n_good) == (8.0, 0)
+
+
+def test_histories_and_views_are_drawn_for_each_step(folder, tmp_path):
+    data = DataConfig(history=4, shortest_history=1, context_views=3, fewest_views=2, target_only_cameras=(3,))
+    stage = dataclasses.replace(CONFIG.stages[1], batch=2)
+    found = set()
+    for step in range(24):
+        batch = draw_batch(scenes(folder), data, stage, 0, step, [0, 1])
+        (alone,) = {draw_batch(scenes(folder), data, stage, 0, step, [s]).n_context for s in (0, 1)}
+        n_images, n_clouds = batch.context.images.shape[0], batch.context.cloud_scene.shape[0]
+        assert batch.n_context == alone and n_clouds == 2 * alone
+        found.add((alone, n_images // n_clouds))
+    assert {history for history, _ in found} == {1, 2, 3, 4} and {views for _, views in found} == {2, 3}
+    model = {"dynamics": {"history_bits": 2}}
+    config = dataclasses.replace(CONFIG, data=data, model=model, stages=(dataclasses.replace(stage, steps=4, batch=1),))
+    for name, sittings in (("whole", [None]), ("parts", [2, None])):
+        for until in sittings:
+            Trainer(config, scenes(folder), tmp_path / name).run(until=until, progress=False)
+    assert curve(tmp_path / "whole") == curve(tmp_path / "parts")
+    with pytest.raises(InputError, match="data.shortest_history: must be at most data.history, 2; got 3"):
+        DataConfig(shortest_history=3)
+
+
+def test_tensorboard_gets_all_numbers_and_videos_and_changes_no_bit(folder, tmp_path):
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    for name in ("without", "with"):
+        Trainer(CONFIG, scenes(folder), tmp_path / name).run(progress=False, until=5, tensorboard=name == "with")
+    assert curve(tmp_path / "without") == curve(tmp_path / "with")
+    board = events.EventAccumulator(str(tmp_path / "with" / "tensorboard"), {"images": 0, "scalars": 0}).Reload()
+    losses = [(event.step, event.value) for event in board.Scalars("train/loss")]
+    assert losses == [(line["step"], pytest.approx(line["loss"])) for line in curve(tmp_path / "with")]
+    names = set(board.Tags()["scalars"])
+    modules = {f"train/grad_norm_by_module/{part}" for part in ("encoder", "dynamics", "renderer")}
+    assert {"train/particles", "train/step_seconds", "train/memory_gib", "train/grad_norm_by_step/2"} | modules <= names
+    (video,) = board.Images("sample/filmed, predicted")
+    assert video.step == 5 and (video.width, video.height) == (64, 32) and video.encoded_image_string[:3] == b"GIF"
+
+
+def test_tensorboard_that_is_not_installed_is_named(folder, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(InputError, match=r"pip install 'gsim3d\[tensorboard\]'"):
+        Trainer(CONFIG, scenes(folder), tmp_path).run(progress=False, tensorboard=True)
+
+
+def test_a_sample_video_shows_film_and_prediction(folder, tmp_path):
+    trainer = trainer_at(folder, tmp_path)
+    video = trainer.sample_video()
+    assert video.shape == (4, 32, 64, 3) and video.dtype == torch.uint8 and trainer.simulator.training
+    assert torch.equal(video[:, :, :32], trainer.scenes[0].images([0], range(4))[:, 0].permute(0, 2, 3, 1))
+    assert video[:, :, 32:].float().std() > 1
+
+
+def test_a_trace_is_written_and_changes_no_bit(folder, tmp_path):
+    Trainer(CONFIG, scenes(folder), tmp_path / "plain").run(progress=False, until=5)
+    Trainer(CONFIG, scenes(folder), tmp_path / "traced").run(progress=False, until=5, profile=True)
+    assert curve(tmp_path / "plain") == curve(tmp_path / "traced")
+    (trace,) = (tmp_path / "traced" / "profile").iterdir()
+    names = {event.get("name") for event in json.loads(trace.read_text())["traceEvents"]}
+    assert trace.name == "process_0.json" and "ProfilerStep#3" in names and "gsim3d::rasterize_gaussians" in names
+    with pytest.raises(InputError, match="--profile traces steps 3 and 4 of a sitting; this one has 1"):
+        Trainer(CONFIG, scenes(folder), tmp_path / "traced").run(progress=False, profile=True)
+
+
+def test_the_log_tells_time_memory_and_particles(folder, tmp_path):
+    Trainer(CONFIG, scenes(folder), tmp_path).run(progress=False, until=2)
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert all(line["machine"]["step_seconds"] > 0 and 0.01 < line["machine"]["memory_gib"] < 100 for line in lines)
+    assert lines[1]["machine"]["seconds"] > lines[0]["machine"]["seconds"]
+    batch = draw_batch(scenes(folder), CONFIG.data, CONFIG.stages[0], 0, 0, [0, 1])
+    assert lines[0]["particles"] == pytest.approx(batch.context.masks.sum().item() / 2)
+    assert math.isfinite(checkpoint.load(tmp_path).state["seconds"])

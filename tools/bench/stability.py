@@ -1,0 +1,190 @@
+"""What the default policy costs: a step of the simulator and an image of it, with its guards and without them.
+
+    python tools/bench/stability.py [--device cuda]
+
+Guards are one look at all rows where a state enters and after every step, and the counts of the rasterizer. Read the
+column of the peer as "the same without guards"; results are the same bits.
+"""
+
+import math
+import statistics
+import time
+from contextlib import contextmanager
+
+import torch
+from harness import Bench, summary, worst_error
+
+import gsim3d.guards
+import gsim3d.simulator
+from gsim3d import Simulator, ops, presets
+from gsim3d.graphs import CapturedRollout
+from gsim3d.presets import ModelConfig
+from gsim3d.stability import StabilityReport
+from gsim3d.types import Cameras, Particles
+
+STEPS = 4  # of a rollout
+PAIRS = 25  # of timings on the CPU
+
+
+def state_of(simulator: Simulator, n: int, device: torch.device) -> Particles:
+    """One scene, n particles in each of as many steps as the model sees: a ball above the ground."""
+    g = torch.Generator().manual_seed(0)
+    dynamics = simulator.config.dynamics
+    n_steps = 2**dynamics.history_bits
+    direction = torch.randn(n, 3, generator=g)
+    body = direction / direction.norm(dim=1, keepdim=True) * 0.3 * torch.rand(n, 1, generator=g).pow(1 / 3)
+    means = torch.cat([body + torch.tensor([0.0, 0.0, -0.03 * t]) for t in range(n_steps)])
+    state = Particles(
+        means=means,
+        opacities=0.05 + 0.9 * torch.rand(n_steps * n, generator=g),
+        dynamic_latents=0.3 * torch.randn(n_steps * n, dynamics.dynamic_latents, generator=g),
+        static_latents=0.3 * torch.randn(n_steps * n, dynamics.static_latents, generator=g),
+        cu_rows=torch.arange(0, (n_steps + 1) * n, n),
+        cloud_scene=torch.zeros(n_steps, dtype=torch.int64),
+        cloud_step=torch.arange(n_steps),
+        activity=torch.zeros(n_steps * n, dtype=torch.uint8),
+        origin=torch.full((1, 3), -2.0, dtype=torch.float64),
+    )
+    return state.to(device)
+
+
+def camera(device: torch.device) -> Cameras:
+    pose = torch.eye(4)
+    pose[2, 3] = 1.5
+    K = torch.tensor([[150.0, 0.0, 64.0], [0.0, 150.0, 64.0], [0.0, 0.0, 1.0]])
+    one = torch.ones(1)
+    cameras = Cameras(pose[None], K[None], 0.5 * one, 4 * one, torch.zeros(1, dtype=torch.int64), 128, 128)
+    return cameras.to(device)
+
+
+@contextmanager
+def no_guards():
+    """Within it states pass unseen, and nobody counts what the rasterizer leaves out."""
+    guard, render = gsim3d.simulator.guard_particles, gsim3d.simulator.render
+    gsim3d.simulator.guard_particles = lambda particles, *args, **options: particles
+
+    def uncounted(*args, report, on_bad, **options):
+        return render(*args, **options, on_bad="drop")
+
+    gsim3d.simulator.render = uncounted
+    try:
+        yield
+    finally:
+        gsim3d.simulator.guard_particles, gsim3d.simulator.render = guard, render
+
+
+def run_of(simulator: Simulator, state: Particles, cameras: Cameras):
+    def run():
+        with torch.no_grad():
+            steps = simulator.rollout(state, STEPS, report=StabilityReport())
+            return [step.means for step in steps] + [simulator.render(steps[-1], cameras).color]
+
+    return run
+
+
+def without_guards(f):
+    def run():
+        with no_guards():
+            return f()
+
+    return run
+
+
+def captured(bench: Bench, config: ModelConfig, n: int, case: str):
+    """The same as run_of as CUDA graphs in bfloat16, one with guards and one that was made without them."""
+    simulator = Simulator(config).to(bench.device).eval()
+    state, cameras = state_of(simulator, n, bench.device), camera(bench.device)
+    with torch.autocast("cuda", torch.bfloat16):
+        ours = CapturedRollout(simulator, state, STEPS, cameras=cameras, copies=False, report=StabilityReport())
+        with no_guards():
+            plain = CapturedRollout(simulator, state, STEPS, cameras=cameras, copies=False, report=StabilityReport())
+
+    def replay_of(graph: CapturedRollout):
+        def run():
+            steps, images = graph(state)
+            return [step.means for step in steps] + [images[-1].color]
+
+        return run
+
+    bench.gpu(case, "bfloat16", replay_of(ours), {"no guards": replay_of(plain)}, tolerance=0.0, capture=False)
+
+
+def cost(bench: Bench, case: str, run, plain):
+    """Processor time of both sides in turns, on one thread, so that a busy machine matters little; the cost is the
+    median over pairs."""
+    assert worst_error(run(), plain()) == 0, f"{case}: guards change results"
+    torch.set_num_threads(1)
+    times: dict = {run: [], plain: []}
+    for pair in range(PAIRS):
+        for f in (run, plain) if pair % 2 else (plain, run):
+            start = time.process_time()
+            f()
+            times[f].append(time.process_time() - start)
+    torch.set_num_threads(bench.args.threads)
+    ratios = [a / b - 1 for a, b in zip(times[run], times[plain])]
+    low, share, high = statistics.quantiles(ratios, n=4, method="inclusive")
+    a, b = summary(times[run]), summary(times[plain])
+    print(f"{case:<44}{a['ms']:>11.2f}{b['ms']:>11.2f} cost {share:.2%} ({low:.2%} to {high:.2%})", flush=True)
+    bench.results.append({"case": case, "gsim3d": a, "plain": b, "cost": share, "quartiles": [low, high]})
+
+
+def main():
+    bench = Bench("stability")
+    on_gpu = bench.device.type == "cuda"
+    cases = [("tiny", presets.tiny(), 4000), ("small", presets.small(), 4000)]
+    if on_gpu:
+        paper = presets.paper_latent(4, 64)
+        cases = [("small", presets.small(), 16384), ("paper_latent", paper, 16384), ("paper_latent", paper, 65536)]
+    for name, config, n in cases:
+        torch.manual_seed(0)
+        simulator = Simulator(config).to(bench.device).eval()
+        run = run_of(simulator, state_of(simulator, n, bench.device), camera(bench.device))
+        case = f"{name}, {n} particles: {STEPS} steps"
+        if not on_gpu:
+            cost(bench, case + ", 1 image", run, without_guards(run))
+            continue
+        bench.gpu(case + ", 1 image", "float32", run, {"no guards": without_guards(run)}, tolerance=0.0, capture=False)
+        captured(bench, config, n, case + f", {STEPS} images, captured")
+    if on_gpu:
+        look(bench)
+    bench.finish()
+
+
+def look(bench: Bench):
+    """The op alone, against the same questions in plain torch."""
+    n = 65536
+    g = torch.Generator().manual_seed(0)
+    means, opacities = torch.rand(n, 3, generator=g), torch.rand(n, generator=g)
+    dynamic, static = torch.randn(n, 32, generator=g), torch.randn(n, 32, generator=g)
+    fields = [x.to(bench.device) for x in (means, opacities, dynamic, static)]
+    cu_rows, zero = torch.tensor([0, n], device=bench.device), torch.zeros(1, dtype=torch.int64, device=bench.device)
+    origin = torch.zeros(1, 3, dtype=torch.float64, device=bench.device)
+    activity = torch.zeros(n, dtype=torch.uint8, device=bench.device)
+    previous = fields[0] + 0.01
+    bounds = [(-math.inf, math.inf), (0.0, 1.0), (-1e4, 1e4), (-1e4, 1e4)]
+
+    def ours():
+        watched = ops.watch_rows(
+            fields,
+            bounds,
+            cu_rows,
+            cloud_scene=zero,
+            origin=origin,
+            activity=activity,
+            grid_size=0.01,
+            previous=previous,
+        )
+        return watched.record[0, 12:15].float()
+
+    def plain():
+        good = torch.stack([((x >= a) & (x <= b)).reshape(n, -1).all(1) for x, (a, b) in zip(fields, bounds)]).all(0)
+        cells = (fields[0].double() - origin) / 0.01
+        good &= ((cells >= 0) & (cells < 2**16)).all(1) & (activity != 2)
+        squared = (fields[0].double() - previous.double()).square().sum(1)
+        return torch.stack([good.sum(), (squared * good).sum() / 2, fields[1].double().sum()]).float()
+
+    bench.gpu("watch_rows, 65k rows of 68 channels", "float32", ours, {"torch": plain}, limit_ms=0.05, tolerance=1e-5)
+
+
+if __name__ == "__main__":
+    main()
