@@ -261,7 +261,8 @@ class Trainer:
         good = f"its last checkpoint in {self.out}" if found else "its start: no checkpoint was written yet"
         raise HardCaseError(
             f"training: {n} steps in a row were skipped up to step {entry['step']}, "
-            f"the last because {entry['skipped']}; lower stages.learning_rate or optimizer.clip_norm and train again: the run goes on from {good}",
+            f"the last because {entry['skipped']}; lower stages.learning_rate or optimizer.clip_norm and train again: "
+            f"the run goes on from {good}",
             step=entry["step"],
         )
 
