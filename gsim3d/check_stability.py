@@ -235,6 +235,8 @@ def save_sample(path: Path, sample: Sample, what: dict) -> None:
 def load_sample(path: str | Path) -> tuple[Sample, dict]:
     """What :func:`save_sample` wrote. Raises InputError where it is no such file."""
     try:
+        if not Path(path).is_file():  # a pipe would be waited for
+            raise InputError(f"{path}: no such file")
         with safe_open(path, "pt") as file:
             what = json.loads((file.metadata() or {})["gsim3d_stability"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}
@@ -247,7 +249,7 @@ def load_sample(path: str | Path) -> tuple[Sample, dict]:
         size = {"width": int(what["width"]), "height": int(what["height"])}
         frames = Frames(cameras=Cameras(**parts["cameras"], **size), **parts["frames"])
         return Sample(frames, Cameras(**parts["targets"], **size), int(what["n_steps"])), what
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+    except (OSError, MemoryError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a file that gsim3d doctor --stability wrote ({type(error).__name__})") from None
 
 

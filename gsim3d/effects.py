@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 
 from gsim3d.errors import InputError
+from gsim3d.files import MAX_TEXT, read_file
 
 VERSION = 1
 BACKGROUNDS = ("frozen", "masked_out", "dynamic")
@@ -113,10 +114,11 @@ class EffectsSpec:
     @classmethod
     def load(cls, path: str | Path) -> EffectsSpec:
         """Reads a YAML (or JSON) file."""
+        text = read_file(path, MAX_TEXT)
         try:
-            values = yaml.safe_load(Path(path).read_text())
-        except (OSError, yaml.YAMLError) as error:
-            raise InputError(f"effects: cannot read {path}: {error}") from error
+            values = yaml.safe_load(text)
+        except (yaml.YAMLError, ValueError, RecursionError, MemoryError) as error:
+            raise InputError(f"effects: {path} cannot be read: {' '.join(str(error).split())[:300]}") from None
         if values is not None and not isinstance(values, dict):
             raise InputError(f"effects: {path} must hold a mapping; got {type(values).__name__}")
         return cls.from_dict(values)

@@ -53,6 +53,7 @@ class Captured:
             raise CaptureError(f"Captured: device must be a GPU; got {device}")
         cached = torch.is_autocast_cache_enabled()
         torch.set_autocast_cache_enabled(False)
+        torch.clear_autocast_cache()  # what it holds was made on another stream, for which a backward pass would wait
         try:
             with torch.cuda.device(self._device), keeping_constants(self._constants):
                 self._capture(function)
@@ -215,7 +216,7 @@ class CapturedRollout:
             renderings = []
             if self._cameras is not None:
                 for step in steps:
-                    renderings.append(self._model.render(step, self._cameras, self._background, plan, report=report))
+                    renderings.append(self._model.draw(step, self._cameras, self._background, plan, report=report))
         return Predicted(steps, renderings)
 
     def _observed(self) -> list[PyramidCapacity]:

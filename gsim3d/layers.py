@@ -6,6 +6,8 @@ splits the rows of a matrix product over threads is its own affair.
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 from collections.abc import Sequence
 
 import torch
@@ -75,27 +77,49 @@ def rounded_weights(module: nn.Module, dtype: torch.dtype) -> tuple[Tensor | Non
     The copies are kept and made again, in the same memory, once a weight has changed: a simulation rounds its weights
     once. Changes are noticed as autograd notices them, so not those made through ``weight.data``.
     """
-    tensors = [t for t in (module.weight, module.bias) if t is not None]
     if module.weight.dtype == dtype:
         return module.weight, module.bias
-    if module.weight.is_cuda and torch.cuda.is_current_stream_capturing():
-        copies = [t.detach().to(dtype) for t in tensors]  # part of the graph: made at each replay
-    else:
-        key = (dtype, *(key for t in tensors for key in (t.data_ptr(), t._version)))
-        known, copies = module.__dict__.get("_rounded", (None, ()))
-        if known != key:
-            copies = _round_into(copies if known is not None and known[0] == dtype else (), tensors, dtype)
-            module.__dict__["_rounded"] = key, copies
-    return copies[0], copies[1] if len(copies) == 2 else None
+    ready = _ready.get().get(id(module))
+    weight, *bias = ready or _rounded([module], dtype)[0]
+    return weight, bias[0] if bias else None
+
+
+@contextlib.contextmanager
+def rounded_at_once(modules: Sequence[nn.Module], dtype: torch.dtype):
+    """A context in which :func:`rounded_weights` of ``modules`` are at hand: made in a few launches, not two a layer."""
+    modules = [module for module in modules if module.weight.dtype != dtype]
+    token = _ready.set(dict(zip(map(id, modules), _rounded(modules, dtype), strict=True)))
+    try:
+        yield
+    finally:
+        _ready.reset(token)
+
+
+_ready: contextvars.ContextVar[dict[int, Sequence[Tensor]]] = contextvars.ContextVar("ready", default={})
 
 
 @torch.inference_mode(False)
 @torch.no_grad()
-def _round_into(copies: Sequence[Tensor], tensors: Sequence[Tensor], dtype: torch.dtype) -> Sequence[Tensor]:
-    if not copies or copies[0].device != tensors[0].device:
-        return [t.to(dtype) for t in tensors]
-    torch._foreach_copy_(copies, tensors)
-    return copies
+def _rounded(modules: Sequence[nn.Module], dtype: torch.dtype) -> list[Sequence[Tensor]]:
+    """Weights and biases of ``modules`` in ``dtype``; all that is not known is rounded by one operation."""
+    results, sources, targets = [], [], []
+    for module in modules:
+        tensors = [t for t in (module.weight, module.bias) if t is not None]
+        if module.weight.is_cuda and torch.cuda.is_current_stream_capturing():
+            copies = [torch.empty_like(t, dtype=dtype) for t in tensors]  # part of the graph: made at each replay
+            sources, targets = sources + tensors, targets + copies
+        else:
+            key = (dtype, *(key for t in tensors for key in (t.data_ptr(), t._version)))
+            known, copies = module.__dict__.get("_rounded", (None, ()))
+            if known != key:
+                if known is None or known[0] != dtype or copies[0].device != module.weight.device:
+                    copies = [torch.empty_like(t, dtype=dtype) for t in tensors]
+                sources, targets = sources + tensors, targets + list(copies)
+                module.__dict__["_rounded"] = key, copies
+        results.append(copies)
+    if sources:
+        torch._foreach_copy_(targets, sources)
+    return results
 
 
 class RowLayerNorm(nn.LayerNorm):

@@ -154,8 +154,22 @@ class Simulator(nn.Module):
             plan: limits the degree of view-dependent colour; default the model's.
             cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
         """
-        on_bad, report = on_bad or self.config.stability.on_bad, self.report if report is None else report
         particles = self._guard("render", on_bad, report, in_workspace=False)(particles)
+        return self.draw(particles, cameras, background, plan, cutoff=cutoff, on_bad=on_bad, report=report)
+
+    def draw(
+        self,
+        particles: Particles,
+        cameras: Cameras,
+        background: Tensor | None = None,
+        plan: Plan | None = None,
+        *,
+        cutoff: str = "exact",
+        on_bad: OnBad | None = None,
+        report: StabilityReport | None = None,
+    ) -> Rendering:
+        """As :meth:`render`, of particles as :meth:`rollout` returned them: their numbers are not looked at again."""
+        on_bad, report = on_bad or self.config.stability.on_bad, self.report if report is None else report
         gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None)
         quirks = self.config.renderer.quirks
         if quirks != Quirks():

@@ -117,12 +117,23 @@ class Reading(NamedTuple):
     sentinels: dict[tuple[int, int], Sentinels]
 
 
+def pack(tensors: list[Tensor]) -> Tensor:
+    """The bits of ``tensors`` of 64-bit numbers in one, int64 [M]: one copy takes all of them to the host."""
+    flat = [tensor.reshape(-1).view(torch.int64) for tensor in tensors]
+    return flat[0] if len(flat) == 1 else torch.cat(flat)
+
+
+def unpack(packed: Tensor, like: list[Tensor]) -> list[Tensor]:
+    """Views of ``packed`` with the shapes and dtypes of ``like``, which :func:`pack` took."""
+    parts = packed.split([tensor.numel() for tensor in like])
+    return [part.view(tensor.dtype).view(tensor.shape) for part, tensor in zip(parts, like, strict=True)]
+
+
 @dataclass
 class _Pending:
-    """A record on its way to the host: the copy is complete when the event is."""
+    """Records on their way to the host: the copies are complete when the event is."""
 
-    numbers: Tensor
-    read: Callable[[Tensor], Reading]
+    records: list[tuple[Tensor, Callable[[Tensor], Reading]]]
     event: torch.cuda.Event
 
 
@@ -176,7 +187,7 @@ class StabilityReport:
         """Takes what a guard counted: at once on the CPU, which also raises; on a GPU when its copy has arrived.
 
         Args:
-            numbers: any small tensor.
+            numbers: any small tensor of 64-bit numbers.
             read: what it says, from a copy on the host.
         """
         if numbers.device.type != "cuda":
@@ -185,7 +196,7 @@ class StabilityReport:
         elif torch.cuda.is_current_stream_capturing():
             self._captured.append((numbers, read))
         else:
-            self._send(numbers, read)
+            self._send([(numbers, read)])
 
     def replayed(self, to: StabilityReport | None = None) -> None:
         """Fetches the records of the CUDA graphs captured with this report, without waiting; call it after a replay.
@@ -194,17 +205,19 @@ class StabilityReport:
             to: report that is told of them, and of what this one has found so far; None: this one.
         """
         target = self if to is None else to
-        for numbers, read in self._captured:
-            target._send(numbers, read)
+        if self._captured:
+            target._send(self._captured)
         if to is not None:
             to._take(Reading(self._found.values(), self._sentinels))
 
-    def _send(self, numbers: Tensor, read: Callable[[Tensor], Reading]) -> None:
-        copy = torch.empty(numbers.shape, dtype=numbers.dtype, pin_memory=True)
-        copy.copy_(numbers, non_blocking=True)
+    def _send(self, records: list[tuple[Tensor, Callable[[Tensor], Reading]]]) -> None:
+        packed = pack([numbers for numbers, _ in records])
+        copy = torch.empty(packed.shape, dtype=packed.dtype, pin_memory=True)
+        copy.copy_(packed, non_blocking=True)
         event = torch.cuda.Event()
         event.record()
-        self._pending.append(_Pending(copy, read, event))
+        arriving = unpack(copy, [numbers for numbers, _ in records])
+        self._pending.append(_Pending([(a, read) for a, (_, read) in zip(arriving, records)], event))
 
     def _take(self, reading: Reading) -> None:
         for finding in reading.findings:
@@ -218,7 +231,8 @@ class StabilityReport:
             elif not self._pending[0].event.query():
                 return
             arrived = self._pending.popleft()
-            self._take(arrived.read(arrived.numbers))
+            for numbers, read in arrived.records:
+                self._take(read(numbers))
 
     # ---- reading ----
 

@@ -158,7 +158,7 @@ BAD = {
     "unknown command": (["trian"], "unknown command 'trian'"),
     "unknown option": (["train", "--speed", "9"], "unrecognized arguments: --speed"),
     "no configuration": (["train", "--data", "{data}", "--out", "{new}"], "CONFIG is needed"),
-    "configuration is missing": (["train", "no.yaml", "--data", "{data}", "--out", "{new}"], "no.yaml: cannot read"),
+    "configuration is missing": (["train", "no.yaml", "--data", "{data}", "--out", "{new}"], "no.yaml cannot be read"),
     "data is missing": (["train", "{config}", "--data", "{new}/data", "--out", "{new}"], "data"),
     "no scene": (["train", "{config}", "--data", "{empty}", "--out", "{new}"], "holds no scene"),
     "bad step": (["train", "{config}", "--data", "{data}", "--out", "{new}", "--until", "0"], "--until"),

@@ -89,5 +89,5 @@ def test_a_file_that_is_no_spec(tmp_path):
     (tmp_path / "bad.yaml").write_text("- 1\n- 2\n")
     with pytest.raises(InputError, match="must hold a mapping"):
         EffectsSpec.load(tmp_path / "bad.yaml")
-    with pytest.raises(InputError, match="cannot read"):
+    with pytest.raises(InputError, match="cannot be read"):
         EffectsSpec.load(tmp_path / "absent.yaml")

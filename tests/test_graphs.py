@@ -235,6 +235,24 @@ def test_a_graph_of_gradients_rounds_weights_that_have_changed(devices):
                 parameter.mul_(1.2)
 
 
+def test_a_graph_of_gradients_inside_an_autocast_that_has_rounded_weights(devices):
+    simulator = make_simulator(devices[1], torch.float32).train()
+    history = make_state(device=devices[1], dtype=torch.float32)
+    history = history.with_clouds(history.clouds)
+    dynamics, parameters = simulator.dynamics, list(simulator.dynamics.parameters())
+    capacity = PyramidCapacity.of(dynamics.geometry(history), history.n_rows, 2)
+
+    def gradients():
+        step = dynamics(history, pyramid=dynamics.geometry(history, capacity=capacity))
+        return torch.autograd.grad(step.dynamic_latents.square().sum(), parameters)
+
+    with torch.autocast("cuda", torch.bfloat16):
+        expected = gradients()
+        captured = Captured(gradients, devices[1])
+    for actual, wanted in zip(captured(), expected, strict=True):
+        assert_same_bits(actual, wanted)
+
+
 def test_what_waits_for_the_device_is_no_graph(devices):
     x = torch.ones(3, device=devices[1])
     with pytest.raises(CaptureError, match="Captured: .*captur"):

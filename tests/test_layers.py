@@ -10,6 +10,7 @@ from gsim3d.layers import (
     _combine,
     _statistics,
     product_dtype,
+    rounded_at_once,
     rounded_weights,
 )
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
@@ -103,6 +104,25 @@ def test_rounded_weights_follow_the_weights():
     with torch.inference_mode():
         assert_same_bits(rounded_weights(layer, torch.bfloat16)[0], layer.weight.detach().bfloat16())
     assert set(layer.state_dict()) == {"weight", "bias"}
+
+
+def test_weights_are_rounded_at_once(device, monkeypatch):
+    layers = [RowLinear(4, 3).to(device), RowLinear(3, 5, bias=False).to(device), RowLinear(2, 2).to(device)]
+    rounded_weights(layers[2], torch.bfloat16)
+    calls, copy = [], torch._foreach_copy_
+    monkeypatch.setattr(torch, "_foreach_copy_", lambda to, of: (calls.append(len(to)), copy(to, of)))
+    for expected in ([3], [3, 3]):
+        with rounded_at_once(layers, torch.bfloat16):
+            for layer in layers:
+                weight, bias = rounded_weights(layer, torch.bfloat16)
+                assert_same_bits(weight, layer.weight.detach().bfloat16())
+                assert bias is None if layer.bias is None else torch.equal(bias, layer.bias.bfloat16())
+        assert calls == expected
+        with torch.no_grad():
+            layers[0].weight.mul_(2), layers[1].weight.mul_(2), layers[0].bias.add_(1)
+    assert_same_bits(rounded_weights(layers[0], torch.bfloat16)[0], layers[0].weight.detach().bfloat16())
+    with rounded_at_once(layers, torch.float32):
+        assert rounded_weights(layers[0], torch.float32)[0] is layers[0].weight
 
 
 def test_products_follow_autocast_on_cuda_only():

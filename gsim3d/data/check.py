@@ -127,6 +127,7 @@ def _common_place(
         if not seen.any():
             continue
         radius = int(np.ceil(Ks[cam, 0, 0] * np.linalg.norm(cell) / 2 / np.median(depth[seen])))
+        radius = min(radius, max(width, height))  # all of the image; calibration that is wrong asks for any
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
         mask = cv2.dilate((labels[cam] == MOVING).astype(np.uint8), disc) > 0
         inside[seen] &= mask[place[seen, 1], place[seen, 0]]

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.errors import InputError
+from gsim3d.files import MAX_TEXT, read_file
 
 MAX_STEPS, MAX_CAMS, MAX_SIZE = 1_000_000, 10_000, 16_384  # beyond them a description is taken to be broken
 MAX_NUMBER = 1e9  # metres, pixels, seconds: likewise
 MAX_NAME = 200  # letters of a file name
-MAX_JSON = 256 * 2**20  # bytes of one description
 SPACING_TOLERANCE = 0.01  # of the time between two steps
 BACKGROUND, FIXED, MOVING = 0, 1, 3  # labels of pixels: nothing, what never moves, bodies that may move
 
@@ -74,13 +74,10 @@ class Recording:
 
 def read_json(file: Path) -> dict:
     """The JSON object in ``file``. Raises InputError when it cannot be read or is none."""
+    text = read_file(file, MAX_TEXT)
     try:
-        if file.stat().st_size > MAX_JSON:
-            raise InputError(f"{file} is larger than {MAX_JSON >> 20} MiB: no description of a scene")
-        content = json.loads(file.read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
+        content = json.loads(text)
+    except (ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"{file} cannot be read: {error}") from error
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold a JSON object; got {type(content).__name__}")
@@ -90,7 +87,7 @@ def read_json(file: Path) -> dict:
 def whole(value, limit: int, what: str, problems: Problems) -> int:
     """``value`` as a whole number from 1 to ``limit``; 1 where it is none."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value // 1 or not 1 <= value <= limit:
-        problems.add(f"{what} must be a whole number from 1 to {limit}; got {value!r}")
+        problems.add(f"{what} must be a whole number from 1 to {limit}; got {value!r:.80}")
         return 1
     return int(value)
 
@@ -99,8 +96,8 @@ def positive(value, what: str, problems: Problems) -> float | None:
     """``value`` as a positive number; None where it is none or absent."""
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
-        problems.add(f"{what} must be a positive number; got {value!r}")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= MAX_NUMBER:
+        problems.add(f"{what} must be a positive number, at most {MAX_NUMBER:g}; got {value!r:.80}")
         return None
     return float(value)
 
@@ -109,7 +106,7 @@ def array(value, shapes: Sequence[tuple[int, ...]], what: str, problems: Problem
     """``value`` as finite float64 numbers of one of ``shapes``; None where it is not."""
     try:
         numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = None
     if numbers is None or numbers.shape not in shapes:
         wanted = " or ".join(str(list(shape)) for shape in shapes)

@@ -82,7 +82,8 @@ class Dynamics(nn.Module):
         everyone = pyramid.found is None and pyramid.rows.shape[0] == history.n_rows
         if not everyone:  # rows of the pyramid <-> rows of the history; those that sleep become 0
             features = ops.pool_mean(features, pyramid.rows, pyramid.cu_rows, check=False)
-        features = self.net(features, pyramid, generator=generator if self.training else None)
+        draws = generator if self.training else None
+        features = self.net(features, pyramid, generator=draws and _beside(draws, features.device))
         if not everyone:
             one = features.new_ones(features.shape[0], 1)
             features, is_awake = (
@@ -123,6 +124,14 @@ class Dynamics(nn.Module):
             tuple(torch.randperm(4, generator=generator, device=generator.device).tolist())
             for _ in range(self.config.n_stages)
         )
+
+
+def _beside(generator: torch.Generator, device: torch.device) -> torch.Generator:
+    """``generator``, or one on ``device`` that follows from it: a GPU would wait for rows drawn on the host."""
+    if generator.device.type == device.type:
+        return generator
+    seed = torch.randint(2**62, (), generator=generator, device=generator.device).item()
+    return torch.Generator(device).manual_seed(seed)
 
 
 def _places(particles: Particles) -> Tensor:

@@ -7,6 +7,7 @@ backward pass in as few launches.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import torch
@@ -142,9 +143,9 @@ def _backward(plan: Plan, w: Weights, kept: Kept, conv_input: Tensor, keep_atten
         grad_sum, grad_out, kept.normed2, kept.sum2, keep_mlp, None, None, kept.stats2[:0], kept.stats2[:0]
     )
     grad_activated, fc2 = linear_grads(grad_branch, kept.activated, w.fc2)
-    grad_hidden = torch.ops.aten.gelu_backward.default(grad_activated, kept.hidden)
+    zero, one = _zeros_and_ones(w.fc1.shape[0], grad2.dtype, grad2.device)
+    grad_hidden, _, fc1_bias = _ops.norm_gelu_backward.default(grad_activated, kept.hidden, zero, one, zero)
     grad_normed, fc1 = linear_grads(grad_hidden, kept.normed2, w.fc1)
-    fc1_bias = _ops.linear_grad_bias.default(grad_hidden)
 
     grad1, grad_branch, proj_bias, _, _, norm2, norm2_bias = _ops.residual_norm_backward.default(
         grad2, grad_normed, kept.normed2, kept.sum2, keep_attention, None, w.norm2, kept.stats2[:0], kept.stats2
@@ -164,9 +165,14 @@ def _backward(plan: Plan, w: Weights, kept: Kept, conv_input: Tensor, keep_atten
     grad_place, linear = linear_grads(grad_position, kept.place, w.linear)
     grad_input = _ops.sparse_conv_grad_input.default(grad_place, w.conv, *plan.geometry(), plan.conv_plan())
     conv, conv_bias = _ops.sparse_conv_grad_weight.default(grad_place, conv_input, plan.kernel_size, *plan.geometry())
-    wide = grad_x.dtype
-    of_layers = conv.to(wide), conv_bias.to(wide), linear, linear_bias, qkv, qkv_bias, proj, proj_bias, fc1, fc1_bias, fc2
+    of_layers = conv, conv_bias, linear, linear_bias, qkv, qkv_bias, proj, proj_bias, fc1, fc1_bias, fc2
     return grad_x, grad_input, *of_layers, fc2_bias, *of_norms, norm2, norm2_bias
+
+
+@functools.lru_cache(maxsize=None)
+def _zeros_and_ones(n: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Mean and scale of a normalisation that changes nothing."""
+    return torch.zeros(n, dtype=dtype, device=device), torch.ones(n, dtype=dtype, device=device)
 
 
 class _Block(torch.autograd.Function):

@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 from gsim3d import ops
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
 from gsim3d.dynamics.fused_block import run_block
-from gsim3d.layers import RowLayerNorm, RowLinear, make_norm, product_dtype, rounded_weights, widened
+from gsim3d.layers import RowLayerNorm, RowLinear, make_norm, product_dtype, rounded_at_once, rounded_weights, widened
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
 TIME_EMBEDDING_STD = 0.02
@@ -298,8 +298,16 @@ class PointTransformer(nn.Module):
         rates = linear_rates(config.drop_path, config.decoder_depths)
         self.decoder = nn.ModuleList(DecoderStage(s, rates[s][::-1], config) for s in range(config.n_stages - 1))
         self.head = Head((*config.decoder_channels, config.encoder_channels[-1])[0], out_channels, config.zero_init)
+        parts = (self.encoder, self.decoder)
+        self._products = [m for part in parts for m in part.modules() if isinstance(m, (RowLinear, SparseConv))]
 
     def forward(self, x: Tensor, pyramid: Pyramid, *, generator: torch.Generator | None = None) -> Tensor:
+        if not x.is_cuda or torch.compiler.is_compiling():
+            return self._compute(x, pyramid, generator)
+        with rounded_at_once(self._products, product_dtype(x)):
+            return self._compute(x, pyramid, generator)
+
+    def _compute(self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None) -> Tensor:
         stages = pyramid.stages
         x = self.stem(x, stages[0])
         skips = []

@@ -14,10 +14,12 @@ import numpy as np
 import torch
 
 from gsim3d.errors import InputError
+from gsim3d.files import read_file
 from gsim3d.rotations import unit_quats
 from gsim3d.types import Gaussians
 
 SMALLEST_SCALE = 1e-9  # metres; keeps the logarithm finite and is far below a pixel
+MAX_BYTES = 2**36  # of a file: 10^8 Gaussians and more
 OPACITY_MARGIN = 1e-6  # opacities are clamped to [margin, 1 - margin]; keeps the logit finite
 
 _DTYPES = {
@@ -74,10 +76,12 @@ def read_ply(path: str | Path) -> Gaussians:
     """
     path = Path(path)
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot read: {error.strerror}") from None
-    table = _read_vertices(path, content)
+        return _gaussians(path, _read_vertices(path, read_file(path, MAX_BYTES)))
+    except MemoryError:
+        raise InputError(f"{path} cannot be read: no memory for its Gaussians") from None
+
+
+def _gaussians(path: Path, table: dict[str, np.ndarray]) -> Gaussians:
     n_rest = len([name for name in table if re.fullmatch(r"f_rest_\d+", name)])
     if n_rest % 3 or n_rest // 3 not in (0, 3, 8, 15):
         raise InputError(f"{path}: {n_rest} properties f_rest_*; expected 0, 9, 24 or 45 (degree 0 to 3)")

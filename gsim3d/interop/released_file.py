@@ -21,6 +21,8 @@ from torch import Tensor
 
 from gsim3d.errors import InputError
 
+# What zipfile raises for an archive that is broken, encrypted or larger than memory.
+BROKEN = (zipfile.BadZipFile, EOFError, OSError, MemoryError, RuntimeError)
 MAX_INDEX = 256 * 2**20  # bytes of data.pkl; that of a model with a million tensors is smaller
 
 _DTYPES = {
@@ -151,7 +153,7 @@ class ReleasedFile:
             raise InputError(f"{self.path}: no such file")
         try:
             self._zip = zipfile.ZipFile(self.path)
-        except zipfile.BadZipFile:
+        except (*BROKEN, ValueError):
             raise InputError(
                 f"{self.path}: not a checkpoint that torch.save wrote as a zip archive (it is truncated, another kind "
                 "of file, or older than torch 1.6; the last can be saved again with a newer torch)"
@@ -179,12 +181,15 @@ class ReleasedFile:
         if stored.n_elements == 0:
             values = torch.zeros(stored.shape, dtype=stored.dtype)
         else:
-            try:
-                flat = torch.frombuffer(bytearray(self._zip.read(member)), dtype=stored.dtype)
-            except (zipfile.BadZipFile, EOFError, OSError) as error:
-                raise InputError(f"{self.path}: truncated or changed: {error}") from None
+            flat = torch.frombuffer(bytearray(self._bytes_of(member)), dtype=stored.dtype)
             values = flat.as_strided(stored.shape, stored.stride, stored.offset)
         return values.to(torch.float32 if stored.dtype.is_floating_point else stored.dtype).clone()
+
+    def _bytes_of(self, member: zipfile.ZipInfo) -> bytes:
+        try:
+            return self._zip.read(member)
+        except BROKEN as error:
+            raise InputError(f"{self.path}: truncated or changed: {error or 'no memory'}") from None
 
     def _index(self) -> tuple[str, dict[str, zipfile.ZipInfo]]:
         """The folder that everything is in, and the archive's members by name."""
@@ -197,7 +202,7 @@ class ReleasedFile:
             if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
                 raise InputError(f"{self.path}: {info.filename} is compressed, which torch.save never does; refused")
         order = members.get(f"{roots[0]}byteorder")
-        if order is not None and self._zip.read(order) != b"little":
+        if order is not None and self._bytes_of(order) != b"little":
             raise InputError(f"{self.path}: written on a big-endian machine, which is not supported")
         return roots[0], members
 
@@ -206,7 +211,7 @@ class ReleasedFile:
         if info.file_size > MAX_INDEX:
             raise InputError(f"{self.path}: data.pkl has {info.file_size} bytes; more than {MAX_INDEX} are refused")
         try:
-            data = self._zip.read(info)
+            data = self._bytes_of(info)
             for opcode, argument, _ in pickletools.genops(data):
                 if "PUT" in opcode.name and argument is not None and int(argument) > len(data):
                     raise ValueError("an index of its memo is out of range")  # would allocate that many slots

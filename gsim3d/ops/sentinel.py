@@ -88,7 +88,9 @@ def watch_rows(
     )
 
 
-def _check_arguments(fields: Sequence[Tensor], bounds: Sequence[tuple[float, float]], others: dict[str, Tensor]) -> None:
+def _check_arguments(
+    fields: Sequence[Tensor], bounds: Sequence[tuple[float, float]], others: dict[str, Tensor]
+) -> None:
     """Types, and the number of bounds; shapes and dtypes are the kernel's."""
     for name, value in {"fields": fields, "bounds": bounds}.items():
         if not isinstance(value, (tuple, list)):

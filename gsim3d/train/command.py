@@ -74,7 +74,8 @@ def run(args: argparse.Namespace) -> int:
         say = print if processes.is_first else lambda *_: None
         trainer = Trainer(config, scenes, args.out, device=args.device, processes=processes)
         if trainer.step:
-            say(f"going on from step {trainer.step} of {config.n_steps}")
+            came = "" if trainer.same_scenes else "; with scenes that came since, so not as it would have gone on without them"
+            say(f"going on from step {trainer.step} of {config.n_steps}{came}")
         trainer.run(until=args.until, tensorboard=args.tensorboard, profile=args.profile)
         say(f"trained to step {trainer.step} of {config.n_steps}: {args.out}")
         if args.export and processes.is_first:

@@ -59,7 +59,8 @@ class Trainer:
 
     Args:
         config: the run. A folder that already has a checkpoint must have been started with the same one.
-        scenes: to train on, in a fixed order.
+        scenes: to train on, in a fixed order. More may come between two sittings, none may go; ``same_scenes`` says whether
+            some came, for then the curve goes on as another one.
         out: run folder, made if absent.
         device: "cpu" or "cuda". A run may change it between two sittings; its numbers then change by rounding.
         processes: those that train together, see :func:`gsim3d.train.processes.joined`; each has a Trainer of its own, and
@@ -100,6 +101,7 @@ class Trainer:
         self.step = self.n_skipped = self.n_skipped_in_a_row = 0
         self.seconds = 0.0
         self.parent = None
+        self.same_scenes = True
         self._ahead: dict[tuple, Future] = {}
         self._reader = ThreadPoolExecutor(READERS)
         if checkpoint.exists(self.out):
@@ -410,6 +412,7 @@ class Trainer:
             "seconds": self.seconds,
             "parent": self.parent,
             "loss_scale": [self.scale.value, self.scale.n_good],
+            "scenes": [scene.name for scene in self.scenes],
         }
         folder = checkpoint.save(
             self.out,
@@ -432,6 +435,14 @@ class Trainer:
         for name in now:
             if name not in FREE_SETTINGS and before.get(name) != now[name]:
                 raise InputError(f"{self.out}: was started with another {name!r}; use the same or another folder")
+        names = [scene.name for scene in self.scenes]
+        known = saved.state.get("scenes", names)
+        if missing := sorted(set(known) - set(names)):
+            raise InputError(
+                f"{self.out}: was trained on {len(missing)} scenes that are not given now, such as {missing[0]}; give the same "
+                "ones, or more, or use another folder"
+            )
+        self.same_scenes = known == names
         self.simulator.load_state_dict(saved.model)
         if self.average:
             self.average = {name: value.to(self.device) for name, value in saved.ema.items()}

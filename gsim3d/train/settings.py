@@ -11,18 +11,17 @@ from typing import Any, TypeVar
 import yaml
 
 from gsim3d.errors import InputError
+from gsim3d.files import MAX_TEXT, read_file
 
 T = TypeVar("T")
 
 
 def load_yaml(path: str | Path) -> dict:
     """A YAML file that holds a mapping; plain data only."""
-    path = Path(path)
+    text = read_file(path, MAX_TEXT)
     try:
-        content = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: cannot read: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: must hold a mapping of settings")

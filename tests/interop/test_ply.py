@@ -100,7 +100,7 @@ def test_broken_files_are_refused(tmp_path):
         with pytest.raises(InputError, match=message):
             read_ply(tmp_path / "bad.ply")
             pytest.fail(what)
-    with pytest.raises(InputError, match="cannot read"):
+    with pytest.raises(InputError, match="cannot be read"):
         read_ply(tmp_path / "missing.ply")
 
 

@@ -274,7 +274,7 @@ def test_weights_without_latent_heads_have_no_signs_of_them():
     [
         (("missing.ckpt", "model.yaml", "model"), "missing.ckpt: no such file"),
         (("model.yaml", "model.yaml", "model"), "model.yaml: not a checkpoint that torch.save wrote"),
-        (("model.ckpt", "missing.yaml", "model"), "missing.yaml: cannot read"),
+        (("model.ckpt", "missing.yaml", "model"), "missing.yaml cannot be read"),
         (("model.ckpt", "model.yaml", "there"), "exists already"),
         (("model.ckpt", "model.yaml", "a/b"), "does not exist"),
     ],

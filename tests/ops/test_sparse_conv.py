@@ -166,7 +166,7 @@ def gathered_convolution(voxels, kernel_map, duplicates):
         (300, 5, 3, 16, 33),
         (200, 4, 1, 8, 130),
         (9000, 24, 3, 40, 64),  # tiles that no other block shares
-        (33000, 60, 3, 64, 72),  # large tiles
+        (33000, 60, 3, 72, 72),  # large tiles
     ],
 )
 def test_low_precision_errs_no_more_than_torch(n, side, kernel_size, c_in, c_out, duplicates, dtype, planned, devices):
@@ -181,6 +181,20 @@ def test_low_precision_errs_no_more_than_torch(n, side, kernel_size, c_in, c_out
     actual = gradients(convolution(*tables, duplicates), inputs, cotangent)
     for name, a, b, e in zip(("result", "x", "weight", "bias"), actual, gradients(plain, inputs, cotangent), exact):
         assert a.dtype == dtype and relative_to_max(a, e) <= 2 * relative_to_max(b, e), name
+
+
+@pytest.mark.parametrize("dtype", LOW_PRECISION)
+@pytest.mark.parametrize("n, side, channels", [(1500, 30, 64), (200, 6, 136), (900, 9, 33)])
+def test_weight_gradients_of_low_precision_are_float32(n, side, channels, dtype, devices):
+    """No sum is rounded to 16 bits: where no voxel has two rows, only the order of float32 sums differs."""
+    cells = random_cells(n, side).unique(dim=0)
+    tables = geometry(cells, 3, devices[1])
+    *inputs, cotangent = (t.to(devices[1]) for t in parameters(len(cells), channels, channels, 3, dtype))
+    actual = torch.ops.gsim3d.sparse_conv_grad_weight(cotangent, inputs[0], 3, *raw_arguments(*tables), False)
+    exact = gradients(gathered_convolution(*tables, "mean"), [t.double() for t in inputs], cotangent)[2:]
+    for a, e in zip(actual, exact, strict=True):
+        assert a.dtype == torch.float32
+        assert_close_relative_to_max(a, e, 1e-5)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, *LOW_PRECISION])

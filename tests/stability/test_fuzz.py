@@ -7,15 +7,22 @@ import pytest
 
 from tests.stability.fuzz.engine import Outcome, make_case, replay, run, targets
 from tests.stability.fuzz.ops import OPS, public_ops
+from tests.stability.fuzz.readers import READERS
 
-FEW, PER_OP = 25, 2000  # inputs of each target in the fast tests, and in the full ones
+FEW, PER_OP = 25, 2000  # inputs of each op in the fast tests, and in the full ones
+FEW_FILES, PER_READER = 4, 500  # damaged files of each reader, likewise
 
 
-def assert_all_answered(outcomes: list[Outcome], count: int) -> None:
+def assert_none_failed(outcomes: list[Outcome], count: int) -> None:
     failed = [outcome for outcome in outcomes if outcome.failures]
     assert not failed, "\n".join(map(str, failed))
     for outcome in outcomes:
         assert outcome.count == count == sum(outcome.answers.values()), outcome
+
+
+def assert_all_answered(outcomes: list[Outcome], count: int) -> None:
+    assert_none_failed(outcomes, count)
+    for outcome in outcomes:
         # Inputs that are all refused, or all computed, test nothing.
         assert 0.03 * count < outcome.answers.get("ok", 0) < 0.97 * count, outcome
 
@@ -32,6 +39,22 @@ def test_ops_answer_a_few_inputs(tmp_path):
 @pytest.mark.parametrize("half", [0, 1])
 def test_ops_answer_thousands_of_inputs(half, tmp_path):
     assert_all_answered(run(sorted(OPS)[half::2], PER_OP, out=tmp_path), PER_OP)
+
+
+@pytest.mark.slow
+def test_ops_answer_on_a_gpu(devices, tmp_path):
+    outcomes = run([f"{name}@cuda" for name in OPS], 300, out=tmp_path)
+    assert_all_answered(outcomes, 300)
+
+
+def test_readers_answer_a_few_files(tmp_path):
+    assert_none_failed(run(list(READERS), FEW_FILES, seed=1, out=tmp_path), FEW_FILES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("quarter", range(4))
+def test_readers_answer_hundreds_of_files(quarter, tmp_path):
+    assert_all_answered(run(sorted(READERS)[quarter::4], PER_READER, out=tmp_path), PER_READER)
 
 
 MISBEHAVIOUR = {

@@ -11,7 +11,7 @@ from gsim3d import presets
 from gsim3d.dynamics import last_steps
 from gsim3d.errors import HardCaseError, InputError
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.stability import StabilityConfig, StabilityReport
+from gsim3d.stability import StabilityConfig, StabilityReport, pack, unpack
 from gsim3d.types import ASLEEP
 from tests.asserts import assert_same_bits
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
@@ -350,6 +350,28 @@ def test_a_report_is_a_table_plain_data_and_forgets(simulator, state):
     assert report.to_dict()["findings"][0]["count"] == report.to_dict()["total"] == 3
     report.clear()
     assert report.findings == () and report.sentinels == {}
+
+
+def test_records_travel_as_one():
+    generator = torch.Generator().manual_seed(0)
+    counts, sums = torch.arange(6).reshape(3, 2), torch.randn(2, 5, generator=generator, dtype=torch.float64)
+    sums[1, 2] = INF
+    for records in ([counts, sums, torch.empty(0, 2, dtype=torch.int64), -counts], [sums]):
+        for a, b in zip(unpack(pack(records).clone(), records), records, strict=True):
+            assert_same_bits(a, b)
+
+
+def test_drawing_is_rendering_without_a_look(simulator, state):
+    report = StabilityReport()
+    with torch.no_grad():
+        (step,) = simulator.rollout(with_value(state, "means", 1, NAN), 1, on_bad="drop", report=report)
+        found = report.total
+        cameras = make_frames(SCENES).cameras
+        cameras = dataclasses.replace(cameras, image_cloud=cameras.image_cloud % len(SCENES)).to(step.means.device)
+        drawn = simulator.draw(step, cameras, on_bad="drop", report=report)
+        rendered = simulator.render(step, cameras, on_bad="drop", report=report)
+    assert_same_bits(drawn.color, rendered.color)
+    assert found == report.total > 0 and float(drawn.alpha.max()) > 0
 
 
 def test_a_copied_model_has_a_report_of_its_own(simulator, state):

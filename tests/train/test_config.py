@@ -71,7 +71,7 @@ def test_broken_files(tmp_path, content, message):
     (tmp_path / "a.yaml").write_text(content)
     with pytest.raises(InputError, match=message):
         load_yaml(tmp_path / "a.yaml")
-    with pytest.raises(InputError, match="cannot read"):
+    with pytest.raises(InputError, match="cannot be read"):
         load_yaml(tmp_path / "b.yaml")
 
 

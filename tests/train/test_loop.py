@@ -197,6 +197,14 @@ def test_another_configuration_does_not_resume(folder, finished):
     assert Trainer(TrainConfig(**{**vars(CONFIG), "log_every": 5}), scenes(folder), finished).step == 6
 
 
+def test_scenes_may_come_but_not_go(folder, tmp_path):
+    known = scenes(folder)
+    Trainer(CONFIG, known[:1], tmp_path).run(until=1, progress=False)
+    assert Trainer(CONFIG, known[:1], tmp_path).same_scenes and not Trainer(CONFIG, known, tmp_path).same_scenes
+    with pytest.raises(InputError, match="trained on 1 scenes that are not given now, such as ball/0000"):
+        Trainer(CONFIG, known[1:], tmp_path)
+
+
 def test_steps_that_are_not_finite_change_nothing(folder, tmp_path):
     trainer = Trainer(CONFIG, scenes(folder), tmp_path)
     loss = trainer.loss

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch.profiler import ProfilerActivity, profile
 
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
 from gsim3d.train.log import memory_gib
@@ -152,15 +153,32 @@ def measure(name: str, args: argparse.Namespace, processes) -> dict:
             seconds.append(time.perf_counter() - start)
         if "skipped" in entry:
             raise SystemExit(f"{name}: {entry['skipped']}")
+        memory = max(processes.gather(memory_gib(args.device)))
+        if args.top and processes.count == 1:
+            print_profile(trainer, args.device, args.top)
     return {
         "case": name,
         "processes": processes.count,
         "batch": args.batch * processes.count,
         "seconds": round(statistics.median(seconds[args.warm_up :]), 4),
-        "gib": round(max(processes.gather(memory_gib(args.device))), 2),
+        "gib": round(memory, 2),
         "particles": round(entry["particles"]),
         "loss": entry["loss"],
     }
+
+
+def print_profile(trainer: Trainer, device: str, n_rows: int) -> None:
+    """The operators and kernels that took longest in one more step."""
+    activities = [ProfilerActivity.CPU] + [ProfilerActivity.CUDA] * (device == "cuda")
+    with profile(activities=activities) as traced:
+        trainer.train_step()
+    averages = traced.key_averages()
+    for key in [f"self_{side}_time_total" for side in (["cpu"] + ["device"] * (device == "cuda"))]:
+        longest = sorted(averages, key=lambda event, key=key: -getattr(event, key))[:n_rows]
+        total = sum(getattr(event, key) for event in averages)
+        print(f"    {key}: {total / 1e6:.3f} s")
+        for event in longest:
+            print(f"    {getattr(event, key) / 1e6:9.3f} s {event.count:7d} x {event.key[:90]}")
 
 
 def main() -> None:
@@ -172,6 +190,9 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128, help="pixels")
     parser.add_argument("--steps", type=int, default=3, help="that are timed; the median is shown")
     parser.add_argument("--warm-up", type=int, default=2, help="steps before them")
+    parser.add_argument(
+        "--top", type=int, default=0, help="of one process, also show what took longest in one more step"
+    )
     parser.add_argument("--json", type=Path, help="append the rows to this file")
     args = parser.parse_args()
     with joined(args.device) as processes:

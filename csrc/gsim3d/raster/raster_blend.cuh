@@ -72,20 +72,24 @@ __device__ int64_t pixel_of(const RasterScene<T>& s, const Quarter& quarter, int
   return x < s.width && y < s.height ? (quarter.image * s.height + y) * s.width + x : -1;
 }
 
-// Values of the batch, by entry. With x, y counted from the first pixel's centre, alpha = 2^(strength - u^2 - v^2),
-// u = ux x + uy y + u0, v = vy y + v0.
-enum Field { kUx, kUy, kU0, kVy, kV0, kStrength, kRed, kGreen, kBlue, kDepth, kFields };
+// Values of the batch, by entry, two of them in one load. With x, y counted from the first pixel's centre,
+// alpha = 2^(strength - u^2 - v^2), u = ux x + uy y + u0, v = vy y + v0.
+enum Field { kUxUy, kU0Vy, kV0Strength, kRedGreen, kBlueDepth, kFields };
 
 template <typename T>
-using Batch = T[kFields][kWarp];
+struct alignas(2 * sizeof(T)) Two {
+  T a, b;
+};
+template <typename T>
+using Batch = Two<T>[kFields][kWarp];
 
 template <typename T>
 __device__ void put(const Record<T>& r, const Quarter& quarter, int lane, Batch<T>& batch) {
   const T x = r.x - (T(quarter.x0) + T(0.5)), y = r.y - (T(quarter.y0) + T(0.5));
   const T uy = -r.tight * r.slope;
-  batch[kUx][lane] = r.tight, batch[kUy][lane] = uy, batch[kU0][lane] = -(r.tight * x + uy * y);
-  batch[kVy][lane] = r.loose, batch[kV0][lane] = -r.loose * y, batch[kStrength][lane] = r.strength;
-  batch[kRed][lane] = r.red, batch[kGreen][lane] = r.green, batch[kBlue][lane] = r.blue, batch[kDepth][lane] = r.z;
+  batch[kUxUy][lane] = {r.tight, uy}, batch[kU0Vy][lane] = {-(r.tight * x + uy * y), r.loose};
+  batch[kV0Strength][lane] = {-r.loose * y, r.strength};
+  batch[kRedGreen][lane] = {r.red, r.green}, batch[kBlueDepth][lane] = {r.blue, r.z};
 }
 
 // The same value, which the compiler would otherwise find anew for every entry. All lanes take part.
@@ -97,8 +101,9 @@ __device__ __forceinline__ T in_register(T value) {
 // alpha of entry j at (x, y) before it is cut.
 template <typename T>
 __device__ __forceinline__ T alpha_at(const Batch<T>& batch, int j, T x, T y) {
-  const T u = batch[kUx][j] * x + (batch[kUy][j] * y + batch[kU0][j]), v = batch[kVy][j] * y + batch[kV0][j];
-  return fast_exp2(batch[kStrength][j] - u * u - v * v);
+  const Two<T> ux_uy = batch[kUxUy][j], u0_vy = batch[kU0Vy][j], v0_strength = batch[kV0Strength][j];
+  const T u = ux_uy.a * x + (ux_uy.b * y + u0_vy.a), v = u0_vy.b * y + v0_strength.a;
+  return fast_exp2(v0_strength.b - u * u - v * v);
 }
 
 // Pixels of the quarter that the record may reach: calls put(row, bits of the columns). May err outwards only.
@@ -221,7 +226,10 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
         if constexpr (kPass) {
           for (int c = 0; c < kFeatures; ++c) features[k][c] += weight[k] * shared.features[c][j];
         } else {
-          for (int c = 0; c < 4; ++c) light[k].sums[c] += weight[k] * batch[kRed + c][j];
+          const Two<T> red_green = batch[kRedGreen][j], blue_depth = batch[kBlueDepth][j];
+          T(&sums)[4] = light[k].sums;
+          sums[0] += weight[k] * red_green.a, sums[1] += weight[k] * red_green.b;
+          sums[2] += weight[k] * blue_depth.a, sums[3] += weight[k] * blue_depth.b;
         }
       }
     }

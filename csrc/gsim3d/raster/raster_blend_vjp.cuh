@@ -21,7 +21,7 @@ template <typename T>
 struct Slots {
   SlotSums<T>* sums;    // [slots], unset where not live
   T* features;          // [slots, n_features], likewise
-  unsigned char* live;  // [slots] 1 where a pixel has seen the entry
+  unsigned char* live;  // [slots] 1 where a pixel may have seen the entry
   SlotSums<T>* unfinished;  // [n_rows] sums of an image's tiles in earlier groups
   T* backgrounds;       // [n_images * n_tiles * kQuarters, 3]
   T* viewmats;          // [n_images, kViewmatParts, 12], or null when nobody asks for them
@@ -199,49 +199,51 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
 
     SlotSums<T> sums{};
     QuarterSums<T> moments;
-    uint32_t live = 0;  // not 0: a pixel has seen the entry
+    uint32_t live = 0;  // not 0: a pixel may have seen the entry
 #pragma unroll
     for (int half = 0; half < kHalves; ++half) {
       const T y = T(lane / kQuarter + half * kHalfRows);
       Behind<T>& at = behind[half];
-      uint32_t mine = transpose_bits(bits[half], lane) & in_front(at.last, base);
+      const uint32_t front = in_front(at.last, base);
+      uint32_t mine = transpose_bits(bits[half], lane) & front;
       const int64_t pixel =
           kWithFeatures ? pixel_of(s, quarter, lane % kQuarter, lane / kQuarter + half * kHalfRows) : 0;
       if constexpr (kWithFeatures) dot_features(s, grads, entry_features, pixel, mine, lane, shared);
       const PixelGrad<T> g = shared.grad[half * kWarp + lane];
-      uint32_t seen = 0;
       while (mine) {
         const int j = kWarp - 1 - __clz(mine);
-        const uint32_t bit = 1u << j;
-        mine ^= bit;
+        mine ^= 1u << j;
         Share<T>& share = shared.shares[lane][j];
-        const T raw = alpha_at(shared.batch, j, x, y);
+        const T full = alpha_at(shared.batch, j, x, y);
+        const T raw = full >= T(kMinAlpha) ? full : T(0);  // an entry that does not count leaves zeros
         T alpha = min_of(raw, T(kMaxAlpha));
         T slope_of_alpha = raw <= T(kMaxAlpha) ? raw : T(0);
-        if constexpr (kFade) {
-          slope_of_alpha *= fade_slope(alpha), alpha = fade(alpha);
-        } else if (!(alpha >= T(kMinAlpha))) {
-          continue;
-        }
+        if constexpr (kFade) slope_of_alpha *= fade_slope(alpha), alpha = fade(alpha);
         const T inverse = fast_reciprocal(T(1) - alpha);
         const T light = at.light * inverse, weight = alpha * light;
         T total = kWithFeatures ? share.v : T(0);
-        for (int c = 0; c < 4; ++c) total += g.value[c] * shared.batch[kRed + c][j];
+        const Two<T> red_green = shared.batch[kRedGreen][j], blue_depth = shared.batch[kBlueDepth][j];
+        total += g.value[0] * red_green.a, total += g.value[1] * red_green.b;
+        total += g.value[2] * blue_depth.a, total += g.value[3] * blue_depth.b;
         share = {(light * total - at.sum * inverse) * slope_of_alpha, weight};
         at.light = light;
         at.sum += weight * total;
-        seen |= bit;
       }
-      const uint32_t seen_by = transpose_bits(seen, lane);  // pixels that have seen the lane's entry
-      live |= seen_by;
+      // Pixels that have visited the lane's entry, and those that have visited any.
+      const bool all_in_front = __all_sync(kFullWarp, front == ~0u);
+      const uint32_t visited_by = bits[half] & (all_in_front ? ~0u : transpose_bits(front, lane));
+      const uint32_t visitors = __reduce_or_sync(kFullWarp, visited_by);
+      live |= visited_by;
       __syncwarp();
 #pragma unroll
       for (int row = 0; row < kHalfRows; ++row) {
+        if (!(visitors >> row * kQuarter & (1u << kQuarter) - 1)) continue;
         T one = 0, vx = 0, vxx = 0;
 #pragma unroll
         for (int column = 0; column < kQuarter; ++column) {
           const int p = row * kQuarter + column;
-          const Share<T> share = seen_by >> p & 1 ? shared.shares[p][lane] : Share<T>{};
+          Share<T> share = shared.shares[p][lane];  // loaded in any case, which is cheaper than to ask first
+          share.v = visited_by >> p & 1 ? share.v : T(0), share.weight = visited_by >> p & 1 ? share.weight : T(0);
           const PixelGrad<T> grad = shared.grad[half * kWarp + p];
           const T from_centre = T(column) - T(kQuarter - 1) / 2;
           one += share.v, vx += share.v * from_centre, vxx += share.v * (from_centre * from_centre);
@@ -252,7 +254,7 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
         moments.y += one * from_centre, moments.xy += vx * from_centre, moments.yy += one * (from_centre * from_centre);
       }
       if constexpr (kWithFeatures)
-        sum_features(s, grads, pixel, lane, seen_by, half > 0, shared,
+        sum_features(s, grads, pixel, lane, visited_by, half > 0, shared,
                      used ? slots.features + slot * s.n_features : nullptr);
       __syncwarp();
     }

@@ -12,7 +12,7 @@ __global__ void __launch_bounds__(kOneBlock) plan_kernel(Job<T> job) {
 }
 
 template <typename T, int kTerms>
-__global__ void __launch_bounds__(kBlock) project_kernel(Job<T> job) {
+__global__ void __launch_bounds__(kBlock, 8) project_kernel(Job<T> job) {
   project_rows<T, kTerms>(job, dynamic_memory);
 }
 
@@ -22,7 +22,7 @@ __global__ void __launch_bounds__(kOneBlock) offsets_kernel(Job<T> job) {
 }
 
 template <typename T>
-__global__ void __launch_bounds__(kBlock) scatter_kernel(Job<T> job) {
+__global__ void __launch_bounds__(kBlock, 8) scatter_kernel(Job<T> job) {
   find_order(job);
   scatter_rows(job);
 }

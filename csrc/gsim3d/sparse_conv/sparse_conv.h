@@ -9,6 +9,7 @@
 
 #include <cstdint>
 
+#include "gsim3d/core/half.h"
 #include "gsim3d/core/parallel.h"
 #include "gsim3d/core/stream.h"
 #include "gsim3d/core/workspace.h"
@@ -34,7 +35,7 @@ struct SparseConvMap {
 
 // Rows in the order in which the tensor cores take them, where each tap of each row reads, and which taps every group
 // of rows has.
-constexpr int64_t kConvGroupRows = 64, kConvPlanStep = 384;
+constexpr int64_t kConvGroupRows = 64, kConvPlanStep = 256;
 inline int64_t sparse_conv_plan_size(int64_t n_rows, int64_t kernel_size) {
   const int64_t taps = kernel_size * kernel_size * kernel_size;
   const int64_t pitch = (n_rows + kConvPlanStep - 1) / kConvPlanStep * kConvPlanStep;
@@ -92,7 +93,7 @@ void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& 
 
 template <typename T>
 void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map, int64_t c_in, int64_t c_out,
-                            T* grad_weight, T* grad_bias, const Workspace& workspace, Stream stream);
+                            Sum<T>* grad_weight, Sum<T>* grad_bias, const Workspace& workspace, Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

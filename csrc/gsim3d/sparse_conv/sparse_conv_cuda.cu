@@ -168,11 +168,10 @@ __global__ void __launch_bounds__(kThreads)
 constexpr int kAdders = 4, kElements = kThreads / kAdders, kEach = 4;
 
 // One tap (first_tap + blockIdx.y), behind the taps the bias.
-template <typename E>
+template <typename E, typename T>
 __global__ void __launch_bounds__(kThreads)
     add_partials(OuterProducts<E> products, int32_t first_tap, int64_t n_chunks, int32_t c_out, int32_t c_in,
-                 const Sum<E>* bias_partials, int64_t bias_blocks, E* grad_weight, E* grad_bias) {
-  using T = Sum<E>;
+                 const T* bias_partials, int64_t bias_blocks, T* grad_weight, T* grad_bias) {
   __shared__ T sums[kAdders][kEach][kElements];
   const int adder = threadIdx.x / kElements, element = threadIdx.x % kElements;
   const int32_t tap = first_tap + static_cast<int32_t>(blockIdx.y);
@@ -209,9 +208,9 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t i = first + adder * kElements;
   if (i >= count) return;
   if (bias)
-    grad_bias[i] = static_cast<E>(sum);
+    grad_bias[i] = sum;
   else
-    grad_weight[(i / c_in * products.taps + tap) * c_in + i % c_in] = static_cast<E>(sum);
+    grad_weight[(i / c_in * products.taps + tap) * c_in + i % c_in] = sum;
 }
 
 template <typename E>
@@ -366,7 +365,7 @@ void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& 
 
 template <typename T>
 void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map, int64_t c_in, int64_t c_out,
-                            T* grad_weight, T* grad_bias, const Workspace& workspace, Stream stream) {
+                            Sum<T>* grad_weight, Sum<T>* grad_bias, const Workspace& workspace, Stream stream) {
   using E = Native<T>;
   const char* op = "sparse_conv_grad_weight";
   check_sizes(op, map, c_in, c_out);
@@ -400,16 +399,15 @@ void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map,
       static_cast<int32_t>(left.channels),
       static_cast<int32_t>(right.channels),
       direct ? nullptr : workspace.take<Sum<E>>(n_blocks * left.channels * right.channels),
-      native_data(grad_weight),
+      grad_weight,
       static_cast<int32_t>(c_out)};
   if constexpr (kIsHalf<E>)
     outer_products_tensor(op, products, n_blocks, stream);
   else
     outer_products_plain(op, products, n_blocks, stream);
   const unsigned columns = blocks_for(op, direct ? c_out : std::max(c_out * c_in, c_out), kElements * kEach);
-  launch(op, add_partials<E>, dim3(columns, direct ? 1 : static_cast<unsigned>(taps + 1)), kThreads, 0, stream,
-         products, direct ? taps : 0, plan.n_chunks, c_out, c_in, bias_partials, bias_blocks, native_data(grad_weight),
-         native_data(grad_bias));
+  launch(op, add_partials<E, Sum<E>>, dim3(columns, direct ? 1 : static_cast<unsigned>(taps + 1)), kThreads, 0, stream,
+         products, direct ? taps : 0, plan.n_chunks, c_out, c_in, bias_partials, bias_blocks, grad_weight, grad_bias);
 }
 
 #define GSIM3D_INSTANTIATE(T)                                                                                 \
@@ -417,8 +415,8 @@ void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map,
                                const Workspace&, Stream);                                                     \
   template void sparse_conv_vjp_input<T>(const T*, const T*, const SparseConvMap&, int64_t, int64_t, T*,      \
                                          const Workspace&, Stream);                                           \
-  template void sparse_conv_vjp_weight<T>(const T*, const T*, const SparseConvMap&, int64_t, int64_t, T*, T*, \
-                                          const Workspace&, Stream);
+  template void sparse_conv_vjp_weight<T>(const T*, const T*, const SparseConvMap&, int64_t, int64_t,         \
+                                          Sum<T>*, Sum<T>*, const Workspace&, Stream);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 GSIM3D_INSTANTIATE(Float16)

@@ -1,7 +1,7 @@
 // The convolution on tensor cores. A block owns a tile of rows, in the order of the plan, and kColumns output channels,
 // whose sums stay in registers. Some warps copy what the tile's taps read, stage by stage; each group of four further
-// warps multiplies 64 rows, and leaves out the taps that none of its rows has. Where there are few tiles the stages of a
-// tile are shared by several blocks, whose sums are added in a fixed order.
+// warps multiplies 64 rows, and leaves out the taps that none of its rows has. Where there are few tiles the stages of
+// a tile are shared by several blocks, whose sums are added in a fixed order.
 #include <algorithm>
 
 #include "gsim3d/sparse_conv/sparse_conv_device.cuh"
@@ -14,6 +14,7 @@ constexpr int kDepth = 64;  // channels of one stage: rows of 128 bytes, in 8 ch
 constexpr int kChunk = 8;   // channels of 16 bytes
 constexpr int kRowBytes = 128, kRowChunks = 8;
 constexpr int kGroupRows = kConvGroupRows;
+constexpr int kCopying = 128;      // threads that copy
 constexpr int64_t kEnough = 128;   // blocks that nearly fill a large GPU
 constexpr int64_t kMaxSplits = 16;
 constexpr int kAdders = 256;
@@ -21,11 +22,10 @@ constexpr int kAdders = 256;
 template <int kGroups_, int kColumns_>
 struct Shape {
   static constexpr int kGroups = kGroups_, kColumns = kColumns_, kRows = kGroupRows * kGroups;
-  static constexpr int kCopying = kGroups == 1 ? 128 : 256;  // threads that copy
   static constexpr int kThreads = kCopying + 128 * kGroups, kBlocksOnSm = kColumns == 128 ? 1 : 2;
-  static constexpr int kStages = kGroups == 1 ? 6 : kGroups == 2 ? 4 : 5;
-  static constexpr int kApart = kCopying / 8;  // rows between those of a thread that copies
+  static constexpr int kStages = kGroups == 1 ? 6 : 4;
   static constexpr int kBytesA = kRows * kRowBytes, kBytesB = kColumns * kRowBytes;
+  static_assert(kConvPlanStep % kRows == 0);
 };
 
 template <typename S>
@@ -125,71 +125,76 @@ struct Tile {
   __device__ uint32_t empty(int slot) const { return shared_address(memory.empty + slot); }
 };
 
-// The rows of the left factor, one chunk of kEach rows a thread. What they are is looked up two stages ahead.
+// The rows of the left factor. A thread copies one chunk of four rows of every group, one below the other. Where they
+// are is looked up one stage ahead.
 template <typename E, typename S>
 struct RowCopy {
-  static constexpr int kEach = S::kRows / S::kApart;
-  struct Lookup {
-    uint32_t source;
-    int32_t rows[kEach];
-  };
+  static constexpr int kEach = 4 * S::kGroups;
+  static_assert(kCopying / kRowChunks * 4 == kGroupRows);
   const Tile<E, S>& tile;
-  const int chunk, row;
-  const uint32_t to;
-  Lookup now, next, later;
+  const int chunk, first_row;
+  const uint32_t to, row_bytes;
+  int32_t rows[kEach], upcoming[kEach];
+  uint32_t tap = kNoTap + 1;  // of rows
+  uint32_t next;
 
   __device__ RowCopy(const Tile<E, S>& tile, int thread)
       : tile(tile),
         chunk(thread % kRowChunks),
-        row(thread / kRowChunks),
-        to(shared_address(tile.memory.a[0]) + row * kRowBytes + ((chunk ^ (row & 7)) << 4)) {
-    later.source = packed_source(kNoTap, 0);
-#pragma unroll
-    for (int i = 0; i < kEach; ++i) later.rows[i] = -1;
-    next = later;
-    look_up(tile.stages.begin);
-    advance(tile.stages.begin + 1);
-    advance(tile.stages.begin + 2);
-  }
+        first_row(thread / kRowChunks * 4),
+        to(shared_address(tile.memory.a[0]) + first_row * kRowBytes),
+        row_bytes(tile.conv.values.channels * static_cast<uint32_t>(sizeof(E))) {}
 
   __device__ void look_up(int32_t stage) {
-    if (stage >= tile.stages.end) return;
-    later.source = tile.tables.sources[stage * kRowChunks + chunk];
-    const uint32_t tap = tap_of(later.source);
-    if (tap == tap_of(next.source)) return;
+    next = tile.tables.sources[stage * kRowChunks + chunk];
+    if (tap_of(next) == tap) return;
     const RowPlan& plan = tile.conv.plan;
-    const int32_t* from = tap == tile.conv.taps / 2 ? plan.order : plan.sources + wide_product(tap, plan.pitch);
+    const bool centre = tap_of(next) == tile.conv.taps / 2;
+    const int32_t* from = centre ? plan.order : plan.sources + wide_product(tap_of(next), plan.pitch);
 #pragma unroll
-    for (int i = 0; i < kEach; ++i) later.rows[i] = tap == kNoTap ? -1 : from[tile.first_place + row + i * S::kApart];
+    for (int i = 0; i < kEach; i += 4) {
+      int4 four{-1, -1, -1, -1};
+      if (tap_of(next) != kNoTap)
+        four = *reinterpret_cast<const int4*>(from + tile.first_place + first_row + i / 4 * kGroupRows);
+      upcoming[i] = four.x;
+      upcoming[i + 1] = four.y;
+      upcoming[i + 2] = four.z;
+      upcoming[i + 3] = four.w;
+    }
   }
 
-  __device__ void advance(int32_t stage) {
-    now = next;
-    next = later;
-    look_up(stage);
-  }
-
-  // Queues the chunk of a stage.
+  // Queues the chunk of a stage that was looked up; then looks up the next.
   __device__ void copy(int32_t stage, int slot) {
+    if (tap_of(next) != tap) {
+      tap = tap_of(next);
+#pragma unroll
+      for (int i = 0; i < kEach; ++i) rows[i] = upcoming[i];
+    }
     const Values<E>& values = tile.conv.values;
     const uint32_t groups = tile.tables.groups[stage], stage_to = to + slot * S::kBytesA;
-    const int32_t column = tap_of(now.source) == kNoTap ? 0 : chunk_of(now.source) * kChunk;
-    const bool alone = values.n_sources == values.n_rows;
+    const int64_t column = tap == kNoTap ? 0 : chunk_of(next) * (kChunk * sizeof(E));
+    // An address is one multiply-add: the values of voxels with several rows count on behind the rows.
+    const int64_t of_rows = reinterpret_cast<int64_t>(values.rows) + column;
+    const int64_t of_shared = reinterpret_cast<int64_t>(values.shared) + column - int64_t{values.n_rows} * row_bytes;
 #pragma unroll
     for (int i = 0; i < kEach; ++i) {
-      if ((groups >> (i * S::kApart / kGroupRows) & 1) == 0) continue;
-      const bool real = static_cast<uint32_t>(now.rows[i]) < static_cast<uint32_t>(values.n_sources);
-      const int32_t source = real ? now.rows[i] : 0;
-      const E* from = alone ? values.rows + wide_product(source, values.channels) : values.at(source);
-      copy_async(stage_to + i * S::kApart * kRowBytes, from + column, real);
+      if ((groups >> (i / 4) & 1) == 0) continue;
+      const bool real = static_cast<uint32_t>(rows[i]) < static_cast<uint32_t>(values.n_sources);
+      const uint32_t source = real ? rows[i] : 0;
+      const int64_t from = (source < static_cast<uint32_t>(values.n_rows) ? of_rows : of_shared) +
+                           static_cast<int64_t>(static_cast<uint64_t>(source) * row_bytes);
+      const int32_t row = i / 4 * kGroupRows + i % 4;
+      copy_async(stage_to + row * kRowBytes + ((chunk ^ ((first_row + i % 4) & 7)) << 4),
+                 reinterpret_cast<const void*>(from), real);
     }
-    advance(stage + 3);
+    if (stage + 1 < tile.stages.end) look_up(stage + 1);
   }
 };
 
 // The right factor: rows of kDepth input channels for each output channel.
 template <typename E, typename S>
 struct WeightCopy {
+  static constexpr int kApart = kCopying / kRowChunks;
   const Tile<E, S>& tile;
   const int chunk, row;
   const E* from;
@@ -200,7 +205,7 @@ struct WeightCopy {
       : tile(tile), chunk(thread % kRowChunks), row(thread / kRowChunks) {
     const int64_t row_step = wide_product(tile.conv.taps, tile.conv.weight_row);
     from = tile.conv.weight + (tile.n0 + row) * row_step;
-    step = S::kApart * row_step;
+    step = kApart * row_step;
     to = shared_address(tile.memory.b[0]) + row * kRowBytes + ((chunk ^ (row & 7)) << 4);
   }
 
@@ -211,9 +216,9 @@ struct WeightCopy {
     const int32_t tap = conv.weight_tap(tap_of(source));
     const E* here = from + wide_product(tap, conv.weight_row) + chunk_of(source) * kChunk;
 #pragma unroll
-    for (int i = 0; i < S::kColumns / S::kApart; ++i, here += step) {
-      const bool real = listed && tile.n0 + row + i * S::kApart < conv.c_write;
-      copy_async(to + slot * S::kBytesB + i * S::kApart * kRowBytes, real ? here : conv.weight, real);
+    for (int i = 0; i < S::kColumns / kApart; ++i, here += step) {
+      const bool real = listed && tile.n0 + row + i * kApart < conv.c_write;
+      copy_async(to + slot * S::kBytesB + i * kApart * kRowBytes, real ? here : conv.weight, real);
     }
   }
 };
@@ -223,6 +228,7 @@ __device__ void copy_tile(const Tile<E, S>& tile, int thread) {
   if (tile.stages.begin >= tile.stages.end) return;
   RowCopy<E, S> rows(tile, thread);
   const WeightCopy<E, S> weights(tile, thread);
+  rows.look_up(tile.stages.begin);
   int slot = 0;
   uint32_t parity = 1;  // the first round finds all slots empty
   for (int32_t stage = tile.stages.begin; stage < tile.stages.end; ++stage) {
@@ -236,6 +242,18 @@ __device__ void copy_tile(const Tile<E, S>& tile, int thread) {
     }
   }
   wait_for_copies<0>();
+}
+
+// Asks for what the tile's taps will look up, on its way from memory to the second-level cache.
+template <typename E, typename S>
+__device__ void prefetch_sources(const Tile<E, S>& tile, int thread) {
+  constexpr int kLine = 32, kLines = S::kRows / kLine;  // of a tap
+  const RowPlan& plan = tile.conv.plan;
+  for (int32_t i = thread; i < tile.walk.n_others * kLines; i += 128 * S::kGroups) {
+    const int32_t* line = plan.sources + wide_product(listed_tap(tile.tables.taps[i / kLines]), plan.pitch) +
+                          tile.first_place + i % kLines * kLine;
+    asm volatile("prefetch.global.L2 [%0];" ::"l"(line));
+  }
 }
 
 // The sums of a warp: rows lane / 4 and lane / 4 + 8 of its 16, columns 2 (lane % 4) and the next of every eight.
@@ -431,7 +449,7 @@ __global__ void __launch_bounds__(S::kThreads, S::kBlocksOnSm)
     if (threadIdx.x == 0) {
       memory.n_others = n;
       for (int i = 0; i < S::kStages; ++i) {
-        start_barrier(shared_address(memory.full + i), S::kCopying);
+        start_barrier(shared_address(memory.full + i), kCopying);
         start_barrier(shared_address(memory.empty + i), 4 * S::kGroups);
       }
     }
@@ -457,10 +475,12 @@ __global__ void __launch_bounds__(S::kThreads, S::kBlocksOnSm)
   __syncthreads();
   const Tile<E, S> tile{conv, memory, tables, walk, stages, index * S::kRows, n0};
   const int group = threadIdx.x / 128;
-  if (group < S::kGroups)
+  if (group < S::kGroups) {
+    prefetch_sources(tile, threadIdx.x);
     multiply_tile<E, S>(tile, group, int64_t{column_blocks} * S::kColumns, partials);
-  else
+  } else {
     copy_tile<E, S>(tile, threadIdx.x - 128 * S::kGroups);
+  }
 }
 
 // y[order[place], c] = bias + the sums of all parts.
@@ -493,7 +513,9 @@ bool convolve_tensor(const char* op, const Convolution<E>& conv, const Workspace
   int shared_bytes = 0;
   check_cuda(cudaDeviceGetAttribute(&shared_bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, stream.device), op);
   const auto bytes_of = [&]<typename S>() { return Memory<S>::bytes(conv.taps, conv.c_read / kChunk); };
-  const auto fits = [&]<typename S>() { return bytes_of.template operator()<S>() <= static_cast<size_t>(shared_bytes); };
+  const auto fits = [&]<typename S>() {
+    return bytes_of.template operator()<S>() <= static_cast<size_t>(shared_bytes);
+  };
   const auto column_blocks = [&]<typename S>() { return (conv.c_write + S::kColumns - 1) / S::kColumns; };
   const auto blocks = [&]<typename S>() {
     return (conv.plan.pitch + S::kRows - 1) / S::kRows * int64_t{column_blocks.template operator()<S>()};
@@ -505,13 +527,12 @@ bool convolve_tensor(const char* op, const Convolution<E>& conv, const Workspace
     const int64_t splits = n_blocks >= kEnough ? 1 : std::min(kMaxSplits, 2 * kEnough / n_blocks);
     float* partials = splits > 1 ? workspace.take<float>(splits * conv.plan.pitch * columns) : nullptr;
     const dim3 grid(blocks_for(op, n_blocks, 1), static_cast<unsigned>(splits));
-    launch(op, convolve<E, S>, grid, S::kThreads,
-           bytes_of.template operator()<S>(), stream, conv, across, partials);
+    launch(op, convolve<E, S>, grid, S::kThreads, bytes_of.template operator()<S>(), stream, conv, across, partials);
     if (splits > 1)
       launch(op, add_parts<E>, blocks_for(op, conv.plan.pitch * columns, 4 * kAdders), kAdders, 0, stream, conv,
              partials, static_cast<int32_t>(splits), columns);
   };
-  using Wide = Shape<3, 128>;
+  using Wide = Shape<4, 128>;
   using Narrow = Shape<2, 64>;
   using Small = Shape<1, 64>;
   const bool suits = round_up(conv.c_write, 128) * 4 <= round_up(conv.c_write, 64) * 5;  // few columns beyond the last

@@ -57,6 +57,7 @@ struct Geometry {
       check_shape(op, "plan", *plan, {sparse_conv_plan_size(n_rows, kernel_size)}, "that of sparse_conv_plan");
       check(plan->is_contiguous(), op, ": plan must be contiguous");
       map.plan = data<int32_t>(*plan);
+      check(reinterpret_cast<uintptr_t>(map.plan) % 16 == 0, op, ": plan must begin at a multiple of 16 bytes");
     }
     // On a GPU the lists stay where they are: kernels skip what is out of range.
     if (!x.is_cuda()) cpu::check_sparse_conv_map(op, map, torch_parallel());
@@ -118,7 +119,8 @@ Tensor sparse_conv(const Tensor& x_, const Tensor& weight_, const std::optional<
 
 Tensor sparse_conv_grad_input(const Tensor& grad_, const Tensor& weight_, const Tensor& row_voxel,
                               const Tensor& voxel_rows, const Tensor& cu_voxel_rows, const Tensor& tap_in,
-                              const Tensor& tap_out, const Tensor& cu_taps, bool first, const std::optional<Tensor>& plan) {
+                              const Tensor& tap_out, const Tensor& cu_taps, bool first,
+                              const std::optional<Tensor>& plan) {
   const char* op = "sparse_conv_grad_input";
   check_weight(op, weight_);
   check_shape(op, "grad", grad_, {-1, weight_.size(0)}, "[N, C_out]");
@@ -156,15 +158,16 @@ std::tuple<Tensor, Tensor> sparse_conv_grad_weight(const Tensor& grad_, const Te
   const int64_t c_in = x.size(1), c_out = grad.size(1);
   const Geometry geometry(op, x, kernel_size, first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out,
                           cu_taps);
-  Tensor grad_weight = empty(grad, {c_out, kernel_size, kernel_size, kernel_size, c_in});
-  Tensor grad_bias = empty(grad, {c_out});
+  const ScalarType wide = grad.scalar_type() == ScalarType::Double ? ScalarType::Double : ScalarType::Float;
+  Tensor grad_weight = empty(grad, {c_out, kernel_size, kernel_size, kernel_size, c_in}, wide);
+  Tensor grad_bias = empty(grad, {c_out}, wide);
   dispatch(op, "grad", grad, [&]<typename T>() {
     TensorWorkspace workspace(grad);
     if constexpr (kWithCuda)
       if (grad.is_cuda())
         return cuda::sparse_conv_vjp_weight(data<T>(grad), data<T>(x), geometry.map, c_in, c_out,
-                                            mutable_data<T>(grad_weight), mutable_data<T>(grad_bias), workspace,
-                                            current_stream(grad));
+                                            mutable_data<Sum<T>>(grad_weight), mutable_data<Sum<T>>(grad_bias),
+                                            workspace, current_stream(grad));
     if constexpr (kOnCpu<T>)
       cpu::sparse_conv_vjp_weight(data<T>(grad), data<T>(x), geometry.map, c_in, c_out, mutable_data<T>(grad_weight),
                                   mutable_data<T>(grad_bias), workspace, torch_parallel());

@@ -153,12 +153,9 @@ __global__ void __launch_bounds__(kThreads, 2) multiply_pairs(OuterProducts<E> p
         const int32_t o = first_out + h * 8, n = first_in + p * kHalf + j * 8;
         const float low = sums.values[p][j][2 * h], high = sums.values[p][j][2 * h + 1];
         if (o >= n_rows || n >= products.c_in) continue;  // c_in is even
-        if (direct)
-          *reinterpret_cast<uint32_t*>(products.result +
-                                       (static_cast<int64_t>(o) * products.taps + block.tap) * products.c_in + n) =
-              pair_of<E>(low, high);
-        else
-          *reinterpret_cast<float2*>(to + static_cast<int64_t>(o) * products.c_in + n) = float2{low, high};
+        float* row = direct ? products.result + (static_cast<int64_t>(o) * products.taps + block.tap) * products.c_in
+                            : to + static_cast<int64_t>(o) * products.c_in;
+        *reinterpret_cast<float2*>(row + n) = float2{low, high};
       }
 }
 

@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[3]
 MEMORY = 2**30  # bytes of address space that inputs may take beyond what the loaded libraries have
 PATIENCE = 30.0  # seconds
 PROGRESS = struct.Struct("<qq")  # number of the job, number of the input
-GROUPS = ("ops", "misbehaving")  # modules of this package with TARGETS
+GROUPS = ("ops", "readers", "misbehaving")  # modules of this package with TARGETS
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class Target:
     call: the input -> nothing; raises what the call under test raises, and Failure where its result is not acceptable.
     expected: errors that are an answer.
     named: (error, input) -> whether the message names what is wrong.
+    on_gpu: whether the call computes on a GPU.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Target:
     call: Callable[[Any, Path], None]
     expected: tuple[type[Exception], ...]
     named: Callable[[Exception, Any], bool] = lambda error, case: True
+    on_gpu: bool = False
 
 
 class Failure(Exception):
@@ -112,6 +114,14 @@ def limit_memory(extra: int) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
+def limit_memory_of_gpu(extra: int) -> None:
+    """Limits what torch may take of the GPU. (Address space is no measure there: CUDA reserves all that it can map.)"""
+    import torch
+
+    torch.zeros(1, device="cuda")
+    torch.cuda.set_per_process_memory_fraction(extra / torch.cuda.get_device_properties(0).total_memory)
+
+
 def work(jobs: list[tuple[str, int, int]], seed: int, out: Path) -> None:
     """The child: inputs ``first`` to ``end - 1`` of each target (name, first, end) of ``jobs``.
 
@@ -125,7 +135,10 @@ def work(jobs: list[tuple[str, int, int]], seed: int, out: Path) -> None:
     known = targets()
     with open(out / "progress", "r+b") as file, open(out / "answers.jsonl", "a") as answers:
         progress = mmap.mmap(file.fileno(), PROGRESS.size)
-        limit_memory(MEMORY)
+        if any(known[name].on_gpu for name, _, _ in jobs):
+            limit_memory_of_gpu(MEMORY)
+        else:
+            limit_memory(MEMORY)
         for number, (name, first, end) in enumerate(jobs):
             target = known[name]
             for index in range(first, end):

