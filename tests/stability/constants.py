@@ -55,6 +55,13 @@ CONSTANTS = (
         _RASTER,
         "the Jacobian is taken at most so far outside of the image: no coordinate over depth beyond it",
     ),
+    Constant(
+        "kLargest",
+        "1e15",
+        "of any number",
+        _RASTER,
+        "a Gaussian with a larger number is left out, or an error by policy: products and squares stay finite",
+    ),
     Constant("kMinQuat", "1e-6", "1", _RASTER, "a shorter quaternion is the identity, without a gradient"),
     Constant(
         "NEAR_PLANE",
@@ -101,6 +108,16 @@ CONSTANTS = (
     ),
     Constant("EPS", "1e-3", "variance", "gsim3d/layers.py", "batch normalisation divides by at least 0.03"),
     Constant("eps", "1e-5", "variance", "gsim3d/ops/row_norm.py", "layer normalisation divides by at least 0.003"),
+    Constant(
+        "kMinEps", "1e-30", "variance", "csrc/gsim3d/row_norm/row_norm_torch.cpp", "no smaller eps can be asked for"
+    ),
+    Constant(
+        "LARGEST",
+        "{torch.float32: 1e15, torch.float64: 1e150, torch.float16: 65504.0, torch.bfloat16: 1e15}",
+        "of any number",
+        "gsim3d/ops/_arguments.py",
+        "larger numbers are refused by ops on the CPU; `check=False` leaves the look at them out",
+    ),
     Constant(
         "MIN_ROWS",
         "16",

@@ -8,7 +8,9 @@ import torch
 from gsim3d import ops
 from gsim3d.dynamics.point_transformer import Attention
 from gsim3d.encoder.heads import PixelRays
+from gsim3d.errors import HardCaseError
 from gsim3d.layers import RowBatchNorm, RowLayerNorm
+from gsim3d.ops._arguments import LARGEST
 from gsim3d.quirks import Quirks
 from tests.asserts import gradients
 from tests.dynamics.scenes import TINY, batch, make_history
@@ -47,6 +49,19 @@ def large_queries(dynamics):
     for name, parameter in dynamics.named_parameters():
         if "qkv" in name:
             parameter.data.mul_(1e6)
+
+
+@pytest.mark.parametrize("setting", NAMES[:2], indirect=True)
+@pytest.mark.parametrize("name", ["q", "k", "v"])
+def test_a25_numbers_beyond_the_range_are_refused(setting, measured, name):
+    """On the CPU; on a GPU nothing waits for a look at numbers."""
+    case = random_case(dtype=setting.dtype)
+    values = getattr(case, name).clone()
+    values[5] = 2 * LARGEST[setting.dtype]
+    with pytest.raises(HardCaseError, match="must be finite and at most") as caught:
+        dataclasses.replace(case, **{name: values}).attend()
+    assert (caught.value.tensor, caught.value.row) == (name, 5)
+    measured.outcome("HardCaseError names tensor and row")
 
 
 QUIRKS = pytest.mark.parametrize("quirks", [Quirks(), Quirks(half_attention=True)], ids=["", "half"])

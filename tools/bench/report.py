@@ -22,6 +22,7 @@ from harness import RESULTS, commit
 
 ROOT = Path(__file__).resolve().parents[2]
 OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster"]
+GUARDS = "stability"
 NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
 INTRODUCTION = """# Benchmarks
 
@@ -42,6 +43,13 @@ CPU = """
 float32. "torch" is the best form of the op in plain torch that we found (vectorised; the code is in
 `tools/bench/<op>.py`). Medians of repeated runs; spread is the distance between the quartiles as a part of the median.
 "faster" below 1 means that torch is faster.
+"""
+
+COSTS = """
+### What guards cost
+
+A rollout and an image with the default policy for numbers that cannot be used ([stability](stability.md)) and without any
+guard: processor time on one thread, both sides in turns; the cost is the median over pairs, with its quartiles.
 """
 
 
@@ -109,15 +117,27 @@ def page(records: dict[str, dict]) -> str:
                 f"| {row['case']} | {row['gsim3d']['ms']:.2f} | {row['torch']['ms']:.2f} | {row['faster']:.1f}x "
                 f"| {spread:.0%} | {row['error']:.0e} |\n"
             )
+    return text + costs(records[GUARDS]) if GUARDS in records else text
+
+
+def costs(r: dict) -> str:
+    text = (
+        f"{COSTS}\n{r['machine']}, torch {r['torch']}, Python {r['python']}, commit {r['commit']}, {r['date']}.\n\n"
+        "| case | guarded ms | unguarded ms | cost | quartiles |\n| --- | ---: | ---: | ---: | ---: |\n"
+    )
+    for row in r["results"]:
+        low, high = row["quartiles"]
+        ms = f"{row['gsim3d']['ms']:.1f} | {row['plain']['ms']:.1f}"
+        text += f"| {row['case']} | {ms} | {row['cost']:.1%} | {low:.1%} to {high:.1%} |\n"
     return text
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ops", nargs="*", choices=[[], *OPS], help="default: all")
+    parser.add_argument("ops", nargs="*", choices=[[], *OPS, GUARDS], help="default: all")
     parser.add_argument("--page", action="store_true", help="run nothing, write the page from the stored numbers")
     args = parser.parse_args()
-    ops = [] if args.page else args.ops or OPS
+    ops = [] if args.page else args.ops or [*OPS, GUARDS]
     records = json.loads(NUMBERS.read_text()) if NUMBERS.exists() else {}
     NUMBERS.parent.mkdir(exist_ok=True)
     for op in ops:

@@ -31,8 +31,9 @@ void launch(const char* what, void (*kernel)(Formal...), dim3 blocks, dim3 threa
   if (blocks.x == 0 || blocks.y == 0 || blocks.z == 0) return;
   constexpr size_t kDefaultLimit = 48 * 1024;
   if (shared_bytes > kDefaultLimit)
-    check_cuda(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(shared_bytes)),
-               what);
+    check_cuda(
+        cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(shared_bytes)),
+        what);
   kernel<<<blocks, threads, shared_bytes, native(stream)>>>(static_cast<Formal>(arguments)...);
   check_cuda(cudaGetLastError(), what);
 }

@@ -63,7 +63,8 @@ class Parallel {
   void* pool_;
 };
 
-// A pool of std::thread workers shared by callers without torch; threads start on first use. n_threads() tells its size.
+// A pool of std::thread workers shared by callers without torch; threads start on first use. n_threads() tells its
+// size.
 Parallel thread_pool();
 // One thread: the loop runs where it is called.
 Parallel serial();

@@ -41,8 +41,8 @@ constexpr GSIM3D_HD uint64_t gray_to_binary(uint64_t v) {
 }
 
 // One level of Skilling's transform (AIP Conf. Proc. 707, 2004), which turns the axes into the transposed Hilbert index
-// from the highest level down: an axis whose bit is set inverts the lower bits of the first axis, otherwise it swaps them
-// with its own.
+// from the highest level down: an axis whose bit is set inverts the lower bits of the first axis, otherwise it swaps
+// them with its own.
 constexpr GSIM3D_HD void transpose_level(uint32_t& a, uint32_t& b, uint32_t& c, int level) {
   const uint32_t low = (1u << level) - 1;
   a ^= low & (0u - ((a >> level) & 1u));

@@ -2,8 +2,9 @@
 // rows fill the GPU together; a digit in which all keys of a row agree costs that row no pass; how many keys a row has
 // may be known on the device only.
 //
-// Low digits get no pass where the digits above tell nearly all keys of a row apart: in the end every key counts the few
-// that agree with it in those and belong on its other side. Whether they are few is judged by a sample of the row's keys.
+// Low digits get no pass where the digits above tell nearly all keys of a row apart: in the end every key counts the
+// few that agree with it in those and belong on its other side. Whether they are few is judged by a sample of the row's
+// keys.
 //
 // A pass takes each tile of a row through shared memory: ranks by digit inside the tile, then the tile's first place
 // for each digit, which is the sum over the tiles before it. Tiles publish their counts and look back over those of the
@@ -40,7 +41,8 @@ constexpr uint32_t kOfTile = 1u << 30, kUpToTile = 2u << 30, kCountMask = kOfTil
 struct Sort {
   SortRows rows;
   uint32_t* totals;     // [rows, kMaxPasses, kDigits]: keys of each digit, then the first place of each digit
-  uint32_t* alike;      // [rows, kMaxPasses]: 0: all keys agree in digit p; else 1 + pairs of the sample that agree from it up
+  // [rows, kMaxPasses]: 0: all keys agree in digit p; else 1 + pairs of the sample that agree from it up
+  uint32_t* alike;
   uint32_t* published;  // [kMaxPasses, rows, tiles, kDigits]
   uint32_t* tickets;    // [kMaxPasses]
   uint64_t* keys[2];    // [rows, room] each
@@ -198,7 +200,8 @@ __global__ void __launch_bounds__(kThreads) plan_passes_kernel(Sort sort) {
 }
 
 // The key with place i in the order.
-__device__ __forceinline__ void write_result(const SortRows& rows, int64_t row, int64_t i, uint64_t key, uint32_t index) {
+__device__ __forceinline__ void write_result(const SortRows& rows, int64_t row, int64_t i, uint64_t key,
+                                             uint32_t index) {
   const int64_t at = row * rows.room;
   if (rows.sorted) rows.sorted[at + i] = rows.squeeze ? unsqueezed(key, rows.squeeze[row]) : key ^ rows.flip;
   if (rows.index) rows.index[at + i] = index;
@@ -335,8 +338,8 @@ __global__ void __launch_bounds__(Tile::kThreads, Tile::kBlocks) move_keys_kerne
   }
 }
 
-// Ends what the passes left: rows that no pass moved are in order, and keys that agree in all moved digits stand side by
-// side, in the order of the caller.
+// Ends what the passes left: rows that no pass moved are in order, and keys that agree in all moved digits stand side
+// by side, in the order of the caller.
 constexpr int kFinishItems = 4, kFinished = kThreads * kFinishItems;
 constexpr int kAround = 64;  // keys before and after those of a block that it holds too
 
@@ -400,16 +403,17 @@ void sort_rows(const char* op, const SortRows& rows, const Workspace& workspace,
   }
   fill_zero(op, sort.totals, n_zeros, stream);
   const unsigned n_rows = static_cast<unsigned>(rows.n_rows);
-  launch(op, count_digits_kernel, dim3(static_cast<unsigned>(std::min<int64_t>((rows.room + 2047) / 2048, 128)), n_rows), kThreads, 0,
-         stream, sort);
+  launch(op, count_digits_kernel,
+         dim3(static_cast<unsigned>(std::min<int64_t>((rows.room + 2047) / 2048, 128)), n_rows), kThreads, 0, stream,
+         sort);
   launch(op, plan_passes_kernel, dim3(n_rows, sort.n_passes), kThreads, 0, stream, sort);
   const auto move = [&]<typename Tile>(Tile, int pass) {
     launch(op, move_keys_kernel<Tile>, blocks_for(op, rows.n_rows * sort.tiles, 1), Tile::kThreads,
            sizeof(PassMemory<Tile>), stream, sort, pass);
   };
   for (int pass = 0; pass < sort.n_passes; ++pass) large ? move(LargeTile{}, pass) : move(SmallTile{}, pass);
-  launch(op, finish_rows_kernel, dim3(static_cast<unsigned>((rows.room + kFinished - 1) / kFinished), n_rows), kThreads, 0,
-         stream, sort);
+  launch(op, finish_rows_kernel, dim3(static_cast<unsigned>((rows.room + kFinished - 1) / kFinished), n_rows), kThreads,
+         0, stream, sort);
 }
 
 }  // namespace gsim3d::cuda

@@ -112,7 +112,8 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
                                   n_clouds,                 origin.size(0)};
     if constexpr (kWithCuda)
       if (positions.is_cuda())
-        return cuda::build_pyramid(clouds, spec, {&TensorArrays::append, &arrays}, workspace, current_stream(positions));
+        return cuda::build_pyramid(clouds, spec, {&TensorArrays::append, &arrays}, workspace,
+                                   current_stream(positions));
     cpu::build_pyramid(clouds, spec, {&TensorArrays::append, &arrays}, workspace, torch_parallel());
   });
   return std::move(arrays.made);

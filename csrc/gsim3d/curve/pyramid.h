@@ -75,7 +75,8 @@ namespace cpu {
 //   rows [N0]: input rows that take part, ascending; the others are not finite or outside [0, 2^16) cells of the origin
 //   cu_rows [N0 + 1]: row i of stage 0 is input row rows[cu_rows[i]]
 //   for every stage, N rows in C clouds and V voxels:
-//     cu_cluster [N + 1]    except at stage 0: row i pools rows order[0, cu_cluster[i]:cu_cluster[i + 1]] of stage s - 1
+//     cu_cluster [N + 1]    except at stage 0: row i pools rows order[0, cu_cluster[i]:cu_cluster[i + 1]] of stage
+//                           s - 1
 //     time_index [N]        only where slots merge: slot inside the merged window
 //     grid [N, 3], cloud [N], cu_clouds [C + 1]: order[:, cu_clouds[c]:cu_clouds[c + 1]] are the rows of cloud c
 //     order [4, N]          rows by (cloud, code, position inside the cell, row)
@@ -84,11 +85,11 @@ namespace cpu {
 //     row_voxel [N], voxel_rows [N], cu_voxel_rows [V + 1]: rows of equal (cloud, cell); voxels by (cloud, x, y, z)
 //     for every kernel size K: tap_in [L], tap_out [L], cu_taps [K^3 + 1]: voxel tap_in lies at (kx, ky, kz) - K / 2
 //                           cells from tap_out, tap = (kx K + ky) K + kz; both ascend inside a tap; centre empty
-// and with spec.capacity at last found [1 + counts]: problems, then the counts that the data has. Then N, C, P, M, L are
-// those of the capacity (N0 = n_rows), V is N + 1, and behind what the data has follow rows that nothing reads: in orders
-// they stay at their places, each is a voxel of its own, `rows` lists those that sleep; the last voxels, patches, clouds
-// and clusters are empty (offsets stay at the end), other entries are 0. Where a count exceeds its capacity, there are
-// such rows only.
+// and with spec.capacity at last found [1 + counts]: problems, then the counts that the data has. Then N, C, P, M, L
+// are those of the capacity (N0 = n_rows), V is N + 1, and behind what the data has follow rows that nothing reads: in
+// orders they stay at their places, each is a voxel of its own, `rows` lists those that sleep; the last voxels,
+// patches, clouds and clusters are empty (offsets stay at the end), other entries are 0. Where a count exceeds its
+// capacity, there are such rows only.
 // T is float or double. Throws ArgumentError where clouds or spec are malformed.
 template <typename T>
 void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,

@@ -408,7 +408,8 @@ Results append_results(const PyramidSpec& spec, const int64_t* counts, const int
       results.most = std::max(results.most, n_taps + 1);
     }
   }
-  if (spec.capacity) results.found = arrays.append({1 + capacity_of_pairs(spec.n_stages, spec.cu_kernels[spec.n_stages])});
+  if (spec.capacity)
+    results.found = arrays.append({1 + capacity_of_pairs(spec.n_stages, spec.cu_kernels[spec.n_stages])});
   return results;
 }
 

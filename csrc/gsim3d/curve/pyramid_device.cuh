@@ -59,8 +59,8 @@ struct MapArrays {
 
 // Where the results of a stage go, null where it has none of a kind, and how large they are.
 struct StageResults {
-  int64_t *input_rows, *cu_input_rows, *cu_cluster, *time_index, *grid, *cloud, *cu_clouds, *order, *cu_q, *cu_k, *kv_rows, *row_voxel,
-      *voxel_rows, *cu_voxel_rows;
+  int64_t *input_rows, *cu_input_rows, *cu_cluster, *time_index, *grid, *cloud, *cu_clouds, *order, *cu_q, *cu_k,
+      *kv_rows, *row_voxel, *voxel_rows, *cu_voxel_rows;
   int64_t n_rows, n_clouds, n_patches, n_keys, n_voxels;
 };
 struct MapResults {

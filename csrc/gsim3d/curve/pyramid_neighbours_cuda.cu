@@ -63,8 +63,8 @@ __device__ __forceinline__ int32_t search_together(const uint64_t* __restrict__ 
 }
 
 // Calls f(tap, hit, neighbour) for the taps before the centre, in order, by every lane of a warp, without those that no
-// lane hits. Keys ascend and differ: one search finds a column of cells, for all lanes near each other. Rows are fewer than
-// 2^29, so places fit 32 bits.
+// lane hits. Keys ascend and differ: one search finds a column of cells, for all lanes near each other. Rows are fewer
+// than 2^29, so places fit 32 bits.
 template <typename F>
 __device__ __forceinline__ void for_first_half(const uint64_t* __restrict__ keys, int32_t n, int32_t p, int kernel_size,
                                                uint64_t* window /* [kWindow], shared */, const F& f) {

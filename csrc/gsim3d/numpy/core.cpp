@@ -188,13 +188,13 @@ py::dict rasterize_gaussians(const Array<T>& means, const Array<T>& quats, const
   gsim3d::check(width > 0 && height > 0 && width <= (1 << 16) && height <= (1 << 16), op,
                 ": width and height must be in [1, 65536]; got ", width, " x ", height);
   std::vector<T> backgrounds;
-  for (int64_t i = 0; i < n_images; ++i) backgrounds.insert(backgrounds.end(), background.data(), background.data() + 3);
+  for (int64_t i = 0; i < n_images; ++i)
+    backgrounds.insert(backgrounds.end(), background.data(), background.data() + 3);
   const std::vector<int64_t> image_cloud(static_cast<size_t>(n_images), 0);
   const int64_t cu_rows[2] = {0, n};
-  const gsim3d::RasterScene<T> scene{means.data(),       quats.data(),    scales.data(), opacities.data(), colors.data(),
-                                     nullptr,            backgrounds.data(), viewmats.data(), Ks.data(), image_cloud.data(),
-                                     cu_rows,            n,               1,             n_images,         0,
-                                     0,                  width,           height,        near_plane,
+  const gsim3d::RasterScene<T> scene{means.data(), quats.data(), scales.data(), opacities.data(), colors.data(),
+                                     nullptr, backgrounds.data(), viewmats.data(), Ks.data(), image_cloud.data(),
+                                     cu_rows, n, 1, n_images, 0, 0, width, height, near_plane,
                                      gsim3d::RasterCutoff::kExact};
   py::array_t<T> color({n_images, height, width, int64_t{3}}), alpha({n_images, height, width}),
       depth({n_images, height, width});
@@ -265,20 +265,21 @@ PYBIND11_MODULE(_core, m) {
         py::arg("voxel_rows"), py::arg("cu_voxel_rows"), py::arg("tap_in"), py::arg("tap_out"), py::arg("cu_taps"),
         py::arg("first") = false,
         "Submanifold convolution [N, C_out] with weight [C_out, K, K, K, C_in]; duplicate rows: mean, or the first.");
-  m.def("patch_attention", &patch_attention<double>, py::arg("q").noconvert(), py::arg("k"), py::arg("v"), py::arg("q_rows"),
-        py::arg("kv_rows"), py::arg("cu_q"), py::arg("cu_k"), py::arg("scale"));
+  m.def("patch_attention", &patch_attention<double>, py::arg("q").noconvert(), py::arg("k"), py::arg("v"),
+        py::arg("q_rows"), py::arg("kv_rows"), py::arg("cu_q"), py::arg("cu_k"), py::arg("scale"));
   m.def("patch_attention", &patch_attention<float>, py::arg("q"), py::arg("k"), py::arg("v"), py::arg("q_rows"),
         py::arg("kv_rows"), py::arg("cu_q"), py::arg("cu_k"), py::arg("scale"),
         "Attention [Nq, H, D] of query rows to the key rows of their patch.");
   m.def("rasterize_gaussians", &rasterize_gaussians<double>, py::arg("means").noconvert(), py::arg("quats"),
-        py::arg("scales"), py::arg("opacities"), py::arg("colors"), py::arg("viewmats"), py::arg("Ks"), py::arg("width"),
-        py::arg("height"), py::arg("background"), py::arg("near_plane") = 0.01);
+        py::arg("scales"), py::arg("opacities"), py::arg("colors"), py::arg("viewmats"), py::arg("Ks"),
+        py::arg("width"), py::arg("height"), py::arg("background"), py::arg("near_plane") = 0.01);
   m.def("rasterize_gaussians", &rasterize_gaussians<float>, py::arg("means"), py::arg("quats"), py::arg("scales"),
-        py::arg("opacities"), py::arg("colors"), py::arg("viewmats"), py::arg("Ks"), py::arg("width"), py::arg("height"),
-        py::arg("background"), py::arg("near_plane") = 0.01f,
+        py::arg("opacities"), py::arg("colors"), py::arg("viewmats"), py::arg("Ks"), py::arg("width"),
+        py::arg("height"), py::arg("background"), py::arg("near_plane") = 0.01f,
         "One cloud of Gaussians seen by I cameras: {color [I, H, W, 3], alpha [I, H, W], depth [I, H, W]}.");
-  m.def("curve_encode", &curve_encode, py::arg("grid"), py::arg("cloud"), py::arg("curve"), py::arg("depth") = 16,
-        "Codes [N] of cells [N, 3] along curve 0 z, 1 z-trans, 2 hilbert, 3 hilbert-trans; cloud << 3 depth above them.");
+  m.def(
+      "curve_encode", &curve_encode, py::arg("grid"), py::arg("cloud"), py::arg("curve"), py::arg("depth") = 16,
+      "Codes [N] of cells [N, 3] along curve 0 z, 1 z-trans, 2 hilbert, 3 hilbert-trans; cloud << 3 depth above them.");
   m.def("curve_sort", &curve_sort, py::arg("codes"), "Stable order and inverse, [R, N] each, of codes [R, N].");
   m.def("plane_sweep", &plane_sweep<double>, py::arg("features").noconvert(), py::arg("homographies"),
         py::arg("translations"), py::arg("inverse_depths"), py::arg("src_images"), py::arg("cu_src"));

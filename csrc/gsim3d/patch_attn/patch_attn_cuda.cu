@@ -42,7 +42,8 @@ __global__ void uses_kernel(PatchTable table, RowUses uses) {
   atomicAdd(uses.count_less_one + row, 1);
 }
 
-constexpr int kRowsPerWarp = 4;  // rows listed several times lie side by side: few a warp, so that many warps share them
+// Rows listed several times lie side by side: few a warp, so that many warps share them.
+constexpr int kRowsPerWarp = 4;
 
 // A warp looks at kRowsPerWarp rows and works on those that no slot or several slots list.
 template <typename T>

@@ -30,9 +30,9 @@ struct TileLayout {
   }
 };
 
-// Queues a group of copies: the listed rows of one head of two matrices into two tiles; rows beyond n up to the next multiple of
-// kStep, and rows outside [0, n_rows), become 0. Where `valid` is given, it gets a byte for each row: whether it takes
-// part. Returns whether all n rows that this thread saw do.
+// Queues a group of copies: the listed rows of one head of two matrices into two tiles; rows beyond n up to the next
+// multiple of kStep, and rows outside [0, n_rows), become 0. Where `valid` is given, it gets a byte for each row:
+// whether it takes part. Returns whether all n rows that this thread saw do.
 template <int D, int kThreads, typename T>
 __device__ __forceinline__ bool copy_tiles(const HeadRows<T> (&x)[2], const int64_t* rows, int n, int64_t n_rows,
                                            int64_t head, const uint32_t (&tiles)[2], uint8_t* valid) {

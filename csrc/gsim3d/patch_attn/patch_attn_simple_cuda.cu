@@ -1,6 +1,6 @@
 // A thread, or L neighbouring ones for head dims above 16, owns a few rows: queries in the forward pass and for their
-// own gradient, keys for theirs. It walks over the rows of the other side, which the block keeps in shared memory a tile
-// at a time, so all sums run in the order of the lists. Every block owns what it writes.
+// own gradient, keys for theirs. It walks over the rows of the other side, which the block keeps in shared memory a
+// tile at a time, so all sums run in the order of the lists. Every block owns what it writes.
 #include <utility>
 
 #include <cuda_bf16.h>
@@ -149,6 +149,34 @@ __device__ __forceinline__ Slots slots_of(const Range& range, const Share& share
   return {range.begin + share.split * kGroup, range.end, division.splits * kGroup};
 }
 
+// body(group, slots, keys, head) for every group of queries that a block owns, with the keys of their patch.
+template <int kGroup, typename T, typename Body>
+__device__ __forceinline__ void for_query_groups(const Work<T>& work, const Body& body) {
+  const PatchTable& table = work.table;
+  for (int64_t i = blockIdx.x; i < work.division.n_shares; i += gridDim.x) {
+    const Share share = work.division.at(i);
+    const Range keys = range_of(table.cu_k, share.patch, table.n_k_listed);
+    const Slots slots = slots_of<kGroup>(range_of(table.cu_q, share.patch, table.n_q_listed), share, work.division);
+    if (keys.begin == keys.end) continue;
+    for (int64_t group = slots.begin; group < slots.end; group += slots.step) body(group, slots, keys, share.head);
+  }
+}
+
+// body(n) for keys and values, n rows of them in the tile at a time. All threads of a block call it.
+template <typename T, int L, typename Body>
+__device__ __forceinline__ void for_key_tiles(const Work<T>& work, const Tile<Sum<T>, L>& tile, const Range& keys,
+                                              int64_t head, const Body& body) {
+  constexpr int kTileRows = Shape<Sum<T>, L>::kTileRows;
+  for (int64_t first = keys.begin; first < keys.end; first += kTileRows) {
+    const int n = static_cast<int>(min(keys.end - first, int64_t{kTileRows}));
+    __syncthreads();
+    tile.fill(work.k, work.v, work.table.kv_rows + first, n, work.table.n_k, head, work.size.dim,
+              [](int64_t) { return Sum<T>(1); });
+    __syncthreads();
+    body(n);
+  }
+}
+
 template <typename T, int L>
 __global__ void __launch_bounds__(kThreads) forward_kernel(Work<T> work) {
   using C = Sum<T>;
@@ -159,75 +187,65 @@ __global__ void __launch_bounds__(kThreads) forward_kernel(Work<T> work) {
   const PatchTable& table = work.table;
   const int64_t dim = work.size.dim, heads = work.size.heads;
   const int part = threadIdx.x % L;
-  for (int64_t i = blockIdx.x; i < work.division.n_shares; i += gridDim.x) {
-    const Share share = work.division.at(i);
-    const Range keys = range_of(table.cu_k, share.patch, table.n_k_listed);
-    const Slots slots = slots_of<S::kGroup>(range_of(table.cu_q, share.patch, table.n_q_listed), share, work.division);
-    if (keys.begin == keys.end) continue;
-    for (int64_t group = slots.begin; group < slots.end; group += slots.step) {
-      C query[R][kDims], result[R][kDims] = {}, largest[R], sum[R] = {};
-      int64_t rows[R];
+  for_query_groups<S::kGroup>(work, [&](int64_t group, const Slots& slots, const Range& keys, int64_t head) {
+    C query[R][kDims], result[R][kDims] = {}, largest[R], sum[R] = {};
+    int64_t rows[R];
 #pragma unroll
-      for (int r = 0; r < R; ++r) {
-        const int64_t slot = group + threadIdx.x / L * R + r;
-        rows[r] = slot < slots.end ? table.q_rows[slot] : -1;
-        if (!inside(rows[r], table.n_q)) rows[r] = -1;
-        load_row<L>(rows[r] < 0 ? nullptr : work.q.at(rows[r], share.head), part, dim, query[r]);
-        largest[r] = work.softmax.kLowestNumber;
-      }
-      for (int64_t first = keys.begin; first < keys.end; first += S::kTileRows) {
-        const int n = static_cast<int>(min(keys.end - first, int64_t{S::kTileRows}));
-        __syncthreads();
-        tile.fill(work.k, work.v, table.kv_rows + first, n, table.n_k, share.head, dim, [](int64_t) { return C(1); });
-        __syncthreads();
-        constexpr int kAhead = 4;
-        for (int j = 0; j < n; j += kAhead) {
-          C s[R][kAhead];
+    for (int r = 0; r < R; ++r) {
+      const int64_t slot = group + threadIdx.x / L * R + r;
+      rows[r] = slot < slots.end ? table.q_rows[slot] : -1;
+      if (!inside(rows[r], table.n_q)) rows[r] = -1;
+      load_row<L>(rows[r] < 0 ? nullptr : work.q.at(rows[r], head), part, dim, query[r]);
+      largest[r] = work.softmax.kLowestNumber;
+    }
+    for_key_tiles<T, L>(work, tile, keys, head, [&](int n) {
+      constexpr int kAhead = 4;
+      for (int j = 0; j < n; j += kAhead) {
+        C s[R][kAhead];
 #pragma unroll
-          for (int a = 0; a < kAhead; ++a) {
-            C key[kDims];
-            read_tile<L>(tile.a + (j + a) * S::kWidth, part, key);
+        for (int a = 0; a < kAhead; ++a) {
+          C key[kDims];
+          read_tile<L>(tile.a + (j + a) * S::kWidth, part, key);
 #pragma unroll
-            for (int r = 0; r < R; ++r) s[r][a] = work.softmax.sign * dot<L>(query[r], key);
+          for (int r = 0; r < R; ++r) s[r][a] = work.softmax.sign * dot<L>(query[r], key);
+        }
+#pragma unroll
+        for (int r = 0; r < R; ++r) {
+          C top = largest[r];
+#pragma unroll
+          for (int a = 0; a < kAhead; ++a)
+            if (tile.taken[j + a] != 0 && !(s[r][a] <= top)) top = s[r][a];
+          if (top != largest[r]) {
+            const C shrink = weight(largest[r] - top, work.softmax);
+            sum[r] *= shrink;
+#pragma unroll
+            for (C& x : result[r]) x *= shrink;
+            largest[r] = top;
           }
+        }
+#pragma unroll
+        for (int a = 0; a < kAhead; ++a) {
+          if (tile.taken[j + a] == 0) continue;
+          C value[kDims];
+          read_tile<L>(tile.b + (j + a) * S::kWidth, part, value);
 #pragma unroll
           for (int r = 0; r < R; ++r) {
-            C top = largest[r];
-#pragma unroll
-            for (int a = 0; a < kAhead; ++a)
-              if (tile.taken[j + a] != 0 && !(s[r][a] <= top)) top = s[r][a];
-            if (top != largest[r]) {
-              const C shrink = weight(largest[r] - top, work.softmax);
-              sum[r] *= shrink;
-#pragma unroll
-              for (C& x : result[r]) x *= shrink;
-              largest[r] = top;
-            }
-          }
-#pragma unroll
-          for (int a = 0; a < kAhead; ++a) {
-            if (tile.taken[j + a] == 0) continue;
-            C value[kDims];
-            read_tile<L>(tile.b + (j + a) * S::kWidth, part, value);
-#pragma unroll
-            for (int r = 0; r < R; ++r) {
-              const C p = weight(s[r][a] - largest[r], work.softmax);
-              sum[r] += p;
-              add_scaled(p, value, result[r]);
-            }
+            const C p = weight(s[r][a] - largest[r], work.softmax);
+            sum[r] += p;
+            add_scaled(p, value, result[r]);
           }
         }
       }
+    });
 #pragma unroll
-      for (int r = 0; r < R; ++r) {
-        if (rows[r] < 0) continue;
-        const int64_t place = rows[r] * heads + share.head;
-        store_row<L>(work.out + place * dim, part, dim, result[r], sum[r] == 0 ? C(0) : C(1) / sum[r]);
-        if (part == 0) work.stats[2 * place] = sum[r] == 0 ? C(0) : largest[r];
-        if (part == 0) work.stats[2 * place + 1] = sum[r];
-      }
+    for (int r = 0; r < R; ++r) {
+      if (rows[r] < 0) continue;
+      const int64_t place = rows[r] * heads + head;
+      store_row<L>(work.out + place * dim, part, dim, result[r], sum[r] == 0 ? C(0) : C(1) / sum[r]);
+      if (part == 0) work.stats[2 * place] = sum[r] == 0 ? C(0) : largest[r];
+      if (part == 0) work.stats[2 * place + 1] = sum[r];
     }
-  }
+  });
 }
 
 // Gradients are divided by the sum of weights, so that the weights need not be; delta = <out, that gradient>.
@@ -241,57 +259,47 @@ __global__ void __launch_bounds__(kThreads) query_kernel(Work<T> work) {
   const PatchTable& table = work.table;
   const int64_t dim = work.size.dim, heads = work.size.heads;
   const int part = threadIdx.x % L;
-  for (int64_t i = blockIdx.x; i < work.division.n_shares; i += gridDim.x) {
-    const Share share = work.division.at(i);
-    const Range keys = range_of(table.cu_k, share.patch, table.n_k_listed);
-    const Slots slots = slots_of<S::kGroup>(range_of(table.cu_q, share.patch, table.n_q_listed), share, work.division);
-    if (keys.begin == keys.end) continue;
-    for (int64_t group = slots.begin; group < slots.end; group += slots.step) {
-      C query[R][kDims], grad[R][kDims], result[R][kDims] = {}, largest[R], delta[R];
-      int64_t rows[R];
+  for_query_groups<S::kGroup>(work, [&](int64_t group, const Slots& slots, const Range& keys, int64_t head) {
+    C query[R][kDims], grad[R][kDims], result[R][kDims] = {}, largest[R], delta[R];
+    int64_t rows[R];
 #pragma unroll
-      for (int r = 0; r < R; ++r) {
-        const int64_t slot = group + threadIdx.x / L * R + r;
-        rows[r] = slot < slots.end ? table.q_rows[slot] : -1;
-        const bool wanted = inside(rows[r], table.n_q);
-        if (!wanted) rows[r] = -1;
-        const int64_t place = wanted ? rows[r] * heads + share.head : 0;
-        load_row<L>(wanted ? work.q.at(rows[r], share.head) : nullptr, part, dim, query[r]);
-        load_row<L>(wanted ? work.grad.at(rows[r], share.head) : nullptr, part, dim, grad[r]);
-        load_row<L>(wanted ? work.out_rows.at(rows[r], share.head) : nullptr, part, dim, result[r]);
-        largest[r] = wanted ? work.stats[2 * place] : C(0);
-        const C one_by_sum = wanted ? C(1) / work.stats[2 * place + 1] : C(0);
+    for (int r = 0; r < R; ++r) {
+      const int64_t slot = group + threadIdx.x / L * R + r;
+      rows[r] = slot < slots.end ? table.q_rows[slot] : -1;
+      const bool wanted = inside(rows[r], table.n_q);
+      if (!wanted) rows[r] = -1;
+      const int64_t place = wanted ? rows[r] * heads + head : 0;
+      load_row<L>(wanted ? work.q.at(rows[r], head) : nullptr, part, dim, query[r]);
+      load_row<L>(wanted ? work.grad.at(rows[r], head) : nullptr, part, dim, grad[r]);
+      load_row<L>(wanted ? work.out_rows.at(rows[r], head) : nullptr, part, dim, result[r]);
+      largest[r] = wanted ? work.stats[2 * place] : C(0);
+      const C one_by_sum = wanted ? C(1) / work.stats[2 * place + 1] : C(0);
 #pragma unroll
-        for (C& x : grad[r]) x *= one_by_sum;
-        delta[r] = dot<L>(grad[r], result[r]);
-        if (slot < slots.end && part == 0) work.deltas[share.head * table.n_q_listed + slot] = delta[r];
+      for (C& x : grad[r]) x *= one_by_sum;
+      delta[r] = dot<L>(grad[r], result[r]);
+      if (slot < slots.end && part == 0) work.deltas[head * table.n_q_listed + slot] = delta[r];
 #pragma unroll
-        for (C& x : result[r]) x = 0;
-      }
-      for (int64_t first = keys.begin; first < keys.end; first += S::kTileRows) {
-        const int n = static_cast<int>(min(keys.end - first, int64_t{S::kTileRows}));
-        __syncthreads();
-        tile.fill(work.k, work.v, table.kv_rows + first, n, table.n_k, share.head, dim, [](int64_t) { return C(1); });
-        __syncthreads();
-        for (int j = 0; j < n; ++j) {
-          if (tile.taken[j] == 0) continue;
-          C key[kDims], value[kDims];
-          read_tile<L>(tile.a + j * S::kWidth, part, key);
-          read_tile<L>(tile.b + j * S::kWidth, part, value);
+      for (C& x : result[r]) x = 0;
+    }
+    for_key_tiles<T, L>(work, tile, keys, head, [&](int n) {
+      for (int j = 0; j < n; ++j) {
+        if (tile.taken[j] == 0) continue;
+        C key[kDims], value[kDims];
+        read_tile<L>(tile.a + j * S::kWidth, part, key);
+        read_tile<L>(tile.b + j * S::kWidth, part, value);
 #pragma unroll
-          for (int r = 0; r < R; ++r) {
-            const C p = weight(work.softmax.sign * dot<L>(query[r], key) - largest[r], work.softmax);
-            add_scaled(p * (dot<L>(grad[r], value) - delta[r]), key, result[r]);
-          }
+        for (int r = 0; r < R; ++r) {
+          const C p = weight(work.softmax.sign * dot<L>(query[r], key) - largest[r], work.softmax);
+          add_scaled(p * (dot<L>(grad[r], value) - delta[r]), key, result[r]);
         }
       }
+    });
 #pragma unroll
-      for (int r = 0; r < R; ++r)
-        if (rows[r] >= 0)
-          store_row<L>(work.out + (rows[r] * heads + share.head) * dim, part, dim, result[r],
-                       static_cast<C>(work.size.scale));
-    }
-  }
+    for (int r = 0; r < R; ++r)
+      if (rows[r] >= 0)
+        store_row<L>(work.out + (rows[r] * heads + head) * dim, part, dim, result[r],
+                     static_cast<C>(work.size.scale));
+  });
 }
 
 template <typename T, int L>

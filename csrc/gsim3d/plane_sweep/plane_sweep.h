@@ -40,8 +40,8 @@ void check_sizes(const char* op, const PlaneSweep<T>& sweep) {
 
 namespace cpu {
 
-// Throws ArgumentError as check_sizes, and unless offsets and images are in range, geometry is finite and inverse depths
-// are positive.
+// Throws ArgumentError as check_sizes, and unless offsets and images are in range, geometry is finite and inverse
+// depths are positive.
 template <typename T>
 void check_plane_sweep(const char* op, const PlaneSweep<T>& sweep);
 

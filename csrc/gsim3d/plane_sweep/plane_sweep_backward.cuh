@@ -123,8 +123,8 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
   }
 }
 
-// One warp owns 32 kVectors channels of four neighbouring pixels as references and gathers from their sources, by pairs,
-// then by source pixels.
+// One warp owns 32 kVectors channels of four neighbouring pixels as references and gathers from their sources, by
+// pairs, then by source pixels.
 constexpr int kGathered = 256;  // source pixels whose weights a warp holds at once
 
 template <typename T>
@@ -208,7 +208,8 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, sizeof(T) == 4 ? 3 : 2)
             for (int j = 0; j < kQuad; ++j) {
               const int32_t rank = before[j] + __popc(bits[j] & ((1u << bit) - 1));
               const bool touches = bits[j] >> bit & 1 && rank < s.capacity;
-              weights[r * kQuad + j] = touches ? lines.weights[lines.slot(pair, quad.pixel(j)) * s.capacity + rank] : T(0);
+              weights[r * kQuad + j] =
+                  touches ? lines.weights[lines.slot(pair, quad.pixel(j)) * s.capacity + rank] : T(0);
             }
           }
         }
@@ -232,8 +233,8 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, sizeof(T) == 4 ? 3 : 2)
   }
 }
 
-// The source pixels of a task: two pieces of kPiece neighbours, one above the other where rows hold whole pieces. A piece
-// lies inside a word. -1: none.
+// The source pixels of a task: two pieces of kPiece neighbours, one above the other where rows hold whole pieces. A
+// piece lies inside a word. -1: none.
 struct Pieces {
   int32_t at[2];
 
@@ -256,8 +257,8 @@ constexpr int64_t source_bytes() {
   return int64_t{kTasks} * kOwned * kWarp * kVectors * sizeof(T);
 }
 
-// kParts warps own 32 kVectors channels of kOwned pixels as sources and add what every kept line gives them, by pairs, then
-// by pixels; each warp takes every kParts-th run of 32 pixels, and their sums are added in order.
+// kParts warps own 32 kVectors channels of kOwned pixels as sources and add what every kept line gives them, by pairs,
+// then by pixels; each warp takes every kParts-th run of 32 pixels, and their sums are added in order.
 template <typename T, int kVectors>
 __global__ void __launch_bounds__(kMaxWarps* kWarp)
     source_kernel(Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s, Lines<T> lines, int64_t tasks_per_image,

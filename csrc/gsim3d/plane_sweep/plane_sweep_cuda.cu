@@ -70,7 +70,8 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, 2)
         for (int j = 0; j < kQuad; ++j) {
           const T* scores = memory.scores + j;
           const T top_left = scores[(places[j].x & 0xffff) * kQuad], top_right = scores[(places[j].x >> 16) * kQuad];
-          const T bottom_left = scores[(places[j].y & 0xffff) * kQuad], bottom_right = scores[(places[j].y >> 16) * kQuad];
+          const T bottom_left = scores[(places[j].y & 0xffff) * kQuad],
+                  bottom_right = scores[(places[j].y >> 16) * kQuad];
           costs[j] += interpolate(top_left, top_right, bottom_left, bottom_right, samples[j].fx, samples[j].fy);
         }
         __syncwarp();
@@ -78,7 +79,8 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, 2)
     }
 #pragma unroll
     for (int j = 0; j < kQuad; ++j)
-      if (k < s.n_depths && quad.holds(j)) cost[(image * s.n_depths + k) * s.n_pixels + quad.pixel(j)] = costs[j] * scale;
+      if (k < s.n_depths && quad.holds(j))
+        cost[(image * s.n_depths + k) * s.n_pixels + quad.pixel(j)] = costs[j] * scale;
   }
 }
 

@@ -65,13 +65,13 @@ __global__ void to_planes_kernel(const T* __restrict__ pixels, int64_t rows, int
   }
 }
 
-// The forward pass gives a warp four neighbouring pixels: their lines run close to each other, so that a source pixel is
-// loaded once for most of them. A lane holds one depth of each.
+// The forward pass gives a warp four neighbouring pixels: their lines run close to each other, so that a source pixel
+// is loaded once for most of them. A lane holds one depth of each.
 constexpr int kQuad = 4;
 constexpr int kRows = 128;  // source pixels whose scores a warp holds at once
 
-// Four neighbouring pixels of an image. The warps of a block take 2 x 4 of them where an image holds whole blocks of them,
-// for the sake of the first-level cache.
+// Four neighbouring pixels of an image. The warps of a block take 2 x 4 of them where an image holds whole blocks of
+// them, for the sake of the first-level cache.
 struct Quad {
   int32_t u, v, width, height;
 

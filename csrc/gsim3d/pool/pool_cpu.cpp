@@ -192,7 +192,8 @@ void pool_mean_vjp(const T* grad, const Segments& segments, int64_t channels, T*
 template <typename T>
 void unpool(const T* x, const Segments& segments, int64_t channels, T* out, const Parallel& parallel) {
   const auto& [rows, cu, n_segments, n_listed, n_rows] = segments;
-  check(n_segments <= std::numeric_limits<int32_t>::max(), "unpool: x must have fewer than 2^31 rows; got ", n_segments);
+  check(n_segments <= std::numeric_limits<int32_t>::max(), "unpool: x must have fewer than 2^31 rows; got ",
+        n_segments);
   bool good = n_rows >= 0 && n_listed <= n_rows && cu[0] == 0 && cu[n_segments] <= n_listed;
   std::vector<int32_t> owner(good ? static_cast<size_t>(n_rows) : 0, -1);
   for (int64_t s = 0; good && s < n_segments; ++s) {

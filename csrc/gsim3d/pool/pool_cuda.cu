@@ -108,8 +108,8 @@ __global__ void sum_by_warp_kernel(const T* __restrict__ x, Segments segments, i
   }
 }
 
-// Every row of a segment gets the segment's value, divided by its size for the mean; rows listed behind the last segment
-// get 0.
+// Every row of a segment gets the segment's value, divided by its size for the mean; rows listed behind the last
+// segment get 0.
 template <typename T, int N, bool kMean>
 __global__ void spread_kernel(const T* __restrict__ x, Segments segments, int64_t channels, T* __restrict__ out) {
   Place at;
@@ -144,8 +144,8 @@ template <typename T, bool kMean>
 void add_up(const char* op, const T* x, const Segments& segments, int64_t channels, T* out, Stream stream) {
   by_width<T>(channels, x, out, [&]<int N>() {
     if (N == 1 && channels >= kWarp)
-      return launch(op, sum_by_warp_kernel<T, kMean>, blocks_for(op, segments.n_segments, kThreads / kWarp), kThreads, 0,
-                    stream, x, segments, channels, out);
+      return launch(op, sum_by_warp_kernel<T, kMean>, blocks_for(op, segments.n_segments, kThreads / kWarp), kThreads,
+                    0, stream, x, segments, channels, out);
     launch(op, sum_kernel<T, N, kMean>, blocks_for(op, segments.n_segments * (channels / N), kThreads), kThreads, 0,
            stream, x, segments, channels, out);
   });

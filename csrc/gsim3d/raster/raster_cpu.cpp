@@ -25,10 +25,11 @@ void check_scene(const RasterScene<T>& s) {
     check(s.image_cloud[i] >= 0 && s.image_cloud[i] < s.n_clouds, kOp,
           ": image_cloud must be in [0, Q) with Q=", s.n_clouds, "; got ", s.image_cloud[i], " for image ", i);
     for (int j = 0; j < 12; ++j)
-      check(usable(s.viewmats[16 * i + j]), kOp, ": viewmats must be finite and at most 1e15; got ", s.viewmats[16 * i + j],
-            " for image ", i);
+      check(usable(s.viewmats[16 * i + j]), kOp, ": viewmats must be finite and at most 1e15; got ",
+            s.viewmats[16 * i + j], " for image ", i);
     const T* K = s.Ks + 9 * i;
-    for (int j = 0; j < 9; ++j) check(usable(K[j]), kOp, ": Ks must be finite and at most 1e15; got ", K[j], " for image ", i);
+    for (int j = 0; j < 9; ++j)
+      check(usable(K[j]), kOp, ": Ks must be finite and at most 1e15; got ", K[j], " for image ", i);
     check(K[0] > 0 && K[4] > 0, kOp, ": focal lengths in Ks must be positive; got ", K[0], " and ", K[4],
           " for image ", i);
     check(K[3] == 0 && K[6] == 0 && K[7] == 0 && K[8] == 1, kOp,

@@ -1,7 +1,8 @@
 // Layer normalisation of packed rows, with the sum that follows it in a residual network.
 //
 // Each row is normalised over its channels, whatever rows are packed with it: its bits do not depend on them. Sums over
-// rows (the gradients of weight and bias) go over fixed blocks of rows in order. Stats keep mean and 1 / sqrt(variance + eps).
+// rows (the gradients of weight and bias) go over fixed blocks of rows in order. Stats keep mean and 1 / sqrt(variance
+// + eps).
 #pragma once
 
 #include <cstdint>
@@ -60,8 +61,8 @@ void residual_norm(const T* x,                 // [n_rows, channels]
                    T* stats,         // [n_rows, 2] where norm is given
                    const Parallel& parallel);
 
-// Gradients of x, branch and the weights that are given; branch_sum is the sum over rows of the branch's gradient, that of
-// a bias of the linear layer before.
+// Gradients of x, branch and the weights that are given; branch_sum is the sum over rows of the branch's gradient, that
+// of a bias of the linear layer before.
 template <typename T>
 void residual_norm_vjp(const T* grad_sum,  // [n_rows, channels], or nullptr: 0
                        const T* grad_out,  // [n_rows, channels], or nullptr: 0
@@ -76,16 +77,16 @@ void residual_norm_vjp(const T* grad_sum,  // [n_rows, channels], or nullptr: 0
 template <typename T>
 void sum_rows(const T* x, RowNormShape shape, T* out, const Parallel& parallel);
 
-// One normalisation of channels and the activation behind it: out = gelu((x - mean) * scale + bias), mean, scale and bias
-// one value a channel.
+// One normalisation of channels and the activation behind it: out = gelu((x - mean) * scale + bias), mean, scale and
+// bias one value a channel.
 template <typename T>
 void norm_gelu(const T* x,  // [n_rows, channels]
                const T* mean, const T* scale, const T* bias, RowNormShape shape, T* out, const Parallel& parallel);
 
 // The gradient of mean is -scale * grad_bias.
 template <typename T>
-void norm_gelu_vjp(const T* grad, const T* x, const T* mean, const T* scale, const T* bias, RowNormShape shape, T* grad_x,
-                   T* grad_scale, T* grad_bias, const Parallel& parallel);
+void norm_gelu_vjp(const T* grad, const T* x, const T* mean, const T* scale, const T* bias, RowNormShape shape,
+                   T* grad_x, T* grad_scale, T* grad_bias, const Parallel& parallel);
 
 }  // namespace cpu
 
@@ -108,19 +109,19 @@ void residual_norm(const Sum<T>* x, const T* branch, const Sum<T>* keep, NormWei
                    Sum<T>* stats, Stream stream);
 
 template <typename T>
-void residual_norm_vjp(const Sum<T>* grad_sum, const T* grad_out, const T* branch, const Sum<T>* sum, const Sum<T>* keep,
-                       const Sum<T>* branch_weight, const Sum<T>* weight, const Sum<T>* branch_stats,
-                       const Sum<T>* stats, RowNormShape shape, Sum<T>* grad_x, T* grad_branch, Sum<T>* branch_sum,
-                       NormGrads<Sum<T>> branch_grads, NormGrads<Sum<T>> grads, const Workspace& workspace,
-                       Stream stream);
+void residual_norm_vjp(const Sum<T>* grad_sum, const T* grad_out, const T* branch, const Sum<T>* sum,
+                       const Sum<T>* keep, const Sum<T>* branch_weight, const Sum<T>* weight,
+                       const Sum<T>* branch_stats, const Sum<T>* stats, RowNormShape shape, Sum<T>* grad_x,
+                       T* grad_branch, Sum<T>* branch_sum, NormGrads<Sum<T>> branch_grads, NormGrads<Sum<T>> grads,
+                       const Workspace& workspace, Stream stream);
 
 template <typename T>
 void sum_rows(const T* x, RowNormShape shape, Sum<T>* out, const Workspace& workspace, Stream stream);
 
 // In and Out as for row_norm.
 template <typename In, typename Out>
-void norm_gelu(const In* x, const Sum<In>* mean, const Sum<In>* scale, const Sum<In>* bias, RowNormShape shape, Out* out,
-               Stream stream);
+void norm_gelu(const In* x, const Sum<In>* mean, const Sum<In>* scale, const Sum<In>* bias, RowNormShape shape,
+               Out* out, Stream stream);
 
 template <typename In, typename Out>
 void norm_gelu_vjp(const Out* grad, const In* x, const Sum<In>* mean, const Sum<In>* scale, const Sum<In>* bias,

@@ -54,8 +54,8 @@ void row_vjp(const T* g, const T* x, const T* weight, RowStats<T> stats, int64_t
   }
 }
 
-// Calls f(begin, end, sums) for chunks of rows; `sums` [n_sums, channels] starts at 0 and belongs to the chunk. Adds the
-// chunks in order to to[0], to[1], ..., where given.
+// Calls f(begin, end, sums) for chunks of rows; `sums` [n_sums, channels] starts at 0 and belongs to the chunk. Adds
+// the chunks in order to to[0], to[1], ..., where given.
 template <typename T, typename F>
 void sum_over_rows(RowNormShape shape, std::initializer_list<T*> to, const Parallel& parallel, const F& f) {
   const int64_t channels = shape.channels, grain = rows_per_chunk(channels), width = channels * std::ssize(to);
@@ -110,7 +110,8 @@ void row_norm_vjp(const T* grad, const T* x, const T* weight, const T* stats, Ro
 
 template <typename T>
 void residual_norm(const T* x, const T* branch, const T* keep, NormWeights<T> branch_norm, NormWeights<T> norm,
-                   RowNormShape shape, double eps, T* sum, T* out, T* branch_stats, T* stats, const Parallel& parallel) {
+                   RowNormShape shape, double eps, T* sum, T* out, T* branch_stats, T* stats,
+                   const Parallel& parallel) {
   const int64_t channels = shape.channels;
   parallel.range(shape.n_rows, rows_per_chunk(channels), [&](int64_t begin, int64_t end) {
     for (int64_t row = begin; row < end; ++row) {
@@ -200,8 +201,8 @@ void norm_gelu(const T* x, const T* mean, const T* scale, const T* bias, RowNorm
 }
 
 template <typename T>
-void norm_gelu_vjp(const T* grad, const T* x, const T* mean, const T* scale, const T* bias, RowNormShape shape, T* grad_x,
-                   T* grad_scale, T* grad_bias, const Parallel& parallel) {
+void norm_gelu_vjp(const T* grad, const T* x, const T* mean, const T* scale, const T* bias, RowNormShape shape,
+                   T* grad_x, T* grad_scale, T* grad_bias, const Parallel& parallel) {
   const int64_t channels = shape.channels;
   sum_over_rows<T>(shape, {grad_scale, grad_bias}, parallel, [&](int64_t begin, int64_t end, T* sums) {
     for (int64_t row = begin; row < end; ++row)

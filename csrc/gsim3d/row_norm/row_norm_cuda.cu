@@ -88,8 +88,8 @@ void row_norm(const In* x, const Sum<In>* weight, const Sum<In>* bias, const Out
   const char* op = "row_norm";
   if (shape.n_rows == 0 || shape.channels == 0) return;
   by_shape(op, shape.channels, aligned(x, weight, bias, residual, out), [&]<int kGroup, int kPacks, bool kExact>() {
-    launch(op, forward_kernel<In, Out, kGroup, kPacks, kExact>, blocks_for(op, shape.n_rows, kThreads / kGroup), kThreads,
-           0, stream, x, weight, bias, residual, shape, eps, out, stats);
+    launch(op, forward_kernel<In, Out, kGroup, kPacks, kExact>, blocks_for(op, shape.n_rows, kThreads / kGroup),
+           kThreads, 0, stream, x, weight, bias, residual, shape, eps, out, stats);
   });
 }
 
@@ -111,8 +111,8 @@ void row_norm_vjp(const Out* grad, const In* x, const Sum<In>* weight, const Sum
     S* partial = workspace.take<S>(static_cast<int64_t>(n_blocks) * 2 * shape.channels);
     launch(op, backward_kernel<In, Out, kGroup, kPacks, kExact>, n_blocks, kThreads,
            kGroups * kGroup * kPacks * kVector * sizeof(S), stream, grad, x, weight, stats, shape, grad_x, partial);
-    launch(op, reduce_kernel<S>, blocks_for(op, 2 * shape.channels, kWarp), dim3(kWarp, kReduceRows), 0, stream, partial,
-           n_blocks, 2 * shape.channels, shape.channels, RowSums<S>{{grad_weight, grad_bias}});
+    launch(op, reduce_kernel<S>, blocks_for(op, 2 * shape.channels, kWarp), dim3(kWarp, kReduceRows), 0, stream,
+           partial, n_blocks, 2 * shape.channels, shape.channels, RowSums<S>{{grad_weight, grad_bias}});
   });
 }
 

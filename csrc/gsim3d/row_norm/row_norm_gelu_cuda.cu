@@ -91,8 +91,8 @@ void by_width(const char* op, RowNormShape shape, bool aligned, const F& f) {
 }  // namespace
 
 template <typename In, typename Out>
-void norm_gelu(const In* x, const Sum<In>* mean, const Sum<In>* scale, const Sum<In>* bias, RowNormShape shape, Out* out,
-               Stream stream) {
+void norm_gelu(const In* x, const Sum<In>* mean, const Sum<In>* scale, const Sum<In>* bias, RowNormShape shape,
+               Out* out, Stream stream) {
   const char* op = "norm_gelu";
   by_width(op, shape, aligned(x, mean, scale, bias, out), [&]<int kGroup, bool kExact>(dim3 blocks) {
     launch(op, gelu_kernel<In, Out, kGroup, kExact>, blocks, kThreads, 0, stream, x, mean, scale, bias, shape, out);
@@ -114,8 +114,8 @@ void norm_gelu_vjp(const Out* grad, const In* x, const Sum<In>* mean, const Sum<
     S* partial = workspace.take<S>(static_cast<int64_t>(blocks.x) * 2 * shape.channels);
     launch(op, gelu_backward_kernel<In, Out, kGroup, kExact>, blocks, kThreads, 0, stream, grad, x, mean, scale, bias,
            shape, grad_x, partial);
-    launch(op, reduce_kernel<S>, blocks_for(op, 2 * shape.channels, kWarp), dim3(kWarp, kReduceRows), 0, stream, partial,
-           blocks.x, 2 * shape.channels, shape.channels, RowSums<S>{{grad_scale, grad_bias}});
+    launch(op, reduce_kernel<S>, blocks_for(op, 2 * shape.channels, kWarp), dim3(kWarp, kReduceRows), 0, stream,
+           partial, blocks.x, 2 * shape.channels, shape.channels, RowSums<S>{{grad_scale, grad_bias}});
   });
 }
 

@@ -68,8 +68,8 @@ struct Backward {
   Sum<T>* partial;  // [blocks, sums, channels]
 };
 
-// Rows as in row_norm's backward kernel. Sums over rows: of the branch's gradient; with kBranchNorm of its norm's weight and
-// bias; with kNorm of the other norm's.
+// Rows as in row_norm's backward kernel. Sums over rows: of the branch's gradient; with kBranchNorm of its norm's
+// weight and bias; with kNorm of the other norm's.
 template <typename T, int kGroup, int kPacks, bool kExact, bool kBranchNorm, bool kNorm>
 __global__ void __launch_bounds__(kThreads) residual_backward_kernel(const Backward<T> at) {
   using S = Sum<T>;
@@ -183,11 +183,11 @@ void residual_norm(const Sum<T>* x, const T* branch, const Sum<T>* keep, NormWei
 }
 
 template <typename T>
-void residual_norm_vjp(const Sum<T>* grad_sum, const T* grad_out, const T* branch, const Sum<T>* sum, const Sum<T>* keep,
-                       const Sum<T>* branch_weight, const Sum<T>* weight, const Sum<T>* branch_stats,
-                       const Sum<T>* stats, RowNormShape shape, Sum<T>* grad_x, T* grad_branch, Sum<T>* branch_sum,
-                       NormGrads<Sum<T>> branch_grads, NormGrads<Sum<T>> grads, const Workspace& workspace,
-                       Stream stream) {
+void residual_norm_vjp(const Sum<T>* grad_sum, const T* grad_out, const T* branch, const Sum<T>* sum,
+                       const Sum<T>* keep, const Sum<T>* branch_weight, const Sum<T>* weight,
+                       const Sum<T>* branch_stats, const Sum<T>* stats, RowNormShape shape, Sum<T>* grad_x,
+                       T* grad_branch, Sum<T>* branch_sum, NormGrads<Sum<T>> branch_grads, NormGrads<Sum<T>> grads,
+                       const Workspace& workspace, Stream stream) {
   using S = Sum<T>;
   const char* op = "residual_norm_backward";
   RowSums<S> sums{{branch_sum}};
@@ -231,8 +231,8 @@ void sum_rows(const T* x, RowNormShape shape, Sum<T>* out, const Workspace& work
   const auto run = [&]<int kGroup, bool kExact>() {
     const unsigned n_blocks = blocks_for(op, shape.n_rows, kThreads / kGroup * kRowsPerGroup);
     S* partial = workspace.take<S>(static_cast<int64_t>(n_blocks) * shape.channels);
-    launch(op, sum_kernel<T, kGroup, kExact>, dim3(n_blocks, blocks_for(op, shape.channels, kGroup * kVector)), kThreads, 0,
-           stream, x, shape, partial);
+    launch(op, sum_kernel<T, kGroup, kExact>, dim3(n_blocks, blocks_for(op, shape.channels, kGroup * kVector)),
+           kThreads, 0, stream, x, shape, partial);
     launch(op, reduce_kernel<S>, blocks_for(op, shape.channels, kWarp), dim3(kWarp, kReduceRows), 0, stream, partial,
            n_blocks, shape.channels, shape.channels, RowSums<S>{{out}});
   };
@@ -242,12 +242,12 @@ void sum_rows(const T* x, RowNormShape shape, Sum<T>* out, const Workspace& work
   else run.template operator()<kWarp, true>();
 }
 
-#define GSIM3D_INSTANTIATE(T)                                                                                           \
-  template void residual_norm<T>(const Sum<T>*, const T*, const Sum<T>*, NormWeights<Sum<T>>, NormWeights<Sum<T>>,      \
-                                 RowNormShape, double, Sum<T>*, T*, Sum<T>*, Sum<T>*, Stream);                          \
-  template void residual_norm_vjp<T>(const Sum<T>*, const T*, const T*, const Sum<T>*, const Sum<T>*, const Sum<T>*,    \
-                                     const Sum<T>*, const Sum<T>*, const Sum<T>*, RowNormShape, Sum<T>*, T*, Sum<T>*,   \
-                                     NormGrads<Sum<T>>, NormGrads<Sum<T>>, const Workspace&, Stream);                   \
+#define GSIM3D_INSTANTIATE(T)                                                                                         \
+  template void residual_norm<T>(const Sum<T>*, const T*, const Sum<T>*, NormWeights<Sum<T>>, NormWeights<Sum<T>>,    \
+                                 RowNormShape, double, Sum<T>*, T*, Sum<T>*, Sum<T>*, Stream);                        \
+  template void residual_norm_vjp<T>(const Sum<T>*, const T*, const T*, const Sum<T>*, const Sum<T>*, const Sum<T>*,  \
+                                     const Sum<T>*, const Sum<T>*, const Sum<T>*, RowNormShape, Sum<T>*, T*, Sum<T>*, \
+                                     NormGrads<Sum<T>>, NormGrads<Sum<T>>, const Workspace&, Stream);                 \
   template void sum_rows<T>(const T*, RowNormShape, Sum<T>*, const Workspace&, Stream);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(Float16)

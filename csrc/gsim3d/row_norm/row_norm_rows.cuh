@@ -33,8 +33,8 @@ struct alignas(sizeof(T) * kVector) Pack {
   T lane[kVector];
 };
 
-// A group of kGroup lanes owns a row; a lane holds kPacks times kVector of its channels. kExact: rows are whole vectors and
-// aligned, else single channels are moved.
+// A group of kGroup lanes owns a row; a lane holds kPacks times kVector of its channels. kExact: rows are whole vectors
+// and aligned, else single channels are moved.
 template <int kGroup, int kPacks, bool kExact>
 struct Layout {
   static __device__ __forceinline__ int channel(int pack, int lane) { return (pack * kGroup + lane) * kVector; }
@@ -156,7 +156,8 @@ __global__ void reduce_kernel(const S* __restrict__ partial, int64_t n_blocks, i
   __shared__ S sums[kReduceRows][kWarp + 1];
   const int64_t c = static_cast<int64_t>(blockIdx.x) * kWarp + threadIdx.x;
   S sum = 0;
-  for (int64_t block = threadIdx.y; c < width && block < n_blocks; block += kReduceRows) sum += partial[block * width + c];
+  for (int64_t block = threadIdx.y; c < width && block < n_blocks; block += kReduceRows)
+    sum += partial[block * width + c];
   sums[threadIdx.y][threadIdx.x] = sum;
   __syncthreads();
   if (threadIdx.y != 0 || c >= width) return;

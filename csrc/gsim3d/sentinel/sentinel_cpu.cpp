@@ -34,7 +34,8 @@ bool all_in_bounds(const WatchedRows<T>& rows, int64_t begin, int64_t end) {
     const T *values = rows.fields[f] + begin * rows.width[f], low = rows.low[f], high = rows.high[f];
     const int64_t n = (end - begin) * rows.width[f];
 #pragma omp simd reduction(| : out)
-    for (int64_t i = 0; i < n; ++i) out |= (values[i] >= low ? Mask{0} : Mask{1}) | (values[i] <= high ? Mask{0} : Mask{1});
+    for (int64_t i = 0; i < n; ++i)
+      out |= (values[i] >= low ? Mask{0} : Mask{1}) | (values[i] <= high ? Mask{0} : Mask{1});
   }
   return out == 0;
 }

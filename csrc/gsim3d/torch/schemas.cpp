@@ -8,12 +8,13 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   m.def("curve_encode(Tensor grid, Tensor cloud, int[] curves, int depth, int shift) -> Tensor");
   m.def("curve_sort(Tensor codes) -> (Tensor order, Tensor inverse)");
   m.def(
-      "build_pyramid(Tensor positions, Tensor cu_rows, Tensor cloud_scene, Tensor cloud_slot, Tensor origin, float grid_size, "
+      "build_pyramid(Tensor positions, Tensor cu_rows, Tensor cloud_scene, Tensor cloud_slot, Tensor origin, "
+      "float grid_size, "
       "int slot_bits, int[] strides, int[] merge_windows, int[] patch_sizes, int[] curves, int[] kernel_sizes, "
       "int[] cu_kernels, bool release, int[] capacity) -> Tensor[]");
 
-  // sparse_conv: submanifold convolution over voxels; weight [C_out, K, K, K, C_in]. A plan is the order of rows and the
-  // sources of their taps on CUDA, made once for all convolutions with a map.
+  // sparse_conv: submanifold convolution over voxels; weight [C_out, K, K, K, C_in]. A plan is the order of rows and
+  // the sources of their taps on CUDA, made once for all convolutions with a map.
   m.def(
       "sparse_conv_plan(Tensor row_voxel, Tensor voxel_rows, Tensor cu_voxel_rows, Tensor tap_in, Tensor tap_out, "
       "Tensor cu_taps, int kernel_size) -> Tensor");
@@ -25,11 +26,13 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first, Tensor? plan=None) -> Tensor");
   m.def(
       "sparse_conv_grad_weight(Tensor grad, Tensor x, int kernel_size, Tensor row_voxel, Tensor voxel_rows, "
-      "Tensor cu_voxel_rows, Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first) -> (Tensor weight, Tensor bias)");
+      "Tensor cu_voxel_rows, Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first) -> (Tensor weight, Tensor "
+      "bias)");
 
   // patch_attn: attention inside patches of a serialized order, separate query and key tables; q, k, v [N, H, D].
   m.def(
-      "patch_attention(Tensor q, Tensor k, Tensor v, Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) "
+      "patch_attention(Tensor q, Tensor k, Tensor v, Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k, float "
+      "scale) "
       "-> (Tensor out, Tensor stats)");
   m.def(
       "patch_attention_backward(Tensor grad, Tensor q, Tensor k, Tensor v, Tensor out, Tensor stats, Tensor q_rows, "
@@ -48,12 +51,14 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "row_norm(Tensor x, Tensor weight, Tensor bias, Tensor? residual, float eps, ScalarType dtype) -> (Tensor out, "
       "Tensor stats)");
   m.def(
-      "row_norm_backward(Tensor grad, Tensor x, Tensor weight, Tensor stats) -> (Tensor x, Tensor weight, Tensor bias)");
+      "row_norm_backward(Tensor grad, Tensor x, Tensor weight, Tensor stats) -> (Tensor x, Tensor weight, Tensor "
+      "bias)");
 
-  // residual_norm: sum = x + keep * norm(branch), out = norm(sum) in the dtype of branch; a norm without weight is left out.
-  // Of the gradient, branch_sum is that of a bias of the layer that made the branch.
+  // residual_norm: sum = x + keep * norm(branch), out = norm(sum) in the dtype of branch; a norm without weight is left
+  // out. Of the gradient, branch_sum is that of a bias of the layer that made the branch.
   m.def(
-      "residual_norm(Tensor x, Tensor branch, Tensor? keep, Tensor? branch_weight, Tensor? branch_bias, Tensor? weight, "
+      "residual_norm(Tensor x, Tensor branch, Tensor? keep, Tensor? branch_weight, Tensor? branch_bias, Tensor? "
+      "weight, "
       "Tensor? bias, float eps) -> (Tensor sum, Tensor out, Tensor branch_stats, Tensor stats)");
   m.def(
       "residual_norm_backward(Tensor? grad_sum, Tensor? grad_out, Tensor branch, Tensor sum, Tensor? keep, "
@@ -61,7 +66,8 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor branch_sum, Tensor branch_weight, Tensor branch_bias, Tensor weight, Tensor bias)");
   m.def("linear_grad_bias(Tensor grad) -> Tensor");
 
-  // norm_gelu: gelu((x - mean) * scale + bias), one mean, scale and bias a channel; batch normalisation and its activation.
+  // norm_gelu: gelu((x - mean) * scale + bias), one mean, scale and bias a channel; batch normalisation and its
+  // activation.
   m.def("norm_gelu(Tensor x, Tensor mean, Tensor scale, Tensor bias, ScalarType dtype) -> Tensor");
   m.def(
       "norm_gelu_backward(Tensor grad, Tensor x, Tensor mean, Tensor scale, Tensor bias) -> (Tensor x, Tensor scale, "
@@ -74,15 +80,17 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
 
   // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
   m.def(
-      "plane_sweep(Tensor features, Tensor homographies, Tensor translations, Tensor inverse_depths, Tensor src_images, "
+      "plane_sweep(Tensor features, Tensor homographies, Tensor translations, Tensor inverse_depths, Tensor "
+      "src_images, "
       "Tensor cu_src) -> Tensor");
   m.def(
-      "plane_sweep_backward(Tensor grad, Tensor features, Tensor homographies, Tensor translations, Tensor inverse_depths, "
+      "plane_sweep_backward(Tensor grad, Tensor features, Tensor homographies, Tensor translations, Tensor "
+      "inverse_depths, "
       "Tensor src_images, Tensor cu_src) -> Tensor");
 
-  // raster: 3D Gaussian projection and blending. color is [N, K, 3] SH coefficients or [N, 3]; cutoff 0 exact, 1 tile3sigma,
-  // 2 smooth; transmittance, last and state are kept for the backward pass. max_* (CUDA) size the state. unusable [I, 2]
-  // counts the rows that were left out, [0, 2] unless `watch`.
+  // raster: 3D Gaussian projection and blending. color is [N, K, 3] SH coefficients or [N, 3]; cutoff 0 exact, 1
+  // tile3sigma, 2 smooth; transmittance, last and state are kept for the backward pass. max_* (CUDA) size the state.
+  // unusable [I, 2] counts the rows that were left out, [0, 2] unless `watch`.
   m.def(
       "rasterize_gaussians(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, Tensor features, "
       "Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, int width, int height, "
@@ -92,7 +100,8 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   m.def(
       "rasterize_gaussians_backward(Tensor grad_color, Tensor grad_alpha, Tensor grad_depth, Tensor grad_features, "
       "Tensor transmittance, Tensor last, Tensor state, Tensor means, Tensor quats, Tensor scales, Tensor opacities, "
-      "Tensor color, Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, "
+      "Tensor color, Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor "
+      "cu_rows, "
       "int width, int height, float near_plane, int cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots, "
       "bool viewmats_grad) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
       "Tensor features, Tensor background, Tensor viewmats)");

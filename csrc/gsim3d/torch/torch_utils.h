@@ -1,5 +1,5 @@
-// What every *_torch.cpp needs: checks with one style of message, dtype dispatch, torch's thread pool and scratch memory.
-// Written against torch's stable ABI (TORCH_TARGET_VERSION 2.11), so one binary serves torch 2.11 and later.
+// What every *_torch.cpp needs: checks with one style of message, dtype dispatch, torch's thread pool and scratch
+// memory. Written against torch's stable ABI (TORCH_TARGET_VERSION 2.11), so one binary serves torch 2.11 and later.
 #pragma once
 
 #include <torch/csrc/stable/accelerator.h>
