@@ -2,6 +2,7 @@
 
 import ast
 import re
+import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -102,3 +103,9 @@ def test_files_stay_small():
         and (lines := len(path.read_text().splitlines())) > 600
     ]
     assert not long, long
+
+
+def test_no_folder_of_tests_is_on_the_path():
+    """Children inherit it: there a module of tests would hide one of the standard library that has its name."""
+    folder = (ROOT / "tests").resolve()
+    assert not [place for place in sys.path if place and Path(place).resolve().is_relative_to(folder)]

@@ -3,10 +3,11 @@
     gsim3d generate elastic --preset mini --out runs/data
     python tools/cut_gradients.py --data runs/data --out runs/cut --device cuda
 
-The release wraps attention, MLPs and the depth predictor in re-entrant checkpoints, which pass on no gradient of tensors inside
-dictionaries: attention and MLP of every block, their norms and the latents of the encoder keep their random first values. Here
-these branches are detached, which has the same effect, in one run of each pair; both runs of a pair have the same first weights
-and see the same samples in the same order. Stopped and started again, it goes on where it was.
+The release wraps attention, MLPs and the depth predictor in re-entrant checkpoints, which pass on no gradient of
+tensors inside dictionaries: attention and MLP of every block, their norms and the latents of the encoder keep their
+random first values. Here these branches are detached, which has the same effect, in one run of each pair; both runs
+of a pair have the same first weights and see the same samples in the same order. Stopped and started again, it goes
+on where it was.
 """
 
 import argparse

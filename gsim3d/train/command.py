@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         say = print if processes.is_first else lambda *_: None
         trainer = Trainer(config, scenes, args.out, device=args.device, processes=processes)
         if trainer.step:
-            came = "" if trainer.same_scenes else "; with scenes that came since, so not as it would have gone on without them"
+            came = "" if trainer.same_scenes else "; scenes have come since, so the curve is another one from here on"
             say(f"going on from step {trainer.step} of {config.n_steps}{came}")
         trainer.run(until=args.until, tensorboard=args.tensorboard, profile=args.profile)
         say(f"trained to step {trainer.step} of {config.n_steps}: {args.out}")

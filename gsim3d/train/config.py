@@ -55,7 +55,7 @@ class DataConfig:
     shortest_history: every optimizer step draws its number of encoded steps from here to ``history``, so that one model
         serves them all; 0: always ``history``. A stage with a history of its own keeps that.
     context_views: input images of each step.
-    fewest_views: every optimizer step draws its number of input images from here to ``context_views``; 0: always as many.
+    fewest_views: every optimizer step draws its number of input images from here to ``context_views``; 0: always all.
     context_cameras: the cameras they come from; empty: all but ``target_only_cameras``.
     target_only_cameras: cameras that are never an input; a loss may look at them.
     background_stride: of pixels that show what never moves, those on every n-th row and column become particles.

@@ -59,13 +59,13 @@ class Trainer:
 
     Args:
         config: the run. A folder that already has a checkpoint must have been started with the same one.
-        scenes: to train on, in a fixed order. More may come between two sittings, none may go; ``same_scenes`` says whether
-            some came, for then the curve goes on as another one.
+        scenes: to train on, in a fixed order. More may come between two sittings, none may go; ``same_scenes`` is False
+            where some came, for then the curve goes on as another one.
         out: run folder, made if absent.
         device: "cpu" or "cuda". A run may change it between two sittings; its numbers then change by rounding.
-        processes: those that train together, see :func:`gsim3d.train.processes.joined`; each has a Trainer of its own, and
-            the first one writes. Another number of them changes numbers by rounding, and what is drawn for drop path and
-            shuffled curves; batch normalisation counts the rows of all.
+        processes: those that train together, see :func:`gsim3d.train.processes.joined`; each has a Trainer of its own,
+            and the first one writes. Another number of them changes numbers by rounding, and what is drawn for drop
+            path and shuffled curves; batch normalisation counts the rows of all.
     """
 
     def __init__(
@@ -115,9 +115,9 @@ class Trainer:
         self.processes.check_agreement(
             **{"CONFIG": self.config, "--out": (self.step, self.parent), "--data": [s.name for s in self.scenes]}
         )
-        # Parts without gradients (the dynamics, in a stage that simulates nothing) are searched for in each step. Then torch
-        # also leaves its buckets as they are: it would order them anew after the first step, and a resumed run would add in
-        # another order. A group of its own, because batch normalisation talks at the same time.
+        # Parts without gradients (the dynamics, in a stage that simulates nothing) are searched for in each step. Then
+        # torch also leaves its buckets as they are: it would order them anew after the first step, and a resumed run
+        # would add in another order. A group of its own, because batch normalisation talks at the same time.
         group = torch.distributed.new_group()
         # What torch 2.13 warns about has no other name in 2.11.
         with warnings.catch_warnings(category=FutureWarning, action="ignore"):
@@ -167,8 +167,8 @@ class Trainer:
     def train_step(self) -> dict:
         """One optimizer step; what to log of it.
 
-        Where loss or gradient is not finite, or a number cannot be used, the step is skipped: weights, moments, averages
-        and statistics stay as they are.
+        Where loss or gradient is not finite, or a number cannot be used, the step is skipped: weights, moments,
+        averages and statistics stay as they are.
         """
         stage, place = self.config.stage_of(self.step)
         rate = one_cycle(place, stage.steps, stage.learning_rate, stage.warm_up)
@@ -260,8 +260,9 @@ class Trainer:
         found = checkpoint.exists(self.out)
         good = f"its last checkpoint in {self.out}" if found else "its start: no checkpoint was written yet"
         raise HardCaseError(
-            f"training: {n} steps in a row were skipped up to step {entry['step']}, the last because {entry['skipped']}; "
-            f"lower stages.learning_rate or optimizer.clip_norm and train again: the run goes on from {good}",
+            f"training: {n} steps in a row were skipped up to step {entry['step']}, "
+            f"the last because {entry['skipped']}; lower stages.learning_rate or optimizer.clip_norm and train again: "
+            f"the run goes on from {good}",
             step=entry["step"],
         )
 
@@ -289,7 +290,7 @@ class Trainer:
         """As :meth:`_gradients`, but gradients are those of the samples of all processes; and how many samples are this
         one's, and what is wrong with them, or None."""
         stage, _ = self.config.stage_of(self.step)
-        # One that raises in the middle of a step leaves the others waiting: what cannot be used is dropped, and told behind.
+        # One that raises within a step leaves the others waiting: what cannot be used is dropped, and told afterwards.
         watch, error = StepWatch(strict=self.simulator.config.stability.on_bad == "raise"), None
         try:
             loss, errors = self.shared(self._batch(samples), samples[0], watch)
@@ -319,7 +320,7 @@ class Trainer:
         return draw_batch(self.scenes, self.config.data, stage, self.config.seed, step, samples)
 
     def loss(self, batch: Batch, sample: int = 0, watch: StepWatch | None = None) -> tuple[Tensor, Tensor]:
-        """The loss of a batch, and the unweighted mean squared error of each step; ``sample`` numbers the randomness."""
+        """The loss of a batch, and each step's unweighted mean squared error; ``sample`` numbers the randomness."""
         watch = watch or StepWatch()
         loss_config, targets = self.config.loss, batch.targets
         images = self._images(batch, sample, watch)
@@ -439,8 +440,8 @@ class Trainer:
         known = saved.state.get("scenes", names)
         if missing := sorted(set(known) - set(names)):
             raise InputError(
-                f"{self.out}: was trained on {len(missing)} scenes that are not given now, such as {missing[0]}; give the same "
-                "ones, or more, or use another folder"
+                f"{self.out}: was trained on {len(missing)} scenes that are not given now, such as {missing[0]}; "
+                "give the same ones, or more, or use another folder"
             )
         self.same_scenes = known == names
         self.simulator.load_state_dict(saved.model)
@@ -468,7 +469,7 @@ class Trainer:
 
 
 class _Loss(nn.Module):
-    """The loss as a module that holds the model, as torch wants it; without a batch a zero in which all weights have a part."""
+    """The loss as a module that holds the model, as torch wants it; without a batch a zero with all weights in it."""
 
     def __init__(self, trainer: Trainer):
         super().__init__()

@@ -20,8 +20,8 @@ Precision = Literal["fp32", "bf16", "fp16"]
 class PrecisionConfig:
     """What matrix products, convolutions and attention of each part read: "fp32", "bf16" or "fp16".
 
-    Weights, the residual stream, norms, positions, depths, curve codes, splats, losses, sums and the optimizer are float32
-    throughout. With "fp16" anywhere the loss is scaled, see :class:`LossScale`.
+    Weights, the residual stream, norms, positions, depths, curve codes, splats, losses, sums and the optimizer are
+    float32 throughout. With "fp16" anywhere the loss is scaled, see :class:`LossScale`.
     """
 
     encoder: Precision = "fp32"

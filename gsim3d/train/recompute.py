@@ -1,4 +1,4 @@
-"""Parts of a training step that are computed again in the backward pass instead of being kept: less memory, same bits."""
+"""Parts of a training step that the backward pass computes again instead of keeping them: less memory, same bits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The experiment on cut gradients: exactly what the published checkpoints leave untrained is cut, and the table is written."""
+"""The experiment on cut gradients: what the published checkpoints leave untrained is cut, and the table is written."""
 
 import importlib.util
 import json

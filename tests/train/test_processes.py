@@ -1,4 +1,4 @@
-"""Several processes: the curve of one process for the same batches, exact resuming, and a skip of one is a skip of all."""
+"""Several processes: the curve of one for the same batches, exact resuming, and a skip of one is a skip of all."""
 
 import dataclasses
 import json
@@ -32,8 +32,8 @@ LAYER = dataclasses.replace(CONFIG, stages=STAGES)
 BATCH = dataclasses.replace(LAYER, model={"dynamics": {"norm": "batch", "zero_init": False}}, recompute=("steps",))
 UNEVEN = dataclasses.replace(LAYER, stages=(dataclasses.replace(STAGES[1], batch=3),))
 RUNS = {"layer": LAYER, "batch": BATCH, "uneven": UNEVEN}
-# float32: a batch is added in another order, and AdamW turns a gradient near zero into a step of full size. Relative; worst
-# on an AMD EPYC: loss 3e-7, norms 8e-6, distance of the weights over the way they went 3e-4.
+# float32: a batch is added in another order, and AdamW turns a gradient near zero into a step of full size. Relative;
+# worst on an AMD EPYC: loss 3e-7, norms 8e-6, distance of the weights over the way they went 3e-4.
 TOLERANCE = {"loss": 1e-5, "grad_norm": 1e-4, "grad_norm_by_module": 1e-4, "grad_norm_by_step": 1e-4, "weights": 0.01}
 
 

@@ -1,11 +1,12 @@
 """Time and memory of a whole training step on synthetic batches of true size.
 
-    python tools/bench/training.py --device cuda                                          # paper_latent, 4-1-12, batch 4
-    torchrun --nproc-per-node 4 tools/bench/training.py --device cuda --case recomputed   # the same batch for each process
+    python tools/bench/training.py --device cuda                                         # paper_latent, 4-1-12, batch 4
+    torchrun --nproc-per-node 4 tools/bench/training.py --device cuda --case recomputed  # this batch for each process
 
-The step is the one of `gsim3d train`: encode, 12 steps fed back, images of 5 views at all 16 steps, gradients, clipping, AdamW.
-A ball falls on a ground disc, seen by 12 cameras; masked means that pixels of neither are no particles. With several processes
-every one gets ``--batch`` scenes, so that the time of a step against that of one process is the efficiency of scaling.
+The step is the one of `gsim3d train`: encode, 12 steps fed back, images of 5 views at all 16 steps, gradients,
+clipping, AdamW. A ball falls on a ground disc, seen by 12 cameras; masked means that pixels of neither are no
+particles. With several processes every one gets ``--batch`` scenes, so that the time of a step against that of one
+process is the efficiency of scaling.
 """
 
 import argparse
