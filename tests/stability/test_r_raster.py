@@ -17,6 +17,7 @@ from tests.stability.packed import (
     without_rows,
 )
 from tests.stability.rollouts import raised
+from tests.stability.setting import NAMES
 
 NAN, INF = float("nan"), float("inf")
 CENTRE = (1 / 16, 1 / 16, 2.0)  # projects onto the centre of pixel (8, 8) of facing(...)
@@ -118,6 +119,12 @@ def check_refused(setting, measured, name: str, value: float) -> None:
 @pytest.mark.parametrize("scale", [2e15, 3e38])
 def test_r07_a_scale_beyond_the_numbers(setting, measured, scale):
     check_refused(setting, measured, "scales", scale)
+
+
+@pytest.mark.parametrize("setting", NAMES[1:], indirect=True)
+def test_r07_an_image_beyond_the_numbers(setting, measured):
+    """The scale can be used, its projection overflows in float32."""
+    check_refused(setting, measured, "scales", 9e14)
 
 
 PLACES = {
