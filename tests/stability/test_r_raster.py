@@ -149,6 +149,13 @@ def test_r09_straddling_the_near_plane(setting, measured, z):
     assert result.grads["color"][1].abs().max() > 0
 
 
+def test_r09_far_beside_the_image(setting, measured):
+    """A centre outside of the camera's field whose Gaussian reaches into it: the Jacobian is that at the margin."""
+    scene = change(change(three(), "means", 1, torch.tensor([3.0, -2.0, 1.0])), "scales", 1, 1.5)
+    result = check_against_oracle(setting, measured, scene)
+    assert result.grads["color"][1].abs().max() > 0
+
+
 def test_r10_camera_inside_an_object(setting, measured):
     g = torch.Generator().manual_seed(0)
     means = torch.nn.functional.normalize(torch.randn(300, 3, generator=g), dim=-1)
