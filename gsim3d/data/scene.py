@@ -226,6 +226,6 @@ def _depths(recording: Recording) -> tuple[float, float]:
                 "would tell how far the scene is"
             )
         near, far = near or guessed[0], far or guessed[1]
-    if far <= near:
+    if not 0 < np.float32(near) < np.float32(far):  # as cameras hold them
         raise InputError(f"{recording.source}: far must lie beyond near; got near {near:g} and far {far:g}")
     return near, far

@@ -110,8 +110,18 @@ def restore(path: str | Path, device: str = "cpu") -> Restored:
     """
     check_device(device)
     saved = checkpoint.load(path)
+    try:
+        return _restored(path, saved, device)
+    except InputError:
+        raise
+    except Exception as error:  # a configuration that describes no model raises anything
+        said = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: its configuration describes no model: {type(error).__name__}: {said}") from None
+
+
+def _restored(path: str | Path, saved: checkpoint.Checkpoint, device: str) -> Restored:
     data = dict(saved.config["data"])
-    image_size = tuple(data.pop("image_size", ()))
+    image_size = tuple(data.pop("image_size", None) or ())
     if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
         data.pop("near_far")
     if len(image_size) != 2 or not all(isinstance(size, int) for size in image_size):

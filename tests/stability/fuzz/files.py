@@ -73,7 +73,7 @@ def _change(content: Any, rng: random.Random) -> str:
     if action == 0:
         del place[key]
         return f"{path} removed"
-    if action == 1 and isinstance(value, (int, float)) and not isinstance(value, bool):
+    if action == 1 and isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
         place[key] = rng.choice((value * -1, value * 1e6, value + 0.5, value * 0))
     elif action == 2 and isinstance(value, list):
         place[key] = rng.choice((value[:-1], value + value[-1:], value * 3, value[::-1]))
