@@ -17,6 +17,7 @@ from tests.stability.packed import (
     without_rows,
 )
 from tests.stability.rollouts import raised
+from tests.stability.setting import NAMES
 
 NAN, INF = float("nan"), float("inf")
 CENTRE = (1 / 16, 1 / 16, 2.0)  # projects onto the centre of pixel (8, 8) of facing(...)
@@ -120,6 +121,12 @@ def test_r07_a_scale_beyond_the_numbers(setting, measured, scale):
     check_refused(setting, measured, "scales", scale)
 
 
+@pytest.mark.parametrize("setting", NAMES[1:], indirect=True)
+def test_r07_an_image_beyond_the_numbers(setting, measured):
+    """The scale can be used, its projection overflows in float32."""
+    check_refused(setting, measured, "scales", 9e14)
+
+
 PLACES = {
     "at the camera": (0.0, 0.0, 0.0),
     "on its plane": (0.3, -0.2, 0.0),
@@ -145,6 +152,13 @@ def test_r09_behind_the_near_plane(setting, measured, place):
 def test_r09_straddling_the_near_plane(setting, measured, z):
     """The centre is beyond the plane, half of the Gaussian is not."""
     scene = change(three(), "means", 1, torch.tensor([0.001, 0.002, z]))
+    result = check_against_oracle(setting, measured, scene)
+    assert result.grads["color"][1].abs().max() > 0
+
+
+def test_r09_far_beside_the_image(setting, measured):
+    """A centre outside of the camera's field whose Gaussian reaches into it: the Jacobian is that at the margin."""
+    scene = change(change(three(), "means", 1, torch.tensor([3.0, -2.0, 1.0])), "scales", 1, 1.5)
     result = check_against_oracle(setting, measured, scene)
     assert result.grads["color"][1].abs().max() > 0
 
