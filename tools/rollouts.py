@@ -41,7 +41,7 @@ head that moves particles by centimetres a step; "demo": what `gsim3d demo` trai
 Bounded is not right: long after the horizon that it was trained on, the demo's model lets bodies sink through the
 ground. A particle that leaves the workspace (here 1.4 m below the origin) falls asleep by rule, no longer awake;
 when the last moving one has left, the energy is 0. These models hold opacities, so their mass cannot drift.
-Metres, metres a step; from the first to the last step where there are two numbers. `tests/stability/test_long_rollouts.py`
+Metres, metres a step; from the first step to the last where there are two. `tests/stability/test_long_rollouts.py`
 and case D42 of [stability.md](stability.md) assert that speed, energy, extent and opacity stay bounded.
 
 ![Energy and opacity over a rollout](rollouts.png)
