@@ -173,9 +173,13 @@ def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     bad = dataclasses.replace(state, means=means)
     name = particle_name(state, state.n_rows - 1)
     scene = int(state.cloud_scene[-1])
-    yield _refuses(
-        "a particle that is no number", lambda: simulator.rollout(bad, 1, sample.plan, on_bad="raise"), f"scene {scene}"
-    )
+
+    def rollout() -> None:
+        report = StabilityReport()
+        simulator.rollout(bad, 1, sample.plan, on_bad="raise", report=report)
+        report.check()  # a GPU is not waited for before
+
+    yield _refuses("a particle that is no number", rollout, f"scene {scene}")
     steps = simulator.rollout(bad, sample.n_steps, sample.plan, on_bad="drop", report=StabilityReport())
     yield from _finite(f"on_bad='drop' with {name} no number: rollout's", steps[-1])
     if sample.n_scenes > 1 and simulator.config.dynamics.origin_of_scene:

@@ -204,5 +204,5 @@ def test_cuda_graph(devices, dtype):
 
 def test_tables_must_be_on_the_device_of_the_queries(devices):
     case = random_case(dtype=torch.float32)
-    with pytest.raises(ValueError, match="q_rows must be on cuda:0"):
+    with pytest.raises(TypeError, match="q_rows is on cpu, but q on cuda:0"):
         dataclasses.replace(case.to(devices[1]), table=case.table).attend()
