@@ -65,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
     if args.export and (not args.export.endswith(".safetensors") or not Path(args.export).absolute().parent.is_dir()):
         raise InputError(f"--export must name a .safetensors file in a folder that exists; got {args.export}")
     folders, _ = split_scenes(find_scenes(args.data))
+    if args.cache:
+        Path(args.cache).mkdir(parents=True, exist_ok=True)  # a folder that cannot be is told before work begins
     scenes = [Scene.open(folder, cache_dir=args.cache, fitting=config.data.fitting) for folder in folders]
 
     from gsim3d.train.loop import Trainer

@@ -5,12 +5,15 @@ import re
 
 import pytest
 
+from gsim3d.__main__ import COMMANDS
+from tests.stability.fuzz import commands
 from tests.stability.fuzz.engine import Outcome, make_case, replay, run, targets
 from tests.stability.fuzz.ops import OPS, public_ops
 from tests.stability.fuzz.readers import READERS
 
 FEW, PER_OP = 25, 2000  # inputs of each op in the fast tests, and in the full ones
 FEW_FILES, PER_READER = 4, 500  # damaged files of each reader, likewise
+FEW_COMMANDS, PER_COMMAND = 4, 200  # wrong arguments of each command, likewise
 
 
 def assert_none_failed(outcomes: list[Outcome], count: int) -> None:
@@ -55,6 +58,21 @@ def test_readers_answer_a_few_files(tmp_path):
 @pytest.mark.parametrize("quarter", range(4))
 def test_readers_answer_hundreds_of_files(quarter, tmp_path):
     assert_all_answered(run(sorted(READERS)[quarter::4], PER_READER, out=tmp_path), PER_READER)
+
+
+def test_every_command_is_fuzzed():
+    assert {f"command-{name}" for name in COMMANDS} == {target.name for target in commands.TARGETS}
+
+
+def test_commands_refuse_a_few_wrong_arguments(tmp_path):
+    assert_none_failed(
+        run([target.name for target in commands.TARGETS], FEW_COMMANDS, seed=1, out=tmp_path), FEW_COMMANDS
+    )
+
+
+@pytest.mark.slow
+def test_commands_refuse_hundreds_of_wrong_arguments(tmp_path):
+    assert_none_failed(run([target.name for target in commands.TARGETS], PER_COMMAND, out=tmp_path), PER_COMMAND)
 
 
 MISBEHAVIOUR = {

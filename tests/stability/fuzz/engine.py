@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[3]
 MEMORY = 2**30  # bytes of address space that inputs may take beyond what the loaded libraries have
 PATIENCE = 30.0  # seconds
 PROGRESS = struct.Struct("<qq")  # number of the job, number of the input
-GROUPS = ("ops", "readers", "misbehaving")  # modules of this package with TARGETS
+GROUPS = ("ops", "readers", "commands", "misbehaving")  # modules of this package with TARGETS
 
 
 @dataclass(frozen=True)
