@@ -2,8 +2,9 @@
 """Long rollouts and the gradients through them: writes docs/rollouts.md and docs/rollouts.png.
 
 python -m gsim3d demo --out runs/demo
-python tools/rollouts.py --checkpoint runs/demo/model.safetensors --data runs/demo/data
+python tools/rollouts.py --demo runs/demo
 
+Also trains `small` on the demo's scenes for a few minutes, into runs/demo/small; stopped and started again, it goes on.
 Every model starts from generated scenes; each image is thinned to a few particles: a thousand steps take a minute.
 """
 
@@ -20,25 +21,27 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 from gsim3d import presets  # noqa: E402
 from gsim3d.check_stability import Subject, open_subject, sample_of_scenes  # noqa: E402
-from gsim3d.data import find_scenes  # noqa: E402
+from gsim3d.data import Scene, find_scenes, split_scenes  # noqa: E402
+from gsim3d.demo import DemoConfig  # noqa: E402
 from gsim3d.endurance import Curves, gradient_norms, rollout_curves  # noqa: E402
 from gsim3d.evaluate.pictures import pyplot  # noqa: E402
 from gsim3d.laws import Sample  # noqa: E402
+from gsim3d.train.loop import Trainer  # noqa: E402
 from gsim3d.train.restore import build_simulator  # noqa: E402
 
 HORIZONS = (12, 48)  # steps that gradients are taken through
+SMALL_STEPS = (60, 20)  # of training `small`: from a history of 2 to the next step, and to the third
 EVERY = 32  # one of so many kept pixels becomes a particle
 PAGE, PICTURE = ROOT / "docs" / "rollouts.md", ROOT / "docs" / "rollouts.png"
 TEXT = """# Long rollouts
 
-Written by `python tools/rollouts.py --checkpoint runs/demo/model.safetensors --data runs/demo/data` after
-`gsim3d demo --out runs/demo`; do not edit.
+Written by `python tools/rollouts.py --demo runs/demo` after `gsim3d demo --out runs/demo`; do not edit.
 
 {n_steps} steps from two generated scenes ({particles} particles in all). "random": weights as they are drawn, with a
-head that moves particles by centimetres a step; "demo": what `gsim3d demo` trained on a few steps. Nobody trained
-`small` here: its weights are random.
+head that moves particles by centimetres a step; "tiny, demo": what `gsim3d demo` trained; "small, demo": `small` after
+{small_steps} steps on the same scenes (a day on a GPU is what it is made for).
 
-Bounded is not right: long after the horizon that it was trained on, the demo's model lets bodies sink through the
+Bounded is not right: long after the horizon that they were trained on, these models let bodies sink through the
 ground. A particle that leaves the workspace (here 1.4 m below the origin) falls asleep by rule, no longer awake;
 when the last moving one has left, the energy is 0. These models hold opacities, so their mass cannot drift.
 Metres, metres a step; from the first step to the last where there are two. `tests/stability/test_long_rollouts.py`
@@ -68,6 +71,17 @@ def random_subject(preset: str) -> Subject:
     with torch.no_grad():
         simulator.dynamics.net.head.fc2.weight.normal_(std=0.1)
     return Subject(simulator.eval(), {"preset": preset})
+
+
+def trained_small(demo: Path) -> Subject:
+    train = DemoConfig().train
+    stages = tuple(dataclasses.replace(s, steps=n) for s, n in zip(train.stages, SMALL_STEPS, strict=False))
+    config = dataclasses.replace(train, preset="small", stages=stages, checkpoint_every=10)
+    folders, _ = split_scenes(find_scenes(demo / "data"))
+    trainer = Trainer(config, [Scene.open(folder) for folder in folders], demo / "small")
+    if trainer.step < config.n_steps:
+        trainer.run()
+    return open_subject(demo / "small")
 
 
 def thinned(sample: Sample) -> Sample:
@@ -111,16 +125,19 @@ def draw(curves: dict[str, Curves]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--checkpoint", type=Path, required=True, help="the demo's model")
-    parser.add_argument("--data", type=Path, required=True, help="the demo's scenes")
+    parser.add_argument("--demo", type=Path, required=True, help="what gsim3d demo wrote")
     parser.add_argument("--steps", type=int, default=1000)
     args = parser.parse_args()
+    subjects = {
+        "tiny, random": random_subject("tiny"),
+        "tiny, demo": open_subject(args.demo / "model.safetensors"),
+        "small, random": random_subject("small"),
+        "small, demo": trained_small(args.demo),
+    }
     torch.set_num_threads(1)  # such small tensors gain nothing from more
-    subjects = {"tiny, random": random_subject("tiny"), "demo": open_subject(args.checkpoint)}
-    subjects["small, random"] = random_subject("small")
     curves, rollouts, gradients, particles = {}, [], [], 0
     for name, subject in subjects.items():
-        sample, problems = sample_of_scenes(subject, find_scenes(args.data))
+        sample, problems = sample_of_scenes(subject, find_scenes(args.demo / "data"))
         assert not problems, problems
         sample, simulator = thinned(sample), subject.simulator
         state = simulator.encode(sample.frames).detach()
@@ -138,7 +155,7 @@ def main() -> None:
     draw(curves)
     tables = {"rollouts": "\n".join(rollouts), "gradients": "\n".join(gradients)}
     part = PAGE.with_name(f".{PAGE.name}.part")
-    part.write_text(TEXT.format(n_steps=args.steps, particles=particles, **tables))
+    part.write_text(TEXT.format(n_steps=args.steps, particles=particles, small_steps=sum(SMALL_STEPS), **tables))
     os.replace(part, PAGE)
 
 
