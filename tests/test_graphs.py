@@ -214,12 +214,17 @@ def test_a_graph_of_gradients(devices):
         optimizer.step()  # the next replay reads other weights
 
 
-def test_a_graph_of_gradients_rounds_weights_that_have_changed(devices):
-    simulator = make_simulator(devices[1], torch.float32).train()
-    history = make_state(device=devices[1], dtype=torch.float32)
+def float32_training(device):
+    """(dynamics, history, capacity for it) to train in float32."""
+    dynamics = make_simulator(device, torch.float32).train().dynamics
+    history = make_state(device=device, dtype=torch.float32)
     history = history.with_clouds(history.clouds)
-    dynamics, parameters = simulator.dynamics, list(simulator.dynamics.parameters())
-    capacity = PyramidCapacity.of(dynamics.geometry(history), history.n_rows, 2)
+    return dynamics, history, PyramidCapacity.of(dynamics.geometry(history), history.n_rows, 2)
+
+
+def test_a_graph_of_gradients_rounds_weights_that_have_changed(devices):
+    dynamics, history, capacity = float32_training(devices[1])
+    parameters = list(dynamics.parameters())
 
     def gradients():
         with torch.autocast("cuda", torch.bfloat16):
@@ -236,11 +241,8 @@ def test_a_graph_of_gradients_rounds_weights_that_have_changed(devices):
 
 
 def test_a_graph_of_gradients_inside_an_autocast_that_has_rounded_weights(devices):
-    simulator = make_simulator(devices[1], torch.float32).train()
-    history = make_state(device=devices[1], dtype=torch.float32)
-    history = history.with_clouds(history.clouds)
-    dynamics, parameters = simulator.dynamics, list(simulator.dynamics.parameters())
-    capacity = PyramidCapacity.of(dynamics.geometry(history), history.n_rows, 2)
+    dynamics, history, capacity = float32_training(devices[1])
+    parameters = list(dynamics.parameters())
 
     def gradients():
         step = dynamics(history, pyramid=dynamics.geometry(history, capacity=capacity))

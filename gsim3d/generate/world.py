@@ -7,6 +7,7 @@ import hashlib
 import importlib
 import json
 import zlib
+from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,7 +53,7 @@ class Actor:
 
 
 @dataclass(frozen=True)
-class World:
+class World(ABC):
     """Options of a data set. Lengths in metres, times in seconds; pairs are ranges that every trajectory draws from."""
 
     n_trajectories: int = 34  # the usual split keeps 30 for training and 4 for tests
@@ -266,9 +267,9 @@ class World:
             return self.n_frames / self.fps / 2
         return (lift + np.sqrt(lift**2 + 2 * GRAVITY * drop)) / GRAVITY
 
+    @abstractmethod
     def _make_body(self, vertices, faces, velocity, spin, rng) -> tuple[SoftBody | RigidBody, dict]:
         """The body with its collision mesh at time 0, and what metadata.json tells of it."""
-        raise NotImplementedError
 
     def _draw_cloth(self, rng: np.random.Generator) -> Cloth | None:
         return None

@@ -121,14 +121,7 @@ void row_norm_vjp(const Out* grad, const In* x, const Sum<In>* weight, const Sum
                                   double, Out*, Sum<In>*, Stream);                                            \
   template void row_norm_vjp<In, Out>(const Out*, const In*, const Sum<In>*, const Sum<In>*,           \
                                       RowNormShape, In*, Sum<In>*, Sum<In>*, const Workspace&, Stream);
-GSIM3D_INSTANTIATE(float, float)
-GSIM3D_INSTANTIATE(float, Float16)
-GSIM3D_INSTANTIATE(float, BFloat16)
-GSIM3D_INSTANTIATE(Float16, float)
-GSIM3D_INSTANTIATE(Float16, Float16)
-GSIM3D_INSTANTIATE(BFloat16, float)
-GSIM3D_INSTANTIATE(BFloat16, BFloat16)
-GSIM3D_INSTANTIATE(double, double)
+GSIM3D_ROW_NORM_TYPES(GSIM3D_INSTANTIATE)
 #undef GSIM3D_INSTANTIATE
 
 }  // namespace gsim3d::cuda

@@ -6,6 +6,11 @@
 #include "gsim3d/core/half.h"
 #include "gsim3d/row_norm/row_norm_math.h"
 
+// apply(In, Out) for the types of rows and results that row_norm and norm_gelu take.
+#define GSIM3D_ROW_NORM_TYPES(apply)                                                               \
+  apply(float, float) apply(float, Float16) apply(float, BFloat16) apply(Float16, float)           \
+  apply(Float16, Float16) apply(BFloat16, float) apply(BFloat16, BFloat16) apply(double, double)
+
 namespace gsim3d::cuda {
 namespace {
 
