@@ -22,7 +22,17 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from gsim3d.dynamics import Dynamics, append_step, concatenate, last_steps, rollout
+from gsim3d.dynamics import (
+    Background,
+    Dynamics,
+    RestLog,
+    Sleepers,
+    append_step,
+    concatenate,
+    last_steps,
+    rollout,
+    rollout_in_parts,
+)
 from gsim3d.effects import EffectsSpec, Plan, make_plan
 from gsim3d.encoder import Encoder, pixel_rows
 from gsim3d.guards import drop_rows, guard_frames, guard_particles
@@ -97,7 +107,8 @@ class Simulator(nn.Module):
         """
         plan, guard = plan or self.plan(), self._guard("step", on_bad, report)
         state = guard(self.prepare(state, plan))
-        return append_step(state, self._predict(state, plan, generator, guard), plan.history)
+        step = self._predict(state, plan=plan, generator=generator, guard=guard)
+        return append_step(state, step, plan.history)
 
     def rollout(
         self,
@@ -110,6 +121,7 @@ class Simulator(nn.Module):
         report: StabilityReport | None = None,
         geometry: Callable[[Particles], Pyramid] | None = None,
         wrap: Callable[[Callable], Callable] | None = None,
+        log: RestLog | None = None,
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
 
@@ -119,11 +131,24 @@ class Simulator(nn.Module):
         Args:
             geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
             wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
+            log: is told which rows rested and were not computed.
         """
         plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
         predict = predict if wrap is None else wrap(predict)
-        return rollout(predict, guard(self.prepare(state, plan)), n_steps, plan.history)
+        state = guard(self.prepare(state, plan))
+        config, rule = self.config.dynamics, plan.sleep
+        if rule is None and not config.is_asymmetric:
+            return rollout(predict, state, n_steps, plan.history)
+        return rollout_in_parts(
+            predict,
+            state,
+            n_steps,
+            plan.history,
+            remember=partial(self.dynamics.remember, generator=generator) if config.is_asymmetric else None,
+            sleepers=None if rule is None else Sleepers(rule, last_steps(state, 1), config.grid_size, plan.history),
+            log=log,
+        )
 
     def prepare(self, state: Particles, plan: Plan) -> Particles:
         """What the dynamics reads of ``state``: its last steps, with the background as the plan wants it."""
@@ -198,13 +223,19 @@ class Simulator(nn.Module):
     def _predict(
         self,
         state: Particles,
+        background: Background | None = None,
+        *,
         plan: Plan,
         generator: torch.Generator | None,
         guard: Callable[..., Particles],
         geometry: Callable[[Particles], Pyramid] | None = None,
     ) -> Particles:
-        """The next steps of every scene, guarded, without the changes that the plan leaves out."""
-        step = self.dynamics(state, generator=generator, pyramid=None if geometry is None else geometry(state))
+        """The next steps of every scene, guarded, without the changes that the plan leaves out.
+
+        background: what rests while ``state`` moves; None: what there is is in the state.
+        """
+        pyramid = None if geometry is None else geometry(state)
+        step = self.dynamics(state, generator=generator, pyramid=pyramid, background=background)
         appearance = plan.spec.appearance
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
         if appearance.changing != "all":
