@@ -33,11 +33,12 @@ from gsim3d.dynamics import (
     rollout,
     rollout_in_parts,
 )
-from gsim3d.effects import EffectsSpec, Plan, make_plan
+from gsim3d.effects import EffectsSpec
 from gsim3d.encoder import Encoder, pixel_rows
 from gsim3d.guards import drop_rows, guard_frames, guard_particles
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
+from gsim3d.plans import Plan, make_plan, unused_parameters
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
 from gsim3d.renderer import GaussianHead, render, render_as_published
@@ -74,20 +75,9 @@ class Simulator(nn.Module):
         Raises:
             UnsupportedEffect: this model cannot simulate an effect of ``spec``.
         """
-        dynamics, renderer = self.config.dynamics, self.config.renderer
-        plan = make_plan(
-            spec,
-            history=2**dynamics.history_bits,
-            sh_degree=renderer.sh_degree,
-            changes_opacity=dynamics.explicit,
-        )
-        merged = dynamics.pyramid_spec(dynamics.history_bits).merged_bits()
-        unused = [
-            f"dynamics.net.encoder.{s}.merge.time_embedding"
-            for s, stage in enumerate(self.dynamics.net.encoder)
-            if stage.merge is not None and merged[s] == 0
-        ]
-        return dataclasses.replace(plan, unused=tuple(unused))
+        plan = make_plan(spec, self.config)
+        names = (name for name, _ in self.named_parameters())
+        return dataclasses.replace(plan, unused=unused_parameters(plan, self.config, names))
 
     def step(
         self,
@@ -137,7 +127,7 @@ class Simulator(nn.Module):
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
         predict = predict if wrap is None else wrap(predict)
         state = guard(self.prepare(state, plan))
-        config, rule = self.config.dynamics, plan.sleep
+        config, rule = self.config.dynamics, plan.spec.dynamics.sleep
         if rule is None and not config.is_asymmetric:
             return rollout(predict, state, n_steps, plan.history)
         return rollout_in_parts(

@@ -6,7 +6,7 @@ from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.dynamics import Dynamics
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.rollout import rollout, rollout_in_parts
-from gsim3d.dynamics.sleep import RestLog, Sleepers, SleepRule
+from gsim3d.dynamics.sleep import RestLog, Sleepers
 
 __all__ = [
     "Background",
@@ -14,7 +14,6 @@ __all__ = [
     "DynamicsConfig",
     "Parts",
     "RestLog",
-    "SleepRule",
     "Sleepers",
     "append_step",
     "concatenate",

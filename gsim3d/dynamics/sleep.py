@@ -18,35 +18,10 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from gsim3d.effects import Sleep
 from gsim3d.types import ASLEEP, FROZEN, Particles
 
-POLICIES = ("exact", "approx")
 CUBE_BITS = 16  # of a cube along an axis; cubes further out share the outermost
-
-
-@dataclass(frozen=True)
-class SleepRule:
-    """When rows sleep.
-
-    policy: "exact" or "approx".
-    eps: cells that a row may move in one step, along each axis, and still be at rest; its latents may change by as much.
-    patience: steps at rest; at least those that the model sees.
-    halo: metres, edge of the cubes of "approx", the speed (a step) up to which nobody wakes too late.
-    """
-
-    policy: str = "exact"
-    eps: float = 1e-3
-    patience: int = 4
-    halo: float = 0.05
-
-    def __post_init__(self):
-        if self.policy not in POLICIES:
-            raise ValueError(f"SleepRule: policy must be one of {', '.join(POLICIES)}; got {self.policy!r}")
-        for name, least in {"eps": 0, "patience": 1}.items():
-            if not getattr(self, name) >= least:
-                raise ValueError(f"SleepRule: {name} must be at least {least}; got {getattr(self, name)}")
-        if not 0 < self.halo < float("inf"):
-            raise ValueError(f"SleepRule: halo must be a length above 0; got {self.halo}")
 
 
 @dataclass
@@ -80,7 +55,7 @@ class Sleepers:
         history: steps that the model sees: who falls asleep has been the same in all of them.
     """
 
-    def __init__(self, rule: SleepRule, newest: Particles, grid_size: float, history: int):
+    def __init__(self, rule: Sleep, newest: Particles, grid_size: float, history: int):
         self.rule, self.patience = rule, max(rule.patience, history)
         self.reach = rule.eps * grid_size
         self.asleep = torch.zeros(newest.n_rows, dtype=torch.bool, device=newest.means.device)
@@ -126,9 +101,3 @@ def _near(cubes: Tensor, restless: Tensor) -> Tensor:
     keys = (cubes * weights).sum(1)
     stirred = torch.unique(keys[restless])[:, None] + offsets
     return torch.isin(keys, stirred)
-
-
-def check_rule(rule: SleepRule, is_asymmetric: bool) -> None:
-    """Raises where a model cannot let rows sleep by ``rule``."""
-    if rule.policy == "approx" and not is_asymmetric:
-        raise ValueError('sleep: policy "approx" needs a model with background="asymmetric"; use "exact"')
