@@ -111,15 +111,14 @@ class Recorder:
 
     def convolved(self, conv: nn.Module, x: Tensor, out: Tensor) -> Tensor:
         """``out``, which ``conv`` made of ``x``."""
-        known = self.background.fields
-        if conv not in known:  # a block that is computed again in the backward pass leaves what was kept
-            at, voxels = self.places.fields[conv.kernel_size], self.stage.voxels
-            n_voxels = at.occupied.shape[0]
-            means = ops.pool_mean(x, voxels.rows, voxels.cu_rows[: n_voxels + 1], check=False)
-            x = means.new_zeros(at.cells.shape[0], means.shape[1]).index_copy(0, at.occupied, means)
-            around = torch.ones_like(conv.weight[:1, ..., :1])  # the centre tap reads a row itself
-            around[0, *[conv.kernel_size // 2] * 3] = 0
-            known[conv] = ops.sparse_conv(x, conv.weight * around, None, at.voxels, at.kernel_map, check=False)
+        at, voxels = self.places.fields[conv.kernel_size], self.stage.voxels
+        means = ops.pool_mean(x, voxels.rows, voxels.cu_rows, check=False)
+        x = means.new_zeros(at.cells.shape[0], means.shape[1]).index_copy(0, at.occupied, means)
+        around = torch.ones_like(conv.weight[:1, ..., :1])  # the centre tap reads a row itself
+        around[0, *[conv.kernel_size // 2] * 3] = 0
+        field = ops.sparse_conv(x, conv.weight * around, None, at.voxels, at.kernel_map, check=False)
+        # A block that is computed again in the backward pass does the same again, and leaves what was kept.
+        self.background.fields.setdefault(conv, field)
         return out
 
     def attended(self, attention: nn.Module, q: Tensor, k: Tensor, v: Tensor, patches: PatchTable, row: int) -> Tensor:
@@ -199,8 +198,8 @@ def _joined(out: Tensor, stats: Tensor, other: Tensor, other_stats: Tensor, scal
     other_total = other_total * ((other_top - largest) * scale).exp()
     both = total + other_total
     share = (other_total / both.clamp(min=torch.finfo(both.dtype).tiny))[..., None]
-    joined = torch.lerp(out.to(both.dtype), other.to(both.dtype), share).to(out.dtype)
-    return joined, torch.stack([largest, both], -1)
+    joined = out * (1 - share) + other * share  # no fused product: its bits would depend on how threads share the rows
+    return joined.to(out.dtype), torch.stack([largest, both], -1)
 
 
 def _lists(patches: PatchTable) -> tuple[Tensor, ...]:
