@@ -125,7 +125,7 @@ def test_frozen_rows_of_the_newest_step_stay_and_older_ones_are_not_read():
     frozen = newest.activity == FROZEN
     for name, value in float_fields(newest).items():
         assert_same_bits(getattr(step, name)[frozen], value[frozen], name)
-        if name in dynamics.layout.changing:
+        if name in dynamics.layout.changes():
             assert not torch.equal(getattr(step, name)[~frozen], value[~frozen])
     older = torch.ones(history.n_rows, dtype=torch.bool)
     table = history.clouds
