@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
 from gsim3d.effects import EffectsSpec, UnsupportedEffect
 from gsim3d.presets import ModelConfig
+from gsim3d.quirks import Quirks
 
 # Of a surface in a grid, a convolution of K^3 taps finds about K^2 neighbours, and a coarser grid keeps 1 / stride^2 rows.
 SURFACE = 2
@@ -116,7 +117,7 @@ def _absent(name: str, value: object | None, empty: str) -> str:
 
 
 def _check_supported(spec: EffectsSpec, model: ModelConfig) -> None:
-    dynamics, outputs = spec.dynamics, spec.outputs
+    dynamics, outputs, published = spec.dynamics, spec.outputs, model.renderer.quirks != Quirks()
     refused = {
         "dynamics.actions": (dynamics.actions and dynamics.actions.names, "this model has no embeddings of actions"),
         "dynamics.contact": (dynamics.contact and dynamics.contact.pairs, "particles do not know their body"),
@@ -133,6 +134,8 @@ def _check_supported(spec: EffectsSpec, model: ModelConfig) -> None:
         ),
         "outputs": (not (outputs.rgb or outputs.depth or outputs.alpha or outputs.features), "there is no image to make"),
         "outputs.features": (outputs.features and model.renderer.latents == 0, "this model's particles have no latents"),
+        "outputs without colour": (not outputs.rgb and published, "the published renderer draws colour"),
+        "outputs.features with quirks": (outputs.features and published, "the published renderer draws none"),
     }  # fmt: skip
     for name, (asked, why) in refused.items():
         if asked:

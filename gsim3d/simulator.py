@@ -33,7 +33,7 @@ from gsim3d.dynamics import (
     rollout,
     rollout_in_parts,
 )
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects import EffectsSpec, OutputEffects
 from gsim3d.encoder import Encoder, pixel_rows
 from gsim3d.guards import drop_rows, guard_frames, guard_particles
 from gsim3d.ops.curve import Pyramid
@@ -166,7 +166,7 @@ class Simulator(nn.Module):
             particles: any clouds.
             cameras: I images.
             background: [3] or [I, 3], default black.
-            plan: limits the degree of view-dependent colour; default the model's.
+            plan: which images, and the degree of view-dependent colour; default colour as the model's, alpha and depth.
             cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
         """
         particles = self._guard("render", on_bad, report, in_workspace=False)(particles)
@@ -185,11 +185,18 @@ class Simulator(nn.Module):
     ) -> Rendering:
         """As :meth:`render`, of particles as :meth:`rollout` returned them: their numbers are not looked at again."""
         on_bad, report = on_bad or self.config.stability.on_bad, self.report if report is None else report
-        gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None)
+        outputs = plan.spec.outputs if plan else OutputEffects(depth=True, alpha=True)
+        gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None, rgb=outputs.rgb)
         quirks = self.config.renderer.quirks
         if quirks != Quirks():
-            return render_as_published(gaussians, cameras, background, quirks=quirks)
-        return render(gaussians, cameras, background, cutoff=cutoff, on_bad=on_bad, report=report)
+            image = render_as_published(gaussians, cameras, background, quirks=quirks)
+        else:
+            features = particles.latents if outputs.features else None
+            image = render(
+                gaussians, cameras, background, features=features, cutoff=cutoff, on_bad=on_bad, report=report
+            )
+        asked = (outputs.rgb, outputs.alpha, outputs.depth, outputs.features)
+        return Rendering(*(made if wanted else None for made, wanted in zip(image, asked, strict=True)))
 
     def _guard(
         self, where: str, on_bad: OnBad | None, report: StabilityReport | None, in_workspace: bool = True
