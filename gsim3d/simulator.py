@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from gsim3d.dynamics import (
     Background,
     Dynamics,
+    Parts,
     RestLog,
     Sleepers,
     append_step,
@@ -112,6 +113,7 @@ class Simulator(nn.Module):
         geometry: Callable[[Particles], Pyramid] | None = None,
         wrap: Callable[[Callable], Callable] | None = None,
         log: RestLog | None = None,
+        background: Background | None = None,
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
 
@@ -122,14 +124,15 @@ class Simulator(nn.Module):
             geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
             wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
             log: is told which rows rested and were not computed.
+            background: what rests, of ``dynamics.remember``; then ``state``, and what is returned, is what moves.
         """
         plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
         predict = predict if wrap is None else wrap(predict)
         state = guard(self.prepare(state, plan))
         config, rule = self.config.dynamics, plan.spec.dynamics.sleep
-        if rule is None and not config.is_asymmetric:
-            return rollout(predict, state, n_steps, plan.history)
+        if background is not None or (rule is None and not config.is_asymmetric):
+            return rollout(partial(predict, background=background), state, n_steps, plan.history)
         return rollout_in_parts(
             predict,
             state,
@@ -148,6 +151,12 @@ class Simulator(nn.Module):
         if background == "dynamic":
             state = dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
         return last_steps(state, plan.history)
+
+    def parts(
+        self, prepared: Particles, *, on_bad: OnBad | None = None, report: StabilityReport | None = None
+    ) -> Parts:
+        """What moves and what rests of a state that :meth:`prepare` made, for a model with an asymmetric background."""
+        return Parts.of(self._guard("rollout", on_bad, report)(prepared), asymmetric=True)
 
     def render(
         self,
