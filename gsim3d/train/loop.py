@@ -25,7 +25,7 @@ from gsim3d.perceptual.lpips import LPIPS
 from gsim3d.perceptual.weights import load
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
-from gsim3d.train.config import TrainConfig
+from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import Log, memory_gib, plain, progress_note
 from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
 from gsim3d.train.precision import FIRST_SCALE, LossScale
@@ -171,7 +171,7 @@ class Trainer:
         averages and statistics stay as they are.
         """
         stage, place = self.config.stage_of(self.step)
-        rate = one_cycle(place, stage.steps, stage.learning_rate, stage.warm_up)
+        rate = self.learning_rate(stage, place)
         statistics = [(buffer, buffer.clone()) for buffer in self.simulator.buffers()]
         entry = {"step": self.step, "loss": math.nan, "learning_rate": rate, "grad_norm": math.nan}
         n_context = history_at(self.config.data, stage, self.config.seed, self.step)
@@ -202,6 +202,10 @@ class Trainer:
             entry["future_psnr"] = _psnr(errors[n_context:])
         self.step += 1
         return {name: plain(value) for name, value in entry.items()}
+
+    def learning_rate(self, stage: StageConfig, place: int) -> float:
+        """Of the step at ``place`` of a stage."""
+        return one_cycle(place, stage.steps, stage.learning_rate, stage.warm_up)
 
     def _whole_batch(self, batch: int) -> tuple[float, Tensor, list[Tensor | None], list[Seen]]:
         """Loss, errors by step and gradients of the whole batch; what was seen in each of its parts."""
@@ -459,13 +463,16 @@ class Trainer:
 
     def _update_average(self) -> None:
         decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (EMA_WARM_UP + self.step))
+        if not self.average:
+            return
         with torch.no_grad():
-            for name, value in self.simulator.state_dict().items():
-                if name in self.average:
-                    if value.is_floating_point():
-                        self.average[name].lerp_(value, 1 - decay)
-                    else:
-                        self.average[name].copy_(value)
+            weights = self.simulator.state_dict()
+            averaged = [name for name, value in weights.items() if value.is_floating_point()]
+            torch._foreach_lerp_(
+                [self.average[name] for name in averaged], [weights[name] for name in averaged], 1 - decay
+            )
+            for name in weights.keys() - set(averaged):
+                self.average[name].copy_(weights[name])
 
 
 class _Loss(nn.Module):
