@@ -3,14 +3,16 @@
 A training step through a rollout launches tens of thousands of small kernels; a GPU would wait for Python most of the
 time. Everything behind the encoder (rollout, images, loss and their gradients) is captured once for each kind of batch and
 replayed with other particles. A graph has fixed sizes: each cloud gets as many rows as the largest, those without a
-particle sleep, and geometry has room for ``FACTOR`` times what was observed. Where a batch needs more, the graph is made
+particle sleep, and geometry has room for more than was observed. Where a batch needs more, the graph is made
 anew, so results never depend on the room.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -27,7 +29,8 @@ from gsim3d.stability import StabilityReport
 from gsim3d.train.samples import Batch
 from gsim3d.types import ASLEEP, CloudTable, Frames, Particles
 
-FACTOR = 1.3  # room over what was observed
+FACTOR = 1.3  # room for geometry over what was observed: little costs captures, much costs time in every step
+ROWS_FACTOR = 1.15  # likewise, for the particles of a cloud
 ROW_UNIT = 256  # rows of a cloud are a multiple of it
 LEARNED = ("means", "opacities", "dynamic_latents", "static_latents")  # of encoded particles, what has gradients
 
@@ -50,16 +53,18 @@ class CapturedLoss:
     Args:
         simulator: that is trained; without drop path and shuffled curves, whose draws a graph would repeat.
         plan: what a step computes.
-        loss: (images [I, H, W, 3], targets, number of encoded steps) -> loss and errors by step.
+        loss: (images [I, H, W, 3], targets, weights of the steps) -> loss and errors by step.
         precision: makes the context in which a part ("dynamics", "renderer") computes.
+        alone: a context in which no other thread uses the GPU, which a capture does not allow.
     """
 
     def __init__(
         self,
         simulator: Simulator,
         plan: Plan,
-        loss: Callable[[Tensor, Frames, int], tuple[Tensor, Tensor]],
+        loss: Callable[[Tensor, Frames, Tensor], tuple[Tensor, Tensor]],
         precision: Callable[[str], torch.autocast],
+        alone: AbstractContextManager | None = None,
     ):
         config = simulator.config.dynamics
         if config.drop_path or config.shuffle_orders or config.norm == "batch" or config.explicit:
@@ -70,6 +75,8 @@ class CapturedLoss:
         self._parameters = [*simulator.dynamics.parameters(), *simulator.renderer.parameters()]
         self._kind: tuple | None = None
         self._rows, self._capacities = 0, []
+        self._alone = alone or nullcontext()
+        self._release()
         self.captures = 0
 
     @property
@@ -77,10 +84,11 @@ class CapturedLoss:
         """Those whose gradients it returns."""
         return self._parameters
 
-    def __call__(self, particles: Particles, batch: Batch, report: StabilityReport) -> Gradients:
+    def __call__(self, particles: Particles, batch: Batch, weights: Tensor, report: StabilityReport) -> Gradients:
         """Of ``particles``, which the encoder made of ``batch``; gradients are overwritten by the next call.
 
         Args:
+            weights: of the steps, the same for all batches of a kind.
             report: is told what the simulator's guards find; rows that cannot be used sleep.
         """
         table = particles.clouds
@@ -88,8 +96,8 @@ class CapturedLoss:
         kind = (table.scenes, table.steps, batch.n_future, len(batch.targets.cameras), particles.means.device)
         if kind != self._kind or largest > self._rows:
             self._release()
-            self._kind, self._rows, self._capacities = kind, _rounded_up(FACTOR * largest), []
-            self._allocate(particles, batch)
+            self._kind, self._rows, self._capacities = kind, _rounded_up(ROWS_FACTOR * largest), []
+            self._allocate(particles, batch, weights)
         places = self._load(particles, batch)
         if not self._capacities:
             self._capacities = self._observed()
@@ -119,7 +127,7 @@ class CapturedLoss:
             images = simulator.draw(
                 concatenate([self._state, *steps]), self._targets.cameras, plan=self._plan, **options
             ).color
-        loss, errors = self._loss(images, self._targets, self._n_context)
+        loss, errors = self._loss(images, self._targets, self._weights)
         gradients = torch.autograd.grad(loss, [*leaves, *self._parameters], allow_unused=True)
         return loss.detach(), errors, gradients
 
@@ -159,7 +167,8 @@ class CapturedLoss:
             capturing = torch.cuda.is_current_stream_capturing()
             return self._given(self._records if capturing else StabilityReport())
 
-        self._graph = Captured(function, self._state.means.device)
+        with self._alone:
+            self._graph = Captured(function, self._state.means.device)
 
     def _replay(self) -> tuple:
         if self._graph is None:
@@ -173,7 +182,7 @@ class CapturedLoss:
 
     # ---- what goes in ----
 
-    def _allocate(self, particles: Particles, batch: Batch) -> None:
+    def _allocate(self, particles: Particles, batch: Batch, weights: Tensor) -> None:
         table, device = particles.clouds, particles.means.device
         n_rows = self._rows * len(table)
         known = CloudTable.make([self._rows] * len(table), table.scenes, table.steps, device)
@@ -181,9 +190,9 @@ class CapturedLoss:
         self._state = particles.with_clouds(known, **fields, origin=particles.origin.clone())
         for name in LEARNED:
             fields[name].requires_grad_()
-        self._targets = batch.targets.map(torch.clone)
-        object.__setattr__(self._targets, "cameras", batch.targets.cameras.map(torch.clone))
-        self._n_context, self._n_future = batch.n_context, batch.n_future
+        targets = batch.targets
+        self._targets = dataclasses.replace(targets.map(torch.clone), cameras=targets.cameras.map(torch.clone))
+        self._n_future, self._weights = batch.n_future, weights
         clouds = torch.arange(len(table), device=device)
         self._first_rows = clouds * self._rows
 

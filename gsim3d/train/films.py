@@ -66,18 +66,18 @@ class FilmStore:
         )
         self._near, self._far = rig.near, rig.far
         self._origin = torch.from_numpy(workspace_origin(rig)).to(device)
-        self._lock = threading.Lock()
+        self.lock = threading.Lock()  # held while films come or are read
         self.films = [Film(slot, Path(f"film_{slot}"), *self._shape[:2], rig.size, rig.size) for slot in range(capacity)]
 
     def put(self, film: np.ndarray) -> None:
         """Keeps a trajectory: uint8 [T, V, H, W, 4], colours and label."""
-        with self._lock:
+        with self.lock:
             self._films[self.count % self.capacity].copy_(torch.from_numpy(film))
             self.count += 1
 
     def draw(self, data: DataConfig, stage: StageConfig, seed: int, step: int, samples: Sequence[int]) -> Batch:
         """As :func:`gsim3d.train.samples.draw_batch`, of the trajectories that are there."""
-        with self._lock:
+        with self.lock:
             known = self.films[: min(self.count, self.capacity)]
             windows = draw_windows(known, data, stage, seed, step, samples)
             n_context = windows[0].n_context

@@ -45,6 +45,7 @@ from gsim3d.train.samples import (
 from gsim3d.train.schedule import one_cycle
 from gsim3d.train.settings import from_dict, to_dict
 from gsim3d.train.watch import Seen, StepWatch, first_not_finite, mean_of_norms, norms_by_module
+from gsim3d.types import Frames
 
 READERS = 2  # threads that read batches; so many steps are read ahead
 EMA_WARM_UP = 10  # the average forgets its first values: decay is at most (1 + step) / (10 + step)
@@ -326,17 +327,23 @@ class Trainer:
     def loss(self, batch: Batch, sample: int = 0, watch: StepWatch | None = None) -> tuple[Tensor, Tensor]:
         """The loss of a batch, and each step's unweighted mean squared error; ``sample`` numbers the randomness."""
         watch = watch or StepWatch()
-        loss_config, targets = self.config.loss, batch.targets
-        images = self._images(batch, sample, watch)
+        return self.loss_of_images(self._images(batch, sample, watch), batch.targets, self.step_weights(batch))
+
+    def step_weights(self, batch: Batch) -> Tensor:
+        """Weight of each step of a batch, on its device."""
+        settings = self.config.loss
+        weights = time_weights(batch.n_context, batch.n_future, balance=settings.balance, discount=settings.discount)
+        return weights.to(self.device)
+
+    def loss_of_images(self, images: Tensor, targets: Frames, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`loss`, of the images [I, H, W, 3] that ``targets`` should have been."""
+        loss_config, n_steps = self.config.loss, weights.shape[0]
         truth = targets.images.permute(0, 2, 3, 1)
         weighted = loss_config.body_weight and targets.dynamic is not None
         weight = 1 + loss_config.body_weight * targets.dynamic if weighted else None
         if targets.valid is not None:
             weight = targets.valid.float() if weight is None else weight * targets.valid
-        weights = time_weights(
-            batch.n_context, batch.n_future, balance=loss_config.balance, discount=loss_config.discount
-        )
-        step = batch.target_step()
+        step = targets.cameras.image_cloud % n_steps
         wrong = image_errors(images, truth, weight)
         if self.perceptual is not None:
             seen = images if targets.valid is None else torch.where(targets.valid[..., None], images, truth)
@@ -344,7 +351,7 @@ class Trainer:
             wrong = wrong + loss_config.perceptual * distances
         loss = image_loss(wrong, step, weights)
         with torch.no_grad():
-            errors = mean_by_step(image_errors(images, truth, targets.valid), step, batch.n_context + batch.n_future)
+            errors = mean_by_step(image_errors(images, truth, targets.valid), step, n_steps)
         return loss, errors
 
     def _images(self, batch: Batch, sample: int, watch: StepWatch) -> Tensor:
@@ -524,8 +531,10 @@ def _start_worker(n_threads: int) -> None:
     torch.set_num_threads(n_threads)
 
 
-def _mean(results: list) -> tuple[Tensor, Tensor, list[Tensor | None]]:
+def _mean(results: list) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:
     """Means of losses, errors and gradients, added in the order of the samples."""
+    if len(results) == 1:
+        return results[0]
     losses, errors, gradients = zip(*results, strict=True)
     means = []
     for parts in zip(*gradients, strict=True):

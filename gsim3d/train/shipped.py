@@ -9,7 +9,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from gsim3d.errors import HardCaseError
+from gsim3d.train.captured import CapturedLoss
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.films import Filming, FilmStore
 from gsim3d.train.log import memory_gib
@@ -17,6 +21,7 @@ from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.precision import PrecisionConfig
 from gsim3d.train.samples import Batch
 from gsim3d.train.sittings import Progress, save_state
+from gsim3d.train.watch import StepWatch
 
 FIRST_FILMS = 64  # before training begins
 SEED, HELD_OUT_SEED = 20261121, 77  # of the trajectories; `gsim3d generate` without --seed makes others
@@ -25,7 +30,7 @@ COOL_DOWN = 0.25  # of a sitting's training, in which the learning rate falls to
 LAST_RATE = 0.03
 SAVE_EVERY = 120.0  # seconds
 
-_stage = partial(StageConfig, batch=8, target_views=3)
+_stage = partial(StageConfig, target_views=3)
 
 
 @dataclass(frozen=True)
@@ -53,12 +58,12 @@ TRAIN = TrainConfig(
         "encoder": {"transformer_layers": 3, "refine_unet_dim": 24},
         "dynamics": {"drop_path": 0.0, "shuffle_orders": False},
     },
-    data=DataConfig(history=4, context_views=4, target_only_cameras=(2, 7), background_stride=3),
+    data=DataConfig(history=4, context_views=4, target_only_cameras=(2, 7), background_stride=4),
     stages=(
         _stage(steps=500, history=1, batch=16, learning_rate=1e-3),
-        _stage(steps=400, horizon=2, learning_rate=1e-3),
-        _stage(steps=400, horizon=5, from_start=0.3, learning_rate=8e-4),
-        _stage(steps=1_000_000, horizon=12, from_start=0.3, learning_rate=6e-4),
+        _stage(steps=300, horizon=2, batch=8, learning_rate=1e-3),
+        _stage(steps=400, horizon=6, batch=4, from_start=0.2, learning_rate=8e-4),
+        _stage(steps=1_000_000, horizon=12, batch=4, from_start=0.2, learning_rate=6e-4),
     ),
     loss=LossConfig(body_weight=3.0),
     optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.995),
@@ -75,6 +80,8 @@ class SittingTrainer(Trainer):
         super().__init__(config, store.films[:1], out, device=device)
         self.store = store
         self.first_step, self.begin, self.end = 0, 0.0, math.inf
+        precision = partial(config.precision.of, device=device)
+        self.captured = CapturedLoss(self.simulator, self.plan, self.loss_of_images, precision, store.lock)
 
     def begin_sitting(self, end: float) -> None:
         """From now to ``end``, on the clock of time.monotonic."""
@@ -90,6 +97,20 @@ class SittingTrainer(Trainer):
     def _batch(self, samples: list[int]) -> Batch:
         stage, _ = self.config.stage_of(self.step)
         return self.store.draw(self.config.data, stage, self.config.seed, self.step, samples)
+
+    def _gradients(self, samples: list[int]) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...], StepWatch]:
+        if not self.config.stage_of(self.step)[0].horizon:
+            return super()._gradients(samples)
+        watch, batch = StepWatch(), self._batch(samples)
+        with self.config.precision.of("encoder", self.device):
+            particles = self.simulator.encode(batch.context, report=watch.report)
+        watch.count(particles)
+        later = self.captured(particles, batch, self.step_weights(batch), watch.report)
+        encoder = list(self.simulator.encoder.parameters())
+        outputs = [getattr(particles, name) for name in later.particles]
+        gradients = torch.autograd.grad(outputs, encoder, list(later.particles.values()), allow_unused=True)
+        known = dict(zip([*encoder, *self.captured.parameters], [*gradients, *later.parameters], strict=True))
+        return later.loss, later.errors, tuple(known[parameter] for parameter in self.parameters.values()), watch
 
 
 def train(
