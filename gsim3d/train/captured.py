@@ -55,7 +55,10 @@ class CapturedLoss:
         plan: what a step computes.
         loss: (images [I, H, W, 3], targets, weights of the steps) -> loss and errors by step.
         precision: makes the context in which a part ("dynamics", "renderer") computes.
+
+    Attributes:
         alone: a context in which no other thread uses the GPU, which a capture does not allow.
+        captures: how often a graph was made.
     """
 
     def __init__(
@@ -64,7 +67,6 @@ class CapturedLoss:
         plan: Plan,
         loss: Callable[[Tensor, Frames, Tensor], tuple[Tensor, Tensor]],
         precision: Callable[[str], torch.autocast],
-        alone: AbstractContextManager | None = None,
     ):
         config = simulator.config.dynamics
         if config.drop_path or config.shuffle_orders or config.norm == "batch" or config.explicit:
@@ -75,7 +77,7 @@ class CapturedLoss:
         self._parameters = [*simulator.dynamics.parameters(), *simulator.renderer.parameters()]
         self._kind: tuple | None = None
         self._rows, self._capacities = 0, []
-        self._alone = alone or nullcontext()
+        self.alone: AbstractContextManager = nullcontext()
         self._release()
         self.captures = 0
 
@@ -88,7 +90,7 @@ class CapturedLoss:
         """Of ``particles``, which the encoder made of ``batch``; gradients are overwritten by the next call.
 
         Args:
-            weights: of the steps, the same for all batches of a kind.
+            weights: of the steps.
             report: is told what the simulator's guards find; rows that cannot be used sleep.
         """
         table = particles.clouds
@@ -98,7 +100,7 @@ class CapturedLoss:
             self._release()
             self._kind, self._rows, self._capacities = kind, _rounded_up(ROWS_FACTOR * largest), []
             self._allocate(particles, batch, weights)
-        places = self._load(particles, batch)
+        places = self._load(particles, batch, weights)
         if not self._capacities:
             self._capacities = self._observed()
             self._capture()
@@ -167,7 +169,7 @@ class CapturedLoss:
             capturing = torch.cuda.is_current_stream_capturing()
             return self._given(self._records if capturing else StabilityReport())
 
-        with self._alone:
+        with self.alone:
             self._graph = Captured(function, self._state.means.device)
 
     def _replay(self) -> tuple:
@@ -192,12 +194,12 @@ class CapturedLoss:
             fields[name].requires_grad_()
         targets = batch.targets
         self._targets = dataclasses.replace(targets.map(torch.clone), cameras=targets.cameras.map(torch.clone))
-        self._n_future, self._weights = batch.n_future, weights
+        self._n_future, self._weights = batch.n_future, weights.clone()
         clouds = torch.arange(len(table), device=device)
         self._first_rows = clouds * self._rows
 
     @torch.no_grad()
-    def _load(self, particles: Particles, batch: Batch) -> Tensor:
+    def _load(self, particles: Particles, batch: Batch, weights: Tensor) -> Tensor:
         """Copies a batch to where the graph reads it; the rows there of the particles' rows."""
         cloud = particles.row_cloud()
         places = torch.arange(particles.n_rows, device=cloud.device) - particles.cu_rows[cloud] + self._first_rows[cloud]
@@ -207,6 +209,7 @@ class CapturedLoss:
         for name, value in state.row_fields().items():
             value.index_copy_(0, places, getattr(particles, name).detach().to(value.dtype))
         state.origin.copy_(particles.origin)
+        self._weights.copy_(weights)
         for own, given in ((self._targets, batch.targets), (self._targets.cameras, batch.targets.cameras)):
             for name, value in vars(given).items():
                 if isinstance(value, Tensor):

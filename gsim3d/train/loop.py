@@ -25,6 +25,7 @@ from gsim3d.perceptual.lpips import LPIPS
 from gsim3d.perceptual.weights import load
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
+from gsim3d.train.captured import CapturedLoss
 from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import Log, memory_gib, plain, progress_note
 from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
@@ -50,7 +51,7 @@ from gsim3d.types import Frames
 READERS = 2  # threads that read batches; so many steps are read ahead
 EMA_WARM_UP = 10  # the average forgets its first values: decay is at most (1 + step) / (10 + step)
 # May change between two sittings of one run without changing the curve; so may the number of workers, if there are any.
-FREE_SETTINGS = ("checkpoint_every", "keep_checkpoints", "log_every", "recompute")
+FREE_SETTINGS = ("captured", "checkpoint_every", "keep_checkpoints", "log_every", "recompute")
 # May change as well, so that a run which diverged can go on; the curve is another one from there on.
 FREE_OF_OPTIMIZER, FREE_OF_STAGES = ("clip_norm", "max_skipped"), ("learning_rate", "warm_up")
 
@@ -110,6 +111,7 @@ class Trainer:
         self.log = Log(self.out, writes=self.processes.is_first)
         self.log.cut(self.step)
         self.shared = self._share() if self.processes.count > 1 else None
+        self.captured = self._capture() if config.captured and device == "cuda" else None
 
     def _share(self) -> DistributedDataParallel:
         """The loss of this process's samples; going back from it gives every process the gradient of all samples."""
@@ -125,6 +127,10 @@ class Trainer:
             return DistributedDataParallel(
                 _Loss(self), broadcast_buffers=False, find_unused_parameters=True, process_group=group
             )
+
+    def _capture(self) -> CapturedLoss:
+        precision = partial(self.config.precision.of, device=self.device)
+        return CapturedLoss(self.simulator, self.plan, self.loss_of_images, precision)
 
     def run(
         self, *, until: int | None = None, progress: bool = True, tensorboard: bool = False, profile: bool = False
@@ -286,10 +292,24 @@ class Trainer:
     def _gradients(self, samples: list[int]) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...], StepWatch]:
         """Loss, errors by step, the gradient of the loss for every parameter (None where it has no part), and what was
         seen on the way."""
-        watch = StepWatch()
-        loss, errors = self.loss(self._batch(samples), samples[0], watch)
+        watch, batch = StepWatch(), self._batch(samples)
+        if self.captured is not None and batch.n_future:
+            return *self._captured_gradients(batch, watch), watch
+        loss, errors = self.loss(batch, samples[0], watch)
         gradients = torch.autograd.grad(loss * self.scale.value, list(self.parameters.values()), allow_unused=True)
         return loss.detach(), errors, gradients, watch
+
+    def _captured_gradients(self, batch: Batch, watch: StepWatch) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...]]:
+        """Loss, errors and gradients, all behind the encoder from a CUDA graph; the next call overwrites them."""
+        scale, encoder = self.scale.value, list(self.simulator.encoder.parameters())
+        with self.config.precision.of("encoder", self.device):
+            particles = self.simulator.encode(batch.context, report=watch.report)
+        watch.count(particles)
+        later = self.captured(particles, batch, self.step_weights(batch) * scale, watch.report)
+        outputs = [getattr(particles, name) for name in later.particles]
+        gradients = torch.autograd.grad(outputs, encoder, list(later.particles.values()), allow_unused=True)
+        known = dict(zip([*encoder, *self.captured.parameters], [*gradients, *later.parameters], strict=True))
+        return later.loss / scale, later.errors, tuple(known[parameter] for parameter in self.parameters.values())
 
     def _shared_gradients(self, samples: list[int]) -> tuple:
         """As :meth:`_gradients`, but gradients are those of the samples of all processes; and how many samples are this
@@ -546,6 +566,8 @@ def _mean(results: list) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:
 def _check_sharing(config: TrainConfig, n_processes: int, norm: str) -> None:
     if config.workers and norm == "batch":
         raise InputError("workers: must be 0 for a model with batch normalisation, which needs all samples at once")
+    if config.captured and (n_processes > 1 or config.workers or config.recompute):
+        raise InputError("captured: needs one process, workers 0 and nothing to recompute")
     if config.workers and n_processes > 1:
         raise InputError(f"workers: must be 0 in {n_processes} processes, which share the samples of a step themselves")
     for i, stage in enumerate(config.stages):

@@ -9,11 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from gsim3d.errors import HardCaseError
-from gsim3d.train.captured import CapturedLoss
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.films import Filming, FilmStore
 from gsim3d.train.log import memory_gib
@@ -21,7 +17,6 @@ from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.precision import PrecisionConfig
 from gsim3d.train.samples import Batch
 from gsim3d.train.sittings import Progress, save_state
-from gsim3d.train.watch import StepWatch
 
 FIRST_FILMS = 64  # before training begins
 SEED, HELD_OUT_SEED = 20261121, 77  # of the trajectories; `gsim3d generate` without --seed makes others
@@ -68,6 +63,7 @@ TRAIN = TrainConfig(
     loss=LossConfig(body_weight=3.0),
     optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.995),
     precision=PrecisionConfig(encoder="bf16", dynamics="bf16"),
+    captured=True,
     log_every=20,
 )
 RECIPES = {world: Recipe(world, TRAIN) for world in ("elastic", "cloth", "rigid")}
@@ -80,8 +76,8 @@ class SittingTrainer(Trainer):
         super().__init__(config, store.films[:1], out, device=device)
         self.store = store
         self.first_step, self.begin, self.end = 0, 0.0, math.inf
-        precision = partial(config.precision.of, device=device)
-        self.captured = CapturedLoss(self.simulator, self.plan, self.loss_of_images, precision, store.lock)
+        if self.captured is not None:
+            self.captured.alone = store.lock
 
     def begin_sitting(self, end: float) -> None:
         """From now to ``end``, on the clock of time.monotonic."""
@@ -97,20 +93,6 @@ class SittingTrainer(Trainer):
     def _batch(self, samples: list[int]) -> Batch:
         stage, _ = self.config.stage_of(self.step)
         return self.store.draw(self.config.data, stage, self.config.seed, self.step, samples)
-
-    def _gradients(self, samples: list[int]) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...], StepWatch]:
-        if not self.config.stage_of(self.step)[0].horizon:
-            return super()._gradients(samples)
-        watch, batch = StepWatch(), self._batch(samples)
-        with self.config.precision.of("encoder", self.device):
-            particles = self.simulator.encode(batch.context, report=watch.report)
-        watch.count(particles)
-        later = self.captured(particles, batch, self.step_weights(batch), watch.report)
-        encoder = list(self.simulator.encoder.parameters())
-        outputs = [getattr(particles, name) for name in later.particles]
-        gradients = torch.autograd.grad(outputs, encoder, list(later.particles.values()), allow_unused=True)
-        known = dict(zip([*encoder, *self.captured.parameters], [*gradients, *later.parameters], strict=True))
-        return later.loss, later.errors, tuple(known[parameter] for parameter in self.parameters.values()), watch
 
 
 def train(
