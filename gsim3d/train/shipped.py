@@ -82,6 +82,7 @@ class SittingTrainer(Trainer):
     def begin_sitting(self, end: float) -> None:
         """From now to ``end``, on the clock of time.monotonic."""
         self.first_step, self.begin, self.end = self.step, time.monotonic(), end
+        self.out.mkdir(parents=True, exist_ok=True)
         self.simulator.train()
 
     def learning_rate(self, stage: StageConfig, place: int) -> float:
