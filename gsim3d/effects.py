@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,28 +54,32 @@ class Contact:
 class Sleep:
     """When particles at rest are skipped.
 
-    policy: "exact": a scene sleeps as a whole, and nothing is lost; "approx": patches sleep, within a bound.
-    eps: in cells; what moves less in one step is at rest.
-    patience: steps at rest before it sleeps.
+    policy: "exact": a scene sleeps as a whole; "approx": cubes of it sleep (:mod:`gsim3d.dynamics.sleep` has the bounds).
+    eps: cells that a particle at rest moves in one step at most, along each axis; its latents change by as much at most.
+    patience: steps at rest before it sleeps, at least those that the model sees.
+    halo: metres, edge of the cubes, and the speed a step up to which nobody wakes too late.
     """
 
     policy: str = "exact"
     eps: float = 1e-3
     patience: int = 4
+    halo: float = 0.05
 
     def __post_init__(self):
         _one_of("dynamics.sleep.policy", self.policy, POLICIES)
         _at_least("dynamics.sleep.eps", self.eps, 0)
         _at_least("dynamics.sleep.patience", self.patience, 1)
+        if not 0 < self.halo < math.inf:
+            raise InputError(f"effects: dynamics.sleep.halo must be a length above 0; got {self.halo!r}")
 
 
 @dataclass(frozen=True)
 class DynamicsEffects:
     """What moves and why.
 
-    background: "frozen": particles marked frozen never move, and others see them; "asymmetric": likewise, and they see
-        only each other, so that they are computed once a rollout; "masked_out": they are left out; "dynamic": every
-        particle may move.
+    background: "frozen": particles marked frozen never move, and others see them; "asymmetric": likewise, by a model in
+        which they see only each other, so that they are computed once a rollout; "masked_out": they are left out;
+        "dynamic": every particle may move.
     history: steps that the model sees; None: as many as the model can use.
     actions: what drives the scene from outside.
     contact: pairs of bodies that may touch.

@@ -23,7 +23,17 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from gsim3d.dynamics import Dynamics, append_step, concatenate, last_steps, rollout
+from gsim3d.dynamics import (
+    Background,
+    Dynamics,
+    RestLog,
+    Sleepers,
+    append_step,
+    concatenate,
+    last_steps,
+    rollout,
+    rollout_in_parts,
+)
 from gsim3d.edits import Edit, by_step
 from gsim3d.effects import EffectsSpec, OutputEffects
 from gsim3d.encoder import Encoder, pixel_rows
@@ -90,7 +100,8 @@ class Simulator(nn.Module):
         """
         plan, guard = plan or self.plan(), self._guard("step", on_bad, report)
         state = guard(self.prepare(state, plan))
-        return append_step(state, self._predict(state, plan, generator, guard), plan.history)
+        step = self._predict(state, plan=plan, generator=generator, guard=guard)
+        return append_step(state, step, plan.history)
 
     def rollout(
         self,
@@ -103,6 +114,7 @@ class Simulator(nn.Module):
         report: StabilityReport | None = None,
         geometry: Callable[[Particles], Pyramid] | None = None,
         wrap: Callable[[Callable], Callable] | None = None,
+        log: RestLog | None = None,
         edits: Iterable[Edit] = (),
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
@@ -113,7 +125,8 @@ class Simulator(nn.Module):
         Args:
             geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
             wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
-            edits: changes of the scene on the way (:mod:`gsim3d.edits`).
+            log: is told which rows rested and were not computed.
+            edits: changes of the scene on the way (:mod:`gsim3d.edits`); they wake everybody.
         Raises:
             InputError: an edit cannot be made; the message names its step and operation.
         """
@@ -127,10 +140,25 @@ class Simulator(nn.Module):
             for edit in changes.get(begin, ()):
                 state = edit.apply(state, self._colors)
             state = guard(state)
-            steps += rollout(predict, state, end - begin, plan.history)
+            steps += self._roll(predict, state, end - begin, plan, generator, log)
             if end < n_steps:
                 state = last_steps(concatenate([state, *steps[begin:end][-plan.history :]]), plan.history)
         return steps
+
+    def _roll(self, predict, state: Particles, n_steps: int, plan: Plan, generator, log) -> list[Particles]:
+        """:meth:`rollout` of a state that is prepared, without edits."""
+        config, rule = self.config.dynamics, plan.spec.dynamics.sleep
+        if rule is None and not config.is_asymmetric:
+            return rollout(predict, state, n_steps, plan.history)
+        return rollout_in_parts(
+            predict,
+            state,
+            n_steps,
+            plan.history,
+            remember=partial(self.dynamics.remember, generator=generator) if config.is_asymmetric else None,
+            sleepers=None if rule is None else Sleepers(rule, last_steps(state, 1), config.grid_size, plan.history),
+            log=log,
+        )
 
     def prepare(self, state: Particles, plan: Plan) -> Particles:
         """What the dynamics reads of ``state``: its last steps, with the background as the plan wants it."""
@@ -216,16 +244,22 @@ class Simulator(nn.Module):
     def _predict(
         self,
         state: Particles,
+        background: Background | None = None,
+        *,
         plan: Plan,
         generator: torch.Generator | None,
         guard: Callable[..., Particles],
         geometry: Callable[[Particles], Pyramid] | None = None,
     ) -> Particles:
-        """The next steps of every scene, guarded."""
+        """The next steps of every scene, guarded.
+
+        background: what rests while ``state`` moves; None: all there is, is in the state.
+        """
         appearance = plan.spec.appearance
         changes = self.dynamics.layout.changes(appearance.changing, appearance.opacity_changes is not False)
         pyramid = None if geometry is None else geometry(state)
-        step = self.dynamics(state, generator=generator, pyramid=pyramid, changes=changes)
+        options = {"pyramid": pyramid, "background": background, "changes": changes}
+        step = self.dynamics(state, generator=generator, **options)
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
         changed = [name for name, who in changes.items() if who != "none"]
         return guard(step, previous=newest, changed=changed)

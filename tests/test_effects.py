@@ -66,7 +66,8 @@ def test_plan_says_what_is_kept_and_why_the_rest_is_not():
     [
         ({"dynamics": {"actions": {"names": ["hand"]}}}, "unsupported effect dynamics.actions"),
         ({"dynamics": {"contact": {"pairs": [["a", "b"]]}}}, "unsupported effect dynamics.contact"),
-        ({"dynamics": {"sleep": {"policy": "exact"}}}, "unsupported effect dynamics.sleep"),
+        ({"dynamics": {"sleep": {"policy": "approx"}}}, "unsupported effect dynamics.sleep.policy approx"),
+        ({"dynamics": {"background": "asymmetric"}}, "unsupported effect dynamics.background asymmetric"),
         ({"outputs": {"rgb": False}}, "unsupported effect outputs: there is no image to make"),
         ({"dynamics": {"history": 5}}, "unsupported effect dynamics.history: this model goes up to 4; got 5"),
         ({"appearance": {"opacity_changes": True}}, "unsupported effect appearance.opacity_changes"),
