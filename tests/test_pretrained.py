@@ -46,7 +46,12 @@ def test_an_unknown_name_lists_the_known_ones(folder, name):
 
 
 @pytest.mark.parametrize(
-    "command", [["simulate", "ball-small", "x", "--out", "y"], ["evaluate", "ball-small", "x"], ["doctor", "--stability", "ball-small"]]
+    "command",
+    [
+        ["simulate", "ball-small", "x", "--out", "y"],
+        ["evaluate", "ball-small", "x"],
+        ["doctor", "--stability", "ball-small"],
+    ],
 )
 def test_commands_name_what_they_do_not_know(command, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -19,11 +19,11 @@ import torch
 from torch import Tensor
 
 from gsim3d.dynamics import concatenate
-from gsim3d.effects import Plan
 from gsim3d.errors import InputError
 from gsim3d.graphs import Captured
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
+from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport
 from gsim3d.train.samples import Batch
@@ -69,10 +69,15 @@ class CapturedLoss:
         precision: Callable[[str], torch.autocast],
     ):
         config = simulator.config.dynamics
-        if config.drop_path or config.shuffle_orders or config.norm == "batch" or config.explicit:
-            raise InputError(
-                'CapturedLoss: the model must have drop_path 0, shuffle_orders false, norm "layer" and explicit false'
-            )
+        if (
+            config.drop_path
+            or config.shuffle_orders
+            or config.norm == "batch"
+            or config.explicit
+            or config.is_asymmetric
+        ):
+            wanted = 'drop_path 0, shuffle_orders false, norm "layer", explicit false and a symmetric background'
+            raise InputError(f"captured: the model must have {wanted}")
         self._simulator, self._plan, self._loss, self._precision = simulator, plan, loss, precision
         self._parameters = [*simulator.dynamics.parameters(), *simulator.renderer.parameters()]
         self._kind: tuple | None = None
@@ -202,7 +207,9 @@ class CapturedLoss:
     def _load(self, particles: Particles, batch: Batch, weights: Tensor) -> Tensor:
         """Copies a batch to where the graph reads it; the rows there of the particles' rows."""
         cloud = particles.row_cloud()
-        places = torch.arange(particles.n_rows, device=cloud.device) - particles.cu_rows[cloud] + self._first_rows[cloud]
+        places = (
+            torch.arange(particles.n_rows, device=cloud.device) - particles.cu_rows[cloud] + self._first_rows[cloud]
+        )
         state = self._state
         state.activity.fill_(ASLEEP)
         state.opacities.zero_()

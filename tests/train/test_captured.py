@@ -38,7 +38,9 @@ def trainer(scenes, tmp_path, device):
 
 
 def captured_loss(trainer):
-    return CapturedLoss(trainer.simulator, trainer.plan, trainer.loss_of_images, lambda part: torch.autocast("cpu", enabled=False))
+    return CapturedLoss(
+        trainer.simulator, trainer.plan, trainer.loss_of_images, lambda part: torch.autocast("cpu", enabled=False)
+    )
 
 
 def batches(scenes, count):
@@ -75,7 +77,9 @@ def test_what_needs_more_room_gets_it(scenes, trainer, device):
     loss = first.loss.clone()
     near = dataclasses.replace(particles, means=particles.means * 0.01)
     captured(near, batch, weights, report)  # few cells, then many
-    captured._capacities = [dataclasses.replace(c, sizes=(c.sizes[0], *(1 for _ in c.sizes[1:]))) for c in captured._capacities]
+    captured._capacities = [
+        dataclasses.replace(c, sizes=(c.sizes[0], *(1 for _ in c.sizes[1:]))) for c in captured._capacities
+    ]
     again = captured(particles, batch, weights, report)
     assert torch.equal(again.loss, loss) and captured.captures >= 2
 
