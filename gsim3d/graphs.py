@@ -224,11 +224,13 @@ class CapturedRollout:
     def _rollout(self, geometry, report: StabilityReport) -> Predicted:
         """The rollout of the graph's own state."""
         plan, rest = _with_background_as_it_is(self._plan), self._rest
-        options = {"geometry": geometry, "report": report, "background": None if rest is None else rest.background}
+        options, renderings = {"geometry": geometry, "report": report}, []
         with torch.no_grad(), self._autocast():
-            steps, renderings = self._model.rollout(self._state, self._n_steps, plan, **options), []
-            if rest is not None:
-                steps = [rest.parts.whole(step, 1 + i) for i, step in enumerate(steps)]
+            if rest is None:
+                steps = self._model.rollout(self._state, self._n_steps, plan, **options)
+            else:
+                moving = self._model.advance(self._state, rest.background, self._n_steps, plan, **options)
+                steps = [rest.parts.whole(step, 1 + i) for i, step in enumerate(moving)]
             if self._cameras is not None:
                 for step in steps:
                     renderings.append(self._model.draw(step, self._cameras, self._background, self._drawn, report=report))

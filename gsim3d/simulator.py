@@ -16,8 +16,9 @@ Every call takes ``on_bad``, the policy for numbers that cannot be used (:mod:`g
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -34,9 +35,11 @@ from gsim3d.dynamics import (
     rollout,
     rollout_in_parts,
 )
+from gsim3d.edits import Edit, by_step
 from gsim3d.effects import EffectsSpec, OutputEffects
 from gsim3d.encoder import Encoder, pixel_rows
 from gsim3d.guards import drop_rows, guard_frames, guard_particles
+from gsim3d.harmonics import SH_0
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
 from gsim3d.plans import Plan, make_plan, unused_parameters
@@ -113,26 +116,41 @@ class Simulator(nn.Module):
         geometry: Callable[[Particles], Pyramid] | None = None,
         wrap: Callable[[Callable], Callable] | None = None,
         log: RestLog | None = None,
-        background: Background | None = None,
+        edits: Iterable[Edit] = (),
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
 
-        Rows are those of the newest step of ``state`` throughout. Gradients flow through all steps. Arguments as
-        :meth:`step`.
+        Rows are those of the newest step of ``state`` throughout, but for edits. Gradients flow through all steps.
+        Arguments as :meth:`step`.
 
         Args:
             geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
             wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
             log: is told which rows rested and were not computed.
-            background: what rests, of ``dynamics.remember``; then ``state``, and what is returned, is what moves.
+            edits: changes of the scene on the way (:mod:`gsim3d.edits`); they wake everybody.
+        Raises:
+            InputError: an edit cannot be made; the message names its step and operation.
         """
         plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
         predict = predict if wrap is None else wrap(predict)
-        state = guard(self.prepare(state, plan))
+        state, steps = self.prepare(state, plan), []
+        structure = plan.spec.structure
+        changes = by_step(edits, n_steps, insert=structure.insert, remove=structure.remove)
+        for begin, end in pairwise(sorted({0, *changes, n_steps})):
+            for edit in changes.get(begin, ()):
+                state = edit.apply(state, self._colors)
+            state = guard(state)
+            steps += self._roll(predict, state, end - begin, plan, generator, log)
+            if end < n_steps:
+                state = last_steps(concatenate([state, *steps[begin:end][-plan.history :]]), plan.history)
+        return steps
+
+    def _roll(self, predict, state: Particles, n_steps: int, plan: Plan, generator, log) -> list[Particles]:
+        """:meth:`rollout` of a state that is prepared, without edits."""
         config, rule = self.config.dynamics, plan.spec.dynamics.sleep
-        if background is not None or (rule is None and not config.is_asymmetric):
-            return rollout(partial(predict, background=background), state, n_steps, plan.history)
+        if rule is None and not config.is_asymmetric:
+            return rollout(predict, state, n_steps, plan.history)
         return rollout_in_parts(
             predict,
             state,
@@ -157,6 +175,21 @@ class Simulator(nn.Module):
     ) -> Parts:
         """What moves and what rests of a state that :meth:`prepare` made, for a model with an asymmetric background."""
         return Parts.of(self._guard("rollout", on_bad, report)(prepared), asymmetric=True)
+
+    def advance(
+        self,
+        moving: Particles,
+        background: Background,
+        n_steps: int,
+        plan: Plan,
+        *,
+        report: StabilityReport | None = None,
+        geometry: Callable[[Particles], Pyramid] | None = None,
+    ) -> list[Particles]:
+        """As :meth:`rollout`, of what moves alone, beside a background of ``dynamics.remember``."""
+        guard = self._guard("rollout", None, report)
+        options = {"plan": plan, "generator": None, "guard": guard, "geometry": geometry, "background": background}
+        return rollout(partial(self._predict, **options), moving, n_steps, plan.history)
 
     def render(
         self,
@@ -206,6 +239,10 @@ class Simulator(nn.Module):
             )
         asked = (outputs.rgb, outputs.alpha, outputs.depth, outputs.features)
         return Rendering(*(made if wanted else None for made, wanted in zip(image, asked, strict=True)))
+
+    def _colors(self, particles: Particles) -> Tensor:
+        """[N, 3], of the Gaussians, seen from nowhere in particular."""
+        return 0.5 + SH_0 * self.renderer(particles, sh_degree=0).sh[:, 0]
 
     def _guard(
         self, where: str, on_bad: OnBad | None, report: StabilityReport | None, in_workspace: bool = True

@@ -96,7 +96,7 @@ def test_view_dependence_beyond_the_model_raises():
         ({"appearance": {"changing": "bunny"}}, "appearance.changing must be one of"),
         ({"dynamics": {"sleep": {"policy": "soundly"}}}, "dynamics.sleep.policy must be one of exact, approx"),
         ({"dynamics": {"sleep": {"patience": 0}}}, "dynamics.sleep.patience must be an integer of at least 1; got 0"),
-        ({"dynamics": {"sleep": {"eps": "1e-3"}}}, "dynamics.sleep.eps must be a number of at least 0; got '1e-3'"),
+        ({"dynamics": {"sleep": {"eps": "1e-3"}}}, "dynamics.sleep.eps must be a number; got '1e-3'"),
         ({"dynamics": {"actions": {"names": "hand"}}}, "dynamics.actions.names must be a list; got 'hand'"),
         ({"dynamics": {"contact": {"pairs": [["a"]]}}}, r"dynamics.contact.pairs must be a list of 2; got \['a'\]"),
         ({"outputs": {"depth": "yes"}}, "outputs.depth must be true or false; got 'yes'"),
