@@ -17,7 +17,7 @@ ROOMS = [
     {"presets", "edits"},
     {"plans"},
     {"simulator"},
-    {"laws", "graphs"},
+    {"laws", "graphs", "agreement"},
     {"endurance"},
     {"data", "interop", "perceptual"},
     {"generate"},
