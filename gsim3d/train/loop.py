@@ -85,6 +85,8 @@ class Trainer:
         self.plan_spec = EffectsSpec.from_dict(config.effects)
         self.simulator = build_simulator(model_config(config), config.seed).to(device)
         self.plan = self.simulator.plan(self.plan_spec)
+        if not self.plan_spec.outputs.rgb:
+            raise InputError("effects: outputs.rgb is off, but the loss compares colours; leave it on")
         _check_history(config, self.plan)
         _check_sharing(config, self.processes.count, self.simulator.config.dynamics.norm)
         self.perceptual = load("lpips_vgg", partial(LPIPS, "vgg")).to(device) if config.loss.perceptual else None
