@@ -1,4 +1,4 @@
-"""``gsim3d demo``: make multi-view video and predict it, with the simulator that comes with gsim3d or one learned here."""
+"""``gsim3d demo``: multi-view video is made and predicted, by a shipped simulator or one learned here."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageCo
 
 EPILOG = """\
 Writes into DIR:
-  held_out/      multi-view video of soft bodies that fall on a round ground, simulated and filmed here; no training saw it
+  held_out/      multi-view video of soft bodies that fall on a round ground, made here; no training saw it
   rollout.mp4    these scenes, truth above prediction
   psnr.png       PSNR over time against the baselines
   metrics.json   all numbers; the most important ones are printed
