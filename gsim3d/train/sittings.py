@@ -10,8 +10,8 @@ A state folder holds, of a model called NAME,
 - ``NAME.metrics.jsonl``: the log.
 
 Six bytes a weight instead of the sixteen of a checkpoint. What is lost: the weights are rounded by 2^-9 of their size,
-and the averages of gradients begin at zero, so that the first ten steps or so are shorter. A run in sittings is therefore
-not the one that was never stopped, bit by bit; one of ``gsim3d train`` is.
+and the averages of gradients begin at zero, so that the first ten steps or so are shorter. So a run in sittings is
+not the one that was never stopped, bit by bit, as one of ``gsim3d train`` is.
 """
 
 from __future__ import annotations
