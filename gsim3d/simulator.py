@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from gsim3d.dynamics import (
     Background,
     Dynamics,
+    Parts,
     RestLog,
     Sleepers,
     append_step,
@@ -168,6 +169,27 @@ class Simulator(nn.Module):
         if background == "dynamic":
             state = dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
         return last_steps(state, plan.history)
+
+    def parts(
+        self, prepared: Particles, *, on_bad: OnBad | None = None, report: StabilityReport | None = None
+    ) -> Parts:
+        """What moves and what rests of a state that :meth:`prepare` made, for a model with an asymmetric background."""
+        return Parts.of(self._guard("rollout", on_bad, report)(prepared), asymmetric=True)
+
+    def advance(
+        self,
+        moving: Particles,
+        background: Background,
+        n_steps: int,
+        plan: Plan,
+        *,
+        report: StabilityReport | None = None,
+        geometry: Callable[[Particles], Pyramid] | None = None,
+    ) -> list[Particles]:
+        """As :meth:`rollout`, of what moves alone, beside a background of ``dynamics.remember``."""
+        guard = self._guard("rollout", None, report)
+        options = {"plan": plan, "generator": None, "guard": guard, "geometry": geometry, "background": background}
+        return rollout(partial(self._predict, **options), moving, n_steps, plan.history)
 
     def render(
         self,

@@ -15,8 +15,9 @@ depends on where they are, and a scene without background is computed as by the 
 
 from __future__ import annotations
 
+import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 
@@ -31,6 +32,7 @@ _ops = torch.ops.gsim3d
 DEPTH = 16  # levels of the curves at stage 0, and bits of a cell along an axis
 SPACE_BITS = 3 * DEPTH  # below the scene in a key
 NOWHERE = torch.iinfo(torch.int64).max  # a key behind all others
+LAST = -1  # offsets go on with their last one
 ALL_CURVES = (0, 1, 2, 3)
 
 
@@ -49,17 +51,19 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """The places of the background at one stage.
+class Places:
+    """Where the background is found at one stage.
 
-    fields: by kernel size.
-    first: int64 [4, P], the key at which each patch begins along each serialization; the first of a scene at its lowest.
-    patches: its keys, of each serialization.
+    cells: of the fields, by kernel size.
+    first: int64 [4, P], the key at which each patch begins along each serialization; of the first patch of a scene the
+        scene's lowest.
+    kv_rows, cu_k: of each serialization, the keys of the patches as in :class:`PatchTable`.
     """
 
-    fields: dict[int, Field]
+    cells: dict[int, Tensor]
     first: Tensor
-    patches: tuple[PatchTable, ...]
+    kv_rows: tuple[Tensor, ...]
+    cu_k: tuple[Tensor, ...]
 
 
 @dataclass(frozen=True)
@@ -68,50 +72,79 @@ class Background:
 
     curves, depths: of each stage: which curves the run uses, as do calls that read it, and how many levels they have.
     places: of each stage; none where no row is seen.
-    fields: [D, C] of every convolution, by module.   keys: (k, v) [N, H, C / H] of every attention, by module.
+    fields: [D, C] of every convolution, by module.   keys, values: [N, H, C / H] of every attention, by module.
     """
 
     curves: tuple[tuple[int, ...], ...]
     depths: tuple[int, ...]
-    places: tuple[Surroundings, ...]
+    places: tuple[Places, ...]
     fields: dict[nn.Module, Tensor] = field(default_factory=dict)
-    keys: dict[nn.Module, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    keys: dict[nn.Module, Tensor] = field(default_factory=dict)
+    values: dict[nn.Module, Tensor] = field(default_factory=dict)
 
     @classmethod
-    def around(
+    def begin(
         cls,
         pyramid: Pyramid,
         particles: Particles,
         strides: Sequence[int],
         curves: tuple[tuple[int, ...], ...] | None = None,
-    ) -> Background:
-        """The places of ``particles``, of which ``pyramid`` is the geometry; nothing is kept of the network yet."""
+    ) -> tuple[Background, list[Recorder]]:
+        """The places of ``particles``, of which ``pyramid`` is the geometry; and what keeps, at each stage, the rest."""
         curves = (ALL_CURVES,) * len(pyramid.stages) if curves is None else curves
         depths = tuple(DEPTH + 1 - n.bit_length() for n in accumulate((1, *strides), operator.mul))
         if pyramid.rows.shape[0] == 0:
-            return cls(curves, depths, ())
-        rooms = zip(pyramid.stages, row_scenes(pyramid, particles), depths, curves, strict=True)
-        return cls(curves, depths, tuple(_surroundings(*room) for room in rooms))
-
-    def recorders(self, pyramid: Pyramid) -> list[Recorder]:
-        """What the run over the background is given, for each stage."""
-        return [Recorder(self, places, stage) for places, stage in zip(self.places, pyramid.stages)]
+            return cls(curves, depths, ()), []
+        rooms = list(zip(pyramid.stages, row_scenes(pyramid, particles), depths, strict=True))
+        fields = [{size: _field(*room, size) for size in room[0].kernel_maps} for room in rooms]
+        places = tuple(_places(at, *room, chosen) for at, room, chosen in zip(fields, rooms, curves, strict=True))
+        background = cls(curves, depths, places)
+        return background, [Recorder(background, at, stage) for at, stage in zip(fields, pyramid.stages)]
 
     def readers(self, pyramid: Pyramid, particles: Particles) -> list[Reader]:
         """What a call over moving ``particles`` is given, for each stage; nothing waits for the device."""
         rooms = zip(self.places, pyramid.stages, row_scenes(pyramid, particles), self.depths, self.curves)
         return [Reader(self, *room) for room in rooms]
 
+    def map(self, f: Callable[[Tensor, int], Tensor]) -> Background:
+        """The same background with ``f`` applied to every tensor and to what may follow its last entries: nothing."""
+        places = tuple(
+            Places(
+                {size: f(cells, NOWHERE) for size, cells in at.cells.items()},
+                f(at.first, NOWHERE),
+                tuple(f(rows, 0) for rows in at.kv_rows),
+                tuple(f(offsets, LAST) for offsets in at.cu_k),
+            )
+            for at in self.places
+        )
+        kept = ({module: f(x, 0) for module, x in part.items()} for part in (self.fields, self.keys, self.values))
+        return Background(self.curves, self.depths, places, *kept)
+
+    def with_room(self, factor: float) -> Background:
+        """Another one that reads alike, with room for ``factor`` times as much."""
+        return self.map(lambda x, fill: _longer(x, fill, math.ceil(factor * _length(x, fill))))
+
+    def load(self, other: Background) -> bool:
+        """Takes the numbers of ``other`` into its own memory; False where there is no room for them."""
+        own, given = [], []
+        self.map(lambda x, fill: own.append((x, fill)) or x)
+        other.map(lambda x, fill: given.append(x) or x)
+        if len(own) != len(given) or any(_length(x, fill) < _length(y, fill) for (x, fill), y in zip(own, given)):
+            return False
+        for (x, fill), y in zip(own, given):
+            x.copy_(_longer(y, fill, _length(x, fill)))
+        return True
+
 
 class Recorder:
     """Keeps what moving rows will read of one stage of the run over the background."""
 
-    def __init__(self, background: Background, places: Surroundings, stage: Stage):
-        self.background, self.places, self.stage = background, places, stage
+    def __init__(self, background: Background, fields: dict[int, Field], stage: Stage):
+        self.background, self.fields, self.stage = background, fields, stage
 
     def convolved(self, conv: nn.Module, x: Tensor, out: Tensor) -> Tensor:
         """``out``, which ``conv`` made of ``x``."""
-        at, voxels = self.places.fields[conv.kernel_size], self.stage.voxels
+        at, voxels = self.fields[conv.kernel_size], self.stage.voxels
         means = ops.pool_mean(x, voxels.rows, voxels.cu_rows, check=False)
         x = means.new_zeros(at.cells.shape[0], means.shape[1]).index_copy(0, at.occupied, means)
         around = torch.ones_like(conv.weight[:1, ..., :1])  # the centre tap reads a row itself
@@ -122,7 +155,9 @@ class Recorder:
         return out
 
     def attended(self, attention: nn.Module, q: Tensor, k: Tensor, v: Tensor, patches: PatchTable, row: int) -> Tensor:
-        self.background.keys.setdefault(attention, (k, v))
+        """``attention`` of the background to itself."""
+        self.background.keys.setdefault(attention, k)
+        self.background.values.setdefault(attention, v)
         return ops.patch_attention(q, k, v, patches, check=False)
 
 
@@ -132,21 +167,21 @@ class Reader:
     def __init__(
         self,
         background: Background,
-        places: Surroundings,
+        places: Places,
         stage: Stage,
         scene: Tensor,
         depth: int,
         curves: tuple[int, ...],
     ):
         self.background = background
-        self.cells = {size: _cell_of(at.cells, _cell_keys(scene, stage.grid)) for size, at in places.fields.items()}
+        self.cells = {size: _cell_of(cells, _cell_keys(scene, stage.grid)) for size, cells in places.cells.items()}
         self.patches = _overlapping(places, stage, scene, depth, curves)
 
     def convolved(self, conv: nn.Module, x: Tensor, out: Tensor) -> Tensor:
         return out + self.background.fields[conv].index_select(0, self.cells[conv.kernel_size]).to(out.dtype)
 
     def attended(self, attention: nn.Module, q: Tensor, k: Tensor, v: Tensor, patches: PatchTable, row: int) -> Tensor:
-        keys, values = (part.to(q.dtype) for part in self.background.keys[attention])
+        keys, values = self.background.keys[attention].to(q.dtype), self.background.values[attention].to(q.dtype)
         return joint_attention(q, k, v, keys, values, patches, self.patches[row])
 
 
@@ -172,7 +207,8 @@ class _JointAttention(torch.autograd.Function):
         scale = q.shape[-1] ** -0.5
         out, stats = _ops.patch_attention.default(q, k, v, *_lists(patches), scale)
         other, other_stats = _ops.patch_attention.default(q, other_k, other_v, *_lists(other_patches), scale)
-        out, stats = _joined(out, stats, other, other_stats, scale)
+        stats, share = _joined(stats, other_stats, scale)
+        out = (out * (1 - share) + other * share).to(out.dtype)  # lerp would round by how threads share the rows
         ctx.save_for_backward(q, k, v, other_k, other_v, out, stats)
         ctx.patches, ctx.scale = (patches, other_patches), scale
         return out
@@ -189,17 +225,18 @@ class _JointAttention(torch.autograd.Function):
         return mine[0] + others[0], *mine[1:], *others[1:], None, None
 
 
-def _joined(out: Tensor, stats: Tensor, other: Tensor, other_stats: Tensor, scale: float) -> tuple[Tensor, Tensor]:
-    """Results of two softmaxes as that of one over the keys of both. Stats: largest product; sum of exponentials."""
-    (top, total), (other_top, other_total) = stats.unbind(-1), other_stats.unbind(-1)
+def _joined(stats: Tensor, other: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+    """The stats of one softmax over the keys of both, and the share [..., 1] of the other keys in it.
+
+    Stats: the largest product of a query and a key, and the sum of exponentials relative to it, 0 of no keys.
+    """
+    (top, total), (other_top, other_total) = stats.unbind(-1), other.unbind(-1)
     other_top = torch.where(other_total > 0, other_top, top)
     largest = torch.maximum(top, other_top)
-    total = total * ((top - largest) * scale).exp()
     other_total = other_total * ((other_top - largest) * scale).exp()
-    both = total + other_total
-    share = (other_total / both.clamp(min=torch.finfo(both.dtype).tiny))[..., None]
-    joined = out * (1 - share) + other * share  # no fused product: its bits would depend on how threads share the rows
-    return joined.to(out.dtype), torch.stack([largest, both], -1)
+    both = total * ((top - largest) * scale).exp() + other_total
+    share = other_total / both.clamp(min=torch.finfo(both.dtype).tiny)
+    return torch.stack([largest, both], -1), share[..., None]
 
 
 def _lists(patches: PatchTable) -> tuple[Tensor, ...]:
@@ -232,19 +269,15 @@ def _shifted(keys: Tensor, offsets: Tensor, depth: int) -> tuple[Tensor, Tensor]
     return keys, inside
 
 
-def _surroundings(stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]) -> Surroundings:
-    voxels = stage.voxels
-    lowest = voxels.rows[voxels.cu_rows[:-1]]
-    keys = _cell_keys(scene[lowest], stage.grid[lowest])
-    fields = {size: _field(keys, size, depth) for size in stage.kernel_maps}
-    starts = stage.patches[0].cu_q[:-1]
-    first = stage.order[:, starts]
-    codes = _codes(stage, scene, depth, curves).gather(1, first)
-    of_scene = scene[first]
+def _places(fields: dict[int, Field], stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]) -> Places:
+    first = stage.order[:, stage.patches[0].cu_q[:-1]]
+    codes, of_scene = _codes(stage, scene, depth, curves).gather(1, first), scene[first]
     opens = torch.ones_like(first, dtype=torch.bool)
     opens[:, 1:] = of_scene[:, 1:] != of_scene[:, :-1]
     codes = torch.where(opens, of_scene << SPACE_BITS, codes)
-    return Surroundings(fields, codes, stage.patches)
+    tables = stage.patches
+    cells = {size: at.cells for size, at in fields.items()}
+    return Places(cells, codes, tuple(t.kv_rows for t in tables), tuple(t.cu_k for t in tables))
 
 
 def _codes(stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]) -> Tensor:
@@ -252,9 +285,9 @@ def _codes(stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]) -> 
     return ops.curve_encode(stage.grid, scene, [CURVES[c] for c in curves], depth=depth, shift=SPACE_BITS)
 
 
-def _field(keys: Tensor, kernel_size: int, depth: int) -> Field:
-    """keys: of the background's voxels, ascending."""
-    reach = kernel_size // 2
+def _field(stage: Stage, scene: Tensor, depth: int, kernel_size: int) -> Field:
+    lowest, reach = stage.voxels.rows[stage.voxels.cu_rows[:-1]], kernel_size // 2
+    keys = _cell_keys(scene[lowest], stage.grid[lowest])  # ascending, as voxels are
     steps = torch.arange(-reach, reach + 1, device=keys.device)
     cells = keys
     for axis in range(3):
@@ -280,7 +313,7 @@ def _cell_of(cells: Tensor, keys: Tensor) -> Tensor:
 
 
 def _overlapping(
-    places: Surroundings, stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]
+    places: Places, stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]
 ) -> tuple[PatchTable, ...]:
     """The patches of the background with the moving rows that lie in their intervals, of each serialization."""
     n_patches = places.first.shape[1]
@@ -292,4 +325,21 @@ def _overlapping(
     order, _ = ops.curve_sort(patch)
     bounds = torch.arange(n_patches + 1, device=scene.device).expand(len(curves), -1).contiguous()
     cu_q = torch.searchsorted(patch.gather(1, order), bounds)
-    return tuple(PatchTable(order[r], own.kv_rows, cu_q[r], own.cu_k) for r, own in enumerate(places.patches))
+    return tuple(PatchTable(*lists) for lists in zip(order, places.kv_rows, cu_q, places.cu_k, strict=True))
+
+
+# ---- room ----
+
+
+def _length(x: Tensor, fill: int) -> int:
+    """Entries along the axis that may be longer, the last one of keys, the first one of rows; offsets have one more."""
+    return x.shape[-1] - (fill == LAST) if fill in (NOWHERE, LAST) else x.shape[0]
+
+
+def _longer(x: Tensor, fill: int, length: int) -> Tensor:
+    more = length - _length(x, fill)
+    if fill == LAST:
+        return torch.cat([x, x[-1:].expand(more)])
+    if fill == NOWHERE:
+        return torch.cat([x, x.new_full((*x.shape[:-1], more), fill)], -1)
+    return torch.cat([x, x.new_zeros(more, *x.shape[1:])])

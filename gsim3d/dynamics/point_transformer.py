@@ -122,7 +122,7 @@ class Block(nn.Module):
         """x [N, C] with attention along serialization ``row``. ``conv_input``: read by the convolution, default x."""
         conv_input = x if conv_input is None else conv_input
         if self.is_fused(x, beside):
-            return self.advance(x, conv_input, stage, row, generator)[0]
+            return self.advance(x, conv_input, stage, row, generator, beside)[0]
         keep = self._draw_keep(x, generator)
         if self._recomputes():
             arguments = (x, conv_input, stage, row, *keep, beside)
@@ -130,16 +130,25 @@ class Block(nn.Module):
         return self._compute(x, conv_input, stage, row, *keep, beside)
 
     def is_fused(self, x: Tensor, beside: Beside | None = None) -> bool:
-        if beside is not None or torch.compiler.is_compiling() or self.attention.rounded_to_half:
+        if isinstance(beside, Recorder) or (beside is not None and torch.is_grad_enabled()):
+            return False
+        if torch.compiler.is_compiling() or self.attention.rounded_to_half:
             return False
         return x.is_cuda if self.fused is None else self.fused
 
     def advance(
-        self, x: Tensor, conv_input: Tensor, stage: Stage, row: int, generator: torch.Generator | None
+        self,
+        x: Tensor,
+        conv_input: Tensor,
+        stage: Stage,
+        row: int,
+        generator: torch.Generator | None,
+        beside: Reader | None = None,
     ) -> tuple[Tensor, Tensor]:
         """What :meth:`forward` returns where the block is fused, and the same in the dtype that convolutions read."""
         keep = self._draw_keep(x, generator)
-        return run_block(self, x, conv_input.to(product_dtype(x)), stage, row, keep, self._recomputes())
+        conv_input = conv_input.to(product_dtype(x))
+        return run_block(self, x, conv_input, stage, row, keep, self._recomputes(), beside)
 
     def _recomputes(self) -> bool:
         return self.checkpointing and self.training and torch.is_grad_enabled()
@@ -181,7 +190,7 @@ def run_blocks(
     for i, block in enumerate(blocks):
         row = i % len(stage.patches)
         if block.is_fused(x, beside):
-            x, conv_input = block.advance(x, conv_input, stage, row, generator)
+            x, conv_input = block.advance(x, conv_input, stage, row, generator, beside)
         else:
             x = conv_input = block(x, stage, row, conv_input=conv_input, generator=generator, beside=beside)
     return x

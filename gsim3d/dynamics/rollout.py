@@ -57,7 +57,7 @@ def rollout_in_parts(
         if parts is None or (sleepers is not None and sleepers.changed):
             if steps:  # all that the model sees was simulated when somebody falls asleep first
                 history = last_steps(concatenate(steps[-max_steps:]), max_steps)
-            asleep = None if sleepers is None else sleepers.asleep
+            asleep = sleepers.asleep if sleepers is not None and bool(sleepers.asleep.any()) else None
             parts, begin = Parts.of(history, asymmetric=remember is not None, asleep=asleep), len(steps)
             moving, background = parts.moving, None
             if parts.background is not None and not parts.nothing_moves:
