@@ -309,8 +309,11 @@ class Trainer:
             particles = self.simulator.encode(batch.context, report=watch.report)
         watch.count(particles)
         later = self.captured(particles, batch, self.step_weights(batch) * scale, watch.report)
-        outputs = [getattr(particles, name) for name in later.particles]
-        gradients = torch.autograd.grad(outputs, encoder, list(later.particles.values()), allow_unused=True)
+        outputs = {name: getattr(particles, name) for name in later.particles}
+        learned = [name for name, value in outputs.items() if value.requires_grad]
+        gradients = torch.autograd.grad(
+            [outputs[name] for name in learned], encoder, [later.particles[name] for name in learned], allow_unused=True
+        )
         known = dict(zip([*encoder, *self.captured.parameters], [*gradients, *later.parameters], strict=True))
         return later.loss / scale, later.errors, tuple(known[parameter] for parameter in self.parameters.values())
 
