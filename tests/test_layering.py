@@ -17,13 +17,13 @@ ROOMS = [
     {"presets", "edits"},
     {"plans"},
     {"simulator"},
-    {"laws", "graphs", "agreement"},
+    {"laws", "graphs", "by_scene", "agreement"},
     {"endurance"},
     {"data", "interop", "perceptual"},
     {"generate"},
     {"train"},
     {"evaluate", "check_stability"},
-    {"simulate", "check_data", "import_released", "demo", "doctor"},
+    {"simulate", "show_plan", "infer_effects", "check_data", "import_released", "demo", "doctor"},
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}

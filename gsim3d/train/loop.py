@@ -88,6 +88,8 @@ class Trainer:
         self.plan_spec = EffectsSpec.from_dict(config.effects)
         self.simulator = build_simulator(model_config(config), config.seed).to(device)
         self.plan = self.simulator.plan(self.plan_spec)
+        if not self.plan_spec.outputs.rgb:
+            raise InputError("effects: outputs.rgb is off, but the loss compares colours; leave it on")
         _check_history(config, self.plan)
         check_thawing(config.data, self.simulator.config.dynamics)
         _check_sharing(config, self.processes.count, self.simulator.config.dynamics.norm)
@@ -309,8 +311,11 @@ class Trainer:
             particles = self.simulator.encode(batch.context, report=watch.report)
         watch.count(particles)
         later = self.captured(particles, batch, self.step_weights(batch) * scale, watch.report)
-        outputs = [getattr(particles, name) for name in later.particles]
-        gradients = torch.autograd.grad(outputs, encoder, list(later.particles.values()), allow_unused=True)
+        outputs = {name: getattr(particles, name) for name in later.particles}
+        learned = [name for name, value in outputs.items() if value.requires_grad]
+        gradients = torch.autograd.grad(
+            [outputs[name] for name in learned], encoder, [later.particles[name] for name in learned], allow_unused=True
+        )
         known = dict(zip([*encoder, *self.captured.parameters], [*gradients, *later.parameters], strict=True))
         return later.loss / scale, later.errors, tuple(known[parameter] for parameter in self.parameters.values())
 

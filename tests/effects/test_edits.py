@@ -85,7 +85,9 @@ def test_what_is_moved_keeps_its_speed():
     by = (0.5, -0.25, 0.125)
     moved = edited(simulator, state, Move("moving", by))
     moving = state.activity == DYNAMIC
-    assert_close_relative_to_max((moved.means - state.means)[moving], torch.tensor([by]).expand(int(moving.sum()), 3), 1e-5)
+    assert_close_relative_to_max(
+        (moved.means - state.means)[moving], torch.tensor([by]).expand(int(moving.sum()), 3), 1e-5
+    )
     assert len(set(state.row_cloud()[moving].tolist())) == 2, "the past moved as well"
 
 
@@ -126,9 +128,7 @@ def test_a_rotation_is_about_the_middle_of_what_turns_and_turns_its_speed():
     turned = edited(simulator, state, Rotate("moving", axis=(1.0, 0.0, 0.0), degrees=90.0))
     for scene in (0, 1):
         olds, news = ([s.select_clouds([2 * scene + t]) for t in (0, 1)] for s in (state, turned))
-        middle, frozen = (
-            [c.means[c.activity == kind].mean(0) for c in (*olds, *news)] for kind in (DYNAMIC, FROZEN)
-        )
+        middle, frozen = ([c.means[c.activity == kind].mean(0) for c in (*olds, *news)] for kind in (DYNAMIC, FROZEN))
         assert_close_relative_to_max(middle[3], middle[1], 1e-5)
         way, turned_way = middle[0] - middle[1], middle[2] - middle[3]
         assert_close_relative_to_max(turned_way, torch.stack([way[0], -way[2], way[1]]), 1e-4)
@@ -271,5 +271,3 @@ def test_files_that_are_no_edits(tmp_path, text, message):
     (tmp_path / "edits.yaml").write_text(text)
     with pytest.raises(InputError, match=message):
         load_edits(tmp_path / "edits.yaml", lambda folder: None)
-
-
