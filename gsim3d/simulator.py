@@ -101,7 +101,7 @@ class Simulator(nn.Module):
 
         Args:
             state: last steps of every scene.
-            plan: what to compute; default everything the model can.
+            plan: what to compute; default everything the model can. Nobody sleeps: that is decided along a rollout.
             generator: randomness of training (drop path, curve shuffling); None: none.
         """
         plan, guard = plan or self.plan(), self._guard("step", on_bad, report)

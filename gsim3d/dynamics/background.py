@@ -3,8 +3,8 @@
 The network runs over the background alone, one cloud a scene in the newest time slot, with cells, clusters, patches and
 curves of its own. Three things are kept of that run, for as long as the background stays:
 
-* of every convolution a field: what the background adds to it in every cell that has background within reach. A moving row
-  looks up its cell: a tap adds the mean of the moving rows of a neighbour cell and the mean of its frozen rows.
+* of every convolution a field: what the background adds to it in every cell that has background within reach. A moving
+  row looks up its cell: a tap adds the mean of the moving rows of a neighbour cell and the mean of its frozen rows.
 * of every attention the keys and values. A moving row attends to its own patch, as without a background, and to the one
   background patch in whose interval of the curve it lies, in one softmax.
 * the places of both: sorted keys, found by binary search.
@@ -90,7 +90,7 @@ class Background:
         strides: Sequence[int],
         curves: tuple[tuple[int, ...], ...] | None = None,
     ) -> tuple[Background, list[Recorder]]:
-        """The places of ``particles``, of which ``pyramid`` is the geometry; and what keeps, at each stage, the rest."""
+        """The places of ``particles``, whose geometry is ``pyramid``; and what keeps, at each stage, the rest."""
         curves = (ALL_CURVES,) * len(pyramid.stages) if curves is None else curves
         depths = tuple(DEPTH + 1 - n.bit_length() for n in accumulate((1, *strides), operator.mul))
         if pyramid.rows.shape[0] == 0:
@@ -295,12 +295,17 @@ def _field(stage: Stage, scene: Tensor, depth: int, kernel_size: int) -> Field:
         offsets[:, axis] = steps
         spread, inside = _shifted(cells, offsets, depth)
         cells = torch.unique(spread[inside])
-    taps = torch.cartesian_prod(steps, steps, steps)
-    seen_from, inside = _shifted(keys, -taps, depth)
-    inside = inside & taps.any(1)[:, None]
     cells = torch.cat([cells, cells.new_full((1,), NOWHERE)])
     occupied = torch.searchsorted(cells, keys)
-    tap_in, tap_out = occupied.expand_as(seen_from)[inside], torch.searchsorted(cells, seen_from[inside])
+    # Cells above each other follow each other: one search serves a column of taps.
+    columns = torch.nn.functional.pad(torch.cartesian_prod(steps, steps), (0, 1))
+    seen_from, inside = _shifted(keys, -columns, depth)
+    heights = (keys & (1 << DEPTH) - 1) - steps[:, None]
+    inside = inside[:, None] & (heights >= 0) & (heights < 1 << depth)
+    inside[columns.shape[0] // 2, reach] = False
+    pairs = inside.flatten().nonzero()[:, 0]
+    tap_out = (torch.searchsorted(cells, seen_from)[:, None] - steps[:, None]).flatten()[pairs]
+    tap_in, inside = occupied[pairs % keys.shape[0]], inside.flatten(0, 1)
     cu_taps = torch.nn.functional.pad(inside.sum(1).cumsum(0), (1, 0))
     each = torch.arange(cells.shape[0] + 1, device=keys.device)
     return Field(cells, occupied, Voxels(each[:-1], each[:-1], each), KernelMap(kernel_size, tap_in, tap_out, cu_taps))

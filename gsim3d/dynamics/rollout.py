@@ -46,8 +46,8 @@ def rollout_in_parts(
 
     Args:
         predict: last steps of what moves, and its background -> the next steps of what moves.
-        remember: what rests -> the background that ``predict`` reads, made anew whenever others rest; None: the model does
-            not tell them apart, and only whole scenes rest.
+        remember: what rests -> the background that ``predict`` reads, made anew whenever others rest; None: the model
+            does not tell them apart, and only whole scenes rest.
         sleepers: who sleeps beside frozen rows; None: nobody.
         log: is told what was computed.
     """
