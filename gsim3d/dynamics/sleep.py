@@ -61,11 +61,10 @@ class Sleepers:
         self.reach = rule.eps * grid_size
         self.asleep = torch.zeros(newest.n_rows, dtype=torch.bool, device=newest.means.device)
         self.steps_at_rest = torch.zeros_like(self.asleep, dtype=torch.int64)
-        self.changed = False
 
     @torch.no_grad()
     def look(self, before: Particles, after: Particles) -> None:
-        """Notes what a step changed, and decides who sleeps in the next; ``changed``: whether these are others."""
+        """Notes what a step changed, and decides who sleeps in the next."""
         at_rest = _largest_change(before.means, after.means) <= self.reach
         for name, value in after.row_fields().items():
             if name not in ("means", "activity", "static_latents"):
@@ -75,12 +74,10 @@ class Sleepers:
         restless = self.steps_at_rest < self.patience
         scene = after.cloud_scene[after.row_cloud()]
         if self.rule.policy == "exact":
-            asleep = ~torch.isin(scene, scene[restless])
+            self.asleep = ~torch.isin(scene, scene[restless])
         else:
-            asleep = ~_near(_cubes(after, scene, self.rule.halo), restless & (after.activity != ASLEEP))
-            asleep &= (after.activity != FROZEN) & ~restless
-        self.changed = not torch.equal(asleep, self.asleep)
-        self.asleep = asleep
+            stirred = _near(_cubes(after, scene, self.rule.halo), restless & (after.activity != ASLEEP))
+            self.asleep = ~stirred & ~restless & (after.activity != FROZEN)
 
 
 def _largest_change(before: Tensor, after: Tensor) -> Tensor:

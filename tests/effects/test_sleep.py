@@ -163,30 +163,33 @@ def test_a_state_without_moving_rows_needs_no_network():
 
 
 def test_rows_asleep_are_read_as_a_background():
-    """A part of a scene falls asleep: from then on each step is that of a state in which it is frozen."""
+    """A part of a scene falls asleep after four steps: the next ones are those of a state in which it is frozen."""
     simulator, state = make_simulator(), make_history((50, 60), frozen_share=0.3)
-    first = simulator.rollout(state, 4)
-    history, newest = concatenate(first), first[-1]
+    newest, dynamics, log = last_steps(state, 1), simulator.dynamics, RestLog()
     asleep = (newest.activity != FROZEN) & (newest.means[:, 0] < 0.5)
 
     class Some(Sleepers):
         def look(self, before, after):
-            self.changed, self.asleep = not torch.equal(self.asleep, asleep), asleep
+            self.steps_at_rest += 1
+            self.asleep = asleep & (self.steps_at_rest >= 4)
 
-    sleepers = Some(Sleep("approx"), newest, 1.0, 4)
-    sleepers.asleep = asleep
-    dynamics = simulator.dynamics
     steps = rollout_in_parts(
         lambda moving, background: dynamics(moving, background=background),
-        history, 2, 4, remember=dynamics.remember, sleepers=sleepers,
-    )  # fmt: skip
-    marked = dataclasses.replace(
-        history, activity=torch.where(asleep.repeat(4), FROZEN, history.activity).to(torch.uint8)
+        state,
+        7,
+        4,
+        remember=dynamics.remember,
+        sleepers=Some(Sleep("approx"), newest, 1.0, 4),
+        log=log,
     )
-    for one, other in zip(steps, simulator.rollout(marked, 2), strict=True):
+    assert log.remembered == 2 and log.moving[3] > log.moving[4] > 0
+    history = concatenate(steps[:4])
+    activity = torch.where(asleep.repeat(4), FROZEN, history.activity).to(torch.uint8)
+    expected = simulator.rollout(dataclasses.replace(history, activity=activity), 3)
+    for one, other in zip(steps[4:], expected, strict=True):
         assert_same_bits(one.means, other.means)
         assert torch.equal(one.activity, newest.activity)
-    assert_same_bits(steps[-1].means[asleep], newest.means[asleep])
+    assert_same_bits(steps[-1].means[asleep], steps[3].means[asleep])
 
 
 def test_sleep_repeats_bit_by_bit():
