@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import Parts, RestLog, Sleepers, concatenate, last_steps, rollout_in_parts
+from gsim3d.dynamics import RestLog, Sleepers, concatenate, last_steps, rollout_in_parts
 from gsim3d.effects import DynamicsEffects, EffectsSpec, Sleep
 from gsim3d.errors import InputError
 from gsim3d.types import FROZEN, Particles
@@ -214,32 +214,6 @@ def test_gradients_reach_what_slept():
     )
     assert awake.abs().max() > 0
     assert_close_relative_to_max(slept, awake, 1e-12)
-
-
-def multiply_adds(simulator, call):
-    """Of all matrix products and convolutions."""
-    counted = []
-
-    def count(module, inputs, output):
-        counted.append(inputs[0].shape[0] * module.weight.numel())
-
-    hooks = [m.register_forward_hook(count) for m in simulator.dynamics.net._products]
-    call()
-    for hook in hooks:
-        hook.remove()
-    return sum(counted)
-
-
-def test_the_more_rests_the_less_is_computed():
-    """0, 50, 90 and 99 % of the rows frozen: the work of a step falls, to a third at 90 % and by far more at 99 %."""
-    simulator, history = make_simulator(), make_history((400, 400, 400, 400), frozen_share=0.0)
-    work = []
-    for share in (0.0, 0.5, 0.9, 0.99):
-        activity = torch.where(torch.arange(400) < share * 400, FROZEN, 0).to(torch.uint8).repeat(4)
-        parts = Parts.of(dataclasses.replace(history, activity=activity), asymmetric=True)
-        background = simulator.dynamics.remember(parts.background)
-        work.append(multiply_adds(simulator, lambda: simulator.dynamics(parts.moving, background=background)))
-    assert work[0] > 1.5 * work[1] and work[0] > 3 * work[2] and work[0] > 15 * work[3]
 
 
 def test_a_symmetric_model_sleeps_by_whole_scenes_only():
