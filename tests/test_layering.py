@@ -17,7 +17,7 @@ ROOMS = [
     {"presets", "edits"},
     {"plans"},
     {"simulator"},
-    {"laws", "graphs", "by_scene"},
+    {"laws", "graphs", "by_scene", "agreement"},
     {"endurance"},
     {"data", "interop", "perceptual"},
     {"generate"},

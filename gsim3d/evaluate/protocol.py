@@ -165,6 +165,7 @@ def score_scene(
     n_future: int | None = None,
     metrics: Sequence[str] = PLAIN_METRICS,
     others: Sequence[Predictions] = (),
+    prediction: Prediction | None = None,
 ) -> SceneScores:
     """Predicts a scene from its first steps and scores every method on the target views.
 
@@ -175,6 +176,7 @@ def score_scene(
         n_future: steps to predict; default to the end of the film.
         metrics: see :func:`gsim3d.evaluate.scoring.measurable`.
         others: predictions of other models.
+        prediction: what :func:`predict` gave for these cameras and steps; None: it is made here.
     """
     if restored is not None:
         context_cams, target_cams = default_views(restored, scene, context_cams, target_cams)
@@ -189,8 +191,9 @@ def score_scene(
     truth = SceneTruth(scene.name, images, labels, filmed, n_encoded, metrics)
 
     def methods() -> Iterator[tuple[str, Tensor]]:
+        nonlocal prediction
         if restored is not None:
-            prediction = predict(restored, scene, context_cams, n_future)
+            prediction = prediction or predict(restored, scene, context_cams, n_future)
             rendered = render_steps(restored, prediction.particles, scene, cams)
             yield "model", rendered
         for other in others:
