@@ -234,9 +234,13 @@ class Merge(nn.Module):
         self.time_embedding = nn.Parameter(torch.empty(window, channels))
         nn.init.trunc_normal_(self.time_embedding, std=TIME_EMBEDDING_STD)
 
+    def marks(self, stage: Stage) -> bool:
+        """Whether there is anything to tell apart."""
+        return stage.time_index is not None or self.newest is not None
+
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
         if stage.time_index is None:
-            return x if self.newest is None else x + self.time_embedding[self.newest].to(x.dtype)
+            return x + self.time_embedding[self.newest].to(x.dtype)
         # A product with a one-hot matrix: its gradient is a sum in row order, where indexing would use atomics on CUDA.
         return x + F.one_hot(stage.time_index, self.time_embedding.shape[0]).to(x) @ self.time_embedding
 
@@ -259,7 +263,7 @@ class EncoderStage(nn.Module):
     ) -> Tensor:
         if self.pool is not None:
             x = self.pool(x, stage)
-        if self.merge is not None:
+        if self.merge is not None and self.merge.marks(stage):
             x = self.merge(x, stage)
         return run_blocks(self.blocks, x, x, stage, generator, beside)
 

@@ -22,22 +22,15 @@ from gsim3d.edits import (
 )
 from gsim3d.effects import DynamicsEffects, EffectsSpec, StructureEffects
 from gsim3d.errors import InputError
-from gsim3d.presets import ModelConfig
-from gsim3d.renderer import RendererConfig
 from gsim3d.types import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
-from tests.dynamics.scenes import EXPLICIT
+from tests.effects.models import MODELS
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 EDITABLE = EffectsSpec(structure=StructureEffects(insert=True, remove=True))
-EXPLICIT_CONFIG = ModelConfig(
-    dataclasses.replace(CONFIG.encoder, explicit=True, dynamic_dim=4, sh_degree=1),
-    dataclasses.replace(EXPLICIT, grid_size=0.1, scale_max=0.3),
-    RendererConfig(latents=0, sh_degree=1, scale_min=0.001, scale_max=0.3),
-)
-CONFIGS = {"latent": CONFIG, "explicit": EXPLICIT_CONFIG}
+CONFIGS = {name: MODELS[name] for name in ("latent", "explicit")}
 
 
 def encoded(config=CONFIG, steps=(2,)):
@@ -181,7 +174,7 @@ def test_two_scenes_are_merged():
     painted = edited(simulator, here, Recolor("moving", (1.0, 0.0, 0.0)), Insert("all", there))
     assert_same_bits(painted.paint[-1], torch.eye(3))
     assert future(simulator, here, 2, [Edit(1, Insert("moving", there))])[-1].n_rows > last_steps(here, 1).n_rows
-    other, foreign, _ = encoded(EXPLICIT_CONFIG, (1,))
+    other, foreign, _ = encoded(MODELS["explicit"], (1,))
     with pytest.raises(InputError, match="edit at step 0, insert: particles.quats must be as those of the state"):
         future(simulator, here, 1, [Edit(0, Insert("all", foreign))])
     with pytest.raises(InputError, match="edit at step 0, insert: particles must be of one scene"):
