@@ -33,7 +33,7 @@ def read_and_reader(dtype=torch.float64):
     history = batch([make_history((150, 140), seed=i, frozen_share=0.6, dtype=dtype) for i in range(2)])
     parts = Parts.of(history, asymmetric=True)
     rest, moving = dynamics.geometry(parts.background), dynamics.geometry(parts.moving)
-    background, recorders = Background.begin(rest, parts.background, ASYMMETRIC.strides)
+    background, recorders = Background.begin(rest, parts.background, ASYMMETRIC.pyramid_spec(0))
     return parts, rest, moving, background, recorders[0]
 
 
