@@ -13,9 +13,19 @@ from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
 from gsim3d import ops
+from gsim3d.branches import Branches
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
 from gsim3d.dynamics.fused_block import run_block
-from gsim3d.layers import RowLayerNorm, RowLinear, make_norm, product_dtype, rounded_at_once, rounded_weights, widened
+from gsim3d.layers import (
+    RowLayerNorm,
+    RowLinear,
+    at_hand,
+    make_norm,
+    product_dtype,
+    round_at_once,
+    rounded_weights,
+    widened,
+)
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
 TIME_EMBEDDING_STD = 0.02
@@ -303,14 +313,15 @@ class PointTransformer(nn.Module):
 
     def forward(self, x: Tensor, pyramid: Pyramid, *, generator: torch.Generator | None = None) -> Tensor:
         if not x.is_cuda or torch.compiler.is_compiling():
-            return self._compute(x, pyramid, generator)
-        with rounded_at_once(self._products, product_dtype(x)):
-            return self._compute(x, pyramid, generator)
+            return self._behind_stem(self.stem(x, pyramid.stages[0]), pyramid, generator)
+        with Branches(x) as beside:
+            rounded = beside.run(round_at_once, self._products, product_dtype(x))
+            x = self.stem(x, pyramid.stages[0])
+        with at_hand(rounded):
+            return self._behind_stem(x, pyramid, generator)
 
-    def _compute(self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None) -> Tensor:
-        stages = pyramid.stages
-        x = self.stem(x, stages[0])
-        skips = []
+    def _behind_stem(self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None) -> Tensor:
+        stages, skips = pyramid.stages, []
         for encoder, stage in zip(self.encoder, stages, strict=True):
             x = encoder(x, stage, generator)
             skips.append(x)

@@ -33,6 +33,27 @@ struct Backward {
   KeyGradients<T> key_gradients;
 };
 
+template <typename T, int D>
+__device__ __forceinline__ QueryNumbers numbers_of(const Backward<T>& args, int64_t row, int64_t head) {
+  if (!inside(row, args.table.n_q)) return QueryNumbers::none();
+  const T* grad = args.grad.at(row, head);
+  const T* out = args.out.at(row, head);
+  float delta = 0;
+#pragma unroll
+  for (int i = 0; i < D / 8; ++i) {
+    const uint4 a = reinterpret_cast<const uint4*>(grad)[i], b = reinterpret_cast<const uint4*>(out)[i];
+    const uint32_t x[4] = {a.x, a.y, a.z, a.w}, y[4] = {b.x, b.y, b.z, b.w};
+#pragma unroll
+    for (int j = 0; j < 4; ++j) {
+      const float2 p = unpack<T>(x[j]), q = unpack<T>(y[j]);
+      delta = fmaf(p.x, q.x, fmaf(p.y, q.y, delta));
+    }
+  }
+  const float2 pair = *reinterpret_cast<const float2*>(args.stats + 2 * (row * args.size.heads + head));
+  const float log_sum = log2f(pair.y);
+  return {pair.x, log_sum, delta, -fmaf(pair.x, args.slope, log_sum)};
+}
+
 // Head dim 16 in one kernel; takes as long for few patches and heads as for one on each multiprocessor. Needs shared
 // memory that not every GPU has.
 bool fits_fused_backward(Stream stream);
