@@ -157,10 +157,9 @@ def _backward(plan: Plan, w: Weights, kept: Kept, conv_input: Tensor, keep_atten
     proj = beside.run(linear_grad_weight, grad_branch, kept.attended.flatten(1))
     grad_attended = grad_branch @ w.proj
     q, k, v = _heads(kept.qkv, plan.heads)
-    grads = _ops.patch_attention_backward.default(
+    grad_qkv = _ops.patch_attention_backward_packed.default(
         grad_attended.view(q.shape), q, k, v, kept.attended, kept.attention_stats, *plan.table(), q.shape[-1] ** -0.5
-    )
-    grad_qkv = torch.stack(grads, 1).flatten(1)
+    ).flatten(1)
     qkv = beside.run(linear_grad_weight, grad_qkv, kept.normed1)
     qkv_bias = beside.run(_ops.linear_grad_bias.default, grad_qkv)
     grad_normed = grad_qkv @ w.qkv

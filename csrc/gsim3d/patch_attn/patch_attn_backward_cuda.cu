@@ -123,7 +123,7 @@ class QueryWarp {
         const int64_t i = first + 16 * m + threadIdx.x % kWarp / 4 + 8 * h;
         const int64_t row = i < end ? args.table.q_rows[i] : -1;
         if (!inside(row, args.table.n_q)) continue;
-        T* to = args.grad_q + (row * args.size.heads + head) * D + 2 * (threadIdx.x % 4);
+        T* to = args.gradients.q + row * args.gradients.row_stride + head * D + 2 * (threadIdx.x % 4);
 #pragma unroll
         for (int c = 0; c < D / 8; ++c)
           *reinterpret_cast<uint32_t*>(to + 8 * c) =
@@ -280,13 +280,13 @@ bool pays_to_fuse(const Backward<T>& args, Stream stream) {
 
 template <typename T>
 void tensor_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v,
-                     const T* out, const float* stats, const PatchTable& table, const AttentionSize& size, T* grad_q,
-                     const KeyGradients<T>& key_gradients, const Workspace& workspace, Stream stream) {
+                     const T* out, const float* stats, const PatchTable& table, const AttentionSize& size,
+                     const Gradients<T>& gradients, const Workspace& workspace, Stream stream) {
   const patch_attn::Softmax<float> softmax(size.scale);
   const HeadRows<T> out_rows{out, size.heads * size.dim, size.dim};
   const Backward<T> args{grad, q, k, v, out_rows, stats, table, size, {}, softmax.slope, softmax.sign,
                          static_cast<float>(size.scale),
-                         workspace.take<QueryNumbers>(size.heads * table.n_q_listed), grad_q, key_gradients};
+                         workspace.take<QueryNumbers>(size.heads * table.n_q_listed), gradients};
   if (size.dim == 16 && pays_to_fuse(args, stream)) fused_backward(args, workspace, stream);
   else if (size.dim == 16) run<T, 16>(args, workspace, stream);
   else if (size.dim == 32) run<T, 32>(args, workspace, stream);
@@ -295,8 +295,8 @@ void tensor_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRo
 
 #define GSIM3D_INSTANTIATE(T)                                                                                        \
   template void tensor_backward<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&,   \
-                                   const T*, const float*, const PatchTable&, const AttentionSize&, T*,              \
-                                   const KeyGradients<T>&, const Workspace&, Stream);
+                                   const T*, const float*, const PatchTable&, const AttentionSize&, \
+                                   const Gradients<T>&, const Workspace&, Stream);
 GSIM3D_INSTANTIATE(__nv_bfloat16)
 GSIM3D_INSTANTIATE(__half)
 #undef GSIM3D_INSTANTIATE

@@ -153,7 +153,7 @@ __global__ void __launch_bounds__(kThreads, 1) fused_kernel(Backward<T> args, fl
             if (!last_keys) so_far[d] = sum[d];
           }
           if (!last_keys) continue;
-          uint4* to = reinterpret_cast<uint4*>(args.grad_q + (row * args.size.heads + share.head) * D);
+          uint4* to = reinterpret_cast<uint4*>(args.gradients.q + row * args.gradients.row_stride + share.head * D);
 #pragma unroll
           for (int c = 0; c < D / 8; ++c) {
             uint32_t pairs[4];
