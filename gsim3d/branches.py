@@ -6,14 +6,13 @@ Kernels over few rows leave most of a GPU idle. In a graph, those of a branch ru
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-MANY = int(os.environ.get("GSIM_BRANCHES", "2"))  # streams; kernels of more would wait for multiprocessors
+N_STREAMS = 4  # what more branches than these are given is queued behind one of them
 
 
 class Branches:
@@ -28,7 +27,7 @@ class Branches:
 
     def __init__(self, like: Tensor):
         captured = like.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
-        self._streams = _streams(like.device)[:MANY] if captured else ()
+        self._streams = _streams(like.device) if captured else ()
         self._count, self._read = 0, []
 
     def __enter__(self) -> Branches:
@@ -53,4 +52,4 @@ class Branches:
 
 @functools.lru_cache(maxsize=None)
 def _streams(device: torch.device) -> tuple[torch.cuda.Stream, ...]:
-    return tuple(torch.cuda.Stream(device) for _ in range(5))
+    return tuple(torch.cuda.Stream(device) for _ in range(N_STREAMS))
