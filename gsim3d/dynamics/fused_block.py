@@ -90,10 +90,13 @@ class Kept(NamedTuple):
     activated: Tensor
 
 
-def run_block(block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keeps: list, recompute: bool):
+def run_block(
+    block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keeps: list, recompute: bool, beside=None
+):
     """(x, what the next convolution reads) behind a ``point_transformer.Block``.
 
-    x [N, C]; conv_input [N, C] in the dtype of the products; keeps: factors [N, 1] of the rows' branches or None.
+    x [N, C]; conv_input [N, C] in the dtype of the products; keeps: factors [N, 1] of the rows' branches or None; beside:
+    what else the rows read, a ``background.Reader``, without gradients only.
     """
     conv, attention, mlp, position = block.position.conv, block.attention, block.mlp, block.position
     plan = Plan(stage, stage.patches[row], conv.kernel_size, conv.duplicates == "first", attention.heads, block.norm1.eps,
@@ -107,19 +110,34 @@ def run_block(block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keep
         out = _Block.apply(plan, Weights(*rounded, *of_norms), x, conv_input, *keeps, *weights, *of_norms)
     else:
         with torch._C._AutoDispatchBelowAutograd(), torch._C._ExcludeDispatchKeyGuard(_autocast):
-            out = _forward(plan, Weights(*rounded, *of_norms), x, conv_input, *keeps)[0]
+            reads = None if beside is None else _Reads(beside, conv, attention, row)
+            out = _forward(plan, Weights(*rounded, *of_norms), x, conv_input, *keeps, reads)[0]
     return out if len(out) == 2 else (out[0], out[0])
 
 
-def _forward(plan: Plan, w: Weights, x: Tensor, conv_input: Tensor, keep_attention, keep_mlp):
+class _Reads(NamedTuple):
+    """A ``background.Reader`` and the modules whose part of the background a block reads."""
+
+    beside: object
+    conv: object
+    attention: object
+    row: int
+
+
+def _forward(plan: Plan, w: Weights, x: Tensor, conv_input: Tensor, keep_attention, keep_mlp, reads: _Reads | None = None):
     """(sum,) or (sum, sum in the dtype of the products); Kept."""
     place = _ops.sparse_conv.default(conv_input, w.conv, w.conv_bias, *plan.geometry(), plan.conv_plan())
+    if reads is not None:
+        place = reads.beside.convolved(reads.conv, conv_input, place)
     position = row_linear(place, w.linear, w.linear_bias)
     norm, norm1, norm2 = (w.position_norm, w.position_norm_bias), (w.norm1, w.norm1_bias), (w.norm2, w.norm2_bias)
     sum1, normed1, position_stats, stats1 = _ops.residual_norm.default(x, position, None, *norm, *norm1, plan.eps)
     qkv = row_linear(normed1, w.qkv, w.qkv_bias)
     q, k, v = _heads(qkv, plan.heads)
-    attended, attention_stats = _ops.patch_attention.default(q, k, v, *plan.table(), q.shape[-1] ** -0.5)
+    if reads is None:
+        attended, attention_stats = _ops.patch_attention.default(q, k, v, *plan.table(), q.shape[-1] ** -0.5)
+    else:
+        attended, attention_stats = reads.beside.attended(reads.attention, q, k, v, plan.patches, reads.row), None
     branch = row_linear(attended.flatten(1), w.proj, w.proj_bias)
     sum2, normed2, _, stats2 = _ops.residual_norm.default(sum1, branch, keep_attention, None, None, *norm2, plan.eps)
     hidden = row_linear(normed2, w.fc1, w.fc1_bias)
