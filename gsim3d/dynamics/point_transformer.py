@@ -15,10 +15,20 @@ from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
 from gsim3d import ops
+from gsim3d.branches import Branches
 from gsim3d.dynamics.background import Reader, Recorder
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
 from gsim3d.dynamics.fused_block import run_block
-from gsim3d.layers import RowLayerNorm, RowLinear, make_norm, product_dtype, rounded_at_once, rounded_weights, widened
+from gsim3d.layers import (
+    RowLayerNorm,
+    RowLinear,
+    at_hand,
+    make_norm,
+    product_dtype,
+    round_at_once,
+    rounded_weights,
+    widened,
+)
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
 Beside = Recorder | Reader
@@ -355,17 +365,20 @@ class PointTransformer(nn.Module):
         generator: torch.Generator | None = None,
         besides: Sequence[Beside] = (),
     ) -> Tensor:
+        besides = besides or [None] * len(pyramid.stages)
         if not x.is_cuda or torch.compiler.is_compiling():
-            return self._compute(x, pyramid, generator, besides)
-        with rounded_at_once(self._products, product_dtype(x)):
-            return self._compute(x, pyramid, generator, besides)
+            x = self.stem(x, pyramid.stages[0], besides[0])
+            return self._behind_stem(x, pyramid, generator, besides)
+        with Branches(x) as branches:
+            rounded = branches.run(round_at_once, self._products, product_dtype(x))
+            x = self.stem(x, pyramid.stages[0], besides[0])
+        with at_hand(rounded):
+            return self._behind_stem(x, pyramid, generator, besides)
 
-    def _compute(
-        self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None, besides: Sequence[Beside]
+    def _behind_stem(
+        self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None, besides: Sequence[Beside | None]
     ) -> Tensor:
-        stages, besides = pyramid.stages, besides or [None] * len(pyramid.stages)
-        x = self.stem(x, stages[0], besides[0])
-        skips = []
+        stages, skips = pyramid.stages, []
         for encoder, stage, beside in zip(self.encoder, stages, besides, strict=True):
             x = encoder(x, stage, generator, beside)
             skips.append(x)
