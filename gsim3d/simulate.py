@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from gsim3d.pretrained import CHECKPOINT_HELP
+
 EPILOG = """\
 The scene's first steps are the input; the following ones are predicted, also beyond the end of the film. Written to
 DIR: rollout.mp4 (truth above prediction, a column for each camera; VP9, plays in browsers), frames/ (predicted images
@@ -11,6 +13,7 @@ as PNG) and gaussians/step_0000.ply ... (3D Gaussians of every step, for viewers
 
 examples:
   gsim3d simulate runs/model runs/data/ball/0000 --out runs/ball
+  gsim3d simulate elastic-small data/elastic/ball/0000 --out runs/ball
   gsim3d simulate model.safetensors runs/data/ball/0000 --out runs/ball --steps 48 --cameras 2 7
 """
 
@@ -18,7 +21,7 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Predicts the future of one scene and writes it as video and as 3D Gaussians."
     parser.epilog = EPILOG
-    parser.add_argument("checkpoint", metavar="CHECKPOINT", help="run folder, checkpoint folder or .safetensors file")
+    parser.add_argument("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/data.md)")
     parser.add_argument("--out", metavar="DIR", required=True, help="folder to write; must not exist yet")
     parser.add_argument("--steps", type=int, help="steps to predict (default: to the end of the film)")

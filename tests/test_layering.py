@@ -10,11 +10,11 @@ ROOT = Path(__file__).parent.parent
 # Each room may import the rooms before it (and its own), never one after it.
 ROOMS = [
     {"errors", "quirks"},
-    {"types", "stability", "files"},
+    {"types", "stability", "files", "pretrained"},
     {"ops", "effects", "harmonics", "rotations"},
     {"layers", "guards"},
     {"encoder", "dynamics", "renderer"},
-    {"presets"},
+    {"presets", "edits"},
     {"plans"},
     {"simulator"},
     {"laws", "graphs"},

@@ -126,7 +126,7 @@ def _make_all(settings, out: Path, scenes: list, processes: int, progress: bool)
                 bar.update()
             return
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(processes, len(scenes)), context, _start_worker) as pool:
+        with ProcessPoolExecutor(min(processes, len(scenes)), context, start_worker) as pool:
             jobs = [pool.submit(_make_one, settings, out, scene) for scene in scenes]
             try:
                 for job in as_completed(jobs):
@@ -141,7 +141,8 @@ def _make_one(settings, out: Path, scene: tuple[str, int]) -> None:
     writer.write_scene(out, settings.make(*scene))
 
 
-def _start_worker() -> None:
+def start_worker() -> None:
+    """To be called first in a process that makes scenes."""
     import cv2
 
     cv2.setNumThreads(1)
