@@ -1,4 +1,4 @@
-"""``gsim3d demo``: make multi-view video and predict it, with the simulator that comes with gsim3d or one learned here."""
+"""``gsim3d demo``: multi-view video is made and predicted, by a shipped simulator or one learned here."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageCo
 
 EPILOG = """\
 Writes into DIR:
-  held_out/      multi-view video of soft bodies that fall on a round ground, simulated and filmed here; no training saw it
+  held_out/      multi-view video of soft bodies that fall on a round ground, made here; no training saw it
   rollout.mp4    these scenes, truth above prediction
   psnr.png       PSNR over time against the baselines
   metrics.json   all numbers; the most important ones are printed
@@ -116,10 +116,10 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, *, progress: boo
     test = [Scene.open(folder) for folder in folders]
     print("predicting the held-out scenes", flush=True)
     with seconds.measure("evaluation"):
-        summary, restored = _evaluate(out, test, config.simulator or out / "model")
+        summary, predictor = _evaluate(out, test, config.simulator or out / "model")
     print("pictures", flush=True)
     with seconds.measure("pictures"):
-        _pictures(out, restored, test, summary)
+        _pictures(out, predictor, test, summary)
     _report(out, summary, seconds.total, time.perf_counter() - start)
     return summary
 
@@ -160,25 +160,42 @@ def _train(out: Path, config: TrainConfig, folders: list[Path], progress: bool, 
         checkpoint.export(checkpoint.load(out / "model"), out / "model.safetensors")
 
 
-def _evaluate(out: Path, scenes: list, simulator: str | Path):
+class _Predictor:
+    """Predicts each scene to its end, once."""
+
+    def __init__(self, simulator: str | Path):
+        from gsim3d.train.restore import restore
+
+        self.restored, self._known = restore(simulator), {}
+
+    def __call__(self, scene):
+        from gsim3d.evaluate.protocol import default_views, predict
+
+        if scene.path not in self._known:
+            context, _ = default_views(self.restored, scene)
+            n_future = scene.n_steps - self.restored.data.history
+            self._known[scene.path] = predict(self.restored, scene, context, n_future)
+        return self._known[scene.path]
+
+
+def _evaluate(out: Path, scenes: list, simulator: str | Path) -> tuple[dict, _Predictor]:
     from gsim3d.evaluate.protocol import score_scene
     from gsim3d.evaluate.report import summarize, write_json
-    from gsim3d.train.restore import restore
 
-    restored = restore(simulator)
-    digest = restored.checkpoint.digest
-    file = out / "metrics.json"
+    predictor = _Predictor(simulator)
+    digest, file = predictor.restored.checkpoint.digest, out / "metrics.json"
     try:
         summary = json.loads(file.read_text())
     except (OSError, ValueError):
         summary = {}
     if summary.get("checkpoint") != digest or "methods" not in summary:
-        summary = {"checkpoint": digest, **summarize([score_scene(restored, scene) for scene in scenes])}
+        scores = [score_scene(predictor.restored, scene, prediction=predictor(scene)) for scene in scenes]
+        summary = {"checkpoint": digest, **summarize(scores)}
         write_json(file, summary)
-    return summary, restored
+    return summary, predictor
 
 
-def _pictures(out: Path, restored, scenes: list, summary: dict) -> None:
+def _pictures(out: Path, predictor: _Predictor, scenes: list, summary: dict) -> None:
     """All pictures; each is made again only where it is missing or older than the numbers."""
     from gsim3d.evaluate.pictures import (
         as_bytes,
@@ -188,17 +205,18 @@ def _pictures(out: Path, restored, scenes: list, summary: dict) -> None:
         write_gaussians,
         write_overview,
     )
-    from gsim3d.evaluate.protocol import default_views, predict, render_steps
+    from gsim3d.evaluate.protocol import default_views, render_steps
     from gsim3d.interop import write_video
 
+    restored = predictor.restored
     made = [out / name for name in ("rollout.mp4", "psnr.png", "overview.png")]
     age = (out / "metrics.json").stat().st_mtime
     if all(file.is_file() and file.stat().st_mtime >= age for file in made):
         return
     truth, images, first = [], [], None
     for scene in scenes:
-        context, target = default_views(restored, scene)
-        prediction = predict(restored, scene, context, scene.n_steps - restored.data.history)
+        _, target = default_views(restored, scene)
+        prediction = predictor(scene)
         rendered = render_steps(restored, prediction.particles, scene, target[:1])
         truth.append(true_images(scene, target[:1], range(prediction.n_steps)))
         images.append(as_bytes(rendered))

@@ -5,8 +5,9 @@
 
 One sitting: processes film trajectories on all spare cores, training begins with the first 64 and goes on with what is
 there; near the end the learning rate falls, the state is written, and held-out trajectories are predicted, scored and
-filmed. Called again, the next sitting goes on with weights, optimizer and the next trajectories (gsim3d/train/sittings.py
-says what is kept and what is rounded). A sitting that is killed loses what came after its last save, two minutes or less.
+filmed. Called again, the next sitting goes on with weights, optimizer and the next trajectories; what is kept and what
+is rounded stands in gsim3d/train/sittings.py. A sitting that is killed loses what came after its last save, two minutes
+or less.
 
 Written to OUT: the state, NAME.scores.json (held-out trajectories over the full horizon) and NAME.mp4 (truth above
 prediction).
@@ -37,7 +38,7 @@ def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: st
 
     Raises:
         InputError: the state in ``state`` is broken or of another recipe, or the time is too short.
-        HardCaseError: too many steps in a row met numbers that cannot be used; the state in ``out`` is the last good one.
+        HardCaseError: too many steps in a row met numbers that cannot be used; ``out`` has the last good state.
     """
     begin = time.monotonic()
     deadline = begin + 60 * minutes

@@ -19,7 +19,7 @@ def start_filming() -> None:
 
 
 def film(world: World, scene: tuple[str, int], file: str) -> str:
-    """Writes uint8 [T, V, H, W, 4], colours and label (as in seg images), of trajectory ``scene`` into ``file``, .npy."""
+    """Writes trajectory ``scene`` into ``file``, .npy: uint8 [T, V, H, W, 4], colours and the label of seg images."""
     views = world.make(*scene).views
     np.save(file, np.stack([np.concatenate([view.rgb, view.segmentation[..., None]], -1) for view in views]))
     return file

@@ -1,10 +1,10 @@
 """Loss and gradients of simulated steps as one CUDA graph.
 
 A training step through a rollout launches tens of thousands of small kernels; a GPU would wait for Python most of the
-time. Everything behind the encoder (rollout, images, loss and their gradients) is captured once for each kind of batch and
-replayed with other particles. A graph has fixed sizes: each cloud gets as many rows as the largest, those without a
-particle sleep, and geometry has room for more than was observed. Where a batch needs more, the graph is made
-anew, so results never depend on the room.
+time. Everything behind the encoder (rollout, images, loss and their gradients) is captured once for each kind of batch
+and replayed with other particles. A graph has fixed sizes: each cloud gets as many rows as the largest, those without a
+particle sleep, and geometry has room for more than was observed. Where a batch needs more, the graph is made anew, so
+results never depend on the room.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ LEARNED = ("means", "opacities", "dynamic_latents", "static_latents")  # of enco
 
 @dataclass(frozen=True)
 class Gradients:
-    """loss: a number. errors: [S], of each step. particles: of LEARNED, by name. parameters: of those given, or None."""
+    """loss: a number.   errors: [S], of each step.
+
+    particles: gradients of LEARNED, by name.   parameters: gradients of ``CapturedLoss.parameters``, or None.
+    """
 
     loss: Tensor
     errors: Tensor

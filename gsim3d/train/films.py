@@ -123,8 +123,8 @@ class FilmStore:
 class Filming:
     """Processes that simulate and film one trajectory after another, from number ``first`` on, into a store.
 
-    Trajectory n is the n-th of the world's list (one of each object in turn), whatever its ``n_trajectories`` says; each
-    number is filmed once. Use as a context; leaving it ends the processes.
+    Trajectory n is the n-th of the world's list (one of each object in turn), whatever its ``n_trajectories`` says;
+    each number is filmed once. Use as a context; leaving it ends the processes.
 
     Attributes:
         next: the smallest number that no process has begun.

@@ -45,8 +45,8 @@ class Recipe:
     first_films: int = FIRST_FILMS
 
 
-# `small` with a lighter encoder, so that three sets of weights in 16 bits stay below 25 MB; without drop path and shuffled
-# curves, as the runs are far too short to overfit.
+# `small` with a lighter encoder, so that three sets of weights in 16 bits stay below 25 MB; without drop path and
+# shuffled curves, as the runs are far too short to overfit.
 TRAIN = TrainConfig(
     preset="small",
     model={

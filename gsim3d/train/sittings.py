@@ -3,14 +3,15 @@
 A state folder holds, of a model called NAME,
 
 - ``NAME.json``: step, next trajectory, what every sitting did, names and hashes of the other files;
-- ``NAME.STEP.weights.safetensors``: the averaged weights in bfloat16 with their configuration: a checkpoint to predict with;
+- ``NAME.STEP.weights.safetensors``: the averaged weights in bfloat16 with their configuration, a checkpoint to predict
+  with;
 - ``NAME.STEP.difference.safetensors``: the weights themselves minus these, in bfloat16;
 - ``NAME.STEP.squares.safetensors``: AdamW's averages of squared gradients, in bfloat16;
 - ``NAME.metrics.jsonl``: the log.
 
-Six bytes a weight instead of the sixteen of a checkpoint. What is lost: the weights are rounded by 2^-9 of their size, and the
-averages of gradients begin at zero, so that the first ten steps or so are shorter. A run in sittings is therefore not
-the one that was never stopped, bit by bit; a checkpoint of ``gsim3d train`` is.
+Six bytes a weight instead of the sixteen of a checkpoint. What is lost: the weights are rounded by 2^-9 of their size,
+and the averages of gradients begin at zero, so that the first ten steps or so are shorter. So a run in sittings is
+not the one that was never stopped, bit by bit, as one of ``gsim3d train`` is.
 """
 
 from __future__ import annotations
