@@ -1,4 +1,4 @@
-"""The ``gsim3d`` command: generate, check-data, train, simulate, evaluate, weights, import, demo, doctor."""
+"""The ``gsim3d`` command: generate, check-data, train, simulate, evaluate, pareto, weights, import, demo, doctor."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ COMMANDS = {
     "train": ("gsim3d.train.command", "learn a simulator from a data set"),
     "simulate": ("gsim3d.simulate", "predict the future of one scene: video and .ply"),
     "evaluate": ("gsim3d.evaluate.command", "measure predictions on a data set, by step, beside baselines and other models"),
+    "pareto": ("gsim3d.pareto.command", "what accuracy costs in time: a report, and settings that keep a promise"),
     "weights": ("gsim3d.perceptual.command", "install the weights of LPIPS and FVD"),
     "import": ("gsim3d.import_released", "bring a checkpoint of the authors' release over: same weights, same predictions"),
     "demo": ("gsim3d.demo", "all of it at a small size, in minutes on a CPU"),
