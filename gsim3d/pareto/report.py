@@ -172,6 +172,8 @@ def _scatter(points: Sequence[Point], axis: str) -> bytes:
     axes.set_ylabel("root mean squared error of images")
     second = axes.secondary_yaxis("right", functions=(_decibel, _error))
     second.set_ylabel(label)
+    second.set_yticks(range(5, 105, 5), [str(n) for n in range(5, 105, 5)])
+    second.minorticks_off()
     for n, point in enumerate(p for p in points if p.failure):
         text = f"{point.setting.name}: {point.failure[:60]}"
         axes.text(0.995, 0.99 - 0.035 * n, f"failed: {text}", transform=axes.transAxes, ha="right", va="top",
@@ -180,7 +182,7 @@ def _scatter(points: Sequence[Point], axis: str) -> bytes:
         if any(p.kind == kind for p in points):
             axes.plot([], [], "o", color=color, label=f"{kind}: {KINDS[kind]}")
     axes.plot([], [], "o", color="#bbbbbb", label="beaten by another in both")
-    axes.legend(fontsize=7, loc="lower left")
+    axes.legend(fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.09))
     return _png(figure)
 
 
