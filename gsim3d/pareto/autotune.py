@@ -13,10 +13,12 @@ from gsim3d.files import MAX_TEXT, read_file
 from gsim3d.pareto.measure import Comparison, Effort, Point, Subject, compare, points_of, ties, time_points
 from gsim3d.pareto.settings import KNOBS, Knob, Setting
 from gsim3d.pareto.timing import Clock, DeviceClock
+from gsim3d.train.restore import Restored
 
 # preset -> share of the reference's gain over the constant baseline, in dB, that it keeps at least
 PROMISES = {"exact": None, "balanced": 0.999, "fast": 0.99}
 SPEEDS = "speeds.json"
+OF_IMAGES = ("image size and decoded frames",)  # what is simulated is tuned, not what is looked at
 
 
 def autotune(
@@ -84,7 +86,7 @@ def fastest(
 ) -> Point:
     """The reference with every turn that keeps the promise and saves time, added one by one and measured together."""
     reference = points[0]
-    useful = [p for p in points[1:] if _faster(p, reference) and keeps(p)]
+    useful = [p for p in points[1:] if p.knob not in OF_IMAGES and _faster(p, reference) and keeps(p)]
     best = reference
     for point in sorted(useful, key=lambda p: p.step_seconds):
         changes = point.setting.to_dict()
@@ -132,15 +134,17 @@ def _most_accurate(
     )
 
 
-def save_speeds(folder: Path, device: str, presets: dict[str, Point]) -> Path:
-    """Keeps tuned presets of one kind of device in ``folder``/speeds.json, beside those of other kinds."""
+def save_speeds(folder: Path, restored: Restored, presets: dict[str, Point]) -> Path:
+    """Keeps the tuned presets of a checkpoint on its device in ``folder``/speeds.json, beside those of others."""
     path = folder / SPEEDS
     known = _read(path) if path.is_file() else {}
-    write_json(path, {**known, device: {name: point.setting.to_dict() for name, point in presets.items()}})
+    digest, device = restored.checkpoint.digest, restored.device.type
+    settings = {name: point.setting.to_dict() for name, point in presets.items()}
+    write_json(path, {**known, digest: {**known.get(digest, {}), device: settings}})
     return path
 
 
-def load_speed(folder: Path, device: str, preset: str) -> Setting:
+def load_speed(folder: Path, restored: Restored, preset: str) -> Setting:
     """The setting of a preset that was tuned for a checkpoint on this kind of device.
 
     Raises:
@@ -150,11 +154,15 @@ def load_speed(folder: Path, device: str, preset: str) -> Setting:
         raise InputError(f"--speed: must be one of {', '.join(PROMISES)}; got {preset!r}")
     if preset == "exact":
         return Setting()
-    path = folder / SPEEDS
-    known = _read(path).get(device) if path.is_file() else None
-    if not isinstance(known, dict) or not isinstance(known.get(preset), dict):
-        raise InputError(f"--speed {preset}: {folder} is not tuned for {device}; run gsim3d pareto CHECKPOINT first")
-    return Setting.from_dict(known[preset])
+    path, device = folder / SPEEDS, restored.device.type
+    found = _read(path) if path.is_file() else {}
+    for key in (restored.checkpoint.digest, device, preset):
+        found = found.get(key)
+        if not isinstance(found, dict):
+            raise InputError(
+                f"--speed {preset}: this checkpoint is not tuned for {device} (in {path}); run gsim3d pareto CHECKPOINT first"
+            )
+    return Setting.from_dict(found)
 
 
 def _read(path: Path) -> dict:
@@ -163,5 +171,5 @@ def _read(path: Path) -> dict:
     except ValueError as error:
         raise InputError(f"{path} cannot be read: {error}") from None
     if not isinstance(content, dict):
-        raise InputError(f"{path} must hold a mapping of devices")
+        raise InputError(f"{path} must hold a mapping of checkpoints")
     return content

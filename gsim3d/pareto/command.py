@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 
+from gsim3d.pretrained import CHECKPOINT_HELP
+
 EPILOG = """\
 Turns every knob that the model has, one at a time: precision, graph capture, input views and steps, particles kept,
 patch and grid size, image size, ... For each setting: how far it is from the reference run of the same checkpoint
 (float32, nothing left out) and from the truth, and what a step takes, by stage. Written to DIR: report.html (one page,
-needs no network), report.json, report.csv, a PNG of each figure, and speeds.json: the fastest settings that keep 99.9 %
-("balanced") and 99 % ("fast") of the reference's gain over particles that hold still, for `gsim3d simulate --speed`.
+needs no network), report.json, report.csv, a PNG of each figure. Beside the checkpoint: speeds.json, the fastest settings
+that keep 99.9 % ("balanced") and 99 % ("fast") of the reference's gain over particles that hold still, for
+`gsim3d simulate --speed`.
 
 Without DATA, held-out scenes of the mini preset are generated in DIR/data (needs pip install 'gsim3d[generate]').
 
@@ -22,7 +25,7 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Measures what accuracy costs in time, for one trained simulator on this machine."
     parser.epilog = EPILOG
-    parser.add_argument("checkpoint", metavar="CHECKPOINT", help="run folder, checkpoint folder or .safetensors file")
+    parser.add_argument("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     parser.add_argument("data", metavar="DATA", nargs="?", help="folder with scenes, or one scene folder")
     parser.add_argument("--out", metavar="DIR", required=True, help="folder of the report; made if absent")
     parser.add_argument(
@@ -50,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.pareto.self_check import self_check
     from gsim3d.pareto.settings import KNOBS
     from gsim3d.pareto.timing import DeviceClock
+    from gsim3d.pretrained import located
     from gsim3d.train.restore import restore
 
     pyplot()
@@ -97,12 +101,25 @@ def run(args: argparse.Namespace) -> int:
         "presets": {name: point.setting.to_dict() for name, point in presets.items()},
     }
     files = report.write(out, points, comparison, conditions)
-    files.append(autotune.save_speeds(out, args.device, presets))
+    files.append(_keep_speeds(located(args.checkpoint), out, restored, presets))
     print(report.table(report.as_dict(points, comparison, conditions)))
     for name, point in presets.items():
         print(f"--speed {name}: {point.setting.name}, {1e3 * point.step_seconds:.2f} ms a step")
     print("written: " + ", ".join(str(path) for path in files))
     return 0 if all(check.holds for check in checks) else 1
+
+
+def _keep_speeds(checkpoint, out, restored, presets: dict):
+    """Beside the checkpoint, where `gsim3d simulate --speed` looks; in ``out`` where nothing can be written there."""
+    from gsim3d.pareto import autotune
+
+    try:
+        return autotune.save_speeds(checkpoint if checkpoint.is_dir() else checkpoint.parent, restored, presets)
+    except OSError as error:
+        print(
+            f"{error.filename or checkpoint}: {error.strerror}; copy {autotune.SPEEDS} there for gsim3d simulate --speed"
+        )
+        return autotune.save_speeds(out, restored, presets)
 
 
 def _scenes(args: argparse.Namespace, restored, out, count: int | None) -> list:

@@ -12,7 +12,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsim3d.data import Scene, make_frames
-from gsim3d.dynamics import last_steps
+from gsim3d.dynamics import concatenate, last_steps
+from gsim3d.edits import Edit
+from gsim3d.errors import InputError
+from gsim3d.evaluate.protocol import Prediction
 from gsim3d.graphs import CapturedRollout
 from gsim3d.layers import exact_convolutions
 from gsim3d.pareto.settings import Setting
@@ -50,10 +53,14 @@ class Runner:
         self.plan = self.simulator.plan(dataclasses.replace(spec, dynamics=dynamics, appearance=appearance))
         self.n_encoded = min(setting.history or restored.data.history, restored.data.history)
 
-    def frames(self, scenes: Sequence[Scene], context: Sequence[Sequence[int]]) -> Frames:
-        """Input images of the first steps: of the last ones of them where the setting's history is shorter."""
-        last = self.restored.data.history
-        steps = [range(last - self.n_encoded, last)] * len(scenes)
+    @property
+    def skipped(self) -> int:
+        """First input steps that a history shorter than the training's leaves out."""
+        return self.restored.data.history - self.n_encoded
+
+    def frames(self, scenes: Sequence[Scene], context: Sequence[Sequence[int]], start: int = 0) -> Frames:
+        """Input images: of the steps from ``start`` that the training's history has, the last ones."""
+        steps = [range(start + self.skipped, start + self.restored.data.history)] * len(scenes)
         if self.setting.context_views is not None:
             context = [_spread(cams, self.setting.context_views) for cams in context]
         masked = all(scene.has_segmentation() for scene in scenes)
@@ -80,6 +87,24 @@ class Runner:
                 particles, self._smaller(cameras), plan=self.plan, cutoff=self.setting.cutoff
             )
         return rendering.color.float().clamp(0, 1)
+
+    @torch.no_grad()
+    def predict(
+        self, scene: Scene, context: Sequence[int], n_future: int, start: int = 0, edits: Sequence[Edit] = ()
+    ) -> Prediction:
+        """As :func:`gsim3d.evaluate.protocol.predict`, of the steps from ``start + skipped`` on. Errors likewise."""
+        self.restored.check_scene(scene)
+        if not 0 <= start <= scene.n_steps - self.restored.data.history:
+            raise InputError(f"{scene.path}: the input steps from step {start} on do not fit its {scene.n_steps} steps")
+        if n_future < 1:
+            raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
+        encoded = self.encode(self.frames([scene], [context], start))
+        with self._precision("dynamics"):
+            if self.setting.captured and not edits:
+                steps = CapturedRollout(self.simulator, encoded, n_future, self.plan)(encoded).steps
+            else:
+                steps = self.simulator.rollout(encoded, n_future, self.plan, edits=edits)
+        return Prediction(concatenate([encoded, *steps]), self.n_encoded, tuple(context))
 
     def newest(self, state: Particles) -> Particles:
         """The last step of every scene."""

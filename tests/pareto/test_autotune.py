@@ -1,5 +1,7 @@
 """Presets keep what they promise, limits are kept, and what was tuned is found again."""
 
+import dataclasses
+
 import pytest
 
 from gsim3d.errors import InputError
@@ -7,6 +9,7 @@ from gsim3d.pareto import autotune
 from gsim3d.pareto.measure import Agreement, Comparison, Effort, Point, compare, time_points
 from gsim3d.pareto.settings import KNOBS, Setting
 from gsim3d.pareto.timing import DeviceClock, Timing
+from gsim3d.train.checkpoint import Checkpoint
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SHORT = Effort(n_rounds=2, repeats=2, warm_up=0)
@@ -63,7 +66,7 @@ def test_turns_that_keep_the_promise_are_added_up(subject, comparison, monkeypat
     reference = at(Setting(), 10.0, 100.0)
     turns = [
         at(Setting(history=1), 6.0, 60.0),
-        at(Setting(every=2), 8.0, 70.0),
+        at(Setting(grid=2.0), 8.0, 70.0),
         at(Setting(kept=0.1), 2.0, 10.0),
         at(Setting(cutoff="tile3sigma"), 9.9, 90.0, other_round=10.2),
     ]
@@ -77,8 +80,8 @@ def test_turns_that_keep_the_promise_are_added_up(subject, comparison, monkeypat
     monkeypatch.setattr(autotune, "compare", fill)
     monkeypatch.setattr(autotune, "time_points", lambda s, points, *_: points[0].step.append(Timing((4.0,))))
     best = autotune.fastest(subject, comparison, [reference, *turns], lambda p: p.agreement.psnr >= 50, None, SHORT)
-    assert best.setting == Setting(history=1, every=2)
-    assert measured == [Setting(history=1, every=2)]
+    assert best.setting == Setting(history=1, grid=2.0)
+    assert measured == [Setting(history=1, grid=2.0)]
 
 
 def test_limits_are_kept(subject):
@@ -93,16 +96,19 @@ def test_limits_are_kept(subject):
         autotune.autotune(subject)
 
 
-def test_tuned_presets_are_found_again(tmp_path):
-    autotune.save_speeds(tmp_path, "cpu", {"fast": at(Setting(history=1, every=2), 1.0, 50.0)})
-    autotune.save_speeds(tmp_path, "cuda", {"fast": at(Setting(captured=True), 1.0, 50.0)})
-    assert autotune.load_speed(tmp_path, "cpu", "fast") == Setting(history=1, every=2)
-    assert autotune.load_speed(tmp_path, "cuda", "fast") == Setting(captured=True)
-    assert autotune.load_speed(tmp_path / "none", "cpu", "exact") == Setting()
-    with pytest.raises(InputError, match="not tuned for cpu; run gsim3d pareto"):
-        autotune.load_speed(tmp_path, "cpu", "balanced")
+def test_tuned_presets_are_found_again(tmp_path, subject):
+    restored, other = (
+        dataclasses.replace(subject.restored, checkpoint=Checkpoint({}, {}, digest=digest)) for digest in ("1f", "2e")
+    )
+    autotune.save_speeds(tmp_path, restored, {"fast": at(Setting(history=1, kept=0.9), 1.0, 50.0)})
+    autotune.save_speeds(tmp_path, other, {"fast": at(Setting(grid=2.0), 1.0, 50.0)})
+    assert autotune.load_speed(tmp_path, restored, "fast") == Setting(history=1, kept=0.9)
+    assert autotune.load_speed(tmp_path, other, "fast") == Setting(grid=2.0)
+    assert autotune.load_speed(tmp_path / "none", restored, "exact") == Setting()
+    with pytest.raises(InputError, match="not tuned for cpu .*run gsim3d pareto"):
+        autotune.load_speed(tmp_path, restored, "balanced")
     with pytest.raises(InputError, match="must be one of exact, balanced, fast"):
-        autotune.load_speed(tmp_path, "cpu", "warp")
+        autotune.load_speed(tmp_path, restored, "warp")
     (tmp_path / autotune.SPEEDS).write_text("[1]")
     with pytest.raises(InputError, match="must hold a mapping"):
-        autotune.load_speed(tmp_path, "cpu", "fast")
+        autotune.load_speed(tmp_path, restored, "fast")
