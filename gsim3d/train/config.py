@@ -25,6 +25,8 @@ class StageConfig:
 
     steps: optimizer steps.
     horizon: simulated steps after the encoded ones; 0 trains encoder and renderer alone.
+    lead: in every other optimizer step, on average, so many steps are simulated before these, without loss and
+        gradients: the model learns to go on from its own states, which a long rollout needs.
     history: encoded steps; 0: as many as the data section says.
     batch: scenes a step, of all processes together.
     target_views: images of each step that the loss compares.
@@ -35,6 +37,7 @@ class StageConfig:
 
     steps: int
     horizon: int = 0
+    lead: int = 0
     history: int = 0
     batch: int = 1
     target_views: int = 5
@@ -43,8 +46,10 @@ class StageConfig:
     warm_up: float = 0.01
 
     def __post_init__(self):
-        _at_least(self, steps=1, horizon=0, history=0, batch=1, target_views=1)
+        _at_least(self, steps=1, horizon=0, lead=0, history=0, batch=1, target_views=1)
         _at_least(self, from_start=0, learning_rate=0, warm_up=0)
+        if self.lead and not self.horizon:
+            raise InputError("lead: needs a horizon of 1 or more")
 
 
 @dataclass(frozen=True)

@@ -85,13 +85,15 @@ class FilmStore:
             n_context = windows[0].n_context
             context = self._frames(windows, [window.context_cams for window in windows], n_context)
             targets = self._frames(windows, [window.target_cams for window in windows], n_context + stage.horizon)
-        return Batch(thin_background(context, data.background_stride), targets, n_context, stage.horizon)
+        return Batch(
+            thin_background(context, data.background_stride), targets, n_context, stage.horizon, windows[0].lead
+        )
 
     def _frames(self, windows: Sequence[Window], cams: Sequence, n_steps: int) -> Frames:
         """The first ``n_steps`` steps of the windows, seen by the cameras of each step."""
         n_views, (n_frames, n_cams, height, width) = len(cams[0][0]), self._shape
         places = [
-            ((window.scene.slot * n_frames + window.start + step) * n_cams + cam, cam)
+            ((window.scene.slot * n_frames + window.steps[step]) * n_cams + cam, cam)
             for window, by_step in zip(windows, cams, strict=True)
             for step in range(n_steps)
             for cam in by_step[step]

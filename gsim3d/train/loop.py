@@ -393,8 +393,13 @@ class Trainer:
         watch.count(particles)
         if batch.n_future:
             with precision.of("dynamics", self.device):
+                begin = particles
+                if batch.n_lead:
+                    with torch.no_grad():
+                        ahead = simulator.rollout(particles, batch.n_lead, self.plan, generator=noise, **options)
+                        begin = concatenate([particles, *ahead])
                 steps = simulator.rollout(
-                    particles, batch.n_future, self.plan, generator=noise, wrap=again("steps", noise), **options
+                    begin, batch.n_future, self.plan, generator=noise, wrap=again("steps", noise), **options
                 )
             watch.follow(steps)
             particles = concatenate([particles, *steps])

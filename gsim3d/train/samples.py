@@ -17,16 +17,17 @@ from gsim3d.types import Frames
 
 @dataclass(frozen=True)
 class Batch:
-    """Windows of B scenes, all of n_context + n_future steps.
+    """Windows of B scenes, all of n_context + n_lead + n_future steps.
 
     context: input images of the first n_context steps of each.
-    targets: images of all steps; image i shows cloud b * (n_context + n_future) + t.
+    targets: images of these and of the last n_future; image i shows cloud b * (n_context + n_future) + t.
     """
 
     context: Frames
     targets: Frames
     n_context: int
     n_future: int
+    n_lead: int = 0
 
     def to(self, device: str | torch.device) -> Batch:
         return dataclasses.replace(self, context=self.context.to(device), targets=self.targets.to(device))
@@ -48,7 +49,7 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, stages: Sequence[Sta
                 f"{first.width}x{first.height}; data.resize brings all to one size"
             )
         for stage in stages:
-            n_steps = (stage.history or data.history) + stage.horizon
+            n_steps = (stage.history or data.history) + stage.lead + stage.horizon
             if scene.n_steps < n_steps:
                 raise InputError(f"{scene.path}: {scene.n_steps} steps; windows of {n_steps} steps do not fit")
             if scene.n_cams < stage.target_views:
@@ -79,12 +80,12 @@ def draw_batch(
     windows = draw_windows(scenes, data, stage, seed, step, samples)
     n_context = windows[0].n_context
     chosen = [window.scene for window in windows]
-    steps = [list(window.steps) for window in windows]
+    steps = [window.steps for window in windows]
     masked = all(scene.has_segmentation() for scene in chosen)
     context_cams = [window.context_cams for window in windows]
     context = make_frames(chosen, context_cams, [s[:n_context] for s in steps], masked=masked)
     targets = make_frames(chosen, [window.target_cams for window in windows], steps, masked=masked)
-    return Batch(thin_background(context, data.background_stride), targets, n_context, stage.horizon)
+    return Batch(thin_background(context, data.background_stride), targets, n_context, stage.horizon, windows[0].lead)
 
 
 def draw_windows(
@@ -99,6 +100,11 @@ def draw_windows(
 def history_at(data: DataConfig, stage: StageConfig, seed: int, step: int) -> int:
     """Encoded steps of all samples of an optimizer step."""
     return stage.history or _drawn(data.shortest_history, data.history, seed, step, "history")
+
+
+def lead_at(stage: StageConfig, seed: int, step: int) -> int:
+    """Steps that all samples of an optimizer step simulate ahead of their horizon."""
+    return stage.lead * int(generator(seed, step, 0, "lead").integers(2)) if stage.lead else 0
 
 
 def _drawn(least: int, most: int, seed: int, step: int, purpose: str) -> int:
@@ -126,8 +132,8 @@ def _draw_window(
 ) -> Window:
     rng = generator(seed, step, sample, "window")
     scene = scenes[int(rng.integers(len(scenes)))]
-    n_steps = n_context + stage.horizon
-    last_start = scene.n_steps - n_steps
+    n_steps, lead = n_context + stage.horizon, lead_at(stage, seed, step)
+    last_start = scene.n_steps - n_steps - lead
     start = int(rng.integers(last_start + 1))
     if rng.random() < stage.from_start:
         start = 0
@@ -137,4 +143,4 @@ def _draw_window(
     targets = tuple(
         tuple(int(cam) for cam in views.permutation(scene.n_cams)[: stage.target_views]) for _ in range(n_steps)
     )
-    return Window(scene, start, n_context, (context,) * n_context, targets)
+    return Window(scene, start, n_context, (context,) * n_context, targets, lead)

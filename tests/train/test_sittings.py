@@ -55,7 +55,7 @@ def store(world, films):
 def test_a_store_gives_what_scene_folders_give(store, tmp_path):
     folders = generate(tmp_path, preset="mini", processes=1, progress=False, **OPTIONS).folders
     scenes = [Scene.open(folder) for folder in folders]
-    for step, stage in enumerate((CONFIG.stages[0], dataclasses.replace(CONFIG.stages[1], batch=3))):
+    for step, stage in enumerate((CONFIG.stages[0], dataclasses.replace(CONFIG.stages[1], batch=3, lead=2))):
         given = store.draw(CONFIG.data, stage, 5, step, range(3))
         wanted = draw_batch(scenes, CONFIG.data, stage, 5, step, range(3))
         assert (given.n_context, given.n_future) == (wanted.n_context, wanted.n_future)
