@@ -27,7 +27,7 @@ from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.scoring import PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.layers import exact_convolutions
 from gsim3d.train.restore import Restored
-from gsim3d.train.samples import context_cameras, spread_views, thin_background
+from gsim3d.train.samples import context_cameras, spread_views, thinned
 from gsim3d.types import DYNAMIC, Particles
 
 METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant")
@@ -86,7 +86,7 @@ def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_fut
         raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
     masked = scene.has_segmentation()
     frames = make_frames([scene], [list(context_cams)], [range(start, start + n_encoded)], masked=masked)
-    frames = thin_background(frames, restored.data.background_stride).to(restored.device)
+    frames = thinned(frames, restored.data).to(restored.device)
     with exact_convolutions():
         encoded = restored.simulator.encode(frames)
         steps = restored.simulator.rollout(encoded, n_future, restored.plan)

@@ -64,6 +64,7 @@ class DataConfig:
     context_cameras: the cameras they come from; empty: all but ``target_only_cameras``.
     target_only_cameras: cameras that are never an input; a loss may look at them.
     background_stride: of pixels that show what never moves, those on every n-th row and column become particles.
+    body_stride: likewise, of pixels that show what may move.
     resize: (width, height) pixels: films are scaled to cover it and cropped around the centre; empty: as filmed.
     near_far: metres, the depth range of all scenes; empty: each scene's own.
     unit_cameras: lengths are in units of the largest coordinate of a scene's cameras.
@@ -76,12 +77,14 @@ class DataConfig:
     context_cameras: tuple[int, ...] = ()
     target_only_cameras: tuple[int, ...] = ()
     background_stride: int = 1
+    body_stride: int = 1
     resize: tuple[int, ...] = ()
     near_far: tuple[float, ...] = ()
     unit_cameras: bool = False
 
     def __post_init__(self):
-        _at_least(self, history=1, shortest_history=0, context_views=1, fewest_views=0, background_stride=1)
+        _at_least(self, history=1, shortest_history=0, context_views=1, fewest_views=0)
+        _at_least(self, background_stride=1, body_stride=1)
         for least, most in (("shortest_history", "history"), ("fewest_views", "context_views")):
             if getattr(self, least) > getattr(self, most):
                 raise InputError(

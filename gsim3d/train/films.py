@@ -22,7 +22,7 @@ from gsim3d.generate.cameras import workspace_origin
 from gsim3d.generate.film import film, start_filming
 from gsim3d.generate.world import World
 from gsim3d.train.config import DataConfig, StageConfig
-from gsim3d.train.samples import Batch, draw_windows, thin_background
+from gsim3d.train.samples import Batch, draw_windows, thinned
 from gsim3d.types import Cameras, Frames
 
 QUEUED = 2  # trajectories that wait for each process that films
@@ -85,9 +85,7 @@ class FilmStore:
             n_context = windows[0].n_context
             context = self._frames(windows, [window.context_cams for window in windows], n_context)
             targets = self._frames(windows, [window.target_cams for window in windows], n_context + stage.horizon)
-        return Batch(
-            thin_background(context, data.background_stride), targets, n_context, stage.horizon, windows[0].lead
-        )
+        return Batch(thinned(context, data), targets, n_context, stage.horizon, windows[0].lead)
 
     def _frames(self, windows: Sequence[Window], cams: Sequence, n_steps: int) -> Frames:
         """The first ``n_steps`` steps of the windows, seen by the cameras of each step."""

@@ -42,7 +42,7 @@ from gsim3d.train.samples import (
     draw_batch,
     history_at,
     spread_views,
-    thin_background,
+    thinned,
 )
 from gsim3d.train.schedule import one_cycle
 from gsim3d.train.settings import from_dict, to_dict
@@ -425,7 +425,7 @@ class Trainer:
         )
         self.simulator.eval()
         try:
-            frames = thin_background(frames, data.background_stride).to(self.device)
+            frames = thinned(frames, data).to(self.device)
             state = self.simulator.encode(frames, on_bad="drop")
             if stage.horizon:
                 later = self.simulator.rollout(state, stage.horizon, self.plan, on_bad="drop")

@@ -85,7 +85,7 @@ def draw_batch(
     context_cams = [window.context_cams for window in windows]
     context = make_frames(chosen, context_cams, [s[:n_context] for s in steps], masked=masked)
     targets = make_frames(chosen, [window.target_cams for window in windows], steps, masked=masked)
-    return Batch(thin_background(context, data.background_stride), targets, n_context, stage.horizon, windows[0].lead)
+    return Batch(thinned(context, data), targets, n_context, stage.horizon, windows[0].lead)
 
 
 def draw_windows(
@@ -112,13 +112,20 @@ def _drawn(least: int, most: int, seed: int, step: int, purpose: str) -> int:
     return int(generator(seed, step, 0, f"number of {purpose}").integers(least, most + 1)) if least else most
 
 
-def thin_background(frames: Frames, stride: int) -> Frames:
-    """``frames`` of whose fixed pixels only those on every ``stride``-th row and column become particles."""
-    if stride == 1 or frames.masks is None or frames.dynamic is None:
+def thinned(frames: Frames, data: DataConfig) -> Frames:
+    """``frames`` of which those pixels become particles that the strides of ``data`` leave."""
+    fixed, moving = data.background_stride, data.body_stride
+    if fixed == moving == 1 or frames.masks is None or frames.dynamic is None:
         return frames
-    kept = torch.zeros(frames.masks.shape[1:], dtype=torch.bool, device=frames.masks.device)
+    kept = torch.where(frames.dynamic, _every(moving, frames.masks), _every(fixed, frames.masks))
+    return dataclasses.replace(frames, masks=frames.masks & kept)
+
+
+def _every(stride: int, like: Tensor) -> Tensor:
+    """bool [H, W]: every n-th row and column of images [I, H, W]."""
+    kept = torch.zeros(like.shape[1:], dtype=torch.bool, device=like.device)
     kept[stride // 2 :: stride, stride // 2 :: stride] = True
-    return dataclasses.replace(frames, masks=frames.masks & (kept | frames.dynamic))
+    return kept
 
 
 def spread_views(cameras: Sequence[int], count: int, turn: int) -> tuple[int, ...]:
