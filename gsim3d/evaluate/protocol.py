@@ -94,6 +94,24 @@ def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_fut
 
 
 @torch.no_grad()
+def predict_together(restored: Restored, scenes: Sequence[Scene], n_future: int) -> list[Prediction]:
+    """:func:`predict` of several scenes from their first steps and default views, in one rollout."""
+    for scene in scenes:
+        restored.check_scene(scene)
+    contexts = [default_views(restored, scene)[0] for scene in scenes]
+    n_encoded, masked = restored.data.history, all(scene.has_segmentation() for scene in scenes)
+    frames = make_frames(scenes, contexts, [range(n_encoded)] * len(scenes), masked=masked)
+    with exact_convolutions():
+        encoded = restored.simulator.encode(thinned(frames, restored.data).to(restored.device))
+        together = concatenate([encoded, *restored.simulator.rollout(encoded, n_future, restored.plan)])
+    n_steps = n_encoded + n_future
+    return [
+        Prediction(together.select_clouds(range(b * n_steps, (b + 1) * n_steps)), n_encoded, context)
+        for b, context in enumerate(contexts)
+    ]
+
+
+@torch.no_grad()
 def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int], start: int = 0) -> Tensor:
     """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles, seen by cameras ``cams``.
 

@@ -67,6 +67,8 @@ class DataConfig:
     body_stride: likewise, of pixels that show what may move.
     resize: (width, height) pixels: films are scaled to cover it and cropped around the centre; empty: as filmed.
     near_far: metres, the depth range of all scenes; empty: each scene's own.
+    targets_apart: targets come from cameras that are no input of their window. Else a model may learn to show each
+        input to its own camera only: particles right before it, too small to be seen by others.
     unit_cameras: lengths are in units of the largest coordinate of a scene's cameras.
     """
 
@@ -80,6 +82,7 @@ class DataConfig:
     body_stride: int = 1
     resize: tuple[int, ...] = ()
     near_far: tuple[float, ...] = ()
+    targets_apart: bool = False
     unit_cameras: bool = False
 
     def __post_init__(self):

@@ -52,7 +52,7 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, stages: Sequence[Sta
             n_steps = (stage.history or data.history) + stage.lead + stage.horizon
             if scene.n_steps < n_steps:
                 raise InputError(f"{scene.path}: {scene.n_steps} steps; windows of {n_steps} steps do not fit")
-            if scene.n_cams < stage.target_views:
+            if scene.n_cams - data.targets_apart * data.context_views < stage.target_views:
                 raise InputError(f"{scene.path}: {scene.n_cams} cameras; {stage.target_views} target views do not fit")
         if len(context_cameras(scene, data)) < data.context_views:
             raise InputError(f"{scene.path}: too few cameras for {data.context_views} context views")
@@ -147,7 +147,8 @@ def _draw_window(
     views = generator(seed, step, sample, "views")
     cameras = context_cameras(scene, data)
     context = spread_views(cameras, data.context_views, int(views.integers(len(cameras))))
+    seen = [cam for cam in range(scene.n_cams) if not (data.targets_apart and cam in context)]
     targets = tuple(
-        tuple(int(cam) for cam in views.permutation(scene.n_cams)[: stage.target_views]) for _ in range(n_steps)
+        tuple(seen[place] for place in views.permutation(len(seen))[: stage.target_views]) for _ in range(n_steps)
     )
     return Window(scene, start, n_context, (context,) * n_context, targets, lead)
