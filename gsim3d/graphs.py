@@ -99,9 +99,9 @@ class CapturedRollout:
     object is made, and to the model in evaluation. Under autocast the weights of matrix products and convolutions are
     rounded once, into a copy: call :meth:`reload` after the model has changed. Without it the graph reads the model's own.
 
-    With a model of ``background="asymmetric"`` the graph advances what moves. Its rows must be as many in every call; the
-    background is computed beside the graph, whenever it has changed, and may need more room, for which the graph is made
-    anew. Sleep (``plan.spec.dynamics.sleep``) is decided between rollouts, not inside a graph.
+    With a model of ``background="asymmetric"`` the graph advances what moves, as many rows in every call. The background
+    is computed beside the graph, whenever it has changed; where it needs more room the graph is made anew. A graph knows
+    no sleep: it advances the same rows always.
 
     On the CPU there are no graphs: calls run the same steps one by one, with the same sizes and the same results.
 
@@ -149,7 +149,7 @@ class CapturedRollout:
         self._report.poll()
         self._background = background
         if self._plan.spec.dynamics.sleep is not None:
-            raise InputError("CapturedRollout: plan must be one without dynamics.sleep; a graph advances the same rows always")
+            raise InputError("CapturedRollout: plan must be one without dynamics.sleep; a graph knows no sleep")
         prepared = simulator.prepare(state, self._plan)
         self._table, self._state, self._rest = prepared.clouds, _own(prepared), None
         self._cameras = None if cameras is None else cameras.map(torch.clone)
@@ -185,8 +185,8 @@ class CapturedRollout:
         return self.finish()
 
     def launch(self, state: Particles, cameras: Cameras | None = None) -> None:
-        """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background, and to tell an
-        asymmetric one from what moves)."""
+        """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background, and to tell
+        an asymmetric one from what moves)."""
         self._report.poll()
         state = self._simulator.prepare(state, self._plan)
         self._check(state, self._table)
@@ -322,8 +322,8 @@ class CapturedRollout:
         table = state.clouds
         if (table.starts, table.scenes) != (own.starts, own.scenes):
             raise InputError(
-                f"CapturedRollout: state must have the rows and scenes of the first one{where}, clouds that start at rows "
-                f"{list(own.starts)} of scenes {list(own.scenes)}; got {list(table.starts)} of {list(table.scenes)}"
+                f"CapturedRollout: state must have the rows and scenes of the first one{where}, clouds that start at "
+                f"rows {list(own.starts)} of scenes {list(own.scenes)}; got {list(table.starts)} of {list(table.scenes)}"
             )
         if _gaps(table) != _gaps(own):
             raise InputError(

@@ -15,6 +15,11 @@ examples:
   gsim3d simulate runs/model runs/data/ball/0000 --out runs/ball
   gsim3d simulate elastic-small data/elastic/ball/0000 --out runs/ball
   gsim3d simulate model.safetensors runs/data/ball/0000 --out runs/ball --steps 48 --cameras 2 7
+  gsim3d simulate runs/model runs/data/ball/0000 --out runs/thrown --edit edits.yaml
+
+edits.yaml, a list (docs/effects.md has all operations):
+  - {step: 0, op: remove, of: frozen}                         no ground
+  - {step: 8, op: throw, of: moving, velocity: [0, 0, 0.1]}   metres a step
 """
 
 
@@ -28,16 +33,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", type=int, default=0, help="first input step (default: 0)")
     parser.add_argument("--cameras", type=int, nargs="+", metavar="CAM", help="cameras to show (default: up to 4 targets)")
     parser.add_argument("--context", type=int, nargs="+", metavar="CAM", help="input cameras (default: spread evenly)")
+    parser.add_argument("--edit", metavar="FILE", help="YAML file of changes of the scene on the way")
+    parser.add_argument("--effects", metavar="FILE", help="YAML file of what to compute (default: as in training)")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
 
 
 def run(args: argparse.Namespace) -> int:
     import os
     import shutil
+    from dataclasses import replace
+    from functools import partial
     from pathlib import Path
 
     import cv2
 
+    from gsim3d.edits import load_edits
+    from gsim3d.effects import EffectsSpec, OutputEffects, StructureEffects
     from gsim3d.errors import InputError
     from gsim3d.evaluate.pictures import as_bytes, comparison_frames, true_images, write_gaussians
     from gsim3d.evaluate.protocol import default_views, predict, render_steps
@@ -56,7 +67,14 @@ def run(args: argparse.Namespace) -> int:
     n_future = args.steps if args.steps is not None else max(1, scene.n_steps - args.start - restored.data.history)
     if bad := [cam for cam in (*cams, *context) if not 0 <= cam < scene.n_cams]:
         raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
-    prediction = predict(restored, scene, context, n_future, args.start)
+    spec = restored.plan.spec if args.effects is None else EffectsSpec.load(args.effects)
+    edits = () if args.edit is None else load_edits(args.edit, partial(_encode, restored))
+    if edits:
+        changes = (edit.operation for edit in edits)
+        structure = StructureEffects(*map(any, zip(*((change.inserts, change.removes) for change in changes))))
+        spec = replace(spec, structure=structure)
+    restored = replace(restored, plan=restored.simulator.plan(replace(spec, outputs=OutputEffects())))
+    prediction = predict(restored, scene, context, n_future, args.start, edits)
     images = as_bytes(render_steps(restored, prediction.particles, scene, cams, args.start))
     part = out.with_name(f".{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
@@ -71,5 +89,14 @@ def run(args: argparse.Namespace) -> int:
         os.replace(part, out)
     finally:
         shutil.rmtree(part, ignore_errors=True)
-    print(f"{prediction.n_encoded} steps encoded, {n_future} predicted; written: {out}")
+    rested = f" ({prediction.resting:.0%} of the particles at rest, not computed)" if prediction.resting else ""
+    print(f"{prediction.n_encoded} steps encoded, {n_future} predicted{rested}; written: {out}")
     return 0
+
+
+def _encode(restored, folder):
+    """The particles of another scene."""
+    from gsim3d.evaluate.protocol import default_views, encode_steps
+
+    scene = restored.open_scene(folder)
+    return encode_steps(restored, scene, default_views(restored, scene)[0])

@@ -36,7 +36,7 @@ from gsim3d.dynamics import (
     rollout_in_parts,
 )
 from gsim3d.edits import Edit, by_step
-from gsim3d.effects import EffectsSpec, OutputEffects
+from gsim3d.effects import EffectsSpec, OutputEffects, UnsupportedEffect
 from gsim3d.encoder import Encoder, pixel_rows
 from gsim3d.guards import drop_rows, guard_frames, guard_particles
 from gsim3d.harmonics import SH_0
@@ -54,6 +54,7 @@ class Simulator(nn.Module):
     """Encoder, dynamics and renderer of one model.
 
     report: StabilityReport of the calls that were given no other.
+    absent: parameters that the weights it was given lack; plans that read them are refused.
     """
 
     def __init__(self, config: ModelConfig):
@@ -63,6 +64,7 @@ class Simulator(nn.Module):
         self.dynamics = Dynamics(config.dynamics)
         self.renderer = GaussianHead(config.renderer)
         self.report = StabilityReport()
+        self.absent: frozenset[str] = frozenset()
 
     def encode(
         self, frames: Frames, *, on_bad: OnBad | None = None, report: StabilityReport | None = None
@@ -81,7 +83,10 @@ class Simulator(nn.Module):
         """
         plan = make_plan(spec, self.config)
         names = (name for name, _ in self.named_parameters())
-        return dataclasses.replace(plan, unused=unused_parameters(plan, self.config, names))
+        unused = unused_parameters(plan, self.config, names)
+        if needed := sorted(self.absent.difference(unused)):
+            raise UnsupportedEffect(f"unsupported effects: they read {', '.join(needed)}, which the weights do not have")
+        return dataclasses.replace(plan, unused=unused)
 
     def step(
         self,
@@ -96,7 +101,7 @@ class Simulator(nn.Module):
 
         Args:
             state: last steps of every scene.
-            plan: what to compute; default everything the model can.
+            plan: what to compute; default everything the model can. Nobody sleeps: that is decided along a rollout.
             generator: randomness of training (drop path, curve shuffling); None: none.
         """
         plan, guard = plan or self.plan(), self._guard("step", on_bad, report)

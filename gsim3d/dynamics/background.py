@@ -3,8 +3,8 @@
 The network runs over the background alone, one cloud a scene in the newest time slot, with cells, clusters, patches and
 curves of its own. Three things are kept of that run, for as long as the background stays:
 
-* of every convolution a field: what the background adds to it in every cell that has background within reach. A moving row
-  looks up its cell: a tap adds the mean of the moving rows of a neighbour cell and the mean of its frozen rows.
+* of every convolution a field: what the background adds to it in every cell that has background within reach. A moving
+  row looks up its cell: a tap adds the mean of the moving rows of a neighbour cell and the mean of its frozen rows.
 * of every attention the keys and values. A moving row attends to its own patch, as without a background, and to the one
   background patch in whose interval of the curve it lies, in one softmax.
 * the places of both: sorted keys, found by binary search.
@@ -25,14 +25,13 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d import ops
-from gsim3d.ops.curve import CURVES, KernelMap, PatchTable, Pyramid, Stage, Voxels
+from gsim3d.ops.curve import CURVES, KernelMap, PatchTable, Pyramid, PyramidSpec, Stage, Voxels
 from gsim3d.types import Particles
 
 _ops = torch.ops.gsim3d
 DEPTH = 16  # levels of the curves at stage 0, and bits of a cell along an axis
 SPACE_BITS = 3 * DEPTH  # below the scene in a key
 NOWHERE = torch.iinfo(torch.int64).max  # a key behind all others
-LAST = -1  # offsets go on with their last one
 ALL_CURVES = (0, 1, 2, 3)
 
 
@@ -57,13 +56,15 @@ class Places:
     cells: of the fields, by kernel size.
     first: int64 [4, P], the key at which each patch begins along each serialization; of the first patch of a scene the
         scene's lowest.
-    kv_rows, cu_k: of each serialization, the keys of the patches as in :class:`PatchTable`.
+    kv_rows, cu_k: int64 [4, M] and [P + 1], the keys of each patch, as in :class:`PatchTable`.
+    patch_size: the most keys of a patch.
     """
 
     cells: dict[int, Tensor]
     first: Tensor
-    kv_rows: tuple[Tensor, ...]
-    cu_k: tuple[Tensor, ...]
+    kv_rows: Tensor
+    cu_k: Tensor
+    patch_size: int
 
 
 @dataclass(frozen=True)
@@ -87,17 +88,18 @@ class Background:
         cls,
         pyramid: Pyramid,
         particles: Particles,
-        strides: Sequence[int],
+        spec: PyramidSpec,
         curves: tuple[tuple[int, ...], ...] | None = None,
     ) -> tuple[Background, list[Recorder]]:
-        """The places of ``particles``, of which ``pyramid`` is the geometry; and what keeps, at each stage, the rest."""
+        """The places of ``particles``, whose geometry is ``pyramid``; and what keeps, at each stage, the rest."""
         curves = (ALL_CURVES,) * len(pyramid.stages) if curves is None else curves
-        depths = tuple(DEPTH + 1 - n.bit_length() for n in accumulate((1, *strides), operator.mul))
+        depths = tuple(DEPTH + 1 - n.bit_length() for n in accumulate((1, *spec.strides), operator.mul))
         if pyramid.rows.shape[0] == 0:
             return cls(curves, depths, ()), []
         rooms = list(zip(pyramid.stages, row_scenes(pyramid, particles), depths, strict=True))
         fields = [{size: _field(*room, size) for size in room[0].kernel_maps} for room in rooms]
-        places = tuple(_places(at, *room, chosen) for at, room, chosen in zip(fields, rooms, curves, strict=True))
+        chosen = zip(fields, rooms, curves, spec.patch_sizes, strict=True)
+        places = tuple(_places(at, *room, of_stage, size) for at, room, of_stage, size in chosen)
         background = cls(curves, depths, places)
         return background, [Recorder(background, at, stage) for at, stage in zip(fields, pyramid.stages)]
 
@@ -107,32 +109,33 @@ class Background:
         return [Reader(self, *room) for room in rooms]
 
     def map(self, f: Callable[[Tensor, int], Tensor]) -> Background:
-        """The same background with ``f`` applied to every tensor and to what may follow its last entries: nothing."""
+        """The same background with ``f`` applied to every tensor and its kind (KEYS, LISTS, OFFSETS or ROWS)."""
         places = tuple(
             Places(
-                {size: f(cells, NOWHERE) for size, cells in at.cells.items()},
-                f(at.first, NOWHERE),
-                tuple(f(rows, 0) for rows in at.kv_rows),
-                tuple(f(offsets, LAST) for offsets in at.cu_k),
+                {size: f(cells, KEYS) for size, cells in at.cells.items()},
+                f(at.first, KEYS),
+                f(at.kv_rows, LISTS),
+                f(at.cu_k, OFFSETS),
+                at.patch_size,
             )
             for at in self.places
         )
-        kept = ({module: f(x, 0) for module, x in part.items()} for part in (self.fields, self.keys, self.values))
+        kept = ({module: f(x, ROWS) for module, x in part.items()} for part in (self.fields, self.keys, self.values))
         return Background(self.curves, self.depths, places, *kept)
 
     def with_room(self, factor: float) -> Background:
         """Another one that reads alike, with room for ``factor`` times as much."""
-        return self.map(lambda x, fill: _longer(x, fill, math.ceil(factor * _length(x, fill))))
+        return self.map(lambda x, kind: _longer(x, kind, math.ceil(factor * _length(x, kind))))
 
     def load(self, other: Background) -> bool:
         """Takes the numbers of ``other`` into its own memory; False where there is no room for them."""
         own, given = [], []
-        self.map(lambda x, fill: own.append((x, fill)) or x)
-        other.map(lambda x, fill: given.append(x) or x)
-        if len(own) != len(given) or any(_length(x, fill) < _length(y, fill) for (x, fill), y in zip(own, given)):
+        self.map(lambda x, kind: own.append((x, kind)) or x)
+        other.map(lambda x, kind: given.append(x) or x)
+        if len(own) != len(given) or any(_length(x, kind) < _length(y, kind) for (x, kind), y in zip(own, given)):
             return False
-        for (x, fill), y in zip(own, given):
-            x.copy_(_longer(y, fill, _length(x, fill)))
+        for (x, kind), y in zip(own, given):
+            x.copy_(_longer(y, kind, _length(x, kind)))
         return True
 
 
@@ -207,10 +210,11 @@ class _JointAttention(torch.autograd.Function):
         scale = q.shape[-1] ** -0.5
         out, stats = _ops.patch_attention.default(q, k, v, *_lists(patches), scale)
         other, other_stats = _ops.patch_attention.default(q, other_k, other_v, *_lists(other_patches), scale)
-        stats, share = _joined(stats, other_stats, scale)
+        largest, total, share = _joined(stats, other_stats, scale)
         out = (out * (1 - share) + other * share).to(out.dtype)  # lerp would round by how threads share the rows
-        ctx.save_for_backward(q, k, v, other_k, other_v, out, stats)
-        ctx.patches, ctx.scale = (patches, other_patches), scale
+        if any(ctx.needs_input_grad):
+            ctx.save_for_backward(q, k, v, other_k, other_v, out, torch.stack([largest, total], -1))
+            ctx.patches, ctx.scale = (patches, other_patches), scale
         return out
 
     @staticmethod
@@ -225,8 +229,8 @@ class _JointAttention(torch.autograd.Function):
         return mine[0] + others[0], *mine[1:], *others[1:], None, None
 
 
-def _joined(stats: Tensor, other: Tensor, scale: float) -> tuple[Tensor, Tensor]:
-    """The stats of one softmax over the keys of both, and the share [..., 1] of the other keys in it.
+def _joined(stats: Tensor, other: Tensor, scale: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The two stats of one softmax over the keys of both, and the share [..., 1] of the other keys in it.
 
     Stats: the largest product of a query and a key, and the sum of exponentials relative to it, 0 of no keys.
     """
@@ -236,7 +240,7 @@ def _joined(stats: Tensor, other: Tensor, scale: float) -> tuple[Tensor, Tensor]
     other_total = other_total * ((other_top - largest) * scale).exp()
     both = total * ((top - largest) * scale).exp() + other_total
     share = other_total / both.clamp(min=torch.finfo(both.dtype).tiny)
-    return torch.stack([largest, both], -1), share[..., None]
+    return largest, both, share[..., None]
 
 
 def _lists(patches: PatchTable) -> tuple[Tensor, ...]:
@@ -269,15 +273,17 @@ def _shifted(keys: Tensor, offsets: Tensor, depth: int) -> tuple[Tensor, Tensor]
     return keys, inside
 
 
-def _places(fields: dict[int, Field], stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]) -> Places:
+def _places(
+    fields: dict[int, Field], stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...], patch_size: int
+) -> Places:
     first = stage.order[:, stage.patches[0].cu_q[:-1]]
     codes, of_scene = _codes(stage, scene, depth, curves).gather(1, first), scene[first]
     opens = torch.ones_like(first, dtype=torch.bool)
     opens[:, 1:] = of_scene[:, 1:] != of_scene[:, :-1]
     codes = torch.where(opens, of_scene << SPACE_BITS, codes)
-    tables = stage.patches
+    kv_rows = torch.stack([table.kv_rows for table in stage.patches])
     cells = {size: at.cells for size, at in fields.items()}
-    return Places(cells, codes, tuple(t.kv_rows for t in tables), tuple(t.cu_k for t in tables))
+    return Places(cells, codes, kv_rows, stage.patches[0].cu_k, patch_size)
 
 
 def _codes(stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]) -> Tensor:
@@ -295,12 +301,17 @@ def _field(stage: Stage, scene: Tensor, depth: int, kernel_size: int) -> Field:
         offsets[:, axis] = steps
         spread, inside = _shifted(cells, offsets, depth)
         cells = torch.unique(spread[inside])
-    taps = torch.cartesian_prod(steps, steps, steps)
-    seen_from, inside = _shifted(keys, -taps, depth)
-    inside = inside & taps.any(1)[:, None]
     cells = torch.cat([cells, cells.new_full((1,), NOWHERE)])
     occupied = torch.searchsorted(cells, keys)
-    tap_in, tap_out = occupied.expand_as(seen_from)[inside], torch.searchsorted(cells, seen_from[inside])
+    # Cells above each other follow each other: one search serves a column of taps.
+    columns = torch.nn.functional.pad(torch.cartesian_prod(steps, steps), (0, 1))
+    seen_from, inside = _shifted(keys, -columns, depth)
+    heights = (keys & (1 << DEPTH) - 1) - steps[:, None]
+    inside = inside[:, None] & (heights >= 0) & (heights < 1 << depth)
+    inside[columns.shape[0] // 2, reach] = False
+    pairs = inside.flatten().nonzero()[:, 0]
+    tap_out = (torch.searchsorted(cells, seen_from)[:, None] - steps[:, None]).flatten()[pairs]
+    tap_in, inside = occupied[pairs % keys.shape[0]], inside.flatten(0, 1)
     cu_taps = torch.nn.functional.pad(inside.sum(1).cumsum(0), (1, 0))
     each = torch.arange(cells.shape[0] + 1, device=keys.device)
     return Field(cells, occupied, Voxels(each[:-1], each[:-1], each), KernelMap(kernel_size, tap_in, tap_out, cu_taps))
@@ -323,23 +334,53 @@ def _overlapping(
     is_row = torch.arange(stage.n_rows, device=scene.device) < stage.cu_clouds[-1]
     patch = torch.where((patch >= 0) & of_scene & is_row, patch, n_patches)
     order, _ = ops.curve_sort(patch)
-    bounds = torch.arange(n_patches + 1, device=scene.device).expand(len(curves), -1).contiguous()
-    cu_q = torch.searchsorted(patch.gather(1, order), bounds)
-    return tuple(PatchTable(*lists) for lists in zip(order, places.kv_rows, cu_q, places.cu_k, strict=True))
+    cu_q = torch.searchsorted(patch.gather(1, order), _counting(n_patches + 1, order))
+    return _in_parts(order, cu_q, places)
+
+
+def _in_parts(order: Tensor, cu_q: Tensor, places: Places) -> tuple[PatchTable, ...]:
+    """Tables of patches that have at most ``patch_size`` queries each: a GPU's blocks share patches, not queries.
+
+    order, cu_q: [4, N] and [4, P + 1], the queries of every patch of ``places``, any number. A patch of many becomes parts,
+    which all list its keys. The number of parts is the largest there can be; the last ones are empty.
+    """
+    size, n_parts = places.patch_size, cu_q.shape[1] - 1 + order.shape[1] // places.patch_size
+    cu_parts = _offsets((cu_q.diff(dim=1) + size - 1) // size)
+    part = _counting(n_parts + 1, order)
+    patch = torch.searchsorted(cu_parts, part, right=True) - 1
+    begin = cu_q.gather(1, patch) + (part - cu_parts.gather(1, patch)) * size
+    begin = torch.minimum(begin, cu_q[:, -1:])
+    n_keys = torch.nn.functional.pad(places.cu_k.diff(), (0, 1))[patch[:, :-1]]
+    cu_k, slot = _offsets(n_keys), _counting(n_parts * size, order)
+    at = (torch.searchsorted(cu_k, slot, right=True) - 1).clamp(max=n_parts - 1)
+    source = places.cu_k[patch.gather(1, at)] + slot - cu_k.gather(1, at)
+    kv_rows = places.kv_rows.gather(1, source.clamp(max=places.kv_rows.shape[1] - 1))
+    return tuple(PatchTable(*lists) for lists in zip(order, kv_rows, begin, cu_k, strict=True))
+
+
+def _offsets(counts: Tensor) -> Tensor:
+    return torch.nn.functional.pad(counts.cumsum(1), (1, 0))
+
+
+def _counting(n: int, like: Tensor) -> Tensor:
+    """0 to n - 1 for each row of ``like``."""
+    return torch.arange(n, device=like.device).expand(like.shape[0], n).contiguous()
 
 
 # ---- room ----
 
-
-def _length(x: Tensor, fill: int) -> int:
-    """Entries along the axis that may be longer, the last one of keys, the first one of rows; offsets have one more."""
-    return x.shape[-1] - (fill == LAST) if fill in (NOWHERE, LAST) else x.shape[0]
+KEYS, LISTS, OFFSETS, ROWS = range(4)  # what may be longer, and how it goes on: nowhere, 0, with its last entry, 0
 
 
-def _longer(x: Tensor, fill: int, length: int) -> Tensor:
-    more = length - _length(x, fill)
-    if fill == LAST:
+def _length(x: Tensor, kind: int) -> int:
+    """Entries along the axis that may be longer, the first one of rows, else the last; offsets have one more."""
+    return x.shape[0] if kind == ROWS else x.shape[-1] - (kind == OFFSETS)
+
+
+def _longer(x: Tensor, kind: int, length: int) -> Tensor:
+    more = length - _length(x, kind)
+    if kind == ROWS:
+        return torch.cat([x, x.new_zeros(more, *x.shape[1:])])
+    if kind == OFFSETS:
         return torch.cat([x, x[-1:].expand(more)])
-    if fill == NOWHERE:
-        return torch.cat([x, x.new_full((*x.shape[:-1], more), fill)], -1)
-    return torch.cat([x, x.new_zeros(more, *x.shape[1:])])
+    return torch.cat([x, x.new_full((*x.shape[:-1], more), NOWHERE if kind == KEYS else 0)], -1)

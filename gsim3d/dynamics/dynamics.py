@@ -71,7 +71,7 @@ class Dynamics(nn.Module):
         """
         curves = self._draw_curves(generator)
         pyramid = self.geometry(background, curves=curves)
-        remembered, recorders = Background.begin(pyramid, background, self.config.strides, curves)
+        remembered, recorders = Background.begin(pyramid, background, self.config.pyramid_spec(0), curves)
         if recorders:
             draws = generator if self.training else None
             x = ops.pool_mean(self.layout.pack(background), pyramid.rows, pyramid.cu_rows, check=False)

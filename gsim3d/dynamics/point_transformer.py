@@ -15,10 +15,20 @@ from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
 from gsim3d import ops
+from gsim3d.branches import Branches
 from gsim3d.dynamics.background import Reader, Recorder
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
 from gsim3d.dynamics.fused_block import run_block
-from gsim3d.layers import RowLayerNorm, RowLinear, make_norm, product_dtype, rounded_at_once, rounded_weights, widened
+from gsim3d.layers import (
+    RowLayerNorm,
+    RowLinear,
+    at_hand,
+    make_norm,
+    product_dtype,
+    round_at_once,
+    rounded_weights,
+    widened,
+)
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
 Beside = Recorder | Reader
@@ -234,9 +244,13 @@ class Merge(nn.Module):
         self.time_embedding = nn.Parameter(torch.empty(window, channels))
         nn.init.trunc_normal_(self.time_embedding, std=TIME_EMBEDDING_STD)
 
+    def marks(self, stage: Stage) -> bool:
+        """Whether there is anything to tell apart."""
+        return stage.time_index is not None or self.newest is not None
+
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
         if stage.time_index is None:
-            return x if self.newest is None else x + self.time_embedding[self.newest].to(x.dtype)
+            return x + self.time_embedding[self.newest].to(x.dtype)
         # A product with a one-hot matrix: its gradient is a sum in row order, where indexing would use atomics on CUDA.
         return x + F.one_hot(stage.time_index, self.time_embedding.shape[0]).to(x) @ self.time_embedding
 
@@ -259,7 +273,7 @@ class EncoderStage(nn.Module):
     ) -> Tensor:
         if self.pool is not None:
             x = self.pool(x, stage)
-        if self.merge is not None:
+        if self.merge is not None and self.merge.marks(stage):
             x = self.merge(x, stage)
         return run_blocks(self.blocks, x, x, stage, generator, beside)
 
@@ -351,17 +365,20 @@ class PointTransformer(nn.Module):
         generator: torch.Generator | None = None,
         besides: Sequence[Beside] = (),
     ) -> Tensor:
+        besides = besides or [None] * len(pyramid.stages)
         if not x.is_cuda or torch.compiler.is_compiling():
-            return self._compute(x, pyramid, generator, besides)
-        with rounded_at_once(self._products, product_dtype(x)):
-            return self._compute(x, pyramid, generator, besides)
+            x = self.stem(x, pyramid.stages[0], besides[0])
+            return self._behind_stem(x, pyramid, generator, besides)
+        with Branches(x) as branches:
+            rounded = branches.run(round_at_once, self._products, product_dtype(x))
+            x = self.stem(x, pyramid.stages[0], besides[0])
+        with at_hand(rounded):
+            return self._behind_stem(x, pyramid, generator, besides)
 
-    def _compute(
-        self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None, besides: Sequence[Beside]
+    def _behind_stem(
+        self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None, besides: Sequence[Beside | None]
     ) -> Tensor:
-        stages, besides = pyramid.stages, besides or [None] * len(pyramid.stages)
-        x = self.stem(x, stages[0], besides[0])
-        skips = []
+        stages, skips = pyramid.stages, []
         for encoder, stage, beside in zip(self.encoder, stages, besides, strict=True):
             x = encoder(x, stage, generator, beside)
             skips.append(x)

@@ -178,6 +178,7 @@ def _conditions(args: argparse.Namespace, restored, others: list, scenes: list, 
     """What was evaluated, and on what: without it two reports cannot be compared."""
     return {
         "checkpoint": None if restored is None else restored.checkpoint.digest,
+        "effects": None if restored is None else restored.plan.spec.hash,
         "predictions": {other.name: str(other.folder) for other in others},
         "data": str(args.data),
         "part": args.scenes,

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+from gsim3d.effects import FILE as EFFECTS_FILE
 from gsim3d.errors import InputError
 from gsim3d.generate import writer
 from gsim3d.generate.worlds import build_world
@@ -75,6 +76,7 @@ def generate(
             scene for scene, folder in zip(scenes, folders) if not writer.is_finished(folder, fingerprints[scene[0]])
         ]
         _make_all(settings, out, missing, processes or len(os.sched_getaffinity(0)), progress)
+        settings.effects().save(out / EFFECTS_FILE)
         manifest = writer.write_manifest(out, folders, {"world": world, **dataclasses.asdict(settings)})
     from gsim3d.data import find_scenes  # not above: the worker processes do without torch
 

@@ -65,6 +65,8 @@ class DataConfig:
     target_only_cameras: cameras that are never an input; a loss may look at them.
     background_stride: of pixels that show what never moves, those on every n-th row and column become particles.
     body_stride: likewise, of pixels that show what may move.
+    thawed: of every scene's background a share drawn from 0 to this one is shown to the dynamics as movable, by cubes:
+        so a model with an asymmetric background learns that rows at rest may be awake or asleep.
     resize: (width, height) pixels: films are scaled to cover it and cropped around the centre; empty: as filmed.
     near_far: metres, the depth range of all scenes; empty: each scene's own.
     targets_apart: targets come from cameras that are no input of their window. Else a model may learn to show each
@@ -80,6 +82,7 @@ class DataConfig:
     target_only_cameras: tuple[int, ...] = ()
     background_stride: int = 1
     body_stride: int = 1
+    thawed: float = 0.0
     resize: tuple[int, ...] = ()
     near_far: tuple[float, ...] = ()
     targets_apart: bool = False
@@ -88,6 +91,8 @@ class DataConfig:
     def __post_init__(self):
         _at_least(self, history=1, shortest_history=0, context_views=1, fewest_views=0)
         _at_least(self, background_stride=1, body_stride=1)
+        if not 0 <= self.thawed <= 1:
+            raise InputError(f"data.thawed: must be from 0 to 1; got {self.thawed}")
         for least, most in (("shortest_history", "history"), ("fewest_views", "context_views")):
             if getattr(self, least) > getattr(self, most):
                 raise InputError(

@@ -46,6 +46,7 @@ from gsim3d.train.samples import (
 )
 from gsim3d.train.schedule import one_cycle
 from gsim3d.train.settings import from_dict, to_dict
+from gsim3d.train.thawing import check_thawing, thaw
 from gsim3d.train.watch import Seen, StepWatch, first_not_finite, mean_of_norms, norms_by_module
 from gsim3d.types import Frames
 
@@ -87,7 +88,10 @@ class Trainer:
         self.plan_spec = EffectsSpec.from_dict(config.effects)
         self.simulator = build_simulator(model_config(config), config.seed).to(device)
         self.plan = self.simulator.plan(self.plan_spec)
+        if not self.plan_spec.outputs.rgb:
+            raise InputError("effects: outputs.rgb is off, but the loss compares colours; leave it on")
         _check_history(config, self.plan)
+        check_thawing(config.data, self.simulator.config.dynamics)
         _check_sharing(config, self.processes.count, self.simulator.config.dynamics.norm)
         self.perceptual = load("lpips_vgg", partial(LPIPS, "vgg")).to(device) if config.loss.perceptual else None
         self.parameters = dict(self.simulator.named_parameters())
@@ -392,6 +396,9 @@ class Trainer:
             particles = again("encoder")(lambda context: simulator.encode(context, **options))(batch.context)
         watch.count(particles)
         if batch.n_future:
+            if self.config.data.thawed:
+                rng = generator(self.config.seed, self.step, sample, "thawed")
+                particles = thaw(particles, self.config.data.thawed, self.plan_spec, rng)
             with precision.of("dynamics", self.device):
                 begin = particles
                 if batch.n_lead:

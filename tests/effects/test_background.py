@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import DynamicsConfig, Parts, RestLog, last_steps, rollout
+from gsim3d.dynamics import DynamicsConfig, Parts, RestLog, last_steps, rollout, rollout_in_parts
 from gsim3d.dynamics.background import Background, joint_attention
 from gsim3d.dynamics.point_transformer import SparseConv
 from gsim3d.graphs import CapturedRollout
@@ -14,7 +14,7 @@ from gsim3d.ops.curve import CURVES
 from gsim3d.quirks import Quirks
 from gsim3d.types import ASLEEP, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
-from tests.dynamics.scenes import TINY, batch, float_fields, make_dynamics, make_history
+from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history
 from tests.effects.resting import ASYMMETRIC, make_scenes, make_simulator
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -33,7 +33,7 @@ def read_and_reader(dtype=torch.float64):
     history = batch([make_history((150, 140), seed=i, frozen_share=0.6, dtype=dtype) for i in range(2)])
     parts = Parts.of(history, asymmetric=True)
     rest, moving = dynamics.geometry(parts.background), dynamics.geometry(parts.moving)
-    background, recorders = Background.begin(rest, parts.background, ASYMMETRIC.strides)
+    background, recorders = Background.begin(rest, parts.background, ASYMMETRIC.pyramid_spec(0))
     return parts, rest, moving, background, recorders[0]
 
 
@@ -122,6 +122,38 @@ def test_a_background_made_once_gives_the_bits_of_one_made_in_every_step():
         assert_same_particles(step, last_steps(state, 1))
 
 
+@pytest.mark.parametrize("values", [{"steps_per_call": 2}, {"steps_per_call": 2, "predicts": "from_previous"}])
+def test_several_steps_a_call(values):
+    dynamics, history = make_dynamics(dataclasses.replace(ASYMMETRIC, **values)), make_scenes()
+    steps = rollout_in_parts(
+        lambda moving, background: dynamics(moving, background=background), history, 5, 4, remember=dynamics.remember
+    )
+    for one, other in zip(steps, rollout(dynamics, history, 5, 4), strict=True):
+        assert_same_particles(one, other)
+
+
+def test_explicit_particles():
+    config = dataclasses.replace(EXPLICIT, background="asymmetric")
+    dynamics, history = make_dynamics(config), make_history((40, 50), config=config, frozen_share=0.5)
+    newest, step = last_steps(history, 1), dynamics(history)
+    frozen = newest.activity == FROZEN
+    for name in ("means", "quats", "scales", "sh", "opacities"):
+        assert_same_bits(getattr(step, name)[frozen], getattr(newest, name)[frozen], name)
+        assert not torch.equal(getattr(step, name)[~frozen], getattr(newest, name)[~frozen])
+
+
+def test_rows_that_cannot_be_seen_are_in_no_background():
+    dynamics, history = make_dynamics(ASYMMETRIC), make_history((40, 50), frozen_share=0.5)
+    frozen = (history.activity == FROZEN)[:, None]
+    lost = torch.arange(90)[:, None] % 3 == 0
+    hidden = dataclasses.replace(history, means=torch.where(frozen & lost, torch.nan, history.means))
+    kept = hidden.select_rows(~(frozen & lost)[:, 0])
+    assert_same_bits(dynamics(hidden).means[~(frozen & lost)[40:, 0]], dynamics(kept).means)
+    nobody = dataclasses.replace(history, means=torch.where(frozen, torch.nan, history.means))
+    alone = history.select_rows(~frozen[:, 0])
+    assert_same_bits(dynamics(nobody).means[~frozen[40:, 0]], dynamics(alone).means)
+
+
 def test_frozen_rows_of_the_newest_step_stay_and_older_ones_are_not_read():
     dynamics, history = make_dynamics(ASYMMETRIC), make_scenes()
     newest, step = last_steps(history, 1), dynamics(history)
@@ -188,15 +220,18 @@ def test_room_changes_no_bit(room):
     assert_same_particles(dynamics(parts.moving, pyramid=given, background=background), expected)
 
 
-def test_a_captured_rollout_has_the_same_bits_also_of_another_background():
-    simulator, state = make_simulator(), make_scenes()
-    captured = CapturedRollout(simulator, state, 3)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@torch.no_grad()
+def test_a_captured_rollout_has_the_same_bits_also_of_another_background(device, dtype):
+    simulator, state = make_simulator().to(device), make_scenes().to(device)
     turned = dataclasses.replace(state, static_latents=state.static_latents.flip(1))
     frozen = (state.activity == FROZEN)[:, None]
     moved = dataclasses.replace(state, means=torch.where(frozen, 0.3 + 0.4 * state.means.flip(1), state.means))
-    for given in (state, turned, moved, state):
-        for step, expected in zip(captured(given).steps, simulator.rollout(given, 3), strict=True):
-            assert_same_particles(step, expected)
+    with torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
+        captured = CapturedRollout(simulator, state, 3)
+        for given in (state, turned, moved, state):
+            for step, expected in zip(captured(given).steps, simulator.rollout(given, 3), strict=True):
+                assert_same_particles(step, expected)
 
 
 def test_a_background_without_room_for_another_is_made_anew():
@@ -215,6 +250,24 @@ def test_a_rollout_repeats_bit_by_bit():
     simulator = make_simulator()
     for one, other in zip(*(simulator.rollout(make_scenes(), 3) for _ in range(2)), strict=True):
         assert_same_particles(one, other)
+
+
+def test_a_gpu_gives_what_the_cpu_gives(devices):
+    results = []
+    for device in devices:
+        simulator, state = make_simulator(dtype=torch.float64).to(device), make_scenes(torch.float64).to(device)
+        state = dataclasses.replace(state, static_latents=state.static_latents.requires_grad_())
+        steps = simulator.rollout(state, 3)
+        loss = sum(step.means.square().sum() + step.dynamic_latents.square().sum() for step in steps)
+        grads = torch.autograd.grad(
+            loss, [state.static_latents, simulator.dynamics.net.encoder[0].blocks[0].mlp.fc1.weight]
+        )
+        with torch.no_grad():  # through blocks in few launches
+            results.append(
+                [*(t.cpu() for t in grads), *(s.means.cpu() for s in (*steps, *simulator.rollout(state, 3)))]
+            )
+    for one, other in zip(*results, strict=True):
+        assert_close_relative_to_max(other, one, 1e-9)
 
 
 def test_joint_attention_has_the_same_bits_for_any_number_of_threads():
