@@ -70,10 +70,10 @@ def _recipe(world: str, near_far: tuple[float, float], lead: int, strides: tuple
             targets_apart=True,
         ),
         stages=(
-            _stage(steps=500, history=1, batch=16, learning_rate=1e-3),
-            _stage(steps=200, horizon=2, batch=8, learning_rate=1e-3),
-            _stage(steps=300, horizon=6, batch=4, from_start=0.2, learning_rate=8e-4),
-            _stage(steps=500, horizon=12, batch=4, from_start=0.2, learning_rate=6e-4),
+            _stage(steps=300, history=1, batch=16, learning_rate=1e-3),
+            _stage(steps=150, horizon=2, batch=8, learning_rate=1e-3),
+            _stage(steps=200, horizon=6, batch=4, from_start=0.2, learning_rate=8e-4),
+            _stage(steps=300, horizon=12, batch=4, from_start=0.2, learning_rate=6e-4),
             _stage(steps=1_000_000, horizon=12, lead=lead, batch=4, from_start=0.2, learning_rate=5e-4),
         ),
         loss=LossConfig(body_weight=3.0),
@@ -183,6 +183,7 @@ def line(entry: dict, machine: dict) -> str:
     numbers = (
         f"step {entry['step']:6d}  loss {entry['loss']:.5f}  past {entry['past_psnr']:.2f}{future} dB  "
         f"norm {entry['grad_norm']:.3f}  rate {entry['learning_rate']:.1e}  {machine['step_seconds']:.3f} s  "
-        f"{machine['memory_gib']:.1f} GiB  {entry['particles']:.0f} particles  {entry['trajectories']} trajectories"
+        f"{machine['memory_gib']:.1f} GiB  {entry['particles']:.0f} particles  {entry['trajectories']} trajectories  "
+        f"{entry['captures']} captures"
     )
     return numbers if "skipped" not in entry else f"step {entry['step']:6d}  skipped: {entry['skipped']}"
