@@ -27,7 +27,7 @@ from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.ops.raster import Rendering
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
-from gsim3d.stability import StabilityReport
+from gsim3d.stability import StabilityReport, pack, unpack
 from gsim3d.types import Cameras, CloudTable, Particles, keeping_constants
 
 FACTOR = 1.25  # room over what was observed
@@ -172,8 +172,11 @@ class CapturedRollout:
         return self.finish()
 
     def launch(self, state: Particles, cameras: Cameras | None = None) -> None:
-        """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background)."""
-        self._report.poll()
+        """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background).
+
+        Raises:
+            HardCaseError: of an earlier call, under the policy "raise".
+        """
         state = self._simulator.prepare(state, self._plan)
         self._check(state)
         for name, value in self._state.row_fields().items():
@@ -184,16 +187,20 @@ class CapturedRollout:
         self._tables = state.clouds
         self._launched = True
         self._replay()
+        self._report.poll()  # here the host reads while the device works
 
     def finish(self) -> Predicted:
         """Waits for what was launched; repeats it with more room where it did not fit."""
         if not self._launched:
             raise InputError("CapturedRollout: finish() must follow launch()")
         self._launched = False
-        while not self._fits():
-            self._make_room([a.grown((0, *b.sizes)) for a, b in zip(self._grown(), self._observed(), strict=True)])
+        found, counted = self._arrive()
+        while not all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)]):
+            needed = zip(self._grown(found), self._observed(), strict=True)
+            self._make_room([a.grown((0, *b.sizes)) for a, b in needed])
             self._replay()
-        self._records.replayed(self._report)
+            found, counted = self._arrive()
+        self._records.replayed(self._report, counted)
         return self._results()
 
     def reload(self) -> None:
@@ -231,16 +238,16 @@ class CapturedRollout:
         self._rollout(geometry, StabilityReport())
         return needed
 
-    def _given(self, report: StabilityReport) -> tuple[Predicted, Tensor]:
+    def _given(self, report: StabilityReport) -> tuple[Predicted, list[Tensor]]:
         """The rollout with the sizes of this object, and what the geometry of every call found."""
         sizes, found = iter(self._capacities), []
 
         def geometry(history: Particles) -> Pyramid:
-            found.append(self._model.dynamics.geometry(history, capacity=next(sizes)))
-            return found[-1]
+            pyramid = self._model.dynamics.geometry(history, capacity=next(sizes))
+            found.append(pyramid.found)
+            return pyramid
 
-        predicted = self._rollout(geometry, report)
-        return predicted, torch.stack([pyramid.found for pyramid in found])
+        return self._rollout(geometry, report), found
 
     def _make_room(self, capacities: list[PyramidCapacity]) -> None:
         """Takes ``capacities`` as sizes and, on a GPU, makes the graph."""
@@ -248,33 +255,38 @@ class CapturedRollout:
         self.captures += 1
         if self._device.type != "cuda":
             return
-        self._graph = self._predicted = self._found = None  # their memory goes back before the next graph takes its own
+        # their memory goes back before the next graph takes its own
+        self._graph = self._predicted = self._numbers = self._packed = None
         self._graph = Captured(self._capture, self._device)
-        self._predicted, self._found = self._graph.result
-        self._found_on_host = torch.empty(self._found.shape, dtype=self._found.dtype, pin_memory=True)
+        self._predicted, self._numbers, self._packed = self._graph.result
+        self._on_host = torch.empty(self._packed.shape, dtype=self._packed.dtype, pin_memory=True)
         self._arrived = torch.cuda.Event()
 
-    def _capture(self) -> tuple[Predicted, Tensor]:
-        return self._given(self._records if torch.cuda.is_current_stream_capturing() else StabilityReport())
+    def _capture(self) -> tuple[Predicted, list[Tensor], Tensor]:
+        report = self._records if torch.cuda.is_current_stream_capturing() else StabilityReport()
+        predicted, found = self._given(report)
+        numbers = found + report.captured()
+        return predicted, numbers, pack(numbers)
 
     def _replay(self) -> None:
         if self._device.type != "cuda":
             self._records = StabilityReport()
-            self._predicted, self._found_on_host = self._given(self._records)
+            self._predicted, self._numbers = self._given(self._records)
             return
         with torch.cuda.device(self._device):
             self._graph()
-            self._found_on_host.copy_(self._found, non_blocking=True)
+            self._on_host.copy_(self._packed, non_blocking=True)
             self._arrived.record()
 
-    def _fits(self) -> bool:
+    def _arrive(self) -> tuple[list[list[int]], list[Tensor]]:
+        """Waits for the replay: what the geometry of every call found, and what the guards counted."""
+        numbers, n_calls = self._numbers, len(self._capacities)
         if self._device.type == "cuda":
             self._arrived.synchronize()
-        found = self._found_on_host.tolist()
-        return all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)])
+            numbers = unpack(self._on_host.clone(), numbers)
+        return [found.tolist() for found in numbers[:n_calls]], numbers[n_calls:]
 
-    def _grown(self) -> list[PyramidCapacity]:
-        found = self._found_on_host.tolist()
+    def _grown(self, found: list[list[int]]) -> list[PyramidCapacity]:
         return [capacity.grown(numbers, self._factor) for capacity, numbers in zip(self._capacities, found, strict=True)]
 
     # ---- what goes in and comes out ----

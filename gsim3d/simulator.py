@@ -56,7 +56,9 @@ class Simulator(nn.Module):
         guard = self._guard("encode", on_bad, report)
         frames, spoiled = guard_frames(frames, guard.keywords["config"], guard.keywords["report"], "encode")
         particles = self.encoder(frames)
-        return guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled)))
+        particles = guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled)))
+        guard.keywords["report"].send()
+        return particles
 
     def plan(self, spec: EffectsSpec = EffectsSpec()) -> Plan:
         """What will be computed for ``spec``, and what will not.
@@ -97,7 +99,9 @@ class Simulator(nn.Module):
         """
         plan, guard = plan or self.plan(), self._guard("step", on_bad, report)
         state = guard(self.prepare(state, plan))
-        return append_step(state, self._predict(state, plan, generator, guard), plan.history)
+        predicted = self._predict(state, plan, generator, guard)
+        guard.keywords["report"].send()
+        return append_step(state, predicted, plan.history)
 
     def rollout(
         self,
@@ -123,7 +127,9 @@ class Simulator(nn.Module):
         plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
         predict = predict if wrap is None else wrap(predict)
-        return rollout(predict, guard(self.prepare(state, plan)), n_steps, plan.history)
+        steps = rollout(predict, guard(self.prepare(state, plan)), n_steps, plan.history)
+        guard.keywords["report"].send()
+        return steps
 
     def prepare(self, state: Particles, plan: Plan) -> Particles:
         """What the dynamics reads of ``state``: its last steps, with the background as the plan wants it."""

@@ -129,12 +129,15 @@ def unpack(packed: Tensor, like: list[Tensor]) -> list[Tensor]:
     return [part.view(tensor.dtype).view(tensor.shape) for part, tensor in zip(parts, like, strict=True)]
 
 
+Record = tuple[Tensor, Callable[[Tensor], Reading]]  # numbers, and what they say once the host can read them
+
+
 @dataclass
 class _Pending:
-    """Records on their way to the host: the copies are complete when the event is."""
+    """Records on their way to the host: the copies are complete when the event is; None: they have arrived."""
 
-    records: list[tuple[Tensor, Callable[[Tensor], Reading]]]
-    event: torch.cuda.Event
+    records: list[Record]
+    event: torch.cuda.Event | None
 
 
 class StabilityReport:
@@ -164,8 +167,10 @@ class StabilityReport:
         self._total, self._raised = 0, 0
         self._errors: list[Finding] = []
         self._sentinels: dict[tuple[int, int], Sentinels] = {}
+        self._unsent: list[Record] = []
+        self._stream: torch.cuda.Stream | None = None  # that computes what is unsent
         self._pending: deque[_Pending] = deque()
-        self._captured: list[tuple[Tensor, Callable[[Tensor], Reading]]] = []
+        self._captured: list[Record] = []
 
     # ---- writing ----
 
@@ -183,12 +188,13 @@ class StabilityReport:
             if finding.action == "error":
                 self._errors.append(finding)
 
-    def record(self, numbers: Tensor, read: Callable[[Tensor], Reading]) -> None:
+    def record(self, numbers: Tensor, read: Callable[[Tensor], Reading], *, at_once: bool = True) -> None:
         """Takes what a guard counted: at once on the CPU, which also raises; on a GPU when its copy has arrived.
 
         Args:
             numbers: any small tensor of 64-bit numbers.
             read: what it says, from a copy on the host.
+            at_once: copy it now; else with others by :meth:`send`, or when somebody reads.
         """
         if numbers.device.type != "cuda":
             self._take(read(numbers))
@@ -196,21 +202,43 @@ class StabilityReport:
         elif torch.cuda.is_current_stream_capturing():
             self._captured.append((numbers, read))
         else:
-            self._send([(numbers, read)])
+            stream = torch.cuda.current_stream(numbers.device)
+            if stream != self._stream:
+                self.send()
+            self._stream = stream
+            self._unsent.append((numbers, read))
+            if at_once:
+                self.send()
 
-    def replayed(self, to: StabilityReport | None = None) -> None:
+    def send(self) -> None:
+        """Begins to copy to the host what has been recorded on a GPU, all in one, without waiting."""
+        if not torch.compiler.is_compiling() and self._unsent:
+            records, self._unsent = self._unsent, []
+            with torch.cuda.stream(self._stream):
+                self._send(records)
+
+    def captured(self) -> list[Tensor]:
+        """The numbers that every replay of the CUDA graphs captured with this report overwrites."""
+        return [numbers for numbers, _ in self._captured]
+
+    def replayed(self, to: StabilityReport | None = None, numbers: list[Tensor] | None = None) -> None:
         """Fetches the records of the CUDA graphs captured with this report, without waiting; call it after a replay.
 
         Args:
             to: report that is told of them, and of what this one has found so far; None: this one.
+            numbers: those of :meth:`captured` on the host, where the caller has them already; nobody else may change them.
         """
         target = self if to is None else to
-        if self._captured:
-            target._send(self._captured)
+        if numbers:
+            reads = [read for _, read in self._captured]
+            target._pending.append(_Pending(list(zip(numbers, reads, strict=True)), None))
+        elif self._captured:
+            with torch.cuda.device(self._captured[0][0].device):
+                target._send(self._captured)
         if to is not None:
             to._take(Reading(self._found.values(), self._sentinels))
 
-    def _send(self, records: list[tuple[Tensor, Callable[[Tensor], Reading]]]) -> None:
+    def _send(self, records: list[Record]) -> None:
         packed = pack([numbers for numbers, _ in records])
         copy = torch.empty(packed.shape, dtype=packed.dtype, pin_memory=True)
         copy.copy_(packed, non_blocking=True)
@@ -225,10 +253,12 @@ class StabilityReport:
         self._sentinels.update(reading.sentinels)
 
     def _collect(self, wait: bool) -> None:
+        self.send()
         while self._pending:
-            if wait:
-                self._pending[0].event.synchronize()
-            elif not self._pending[0].event.query():
+            event = self._pending[0].event
+            if wait and event is not None:
+                event.synchronize()
+            elif event is not None and not event.query():
                 return
             arrived = self._pending.popleft()
             for numbers, read in arrived.records:
@@ -240,7 +270,7 @@ class StabilityReport:
         """Raises the first error that has arrived and was not raised yet; waits for nothing."""
         if torch.compiler.is_compiling():
             return
-        if self._pending and not torch.cuda.is_current_stream_capturing():
+        if (self._unsent or self._pending) and not torch.cuda.is_current_stream_capturing():
             self._collect(wait=False)
         with self._lock:
             new, self._errors = self._errors, []
