@@ -21,10 +21,10 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d.dynamics.point_transformer import SparseConv
-from gsim3d.effects import Plan
 from gsim3d.errors import InputError
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.ops.raster import Rendering
+from gsim3d.plans import Plan
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport, pack, unpack
@@ -349,6 +349,8 @@ def _gaps(table: CloudTable) -> list[int | None]:
 
 def _with_background_as_it_is(plan: Plan) -> Plan:
     """``plan`` for a state that is prepared already."""
+    if plan.spec.dynamics.background not in ("masked_out", "dynamic"):
+        return plan
     dynamics = dataclasses.replace(plan.spec.dynamics, background="frozen")
     return dataclasses.replace(plan, spec=dataclasses.replace(plan.spec, dynamics=dynamics))
 

@@ -23,11 +23,12 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d.dynamics import Dynamics, append_step, concatenate, last_steps, rollout
-from gsim3d.effects import EffectsSpec, Plan, make_plan
+from gsim3d.effects import EffectsSpec
 from gsim3d.encoder import Encoder, pixel_rows
 from gsim3d.guards import drop_rows, guard_frames, guard_particles
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
+from gsim3d.plans import Plan, make_plan, unused_parameters
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
 from gsim3d.renderer import GaussianHead, render, render_as_published
@@ -66,20 +67,9 @@ class Simulator(nn.Module):
         Raises:
             UnsupportedEffect: this model cannot simulate an effect of ``spec``.
         """
-        dynamics, renderer = self.config.dynamics, self.config.renderer
-        plan = make_plan(
-            spec,
-            history=2**dynamics.history_bits,
-            sh_degree=renderer.sh_degree,
-            changes_opacity=dynamics.explicit,
-        )
-        merged = dynamics.pyramid_spec(dynamics.history_bits).merged_bits()
-        unused = [
-            f"dynamics.net.encoder.{s}.merge.time_embedding"
-            for s, stage in enumerate(self.dynamics.net.encoder)
-            if stage.merge is not None and merged[s] == 0
-        ]
-        return dataclasses.replace(plan, unused=tuple(unused))
+        plan = make_plan(spec, self.config)
+        names = (name for name, _ in self.named_parameters())
+        return dataclasses.replace(plan, unused=unused_parameters(plan, self.config, names))
 
     def step(
         self,
@@ -209,16 +199,11 @@ class Simulator(nn.Module):
         guard: Callable[..., Particles],
         geometry: Callable[[Particles], Pyramid] | None = None,
     ) -> Particles:
-        """The next steps of every scene, guarded, without the changes that the plan leaves out."""
-        step = self.dynamics(state, generator=generator, pyramid=None if geometry is None else geometry(state))
+        """The next steps of every scene, guarded."""
         appearance = plan.spec.appearance
+        changes = self.dynamics.layout.changes(appearance.changing, appearance.opacity_changes is not False)
+        pyramid = None if geometry is None else geometry(state)
+        step = self.dynamics(state, generator=generator, pyramid=pyramid, changes=changes)
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
-        if appearance.changing != "all":
-            held = (step.activity == FROZEN) | (appearance.changing == "none")
-            latents = torch.where(held[:, None], newest.dynamic_latents, step.dynamic_latents)
-            step = dataclasses.replace(step, dynamic_latents=latents)
-            if step.sh is not None:
-                step = dataclasses.replace(step, sh=torch.where(held[:, None, None], newest.sh, step.sh))
-        if appearance.opacity_changes is False:
-            step = dataclasses.replace(step, opacities=newest.opacities)
-        return guard(step, previous=newest, changed=self.dynamics.layout.changing)
+        changed = [name for name, who in changes.items() if who != "none"]
+        return guard(step, previous=newest, changed=changed)
