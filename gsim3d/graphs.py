@@ -287,7 +287,8 @@ class CapturedRollout:
         return [found.tolist() for found in numbers[:n_calls]], numbers[n_calls:]
 
     def _grown(self, found: list[list[int]]) -> list[PyramidCapacity]:
-        return [capacity.grown(numbers, self._factor) for capacity, numbers in zip(self._capacities, found, strict=True)]
+        calls = zip(self._capacities, found, strict=True)
+        return [capacity.grown(numbers, self._factor) for capacity, numbers in calls]
 
     # ---- what goes in and comes out ----
 

@@ -41,9 +41,7 @@ def _looks_at(names: tuple[str, ...], config: StabilityConfig, max_opacity: floa
     }
     bounds = [limits.get(name, (-config.max_latent, config.max_latent)) for name in names]
     action, by_rule = ACTIONS[config.on_bad], "clamped" if config.on_bad == "clamp" else "asleep"
-    kinds = [
-        (f"particles.{name}", BOUNDED.get(name) or _what(high), action) for name, (_, high) in zip(names, bounds)
-    ]
+    kinds = [(f"particles.{name}", BOUNDED.get(name) or _what(high), action) for name, (_, high) in zip(names, bounds)]
     kinds += [("particles.means", "outside the workspace", by_rule), ("particles.means", "speed limit", by_rule)]
     return _Looks(bounds, kinds, [float(name == "quats") for name in names])
 

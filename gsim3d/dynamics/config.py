@@ -10,6 +10,7 @@ from gsim3d.stability import LARGEST
 
 PREDICTS = ("from_newest", "from_previous", "absolute")
 STEM_KERNEL, BLOCK_KERNEL = 5, 3  # edges of the convolutions, in cells
+MAX_HISTORY_BITS = 32  # that the geometry counts
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,10 @@ class DynamicsConfig:
             raise ValueError(f'DynamicsConfig: norm must be "layer" or "batch"; got {self.norm!r}')
         if self.predicts not in PREDICTS:
             raise ValueError(f"DynamicsConfig: predicts must be one of {', '.join(PREDICTS)}; got {self.predicts!r}")
+        if not 0 <= self.history_bits <= MAX_HISTORY_BITS:
+            raise ValueError(
+                f"DynamicsConfig: history_bits must be from 0 to {MAX_HISTORY_BITS}; got {self.history_bits}"
+            )
         if self.steps_per_call < 1:
             raise ValueError(f"DynamicsConfig: steps_per_call must be at least 1; got {self.steps_per_call}")
 

@@ -124,7 +124,9 @@ def _check_arguments(
         if not isinstance(value, (tuple, list)):
             raise TypeError(f"watch_rows: {name} must be a tuple or a list; got {type(value).__name__}")
         if len(value) != len(fields):
-            raise ValueError(f"watch_rows: {name} must have one entry for each of {len(fields)} fields; got {len(value)}")
+            raise ValueError(
+                f"watch_rows: {name} must have one entry for each of {len(fields)} fields; got {len(value)}"
+            )
     tensors = {f"fields[{f}]": field for f, field in enumerate(fields)}
     tensors |= {f"previous[{f}]": field for f, field in enumerate(previous or ())}
     check_tensors("watch_rows", **tensors, **clouds)

@@ -95,7 +95,9 @@ def test_rows_are_mended_only_if_asked():
 
 
 def test_what_is_counted():
-    means = torch.tensor([[0.5, 0.5, 0.5], [0.5, float("nan"), 0.5], [-0.1, 0.5, 0.5], [0.9, 0.5, 0.5], [3.0, 0.5, 0.5]])
+    means = torch.tensor(
+        [[0.5, 0.5, 0.5], [0.5, float("nan"), 0.5], [-0.1, 0.5, 0.5], [0.9, 0.5, 0.5], [3.0, 0.5, 0.5]]
+    )
     opacities = torch.tensor([0.25, 0.5, 0.5, 1.0, 2.0])
     watched = watch_rows(
         [means, opacities],
@@ -224,13 +226,19 @@ def test_gradients_pass_by():
         (lambda f, o: ([*f[:2], f[2][:4], *f[3:]], o), r"fields must have N=5000 rows; got \[4, 5\]"),
         (lambda f, o: (f, o | {"origin": o["origin"].float()}), "origin must be float64; got float32"),
         (lambda f, o: (f, o | {"activity": o["activity"].long()}), "activity must be uint8; got int64"),
-        (lambda f, o: (f, o | {"previous": o["previous"][:4]}), "previous must have one entry for each of 5 fields; got 4"),
+        (
+            lambda f, o: (f, o | {"previous": o["previous"][:4]}),
+            "previous must have one entry for each of 5 fields; got 4",
+        ),
         (
             lambda f, o: (f, o | {"previous": [x[:9] for x in o["previous"]]}),
             r"previous must have the shapes of fields; got \[9, 3\] for \[5000, 3\]",
         ),
         (lambda f, o: (f, o | {"neutral": [0.0]}), "neutral must have one entry for each of 5 fields; got 1"),
-        (lambda f, o: (f, o | {"cloud_scene": o["cloud_scene"] + 1}), r"cloud_scene must be in \[0, B\) with B=2; got 2"),
+        (
+            lambda f, o: (f, o | {"cloud_scene": o["cloud_scene"] + 1}),
+            r"cloud_scene must be in \[0, B\) with B=2; got 2",
+        ),
     ],
 )
 def test_errors_name_what_is_wrong(change, message):

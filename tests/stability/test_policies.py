@@ -120,6 +120,35 @@ def test_gradients_of_dropped_rows_are_zero_and_of_all_others_finite(simulator, 
     assert all(bool(torch.isfinite(other).all()) for other in others if other is not None)
 
 
+@pytest.mark.parametrize("knows_previous", [False, True])
+def test_rows_are_mended_alike_with_and_without_gradients(simulator, state, knows_previous):
+    """The kernel mends where nobody asks for gradients, torch where somebody does."""
+    newest, generator = last_steps(state, 1), torch.Generator().manual_seed(0)
+    shapes = {"quats": (4,), "scales": (3,), "sh": (4, 3)}
+    explicit = {name: torch.rand(newest.n_rows, *shape, generator=generator) for name, shape in shapes.items()}
+    newest = dataclasses.replace(newest, **{name: value.to(newest.means) for name, value in explicit.items()})
+    bad = newest
+    cases = [
+        *BAD,
+        *((name, value, "") for name in shapes for value in (NAN, -INF)),
+        ("means", 90.0, ""),
+        ("means", 9e3, ""),
+    ]
+    for row, (name, value, _) in enumerate(cases):
+        bad = with_value(bad, name, row, value)
+    guard = simulator._guard("rollout", "drop", StabilityReport())
+    options = {"previous": newest} if knows_previous else {}
+    expected = guard(bad, **options)
+    leaves = {name: value.clone().requires_grad_() for name, value in bad.row_fields().items() if name != "activity"}
+    actual = guard(dataclasses.replace(bad, **leaves), **options)
+    for name, value in expected.row_fields().items():
+        assert not value.requires_grad and getattr(actual, name).requires_grad == (name != "activity")
+        assert_same_bits(getattr(actual, name).detach(), value)
+    assert_finite(expected)
+    asleep = (expected.activity == ASLEEP).nonzero()[:, 0].tolist()
+    assert asleep == [row for row in range(len(cases)) if knows_previous or row != len(cases) - 2]
+
+
 def kick_row(simulator, row, call, kick):
     """At that call of the dynamics, ``kick`` is added to the position of one row of the result."""
     calls = []

@@ -40,8 +40,9 @@ struct WatchedRows {
   double max_step;   // metres
 };
 
-// The same rows, of which those with a status sleep. One with a fault of a field, or kFast, has the numbers of one step
-// before; where there was none the corner of its workspace, and `neutral` followed by zeros. Opacity is 0 after a fault.
+// The same rows, of which those with a status sleep. One with a fault of a field, or kFast, has the numbers of one
+// step before; where there was none the corner of its workspace, and `neutral` followed by zeros. Opacity is 0 after a
+// fault.
 template <typename T>
 struct MendedRows {
   T* fields[kMaxWatchedFields];  // [n_rows, width[f]]

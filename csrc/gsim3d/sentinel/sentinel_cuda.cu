@@ -87,8 +87,8 @@ struct Sums {
 
 template <typename T>
 __global__ void __launch_bounds__(kPiece)
-    look_kernel(const __grid_constant__ WatchedRows<T> rows, const __grid_constant__ MendedRows<T> mended, int32_t* status,
-                double* partial) {
+    look_kernel(const __grid_constant__ WatchedRows<T> rows, const __grid_constant__ MendedRows<T> mended,
+                int32_t* status, double* partial) {
   constexpr int kKinds = kMaxWatchedFields + 2;
   __shared__ int32_t counts[kKinds], firsts[kKinds];
   __shared__ double of_warp[kWarps][kWatchedSums];

@@ -44,8 +44,8 @@ std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
   for (const Tensor* tensor : {&cu_rows, &cloud_scene, &origin, &activity})
     check_device(op, "clouds and origin", *tensor, fields[0]);
   for (size_t f = 0; f < previous.size(); ++f) {
-    check(previous[f].dim() >= 1 && shape_of(previous[f]) == shape_of(fields[f]), op, ": previous must have the shapes of ",
-          "fields; got ", shape_of(previous[f]), " for ", shape_of(fields[f]));
+    check(previous[f].sizes() == fields[f].sizes(), op, ": previous must have the shapes of fields; got ",
+          shape_of(previous[f]), " for ", shape_of(fields[f]));
     check_dtype(op, "previous", previous[f], fields[0].scalar_type());
     check_device(op, "previous", previous[f], fields[0]);
     previous[f] = rows_of(previous[f]);
