@@ -139,7 +139,7 @@ class CapturedRollout:
         if cameras is not None and simulator.config.renderer.quirks != Quirks():
             raise InputError("CapturedRollout: cameras cannot be rendered as published inside a graph; render the steps")
         self._simulator, self._n_steps, self._factor, self._copies = simulator, n_steps, factor, copies
-        self._plan = plan or simulator.plan()
+        self._plan, self._drawn = plan or simulator.plan(), plan
         self._report = simulator.report if report is None else report
         self._report.poll()
         self._background = background
@@ -223,7 +223,7 @@ class CapturedRollout:
             renderings = []
             if self._cameras is not None:
                 for step in steps:
-                    renderings.append(self._model.draw(step, self._cameras, self._background, plan, report=report))
+                    renderings.append(self._model.draw(step, self._cameras, self._background, self._drawn, report=report))
         return Predicted(steps, renderings)
 
     def _observed(self) -> list[PyramidCapacity]:

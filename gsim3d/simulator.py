@@ -16,16 +16,29 @@ Every call takes ``on_bad``, the policy for numbers that cannot be used (:mod:`g
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
-from gsim3d.dynamics import Dynamics, append_step, concatenate, last_steps, rollout
-from gsim3d.effects import EffectsSpec
+from gsim3d.dynamics import (
+    Background,
+    Dynamics,
+    RestLog,
+    Sleepers,
+    append_step,
+    concatenate,
+    last_steps,
+    rollout,
+    rollout_in_parts,
+)
+from gsim3d.edits import Edit, by_step
+from gsim3d.effects import EffectsSpec, OutputEffects
 from gsim3d.encoder import Encoder, pixel_rows
 from gsim3d.guards import drop_rows, guard_frames, guard_particles
+from gsim3d.harmonics import SH_0
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
 from gsim3d.plans import Plan, make_plan, unused_parameters
@@ -89,9 +102,9 @@ class Simulator(nn.Module):
         """
         plan, guard = plan or self.plan(), self._guard("step", on_bad, report)
         state = guard(self.prepare(state, plan))
-        predicted = self._predict(state, plan, generator, guard)
+        step = self._predict(state, plan=plan, generator=generator, guard=guard)
         guard.keywords["report"].send()
-        return append_step(state, predicted, plan.history)
+        return append_step(state, step, plan.history)
 
     def rollout(
         self,
@@ -104,22 +117,52 @@ class Simulator(nn.Module):
         report: StabilityReport | None = None,
         geometry: Callable[[Particles], Pyramid] | None = None,
         wrap: Callable[[Callable], Callable] | None = None,
+        log: RestLog | None = None,
+        edits: Iterable[Edit] = (),
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
 
-        Rows are those of the newest step of ``state`` throughout. Gradients flow through all steps. Arguments as
-        :meth:`step`.
+        Rows are those of the newest step of ``state`` throughout, but for edits. Gradients flow through all steps.
+        Arguments as :meth:`step`.
 
         Args:
             geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
             wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
+            log: is told which rows rested and were not computed.
+            edits: changes of the scene on the way (:mod:`gsim3d.edits`); they wake everybody.
+        Raises:
+            InputError: an edit cannot be made; the message names its step and operation.
         """
         plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
         predict = predict if wrap is None else wrap(predict)
-        steps = rollout(predict, guard(self.prepare(state, plan)), n_steps, plan.history)
+        state, steps = self.prepare(state, plan), []
+        structure = plan.spec.structure
+        changes = by_step(edits, n_steps, insert=structure.insert, remove=structure.remove)
+        for begin, end in pairwise(sorted({0, *changes, n_steps})):
+            for edit in changes.get(begin, ()):
+                state = edit.apply(state, self._colors)
+            state = guard(state)
+            steps += self._roll(predict, state, end - begin, plan, generator, log)
+            if end < n_steps:
+                state = last_steps(concatenate([state, *steps[begin:end][-plan.history :]]), plan.history)
         guard.keywords["report"].send()
         return steps
+
+    def _roll(self, predict, state: Particles, n_steps: int, plan: Plan, generator, log) -> list[Particles]:
+        """:meth:`rollout` of a state that is prepared, without edits."""
+        config, rule = self.config.dynamics, plan.spec.dynamics.sleep
+        if rule is None and not config.is_asymmetric:
+            return rollout(predict, state, n_steps, plan.history)
+        return rollout_in_parts(
+            predict,
+            state,
+            n_steps,
+            plan.history,
+            remember=partial(self.dynamics.remember, generator=generator) if config.is_asymmetric else None,
+            sleepers=None if rule is None else Sleepers(rule, last_steps(state, 1), config.grid_size, plan.history),
+            log=log,
+        )
 
     def prepare(self, state: Particles, plan: Plan) -> Particles:
         """What the dynamics reads of ``state``: its last steps, with the background as the plan wants it."""
@@ -147,7 +190,7 @@ class Simulator(nn.Module):
             particles: any clouds.
             cameras: I images.
             background: [3] or [I, 3], default black.
-            plan: limits the degree of view-dependent colour; default the model's.
+            plan: which images, and the degree of view-dependent colour; default colour as the model's, alpha and depth.
             cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
         """
         particles = self._guard("render", on_bad, report, in_workspace=False)(particles)
@@ -166,11 +209,22 @@ class Simulator(nn.Module):
     ) -> Rendering:
         """As :meth:`render`, of particles as :meth:`rollout` returned them: their numbers are not looked at again."""
         on_bad, report = on_bad or self.config.stability.on_bad, self.report if report is None else report
-        gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None)
+        outputs = plan.spec.outputs if plan else OutputEffects(depth=True, alpha=True)
+        gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None, rgb=outputs.rgb)
         quirks = self.config.renderer.quirks
         if quirks != Quirks():
-            return render_as_published(gaussians, cameras, background, quirks=quirks)
-        return render(gaussians, cameras, background, cutoff=cutoff, on_bad=on_bad, report=report)
+            image = render_as_published(gaussians, cameras, background, quirks=quirks)
+        else:
+            features = particles.latents if outputs.features else None
+            image = render(
+                gaussians, cameras, background, features=features, cutoff=cutoff, on_bad=on_bad, report=report
+            )
+        asked = (outputs.rgb, outputs.alpha, outputs.depth, outputs.features)
+        return Rendering(*(made if wanted else None for made, wanted in zip(image, asked, strict=True)))
+
+    def _colors(self, particles: Particles) -> Tensor:
+        """[N, 3], of the Gaussians, seen from nowhere in particular."""
+        return 0.5 + SH_0 * self.renderer(particles, sh_degree=0).sh[:, 0]
 
     def _guard(
         self, where: str, on_bad: OnBad | None, report: StabilityReport | None, in_workspace: bool = True
@@ -194,16 +248,22 @@ class Simulator(nn.Module):
     def _predict(
         self,
         state: Particles,
+        background: Background | None = None,
+        *,
         plan: Plan,
         generator: torch.Generator | None,
         guard: Callable[..., Particles],
         geometry: Callable[[Particles], Pyramid] | None = None,
     ) -> Particles:
-        """The next steps of every scene, guarded."""
+        """The next steps of every scene, guarded.
+
+        background: what rests while ``state`` moves; None: all there is, is in the state.
+        """
         appearance = plan.spec.appearance
         changes = self.dynamics.layout.changes(appearance.changing, appearance.opacity_changes is not False)
         pyramid = None if geometry is None else geometry(state)
-        step = self.dynamics(state, generator=generator, pyramid=pyramid, changes=changes)
+        options = {"pyramid": pyramid, "background": background, "changes": changes}
+        step = self.dynamics(state, generator=generator, **options)
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
         changed = [name for name, who in changes.items() if who != "none"]
         return guard(step, previous=newest, changed=changed)

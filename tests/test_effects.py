@@ -66,7 +66,8 @@ def test_plan_says_what_is_kept_and_why_the_rest_is_not():
     [
         ({"dynamics": {"actions": {"names": ["hand"]}}}, "unsupported effect dynamics.actions"),
         ({"dynamics": {"contact": {"pairs": [["a", "b"]]}}}, "unsupported effect dynamics.contact"),
-        ({"dynamics": {"sleep": {"policy": "exact"}}}, "unsupported effect dynamics.sleep"),
+        ({"dynamics": {"sleep": {"policy": "approx"}}}, "unsupported effect dynamics.sleep.policy approx"),
+        ({"dynamics": {"background": "asymmetric"}}, "unsupported effect dynamics.background asymmetric"),
         ({"outputs": {"rgb": False}}, "unsupported effect outputs: there is no image to make"),
         ({"dynamics": {"history": 5}}, "unsupported effect dynamics.history: this model goes up to 4; got 5"),
         ({"appearance": {"opacity_changes": True}}, "unsupported effect appearance.opacity_changes"),
@@ -95,7 +96,7 @@ def test_view_dependence_beyond_the_model_raises():
         ({"appearance": {"changing": "bunny"}}, "appearance.changing must be one of"),
         ({"dynamics": {"sleep": {"policy": "soundly"}}}, "dynamics.sleep.policy must be one of exact, approx"),
         ({"dynamics": {"sleep": {"patience": 0}}}, "dynamics.sleep.patience must be an integer of at least 1; got 0"),
-        ({"dynamics": {"sleep": {"eps": "1e-3"}}}, "dynamics.sleep.eps must be a number of at least 0; got '1e-3'"),
+        ({"dynamics": {"sleep": {"eps": "1e-3"}}}, "dynamics.sleep.eps must be a number; got '1e-3'"),
         ({"dynamics": {"actions": {"names": "hand"}}}, "dynamics.actions.names must be a list; got 'hand'"),
         ({"dynamics": {"contact": {"pairs": [["a"]]}}}, r"dynamics.contact.pairs must be a list of 2; got \['a'\]"),
         ({"outputs": {"depth": "yes"}}, "outputs.depth must be true or false; got 'yes'"),

@@ -14,7 +14,7 @@ ROOMS = [
     {"ops", "effects", "harmonics", "rotations"},
     {"layers", "guards"},
     {"encoder", "dynamics", "renderer"},
-    {"presets"},
+    {"presets", "edits"},
     {"plans"},
     {"simulator"},
     {"laws", "graphs"},
