@@ -193,8 +193,10 @@ class Simulator(nn.Module):
             plan: which images, and the degree of view-dependent colour; default colour as the model's, alpha and depth.
             cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
         """
-        particles = self._guard("render", on_bad, report, in_workspace=False)(particles)
-        return self.draw(particles, cameras, background, plan, cutoff=cutoff, on_bad=on_bad, report=report)
+        guard = self._guard("render", on_bad, report, in_workspace=False)
+        image = self.draw(guard(particles), cameras, background, plan, cutoff=cutoff, on_bad=on_bad, report=report)
+        guard.keywords["report"].send()
+        return image
 
     def draw(
         self,
