@@ -58,7 +58,7 @@ def watch_rows(
 
     In the mended copy rows with a status sleep. Those out of bounds of a field, or FAST, have the numbers of ``previous``;
     without it their position is ``origin``, and a field's first number that of ``neutral``, followed by zeros. The
-    opacity of rows out of bounds is 0.
+    opacity of rows out of bounds is 0. Rows that sleep already stay as they are.
 
     Args:
         fields: 2 to 8 tensors with N rows, float32 or float64: positions [N, 3], opacities [N], and others of any shape.
@@ -68,7 +68,7 @@ def watch_rows(
         origin: float64 [B, 3] metres, lower corner of each scene's workspace.
         activity: uint8 [N] as in Particles; rows of 2 are asleep and not looked at: their status is 0.
         grid_size: metres, edge of a cell; 0: no row is OUTSIDE.
-        previous: the fields one step before; None: no row is FAST, and the kinetic energy is 0.
+        previous: the fields one step before, all finite; None: no row is FAST, and the kinetic energy is 0.
         max_step: metres.
         neutral: one number a field; None: nothing is mended.
         check: look at the types of the arguments; a model that makes them itself leaves it out.

@@ -232,7 +232,7 @@ def test_gradients_pass_by():
         ),
         (
             lambda f, o: (f, o | {"previous": [x[:9] for x in o["previous"]]}),
-            r"previous must have the shapes of fields; got \[9, 3\] for \[5000, 3\]",
+            r"previous\[0\] must have the shape of its field, \[5000, 3\]; got \[9, 3\]",
         ),
         (lambda f, o: (f, o | {"neutral": [0.0]}), "neutral must have one entry for each of 5 fields; got 1"),
         (

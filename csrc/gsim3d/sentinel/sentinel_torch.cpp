@@ -1,5 +1,6 @@
 #include "gsim3d/sentinel/sentinel.h"
 
+#include <string>
 #include <vector>
 
 #include "gsim3d/torch/torch_utils.h"
@@ -44,10 +45,11 @@ std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
   for (const Tensor* tensor : {&cu_rows, &cloud_scene, &origin, &activity})
     check_device(op, "clouds and origin", *tensor, fields[0]);
   for (size_t f = 0; f < previous.size(); ++f) {
-    check(previous[f].sizes() == fields[f].sizes(), op, ": previous must have the shapes of fields; got ",
-          shape_of(previous[f]), " for ", shape_of(fields[f]));
-    check_dtype(op, "previous", previous[f], fields[0].scalar_type());
-    check_device(op, "previous", previous[f], fields[0]);
+    const std::string name = "previous[" + std::to_string(f) + "]";
+    check(previous[f].sizes() == fields[f].sizes(), op, ": ", name, " must have the shape of its field, ",
+          shape_of(fields[f]), "; got ", shape_of(previous[f]));
+    check_dtype(op, name.c_str(), previous[f], fields[0].scalar_type());
+    check_device(op, name.c_str(), previous[f], fields[0]);
     previous[f] = rows_of(previous[f]);
   }
   Tensor status = empty(fields[0], {n}, ScalarType::Int);
