@@ -27,7 +27,7 @@ from gsim3d.ops.raster import Rendering
 from gsim3d.plans import Plan
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
-from gsim3d.stability import StabilityReport, pack, unpack
+from gsim3d.stability import StabilityReport, pack
 from gsim3d.types import Cameras, CloudTable, Particles, keeping_constants
 
 FACTOR = 1.25  # room over what was observed
@@ -238,16 +238,16 @@ class CapturedRollout:
         self._rollout(geometry, StabilityReport())
         return needed
 
-    def _given(self, report: StabilityReport) -> tuple[Predicted, list[Tensor]]:
+    def _given(self, report: StabilityReport) -> tuple[Predicted, Tensor]:
         """The rollout with the sizes of this object, and what the geometry of every call found."""
         sizes, found = iter(self._capacities), []
 
         def geometry(history: Particles) -> Pyramid:
-            pyramid = self._model.dynamics.geometry(history, capacity=next(sizes))
-            found.append(pyramid.found)
-            return pyramid
+            found.append(self._model.dynamics.geometry(history, capacity=next(sizes)))
+            return found[-1]
 
-        return self._rollout(geometry, report), found
+        predicted = self._rollout(geometry, report)
+        return predicted, torch.stack([pyramid.found for pyramid in found])
 
     def _make_room(self, capacities: list[PyramidCapacity]) -> None:
         """Takes ``capacities`` as sizes and, on a GPU, makes the graph."""
@@ -256,35 +256,34 @@ class CapturedRollout:
         if self._device.type != "cuda":
             return
         # their memory goes back before the next graph takes its own
-        self._graph = self._predicted = self._numbers = self._packed = None
+        self._graph = self._predicted = self._found = self._packed = None
         self._graph = Captured(self._capture, self._device)
-        self._predicted, self._numbers, self._packed = self._graph.result
+        self._predicted, self._found, self._packed = self._graph.result
         self._on_host = torch.empty(self._packed.shape, dtype=self._packed.dtype, pin_memory=True)
         self._arrived = torch.cuda.Event()
 
-    def _capture(self) -> tuple[Predicted, list[Tensor], Tensor]:
+    def _capture(self) -> tuple[Predicted, Tensor, Tensor]:
         report = self._records if torch.cuda.is_current_stream_capturing() else StabilityReport()
         predicted, found = self._given(report)
-        numbers = found + report.captured()
-        return predicted, numbers, pack(numbers)
+        return predicted, found, pack([found, *report.captured()])
 
     def _replay(self) -> None:
         if self._device.type != "cuda":
             self._records = StabilityReport()
-            self._predicted, self._numbers = self._given(self._records)
+            self._predicted, self._found = self._given(self._records)
             return
         with torch.cuda.device(self._device):
             self._graph()
             self._on_host.copy_(self._packed, non_blocking=True)
             self._arrived.record()
 
-    def _arrive(self) -> tuple[list[list[int]], list[Tensor]]:
-        """Waits for the replay: what the geometry of every call found, and what the guards counted."""
-        numbers, n_calls = self._numbers, len(self._capacities)
-        if self._device.type == "cuda":
-            self._arrived.synchronize()
-            numbers = unpack(self._on_host.clone(), numbers)
-        return [found.tolist() for found in numbers[:n_calls]], numbers[n_calls:]
+    def _arrive(self) -> tuple[list[list[int]], Tensor | None]:
+        """Waits for the replay: what the geometry of every call found, and what the guards of a graph counted."""
+        if self._device.type != "cuda":
+            return self._found.tolist(), None
+        self._arrived.synchronize()
+        numbers, n_found = self._on_host.clone(), self._found.numel()
+        return numbers[:n_found].view(self._found.shape).tolist(), numbers[n_found:]
 
     def _grown(self, found: list[list[int]]) -> list[PyramidCapacity]:
         calls = zip(self._capacities, found, strict=True)

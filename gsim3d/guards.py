@@ -102,7 +102,8 @@ def guard_particles(
     )
     if not torch.compiler.is_compiling():
         read = partial(_read, particles.clouds, where, looks, previous is not None)
-        report.record(watched.record, read, at_once=False)
+        counts = _places_of_counts(*watched.record.shape, len(looks.kinds))
+        report.record(watched.record, read, counts=counts, at_once=False)
         if watched.status.device.type == "cpu" and not bool(watched.status.any()):
             return particles
     if watched.fields is not None:
@@ -165,6 +166,12 @@ def _read(clouds: CloudTable, where: str, looks: _Looks, moved: bool, record: Te
             extent = math.dist(corners[:3], corners[3:]) if awake else 0.0
             sentinels[scene, step] = Sentinels(int(awake), energy, opacity, extent)
     return Reading(findings, sentinels)
+
+
+@functools.lru_cache(maxsize=64)
+def _places_of_counts(n_clouds: int, n_columns: int, n_kinds: int) -> tuple[int, ...]:
+    """Where a record of watch_rows holds how many rows were bad."""
+    return tuple(q * n_columns + 2 * k for q in range(n_clouds) for k in range(n_kinds))
 
 
 def _have_gradients(*groups: Iterable[Tensor]) -> bool:
