@@ -217,7 +217,9 @@ class Insert(Operation):
             if field not in ("turns", "paint") and (mine is None or mine.shape[1:] != value.shape[1:]):
                 raise InputError(f"particles.{field} must be as those of the state; were they made by another model?")
         given = _moved(given, rows, self.by).select_rows(rows).to(state.means.device)
-        table, newest = state.clouds, {state.clouds.scenes[q]: state.clouds.steps[q] for q in newest_clouds(state.clouds)}
+        table, newest = state.clouds, {
+            state.clouds.scenes[q]: state.clouds.steps[q] for q in newest_clouds(state.clouds)
+        }
         ages = [given.clouds.steps[-1] - step for step in given.clouds.steps]
         runs = []
         for scene, step in zip(table.scenes, table.steps):
@@ -290,7 +292,7 @@ def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Partic
     step, op = values.pop("step", None), values.pop("op", None)
     if isinstance(step, bool) or not isinstance(step, int):
         raise InputError(f"{where}: step must be a whole number; got {step!r}")
-    if op not in OPERATIONS:
+    if not isinstance(op, str) or op not in OPERATIONS:
         raise InputError(f"{where} at step {step}: op must be one of {', '.join(OPERATIONS)}; got {op!r}")
     where = f"{where} at step {step}, {op}"
     if isinstance(values.get("of"), str):
@@ -341,9 +343,7 @@ def _joined(state: Particles, more: Particles) -> Particles:
     parts = alike([state, more])
     clouds = torch.cat([part.row_cloud() for part in parts])
     order = torch.argsort(clouds, stable=True)
-    fields = {
-        name: torch.cat([value, getattr(parts[1], name)])[order] for name, value in parts[0].row_fields().items()
-    }
+    fields = {name: torch.cat([value, getattr(parts[1], name)])[order] for name, value in parts[0].row_fields().items()}
     tables = [part.clouds for part in parts]
     counts = [sum(table.count(q) for table in tables) for q in range(len(tables[0]))]
     table = CloudTable.make(counts, tables[0].scenes, tables[0].steps, state.cu_rows.device)

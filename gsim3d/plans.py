@@ -211,3 +211,10 @@ def _network(config: DynamicsConfig, rows: float, history: int) -> float:
 def _block(config: DynamicsConfig, rows: float, channels: int, patch: int) -> float:
     dense = (BLOCK_KERNEL**SURFACE + 1 + 4 + 2 * config.mlp_ratio) * channels**2
     return rows * (dense + 2 * min(rows, patch) * channels)
+
+
+def in_columns(rows: list[tuple[str, ...]]) -> str:
+    """A table whose columns are as wide as their longest entry; the last one as it is."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
+    lines = ("  ".join(text.ljust(width) for text, width in zip(row, [*widths, 0], strict=True)) for row in rows)
+    return "\n".join(line.rstrip() for line in lines)

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from gsim3d.dynamics import (
     Background,
     Dynamics,
+    Parts,
     RestLog,
     Sleepers,
     append_step,
@@ -35,7 +36,7 @@ from gsim3d.dynamics import (
     rollout_in_parts,
 )
 from gsim3d.edits import Edit, by_step
-from gsim3d.effects import EffectsSpec, OutputEffects
+from gsim3d.effects import EffectsSpec, OutputEffects, UnsupportedEffect
 from gsim3d.encoder import Encoder, pixel_rows
 from gsim3d.guards import drop_rows, guard_frames, guard_particles
 from gsim3d.harmonics import SH_0
@@ -53,6 +54,7 @@ class Simulator(nn.Module):
     """Encoder, dynamics and renderer of one model.
 
     report: StabilityReport of the calls that were given no other.
+    absent: parameters that the weights it was given lack; plans that read them are refused.
     """
 
     def __init__(self, config: ModelConfig):
@@ -62,6 +64,7 @@ class Simulator(nn.Module):
         self.dynamics = Dynamics(config.dynamics)
         self.renderer = GaussianHead(config.renderer)
         self.report = StabilityReport()
+        self.absent: frozenset[str] = frozenset()
 
     def encode(
         self, frames: Frames, *, on_bad: OnBad | None = None, report: StabilityReport | None = None
@@ -82,7 +85,10 @@ class Simulator(nn.Module):
         """
         plan = make_plan(spec, self.config)
         names = (name for name, _ in self.named_parameters())
-        return dataclasses.replace(plan, unused=unused_parameters(plan, self.config, names))
+        unused = unused_parameters(plan, self.config, names)
+        if needed := sorted(self.absent.difference(unused)):
+            raise UnsupportedEffect(f"unsupported effects: they read {', '.join(needed)}, which the weights do not have")
+        return dataclasses.replace(plan, unused=unused)
 
     def step(
         self,
@@ -97,7 +103,7 @@ class Simulator(nn.Module):
 
         Args:
             state: last steps of every scene.
-            plan: what to compute; default everything the model can.
+            plan: what to compute; default everything the model can. Nobody sleeps: that is decided along a rollout.
             generator: randomness of training (drop path, curve shuffling); None: none.
         """
         plan, guard = plan or self.plan(), self._guard("step", on_bad, report)
@@ -172,6 +178,27 @@ class Simulator(nn.Module):
         if background == "dynamic":
             state = dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
         return last_steps(state, plan.history)
+
+    def parts(
+        self, prepared: Particles, *, on_bad: OnBad | None = None, report: StabilityReport | None = None
+    ) -> Parts:
+        """What moves and what rests of a state that :meth:`prepare` made, for a model with an asymmetric background."""
+        return Parts.of(self._guard("rollout", on_bad, report)(prepared), asymmetric=True)
+
+    def advance(
+        self,
+        moving: Particles,
+        background: Background,
+        n_steps: int,
+        plan: Plan,
+        *,
+        report: StabilityReport | None = None,
+        geometry: Callable[[Particles], Pyramid] | None = None,
+    ) -> list[Particles]:
+        """As :meth:`rollout`, of what moves alone, beside a background of ``dynamics.remember``."""
+        guard = self._guard("rollout", None, report)
+        options = {"plan": plan, "generator": None, "guard": guard, "geometry": geometry, "background": background}
+        return rollout(partial(self._predict, **options), moving, n_steps, plan.history)
 
     def render(
         self,

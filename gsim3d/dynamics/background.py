@@ -3,8 +3,8 @@
 The network runs over the background alone, one cloud a scene in the newest time slot, with cells, clusters, patches and
 curves of its own. Three things are kept of that run, for as long as the background stays:
 
-* of every convolution a field: what the background adds to it in every cell that has background within reach. A moving row
-  looks up its cell: a tap adds the mean of the moving rows of a neighbour cell and the mean of its frozen rows.
+* of every convolution a field: what the background adds to it in every cell that has background within reach. A moving
+  row looks up its cell: a tap adds the mean of the moving rows of a neighbour cell and the mean of its frozen rows.
 * of every attention the keys and values. A moving row attends to its own patch, as without a background, and to the one
   background patch in whose interval of the curve it lies, in one softmax.
 * the places of both: sorted keys, found by binary search.
@@ -15,8 +15,9 @@ depends on where they are, and a scene without background is computed as by the 
 
 from __future__ import annotations
 
+import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 
@@ -24,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d import ops
-from gsim3d.ops.curve import CURVES, KernelMap, PatchTable, Pyramid, Stage, Voxels
+from gsim3d.ops.curve import CURVES, KernelMap, PatchTable, Pyramid, PyramidSpec, Stage, Voxels
 from gsim3d.types import Particles
 
 _ops = torch.ops.gsim3d
@@ -49,17 +50,21 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """The places of the background at one stage.
+class Places:
+    """Where the background is found at one stage.
 
-    fields: by kernel size.
-    first: int64 [4, P], the key at which each patch begins along each serialization; the first of a scene at its lowest.
-    patches: its keys, of each serialization.
+    cells: of the fields, by kernel size.
+    first: int64 [4, P], the key at which each patch begins along each serialization; of the first patch of a scene the
+        scene's lowest.
+    kv_rows, cu_k: int64 [4, M] and [P + 1], the keys of each patch, as in :class:`PatchTable`.
+    patch_size: the most keys of a patch.
     """
 
-    fields: dict[int, Field]
+    cells: dict[int, Tensor]
     first: Tensor
-    patches: tuple[PatchTable, ...]
+    kv_rows: Tensor
+    cu_k: Tensor
+    patch_size: int
 
 
 @dataclass(frozen=True)
@@ -68,50 +73,81 @@ class Background:
 
     curves, depths: of each stage: which curves the run uses, as do calls that read it, and how many levels they have.
     places: of each stage; none where no row is seen.
-    fields: [D, C] of every convolution, by module.   keys: (k, v) [N, H, C / H] of every attention, by module.
+    fields: [D, C] of every convolution, by module.   keys, values: [N, H, C / H] of every attention, by module.
     """
 
     curves: tuple[tuple[int, ...], ...]
     depths: tuple[int, ...]
-    places: tuple[Surroundings, ...]
+    places: tuple[Places, ...]
     fields: dict[nn.Module, Tensor] = field(default_factory=dict)
-    keys: dict[nn.Module, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    keys: dict[nn.Module, Tensor] = field(default_factory=dict)
+    values: dict[nn.Module, Tensor] = field(default_factory=dict)
 
     @classmethod
-    def around(
+    def begin(
         cls,
         pyramid: Pyramid,
         particles: Particles,
-        strides: Sequence[int],
+        spec: PyramidSpec,
         curves: tuple[tuple[int, ...], ...] | None = None,
-    ) -> Background:
-        """The places of ``particles``, of which ``pyramid`` is the geometry; nothing is kept of the network yet."""
+    ) -> tuple[Background, list[Recorder]]:
+        """The places of ``particles``, whose geometry is ``pyramid``; and what keeps, at each stage, the rest."""
         curves = (ALL_CURVES,) * len(pyramid.stages) if curves is None else curves
-        depths = tuple(DEPTH + 1 - n.bit_length() for n in accumulate((1, *strides), operator.mul))
+        depths = tuple(DEPTH + 1 - n.bit_length() for n in accumulate((1, *spec.strides), operator.mul))
         if pyramid.rows.shape[0] == 0:
-            return cls(curves, depths, ())
-        rooms = zip(pyramid.stages, row_scenes(pyramid, particles), depths, curves, strict=True)
-        return cls(curves, depths, tuple(_surroundings(*room) for room in rooms))
-
-    def recorders(self, pyramid: Pyramid) -> list[Recorder]:
-        """What the run over the background is given, for each stage."""
-        return [Recorder(self, places, stage) for places, stage in zip(self.places, pyramid.stages)]
+            return cls(curves, depths, ()), []
+        rooms = list(zip(pyramid.stages, row_scenes(pyramid, particles), depths, strict=True))
+        fields = [{size: _field(*room, size) for size in room[0].kernel_maps} for room in rooms]
+        chosen = zip(fields, rooms, curves, spec.patch_sizes, strict=True)
+        places = tuple(_places(at, *room, of_stage, size) for at, room, of_stage, size in chosen)
+        background = cls(curves, depths, places)
+        return background, [Recorder(background, at, stage) for at, stage in zip(fields, pyramid.stages)]
 
     def readers(self, pyramid: Pyramid, particles: Particles) -> list[Reader]:
         """What a call over moving ``particles`` is given, for each stage; nothing waits for the device."""
         rooms = zip(self.places, pyramid.stages, row_scenes(pyramid, particles), self.depths, self.curves)
         return [Reader(self, *room) for room in rooms]
 
+    def map(self, f: Callable[[Tensor, int], Tensor]) -> Background:
+        """The same background with ``f`` applied to every tensor and its kind (KEYS, LISTS, OFFSETS or ROWS)."""
+        places = tuple(
+            Places(
+                {size: f(cells, KEYS) for size, cells in at.cells.items()},
+                f(at.first, KEYS),
+                f(at.kv_rows, LISTS),
+                f(at.cu_k, OFFSETS),
+                at.patch_size,
+            )
+            for at in self.places
+        )
+        kept = ({module: f(x, ROWS) for module, x in part.items()} for part in (self.fields, self.keys, self.values))
+        return Background(self.curves, self.depths, places, *kept)
+
+    def with_room(self, factor: float) -> Background:
+        """Another one that reads alike, with room for ``factor`` times as much."""
+        return self.map(lambda x, kind: _longer(x, kind, math.ceil(factor * _length(x, kind))))
+
+    def load(self, other: Background) -> bool:
+        """Takes the numbers of ``other`` into its own memory; False where there is no room for them."""
+        own, given = [], []
+        self.map(lambda x, kind: own.append((x, kind)) or x)
+        other.map(lambda x, kind: given.append(x) or x)
+        if len(own) != len(given) or any(_length(x, kind) < _length(y, kind) for (x, kind), y in zip(own, given)):
+            return False
+        for (x, kind), y in zip(own, given):
+            x.copy_(_longer(y, kind, _length(x, kind)))
+        return True
+
 
 class Recorder:
     """Keeps what moving rows will read of one stage of the run over the background."""
 
-    def __init__(self, background: Background, places: Surroundings, stage: Stage):
-        self.background, self.places, self.stage = background, places, stage
+    def __init__(self, background: Background, fields: dict[int, Field], stage: Stage):
+        self.background, self.fields, self.stage = background, fields, stage
 
     def convolved(self, conv: nn.Module, x: Tensor, out: Tensor) -> Tensor:
         """``out``, which ``conv`` made of ``x``."""
-        at, voxels = self.places.fields[conv.kernel_size], self.stage.voxels
+        at, voxels = self.fields[conv.kernel_size], self.stage.voxels
         means = ops.pool_mean(x, voxels.rows, voxels.cu_rows, check=False)
         x = means.new_zeros(at.cells.shape[0], means.shape[1]).index_copy(0, at.occupied, means)
         around = torch.ones_like(conv.weight[:1, ..., :1])  # the centre tap reads a row itself
@@ -122,7 +158,9 @@ class Recorder:
         return out
 
     def attended(self, attention: nn.Module, q: Tensor, k: Tensor, v: Tensor, patches: PatchTable, row: int) -> Tensor:
-        self.background.keys.setdefault(attention, (k, v))
+        """``attention`` of the background to itself."""
+        self.background.keys.setdefault(attention, k)
+        self.background.values.setdefault(attention, v)
         return ops.patch_attention(q, k, v, patches, check=False)
 
 
@@ -132,21 +170,21 @@ class Reader:
     def __init__(
         self,
         background: Background,
-        places: Surroundings,
+        places: Places,
         stage: Stage,
         scene: Tensor,
         depth: int,
         curves: tuple[int, ...],
     ):
         self.background = background
-        self.cells = {size: _cell_of(at.cells, _cell_keys(scene, stage.grid)) for size, at in places.fields.items()}
+        self.cells = {size: _cell_of(cells, _cell_keys(scene, stage.grid)) for size, cells in places.cells.items()}
         self.patches = _overlapping(places, stage, scene, depth, curves)
 
     def convolved(self, conv: nn.Module, x: Tensor, out: Tensor) -> Tensor:
         return out + self.background.fields[conv].index_select(0, self.cells[conv.kernel_size]).to(out.dtype)
 
     def attended(self, attention: nn.Module, q: Tensor, k: Tensor, v: Tensor, patches: PatchTable, row: int) -> Tensor:
-        keys, values = (part.to(q.dtype) for part in self.background.keys[attention])
+        keys, values = self.background.keys[attention].to(q.dtype), self.background.values[attention].to(q.dtype)
         return joint_attention(q, k, v, keys, values, patches, self.patches[row])
 
 
@@ -172,7 +210,8 @@ class _JointAttention(torch.autograd.Function):
         scale = q.shape[-1] ** -0.5
         out, stats = _ops.patch_attention.default(q, k, v, *_lists(patches), scale)
         other, other_stats = _ops.patch_attention.default(q, other_k, other_v, *_lists(other_patches), scale)
-        out, stats = _joined(out, stats, other, other_stats, scale)
+        stats, share = _joined(stats, other_stats, scale)
+        out = (out * (1 - share) + other * share).to(out.dtype)  # lerp would round by how threads share the rows
         ctx.save_for_backward(q, k, v, other_k, other_v, out, stats)
         ctx.patches, ctx.scale = (patches, other_patches), scale
         return out
@@ -189,17 +228,18 @@ class _JointAttention(torch.autograd.Function):
         return mine[0] + others[0], *mine[1:], *others[1:], None, None
 
 
-def _joined(out: Tensor, stats: Tensor, other: Tensor, other_stats: Tensor, scale: float) -> tuple[Tensor, Tensor]:
-    """Results of two softmaxes as that of one over the keys of both. Stats: largest product; sum of exponentials."""
-    (top, total), (other_top, other_total) = stats.unbind(-1), other_stats.unbind(-1)
+def _joined(stats: Tensor, other: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+    """The stats of one softmax over the keys of both, and the share [..., 1] of the other keys in it.
+
+    Stats: the largest product of a query and a key, and the sum of exponentials relative to it, 0 of no keys.
+    """
+    (top, total), (other_top, other_total) = stats.unbind(-1), other.unbind(-1)
     other_top = torch.where(other_total > 0, other_top, top)
     largest = torch.maximum(top, other_top)
-    total = total * ((top - largest) * scale).exp()
     other_total = other_total * ((other_top - largest) * scale).exp()
-    both = total + other_total
-    share = (other_total / both.clamp(min=torch.finfo(both.dtype).tiny))[..., None]
-    joined = out * (1 - share) + other * share  # no fused product: its bits would depend on how threads share the rows
-    return joined.to(out.dtype), torch.stack([largest, both], -1)
+    both = total * ((top - largest) * scale).exp() + other_total
+    share = other_total / both.clamp(min=torch.finfo(both.dtype).tiny)
+    return torch.stack([largest, both], -1), share[..., None]
 
 
 def _lists(patches: PatchTable) -> tuple[Tensor, ...]:
@@ -232,19 +272,17 @@ def _shifted(keys: Tensor, offsets: Tensor, depth: int) -> tuple[Tensor, Tensor]
     return keys, inside
 
 
-def _surroundings(stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]) -> Surroundings:
-    voxels = stage.voxels
-    lowest = voxels.rows[voxels.cu_rows[:-1]]
-    keys = _cell_keys(scene[lowest], stage.grid[lowest])
-    fields = {size: _field(keys, size, depth) for size in stage.kernel_maps}
-    starts = stage.patches[0].cu_q[:-1]
-    first = stage.order[:, starts]
-    codes = _codes(stage, scene, depth, curves).gather(1, first)
-    of_scene = scene[first]
+def _places(
+    fields: dict[int, Field], stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...], patch_size: int
+) -> Places:
+    first = stage.order[:, stage.patches[0].cu_q[:-1]]
+    codes, of_scene = _codes(stage, scene, depth, curves).gather(1, first), scene[first]
     opens = torch.ones_like(first, dtype=torch.bool)
     opens[:, 1:] = of_scene[:, 1:] != of_scene[:, :-1]
     codes = torch.where(opens, of_scene << SPACE_BITS, codes)
-    return Surroundings(fields, codes, stage.patches)
+    kv_rows = torch.stack([table.kv_rows for table in stage.patches])
+    cells = {size: at.cells for size, at in fields.items()}
+    return Places(cells, codes, kv_rows, stage.patches[0].cu_k, patch_size)
 
 
 def _codes(stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]) -> Tensor:
@@ -252,9 +290,9 @@ def _codes(stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]) -> 
     return ops.curve_encode(stage.grid, scene, [CURVES[c] for c in curves], depth=depth, shift=SPACE_BITS)
 
 
-def _field(keys: Tensor, kernel_size: int, depth: int) -> Field:
-    """keys: of the background's voxels, ascending."""
-    reach = kernel_size // 2
+def _field(stage: Stage, scene: Tensor, depth: int, kernel_size: int) -> Field:
+    lowest, reach = stage.voxels.rows[stage.voxels.cu_rows[:-1]], kernel_size // 2
+    keys = _cell_keys(scene[lowest], stage.grid[lowest])  # ascending, as voxels are
     steps = torch.arange(-reach, reach + 1, device=keys.device)
     cells = keys
     for axis in range(3):
@@ -262,12 +300,17 @@ def _field(keys: Tensor, kernel_size: int, depth: int) -> Field:
         offsets[:, axis] = steps
         spread, inside = _shifted(cells, offsets, depth)
         cells = torch.unique(spread[inside])
-    taps = torch.cartesian_prod(steps, steps, steps)
-    seen_from, inside = _shifted(keys, -taps, depth)
-    inside = inside & taps.any(1)[:, None]
     cells = torch.cat([cells, cells.new_full((1,), NOWHERE)])
     occupied = torch.searchsorted(cells, keys)
-    tap_in, tap_out = occupied.expand_as(seen_from)[inside], torch.searchsorted(cells, seen_from[inside])
+    # Cells above each other follow each other: one search serves a column of taps.
+    columns = torch.nn.functional.pad(torch.cartesian_prod(steps, steps), (0, 1))
+    seen_from, inside = _shifted(keys, -columns, depth)
+    heights = (keys & (1 << DEPTH) - 1) - steps[:, None]
+    inside = inside[:, None] & (heights >= 0) & (heights < 1 << depth)
+    inside[columns.shape[0] // 2, reach] = False
+    pairs = inside.flatten().nonzero()[:, 0]
+    tap_out = (torch.searchsorted(cells, seen_from)[:, None] - steps[:, None]).flatten()[pairs]
+    tap_in, inside = occupied[pairs % keys.shape[0]], inside.flatten(0, 1)
     cu_taps = torch.nn.functional.pad(inside.sum(1).cumsum(0), (1, 0))
     each = torch.arange(cells.shape[0] + 1, device=keys.device)
     return Field(cells, occupied, Voxels(each[:-1], each[:-1], each), KernelMap(kernel_size, tap_in, tap_out, cu_taps))
@@ -280,7 +323,7 @@ def _cell_of(cells: Tensor, keys: Tensor) -> Tensor:
 
 
 def _overlapping(
-    places: Surroundings, stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]
+    places: Places, stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]
 ) -> tuple[PatchTable, ...]:
     """The patches of the background with the moving rows that lie in their intervals, of each serialization."""
     n_patches = places.first.shape[1]
@@ -290,6 +333,53 @@ def _overlapping(
     is_row = torch.arange(stage.n_rows, device=scene.device) < stage.cu_clouds[-1]
     patch = torch.where((patch >= 0) & of_scene & is_row, patch, n_patches)
     order, _ = ops.curve_sort(patch)
-    bounds = torch.arange(n_patches + 1, device=scene.device).expand(len(curves), -1).contiguous()
-    cu_q = torch.searchsorted(patch.gather(1, order), bounds)
-    return tuple(PatchTable(order[r], own.kv_rows, cu_q[r], own.cu_k) for r, own in enumerate(places.patches))
+    cu_q = torch.searchsorted(patch.gather(1, order), _counting(n_patches + 1, order))
+    return _in_parts(order, cu_q, places)
+
+
+def _in_parts(order: Tensor, cu_q: Tensor, places: Places) -> tuple[PatchTable, ...]:
+    """Tables of patches that have at most ``patch_size`` queries each: a GPU's blocks share patches, not queries.
+
+    order, cu_q: [4, N] and [4, P + 1], the queries of every patch of ``places``, any number. A patch of many becomes parts,
+    which all list its keys. The number of parts is the largest there can be; the last ones are empty.
+    """
+    size, n_parts = places.patch_size, cu_q.shape[1] - 1 + order.shape[1] // places.patch_size
+    cu_parts = _offsets((cu_q.diff(dim=1) + size - 1) // size)
+    part = _counting(n_parts + 1, order)
+    patch = torch.searchsorted(cu_parts, part, right=True) - 1
+    begin = cu_q.gather(1, patch) + (part - cu_parts.gather(1, patch)) * size
+    begin = torch.minimum(begin, cu_q[:, -1:])
+    n_keys = torch.nn.functional.pad(places.cu_k.diff(), (0, 1))[patch[:, :-1]]
+    cu_k, slot = _offsets(n_keys), _counting(n_parts * size, order)
+    at = (torch.searchsorted(cu_k, slot, right=True) - 1).clamp(max=n_parts - 1)
+    source = places.cu_k[patch.gather(1, at)] + slot - cu_k.gather(1, at)
+    kv_rows = places.kv_rows.gather(1, source.clamp(max=places.kv_rows.shape[1] - 1))
+    return tuple(PatchTable(*lists) for lists in zip(order, kv_rows, begin, cu_k, strict=True))
+
+
+def _offsets(counts: Tensor) -> Tensor:
+    return torch.nn.functional.pad(counts.cumsum(1), (1, 0))
+
+
+def _counting(n: int, like: Tensor) -> Tensor:
+    """0 to n - 1 for each row of ``like``."""
+    return torch.arange(n, device=like.device).expand(like.shape[0], n).contiguous()
+
+
+# ---- room ----
+
+KEYS, LISTS, OFFSETS, ROWS = range(4)  # what may be longer, and how it goes on: nowhere, 0, with its last entry, 0
+
+
+def _length(x: Tensor, kind: int) -> int:
+    """Entries along the axis that may be longer, the first one of rows, else the last; offsets have one more."""
+    return x.shape[0] if kind == ROWS else x.shape[-1] - (kind == OFFSETS)
+
+
+def _longer(x: Tensor, kind: int, length: int) -> Tensor:
+    more = length - _length(x, kind)
+    if kind == ROWS:
+        return torch.cat([x, x.new_zeros(more, *x.shape[1:])])
+    if kind == OFFSETS:
+        return torch.cat([x, x[-1:].expand(more)])
+    return torch.cat([x, x.new_full((*x.shape[:-1], more), NOWHERE if kind == KEYS else 0)], -1)

@@ -44,9 +44,9 @@ class DynamicsConfig:
         mlp_ratio: hidden channels of a block's MLP over its channels.
         norm: "layer", or "batch" as published: evaluation uses running statistics, training those of the call's rows.
         zero_init: the last layer starts at zero: an untrained model that predicts differences predicts none.
-        background: "symmetric": frozen rows are rows like others to the network, and their latents change; "asymmetric":
-            frozen rows of the newest step read each other only, never change, and are computed once a rollout; the others
-            read both (:mod:`gsim3d.dynamics.background`). Weights fit both; a model should be trained as it is used.
+        background: "symmetric": frozen rows are rows like others to the network, and their latents change;
+            "asymmetric": frozen rows of the newest step read each other only, never change, and are computed once a
+            rollout; the others read both (:mod:`gsim3d.dynamics.background`). Weights fit both; train as you simulate.
     Training:
         drop_path: share of rows that skip a branch of a block, growing from 0 at the first block.
         shuffle_orders: the four curves of a stage change places at random.

@@ -71,12 +71,11 @@ class Dynamics(nn.Module):
         """
         curves = self._draw_curves(generator)
         pyramid = self.geometry(background, curves=curves)
-        remembered = Background.around(pyramid, background, self.config.strides, curves)
-        if remembered.places:
+        remembered, recorders = Background.begin(pyramid, background, self.config.pyramid_spec(0), curves)
+        if recorders:
             draws = generator if self.training else None
             x = ops.pool_mean(self.layout.pack(background), pyramid.rows, pyramid.cu_rows, check=False)
-            besides = remembered.recorders(pyramid)
-            self.net(x, pyramid, generator=draws and _beside(draws, x.device), besides=besides)
+            self.net(x, pyramid, generator=draws and _beside(draws, x.device), besides=recorders)
         return remembered
 
     def forward(

@@ -56,7 +56,7 @@ class Parts:
         return self.moving.n_clouds == 0
 
     def whole(self, step: Particles | None, ahead: int) -> Particles:
-        """All rows of every scene ``ahead`` steps after the newest; ``step``: the moving ones, None where there are none."""
+        """All rows of every scene ``ahead`` steps after the newest; ``step``: those that move, None where none do."""
         table = self.newest.clouds
         counts = [table.count(q) for q in range(len(table))]
         later = CloudTable.make(counts, table.scenes, (s + ahead for s in table.steps), self.newest.cu_rows.device)

@@ -15,10 +15,20 @@ from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
 from gsim3d import ops
+from gsim3d.branches import Branches
 from gsim3d.dynamics.background import Reader, Recorder
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
 from gsim3d.dynamics.fused_block import run_block
-from gsim3d.layers import RowLayerNorm, RowLinear, make_norm, product_dtype, rounded_at_once, rounded_weights, widened
+from gsim3d.layers import (
+    RowLayerNorm,
+    RowLinear,
+    at_hand,
+    make_norm,
+    product_dtype,
+    round_at_once,
+    rounded_weights,
+    widened,
+)
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
 Beside = Recorder | Reader
@@ -122,7 +132,7 @@ class Block(nn.Module):
         """x [N, C] with attention along serialization ``row``. ``conv_input``: read by the convolution, default x."""
         conv_input = x if conv_input is None else conv_input
         if self.is_fused(x, beside):
-            return self.advance(x, conv_input, stage, row, generator)[0]
+            return self.advance(x, conv_input, stage, row, generator, beside)[0]
         keep = self._draw_keep(x, generator)
         if self._recomputes():
             arguments = (x, conv_input, stage, row, *keep, beside)
@@ -130,16 +140,25 @@ class Block(nn.Module):
         return self._compute(x, conv_input, stage, row, *keep, beside)
 
     def is_fused(self, x: Tensor, beside: Beside | None = None) -> bool:
-        if beside is not None or torch.compiler.is_compiling() or self.attention.rounded_to_half:
+        if isinstance(beside, Recorder) or (beside is not None and torch.is_grad_enabled()):
+            return False
+        if torch.compiler.is_compiling() or self.attention.rounded_to_half:
             return False
         return x.is_cuda if self.fused is None else self.fused
 
     def advance(
-        self, x: Tensor, conv_input: Tensor, stage: Stage, row: int, generator: torch.Generator | None
+        self,
+        x: Tensor,
+        conv_input: Tensor,
+        stage: Stage,
+        row: int,
+        generator: torch.Generator | None,
+        beside: Reader | None = None,
     ) -> tuple[Tensor, Tensor]:
         """What :meth:`forward` returns where the block is fused, and the same in the dtype that convolutions read."""
         keep = self._draw_keep(x, generator)
-        return run_block(self, x, conv_input.to(product_dtype(x)), stage, row, keep, self._recomputes())
+        conv_input = conv_input.to(product_dtype(x))
+        return run_block(self, x, conv_input, stage, row, keep, self._recomputes(), beside)
 
     def _recomputes(self) -> bool:
         return self.checkpointing and self.training and torch.is_grad_enabled()
@@ -181,7 +200,7 @@ def run_blocks(
     for i, block in enumerate(blocks):
         row = i % len(stage.patches)
         if block.is_fused(x, beside):
-            x, conv_input = block.advance(x, conv_input, stage, row, generator)
+            x, conv_input = block.advance(x, conv_input, stage, row, generator, beside)
         else:
             x = conv_input = block(x, stage, row, conv_input=conv_input, generator=generator, beside=beside)
     return x
@@ -225,9 +244,13 @@ class Merge(nn.Module):
         self.time_embedding = nn.Parameter(torch.empty(window, channels))
         nn.init.trunc_normal_(self.time_embedding, std=TIME_EMBEDDING_STD)
 
+    def marks(self, stage: Stage) -> bool:
+        """Whether there is anything to tell apart."""
+        return stage.time_index is not None or self.newest is not None
+
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
         if stage.time_index is None:
-            return x if self.newest is None else x + self.time_embedding[self.newest].to(x.dtype)
+            return x + self.time_embedding[self.newest].to(x.dtype)
         # A product with a one-hot matrix: its gradient is a sum in row order, where indexing would use atomics on CUDA.
         return x + F.one_hot(stage.time_index, self.time_embedding.shape[0]).to(x) @ self.time_embedding
 
@@ -250,7 +273,7 @@ class EncoderStage(nn.Module):
     ) -> Tensor:
         if self.pool is not None:
             x = self.pool(x, stage)
-        if self.merge is not None:
+        if self.merge is not None and self.merge.marks(stage):
             x = self.merge(x, stage)
         return run_blocks(self.blocks, x, x, stage, generator, beside)
 
@@ -342,17 +365,20 @@ class PointTransformer(nn.Module):
         generator: torch.Generator | None = None,
         besides: Sequence[Beside] = (),
     ) -> Tensor:
+        besides = besides or [None] * len(pyramid.stages)
         if not x.is_cuda or torch.compiler.is_compiling():
-            return self._compute(x, pyramid, generator, besides)
-        with rounded_at_once(self._products, product_dtype(x)):
-            return self._compute(x, pyramid, generator, besides)
+            x = self.stem(x, pyramid.stages[0], besides[0])
+            return self._behind_stem(x, pyramid, generator, besides)
+        with Branches(x) as branches:
+            rounded = branches.run(round_at_once, self._products, product_dtype(x))
+            x = self.stem(x, pyramid.stages[0], besides[0])
+        with at_hand(rounded):
+            return self._behind_stem(x, pyramid, generator, besides)
 
-    def _compute(
-        self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None, besides: Sequence[Beside]
+    def _behind_stem(
+        self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None, besides: Sequence[Beside | None]
     ) -> Tensor:
-        stages, besides = pyramid.stages, besides or [None] * len(pyramid.stages)
-        x = self.stem(x, stages[0], besides[0])
-        skips = []
+        stages, skips = pyramid.stages, []
         for encoder, stage, beside in zip(self.encoder, stages, besides, strict=True):
             x = encoder(x, stage, generator, beside)
             skips.append(x)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import torch
+
 from gsim3d.dynamics.background import Background
 from gsim3d.dynamics.clouds import append_step, concatenate, last_steps, single_steps
 from gsim3d.dynamics.parts import Parts
@@ -46,19 +48,19 @@ def rollout_in_parts(
 
     Args:
         predict: last steps of what moves, and its background -> the next steps of what moves.
-        remember: what rests -> the background that ``predict`` reads, made anew whenever others rest; None: the model does
-            not tell them apart, and only whole scenes rest.
+        remember: what rests -> the background that ``predict`` reads, made anew whenever others rest; None: the model
+            does not tell them apart, and only whole scenes rest.
         sleepers: who sleeps beside frozen rows; None: nobody.
         log: is told what was computed.
     """
     history, steps, parts = last_steps(history, max_steps), [], None
     log = RestLog() if log is None else log
     while len(steps) < n_steps:
-        if parts is None or (sleepers is not None and sleepers.changed):
+        if parts is None or (sleepers is not None and not torch.equal(asleep, sleepers.asleep)):
             if steps:  # all that the model sees was simulated when somebody falls asleep first
                 history = last_steps(concatenate(steps[-max_steps:]), max_steps)
             asleep = None if sleepers is None else sleepers.asleep
-            parts, begin = Parts.of(history, asymmetric=remember is not None, asleep=asleep), len(steps)
+            parts, begin = Parts.of(history, asymmetric=remember is not None, asleep=asleep if steps else None), len(steps)
             moving, background = parts.moving, None
             if parts.background is not None and not parts.nothing_moves:
                 background = remember(parts.background)

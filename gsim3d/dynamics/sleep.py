@@ -1,14 +1,15 @@
 """Rows that came to rest are not computed until something near them moves.
 
-A row is quiet after ``patience`` steps in which it changed by less than ``eps``. By the policy "exact" a scene sleeps once
-all its rows are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of ``halo`` metres, and a
-cube sleeps while no row in it or in one of its 26 neighbours is restless; it wakes in the step after one of these has become
-so. A row that moves by less than ``halo`` a step is in a neighbouring cube one step before it can be in the sleeping one:
-whom it may meet is awake by then. Rows asleep are a background to those awake, so "approx" needs a model with
+A row is quiet after ``patience`` steps in which it changed by no more than ``eps``. By the policy "exact" a scene sleeps
+once all its rows are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of ``halo``
+metres. A cube sleeps while no row in it or in one of its 26 neighbours is restless, and wakes in the step after one has
+become so. A row that moves by less than ``halo`` a step is in a neighbouring cube one step before it can be in the
+sleeping one: whom it may meet is awake by then. Rows asleep are a background to those awake, so "approx" needs a model of
 ``background="asymmetric"``.
 
-What it costs: a row that sleeps misses changes of less than ``eps`` a step. Where a simulation that never sleeps changes no
-row of a sleeping scene by ``eps`` or more, the two differ by at most ``eps`` times the steps slept, by nothing with eps=0.
+A row that sleeps misses changes of up to ``eps`` a step. Where a simulation that never sleeps would change no row of a
+sleeping scene by more, the two differ by at most ``eps`` times the steps slept; with ``eps=0`` by nothing, for then the
+network was shown the same state in all steps of its history and changed nothing.
 """
 
 from __future__ import annotations
@@ -60,11 +61,10 @@ class Sleepers:
         self.reach = rule.eps * grid_size
         self.asleep = torch.zeros(newest.n_rows, dtype=torch.bool, device=newest.means.device)
         self.steps_at_rest = torch.zeros_like(self.asleep, dtype=torch.int64)
-        self.changed = False
 
     @torch.no_grad()
     def look(self, before: Particles, after: Particles) -> None:
-        """Notes what a step changed, and decides who sleeps in the next; ``changed``: whether these are others."""
+        """Notes what a step changed, and decides who sleeps in the next."""
         at_rest = _largest_change(before.means, after.means) <= self.reach
         for name, value in after.row_fields().items():
             if name not in ("means", "activity", "static_latents"):
@@ -74,12 +74,10 @@ class Sleepers:
         restless = self.steps_at_rest < self.patience
         scene = after.cloud_scene[after.row_cloud()]
         if self.rule.policy == "exact":
-            asleep = ~torch.isin(scene, scene[restless])
+            self.asleep = ~torch.isin(scene, scene[restless])
         else:
-            asleep = ~_near(_cubes(after, scene, self.rule.halo), restless & (after.activity != ASLEEP))
-            asleep &= (after.activity != FROZEN) & ~restless
-        self.changed = not torch.equal(asleep, self.asleep)
-        self.asleep = asleep
+            stirred = _near(_cubes(after, scene, self.rule.halo), restless & (after.activity != ASLEEP))
+            self.asleep = ~stirred & ~restless & (after.activity != FROZEN)
 
 
 def _largest_change(before: Tensor, after: Tensor) -> Tensor:

@@ -100,7 +100,13 @@ class _WithoutFirstWeights(TorchFunctionMode):
         return function(*args, **(kwargs or {}))
 
 
-def check_sizes(config: ModelConfig, weights: dict[str, Tensor]) -> None:
+def first_weights(simulator: Simulator, spec: EffectsSpec, weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The simulator's own weights that no effect of ``spec`` reads, so that they need not be among ``weights``."""
+    lacks = set(simulator.plan(spec).unused).difference(weights)
+    return {name: value for name, value in simulator.state_dict().items() if name in lacks}
+
+
+def check_sizes(config: ModelConfig, spec: EffectsSpec, weights: dict[str, Tensor]) -> None:
     """Raises RuntimeError where ``config`` describes other weights than those, before it takes memory for its own."""
     n_most, n_made = sum(value.numel() for value in weights.values()), 0
 
@@ -120,7 +126,8 @@ def check_sizes(config: ModelConfig, weights: dict[str, Tensor]) -> None:
     finally:
         for hook in hooks:
             hook.remove()
-    simulator.load_state_dict({name: torch.empty_like(value, device="meta") for name, value in weights.items()})
+    sizes = {name: torch.empty_like(value, device="meta") for name, value in weights.items()}
+    simulator.load_state_dict({**first_weights(simulator, spec, weights), **sizes})
 
 
 def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: EffectsSpec) -> dict:
@@ -172,9 +179,11 @@ def _restored(path: str | Path, saved: checkpoint.Checkpoint, device: str) -> Re
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     try:
-        check_sizes(model, saved.weights)
+        check_sizes(model, spec, saved.weights)
         simulator = build_simulator(model, seed=0)
-        simulator.load_state_dict(saved.weights)
+        own = first_weights(simulator, spec, saved.weights)
+        simulator.load_state_dict({**own, **saved.weights})
     except RuntimeError as error:
         raise InputError(f"{path}: the weights do not fit the model: {str(error).splitlines()[-1].strip()}") from None
+    simulator.absent = frozenset(own)
     return Restored(simulator.eval().to(device), settings, image_size, simulator.plan(spec), saved)

@@ -5,15 +5,16 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import DynamicsConfig, Parts, RestLog, last_steps, rollout
+from gsim3d.dynamics import DynamicsConfig, Parts, RestLog, last_steps, rollout, rollout_in_parts
 from gsim3d.dynamics.background import Background, joint_attention
 from gsim3d.dynamics.point_transformer import SparseConv
+from gsim3d.graphs import CapturedRollout
 from gsim3d.ops import PatchTable, PyramidCapacity, curve_encode
 from gsim3d.ops.curve import CURVES
 from gsim3d.quirks import Quirks
 from gsim3d.types import ASLEEP, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
-from tests.dynamics.scenes import TINY, batch, float_fields, make_dynamics, make_history
+from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history
 from tests.effects.resting import ASYMMETRIC, make_scenes, make_simulator
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -32,8 +33,8 @@ def read_and_reader(dtype=torch.float64):
     history = batch([make_history((150, 140), seed=i, frozen_share=0.6, dtype=dtype) for i in range(2)])
     parts = Parts.of(history, asymmetric=True)
     rest, moving = dynamics.geometry(parts.background), dynamics.geometry(parts.moving)
-    background = Background.around(rest, parts.background, ASYMMETRIC.strides)
-    return parts, rest, moving, background
+    background, recorders = Background.begin(rest, parts.background, ASYMMETRIC.pyramid_spec(0))
+    return parts, rest, moving, background, recorders[0]
 
 
 def scene_of_rows(particles):
@@ -42,10 +43,10 @@ def scene_of_rows(particles):
 
 @pytest.mark.parametrize("kernel_size", [3, 5])
 def test_a_tap_adds_the_means_of_moving_and_of_frozen_rows_of_its_cell(kernel_size):
-    parts, rest, moving, background = read_and_reader()
+    parts, rest, moving, background, recorder = read_and_reader()
     conv = SparseConv(3, 4, kernel_size, bias=True, duplicates="mean").double()
     x_rest, x = torch.randn(rest.stages[0].n_rows, 3).double(), torch.randn(moving.stages[0].n_rows, 3).double()
-    background.recorders(rest)[0].convolved(conv, x_rest, x_rest)
+    recorder.convolved(conv, x_rest, x_rest)
     out = conv(x, moving.stages[0], background.readers(moving, parts.moving)[0])
 
     def cells(stage, group):
@@ -75,7 +76,7 @@ def test_a_tap_adds_the_means_of_moving_and_of_frozen_rows_of_its_cell(kernel_si
 
 @pytest.mark.parametrize("row", range(4))
 def test_attention_reads_the_own_patch_and_the_patch_of_the_background_around_it(row):
-    parts, rest, moving, background = read_and_reader()
+    parts, rest, moving, background, _ = read_and_reader()
     stage, frozen = moving.stages[0], rest.stages[0]
     q, k, v = torch.randn(3, stage.n_rows, 2, 4).double()
     other_k, other_v = torch.randn(2, frozen.n_rows, 2, 4).double()
@@ -106,7 +107,9 @@ def test_joint_attention_has_the_gradients_of_one_softmax():
     q, k, v, other_k, other_v = (torch.randn(n, 2, 4).double().requires_grad_() for n in (9, 9, 9, 7, 7))
     cu, rows = torch.tensor([0, 4, 8]), torch.randperm(9)
     own = PatchTable(rows, rows, cu, cu)
-    other = PatchTable(torch.arange(9).flip(0), torch.tensor([3, 1, 0, 6, 2]), torch.tensor([0, 5, 7]), torch.tensor([0, 2, 5]))
+    other = PatchTable(
+        torch.arange(9).flip(0), torch.tensor([3, 1, 0, 6, 2]), torch.tensor([0, 5, 7]), torch.tensor([0, 2, 5])
+    )
     assert torch.autograd.gradcheck(lambda *x: joint_attention(*x, own, other), (q, k, v, other_k, other_v))
 
 
@@ -117,6 +120,38 @@ def test_a_background_made_once_gives_the_bits_of_one_made_in_every_step():
     for step in steps:
         state = simulator.step(state)
         assert_same_particles(step, last_steps(state, 1))
+
+
+@pytest.mark.parametrize("values", [{"steps_per_call": 2}, {"steps_per_call": 2, "predicts": "from_previous"}])
+def test_several_steps_a_call(values):
+    dynamics, history = make_dynamics(dataclasses.replace(ASYMMETRIC, **values)), make_scenes()
+    steps = rollout_in_parts(
+        lambda moving, background: dynamics(moving, background=background), history, 5, 4, remember=dynamics.remember
+    )
+    for one, other in zip(steps, rollout(dynamics, history, 5, 4), strict=True):
+        assert_same_particles(one, other)
+
+
+def test_explicit_particles():
+    config = dataclasses.replace(EXPLICIT, background="asymmetric")
+    dynamics, history = make_dynamics(config), make_history((40, 50), config=config, frozen_share=0.5)
+    newest, step = last_steps(history, 1), dynamics(history)
+    frozen = newest.activity == FROZEN
+    for name in ("means", "quats", "scales", "sh", "opacities"):
+        assert_same_bits(getattr(step, name)[frozen], getattr(newest, name)[frozen], name)
+        assert not torch.equal(getattr(step, name)[~frozen], getattr(newest, name)[~frozen])
+
+
+def test_rows_that_cannot_be_seen_are_in_no_background():
+    dynamics, history = make_dynamics(ASYMMETRIC), make_history((40, 50), frozen_share=0.5)
+    frozen = (history.activity == FROZEN)[:, None]
+    lost = torch.arange(90)[:, None] % 3 == 0
+    hidden = dataclasses.replace(history, means=torch.where(frozen & lost, torch.nan, history.means))
+    kept = hidden.select_rows(~(frozen & lost)[:, 0])
+    assert_same_bits(dynamics(hidden).means[~(frozen & lost)[40:, 0]], dynamics(kept).means)
+    nobody = dataclasses.replace(history, means=torch.where(frozen, torch.nan, history.means))
+    alone = history.select_rows(~frozen[:, 0])
+    assert_same_bits(dynamics(nobody).means[~frozen[40:, 0]], dynamics(alone).means)
 
 
 def test_frozen_rows_of_the_newest_step_stay_and_older_ones_are_not_read():
@@ -183,6 +218,29 @@ def test_room_changes_no_bit(room):
     given = dynamics.geometry(parts.moving, capacity=capacity)
     expected = dynamics(parts.moving, background=background)
     assert_same_particles(dynamics(parts.moving, pyramid=given, background=background), expected)
+
+
+def test_a_captured_rollout_has_the_same_bits_also_of_another_background():
+    simulator, state = make_simulator(), make_scenes()
+    captured = CapturedRollout(simulator, state, 3)
+    turned = dataclasses.replace(state, static_latents=state.static_latents.flip(1))
+    frozen = (state.activity == FROZEN)[:, None]
+    moved = dataclasses.replace(state, means=torch.where(frozen, 0.3 + 0.4 * state.means.flip(1), state.means))
+    for given in (state, turned, moved, state):
+        for step, expected in zip(captured(given).steps, simulator.rollout(given, 3), strict=True):
+            assert_same_particles(step, expected)
+
+
+def test_a_background_without_room_for_another_is_made_anew():
+    simulator = make_simulator()
+    few, many = (make_history((60, 60), seed=2, frozen_share=0.5) for _ in range(2))
+    frozen = (few.activity == FROZEN)[:, None]
+    few = dataclasses.replace(few, means=torch.where(frozen, 0.3 + 0.01 * few.means, few.means))
+    captured = CapturedRollout(simulator, few, 2)
+    steps = captured(many).steps
+    assert captured.captures == 2
+    for step, expected in zip(steps, simulator.rollout(many, 2), strict=True):
+        assert_same_particles(step, expected)
 
 
 def test_a_rollout_repeats_bit_by_bit():

@@ -22,22 +22,15 @@ from gsim3d.edits import (
 )
 from gsim3d.effects import DynamicsEffects, EffectsSpec, StructureEffects
 from gsim3d.errors import InputError
-from gsim3d.presets import ModelConfig
-from gsim3d.renderer import RendererConfig
 from gsim3d.types import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
-from tests.dynamics.scenes import EXPLICIT
+from tests.effects.models import MODELS
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 EDITABLE = EffectsSpec(structure=StructureEffects(insert=True, remove=True))
-EXPLICIT_CONFIG = ModelConfig(
-    dataclasses.replace(CONFIG.encoder, explicit=True, dynamic_dim=4, sh_degree=1),
-    dataclasses.replace(EXPLICIT, grid_size=0.1, scale_max=0.3),
-    RendererConfig(latents=0, sh_degree=1, scale_min=0.001, scale_max=0.3),
-)
-CONFIGS = {"latent": CONFIG, "explicit": EXPLICIT_CONFIG}
+CONFIGS = {name: MODELS[name] for name in ("latent", "explicit")}
 
 
 def encoded(config=CONFIG, steps=(2,)):
@@ -85,7 +78,9 @@ def test_what_is_moved_keeps_its_speed():
     by = (0.5, -0.25, 0.125)
     moved = edited(simulator, state, Move("moving", by))
     moving = state.activity == DYNAMIC
-    assert_close_relative_to_max((moved.means - state.means)[moving], torch.tensor([by]).expand(int(moving.sum()), 3), 1e-5)
+    assert_close_relative_to_max(
+        (moved.means - state.means)[moving], torch.tensor([by]).expand(int(moving.sum()), 3), 1e-5
+    )
     assert len(set(state.row_cloud()[moving].tolist())) == 2, "the past moved as well"
 
 
@@ -126,9 +121,7 @@ def test_a_rotation_is_about_the_middle_of_what_turns_and_turns_its_speed():
     turned = edited(simulator, state, Rotate("moving", axis=(1.0, 0.0, 0.0), degrees=90.0))
     for scene in (0, 1):
         olds, news = ([s.select_clouds([2 * scene + t]) for t in (0, 1)] for s in (state, turned))
-        middle, frozen = (
-            [c.means[c.activity == kind].mean(0) for c in (*olds, *news)] for kind in (DYNAMIC, FROZEN)
-        )
+        middle, frozen = ([c.means[c.activity == kind].mean(0) for c in (*olds, *news)] for kind in (DYNAMIC, FROZEN))
         assert_close_relative_to_max(middle[3], middle[1], 1e-5)
         way, turned_way = middle[0] - middle[1], middle[2] - middle[3]
         assert_close_relative_to_max(turned_way, torch.stack([way[0], -way[2], way[1]]), 1e-4)
@@ -181,7 +174,7 @@ def test_two_scenes_are_merged():
     painted = edited(simulator, here, Recolor("moving", (1.0, 0.0, 0.0)), Insert("all", there))
     assert_same_bits(painted.paint[-1], torch.eye(3))
     assert future(simulator, here, 2, [Edit(1, Insert("moving", there))])[-1].n_rows > last_steps(here, 1).n_rows
-    other, foreign, _ = encoded(EXPLICIT_CONFIG, (1,))
+    other, foreign, _ = encoded(MODELS["explicit"], (1,))
     with pytest.raises(InputError, match="edit at step 0, insert: particles.quats must be as those of the state"):
         future(simulator, here, 1, [Edit(0, Insert("all", foreign))])
     with pytest.raises(InputError, match="edit at step 0, insert: particles must be of one scene"):
@@ -255,6 +248,7 @@ def test_files(tmp_path):
         ("step: 0", "must hold a list; got dict"),
         ("- 3", "edit 0 must be a mapping; got 3"),
         ("- {op: move}", "edit 0: step must be a whole number; got None"),
+        ("- {step: 2, op: [move]}", "edit 0 at step 2: op must be one of remove, move"),
         ("- {step: 2, op: explode}", "edit 0 at step 2: op must be one of remove, move"),
         ("- {step: 2, op: move, to: [0, 0, 1]}", "edit 0 at step 2, move: unknown key to; known: of, by"),
         ("- {step: 2, op: move, by: [0, 1]}", r"edit 0 at step 2, move: by must be a list of 3; got \[0, 1\]"),
@@ -271,5 +265,3 @@ def test_files_that_are_no_edits(tmp_path, text, message):
     (tmp_path / "edits.yaml").write_text(text)
     with pytest.raises(InputError, match=message):
         load_edits(tmp_path / "edits.yaml", lambda folder: None)
-
-

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from gsim3d import Simulator, presets
+from gsim3d.effects import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.train.checkpoint import Checkpoint, export
 from gsim3d.train.config import DataConfig
@@ -75,12 +76,12 @@ def test_a_good_configuration_is_restored(tmp_path):
 def test_sizes_are_compared_without_memory():
     config = presets.tiny()
     weights = {name: value.to("meta") for name, value in Simulator(config).state_dict().items()}
-    check_sizes(config, weights)
+    check_sizes(config, EffectsSpec(), weights)
     name = next(iter(weights))
     with pytest.raises(RuntimeError, match="Missing key"):
-        check_sizes(config, {key: value for key, value in weights.items() if key != name})
+        check_sizes(config, EffectsSpec(), {key: value for key, value in weights.items() if key != name})
     with pytest.raises(RuntimeError, match="size mismatch"):
-        check_sizes(config, {**weights, name: torch.empty(1, 2, 3, device="meta")})
+        check_sizes(config, EffectsSpec(), {**weights, name: torch.empty(1, 2, 3, device="meta")})
 
 
 def test_comparing_sizes_leaves_torch_as_it_was():
@@ -88,7 +89,7 @@ def test_comparing_sizes_leaves_torch_as_it_was():
     before = build_simulator(config, 0).state_dict()
     dynamics = dataclasses.replace(config.dynamics, mlp_ratio=10**6)
     with pytest.raises(RuntimeError, match="more than twice"):
-        check_sizes(dataclasses.replace(config, dynamics=dynamics), before)
+        check_sizes(dataclasses.replace(config, dynamics=dynamics), EffectsSpec(), before)
     for name, value in build_simulator(config, 0).state_dict().items():
         assert torch.equal(value, before[name])
 

@@ -12,8 +12,6 @@ import datetime
 import json
 import math
 import statistics
-import time
-from collections.abc import Callable
 from contextlib import contextmanager
 
 import torch
@@ -27,7 +25,7 @@ from gsim3d.stability import StabilityReport
 from gsim3d.types import Cameras, Particles
 
 STEPS = 4  # of a rollout
-MIN_PAIRS, MAX_PAIRS = 25, 400  # of timings
+MIN_PAIRS, MAX_PAIRS = 25, 400  # of timings on a GPU
 
 
 def state_of(simulator: Simulator, n: int, device: torch.device) -> Particles:
@@ -114,13 +112,7 @@ def replays_of(simulator: Simulator, state: Particles, cameras: Cameras):
     return replay_of(guarded), replay_of(plain)
 
 
-def processor_ms(f) -> float:
-    start = time.process_time()
-    f()
-    return 1e3 * (time.process_time() - start)
-
-
-def cost(bench: Bench, case: str, dtype: str, run, plain, timed: Callable[[Callable], float]):
+def cost_on_gpu(bench: Bench, case: str, dtype: str, run, plain):
     """Prints and stores what guards add to ``plain``, a share of its time."""
     for _ in range(2):
         assert worst_error(run(), plain()) == 0, f"{case}: guards change results"
@@ -128,34 +120,23 @@ def cost(bench: Bench, case: str, dtype: str, run, plain, timed: Callable[[Calla
     spent = 0.0
     while len(times[run]) < MIN_PAIRS or (spent < 2e3 * bench.args.seconds and len(times[run]) < MAX_PAIRS):
         for f in (run, plain) if len(times[run]) % 2 else (plain, run):
-            times[f].append(timed(f))
+            times[f].append(event_ms(f))
             spent += times[f][-1]
     low, share, high = statistics.quantiles((a / b - 1 for a, b in zip(*times.values())), n=4, method="inclusive")
     guarded, unguarded = (summary([ms / 1e3 for ms in values]) for values in times.values())
-    ms = f"{guarded['ms']:>11.2f}{unguarded['ms']:>11.2f}"
-    print(f"{case + ' ' + dtype:<66}{ms}  cost {share:.2%} ({low:.2%} to {high:.2%})", flush=True)
-    row = {"case": case, "dtype": dtype, "cost": share, "quartiles": [low, high]}
-    if bench.device.type == "cpu":
-        bench.results.append({**row, "gsim3d": guarded, "plain": unguarded})
-        return
-    bench.results.append(
-        {
-            "op": bench.op, **row, "ours_ms": guarded["ms"], "ours_graph_ms": None, "peer": "no guards",
-            "peer_ms": unguarded["ms"], "peer_graph_ms": None, "target_ratio": None, "limit_ms": None,
-            "gpu": torch.cuda.get_device_name(), "torch": torch.__version__, "commit": commit(),
-            "spread": guarded["spread"], "date": datetime.date.today().isoformat(),
-        }  # fmt: skip
-    )
+    ms = f"{guarded['ms']:>10.3f}{'-':>9}{unguarded['ms']:>10.3f}"
+    print(f"{case + ' ' + dtype:<52}{ms} cost {share:.2%} ({low:.2%} to {high:.2%})", flush=True)
+    row = {
+        "op": bench.op, "case": case, "dtype": dtype, "cost": share, "quartiles": [low, high],
+        "ours_ms": guarded["ms"], "ours_graph_ms": None, "peer": "no guards", "peer_ms": unguarded["ms"],
+        "peer_graph_ms": None, "target_ratio": None, "limit_ms": None, "gpu": torch.cuda.get_device_name(),
+        "torch": torch.__version__, "commit": commit(), "spread": guarded["spread"],
+        "date": datetime.date.today().isoformat(),
+    }  # fmt: skip
+    bench.results.append(row)
     file = bench.args.json or RESULTS / f"{bench.op}.jsonl"
     file.parent.mkdir(exist_ok=True)
     file.write_text("".join(json.dumps(row) + "\n" for row in bench.results))
-
-
-def cost_on_cpu(bench: Bench, case: str, run, plain):
-    """Processor time on one thread, so that a busy machine matters little."""
-    torch.set_num_threads(1)
-    cost(bench, case + ", 1 image", "float32", run, plain, processor_ms)
-    torch.set_num_threads(bench.args.threads)
 
 
 def main():
@@ -172,10 +153,10 @@ def main():
         run = run_of(simulator, state, cameras)
         case = f"{name}, {n} particles: {STEPS} steps"
         if not on_gpu:
-            cost_on_cpu(bench, case, run, without_guards(run))
+            bench.cost(case + ", 1 image", run, without_guards(run))
             continue
-        cost(bench, case + ", 1 image", "float32", run, without_guards(run), event_ms)
-        cost(bench, case + f", {STEPS} images, captured", "bfloat16", *replays_of(simulator, state, cameras), event_ms)
+        cost_on_gpu(bench, case + ", 1 image", "float32", run, without_guards(run))
+        cost_on_gpu(bench, case + f", {STEPS} images, captured", "bfloat16", *replays_of(simulator, state, cameras))
     if on_gpu:
         look(bench)
     bench.finish()
