@@ -131,8 +131,9 @@ def costs() -> str:
     text = """
 ## What guards cost
 
-A rollout of 4 steps with one image, or from a CUDA graph with 4, under the default policy and without any guard, both in
-turns: processor time on one thread, or time between two events on a GPU. The cost is the median over pairs, with its quartiles.
+A rollout of 4 steps with one image, or from a CUDA graph with 4, under the default policy and without any guard, both
+in turns: processor time on one thread, or time between two events on a GPU. The cost is the median over pairs, with its
+quartiles.
 
 | machine | case | numbers | guarded ms | unguarded ms | cost | quartiles |
 | --- | --- | --- | ---: | ---: | ---: | ---: |

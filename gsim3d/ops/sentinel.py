@@ -55,9 +55,9 @@ def watch_rows(
     OUTSIDE unless ``0 <= (means - origin) / grid_size < 2^16`` on all axes, and FAST if it moved further than
     ``max_step`` from ``previous``; both only where its position is in bounds.
 
-    In the mended copy rows with a status sleep. Those out of bounds of a field, or FAST, have the numbers of ``previous``;
-    without it their position is ``origin``, and a field's first number that of ``neutral``, followed by zeros. The
-    opacity of rows out of bounds is 0. Rows that sleep already stay as they are.
+    In the mended copy rows with a status sleep. Those out of bounds of a field, or FAST, have the numbers of
+    ``previous``; without it their position is ``origin``, and a field's first number that of ``neutral``, followed by
+    zeros. The opacity of rows out of bounds is 0. Rows that sleep already stay as they are.
 
     Args:
         fields: 2 to 8 tensors with N rows, float32 or float64: positions [N, 3], opacities [N], and others of any shape.

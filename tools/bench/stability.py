@@ -3,9 +3,9 @@
     python tools/bench/stability.py [--device cuda] [--seconds 5]
 
 Guards are one look at all rows where a state enters and after every step, and the counts of the rasterizer. The peer is
-the same without guards; results are the same bits. Both sides run in turns, first one ahead and then the other; the cost
-is the median over pairs, between its quartiles. On a GPU a time is that between two events around a call: of eager calls,
-which wait for Python, and of replays of two CUDA graphs.
+the same without guards; results are the same bits. Both sides run in turns, first one ahead and then the other; the
+cost is the median over pairs, between its quartiles. On a GPU a time is that between two events around a call: of eager
+calls, which wait for Python, and of replays of two CUDA graphs.
 """
 
 import datetime
@@ -93,7 +93,7 @@ def without_guards(f):
 
 
 def replays_of(simulator: Simulator, state: Particles, cameras: Cameras):
-    """The same as run_of, with an image of every step, from CUDA graphs in bfloat16: guarded, and made without guards."""
+    """As run_of, with an image of every step, from CUDA graphs in bfloat16: guarded, and made without guards."""
 
     def graph():
         return CapturedRollout(simulator, state, STEPS, cameras=cameras, copies=False, report=StabilityReport())
