@@ -28,7 +28,7 @@ from gsim3d.ops.raster import Rendering
 from gsim3d.plans import Plan
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
-from gsim3d.stability import StabilityReport
+from gsim3d.stability import StabilityReport, pack
 from gsim3d.types import Cameras, CloudTable, Particles, keeping_constants
 
 FACTOR = 1.25  # room over what was observed
@@ -186,8 +186,11 @@ class CapturedRollout:
 
     def launch(self, state: Particles, cameras: Cameras | None = None) -> None:
         """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background, and to tell
-        an asymmetric one from what moves)."""
-        self._report.poll()
+        an asymmetric one from what moves).
+
+        Raises:
+            HardCaseError: of an earlier call, under the policy "raise".
+        """
         state = self._simulator.prepare(state, self._plan)
         self._check(state, self._table)
         tables = state.clouds
@@ -199,16 +202,20 @@ class CapturedRollout:
         self._tables = tables
         self._launched = True
         self._replay()
+        self._report.poll()  # here the host reads while the device works
 
     def finish(self) -> Predicted:
         """Waits for what was launched; repeats it with more room where it did not fit."""
         if not self._launched:
             raise InputError("CapturedRollout: finish() must follow launch()")
         self._launched = False
-        while not self._fits():
-            self._make_room([a.grown((0, *b.sizes)) for a, b in zip(self._grown(), self._observed(), strict=True)])
+        found, counted = self._arrive()
+        while not all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)]):
+            needed = zip(self._grown(found), self._observed(), strict=True)
+            self._make_room([a.grown((0, *b.sizes)) for a, b in needed])
             self._replay()
-        self._records.replayed(self._report)
+            found, counted = self._arrive()
+        self._records.replayed(self._report, counted)
         return self._results()
 
     def reload(self) -> None:
@@ -272,34 +279,39 @@ class CapturedRollout:
         self.captures += 1
         if self._device.type != "cuda":
             return
-        self._graph = self._predicted = self._found = None  # their memory goes back before the next graph takes its own
+        # their memory goes back before the next graph takes its own
+        self._graph = self._predicted = self._found = self._packed = None
         self._graph = Captured(self._capture, self._device)
-        self._predicted, self._found = self._graph.result
-        self._found_on_host = torch.empty(self._found.shape, dtype=self._found.dtype, pin_memory=True)
+        self._predicted, self._found, self._packed = self._graph.result
+        self._on_host = torch.empty(self._packed.shape, dtype=self._packed.dtype, pin_memory=True)
         self._arrived = torch.cuda.Event()
 
-    def _capture(self) -> tuple[Predicted, Tensor]:
-        return self._given(self._records if torch.cuda.is_current_stream_capturing() else StabilityReport())
+    def _capture(self) -> tuple[Predicted, Tensor, Tensor]:
+        report = self._records if torch.cuda.is_current_stream_capturing() else StabilityReport()
+        predicted, found = self._given(report)
+        return predicted, found, pack([found, *report.captured()])
 
     def _replay(self) -> None:
         if self._device.type != "cuda":
             self._records = StabilityReport()
-            self._predicted, self._found_on_host = self._given(self._records)
+            self._predicted, self._found = self._given(self._records)
             return
         with torch.cuda.device(self._device):
             self._graph()
-            self._found_on_host.copy_(self._found, non_blocking=True)
+            self._on_host.copy_(self._packed, non_blocking=True)
             self._arrived.record()
 
-    def _fits(self) -> bool:
-        if self._device.type == "cuda":
-            self._arrived.synchronize()
-        found = self._found_on_host.tolist()
-        return all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)])
+    def _arrive(self) -> tuple[list[list[int]], Tensor | None]:
+        """Waits for the replay: what the geometry of every call found, and what the guards of a graph counted."""
+        if self._device.type != "cuda":
+            return self._found.tolist(), None
+        self._arrived.synchronize()
+        numbers, n_found = self._on_host.clone(), self._found.numel()
+        return numbers[:n_found].view(self._found.shape).tolist(), numbers[n_found:]
 
-    def _grown(self) -> list[PyramidCapacity]:
-        found = self._found_on_host.tolist()
-        return [capacity.grown(numbers, self._factor) for capacity, numbers in zip(self._capacities, found, strict=True)]
+    def _grown(self, found: list[list[int]]) -> list[PyramidCapacity]:
+        calls = zip(self._capacities, found, strict=True)
+        return [capacity.grown(numbers, self._factor) for capacity, numbers in calls]
 
     # ---- what goes in and comes out ----
 

@@ -11,8 +11,7 @@ import contextvars
 from collections.abc import Sequence
 
 import torch
-import torch.distributed
-import torch.distributed.nn.functional
+import torch.distributed as dist
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
@@ -193,10 +192,27 @@ def _statistics(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     n_rows = x.new_full((), x.shape[0])
     mean = x.sum(0) / n_rows.clamp(min=1)
     spread = (x - mean).square().sum(0)
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
+    if dist.is_available() and dist.is_initialized():
         mine = torch.cat([n_rows[None], mean, spread])
-        n_rows, mean, spread = _combine(torch.distributed.nn.functional.all_gather(mine), x.shape[1])
+        n_rows, mean, spread = _combine(_OfAllProcesses.apply(mine), x.shape[1])
     return mean, spread / n_rows.clamp(min=1), n_rows
+
+
+class _OfAllProcesses(torch.autograd.Function):
+    """A tensor of every process, in the order of their ranks, to each of them."""
+
+    @staticmethod
+    def forward(ctx, mine):
+        parts = [torch.empty_like(mine) for _ in range(dist.get_world_size())]
+        dist.all_gather(parts, mine)
+        return tuple(parts)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *grads):
+        total = torch.stack(grads)
+        dist.all_reduce(total)
+        return total[dist.get_rank()]
 
 
 def _combine(parts: tuple[Tensor, ...], n_channels: int) -> tuple[Tensor, Tensor, Tensor]:

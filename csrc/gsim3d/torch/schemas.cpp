@@ -76,10 +76,11 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "norm_gelu_backward(Tensor grad, Tensor x, Tensor mean, Tensor scale, Tensor bias) -> (Tensor x, Tensor scale, "
       "Tensor bias)");
 
-  // sentinel: which rows cannot be used, and sums over clouds.
+  // sentinel: which rows cannot be used, what stands in for them, and sums over clouds.
   m.def(
       "watch_rows(Tensor[] fields, float[] low, float[] high, Tensor cu_rows, Tensor cloud_scene, Tensor origin, "
-      "Tensor activity, Tensor? previous, float grid_size, float max_step) -> (Tensor status, Tensor record)");
+      "Tensor activity, Tensor[] previous, float grid_size, float max_step, float[] neutral) -> (Tensor status, Tensor "
+      "record, Tensor[] mended)");
 
   // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
   m.def(
