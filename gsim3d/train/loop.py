@@ -96,6 +96,7 @@ class Trainer:
             betas=(settings.beta1, settings.beta2),
             eps=settings.eps,
             weight_decay=settings.weight_decay,
+            fused=device == "cuda",
         )
         self.average = {k: v.clone() for k, v in self.simulator.state_dict().items()} if settings.ema_decay else {}
         self.scale = LossScale(FIRST_SCALE if config.precision.scales_loss else 1.0)
@@ -207,7 +208,7 @@ class Trainer:
     def _whole_batch(self, batch: int) -> tuple[float, Tensor, list[Tensor | None], list[Seen]]:
         """Loss, errors by step and gradients of the whole batch; what was seen in each of its parts."""
         scale = self.scale.value
-        norms_scale = scale if self.step % self.config.log_every == 0 else None
+        norms_scale = scale if self._is_logged else None
         if self.shared is not None:
             parts = self._shared_gradients(self.processes.share(batch))
             loss, errors, gradients, watch, n_samples, error = parts
@@ -234,14 +235,13 @@ class Trainer:
         named = dict(zip(self.parameters, gradients, strict=True))
         for name, parameter in self.parameters.items():
             parameter.grad = named[name]
-        is_logged = self.step % self.config.log_every == 0
-        if is_logged:
+        if self._is_logged:
             entry["grad_norm_by_module"] = norms_by_module(named)
         entry["loss"] = loss
         entry["grad_norm"] = torch.nn.utils.clip_grad_norm_(
             self.parameters.values(), self.config.optimizer.clip_norm or math.inf
         ).item()
-        if is_logged and (by_step := mean_of_norms([part.norms for part in seen])):
+        if self._is_logged and (by_step := mean_of_norms([part.norms for part in seen])):
             entry["grad_norm_by_step"] = by_step
         entry["particles"] = sum(part.n_rows for part in seen) / max(1, sum(part.n_clouds for part in seen))
         if total := sum(part.n_unusable for part in seen):
@@ -253,6 +253,10 @@ class Trainer:
         if not math.isfinite(entry["grad_norm"]):
             return f"the gradient is not finite, first that of {first_not_finite(named.items())}"
         return None
+
+    @property
+    def _is_logged(self) -> bool:
+        return self.step % self.config.log_every == 0
 
     def _stop_if_diverged(self, entry: dict) -> None:
         n, limit = self.n_skipped_in_a_row, self.config.optimizer.max_skipped
@@ -362,7 +366,8 @@ class Trainer:
                 steps = simulator.rollout(
                     particles, batch.n_future, self.plan, generator=noise, wrap=again("steps", noise), **options
                 )
-            watch.follow(steps)
+            if self._is_logged:
+                watch.follow(steps)
             particles = concatenate([particles, *steps])
         with precision.of("renderer", self.device):
             render = again("images")(
@@ -451,8 +456,8 @@ class Trainer:
         for key, value in saved.optimizer.items():
             kind, name = key.split(".", 1)
             if name in self.parameters:
-                # AdamW counts its steps on the host.
-                self.optimizer.state[self.parameters[name]][kind] = value if kind == "step" else value.to(self.device)
+                counts_on_host = kind == "step" and self.device == "cpu"  # on a GPU the fused AdamW counts there
+                self.optimizer.state[self.parameters[name]][kind] = value if counts_on_host else value.to(self.device)
         self.step, self.n_skipped = saved.state["step"], saved.state["n_skipped"]
         self.n_skipped_in_a_row = saved.state.get("n_skipped_in_a_row", 0)
         self.seconds, self.parent = saved.state["seconds"], saved.digest
@@ -460,13 +465,13 @@ class Trainer:
 
     def _update_average(self) -> None:
         decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (EMA_WARM_UP + self.step))
+        values = {name: value for name, value in self.simulator.state_dict().items() if name in self.average}
+        kinds = (True, torch._foreach_lerp_, [1 - decay]), (False, torch._foreach_copy_, [])
         with torch.no_grad():
-            for name, value in self.simulator.state_dict().items():
-                if name in self.average:
-                    if value.is_floating_point():
-                        self.average[name].lerp_(value, 1 - decay)
-                    else:
-                        self.average[name].copy_(value)
+            for is_real, change, weight in kinds:
+                names = [name for name, value in values.items() if value.is_floating_point() == is_real]
+                if names:
+                    change([self.average[name] for name in names], [values[name] for name in names], *weight)
 
 
 class _Loss(nn.Module):
@@ -520,6 +525,8 @@ def _start_worker(n_threads: int) -> None:
 
 def _mean(results: list) -> tuple[Tensor, Tensor, list[Tensor | None]]:
     """Means of losses, errors and gradients, added in the order of the samples."""
+    if len(results) == 1:
+        return results[0]
     losses, errors, gradients = zip(*results, strict=True)
     means = []
     for parts in zip(*gradients, strict=True):
