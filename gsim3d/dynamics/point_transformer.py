@@ -145,8 +145,8 @@ class Block(nn.Module):
         """
         if not self.training or generator is None or self.drop_path == 0:
             return [None, None]
-        draws = [torch.rand(x.shape[0], 1, generator=generator, device=generator.device) for _ in range(2)]
-        return [(draw >= self.drop_path).to(x) / (1 - self.drop_path) for draw in draws]
+        draws = torch.rand(2, x.shape[0], 1, generator=generator, device=generator.device)
+        return list((draws >= self.drop_path).to(x).div_(1 - self.drop_path).unbind())
 
 
 def scaled(x: Tensor, keep: Tensor | None) -> Tensor:
