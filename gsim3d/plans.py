@@ -144,7 +144,7 @@ def unused_parameters(plan: Plan, model: ModelConfig, names: Iterable[str]) -> t
 
 def _merged_bits(config: DynamicsConfig, history: int) -> tuple[int, ...]:
     """Of each stage; steps are counted back from the newest, so that it has its place in every table that the model has."""
-    bits = (history - 1).bit_length() if config.quirks.slots_from_first else config.history_bits
+    bits = config.history_bits if config.slots_from_newest else (history - 1).bit_length()
     return config.pyramid_spec(bits).merged_bits()
 
 

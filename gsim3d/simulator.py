@@ -193,16 +193,11 @@ class Simulator(nn.Module):
         guard: Callable[..., Particles],
         geometry: Callable[[Particles], Pyramid] | None = None,
     ) -> Particles:
-        """The next steps of every scene, guarded, without the changes that the plan leaves out."""
-        step = self.dynamics(state, generator=generator, pyramid=None if geometry is None else geometry(state))
+        """The next steps of every scene, guarded."""
         appearance = plan.spec.appearance
+        changes = self.dynamics.layout.changes(appearance.changing, appearance.opacity_changes is not False)
+        pyramid = None if geometry is None else geometry(state)
+        step = self.dynamics(state, generator=generator, pyramid=pyramid, changes=changes)
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
-        if appearance.changing != "all":
-            held = (step.activity == FROZEN) | (appearance.changing == "none")
-            latents = torch.where(held[:, None], newest.dynamic_latents, step.dynamic_latents)
-            step = dataclasses.replace(step, dynamic_latents=latents)
-            if step.sh is not None:
-                step = dataclasses.replace(step, sh=torch.where(held[:, None, None], newest.sh, step.sh))
-        if appearance.opacity_changes is False:
-            step = dataclasses.replace(step, opacities=newest.opacities)
-        return guard(step, previous=newest, changed=self.dynamics.layout.changing)
+        changed = [name for name, who in changes.items() if who != "none"]
+        return guard(step, previous=newest, changed=changed)
