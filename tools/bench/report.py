@@ -5,7 +5,7 @@
     python tools/bench/report.py raster pool      run these again, keep the other numbers
     python tools/bench/report.py --page           only write the page again, with what tools/gpu_check.sh bench measured
 
-Let nothing else run meanwhile.
+It also puts what tools/bench/training.py measured on a GPU into docs/training.md. Let nothing else run meanwhile.
 """
 
 import argparse
@@ -24,6 +24,8 @@ ROOT = Path(__file__).resolve().parents[2]
 OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster"]
 GUARDS = "stability"
 NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
+STEPS, STEPS_PAGE = RESULTS / "training.json", ROOT / "docs" / "training.md"
+STEPS_MARKS = "<!-- steps: written by tools/bench/report.py -->\n", "<!-- end of steps -->"
 INTRODUCTION = """# Benchmarks
 
 Written by `python tools/bench/report.py`; do not edit. Every case first compares the results of both sides, then times
@@ -132,6 +134,31 @@ def costs(r: dict) -> str:
     return text
 
 
+def steps_table(rows: list[dict]) -> str:
+    """What training.py measured, as a table."""
+    if not rows:
+        return "Not measured yet.\n"
+    first = rows[0]
+    text = f"{first['gpu']}, torch {first['torch']}, commit {first['commit']}, {first['date']}; medians.\n\n"
+    text += "| case | processes | batch | particles a step | s a step | peak GiB | efficiency |\n"
+    text += "| --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
+    for row in sorted(rows, key=lambda row: row["processes"]):
+        efficiency = f"{row['efficiency']:.0%}" if row["efficiency"] else "-"
+        text += (
+            f"| {row['case']} | {row['processes']} | {row['batch']} | {row['particles']} | {row['seconds']:.2f} "
+            f"| {row['gib']:.1f} | {efficiency} |\n"
+        )
+    return text
+
+
+def with_steps(page: str, rows: list[dict]) -> str:
+    """``page`` with the table of ``rows`` between its marks."""
+    begin, end = STEPS_MARKS
+    head, _, rest = page.partition(begin)
+    _, _, tail = rest.partition(end)
+    return head + begin + steps_table(rows) + end + tail
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("ops", nargs="*", choices=[[], *OPS, GUARDS], help="default: all")
@@ -144,6 +171,8 @@ def main() -> None:
         records[op] = run(op)
         NUMBERS.write_text(json.dumps(records, indent=1) + "\n")
     PAGE.write_text(page(records))
+    steps = json.loads(STEPS.read_text()) if STEPS.exists() else []
+    STEPS_PAGE.write_text(with_steps(STEPS_PAGE.read_text(), steps))
 
 
 if __name__ == "__main__":
