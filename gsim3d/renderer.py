@@ -14,6 +14,7 @@ from gsim3d import ops
 from gsim3d.harmonics import (
     degree_damping,
     published_axes,
+    readings,
     rotate_harmonics,
     sh_basis,
     turn_predicted_harmonics,
@@ -85,7 +86,19 @@ class GaussianHead(nn.Module):
         if self.config.latents == 0:
             return particles.sh[:, :n_harmonics], particles.quats, particles.scales
         latents = torch.cat([particles.dynamic_latents, particles.static_latents], 1)
-        raw = widened(self.fc2(F.gelu(self.fc1(latents))))
+        raw = self.fc2(F.gelu(self.fc1(latents)))
+        if self.config.quirks == Quirks():
+            wide = torch.float64 if raw.dtype == torch.float64 else torch.float32
+            quats, scales, sh = ops.decode_gaussians(
+                raw,
+                readings(wide, raw.device),
+                degree=math.isqrt(n_harmonics) - 1,
+                scale_min=self.config.scale_min,
+                scale_max=self.config.scale_max,
+                check=False,
+            )
+            return sh, quats, scales
+        raw = widened(raw)
         sh, quats, scales = raw.split([raw.shape[1] - 7, 4, 3], 1)
         quats = unit_quats(quats.roll(1, 1))
         smallest, largest = self.config.scale_min, self.config.scale_max

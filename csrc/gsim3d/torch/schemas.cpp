@@ -73,6 +73,14 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "norm_gelu_backward(Tensor grad, Tensor x, Tensor mean, Tensor scale, Tensor bias) -> (Tensor x, Tensor scale, "
       "Tensor bias)");
 
+  // decode: what a network says about shapes and colours of Gaussians -> rotations, scales, harmonics in the world.
+  m.def(
+      "decode_gaussians(Tensor raw, Tensor readings, int degree, float scale_min, float scale_max) -> (Tensor quats, "
+      "Tensor scales, Tensor sh)");
+  m.def(
+      "decode_gaussians_backward(Tensor grad_quats, Tensor grad_scales, Tensor grad_sh, Tensor raw, Tensor readings, "
+      "int degree, float scale_min, float scale_max) -> Tensor");
+
   // sentinel: which rows cannot be used, and sums over clouds.
   m.def(
       "watch_rows(Tensor[] fields, float[] low, float[] high, Tensor cu_rows, Tensor cloud_scene, Tensor origin, "
