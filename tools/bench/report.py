@@ -21,7 +21,7 @@ from pathlib import Path
 from harness import RESULTS, commit
 
 ROOT = Path(__file__).resolve().parents[2]
-OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster"]
+OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "decode"]
 GUARDS = "stability"
 NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
 STEPS, STEPS_PAGE = RESULTS / "training.json", ROOT / "docs" / "training.md"

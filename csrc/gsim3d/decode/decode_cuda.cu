@@ -1,5 +1,5 @@
-// A block copies the rows of its threads into shared memory, each thread works on one row there, and the block copies the
-// results: neighbouring threads read and write neighbouring words of memory.
+// A block copies the rows of its threads into shared memory, each thread works on one row there, and the block copies
+// the results: neighbouring threads read and write neighbouring words of memory.
 #include "gsim3d/core/cuda_utils.cuh"
 #include "gsim3d/core/half.cuh"
 #include "gsim3d/decode/decode.h"

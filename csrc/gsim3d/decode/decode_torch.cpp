@@ -9,6 +9,7 @@ namespace gsim3d::binding {
 namespace {
 
 constexpr int kLargestDegree = 3;
+constexpr double kLargestScale = 1e15;  // metres, as of any number that an op reads
 
 // Calls f.template operator()<T>() for the dtype of the rows.
 template <typename F>
@@ -36,6 +37,9 @@ DecodeShape check_rows(const char* op, const Tensor& raw, const Tensor& readings
     if (raw.size(1) == 3 * (d + 1) * (d + 1) + 7) terms = (d + 1) * (d + 1);
   check(terms >= (degree + 1) * (degree + 1), op, ": raw must have 3 K + 7 columns with K = 1, 4, 9 or 16, at least ",
         (degree + 1) * (degree + 1), "; got ", raw.size(1));
+  check(scale_min >= 0 && scale_max >= scale_min && scale_max <= kLargestScale, op,
+        ": scale_min and scale_max must rise from 0 to at most ", kLargestScale, "; got ", scale_min, " and ",
+        scale_max);
   check_dtype(op, "readings", readings, wide_type(raw));
   check_device(op, "readings", readings, raw);
   check_shape(op, "readings", readings, {kReadings}, "what harmonics are read with");
