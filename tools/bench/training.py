@@ -150,7 +150,7 @@ def alone(args: argparse.Namespace) -> dict[str, float]:
 
 
 class Stages:
-    """When one step came to the ends of its parts: on the device, and in Python, which runs ahead."""
+    """When one step came to the ends of its parts: on the device, and in Python, which runs ahead; and its memory."""
 
     def __init__(self, trainer: Trainer, device: str):
         self._device, self._marks, self._forward = device, [], True
@@ -168,20 +168,21 @@ class Stages:
         trainer._look_at = after_gradients
 
     def mark(self, name: str) -> None:
-        event = None
+        event, gib = None, memory_gib(self._device)
         if self._device == "cuda":
             event = torch.cuda.Event(enable_timing=True)
             event.record()
-        self._marks.append((name, event, time.perf_counter()))
+            torch.cuda.reset_peak_memory_stats()
+        self._marks.append((name, event, time.perf_counter(), gib))
 
-    def rows(self) -> list[tuple[str, float, float]]:
-        """(part, milliseconds on the device, milliseconds of Python)."""
+    def rows(self) -> list[tuple[str, float, float, float]]:
+        """(part, milliseconds on the device, milliseconds of Python, GiB at most)."""
         if self._device == "cuda":
             torch.cuda.synchronize()
         rows = []
-        for (_, before, earlier), (name, event, later) in zip(self._marks, self._marks[1:]):
+        for (_, before, earlier, _), (name, event, later, gib) in zip(self._marks, self._marks[1:]):
             host = 1e3 * (later - earlier)
-            rows.append((name, before.elapsed_time(event) if event else host, host))
+            rows.append((name, before.elapsed_time(event) if event else host, host, gib))
         return rows
 
     def _end(self, owner, attribute: str, name: str, then=lambda result: None) -> None:
@@ -208,8 +209,8 @@ def print_stages(trainer: Trainer, device: str) -> None:
     stages.mark("start")
     trainer.train_step()
     stages.mark("clipping, AdamW, averages")
-    for name, on_device, host in stages.rows():
-        print(f"    {name:<28}{on_device:9.1f} ms, issued in {host:9.1f} ms", flush=True)
+    for name, on_device, host, gib in stages.rows():
+        print(f"    {name:<28}{on_device:9.1f} ms, issued in {host:9.1f} ms, {gib:6.1f} GiB", flush=True)
 
 
 def print_kernels(trainer: Trainer, n_rows: int) -> None:
