@@ -9,8 +9,9 @@ from gsim3d.layers import (
     RowLinear,
     _combine,
     _statistics,
+    at_hand,
     product_dtype,
-    rounded_at_once,
+    round_at_once,
     rounded_weights,
 )
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
@@ -112,7 +113,7 @@ def test_weights_are_rounded_at_once(device, monkeypatch):
     calls, copy = [], torch._foreach_copy_
     monkeypatch.setattr(torch, "_foreach_copy_", lambda to, of: (calls.append(len(to)), copy(to, of)))
     for expected in ([3], [3, 3]):
-        with rounded_at_once(layers, torch.bfloat16):
+        with at_hand(round_at_once(layers, torch.bfloat16)):
             for layer in layers:
                 weight, bias = rounded_weights(layer, torch.bfloat16)
                 assert_same_bits(weight, layer.weight.detach().bfloat16())
@@ -121,7 +122,7 @@ def test_weights_are_rounded_at_once(device, monkeypatch):
         with torch.no_grad():
             layers[0].weight.mul_(2), layers[1].weight.mul_(2), layers[0].bias.add_(1)
     assert_same_bits(rounded_weights(layers[0], torch.bfloat16)[0], layers[0].weight.detach().bfloat16())
-    with rounded_at_once(layers, torch.float32):
+    with at_hand(round_at_once(layers, torch.float32)):
         assert rounded_weights(layers[0], torch.float32)[0] is layers[0].weight
 
 

@@ -90,7 +90,7 @@ run_sanitize() {
 }
 run_bench() {
   local failed=0 file
-  for file in "${OPS[@]}" end_to_end; do
+  for file in "${OPS[@]}" end_to_end effects sleeping; do
     [ -f "tools/bench/$file.py" ] || continue
     step "bench_$file" "$PYTHON" "tools/bench/$file.py" --device cuda || failed=1
     cat "$STATE/bench_$file.log"
