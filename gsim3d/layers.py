@@ -145,7 +145,7 @@ class RowLayerNorm(nn.LayerNorm):
     def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
         return row_norm(x, self.weight, self.bias, residual, eps=self.eps, check=False)
 
-    def activated(self, x: Tensor) -> Tensor:
+    def activated(self, x: Tensor, n_data: int | None = None) -> Tensor:
         return F.gelu(self(x))
 
 
@@ -170,20 +170,25 @@ class RowBatchNorm(nn.Module):
         mean, scale = self._mean_and_scale(x)
         return (x - mean) * scale + self.bias
 
-    def activated(self, x: Tensor) -> Tensor:
-        """``F.gelu(self(x))``, on a GPU in as few passes over the rows as can be."""
-        if not x.is_cuda or torch.compiler.is_compiling():
+    def activated(self, x: Tensor, n_data: int | None = None) -> Tensor:
+        """``F.gelu(self(x))``, on a GPU in as few passes over the rows as can be.
+
+        n_data: statistics are those of the first ``n_data`` rows; None: of all.
+        """
+        is_padded = self.training and n_data is not None and n_data < x.shape[0]
+        if not (x.is_cuda or is_padded) or torch.compiler.is_compiling():
             return F.gelu(self(x))
         if self.training:
-            return self.activated_in_training(x)
+            return self.activated_in_training(x, n_data)
         return norm_gelu(x, *self._mean_and_scale(x), self.bias, check=False)
 
-    def activated_in_training(self, x: Tensor) -> Tensor:
-        """``F.gelu(self(x))`` by statistics of the rows, with one node of autograd; once differentiable."""
+    def activated_in_training(self, x: Tensor, n_data: int | None = None) -> Tensor:
+        """``F.gelu(self(x))`` by statistics of the rows, with one node of autograd; once differentiable. Arguments as
+        :meth:`activated`; gradients of other rows must be 0."""
         with torch.no_grad():
-            mean, var, n_rows = _statistics_at_once(x)
+            mean, var, n_rows = _statistics_at_once(x[:n_data])
             self._follow(mean, var, n_rows)
-        return _BatchNormGelu.apply(x, self.weight, self.bias, mean, torch.rsqrt(var + self.EPS), n_rows)
+        return _BatchNormGelu.apply(x, self.weight, self.bias, mean, torch.rsqrt(var + self.EPS), n_rows, n_data)
 
     def _mean_and_scale(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if not self.training:
@@ -208,10 +213,10 @@ class _BatchNormGelu(torch.autograd.Function):
     """Normalised by statistics of all rows, scaled, shifted, activated: torch would keep and add up five tensors of rows."""
 
     @staticmethod
-    def forward(ctx, x, weight, bias, mean, rsqrt, n_rows):
+    def forward(ctx, x, weight, bias, mean, rsqrt, n_rows, n_data):
         scale = weight * rsqrt
         ctx.save_for_backward(x, bias, mean, rsqrt, scale)
-        ctx.n_rows = n_rows
+        ctx.n_rows, ctx.n_data = n_rows, n_data
         return norm_gelu(x, mean, scale, bias, check=False)
 
     @staticmethod
@@ -225,8 +230,9 @@ class _BatchNormGelu(torch.autograd.Function):
         # What changes because mean and deviation change with x.
         by_scale, by_bias = (sums * (-scale / ctx.n_rows)).unbind()
         slope = by_scale * rsqrt.square()
-        correction = torch.addcmul(by_bias - mean * slope, x, slope)
-        return grad_x.add_(correction), grad_scale * rsqrt, grad_bias, None, None, None
+        correction = torch.addcmul(by_bias - mean * slope, x[: ctx.n_data], slope)
+        grad_x[: ctx.n_data].add_(correction)
+        return grad_x, grad_scale * rsqrt, grad_bias, None, None, None, None
 
 
 def _statistics(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:

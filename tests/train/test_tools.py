@@ -95,6 +95,8 @@ def test_particles_of_the_benchmark_sink_with_the_body(bench, tmp_path):
     assert state.means.equal(places)
     moved = steps[1].means - last_steps(state, 1).means
     assert (moved - torch.tensor([0, 0, -2 * scene.FALL])).abs().max() < 1e-3
+    scales = simulator.renderer(steps[1]).scales
+    assert (scales / scene.WIDTH - 1).abs().max() < 0.05
 
 
 def test_rows_of_other_cases_are_kept(bench, tmp_path):

@@ -6,7 +6,8 @@ quarter of their pixels and the ground in all others. Masked means the body alon
 
 What a step costs depends on where particles lie, and untrained weights would scatter them. So :func:`as_if_trained` keeps
 all of a model's work and gradients, but puts encoded particles onto the surfaces that the pixels show, and lets the last
-layer of the dynamics predict little more than that bodies sink on.
+layers predict little more than that bodies sink on and that Gaussians are as wide as 0.7 pixels (untrained they are 5 cm
+wide, and each is in sight of a quarter of all pixels).
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ N_CAMS = 12
 DISC_RADIUS, HALF_AXES, FIRST_HEIGHT, FALL = 1.5, (0.25, 0.2, 0.22), 0.9, 0.04  # metres; FALL a step
 CAMERA_RADIUS, CAMERA_HEIGHT, LOOKED_AT, FOCAL = 1.45, 2.7, 0.72, 3.02  # FOCAL in image widths
 NEAR, FAR, CORNER = 1.2, 4.5, -4.0  # CORNER of the workspace on each axis
-LITTLE = 1e-3  # what is left of the last layer's weights
+LITTLE = 1e-3  # what is left of the weights of last layers
+WIDTH = 0.0045  # metres, of a Gaussian
 
 
 def points(n_steps: int, n: int, moving_share: float) -> Tensor:
@@ -119,7 +121,7 @@ def evenly(n_views: int) -> list[int]:
 
 
 def as_if_trained(simulator: Simulator, places: Tensor) -> Simulator:
-    """``simulator``, changed: what it encodes lies at ``places``, whatever depth it predicts; its dynamics lets bodies sink."""
+    """``simulator``, changed: what it encodes lies at ``places``, whatever depth it predicts; bodies sink."""
     encode = simulator.encode
 
     def encode_truly(frames: Frames, **options) -> Particles:
@@ -137,4 +139,9 @@ def as_if_trained(simulator: Simulator, places: Tensor) -> Simulator:
                 limit = dynamics.config.max_step
                 last.bias[first + 2] = -FALL if limit is None else math.atanh(-FALL / limit)
             first += n
+        head = simulator.renderer
+        if head.config.latents:
+            share = (WIDTH - head.config.scale_min) / (head.config.scale_max - head.config.scale_min)
+            head.fc2.weight[-3:].mul_(LITTLE)
+            head.fc2.bias[-3:] = math.log(share / (1 - share))
     return simulator
