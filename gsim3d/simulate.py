@@ -89,7 +89,8 @@ def run(args: argparse.Namespace) -> int:
         os.replace(part, out)
     finally:
         shutil.rmtree(part, ignore_errors=True)
-    print(f"{prediction.n_encoded} steps encoded, {n_future} predicted; written: {out}")
+    rested = f" ({prediction.resting:.0%} of the particles at rest, not computed)" if prediction.resting else ""
+    print(f"{prediction.n_encoded} steps encoded, {n_future} predicted{rested}; written: {out}")
     return 0
 
 

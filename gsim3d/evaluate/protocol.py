@@ -21,7 +21,7 @@ from torch import Tensor
 
 from gsim3d.data import Scene, make_frames
 from gsim3d.data.recording import BACKGROUND
-from gsim3d.dynamics import concatenate
+from gsim3d.dynamics import RestLog, concatenate
 from gsim3d.edits import Edit
 from gsim3d.errors import InputError
 from gsim3d.evaluate.predictions import Predictions
@@ -40,11 +40,13 @@ class Prediction:
 
     particles: one cloud a step, the first ``n_encoded`` of them encoded.
     context_cams: cameras whose images were the input.
+    resting: share of the predicted particles that rested and were not computed.
     """
 
     particles: Particles
     n_encoded: int
     context_cams: tuple[int, ...]
+    resting: float = 0.0
 
     @property
     def n_steps(self) -> int:
@@ -93,8 +95,8 @@ def predict(
         raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
     encoded = encode_steps(restored, scene, context_cams, start)
     with exact_convolutions():
-        steps = restored.simulator.rollout(encoded, n_future, restored.plan, edits=edits)
-    return Prediction(concatenate([encoded, *steps]), restored.data.history, tuple(context_cams))
+        steps = restored.simulator.rollout(encoded, n_future, restored.plan, edits=edits, log=(log := RestLog()))
+    return Prediction(concatenate([encoded, *steps]), restored.data.history, tuple(context_cams), log.resting_share)
 
 
 @torch.no_grad()

@@ -220,15 +220,18 @@ def test_room_changes_no_bit(room):
     assert_same_particles(dynamics(parts.moving, pyramid=given, background=background), expected)
 
 
-def test_a_captured_rollout_has_the_same_bits_also_of_another_background():
-    simulator, state = make_simulator(), make_scenes()
-    captured = CapturedRollout(simulator, state, 3)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@torch.no_grad()
+def test_a_captured_rollout_has_the_same_bits_also_of_another_background(device, dtype):
+    simulator, state = make_simulator().to(device), make_scenes().to(device)
     turned = dataclasses.replace(state, static_latents=state.static_latents.flip(1))
     frozen = (state.activity == FROZEN)[:, None]
     moved = dataclasses.replace(state, means=torch.where(frozen, 0.3 + 0.4 * state.means.flip(1), state.means))
-    for given in (state, turned, moved, state):
-        for step, expected in zip(captured(given).steps, simulator.rollout(given, 3), strict=True):
-            assert_same_particles(step, expected)
+    with torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
+        captured = CapturedRollout(simulator, state, 3)
+        for given in (state, turned, moved, state):
+            for step, expected in zip(captured(given).steps, simulator.rollout(given, 3), strict=True):
+                assert_same_particles(step, expected)
 
 
 def test_a_background_without_room_for_another_is_made_anew():
@@ -247,6 +250,24 @@ def test_a_rollout_repeats_bit_by_bit():
     simulator = make_simulator()
     for one, other in zip(*(simulator.rollout(make_scenes(), 3) for _ in range(2)), strict=True):
         assert_same_particles(one, other)
+
+
+def test_a_gpu_gives_what_the_cpu_gives(devices):
+    results = []
+    for device in devices:
+        simulator, state = make_simulator(dtype=torch.float64).to(device), make_scenes(torch.float64).to(device)
+        state = dataclasses.replace(state, static_latents=state.static_latents.requires_grad_())
+        steps = simulator.rollout(state, 3)
+        loss = sum(step.means.square().sum() + step.dynamic_latents.square().sum() for step in steps)
+        grads = torch.autograd.grad(
+            loss, [state.static_latents, simulator.dynamics.net.encoder[0].blocks[0].mlp.fc1.weight]
+        )
+        with torch.no_grad():  # through blocks in few launches
+            results.append(
+                [*(t.cpu() for t in grads), *(s.means.cpu() for s in (*steps, *simulator.rollout(state, 3)))]
+            )
+    for one, other in zip(*results, strict=True):
+        assert_close_relative_to_max(other, one, 1e-9)
 
 
 def test_joint_attention_has_the_same_bits_for_any_number_of_threads():

@@ -248,6 +248,7 @@ def test_files(tmp_path):
         ("step: 0", "must hold a list; got dict"),
         ("- 3", "edit 0 must be a mapping; got 3"),
         ("- {op: move}", "edit 0: step must be a whole number; got None"),
+        ("- {step: 2, op: [move]}", "edit 0 at step 2: op must be one of remove, move"),
         ("- {step: 2, op: explode}", "edit 0 at step 2: op must be one of remove, move"),
         ("- {step: 2, op: move, to: [0, 0, 1]}", "edit 0 at step 2, move: unknown key to; known: of, by"),
         ("- {step: 2, op: move, by: [0, 1]}", r"edit 0 at step 2, move: by must be a list of 3; got \[0, 1\]"),

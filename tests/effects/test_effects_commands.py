@@ -116,6 +116,15 @@ def test_simulate_computes_what_a_file_asks_for(capsys, work, tmp_path):  # noqa
     assert predicted < given
 
 
+def test_simulate_tells_how_much_rested(capsys, work, tmp_path):  # noqa: F811
+    scene, file = work / "data" / "ball" / "0000", tmp_path / "effects.yaml"
+    file.write_text("dynamics: {sleep: {eps: 1000000.0, patience: 2}}")
+    options = ["--steps", "4", "--cameras", "0", "--effects", file, "--out", tmp_path / "out"]
+    code, out, err = call(capsys, "simulate", work / "run", scene, *options)
+    assert code == 0, err
+    assert "4 predicted (50% of the particles at rest, not computed)" in out
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
