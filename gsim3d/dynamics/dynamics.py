@@ -31,7 +31,7 @@ class Dynamics(nn.Module):
         super().__init__()
         self.config = config
         self.layout = StateLayout.of(config)
-        self.rounds = None
+        self.rounds = False
         self.net = PointTransformer(self.layout.in_channels, self.layout.out_channels, config)
 
     def geometry(
