@@ -11,8 +11,7 @@ import contextvars
 from collections.abc import Sequence
 
 import torch
-import torch.distributed
-import torch.distributed.nn.functional
+import torch.distributed as dist
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
@@ -242,7 +241,7 @@ def _statistics(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     spread = (x - mean).square().sum(0)
     if _shares_rows():
         mine = torch.cat([n_rows[None], mean, spread])
-        n_rows, mean, spread = _combine(torch.distributed.nn.functional.all_gather(mine), x.shape[1])
+        n_rows, mean, spread = _combine(_OfAllProcesses.apply(mine), x.shape[1])
     return mean, spread / n_rows.clamp(min=1), n_rows
 
 
@@ -265,14 +264,29 @@ def _statistics_at_once(x: Tensor) -> tuple[Tensor, Tensor, Tensor | int]:
 
 def _shares_rows() -> bool:
     """Whether other processes have rows of the same batch."""
-    return torch.distributed.is_available() and torch.distributed.is_initialized()
+    return dist.is_available() and dist.is_initialized()
 
 
 def _gathered(mine: Tensor) -> list[Tensor]:
     """``mine`` of every process, in the order of their ranks."""
-    parts = [torch.empty_like(mine) for _ in range(torch.distributed.get_world_size())]
-    torch.distributed.all_gather(parts, mine)
+    parts = [torch.empty_like(mine) for _ in range(dist.get_world_size())]
+    dist.all_gather(parts, mine)
     return parts
+
+
+class _OfAllProcesses(torch.autograd.Function):
+    """A tensor of every process, in the order of their ranks, to each of them."""
+
+    @staticmethod
+    def forward(ctx, mine):
+        return tuple(_gathered(mine))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *grads):
+        total = torch.stack(grads)
+        dist.all_reduce(total)
+        return total[dist.get_rank()]
 
 
 def _combine(parts: tuple[Tensor, ...], n_channels: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import surface_scene
@@ -39,11 +39,25 @@ from gsim3d.train.samples import Batch
 N_PAST, N_FUTURE, N_VIEWS, N_TARGETS = 4, 12, 4, 5
 PUBLISHED = "the paper: 4.3 s a step and less than 20 GB (H100)"
 LEAN = PrecisionConfig(encoder="bf16", dynamics="bf16", renderer="bf16")
-CASES = {  # name -> (masked, blocks computed again, parts computed again)
-    "kept": (True, False, ()),
-    "blocks": (True, True, ()),
-    "recomputed": (True, False, ("encoder", "steps")),
-    "unmasked": (False, True, ("encoder", "steps", "images")),
+FIXED = {"norm": "layer", "drop_path": 0.0, "shuffle_orders": False}  # what a captured step asks of a model
+
+
+@dataclass(frozen=True)
+class Case:
+    """masked: the body alone. dynamics, recompute, captured: of the configuration."""
+
+    masked: bool = True
+    dynamics: dict = field(default_factory=dict)
+    recompute: tuple[str, ...] = ()
+    captured: bool = False
+
+
+CASES = {
+    "kept": Case(),
+    "captured": Case(dynamics=FIXED, captured=True),
+    "blocks": Case(dynamics={"checkpointing": True}),
+    "recomputed": Case(recompute=("encoder", "steps")),
+    "unmasked": Case(masked=False, dynamics={"checkpointing": True}, recompute=("encoder", "steps", "images")),
 }
 
 
@@ -76,16 +90,17 @@ def synthetic_batch(n_scenes: int, size: int, masked: bool) -> tuple[Batch, torc
 
 def make_trainer(name: str, args: argparse.Namespace, processes: Processes, folder: str) -> Trainer:
     """The trainer of a case, which sees the same batch in every step."""
-    masked, blocks, recompute = CASES[name]
+    case = CASES[name]
     config = TrainConfig(
         stages=(StageConfig(steps=1000, horizon=N_FUTURE, batch=args.batch * processes.count, target_views=N_TARGETS),),
         preset=args.preset,
-        model={"dynamics": {"checkpointing": blocks}},
+        model={"dynamics": case.dynamics},
         data=DataConfig(history=N_PAST, context_views=N_VIEWS),
         precision=LEAN,
-        recompute=recompute,
+        recompute=case.recompute,
+        captured=case.captured,
     )
-    batch, places = synthetic_batch(args.batch, args.size, masked)
+    batch, places = synthetic_batch(args.batch, args.size, case.masked)
     trainer = Trainer(config, [SyntheticScene(args.size)], folder, device=args.device, processes=processes)
     surface_scene.as_if_trained(trainer.simulator, places.to(args.device))
     trainer.simulator.train()

@@ -84,10 +84,11 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "decode_gaussians_backward(Tensor grad_quats, Tensor grad_scales, Tensor grad_sh, Tensor raw, Tensor readings, "
       "int degree, float scale_min, float scale_max) -> Tensor");
 
-  // sentinel: which rows cannot be used, and sums over clouds.
+  // sentinel: which rows cannot be used, what stands in for them, and sums over clouds.
   m.def(
       "watch_rows(Tensor[] fields, float[] low, float[] high, Tensor cu_rows, Tensor cloud_scene, Tensor origin, "
-      "Tensor activity, Tensor? previous, float grid_size, float max_step) -> (Tensor status, Tensor record)");
+      "Tensor activity, Tensor[] previous, float grid_size, float max_step, float[] neutral) -> (Tensor status, Tensor "
+      "record, Tensor[] mended)");
 
   // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
   m.def(

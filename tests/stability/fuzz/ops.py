@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsim3d import ops
 from gsim3d.harmonics import readings
-from gsim3d.types import Cameras
+from gsim3d.types import ASLEEP, Cameras
 from tests.stability.fuzz.engine import Failure, Target, finite
 from tests.stability.fuzz.poison import mutate, tensor
 
@@ -191,25 +191,33 @@ def _call_residual_norm(a: Arguments):
 def _watch_rows(rng: random.Random) -> Arguments:
     n, clouds, dtype = _size(rng), rng.choice((0, 1, 2, 3)), _dtype(rng)
     n = n if clouds else 0
-    previous = tensor(rng, n, 3, dtype=dtype)
+    shapes = (n, 3), (n,), (n, *rng.choice(((), (2,), (0,), (2, 3))))
+    previous = {f"previous[{f}]": tensor(rng, *shape, dtype=dtype) for f, shape in enumerate(shapes)}
     return {
-        "fields[0]": tensor(rng, n, 3, dtype=dtype).abs(),
-        "fields[1]": tensor(rng, n, dtype=dtype).sigmoid(),
-        "fields[2]": tensor(rng, n, *rng.choice(((), (2,), (0,), (2, 3))), dtype=dtype),
+        "fields[0]": tensor(rng, *shapes[0], dtype=dtype).abs(),
+        "fields[1]": tensor(rng, *shapes[1], dtype=dtype).sigmoid(),
+        "fields[2]": tensor(rng, *shapes[2], dtype=dtype),
         "bounds": ((-10.0, 10.0), (0.0, 1.0), (-9.0, 9.0)),
         "cu_rows": _offsets(rng, n, clouds),
         "cloud_scene": torch.arange(clouds) // 2,
         "origin": torch.zeros((clouds + 1) // 2, 3, dtype=torch.float64),
         "activity": torch.tensor([rng.randrange(3) for _ in range(n)], dtype=torch.uint8),
         "grid_size": rng.choice((0.0, 0.1)),
-        "previous": rng.choice((None, previous)),
         "max_step": 1.0,
+        "neutral": rng.choice((None, [0.0, 0.0, 1.0])),
+        **rng.choice(({}, previous)),
     }
 
 
 def _call_watch_rows(a: Arguments):
     fields = [a[f"fields[{f}]"] for f in range(3)]
-    return ops.watch_rows(fields, **{name: value for name, value in a.items() if not name.startswith("fields")})
+    previous = [a[f"previous[{f}]"] for f in range(3)] if "previous[0]" in a else None
+    others = {name: value for name, value in a.items() if "[" not in name}
+    watched = ops.watch_rows(fields, previous=previous, **others)
+    awake = a["activity"] != ASLEEP  # who sleeps is not looked at
+    if watched.fields is None or not all(bool(field.isfinite().all()) for field in previous or ()):
+        return watched.status, watched.record
+    return watched.status, watched.record, *(field[awake] for field in watched.fields)
 
 
 def _norm_gelu(rng: random.Random) -> Arguments:
