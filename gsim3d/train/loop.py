@@ -223,7 +223,7 @@ class Trainer:
     def _whole_batch(self, batch: int) -> tuple[float, Tensor, list[Tensor | None], list[Seen]]:
         """Loss, errors by step and gradients of the whole batch; what was seen in each of its parts."""
         scale = self.scale.value
-        norms_scale = scale if self.step % self.config.log_every == 0 else None
+        norms_scale = scale if self._is_logged else None
         if self.shared is not None:
             parts = self._shared_gradients(self.processes.share(batch))
             loss, errors, gradients, watch, n_samples, error = parts
@@ -250,14 +250,13 @@ class Trainer:
         named = dict(zip(self.parameters, gradients, strict=True))
         for name, parameter in self.parameters.items():
             parameter.grad = named[name]
-        is_logged = self.step % self.config.log_every == 0
-        if is_logged:
+        if self._is_logged:
             entry["grad_norm_by_module"] = norms_by_module(named)
         entry["loss"] = loss
         entry["grad_norm"] = torch.nn.utils.clip_grad_norm_(
             self.parameters.values(), self.config.optimizer.clip_norm or math.inf
         ).item()
-        if is_logged and (by_step := mean_of_norms([part.norms for part in seen])):
+        if self._is_logged and (by_step := mean_of_norms([part.norms for part in seen])):
             entry["grad_norm_by_step"] = by_step
         entry["particles"] = sum(part.n_rows for part in seen) / max(1, sum(part.n_clouds for part in seen))
         if total := sum(part.n_unusable for part in seen):
@@ -269,6 +268,10 @@ class Trainer:
         if not math.isfinite(entry["grad_norm"]):
             return f"the gradient is not finite, first that of {first_not_finite(named.items())}"
         return None
+
+    @property
+    def _is_logged(self) -> bool:
+        return self.step % self.config.log_every == 0
 
     def _stop_if_diverged(self, entry: dict) -> None:
         n, limit = self.n_skipped_in_a_row, self.config.optimizer.max_skipped
@@ -409,7 +412,8 @@ class Trainer:
                 steps = simulator.rollout(
                     begin, batch.n_future, self.plan, generator=noise, wrap=again("steps", noise), **options
                 )
-            watch.follow(steps)
+            if self._is_logged:
+                watch.follow(steps)
             particles = concatenate([particles, *steps])
         with precision.of("renderer", self.device):
             render = again("images")(
