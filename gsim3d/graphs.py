@@ -100,8 +100,8 @@ class CapturedRollout:
     rounded once, into a copy: call :meth:`reload` after the model has changed. Without it the graph reads the model's own.
 
     With a model of ``background="asymmetric"`` the graph advances what moves, as many rows in every call. The background
-    is computed beside the graph, whenever it has changed; where it needs more room the graph is made anew. A graph knows
-    no sleep: it advances the same rows always.
+    is computed beside the graph whenever it has changed (call :meth:`reload` after the model has); where it needs more
+    room the graph is made anew. A graph knows no sleep: it advances the same rows always.
 
     On the CPU there are no graphs: calls run the same steps one by one, with the same sizes and the same results.
 
@@ -162,7 +162,7 @@ class CapturedRollout:
             rooms = {name: rounded(room, self._dtype) for name, room in _rooms(simulator).items()}
             self._model.__dict__["_modules"] = {**simulator._modules, **rooms}
         self.captures = 0
-        self._launched = False
+        self._launched = self._is_stale = False
         if simulator.config.dynamics.is_asymmetric:
             parts = simulator.parts(prepared, report=self._report)
             if parts.nothing_moves:
@@ -219,7 +219,8 @@ class CapturedRollout:
         return self._results()
 
     def reload(self) -> None:
-        """Reads the weights of the simulator again."""
+        """Reads the weights of the simulator again, and makes the background anew in the next call."""
+        self._is_stale = True
         if self._model is not self._simulator:
             with torch.no_grad():
                 for own, given in zip(_rooms(self._model).values(), _rooms(self._simulator).values(), strict=True):
@@ -319,11 +320,13 @@ class CapturedRollout:
         """Takes what rests into the graph's memory; what moves."""
         own = self._rest.parts
         self._check(parts.moving, own.moving.clouds, " in what moves")
-        changed = not all(torch.equal(getattr(parts.background, n), x) for n, x in own.background.row_fields().items())
+        background = parts.background.row_fields()
+        changed = self._is_stale or not all(torch.equal(background[n], x) for n, x in own.background.row_fields().items())
         for mine, given in ((own.newest, parts.newest), (own.background, parts.background)):
             _copy(mine, given)
         own.rows.copy_(parts.rows)
         if changed:
+            self._is_stale = False
             remembered = self._remember(parts.background)
             if not self._rest.background.load(remembered):
                 self._rest = _Rest(own, remembered)

@@ -28,7 +28,7 @@ from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.scoring import PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.layers import exact_convolutions
 from gsim3d.train.restore import Restored
-from gsim3d.train.samples import context_cameras, spread_views, thin_background
+from gsim3d.train.samples import context_cameras, spread_views, thinned
 from gsim3d.types import DYNAMIC, Particles
 
 METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant")
@@ -108,9 +108,27 @@ def encode_steps(restored: Restored, scene: Scene, context_cams: Sequence[int], 
         raise InputError(f"{scene.path}: {n_encoded} steps from step {start} on do not fit its {scene.n_steps} steps")
     masked = scene.has_segmentation()
     frames = make_frames([scene], [list(context_cams)], [range(start, start + n_encoded)], masked=masked)
-    frames = thin_background(frames, restored.data.background_stride).to(restored.device)
+    frames = thinned(frames, restored.data).to(restored.device)
     with exact_convolutions():
         return restored.simulator.encode(frames)
+
+
+@torch.no_grad()
+def predict_together(restored: Restored, scenes: Sequence[Scene], n_future: int) -> list[Prediction]:
+    """:func:`predict` of several scenes from their first steps and default views, in one rollout."""
+    for scene in scenes:
+        restored.check_scene(scene)
+    contexts = [default_views(restored, scene)[0] for scene in scenes]
+    n_encoded, masked = restored.data.history, all(scene.has_segmentation() for scene in scenes)
+    frames = make_frames(scenes, contexts, [range(n_encoded)] * len(scenes), masked=masked)
+    with exact_convolutions():
+        encoded = restored.simulator.encode(thinned(frames, restored.data).to(restored.device))
+        together = concatenate([encoded, *restored.simulator.rollout(encoded, n_future, restored.plan)])
+    n_steps = n_encoded + n_future
+    return [
+        Prediction(together.select_clouds(range(b * n_steps, (b + 1) * n_steps)), n_encoded, context)
+        for b, context in enumerate(contexts)
+    ]
 
 
 @torch.no_grad()

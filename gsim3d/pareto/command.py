@@ -50,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.evaluate.pictures import pyplot
     from gsim3d.pareto import autotune, report
     from gsim3d.pareto.measure import FULL, QUICK, Comparison, Subject, compare, points_of, time_points
+    from gsim3d.pareto.regimes import throughput, training_step
     from gsim3d.pareto.self_check import self_check
     from gsim3d.pareto.settings import KNOBS
     from gsim3d.pareto.timing import DeviceClock
@@ -87,7 +88,10 @@ def run(args: argparse.Namespace) -> int:
         time_points(subject, points, clock, effort, progress=progress)
     presets = autotune.tune(subject, comparison, points, clock, effort)
     points += [point for point in presets.values() if not any(point is p for p in points)]
+    kept = {point.setting: point for point in presets.values()}
+    throughputs = [throughput(subject, setting, clock) for setting in kept]
     conditions = {
+        "regimes": report.regimes_as_dict(throughputs, training_step(subject, clock)),
         "command": shlex.join(["gsim3d", "pareto", *sys.argv[2:]]),
         "machine": report.machine(restored.device),
         "subject": {

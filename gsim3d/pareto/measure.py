@@ -127,6 +127,15 @@ class Subject:
         scene, (_, targets) = self.scenes[number], self.views[number]
         return scene.cameras_at(list(targets), [self.first + step]).to(self.restored.device)
 
+    def cameras_of(self, numbers: Sequence[int], step: int) -> Cameras:
+        """The target views of several scenes, cloud after cloud."""
+        parts = [self.cameras(number, step) for number in numbers]
+        tensors = {
+            name: torch.cat([getattr(part, name) for part in parts]) for name in ("viewmats", "Ks", "near", "far")
+        }
+        clouds = torch.cat([part.image_cloud + cloud for cloud, part in enumerate(parts)])
+        return dataclasses.replace(parts[0], image_cloud=clouds, **tensors)
+
     def truth(self, number: int, steps: Sequence[int]) -> tuple[Tensor, Tensor | None]:
         """([S, V, H, W, 3] in [0, 1], bool [S, V, H, W] of what is no background) of predicted steps."""
         scene, targets = self.scenes[number], list(self.views[number][1])

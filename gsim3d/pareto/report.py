@@ -18,6 +18,7 @@ from gsim3d.evaluate.metrics import PSNR_CAP
 from gsim3d.evaluate.pictures import pyplot
 from gsim3d.evaluate.report import write_json
 from gsim3d.pareto.measure import Comparison, Point, disagreement, front, ties
+from gsim3d.pareto.regimes import Throughput, TrainingStep
 from gsim3d.pareto.settings import KINDS, KNOBS
 from gsim3d.pareto.timing import ADDS_UP, STAGES, Timing
 
@@ -108,6 +109,35 @@ def _front(points: Sequence[Point], axis: str) -> list[Point]:
         return front(points, disagreement)
     value = AXES[axis][1]
     return front(points, lambda p: None if value(p) is None else -value(p))
+
+
+def regimes_as_dict(throughputs: Sequence[Throughput], training: TrainingStep) -> dict:
+    """The other ways to use the simulator, for ``conditions``."""
+    rows = [
+        {
+            "setting": t.setting.name,
+            "scenes": t.n_scenes,
+            "steps_a_second": t.steps_a_second,
+            "step_ms": _times([t.timing]),
+        }
+        for t in throughputs
+    ]
+    step: dict = {"problem": training.problem}
+    if training.timing is not None:
+        step = {"batch": training.batch, "horizon": training.horizon, "step_ms": _times([training.timing])}
+    return {"throughput": rows, "training": step}
+
+
+def _regimes(regimes: dict) -> list[str]:
+    lines = [
+        f"{row['setting']}: {row['steps_a_second']:.3g} steps a second of {row['scenes']} scenes at once, images included"
+        for row in regimes["throughput"]
+    ]
+    training = regimes["training"]
+    if "problem" in training:
+        return [*lines, f"training step: not measured: {training['problem']}"]
+    batch = f"{training['batch']} scenes, {training['horizon']} steps fed back"
+    return [*lines, f"training step ({batch}): {training['step_ms']['median'] / 1e3:.3g} s"]
 
 
 def write(folder: Path, points: Sequence[Point], comparison: Comparison, conditions: dict) -> list[Path]:
@@ -256,6 +286,7 @@ def _page(content: dict, pictures: dict[str, bytes]) -> str:
     )
     kinds = "".join(f"<li><b>{e(kind)}</b>: {e(text)}" for kind, text in KINDS.items())
     missing = "".join(f"<li>{e(name)}: needs {e(needs)}" for name, needs in content["not_turned"].items())
+    other = "".join(f"<li>{e(line)}" for line in _regimes(content["regimes"]))
     checks = "".join(f"<li>{e(line)}" for line in content.get("self_check", []))
     return f"""<!doctype html><html lang=en><meta charset=utf-8><title>gsim3d: accuracy against time</title><style>
 body{{font:15px/1.5 sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222}}
@@ -270,7 +301,7 @@ may move, largest, in cells; gain over particles held still. A tie is nearer to 
 of one thing; stages of a step add up to it within {ADDS_UP:.0%}, or the table of the report says by how much they do not.</p>
 <table><tr><th>setting<th>kind<th>step ms<th>p95<th>encode ms<th>faster<th>agreement dB<th>position<th>gain dB<th>SSIM
 {"".join(rows)}</table><ul>{kinds}</ul>
-<h2>Not turned</h2><ul>{missing}</ul>{f"<h2>Self-check</h2><ul>{checks}</ul>" if checks else ""}</html>
+<h2>Many scenes, and training</h2><ul>{other}</ul><h2>Not turned</h2><ul>{missing}</ul>{f"<h2>Self-check</h2><ul>{checks}</ul>" if checks else ""}</html>
 """
 
 
@@ -293,4 +324,6 @@ def table(content: dict) -> str:
             f"{row['name']:{width}}{step['median']:10.2f}{step['p95']:10.2f}{faster:>9}"
             f"{_cell(agreement.get('psnr'), 1):>14}{_cell(row['gain_db'], 2):>9} {star}"
         )
-    return "\n".join([*lines, "* no other is both faster and nearer to the reference"])
+    return "\n".join(
+        [*lines, "* no other is both faster and nearer to the reference", "", *_regimes(content["regimes"])]
+    )

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsim3d.data import Scene, make_frames
-from gsim3d.dynamics import concatenate, last_steps
+from gsim3d.dynamics import RestLog, concatenate, last_steps
 from gsim3d.edits import Edit
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import Prediction
@@ -22,7 +22,7 @@ from gsim3d.pareto.settings import Setting
 from gsim3d.simulator import Simulator
 from gsim3d.train.precision import PrecisionConfig
 from gsim3d.train.restore import Restored
-from gsim3d.train.samples import thin_background
+from gsim3d.train.samples import thinned
 from gsim3d.types import DYNAMIC, Cameras, Frames, Particles
 
 
@@ -65,7 +65,7 @@ class Runner:
             context = [_spread(cams, self.setting.context_views) for cams in context]
         masked = all(scene.has_segmentation() for scene in scenes)
         frames = make_frames(scenes, [list(cams) for cams in context], steps, masked=masked)
-        return thin_background(frames, self.restored.data.background_stride).to(self.device)
+        return thinned(frames, self.restored.data).to(self.device)
 
     @torch.no_grad()
     def encode(self, frames: Frames) -> Particles:
@@ -99,12 +99,13 @@ class Runner:
         if n_future < 1:
             raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
         encoded = self.encode(self.frames([scene], [context], start))
+        log = RestLog()
         with self._precision("dynamics"):
             if self.setting.captured and not edits:
                 steps = CapturedRollout(self.simulator, encoded, n_future, self.plan)(encoded).steps
             else:
-                steps = self.simulator.rollout(encoded, n_future, self.plan, edits=edits)
-        return Prediction(concatenate([encoded, *steps]), self.n_encoded, tuple(context))
+                steps = self.simulator.rollout(encoded, n_future, self.plan, edits=edits, log=log)
+        return Prediction(concatenate([encoded, *steps]), self.n_encoded, tuple(context), log.resting_share)
 
     def newest(self, state: Particles) -> Particles:
         """The last step of every scene."""

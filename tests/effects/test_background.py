@@ -14,8 +14,8 @@ from gsim3d.ops.curve import CURVES
 from gsim3d.quirks import Quirks
 from gsim3d.types import ASLEEP, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
-from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history
-from tests.effects.resting import ASYMMETRIC, make_scenes, make_simulator
+from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
+from tests.effects.resting import ASYMMETRIC, make_scenes, make_simulator, newest_rows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -201,6 +201,19 @@ def test_scenes_of_a_batch_do_not_change_each_other():
             assert_same_bits(getattr(together, name)[begin : begin + alone.n_rows], value, name)
 
 
+def test_neither_the_order_of_rows_nor_the_place_of_a_scene_matters():
+    config = dataclasses.replace(ASYMMETRIC, position_features=False)
+    dynamics, history = make_dynamics(config, dtype=torch.float64), make_scenes(torch.float64)
+    step = dynamics(history)
+    mixed, order = permute_rows(history)
+    newest = torch.nonzero(newest_rows(history))[:, 0]
+    place = torch.zeros(history.n_rows, dtype=torch.int64).index_copy(0, newest, torch.arange(newest.shape[0]))
+    assert_close_relative_to_max(dynamics(mixed).means, step.means[place[order[newest]]], 1e-12)
+    by = torch.tensor([16.0, -8.0, 4.0], dtype=torch.float64)
+    moved = dynamics(dataclasses.replace(history, means=history.means + by, origin=history.origin + by))
+    assert_close_relative_to_max(moved.means - by, step.means, 1e-12)
+
+
 def test_asleep_rows_are_in_neither_part():
     dynamics, history = make_dynamics(ASYMMETRIC), make_history((60, 60), frozen_share=0.5)
     asleep = torch.arange(120) % 4 == 0
@@ -232,6 +245,20 @@ def test_a_captured_rollout_has_the_same_bits_also_of_another_background(device,
         for given in (state, turned, moved, state):
             for step, expected in zip(captured(given).steps, simulator.rollout(given, 3), strict=True):
                 assert_same_particles(step, expected)
+
+
+@torch.no_grad()
+def test_a_background_is_made_anew_where_weights_have_changed(device):
+    simulator, state = make_simulator().to(device), make_scenes().to(device)
+    captured = CapturedRollout(simulator, state, 2)
+    before = captured(state).steps[1].means
+    for parameter in simulator.dynamics.parameters():
+        parameter.mul_(1.1)
+    captured.reload()
+    after = captured(state).steps
+    assert not torch.equal(after[1].means, before)
+    for step, expected in zip(after, simulator.rollout(state, 2), strict=True):
+        assert_same_particles(step, expected)
 
 
 def test_a_background_without_room_for_another_is_made_anew():

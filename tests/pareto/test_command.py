@@ -14,7 +14,9 @@ from gsim3d.pareto.timing import DeviceClock
 from tests.pareto.test_autotune import SHORT
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+REGIMES = {"throughput": [], "training": {"problem": "no configuration"}}
 CONDITIONS = {
+    "regimes": REGIMES,
     "command": "gsim3d pareto <x>",
     "machine": {"device": "here"},
     "subject": {"steps": 4},
@@ -61,6 +63,7 @@ def test_the_page_needs_nothing_from_elsewhere(written):
     assert page.count("data:image/png;base64,") == 4
     assert not re.findall(r"(?:src|href)=['\"](?!data:)", page) and "<script" not in page
     assert "gsim3d pareto &lt;x&gt;" in page and "out of memory at step 3" in page and "holds: a" in page
+    assert "training step: not measured: no configuration" in page
 
 
 def test_the_table_tells_failures_and_ties(written, subject):

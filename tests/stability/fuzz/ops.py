@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from gsim3d import ops
+from gsim3d.harmonics import readings
 from gsim3d.types import ASLEEP, Cameras
 from tests.stability.fuzz.engine import Failure, Target, finite
 from tests.stability.fuzz.poison import mutate, tensor
@@ -225,6 +226,19 @@ def _norm_gelu(rng: random.Random) -> Arguments:
     return {"x": tensor(rng, _size(rng), channels, dtype=dtype), **columns}
 
 
+def _decode(rng: random.Random) -> Arguments:
+    degree = rng.randrange(4)
+    raw = tensor(rng, _size(rng), 3 * (degree + 1) ** 2 + 7, dtype=_dtype(rng))
+    return {"raw": raw, "degree": rng.randint(0, degree), "scale_min": 0.001, "scale_max": 0.1}
+
+
+def _call_decode(a: Arguments):
+    raw = a["raw"]
+    wide = torch.float64 if isinstance(raw, Tensor) and raw.dtype == torch.float64 else torch.float32
+    device = raw.device if isinstance(raw, Tensor) and not raw.is_meta else torch.device("cpu")
+    return ops.decode_gaussians(**a, readings=readings(wide, device))
+
+
 def _cameras(rng: random.Random, images: int) -> dict[str, Tensor]:
     viewmats = torch.eye(4).repeat(images, 1, 1)
     viewmats[:, :3, 3] = tensor(rng, images, 3, scale=0.1)
@@ -311,6 +325,7 @@ OPS: dict[str, tuple[Callable[[random.Random], Arguments], Callable[[Arguments],
     "residual_norm": (_residual_norm, _call_residual_norm),
     "watch_rows": (_watch_rows, _call_watch_rows),
     "norm_gelu": (_norm_gelu, lambda a: ops.norm_gelu(**a)),
+    "decode_gaussians": (_decode, _call_decode),
     "plane_sweep": (_plane_sweep, lambda a: ops.plane_sweep(**a)),
     "sweep_geometry": (_sweep_geometry, lambda a: ops.sweep_geometry(**a)),
     "rasterize_gaussians": (_raster, _call_raster),
