@@ -34,6 +34,7 @@ RIGHT = {
     "simulate": "{good}/model.safetensors {good}/data/ball/0000 --out {out} --steps 1",
     "plan": "{good}/data/ball/0000 {good}/model.safetensors",
     "effects": "infer {good}/data/ball/0000 {good}/model.safetensors --out {out}.yaml",
+    "pareto": "{good}/model.safetensors {good}/data --out {out} --quiet",
     "evaluate": "{good}/model.safetensors {good}/data --out {out} --steps 1",
     "weights": "lpips --from {good}/train.yaml",
     "import": "{good}/model.safetensors --config {good}/train.yaml --out {out}",
