@@ -5,7 +5,6 @@
 // column of ones in the product with the values gives the sum of weights. In place of a running maximum it starts with
 // the largest score of the first 16 keys: weights may then exceed 1, which float32 and bfloat16 can hold. Where the sum
 // shows that they went too far, the warp starts again with a running maximum.
-#include <cstdlib>
 #include "gsim3d/core/overlap.cuh"
 #include "gsim3d/patch_attn/patch_attn_mma_tile.cuh"
 #include "gsim3d/patch_attn/patch_attn_softmax.cuh"
@@ -38,11 +37,10 @@ struct Forward {
   float* stats;  // [n_q, H, 2]
 };
 
-template <typename T, int D, int V>
+template <typename T, int D>
 class Warp {
-  static constexpr bool kAdds = V & 1;
-  static constexpr int M = Shape<D>::kRowTiles, kUnroll = V & 4 ? 8 : V & 16 ? 2 : D == 16 ? 4 : 2;
-  static constexpr bool kMultiplies = D == 16 && !(V & 2);  // wider heads wait for the tensor cores, not for exponentials
+  static constexpr int M = Shape<D>::kRowTiles, kUnroll = D == 16 ? 4 : 2;
+  static constexpr bool kMultiplies = D == 16;  // wider heads wait for the tensor cores, not for exponentials
 
  public:
   __device__ __forceinline__ Warp(const Forward<T>& args, uint32_t keys, uint32_t values, const uint8_t* valid)
@@ -115,23 +113,8 @@ class Warp {
                                     : fast_weight(x, slope_, shift[m][i % 4 / 2]);
         }
         pack_tile<T>(s[m], p[m]);
-        if constexpr (kAdds) {
-#pragma unroll
-          for (int h = 0; h < 2; ++h)
-            sum_[m][2 * h] += (s[m][0][2 * h] + s[m][0][2 * h + 1]) + (s[m][1][2 * h] + s[m][1][2 * h + 1]);
-        }
       }
       add_values(step, p);
-    }
-  }
-
-  // The sums of the lanes become those of rows.
-  __device__ __forceinline__ void finish_sums() {
-    if constexpr (kAdds) {
-#pragma unroll
-      for (int m = 0; m < M; ++m)
-#pragma unroll
-        for (int h = 0; h < 2; ++h) sum_[m][2 * h] = sum_[m][2 * h + 1] = sum_of_row(sum_[m][2 * h]);
     }
   }
 
@@ -165,8 +148,6 @@ class Warp {
 #pragma unroll
           for (int c = 0; c < D / 8; ++c) out_[m][c][i] *= shrink;
         }
-        if constexpr (kAdds)
-          sum_[m][2 * h] += (s[m][0][2 * h] + s[m][0][2 * h + 1]) + (s[m][1][2 * h] + s[m][1][2 * h + 1]);
       }
       pack_tile<T>(s[m], p[m]);
     }
@@ -206,7 +187,7 @@ class Warp {
         const int64_t row = rows_[m][h];
         if (!inside(row, args.table.n_q)) continue;
         const int64_t place = row * args.division.heads + head;
-        const float sum = sum_[m][2 * h], share = sum == 0 ? 0.0f : V & 8 ? __fdividef(1.0f, sum) : 1.0f / sum;
+        const float sum = sum_[m][2 * h], share = sum == 0 ? 0.0f : 1.0f / sum;
         T* out = args.out + place * D + 2 * t;
 #pragma unroll
         for (int c = 0; c < D / 8; ++c)
@@ -225,10 +206,8 @@ class Warp {
   __device__ __forceinline__ void add_values(int step, const uint32_t (&p)[M][4]) {
     constexpr uint32_t kOnes = std::is_same_v<T, __nv_bfloat16> ? 0x3f803f80u : 0x3c003c00u;
     multiply_by_columns<T, D, M>(p, values_, step, out_);
-    if constexpr (!kAdds) {
 #pragma unroll
-      for (int m = 0; m < M; ++m) mma<T>(sum_[m], p[m], kOnes, kOnes);
-    }
+    for (int m = 0; m < M; ++m) mma<T>(sum_[m], p[m], kOnes, kOnes);
   }
 
   float slope_;
@@ -239,7 +218,7 @@ class Warp {
   float out_[M][D / 8][4], sum_[M][4], largest_[M][2];
 };
 
-template <typename T, int D, int V>
+template <typename T, int D>
 __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> args) {
   using S = Shape<D>;
   extern __shared__ uint4 shared[];
@@ -268,7 +247,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
     const int64_t step = args.division.splits * S::kGroup;
     int64_t group = q_range.begin + share.split * S::kGroup;
     int64_t first = group + threadIdx.x / kWarp * 16 * S::kRowTiles;  // of the warp
-    Warp<T, D, V> warp(args, keys, values, valid);
+    Warp<T, D> warp(args, keys, values, valid);
     warp.load_queries(args, first, q_range.end, share.head);
     // The one tile of a patch is on its way while the first queries are read, and then stays.
     bool arriving = n_tiles == 1, plain = arriving && load_tile(0);
@@ -294,7 +273,6 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
         arriving = false;
         if (active && good && n % kStep != 0) warp.careful_step(n / kStep);
       }
-      warp.finish_sums();
       if (active) good = good && warp.is_good();
       if (n_tiles > 1 ? __syncthreads_or(!good) : !good) {
         if (!good) warp.reset();
@@ -307,7 +285,6 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
           if (!good)
             for (int step = 0; step * kStep < tile_size(tile); ++step) warp.careful_step(step);
         }
-        if (!good) warp.finish_sums();
       }
       warp.load_rows(args, first, q_range.end);
       first += step;
@@ -336,18 +313,8 @@ void run(Forward<T> args, int64_t heads, Stream stream) {
   const int64_t n_stats = args.table.n_q * heads, n_out = n_stats * D * sizeof(T) / sizeof(uint2);
   launch(kOp, clear_kernel, multiprocessors(kOp, stream), kThreads, 0, stream, reinterpret_cast<uint2*>(args.out),
          n_out, reinterpret_cast<uint2*>(args.stats), n_stats);
-  const char* variant = std::getenv("GSIM_V");
-  const int v = variant ? std::atoi(variant) : 0;
-  auto* kernel = forward_kernel<T, D, 0>;
-  if constexpr (D == 16 && std::is_same_v<T, __nv_bfloat16>) {
-    if (v == 1) kernel = forward_kernel<T, D, 1>;
-    if (v == 3) kernel = forward_kernel<T, D, 3>;
-    if (v == 2) kernel = forward_kernel<T, D, 2>;
-    if (v == 5) kernel = forward_kernel<T, D, 5>;
-    if (v == 9) kernel = forward_kernel<T, D, 9>;
-    if (v == 17) kernel = forward_kernel<T, D, 17>;
-  }
-  launch_overlapping(kOp, kernel, blocks_of(args.division), kThreads, Shape<D>::kSharedBytes, stream, args);
+  launch_overlapping(kOp, forward_kernel<T, D>, blocks_of(args.division), kThreads, Shape<D>::kSharedBytes, stream,
+                     args);
 }
 
 }  // namespace
