@@ -20,14 +20,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from gsim3d.dynamics import Background, Parts
 from gsim3d.dynamics.point_transformer import SparseConv
-from gsim3d.effects import Plan
 from gsim3d.errors import InputError
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.ops.raster import Rendering
+from gsim3d.plans import Plan
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
-from gsim3d.stability import StabilityReport
+from gsim3d.stability import StabilityReport, pack
 from gsim3d.types import Cameras, CloudTable, Particles, keeping_constants
 
 FACTOR = 1.25  # room over what was observed
@@ -98,6 +99,10 @@ class CapturedRollout:
     object is made, and to the model in evaluation. Under autocast the weights of matrix products and convolutions are
     rounded once, into a copy: call :meth:`reload` after the model has changed. Without it the graph reads the model's own.
 
+    With a model of ``background="asymmetric"`` the graph advances what moves, as many rows in every call. The background
+    is computed beside the graph whenever it has changed (call :meth:`reload` after the model has); where it needs more
+    room the graph is made anew. A graph knows no sleep: it advances the same rows always.
+
     On the CPU there are no graphs: calls run the same steps one by one, with the same sizes and the same results.
 
     Args:
@@ -139,13 +144,14 @@ class CapturedRollout:
         if cameras is not None and simulator.config.renderer.quirks != Quirks():
             raise InputError("CapturedRollout: cameras cannot be rendered as published inside a graph; render the steps")
         self._simulator, self._n_steps, self._factor, self._copies = simulator, n_steps, factor, copies
-        self._plan = plan or simulator.plan()
+        self._plan, self._drawn = plan or simulator.plan(), plan
         self._report = simulator.report if report is None else report
         self._report.poll()
         self._background = background
+        if self._plan.spec.dynamics.sleep is not None:
+            raise InputError("CapturedRollout: plan must be one without dynamics.sleep; a graph knows no sleep")
         prepared = simulator.prepare(state, self._plan)
-        self._table = prepared.clouds
-        self._state = prepared.with_clouds(self._table, **_clones(prepared.row_fields()), origin=prepared.origin.clone())
+        self._table, self._state, self._rest = prepared.clouds, _own(prepared), None
         self._cameras = None if cameras is None else cameras.map(torch.clone)
         self._device = prepared.means.device
         kind = self._device.type
@@ -156,7 +162,14 @@ class CapturedRollout:
             rooms = {name: rounded(room, self._dtype) for name, room in _rooms(simulator).items()}
             self._model.__dict__["_modules"] = {**simulator._modules, **rooms}
         self.captures = 0
-        self._launched = False
+        self._launched = self._is_stale = False
+        if simulator.config.dynamics.is_asymmetric:
+            parts = simulator.parts(prepared, report=self._report)
+            if parts.nothing_moves:
+                raise InputError("CapturedRollout: state has no row that moves; there is nothing to capture")
+            self._state = _own(parts.moving)
+            own = Parts(_own(parts.newest), self._state, _own(parts.background), parts.rows.clone())
+            self._rest = _Rest(own, self._remember(parts.background))
         self._make_room(self._observed())
 
     def __call__(self, state: Particles, cameras: Cameras | None = None) -> Predicted:
@@ -172,32 +185,42 @@ class CapturedRollout:
         return self.finish()
 
     def launch(self, state: Particles, cameras: Cameras | None = None) -> None:
-        """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background)."""
-        self._report.poll()
+        """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background, and to tell
+        an asymmetric one from what moves).
+
+        Raises:
+            HardCaseError: of an earlier call, under the policy "raise".
+        """
         state = self._simulator.prepare(state, self._plan)
-        self._check(state)
-        for name, value in self._state.row_fields().items():
-            value.copy_(getattr(state, name))
-        self._state.origin.copy_(state.origin)
+        self._check(state, self._table)
+        tables = state.clouds
+        if self._rest is not None:
+            state = self._load_parts(self._simulator.parts(state, report=self._report))
+        _copy(self._state, state)
         if cameras is not None:
             self._load(cameras)
-        self._tables = state.clouds
+        self._tables = tables
         self._launched = True
         self._replay()
+        self._report.poll()  # here the host reads while the device works
 
     def finish(self) -> Predicted:
         """Waits for what was launched; repeats it with more room where it did not fit."""
         if not self._launched:
             raise InputError("CapturedRollout: finish() must follow launch()")
         self._launched = False
-        while not self._fits():
-            self._make_room([a.grown((0, *b.sizes)) for a, b in zip(self._grown(), self._observed(), strict=True)])
+        found, counted = self._arrive()
+        while not all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)]):
+            needed = zip(self._grown(found), self._observed(), strict=True)
+            self._make_room([a.grown((0, *b.sizes)) for a, b in needed])
             self._replay()
-        self._records.replayed(self._report)
+            found, counted = self._arrive()
+        self._records.replayed(self._report, counted)
         return self._results()
 
     def reload(self) -> None:
-        """Reads the weights of the simulator again."""
+        """Reads the weights of the simulator again, and makes the background anew in the next call."""
+        self._is_stale = True
         if self._model is not self._simulator:
             with torch.no_grad():
                 for own, given in zip(_rooms(self._model).values(), _rooms(self._simulator).values(), strict=True):
@@ -208,16 +231,25 @@ class CapturedRollout:
 
     def _rollout(self, geometry, report: StabilityReport) -> Predicted:
         """The rollout of the graph's own state."""
-        plan = _with_background_as_it_is(self._plan)
-        enabled = self._dtype is not None
-        autocast = torch.autocast(self._device.type, self._dtype, enabled=enabled, cache_enabled=False)
-        with torch.no_grad(), autocast:
-            steps = self._model.rollout(self._state, self._n_steps, plan, geometry=geometry, report=report)
-            renderings = []
+        plan, rest = _with_background_as_it_is(self._plan), self._rest
+        options, renderings = {"geometry": geometry, "report": report}, []
+        with torch.no_grad(), self._autocast():
+            if rest is None:
+                steps = self._model.rollout(self._state, self._n_steps, plan, **options)
+            else:
+                moving = self._model.advance(self._state, rest.background, self._n_steps, plan, **options)
+                steps = [rest.parts.whole(step, 1 + i) for i, step in enumerate(moving)]
             if self._cameras is not None:
                 for step in steps:
-                    renderings.append(self._model.draw(step, self._cameras, self._background, plan, report=report))
+                    renderings.append(self._model.draw(step, self._cameras, self._background, self._drawn, report=report))
         return Predicted(steps, renderings)
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self._device.type, self._dtype, enabled=self._dtype is not None, cache_enabled=False)
+
+    def _remember(self, background: Particles) -> Background:
+        with torch.no_grad(), self._autocast():
+            return self._model.dynamics.remember(background).with_room(self._factor)
 
     def _observed(self) -> list[PyramidCapacity]:
         """What the calls of the dynamics need, with room; from a rollout that waits for every count."""
@@ -248,43 +280,65 @@ class CapturedRollout:
         self.captures += 1
         if self._device.type != "cuda":
             return
-        self._graph = self._predicted = self._found = None  # their memory goes back before the next graph takes its own
+        # their memory goes back before the next graph takes its own
+        self._graph = self._predicted = self._found = self._packed = None
         self._graph = Captured(self._capture, self._device)
-        self._predicted, self._found = self._graph.result
-        self._found_on_host = torch.empty(self._found.shape, dtype=self._found.dtype, pin_memory=True)
+        self._predicted, self._found, self._packed = self._graph.result
+        self._on_host = torch.empty(self._packed.shape, dtype=self._packed.dtype, pin_memory=True)
         self._arrived = torch.cuda.Event()
 
-    def _capture(self) -> tuple[Predicted, Tensor]:
-        return self._given(self._records if torch.cuda.is_current_stream_capturing() else StabilityReport())
+    def _capture(self) -> tuple[Predicted, Tensor, Tensor]:
+        report = self._records if torch.cuda.is_current_stream_capturing() else StabilityReport()
+        predicted, found = self._given(report)
+        return predicted, found, pack([found, *report.captured()])
 
     def _replay(self) -> None:
         if self._device.type != "cuda":
             self._records = StabilityReport()
-            self._predicted, self._found_on_host = self._given(self._records)
+            self._predicted, self._found = self._given(self._records)
             return
         with torch.cuda.device(self._device):
             self._graph()
-            self._found_on_host.copy_(self._found, non_blocking=True)
+            self._on_host.copy_(self._packed, non_blocking=True)
             self._arrived.record()
 
-    def _fits(self) -> bool:
-        if self._device.type == "cuda":
-            self._arrived.synchronize()
-        found = self._found_on_host.tolist()
-        return all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)])
+    def _arrive(self) -> tuple[list[list[int]], Tensor | None]:
+        """Waits for the replay: what the geometry of every call found, and what the guards of a graph counted."""
+        if self._device.type != "cuda":
+            return self._found.tolist(), None
+        self._arrived.synchronize()
+        numbers, n_found = self._on_host.clone(), self._found.numel()
+        return numbers[:n_found].view(self._found.shape).tolist(), numbers[n_found:]
 
-    def _grown(self) -> list[PyramidCapacity]:
-        found = self._found_on_host.tolist()
-        return [capacity.grown(numbers, self._factor) for capacity, numbers in zip(self._capacities, found, strict=True)]
+    def _grown(self, found: list[list[int]]) -> list[PyramidCapacity]:
+        calls = zip(self._capacities, found, strict=True)
+        return [capacity.grown(numbers, self._factor) for capacity, numbers in calls]
 
     # ---- what goes in and comes out ----
 
-    def _check(self, state: Particles) -> None:
-        table, own = state.clouds, self._table
+    def _load_parts(self, parts: Parts) -> Particles:
+        """Takes what rests into the graph's memory; what moves."""
+        own = self._rest.parts
+        self._check(parts.moving, own.moving.clouds, " in what moves")
+        background = parts.background.row_fields()
+        changed = self._is_stale or not all(torch.equal(background[n], x) for n, x in own.background.row_fields().items())
+        for mine, given in ((own.newest, parts.newest), (own.background, parts.background)):
+            _copy(mine, given)
+        own.rows.copy_(parts.rows)
+        if changed:
+            self._is_stale = False
+            remembered = self._remember(parts.background)
+            if not self._rest.background.load(remembered):
+                self._rest = _Rest(own, remembered)
+                self._make_room(self._observed())
+        return parts.moving
+
+    def _check(self, state: Particles, own: CloudTable, where: str = "") -> None:
+        table = state.clouds
         if (table.starts, table.scenes) != (own.starts, own.scenes):
             raise InputError(
-                "CapturedRollout: state must have the rows and scenes of the first one, clouds that start at rows "
-                f"{list(own.starts)} of scenes {list(own.scenes)}; got {list(table.starts)} of {list(table.scenes)}"
+                f"CapturedRollout: state must have the rows and scenes of the first one{where}, clouds that start at "
+                f"rows {list(own.starts)} of scenes {list(own.scenes)}; got {list(table.starts)} of {list(table.scenes)}"
             )
         if _gaps(table) != _gaps(own):
             raise InputError(
@@ -292,9 +346,9 @@ class CapturedRollout:
                 f"got {list(table.steps)}"
             )
         for name, value in self._state.row_fields().items():
-            given = getattr(state, name)
-            if given is None or given.shape != value.shape or given.device != value.device:
-                raise InputError(f"CapturedRollout: state.{name} must be {list(value.shape)} on {value.device}")
+            given, shape = getattr(state, name), (table.starts[-1], *value.shape[1:])
+            if given is None or given.shape != shape or given.device != value.device:
+                raise InputError(f"CapturedRollout: state.{name} must be {list(shape)} on {value.device}")
 
     def _load(self, cameras: Cameras) -> None:
         own = self._cameras
@@ -325,6 +379,24 @@ class CapturedRollout:
         return Predicted(steps, list(renderings))
 
 
+class _Rest(NamedTuple):
+    """What rests during the rollouts of a graph, in the graph's own memory."""
+
+    parts: Parts
+    background: Background
+
+
+def _own(particles: Particles) -> Particles:
+    table = particles.clouds
+    return particles.with_clouds(table, **_clones(particles.row_fields()), origin=particles.origin.clone())
+
+
+def _copy(own: Particles, given: Particles) -> None:
+    for name, value in own.row_fields().items():
+        value.copy_(getattr(given, name))
+    own.origin.copy_(given.origin)
+
+
 def _clones(fields: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: value.detach().clone() for name, value in fields.items()}
 
@@ -337,6 +409,8 @@ def _gaps(table: CloudTable) -> list[int | None]:
 
 def _with_background_as_it_is(plan: Plan) -> Plan:
     """``plan`` for a state that is prepared already."""
+    if plan.spec.dynamics.background not in ("masked_out", "dynamic"):
+        return plan
     dynamics = dataclasses.replace(plan.spec.dynamics, background="frozen")
     return dataclasses.replace(plan, spec=dataclasses.replace(plan.spec, dynamics=dynamics))
 

@@ -11,12 +11,12 @@ import contextvars
 from collections.abc import Sequence
 
 import torch
-import torch.distributed
-import torch.distributed.nn.functional
+import torch.distributed as dist
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from gsim3d.branches import Branches
 from gsim3d.ops import norm_gelu, row_norm
 
 MIN_ROWS = 16  # matrix products of fewer rows go through other code in BLAS, which rounds differently
@@ -30,12 +30,10 @@ def row_linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     return F.linear(F.pad(x, (0, 0, 0, MIN_ROWS - n_rows)), weight, bias)[:n_rows]
 
 
-def linear_grads(grad: Tensor, x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of x and weight of ``x @ weight.T``; the second is float32 or wider."""
+def linear_grad_weight(grad: Tensor, x: Tensor) -> Tensor:
+    """The gradient of weight of ``x @ weight.T``, float32 or wider."""
     wide = torch.promote_types(grad.dtype, torch.float32)
-    if wide == grad.dtype:
-        return grad @ weight, grad.t() @ x
-    return grad @ weight, torch.mm(grad.t(), x, out_dtype=wide)
+    return grad.t() @ x if wide == grad.dtype else torch.mm(grad.t(), x, out_dtype=wide)
 
 
 class RowLinear(nn.Linear):
@@ -46,6 +44,15 @@ class RowLinear(nn.Linear):
             return row_linear(x, self.weight, self.bias)
         x = x.to(product_dtype(x))
         return _RowLinear.apply(x, self.weight, self.bias, *rounded_weights(self, x.dtype))
+
+    def some(self, x: Tensor, outputs: Sequence[tuple[int, int]]) -> Tensor:
+        """The channels in ``outputs``, (first, one behind the last) of each run; the others are not computed."""
+        x = x.to(product_dtype(x))
+        weight, bias = (
+            value[outputs[0][0] : outputs[0][1]] if len(outputs) == 1 else torch.cat([value[a:b] for a, b in outputs])
+            for value in (self.weight, self.bias)
+        )
+        return row_linear(x, weight.to(x.dtype), bias.to(x.dtype))
 
 
 class _RowLinear(torch.autograd.Function):
@@ -62,7 +69,11 @@ class _RowLinear(torch.autograd.Function):
     def backward(ctx, grad):
         x, _ = ctx.saved_tensors
         grad = grad.contiguous()
-        return *linear_grads(grad, x, ctx.rounded_weight), torch.ops.gsim3d.linear_grad_bias(grad), None, None
+        with Branches(grad) as beside:
+            weight = beside.run(linear_grad_weight, grad, x)
+            bias = beside.run(torch.ops.gsim3d.linear_grad_bias, grad)
+            grad_x = grad @ ctx.rounded_weight
+        return grad_x, weight, bias, None, None
 
 
 def product_dtype(x: Tensor) -> torch.dtype:
@@ -84,11 +95,16 @@ def rounded_weights(module: nn.Module, dtype: torch.dtype) -> tuple[Tensor | Non
     return weight, bias[0] if bias else None
 
 
-@contextlib.contextmanager
-def rounded_at_once(modules: Sequence[nn.Module], dtype: torch.dtype):
-    """A context in which :func:`rounded_weights` of ``modules`` are at hand: made in a few launches, not two a layer."""
+def round_at_once(modules: Sequence[nn.Module], dtype: torch.dtype) -> dict[int, Sequence[Tensor]]:
+    """The :func:`rounded_weights` of ``modules``, made in a few launches, not two a layer."""
     modules = [module for module in modules if module.weight.dtype != dtype]
-    token = _ready.set(dict(zip(map(id, modules), _rounded(modules, dtype), strict=True)))
+    return dict(zip(map(id, modules), _rounded(modules, dtype), strict=True))
+
+
+@contextlib.contextmanager
+def at_hand(rounded: dict[int, Sequence[Tensor]]):
+    """A context in which :func:`rounded_weights` returns what :func:`round_at_once` has made."""
+    token = _ready.set(rounded)
     try:
         yield
     finally:
@@ -128,7 +144,7 @@ class RowLayerNorm(nn.LayerNorm):
     def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
         return row_norm(x, self.weight, self.bias, residual, eps=self.eps, check=False)
 
-    def activated(self, x: Tensor) -> Tensor:
+    def activated(self, x: Tensor, n_data: int | None = None) -> Tensor:
         return F.gelu(self(x))
 
 
@@ -153,22 +169,69 @@ class RowBatchNorm(nn.Module):
         mean, scale = self._mean_and_scale(x)
         return (x - mean) * scale + self.bias
 
-    def activated(self, x: Tensor) -> Tensor:
-        """``F.gelu(self(x))``, on a GPU in one pass over the rows."""
-        if not x.is_cuda or torch.compiler.is_compiling():
+    def activated(self, x: Tensor, n_data: int | None = None) -> Tensor:
+        """``F.gelu(self(x))``, on a GPU in as few passes over the rows as can be.
+
+        n_data: statistics are those of the first ``n_data`` rows; None: of all.
+        """
+        is_padded = self.training and n_data is not None and n_data < x.shape[0]
+        if not (x.is_cuda or is_padded) or torch.compiler.is_compiling():
             return F.gelu(self(x))
+        if self.training:
+            return self.activated_in_training(x, n_data)
         return norm_gelu(x, *self._mean_and_scale(x), self.bias, check=False)
+
+    def activated_in_training(self, x: Tensor, n_data: int | None = None) -> Tensor:
+        """``F.gelu(self(x))`` by statistics of the rows, with one node of autograd; once differentiable. Arguments as
+        :meth:`activated`; gradients of other rows must be 0."""
+        with torch.no_grad():
+            mean, var, n_rows = _statistics_at_once(x[:n_data])
+            self._follow(mean, var, n_rows)
+        return _BatchNormGelu.apply(x, self.weight, self.bias, mean, torch.rsqrt(var + self.EPS), n_rows, n_data)
 
     def _mean_and_scale(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if not self.training:
             return self.running_mean, self.weight * torch.rsqrt(self.running_var + self.EPS)
         mean, var, n_rows = _statistics(widened(x))
         with torch.no_grad():
-            rate = self.MOMENTUM * (n_rows > 1).to(self.running_var)
-            self.running_mean.lerp_(mean.to(self.running_mean), rate)
-            unbiased = var * n_rows / (n_rows - 1).clamp(min=1)
-            self.running_var.lerp_(unbiased.to(self.running_var), rate)
+            self._follow(mean, var, n_rows)
         return mean, self.weight * torch.rsqrt(var + self.EPS)
+
+    def _follow(self, mean: Tensor, var: Tensor, n_rows: Tensor | int) -> None:
+        """Moves the running statistics towards those of ``n_rows`` rows."""
+        if isinstance(n_rows, int):
+            rate, unbiased = self.MOMENTUM * (n_rows > 1), var * (n_rows / max(n_rows - 1, 1))
+        else:
+            rate = self.MOMENTUM * (n_rows > 1).to(self.running_var)
+            unbiased = var * n_rows / (n_rows - 1).clamp(min=1)
+        self.running_mean.lerp_(mean.to(self.running_mean), rate)
+        self.running_var.lerp_(unbiased.to(self.running_var), rate)
+
+
+class _BatchNormGelu(torch.autograd.Function):
+    """Normalised by statistics of all rows, scaled, shifted, activated: torch would keep and add up five tensors of rows."""
+
+    @staticmethod
+    def forward(ctx, x, weight, bias, mean, rsqrt, n_rows, n_data):
+        scale = weight * rsqrt
+        ctx.save_for_backward(x, bias, mean, rsqrt, scale)
+        ctx.n_rows, ctx.n_data = n_rows, n_data
+        return norm_gelu(x, mean, scale, bias, check=False)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        x, bias, mean, rsqrt, scale = ctx.saved_tensors
+        grad_x, grad_scale, grad_bias = torch.ops.gsim3d.norm_gelu_backward(grad, x, mean, scale, bias)
+        sums = torch.stack([grad_scale, grad_bias])
+        if _shares_rows():
+            sums = sum(_gathered(sums))
+        # What changes because mean and deviation change with x.
+        by_scale, by_bias = (sums * (-scale / ctx.n_rows)).unbind()
+        slope = by_scale * rsqrt.square()
+        correction = torch.addcmul(by_bias - mean * slope, x[: ctx.n_data], slope)
+        grad_x[: ctx.n_data].add_(correction)
+        return grad_x, grad_scale * rsqrt, grad_bias, None, None, None, None
 
 
 def _statistics(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -176,10 +239,54 @@ def _statistics(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     n_rows = x.new_full((), x.shape[0])
     mean = x.sum(0) / n_rows.clamp(min=1)
     spread = (x - mean).square().sum(0)
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
+    if _shares_rows():
         mine = torch.cat([n_rows[None], mean, spread])
-        n_rows, mean, spread = _combine(torch.distributed.nn.functional.all_gather(mine), x.shape[1])
+        n_rows, mean, spread = _combine(_OfAllProcesses.apply(mine), x.shape[1])
     return mean, spread / n_rows.clamp(min=1), n_rows
+
+
+def _statistics_at_once(x: Tensor) -> tuple[Tensor, Tensor, Tensor | int]:
+    """As :func:`_statistics`, without gradients, on a GPU in one pass; of rows of all processes, at least 1 is counted."""
+    n_rows = x.shape[0]
+    if n_rows == 0:
+        mean, var = torch.zeros(2, x.shape[1], dtype=torch.promote_types(x.dtype, torch.float32), device=x.device)
+    elif x.is_cuda:
+        mean, var = torch.batch_norm_update_stats(x.contiguous(), None, None, 0.0)
+    else:
+        var, mean = torch.var_mean(widened(x), 0, correction=0)
+    if not _shares_rows():
+        return mean, var, max(n_rows, 1)
+    parts = _gathered(torch.cat([mean.new_full((1,), n_rows), mean, var * n_rows]))
+    n_rows, mean, spread = _combine(tuple(parts), x.shape[1])
+    n_rows = n_rows.clamp(min=1)
+    return mean, spread / n_rows, n_rows
+
+
+def _shares_rows() -> bool:
+    """Whether other processes have rows of the same batch."""
+    return dist.is_available() and dist.is_initialized()
+
+
+def _gathered(mine: Tensor) -> list[Tensor]:
+    """``mine`` of every process, in the order of their ranks."""
+    parts = [torch.empty_like(mine) for _ in range(dist.get_world_size())]
+    dist.all_gather(parts, mine)
+    return parts
+
+
+class _OfAllProcesses(torch.autograd.Function):
+    """A tensor of every process, in the order of their ranks, to each of them."""
+
+    @staticmethod
+    def forward(ctx, mine):
+        return tuple(_gathered(mine))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *grads):
+        total = torch.stack(grads)
+        dist.all_reduce(total)
+        return total[dist.get_rank()]
 
 
 def _combine(parts: tuple[Tensor, ...], n_channels: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -9,8 +9,9 @@ from gsim3d.layers import (
     RowLinear,
     _combine,
     _statistics,
+    at_hand,
     product_dtype,
-    rounded_at_once,
+    round_at_once,
     rounded_weights,
 )
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
@@ -112,7 +113,7 @@ def test_weights_are_rounded_at_once(device, monkeypatch):
     calls, copy = [], torch._foreach_copy_
     monkeypatch.setattr(torch, "_foreach_copy_", lambda to, of: (calls.append(len(to)), copy(to, of)))
     for expected in ([3], [3, 3]):
-        with rounded_at_once(layers, torch.bfloat16):
+        with at_hand(round_at_once(layers, torch.bfloat16)):
             for layer in layers:
                 weight, bias = rounded_weights(layer, torch.bfloat16)
                 assert_same_bits(weight, layer.weight.detach().bfloat16())
@@ -121,7 +122,7 @@ def test_weights_are_rounded_at_once(device, monkeypatch):
         with torch.no_grad():
             layers[0].weight.mul_(2), layers[1].weight.mul_(2), layers[0].bias.add_(1)
     assert_same_bits(rounded_weights(layers[0], torch.bfloat16)[0], layers[0].weight.detach().bfloat16())
-    with rounded_at_once(layers, torch.float32):
+    with at_hand(round_at_once(layers, torch.float32)):
         assert rounded_weights(layers[0], torch.float32)[0] is layers[0].weight
 
 
@@ -154,6 +155,22 @@ def test_activation_behind_batch_norm(training, device):
     for f in (layer.activated, lambda x: torch.nn.functional.gelu(layer(x))):
         out = f(x)
         results.append([out, *torch.autograd.grad(out.sin().sum(), [x, layer.weight, layer.bias])])
+    for a, b in zip(*results, strict=True):
+        assert_close_relative_to_max(a, b, 1e-12)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 60])
+def test_batch_norm_as_one_node_is_that_of_many(n, device):
+    torch.manual_seed(0)
+    one, many = (RowBatchNorm(24).double().to(device) for _ in range(2))
+    torch.nn.init.normal_(one.weight), torch.nn.init.normal_(one.bias)
+    many.load_state_dict(one.state_dict())
+    x = (3 + rows(n, dtype=torch.float64)).to(device).requires_grad_()
+    results = []
+    for layer, f in ((one, one.activated_in_training), (many, lambda x: torch.nn.functional.gelu(many(x)))):
+        out = f(x)
+        gradients = torch.autograd.grad(out.sin().sum(), [x, layer.weight, layer.bias])
+        results.append([out, *gradients, layer.running_mean, layer.running_var])
     for a, b in zip(*results, strict=True):
         assert_close_relative_to_max(a, b, 1e-12)
 
