@@ -26,12 +26,12 @@ __device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t row, co
     SlotSums<T> some[kAtOnce];
 #pragma unroll
     for (int k = 0; k < kAtOnce; ++k) used[k] = i + k < n && live[i + k];
-#pragma unroll  // what is not live is loaded, too: to wait for `live` first costs more
-    for (int k = 0; k < kAtOnce; ++k) some[k] = slots.sums[int64_t{slot_begin} + (i + k < n ? i + k : i)];
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) some[k] = used[k] ? slots.sums[int64_t{slot_begin} + i + k] : SlotSums<T>{};
 #pragma unroll
     for (int k = 0; k < kAtOnce; ++k) {
       any |= used[k];
-      for (int c = 0; c < kSlotValues; ++c) sums.value[c] += used[k] ? some[k].value[c] : T(0);
+      for (int c = 0; c < kSlotValues; ++c) sums.value[c] += some[k].value[c];
       for (int64_t c = 0; used[k] && features && c < n_features; ++c)
         features[c] += slots.features[(int64_t{slot_begin} + i + k) * n_features + c];
     }

@@ -24,7 +24,7 @@ constexpr int kBlock = 128;  // threads of a block in the phases that many block
 constexpr int kQuarter = 8;  // pixels
 constexpr int kQuarters = 4;
 constexpr int kBins = 64;  // of tiles by the lengths of their lists
-constexpr int kBinWidth = 64;
+constexpr int kBinWidth = 64;  // entries
 constexpr int32_t kNoImage = INT32_MAX;
 
 // What a tile needs of one Gaussian in one image. alpha = 2^(strength - (tight u)^2 - (loose dy)^2), u = dx - slope dy.
