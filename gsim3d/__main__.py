@@ -18,6 +18,7 @@ COMMANDS = {
     "effects": ("gsim3d.infer_effects", "find out which effects a scene needs"),
     "evaluate": ("gsim3d.evaluate.command", "measure predictions on a data set, by step, beside baselines and other models"),
     "pareto": ("gsim3d.pareto.command", "what accuracy costs in time: a report, and settings that keep a promise"),
+    "ablate": ("gsim3d.ablate.command", "the paper's ablations: the same training with one thing changed, in one table"),
     "weights": ("gsim3d.perceptual.command", "install the weights of LPIPS and FVD"),
     "import": ("gsim3d.import_released", "bring a checkpoint of the authors' release over: same weights, same predictions"),
     "demo": ("gsim3d.demo", "all of it at a small size, in minutes on a CPU"),

@@ -24,6 +24,7 @@ ROOMS = [
     {"train"},
     {"evaluate", "check_stability"},
     {"pareto"},
+    {"ablate"},
     {"simulate", "show_plan", "infer_effects", "check_data", "import_released", "demo", "doctor"},
     {"__main__"},
 ]

@@ -186,8 +186,9 @@ def score_scene(
     metrics: Sequence[str] = PLAIN_METRICS,
     others: Sequence[Predictions] = (),
     prediction: Prediction | None = None,
+    start: int = 0,
 ) -> SceneScores:
-    """Predicts a scene from its first steps and scores every method on the target views.
+    """Predicts a scene from its first steps, or those from ``start`` on, and scores every method on the target views.
 
     Args:
         restored: the model; None: only ``others`` and ``copy`` are scored.
@@ -197,12 +198,14 @@ def score_scene(
         metrics: see :func:`gsim3d.evaluate.scoring.measurable`.
         others: predictions of other models.
         prediction: what :func:`predict` gave for these cameras and steps; None: it is made here.
+        start: first given step; the scores begin there.
     """
     if restored is not None:
         context_cams, target_cams = default_views(restored, scene, context_cams, target_cams)
         n_encoded = restored.data.history
-    n_future = horizon(scene, n_encoded, n_future)
-    cams, steps = list(target_cams), range(n_encoded + n_future)
+    n_given = start + n_encoded
+    n_future = horizon(scene, n_given, n_future)
+    cams, steps = list(target_cams), range(start, n_given + n_future)
     device = torch.device("cpu") if restored is None else restored.device
     images = scene.images(cams, steps).permute(0, 1, 3, 4, 2).to(device).float() / 255
     labels = scene.segmentation(cams, steps).to(device) if scene.has_segmentation() else None
@@ -213,33 +216,39 @@ def score_scene(
     def methods() -> Iterator[tuple[str, Tensor]]:
         nonlocal prediction
         if restored is not None:
-            prediction = prediction or predict(restored, scene, context_cams, n_future)
-            rendered = render_steps(restored, prediction.particles, scene, cams)
+            prediction = prediction or predict(restored, scene, context_cams, n_future, start)
+            rendered = render_steps(restored, prediction.particles, scene, cams, start)
             yield "model", rendered
         for other in others:
-            predicted = other.images(scene, cams, n_encoded, n_future).to(device).float() / 255
+            predicted = other.images(scene, cams, n_given, n_future).to(device).float() / 255
             if scene.recording.is_film and labels is not None:  # the film's own background is black there
                 predicted *= (labels[n_encoded:] != BACKGROUND)[..., None]
             yield other.name, predicted
         if restored is not None:
-            yield "constant", _held(restored, prediction, rendered, n_encoded - 1, scene, cams)
+            yield "constant", _held(restored, prediction, rendered, n_encoded - 1, scene, cams, start)
         yield "copy", images[n_encoded - 1].expand(n_future, *images.shape[1:])
         if restored is not None:
-            yield "constant_velocity", render_steps(restored, constant_velocity(prediction), scene, cams, n_encoded)
-            yield "release_constant", _held(restored, prediction, rendered, n_encoded, scene, cams)
+            yield "constant_velocity", render_steps(restored, constant_velocity(prediction), scene, cams, n_given)
+            yield "release_constant", _held(restored, prediction, rendered, n_encoded, scene, cams, start)
 
     return truth.score(methods())
 
 
 def _held(
-    restored: Restored, prediction: Prediction, rendered: Tensor, step: int, scene: Scene, cams: Sequence[int]
+    restored: Restored,
+    prediction: Prediction,
+    rendered: Tensor,
+    step: int,
+    scene: Scene,
+    cams: Sequence[int],
+    start: int,
 ) -> Tensor:
-    """Images of the predicted steps that would be seen if everything stood still as it is at ``step``."""
+    """Images of the predicted steps that would be seen if everything stood still as it is at cloud ``step``."""
     later = range(prediction.n_encoded, prediction.n_steps)
     if not scene.cameras_move:
         return rendered[step].expand(len(later), *rendered.shape[1:])
     still = _cloud(prediction.particles, step)
-    return torch.cat([render_steps(restored, still, scene, cams, seen) for seen in later])
+    return torch.cat([render_steps(restored, still, scene, cams, start + seen) for seen in later])
 
 
 def _cloud(particles: Particles, step: int) -> Particles:

@@ -88,6 +88,22 @@ def test_views_that_are_named(restored, scene):
         default_views(elsewhere, scene, None, (2,))
 
 
+def test_scores_from_a_later_step_are_those_of_the_film_cut_there(restored, scene, tmp_path):
+    cut = write_scene(tmp_path / "cut")
+    for folder in cut.glob("cam_*"):
+        for image in sorted(folder.iterdir()):  # step 0 is lost, the others move up
+            image.rename(folder / f"{image.stem[:-4]}{max(0, int(image.stem[-4:]) - 1):04d}.png")
+    metadata = json.loads((cut / "metadata.json").read_text())
+    (cut / "metadata.json").write_text(json.dumps({**metadata, "n_steps": scene.n_steps - 1}))
+    later, expected = score_scene(restored, scene, start=1), score_scene(restored, Scene.open(cut))
+    assert later.n_steps == expected.n_steps == 5 and list(later.values) == list(METHODS)
+    for method, metrics in expected.values.items():
+        for metric, values in metrics.items():
+            torch.testing.assert_close(later.values[method][metric], values, rtol=0, atol=0, equal_nan=True)
+    with pytest.raises(InputError, match="but only 0 after the input"):
+        score_scene(restored, scene, start=4)
+
+
 def test_rollout_rows_keep_their_number_and_frozen_ones_their_place(restored, scene):
     prediction = predict(restored, scene, (0, 2), 3)
     assert prediction.n_steps == 5

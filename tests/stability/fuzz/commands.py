@@ -35,6 +35,7 @@ RIGHT = {
     "plan": "{good}/data/ball/0000 {good}/model.safetensors",
     "effects": "infer {good}/data/ball/0000 {good}/model.safetensors --out {out}.yaml",
     "pareto": "{good}/model.safetensors {good}/data --out {out} --quiet",
+    "ablate": "{good}/data --rows latent --config {good}/train.yaml --out {out} --quiet",
     "evaluate": "{good}/model.safetensors {good}/data --out {out} --steps 1",
     "weights": "lpips --from {good}/train.yaml",
     "import": "{good}/model.safetensors --config {good}/train.yaml --out {out}",

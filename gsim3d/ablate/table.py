@@ -1,0 +1,147 @@
+"""One table of all rows: means over the seeds, and differences that are larger than what the seed alone does."""
+
+from __future__ import annotations
+
+import statistics
+from typing import TYPE_CHECKING
+
+import torch
+
+from gsim3d.pareto.report import machine
+from gsim3d.train.settings import to_dict
+
+if TYPE_CHECKING:
+    from gsim3d.ablate.study import Study
+
+FORMAT = 1
+ENOUGH = 3  # runs of a row that tell a difference from chance
+VALUES = (
+    "psnr_masked",
+    "constant.psnr_masked",
+    "copy.psnr_masked",
+    "psnr",
+    "constant.psnr",
+    "copy.psnr",
+    "step_seconds",
+)
+
+
+def as_dict(study: Study, results: dict[str, list[dict]], command: str) -> dict:
+    """What ablation.json holds.
+
+    Of each row: what differs, the paper's number, ``runs`` (by seed) and their means; ``difference`` to the first row in
+    dB of masked PSNR (of all pixels where scenes have no masks), ``spread``: how far apart runs of one row are at most,
+    of either row; ``tie``: whether the difference is within it, null with one seed. ``same_as``: the row that it is.
+
+    Args:
+        results: by the name of a row whose run is its own, by seed; those that are done.
+    """
+    rows = []
+    for row in study.rows:
+        same = study.same_as(row.name)
+        entry: dict = {"row": row.name, "differs": row.differs, "paper": row.paper or None}
+        if same != row.name:
+            entry["same_as"] = same
+        runs = results.get(same, [])
+        rows.append({**entry, "runs": runs, **_means([run for run in runs if "failure" not in run])})
+    first = rows[0]
+    metric = "psnr_masked" if first.get("psnr_masked") is not None else "psnr"
+    for row in rows[1:]:
+        row.update(_compared(row, first, metric))
+    return {
+        "format": FORMAT,
+        "command": command,
+        "machine": machine(torch.device(study.device)),
+        "base": to_dict(study.base),
+        "scenes": {"trained": len(study.train), "held_out": len(study.test)},
+        "steps": {"before": study.n_given, "predicted": study.n_future},
+        "seeds": study.n_seeds,
+        "compared": metric,
+        "rows": rows,
+    }
+
+
+def _means(runs: list[dict]) -> dict:
+    """Of every value that all runs have."""
+    known = [name for name in VALUES if runs and all(run.get(name) is not None for run in runs)]
+    return {name: statistics.fmean(run[name] for run in runs) for name in known}
+
+
+def _compared(row: dict, first: dict, metric: str) -> dict:
+    if metric not in row or metric not in first:
+        return {}
+    difference, spreads = row[metric] - first[metric], []
+    for runs in (row["runs"], first["runs"]):
+        values = [run[metric] for run in runs if "failure" not in run]
+        if len(values) < 2:
+            return {"difference": difference, "spread": None, "tie": None}
+        spreads.append(max(values) - min(values))
+    return {"difference": difference, "spread": max(spreads), "tie": abs(difference) <= max(spreads)}
+
+
+def markdown(content: dict) -> str:
+    """The table for people, and what a reader of it must know."""
+    rows, n_seeds = content["rows"], content["seeds"]
+    head = [
+        "row",
+        "what differs",
+        "PSNR masked",
+        "constant, copy",
+        "PSNR",
+        "constant, copy",
+        f"against {rows[0]['row']}",
+    ]
+    lines = [_line([*head, "s a step", "paper"]), _line(["---"] * (len(head) + 2))]
+    for row in rows:
+        cells = [row["row"], row["differs"]]
+        for metric in ("psnr_masked", "psnr"):
+            held = ", ".join(_number(row.get(f"{baseline}.{metric}")) for baseline in ("constant", "copy"))
+            cells += [_number(row.get(metric)), held]
+        seconds = row.get("step_seconds")
+        cells += [_against(row), "-" if seconds is None else f"{seconds:.3g}", row["paper"] or "-"]
+        lines.append(_line(cells))
+    base, scenes, steps = content["base"], content["scenes"], content["steps"]
+    lines += [
+        "",
+        f"Base run: preset {base['preset']}, {sum(stage['steps'] for stage in base['stages'])} optimizer steps, "
+        f"{scenes['trained']} scenes; scored on {scenes['held_out']} held-out scenes, {steps['predicted']} steps predicted "
+        f"after step {steps['before']}, {n_seeds} {'seed' if n_seeds == 1 else 'seeds'}, {content['machine']['device']}. "
+        "PSNR in dB, means over the seeds; masked: without background; constant: the row's own last encoded particles held "
+        "still; copy: the last given image. Seconds are those of an optimizer step, the median of the last stage. The "
+        "paper's numbers are PSNR of its own data and budget (docs/accuracy-time.md says where they contradict each other): "
+        "compare differences, not values.",
+        "",
+        _of_ties(n_seeds),
+        "",
+        f"Made by `{content['command']}`",
+    ]
+    for row in rows:
+        for run in row["runs"]:
+            if "failure" in run:
+                lines += ["", f"{row['row']} failed: {run['failure']}"]
+    return "\n".join(lines) + "\n"
+
+
+def _of_ties(n_seeds: int) -> str:
+    if n_seeds == 1:
+        return "One seed: whether a difference is more than chance is not known (--seeds 3)."
+    few = "" if n_seeds >= ENOUGH else f" {n_seeds} seeds are few: {ENOUGH} or more tell it from chance."
+    return f"A tie: the difference is not larger than that between two runs of one row.{few}"
+
+
+def _against(row: dict) -> str:
+    if "same_as" in row:
+        return f"is {row['same_as']}"
+    if "difference" not in row:
+        return "failed" if any("failure" in run for run in row["runs"]) else "-"
+    if row["tie"]:
+        return f"tie (within {row['spread']:.2f})"
+    return f"{row['difference']:+.2f}"
+
+
+def _line(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
