@@ -201,6 +201,24 @@ def make_norm(kind: str, channels: int) -> nn.Module:
     return RowLayerNorm(channels) if kind == "layer" else RowBatchNorm(channels)
 
 
+@contextlib.contextmanager
+def tf32_only_if_asked():
+    """A context in which a GPU's float32 convolutions use TF32 only if matrix products may.
+
+    Torch has a switch for each, and that of convolutions is on unless somebody turns it off. How TF32 rounds depends on
+    the algorithm, which cuDNN chooses by the number of images: a scene would differ from itself in a larger batch.
+    """
+    convolutions = torch.backends.cudnn.conv
+    unasked = convolutions.fp32_precision == "tf32" and torch.backends.cuda.matmul.fp32_precision != "tf32"
+    if unasked:
+        convolutions.fp32_precision = "ieee"
+    try:
+        yield
+    finally:
+        if unasked:
+            convolutions.fp32_precision = "tf32"
+
+
 def exact_convolutions():
     """A context in which a GPU's dense convolutions are float32 proper (no TF32) and repeat bit by bit."""
     return torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False)

@@ -12,7 +12,8 @@
 
 namespace gsim3d::cuda {
 
-// What the weights and slopes of a query need. A slot whose row is out of range has log_sum = inf: its weights are 0.
+// What the weights and slopes of a query need. A slot whose row is out of range, and a query that saw no key, has
+// log_sum = inf: its weights are 0.
 struct alignas(16) QueryNumbers {
   float largest, log_sum, delta, shift;  // shift: of fast_weight
 

@@ -89,6 +89,7 @@ __device__ __forceinline__ QueryNumbers numbers_of(const Backward<T>& args, int6
     }
   }
   const float2 pair = *reinterpret_cast<const float2*>(args.stats + 2 * (row * args.size.heads + head));
+  if (pair.y == 0) return QueryNumbers::none();
   const float log_sum = log2f(pair.y);
   return {pair.x, log_sum, delta, -fmaf(pair.x, args.slope, log_sum)};
 }
