@@ -11,8 +11,10 @@ import torch
 
 from gsim3d.ops import KernelMap, PatchTable, Voxels, patch_attention, plane_sweep, pool_max, pool_mean, unpool
 from tests.asserts import gradients
+from tests.ops import raster_scene
 from tests.ops.test_patch_attn import cotangent_of, lists, random_case
 from tests.ops.test_plane_sweep import make, run
+from tests.ops.test_sentinel import look, state
 from tests.ops.test_sparse_conv import RULES, convolution, geometry, parameters, random_cells, with_plan
 
 
@@ -213,3 +215,37 @@ def test_patch_attention_without_patches(devices):
     table = PatchTable(case.table.q_rows, case.table.kv_rows, nothing, nothing)
     results = gradients(lambda *x: patch_attention(*x, table, scale=case.scale), case.inputs, cotangent_of(case))
     assert not any(x.any() for x in results)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("which, wrong", [("image_cloud", w) for w in INDICES] + [("cu_rows", w) for w in OFFSETS])
+def test_rasterizer(which, wrong, dtype, devices):
+    """An image of no cloud, and all images where offsets do not ascend from 0 to the number of rows: the background."""
+    scene = raster_scene.random_scene(n=80, clouds=4, dtype=dtype)
+    spoil = (OFFSETS if which == "cu_rows" else INDICES)[wrong]
+    scene = scene.replace(**{which: spoil(getattr(scene, which))}).to(devices[1])
+    color, alpha, depth, features = scene.render()
+    grads = raster_scene.gradients(scene.render, scene)
+    assert_finite([color, alpha, depth, features, *grads])
+    offsets = [0, *scene.cu_rows.tolist(), 80]
+    empty = (scene.image_cloud < 0) | (scene.image_cloud >= 4)
+    if offsets != sorted(offsets) or offsets[1] != 0 or offsets[-2] != 80:
+        empty = torch.ones_like(empty)
+    assert empty.any() or wrong == "one for all"
+    assert not alpha[empty].any() and not depth[empty].any() and not features[empty].any()
+    assert torch.equal(color[empty], scene.background[empty][:, None, None].expand_as(color[empty]))
+    if empty.all():
+        of_background = scene.NAMES.index("background")
+        assert not any(grad.any() for i, grad in enumerate(grads) if i != of_background)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("offsets", OFFSETS)
+def test_watched_rows(offsets, dtype, devices):
+    fields, bounds, cu_rows, options = state(dtype=dtype, device=devices[1])
+    cu_rows = OFFSETS[offsets](cu_rows)
+    status, record = look((fields, bounds, cu_rows, options))
+    rows = torch.arange(len(status), device=status.device)
+    watched = is_named(torch.cat(listed(rows, cu_rows)), len(rows))
+    assert not status[~watched].any() and not (status == torch.iinfo(status.dtype).max).any()
+    assert not record.isnan().any()

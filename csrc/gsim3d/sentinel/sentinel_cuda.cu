@@ -32,6 +32,8 @@ template <typename T>
 __global__ void __launch_bounds__(kThreads) look_kernel(WatchedRows<T> rows, int32_t* status, double* partial) {
   const int n_fields = rows.n_fields, n_kinds = n_fields + 2, columns = watched_columns(n_fields);
   const int64_t begin = blockIdx.x * kPiece, end = min(rows.n_rows, begin + kPiece);
+  for (int64_t row = begin + threadIdx.x; row < end; row += kThreads) status[row] = 0;  // also those of no cloud
+  __syncthreads();
   int64_t low = 0, high = rows.n_clouds;  // the last cloud that begins at or before the piece
   while (high - low > 1) {
     const int64_t middle = (low + high) / 2;
@@ -112,8 +114,10 @@ template <typename T>
 void watch_rows(const WatchedRows<T>& rows, int32_t* status, double* record, const Workspace& workspace,
                 Stream stream) {
   const int64_t n_pieces = (rows.n_rows + kPiece - 1) / kPiece;
-  double* partial = workspace.take<double>((n_pieces + rows.n_clouds) * watched_columns(rows.n_fields));
+  const int64_t n_partial = (n_pieces + rows.n_clouds) * watched_columns(rows.n_fields);
+  double* partial = workspace.take<double>(n_partial);
   check(n_pieces <= INT32_MAX, kWatch, ": at most 2^41 rows; got ", rows.n_rows);
+  fill_zero(kWatch, partial, n_partial, stream);  // offsets that do not ascend leave some out
   launch(kWatch, look_kernel<T>, static_cast<unsigned>(n_pieces), kThreads, 0, stream, rows, status, partial);
   launch(kWatch, join_kernel<T>, static_cast<unsigned>(std::min<int64_t>(rows.n_clouds, 1 << 16)), kThreads, 0, stream,
          rows, static_cast<const double*>(partial), record);
