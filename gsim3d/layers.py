@@ -208,15 +208,15 @@ def tf32_only_if_asked():
     Torch has a switch for each, and that of convolutions is on unless somebody turns it off. How TF32 rounds depends on
     the algorithm, which cuDNN chooses by the number of images: a scene would differ from itself in a larger batch.
     """
-    convolutions = torch.backends.cudnn.conv
-    unasked = convolutions.fp32_precision == "tf32" and torch.backends.cuda.matmul.fp32_precision != "tf32"
+    products, cudnn = torch.backends.cuda.matmul, torch.backends.cudnn
+    unasked = cudnn.conv.fp32_precision == "tf32" and products.fp32_precision != "tf32"
     if unasked:
-        convolutions.fp32_precision = "ieee"
+        cudnn.allow_tf32 = False
     try:
         yield
     finally:
         if unasked:
-            convolutions.fp32_precision = "tf32"
+            cudnn.allow_tf32 = True
 
 
 def exact_convolutions():
