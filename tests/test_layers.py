@@ -9,10 +9,13 @@ from gsim3d.layers import (
     RowLinear,
     _combine,
     _statistics,
+    exact_convolutions,
     product_dtype,
     rounded_at_once,
     rounded_weights,
+    tf32_only_if_asked,
 )
+from gsim3d.train.loop import deterministic
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 
 
@@ -176,3 +179,21 @@ def test_layers_under_autocast_err_no_more_than_torchs(dtype, devices):
     for a, b, truth in zip(ours, torchs, exact, strict=True):
         error, allowed = ((t.float() - truth).abs().max().item() for t in (a, b))
         assert error <= 2 * allowed + 1e-3 * truth.abs().max().item()
+
+
+@pytest.mark.parametrize("context", [tf32_only_if_asked, deterministic])
+def test_convolutions_use_tf32_only_if_asked(context):
+    cudnn = torch.backends.cudnn
+    assert cudnn.conv.fp32_precision == "tf32"  # which torch chooses, and nobody asked for
+    for inner in (tf32_only_if_asked, exact_convolutions):
+        with context(), inner():
+            assert cudnn.conv.fp32_precision != "tf32"
+        with exact_convolutions(), context():
+            assert cudnn.conv.fp32_precision != "tf32"
+    torch.backends.cuda.matmul.allow_tf32 = True
+    try:
+        with context():
+            assert cudnn.conv.fp32_precision == "tf32"
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = False
+    assert cudnn.conv.fp32_precision == "tf32" and cudnn.allow_tf32
