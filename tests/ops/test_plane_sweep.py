@@ -166,6 +166,7 @@ def test_cuda_gives_the_same_bits_every_time(case, devices):
 LARGE = {
     "pairs in pieces": dict(sources=((1,) * 6, (0,) * 6), channels=3, depths=8, size=(128, 128)),
     "pixels in pieces": dict(sources=((), (0,)), channels=1, depths=2, size=(256, 256)),
+    "tiles in pieces": dict(sources=((1,), (0,)), channels=2, depths=8, size=(400, 400)),
     "channels in blocks": dict(channels=260, size=(9, 16)),
 }
 
