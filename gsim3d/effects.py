@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
+import types
+import typing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,8 +18,11 @@ from gsim3d.errors import InputError
 from gsim3d.files import MAX_TEXT, read_file
 
 VERSION = 1
-BACKGROUNDS = ("frozen", "masked_out", "dynamic")
+FILE = "effects.yaml"  # of a scene or of a whole data set, in its folder
+BACKGROUNDS = ("frozen", "masked_out", "dynamic", "asymmetric")
+POLICIES = ("exact", "approx")
 CHANGING = ("all", "dynamic", "none")
+ACTIONS = ("keypoints3d",)
 
 
 class UnsupportedEffect(InputError):
@@ -24,11 +30,53 @@ class UnsupportedEffect(InputError):
 
 
 @dataclass(frozen=True)
+class Actions:
+    """What drives the scene from outside: points that are moved. Without names there is nothing to drive."""
+
+    type: str = "keypoints3d"
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        _one_of("dynamics.actions.type", self.type, ACTIONS)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Pairs of bodies that may touch, named, and from how far [metres] they feel each other."""
+
+    pairs: tuple[tuple[str, str], ...] = ()
+    halo: float = 0.05
+
+    def __post_init__(self):
+        _at_least("dynamics.contact.halo", self.halo, 0)
+
+
+@dataclass(frozen=True)
+class Sleep:
+    """When particles at rest are skipped.
+
+    policy: "exact": a scene sleeps as a whole, and nothing is lost; "approx": patches sleep, within a bound.
+    eps: in cells; what moves less in one step is at rest.
+    patience: steps at rest before it sleeps.
+    """
+
+    policy: str = "exact"
+    eps: float = 1e-3
+    patience: int = 4
+
+    def __post_init__(self):
+        _one_of("dynamics.sleep.policy", self.policy, POLICIES)
+        _at_least("dynamics.sleep.eps", self.eps, 0)
+        _at_least("dynamics.sleep.patience", self.patience, 1)
+
+
+@dataclass(frozen=True)
 class DynamicsEffects:
     """What moves and why.
 
-    background: "frozen": particles marked frozen never move, and others see them; "masked_out": they are left out;
-        "dynamic": every particle may move.
+    background: "frozen": particles marked frozen never move, and others see them; "asymmetric": likewise, and they see
+        only each other, so that they are computed once a rollout; "masked_out": they are left out; "dynamic": every
+        particle may move.
     history: steps that the model sees; None: as many as the model can use.
     actions: what drives the scene from outside.
     contact: pairs of bodies that may touch.
@@ -37,9 +85,14 @@ class DynamicsEffects:
 
     background: str = "frozen"
     history: int | None = None
-    actions: dict[str, Any] | None = None
-    contact: dict[str, Any] | None = None
-    sleep: dict[str, Any] | None = None
+    actions: Actions | None = None
+    contact: Contact | None = None
+    sleep: Sleep | None = None
+
+    def __post_init__(self):
+        _one_of("dynamics.background", self.background, BACKGROUNDS)
+        if self.history is not None:
+            _at_least("dynamics.history", self.history, 1)
 
 
 @dataclass(frozen=True)
@@ -55,10 +108,15 @@ class AppearanceEffects:
     changing: str = "all"
     opacity_changes: bool | None = None
 
+    def __post_init__(self):
+        _one_of("appearance.changing", self.changing, CHANGING)
+        if self.view_dependent not in (None, 0, 1, 2, 3):
+            raise InputError(f"effects: appearance.view_dependent must be 0 to 3; got {self.view_dependent}")
+
 
 @dataclass(frozen=True)
 class StructureEffects:
-    """Particles that come or go during a rollout."""
+    """Particles that come or go during a rollout (:mod:`gsim3d.edits`)."""
 
     insert: bool = False
     remove: bool = False
@@ -66,10 +124,15 @@ class StructureEffects:
 
 @dataclass(frozen=True)
 class OutputEffects:
-    """Images to make beside colour."""
+    """Images to make, all in one pass. Colour is what is left on unless it is switched off.
 
+    features: the latents of the particles, blended like colour.
+    """
+
+    rgb: bool = True
     depth: bool = False
     alpha: bool = False
+    features: bool = False
 
 
 @dataclass(frozen=True)
@@ -89,15 +152,6 @@ class EffectsSpec:
     structure: StructureEffects = field(default_factory=StructureEffects)
     outputs: OutputEffects = field(default_factory=OutputEffects)
 
-    def __post_init__(self):
-        _one_of("dynamics.background", self.dynamics.background, BACKGROUNDS)
-        _one_of("appearance.changing", self.appearance.changing, CHANGING)
-        history = self.dynamics.history
-        if history is not None and not (isinstance(history, int) and history >= 1):
-            raise InputError(f"effects: dynamics.history must be an integer of at least 1; got {history!r}")
-        if self.appearance.view_dependent not in (None, 0, 1, 2, 3):
-            raise InputError(f"effects: appearance.view_dependent must be 0 to 3; got {self.appearance.view_dependent}")
-
     @classmethod
     def from_dict(cls, values: dict[str, Any] | None) -> EffectsSpec:
         """From nested plain values; unknown keys raise."""
@@ -109,7 +163,7 @@ class EffectsSpec:
 
     def to_dict(self) -> dict[str, Any]:
         """Nested plain values; what is off or left to the model is absent."""
-        return {"version": VERSION, **_differences(self, EffectsSpec())}
+        return {"version": VERSION, **_differences(self)}
 
     @classmethod
     def load(cls, path: str | Path) -> EffectsSpec:
@@ -123,11 +177,22 @@ class EffectsSpec:
             raise InputError(f"effects: {path} must hold a mapping; got {type(values).__name__}")
         return cls.from_dict(values)
 
+    @classmethod
+    def of_scene(cls, folder: str | Path) -> EffectsSpec | None:
+        """The spec that a scene ships: effects.yaml in its folder or, of a whole set, up to two folders above."""
+        folder = Path(folder).absolute()
+        for place in (folder, folder.parent, folder.parent.parent):
+            if (place / FILE).is_file():
+                return cls.load(place / FILE)
+        return None
+
     def save(self, path: str | Path) -> None:
         """Writes YAML, or JSON where the name ends in .json."""
         path = Path(path)
+        part = path.with_name(f".{path.name}.part")
         as_json = path.suffix == ".json"
-        path.write_text(json.dumps(self.to_dict(), indent=2) if as_json else yaml.safe_dump(self.to_dict()))
+        part.write_text(json.dumps(self.to_dict(), indent=2) if as_json else yaml.safe_dump(self.to_dict()))
+        os.replace(part, path)
 
     @property
     def hash(self) -> str:
@@ -135,92 +200,56 @@ class EffectsSpec:
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()[:16]
 
 
-@dataclass(frozen=True)
-class Plan:
-    """How a simulator will meet a spec.
-
-    history: steps kept.   sh_degree: of rendered colours.
-    kept: effects that are computed.   skipped: effects that are not -> why.
-    unused: parameters of the model that no kept effect reads, by name.
-    """
-
-    spec: EffectsSpec
-    history: int
-    sh_degree: int
-    kept: tuple[str, ...]
-    skipped: dict[str, str]
-    unused: tuple[str, ...] = ()
-
-
-def make_plan(spec: EffectsSpec, *, history: int, sh_degree: int, changes_opacity: bool) -> Plan:
-    """The plan of a model that sees up to ``history`` steps and colours of ``sh_degree``.
-
-    Raises:
-        UnsupportedEffect: the model, or this version, cannot simulate an effect of ``spec``.
-    """
-    for name, asked in {
-        "dynamics.actions": spec.dynamics.actions,
-        "dynamics.contact": spec.dynamics.contact,
-        "dynamics.sleep": spec.dynamics.sleep,
-        "structure.insert": spec.structure.insert,
-        "structure.remove": spec.structure.remove,
-    }.items():
-        if asked:
-            raise UnsupportedEffect(f"unsupported effect {name}: not simulated by this version; leave it out")
-    if spec.appearance.opacity_changes and not changes_opacity:
-        raise UnsupportedEffect("unsupported effect appearance.opacity_changes: this model holds opacities")
-    wanted = {
-        "dynamics.history": (spec.dynamics.history, history),
-        "appearance.view_dependent": (spec.appearance.view_dependent, sh_degree),
-    }
-    chosen = {}
-    for name, (asked, largest) in wanted.items():
-        if asked is not None and asked > largest:
-            raise UnsupportedEffect(f"unsupported effect {name}: this model goes up to {largest}; got {asked}")
-        chosen[name] = largest if asked is None else asked
-    history, sh_degree = chosen.values()
-    switches = {
-        "view-dependent colour": (sh_degree > 0, "degree 0 is asked for or all the model has"),
-        "time merging": (history > 1, "a history of one step has nothing to merge"),
-        "frozen background": (spec.dynamics.background == "frozen", f"background is {spec.dynamics.background}"),
-        "changing features": (spec.appearance.changing != "none", "appearance.changing is none"),
-        "changing opacities": (
-            changes_opacity and spec.appearance.opacity_changes is not False,
-            "appearance.opacity_changes is off" if changes_opacity else "this model holds opacities",
-        ),
-        "depth images": (spec.outputs.depth, "outputs.depth is off"),
-        "alpha images": (spec.outputs.alpha, "outputs.alpha is off"),
-        "actions": (False, "dynamics.actions is absent"),
-        "insertion and removal": (False, "structure is absent"),
-    }
-    kept = tuple(name for name, (on, _) in switches.items() if on)
-    return Plan(spec, history, sh_degree, kept, {name: why for name, (on, why) in switches.items() if not on})
-
-
 def _one_of(name: str, value: Any, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         raise InputError(f"effects: {name} must be one of {', '.join(allowed)}; got {value!r}")
 
 
-def _build(cls: type, values: dict[str, Any], where: str) -> Any:
-    fields = {f.name: f for f in dataclasses.fields(cls)}
-    if unknown := sorted(set(values) - set(fields)):
-        known = ", ".join(fields)
-        raise InputError(f"effects: unknown key {where}{unknown[0]}; known: {known}")
-    arguments = {}
-    for name, value in values.items():
-        factory = fields[name].default_factory
-        nested = isinstance(factory, type) and dataclasses.is_dataclass(factory)
-        if nested and not isinstance(value, dict):
-            raise InputError(f"effects: {where}{name} must be a mapping; got {value!r}")
-        arguments[name] = _build(factory, value, f"{where}{name}.") if nested else value
-    return cls(**arguments)
+def _at_least(name: str, value: Any, least: int) -> None:
+    whole = least == 1
+    kind = "an integer" if whole else "a number"
+    if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)) or not value >= least:
+        raise InputError(f"effects: {name} must be {kind} of at least {least}; got {value!r}")
 
 
-def _differences(value: Any, default: Any) -> dict[str, Any]:
-    out = {}
+def _build(cls: type, values: Any, where: str) -> Any:
+    """An object of the dataclass ``cls`` from plain values."""
+    if not isinstance(values, dict):
+        raise InputError(f"effects: {where.rstrip('.')} must be a mapping; got {values!r}")
+    hints = typing.get_type_hints(cls)
+    if unknown := [name for name in values if name not in hints]:
+        raise InputError(f"effects: unknown key {where}{unknown[0]}; known: {', '.join(hints)}")
+    return cls(**{name: _value(hints[name], value, where + name) for name, value in values.items()})
+
+
+def _value(hint: Any, value: Any, where: str) -> Any:
+    """``value`` as ``hint`` asks for it."""
+    if typing.get_origin(hint) is types.UnionType:
+        if value is None:
+            return None
+        hint = typing.get_args(hint)[0]
+    if dataclasses.is_dataclass(hint):
+        return _build(hint, value, f"{where}.")
+    if typing.get_origin(hint) is tuple:
+        items = typing.get_args(hint)
+        if not isinstance(value, (list, tuple)) or (items[-1] is not ... and len(value) != len(items)):
+            raise InputError(f"effects: {where} must be a list{'' if items[-1] is ... else f' of {len(items)}'}; got {value!r}")
+        items = [items[0]] * len(value) if items[-1] is ... else items
+        return tuple(_value(item, v, where) for item, v in zip(items, value, strict=True))
+    if hint in (bool, str) and not isinstance(value, hint):
+        raise InputError(f"effects: {where} must be {'true or false' if hint is bool else 'a text'}; got {value!r}")
+    return value
+
+
+def _differences(value: Any) -> dict[str, Any]:
+    """Plain values of the fields of a dataclass that differ from those of a new one."""
+    default, out = type(value)(), {}
     for f in dataclasses.fields(value):
-        mine, base = getattr(value, f.name), getattr(default, f.name)
-        if mine != base:
-            out[f.name] = _differences(mine, base) if dataclasses.is_dataclass(mine) else mine
+        mine = getattr(value, f.name)
+        if mine != getattr(default, f.name):
+            out[f.name] = _differences(mine) if dataclasses.is_dataclass(mine) else _plain(mine)
     return out
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value

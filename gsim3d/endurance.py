@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from gsim3d.dynamics import last_steps
-from gsim3d.effects import Plan
 from gsim3d.errors import HardCaseError
 from gsim3d.laws import Deviation, Law, Sample, particle_name, take_scenes_of_particles
+from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport
 from gsim3d.types import Cameras, CloudTable, Frames, Particles, take_runs

@@ -21,10 +21,10 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d.dynamics.point_transformer import SparseConv
-from gsim3d.effects import Plan
 from gsim3d.errors import InputError
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.ops.raster import Rendering
+from gsim3d.plans import Plan
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport
@@ -139,7 +139,7 @@ class CapturedRollout:
         if cameras is not None and simulator.config.renderer.quirks != Quirks():
             raise InputError("CapturedRollout: cameras cannot be rendered as published inside a graph; render the steps")
         self._simulator, self._n_steps, self._factor, self._copies = simulator, n_steps, factor, copies
-        self._plan = plan or simulator.plan()
+        self._plan, self._drawn = plan or simulator.plan(), plan
         self._report = simulator.report if report is None else report
         self._report.poll()
         self._background = background
@@ -216,7 +216,7 @@ class CapturedRollout:
             renderings = []
             if self._cameras is not None:
                 for step in steps:
-                    renderings.append(self._model.draw(step, self._cameras, self._background, plan, report=report))
+                    renderings.append(self._model.draw(step, self._cameras, self._background, self._drawn, report=report))
         return Predicted(steps, renderings)
 
     def _observed(self) -> list[PyramidCapacity]:
@@ -337,6 +337,8 @@ def _gaps(table: CloudTable) -> list[int | None]:
 
 def _with_background_as_it_is(plan: Plan) -> Plan:
     """``plan`` for a state that is prepared already."""
+    if plan.spec.dynamics.background not in ("masked_out", "dynamic"):
+        return plan
     dynamics = dataclasses.replace(plan.spec.dynamics, background="frozen")
     return dataclasses.replace(plan, spec=dataclasses.replace(plan.spec, dynamics=dynamics))
 

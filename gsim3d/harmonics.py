@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from gsim3d.quirks import Quirks
 
 MAX_DEGREE = 3
+SH_0 = 0.28209479177387814  # the constant of the basis
 AXIS_LIMIT = 1 - 1e-6  # of each component of the axis from which the published model derives its angles
 # Radians between neighbours of the spiral of 2 l + 1 directions on which degree l is read, and where it starts: with
 # these the harmonics' values there have condition numbers of 1.4, 2.4 and 3.4.
@@ -22,7 +23,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """[..., 3] unit directions -> [..., (degree + 1)^2], the real basis of 3D Gaussian splatting, degree at most 3."""
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
-    basis = [torch.full_like(x, 0.28209479177387814)]
+    basis = [torch.full_like(x, SH_0)]
     if degree > 0:
         basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if degree > 1:
@@ -34,6 +35,13 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
         basis += [d * z * (2 * zz - 3 * xx - 3 * yy), -c * x * (4 * zz - xx - yy)]
         basis += [b / 2 * z * (xx - yy), -a * x * (xx - 3 * yy)]
     return torch.stack(basis, -1)
+
+
+def painted(sh: Tensor, paint: Tensor) -> Tensor:
+    """Coefficients [N, K, 3] of colours that went through the matrices ``paint`` [N, 3, 3]."""
+    offset = 0.5 * (paint.sum(2) - 1) / SH_0  # colours are sums of harmonics plus a half
+    sh = sh @ paint.mT
+    return torch.cat([sh[:, :1] + offset[:, None], sh[:, 1:]], 1)
 
 
 def degree_damping(degree: int, like: Tensor) -> Tensor:

@@ -21,8 +21,8 @@ from torch import Tensor
 from gsim3d.dynamics import last_steps
 from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.dynamics.state import rotate_left
-from gsim3d.effects import Plan
 from gsim3d.harmonics import rotate_harmonics
+from gsim3d.plans import Plan
 from gsim3d.renderer import render, rotation_matrices
 from gsim3d.simulator import Simulator
 from gsim3d.types import DYNAMIC, Cameras, CloudTable, Frames, Gaussians, Particles, take_runs

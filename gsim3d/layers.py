@@ -47,6 +47,15 @@ class RowLinear(nn.Linear):
         x = x.to(product_dtype(x))
         return _RowLinear.apply(x, self.weight, self.bias, *rounded_weights(self, x.dtype))
 
+    def some(self, x: Tensor, outputs: Sequence[tuple[int, int]]) -> Tensor:
+        """The channels in ``outputs``, (first, one behind the last) of each run; the others are not computed."""
+        x = x.to(product_dtype(x))
+        weight, bias = (
+            value[outputs[0][0] : outputs[0][1]] if len(outputs) == 1 else torch.cat([value[a:b] for a, b in outputs])
+            for value in (self.weight, self.bias)
+        )
+        return row_linear(x, weight.to(x.dtype), bias.to(x.dtype))
+
 
 class _RowLinear(torch.autograd.Function):
     """On a GPU torch would sum the gradients of biases slowly, and those of weights in 16 bits."""

@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from gsim3d import ops
 from gsim3d.harmonics import (
     degree_damping,
+    painted,
     published_axes,
     rotate_harmonics,
     sh_basis,
@@ -21,7 +22,7 @@ from gsim3d.harmonics import (
 from gsim3d.layers import RowLinear, widened
 from gsim3d.ops.raster import Rendering
 from gsim3d.quirks import Quirks
-from gsim3d.rotations import rotation_matrices, unit_quats
+from gsim3d.rotations import quat_product, rotation_matrices, unit_quats
 from gsim3d.stability import OnBad, StabilityReport
 from gsim3d.types import Cameras, Gaussians, Particles
 
@@ -75,24 +76,33 @@ class GaussianHead(nn.Module):
                 share = (config.initial_scale - config.scale_min) / (config.scale_max - config.scale_min)
                 self.fc2.bias[-3:] = math.log(share / (1 - share))
 
-    def forward(self, particles: Particles, *, sh_degree: int | None = None) -> Gaussians:
-        """The Gaussians of all rows; ``sh_degree``: leave out colours of higher degrees."""
-        n_harmonics = self.config.n_harmonics if sh_degree is None else (sh_degree + 1) ** 2
+    def forward(self, particles: Particles, *, sh_degree: int | None = None, rgb: bool = True) -> Gaussians:
+        """The Gaussians of all rows; ``sh_degree``: leave out colours of higher degrees; ``rgb``: False: all of them."""
+        n_harmonics = (self.config.n_harmonics if sh_degree is None else (sh_degree + 1) ** 2) if rgb else 0
         sh, quats, scales = self._shape_and_color(particles, n_harmonics)
         return Gaussians(particles.means, quats, scales, particles.opacities, sh, particles.cu_rows)
 
-    def _shape_and_color(self, particles: Particles, n_harmonics: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _shape_and_color(self, particles: Particles, n_harmonics: int) -> tuple[Tensor | None, Tensor, Tensor]:
         if self.config.latents == 0:
-            return particles.sh[:, :n_harmonics], particles.quats, particles.scales
-        latents = torch.cat([particles.dynamic_latents, particles.static_latents], 1)
-        raw = widened(self.fc2(F.gelu(self.fc1(latents))))
-        sh, quats, scales = raw.split([raw.shape[1] - 7, 4, 3], 1)
+            return particles.sh[:, :n_harmonics] if n_harmonics else None, particles.quats, particles.scales
+        hidden, K = F.gelu(self.fc1(particles.latents)), self.config.n_harmonics
+        if n_harmonics == K:
+            raw = self.fc2(hidden)
+        else:
+            wanted = [(c * K, c * K + n_harmonics) for c in range(3)] if n_harmonics else []
+            raw = self.fc2.some(hidden, [*wanted, (3 * K, 3 * K + 7)])
+        sh, quats, scales = widened(raw).split([raw.shape[1] - 7, 4, 3], 1)
         quats = unit_quats(quats.roll(1, 1))
+        if particles.turns is not None:
+            quats = quat_product(particles.turns, quats)
         smallest, largest = self.config.scale_min, self.config.scale_max
         scales = smallest + (largest - smallest) * scales.sigmoid()
-        damping = degree_damping(self.config.sh_degree, sh)[:n_harmonics, None]
-        sh = sh.unflatten(1, (3, -1))[:, :, :n_harmonics].mT * damping
-        return turn_predicted_harmonics(sh, rotation_matrices(quats), self.config.quirks), quats, scales
+        if n_harmonics == 0:
+            return None, quats, scales
+        sh = sh.unflatten(1, (3, -1)).mT * degree_damping(self.config.sh_degree, sh)[:n_harmonics, None]
+        if n_harmonics > 1:  # the constant looks the same from everywhere
+            sh = turn_predicted_harmonics(sh, rotation_matrices(quats), self.config.quirks)
+        return sh if particles.paint is None else painted(sh, particles.paint), quats, scales
 
 
 def render(
@@ -101,21 +111,24 @@ def render(
     background: Tensor | None = None,
     *,
     near_plane: float = NEAR_PLANE,
+    features: Tensor | None = None,
     cutoff: str = "exact",
     on_bad: OnBad = "raise",
     report: StabilityReport | None = None,
 ) -> Rendering:
     """Images of ``cameras``; camera i shows cloud ``cameras.image_cloud[i]`` of ``gaussians``.
 
-    Arguments and errors as :func:`gsim3d.ops.rasterize_gaussians`.
+    Arguments and errors as :func:`gsim3d.ops.rasterize_gaussians`. The colours of Gaussians without any mean nothing.
     """
+    color = {"colors": gaussians.means} if gaussians.sh is None else {"sh": gaussians.sh}
     return ops.rasterize_gaussians(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
         gaussians.opacities,
         cameras,
-        sh=gaussians.sh,
+        **color,
+        features=features,
         background=background,
         cu_rows=gaussians.cu_rows,
         near_plane=near_plane,

@@ -15,6 +15,12 @@ def unit_quats(quats: Tensor) -> Tensor:
     return quats / quats.norm(dim=-1, keepdim=True)
 
 
+def quat_product(a: Tensor, b: Tensor) -> Tensor:
+    """[..., 4]: the rotation ``b``, then ``a``."""
+    aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    return torch.cat([aw * bw - (av * bv).sum(-1, keepdim=True), aw * bv + bw * av + torch.linalg.cross(av, bv)], -1)
+
+
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Unit quaternions [N, 4] (w, x, y, z) -> [N, 3, 3]."""
     w, x, y, z = quats.unbind(1)

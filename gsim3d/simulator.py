@@ -23,11 +23,12 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d.dynamics import Dynamics, append_step, concatenate, last_steps, rollout
-from gsim3d.effects import EffectsSpec, Plan, make_plan
+from gsim3d.effects import EffectsSpec, OutputEffects
 from gsim3d.encoder import Encoder, pixel_rows
 from gsim3d.guards import drop_rows, guard_frames, guard_particles
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
+from gsim3d.plans import Plan, make_plan, unused_parameters
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
 from gsim3d.renderer import GaussianHead, render, render_as_published
@@ -64,20 +65,9 @@ class Simulator(nn.Module):
         Raises:
             UnsupportedEffect: this model cannot simulate an effect of ``spec``.
         """
-        dynamics, renderer = self.config.dynamics, self.config.renderer
-        plan = make_plan(
-            spec,
-            history=2**dynamics.history_bits,
-            sh_degree=renderer.sh_degree,
-            changes_opacity=dynamics.explicit,
-        )
-        merged = dynamics.pyramid_spec(dynamics.history_bits).merged_bits()
-        unused = [
-            f"dynamics.net.encoder.{s}.merge.time_embedding"
-            for s, stage in enumerate(self.dynamics.net.encoder)
-            if stage.merge is not None and merged[s] == 0
-        ]
-        return dataclasses.replace(plan, unused=tuple(unused))
+        plan = make_plan(spec, self.config)
+        names = (name for name, _ in self.named_parameters())
+        return dataclasses.replace(plan, unused=unused_parameters(plan, self.config, names))
 
     def step(
         self,
@@ -151,7 +141,7 @@ class Simulator(nn.Module):
             particles: any clouds.
             cameras: I images.
             background: [3] or [I, 3], default black.
-            plan: limits the degree of view-dependent colour; default the model's.
+            plan: which images, and the degree of view-dependent colour; default colour as the model's, alpha and depth.
             cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
         """
         particles = self._guard("render", on_bad, report, in_workspace=False)(particles)
@@ -170,11 +160,18 @@ class Simulator(nn.Module):
     ) -> Rendering:
         """As :meth:`render`, of particles as :meth:`rollout` returned them: their numbers are not looked at again."""
         on_bad, report = on_bad or self.config.stability.on_bad, self.report if report is None else report
-        gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None)
+        outputs = plan.spec.outputs if plan else OutputEffects(depth=True, alpha=True)
+        gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None, rgb=outputs.rgb)
         quirks = self.config.renderer.quirks
         if quirks != Quirks():
-            return render_as_published(gaussians, cameras, background, quirks=quirks)
-        return render(gaussians, cameras, background, cutoff=cutoff, on_bad=on_bad, report=report)
+            image = render_as_published(gaussians, cameras, background, quirks=quirks)
+        else:
+            features = particles.latents if outputs.features else None
+            image = render(
+                gaussians, cameras, background, features=features, cutoff=cutoff, on_bad=on_bad, report=report
+            )
+        asked = (outputs.rgb, outputs.alpha, outputs.depth, outputs.features)
+        return Rendering(*(made if wanted else None for made, wanted in zip(image, asked, strict=True)))
 
     def _guard(
         self, where: str, on_bad: OnBad | None, report: StabilityReport | None, in_workspace: bool = True
@@ -203,16 +200,11 @@ class Simulator(nn.Module):
         guard: Callable[..., Particles],
         geometry: Callable[[Particles], Pyramid] | None = None,
     ) -> Particles:
-        """The next steps of every scene, guarded, without the changes that the plan leaves out."""
-        step = self.dynamics(state, generator=generator, pyramid=None if geometry is None else geometry(state))
+        """The next steps of every scene, guarded."""
         appearance = plan.spec.appearance
+        changes = self.dynamics.layout.changes(appearance.changing, appearance.opacity_changes is not False)
+        pyramid = None if geometry is None else geometry(state)
+        step = self.dynamics(state, generator=generator, pyramid=pyramid, changes=changes)
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
-        if appearance.changing != "all":
-            held = (step.activity == FROZEN) | (appearance.changing == "none")
-            latents = torch.where(held[:, None], newest.dynamic_latents, step.dynamic_latents)
-            step = dataclasses.replace(step, dynamic_latents=latents)
-            if step.sh is not None:
-                step = dataclasses.replace(step, sh=torch.where(held[:, None, None], newest.sh, step.sh))
-        if appearance.opacity_changes is False:
-            step = dataclasses.replace(step, opacities=newest.opacities)
-        return guard(step, previous=newest, changed=self.dynamics.layout.changing)
+        changed = [name for name, who in changes.items() if who != "none"]
+        return guard(step, previous=newest, changed=changed)

@@ -194,6 +194,8 @@ class Particles(_Tensors):
         see gsim3d.stability). A masked-out particle is absent.
     origin: float64 [B, 3] metres, lower corner of each scene's workspace.
     quats [N, 4] (w, x, y, z), scales [N, 3] metres, sh [N, K, 3]: only in explicit models.
+    turns [N, 4] (w, x, y, z), paint [N, 3, 3]: only where an edit turned or painted particles whose look is latent
+        (:mod:`gsim3d.edits`): what is drawn is turned further, and its colours go through the matrix.
 
     Rows of two encoded steps are not aligned (each step sees other pixels); rows of two simulated steps are.
     """
@@ -210,10 +212,12 @@ class Particles(_Tensors):
     quats: Tensor | None = None
     scales: Tensor | None = None
     sh: Tensor | None = None
+    turns: Tensor | None = None
+    paint: Tensor | None = None
     known: CloudTable | None = None  # see clouds
 
     ROW_FIELDS = (
-        "means", "opacities", "dynamic_latents", "static_latents", "activity", "quats", "scales", "sh",
+        "means", "opacities", "dynamic_latents", "static_latents", "activity", "quats", "scales", "sh", "turns", "paint",
     )
 
     @property
@@ -236,6 +240,11 @@ class Particles(_Tensors):
         """These particles packed as ``table`` says; ``fields`` replaces what changes with it."""
         cu_rows, scene, step = table.tensors
         return dataclasses.replace(self, **fields, cu_rows=cu_rows, cloud_scene=scene, cloud_step=step, known=table)
+
+    @property
+    def latents(self) -> Tensor:
+        """[N, Fd + Fs], those that change with time first."""
+        return torch.cat([self.dynamic_latents, self.static_latents], 1)
 
     def row_fields(self) -> dict[str, Tensor]:
         """The tensors that have one row a particle, by name."""
@@ -273,7 +282,8 @@ class Gaussians(_Tensors):
     """3D Gaussians, packed like the particles they came from.
 
     means [N, 3] metres, quats [N, 4] (w, x, y, z), scales [N, 3] metres, opacities [N] in (0, 1),
-    sh [N, K, 3] coefficients of the standard 3DGS basis (K = (degree + 1)^2; colour = sum + 0.5, clamped at 0),
+    sh [N, K, 3] coefficients of the standard 3DGS basis (K = (degree + 1)^2; colour = sum + 0.5, clamped at 0); None
+    where no colour is asked for,
     cu_rows int64 [Q + 1].
     """
 
@@ -281,5 +291,5 @@ class Gaussians(_Tensors):
     quats: Tensor
     scales: Tensor
     opacities: Tensor
-    sh: Tensor
+    sh: Tensor | None
     cu_rows: Tensor

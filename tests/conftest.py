@@ -28,6 +28,14 @@ def cuda_device() -> torch.device:
     return torch.device("cuda")
 
 
+def pytest_collection_modifyitems(items):
+    """Marks the tests that use the GPU: ``-m gpu`` selects them."""
+    for item in items:
+        values = item.callspec.params.values() if hasattr(item, "callspec") else ()
+        if "devices" in item.fixturenames or any("cuda" in str(value) for value in values):
+            item.add_marker(pytest.mark.gpu)
+
+
 @pytest.fixture(params=["cpu", "cuda"])
 def device(request) -> torch.device:
     """Runs the test once for each device."""

@@ -4,12 +4,28 @@ import json
 
 import pytest
 
-from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects, UnsupportedEffect, make_plan
+from gsim3d import presets
+from gsim3d.effects import (
+    Actions,
+    AppearanceEffects,
+    Contact,
+    DynamicsEffects,
+    EffectsSpec,
+    OutputEffects,
+    Sleep,
+    UnsupportedEffect,
+)
 from gsim3d.errors import InputError
+from gsim3d.plans import make_plan
 
-MODEL = {"history": 4, "sh_degree": 3, "changes_opacity": False}
-FULL = EffectsSpec(
+MODEL = presets.paper_latent(4)  # holds opacities
+SOME = EffectsSpec(
     DynamicsEffects(background="masked_out", history=2),
+    AppearanceEffects(view_dependent=1, changing="dynamic"),
+    outputs=OutputEffects(depth=True),
+)
+FULL = EffectsSpec(
+    DynamicsEffects("masked_out", 2, Actions(names=("hand",)), Contact((("bunny", "ground"),)), Sleep("approx")),
     AppearanceEffects(view_dependent=1, changing="dynamic"),
     outputs=OutputEffects(depth=True),
 )
@@ -18,26 +34,27 @@ FULL = EffectsSpec(
 def test_absent_is_off():
     spec = EffectsSpec()
     assert spec.to_dict() == {"version": 1} and EffectsSpec.from_dict(None) == spec == EffectsSpec.from_dict({})
-    plan = make_plan(spec, **MODEL)
+    plan = make_plan(spec, MODEL)
     assert (plan.history, plan.sh_degree) == (4, 3)
-    assert {"depth images", "actions", "insertion and removal", "changing opacities"} <= set(plan.skipped)
+    assert {"depth images", "actions", "insertion", "removal", "changing opacities"} <= set(plan.skipped)
 
 
 @pytest.mark.parametrize("name", ["effects.yaml", "effects.json"])
 def test_round_trip(tmp_path, name):
     path = tmp_path / name
-    FULL.save(path)
-    assert EffectsSpec.load(path) == FULL
-    assert EffectsSpec.from_dict(json.loads(json.dumps(FULL.to_dict()))) == FULL
+    for spec in (EffectsSpec(), SOME, FULL):
+        spec.save(path)
+        assert EffectsSpec.load(path) == spec and EffectsSpec.load(path).hash == spec.hash
+        assert EffectsSpec.from_dict(json.loads(json.dumps(spec.to_dict()))) == spec
 
 
 def test_hash_tells_specs_apart():
     assert EffectsSpec().hash == EffectsSpec.from_dict({"version": 1}).hash != FULL.hash
-    assert len(FULL.hash) == 16
+    assert len(FULL.hash) == 16 and FULL.hash != SOME.hash
 
 
 def test_plan_says_what_is_kept_and_why_the_rest_is_not():
-    plan = make_plan(FULL, **MODEL)
+    plan = make_plan(SOME, MODEL)
     assert (plan.history, plan.sh_degree) == (2, 1)
     assert "view-dependent colour" in plan.kept and "depth images" in plan.kept
     assert plan.skipped["frozen background"] == "background is masked_out"
@@ -47,23 +64,22 @@ def test_plan_says_what_is_kept_and_why_the_rest_is_not():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"dynamics": {"actions": {"type": "keypoints3d"}}}, "unsupported effect dynamics.actions"),
+        ({"dynamics": {"actions": {"names": ["hand"]}}}, "unsupported effect dynamics.actions"),
         ({"dynamics": {"contact": {"pairs": [["a", "b"]]}}}, "unsupported effect dynamics.contact"),
         ({"dynamics": {"sleep": {"policy": "exact"}}}, "unsupported effect dynamics.sleep"),
-        ({"structure": {"insert": True}}, "unsupported effect structure.insert"),
-        ({"structure": {"remove": True}}, "unsupported effect structure.remove"),
+        ({"outputs": {"rgb": False}}, "unsupported effect outputs: there is no image to make"),
         ({"dynamics": {"history": 5}}, "unsupported effect dynamics.history: this model goes up to 4; got 5"),
         ({"appearance": {"opacity_changes": True}}, "unsupported effect appearance.opacity_changes"),
     ],
 )
 def test_what_cannot_be_simulated_raises(values, message):
     with pytest.raises(UnsupportedEffect, match=message):
-        make_plan(EffectsSpec.from_dict(values), **MODEL)
+        make_plan(EffectsSpec.from_dict(values), MODEL)
 
 
 def test_view_dependence_beyond_the_model_raises():
     with pytest.raises(UnsupportedEffect, match="view_dependent: this model goes up to 0; got 2"):
-        make_plan(EffectsSpec(appearance=AppearanceEffects(view_dependent=2)), **{**MODEL, "sh_degree": 0})
+        make_plan(EffectsSpec(appearance=AppearanceEffects(view_dependent=2)), presets.tiny())
 
 
 @pytest.mark.parametrize(
@@ -77,6 +93,12 @@ def test_view_dependence_beyond_the_model_raises():
         ({"dynamics": {"history": "2"}}, "dynamics.history must be an integer of at least 1; got '2'"),
         ({"appearance": {"view_dependent": 4}}, "view_dependent must be 0 to 3; got 4"),
         ({"appearance": {"changing": "bunny"}}, "appearance.changing must be one of"),
+        ({"dynamics": {"sleep": {"policy": "soundly"}}}, "dynamics.sleep.policy must be one of exact, approx"),
+        ({"dynamics": {"sleep": {"patience": 0}}}, "dynamics.sleep.patience must be an integer of at least 1; got 0"),
+        ({"dynamics": {"sleep": {"eps": "1e-3"}}}, "dynamics.sleep.eps must be a number of at least 0; got '1e-3'"),
+        ({"dynamics": {"actions": {"names": "hand"}}}, "dynamics.actions.names must be a list; got 'hand'"),
+        ({"dynamics": {"contact": {"pairs": [["a"]]}}}, r"dynamics.contact.pairs must be a list of 2; got \['a'\]"),
+        ({"outputs": {"depth": "yes"}}, "outputs.depth must be true or false; got 'yes'"),
         ({"version": 2}, "version must be 1; got 2"),
     ],
 )

@@ -15,6 +15,7 @@ ROOMS = [
     {"layers", "guards"},
     {"encoder", "dynamics", "renderer"},
     {"presets"},
+    {"plans"},
     {"simulator"},
     {"laws", "graphs"},
     {"endurance"},

@@ -198,13 +198,13 @@ def cells_of(dynamics, history):
 def test_slots_from_first(quirk):
     dynamics = with_quirks(slots_from_first=quirk)
     seen = []
-    dynamics.net.encoder[1].merge.register_forward_pre_hook(lambda _, args: seen.append(args[1].time_index))
-    step = dynamics(make_history((30,)))
+    dynamics.net.encoder[2].merge.register_forward_pre_hook(lambda _, args: seen.append(args[1].time_index))
+    step = dynamics(make_history((30, 30)))
     assert torch.isfinite(step.means).all()
     if quirk:
-        assert seen[0] is None  # one step: nothing merges
+        assert seen[0] is None  # two steps: nothing is left to merge a second time
     else:
-        assert_same_bits(seen[0], torch.ones_like(seen[0]))  # the newest of the pair that would merge
+        assert_same_bits(seen[0], torch.ones_like(seen[0]))  # the newest of the pairs that would merge
 
 
 def advanced(particles, value, **switches):

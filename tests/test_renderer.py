@@ -76,7 +76,7 @@ def test_explicit_particles_are_gaussians_already():
 
 def test_lower_degrees_are_the_first_coefficients():
     particles, head = make_history((10,)), make_head()
-    assert_same_bits(head(particles, sh_degree=0).sh, head(particles).sh[:, :1])
+    assert_close_relative_to_max(head(particles, sh_degree=0).sh, head(particles).sh[:, :1], 1e-6)
 
 
 def test_short_quaternions_are_the_identity_without_gradient():

@@ -3,7 +3,7 @@
 #
 #   tools/gpu_check.sh all                  everything, in this order
 #   tools/gpu_check.sh build                the extension with its CUDA kernels, in place
-#   tools/gpu_check.sh test                 all tests; one that cannot reach the GPU fails
+#   tools/gpu_check.sh test                 the tests that use the GPU; tools/test.sh has the others
 #   tools/gpu_check.sh sanitize             compute-sanitizer (memcheck, racecheck) on the tests of the ops
 #   tools/gpu_check.sh bench                every op and the whole model against its peers: tools/bench/results/*.jsonl
 #
@@ -51,36 +51,31 @@ compile() {
   MAX_JOBS="${MAX_JOBS:-$(nproc)}" GSIM3D_CUDA=1 "$PYTHON" setup.py build_ext --inplace
 }
 
-# Test files run side by side where pytest-xdist is installed; they share the GPU.
-pytest_() {
+# Tests run side by side where pytest-xdist is installed; they share the GPU.
+tests() {
   local parallel=()
-  "$PYTHON" -c 'import xdist' 2>/dev/null && parallel=(-n 8 --dist loadfile)
-  GSIM3D_REQUIRE_CUDA=1 OMP_NUM_THREADS=2 "$PYTHON" -m pytest -q "${parallel[@]}" "$@"
+  "$PYTHON" -c 'import xdist' 2>/dev/null && parallel=(-n "$(($(nproc) < 14 ? $(nproc) : 14))" --dist load)
+  # What the hard cases measured: python tools/stability.py --add FILE puts it into docs/stability.md.
+  GSIM3D_REQUIRE_CUDA=1 GSIM3D_STABILITY_JSON="$STATE/stability.json" OMP_NUM_THREADS=1 \
+    "$PYTHON" -m pytest -q "${parallel[@]}" tests -m "gpu and not slow"
 }
 
 sanitize() {
   local tool="$1" file="$2"
   # Without torch's memory pool every tensor is an allocation that the tool watches; a graph cannot be captured so.
   GSIM3D_REQUIRE_CUDA=1 PYTORCH_NO_CUDA_MEMORY_CACHING=1 OMP_NUM_THREADS=1 compute-sanitizer --tool "$tool" \
-    --error-exitcode 9 "$PYTHON" -m pytest -q -p no:cacheprovider "$file" -k "cuda and not compile and not graph and not opcheck"
+    --error-exitcode 9 "$PYTHON" -m pytest -q -p no:cacheprovider "$file" -m gpu -k "not compile and not graph and not opcheck"
 }
 
 run_build() { step build compile; }
-run_test() {
-  local failed=0
-  step test_ops pytest_ tests/ops tests/test_registry.py || failed=1
-  # What the hard cases measured: python tools/stability.py --add FILE puts it into docs/stability.md.
-  GSIM3D_STABILITY_JSON="$STATE/stability.json" step test_model pytest_ tests --ignore tests/ops --ignore tests/test_registry.py --ignore tests/test_cpp.py \
-    --ignore tests/test_demo.py -m "not slow" || failed=1
-  return $failed
-}
+run_test() { step test tests; }
 run_sanitize() {
   command -v compute-sanitizer >/dev/null || die "compute-sanitizer was not found: it comes with the CUDA toolkit"
   local failed=0 tool file name
   # Few at a time, for they wait for one GPU; the longest first.
   for file in $(ls -S tests/ops/test_*.py); do
     for tool in memcheck racecheck; do
-      while [ "$(jobs -rp | wc -l)" -ge 6 ]; do wait -n; done
+      while [ "$(jobs -rp | wc -l)" -ge 10 ]; do wait -n; done
       step "${tool}_$(basename "$file" .py)" sanitize "$tool" "$file" &
     done
   done

@@ -113,6 +113,11 @@ class DynamicsConfig:
         return not self.quirks.anchor_at_minimum
 
     @property
+    def slots_from_newest(self) -> bool:
+        """Whether steps are counted back from the newest, so that it has one place in histories of any length."""
+        return not self.quirks.slots_from_first
+
+    @property
     def max_opacity(self) -> float:
         """The largest opacity of a particle."""
         return LARGEST if self.quirks.unbounded_opacity else 1.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor, nn
 
@@ -56,7 +58,12 @@ class Dynamics(nn.Module):
         )
 
     def forward(
-        self, history: Particles, *, generator: torch.Generator | None = None, pyramid: Pyramid | None = None
+        self,
+        history: Particles,
+        *,
+        generator: torch.Generator | None = None,
+        pyramid: Pyramid | None = None,
+        changes: Mapping[str, str] | None = None,
     ) -> Particles:
         """The next step of every scene, or the next ``config.steps_per_call`` steps.
 
@@ -65,6 +72,7 @@ class Dynamics(nn.Module):
             generator: of drop path and of the curves' shuffling, both in training only; None: neither happens.
             pyramid: ``geometry(history)``; None: made here. With one of a given capacity nothing waits for the device,
                 and the result has the same values as long as ``pyramid.found`` fits the capacity.
+            changes: what a step changes, of ``layout.changes``; the rest is not computed. None: all that is predicted.
         Returns:
             One cloud a scene and step, each with the rows of the scene's newest step.
         Gradients: features and positions of ``history``, parameters. Cells are constants.
@@ -89,8 +97,8 @@ class Dynamics(nn.Module):
             features, is_awake = (
                 ops.unpool(x, pyramid.rows, pyramid.cu_rows, history.n_rows, check=False) for x in (features, one)
             )
-        runs = clouds.row_runs(newest)
-        prediction = self.net.head(take_runs(features, runs))
+        runs, changes = clouds.row_runs(newest), changes or self.layout.changes()
+        prediction = self.net.head(take_runs(features, runs), self.layout.columns(changes))
         if is_awake is not None:
             is_awake = take_runs(is_awake, runs)[:, 0] > 0
 
@@ -99,23 +107,25 @@ class Dynamics(nn.Module):
         counts = [table.count(q) for q in range(len(table))]
         steps = [
             step.with_clouds(CloudTable.make(counts, table.scenes, (s + 1 + i for s in table.steps), state.cu_rows.device))
-            for i, step in enumerate(self.layout.advance(state, prediction, is_awake))
+            for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes))
         ]
         return steps[0] if len(steps) == 1 else concatenate(steps)
 
     def _slots(self, clouds: CloudTable, newest: list[int]) -> tuple[tuple[int, ...], int]:
-        """Time slot of each cloud, and the bits they are counted in."""
+        """Time slot of each cloud, and the bits they are counted in: none where no scene has two steps to merge."""
         slots, longest, begin, bits = [], 1, 0, self.config.history_bits
-        from_first = self.config.quirks.slots_from_first
+        from_newest = self.config.slots_from_newest
         for last in newest:
             span = clouds.steps[last] - clouds.steps[begin]
             longest = max(longest, span + 1)
-            shift = 0 if from_first else 2**bits - 1 - span
+            shift = 2**bits - 1 - span if from_newest else 0
             slots += [shift + clouds.steps[q] - clouds.steps[begin] for q in range(begin, last + 1)]
             begin = last + 1
         if longest > 2**bits:
             raise ValueError(f"Dynamics: a history must span at most {2**bits} steps; got {longest}")
-        return tuple(slots), (longest - 1).bit_length() if from_first else bits
+        if longest == 1 and from_newest:
+            return (0,) * len(slots), 0
+        return tuple(slots), bits if from_newest else (longest - 1).bit_length()
 
     def _draw_curves(self, generator: torch.Generator | None) -> tuple[tuple[int, ...], ...] | None:
         if generator is None:

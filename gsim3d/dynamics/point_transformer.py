@@ -7,6 +7,8 @@ Source: Point Transformer V3 (Wu et al. 2024), time merging of 3DGSim.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -198,16 +200,20 @@ class Pool(nn.Module):
 
 
 class Merge(nn.Module):
-    """Marks each row with its step inside the merged window. (That steps share a cloud is part of the geometry.)"""
+    """Marks each row with its step inside the merged window. (That steps share a cloud is part of the geometry.)
 
-    def __init__(self, window: int, channels: int):
+    newest: the mark of the newest step, which a history of one step has throughout; None: it has none.
+    """
+
+    def __init__(self, window: int, channels: int, newest: int | None):
         super().__init__()
+        self.newest = newest
         self.time_embedding = nn.Parameter(torch.empty(window, channels))
         nn.init.trunc_normal_(self.time_embedding, std=TIME_EMBEDDING_STD)
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
         if stage.time_index is None:
-            return x
+            return x if self.newest is None else x + self.time_embedding[self.newest].to(x.dtype)
         # A product with a one-hot matrix: its gradient is a sum in row order, where indexing would use atomics on CUDA.
         return x + F.one_hot(stage.time_index, self.time_embedding.shape[0]).to(x) @ self.time_embedding
 
@@ -218,7 +224,9 @@ class EncoderStage(nn.Module):
         channels = config.encoder_channels
         self.pool = Pool(channels[index - 1], channels[index], config.norm) if index > 0 else None
         window = config.merge_windows[index - 1] if index > 0 else 1
-        self.merge = Merge(window, channels[index]) if window > 1 and config.time_embedding else None
+        n_merged = 2 ** config.pyramid_spec(config.history_bits).merged_bits()[index]
+        newest = n_merged - 1 if config.slots_from_newest and n_merged > 1 else None
+        self.merge = Merge(window, channels[index], newest) if window > 1 and config.time_embedding else None
         self.blocks = nn.ModuleList(
             Block(channels[index], config.encoder_heads[index], drop_path, config) for drop_path in drop_paths
         )
@@ -277,8 +285,10 @@ class Head(nn.Module):
             nn.init.zeros_(self.fc2.weight)
             nn.init.zeros_(self.fc2.bias)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(self.fc1(F.gelu(self.norm(x))))
+    def forward(self, x: Tensor, outputs: Sequence[tuple[int, int]] | None = None) -> Tensor:
+        """``outputs``: channels to compute, as :meth:`RowLinear.some`; None: all."""
+        x = self.fc1(F.gelu(self.norm(x)))
+        return self.fc2(x) if outputs is None else self.fc2.some(x, outputs)
 
 
 class PointTransformer(nn.Module):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -51,10 +52,30 @@ class StateLayout:
     def in_channels(self) -> int:
         return sum(n for _, n in self.inputs) + POSITION_CHANNELS * self.config.position_features
 
-    @property
-    def changing(self) -> tuple[str, ...]:
-        """Fields of Particles that a step may change."""
-        return tuple(name for name, _ in self.outputs)
+    def changes(self, features: str = "all", opacities: bool = True) -> dict[str, str]:
+        """Of each output, whose values a step changes: "all", "dynamic" or "none".
+
+        Args:
+            features: whose latents and colours change. Those of frozen particles may: a shadow may fall on them.
+            opacities: whether they change, where they are predicted.
+        """
+        quirk = self.config.steps_per_call == 1 and self.config.quirks.frozen_rows_turn
+        who = {name: "dynamic" for name, _ in self.outputs}
+        who |= {name: features for name in ("dynamic_latents", "sh") if name in who}
+        if "opacities" in who and not opacities:
+            who["opacities"] = "none"
+        if "quats" in who and quirk:
+            who["quats"] = "all"
+        return who
+
+    def columns(self, changes: Mapping[str, str]) -> list[tuple[int, int]] | None:
+        """Runs of output channels that ``changes`` asks for; None: all of them."""
+        runs, begin = [], 0
+        for name, n in self.outputs * self.config.steps_per_call:
+            if changes[name] != "none":
+                runs.append((runs.pop()[0] if runs and runs[-1][1] == begin else begin, begin + n))
+            begin += n
+        return None if runs == [(0, begin)] else runs
 
     @property
     def out_channels(self) -> int:
@@ -73,26 +94,28 @@ class StateLayout:
             columns.append(position_features(particles, self.config.grid_size, self.config.position_length))
         return torch.cat(columns, 1)
 
-    def advance(self, particles: Particles, prediction: Tensor, awake: Tensor | None = None) -> list[Particles]:
+    def advance(
+        self, particles: Particles, prediction: Tensor, awake: Tensor | None = None, changes: Mapping[str, str] | None = None
+    ) -> list[Particles]:
         """The particles after 1, 2, ... ``steps_per_call`` steps.
 
         Args:
             particles: N rows, the newest state.
-            prediction: [N, out_channels].
+            prediction: [N, channels], the outputs that change.
             awake: bool [N], rows that change at all; None: all.
+            changes: of :meth:`changes`; None: all that is predicted.
         """
-        widths = [n for _, n in self.outputs]
+        changes = changes or self.changes()
+        outputs = [(name, n) for name, n in self.outputs if changes[name] != "none"]
+        widths = [n for _, n in outputs]
         parts = widened(prediction).unflatten(1, (self.config.steps_per_call, -1)).transpose(0, 1).split(widths, 2)
         moves = (particles.activity != FROZEN)[:, None].to(parts[0])
         everywhere = torch.ones_like(moves)
         if awake is not None:
             moves, everywhere = moves * awake[:, None], everywhere * awake[:, None]
         later = {}
-        for (name, _), part in zip(self.outputs, parts, strict=True):
-            # Latents and colours of frozen particles change too: a shadow may fall on them.
-            share = everywhere if name in ("dynamic_latents", "sh") else moves
-            if name == "quats" and self.config.steps_per_call == 1 and self.config.quirks.frozen_rows_turn:
-                share = everywhere
+        for (name, _), part in zip(outputs, parts, strict=True):
+            share = everywhere if changes[name] == "all" else moves
             later[name] = self.later_values(name, getattr(particles, name), part, share)
         return [
             dataclasses.replace(particles, **{name: values[step] for name, values in later.items()})

@@ -33,7 +33,7 @@ FAULT_BITS, OF_ROWS = 9, 7  # the first faults are of rows
 
 
 class Rendering(NamedTuple):
-    """Images of one call.
+    """Images of one call; of a simulator, those that its plan asks for, and None for the others.
 
     color: [I, H, W, 3].
     alpha: [I, H, W] in [0, 1), how much of the background is hidden.

@@ -19,11 +19,12 @@ from tqdm import tqdm
 
 from gsim3d.data import Scene, generator, make_frames
 from gsim3d.dynamics import concatenate
-from gsim3d.effects import EffectsSpec, Plan
+from gsim3d.effects import EffectsSpec
 from gsim3d.errors import HardCaseError, InputError
 from gsim3d.layers import tf32_only_if_asked
 from gsim3d.perceptual.lpips import LPIPS
 from gsim3d.perceptual.weights import load
+from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.config import TrainConfig

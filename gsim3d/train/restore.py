@@ -10,9 +10,10 @@ import torch
 
 from gsim3d import presets
 from gsim3d.data import Scene
-from gsim3d.effects import EffectsSpec, Plan
+from gsim3d.effects import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.ops import cuda_compiled
+from gsim3d.plans import Plan
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator

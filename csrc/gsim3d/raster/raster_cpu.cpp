@@ -90,15 +90,23 @@ void project_chunk_vjp(const RasterScene<T>& scene, const Group<T>& group, const
     scatter_add<T>(sum[5] / opacity, rows, n, 1, 0, grads.opacities);
 
     if constexpr (kTerms > 0) {
-      const Direction<V> direction = view_direction(camera, p.point);
       V coefficients[kTerms * 3], grad_coefficients[kTerms * 3], color[3];
-      V basis[kTerms], grad_basis[kTerms], grad_unit[3];
+      V basis[kTerms], grad_basis[kTerms];
       for (int i = 0; i < kTerms * 3; ++i) coefficients[i] = gather(scene.color, seen, kTerms * 3, i);
-      sh_basis<kTerms>(direction.unit, basis);
-      sh_color<kTerms>(basis, coefficients, color);
-      sh_color_vjp<kTerms>(basis, coefficients, color, sum + 6, grad_basis, grad_coefficients);
-      sh_basis_vjp<kTerms>(direction.unit, grad_basis, grad_unit);
-      view_direction_vjp(camera, p.point, direction, grad_unit, grad.point, viewmat_sums);
+      const auto through_color = [&](const V direction[3]) {
+        sh_basis<kTerms>(direction, basis);
+        sh_color<kTerms>(basis, coefficients, color);
+        sh_color_vjp<kTerms>(basis, coefficients, color, sum + 6, grad_basis, grad_coefficients);
+      };
+      if constexpr (kTerms > 1) {
+        const Direction<V> direction = view_direction(camera, p.point);
+        V grad_unit[3];
+        through_color(direction.unit);
+        sh_basis_vjp<kTerms>(direction.unit, grad_basis, grad_unit);
+        view_direction_vjp(camera, p.point, direction, grad_unit, grad.point, viewmat_sums);
+      } else {
+        through_color(mean);  // the constant, whatever the direction
+      }
       for (int i = 0; i < kTerms * 3; ++i) scatter_add<T>(grad_coefficients[i], rows, n, kTerms * 3, i, grads.color);
     } else {
       for (int c = 0; c < 3; ++c) scatter_add<T>(sum[6 + c], rows, n, 3, c, grads.color);

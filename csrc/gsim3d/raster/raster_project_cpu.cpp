@@ -65,7 +65,11 @@ Unusable project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, con
     for (int i = 0; i < kColumns; ++i) coefficients[i] = gather(scene.color, rows, kColumns, i);
     if constexpr (kTerms > 0) {
       V basis[kTerms];
-      sh_basis<kTerms>(view_direction(camera, p.point).unit, basis);
+      if constexpr (kTerms > 1) {
+        sh_basis<kTerms>(view_direction(camera, p.point).unit, basis);
+      } else {
+        sh_basis<kTerms>(mean, basis);  // the constant, whatever the direction
+      }
       sh_color<kTerms>(basis, coefficients, color);
     } else {
       for (int c = 0; c < 3; ++c) color[c] = coefficients[c];
