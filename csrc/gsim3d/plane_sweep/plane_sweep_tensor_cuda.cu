@@ -100,6 +100,7 @@ __global__ void __launch_bounds__(kTileThreads, 2)
   const int64_t image_size = int64_t{s.n_pixels} * 2 * s.channels;
   const Range pairs = range_of(sweep.cu_src, image, sweep.n_pairs);
   memory.fill_depths(sweep, image);
+  const float own_inverse = halves.inverses[image];
   int32_t held = -1;  // the first of the channels in `own`
 
   for (int32_t first_depth = 0; first_depth < s.n_depths; first_depth += kDepths * kTileWarps) {
@@ -109,7 +110,7 @@ __global__ void __launch_bounds__(kTileThreads, 2)
       const int64_t source = sweep.src_images[pair];
       if (!inside(source, sweep.n_images)) continue;
       const TileLines lines(sweep, pair, pixel);
-      const Unit unit(halves.inverses[image], halves.inverses[source]);
+      const float source_inverse = halves.inverses[source];  // on its way while the lines are marked
       const int32_t count =
           mark_lines(lines, memory.depths, first_depth, end_depth, s, flags, memory.sums, memory.words);
       for (int32_t first = 0; first < count; first += kScored) {
@@ -128,6 +129,7 @@ __global__ void __launch_bounds__(kTileThreads, 2)
                      scores);
         }
         __syncthreads();
+        const Unit unit(own_inverse, source_inverse);
 #pragma unroll
         for (int j = 0; j < kDepths; ++j) {
           const int32_t k = first_depth + warp + j * kTileWarps;
