@@ -1,4 +1,4 @@
-"""The ``gsim3d`` command: generate, check-data, train, simulate, evaluate, weights, import, demo, doctor."""
+"""The ``gsim3d`` command: make and check data, train, simulate, evaluate, import, and tell what is wrong."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ COMMANDS = {
     "check-data": ("gsim3d.check_data", "what is wrong with recorded scenes, and a picture of their cameras"),
     "train": ("gsim3d.train.command", "learn a simulator from a data set"),
     "simulate": ("gsim3d.simulate", "predict the future of one scene: video and .ply"),
+    "plan": ("gsim3d.show_plan", "which effects of a scene are computed, which are not, and what that costs"),
+    "effects": ("gsim3d.infer_effects", "find out which effects a scene needs"),
     "evaluate": ("gsim3d.evaluate.command", "measure predictions on a data set, by step, beside baselines and other models"),
     "weights": ("gsim3d.perceptual.command", "install the weights of LPIPS and FVD"),
     "import": ("gsim3d.import_released", "bring a checkpoint of the authors' release over: same weights, same predictions"),

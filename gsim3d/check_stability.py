@@ -22,6 +22,7 @@ from gsim3d.endurance import CASES
 from gsim3d.errors import InputError
 from gsim3d.laws import LAWS, Deviation, Sample
 from gsim3d.quirks import Quirks
+from gsim3d.pretrained import located, names
 from gsim3d.simulator import Simulator
 from gsim3d.train.restore import Restored, build_simulator, restore
 from gsim3d.train.samples import context_cameras, spread_views
@@ -320,7 +321,7 @@ def run(job: Job) -> Report:
         raise InputError(f"--only: unknown check {unknown[0]!r}; checks: {', '.join(CHECKS)}")
     if job.n_steps < 1:
         raise InputError(f"--steps must be at least 1; got {job.n_steps}")
-    paths = [Path(path) for path in job.paths]
+    paths = [located(path) if str(path) in names() else Path(path) for path in job.paths]
     for path in paths:
         if not path.exists():
             raise InputError(f"{path}: no such file or folder")
@@ -330,7 +331,7 @@ def run(job: Job) -> Report:
         raise InputError("--stability takes one checkpoint, and one scene or folder of scenes")
     folders = find_scenes(others[0]) if others else []
     subject = open_subject(checkpoints[0] if checkpoints else None, job.device)
-    names = subject.origin | ({"scenes": str(others[0])} if others else {"scenes": "random images"})
+    origin = subject.origin | ({"scenes": str(others[0])} if others else {"scenes": "random images"})
     sample, problems = sample_of_scenes(subject, folders) if folders else (random_sample(subject), [])
     findings: list[Finding] = []
     if sample is not None:
@@ -343,7 +344,7 @@ def run(job: Job) -> Report:
                     finding = dataclasses.replace(finding, file=str(file))
                 findings.append(finding)
                 bar.update()
-    report = Report(names, tuple(problems), tuple(findings))
+    report = Report(origin, tuple(problems), tuple(findings))
     job.out.mkdir(parents=True, exist_ok=True)
     write_report(report, job.out)
     return report

@@ -1,4 +1,4 @@
-"""``gsim3d demo``: the main job at a small size: make multi-view video, learn a simulator, predict unseen scenes."""
+"""``gsim3d demo``: multi-view video is made and predicted, by a shipped simulator or one learned here."""
 
 from __future__ import annotations
 
@@ -15,22 +15,27 @@ from pathlib import Path
 from typing import Any
 
 from gsim3d.errors import InputError
+from gsim3d.pretrained import names
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
 
 EPILOG = """\
 Writes into DIR:
-  data/          multi-view video of soft bodies that fall on a round ground (simulated and filmed here)
-  model/         checkpoints and log of the training; model.safetensors beside it is the result in one file
-  rollout.mp4    held-out scenes, truth above prediction
+  held_out/      multi-view video of soft bodies that fall on a round ground, made here; no training saw it
+  rollout.mp4    these scenes, truth above prediction
   psnr.png       PSNR over time against the baselines
   metrics.json   all numbers; the most important ones are printed
   gaussians/     the predicted 3D Gaussians of one scene, a .ply for each step
   overview.png   input views, Gaussians, predicted and true frames in one picture
 
-About 7 minutes on 2 cores. Stopped and started again, it goes on where it was.
+With --train, the main job at a small size, also
+  data/          instead of held_out/: smaller scenes, of which a few are held out
+  model/         checkpoints and log of the training; model.safetensors beside it is the result in one file
 
-example:
+About a minute on 2 cores; 7 minutes with --train. Stopped and started again, it goes on where it was.
+
+examples:
   gsim3d demo --out runs/demo
+  gsim3d demo --train --out runs/demo
 """
 
 
@@ -39,8 +44,12 @@ _stage = partial(StageConfig, batch=2, target_views=2, warm_up=0.1)
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """data: options of gsim3d.generate's preset "mini" to change.   train: the training."""
+    """preset, data: of gsim3d.generate, and options to change.   train: the training.
 
+    simulator: name of one that comes with gsim3d, which is then used instead of a training.
+    """
+
+    preset: str = "mini"
     data: dict[str, Any] = field(default_factory=lambda: {"n_frames": 18, "fps": 16.0})
     train: TrainConfig = TrainConfig(
         preset="tiny",
@@ -57,16 +66,23 @@ class DemoConfig:
         checkpoint_every=50,
         log_every=1,
     )
+    simulator: str | None = None
+
+
+SHIPPED = DemoConfig(
+    preset="paper", data={"n_trajectories": 2, "n_frames": 44, "objects": ("star", "torus")}, simulator="elastic-small"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Makes multi-view video, learns a simulator from it, and predicts scenes it has never seen."
+    parser.description = "Makes multi-view video of falling bodies and predicts it with a simulator that never saw it."
     parser.epilog = EPILOG
     parser.add_argument("--out", metavar="DIR", required=True, help="folder for everything; made if absent")
+    parser.add_argument("--train", action="store_true", help="learn the simulator here, from scratch")
 
 
 def run(args: argparse.Namespace) -> int:
-    run_demo(args.out)
+    run_demo(args.out, DemoConfig() if args.train or SHIPPED.simulator not in names() else SHIPPED)
     return 0
 
 
@@ -89,19 +105,21 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, *, progress: boo
     from gsim3d.generate import generate
 
     pyplot()
-    print("1/4 multi-view video of bodies that fall", flush=True)
+    place = "data" if config.simulator is None else "held_out"
+    print("multi-view video of bodies that fall", flush=True)
     with seconds.measure("data"):
-        folders = generate(out / "data", preset="mini", progress=progress, **config.data).folders
-    train_folders, test_folders = split_scenes(folders)
-    test = [Scene.open(folder) for folder in test_folders]
-    print(f"2/4 training on {len(train_folders)} scenes; {len(test)} are held out", flush=True)
-    digest = _train(out, config.train, train_folders, progress, seconds)
-    print("3/4 predicting the held-out scenes", flush=True)
+        folders = generate(out / place, preset=config.preset, progress=progress, **config.data).folders
+    if config.simulator is None:
+        train_folders, folders = split_scenes(folders)
+        print(f"training on {len(train_folders)} scenes; {len(folders)} are held out", flush=True)
+        _train(out, config.train, train_folders, progress, seconds)
+    test = [Scene.open(folder) for folder in folders]
+    print("predicting the held-out scenes", flush=True)
     with seconds.measure("evaluation"):
-        summary, restored = _evaluate(out, test, digest)
-    print("4/4 pictures", flush=True)
+        summary, predictor = _evaluate(out, test, config.simulator or out / "model")
+    print("pictures", flush=True)
     with seconds.measure("pictures"):
-        _pictures(out, restored, test, summary)
+        _pictures(out, predictor, test, summary)
     _report(out, summary, seconds.total, time.perf_counter() - start)
     return summary
 
@@ -126,8 +144,8 @@ class _Stopwatch:
             self.file.write_text(json.dumps(self.total))
 
 
-def _train(out: Path, config: TrainConfig, folders: list[Path], progress: bool, seconds: _Stopwatch) -> str:
-    """Trains to the end and exports; returns the hash of the last checkpoint."""
+def _train(out: Path, config: TrainConfig, folders: list[Path], progress: bool, seconds: _Stopwatch) -> None:
+    """Trains to the end and exports."""
     from gsim3d.data import Scene
     from gsim3d.train import checkpoint
     from gsim3d.train.loop import Trainer
@@ -138,30 +156,46 @@ def _train(out: Path, config: TrainConfig, folders: list[Path], progress: bool, 
     if trainer.step < config.n_steps:
         with seconds.measure("training"):
             trainer.run(progress=progress)
-    saved = checkpoint.load(out / "model")
     if not (out / "model.safetensors").is_file():
-        checkpoint.export(saved, out / "model.safetensors")
-    return saved.digest
+        checkpoint.export(checkpoint.load(out / "model"), out / "model.safetensors")
 
 
-def _evaluate(out: Path, scenes: list, digest: str):
+class _Predictor:
+    """Predicts each scene to its end, once."""
+
+    def __init__(self, simulator: str | Path):
+        from gsim3d.train.restore import restore
+
+        self.restored, self._known = restore(simulator), {}
+
+    def __call__(self, scene):
+        from gsim3d.evaluate.protocol import default_views, predict
+
+        if scene.path not in self._known:
+            context, _ = default_views(self.restored, scene)
+            n_future = scene.n_steps - self.restored.data.history
+            self._known[scene.path] = predict(self.restored, scene, context, n_future)
+        return self._known[scene.path]
+
+
+def _evaluate(out: Path, scenes: list, simulator: str | Path) -> tuple[dict, _Predictor]:
     from gsim3d.evaluate.protocol import score_scene
     from gsim3d.evaluate.report import summarize, write_json
-    from gsim3d.train.restore import restore
 
-    restored = restore(out / "model")
-    file = out / "metrics.json"
+    predictor = _Predictor(simulator)
+    digest, file = predictor.restored.checkpoint.digest, out / "metrics.json"
     try:
         summary = json.loads(file.read_text())
     except (OSError, ValueError):
         summary = {}
     if summary.get("checkpoint") != digest or "methods" not in summary:
-        summary = {"checkpoint": digest, **summarize([score_scene(restored, scene) for scene in scenes])}
+        scores = [score_scene(predictor.restored, scene, prediction=predictor(scene)) for scene in scenes]
+        summary = {"checkpoint": digest, **summarize(scores)}
         write_json(file, summary)
-    return summary, restored
+    return summary, predictor
 
 
-def _pictures(out: Path, restored, scenes: list, summary: dict) -> None:
+def _pictures(out: Path, predictor: _Predictor, scenes: list, summary: dict) -> None:
     """All pictures; each is made again only where it is missing or older than the numbers."""
     from gsim3d.evaluate.pictures import (
         as_bytes,
@@ -171,17 +205,18 @@ def _pictures(out: Path, restored, scenes: list, summary: dict) -> None:
         write_gaussians,
         write_overview,
     )
-    from gsim3d.evaluate.protocol import default_views, predict, render_steps
+    from gsim3d.evaluate.protocol import default_views, render_steps
     from gsim3d.interop import write_video
 
+    restored = predictor.restored
     made = [out / name for name in ("rollout.mp4", "psnr.png", "overview.png")]
     age = (out / "metrics.json").stat().st_mtime
     if all(file.is_file() and file.stat().st_mtime >= age for file in made):
         return
     truth, images, first = [], [], None
     for scene in scenes:
-        context, target = default_views(restored, scene)
-        prediction = predict(restored, scene, context, scene.n_steps - restored.data.history)
+        _, target = default_views(restored, scene)
+        prediction = predictor(scene)
         rendered = render_steps(restored, prediction.particles, scene, target[:1])
         truth.append(true_images(scene, target[:1], range(prediction.n_steps)))
         images.append(as_bytes(rendered))

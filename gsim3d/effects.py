@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import os
-import types
-import typing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import yaml
 
 from gsim3d.errors import InputError
-from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.files import read_yaml, typed
 
 VERSION = 1
 FILE = "effects.yaml"  # of a scene or of a whole data set, in its folder
@@ -55,28 +54,32 @@ class Contact:
 class Sleep:
     """When particles at rest are skipped.
 
-    policy: "exact": a scene sleeps as a whole, and nothing is lost; "approx": patches sleep, within a bound.
-    eps: in cells; what moves less in one step is at rest.
-    patience: steps at rest before it sleeps.
+    policy: "exact": a scene sleeps as a whole; "approx": cubes of it sleep (:mod:`gsim3d.dynamics.sleep` has the bounds).
+    eps: cells that a particle at rest moves in one step at most, along each axis; its latents change by as much at most.
+    patience: steps at rest before it sleeps, at least those that the model sees.
+    halo: metres, edge of the cubes, and the speed a step up to which nobody wakes too late.
     """
 
     policy: str = "exact"
     eps: float = 1e-3
     patience: int = 4
+    halo: float = 0.05
 
     def __post_init__(self):
         _one_of("dynamics.sleep.policy", self.policy, POLICIES)
         _at_least("dynamics.sleep.eps", self.eps, 0)
         _at_least("dynamics.sleep.patience", self.patience, 1)
+        if not 0 < self.halo < math.inf:
+            raise InputError(f"effects: dynamics.sleep.halo must be a length above 0; got {self.halo!r}")
 
 
 @dataclass(frozen=True)
 class DynamicsEffects:
     """What moves and why.
 
-    background: "frozen": particles marked frozen never move, and others see them; "asymmetric": likewise, and they see
-        only each other, so that they are computed once a rollout; "masked_out": they are left out; "dynamic": every
-        particle may move.
+    background: "frozen": particles marked frozen never move, and others see them; "asymmetric": likewise, by a model in
+        which they see only each other, so that they are computed once a rollout; "masked_out": they are left out;
+        "dynamic": every particle may move.
     history: steps that the model sees; None: as many as the model can use.
     actions: what drives the scene from outside.
     contact: pairs of bodies that may touch.
@@ -159,7 +162,7 @@ class EffectsSpec:
         version = values.pop("version", VERSION)
         if version != VERSION:
             raise InputError(f"effects: version must be {VERSION}; got {version}")
-        return _build(cls, values, "")
+        return typed(cls, values, "effects")
 
     def to_dict(self) -> dict[str, Any]:
         """Nested plain values; what is off or left to the model is absent."""
@@ -168,11 +171,7 @@ class EffectsSpec:
     @classmethod
     def load(cls, path: str | Path) -> EffectsSpec:
         """Reads a YAML (or JSON) file."""
-        text = read_file(path, MAX_TEXT)
-        try:
-            values = yaml.safe_load(text)
-        except (yaml.YAMLError, ValueError, RecursionError, MemoryError) as error:
-            raise InputError(f"effects: {path} cannot be read: {' '.join(str(error).split())[:300]}") from None
+        values = read_yaml(path, "effects")
         if values is not None and not isinstance(values, dict):
             raise InputError(f"effects: {path} must hold a mapping; got {type(values).__name__}")
         return cls.from_dict(values)
@@ -210,35 +209,6 @@ def _at_least(name: str, value: Any, least: int) -> None:
     kind = "an integer" if whole else "a number"
     if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)) or not value >= least:
         raise InputError(f"effects: {name} must be {kind} of at least {least}; got {value!r}")
-
-
-def _build(cls: type, values: Any, where: str) -> Any:
-    """An object of the dataclass ``cls`` from plain values."""
-    if not isinstance(values, dict):
-        raise InputError(f"effects: {where.rstrip('.')} must be a mapping; got {values!r}")
-    hints = typing.get_type_hints(cls)
-    if unknown := [name for name in values if name not in hints]:
-        raise InputError(f"effects: unknown key {where}{unknown[0]}; known: {', '.join(hints)}")
-    return cls(**{name: _value(hints[name], value, where + name) for name, value in values.items()})
-
-
-def _value(hint: Any, value: Any, where: str) -> Any:
-    """``value`` as ``hint`` asks for it."""
-    if typing.get_origin(hint) is types.UnionType:
-        if value is None:
-            return None
-        hint = typing.get_args(hint)[0]
-    if dataclasses.is_dataclass(hint):
-        return _build(hint, value, f"{where}.")
-    if typing.get_origin(hint) is tuple:
-        items = typing.get_args(hint)
-        if not isinstance(value, (list, tuple)) or (items[-1] is not ... and len(value) != len(items)):
-            raise InputError(f"effects: {where} must be a list{'' if items[-1] is ... else f' of {len(items)}'}; got {value!r}")
-        items = [items[0]] * len(value) if items[-1] is ... else items
-        return tuple(_value(item, v, where) for item, v in zip(items, value, strict=True))
-    if hint in (bool, str) and not isinstance(value, hint):
-        raise InputError(f"effects: {where} must be {'true or false' if hint is bool else 'a text'}; got {value!r}")
-    return value
 
 
 def _differences(value: Any) -> dict[str, Any]:

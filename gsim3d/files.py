@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+import types
+import typing
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from gsim3d.errors import InputError
 
@@ -29,3 +36,53 @@ def read_file(path: str | Path, most: int) -> bytes:
         raise InputError(f"{path} cannot be read: no memory for {size} bytes") from None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
+
+
+def read_yaml(path: str | Path, subject: str) -> Any:
+    """Plain values of a YAML (or JSON) file.
+
+    Raises:
+        InputError: as :func:`read_file`, or it is none; the message starts with ``subject``.
+    """
+    text = read_file(path, MAX_TEXT)
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError, MemoryError) as error:
+        raise InputError(f"{subject}: {path} cannot be read: {' '.join(str(error).split())[:300]}") from None
+
+
+def typed(cls: type, values: Any, subject: str, where: str = "") -> Any:
+    """An object of the dataclass ``cls`` from plain values, whose types are those of its fields.
+
+    Raises:
+        InputError: a key is unknown or a value of another type; the message starts with ``subject`` and names the key.
+    """
+    if not isinstance(values, dict):
+        raise InputError(f"{subject}: {where.rstrip('.')} must be a mapping; got {values!r}")
+    hints = typing.get_type_hints(cls)
+    hints = {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+    if unknown := [name for name in values if name not in hints]:
+        raise InputError(f"{subject}: unknown key {where}{unknown[0]}; known: {', '.join(hints)}")
+    return cls(**{name: _value(hints[name], value, subject, where + name) for name, value in values.items()})
+
+
+def _value(hint: Any, value: Any, subject: str, where: str) -> Any:
+    """``value`` as ``hint`` asks for it."""
+    if typing.get_origin(hint) is types.UnionType:
+        if value is None:
+            return None
+        hint = typing.get_args(hint)[0]
+    if dataclasses.is_dataclass(hint):
+        return typed(hint, value, subject, f"{where}.")
+    if typing.get_origin(hint) is tuple:
+        items = typing.get_args(hint)
+        n = None if items[-1] is ... else len(items)
+        if not isinstance(value, (list, tuple)) or n not in (None, len(value)):
+            raise InputError(f"{subject}: {where} must be a list{'' if n is None else f' of {n}'}; got {value!r}")
+        return tuple(_value(item, v, subject, where) for item, v in zip(items if n else items[:1] * len(value), value))
+    number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    fits = {bool: isinstance(value, bool), str: isinstance(value, str), float: number}
+    if not fits.get(hint, True):
+        wanted = {bool: "true or false", str: "a text", float: "a number"}[hint]
+        raise InputError(f"{subject}: {where} must be {wanted}; got {value!r}")
+    return value

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from gsim3d.dynamics import Background, Parts
 from gsim3d.dynamics.point_transformer import SparseConv
 from gsim3d.errors import InputError
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
@@ -98,6 +99,10 @@ class CapturedRollout:
     object is made, and to the model in evaluation. Under autocast the weights of matrix products and convolutions are
     rounded once, into a copy: call :meth:`reload` after the model has changed. Without it the graph reads the model's own.
 
+    With a model of ``background="asymmetric"`` the graph advances what moves, as many rows in every call. The background
+    is computed beside the graph, whenever it has changed; where it needs more room the graph is made anew. A graph knows
+    no sleep: it advances the same rows always.
+
     On the CPU there are no graphs: calls run the same steps one by one, with the same sizes and the same results.
 
     Args:
@@ -143,9 +148,10 @@ class CapturedRollout:
         self._report = simulator.report if report is None else report
         self._report.poll()
         self._background = background
+        if self._plan.spec.dynamics.sleep is not None:
+            raise InputError("CapturedRollout: plan must be one without dynamics.sleep; a graph knows no sleep")
         prepared = simulator.prepare(state, self._plan)
-        self._table = prepared.clouds
-        self._state = prepared.with_clouds(self._table, **_clones(prepared.row_fields()), origin=prepared.origin.clone())
+        self._table, self._state, self._rest = prepared.clouds, _own(prepared), None
         self._cameras = None if cameras is None else cameras.map(torch.clone)
         self._device = prepared.means.device
         kind = self._device.type
@@ -157,6 +163,13 @@ class CapturedRollout:
             self._model.__dict__["_modules"] = {**simulator._modules, **rooms}
         self.captures = 0
         self._launched = False
+        if simulator.config.dynamics.is_asymmetric:
+            parts = simulator.parts(prepared, report=self._report)
+            if parts.nothing_moves:
+                raise InputError("CapturedRollout: state has no row that moves; there is nothing to capture")
+            self._state = _own(parts.moving)
+            own = Parts(_own(parts.newest), self._state, _own(parts.background), parts.rows.clone())
+            self._rest = _Rest(own, self._remember(parts.background))
         self._make_room(self._observed())
 
     def __call__(self, state: Particles, cameras: Cameras | None = None) -> Predicted:
@@ -172,16 +185,18 @@ class CapturedRollout:
         return self.finish()
 
     def launch(self, state: Particles, cameras: Cameras | None = None) -> None:
-        """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background)."""
+        """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background, and to tell
+        an asymmetric one from what moves)."""
         self._report.poll()
         state = self._simulator.prepare(state, self._plan)
-        self._check(state)
-        for name, value in self._state.row_fields().items():
-            value.copy_(getattr(state, name))
-        self._state.origin.copy_(state.origin)
+        self._check(state, self._table)
+        tables = state.clouds
+        if self._rest is not None:
+            state = self._load_parts(self._simulator.parts(state, report=self._report))
+        _copy(self._state, state)
         if cameras is not None:
             self._load(cameras)
-        self._tables = state.clouds
+        self._tables = tables
         self._launched = True
         self._replay()
 
@@ -208,16 +223,25 @@ class CapturedRollout:
 
     def _rollout(self, geometry, report: StabilityReport) -> Predicted:
         """The rollout of the graph's own state."""
-        plan = _with_background_as_it_is(self._plan)
-        enabled = self._dtype is not None
-        autocast = torch.autocast(self._device.type, self._dtype, enabled=enabled, cache_enabled=False)
-        with torch.no_grad(), autocast:
-            steps = self._model.rollout(self._state, self._n_steps, plan, geometry=geometry, report=report)
-            renderings = []
+        plan, rest = _with_background_as_it_is(self._plan), self._rest
+        options, renderings = {"geometry": geometry, "report": report}, []
+        with torch.no_grad(), self._autocast():
+            if rest is None:
+                steps = self._model.rollout(self._state, self._n_steps, plan, **options)
+            else:
+                moving = self._model.advance(self._state, rest.background, self._n_steps, plan, **options)
+                steps = [rest.parts.whole(step, 1 + i) for i, step in enumerate(moving)]
             if self._cameras is not None:
                 for step in steps:
                     renderings.append(self._model.draw(step, self._cameras, self._background, self._drawn, report=report))
         return Predicted(steps, renderings)
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self._device.type, self._dtype, enabled=self._dtype is not None, cache_enabled=False)
+
+    def _remember(self, background: Particles) -> Background:
+        with torch.no_grad(), self._autocast():
+            return self._model.dynamics.remember(background).with_room(self._factor)
 
     def _observed(self) -> list[PyramidCapacity]:
         """What the calls of the dynamics need, with room; from a rollout that waits for every count."""
@@ -279,12 +303,27 @@ class CapturedRollout:
 
     # ---- what goes in and comes out ----
 
-    def _check(self, state: Particles) -> None:
-        table, own = state.clouds, self._table
+    def _load_parts(self, parts: Parts) -> Particles:
+        """Takes what rests into the graph's memory; what moves."""
+        own = self._rest.parts
+        self._check(parts.moving, own.moving.clouds, " in what moves")
+        changed = not all(torch.equal(getattr(parts.background, n), x) for n, x in own.background.row_fields().items())
+        for mine, given in ((own.newest, parts.newest), (own.background, parts.background)):
+            _copy(mine, given)
+        own.rows.copy_(parts.rows)
+        if changed:
+            remembered = self._remember(parts.background)
+            if not self._rest.background.load(remembered):
+                self._rest = _Rest(own, remembered)
+                self._make_room(self._observed())
+        return parts.moving
+
+    def _check(self, state: Particles, own: CloudTable, where: str = "") -> None:
+        table = state.clouds
         if (table.starts, table.scenes) != (own.starts, own.scenes):
             raise InputError(
-                "CapturedRollout: state must have the rows and scenes of the first one, clouds that start at rows "
-                f"{list(own.starts)} of scenes {list(own.scenes)}; got {list(table.starts)} of {list(table.scenes)}"
+                f"CapturedRollout: state must have the rows and scenes of the first one{where}, clouds that start at "
+                f"rows {list(own.starts)} of scenes {list(own.scenes)}; got {list(table.starts)} of {list(table.scenes)}"
             )
         if _gaps(table) != _gaps(own):
             raise InputError(
@@ -292,9 +331,9 @@ class CapturedRollout:
                 f"got {list(table.steps)}"
             )
         for name, value in self._state.row_fields().items():
-            given = getattr(state, name)
-            if given is None or given.shape != value.shape or given.device != value.device:
-                raise InputError(f"CapturedRollout: state.{name} must be {list(value.shape)} on {value.device}")
+            given, shape = getattr(state, name), (table.starts[-1], *value.shape[1:])
+            if given is None or given.shape != shape or given.device != value.device:
+                raise InputError(f"CapturedRollout: state.{name} must be {list(shape)} on {value.device}")
 
     def _load(self, cameras: Cameras) -> None:
         own = self._cameras
@@ -323,6 +362,24 @@ class CapturedRollout:
         if self._copies:
             renderings = [Rendering(*(x if x is None else x.clone() for x in image)) for image in renderings]
         return Predicted(steps, list(renderings))
+
+
+class _Rest(NamedTuple):
+    """What rests during the rollouts of a graph, in the graph's own memory."""
+
+    parts: Parts
+    background: Background
+
+
+def _own(particles: Particles) -> Particles:
+    table = particles.clouds
+    return particles.with_clouds(table, **_clones(particles.row_fields()), origin=particles.origin.clone())
+
+
+def _copy(own: Particles, given: Particles) -> None:
+    for name, value in own.row_fields().items():
+        value.copy_(getattr(given, name))
+    own.origin.copy_(given.origin)
 
 
 def _clones(fields: dict[str, Tensor]) -> dict[str, Tensor]:

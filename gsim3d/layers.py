@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from gsim3d.branches import Branches
 from gsim3d.ops import norm_gelu, row_norm
 
 MIN_ROWS = 16  # matrix products of fewer rows go through other code in BLAS, which rounds differently
@@ -30,12 +31,10 @@ def row_linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     return F.linear(F.pad(x, (0, 0, 0, MIN_ROWS - n_rows)), weight, bias)[:n_rows]
 
 
-def linear_grads(grad: Tensor, x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of x and weight of ``x @ weight.T``; the second is float32 or wider."""
+def linear_grad_weight(grad: Tensor, x: Tensor) -> Tensor:
+    """The gradient of weight of ``x @ weight.T``, float32 or wider."""
     wide = torch.promote_types(grad.dtype, torch.float32)
-    if wide == grad.dtype:
-        return grad @ weight, grad.t() @ x
-    return grad @ weight, torch.mm(grad.t(), x, out_dtype=wide)
+    return grad.t() @ x if wide == grad.dtype else torch.mm(grad.t(), x, out_dtype=wide)
 
 
 class RowLinear(nn.Linear):
@@ -71,7 +70,11 @@ class _RowLinear(torch.autograd.Function):
     def backward(ctx, grad):
         x, _ = ctx.saved_tensors
         grad = grad.contiguous()
-        return *linear_grads(grad, x, ctx.rounded_weight), torch.ops.gsim3d.linear_grad_bias(grad), None, None
+        with Branches(grad) as beside:
+            weight = beside.run(linear_grad_weight, grad, x)
+            bias = beside.run(torch.ops.gsim3d.linear_grad_bias, grad)
+            grad_x = grad @ ctx.rounded_weight
+        return grad_x, weight, bias, None, None
 
 
 def product_dtype(x: Tensor) -> torch.dtype:
@@ -93,11 +96,16 @@ def rounded_weights(module: nn.Module, dtype: torch.dtype) -> tuple[Tensor | Non
     return weight, bias[0] if bias else None
 
 
-@contextlib.contextmanager
-def rounded_at_once(modules: Sequence[nn.Module], dtype: torch.dtype):
-    """A context in which :func:`rounded_weights` of ``modules`` are at hand: made in a few launches, not two a layer."""
+def round_at_once(modules: Sequence[nn.Module], dtype: torch.dtype) -> dict[int, Sequence[Tensor]]:
+    """The :func:`rounded_weights` of ``modules``, made in a few launches, not two a layer."""
     modules = [module for module in modules if module.weight.dtype != dtype]
-    token = _ready.set(dict(zip(map(id, modules), _rounded(modules, dtype), strict=True)))
+    return dict(zip(map(id, modules), _rounded(modules, dtype), strict=True))
+
+
+@contextlib.contextmanager
+def at_hand(rounded: dict[int, Sequence[Tensor]]):
+    """A context in which :func:`rounded_weights` returns what :func:`round_at_once` has made."""
+    token = _ready.set(rounded)
     try:
         yield
     finally:

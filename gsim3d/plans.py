@@ -82,8 +82,9 @@ def make_plan(spec: EffectsSpec, model: ModelConfig) -> Plan:
          "time indices, their products with time embeddings"),
         ("frozen background", background in ("frozen", "asymmetric"), "particles marked frozen are seen, and stay",
          f"background is {background}", "rows of the background in every step of the dynamics"),
-        ("background made once", background == "asymmetric", "frozen particles see only each other",
-         f"background is {background}", "features of the background at every stage, kept for a rollout"),
+        ("background made once", _is_asymmetric(spec, model), "in this model frozen particles see only each other",
+         "in this model frozen particles see all" if not model.dynamics.is_asymmetric else f"background is {background}",
+         "features of the background at every stage, kept for a rollout"),
         ("sleep", dynamics.sleep is not None, "particles at rest are skipped", "dynamics.sleep is absent",
          "counters of rest, results of sleepers"),
         ("actions", False, "", _absent("dynamics.actions", dynamics.actions, "no names"), "embeddings of actions"),
@@ -107,6 +108,10 @@ def make_plan(spec: EffectsSpec, model: ModelConfig) -> Plan:
     return Plan(spec, history, sh_degree, effects)
 
 
+def _is_asymmetric(spec: EffectsSpec, model: ModelConfig) -> bool:
+    return model.dynamics.is_asymmetric and spec.dynamics.background in ("frozen", "asymmetric")
+
+
 def _absent(name: str, value: object | None, empty: str) -> str:
     return f"{name} is absent" if value is None else f"{name} has {empty}"
 
@@ -116,8 +121,14 @@ def _check_supported(spec: EffectsSpec, model: ModelConfig) -> None:
     refused = {
         "dynamics.actions": (dynamics.actions and dynamics.actions.names, "this model has no embeddings of actions"),
         "dynamics.contact": (dynamics.contact and dynamics.contact.pairs, "particles do not know their body"),
-        "dynamics.background asymmetric": (dynamics.background == "asymmetric", "not simulated by this version"),
-        "dynamics.sleep": (dynamics.sleep, "not simulated by this version"),
+        "dynamics.background asymmetric": (
+            dynamics.background == "asymmetric" and not model.dynamics.is_asymmetric,
+            "in this model frozen particles see all others",
+        ),
+        "dynamics.sleep.policy approx": (
+            dynamics.sleep and dynamics.sleep.policy == "approx" and not model.dynamics.is_asymmetric,
+            "this model cannot tell sleepers from others (dynamics.background is symmetric); the policy exact it can",
+        ),
         "appearance.opacity_changes": (
             spec.appearance.opacity_changes and not model.dynamics.explicit, "this model holds opacities"
         ),
@@ -160,7 +171,7 @@ def predicted_cost(plan: Plan, model: ModelConfig, work: Workload) -> dict[str, 
     background = plan.spec.dynamics.background
     moving = work.moving + (work.frozen if background == "dynamic" else 0)
     frozen = work.frozen if background in ("frozen", "asymmetric") else 0
-    computed = moving + (frozen if background == "frozen" else 0)
+    computed = moving + (0 if _is_asymmetric(plan.spec, model) else frozen)
     drawn = moving + frozen
     renderer, outputs = model.renderer, plan.spec.outputs
     harmonics = 3 * (plan.sh_degree + 1) ** 2 if outputs.rgb else 0
@@ -200,3 +211,10 @@ def _network(config: DynamicsConfig, rows: float, history: int) -> float:
 def _block(config: DynamicsConfig, rows: float, channels: int, patch: int) -> float:
     dense = (BLOCK_KERNEL**SURFACE + 1 + 4 + 2 * config.mlp_ratio) * channels**2
     return rows * (dense + 2 * min(rows, patch) * channels)
+
+
+def in_columns(rows: list[tuple[str, ...]]) -> str:
+    """A table whose columns are as wide as their longest entry; the last one as it is."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
+    lines = ("  ".join(text.ljust(width) for text, width in zip(row, [*widths, 0], strict=True)) for row in rows)
+    return "\n".join(line.rstrip() for line in lines)

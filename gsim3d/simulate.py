@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from gsim3d.pretrained import CHECKPOINT_HELP
+
 EPILOG = """\
 The scene's first steps are the input; the following ones are predicted, also beyond the end of the film. Written to
 DIR: rollout.mp4 (truth above prediction, a column for each camera; VP9, plays in browsers), frames/ (predicted images
@@ -11,30 +13,42 @@ as PNG) and gaussians/step_0000.ply ... (3D Gaussians of every step, for viewers
 
 examples:
   gsim3d simulate runs/model runs/data/ball/0000 --out runs/ball
+  gsim3d simulate elastic-small data/elastic/ball/0000 --out runs/ball
   gsim3d simulate model.safetensors runs/data/ball/0000 --out runs/ball --steps 48 --cameras 2 7
+  gsim3d simulate runs/model runs/data/ball/0000 --out runs/thrown --edit edits.yaml
+
+edits.yaml, a list (docs/effects.md has all operations):
+  - {step: 0, op: remove, of: frozen}                         no ground
+  - {step: 8, op: throw, of: moving, velocity: [0, 0, 0.1]}   metres a step
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Predicts the future of one scene and writes it as video and as 3D Gaussians."
     parser.epilog = EPILOG
-    parser.add_argument("checkpoint", metavar="CHECKPOINT", help="run folder, checkpoint folder or .safetensors file")
+    parser.add_argument("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/data.md)")
     parser.add_argument("--out", metavar="DIR", required=True, help="folder to write; must not exist yet")
     parser.add_argument("--steps", type=int, help="steps to predict (default: to the end of the film)")
     parser.add_argument("--start", type=int, default=0, help="first input step (default: 0)")
     parser.add_argument("--cameras", type=int, nargs="+", metavar="CAM", help="cameras to show (default: up to 4 targets)")
     parser.add_argument("--context", type=int, nargs="+", metavar="CAM", help="input cameras (default: spread evenly)")
+    parser.add_argument("--edit", metavar="FILE", help="YAML file of changes of the scene on the way")
+    parser.add_argument("--effects", metavar="FILE", help="YAML file of what to compute (default: as in training)")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
 
 
 def run(args: argparse.Namespace) -> int:
     import os
     import shutil
+    from dataclasses import replace
+    from functools import partial
     from pathlib import Path
 
     import cv2
 
+    from gsim3d.edits import load_edits
+    from gsim3d.effects import EffectsSpec, OutputEffects, StructureEffects
     from gsim3d.errors import InputError
     from gsim3d.evaluate.pictures import as_bytes, comparison_frames, true_images, write_gaussians
     from gsim3d.evaluate.protocol import default_views, predict, render_steps
@@ -53,7 +67,14 @@ def run(args: argparse.Namespace) -> int:
     n_future = args.steps if args.steps is not None else max(1, scene.n_steps - args.start - restored.data.history)
     if bad := [cam for cam in (*cams, *context) if not 0 <= cam < scene.n_cams]:
         raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
-    prediction = predict(restored, scene, context, n_future, args.start)
+    spec = restored.plan.spec if args.effects is None else EffectsSpec.load(args.effects)
+    edits = () if args.edit is None else load_edits(args.edit, partial(_encode, restored))
+    if edits:
+        changes = (edit.operation for edit in edits)
+        structure = StructureEffects(*map(any, zip(*((change.inserts, change.removes) for change in changes))))
+        spec = replace(spec, structure=structure)
+    restored = replace(restored, plan=restored.simulator.plan(replace(spec, outputs=OutputEffects())))
+    prediction = predict(restored, scene, context, n_future, args.start, edits)
     images = as_bytes(render_steps(restored, prediction.particles, scene, cams, args.start))
     part = out.with_name(f".{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
@@ -70,3 +91,11 @@ def run(args: argparse.Namespace) -> int:
         shutil.rmtree(part, ignore_errors=True)
     print(f"{prediction.n_encoded} steps encoded, {n_future} predicted; written: {out}")
     return 0
+
+
+def _encode(restored, folder):
+    """The particles of another scene."""
+    from gsim3d.evaluate.protocol import default_views, encode_steps
+
+    scene = restored.open_scene(folder)
+    return encode_steps(restored, scene, default_views(restored, scene)[0])

@@ -16,16 +16,30 @@ Every call takes ``on_bad``, the policy for numbers that cannot be used (:mod:`g
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 
-from gsim3d.dynamics import Dynamics, append_step, concatenate, last_steps, rollout
-from gsim3d.effects import EffectsSpec, OutputEffects
+from gsim3d.dynamics import (
+    Background,
+    Dynamics,
+    Parts,
+    RestLog,
+    Sleepers,
+    append_step,
+    concatenate,
+    last_steps,
+    rollout,
+    rollout_in_parts,
+)
+from gsim3d.edits import Edit, by_step
+from gsim3d.effects import EffectsSpec, OutputEffects, UnsupportedEffect
 from gsim3d.encoder import Encoder, pixel_rows
 from gsim3d.guards import drop_rows, guard_frames, guard_particles
+from gsim3d.harmonics import SH_0
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
 from gsim3d.plans import Plan, make_plan, unused_parameters
@@ -40,6 +54,7 @@ class Simulator(nn.Module):
     """Encoder, dynamics and renderer of one model.
 
     report: StabilityReport of the calls that were given no other.
+    absent: parameters that the weights it was given lack; plans that read them are refused.
     """
 
     def __init__(self, config: ModelConfig):
@@ -49,6 +64,7 @@ class Simulator(nn.Module):
         self.dynamics = Dynamics(config.dynamics)
         self.renderer = GaussianHead(config.renderer)
         self.report = StabilityReport()
+        self.absent: frozenset[str] = frozenset()
 
     def encode(
         self, frames: Frames, *, on_bad: OnBad | None = None, report: StabilityReport | None = None
@@ -67,7 +83,10 @@ class Simulator(nn.Module):
         """
         plan = make_plan(spec, self.config)
         names = (name for name, _ in self.named_parameters())
-        return dataclasses.replace(plan, unused=unused_parameters(plan, self.config, names))
+        unused = unused_parameters(plan, self.config, names)
+        if needed := sorted(self.absent.difference(unused)):
+            raise UnsupportedEffect(f"unsupported effects: they read {', '.join(needed)}, which the weights do not have")
+        return dataclasses.replace(plan, unused=unused)
 
     def step(
         self,
@@ -82,12 +101,13 @@ class Simulator(nn.Module):
 
         Args:
             state: last steps of every scene.
-            plan: what to compute; default everything the model can.
+            plan: what to compute; default everything the model can. Nobody sleeps: that is decided along a rollout.
             generator: randomness of training (drop path, curve shuffling); None: none.
         """
         plan, guard = plan or self.plan(), self._guard("step", on_bad, report)
         state = guard(self.prepare(state, plan))
-        return append_step(state, self._predict(state, plan, generator, guard), plan.history)
+        step = self._predict(state, plan=plan, generator=generator, guard=guard)
+        return append_step(state, step, plan.history)
 
     def rollout(
         self,
@@ -100,20 +120,51 @@ class Simulator(nn.Module):
         report: StabilityReport | None = None,
         geometry: Callable[[Particles], Pyramid] | None = None,
         wrap: Callable[[Callable], Callable] | None = None,
+        log: RestLog | None = None,
+        edits: Iterable[Edit] = (),
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
 
-        Rows are those of the newest step of ``state`` throughout. Gradients flow through all steps. Arguments as
-        :meth:`step`.
+        Rows are those of the newest step of ``state`` throughout, but for edits. Gradients flow through all steps.
+        Arguments as :meth:`step`.
 
         Args:
             geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
             wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
+            log: is told which rows rested and were not computed.
+            edits: changes of the scene on the way (:mod:`gsim3d.edits`); they wake everybody.
+        Raises:
+            InputError: an edit cannot be made; the message names its step and operation.
         """
         plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
         predict = predict if wrap is None else wrap(predict)
-        return rollout(predict, guard(self.prepare(state, plan)), n_steps, plan.history)
+        state, steps = self.prepare(state, plan), []
+        structure = plan.spec.structure
+        changes = by_step(edits, n_steps, insert=structure.insert, remove=structure.remove)
+        for begin, end in pairwise(sorted({0, *changes, n_steps})):
+            for edit in changes.get(begin, ()):
+                state = edit.apply(state, self._colors)
+            state = guard(state)
+            steps += self._roll(predict, state, end - begin, plan, generator, log)
+            if end < n_steps:
+                state = last_steps(concatenate([state, *steps[begin:end][-plan.history :]]), plan.history)
+        return steps
+
+    def _roll(self, predict, state: Particles, n_steps: int, plan: Plan, generator, log) -> list[Particles]:
+        """:meth:`rollout` of a state that is prepared, without edits."""
+        config, rule = self.config.dynamics, plan.spec.dynamics.sleep
+        if rule is None and not config.is_asymmetric:
+            return rollout(predict, state, n_steps, plan.history)
+        return rollout_in_parts(
+            predict,
+            state,
+            n_steps,
+            plan.history,
+            remember=partial(self.dynamics.remember, generator=generator) if config.is_asymmetric else None,
+            sleepers=None if rule is None else Sleepers(rule, last_steps(state, 1), config.grid_size, plan.history),
+            log=log,
+        )
 
     def prepare(self, state: Particles, plan: Plan) -> Particles:
         """What the dynamics reads of ``state``: its last steps, with the background as the plan wants it."""
@@ -123,6 +174,27 @@ class Simulator(nn.Module):
         if background == "dynamic":
             state = dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
         return last_steps(state, plan.history)
+
+    def parts(
+        self, prepared: Particles, *, on_bad: OnBad | None = None, report: StabilityReport | None = None
+    ) -> Parts:
+        """What moves and what rests of a state that :meth:`prepare` made, for a model with an asymmetric background."""
+        return Parts.of(self._guard("rollout", on_bad, report)(prepared), asymmetric=True)
+
+    def advance(
+        self,
+        moving: Particles,
+        background: Background,
+        n_steps: int,
+        plan: Plan,
+        *,
+        report: StabilityReport | None = None,
+        geometry: Callable[[Particles], Pyramid] | None = None,
+    ) -> list[Particles]:
+        """As :meth:`rollout`, of what moves alone, beside a background of ``dynamics.remember``."""
+        guard = self._guard("rollout", None, report)
+        options = {"plan": plan, "generator": None, "guard": guard, "geometry": geometry, "background": background}
+        return rollout(partial(self._predict, **options), moving, n_steps, plan.history)
 
     def render(
         self,
@@ -173,6 +245,10 @@ class Simulator(nn.Module):
         asked = (outputs.rgb, outputs.alpha, outputs.depth, outputs.features)
         return Rendering(*(made if wanted else None for made, wanted in zip(image, asked, strict=True)))
 
+    def _colors(self, particles: Particles) -> Tensor:
+        """[N, 3], of the Gaussians, seen from nowhere in particular."""
+        return 0.5 + SH_0 * self.renderer(particles, sh_degree=0).sh[:, 0]
+
     def _guard(
         self, where: str, on_bad: OnBad | None, report: StabilityReport | None, in_workspace: bool = True
     ) -> partial[Particles]:
@@ -195,16 +271,22 @@ class Simulator(nn.Module):
     def _predict(
         self,
         state: Particles,
+        background: Background | None = None,
+        *,
         plan: Plan,
         generator: torch.Generator | None,
         guard: Callable[..., Particles],
         geometry: Callable[[Particles], Pyramid] | None = None,
     ) -> Particles:
-        """The next steps of every scene, guarded."""
+        """The next steps of every scene, guarded.
+
+        background: what rests while ``state`` moves; None: all there is, is in the state.
+        """
         appearance = plan.spec.appearance
         changes = self.dynamics.layout.changes(appearance.changing, appearance.opacity_changes is not False)
         pyramid = None if geometry is None else geometry(state)
-        step = self.dynamics(state, generator=generator, pyramid=pyramid, changes=changes)
+        options = {"pyramid": pyramid, "background": background, "changes": changes}
+        step = self.dynamics(state, generator=generator, **options)
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
         changed = [name for name, who in changes.items() if who != "none"]
         return guard(step, previous=newest, changed=changed)

@@ -1,6 +1,7 @@
 """Fixtures shared by all tests: devices are parameters of a test, never an ``if`` in its body."""
 
 import os
+from collections import defaultdict
 
 import pytest
 import torch
@@ -29,11 +30,19 @@ def cuda_device() -> torch.device:
 
 
 def pytest_collection_modifyitems(items):
-    """Marks the tests that use the GPU: ``-m gpu`` selects them."""
+    """Marks the tests that use the GPU: ``-m gpu`` selects them. GSIM3D_FEW=N keeps N cases of each such test."""
+    few = int(os.environ.get("GSIM3D_FEW", 0))
     for item in items:
         values = item.callspec.params.values() if hasattr(item, "callspec") else ()
         if "devices" in item.fixturenames or any("cuda" in str(value) for value in values):
             item.add_marker(pytest.mark.gpu)
+    if few:
+        of_test = defaultdict(list)
+        for item in items:
+            if item.get_closest_marker("gpu"):
+                of_test[item.path, item.originalname].append(item)
+        kept = {id(cases[k * len(cases) // few]) for cases in of_test.values() for k in range(few)}
+        items[:] = [item for item in items if id(item) in kept]
 
 
 @pytest.fixture(params=["cpu", "cuda"])

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from gsim3d.__main__ import COMMANDS, main
+from gsim3d.effects import EffectsSpec
 from gsim3d.interop import read_ply
 from tests.conftest import cuda_problem
 from tests.tiny_scenes import write_scene, write_scenes
@@ -110,6 +111,7 @@ def test_evaluate_takes_other_views_and_metrics_and_options_anywhere(capsys, wor
     metrics = json.loads((tmp_path / "m.json").read_text())
     assert metrics["cameras"] == {"ball/0000": {"context": [0, 2], "target": [1, 4]}}
     assert metrics["part"] == "test" and metrics["data"] == str(work / "data") and len(metrics["checkpoint"]) == 64
+    assert metrics["effects"] == EffectsSpec().hash
     assert metrics["methods"] == ["model", "constant", "copy", "constant_velocity", "release_constant"]
     assert list(metrics["by_step"])[:2] == ["psnr", "ssim"] and metrics["not_measured"] == {}
     for file in ("m.csv", "m.md", "m.png"):

@@ -86,3 +86,30 @@ def test_the_real_settings_are_what_the_demo_promises():
     assert world.n_frames - config.train.data.history >= 16
     assert len(config.train.data.target_only_cameras) == 2 and isinstance(config.train, TrainConfig)
     model_config(config.train)
+
+
+def test_a_trained_simulator_needs_no_training(finished, tmp_path, capsys):
+    out, _ = finished
+    data = {**DATA, "n_trajectories": 1, "seed": 3}
+    config = DemoConfig(preset="mini", data=data, simulator=str(out / "model.safetensors"))
+    summary = run_demo(tmp_path, config, progress=False)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"held_out", "metrics.json", "overview.png", "psnr.png", "rollout.mp4", "gaussians"} <= names
+    assert not names & {"model", "data"} and summary["n_scenes"] == 1 and summary["n_future_steps"] == 4
+    before = (tmp_path / "rollout.mp4").stat().st_mtime_ns
+    assert run_demo(tmp_path, config, progress=False) == summary
+    assert (tmp_path / "rollout.mp4").stat().st_mtime_ns == before
+    assert "training" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("options, shipped", [([], True), (["--train"], False)])
+def test_the_command_trains_when_asked_or_when_nothing_is_shipped(options, shipped, tmp_path, monkeypatch):
+    from gsim3d import demo
+    from gsim3d.__main__ import main
+
+    calls = []
+    monkeypatch.setattr(demo, "run_demo", lambda out, config: calls.append(config))
+    for known in ([demo.SHIPPED.simulator], []):
+        monkeypatch.setattr(demo, "names", lambda known=known: known)
+        assert main(["demo", "--out", str(tmp_path), *options]) == 0
+    assert calls == [demo.SHIPPED if shipped else DemoConfig(), DemoConfig()]

@@ -1,10 +1,14 @@
 """What a scene calls for: typed, serialisable, and honest about what cannot be done."""
 
+import dataclasses
 import json
+import re
+from pathlib import Path
 
 import pytest
 
 from gsim3d import presets
+from gsim3d.edits import OPERATIONS, load_edits
 from gsim3d.effects import (
     Actions,
     AppearanceEffects,
@@ -66,7 +70,8 @@ def test_plan_says_what_is_kept_and_why_the_rest_is_not():
     [
         ({"dynamics": {"actions": {"names": ["hand"]}}}, "unsupported effect dynamics.actions"),
         ({"dynamics": {"contact": {"pairs": [["a", "b"]]}}}, "unsupported effect dynamics.contact"),
-        ({"dynamics": {"sleep": {"policy": "exact"}}}, "unsupported effect dynamics.sleep"),
+        ({"dynamics": {"sleep": {"policy": "approx"}}}, "unsupported effect dynamics.sleep.policy approx"),
+        ({"dynamics": {"background": "asymmetric"}}, "unsupported effect dynamics.background asymmetric"),
         ({"outputs": {"rgb": False}}, "unsupported effect outputs: there is no image to make"),
         ({"dynamics": {"history": 5}}, "unsupported effect dynamics.history: this model goes up to 4; got 5"),
         ({"appearance": {"opacity_changes": True}}, "unsupported effect appearance.opacity_changes"),
@@ -95,7 +100,7 @@ def test_view_dependence_beyond_the_model_raises():
         ({"appearance": {"changing": "bunny"}}, "appearance.changing must be one of"),
         ({"dynamics": {"sleep": {"policy": "soundly"}}}, "dynamics.sleep.policy must be one of exact, approx"),
         ({"dynamics": {"sleep": {"patience": 0}}}, "dynamics.sleep.patience must be an integer of at least 1; got 0"),
-        ({"dynamics": {"sleep": {"eps": "1e-3"}}}, "dynamics.sleep.eps must be a number of at least 0; got '1e-3'"),
+        ({"dynamics": {"sleep": {"eps": "1e-3"}}}, "dynamics.sleep.eps must be a number; got '1e-3'"),
         ({"dynamics": {"actions": {"names": "hand"}}}, "dynamics.actions.names must be a list; got 'hand'"),
         ({"dynamics": {"contact": {"pairs": [["a"]]}}}, r"dynamics.contact.pairs must be a list of 2; got \['a'\]"),
         ({"outputs": {"depth": "yes"}}, "outputs.depth must be true or false; got 'yes'"),
@@ -105,6 +110,23 @@ def test_view_dependence_beyond_the_model_raises():
 def test_malformed_specs_raise(values, message):
     with pytest.raises(InputError, match=message):
         EffectsSpec.from_dict(values)
+
+
+def test_the_page_tells_of_every_field_and_its_examples_can_be_read(tmp_path):
+    page = (Path(__file__).parent.parent / "docs" / "effects.md").read_text()
+    spec, edits = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    for name, text in (("spec.yaml", spec), ("edits.yaml", edits)):
+        (tmp_path / name).write_text(text)
+    read = EffectsSpec.load(tmp_path / "spec.yaml")
+    assert read.structure.insert and read.dynamics.sleep == Sleep()
+    operations = {edit.operation.name for edit in load_edits(tmp_path / "edits.yaml", lambda folder: None)}
+    assert operations == set(OPERATIONS)
+    keys = re.findall(r"^\| (`.*?) \|", page, re.MULTILINE)
+    table = " ".join(keys)
+    for room in ("dynamics", "appearance", "structure"):
+        for field in dataclasses.fields(getattr(read, room)):
+            assert f"`{room}.{field.name}`" in table or f"`.{field.name}`" in table, field.name
+    assert all(f"`{field.name}" in page for field in dataclasses.fields(read.outputs))
 
 
 def test_a_file_that_is_no_spec(tmp_path):

@@ -10,20 +10,20 @@ ROOT = Path(__file__).parent.parent
 # Each room may import the rooms before it (and its own), never one after it.
 ROOMS = [
     {"errors", "quirks"},
-    {"types", "stability", "files"},
+    {"types", "stability", "files", "pretrained", "branches"},
     {"ops", "effects", "harmonics", "rotations"},
     {"layers", "guards"},
     {"encoder", "dynamics", "renderer"},
-    {"presets"},
+    {"presets", "edits"},
     {"plans"},
     {"simulator"},
-    {"laws", "graphs"},
+    {"laws", "graphs", "by_scene", "agreement"},
     {"endurance"},
     {"data", "interop", "perceptual"},
     {"generate"},
     {"train"},
     {"evaluate", "check_stability"},
-    {"simulate", "check_data", "import_released", "demo", "doctor"},
+    {"simulate", "show_plan", "infer_effects", "check_data", "import_released", "demo", "doctor"},
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}

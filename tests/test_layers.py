@@ -9,9 +9,10 @@ from gsim3d.layers import (
     RowLinear,
     _combine,
     _statistics,
+    at_hand,
     exact_convolutions,
     product_dtype,
-    rounded_at_once,
+    round_at_once,
     rounded_weights,
     tf32_only_if_asked,
 )
@@ -115,7 +116,7 @@ def test_weights_are_rounded_at_once(device, monkeypatch):
     calls, copy = [], torch._foreach_copy_
     monkeypatch.setattr(torch, "_foreach_copy_", lambda to, of: (calls.append(len(to)), copy(to, of)))
     for expected in ([3], [3, 3]):
-        with rounded_at_once(layers, torch.bfloat16):
+        with at_hand(round_at_once(layers, torch.bfloat16)):
             for layer in layers:
                 weight, bias = rounded_weights(layer, torch.bfloat16)
                 assert_same_bits(weight, layer.weight.detach().bfloat16())
@@ -124,7 +125,7 @@ def test_weights_are_rounded_at_once(device, monkeypatch):
         with torch.no_grad():
             layers[0].weight.mul_(2), layers[1].weight.mul_(2), layers[0].bias.add_(1)
     assert_same_bits(rounded_weights(layers[0], torch.bfloat16)[0], layers[0].weight.detach().bfloat16())
-    with rounded_at_once(layers, torch.float32):
+    with at_hand(round_at_once(layers, torch.float32)):
         assert rounded_weights(layers[0], torch.float32)[0] is layers[0].weight
 
 
@@ -175,7 +176,9 @@ def test_layers_under_autocast_err_no_more_than_torchs(dtype, devices):
     exact = run(lambda x: torch.nn.functional.gelu(norm(torch.nn.functional.linear(x, linear.weight, linear.bias))))
     with torch.autocast("cuda", dtype):
         ours = run(lambda x: norm.activated(linear(x)))
-        torchs = run(lambda x: torch.nn.functional.gelu(norm(torch.nn.functional.linear(x, linear.weight, linear.bias))))
+        torchs = run(
+            lambda x: torch.nn.functional.gelu(norm(torch.nn.functional.linear(x, linear.weight, linear.bias)))
+        )
     for a, b, truth in zip(ours, torchs, exact, strict=True):
         error, allowed = ((t.float() - truth).abs().max().item() for t in (a, b))
         assert error <= 2 * allowed + 1e-3 * truth.abs().max().item()

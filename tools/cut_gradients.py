@@ -1,7 +1,8 @@
 """What it costs that the published training cuts gradients: the same runs with gradients cut and kept.
 
     gsim3d generate elastic --preset mini --out runs/data
-    python tools/cut_gradients.py --data runs/data --out runs/cut --device cuda
+    python tools/cut_gradients.py --data runs/data --out runs/cut --device cuda --together
+    python tools/cut_gradients.py --picture runs/cut docs/cut-gradients.png
 
 The release wraps attention, MLPs and the depth predictor in re-entrant checkpoints, which pass on no gradient of
 tensors inside dictionaries: attention and MLP of every block, their norms and the latents of the encoder keep their
@@ -13,19 +14,24 @@ on where it was.
 import argparse
 import dataclasses
 import json
+import os
 import statistics
+import subprocess
+import sys
 from pathlib import Path
 
 from torch import nn
 
-from gsim3d.data import Scene, find_scenes, split_scenes
-from gsim3d.dynamics.point_transformer import Block
-from gsim3d.evaluate.protocol import score_scene
-from gsim3d.evaluate.report import summarize, write_json
-from gsim3d.simulator import Simulator
-from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
-from gsim3d.train.loop import Trainer
-from gsim3d.train.restore import restore
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+from gsim3d.data import Scene, find_scenes, split_scenes  # noqa: E402
+from gsim3d.dynamics.point_transformer import Block  # noqa: E402
+from gsim3d.evaluate.protocol import score_scene  # noqa: E402
+from gsim3d.evaluate.report import summarize, write_json  # noqa: E402
+from gsim3d.simulator import Simulator  # noqa: E402
+from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig  # noqa: E402
+from gsim3d.train.loop import Trainer  # noqa: E402
+from gsim3d.train.restore import restore  # noqa: E402
 
 RUN = TrainConfig(
     preset="tiny",
@@ -33,11 +39,14 @@ RUN = TrainConfig(
     data=DataConfig(history=2, context_views=4, target_only_cameras=(2, 7), background_stride=2),
     stages=(
         StageConfig(steps=800, history=1, batch=2, target_views=2, learning_rate=2e-3),
-        StageConfig(steps=2400, horizon=8, batch=2, target_views=2, from_start=0.4, learning_rate=1e-3),
+        StageConfig(steps=1200, horizon=4, batch=2, target_views=2, from_start=0.4, learning_rate=1e-3),
+        StageConfig(steps=1200, horizon=8, batch=2, target_views=2, from_start=0.4, learning_rate=1e-3),
     ),
     loss=LossConfig(body_weight=2.0),
     optimizer=OptimizerConfig(ema_decay=0.98),
+    captured=True,
 )
+SMOOTHED = 200  # steps that a point of the curves is a mean of
 MEASURED = ("future.psnr_masked", "future.psnr", "future_late.psnr_masked")
 
 
@@ -74,10 +83,11 @@ def train_and_score(config: TrainConfig, folders: tuple, out: Path, is_cut: bool
 
 def table(results: dict[str, list[dict[str, float]]]) -> str:
     """Mean and standard deviation over the seeds, dB."""
-    lines = ["| gradients | " + " | ".join(results["kept"][0]) + " |", "| --- " * (1 + len(results["kept"][0])) + "|"]
+    names = [*MEASURED, "constant"]
+    lines = ["| gradients | " + " | ".join(names) + " |", "| --- " * (1 + len(names)) + "|"]
     for kind, seeds in results.items():
         cells = []
-        for name in seeds[0]:
+        for name in names:
             values = [seed[name] for seed in seeds]
             spread = f" ± {statistics.stdev(values):.2f}" if len(values) > 1 else ""
             cells.append(f"{statistics.mean(values):.2f}{spread}")
@@ -85,22 +95,90 @@ def table(results: dict[str, list[dict[str, float]]]) -> str:
     return "\n".join(lines)
 
 
+def curve(run: Path) -> list[tuple[float, float]]:
+    """(step, PSNR of simulated steps) of a run's log, each a mean over SMOOTHED steps."""
+    parts: dict[int, list[float]] = {}
+    for line in (run / "metrics.jsonl").read_text().splitlines():
+        entry = json.loads(line)
+        if isinstance(entry.get("future_psnr"), float):
+            parts.setdefault(entry["step"] // SMOOTHED, []).append(entry["future_psnr"])
+    return [((part + 0.5) * SMOOTHED, statistics.mean(values)) for part, values in sorted(parts.items())]
+
+
+def draw(results: dict, path: Path) -> None:
+    """Curves of all runs, and what held-out scenes say."""
+    from gsim3d.evaluate.pictures import pyplot
+
+    plt = pyplot()
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
+    for (kind, runs), color in zip(results.items(), ("#1f5fbf", "#c0504d"), strict=True):
+        for seed, run in enumerate(runs):
+            label = f"gradients {kind}" if seed == 0 else None
+            left.plot(*zip(*run["curve"], strict=True), color=color, linewidth=1.3, label=label)
+        for place, name in enumerate(MEASURED):
+            values = [run[name] for run in runs]
+            x = place + (0.15 if kind == "cut" else -0.15)
+            right.bar(x, statistics.mean(values), 0.28, color=color, alpha=0.4)
+            right.plot([x] * len(values), values, "o", color=color, markersize=4)
+    left.set(title="simulated steps of training samples", xlabel="optimizer step", ylabel="PSNR, dB")
+    left.legend(fontsize=8)
+    right.set(title="held-out scenes, a dot for each seed", ylabel="dB", xticks=range(len(MEASURED)))
+    right.set_xticklabels(
+        [name.replace("future", "all steps").replace("all steps_late", "second half") for name in MEASURED]
+    )
+    lowest = min(run[name] for runs in results.values() for run in runs for name in MEASURED)
+    right.set_ylim(bottom=lowest - 2)
+    figure.savefig(path, dpi=110)
+
+
+def train_together(args: argparse.Namespace, names: list[str]) -> None:
+    """All runs at the same time, a process each, with logs beside them."""
+    args.out.mkdir(parents=True, exist_ok=True)
+    running = {}
+    for name in names:
+        command = [sys.executable, __file__, "--data", args.data, "--out", args.out, "--device", args.device]
+        environment = {**os.environ, "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // len(names)))}
+        with open(args.out / f"{name}.log", "w") as log:
+            running[name] = subprocess.Popen(
+                [str(word) for word in (*command, "--only", name)], stdout=log, stderr=log, env=environment
+            )
+    failed = [name for name, process in running.items() if process.wait()]
+    if failed:
+        last = (args.out / f"{failed[0]}.log").read_text().splitlines()[-1:]
+        raise SystemExit(f"cut_gradients: {', '.join(failed)} failed, the first with: {' '.join(last)}")
+
+
 def main(arguments: list[str] | None = None, config: TrainConfig = RUN) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", required=True, help="folder with scenes")
-    parser.add_argument("--out", required=True, type=Path, help="folder for the runs")
+    parser.add_argument("--data", help="folder with scenes")
+    parser.add_argument("--out", type=Path, help="folder for the runs")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--together", action="store_true", help="all runs at the same time")
+    parser.add_argument("--only", metavar="RUN", help="one of them, such as cut_0")
+    parser.add_argument(
+        "--picture", nargs=2, type=Path, metavar=("OUT", "FILE"), help="draw what OUT/metrics.json says"
+    )
     args = parser.parse_args(arguments)
+    if args.picture:
+        draw(json.loads((args.picture[0] / "metrics.json").read_text()), args.picture[1])
+        return
+    if args.data is None or args.out is None:
+        parser.error("--data and --out are needed")
     folders = split_scenes(find_scenes(args.data))
+    runs = {f"{kind}_{seed}": (kind, seed) for seed in range(args.seeds) for kind in ("kept", "cut")}
+    if args.together:
+        train_together(args, list(runs))
     results: dict[str, list] = {"kept": [], "cut": []}
-    for seed in range(args.seeds):
-        for kind, scores in results.items():
+    for name, (kind, seed) in runs.items():
+        if args.only in (None, name):
             print(f"seed {seed}, gradients {kind}", flush=True)
             run = dataclasses.replace(config, seed=seed)
-            scores.append(train_and_score(run, folders, args.out / f"{kind}_{seed}", kind == "cut", args.device))
-    print(table(results))
-    write_json(args.out / "metrics.json", results)
+            scores = train_and_score(run, folders, args.out / name, kind == "cut", args.device)
+            results[kind].append({**scores, "curve": curve(args.out / name)})
+    if not args.only:
+        print(table(results))
+        write_json(args.out / "metrics.json", results)
 
 
 if __name__ == "__main__":

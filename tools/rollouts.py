@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Long rollouts and the gradients through them: writes docs/rollouts.md and docs/rollouts.png.
 
-python -m gsim3d demo --out runs/demo
+python -m gsim3d demo --train --out runs/demo
 python tools/rollouts.py --demo runs/demo
 
 Also trains `small` on the demo's scenes for a few minutes, into runs/demo/small; stopped and started again, it goes on.
@@ -35,7 +35,7 @@ EVERY = 32  # one of so many kept pixels becomes a particle
 PAGE, PICTURE = ROOT / "docs" / "rollouts.md", ROOT / "docs" / "rollouts.png"
 TEXT = """# Long rollouts
 
-Written by `python tools/rollouts.py --demo runs/demo` after `gsim3d demo --out runs/demo`; do not edit.
+Written by `python tools/rollouts.py --demo runs/demo` after `gsim3d demo --train --out runs/demo`; do not edit.
 
 {n_steps} steps from two generated scenes ({particles} particles in all). "random": weights as they are drawn, with a
 head that moves particles by centimetres a step; "tiny, demo": what `gsim3d demo` trained; "small, demo": `small` after

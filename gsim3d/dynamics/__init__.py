@@ -1,8 +1,23 @@
 """Particles of the last steps -> particles of the next steps."""
 
+from gsim3d.dynamics.background import Background
 from gsim3d.dynamics.clouds import append_step, concatenate, last_steps
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.dynamics import Dynamics
-from gsim3d.dynamics.rollout import rollout
+from gsim3d.dynamics.parts import Parts
+from gsim3d.dynamics.rollout import rollout, rollout_in_parts
+from gsim3d.dynamics.sleep import RestLog, Sleepers
 
-__all__ = ["Dynamics", "DynamicsConfig", "append_step", "concatenate", "last_steps", "rollout"]
+__all__ = [
+    "Background",
+    "Dynamics",
+    "DynamicsConfig",
+    "Parts",
+    "RestLog",
+    "Sleepers",
+    "append_step",
+    "concatenate",
+    "last_steps",
+    "rollout",
+    "rollout_in_parts",
+]

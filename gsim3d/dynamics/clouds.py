@@ -5,9 +5,11 @@ All of it is bookkeeping on numbers that the host knows (:class:`gsim3d.types.Cl
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import torch
+from torch.nn import functional as F
 
 from gsim3d.types import CloudTable, Particles
 
@@ -41,8 +43,26 @@ def last_steps(particles: Particles, n_steps: int) -> Particles:
     return particles if len(kept) == particles.n_clouds else particles.select_clouds(kept)
 
 
+def with_look(particles: Particles, name: str) -> Particles:
+    """``particles`` with the field ``name``, "turns" or "paint", which changes nothing where there was none."""
+    if getattr(particles, name) is not None:
+        return particles
+    like = particles.means.new_ones(particles.n_rows, 1)
+    identity = F.pad(like, (0, 3)) if name == "turns" else torch.diag_embed(like.expand(-1, 3))
+    return dataclasses.replace(particles, **{name: identity})
+
+
+def alike(parts: Sequence[Particles]) -> list[Particles]:
+    """``parts`` with the same fields: what some have of "turns" and "paint", all have."""
+    for name in ("turns", "paint"):
+        if any(getattr(part, name) is not None for part in parts):
+            parts = [with_look(part, name) for part in parts]
+    return list(parts)
+
+
 def concatenate(parts: Sequence[Particles]) -> Particles:
     """The clouds of several particle sets of the same scenes in one, sorted by (scene, step)."""
+    parts = alike(parts)
     tables = [part.clouds for part in parts]
     places = [(table.scenes[q], table.steps[q], p, q) for p, table in enumerate(tables) for q in range(len(table))]
     places.sort(key=lambda place: place[:2])

@@ -9,6 +9,7 @@ from gsim3d.quirks import Quirks
 from gsim3d.stability import LARGEST
 
 PREDICTS = ("from_newest", "from_previous", "absolute")
+BACKGROUNDS = ("symmetric", "asymmetric")
 STEM_KERNEL, BLOCK_KERNEL = 5, 3  # edges of the convolutions, in cells
 
 
@@ -42,6 +43,9 @@ class DynamicsConfig:
         mlp_ratio: hidden channels of a block's MLP over its channels.
         norm: "layer", or "batch" as published: evaluation uses running statistics, training those of the call's rows.
         zero_init: the last layer starts at zero: an untrained model that predicts differences predicts none.
+        background: "symmetric": frozen rows are rows like others to the network, and their latents change;
+            "asymmetric": frozen rows of the newest step read each other only, never change, and are computed once a
+            rollout; the others read both (:mod:`gsim3d.dynamics.background`). Weights fit both; train as you simulate.
     Training:
         drop_path: share of rows that skip a branch of a block, growing from 0 at the first block.
         shuffle_orders: the four curves of a stage change places at random.
@@ -75,6 +79,7 @@ class DynamicsConfig:
     mlp_ratio: int = 4
     norm: str = "batch"
     zero_init: bool = False
+    background: str = "symmetric"
     drop_path: float = 0.3
     shuffle_orders: bool = True
     checkpointing: bool = False
@@ -100,12 +105,22 @@ class DynamicsConfig:
             raise ValueError(f'DynamicsConfig: norm must be "layer" or "batch"; got {self.norm!r}')
         if self.predicts not in PREDICTS:
             raise ValueError(f"DynamicsConfig: predicts must be one of {', '.join(PREDICTS)}; got {self.predicts!r}")
+        if self.background not in BACKGROUNDS:
+            raise ValueError(
+                f"DynamicsConfig: background must be one of {', '.join(BACKGROUNDS)}; got {self.background!r}"
+            )
+        if self.is_asymmetric and (self.norm == "batch" or self.quirks != Quirks()):
+            raise ValueError('DynamicsConfig: background="asymmetric" needs norm="layer" and no quirks')
         if self.steps_per_call < 1:
             raise ValueError(f"DynamicsConfig: steps_per_call must be at least 1; got {self.steps_per_call}")
 
     @property
     def n_stages(self) -> int:
         return len(self.encoder_channels)
+
+    @property
+    def is_asymmetric(self) -> bool:
+        return self.background == "asymmetric"
 
     @property
     def origin_of_scene(self) -> bool:

@@ -8,8 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d import ops
-from gsim3d.dynamics.clouds import concatenate, newest_clouds
+from gsim3d.dynamics.background import Background
+from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps
 from gsim3d.dynamics.config import DynamicsConfig
+from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.point_transformer import PointTransformer
 from gsim3d.dynamics.state import StateLayout
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
@@ -37,12 +39,14 @@ class Dynamics(nn.Module):
         *,
         generator: torch.Generator | None = None,
         capacity: PyramidCapacity | None = None,
+        curves: tuple[tuple[int, ...], ...] | None = None,
     ) -> Pyramid:
         """All that the network reads of the positions, as integers.
 
         Args:
             history, generator: as :meth:`forward`.
             capacity: sizes of the result, so that nothing waits for the device; None: what the positions need.
+            curves: of each stage, as of a background that is read; None: drawn from ``generator``.
         """
         clouds = history.clouds
         slots, history_bits = self._slots(clouds, newest_clouds(clouds))
@@ -53,9 +57,26 @@ class Dynamics(nn.Module):
             constant(slots, history.cu_rows.device),
             history.origin,
             self.config.pyramid_spec(history_bits),
-            curves=self._draw_curves(generator) if self.training and self.config.shuffle_orders else None,
+            curves=self._draw_curves(generator) if curves is None else curves,
             capacity=capacity,
         )
+
+    def remember(self, background: Particles, *, generator: torch.Generator | None = None) -> Background:
+        """What moving rows read of a background, for all calls until it changes.
+
+        Args:
+            background: at most one cloud a scene.
+            generator: as :meth:`forward`.
+        Gradients: as :meth:`forward`.
+        """
+        curves = self._draw_curves(generator)
+        pyramid = self.geometry(background, curves=curves)
+        remembered, recorders = Background.begin(pyramid, background, self.config.pyramid_spec(0), curves)
+        if recorders:
+            draws = generator if self.training else None
+            x = ops.pool_mean(self.layout.pack(background), pyramid.rows, pyramid.cu_rows, check=False)
+            self.net(x, pyramid, generator=draws and _beside(draws, x.device), besides=recorders)
+        return remembered
 
     def forward(
         self,
@@ -63,6 +84,7 @@ class Dynamics(nn.Module):
         *,
         generator: torch.Generator | None = None,
         pyramid: Pyramid | None = None,
+        background: Background | None = None,
         changes: Mapping[str, str] | None = None,
     ) -> Particles:
         """The next step of every scene, or the next ``config.steps_per_call`` steps.
@@ -72,6 +94,8 @@ class Dynamics(nn.Module):
             generator: of drop path and of the curves' shuffling, both in training only; None: neither happens.
             pyramid: ``geometry(history)``; None: made here. With one of a given capacity nothing waits for the device,
                 and the result has the same values as long as ``pyramid.found`` fits the capacity.
+            background: what rests, of :meth:`remember`; then ``history`` holds what moves, as :class:`Parts` tells them
+                apart. None: with ``config.background="asymmetric"`` all that is done here.
             changes: what a step changes, of ``layout.changes``; the rest is not computed. None: all that is predicted.
         Returns:
             One cloud a scene and step, each with the rows of the scene's newest step.
@@ -80,10 +104,13 @@ class Dynamics(nn.Module):
             ValueError: clouds are not sorted, a history is longer than the model's, or a model with ``norm="batch"`` is
                 trained on a pyramid of given capacity: its statistics would count rows that are none.
         """
+        if background is None and self.config.is_asymmetric:
+            return self._forward_in_parts(history, generator, changes)
         clouds = history.clouds
         newest = newest_clouds(clouds)
         if pyramid is None:
-            pyramid = self.geometry(history, generator=generator)
+            curves = None if background is None else background.curves
+            pyramid = self.geometry(history, generator=generator, curves=curves)
         if pyramid.found is not None and self.training and self.config.norm == "batch":
             raise ValueError('Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"')
         features, is_awake = self.layout.pack(history), None
@@ -91,7 +118,8 @@ class Dynamics(nn.Module):
         if not everyone:  # rows of the pyramid <-> rows of the history; those that sleep become 0
             features = ops.pool_mean(features, pyramid.rows, pyramid.cu_rows, check=False)
         draws = generator if self.training else None
-        features = self.net(features, pyramid, generator=draws and _beside(draws, features.device))
+        besides = () if background is None else background.readers(pyramid, history)
+        features = self.net(features, pyramid, generator=draws and _beside(draws, features.device), besides=besides)
         if not everyone:
             one = features.new_ones(features.shape[0], 1)
             features, is_awake = (
@@ -111,6 +139,18 @@ class Dynamics(nn.Module):
         ]
         return steps[0] if len(steps) == 1 else concatenate(steps)
 
+    def _forward_in_parts(
+        self, history: Particles, generator: torch.Generator | None, changes: Mapping[str, str] | None
+    ) -> Particles:
+        parts, n_steps = Parts.of(history, asymmetric=True), self.config.steps_per_call
+        steps = [None] * n_steps
+        if not parts.nothing_moves:
+            background = self.remember(parts.background, generator=generator)
+            step = self(parts.moving, generator=generator, background=background, changes=changes)
+            steps = single_steps(step)
+        wholes = [parts.whole(step, 1 + i) for i, step in enumerate(steps)]
+        return wholes[0] if n_steps == 1 else concatenate(wholes)
+
     def _slots(self, clouds: CloudTable, newest: list[int]) -> tuple[tuple[int, ...], int]:
         """Time slot of each cloud, and the bits they are counted in: none where no scene has two steps to merge."""
         slots, longest, begin, bits = [], 1, 0, self.config.history_bits
@@ -128,7 +168,7 @@ class Dynamics(nn.Module):
         return tuple(slots), bits if from_newest else (longest - 1).bit_length()
 
     def _draw_curves(self, generator: torch.Generator | None) -> tuple[tuple[int, ...], ...] | None:
-        if generator is None:
+        if generator is None or not (self.training and self.config.shuffle_orders):
             return None
         return tuple(
             tuple(torch.randperm(4, generator=generator, device=generator.device).tolist())

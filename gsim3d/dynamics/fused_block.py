@@ -15,7 +15,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from gsim3d.layers import linear_grads, rounded_weights, row_linear
+from gsim3d.branches import Branches
+from gsim3d.layers import linear_grad_weight, rounded_weights, row_linear
 from gsim3d.ops.curve import PatchTable, Stage
 
 _ops = torch.ops.gsim3d
@@ -89,10 +90,13 @@ class Kept(NamedTuple):
     activated: Tensor
 
 
-def run_block(block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keeps: list, recompute: bool):
+def run_block(
+    block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keeps: list, recompute: bool, beside=None
+):
     """(x, what the next convolution reads) behind a ``point_transformer.Block``.
 
-    x [N, C]; conv_input [N, C] in the dtype of the products; keeps: factors [N, 1] of the rows' branches or None.
+    x [N, C]; conv_input [N, C] in the dtype of the products; keeps: factors [N, 1] of the rows' branches or None; beside:
+    what else the rows read, a ``background.Reader``, without gradients only.
     """
     conv, attention, mlp, position = block.position.conv, block.attention, block.mlp, block.position
     plan = Plan(stage, stage.patches[row], conv.kernel_size, conv.duplicates == "first", attention.heads, block.norm1.eps,
@@ -106,19 +110,34 @@ def run_block(block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keep
         out = _Block.apply(plan, Weights(*rounded, *of_norms), x, conv_input, *keeps, *weights, *of_norms)
     else:
         with torch._C._AutoDispatchBelowAutograd(), torch._C._ExcludeDispatchKeyGuard(_autocast):
-            out = _forward(plan, Weights(*rounded, *of_norms), x, conv_input, *keeps)[0]
+            reads = None if beside is None else _Reads(beside, conv, attention, row)
+            out = _forward(plan, Weights(*rounded, *of_norms), x, conv_input, *keeps, reads)[0]
     return out if len(out) == 2 else (out[0], out[0])
 
 
-def _forward(plan: Plan, w: Weights, x: Tensor, conv_input: Tensor, keep_attention, keep_mlp):
+class _Reads(NamedTuple):
+    """A ``background.Reader`` and the modules whose part of the background a block reads."""
+
+    beside: object
+    conv: object
+    attention: object
+    row: int
+
+
+def _forward(plan: Plan, w: Weights, x: Tensor, conv_input: Tensor, keep_attention, keep_mlp, reads: _Reads | None = None):
     """(sum,) or (sum, sum in the dtype of the products); Kept."""
     place = _ops.sparse_conv.default(conv_input, w.conv, w.conv_bias, *plan.geometry(), plan.conv_plan())
+    if reads is not None:
+        place = reads.beside.convolved(reads.conv, conv_input, place)
     position = row_linear(place, w.linear, w.linear_bias)
     norm, norm1, norm2 = (w.position_norm, w.position_norm_bias), (w.norm1, w.norm1_bias), (w.norm2, w.norm2_bias)
     sum1, normed1, position_stats, stats1 = _ops.residual_norm.default(x, position, None, *norm, *norm1, plan.eps)
     qkv = row_linear(normed1, w.qkv, w.qkv_bias)
     q, k, v = _heads(qkv, plan.heads)
-    attended, attention_stats = _ops.patch_attention.default(q, k, v, *plan.table(), q.shape[-1] ** -0.5)
+    if reads is None:
+        attended, attention_stats = _ops.patch_attention.default(q, k, v, *plan.table(), q.shape[-1] ** -0.5)
+    else:
+        attended, attention_stats = reads.beside.attended(reads.attention, q, k, v, plan.patches, reads.row), None
     branch = row_linear(attended.flatten(1), w.proj, w.proj_bias)
     sum2, normed2, _, stats2 = _ops.residual_norm.default(sum1, branch, keep_attention, None, None, *norm2, plan.eps)
     hidden = row_linear(normed2, w.fc1, w.fc1_bias)
@@ -136,35 +155,42 @@ def _heads(qkv: Tensor, heads: int) -> tuple[Tensor, ...]:
     return qkv.view(qkv.shape[0], 3, heads, qkv.shape[1] // (3 * heads)).unbind(1)
 
 
-def _backward(plan: Plan, w: Weights, kept: Kept, conv_input: Tensor, keep_attention, keep_mlp, grad_sum, grad_out):
-    """Gradients of x, conv_input and all weights, in their order."""
+def _backward(plan: Plan, w: Weights, kept: Kept, conv_input: Tensor, keep_attention, keep_mlp, grad_sum, grad_out,
+              beside: Branches):  # fmt: skip
+    """Gradients of x, conv_input and all weights, in their order; those of weights of layers are made ``beside``."""
     # Without a norm of the branch the op reads only the dtype of the branch: any tensor like it will do.
     grad2, grad_branch, fc2_bias, *_ = _ops.residual_norm_backward.default(
         grad_sum, grad_out, kept.normed2, kept.sum2, keep_mlp, None, None, kept.stats2[:0], kept.stats2[:0]
     )
-    grad_activated, fc2 = linear_grads(grad_branch, kept.activated, w.fc2)
+    fc2 = beside.run(linear_grad_weight, grad_branch, kept.activated)
+    grad_activated = grad_branch @ w.fc2
     zero, one = _zeros_and_ones(w.fc1.shape[0], grad2.dtype, grad2.device)
     grad_hidden, _, fc1_bias = _ops.norm_gelu_backward.default(grad_activated, kept.hidden, zero, one, zero)
-    grad_normed, fc1 = linear_grads(grad_hidden, kept.normed2, w.fc1)
+    fc1 = beside.run(linear_grad_weight, grad_hidden, kept.normed2)
+    grad_normed = grad_hidden @ w.fc1
 
     grad1, grad_branch, proj_bias, _, _, norm2, norm2_bias = _ops.residual_norm_backward.default(
         grad2, grad_normed, kept.normed2, kept.sum2, keep_attention, None, w.norm2, kept.stats2[:0], kept.stats2
     )
-    grad_attended, proj = linear_grads(grad_branch, kept.attended.flatten(1), w.proj)
+    proj = beside.run(linear_grad_weight, grad_branch, kept.attended.flatten(1))
+    grad_attended = grad_branch @ w.proj
     q, k, v = _heads(kept.qkv, plan.heads)
-    grads = _ops.patch_attention_backward.default(
+    grad_qkv = _ops.patch_attention_backward_packed.default(
         grad_attended.view(q.shape), q, k, v, kept.attended, kept.attention_stats, *plan.table(), q.shape[-1] ** -0.5
-    )
-    grad_qkv = torch.stack(grads, 1).flatten(1)
-    grad_normed, qkv = linear_grads(grad_qkv, kept.normed1, w.qkv)
-    qkv_bias = _ops.linear_grad_bias.default(grad_qkv)
+    ).flatten(1)
+    qkv = beside.run(linear_grad_weight, grad_qkv, kept.normed1)
+    qkv_bias = beside.run(_ops.linear_grad_bias.default, grad_qkv)
+    grad_normed = grad_qkv @ w.qkv
 
     grad_x, grad_position, linear_bias, *of_norms = _ops.residual_norm_backward.default(
         grad1, grad_normed, kept.position, kept.sum1, None, w.position_norm, w.norm1, kept.position_stats, kept.stats1
     )
-    grad_place, linear = linear_grads(grad_position, kept.place, w.linear)
+    grad_place = grad_position @ w.linear
+    conv, conv_bias = beside.run(
+        _ops.sparse_conv_grad_weight.default, grad_place, conv_input, plan.kernel_size, *plan.geometry()
+    )
+    linear = beside.run(linear_grad_weight, grad_position, kept.place)
     grad_input = _ops.sparse_conv_grad_input.default(grad_place, w.conv, *plan.geometry(), plan.conv_plan())
-    conv, conv_bias = _ops.sparse_conv_grad_weight.default(grad_place, conv_input, plan.kernel_size, *plan.geometry())
     of_layers = conv, conv_bias, linear, linear_bias, qkv, qkv_bias, proj, proj_bias, fc1, fc1_bias, fc2
     return grad_x, grad_input, *of_layers, fc2_bias, *of_norms, norm2, norm2_bias
 
@@ -195,7 +221,7 @@ class _Block(torch.autograd.Function):
                 kept = _forward(ctx.plan, ctx.weights, x, conv_input, keep_attention, keep_mlp)[1]
             else:
                 kept = Kept(*saved[: len(Kept._fields)])
-            grads = _backward(
-                ctx.plan, ctx.weights, kept, conv_input, keep_attention, keep_mlp, grad_sum, grad_out
-            )
+            keeps = keep_attention, keep_mlp
+            with Branches(conv_input) as beside:
+                grads = _backward(ctx.plan, ctx.weights, kept, conv_input, *keeps, grad_sum, grad_out, beside)
         return None, None, *grads[:2], None, None, *grads[2:]

@@ -15,11 +15,23 @@ from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
 from gsim3d import ops
+from gsim3d.branches import Branches
+from gsim3d.dynamics.background import Reader, Recorder
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
 from gsim3d.dynamics.fused_block import run_block
-from gsim3d.layers import RowLayerNorm, RowLinear, make_norm, product_dtype, rounded_at_once, rounded_weights, widened
+from gsim3d.layers import (
+    RowLayerNorm,
+    RowLinear,
+    at_hand,
+    make_norm,
+    product_dtype,
+    round_at_once,
+    rounded_weights,
+    widened,
+)
 from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
+Beside = Recorder | Reader
 TIME_EMBEDDING_STD = 0.02
 HALF_MAX = torch.finfo(torch.float16).max  # beyond it half precision has infinity, and attention NaN
 
@@ -35,11 +47,12 @@ class SparseConv(nn.Module):
         self.weight = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.empty(out_channels).uniform_(-bound, bound)) if bias else None
 
-    def forward(self, x: Tensor, stage: Stage) -> Tensor:
+    def forward(self, x: Tensor, stage: Stage, beside: Beside | None = None) -> Tensor:
         kernel_map, weight, bias = stage.kernel_maps[self.kernel_size], self.weight, self.bias
         if x.is_cuda and not torch.is_grad_enabled() and not torch.compiler.is_compiling():
             weight, bias = rounded_weights(self, product_dtype(x))
-        return ops.sparse_conv(x, weight, bias, stage.voxels, kernel_map, duplicates=self.duplicates, check=False)
+        out = ops.sparse_conv(x, weight, bias, stage.voxels, kernel_map, duplicates=self.duplicates, check=False)
+        return out if beside is None else beside.convolved(self, x, out)
 
 
 class PositionEncoding(nn.Module):
@@ -51,8 +64,8 @@ class PositionEncoding(nn.Module):
         self.linear = RowLinear(channels, channels)
         self.norm = RowLayerNorm(channels)
 
-    def forward(self, x: Tensor, stage: Stage, residual: Tensor) -> Tensor:
-        return self.norm(self.linear(self.conv(x, stage)), residual)
+    def forward(self, x: Tensor, stage: Stage, residual: Tensor, beside: Beside | None = None) -> Tensor:
+        return self.norm(self.linear(self.conv(x, stage, beside)), residual)
 
 
 class Attention(nn.Module):
@@ -64,9 +77,14 @@ class Attention(nn.Module):
         self.qkv = RowLinear(channels, 3 * channels)
         self.proj = RowLinear(channels, channels)
 
-    def forward(self, x: Tensor, patches: PatchTable) -> Tensor:
+    def forward(self, x: Tensor, patches: PatchTable, row: int = 0, beside: Beside | None = None) -> Tensor:
+        """x [N, C] in the patches of serialization ``row``."""
         q, k, v = self._rounded(self.qkv(x)).unflatten(1, (3, self.heads, -1)).unbind(1)
-        return self.proj(self._rounded(ops.patch_attention(q, k, v, patches, check=False).flatten(1)))
+        if beside is None:
+            out = ops.patch_attention(q, k, v, patches, check=False)
+        else:
+            out = beside.attended(self, q, k, v, patches, row)
+        return self.proj(self._rounded(out.flatten(1)))
 
     def _rounded(self, x: Tensor) -> Tensor:
         if not self.rounded_to_half:
@@ -109,35 +127,45 @@ class Block(nn.Module):
         *,
         conv_input: Tensor | None = None,
         generator: torch.Generator | None = None,
+        beside: Beside | None = None,
     ) -> Tensor:
         """x [N, C] with attention along serialization ``row``. ``conv_input``: read by the convolution, default x."""
         conv_input = x if conv_input is None else conv_input
-        if self.is_fused(x):
-            return self.advance(x, conv_input, stage, row, generator)[0]
+        if self.is_fused(x, beside):
+            return self.advance(x, conv_input, stage, row, generator, beside)[0]
         keep = self._draw_keep(x, generator)
         if self._recomputes():
-            arguments = (x, conv_input, stage, row, *keep)
+            arguments = (x, conv_input, stage, row, *keep, beside)
             return checkpoint(self._compute, *arguments, use_reentrant=False, preserve_rng_state=False)
-        return self._compute(x, conv_input, stage, row, *keep)
+        return self._compute(x, conv_input, stage, row, *keep, beside)
 
-    def is_fused(self, x: Tensor) -> bool:
+    def is_fused(self, x: Tensor, beside: Beside | None = None) -> bool:
+        if isinstance(beside, Recorder) or (beside is not None and torch.is_grad_enabled()):
+            return False
         if torch.compiler.is_compiling() or self.attention.rounded_to_half:
             return False
         return x.is_cuda if self.fused is None else self.fused
 
     def advance(
-        self, x: Tensor, conv_input: Tensor, stage: Stage, row: int, generator: torch.Generator | None
+        self,
+        x: Tensor,
+        conv_input: Tensor,
+        stage: Stage,
+        row: int,
+        generator: torch.Generator | None,
+        beside: Reader | None = None,
     ) -> tuple[Tensor, Tensor]:
         """What :meth:`forward` returns where the block is fused, and the same in the dtype that convolutions read."""
         keep = self._draw_keep(x, generator)
-        return run_block(self, x, conv_input.to(product_dtype(x)), stage, row, keep, self._recomputes())
+        conv_input = conv_input.to(product_dtype(x))
+        return run_block(self, x, conv_input, stage, row, keep, self._recomputes(), beside)
 
     def _recomputes(self) -> bool:
         return self.checkpointing and self.training and torch.is_grad_enabled()
 
-    def _compute(self, x, conv_input, stage, row, keep_attention, keep_mlp):
-        x = self.position(conv_input, stage, x)
-        x = x + scaled(self.attention(self.norm1(x), stage.patches[row]), keep_attention)
+    def _compute(self, x, conv_input, stage, row, keep_attention, keep_mlp, beside):
+        x = self.position(conv_input, stage, x, beside)
+        x = x + scaled(self.attention(self.norm1(x), stage.patches[row], row, beside), keep_attention)
         return x + scaled(self.mlp(self.norm2(x)), keep_mlp)
 
     def _draw_keep(self, x: Tensor, generator: torch.Generator | None) -> list[Tensor | None]:
@@ -160,16 +188,21 @@ def duplicates_rule(config: DynamicsConfig) -> str:
 
 
 def run_blocks(
-    blocks: nn.ModuleList, x: Tensor, conv_input: Tensor, stage: Stage, generator: torch.Generator | None
+    blocks: nn.ModuleList,
+    x: Tensor,
+    conv_input: Tensor,
+    stage: Stage,
+    generator: torch.Generator | None,
+    beside: Beside | None = None,
 ) -> Tensor:
     """x behind ``blocks``; the first convolution reads ``conv_input``, the others what the block before them made."""
     x = widened(x)
     for i, block in enumerate(blocks):
         row = i % len(stage.patches)
-        if block.is_fused(x):
-            x, conv_input = block.advance(x, conv_input, stage, row, generator)
+        if block.is_fused(x, beside):
+            x, conv_input = block.advance(x, conv_input, stage, row, generator, beside)
         else:
-            x = conv_input = block(x, stage, row, conv_input=conv_input, generator=generator)
+            x = conv_input = block(x, stage, row, conv_input=conv_input, generator=generator, beside=beside)
     return x
 
 
@@ -182,8 +215,8 @@ class Stem(nn.Module):
         self.conv = SparseConv(in_channels, channels, STEM_KERNEL, bias=False, duplicates=duplicates_rule(config))
         self.norm = make_norm(config.norm, channels)
 
-    def forward(self, x: Tensor, stage: Stage) -> Tensor:
-        return self.norm.activated(self.conv(x, stage))
+    def forward(self, x: Tensor, stage: Stage, beside: Beside | None = None) -> Tensor:
+        return self.norm.activated(self.conv(x, stage, beside))
 
 
 class Pool(nn.Module):
@@ -211,9 +244,13 @@ class Merge(nn.Module):
         self.time_embedding = nn.Parameter(torch.empty(window, channels))
         nn.init.trunc_normal_(self.time_embedding, std=TIME_EMBEDDING_STD)
 
+    def marks(self, stage: Stage) -> bool:
+        """Whether there is anything to tell apart."""
+        return stage.time_index is not None or self.newest is not None
+
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
         if stage.time_index is None:
-            return x if self.newest is None else x + self.time_embedding[self.newest].to(x.dtype)
+            return x + self.time_embedding[self.newest].to(x.dtype)
         # A product with a one-hot matrix: its gradient is a sum in row order, where indexing would use atomics on CUDA.
         return x + F.one_hot(stage.time_index, self.time_embedding.shape[0]).to(x) @ self.time_embedding
 
@@ -231,12 +268,14 @@ class EncoderStage(nn.Module):
             Block(channels[index], config.encoder_heads[index], drop_path, config) for drop_path in drop_paths
         )
 
-    def forward(self, x: Tensor, stage: Stage, generator: torch.Generator | None) -> Tensor:
+    def forward(
+        self, x: Tensor, stage: Stage, generator: torch.Generator | None, beside: Beside | None = None
+    ) -> Tensor:
         if self.pool is not None:
             x = self.pool(x, stage)
-        if self.merge is not None:
+        if self.merge is not None and self.merge.marks(stage):
             x = self.merge(x, stage)
-        return run_blocks(self.blocks, x, x, stage, generator)
+        return run_blocks(self.blocks, x, x, stage, generator, beside)
 
 
 class Unpool(nn.Module):
@@ -269,10 +308,16 @@ class DecoderStage(nn.Module):
         self.stale_conv = config.quirks.stale_decoder_conv
 
     def forward(
-        self, x: Tensor, skip: Tensor, stage: Stage, coarse: Stage, generator: torch.Generator | None
+        self,
+        x: Tensor,
+        skip: Tensor,
+        stage: Stage,
+        coarse: Stage,
+        generator: torch.Generator | None,
+        beside: Beside | None = None,
     ) -> Tensor:
         x, skip = self.unpool(x, skip, coarse)
-        return run_blocks(self.blocks, x, skip if self.stale_conv else x, stage, generator)
+        return run_blocks(self.blocks, x, skip if self.stale_conv else x, stage, generator, beside)
 
 
 class Head(nn.Module):
@@ -298,6 +343,7 @@ class PointTransformer(nn.Module):
         x: features of the rows of stage 0.
         pyramid: their geometry.
         generator: of drop path, in training; None: no drop path.
+        besides: of each stage what else its rows read, or who listens; none: nothing and nobody.
     """
 
     def __init__(self, in_channels: int, out_channels: int, config: DynamicsConfig):
@@ -311,21 +357,33 @@ class PointTransformer(nn.Module):
         parts = (self.encoder, self.decoder)
         self._products = [m for part in parts for m in part.modules() if isinstance(m, (RowLinear, SparseConv))]
 
-    def forward(self, x: Tensor, pyramid: Pyramid, *, generator: torch.Generator | None = None) -> Tensor:
+    def forward(
+        self,
+        x: Tensor,
+        pyramid: Pyramid,
+        *,
+        generator: torch.Generator | None = None,
+        besides: Sequence[Beside] = (),
+    ) -> Tensor:
+        besides = besides or [None] * len(pyramid.stages)
         if not x.is_cuda or torch.compiler.is_compiling():
-            return self._compute(x, pyramid, generator)
-        with rounded_at_once(self._products, product_dtype(x)):
-            return self._compute(x, pyramid, generator)
+            x = self.stem(x, pyramid.stages[0], besides[0])
+            return self._behind_stem(x, pyramid, generator, besides)
+        with Branches(x) as branches:
+            rounded = branches.run(round_at_once, self._products, product_dtype(x))
+            x = self.stem(x, pyramid.stages[0], besides[0])
+        with at_hand(rounded):
+            return self._behind_stem(x, pyramid, generator, besides)
 
-    def _compute(self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None) -> Tensor:
-        stages = pyramid.stages
-        x = self.stem(x, stages[0])
-        skips = []
-        for encoder, stage in zip(self.encoder, stages, strict=True):
-            x = encoder(x, stage, generator)
+    def _behind_stem(
+        self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None, besides: Sequence[Beside | None]
+    ) -> Tensor:
+        stages, skips = pyramid.stages, []
+        for encoder, stage, beside in zip(self.encoder, stages, besides, strict=True):
+            x = encoder(x, stage, generator, beside)
             skips.append(x)
         for s in reversed(range(len(self.decoder))):
-            x = self.decoder[s](x, skips[s], stages[s], stages[s + 1], generator)
+            x = self.decoder[s](x, skips[s], stages[s], stages[s + 1], generator, besides[s])
         return x
 
 

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from gsim3d.dynamics.clouds import append_step, last_steps, single_steps
+import torch
+
+from gsim3d.dynamics.background import Background
+from gsim3d.dynamics.clouds import append_step, concatenate, last_steps, single_steps
+from gsim3d.dynamics.parts import Parts
+from gsim3d.dynamics.sleep import RestLog, Sleepers
 from gsim3d.types import Particles
 
 
@@ -26,4 +31,51 @@ def rollout(
         predicted = predict(history)
         steps += single_steps(predicted)
         history = append_step(history, predicted, max_steps)
+    return steps[:n_steps]
+
+
+def rollout_in_parts(
+    predict: Callable[[Particles, Background | None], Particles],
+    history: Particles,
+    n_steps: int,
+    max_steps: int,
+    *,
+    remember: Callable[[Particles], Background] | None = None,
+    sleepers: Sleepers | None = None,
+    log: RestLog | None = None,
+) -> list[Particles]:
+    """As :func:`rollout`, of which ``predict`` sees what moves only.
+
+    Args:
+        predict: last steps of what moves, and its background -> the next steps of what moves.
+        remember: what rests -> the background that ``predict`` reads, made anew whenever others rest; None: the model
+            does not tell them apart, and only whole scenes rest.
+        sleepers: who sleeps beside frozen rows; None: nobody.
+        log: is told what was computed.
+    """
+    history, steps, parts = last_steps(history, max_steps), [], None
+    log = RestLog() if log is None else log
+    while len(steps) < n_steps:
+        if parts is None or (sleepers is not None and not torch.equal(asleep, sleepers.asleep)):
+            if steps:  # all that the model sees was simulated when somebody falls asleep first
+                history = last_steps(concatenate(steps[-max_steps:]), max_steps)
+            asleep = None if sleepers is None else sleepers.asleep
+            parts, begin = Parts.of(history, asymmetric=remember is not None, asleep=asleep if steps else None), len(steps)
+            moving, background = parts.moving, None
+            if parts.background is not None and not parts.nothing_moves:
+                background = remember(parts.background)
+                log.remembered += 1
+            log.n_rows = parts.newest.n_rows
+        predicted = [None]
+        if not parts.nothing_moves:
+            predicted = predict(moving, background)
+            moving = append_step(moving, predicted, max_steps)
+            predicted = single_steps(predicted)
+            log.calls += 1
+        for step in predicted:
+            before = steps[-1] if steps else parts.newest
+            steps.append(parts.whole(step, len(steps) + 1 - begin))
+            log.moving.append(parts.rows.shape[0])
+            if sleepers is not None:
+                sleepers.look(before, steps[-1])
     return steps[:n_steps]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from gsim3d.pretrained import CHECKPOINT_HELP, FOLDER, located
+
 EPILOG = """\
 Every scene's first steps are given, all others predicted and compared with the film, seen from cameras that were no
 input. Measured are psnr (all pixels), psnr_masked (without background), psnr_body (what may move), ssim, lpips_alex,
@@ -28,6 +30,7 @@ Written: FILE.json (all numbers), and beside it .csv (scene, method, step), .md 
 examples:
   gsim3d evaluate runs/model runs/data
   gsim3d evaluate model.safetensors runs/data --scenes all --steps 16 --out metrics.json
+  gsim3d evaluate elastic-small data/elastic-unseen --scenes all
   gsim3d evaluate runs/model runs/data --metrics psnr psnr_masked ssim lpips_vgg
   gsim3d evaluate runs/model runs/data --predictions video=runs/video_model
   gsim3d evaluate --predictions runs/video_model runs/data --given 4
@@ -41,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "checkpoint",
         metavar="CHECKPOINT",
         nargs="?",
-        help="run folder, checkpoint folder or .safetensors file (left out: only --predictions are scored)",
+        help=f"{CHECKPOINT_HELP} (left out: only --predictions are scored)",
     )
     parser.add_argument("data", metavar="DATA", help="folder with scenes, or one scene folder")
     parser.add_argument(
@@ -81,7 +84,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="FILE",
-        help="JSON file (default: metrics.json beside the checkpoint's files, or in the folder of the predictions)",
+        help="JSON file (default: metrics.json beside the checkpoint's files, in the folder of the predictions, or, of a "
+        "simulator that comes with gsim3d, in the current folder)",
     )
 
 
@@ -146,8 +150,9 @@ def _out_file(args: argparse.Namespace, others: list):
         if out.suffix != ".json":
             raise InputError(f"--out: the name must end in .json; got {out}")
     else:
-        place = Path(args.checkpoint or others[0].folder)
-        out = (place if place.is_dir() else place.parent) / "metrics.json"
+        place = located(args.checkpoint) if args.checkpoint else Path(others[0].folder)
+        shipped = place.is_relative_to(FOLDER)  # nothing is written into the package
+        out = Path() / "metrics.json" if shipped else (place if place.is_dir() else place.parent) / "metrics.json"
     if not out.parent.is_dir() and args.out:
         raise InputError(f"--out: the folder {out.parent} does not exist")
     return out
@@ -173,6 +178,7 @@ def _conditions(args: argparse.Namespace, restored, others: list, scenes: list, 
     """What was evaluated, and on what: without it two reports cannot be compared."""
     return {
         "checkpoint": None if restored is None else restored.checkpoint.digest,
+        "effects": None if restored is None else restored.plan.spec.hash,
         "predictions": {other.name: str(other.folder) for other in others},
         "data": str(args.data),
         "part": args.scenes,

@@ -22,6 +22,7 @@ from torch import Tensor
 from gsim3d.data import Scene, make_frames
 from gsim3d.data.recording import BACKGROUND
 from gsim3d.dynamics import concatenate
+from gsim3d.edits import Edit
 from gsim3d.errors import InputError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.scoring import PLAIN_METRICS, SceneScores, SceneTruth
@@ -72,25 +73,42 @@ def default_views(
 
 
 @torch.no_grad()
-def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_future: int, start: int = 0) -> Prediction:
+def predict(
+    restored: Restored,
+    scene: Scene,
+    context_cams: Sequence[int],
+    n_future: int,
+    start: int = 0,
+    edits: Sequence[Edit] = (),
+) -> Prediction:
     """Encodes ``history`` steps of a scene from ``start`` and rolls out ``n_future`` steps, also beyond the film's end.
 
+    Args:
+        edits: changes of the scene on the way.
     Raises:
-        InputError: images of another size than in training, or cameras and steps that the scene has not.
+        InputError: images of another size than in training, cameras and steps that the scene has not, or an edit that
+            cannot be made.
     """
+    if n_future < 1:
+        raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
+    encoded = encode_steps(restored, scene, context_cams, start)
+    with exact_convolutions():
+        steps = restored.simulator.rollout(encoded, n_future, restored.plan, edits=edits)
+    return Prediction(concatenate([encoded, *steps]), restored.data.history, tuple(context_cams))
+
+
+@torch.no_grad()
+def encode_steps(restored: Restored, scene: Scene, context_cams: Sequence[int], start: int = 0) -> Particles:
+    """``history`` steps of a scene from ``start``. Errors as :func:`predict`."""
     restored.check_scene(scene)
     n_encoded = restored.data.history
     if not 0 <= start <= scene.n_steps - n_encoded:
         raise InputError(f"{scene.path}: {n_encoded} steps from step {start} on do not fit its {scene.n_steps} steps")
-    if n_future < 1:
-        raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
     masked = scene.has_segmentation()
     frames = make_frames([scene], [list(context_cams)], [range(start, start + n_encoded)], masked=masked)
     frames = thin_background(frames, restored.data.background_stride).to(restored.device)
     with exact_convolutions():
-        encoded = restored.simulator.encode(frames)
-        steps = restored.simulator.rollout(encoded, n_future, restored.plan)
-    return Prediction(concatenate([encoded, *steps]), n_encoded, tuple(context_cams))
+        return restored.simulator.encode(frames)
 
 
 @torch.no_grad()
@@ -147,6 +165,7 @@ def score_scene(
     n_future: int | None = None,
     metrics: Sequence[str] = PLAIN_METRICS,
     others: Sequence[Predictions] = (),
+    prediction: Prediction | None = None,
 ) -> SceneScores:
     """Predicts a scene from its first steps and scores every method on the target views.
 
@@ -157,6 +176,7 @@ def score_scene(
         n_future: steps to predict; default to the end of the film.
         metrics: see :func:`gsim3d.evaluate.scoring.measurable`.
         others: predictions of other models.
+        prediction: what :func:`predict` gave for these cameras and steps; None: it is made here.
     """
     if restored is not None:
         context_cams, target_cams = default_views(restored, scene, context_cams, target_cams)
@@ -171,8 +191,9 @@ def score_scene(
     truth = SceneTruth(scene.name, images, labels, filmed, n_encoded, metrics)
 
     def methods() -> Iterator[tuple[str, Tensor]]:
+        nonlocal prediction
         if restored is not None:
-            prediction = predict(restored, scene, context_cams, n_future)
+            prediction = prediction or predict(restored, scene, context_cams, n_future)
             rendered = render_steps(restored, prediction.particles, scene, cams)
             yield "model", rendered
         for other in others:

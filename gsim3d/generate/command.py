@@ -32,6 +32,7 @@ layout:
                                /depth_<step>.png       16 bits, 0.1 mm along the camera's axis, 0: nothing (--depth)
   DIR/<object>/<sample>/states.npz                     what carries each body and the cloth at every step, metres
   DIR/manifest.json                                    options, hashes, rejected draws, machine, versions
+  DIR/effects.yaml                                     what these scenes call for (gsim3d plan)
 
 The same options give the same bytes for any number of processes. It may be killed at any time: run it again and
 it goes on where it stopped. A larger --trajectories adds scenes to a finished set.

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+from gsim3d.effects import FILE as EFFECTS_FILE
 from gsim3d.errors import InputError
 from gsim3d.generate import writer
 from gsim3d.generate.worlds import build_world
@@ -75,6 +76,7 @@ def generate(
             scene for scene, folder in zip(scenes, folders) if not writer.is_finished(folder, fingerprints[scene[0]])
         ]
         _make_all(settings, out, missing, processes or len(os.sched_getaffinity(0)), progress)
+        settings.effects().save(out / EFFECTS_FILE)
         manifest = writer.write_manifest(out, folders, {"world": world, **dataclasses.asdict(settings)})
     from gsim3d.data import find_scenes  # not above: the worker processes do without torch
 
@@ -126,7 +128,7 @@ def _make_all(settings, out: Path, scenes: list, processes: int, progress: bool)
                 bar.update()
             return
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(processes, len(scenes)), context, _start_worker) as pool:
+        with ProcessPoolExecutor(min(processes, len(scenes)), context, start_worker) as pool:
             jobs = [pool.submit(_make_one, settings, out, scene) for scene in scenes]
             try:
                 for job in as_completed(jobs):
@@ -141,7 +143,8 @@ def _make_one(settings, out: Path, scene: tuple[str, int]) -> None:
     writer.write_scene(out, settings.make(*scene))
 
 
-def _start_worker() -> None:
+def start_worker() -> None:
+    """To be called first in a process that makes scenes."""
     import cv2
 
     cv2.setNumThreads(1)

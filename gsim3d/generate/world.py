@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects
 from gsim3d.errors import InputError
 from gsim3d.generate import cameras, meshes, render, shapes, writer
 from gsim3d.generate.carriers import grid_faces
@@ -172,6 +173,14 @@ class World(ABC):
             target_height=self.target_height,
             elevations=self.elevations,
             fov=self.fov,
+        )
+
+    def effects(self) -> EffectsSpec:
+        """What its scenes call for: positions and velocities, matt surfaces, and shadows where there is a ground."""
+        return EffectsSpec(
+            DynamicsEffects("frozen" if self.ground else "masked_out", history=2),
+            AppearanceEffects(view_dependent=0, changing="all" if self.ground else "dynamic"),
+            outputs=OutputEffects(depth=self.depth),
         )
 
     def make(self, name: str, sample: int) -> writer.Scene:

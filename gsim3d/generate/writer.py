@@ -1,6 +1,7 @@
 """Scene folders and the manifest of a generated data set.
 
-Layout: OUT/<object>/<sample>/metadata.json, cam_<j>/{rgb,seg,inst,depth}_<step>.png, states.npz; OUT/manifest.json.
+Layout: OUT/<object>/<sample>/metadata.json, cam_<j>/{rgb,seg,inst,depth}_<step>.png, states.npz; OUT/manifest.json,
+OUT/effects.yaml (what the scenes call for, see gsim3d.effects).
 A scene is written to a hidden folder beside its place and renamed when it is whole.
 """
 

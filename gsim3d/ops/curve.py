@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsim3d.branches import Branches
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_real, check_tensors, check_whole
 
@@ -341,7 +342,8 @@ def build_pyramid(
         spec.release,
         () if capacity is None else capacity.sizes,
     )
-    return _assemble(arrays, spec, capacity is not None)
+    with Branches(positions) as beside:
+        return _assemble(arrays, spec, capacity is not None, beside)
 
 
 def _check_spec(spec: PyramidSpec, curves: tuple[tuple[int, ...], ...] | None) -> None:
@@ -367,17 +369,16 @@ def _check_whole_numbers(name: str, values: tuple[int, ...]) -> None:
         check_whole("build_pyramid", **{name: value})
 
 
-def _kernel_map(size: int, voxels: Voxels, tap_in: Tensor, tap_out: Tensor, cu_taps: Tensor) -> KernelMap:
+def _kernel_map(size: int, voxels: Voxels, taps: tuple[Tensor, Tensor, Tensor], beside: Branches) -> KernelMap:
     """Larger kernels have one convolution a network call and tables of K^3 entries a row: no plan is kept."""
     plan = None
-    if tap_in.is_cuda and size == 3:
-        plan = torch.ops.gsim3d.sparse_conv_plan(
-            voxels.row_voxel, voxels.rows, voxels.cu_rows, tap_in, tap_out, cu_taps, size
-        )
-    return KernelMap(size, tap_in, tap_out, cu_taps, plan)
+    if taps[0].is_cuda and size == 3:
+        make = torch.ops.gsim3d.sparse_conv_plan
+        plan = beside.run(make, voxels.row_voxel, voxels.rows, voxels.cu_rows, *taps, size)
+    return KernelMap(size, *taps, plan)
 
 
-def _assemble(arrays: list[Tensor], spec: PyramidSpec, has_found: bool) -> Pyramid:
+def _assemble(arrays: list[Tensor], spec: PyramidSpec, has_found: bool, beside: Branches) -> Pyramid:
     """Names the flat results, in the order that csrc/gsim3d/curve/pyramid.h states."""
     left = list(arrays)
     left.reverse()
@@ -389,7 +390,7 @@ def _assemble(arrays: list[Tensor], spec: PyramidSpec, has_found: bool) -> Pyram
         grid, cloud, cu_clouds, order, cu_q, cu_k, kv_rows = [take() for _ in range(7)]
         patches = tuple(PatchTable(order[r], kv_rows[r], cu_q, cu_k) for r in range(4))
         voxels = Voxels(take(), take(), take())
-        kernel_maps = {size: _kernel_map(size, voxels, take(), take(), take()) for size in sizes}
+        kernel_maps = {size: _kernel_map(size, voxels, (take(), take(), take()), beside) for size in sizes}
         stages.append(Stage(grid, cloud, cu_clouds, order, patches, voxels, kernel_maps, cluster, time_index))
     return Pyramid(rows, cu_rows, tuple(stages), take() if has_found else None)
 

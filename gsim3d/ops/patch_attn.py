@@ -68,6 +68,11 @@ def _(grad, q, k, v, out, stats, q_rows, kv_rows, cu_q, cu_k, scale):
     return q.new_empty(q.shape), k.new_empty(k.shape), k.new_empty(k.shape)
 
 
+@torch.library.register_fake("gsim3d::patch_attention_backward_packed")
+def _(grad, q, k, v, out, stats, q_rows, kv_rows, cu_q, cu_k, scale):
+    return q.new_empty(q.shape[0], 3, *q.shape[1:])
+
+
 def _setup(ctx, inputs, output):
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(output[1])

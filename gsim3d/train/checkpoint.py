@@ -31,6 +31,7 @@ from torch import Tensor
 from gsim3d import __version__
 from gsim3d.errors import InputError
 from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.pretrained import located
 from gsim3d.train.settings import load_yaml
 
 FORMAT = 1
@@ -128,21 +129,20 @@ def digest_of(folder: Path) -> str:
 
 
 def load(path: str | Path) -> Checkpoint:
-    """Reads a run folder (its last good checkpoint), a checkpoint folder, or a single exported file.
+    """Reads a run folder (its last good checkpoint), a checkpoint folder, a single exported file, or the simulator of
+    this name that comes with gsim3d.
 
     Raises:
         InputError: it is none of these, or a file is missing, truncated or changed; the message names it, and of a run
             folder the newest checkpoint that is whole.
     """
     try:
-        return _load(Path(path))
+        return _load(located(path))
     except (OSError, MemoryError) as error:
         raise InputError(f"{path}: the checkpoint cannot be read: {error or 'no memory'}") from None
 
 
 def _load(path: Path) -> Checkpoint:
-    if not path.exists():
-        raise InputError(f"{path}: no such checkpoint")
     if path.is_file():
         return _load_single(path)
     pointer = path / "checkpoints" / POINTER

@@ -59,6 +59,8 @@ class DataConfig:
     context_cameras: the cameras they come from; empty: all but ``target_only_cameras``.
     target_only_cameras: cameras that are never an input; a loss may look at them.
     background_stride: of pixels that show what never moves, those on every n-th row and column become particles.
+    thawed: of every scene's background a share drawn from 0 to this one is shown to the dynamics as movable, by cubes:
+        so a model with an asymmetric background learns that rows at rest may be awake or asleep.
     resize: (width, height) pixels: films are scaled to cover it and cropped around the centre; empty: as filmed.
     near_far: metres, the depth range of all scenes; empty: each scene's own.
     unit_cameras: lengths are in units of the largest coordinate of a scene's cameras.
@@ -71,12 +73,15 @@ class DataConfig:
     context_cameras: tuple[int, ...] = ()
     target_only_cameras: tuple[int, ...] = ()
     background_stride: int = 1
+    thawed: float = 0.0
     resize: tuple[int, ...] = ()
     near_far: tuple[float, ...] = ()
     unit_cameras: bool = False
 
     def __post_init__(self):
         _at_least(self, history=1, shortest_history=0, context_views=1, fewest_views=0, background_stride=1)
+        if not 0 <= self.thawed <= 1:
+            raise InputError(f"data.thawed: must be from 0 to 1; got {self.thawed}")
         for least, most in (("shortest_history", "history"), ("fewest_views", "context_views")):
             if getattr(self, least) > getattr(self, most):
                 raise InputError(
@@ -150,6 +155,9 @@ class TrainConfig:
     recompute: parts of a step that the backward pass computes again instead of keeping them, which saves memory and
         changes no bit: "encoder", "steps" (all of a simulated step), "images". Beside "steps",
         ``model.dynamics.checkpointing`` halves what one simulated step holds and costs another pass.
+    captured: on a GPU, steps that simulate run from CUDA graphs (gsim3d.train.captured): the same sums in fewer seconds
+        where a step has more small kernels than the host can launch. For one process and models without drop path,
+        shuffled curves and batch normalisation; numbers differ from those without by rounding.
     seed: all randomness follows from it and from the step.
     workers: samples of a step that are computed at the same time, each on its share of the CPU threads; the numbers are
         the same for any count above 0. 0: a step's samples form one batch, as a GPU and batch normalisation want it.
@@ -166,6 +174,7 @@ class TrainConfig:
     optimizer: OptimizerConfig = OptimizerConfig()
     precision: PrecisionConfig = PrecisionConfig()
     recompute: tuple[Literal["encoder", "steps", "images"], ...] = ()
+    captured: bool = False
     seed: int = 0
     workers: int = 0
     checkpoint_every: int = 500

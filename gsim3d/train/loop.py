@@ -27,7 +27,8 @@ from gsim3d.perceptual.weights import load
 from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
-from gsim3d.train.config import TrainConfig
+from gsim3d.train.captured import CapturedLoss
+from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import Log, memory_gib, plain, progress_note
 from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
 from gsim3d.train.precision import FIRST_SCALE, LossScale
@@ -46,12 +47,14 @@ from gsim3d.train.samples import (
 )
 from gsim3d.train.schedule import one_cycle
 from gsim3d.train.settings import from_dict, to_dict
+from gsim3d.train.thawing import check_thawing, thaw
 from gsim3d.train.watch import Seen, StepWatch, first_not_finite, mean_of_norms, norms_by_module
+from gsim3d.types import Frames
 
 READERS = 2  # threads that read batches; so many steps are read ahead
 EMA_WARM_UP = 10  # the average forgets its first values: decay is at most (1 + step) / (10 + step)
 # May change between two sittings of one run without changing the curve; so may the number of workers, if there are any.
-FREE_SETTINGS = ("checkpoint_every", "keep_checkpoints", "log_every", "recompute")
+FREE_SETTINGS = ("captured", "checkpoint_every", "keep_checkpoints", "log_every", "recompute")
 # May change as well, so that a run which diverged can go on; the curve is another one from there on.
 FREE_OF_OPTIMIZER, FREE_OF_STAGES = ("clip_norm", "max_skipped"), ("learning_rate", "warm_up")
 
@@ -86,7 +89,10 @@ class Trainer:
         self.plan_spec = EffectsSpec.from_dict(config.effects)
         self.simulator = build_simulator(model_config(config), config.seed).to(device)
         self.plan = self.simulator.plan(self.plan_spec)
+        if not self.plan_spec.outputs.rgb:
+            raise InputError("effects: outputs.rgb is off, but the loss compares colours; leave it on")
         _check_history(config, self.plan)
+        check_thawing(config.data, self.simulator.config.dynamics)
         _check_sharing(config, self.processes.count, self.simulator.config.dynamics.norm)
         self.perceptual = load("lpips_vgg", partial(LPIPS, "vgg")).to(device) if config.loss.perceptual else None
         self.parameters = dict(self.simulator.named_parameters())
@@ -111,6 +117,7 @@ class Trainer:
         self.log = Log(self.out, writes=self.processes.is_first)
         self.log.cut(self.step)
         self.shared = self._share() if self.processes.count > 1 else None
+        self.captured = self._capture() if config.captured and device == "cuda" else None
 
     def _share(self) -> DistributedDataParallel:
         """The loss of this process's samples; going back from it gives every process the gradient of all samples."""
@@ -126,6 +133,10 @@ class Trainer:
             return DistributedDataParallel(
                 _Loss(self), broadcast_buffers=False, find_unused_parameters=True, process_group=group
             )
+
+    def _capture(self) -> CapturedLoss:
+        precision = partial(self.config.precision.of, device=self.device)
+        return CapturedLoss(self.simulator, self.plan, self.loss_of_images, precision)
 
     def run(
         self, *, until: int | None = None, progress: bool = True, tensorboard: bool = False, profile: bool = False
@@ -173,7 +184,7 @@ class Trainer:
         averages and statistics stay as they are.
         """
         stage, place = self.config.stage_of(self.step)
-        rate = one_cycle(place, stage.steps, stage.learning_rate, stage.warm_up)
+        rate = self.learning_rate(stage, place)
         statistics = [(buffer, buffer.clone()) for buffer in self.simulator.buffers()]
         entry = {"step": self.step, "loss": math.nan, "learning_rate": rate, "grad_norm": math.nan}
         n_context = history_at(self.config.data, stage, self.config.seed, self.step)
@@ -204,6 +215,10 @@ class Trainer:
             entry["future_psnr"] = _psnr(errors[n_context:])
         self.step += 1
         return {name: plain(value) for name, value in entry.items()}
+
+    def learning_rate(self, stage: StageConfig, place: int) -> float:
+        """Of the step at ``place`` of a stage."""
+        return one_cycle(place, stage.steps, stage.learning_rate, stage.warm_up)
 
     def _whole_batch(self, batch: int) -> tuple[float, Tensor, list[Tensor | None], list[Seen]]:
         """Loss, errors by step and gradients of the whole batch; what was seen in each of its parts."""
@@ -283,10 +298,27 @@ class Trainer:
     def _gradients(self, samples: list[int]) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...], StepWatch]:
         """Loss, errors by step, the gradient of the loss for every parameter (None where it has no part), and what was
         seen on the way."""
-        watch = StepWatch()
-        loss, errors = self.loss(self._batch(samples), samples[0], watch)
+        watch, batch = StepWatch(), self._batch(samples)
+        if self.captured is not None and batch.n_future:
+            return *self._captured_gradients(batch, watch), watch
+        loss, errors = self.loss(batch, samples[0], watch)
         gradients = torch.autograd.grad(loss * self.scale.value, list(self.parameters.values()), allow_unused=True)
         return loss.detach(), errors, gradients, watch
+
+    def _captured_gradients(self, batch: Batch, watch: StepWatch) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...]]:
+        """Loss, errors and gradients, all behind the encoder from a CUDA graph; the next call overwrites them."""
+        scale, encoder = self.scale.value, list(self.simulator.encoder.parameters())
+        with self.config.precision.of("encoder", self.device):
+            particles = self.simulator.encode(batch.context, report=watch.report)
+        watch.count(particles)
+        later = self.captured(particles, batch, self.step_weights(batch) * scale, watch.report)
+        outputs = {name: getattr(particles, name) for name in later.particles}
+        learned = [name for name, value in outputs.items() if value.requires_grad]
+        gradients = torch.autograd.grad(
+            [outputs[name] for name in learned], encoder, [later.particles[name] for name in learned], allow_unused=True
+        )
+        known = dict(zip([*encoder, *self.captured.parameters], [*gradients, *later.parameters], strict=True))
+        return later.loss / scale, later.errors, tuple(known[parameter] for parameter in self.parameters.values())
 
     def _shared_gradients(self, samples: list[int]) -> tuple:
         """As :meth:`_gradients`, but gradients are those of the samples of all processes; and how many samples are this
@@ -324,17 +356,23 @@ class Trainer:
     def loss(self, batch: Batch, sample: int = 0, watch: StepWatch | None = None) -> tuple[Tensor, Tensor]:
         """The loss of a batch, and each step's unweighted mean squared error; ``sample`` numbers the randomness."""
         watch = watch or StepWatch()
-        loss_config, targets = self.config.loss, batch.targets
-        images = self._images(batch, sample, watch)
+        return self.loss_of_images(self._images(batch, sample, watch), batch.targets, self.step_weights(batch))
+
+    def step_weights(self, batch: Batch) -> Tensor:
+        """Weight of each step of a batch, on its device."""
+        settings = self.config.loss
+        weights = time_weights(batch.n_context, batch.n_future, balance=settings.balance, discount=settings.discount)
+        return weights.to(self.device)
+
+    def loss_of_images(self, images: Tensor, targets: Frames, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`loss`, of the images [I, H, W, 3] that ``targets`` should have been."""
+        loss_config, n_steps = self.config.loss, weights.shape[0]
         truth = targets.images.permute(0, 2, 3, 1)
         weighted = loss_config.body_weight and targets.dynamic is not None
         weight = 1 + loss_config.body_weight * targets.dynamic if weighted else None
         if targets.valid is not None:
             weight = targets.valid.float() if weight is None else weight * targets.valid
-        weights = time_weights(
-            batch.n_context, batch.n_future, balance=loss_config.balance, discount=loss_config.discount
-        )
-        step = batch.target_step()
+        step = targets.cameras.image_cloud % n_steps
         wrong = image_errors(images, truth, weight)
         if self.perceptual is not None:
             seen = images if targets.valid is None else torch.where(targets.valid[..., None], images, truth)
@@ -342,7 +380,7 @@ class Trainer:
             wrong = wrong + loss_config.perceptual * distances
         loss = image_loss(wrong, step, weights)
         with torch.no_grad():
-            errors = mean_by_step(image_errors(images, truth, targets.valid), step, batch.n_context + batch.n_future)
+            errors = mean_by_step(image_errors(images, truth, targets.valid), step, n_steps)
         return loss, errors
 
     def _images(self, batch: Batch, sample: int, watch: StepWatch) -> Tensor:
@@ -359,6 +397,9 @@ class Trainer:
             particles = again("encoder")(lambda context: simulator.encode(context, **options))(batch.context)
         watch.count(particles)
         if batch.n_future:
+            if self.config.data.thawed:
+                rng = generator(self.config.seed, self.step, sample, "thawed")
+                particles = thaw(particles, self.config.data.thawed, self.plan_spec, rng)
             with precision.of("dynamics", self.device):
                 steps = simulator.rollout(
                     particles, batch.n_future, self.plan, generator=noise, wrap=again("steps", noise), **options
@@ -461,13 +502,16 @@ class Trainer:
 
     def _update_average(self) -> None:
         decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (EMA_WARM_UP + self.step))
+        if not self.average:
+            return
         with torch.no_grad():
-            for name, value in self.simulator.state_dict().items():
-                if name in self.average:
-                    if value.is_floating_point():
-                        self.average[name].lerp_(value, 1 - decay)
-                    else:
-                        self.average[name].copy_(value)
+            weights = self.simulator.state_dict()
+            averaged = [name for name, value in weights.items() if value.is_floating_point()]
+            torch._foreach_lerp_(
+                [self.average[name] for name in averaged], [weights[name] for name in averaged], 1 - decay
+            )
+            for name in weights.keys() - set(averaged):
+                self.average[name].copy_(weights[name])
 
 
 class _Loss(nn.Module):
@@ -520,8 +564,10 @@ def _start_worker(n_threads: int) -> None:
     torch.set_num_threads(n_threads)
 
 
-def _mean(results: list) -> tuple[Tensor, Tensor, list[Tensor | None]]:
+def _mean(results: list) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:
     """Means of losses, errors and gradients, added in the order of the samples."""
+    if len(results) == 1:
+        return results[0]
     losses, errors, gradients = zip(*results, strict=True)
     means = []
     for parts in zip(*gradients, strict=True):
@@ -533,6 +579,8 @@ def _mean(results: list) -> tuple[Tensor, Tensor, list[Tensor | None]]:
 def _check_sharing(config: TrainConfig, n_processes: int, norm: str) -> None:
     if config.workers and norm == "batch":
         raise InputError("workers: must be 0 for a model with batch normalisation, which needs all samples at once")
+    if config.captured and (n_processes > 1 or config.workers or config.recompute):
+        raise InputError("captured: needs one process, workers 0 and nothing to recompute")
     if config.workers and n_processes > 1:
         raise InputError(f"workers: must be 0 in {n_processes} processes, which share the samples of a step themselves")
     for i, stage in enumerate(config.stages):

@@ -134,8 +134,12 @@ def _restored(path: str | Path, saved: checkpoint.Checkpoint, device: str) -> Re
         spec = EffectsSpec.from_dict(saved.config.get("effects", {}).get("spec"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    plan = simulator.plan(spec)
     try:
-        simulator.load_state_dict(saved.weights)
+        lacks = set(plan.unused).difference(saved.weights)  # what no effect reads need not be there
+        own = {name: value for name, value in simulator.state_dict().items() if name in lacks}
+        simulator.load_state_dict({**own, **saved.weights})
     except RuntimeError as error:
         raise InputError(f"{path}: the weights do not fit the model: {str(error).splitlines()[-1].strip()}") from None
-    return Restored(simulator.eval().to(device), settings, image_size, simulator.plan(spec), saved)
+    simulator.absent = frozenset(lacks)
+    return Restored(simulator.eval().to(device), settings, image_size, plan, saved)

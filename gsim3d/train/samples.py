@@ -76,9 +76,8 @@ def draw_batch(
     Context views are spread evenly around the list of allowed cameras, turned at random, the same at all steps of a
     window; target views are any cameras, drawn afresh at every step.
     """
-    n_context = history_at(data, stage, seed, step)
-    data = dataclasses.replace(data, context_views=_drawn(data.fewest_views, data.context_views, seed, step, "views"))
-    windows = [_draw_window(scenes, data, stage, n_context, seed, step, sample) for sample in samples]
+    windows = draw_windows(scenes, data, stage, seed, step, samples)
+    n_context = windows[0].n_context
     chosen = [window.scene for window in windows]
     steps = [list(window.steps) for window in windows]
     masked = all(scene.has_segmentation() for scene in chosen)
@@ -86,6 +85,15 @@ def draw_batch(
     context = make_frames(chosen, context_cams, [s[:n_context] for s in steps], masked=masked)
     targets = make_frames(chosen, [window.target_cams for window in windows], steps, masked=masked)
     return Batch(thin_background(context, data.background_stride), targets, n_context, stage.horizon)
+
+
+def draw_windows(
+    scenes: Sequence[Scene], data: DataConfig, stage: StageConfig, seed: int, step: int, samples: Sequence[int]
+) -> list[Window]:
+    """What :func:`draw_batch` shows of which scene; of ``scenes`` only the numbers of steps and cameras are read."""
+    n_context = history_at(data, stage, seed, step)
+    data = dataclasses.replace(data, context_views=_drawn(data.fewest_views, data.context_views, seed, step, "views"))
+    return [_draw_window(scenes, data, stage, n_context, seed, step, sample) for sample in samples]
 
 
 def history_at(data: DataConfig, stage: StageConfig, seed: int, step: int) -> int:

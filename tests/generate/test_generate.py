@@ -15,12 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gsim3d import presets
 from gsim3d.data import Scene, find_scenes, make_frames
+from gsim3d.effects import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.generate import generate
 from gsim3d.generate.cameras import project
 from gsim3d.generate.command import add_arguments, run
 from gsim3d.generate.worlds import HELD_OUT, PRESETS, WORLDS, build_world
+from gsim3d.plans import make_plan
 from tests.tolerances import TOLERANCES
 
 SMALL = {
@@ -55,7 +58,7 @@ def test_layout(made):
     out, report = made
     names = [folder.relative_to(out).as_posix() for folder in report.folders]
     assert names == ["ball/0000", "ball/0001", "torus/0000"] and report.n_made == 3
-    assert sorted(os.listdir(out)) == ["ball", "manifest.json", "torus"]
+    assert sorted(os.listdir(out)) == ["ball", "effects.yaml", "manifest.json", "torus"]
     assert len(list(report.folders[0].rglob("*.png"))) == 3 * 3 * 4
     assert find_scenes(out) == report.folders
 
@@ -91,6 +94,20 @@ def test_states_and_labels_agree(made):
             assert x.min() >= low[0] - 1 and y.min() >= low[1] - 1
             assert x.max() <= high[0] and y.max() <= high[1]
             assert (high - low < 1.8 * np.array([np.ptp(x) + 1, np.ptp(y) + 1]) + 2).all()
+
+
+def test_each_world_ships_the_spec_that_it_calls_for(made):
+    out, report = made
+    spec = EffectsSpec.of_scene(report.folders[0])
+    assert spec == EffectsSpec.load(out / "effects.yaml") == build_world("elastic", "mini", {}).effects()
+    assert spec.dynamics.background == "frozen" and spec.dynamics.history == 2 and spec.appearance.view_dependent == 0
+    for world in WORLDS:
+        for subset in ("train", *(name for name, worlds in HELD_OUT.items() if world in worlds)):
+            settings = build_world(world, "mini", {"subset": subset, "depth": True})
+            spec = settings.effects()
+            assert spec.outputs.depth and (spec.dynamics.background == "masked_out") == (subset == "no-ground")
+            plan = make_plan(spec, presets.tiny())
+            assert plan.history == 2 and ("frozen background" in plan.kept) == settings.ground
 
 
 def test_manifest(made):

@@ -174,6 +174,26 @@ def test_views_of_one_tensor(device):
     assert_same_bits(grad, torch.stack(expected[1:], 1))
 
 
+def backward_arguments(case, dtype):
+    """Arguments of the backward ops, all rows in one tensor, in ``dtype``."""
+    q, k, v = torch.stack([x.to(dtype) for x in case.inputs], 1).unbind(1)
+    table = (*lists(case.table), case.scale)
+    out, stats = torch.ops.gsim3d.patch_attention(q, k, v, *table)
+    return cotangent_of(case).to(out), q, k, v, out, stats, *table
+
+
+@pytest.mark.parametrize("dtype", [*DTYPES, torch.bfloat16], ids=[*DTYPES.values(), "bfloat16"])
+@pytest.mark.parametrize("dim", [16, 20])
+def test_packed_gradients(device, dim, dtype):
+    if dtype == torch.bfloat16 and device.type == "cpu":
+        pytest.skip("16-bit attention needs a GPU")
+    case = random_case(dim=dim, n_keys=sum(n for n, _ in RAGGED) + 3)  # as many keys as queries
+    arguments = backward_arguments(case.to(device), dtype)
+    expected = torch.stack(torch.ops.gsim3d.patch_attention_backward(*arguments), 1)
+    assert expected.any(2).any(2).any(0).all()
+    assert_same_bits(torch.ops.gsim3d.patch_attention_backward_packed(*arguments), expected)
+
+
 # ---- 3 gradcheck ---------------------------------------------------------------------------------------------------
 
 
@@ -208,6 +228,11 @@ def test_opcheck(device):
         (torch.ones_like(out), *case.inputs, out, stats, *args[3:]),
         test_utils=("test_schema", "test_faketensor"),
     )
+    packed = torch.ops.gsim3d.patch_attention_backward_packed
+    square = backward_arguments(self_case((2, 3), dim=4).to(device), torch.float32)
+    torch.library.opcheck(packed.default, square, test_utils=("test_schema", "test_faketensor"))
+    with pytest.raises(ValueError, match="patch_attention_backward_packed: k must be"):
+        packed(torch.ones_like(out), *case.inputs, out, stats, *args[3:])
 
 
 def test_autocast_on_the_cpu_computes_in_float32():

@@ -74,3 +74,5 @@ def test_the_table_compares_both_over_the_seeds(tool, folder, tmp_path, capsys):
     assert "| kept | " in first and " ± " in first
     tool.main(arguments, RUN)
     assert json.loads((tmp_path / "metrics.json").read_text()) == results
+    tool.main(["--picture", str(tmp_path), str(tmp_path / "cut.png")])
+    assert (tmp_path / "cut.png").read_bytes().startswith(b"\x89PNG")

@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 MIN_ROUNDS, MAX_ROUNDS = 5, 200
+PAIRS = 25  # of timings of a cost
 GPU_ROUNDS = 20  # or MIN_ROUNDS of what takes long
 RESULTS = Path(__file__).parent / "results"  # one JSON line for each row measured on a GPU
 
@@ -197,6 +198,26 @@ class Bench:
         file = self.args.json or RESULTS / f"{self.op}.jsonl"  # after each row: a benchmark may be cut short
         file.parent.mkdir(exist_ok=True)
         file.write_text("".join(json.dumps(row) + "\n" for row in self.results))
+
+    def cost(self, case: str, run, plain, *, tolerance: float | None = 0.0) -> None:
+        """What ``run`` costs over ``plain``: processor time on one thread, both sides in turns, so that a busy machine
+        matters little; the cost is the median over pairs. ``tolerance``: of the results; None: they are others."""
+        if tolerance is not None:
+            error = worst_error(run(), plain())
+            assert error <= tolerance, f"{self.op}, {case}: results differ by {error:.1e} of the largest value"
+        torch.set_num_threads(1)
+        times: dict = {run: [], plain: []}
+        for pair in range(PAIRS):
+            for f in (run, plain) if pair % 2 else (plain, run):
+                start = time.process_time()
+                f()
+                times[f].append(time.process_time() - start)
+        torch.set_num_threads(self.args.threads)
+        ratios = [a / b - 1 for a, b in zip(times[run], times[plain])]
+        low, share, high = statistics.quantiles(ratios, n=4, method="inclusive")
+        a, b = summary(times[run]), summary(times[plain])
+        print(f"{case:<44}{a['ms']:>11.2f}{b['ms']:>11.2f} cost {share:.2%} ({low:.2%} to {high:.2%})", flush=True)
+        self.results.append({"case": case, "gsim3d": a, "plain": b, "cost": share, "quartiles": [low, high]})
 
     def finish(self) -> None:
         if self.args.device == "cpu" and self.args.json:

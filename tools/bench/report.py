@@ -22,8 +22,9 @@ from harness import RESULTS, commit
 
 ROOT = Path(__file__).resolve().parents[2]
 OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster"]
-GUARDS = "stability"
+GUARDS, EFFECTS = "stability", "effects"
 NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
+EFFECTS_PAGE, MARKS = ROOT / "docs" / "effects.md", ("<!-- table -->\n", "<!-- end of table -->\n")
 INTRODUCTION = """# Benchmarks
 
 Written by `python tools/bench/report.py`; do not edit. Every case first compares the results of both sides, then times
@@ -132,18 +133,36 @@ def costs(r: dict) -> str:
     return text
 
 
+def effects(r: dict) -> str:
+    """The table of docs/effects.md."""
+    text = (
+        f"{r['machine']}, one thread, torch {r['torch']}, Python {r['python']}, commit {r['commit']}, {r['date']}.\n\n"
+        "| effect | with ms | without ms | cost | quartiles | wanted |\n| --- | ---: | ---: | ---: | ---: | ---: |\n"
+    )
+    for row in r["results"]:
+        low, high = row["quartiles"]
+        wanted = "-" if row["limit"] is None else f"{row['limit'] - 1:.0%}"
+        ms = f"{row['gsim3d']['ms']:.1f} | {row['plain']['ms']:.1f}"
+        text += f"| {row['case']} | {ms} | {row['cost']:.1%} | {low:.1%} to {high:.1%} | {wanted} |\n"
+    return text
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ops", nargs="*", choices=[[], *OPS, GUARDS], help="default: all")
+    parser.add_argument("ops", nargs="*", choices=[[], *OPS, GUARDS, EFFECTS], help="default: all")
     parser.add_argument("--page", action="store_true", help="run nothing, write the page from the stored numbers")
     args = parser.parse_args()
-    ops = [] if args.page else args.ops or [*OPS, GUARDS]
+    ops = [] if args.page else args.ops or [*OPS, GUARDS, EFFECTS]
     records = json.loads(NUMBERS.read_text()) if NUMBERS.exists() else {}
     NUMBERS.parent.mkdir(exist_ok=True)
     for op in ops:
         records[op] = run(op)
         NUMBERS.write_text(json.dumps(records, indent=1) + "\n")
     PAGE.write_text(page(records))
+    if EFFECTS in records:
+        before, rest = EFFECTS_PAGE.read_text().split(MARKS[0])
+        table = MARKS[0] + effects(records[EFFECTS]) + MARKS[1]
+        EFFECTS_PAGE.write_text(before + table + rest.split(MARKS[1])[1])
 
 
 if __name__ == "__main__":

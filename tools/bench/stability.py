@@ -7,12 +7,10 @@ column of the peer as "the same without guards"; results are the same bits.
 """
 
 import math
-import statistics
-import time
 from contextlib import contextmanager
 
 import torch
-from harness import Bench, summary, worst_error
+from harness import Bench
 
 import gsim3d.guards
 import gsim3d.simulator
@@ -23,7 +21,6 @@ from gsim3d.stability import StabilityReport
 from gsim3d.types import Cameras, Particles
 
 STEPS = 4  # of a rollout
-PAIRS = 25  # of timings on the CPU
 
 
 def state_of(simulator: Simulator, n: int, device: torch.device) -> Particles:
@@ -109,25 +106,6 @@ def captured(bench: Bench, config: ModelConfig, n: int, case: str):
     bench.gpu(case, "bfloat16", replay_of(ours), {"no guards": replay_of(plain)}, tolerance=0.0, capture=False)
 
 
-def cost(bench: Bench, case: str, run, plain):
-    """Processor time of both sides in turns, on one thread, so that a busy machine matters little; the cost is the
-    median over pairs."""
-    assert worst_error(run(), plain()) == 0, f"{case}: guards change results"
-    torch.set_num_threads(1)
-    times: dict = {run: [], plain: []}
-    for pair in range(PAIRS):
-        for f in (run, plain) if pair % 2 else (plain, run):
-            start = time.process_time()
-            f()
-            times[f].append(time.process_time() - start)
-    torch.set_num_threads(bench.args.threads)
-    ratios = [a / b - 1 for a, b in zip(times[run], times[plain])]
-    low, share, high = statistics.quantiles(ratios, n=4, method="inclusive")
-    a, b = summary(times[run]), summary(times[plain])
-    print(f"{case:<44}{a['ms']:>11.2f}{b['ms']:>11.2f} cost {share:.2%} ({low:.2%} to {high:.2%})", flush=True)
-    bench.results.append({"case": case, "gsim3d": a, "plain": b, "cost": share, "quartiles": [low, high]})
-
-
 def main():
     bench = Bench("stability")
     on_gpu = bench.device.type == "cuda"
@@ -141,7 +119,7 @@ def main():
         run = run_of(simulator, state_of(simulator, n, bench.device), camera(bench.device))
         case = f"{name}, {n} particles: {STEPS} steps"
         if not on_gpu:
-            cost(bench, case + ", 1 image", run, without_guards(run))
+            bench.cost(case + ", 1 image", run, without_guards(run))
             continue
         bench.gpu(case + ", 1 image", "float32", run, {"no guards": without_guards(run)}, tolerance=0.0, capture=False)
         captured(bench, config, n, case + f", {STEPS} images, captured")

@@ -79,6 +79,13 @@ namespace cuda {
 template <typename T>
 using StatsOf = std::conditional_t<sizeof(T) == 2, float, T>;
 
+// Where the gradients of q [n_q, H, D], k and v [n_k, H, D] go: rows of H D numbers, row_stride apart.
+template <typename T>
+struct GradientRows {
+  T *q, *k, *v;
+  int64_t row_stride;
+};
+
 template <typename T>
 void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
                      const AttentionSize& size, T* out, StatsOf<T>* stats, Stream stream);
@@ -86,7 +93,7 @@ void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<
 template <typename T>
 void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v,
                          const T* out, const StatsOf<T>* stats, const PatchTable& table, const AttentionSize& size,
-                         T* const (&grads)[3], const Workspace& workspace, Stream stream);
+                         const GradientRows<T>& grads, const Workspace& workspace, Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

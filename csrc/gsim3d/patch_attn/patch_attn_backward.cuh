@@ -30,9 +30,30 @@ struct Backward {
   Division division;
   float slope, sign, scale;
   QueryNumbers* numbers;  // [H, n_q_listed]
-  T* grad_q;              // [n_q, H, D]
-  KeyGradients<T> key_gradients;
+  Gradients<T> gradients;
 };
+
+template <typename T, int D>
+__device__ __forceinline__ QueryNumbers numbers_of(const Backward<T>& args, int64_t row, int64_t head) {
+  if (!inside(row, args.table.n_q)) return QueryNumbers::none();
+  const T* grad = args.grad.at(row, head);
+  const T* out = args.out.at(row, head);
+  float delta = 0;
+#pragma unroll
+  for (int i = 0; i < D / 8; ++i) {
+    const uint4 a = reinterpret_cast<const uint4*>(grad)[i], b = reinterpret_cast<const uint4*>(out)[i];
+    const uint32_t x[4] = {a.x, a.y, a.z, a.w}, y[4] = {b.x, b.y, b.z, b.w};
+#pragma unroll
+    for (int j = 0; j < 4; ++j) {
+      const float2 p = unpack<T>(x[j]), q = unpack<T>(y[j]);
+      delta = fmaf(p.x, q.x, fmaf(p.y, q.y, delta));
+    }
+  }
+  const float2 pair = *reinterpret_cast<const float2*>(args.stats + 2 * (row * args.size.heads + head));
+  if (pair.y == 0) return QueryNumbers::none();
+  const float log_sum = log2f(pair.y);
+  return {pair.x, log_sum, delta, -fmaf(pair.x, args.slope, log_sum)};
+}
 
 // Head dim 16 in one kernel; takes as long for few patches and heads as for one on each multiprocessor. Needs shared
 // memory that not every GPU has.
@@ -137,16 +158,16 @@ class KeyWarp {
         const int64_t slot = first + 16 * m + threadIdx.x % kWarp / 4 + 8 * h;
         const int64_t row = slot < end ? args.table.kv_rows[slot] : -1;
         if (!inside(row, args.table.n_k)) continue;
-        const bool at_once = args.key_gradients.at_once(row);
-        const int64_t place = (row * args.size.heads + head) * D + 2 * t;
-        float* to = args.key_gradients.slot(slot, head, args.size) + 2 * t;
+        const bool at_once = args.gradients.at_once(row);
+        const int64_t place = row * args.gradients.row_stride + head * D + 2 * t;
+        float* to = args.gradients.slot(slot, head, args.size) + 2 * t;
 #pragma unroll
         for (int c = 0; c < D / 8; ++c) {
           const float2 k = {grad_k_[m][c][2 * h] * args.scale, grad_k_[m][c][2 * h + 1] * args.scale};
           const float2 v = {grad_v_[m][c][2 * h], grad_v_[m][c][2 * h + 1]};
           if (at_once) {
-            *reinterpret_cast<uint32_t*>(args.key_gradients.k + place + 8 * c) = pack<T>(k.x, k.y);
-            *reinterpret_cast<uint32_t*>(args.key_gradients.v + place + 8 * c) = pack<T>(v.x, v.y);
+            *reinterpret_cast<uint32_t*>(args.gradients.k + place + 8 * c) = pack<T>(k.x, k.y);
+            *reinterpret_cast<uint32_t*>(args.gradients.v + place + 8 * c) = pack<T>(v.x, v.y);
           } else {
             *reinterpret_cast<float2*>(to + 8 * c) = k;
             *reinterpret_cast<float2*>(to + D + 8 * c) = v;

@@ -1,5 +1,7 @@
-// Backward pass in 16-bit numbers on the tensor cores: one kernel owns queries, one owns keys. Each finds the weights
-// again from the saved maximum and sum, so no block adds to what another one wrote.
+// Backward pass in 16-bit numbers on the tensor cores: some blocks own queries, some own keys. Each finds the weights
+// again from the saved maximum and sum, so no block adds to what another one wrote or waits for it.
+#include <algorithm>
+
 #include "gsim3d/patch_attn/patch_attn_backward.cuh"
 
 namespace gsim3d::cuda {
@@ -15,8 +17,7 @@ struct Shape {
   static constexpr int kBlocks = D < 64 ? 2 : 1;          // of a multiprocessor at a time
   static constexpr int kTileRows = 16384 / D;             // rows of the other side in shared memory
   static constexpr int kTileBytes = kTileRows * D * 2;
-  static constexpr size_t kQuerySharedBytes = 2 * kTileBytes + kTileRows;
-  static constexpr size_t kKeySharedBytes = 2 * kTileBytes + kTileRows * 3 * sizeof(float);
+  static constexpr size_t kSharedBytes = 2 * kTileBytes + kTileRows * 3 * sizeof(float);
 };
 
 // ---- queries --------------------------------------------------------------------------------------------------------
@@ -29,8 +30,8 @@ class QueryWarp {
   __device__ __forceinline__ QueryWarp(const Backward<T>& args, uint32_t keys, uint32_t values, const uint8_t* valid)
       : slope_(args.slope), keys_(keys), values_(values), valid_(valid) {}
 
-  // Reads the queries, and writes the numbers that the kernel of the keys needs. False where scores are so large that
-  // the fast way loses accuracy.
+  // Reads the queries, and keeps their numbers for the careful way. False where scores are so large that the fast way
+  // loses accuracy.
   __device__ __forceinline__ bool load(const Backward<T>& args, int64_t first, int64_t end, int64_t head) {
     bool fast = true;
     clear(grad_q_);
@@ -122,7 +123,7 @@ class QueryWarp {
         const int64_t i = first + 16 * m + threadIdx.x % kWarp / 4 + 8 * h;
         const int64_t row = i < end ? args.table.q_rows[i] : -1;
         if (!inside(row, args.table.n_q)) continue;
-        T* to = args.grad_q + (row * args.size.heads + head) * D + 2 * (threadIdx.x % 4);
+        T* to = args.gradients.q + row * args.gradients.row_stride + head * D + 2 * (threadIdx.x % 4);
 #pragma unroll
         for (int c = 0; c < D / 8; ++c)
           *reinterpret_cast<uint32_t*>(to + 8 * c) =
@@ -141,13 +142,13 @@ class QueryWarp {
 };
 
 template <typename T, int D>
-__global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) query_kernel(Backward<T> args) {
+__device__ __forceinline__ void own_queries(const Backward<T>& args, int64_t block, int64_t n_blocks) {
   using S = Shape<D>;
   extern __shared__ uint4 shared[];
   uint8_t* valid = reinterpret_cast<uint8_t*>(shared) + 2 * S::kTileBytes;
   const uint32_t keys = shared_address(shared), values = keys + S::kTileBytes;
   const PatchTable& table = args.table;
-  for (int64_t i = blockIdx.x; i < args.division.n_shares; i += gridDim.x) {
+  for (int64_t i = block; i < args.division.n_shares; i += n_blocks) {
     const Share share = args.division.at(i);
     const Range q_range = range_of(table.cu_q, share.patch, table.n_q_listed);
     const Range k_range = range_of(table.cu_k, share.patch, table.n_k_listed);
@@ -186,7 +187,7 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) query_kernel(Back
 // ---- keys -----------------------------------------------------------------------------------------------------------
 
 template <typename T, int D>
-__global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) key_kernel(Backward<T> args) {
+__device__ __forceinline__ void own_keys(const Backward<T>& args, int64_t block, int64_t n_blocks) {
   using S = Shape<D>;
   extern __shared__ uint4 shared[];
   float* minus_delta = reinterpret_cast<float*>(shared + 2 * S::kTileBytes / sizeof(uint4));
@@ -194,7 +195,7 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) key_kernel(Backwa
   const TileNumbers numbers{shift, reinterpret_cast<const float4*>(minus_delta)};
   const uint32_t queries = shared_address(shared), grads = queries + S::kTileBytes;
   const PatchTable& table = args.table;
-  for (int64_t i = blockIdx.x; i < args.division.n_shares; i += gridDim.x) {
+  for (int64_t i = block; i < args.division.n_shares; i += n_blocks) {
     const Share share = args.division.at(i);
     const Range q_range = range_of(table.cu_q, share.patch, table.n_q_listed);
     const Range k_range = range_of(table.cu_k, share.patch, table.n_k_listed);
@@ -209,14 +210,16 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) key_kernel(Backwa
       for (int64_t tile = 0; tile < n_tiles; ++tile) {
         const int64_t begin = q_range.begin + tile * S::kTileRows;
         const int n = static_cast<int>(min(q_range.end - begin, int64_t{S::kTileRows}));
-        const QueryNumbers* listed = args.numbers + share.head * table.n_q_listed + begin;
+        QueryNumbers* listed = args.numbers + share.head * table.n_q_listed + begin;
         if (n_tiles > 1 || !loaded) {
           __syncthreads();
           copy_tiles<D, kThreads>({args.q, args.grad}, table.q_rows + begin, n, table.n_q, share.head,
                                   {queries, grads}, nullptr);
           bool fast = true;
           for (int r = threadIdx.x; r < (n + kStep - 1) / kStep * kStep; r += kThreads) {
-            const QueryNumbers x = r < n ? listed[r] : QueryNumbers::none();
+            const QueryNumbers x =
+                r < n ? numbers_of<T, D>(args, table.q_rows[begin + r], share.head) : QueryNumbers::none();
+            if (r < n) listed[r] = x;
             shift[r] = x.shift;
             minus_delta[r / 2 * 4 + r % 2] = minus_delta[r / 2 * 4 + r % 2 + 2] = -x.delta;
             fast = fast && x.is_fast(args.slope);
@@ -239,15 +242,30 @@ __global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks) key_kernel(Backwa
   }
 }
 
+// ---- both -----------------------------------------------------------------------------------------------------------
+
+// The first blocks own queries, the others keys.
 template <typename T, int D>
-void run(Backward<T> args, Stream stream) {
+__global__ void __launch_bounds__(kThreads, Shape<D>::kBlocks)
+    backward_kernel(Backward<T> of_queries, Backward<T> of_keys, int64_t query_blocks) {
+  if (blockIdx.x < query_blocks) own_queries<T, D>(of_queries, blockIdx.x, query_blocks);
+  else own_keys<T, D>(of_keys, blockIdx.x - query_blocks, gridDim.x - query_blocks);
+}
+
+template <typename T, int D>
+void run(Backward<T> of_queries, const Workspace& workspace, Stream stream) {
   using S = Shape<D>;
-  const PatchTable& table = args.table;
-  const int64_t resident = S::kBlocks * multiprocessors(kOp, stream);
-  args.division = divide(table.n_patches, table.n_q_listed, S::kGroup, args.size.heads, resident);
-  launch(kOp, query_kernel<T, D>, blocks_of(args.division), kThreads, S::kQuerySharedBytes, stream, args);
-  args.division = divide(table.n_patches, table.n_k_listed, S::kGroup, args.size.heads, resident);
-  launch(kOp, key_kernel<T, D>, blocks_of(args.division), kThreads, S::kKeySharedBytes, stream, args);
+  const PatchTable& table = of_queries.table;
+  const int64_t heads = of_queries.size.heads, resident = S::kBlocks * multiprocessors(kOp, stream);
+  Backward<T> of_keys = of_queries;
+  of_keys.numbers = workspace.take<QueryNumbers>(heads * table.n_q_listed);
+  of_queries.division = divide(table.n_patches, table.n_q_listed, S::kGroup, heads, resident);
+  of_keys.division = divide(table.n_patches, table.n_k_listed, S::kGroup, heads, resident);
+  constexpr int64_t kMostBlocks = 1 << 30;
+  const int64_t query_blocks = std::min(of_queries.division.n_shares, kMostBlocks);
+  const int64_t key_blocks = std::min(of_keys.division.n_shares, kMostBlocks);
+  launch(kOp, backward_kernel<T, D>, static_cast<unsigned>(query_blocks + key_blocks), kThreads, S::kSharedBytes,
+         stream, of_queries, of_keys, query_blocks);
 }
 
 // One kernel is 1.8 times as fast as two, if it fills the multiprocessors.
@@ -262,23 +280,23 @@ bool pays_to_fuse(const Backward<T>& args, Stream stream) {
 
 template <typename T>
 void tensor_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v,
-                     const T* out, const float* stats, const PatchTable& table, const AttentionSize& size, T* grad_q,
-                     const KeyGradients<T>& key_gradients, const Workspace& workspace, Stream stream) {
+                     const T* out, const float* stats, const PatchTable& table, const AttentionSize& size,
+                     const Gradients<T>& gradients, const Workspace& workspace, Stream stream) {
   const patch_attn::Softmax<float> softmax(size.scale);
   const HeadRows<T> out_rows{out, size.heads * size.dim, size.dim};
   const Backward<T> args{grad, q, k, v, out_rows, stats, table, size, {}, softmax.slope, softmax.sign,
                          static_cast<float>(size.scale),
-                         workspace.take<QueryNumbers>(size.heads * table.n_q_listed), grad_q, key_gradients};
+                         workspace.take<QueryNumbers>(size.heads * table.n_q_listed), gradients};
   if (size.dim == 16 && pays_to_fuse(args, stream)) fused_backward(args, workspace, stream);
-  else if (size.dim == 16) run<T, 16>(args, stream);
-  else if (size.dim == 32) run<T, 32>(args, stream);
-  else run<T, 64>(args, stream);
+  else if (size.dim == 16) run<T, 16>(args, workspace, stream);
+  else if (size.dim == 32) run<T, 32>(args, workspace, stream);
+  else run<T, 64>(args, workspace, stream);
 }
 
 #define GSIM3D_INSTANTIATE(T)                                                                                        \
   template void tensor_backward<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&,   \
-                                   const T*, const float*, const PatchTable&, const AttentionSize&, T*,              \
-                                   const KeyGradients<T>&, const Workspace&, Stream);
+                                   const T*, const float*, const PatchTable&, const AttentionSize&, \
+                                   const Gradients<T>&, const Workspace&, Stream);
 GSIM3D_INSTANTIATE(__nv_bfloat16)
 GSIM3D_INSTANTIATE(__half)
 #undef GSIM3D_INSTANTIATE

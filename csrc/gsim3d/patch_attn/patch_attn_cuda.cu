@@ -1,4 +1,6 @@
 // Patch attention on a GPU: which kernels run, and gradients of rows that several slots list.
+#include <algorithm>
+
 #include "gsim3d/patch_attn/patch_attn_simple.h"
 #include "gsim3d/patch_attn/patch_attn_tensor.h"
 
@@ -6,6 +8,12 @@ namespace gsim3d::cuda {
 namespace {
 
 constexpr int kThreads = 256;
+constexpr int kVector = 4;  // numbers written at once; a head has a multiple of it
+
+template <typename T>
+struct alignas(kVector * sizeof(T)) Vector {
+  T numbers[kVector];
+};
 
 template <typename T>
 HeadRows<Native<T>> device(const HeadRows<T>& x) {
@@ -31,8 +39,15 @@ bool fits_tensor_cores(const AttentionSize& size, const Rows&... rows) {
   return sizeof(T) == 2 && (size.dim == 16 || size.dim == 32 || size.dim == 64) && (has_aligned_rows(rows) && ...);
 }
 
-__global__ void uses_kernel(PatchTable table, RowUses uses) {
+// Finds how keys are used and clears the gradients of the queries, `width` numbers a row.
+template <typename T>
+__global__ void prepare_kernel(PatchTable table, RowUses uses, T* grad_q, int64_t row_stride, int64_t width) {
+  const int lane = threadIdx.x % kWarp;
   const int64_t slot = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t n_warps = static_cast<int64_t>(gridDim.x) * (kThreads / kWarp);
+  for (int64_t row = slot / kWarp; row < table.n_q; row += n_warps)
+    for (int64_t i = lane; i < width / kVector; i += kWarp)
+      reinterpret_cast<Vector<T>*>(grad_q + row * row_stride)[i] = {};
   const int64_t end = min(table.cu_k[table.n_patches], table.n_k_listed);
   if (slot >= end || slot < table.cu_k[0]) return;
   const int64_t row = table.kv_rows[slot];
@@ -47,7 +62,7 @@ constexpr int kRowsPerWarp = 4;
 
 // A warp looks at kRowsPerWarp rows and works on those that no slot or several slots list.
 template <typename T>
-__global__ void finish_kernel(PatchTable table, AttentionSize size, RowUses uses, KeyGradients<T> gradients) {
+__global__ void finish_kernel(PatchTable table, AttentionSize size, RowUses uses, Gradients<T> gradients) {
   using C = Sum<T>;
   const int lane = threadIdx.x % kWarp;
   const int64_t first = (static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x) / kWarp * kRowsPerWarp;
@@ -71,8 +86,8 @@ __global__ void finish_kernel(PatchTable table, AttentionSize size, RowUses uses
         for (int64_t slot = begin + 1; slot < last; ++slot)
           if (table.kv_rows[slot] == row) add(slot);
       if (count > 1) add(last);
-      gradients.k[row * width + i] = static_cast<T>(k);
-      gradients.v[row * width + i] = static_cast<T>(v);
+      gradients.k[row * gradients.row_stride + i] = static_cast<T>(k);
+      gradients.v[row * gradients.row_stride + i] = static_cast<T>(v);
     }
   }
 }
@@ -94,29 +109,29 @@ void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<
 template <typename T>
 void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v,
                          const T* out, const StatsOf<T>* stats, const PatchTable& table, const AttentionSize& size,
-                         T* const (&grads)[3], const Workspace& workspace, Stream stream) {
+                         const GradientRows<T>& grads, const Workspace& workspace, Stream stream) {
   const char* op = "patch_attention_backward";
-  fill_zero(op, grads[0], table.n_q * size.heads * size.dim, stream);
   const int64_t use_bytes = table.n_k * (2 * sizeof(unsigned long long) + sizeof(int));
   auto* use_memory = workspace.take<unsigned long long>(use_bytes / sizeof(unsigned long long) + 1);
   const RowUses uses{use_memory, use_memory + table.n_k, reinterpret_cast<int*>(use_memory + 2 * table.n_k)};
   check_cuda(cudaMemsetAsync(use_memory, 0xff, use_bytes, native(stream)), op);
-  launch(op, uses_kernel, blocks_for(op, table.n_k_listed, kThreads), kThreads, 0, stream, table, uses);
+  launch(op, prepare_kernel<Native<T>>, blocks_for(op, std::max(table.n_k_listed, table.n_q), kThreads), kThreads, 0,
+         stream, table, uses, device(grads.q), grads.row_stride, size.heads * size.dim);
 
   using C = Sum<Native<T>>;
-  const KeyGradients<Native<T>> gradients{device(grads[1]), device(grads[2]),
-                                          workspace.take<C>(table.n_k_listed * size.heads * 2 * size.dim),
-                                          uses.count_less_one};
+  const Gradients<Native<T>> gradients{device(grads.q), device(grads.k), device(grads.v), grads.row_stride,
+                                       workspace.take<C>(table.n_k_listed * size.heads * 2 * size.dim),
+                                       uses.count_less_one};
   bool done = false;
   if constexpr (sizeof(T) == 2)
     if (fits_tensor_cores<T>(size, grad, q, k, v, HeadRows<T>{out, size.heads * size.dim, size.dim})) {
-      tensor_backward(device(grad), device(q), device(k), device(v), device(out), stats, table, size, device(grads[0]),
-                      gradients, workspace, stream);
+      tensor_backward(device(grad), device(q), device(k), device(v), device(out), stats, table, size, gradients,
+                      workspace, stream);
       done = true;
     }
   if (!done)
-    simple_backward(device(grad), device(q), device(k), device(v), device(out), stats, table, size, device(grads[0]),
-                    gradients, workspace, stream);
+    simple_backward(device(grad), device(q), device(k), device(v), device(out), stats, table, size, gradients,
+                    workspace, stream);
   launch(op, finish_kernel<Native<T>>, blocks_for(op, table.n_k, kThreads / kWarp * kRowsPerWarp), kThreads, 0, stream,
          table, size, uses, gradients);
 }
@@ -126,7 +141,7 @@ void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const He
                                    const AttentionSize&, T*, StatsOf<T>*, Stream);                                    \
   template void patch_attention_vjp<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, \
                                        const T*, const StatsOf<T>*, const PatchTable&, const AttentionSize&,          \
-                                       T* const (&)[3], const Workspace&, Stream);
+                                       const GradientRows<T>&, const Workspace&, Stream);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 GSIM3D_INSTANTIATE(Float16)

@@ -73,28 +73,6 @@ class QuerySums {
 };
 
 template <typename T>
-__device__ __forceinline__ QueryNumbers numbers_of(const Backward<T>& args, int64_t row, int64_t head) {
-  if (!inside(row, args.table.n_q)) return QueryNumbers::none();
-  const T* grad = args.grad.at(row, head);
-  const T* out = args.out.at(row, head);
-  float delta = 0;
-#pragma unroll
-  for (int i = 0; i < D / 8; ++i) {
-    const uint4 a = reinterpret_cast<const uint4*>(grad)[i], b = reinterpret_cast<const uint4*>(out)[i];
-    const uint32_t x[4] = {a.x, a.y, a.z, a.w}, y[4] = {b.x, b.y, b.z, b.w};
-#pragma unroll
-    for (int j = 0; j < 4; ++j) {
-      const float2 p = unpack<T>(x[j]), q = unpack<T>(y[j]);
-      delta = fmaf(p.x, q.x, fmaf(p.y, q.y, delta));
-    }
-  }
-  const float2 pair = *reinterpret_cast<const float2*>(args.stats + 2 * (row * args.size.heads + head));
-  if (pair.y == 0) return QueryNumbers::none();
-  const float log_sum = log2f(pair.y);
-  return {pair.x, log_sum, delta, -fmaf(pair.x, args.slope, log_sum)};
-}
-
-template <typename T>
 __global__ void __launch_bounds__(kThreads, 1) fused_kernel(Backward<T> args, float* partial) {
   extern __shared__ uint4 shared[];
   float* minus_delta = reinterpret_cast<float*>(shared + 2 * kTileBytes / sizeof(uint4));
@@ -131,7 +109,8 @@ __global__ void __launch_bounds__(kThreads, 1) fused_kernel(Backward<T> args, fl
                                   {queries, grads}, nullptr);
           bool fast = true;
           for (int r = threadIdx.x; r < n_steps * kStep; r += kThreads) {
-            const QueryNumbers x = r < n ? numbers_of(args, table.q_rows[begin + r], share.head) : QueryNumbers::none();
+            const QueryNumbers x =
+                r < n ? numbers_of<T, D>(args, table.q_rows[begin + r], share.head) : QueryNumbers::none();
             if (r < n) listed[r] = x;
             shift[r] = x.shift;
             minus_delta[r / 2 * 4 + r % 2] = minus_delta[r / 2 * 4 + r % 2 + 2] = -x.delta;
@@ -174,7 +153,7 @@ __global__ void __launch_bounds__(kThreads, 1) fused_kernel(Backward<T> args, fl
             if (!last_keys) so_far[d] = sum[d];
           }
           if (!last_keys) continue;
-          uint4* to = reinterpret_cast<uint4*>(args.grad_q + (row * args.size.heads + share.head) * D);
+          uint4* to = reinterpret_cast<uint4*>(args.gradients.q + row * args.gradients.row_stride + share.head * D);
 #pragma unroll
           for (int c = 0; c < D / 8; ++c) {
             uint32_t pairs[4];

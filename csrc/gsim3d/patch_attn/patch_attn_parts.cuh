@@ -56,12 +56,14 @@ struct RowUses {
   int* count_less_one;             // [n_k]
 };
 
-// Gradients of the keys and values: a row listed once is written at once, the others are summed over their slots later.
+// Where gradients go. Those of a key listed once are written at once, the others are summed over their slots later.
 template <typename T>
-struct KeyGradients {
-  T* k;                  // [n_k, H, D]
-  T* v;                  // [n_k, H, D]
-  Sum<T>* slots;        // [n_k_listed, H, 2, D], only slots of rows listed more than once are written
+struct Gradients {
+  T* q;                // [n_q, H, D]
+  T* k;                // [n_k, H, D]
+  T* v;                // [n_k, H, D]
+  int64_t row_stride;  // of all three
+  Sum<T>* slots;       // [n_k_listed, H, 2, D], only slots of rows listed more than once are written
   const int* count_less_one;
 
   __device__ __forceinline__ bool at_once(int64_t row) const { return count_less_one[row] == 0; }

@@ -134,10 +134,10 @@ struct Work {
   AttentionSize size;
   Division division;
   patch_attn::Softmax<Sum<T>> softmax;
-  T* out;  // or the gradient of q
+  T* out;
   Sum<T>* stats;
   Sum<T>* deltas;  // [H, n_q_listed]
-  KeyGradients<T> key_gradients;
+  Gradients<T> gradients;
 };
 
 // The rows of a thread group, in groups of kGroup: body(first, end of the patch's slots).
@@ -303,7 +303,7 @@ __global__ void __launch_bounds__(kThreads) query_kernel(Work<T> work) {
 #pragma unroll
     for (int r = 0; r < R; ++r)
       if (rows[r] >= 0)
-        store_row<L>(work.out + (rows[r] * heads + head) * dim, part, dim, result[r],
+        store_row<L>(work.gradients.q + rows[r] * work.gradients.row_stride + head * dim, part, dim, result[r],
                      static_cast<C>(work.size.scale));
   });
 }
@@ -352,11 +352,12 @@ __global__ void __launch_bounds__(kThreads) key_kernel(Work<T> work) {
       }
       if (row < 0) continue;
       const C scale = static_cast<C>(work.size.scale);
-      if (work.key_gradients.at_once(row)) {
-        store_row<L>(work.key_gradients.k + (row * heads + share.head) * dim, part, dim, grad_k, scale);
-        store_row<L>(work.key_gradients.v + (row * heads + share.head) * dim, part, dim, grad_v, C(1));
+      const int64_t place = row * work.gradients.row_stride + share.head * dim;
+      if (work.gradients.at_once(row)) {
+        store_row<L>(work.gradients.k + place, part, dim, grad_k, scale);
+        store_row<L>(work.gradients.v + place, part, dim, grad_v, C(1));
       } else {
-        C* to = work.key_gradients.slot(slot, share.head, work.size);
+        C* to = work.gradients.slot(slot, share.head, work.size);
         store_row<L>(to, part, dim, grad_k, scale);
         store_row<L>(to + dim, part, dim, grad_v, C(1));
       }
@@ -390,13 +391,13 @@ void simple_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T
 
 template <typename T>
 void simple_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v,
-                     const T* out, const Sum<T>* stats, const PatchTable& table, const AttentionSize& size, T* grad_q,
-                     const KeyGradients<T>& key_gradients, const Workspace& workspace, Stream stream) {
+                     const T* out, const Sum<T>* stats, const PatchTable& table, const AttentionSize& size,
+                     const Gradients<T>& gradients, const Workspace& workspace, Stream stream) {
   const char* op = "patch_attention_backward";
   const HeadRows<T> out_rows{out, size.heads * size.dim, size.dim};
   const int64_t resident = 4 * multiprocessors(op, stream);
-  Work<T> work{grad, q, k, v, out_rows, table, size, {}, patch_attn::Softmax<Sum<T>>(size.scale), grad_q,
-               const_cast<Sum<T>*>(stats), workspace.take<Sum<T>>(size.heads * table.n_q_listed), key_gradients};
+  Work<T> work{grad, q, k, v, out_rows, table, size, {}, patch_attn::Softmax<Sum<T>>(size.scale), nullptr,
+               const_cast<Sum<T>*>(stats), workspace.take<Sum<T>>(size.heads * table.n_q_listed), gradients};
   with_lanes(size.dim, [&]<int L>() {
     using S = Shape<Sum<T>, L>;
     work.division = divide(table.n_patches, table.n_q_listed, S::kGroup, size.heads, resident);
@@ -410,8 +411,8 @@ void simple_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRo
   template void simple_forward<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const PatchTable&,     \
                                   const AttentionSize&, T*, Sum<T>*, Stream);                                       \
   template void simple_backward<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&,   \
-                                   const T*, const Sum<T>*, const PatchTable&, const AttentionSize&, T*,            \
-                                   const KeyGradients<T>&, const Workspace&, Stream);
+                                   const T*, const Sum<T>*, const PatchTable&, const AttentionSize&, \
+                                   const Gradients<T>&, const Workspace&, Stream);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 GSIM3D_INSTANTIATE(__nv_bfloat16)

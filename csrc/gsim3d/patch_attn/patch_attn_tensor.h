@@ -11,10 +11,10 @@ template <typename T>
 void tensor_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
                     const AttentionSize& size, T* out, float* stats, Stream stream);
 
-// Writes the rows of grad_q that some patch with keys lists, and the gradients of all slots of kv_rows in patches.
+// Writes the gradients of queries that some patch with keys lists, and those of all slots of kv_rows in patches.
 template <typename T>
 void tensor_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v,
-                     const T* out, const float* stats, const PatchTable& table, const AttentionSize& size, T* grad_q,
-                     const KeyGradients<T>& key_gradients, const Workspace& workspace, Stream stream);
+                     const T* out, const float* stats, const PatchTable& table, const AttentionSize& size,
+                     const Gradients<T>& gradients, const Workspace& workspace, Stream stream);
 
 }  // namespace gsim3d::cuda

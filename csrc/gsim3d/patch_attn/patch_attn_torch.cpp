@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <type_traits>
 
 #include "gsim3d/core/half.h"
@@ -95,22 +96,31 @@ std::tuple<Tensor, Tensor> patch_attention(const Tensor& q, const Tensor& k, con
   return {out, stats};
 }
 
-std::tuple<Tensor, Tensor, Tensor> patch_attention_backward(const Tensor& grad_, const Tensor& q, const Tensor& k,
-                                                            const Tensor& v, const Tensor& out_, const Tensor& stats_,
+// What the backward pass reads beside the inputs.
+struct Outputs {
+  Tensor grad, out, stats;
+};
+
+Outputs outputs_of(const char* op, const Tensor& grad, const Tensor& out, const Tensor& stats, const Tensor& q) {
+  check_shape(op, "grad", grad, {q.size(0), q.size(1), q.size(2)}, "[Nq, H, D]");
+  check_shape(op, "out", out, {q.size(0), q.size(1), q.size(2)}, "[Nq, H, D]");
+  check_shape(op, "stats", stats, {q.size(0), q.size(1), 2}, "[Nq, H, 2]");
+  check_dtype(op, "grad", grad, q.scalar_type());
+  check_dtype(op, "out", out, q.scalar_type());
+  check_dtype(op, "stats", stats, stats_type(q));
+  check_device(op, "grad", grad, q);
+  check_device(op, "out", out, q);
+  check_device(op, "stats", stats, q);
+  return {heads_of(grad), rows_of(out), rows_of(stats)};
+}
+
+std::tuple<Tensor, Tensor, Tensor> patch_attention_backward(const Tensor& grad, const Tensor& q, const Tensor& k,
+                                                            const Tensor& v, const Tensor& out, const Tensor& stats,
                                                             const Tensor& q_rows, const Tensor& kv_rows,
                                                             const Tensor& cu_q, const Tensor& cu_k, double scale) {
   const char* op = "patch_attention_backward";
   const Inputs in = inputs_of(op, q, k, v, q_rows, kv_rows, cu_q, cu_k, scale);
-  check_shape(op, "grad", grad_, {q.size(0), q.size(1), q.size(2)}, "[Nq, H, D]");
-  check_shape(op, "out", out_, {q.size(0), q.size(1), q.size(2)}, "[Nq, H, D]");
-  check_shape(op, "stats", stats_, {q.size(0), q.size(1), 2}, "[Nq, H, 2]");
-  check_dtype(op, "grad", grad_, q.scalar_type());
-  check_dtype(op, "out", out_, q.scalar_type());
-  check_dtype(op, "stats", stats_, stats_type(q));
-  check_device(op, "grad", grad_, q);
-  check_device(op, "out", out_, q);
-  check_device(op, "stats", stats_, q);
-  const Tensor grad = heads_of(grad_), out = rows_of(out_), stats = rows_of(stats_);
+  const Outputs of = outputs_of(op, grad, out, stats, q);
   Tensor grad_q = empty(q, {q.size(0), q.size(1), q.size(2)});
   Tensor grad_k = empty(k, {k.size(0), k.size(1), k.size(2)});
   Tensor grad_v = empty(k, {k.size(0), k.size(1), k.size(2)});
@@ -119,19 +129,53 @@ std::tuple<Tensor, Tensor, Tensor> patch_attention_backward(const Tensor& grad_,
     T* const grads[3] = {mutable_data<T>(grad_q), mutable_data<T>(grad_k), mutable_data<T>(grad_v)};
     if constexpr (kWithCuda)
       if (q.is_cuda())
-        return cuda::patch_attention_vjp<T>(view_of<T>(grad), view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v),
-                                            data<T>(out), data<cuda::StatsOf<T>>(stats), in.table, in.size, grads,
-                                            workspace, current_stream(q));
+        return cuda::patch_attention_vjp<T>(view_of<T>(of.grad), view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v),
+                                            data<T>(of.out), data<cuda::StatsOf<T>>(of.stats), in.table, in.size,
+                                            {grads[0], grads[1], grads[2], q.size(1) * q.size(2)}, workspace,
+                                            current_stream(q));
     if constexpr (kOnCpu<T>)
-      cpu::patch_attention_vjp<T>(view_of<T>(grad), view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v),
-                                  data<T>(out), data<T>(stats), in.table, in.size, grads, workspace, torch_parallel());
+      cpu::patch_attention_vjp<T>(view_of<T>(of.grad), view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v),
+                                  data<T>(of.out), data<T>(of.stats), in.table, in.size, grads, workspace,
+                                  torch_parallel());
   });
   return {grad_q, grad_k, grad_v};
+}
+
+Tensor patch_attention_backward_packed(const Tensor& grad, const Tensor& q, const Tensor& k, const Tensor& v,
+                                       const Tensor& out, const Tensor& stats, const Tensor& q_rows,
+                                       const Tensor& kv_rows, const Tensor& cu_q, const Tensor& cu_k, double scale) {
+  const char* op = "patch_attention_backward_packed";
+  const Inputs in = inputs_of(op, q, k, v, q_rows, kv_rows, cu_q, cu_k, scale);
+  const Outputs of = outputs_of(op, grad, out, stats, q);
+  const int64_t n = q.size(0), width = q.size(1) * q.size(2);
+  check_shape(op, "k", k, {n, q.size(1), q.size(2)}, "[N, H, D] like q");
+  Tensor packed = empty(q, {n, 3, q.size(1), q.size(2)});
+  dispatch(op, q, [&]<typename T>() {
+    TensorWorkspace workspace(q);
+    T* const to = mutable_data<T>(packed);
+    if constexpr (kWithCuda)
+      if (q.is_cuda())
+        return cuda::patch_attention_vjp<T>(view_of<T>(of.grad), view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v),
+                                            data<T>(of.out), data<cuda::StatsOf<T>>(of.stats), in.table, in.size,
+                                            {to, to + width, to + 2 * width, 3 * width}, workspace, current_stream(q));
+    if constexpr (kOnCpu<T>) {
+      Tensor apart = empty(q, {3, n, width});
+      T* const from = mutable_data<T>(apart);
+      T* const grads[3] = {from, from + n * width, from + 2 * n * width};
+      cpu::patch_attention_vjp<T>(view_of<T>(of.grad), view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v),
+                                  data<T>(of.out), data<T>(of.stats), in.table, in.size, grads, workspace,
+                                  torch_parallel());
+      for (int64_t row = 0; row < n; ++row)
+        for (int i = 0; i < 3; ++i) std::copy_n(grads[i] + row * width, width, to + (3 * row + i) * width);
+    }
+  });
+  return packed;
 }
 
 void kernels(auto& m) {
   m.impl("patch_attention", TORCH_BOX(&patch_attention));
   m.impl("patch_attention_backward", TORCH_BOX(&patch_attention_backward));
+  m.impl("patch_attention_backward_packed", TORCH_BOX(&patch_attention_backward_packed));
 }
 
 }  // namespace

@@ -38,12 +38,12 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// A block takes kRowsPerGroup rows for each of its groups; group g the rows g, g + groups, ... of them. partial is
+// A block takes `rows` rows for each of its groups; group g the rows g, g + groups, ... of them. partial is
 // [blocks, 2, channels]: sums of this block's rows, groups added in order.
 template <typename In, typename Out, int kGroup, int kPacks, bool kExact>
 __global__ void __launch_bounds__(kThreads)
     backward_kernel(const Out* __restrict__ grad, const In* __restrict__ x, const Sum<In>* __restrict__ weight,
-                    const Sum<In>* __restrict__ stats, RowNormShape shape, In* __restrict__ grad_x,
+                    const Sum<In>* __restrict__ stats, RowNormShape shape, int rows, In* __restrict__ grad_x,
                     Sum<In>* __restrict__ partial) {
   using S = Sum<In>;
   using Rows = Layout<kGroup, kPacks, kExact>;
@@ -53,8 +53,8 @@ __global__ void __launch_bounds__(kThreads)
   const int lane = threadIdx.x % kGroup, group = threadIdx.x / kGroup, channels = static_cast<int>(shape.channels);
   S w[kPacks][kVector], weight_sum[kPacks][kVector] = {}, bias_sum[kPacks][kVector] = {};
   Rows::load(weight, channels, lane, w);
-  const int64_t first = static_cast<int64_t>(blockIdx.x) * kGroups * kRowsPerGroup;
-  for (int i = 0; i < kRowsPerGroup; ++i) {
+  const int64_t first = static_cast<int64_t>(blockIdx.x) * kGroups * rows;
+  for (int i = 0; i < rows; ++i) {
     const int64_t owned = first + static_cast<int64_t>(i) * kGroups + group;
     const bool mine = owned < shape.n_rows;
     const int64_t row = min(owned, shape.n_rows - 1);
@@ -107,10 +107,12 @@ void row_norm_vjp(const Out* grad, const In* x, const Sum<In>* weight, const Sum
   }
   by_shape(op, shape.channels, aligned(grad, x, weight, grad_x), [&]<int kGroup, int kPacks, bool kExact>() {
     constexpr int kGroups = kThreads / kGroup;
-    const unsigned n_blocks = blocks_for(op, shape.n_rows, kGroups * kRowsPerGroup);
+    const int rows = rows_of_group(shape.n_rows, kGroups);
+    const unsigned n_blocks = blocks_for(op, shape.n_rows, kGroups * rows);
     S* partial = workspace.take<S>(static_cast<int64_t>(n_blocks) * 2 * shape.channels);
     launch(op, backward_kernel<In, Out, kGroup, kPacks, kExact>, n_blocks, kThreads,
-           kGroups * kGroup * kPacks * kVector * sizeof(S), stream, grad, x, weight, stats, shape, grad_x, partial);
+           kGroups * kGroup * kPacks * kVector * sizeof(S), stream, grad, x, weight, stats, shape, rows, grad_x,
+           partial);
     launch(op, reduce_kernel<S>, blocks_for(op, 2 * shape.channels, kWarp), dim3(kWarp, kReduceRows), 0, stream,
            partial, n_blocks, 2 * shape.channels, shape.channels, RowSums<S>{{grad_weight, grad_bias}});
   });

@@ -66,6 +66,7 @@ struct Backward {
   Sum<T>* grad_x;
   T* grad_branch;
   Sum<T>* partial;  // [blocks, sums, channels]
+  int rows;         // of a group
 };
 
 // Rows as in row_norm's backward kernel. Sums over rows: of the branch's gradient; with kBranchNorm of its norm's
@@ -79,14 +80,16 @@ __global__ void __launch_bounds__(kThreads) residual_backward_kernel(const Backw
   extern __shared__ __align__(16) unsigned char shared[];
   const int lane = threadIdx.x % kGroup, group = threadIdx.x / kGroup, channels = static_cast<int>(at.shape.channels);
   S total[kSums][kPacks][kVector] = {};
-  const int64_t first = static_cast<int64_t>(blockIdx.x) * kGroups * kRowsPerGroup;
-  for (int i = 0; i < kRowsPerGroup; ++i) {
+  const int64_t first = static_cast<int64_t>(blockIdx.x) * kGroups * at.rows;
+  for (int i = 0; i < at.rows; ++i) {
     const int64_t owned = first + static_cast<int64_t>(i) * kGroups + group;
     if (owned - group >= at.shape.n_rows) break;  // the same for all lanes of the block
     const bool mine = owned < at.shape.n_rows;
     const int64_t row = min(owned, at.shape.n_rows - 1), start = row * channels;
     const S counted = mine ? S(1) : S(0);
     S g[kPacks][kVector] = {}, grad[kPacks][kVector], value[kPacks][kVector], w[kPacks][kVector];
+    S branch[kBranchNorm ? kPacks : 1][kVector];  // on its way while the sums of the other norm are formed
+    if constexpr (kBranchNorm) Rows::load(at.branch + start, channels, lane, branch);
     if (at.grad_sum) Rows::load(at.grad_sum + start, channels, lane, g);
     if (at.grad_out) {
       Rows::load(at.grad_out + start, channels, lane, grad);
@@ -117,17 +120,16 @@ __global__ void __launch_bounds__(kThreads) residual_backward_kernel(const Backw
 #pragma unroll
       for (int j = 0; j < kVector; ++j) g[p][j] = Rows::channel(p, lane) + j < channels ? share * g[p][j] : S(0);
     if constexpr (kBranchNorm) {
-      Rows::load(at.branch + start, channels, lane, value);
       Rows::load(at.branch_weight, channels, lane, w);
       const RowStats<S> of{at.branch_stats[2 * row], at.branch_stats[2 * row + 1]};
-      const auto [mean_grad, mean_grad_x] = grad_means_of<kGroup>(g, value, w, of, channels);
+      const auto [mean_grad, mean_grad_x] = grad_means_of<kGroup>(g, branch, w, of, channels);
 #pragma unroll
       for (int p = 0; p < kPacks; ++p)
 #pragma unroll
         for (int j = 0; j < kVector; ++j) {
-          total[1][p][j] += counted * g[p][j] * normalised(value[p][j], of);
+          total[1][p][j] += counted * g[p][j] * normalised(branch[p][j], of);
           total[2][p][j] += counted * g[p][j];
-          g[p][j] = row_norm_value_vjp(g[p][j], value[p][j], of, w[p][j], mean_grad, mean_grad_x);
+          g[p][j] = row_norm_value_vjp(g[p][j], branch[p][j], of, w[p][j], mean_grad, mean_grad_x);
         }
     }
 #pragma unroll
@@ -142,10 +144,10 @@ __global__ void __launch_bounds__(kThreads) residual_backward_kernel(const Backw
     sum_groups<Rows, kGroup>(total[s], channels, reinterpret_cast<S*>(shared), to + static_cast<int64_t>(s) * channels);
 }
 
-// Sums over rows. A block adds up kGroup * kVector channels of kRowsPerGroup rows for each of its groups.
+// Sums over rows. A block adds up kGroup * kVector channels of `rows` rows for each of its groups.
 template <typename T, int kGroup, bool kExact>
 __global__ void __launch_bounds__(kThreads)
-    sum_kernel(const T* __restrict__ x, RowNormShape shape, Sum<T>* __restrict__ partial) {
+    sum_kernel(const T* __restrict__ x, RowNormShape shape, int rows, Sum<T>* __restrict__ partial) {
   using S = Sum<T>;
   using Rows = Layout<kGroup, 1, kExact>;
   constexpr int kGroups = kThreads / kGroup;
@@ -154,11 +156,11 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t column = static_cast<int64_t>(blockIdx.y) * kGroup * kVector;
   const int width = static_cast<int>(min(shape.channels - column, static_cast<int64_t>(kGroup * kVector)));
   S total[1][kVector] = {};
-  const int64_t first = static_cast<int64_t>(blockIdx.x) * kGroups * kRowsPerGroup;
+  const int64_t first = static_cast<int64_t>(blockIdx.x) * kGroups * rows + group;
+  const int mine = rows_before<kGroups>(first, shape.n_rows, rows);
 #pragma unroll 4
-  for (int i = 0; i < kRowsPerGroup; ++i) {
-    const int64_t row = first + static_cast<int64_t>(i) * kGroups + group;
-    if (row >= shape.n_rows) break;
+  for (int i = 0; i < mine; ++i) {
+    const int64_t row = first + static_cast<int64_t>(i) * kGroups;
     S value[1][kVector];
     Rows::load(x + row * shape.channels + column, width, lane, value);
 #pragma unroll
@@ -205,10 +207,11 @@ void residual_norm_vjp(const Sum<T>* grad_sum, const T* grad_out, const T* branc
   const bool exact = aligned(grad_sum, grad_out, branch, sum, branch_weight, weight, grad_x, grad_branch);
   by_shape(op, shape.channels, exact, [&]<int kGroup, int kPacks, bool kExact>() {
     constexpr int kGroups = kThreads / kGroup;
-    const unsigned n_blocks = blocks_for(op, shape.n_rows, kGroups * kRowsPerGroup);
+    const int rows = rows_of_group(shape.n_rows, kGroups);
+    const unsigned n_blocks = blocks_for(op, shape.n_rows, kGroups * rows);
     S* partial = workspace.take<S>(static_cast<int64_t>(n_blocks) * n_sums * shape.channels);
     const Backward<T> at{grad_sum,     grad_out, branch, sum,    keep,        branch_weight, weight,
-                         branch_stats, stats,    shape,  grad_x, grad_branch, partial};
+                         branch_stats, stats,    shape,  grad_x, grad_branch, partial, rows};
     const auto run = [&]<bool kBranchNorm, bool kNorm>() {
       launch(op, residual_backward_kernel<T, kGroup, kPacks, kExact, kBranchNorm, kNorm>, n_blocks, kThreads,
              kGroups * kGroup * kPacks * kVector * sizeof(S), stream, at);
@@ -229,10 +232,11 @@ void sum_rows(const T* x, RowNormShape shape, Sum<T>* out, const Workspace& work
   if (shape.n_rows == 0) return fill_zero(op, out, shape.channels, stream);
   const bool exact = aligned(x) && shape.channels % kVector == 0;
   const auto run = [&]<int kGroup, bool kExact>() {
-    const unsigned n_blocks = blocks_for(op, shape.n_rows, kThreads / kGroup * kRowsPerGroup);
+    const unsigned columns = blocks_for(op, shape.channels, kGroup * kVector);
+    const int rows = rows_of_group(shape.n_rows, kThreads / kGroup, columns);
+    const unsigned n_blocks = blocks_for(op, shape.n_rows, kThreads / kGroup * rows);
     S* partial = workspace.take<S>(static_cast<int64_t>(n_blocks) * shape.channels);
-    launch(op, sum_kernel<T, kGroup, kExact>, dim3(n_blocks, blocks_for(op, shape.channels, kGroup * kVector)),
-           kThreads, 0, stream, x, shape, partial);
+    launch(op, sum_kernel<T, kGroup, kExact>, dim3(n_blocks, columns), kThreads, 0, stream, x, shape, rows, partial);
     launch(op, reduce_kernel<S>, blocks_for(op, shape.channels, kWarp), dim3(kWarp, kReduceRows), 0, stream, partial,
            n_blocks, shape.channels, shape.channels, RowSums<S>{{out}});
   };

@@ -1,6 +1,8 @@
 // Device helpers of row_norm: a group of lanes owns a row and keeps it in registers.
 #pragma once
 
+#include <algorithm>
+
 #include "gsim3d/core/cuda_utils.cuh"
 #include "gsim3d/core/half.cuh"
 #include "gsim3d/core/half.h"
@@ -16,8 +18,16 @@ namespace {
 
 constexpr int kThreads = 256;
 constexpr int kVector = 4;           // channels that a lane moves at once
-constexpr int kRowsPerGroup = 16;    // rows of one group of lanes in the backward pass: the borders of its partial sums
+constexpr int64_t kMostRows = 16;    // of one group of lanes where rows are summed
+constexpr int64_t kManyBlocks = 512; // occupy a large GPU
 constexpr int kReduceRows = 32;      // partial sums that one block of the last reduction adds side by side
+
+// Rows of one group of lanes, `groups` of them a block and `columns` blocks side by side: the borders of sums over rows.
+// The same for the same sizes, whatever the GPU. Few rows are spread over many blocks, for each row waits for memory.
+inline int rows_of_group(int64_t n_rows, int64_t groups, unsigned columns = 1, int64_t blocks = kManyBlocks) {
+  const int64_t at_once = groups * std::max<int64_t>(1, blocks / std::max(1u, columns));
+  return static_cast<int>(std::clamp<int64_t>((n_rows + at_once - 1) / at_once, 1, kMostRows));
+}
 
 template <typename S>
 __device__ __forceinline__ S widen(S x) {
@@ -127,6 +137,12 @@ __device__ __forceinline__ GradMeans<S> grad_means_of(const S (&g)[kPacks][kVect
       sum_x += scaled * normalised(x[p][j], stats);
     }
   return {group_sum<kGroup>(sum) / static_cast<S>(channels), group_sum<kGroup>(sum_x) / static_cast<S>(channels)};
+}
+
+// How many of the rows first, first + kGroups, ... lie before n_rows, of `rows` at most.
+template <int kGroups>
+__device__ __forceinline__ int rows_before(int64_t first, int64_t n_rows, int rows) {
+  return static_cast<int>(min(max((n_rows - first + kGroups - 1) / kGroups, int64_t{0}), static_cast<int64_t>(rows)));
 }
 
 // to[c] = sum over the groups of a block of `mine`, groups in order. sums: shared memory for one row a group.

@@ -37,6 +37,9 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   m.def(
       "patch_attention_backward(Tensor grad, Tensor q, Tensor k, Tensor v, Tensor out, Tensor stats, Tensor q_rows, "
       "Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) -> (Tensor q, Tensor k, Tensor v)");
+  m.def(
+      "patch_attention_backward_packed(Tensor grad, Tensor q, Tensor k, Tensor v, Tensor out, Tensor stats, Tensor "
+      "q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) -> Tensor");
 
   // pool: segment max and mean over clusters, and unpooling.
   m.def("pool_max(Tensor x, Tensor rows, Tensor cu_rows) -> (Tensor out, Tensor argmax)");

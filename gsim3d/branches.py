@@ -1,0 +1,55 @@
+"""Branches of a CUDA graph: work that nobody waits for until its results are needed.
+
+Kernels over few rows leave most of a GPU idle. In a graph, those of a branch run beside those that follow it.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+N_STREAMS = 4  # what more branches than these are given is queued behind one of them
+
+
+class Branches:
+    """A context; what is run in it is done when the context is left, and may be read only then.
+
+    While a graph is captured, :meth:`run` makes nodes that wait for the work before them, not the other way round. Else,
+    and on the CPU, everything runs in order. The numbers are the same.
+
+    Args:
+        like: on the device of the work.
+    """
+
+    def __init__(self, like: Tensor):
+        captured = like.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
+        self._streams = _streams(like.device) if captured else ()
+        self._count, self._read = 0, []
+
+    def __enter__(self) -> Branches:
+        return self
+
+    def run(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """``function(*arguments)``."""
+        if not self._streams:
+            return function(*arguments)
+        stream = self._streams[self._count % len(self._streams)]
+        self._count += 1
+        self._read.append(arguments)  # their memory must not be used anew before the context is left
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            return function(*arguments)
+
+    def __exit__(self, *_) -> None:
+        for stream in self._streams[: self._count]:
+            torch.cuda.current_stream().wait_stream(stream)
+        self._read.clear()
+
+
+@functools.lru_cache(maxsize=None)
+def _streams(device: torch.device) -> tuple[torch.cuda.Stream, ...]:
+    return tuple(torch.cuda.Stream(device) for _ in range(N_STREAMS))

@@ -1,0 +1,186 @@
+"""``gsim3d effects infer``: the smallest spec under which a model predicts a scene as well as under its own."""
+
+from __future__ import annotations
+
+import argparse
+
+EPILOG = """\
+Each effect that the checkpoint's spec has on is switched off alone, or lowered, and the prediction of a few steps
+compared with the film: what it is worth is how many dB of PSNR that loses, what it costs is the time of a step and its
+images that it takes. The smallest settings within the tolerance are taken together; while together they lose more, the
+one that is worth most comes back.
+
+examples:
+  gsim3d effects infer runs/data/ball/0000 runs/model --tolerance 0.1dB
+  gsim3d simulate runs/model runs/data/ball/0000 --out runs/ball --effects runs/data/ball/0000/effects.yaml
+"""
+STEPS = 4  # predicted and compared
+ROUNDS = 3  # of which the fastest counts
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Finds out which effects a scene needs, and writes them to effects.yaml."
+    parser.epilog = EPILOG
+    parser.add_argument("action", choices=("infer",), help="infer: switch effects off one by one and compare")
+    parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/data.md)")
+    parser.add_argument("checkpoint", metavar="CHECKPOINT", help="run folder, checkpoint folder or .safetensors file")
+    parser.add_argument("--tolerance", default="0.1dB", metavar="X", help="PSNR that may be lost (default: 0.1dB)")
+    parser.add_argument("--out", metavar="FILE", help="file to write; must not exist yet (default: SCENE/effects.yaml)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
+
+
+def run(args: argparse.Namespace) -> int:
+    from pathlib import Path
+
+    from gsim3d.effects import FILE
+    from gsim3d.errors import InputError
+    from gsim3d.plans import in_columns
+    from gsim3d.train.restore import restore
+
+    tolerance = _decibels(args.tolerance)
+    out = Path(args.out or Path(args.scene) / FILE)
+    if out.exists():
+        raise InputError(f"--out: {out} exists already; name another file or remove it")
+    if not out.parent.is_dir():
+        raise InputError(f"--out: the folder {out.parent} does not exist")
+    restored = restore(args.checkpoint, args.device)
+    scene = restored.open_scene(args.scene)
+    trial = _Trial(restored, scene)
+    base = restored.plan.spec
+    psnr, seconds = trial(base)
+    print(
+        f"{scene.name}: {psnr:.2f} dB, {1e3 * seconds:.1f} ms a step with its images, with what the checkpoint has on"
+    )
+    rows, spec, (now, time) = propose(base, smaller(base, restored.simulator.config), trial, (psnr, seconds), tolerance)
+    print(in_columns([("effect", "setting", "worth dB", "costs ms", ""), *rows]))
+    spec.save(out)
+    print(f"proposed: {psnr - now:+.3f} dB, {seconds / time:.2f} times as fast; written: {out}")
+    return 0
+
+
+def propose(base, settings: dict, trial, measured: tuple[float, float], tolerance: float):
+    """Rows of a table, the smallest spec that loses at most ``tolerance`` dB of ``measured``, and what it was measured at.
+
+    Args:
+        settings: of :func:`smaller`.
+        trial: spec -> PSNR, seconds.   measured: those of ``base``.
+    """
+    psnr, seconds = measured
+    table, chosen, lost = [], {}, {}
+    for effect, specs in settings.items():
+        for name, spec in specs:
+            now, time = trial(spec)
+            if effect not in chosen and psnr - now <= tolerance:
+                chosen[effect], lost[effect] = spec, psnr - now
+            table.append((effect, name, psnr - now, seconds - time, chosen.get(effect) is spec))
+    alone = dict(chosen)
+    while True:
+        spec = together(base, chosen.values())
+        now, time = trial(spec) if chosen else measured
+        if psnr - now <= tolerance:
+            break
+        del chosen[max(chosen, key=lost.get)]
+    rows = []
+    for effect, name, worth, cost, fits in table:
+        note = (
+            "proposed" if fits and effect in chosen else "too much with the others" if fits and effect in alone else ""
+        )
+        rows.append((effect, name, f"{worth:+.3f}", f"{1e3 * cost:+.1f}", note))
+    return rows, spec, (now, time)
+
+
+def _decibels(text: str) -> float:
+    import math
+
+    from gsim3d.errors import InputError
+
+    try:
+        value = float(text.removesuffix("dB"))
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise InputError(f"--tolerance: must be a number of dB of at least 0, such as 0.1dB; got {text!r}")
+    return value
+
+
+def smaller(base, model) -> dict:
+    """Effect -> (setting, ``base`` with that setting) for each setting below its own, the smallest first."""
+    from dataclasses import replace
+
+    from gsim3d.plans import make_plan
+
+    plan, dynamics, look = make_plan(base, model), base.dynamics, base.appearance
+    history = [2**bits for bits in range(model.dynamics.history_bits + 1) if 2**bits < plan.history]
+    found = {
+        "time merging": [
+            (f"{n} step{'s' if n > 1 else ''}", replace(base, dynamics=replace(dynamics, history=n))) for n in history
+        ],
+        "view-dependent colour": [
+            (f"degree {d}", replace(base, appearance=replace(look, view_dependent=d))) for d in range(plan.sh_degree)
+        ],
+        "changing features": [
+            (who, replace(base, appearance=replace(look, changing=who)))
+            for who in ("none", "dynamic")[: ("none", "dynamic", "all").index(look.changing)]
+        ],
+        "changing opacities": (
+            [("off", replace(base, appearance=replace(look, opacity_changes=False)))]
+            if "changing opacities" in plan.kept
+            else []
+        ),
+        "frozen background": (
+            [("masked out", replace(base, dynamics=replace(dynamics, background="masked_out")))]
+            if "frozen background" in plan.kept
+            else []
+        ),
+    }
+    return {effect: settings for effect, settings in found.items() if settings}
+
+
+def together(base, specs):
+    """``base`` with every setting in which one of ``specs`` differs from it."""
+    from dataclasses import fields, replace
+
+    spec = base
+    for other in specs:
+        for room in fields(base):
+            mine, theirs = getattr(base, room.name), getattr(other, room.name)
+            changed = {f.name: getattr(theirs, f.name) for f in fields(mine)}
+            changed = {name: value for name, value in changed.items() if value != getattr(mine, name)}
+            spec = replace(spec, **{room.name: replace(getattr(spec, room.name), **changed)})
+    return spec
+
+
+class _Trial:
+    """spec -> PSNR of a prediction of the scene against its film, seconds of a step and its images."""
+
+    def __init__(self, restored, scene):
+        from gsim3d.evaluate.protocol import default_views, encode_steps, horizon
+
+        self.restored, self.scene = restored, scene
+        self.n_encoded = restored.data.history
+        self.n_steps = min(STEPS, horizon(scene, self.n_encoded, None))
+        context, self.cams = default_views(restored, scene)
+        self.state = encode_steps(restored, scene, context)
+        steps = range(self.n_encoded, self.n_encoded + self.n_steps)
+        self.truth = scene.images(list(self.cams), steps).permute(0, 1, 3, 4, 2).to(restored.device).float() / 255
+
+    def __call__(self, spec) -> tuple[float, float]:
+        import dataclasses
+        import time
+
+        import torch
+
+        from gsim3d.dynamics import concatenate
+        from gsim3d.evaluate.protocol import render_steps
+        from gsim3d.layers import exact_convolutions
+
+        plan = self.restored.simulator.plan(spec)
+        restored, times = dataclasses.replace(self.restored, plan=plan), []
+        for _ in range(ROUNDS):
+            start = time.perf_counter()
+            with torch.no_grad(), exact_convolutions():
+                steps = restored.simulator.rollout(self.state, self.n_steps, plan)
+                images = render_steps(restored, concatenate(steps), self.scene, self.cams, self.n_encoded)
+            error = float((images - self.truth).square().mean())  # waits for the device
+            times.append(time.perf_counter() - start)
+        return -10 * torch.tensor(max(error, 1e-10)).log10().item(), min(times) / self.n_steps

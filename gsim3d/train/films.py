@@ -1,0 +1,196 @@
+"""Trajectories that are simulated and filmed while a training run goes on, and kept decoded where it computes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import shutil
+import tempfile
+import threading
+from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsim3d.data import Window
+from gsim3d.data.recording import BACKGROUND, MOVING
+from gsim3d.generate.cameras import workspace_origin
+from gsim3d.generate.film import film, start_filming
+from gsim3d.generate.world import World
+from gsim3d.train.config import DataConfig, StageConfig
+from gsim3d.train.samples import Batch, draw_windows, thin_background
+from gsim3d.types import Cameras, Frames
+
+QUEUED = 2  # trajectories that wait for each process that films
+
+
+@dataclass(frozen=True)
+class Film:
+    """One trajectory of a store, as far as the drawing of windows looks at it. slot: its place in the store."""
+
+    slot: int
+    path: Path
+    n_steps: int
+    n_cams: int
+    width: int
+    height: int
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    def has_segmentation(self) -> bool:
+        return True
+
+
+class FilmStore:
+    """Images and labels of many trajectories of one world in the memory of a device; the newest replace the oldest.
+
+    Args:
+        world: whose cameras film; the same in every trajectory.
+        capacity: trajectories that there is room for.
+        device: where they are kept.
+    """
+
+    def __init__(self, world: World, capacity: int, device: str):
+        rig = world.rig()
+        self.capacity, self.device, self.count = capacity, torch.device(device), 0
+        self._shape = (world.n_frames, rig.n_cams, rig.size, rig.size)
+        self._films = torch.empty((capacity, *self._shape, 4), dtype=torch.uint8, device=device)
+        self._viewmats, self._Ks = (
+            torch.from_numpy(np.ascontiguousarray(values)).float().to(device) for values in (rig.viewmats, rig.Ks)
+        )
+        self._near, self._far = rig.near, rig.far
+        self._origin = torch.from_numpy(workspace_origin(rig)).to(device)
+        self.lock = threading.Lock()  # held while films come or are read
+        self.films = [
+            Film(slot, Path(f"film_{slot}"), *self._shape[:2], rig.size, rig.size) for slot in range(capacity)
+        ]
+
+    def put(self, film: np.ndarray) -> None:
+        """Keeps a trajectory: uint8 [T, V, H, W, 4], colours and label."""
+        with self.lock:
+            self._films[self.count % self.capacity].copy_(torch.from_numpy(film))
+            self.count += 1
+
+    def draw(self, data: DataConfig, stage: StageConfig, seed: int, step: int, samples: Sequence[int]) -> Batch:
+        """As :func:`gsim3d.train.samples.draw_batch`, of the trajectories that are there."""
+        with self.lock:
+            known = self.films[: min(self.count, self.capacity)]
+            windows = draw_windows(known, data, stage, seed, step, samples)
+            n_context = windows[0].n_context
+            context = self._frames(windows, [window.context_cams for window in windows], n_context)
+            targets = self._frames(windows, [window.target_cams for window in windows], n_context + stage.horizon)
+        return Batch(thin_background(context, data.background_stride), targets, n_context, stage.horizon)
+
+    def _frames(self, windows: Sequence[Window], cams: Sequence, n_steps: int) -> Frames:
+        """The first ``n_steps`` steps of the windows, seen by the cameras of each step."""
+        n_views, (n_frames, n_cams, height, width) = len(cams[0][0]), self._shape
+        places = [
+            ((window.scene.slot * n_frames + window.start + step) * n_cams + cam, cam)
+            for window, by_step in zip(windows, cams, strict=True)
+            for step in range(n_steps)
+            for cam in by_step[step]
+        ]
+        image, cam = torch.tensor(places, device=self.device).T
+        n_clouds = len(windows) * n_steps
+        cloud = torch.arange(n_clouds, device=self.device)
+        pixels = self._films.view(-1, height, width, 4)[image]
+        labels, depth = pixels[..., 3], torch.ones(len(places), device=self.device)
+        return Frames(
+            images=pixels[..., :3].permute(0, 3, 1, 2).float().contiguous().div_(255),
+            cameras=Cameras(
+                self._viewmats[cam],
+                self._Ks[cam],
+                depth * self._near,
+                depth * self._far,
+                cloud.repeat_interleave(n_views),
+                width,
+                height,
+            ),
+            cloud_scene=cloud // n_steps,
+            cloud_step=cloud % n_steps,
+            origin=self._origin.expand(len(windows), 3).clone(),
+            masks=labels != BACKGROUND,
+            dynamic=labels == MOVING,
+        )
+
+
+class Filming:
+    """Processes that simulate and film one trajectory after another, from number ``first`` on, into a store.
+
+    Trajectory n is the n-th of the world's list (one of each object in turn), whatever its ``n_trajectories`` says;
+    each number is filmed once. Use as a context; leaving it ends the processes.
+
+    Attributes:
+        next: the smallest number that no process has begun.
+    """
+
+    def __init__(self, world: World, store: FilmStore, first: int, processes: int, cache: str | Path | None = None):
+        self._world, self._store, self.next = world, store, first
+        self._processes, self._names = processes, world.object_names()
+        self._cache = Path(tempfile.mkdtemp(prefix="films_", dir=cache))
+        self._running = True
+        self._failure: BaseException | None = None
+        self._arrived = threading.Condition()
+
+    def __enter__(self) -> Filming:
+        context = multiprocessing.get_context("spawn")
+        self._pool = ProcessPoolExecutor(self._processes, context, start_filming)
+        threads = os.environ.get("OMP_NUM_THREADS")
+        os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that start now
+        try:
+            for _ in range(self._processes * QUEUED):
+                self._begin()
+        finally:
+            os.environ.pop("OMP_NUM_THREADS") if threads is None else os.environ.update(OMP_NUM_THREADS=threads)
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._running = False
+        for process in list((self._pool._processes or {}).values()):
+            process.terminate()  # none of them has anything to finish
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        shutil.rmtree(self._cache, ignore_errors=True)
+
+    @property
+    def count(self) -> int:
+        """Trajectories that have arrived."""
+        return self._store.count
+
+    def wait_for(self, count: int, seconds: float) -> bool:
+        """Waits until the store has seen ``count`` trajectories; False where ``seconds`` passed before."""
+        with self._arrived:
+            done = self._arrived.wait_for(lambda: self._failure or self._store.count >= count, seconds)
+        self.check()
+        return bool(done)
+
+    def check(self) -> None:
+        """Raises what a process raised."""
+        if self._failure is not None:
+            raise self._failure
+
+    def _begin(self) -> None:
+        number, names = self.next, self._names
+        self.next += 1
+        scene = names[number % len(names)], number // len(names)
+        job = self._pool.submit(film, self._world, scene, str(self._cache / f"{number}.npy"))
+        job.add_done_callback(self._take)
+
+    def _take(self, job: Future) -> None:
+        """Moves what a process has filmed into the store; called in a thread of the pool."""
+        if not self._running:
+            return
+        try:
+            file = Path(job.result())
+            self._store.put(np.load(file))
+            file.unlink()
+            self._begin()
+        except BaseException as error:  # told to the thread that trains
+            self._failure = self._failure or error
+        with self._arrived:
+            self._arrived.notify_all()

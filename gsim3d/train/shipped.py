@@ -1,0 +1,162 @@
+"""How the simulators that come with gsim3d are trained: recipes, and a trainer that goes by the clock."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from gsim3d.errors import HardCaseError
+from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
+from gsim3d.train.films import Filming, FilmStore
+from gsim3d.train.log import memory_gib
+from gsim3d.train.loop import Trainer, deterministic
+from gsim3d.train.precision import PrecisionConfig
+from gsim3d.train.samples import Batch
+from gsim3d.train.sittings import Progress, save_state
+
+FIRST_FILMS = 64  # before training begins
+SEED, HELD_OUT_SEED = 20261121, 77  # of the trajectories; `gsim3d generate` without --seed makes others
+WARM_UP = 40  # steps at the beginning of a sitting
+COOL_DOWN = 0.25  # of a sitting's training, in which the learning rate falls to LAST_RATE of its peak
+LAST_RATE = 0.03
+SAVE_EVERY = 120.0  # seconds
+
+_stage = partial(StageConfig, target_views=3)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How one simulator is trained.
+
+    world, options: `gsim3d generate WORLD --preset paper`, and options to change.
+    capacity: trajectories that are kept at a time.   held_out: that are predicted and scored at the end of a sitting.
+    first_films: before training begins.
+    """
+
+    world: str
+    train: TrainConfig
+    options: dict = field(default_factory=dict)
+    capacity: int = 600
+    held_out: int = 14
+    first_films: int = FIRST_FILMS
+
+
+# `small` with a lighter encoder, so that three sets of weights in 16 bits stay below 25 MB; without drop path and
+# shuffled curves, as the runs are far too short to overfit.
+TRAIN = TrainConfig(
+    preset="small",
+    model={
+        "encoder": {"transformer_layers": 3, "refine_unet_dim": 24},
+        "dynamics": {"drop_path": 0.0, "shuffle_orders": False},
+    },
+    data=DataConfig(history=4, context_views=4, target_only_cameras=(2, 7), background_stride=4),
+    stages=(
+        _stage(steps=500, history=1, batch=16, learning_rate=1e-3),
+        _stage(steps=300, horizon=2, batch=8, learning_rate=1e-3),
+        _stage(steps=400, horizon=6, batch=4, from_start=0.2, learning_rate=8e-4),
+        _stage(steps=1_000_000, horizon=12, batch=4, from_start=0.2, learning_rate=6e-4),
+    ),
+    loss=LossConfig(body_weight=3.0),
+    optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.995),
+    precision=PrecisionConfig(encoder="bf16", dynamics="bf16"),
+    captured=True,
+    log_every=20,
+)
+RECIPES = {world: Recipe(world, TRAIN) for world in ("elastic", "cloth", "rigid")}
+
+
+class SittingTrainer(Trainer):
+    """Trains on what a store holds, at a rate that follows the clock: it rises, stays and falls in every sitting."""
+
+    def __init__(self, config: TrainConfig, store: FilmStore, out: Path, device: str):
+        super().__init__(config, store.films[:1], out, device=device)
+        self.store = store
+        self.first_step, self.begin, self.end = 0, 0.0, math.inf
+        if self.captured is not None:
+            self.captured.alone = store.lock
+
+    def begin_sitting(self, end: float) -> None:
+        """From now to ``end``, on the clock of time.monotonic."""
+        self.first_step, self.begin, self.end = self.step, time.monotonic(), end
+        self.out.mkdir(parents=True, exist_ok=True)
+        self.simulator.train()
+
+    def learning_rate(self, stage: StageConfig, place: int) -> float:
+        rise = min(1.0, (self.step - self.first_step + 1) / WARM_UP)
+        left = (self.end - time.monotonic()) / max(1e-9, self.end - self.begin)
+        fall = min(1.0, max(0.0, left) / COOL_DOWN)
+        return stage.learning_rate * rise * (LAST_RATE + (1 - LAST_RATE) * fall)
+
+    def _batch(self, samples: list[int]) -> Batch:
+        stage, _ = self.config.stage_of(self.step)
+        return self.store.draw(self.config.data, stage, self.config.seed, self.step, samples)
+
+
+def train(
+    trainer: SittingTrainer,
+    filming: Filming,
+    progress: Progress,
+    sitting: dict,
+    *,
+    end: float,
+    out: Path,
+    name: str,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Trains until the clock (time.monotonic) shows ``end``, saves now and then and at last.
+
+    Args:
+        progress: before this sitting.
+        sitting: what the progress will say of it, beside steps, seconds and trajectories.
+        out, name: where the state goes.
+        say: is told of every logged step.
+    Raises:
+        HardCaseError: too many steps in a row met numbers that cannot be used.
+    """
+    steps, seconds, saved = trainer.step, trainer.seconds, time.monotonic()
+    settings = trainer.config
+
+    def save() -> None:
+        done = {
+            **sitting,
+            "steps": [steps, trainer.step],
+            "training_seconds": round(trainer.seconds - seconds, 1),
+            "trajectories": filming.count,
+        }
+        known = {"next_trajectory": filming.next, "sittings": [*progress.sittings, done]}
+        save_state(trainer, out, name, dataclasses.replace(progress, **known))
+
+    trainer.begin_sitting(end)
+    with deterministic(), trainer.log.opened(tensorboard=False):
+        while time.monotonic() < end:
+            start = time.perf_counter()
+            entry = trainer.train_step()
+            spent = time.perf_counter() - start
+            trainer.seconds += spent
+            if entry["step"] % settings.log_every == 0 or "skipped" in entry:
+                machine = {"seconds": trainer.seconds, "step_seconds": spent, "memory_gib": memory_gib(trainer.device)}
+                entry["trajectories"] = filming.count
+                trainer.log.write(entry, machine)
+                say(line(entry, machine))
+            if trainer.n_skipped_in_a_row >= settings.optimizer.max_skipped:
+                raise HardCaseError(f"{name}: step {entry['step']}: {entry['skipped']}", step=entry["step"])
+            filming.check()
+            if time.monotonic() - saved > SAVE_EVERY:
+                save()
+                saved = time.monotonic()
+    save()
+
+
+def line(entry: dict, machine: dict) -> str:
+    """What is said of a step."""
+    future = f" future {entry['future_psnr']:.2f}" if isinstance(entry.get("future_psnr"), float) else ""
+    numbers = (
+        f"step {entry['step']:6d}  loss {entry['loss']:.5f}  past {entry['past_psnr']:.2f}{future} dB  "
+        f"norm {entry['grad_norm']:.3f}  rate {entry['learning_rate']:.1e}  {machine['step_seconds']:.3f} s  "
+        f"{machine['memory_gib']:.1f} GiB  {entry['particles']:.0f} particles  {entry['trajectories']} trajectories"
+    )
+    return numbers if "skipped" not in entry else f"step {entry['step']:6d}  skipped: {entry['skipped']}"

@@ -1,0 +1,168 @@
+"""A training run in sittings of given length on machines that keep nothing: what travels from one to the next.
+
+A state folder holds, of a model called NAME,
+
+- ``NAME.json``: step, next trajectory, what every sitting did, names and hashes of the other files;
+- ``NAME.STEP.weights.safetensors``: the averaged weights in bfloat16 with their configuration, a checkpoint to predict
+  with;
+- ``NAME.STEP.difference.safetensors``: the weights themselves minus these, in bfloat16;
+- ``NAME.STEP.squares.safetensors``: AdamW's averages of squared gradients, in bfloat16;
+- ``NAME.metrics.jsonl``: the log.
+
+Six bytes a weight instead of the sixteen of a checkpoint. What is lost: the weights are rounded by 2^-9 of their size,
+and the averages of gradients begin at zero, so that the first ten steps or so are shorter. So a run in sittings is
+not the one that was never stopped, bit by bit, as one of ``gsim3d train`` is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from gsim3d.errors import InputError
+from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.train import checkpoint
+from gsim3d.train.log import LOG
+from gsim3d.train.loop import Trainer
+from gsim3d.train.restore import describe
+
+FORMAT = 1
+WEIGHTS, DIFFERENCE, SQUARES = "weights", "difference", "squares"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run has come.
+
+    step: optimizer steps done.   next_trajectory: number of the first one that was not begun to be filmed.
+    seconds: of training, of all sittings.   n_skipped: steps that changed nothing.
+    sittings: what each of them did, as written by the tool.   files: name -> sha256.
+    """
+
+    step: int = 0
+    next_trajectory: int = 0
+    seconds: float = 0.0
+    n_skipped: int = 0
+    sittings: list[dict[str, Any]] = field(default_factory=list)
+    files: dict[str, str] = field(default_factory=dict)
+
+
+def load_progress(folder: str | Path, name: str) -> Progress:
+    """The progress of run ``name`` in ``folder``; that of a new one where there is none.
+
+    Raises:
+        InputError: it cannot be read, or a file is missing, cut off or changed.
+    """
+    file = Path(folder) / f"{name}.json"
+    if not file.is_file():
+        return Progress()
+    try:
+        content = json.loads(read_file(file, MAX_TEXT))
+        if content.pop("format") != FORMAT:
+            raise ValueError("another version of the format")
+        progress = Progress(**content)
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{file}: not the state of a run: {error}") from None
+    for part, digest in progress.files.items():
+        path = file.parent / Path(part).name
+        if not path.is_file() or _sha256(path) != digest:
+            raise InputError(f"{path}: missing, cut off or changed since it was written")
+    return progress
+
+
+def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progress) -> None:
+    """Weights, averages and moments of the run's last sitting into a new trainer; its log into the trainer's folder."""
+    folder = Path(folder)
+    trainer.out.mkdir(parents=True, exist_ok=True)
+    log = folder / f"{name}.{LOG}"
+    if log.is_file() and log.resolve() != (trainer.out / LOG).resolve():
+        shutil.copyfile(log, trainer.out / LOG)
+    if not progress.step:
+        return
+    averaged, difference, squares = (
+        {key: value.float() for key, value in _read(folder, progress, part).items()}
+        for part in (WEIGHTS, DIFFERENCE, SQUARES)
+    )
+    try:
+        trainer.simulator.load_state_dict({key: value + difference[key] for key, value in averaged.items()})
+        trainer.average = {key: value.to(trainer.device) for key, value in averaged.items()}
+        for key, value in squares.items():
+            parameter = trainer.parameters[key]
+            trainer.optimizer.state[parameter] = {
+                "step": torch.tensor(float(progress.step)),
+                "exp_avg": torch.zeros_like(parameter),
+                "exp_avg_sq": value.to(parameter),
+            }
+    except (RuntimeError, KeyError) as error:
+        raise InputError(
+            f"{folder}: the state of {name} is of another model: {str(error).splitlines()[-1].strip()}"
+        ) from None
+    trainer.step, trainer.seconds, trainer.n_skipped = progress.step, progress.seconds, progress.n_skipped
+    trainer.log.cut(trainer.step)
+
+
+def save_state(trainer: Trainer, folder: str | Path, name: str, progress: Progress) -> Progress:
+    """Writes the state; one that was there stays good until the new one is whole, and is removed then."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    start = f"{name}.{trainer.step:06d}"
+    averaged = {key: value.to(torch.bfloat16) for key, value in trainer.average.items()}
+    config = describe(trainer.config, trainer.simulator.config, trainer.scenes[0], trainer.plan_spec)
+    saved = checkpoint.Checkpoint(model=averaged, config=config, state={"step": trainer.step})
+    weights = folder / f"{start}.{WEIGHTS}.safetensors"
+    checkpoint.export(saved, weights)
+    states = {key: trainer.optimizer.state[parameter] for key, parameter in trainer.parameters.items()}
+    squares = {key: state["exp_avg_sq"] for key, state in states.items() if "exp_avg_sq" in state}
+    parts = {
+        DIFFERENCE: {key: value - averaged[key].float() for key, value in trainer.simulator.state_dict().items()},
+        SQUARES: squares,
+    }
+    files = {weights.name: _sha256(weights)}
+    for part, tensors in parts.items():
+        path = folder / f"{start}.{part}.safetensors"
+        _write(path, safetensors.torch.save({k: v.to("cpu", torch.bfloat16).contiguous() for k, v in tensors.items()}))
+        files[path.name] = _sha256(path)
+    if (log := trainer.out / LOG).is_file():
+        _write(folder / f"{name}.{LOG}", log.read_bytes())
+    done = dataclasses.replace(
+        progress, step=trainer.step, seconds=round(trainer.seconds, 1), n_skipped=trainer.n_skipped, files=files
+    )
+    _write(folder / f"{name}.json", json.dumps({"format": FORMAT, **dataclasses.asdict(done)}, indent=1).encode())
+    for old in folder.glob(f"{name}.*.safetensors"):
+        if old.name not in files:
+            old.unlink()
+    return done
+
+
+def weights_file(folder: str | Path, progress: Progress) -> Path:
+    """The checkpoint to predict with."""
+    return Path(folder) / _named(progress, WEIGHTS)
+
+
+def _named(progress: Progress, part: str) -> str:
+    return next(name for name in progress.files if name.endswith(f".{part}.safetensors"))
+
+
+def _read(folder: Path, progress: Progress, part: str) -> dict[str, Tensor]:
+    return safetensors.torch.load_file(folder / _named(progress, part))
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _write(path: Path, content: bytes) -> None:
+    part = path.with_name(f".{path.name}.part")
+    part.write_bytes(content)
+    os.replace(part, path)

@@ -1,0 +1,44 @@
+"""What is off, or on and idle, calls what a build without it calls; times are rows of tools/bench/effects.py."""
+
+import dataclasses
+
+import pytest
+
+from tests.effects.models import MODELS, Case
+from tests.test_simulator import CONFIG
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+IDLE = {
+    "actions": {"dynamics": {"actions": {"names": []}}},
+    "contact": {"dynamics": {"contact": {"pairs": []}}},
+    "insertion and removal": {"structure": {"insert": True, "remove": True}},
+    "images in the same pass": {"outputs": {"depth": True, "alpha": True}},
+}
+
+
+@pytest.mark.parametrize("what", IDLE)
+@pytest.mark.parametrize("model", MODELS)
+def test_on_but_idle_calls_nothing_more(what, model):
+    case = Case(MODELS[model])
+    (idle, modules), (off, other_modules) = case.run(IDLE[what]), case.run({})
+    assert idle.calls == off.calls and idle.bytes == off.bytes and modules == other_modules
+
+
+def test_sleep_that_finds_nobody_at_rest_looks_once_a_step():
+    case = Case(n_steps=6)
+    (idle, modules), (off, other_modules) = case.run({"dynamics": {"sleep": {"eps": 0.0}}}), case.run({})
+    assert modules == other_modules
+    for operation in ("gsim3d.sparse_conv.default", "gsim3d.patch_attn.default", "gsim3d.build_pyramid.default"):
+        assert idle.calls[operation] == off.calls[operation]
+    more = (idle.calls.total() - off.calls.total()) / case.n_steps
+    assert more < 60, f"{more} calls a step"
+
+
+def test_one_step_calls_what_a_model_without_merging_calls():
+    config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, history_bits=0))
+    case, other = Case(config, steps=(1,)), Case(config, steps=(1,))
+    for stage in other.simulator.dynamics.net.encoder:
+        stage.merge = None
+    (off, _), (without, _) = case.run({}), other.run({})
+    assert off.calls == without.calls and off.bytes == without.bytes

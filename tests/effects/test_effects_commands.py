@@ -1,0 +1,131 @@
+"""gsim3d plan, gsim3d effects infer, and edits and specs of gsim3d simulate."""
+
+import re
+
+import pytest
+
+from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec
+from gsim3d.infer_effects import propose, smaller
+from gsim3d.interop import read_ply
+from gsim3d.presets import paper_latent
+from tests.test_commands import call, work  # noqa: F401
+from tests.tiny_scenes import write_scene
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_plan_is_a_table_with_reasons_and_costs(capsys, work):  # noqa: F811
+    scene = work / "data" / "ball" / "0000"
+    code, out, _ = call(capsys, "plan", scene, work / "run")
+    assert code == 0 and re.search(r"ball/0000: \d+ moving and \d+ frozen particles a step, 1 image of 32x32", out)
+    assert re.search(r"^depth images +no +outputs.depth is off +an image of 1 channel$", out, re.MULTILINE)
+    assert re.search(r"^time merging +yes +2 steps of history", out, re.MULTILINE)
+    assert re.search(r"^parameters not needed: 0 of \d+", out, re.MULTILINE) and "the checkpoint's" in out
+    assert re.search(r"^dynamics +\d+\.\d +\d+\.\d +1\.00$", out, re.MULTILINE)
+
+
+def test_plan_reads_the_spec_that_the_data_ship(capsys, tmp_path):
+    scene = write_scene(tmp_path / "set" / "ball" / "0000")
+    EffectsSpec(DynamicsEffects("masked_out", 1), AppearanceEffects(0)).save(tmp_path / "set" / "effects.yaml")
+    code, out, _ = call(capsys, "plan", scene)
+    assert code == 0 and "preset tiny, untrained; effects: the scene's own" in out
+    assert "a history of one step has nothing to merge" in out and "background is masked_out" in out
+    share = float(re.search(r"^dynamics .* (\d\.\d\d)$", out, re.MULTILINE)[1])
+    assert share < 0.5
+    (scene / "effects.yaml").write_text("dynamics: {history: 9}")
+    code, out, err = call(capsys, "plan", scene)
+    assert code == 2 and "unsupported effect dynamics.history: this model goes up to 2; got 9" in err
+
+
+def test_infer_measures_every_effect_and_writes_the_smallest_spec(capsys, work, tmp_path):  # noqa: F811
+    scene, out_file = work / "data" / "ball" / "0000", tmp_path / "effects.yaml"
+    code, out, _ = call(capsys, "effects", "infer", scene, work / "run", "--tolerance", "100dB", "--out", out_file)
+    assert code == 0
+    for row in (
+        "time merging +1 step ",
+        "changing features +none ",
+        "changing features +dynamic ",
+        "frozen background +masked",
+    ):
+        assert re.search(rf"^{row}.* [+-]\d+\.\d{{3}} +[+-]\d+\.\d", out, re.MULTILINE), row
+    smallest = EffectsSpec(DynamicsEffects("masked_out", 1), AppearanceEffects(changing="none"))
+    assert EffectsSpec.load(out_file) == smallest, "everything may be lost"
+    code, _, err = call(capsys, "effects", "infer", scene, work / "run", "--out", out_file)
+    assert code == 2 and "effects.yaml exists already" in err
+    code, out, _ = call(capsys, "effects", "infer", scene, work / "run", "--tolerance", "0.1dB")
+    (scene / "effects.yaml").unlink()
+    assert code == 0
+    lost = float(re.search(r"^proposed: ([+-]\d+\.\d+) dB", out, re.MULTILINE)[1])
+    assert lost <= 0.1
+
+
+def test_infer_puts_back_what_is_worth_most_when_together_too_much_is_lost():
+    """A measure that loses 0.05 dB for each of three effects, and 0.5 dB for the fourth."""
+    model, base = paper_latent(2), EffectsSpec()
+
+    def trial(spec):
+        history, degree = spec.dynamics.history or 2, spec.appearance.view_dependent
+        lost = 0.05 * (history < 2) + 0.04 * (0 if degree is None else 3 - degree)
+        lost += 0.03 * (spec.appearance.changing != "all") + 0.5 * (spec.dynamics.background != "frozen")
+        return 30 - lost, 1.0
+
+    rows, spec, (psnr, _) = propose(base, smaller(base, model), trial, (30.0, 1.0), 0.1)
+    assert spec == EffectsSpec(DynamicsEffects(history=1), AppearanceEffects(changing="none"))
+    assert psnr == pytest.approx(30 - 0.08)
+    notes = {(effect, setting): (worth, note) for effect, setting, worth, _, note in rows}
+    assert notes["frozen background", "masked out"] == ("+0.500", "")
+    assert notes["time merging", "1 step"] == ("+0.050", "proposed")
+    assert notes["view-dependent colour", "degree 0"] == ("+0.120", "")
+    assert notes["view-dependent colour", "degree 1"] == ("+0.080", "too much with the others")
+    assert notes["changing features", "none"] == ("+0.030", "proposed")
+
+
+@pytest.mark.parametrize("text", ["loud", "-1", "nandB", "inf"])
+def test_infer_wants_a_tolerance(capsys, work, text):  # noqa: F811
+    arguments = ["infer", work / "data" / "ball" / "0000", work / "run", f"--tolerance={text}"]
+    code, _, err = call(capsys, "effects", *arguments)
+    assert code == 2 and f"--tolerance: must be a number of dB of at least 0, such as 0.1dB; got '{text}'" in err
+
+
+def test_simulate_applies_edits(capsys, work, tmp_path):  # noqa: F811
+    (tmp_path / "edits.yaml").write_text(f"""
+        - {{step: 1, op: remove, of: frozen}}
+        - {{step: 2, op: recolor, color: [1, 0, 0]}}
+        - {{step: 2, op: insert, scene: {work / "data" / "ball" / "0001"}, by: [0.2, 0, 0]}}
+        """)
+    scene, options = work / "data" / "ball" / "0000", ["--steps", "3", "--cameras", "3"]
+    code, _, err = call(capsys, "simulate", work / "run", scene, *options, "--out", tmp_path / "plain")
+    assert code == 0, err
+    options += ["--edit", tmp_path / "edits.yaml"]
+    code, _, err = call(capsys, "simulate", work / "run", scene, *options, "--out", tmp_path / "edited")
+    assert code == 0, err
+    plain, edited = (
+        [read_ply(tmp_path / folder / "gaussians" / f"step_{i:04d}.ply").means.shape[0] for i in range(5)]
+        for folder in ("plain", "edited")
+    )
+    assert edited[:3] == plain[:3] and edited[3] < plain[3] and edited[4] > edited[3]
+
+
+def test_simulate_computes_what_a_file_asks_for(capsys, work, tmp_path):  # noqa: F811
+    EffectsSpec(DynamicsEffects("masked_out")).save(tmp_path / "spec.yaml")
+    scene = work / "data" / "ball" / "0000"
+    options = ["--steps", "1", "--cameras", "3", "--effects", tmp_path / "spec.yaml", "--out", tmp_path / "out"]
+    code, _, err = call(capsys, "simulate", work / "run", scene, *options)
+    assert code == 0, err
+    given, predicted = (read_ply(tmp_path / "out" / "gaussians" / f"step_{i:04d}.ply").means.shape[0] for i in (1, 2))
+    assert predicted < given
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("- {step: 9, op: remove, of: frozen}", "edit at step 9, remove: the rollout has steps 0 to 1"),
+        ("- {step: 0, op: fly}", "edit 0 at step 0: op must be one of remove, move"),
+        ("- {step: 0, op: insert, scene: nowhere}", "nowhere"),
+    ],
+)
+def test_edits_that_cannot_be_made_end_with_one_line(capsys, work, tmp_path, text, message):  # noqa: F811
+    (tmp_path / "edits.yaml").write_text(text)
+    options = ["--steps", "2", "--edit", tmp_path / "edits.yaml", "--out", tmp_path / "out"]
+    code, _, err = call(capsys, "simulate", work / "run", work / "data" / "ball" / "0000", *options)
+    assert code == 2 and message in err and err.count("\n") == 1 and not (tmp_path / "out").exists()

@@ -1,0 +1,87 @@
+"""An effect that is off runs no kernel, makes no buffer and calls no module."""
+
+import dataclasses
+
+import pytest
+import torch
+
+import gsim3d.edits
+import gsim3d.simulator
+from gsim3d.effects import EffectsSpec
+from tests.effects.models import MODELS, Case
+from tests.test_simulator import CONFIG
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+ALL_IMAGES = {"depth": True, "alpha": True, "features": True}
+# effect -> model, its spec with the effect on and off, and how many calls of which operations that spares at least
+EFFECTS = {
+    "time merging": ("latent", {}, {"dynamics": {"history": 1}}, {"aten.mm.default": 2}),
+    "frozen background": ("latent", {}, {"dynamics": {"background": "masked_out"}}, {}),
+    "background made once": (
+        "asymmetric", {}, {"dynamics": {"background": "masked_out"}}, {"gsim3d.sparse_conv.default": 5},
+    ),
+    "sleep": ("latent", {"dynamics": {"sleep": {}}}, {}, {}),
+    "view-dependent colour": ("latent", {}, {"appearance": {"view_dependent": 0}}, {"aten.bmm.default": 3}),
+    "changing features": ("latent", {}, {"appearance": {"changing": "none"}}, {"aten.tanh.default": 2}),
+    "changing opacities": ("explicit", {}, {"appearance": {"opacity_changes": False}}, {"aten.clamp.default": 2}),
+    "feature images": ("latent", {"outputs": {"features": True}}, {}, {"aten.cat.default": 1}),
+    "colour images": ("latent", {"outputs": ALL_IMAGES}, {"outputs": {"rgb": False, **ALL_IMAGES}}, {"aten.bmm.default": 3}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_what_is_off_calls_less_and_makes_less(name):
+    model, on, off, spared = EFFECTS[name]
+    case = Case(MODELS[model])
+    plans = [case.simulator.plan(EffectsSpec.from_dict(values)) for values in (on, off)]
+    assert name in plans[0].kept and name in plans[1].skipped
+    (with_it, modules), (without, other_modules) = case.run(on), case.run(off)
+    assert other_modules <= modules and without.bytes < with_it.bytes
+    for operation, count in spared.items():
+        assert with_it.calls[operation] - without.calls[operation] >= count, operation
+
+
+def test_a_model_of_one_step_enters_no_merge():
+    config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, history_bits=0))
+    case = Case(config, steps=(1,))
+    _, modules = case.run({})
+    merges = {
+        name for name, _ in case.simulator.named_modules() if name.startswith("dynamics") and name.endswith("merge")
+    }
+    assert len(merges) == 2 and not merges & modules and "dynamics.net.encoder.1.pool" in modules
+    assert set(case.simulator.plan().unused) == {f"{name}.time_embedding" for name in merges}
+
+
+def test_what_is_masked_out_has_no_row_in_the_network():
+    case = Case()
+    seen = []
+    case.simulator.dynamics.net.register_forward_pre_hook(lambda _, args: seen.append(args[0].shape[0]))
+    case(EffectsSpec())
+    case(EffectsSpec.from_dict({"dynamics": {"background": "masked_out"}}))
+    moving = int((case.state.activity == 0).sum())
+    assert seen[0] == case.state.n_rows and seen[2] == moving < seen[0]
+
+
+def test_nobody_keeps_a_log_of_rest_without_sleep_or_background(monkeypatch):
+    def refuse(*_, **__):
+        raise AssertionError("called although it is off")
+
+    for name in ("rollout_in_parts", "Sleepers"):
+        monkeypatch.setattr(gsim3d.simulator, name, refuse)
+    monkeypatch.setattr(gsim3d.edits.Edit, "apply", refuse)
+    case = Case()
+    monkeypatch.setattr(case.simulator, "_colors", refuse)
+    steps, image = case(EffectsSpec())
+    assert len(steps) == 2 and image.alpha is None and image.depth is None and image.features is None
+    assert steps[0].turns is None and steps[0].paint is None
+    with pytest.raises(AssertionError, match="although it is off"):
+        case(EffectsSpec.from_dict({"dynamics": {"sleep": {}}}))
+
+
+def test_columns_of_what_is_held_are_not_computed():
+    case = Case()
+    layout, head = case.simulator.dynamics.layout, case.simulator.dynamics.net.head
+    held = layout.changes("none")
+    assert layout.columns(held) == [(4, 7)] and layout.columns(layout.changes()) is None
+    assert head(torch.rand(20, 8), layout.columns(held)).shape == (20, 3)

@@ -1,0 +1,81 @@
+"""Names of simulators stand for checkpoints; what is shipped is whole, small and described."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from gsim3d import pretrained
+from gsim3d.__main__ import main
+from gsim3d.errors import InputError
+from gsim3d.train import checkpoint
+from gsim3d.train.restore import restore
+
+PARTS = {"model.safetensors", "config.yaml", "training.jsonl", "recipe.json", "scores.json", "README.md"}
+MOST_BYTES = 25_000_000  # of all weights together
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
+    return tmp_path
+
+
+def test_a_name_is_the_simulator_and_a_path_the_file(folder, monkeypatch):
+    (folder / "ball-tiny").mkdir()
+    assert pretrained.names() == []
+    (folder / "ball-tiny" / pretrained.WEIGHTS).write_bytes(b"")
+    assert pretrained.names() == ["ball-tiny"]
+    assert pretrained.located("ball-tiny") == folder / "ball-tiny" / pretrained.WEIGHTS
+    monkeypatch.chdir(folder)
+    assert pretrained.located("ball-tiny") == pretrained.Path("ball-tiny")  # there is a folder of this name here
+    assert pretrained.located(folder) == folder
+
+
+@pytest.mark.parametrize("name", ["ball-tiny", "ball-tiny/model.safetensors", "../ball-tiny", ""])
+def test_an_unknown_name_lists_the_known_ones(folder, name):
+    (folder / "cube-tiny").mkdir()
+    (folder / "cube-tiny" / pretrained.WEIGHTS).write_bytes(b"")
+    if name:
+        with pytest.raises(InputError, match="no such checkpoint.*: cube-tiny"):
+            checkpoint.load(name)
+    else:
+        with pytest.raises(InputError, match="not a checkpoint"):
+            checkpoint.load(name)  # the current folder
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["simulate", "ball-small", "x", "--out", "y"],
+        ["evaluate", "ball-small", "x"],
+        ["doctor", "--stability", "ball-small"],
+    ],
+)
+def test_commands_name_what_they_do_not_know(command, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(command) == 2
+    assert "ball-small: no such" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", pretrained.names())
+def test_what_is_shipped_is_whole_and_described(name):
+    folder = pretrained.FOLDER / name
+    assert {path.name for path in folder.iterdir()} == PARTS
+    weights = load_file(folder / pretrained.WEIGHTS)
+    assert all(value.dtype == torch.bfloat16 for value in weights.values())
+    assert all(bool(value.isfinite().all()) for value in weights.values())
+    restored = restore(name)
+    assert restored.image_size == (128, 128)
+    recipe, scores = (json.loads((folder / f"{part}.json").read_text()) for part in ("recipe", "scores"))
+    steps = [json.loads(line)["step"] for line in (folder / "training.jsonl").read_text().splitlines()]
+    assert steps == sorted(steps) and steps[-1] < recipe["steps"]
+    card = (folder / "README.md").read_text()
+    assert f"{recipe['steps']:,}" in card and f"{scores['held_out']['future.psnr_masked']:.2f}" in card
+    assert "What is wrong" in card
+
+
+def test_all_that_is_shipped_is_small():
+    sizes = [(pretrained.FOLDER / name / pretrained.WEIGHTS).stat().st_size for name in pretrained.names()]
+    assert sum(sizes) <= MOST_BYTES

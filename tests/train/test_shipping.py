@@ -1,0 +1,105 @@
+"""From the state of a run to a simulator in the package: scores, card, page."""
+
+import importlib.util
+import json
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gsim3d import pretrained
+from gsim3d.errors import InputError
+from gsim3d.generate.film import film
+from gsim3d.generate.worlds import build_world
+from gsim3d.train import shipped
+from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.films import FilmStore
+from gsim3d.train.restore import restore
+from gsim3d.train.shipped import Recipe, SittingTrainer
+from gsim3d.train.sittings import Progress, save_state, weights_file
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+ROOT = Path(__file__).parent.parent.parent
+NAME = "elastic-small"
+OPTIONS = {"image_size": 32, "n_frames": 6, "objects": ("ball",)}
+CONFIG = TrainConfig(
+    stages=(StageConfig(steps=9, horizon=1, target_views=2),),
+    data=DataConfig(history=2, context_views=2, target_only_cameras=(2, 7), background_stride=2),
+    log_every=1,
+)
+
+
+def tool(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def scored(tmp_path_factory, one_thread):
+    """A state after two steps, and its scores."""
+    import numpy as np
+
+    out = tmp_path_factory.mktemp("shipping")
+    world = build_world("elastic", "paper", OPTIONS)
+    store = FilmStore(world, 1, "cpu")
+    store.put(np.load(film(world, ("ball", 0), str(out / "film.npy"))))
+    trainer = SittingTrainer(CONFIG, store, out / "run", "cpu")
+    trainer.begin_sitting(time.monotonic() + 60)
+    with trainer.log.opened(tensorboard=False):
+        for _ in range(2):
+            trainer.log.write(trainer.train_step(), {})
+    sitting = {"device": "cpu", "trajectories": 1, "steps": [0, 2]}
+    progress = save_state(trainer, out / "state", NAME, Progress(next_trajectory=1, sittings=[sitting]))
+    score = tool("score_shipped").score
+    given = {"device": "cpu", "counts": (2, 1), "changes": {**OPTIONS, "objects": ("ball",)}}
+    score(weights_file(out / "state", progress), NAME, out / "films", out / "scores", **given)
+    return out
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "pretrained")
+    pretrained.FOLDER.mkdir()
+    module = tool("ship_model")
+    monkeypatch.setattr(module, "PAGE", tmp_path / "trained.md")
+    monkeypatch.setattr(module, "RECIPES", {"elastic": Recipe("elastic", CONFIG, OPTIONS)})
+    return module
+
+
+def test_all_sets_are_scored_over_the_full_horizon(scored):
+    scores = json.loads((scored / "scores" / f"{NAME}.scores.json").read_text())
+    counts = {name: s["n_scenes"] for name, s in scores.items() if isinstance(s, dict)}
+    assert counts == {"held_out": 2, "unseen": 1, "several": 1, "no-ground": 1, "raised": 1}
+    assert scores["held_out"]["n_future_steps"] == 4 and "constant" in scores["raised"]["methods"]
+    assert (scored / "scores" / f"{NAME}.frames.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_state_becomes_a_simulator_with_card_and_page(scored, package, tmp_path):
+    (tmp_path / "wrong.md").write_text("It floats.\n")
+    paths = ["--state", str(scored / "state"), "--scores", str(scored / "scores")]
+    with pytest.raises(InputError, match="--wrong is needed"):
+        package.main([NAME, *paths])
+    package.main([NAME, *paths, "--wrong", str(tmp_path / "wrong.md")])
+    folder = pretrained.FOLDER / NAME
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"model.safetensors", "config.yaml", "training.jsonl", "recipe.json", "scores.json", "README.md"}
+    assert restore(NAME).checkpoint.state["step"] == 2
+    text, page = (folder / "README.md").read_text(), (tmp_path / "trained.md").read_text()
+    scores = json.loads((folder / "scores.json").read_text())
+    assert text.endswith("## What is wrong with it\n\nIt floats.\n") and "--seed" in text
+    assert f"{scores['unseen']['future.psnr_masked']:.2f}" in text and "It floats." in page
+    assert (tmp_path / f"trained-{NAME}.png").is_file() and "Truth above prediction" in page
+    package.main([NAME, *paths])  # keeps what was said to be wrong
+    assert (folder / "README.md").read_text() == text
+
+
+def test_scores_of_other_weights_are_refused(scored, package, tmp_path):
+    content = json.loads((scored / "scores" / f"{NAME}.scores.json").read_text())
+    (tmp_path / f"{NAME}.scores.json").write_text(json.dumps({**content, "checkpoint": "0"}))
+    with pytest.raises(InputError, match="of other weights"):
+        package.ship(NAME, scored / "state", tmp_path, "")
+    assert shipped.HELD_OUT_SEED != shipped.SEED and pretrained.names() == []

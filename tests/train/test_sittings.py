@@ -1,0 +1,196 @@
+"""Sittings: films arrive while a run goes on, its state travels, and a second sitting goes on with it."""
+
+import dataclasses
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from gsim3d.data import Scene, find_scenes
+from gsim3d.errors import InputError
+from gsim3d.generate import generate
+from gsim3d.generate.film import film
+from gsim3d.generate.worlds import build_world
+from gsim3d.train import shipped
+from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.films import Filming, FilmStore
+from gsim3d.train.restore import restore
+from gsim3d.train.samples import draw_batch
+from gsim3d.train.shipped import RECIPES, SittingTrainer, train
+from gsim3d.train.sittings import Progress, load_into, load_progress, save_state, weights_file
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+NAME = "ball-tiny"
+OPTIONS = {"image_size": 32, "n_frames": 6, "objects": ("ball",), "n_trajectories": 2}
+CONFIG = TrainConfig(
+    stages=(StageConfig(steps=2, history=1, batch=2, target_views=2), StageConfig(steps=98, horizon=2, target_views=2)),
+    data=DataConfig(history=2, context_views=2, target_only_cameras=(2, 7), background_stride=2),
+    log_every=1,
+)
+
+
+@pytest.fixture(scope="module")
+def world():
+    return build_world("elastic", "mini", OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def films(world, tmp_path_factory):
+    out = tmp_path_factory.mktemp("films")
+    return [np.load(film(world, scene, str(out / f"{scene[1]}.npy"))) for scene in world.scenes()]
+
+
+@pytest.fixture
+def store(world, films):
+    store = FilmStore(world, 2, "cpu")
+    for images in films:
+        store.put(images)
+    return store
+
+
+def test_a_store_gives_what_scene_folders_give(store, tmp_path):
+    folders = generate(tmp_path, preset="mini", processes=1, progress=False, **OPTIONS).folders
+    scenes = [Scene.open(folder) for folder in folders]
+    for step, stage in enumerate((CONFIG.stages[0], dataclasses.replace(CONFIG.stages[1], batch=3))):
+        given = store.draw(CONFIG.data, stage, 5, step, range(3))
+        wanted = draw_batch(scenes, CONFIG.data, stage, 5, step, range(3))
+        assert (given.n_context, given.n_future) == (wanted.n_context, wanted.n_future)
+        for part in ("context", "targets"):
+            a, b = getattr(given, part), getattr(wanted, part)
+            for name in ("images", "cloud_scene", "cloud_step", "origin", "masks", "dynamic"):
+                assert torch.equal(getattr(a, name), getattr(b, name)), (part, name)
+            for name in ("viewmats", "Ks", "near", "far", "image_cloud"):
+                assert torch.equal(getattr(a.cameras, name), getattr(b.cameras, name)), (part, name)
+
+
+def test_the_newest_replace_the_oldest(store, films):
+    store.put(films[0] // 2)
+    assert store.count == 3
+    assert torch.equal(store._films[0], torch.from_numpy(films[0] // 2))
+    assert torch.equal(store._films[1], torch.from_numpy(films[1]))
+
+
+def test_trajectories_are_filmed_once_each_while_others_work(world, films, tmp_path):
+    store = FilmStore(world, 4, "cpu")
+    with Filming(world, store, 1, 1, tmp_path) as filming:
+        assert filming.wait_for(2, seconds=60)
+        assert filming.next >= 3
+    assert torch.equal(store._films[0], torch.from_numpy(films[1]))  # it began with number 1
+    assert not torch.equal(store._films[0], store._films[1])
+    assert not list(tmp_path.iterdir()) and threading.active_count() < 50
+
+
+def test_what_a_process_raises_is_told(world, tmp_path):
+    store = FilmStore(dataclasses.replace(world, n_frames=5), 4, "cpu")  # its films are shorter than those that come
+    with Filming(world, store, 0, 1, tmp_path) as filming:
+        with pytest.raises(RuntimeError, match="size"):
+            filming.wait_for(1, seconds=60)
+
+
+class NoFilming:
+    count, next = 2, 7
+
+    def check(self):
+        pass
+
+
+@pytest.fixture
+def sat(store, tmp_path):
+    """A first sitting of three steps."""
+    trainer = SittingTrainer(CONFIG, store, tmp_path / "run", "cpu")
+    trainer.begin_sitting(time.monotonic() + 60)
+    with trainer.log.opened(tensorboard=False):
+        for _ in range(3):
+            trainer.log.write(trainer.train_step(), {})
+    done = save_state(trainer, tmp_path / "state", NAME, Progress(next_trajectory=7, sittings=[{"device": "cpu"}]))
+    return trainer, tmp_path / "state", done
+
+
+def test_the_next_sitting_goes_on(sat, store, tmp_path):
+    trainer, state, done = sat
+    progress = load_progress(state, NAME)
+    assert progress == done and (progress.step, progress.next_trajectory) == (3, 7)
+    other = SittingTrainer(CONFIG, store, tmp_path / "again", "cpu")
+    load_into(other, state, NAME, progress)
+    assert other.step == 3 and (tmp_path / "again" / "metrics.jsonl").read_text().count("\n") == 3
+    for name, value in trainer.simulator.state_dict().items():
+        scale = value.abs().max().clamp(min=1e-6)
+        assert (other.simulator.state_dict()[name] - value).abs().max() <= 2**-7 * scale, name
+        assert (other.average[name] - trainer.average[name]).abs().max() <= 2**-8 * scale, name
+    for name, parameter in trainer.parameters.items():
+        before, now = trainer.optimizer.state[parameter], other.optimizer.state[other.parameters[name]]
+        assert before.keys() == now.keys()
+        if before:
+            torch.testing.assert_close(now["exp_avg_sq"], before["exp_avg_sq"], rtol=2**-8, atol=1e-37)
+            assert not now["exp_avg"].any()
+    other.begin_sitting(time.monotonic() + 60)
+    assert np.isfinite(other.train_step()["loss"])
+
+
+def test_the_weights_are_a_checkpoint(sat, store):
+    trainer, state, done = sat
+    restored = restore(weights_file(state, done))
+    assert restored.image_size == (32, 32) and restored.data == CONFIG.data
+    weights = restored.simulator.state_dict()
+    assert all(torch.equal(weights[k], v.bfloat16().float()) for k, v in trainer.average.items())
+
+
+def test_a_state_replaces_the_one_before(sat):
+    trainer, state, done = sat
+    trainer.train_step()
+    save_state(trainer, state, NAME, done)
+    assert load_progress(state, NAME).step == 4 and len(list(state.glob("*.safetensors"))) == 3
+
+
+def test_a_run_without_state_begins(tmp_path):
+    assert load_progress(tmp_path, NAME) == Progress()
+
+
+@pytest.mark.parametrize("damage", ["cut", "missing", "other format", "no json"])
+def test_a_damaged_state_is_named(sat, damage):
+    _, state, done = sat
+    file = weights_file(state, done)
+    if damage == "cut":
+        file.write_bytes(file.read_bytes()[:-1])
+    elif damage == "missing":
+        file.unlink()
+    else:
+        file = state / f"{NAME}.json"
+        text = file.read_text()
+        file.write_text("{" if damage == "no json" else text.replace('"format": 1', '"format": 0'))
+    with pytest.raises(InputError, match=file.name):
+        load_progress(state, NAME)
+
+
+def test_a_state_of_another_model_is_refused(sat, store, tmp_path):
+    _, state, done = sat
+    config = dataclasses.replace(CONFIG, model={"dynamics": {"mlp_ratio": 4}})
+    with pytest.raises(InputError, match="another model"):
+        load_into(SittingTrainer(config, store, tmp_path / "other", "cpu"), state, NAME, done)
+
+
+def test_a_sitting_ends_on_time_with_a_falling_rate_and_a_saved_state(store, tmp_path, monkeypatch):
+    monkeypatch.setattr(shipped, "WARM_UP", 1)
+    trainer, said = SittingTrainer(CONFIG, store, tmp_path / "run", "cpu"), []
+    end = time.monotonic() + 3
+    given = {"end": end, "out": tmp_path / "state", "name": NAME, "say": said.append}
+    train(trainer, NoFilming(), Progress(sittings=[{"steps": [0, 0]}]), {"device": "cpu"}, **given)
+    progress = load_progress(tmp_path / "state", NAME)
+    assert time.monotonic() - end < 30 and progress.step == trainer.step == len(said) > 1
+    assert progress.next_trajectory == 7 and progress.sittings[1]["steps"] == [0, trainer.step]
+    log = (tmp_path / "state" / f"{NAME}.metrics.jsonl").read_text().splitlines()
+    rates = [json.loads(entry)["learning_rate"] for entry in log]
+    assert rates[0] == pytest.approx(CONFIG.stages[0].learning_rate) and rates[-1] < rates[0]
+
+
+def test_recipes_are_sound():
+    for world, recipe in RECIPES.items():
+        settings = build_world(recipe.world, "paper", {"seed": shipped.SEED, **recipe.options})
+        data, stages = recipe.train.data, recipe.train.stages
+        assert recipe.world == world and recipe.first_films == 64 <= recipe.capacity
+        assert settings.n_frames >= data.history + max(stage.horizon for stage in stages)
+        assert stages[-1].horizon == 12 and shipped.SEED != shipped.HELD_OUT_SEED

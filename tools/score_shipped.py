@@ -1,0 +1,118 @@
+#!/usr/bin/env python
+"""Scores a simulator that comes with gsim3d, or is about to: held-out trajectories over the full horizon, and held-out sets.
+
+    python tools/score_shipped.py elastic-small --data runs/held_out --out runs/scores --device cuda
+
+Trajectories are made in DATA where they are not there: of the kind it was trained on (another seed), with unseen shapes,
+with several bodies, without ground, and on raised ground. Written to OUT: NAME.scores.json, and NAME.frames.png, a
+trajectory of each set, truth above prediction. LPIPS and FVD are measured where their weights are installed.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+from gsim3d.errors import InputError  # noqa: E402
+
+KIND = "held_out"  # of what it was trained on
+SETS = ("unseen", "several", "no-ground", "raised")
+SHOWN = 7  # frames of a trajectory in the picture
+
+
+def score(
+    checkpoint: str | Path,
+    name: str,
+    data: Path,
+    out: Path,
+    *,
+    device: str,
+    counts: tuple[int, int],
+    changes: Mapping = MappingProxyType({}),
+) -> dict:
+    """Writes and returns the scores of ``name``.
+
+    Args:
+        counts: trajectories of its own kind, and of each other set.
+        changes: of the options of the preset.
+    """
+    import cv2
+    import numpy as np
+
+    from gsim3d.evaluate.report import summarize, write_json
+    from gsim3d.evaluate.scoring import measurable
+    from gsim3d.generate import generate
+    from gsim3d.generate.worlds import HELD_OUT
+    from gsim3d.train.restore import restore
+    from gsim3d.train.shipped import HELD_OUT_SEED
+
+    restored = restore(checkpoint, device)
+    world = name.split("-")[0]
+    metrics, missing = measurable()
+    sets, rows = {}, []
+    for subset in (KIND, *(subset for subset in SETS if world in HELD_OUT[subset])):
+        begin = time.monotonic()
+        count = counts[0] if subset == KIND else counts[1]
+        options = {**changes, **({} if subset == KIND else {"subset": subset})}
+        made = generate(
+            data / world / subset, world, preset="paper", n_trajectories=count, seed=HELD_OUT_SEED, **options
+        )
+        filmed, scores = time.monotonic(), []
+        for folder in made.folders:
+            found, row = score_one(restored, folder, metrics, with_frames=not scores)
+            scores.append(found)
+            rows += row
+        sets[subset] = {"seconds": round(time.monotonic() - filmed, 1), **summarize(scores, missing)}
+        print(
+            f"{subset}: {count} trajectories, filmed in {filmed - begin:.0f} s, scored in {sets[subset]['seconds']:.0f} s: "
+            f"masked {sets[subset]['future.psnr_masked']:.2f}, constant {sets[subset]['constant.future.psnr_masked']:.2f} dB",
+            flush=True,
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    scores = {"name": name, "checkpoint": restored.checkpoint.digest, "step": restored.checkpoint.state["step"], **sets}
+    write_json(out / f"{name}.scores.json", scores)
+    cv2.imwrite(str(out / f"{name}.frames.png"), np.concatenate(rows)[..., ::-1])
+    return scores
+
+
+def score_one(restored, folder: Path, metrics: tuple[str, ...], *, with_frames: bool) -> tuple:
+    """Scores of one trajectory; and, if asked, frames [2 H, SHOWN W, 3] of it, truth above prediction."""
+    import numpy as np
+
+    from gsim3d.evaluate.pictures import as_bytes, true_images
+    from gsim3d.evaluate.protocol import default_views, predict, render_steps, score_scene
+
+    scene = restored.open_scene(folder)
+    scores = score_scene(restored, scene, metrics=metrics)
+    if not with_frames:
+        return scores, []
+    context, target = default_views(restored, scene)
+    prediction = predict(restored, scene, context, scene.n_steps - restored.data.history)
+    steps = np.linspace(prediction.n_encoded, scene.n_steps - 1, SHOWN).round().astype(int).tolist()
+    truth = true_images(scene, target[:1], steps)[:, 0]
+    rendered = as_bytes(render_steps(restored, prediction.particles, scene, target[:1]))[steps, 0]
+    return scores, [np.concatenate(list(images), 1) for images in (truth, rendered)]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("name", help="world and size, such as elastic-small")
+    parser.add_argument("--checkpoint", help="where its weights are (default: those that come with gsim3d)")
+    parser.add_argument("--data", type=Path, required=True, help="folder of the trajectories; made if absent")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--trajectories", type=int, nargs=2, default=(14, 7), metavar=("OWN", "OTHERS"))
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    args = parser.parse_args(arguments)
+    counts = tuple(args.trajectories)
+    score(args.checkpoint or args.name, args.name, args.data, args.out, device=args.device, counts=counts)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        sys.exit(f"score_shipped: error: {error}")
