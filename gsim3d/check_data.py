@@ -22,16 +22,19 @@ bounds of the scene: given, or what most cameras see; the yellow line is the out
   it is so in one camera only       that camera's pose is wrong, or two cameras are exchanged
 
 examples:
-  gsim3d check-data runs/data
+  gsim3d check-data runs/data --out check-data.png
   gsim3d check-data my_recording --out my_recording.png
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Reads recorded scenes, lists every problem, and draws a contact sheet of frames and cameras."
+    parser.description = (
+        "Reads recorded scenes, lists every problem, and draws a picture of frames and cameras on request."
+    )
     parser.epilog = EPILOG
     parser.add_argument("data", metavar="DIR", help="folder with scenes of any layout, or one scene folder")
-    parser.add_argument("--out", metavar="FILE", default="check-data.png", help="contact sheet (default: %(default)s)")
+    parser.add_argument("--out", metavar="FILE.png", help="picture to draw (default: none)")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar, only problems and the last line")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,19 +49,20 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.data.check import check_scene, contact_sheet, describe
     from gsim3d.errors import InputError
 
-    out = Path(args.out)
-    if out.suffix != ".png" or not out.absolute().parent.is_dir():
+    out = None if args.out is None else Path(args.out)
+    if out is not None and (out.suffix != ".png" or not out.absolute().parent.is_dir()):
         raise InputError(f"--out must name a .png file in a folder that exists; got {out}")
     folders = find_scenes(args.data)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        made = tqdm(pool.map(check_scene, folders), "scenes", len(folders), unit="scene", disable=len(folders) == 1)
-        checks = list(made)
+        hidden = args.quiet or len(folders) == 1
+        checks = list(tqdm(pool.map(check_scene, folders), "scenes", len(folders), unit="scene", disable=hidden))
     for check in checks:
-        print(describe(check.scene) if check.scene else f"{check.path}: cannot be opened")
+        if check.problems or not args.quiet:
+            print(describe(check.scene) if check.scene else f"{check.path}: cannot be opened")
         for problem in check.problems:
             print(f"  problem: {problem}")
     scenes = [check.scene for check in checks if check.scene]
-    if scenes:
+    if scenes and out is not None:
         part = out.with_name(f".{out.stem}.part.png")
         cv2.imwrite(str(part), contact_sheet(scenes))
         os.replace(part, out)
@@ -66,5 +70,6 @@ def run(args: argparse.Namespace) -> int:
     n_bad = sum(bool(check.problems) for check in checks)
     read = f"{len(checks)} scene{'s' if len(checks) > 1 else ''} read"
     found = f"{n_problems} problem{'s' if n_problems > 1 else ''} in {n_bad}" if n_problems else "no problem"
-    print(f"{read}, {found}; " + (f"look at {out}" if scenes else "no scene could be drawn"))
+    drawn = "--out draws a picture of the cameras" if out is None else f"look at {out}"
+    print(f"{read}, {found}; {drawn if scenes else 'no scene could be drawn'}")
     return 1 if n_problems else 0

@@ -70,7 +70,7 @@ class DemoConfig:
 
 
 SHIPPED = DemoConfig(
-    preset="paper", data={"n_trajectories": 2, "n_frames": 44, "objects": ("star", "torus")}, simulator="elastic-small"
+    preset="paper", data={"n_trajectories": 2, "objects": ("star", "torus")}, simulator="elastic-small"
 )
 
 

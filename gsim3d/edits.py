@@ -292,7 +292,7 @@ def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Partic
     step, op = values.pop("step", None), values.pop("op", None)
     if isinstance(step, bool) or not isinstance(step, int):
         raise InputError(f"{where}: step must be a whole number; got {step!r}")
-    if op not in OPERATIONS:
+    if not isinstance(op, str) or op not in OPERATIONS:
         raise InputError(f"{where} at step {step}: op must be one of {', '.join(OPERATIONS)}; got {op!r}")
     where = f"{where} at step {step}, {op}"
     if isinstance(values.get("of"), str):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
+import sys
 import types
 import typing
 from pathlib import Path
@@ -80,7 +80,7 @@ def _value(hint: Any, value: Any, subject: str, where: str) -> Any:
         if not isinstance(value, (list, tuple)) or n not in (None, len(value)):
             raise InputError(f"{subject}: {where} must be a list{'' if n is None else f' of {n}'}; got {value!r}")
         return tuple(_value(item, v, subject, where) for item, v in zip(items if n else items[:1] * len(value), value))
-    number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
     fits = {bool: isinstance(value, bool), str: isinstance(value, str), float: number}
     if not fits.get(hint, True):
         wanted = {bool: "true or false", str: "a text", float: "a number"}[hint]

@@ -28,7 +28,7 @@ from gsim3d.ops.raster import Rendering
 from gsim3d.plans import Plan
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
-from gsim3d.stability import StabilityReport
+from gsim3d.stability import StabilityReport, pack
 from gsim3d.types import Cameras, CloudTable, Particles, keeping_constants
 
 FACTOR = 1.25  # room over what was observed
@@ -100,8 +100,8 @@ class CapturedRollout:
     rounded once, into a copy: call :meth:`reload` after the model has changed. Without it the graph reads the model's own.
 
     With a model of ``background="asymmetric"`` the graph advances what moves, as many rows in every call. The background
-    is computed beside the graph, whenever it has changed; where it needs more room the graph is made anew. A graph knows
-    no sleep: it advances the same rows always.
+    is computed beside the graph whenever it has changed (call :meth:`reload` after the model has); where it needs more
+    room the graph is made anew. A graph knows no sleep: it advances the same rows always.
 
     On the CPU there are no graphs: calls run the same steps one by one, with the same sizes and the same results.
 
@@ -162,7 +162,7 @@ class CapturedRollout:
             rooms = {name: rounded(room, self._dtype) for name, room in _rooms(simulator).items()}
             self._model.__dict__["_modules"] = {**simulator._modules, **rooms}
         self.captures = 0
-        self._launched = False
+        self._launched = self._is_stale = False
         if simulator.config.dynamics.is_asymmetric:
             parts = simulator.parts(prepared, report=self._report)
             if parts.nothing_moves:
@@ -186,8 +186,11 @@ class CapturedRollout:
 
     def launch(self, state: Particles, cameras: Cameras | None = None) -> None:
         """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background, and to tell
-        an asymmetric one from what moves)."""
-        self._report.poll()
+        an asymmetric one from what moves).
+
+        Raises:
+            HardCaseError: of an earlier call, under the policy "raise".
+        """
         state = self._simulator.prepare(state, self._plan)
         self._check(state, self._table)
         tables = state.clouds
@@ -199,20 +202,25 @@ class CapturedRollout:
         self._tables = tables
         self._launched = True
         self._replay()
+        self._report.poll()  # here the host reads while the device works
 
     def finish(self) -> Predicted:
         """Waits for what was launched; repeats it with more room where it did not fit."""
         if not self._launched:
             raise InputError("CapturedRollout: finish() must follow launch()")
         self._launched = False
-        while not self._fits():
-            self._make_room([a.grown((0, *b.sizes)) for a, b in zip(self._grown(), self._observed(), strict=True)])
+        found, counted = self._arrive()
+        while not all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)]):
+            needed = zip(self._grown(found), self._observed(), strict=True)
+            self._make_room([a.grown((0, *b.sizes)) for a, b in needed])
             self._replay()
-        self._records.replayed(self._report)
+            found, counted = self._arrive()
+        self._records.replayed(self._report, counted)
         return self._results()
 
     def reload(self) -> None:
-        """Reads the weights of the simulator again."""
+        """Reads the weights of the simulator again, and makes the background anew in the next call."""
+        self._is_stale = True
         if self._model is not self._simulator:
             with torch.no_grad():
                 for own, given in zip(_rooms(self._model).values(), _rooms(self._simulator).values(), strict=True):
@@ -272,34 +280,39 @@ class CapturedRollout:
         self.captures += 1
         if self._device.type != "cuda":
             return
-        self._graph = self._predicted = self._found = None  # their memory goes back before the next graph takes its own
+        # their memory goes back before the next graph takes its own
+        self._graph = self._predicted = self._found = self._packed = None
         self._graph = Captured(self._capture, self._device)
-        self._predicted, self._found = self._graph.result
-        self._found_on_host = torch.empty(self._found.shape, dtype=self._found.dtype, pin_memory=True)
+        self._predicted, self._found, self._packed = self._graph.result
+        self._on_host = torch.empty(self._packed.shape, dtype=self._packed.dtype, pin_memory=True)
         self._arrived = torch.cuda.Event()
 
-    def _capture(self) -> tuple[Predicted, Tensor]:
-        return self._given(self._records if torch.cuda.is_current_stream_capturing() else StabilityReport())
+    def _capture(self) -> tuple[Predicted, Tensor, Tensor]:
+        report = self._records if torch.cuda.is_current_stream_capturing() else StabilityReport()
+        predicted, found = self._given(report)
+        return predicted, found, pack([found, *report.captured()])
 
     def _replay(self) -> None:
         if self._device.type != "cuda":
             self._records = StabilityReport()
-            self._predicted, self._found_on_host = self._given(self._records)
+            self._predicted, self._found = self._given(self._records)
             return
         with torch.cuda.device(self._device):
             self._graph()
-            self._found_on_host.copy_(self._found, non_blocking=True)
+            self._on_host.copy_(self._packed, non_blocking=True)
             self._arrived.record()
 
-    def _fits(self) -> bool:
-        if self._device.type == "cuda":
-            self._arrived.synchronize()
-        found = self._found_on_host.tolist()
-        return all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)])
+    def _arrive(self) -> tuple[list[list[int]], Tensor | None]:
+        """Waits for the replay: what the geometry of every call found, and what the guards of a graph counted."""
+        if self._device.type != "cuda":
+            return self._found.tolist(), None
+        self._arrived.synchronize()
+        numbers, n_found = self._on_host.clone(), self._found.numel()
+        return numbers[:n_found].view(self._found.shape).tolist(), numbers[n_found:]
 
-    def _grown(self) -> list[PyramidCapacity]:
-        found = self._found_on_host.tolist()
-        return [capacity.grown(numbers, self._factor) for capacity, numbers in zip(self._capacities, found, strict=True)]
+    def _grown(self, found: list[list[int]]) -> list[PyramidCapacity]:
+        calls = zip(self._capacities, found, strict=True)
+        return [capacity.grown(numbers, self._factor) for capacity, numbers in calls]
 
     # ---- what goes in and comes out ----
 
@@ -307,11 +320,13 @@ class CapturedRollout:
         """Takes what rests into the graph's memory; what moves."""
         own = self._rest.parts
         self._check(parts.moving, own.moving.clouds, " in what moves")
-        changed = not all(torch.equal(getattr(parts.background, n), x) for n, x in own.background.row_fields().items())
+        background = parts.background.row_fields()
+        changed = self._is_stale or not all(torch.equal(background[n], x) for n, x in own.background.row_fields().items())
         for mine, given in ((own.newest, parts.newest), (own.background, parts.background)):
             _copy(mine, given)
         own.rows.copy_(parts.rows)
         if changed:
+            self._is_stale = False
             remembered = self._remember(parts.background)
             if not self._rest.background.load(remembered):
                 self._rest = _Rest(own, remembered)

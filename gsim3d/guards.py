@@ -3,18 +3,50 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gsim3d.ops.sentinel import CELLS, FAST, OUTSIDE, SUMS, watch_rows
+from gsim3d.ops.sentinel import CELLS, FAST, OUTSIDE, watch_rows
 from gsim3d.stability import ACTIONS, LARGEST, Finding, Reading, Sentinels, StabilityConfig, StabilityReport
 from gsim3d.types import ASLEEP, CloudTable, Frames, Particles
 
 BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
+ALWAYS = ("means", "opacities")  # are looked at, changed or not
+
+
+class _Looks(NamedTuple):
+    """How a guard looks at the fields of particles.
+
+    kinds: (tensor, what is wrong, action) of every kind that watch_rows counts.
+    neutral: first number of what stands in for a row that nobody knows, others are 0.
+    """
+
+    bounds: list[tuple[float, float]]
+    kinds: list[tuple[str, str, str]]
+    neutral: list[float]
+
+
+def _looks_at(names: tuple[str, ...], config: StabilityConfig, max_opacity: float) -> _Looks:
+    limits = {
+        "means": (-LARGEST, LARGEST),
+        "opacities": (0.0, max_opacity),
+        "quats": (-LARGEST, LARGEST),
+        "scales": (0.0, LARGEST),
+    }
+    bounds = [limits.get(name, (-config.max_latent, config.max_latent)) for name in names]
+    action, by_rule = ACTIONS[config.on_bad], "clamped" if config.on_bad == "clamp" else "asleep"
+    kinds = [(f"particles.{name}", BOUNDED.get(name) or _what(high), action) for name, (_, high) in zip(names, bounds)]
+    kinds += [("particles.means", "outside the workspace", by_rule), ("particles.means", "speed limit", by_rule)]
+    return _Looks(bounds, kinds, [float(name == "quats") for name in names])
+
+
+_recent_looks = functools.lru_cache(maxsize=64)(_looks_at)
 
 
 def guard_particles(
@@ -45,35 +77,39 @@ def guard_particles(
     Raises:
         HardCaseError: ``config.on_bad`` is "raise", on the CPU.
     """
-    looked_at = {"means", "opacities", *(particles.ROW_FIELDS if changed is None else changed)} - {"activity"}
-    fields = {name: value for name, value in particles.row_fields().items() if name in looked_at}
-    limits = {
-        "means": (-LARGEST, LARGEST),
-        "opacities": (0.0, max_opacity),
-        "quats": (-LARGEST, LARGEST),
-        "scales": (0.0, LARGEST),
+    fields = {
+        name: value
+        for name, value in particles.row_fields().items()
+        if name != "activity" and (changed is None or name in changed or name in ALWAYS)
     }
-    bounds = [limits.get(name, (-config.max_latent, config.max_latent)) for name in fields]
+    looks = (_looks_at if torch.compiler.is_compiling() else _recent_looks)(tuple(fields), config, max_opacity)
+    before = None if previous is None else [getattr(previous, name) for name in fields]
+    clamps = config.on_bad == "clamp"
+    # the copies that the kernel mends carry no gradients
+    in_kernel = not clamps and not (torch.is_grad_enabled() and _have_gradients(fields.values(), before or ()))
     watched = watch_rows(
         list(fields.values()),
-        bounds,
+        looks.bounds,
         particles.cu_rows,
         cloud_scene=particles.cloud_scene,
         origin=particles.origin,
         activity=particles.activity,
         grid_size=grid_size,
-        previous=None if previous is None else previous.means,
+        previous=before,
         max_step=config.max_speed,
+        neutral=looks.neutral if in_kernel else None,
+        check=False,
     )
     if not torch.compiler.is_compiling():
-        names = [f"particles.{name}" for name in fields]
-        whats = [BOUNDED.get(name) or _what(high) for name, (_, high) in zip(fields, bounds)]
-        read = partial(_read, particles.clouds, where, names, whats, config.on_bad, previous is not None)
-        report.record(watched.record, read)
+        read = partial(_read, particles.clouds, where, looks, previous is not None)
+        counts = _places_of_counts(*watched.record.shape, len(looks.kinds))
+        report.record(watched.record, read, counts=counts, at_once=False)
         if watched.status.device.type == "cpu" and not bool(watched.status.any()):
             return particles
-    mend = _clamp if config.on_bad == "clamp" else _put_to_sleep
-    return mend(particles, fields, bounds, watched.status, config, grid_size, previous)
+    if watched.fields is not None:
+        return dataclasses.replace(particles, **dict(zip(fields, watched.fields)), activity=watched.activity)
+    mend = _clamp if clamps else _put_to_sleep
+    return mend(particles, fields, looks.bounds, watched.status, config, grid_size, previous)
 
 
 def guard_frames(
@@ -116,27 +152,30 @@ def _what(high: float) -> str:
     return "not finite" if high == LARGEST else f"not finite or beyond {high:g}"
 
 
-def _read(
-    clouds: CloudTable, where: str, names: list[str], whats: list[str], on_bad: str, moved: bool, record: Tensor
-) -> Reading:
+def _read(clouds: CloudTable, where: str, looks: _Looks, moved: bool, record: Tensor) -> Reading:
     """What a record of watch_rows says."""
-    by_rule = "clamped" if on_bad == "clamp" else "asleep"
-    kinds = [(name, what, ACTIONS[on_bad]) for name, what in zip(names, whats, strict=True)]
-    kinds += [("particles.means", "outside the workspace", by_rule), ("particles.means", "speed limit", by_rule)]
-    findings, sentinels = [], {}
-    for q, numbers in enumerate(record.tolist()):
-        scene, step = clouds.scenes[q], clouds.steps[q]
-        for k, (name, what, action) in enumerate(kinds):
-            count, row = (int(number) for number in numbers[2 * k : 2 * k + 2])
-            if count:
-                findings.append(Finding(what, where, name, action, count, row, scene, step))
+    findings, sentinels, n_counts = [], {}, 2 * len(looks.kinds)
+    for scene, step, numbers in zip(clouds.scenes, clouds.steps, record.tolist(), strict=True):
+        if any(numbers[:n_counts:2]):
+            for k, (name, what, action) in enumerate(looks.kinds):
+                count, row = (int(number) for number in numbers[2 * k : 2 * k + 2])
+                if count:
+                    findings.append(Finding(what, where, name, action, count, row, scene, step))
         if moved:
-            sums = dict(zip(SUMS, numbers[2 * len(kinds) :], strict=True))
-            sides = [sums[f"high_{axis}"] - sums[f"low_{axis}"] for axis in "xyz"] if sums["awake"] else [0.0]
-            sentinels[scene, step] = Sentinels(
-                int(sums["awake"]), sums["kinetic_energy"], sums["opacity_mass"], math.hypot(*sides)
-            )
+            awake, energy, opacity, *corners = numbers[n_counts:]
+            extent = math.dist(corners[:3], corners[3:]) if awake else 0.0
+            sentinels[scene, step] = Sentinels(int(awake), energy, opacity, extent)
     return Reading(findings, sentinels)
+
+
+@functools.lru_cache(maxsize=64)
+def _places_of_counts(n_clouds: int, n_columns: int, n_kinds: int) -> tuple[int, ...]:
+    """Where a record of watch_rows holds how many rows were bad."""
+    return tuple(q * n_columns + 2 * k for q in range(n_clouds) for k in range(n_kinds))
+
+
+def _have_gradients(*groups: Iterable[Tensor]) -> bool:
+    return any(value.requires_grad for group in groups for value in group)
 
 
 def _neutral(name: str, particles: Particles) -> Tensor:

@@ -148,6 +148,19 @@ def _reading(level: int, dtype: torch.dtype, device: torch.device) -> tuple[Tens
         return directions.to(device, dtype), read.to(device, dtype)
 
 
+def readings(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """[128]: of degrees 1 to 3 the directions, then what turns values into coefficients; for
+    :func:`gsim3d.ops.decode_gaussians`."""
+    return _readings(dtype, device)
+
+
+@functools.lru_cache(maxsize=64)
+def _readings(dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        parts = [part.flatten() for level in range(1, MAX_DEGREE + 1) for part in _reading(level, dtype, device)]
+        return torch.cat(parts)
+
+
 def _spiral(level: int) -> Tensor:
     """float64 [2 l + 1, 3] directions of the upper half sphere."""
     turn, start = SPIRALS[level]

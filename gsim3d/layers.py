@@ -11,8 +11,7 @@ import contextvars
 from collections.abc import Sequence
 
 import torch
-import torch.distributed
-import torch.distributed.nn.functional
+import torch.distributed as dist
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
@@ -145,7 +144,7 @@ class RowLayerNorm(nn.LayerNorm):
     def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
         return row_norm(x, self.weight, self.bias, residual, eps=self.eps, check=False)
 
-    def activated(self, x: Tensor) -> Tensor:
+    def activated(self, x: Tensor, n_data: int | None = None) -> Tensor:
         return F.gelu(self(x))
 
 
@@ -170,22 +169,69 @@ class RowBatchNorm(nn.Module):
         mean, scale = self._mean_and_scale(x)
         return (x - mean) * scale + self.bias
 
-    def activated(self, x: Tensor) -> Tensor:
-        """``F.gelu(self(x))``, on a GPU in one pass over the rows."""
-        if not x.is_cuda or torch.compiler.is_compiling():
+    def activated(self, x: Tensor, n_data: int | None = None) -> Tensor:
+        """``F.gelu(self(x))``, on a GPU in as few passes over the rows as can be.
+
+        n_data: statistics are those of the first ``n_data`` rows; None: of all.
+        """
+        is_padded = self.training and n_data is not None and n_data < x.shape[0]
+        if not (x.is_cuda or is_padded) or torch.compiler.is_compiling():
             return F.gelu(self(x))
+        if self.training:
+            return self.activated_in_training(x, n_data)
         return norm_gelu(x, *self._mean_and_scale(x), self.bias, check=False)
+
+    def activated_in_training(self, x: Tensor, n_data: int | None = None) -> Tensor:
+        """``F.gelu(self(x))`` by statistics of the rows, with one node of autograd; once differentiable. Arguments as
+        :meth:`activated`; gradients of other rows must be 0."""
+        with torch.no_grad():
+            mean, var, n_rows = _statistics_at_once(x[:n_data])
+            self._follow(mean, var, n_rows)
+        return _BatchNormGelu.apply(x, self.weight, self.bias, mean, torch.rsqrt(var + self.EPS), n_rows, n_data)
 
     def _mean_and_scale(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if not self.training:
             return self.running_mean, self.weight * torch.rsqrt(self.running_var + self.EPS)
         mean, var, n_rows = _statistics(widened(x))
         with torch.no_grad():
-            rate = self.MOMENTUM * (n_rows > 1).to(self.running_var)
-            self.running_mean.lerp_(mean.to(self.running_mean), rate)
-            unbiased = var * n_rows / (n_rows - 1).clamp(min=1)
-            self.running_var.lerp_(unbiased.to(self.running_var), rate)
+            self._follow(mean, var, n_rows)
         return mean, self.weight * torch.rsqrt(var + self.EPS)
+
+    def _follow(self, mean: Tensor, var: Tensor, n_rows: Tensor | int) -> None:
+        """Moves the running statistics towards those of ``n_rows`` rows."""
+        if isinstance(n_rows, int):
+            rate, unbiased = self.MOMENTUM * (n_rows > 1), var * (n_rows / max(n_rows - 1, 1))
+        else:
+            rate = self.MOMENTUM * (n_rows > 1).to(self.running_var)
+            unbiased = var * n_rows / (n_rows - 1).clamp(min=1)
+        self.running_mean.lerp_(mean.to(self.running_mean), rate)
+        self.running_var.lerp_(unbiased.to(self.running_var), rate)
+
+
+class _BatchNormGelu(torch.autograd.Function):
+    """Normalised by statistics of all rows, scaled, shifted, activated: torch would keep and add up five tensors of rows."""
+
+    @staticmethod
+    def forward(ctx, x, weight, bias, mean, rsqrt, n_rows, n_data):
+        scale = weight * rsqrt
+        ctx.save_for_backward(x, bias, mean, rsqrt, scale)
+        ctx.n_rows, ctx.n_data = n_rows, n_data
+        return norm_gelu(x, mean, scale, bias, check=False)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        x, bias, mean, rsqrt, scale = ctx.saved_tensors
+        grad_x, grad_scale, grad_bias = torch.ops.gsim3d.norm_gelu_backward(grad, x, mean, scale, bias)
+        sums = torch.stack([grad_scale, grad_bias])
+        if _shares_rows():
+            sums = sum(_gathered(sums))
+        # What changes because mean and deviation change with x.
+        by_scale, by_bias = (sums * (-scale / ctx.n_rows)).unbind()
+        slope = by_scale * rsqrt.square()
+        correction = torch.addcmul(by_bias - mean * slope, x[: ctx.n_data], slope)
+        grad_x[: ctx.n_data].add_(correction)
+        return grad_x, grad_scale * rsqrt, grad_bias, None, None, None, None
 
 
 def _statistics(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -193,10 +239,54 @@ def _statistics(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     n_rows = x.new_full((), x.shape[0])
     mean = x.sum(0) / n_rows.clamp(min=1)
     spread = (x - mean).square().sum(0)
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
+    if _shares_rows():
         mine = torch.cat([n_rows[None], mean, spread])
-        n_rows, mean, spread = _combine(torch.distributed.nn.functional.all_gather(mine), x.shape[1])
+        n_rows, mean, spread = _combine(_OfAllProcesses.apply(mine), x.shape[1])
     return mean, spread / n_rows.clamp(min=1), n_rows
+
+
+def _statistics_at_once(x: Tensor) -> tuple[Tensor, Tensor, Tensor | int]:
+    """As :func:`_statistics`, without gradients, on a GPU in one pass; of rows of all processes, at least 1 is counted."""
+    n_rows = x.shape[0]
+    if n_rows == 0:
+        mean, var = torch.zeros(2, x.shape[1], dtype=torch.promote_types(x.dtype, torch.float32), device=x.device)
+    elif x.is_cuda:
+        mean, var = torch.batch_norm_update_stats(x.contiguous(), None, None, 0.0)
+    else:
+        var, mean = torch.var_mean(widened(x), 0, correction=0)
+    if not _shares_rows():
+        return mean, var, max(n_rows, 1)
+    parts = _gathered(torch.cat([mean.new_full((1,), n_rows), mean, var * n_rows]))
+    n_rows, mean, spread = _combine(tuple(parts), x.shape[1])
+    n_rows = n_rows.clamp(min=1)
+    return mean, spread / n_rows, n_rows
+
+
+def _shares_rows() -> bool:
+    """Whether other processes have rows of the same batch."""
+    return dist.is_available() and dist.is_initialized()
+
+
+def _gathered(mine: Tensor) -> list[Tensor]:
+    """``mine`` of every process, in the order of their ranks."""
+    parts = [torch.empty_like(mine) for _ in range(dist.get_world_size())]
+    dist.all_gather(parts, mine)
+    return parts
+
+
+class _OfAllProcesses(torch.autograd.Function):
+    """A tensor of every process, in the order of their ranks, to each of them."""
+
+    @staticmethod
+    def forward(ctx, mine):
+        return tuple(_gathered(mine))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *grads):
+        total = torch.stack(grads)
+        dist.all_reduce(total)
+        return total[dist.get_rank()]
 
 
 def _combine(parts: tuple[Tensor, ...], n_channels: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -15,6 +15,7 @@ from gsim3d.harmonics import (
     degree_damping,
     painted,
     published_axes,
+    readings,
     rotate_harmonics,
     sh_basis,
     turn_predicted_harmonics,
@@ -91,6 +92,17 @@ class GaussianHead(nn.Module):
         else:
             wanted = [(c * K, c * K + n_harmonics) for c in range(3)] if n_harmonics else []
             raw = self.fc2.some(hidden, [*wanted, (3 * K, 3 * K + 7)])
+        if n_harmonics and particles.turns is None and self.config.quirks == Quirks():
+            wide = torch.float64 if raw.dtype == torch.float64 else torch.float32
+            quats, scales, sh = ops.decode_gaussians(
+                raw,
+                readings(wide, raw.device),
+                degree=math.isqrt(n_harmonics) - 1,
+                scale_min=self.config.scale_min,
+                scale_max=self.config.scale_max,
+                check=False,
+            )
+            return sh if particles.paint is None else painted(sh, particles.paint), quats, scales
         sh, quats, scales = widened(raw).split([raw.shape[1] - 7, 4, 3], 1)
         quats = unit_quats(quats.roll(1, 1))
         if particles.turns is not None:

@@ -69,12 +69,12 @@ def workload(scene, data):
     """Particles of the first step as the model would see it, and one image."""
     from gsim3d.data import make_frames
     from gsim3d.plans import Workload
-    from gsim3d.train.samples import context_cameras, spread_views, thin_background
+    from gsim3d.train.samples import context_cameras, spread_views, thinned
 
     cameras = context_cameras(scene, data)
     views = spread_views(cameras, min(data.context_views, len(cameras)), 0)
     frames = make_frames([scene], [list(views)], [range(1)], masked=scene.has_segmentation())
-    frames = thin_background(frames, data.background_stride)
+    frames = thinned(frames, data)
     pixels = frames.images.shape[0] * scene.height * scene.width
     kept = pixels if frames.masks is None else int(frames.masks.sum())
     moving = kept

@@ -31,10 +31,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", required=True, help="folder to write; must not exist yet")
     parser.add_argument("--steps", type=int, help="steps to predict (default: to the end of the film)")
     parser.add_argument("--start", type=int, default=0, help="first input step (default: 0)")
-    parser.add_argument("--cameras", type=int, nargs="+", metavar="CAM", help="cameras to show (default: up to 4 targets)")
+    parser.add_argument(
+        "--cameras", type=int, nargs="+", metavar="CAM", help="cameras to show (default: up to 4 targets)"
+    )
     parser.add_argument("--context", type=int, nargs="+", metavar="CAM", help="input cameras (default: spread evenly)")
     parser.add_argument("--edit", metavar="FILE", help="YAML file of changes of the scene on the way")
     parser.add_argument("--effects", metavar="FILE", help="YAML file of what to compute (default: as in training)")
+    parser.add_argument(
+        "--speed",
+        default="exact",
+        metavar="PRESET",
+        help="exact (default), or balanced or fast: tuned by gsim3d pareto to keep 99.9 %% or 99 %% of the gain",
+    )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
 
 
@@ -51,8 +59,11 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.effects import EffectsSpec, OutputEffects, StructureEffects
     from gsim3d.errors import InputError
     from gsim3d.evaluate.pictures import as_bytes, comparison_frames, true_images, write_gaussians
-    from gsim3d.evaluate.protocol import default_views, predict, render_steps
+    from gsim3d.evaluate.protocol import default_views, render_steps
     from gsim3d.interop import write_video
+    from gsim3d.pareto.autotune import load_speed
+    from gsim3d.pareto.runner import Runner
+    from gsim3d.pretrained import located
     from gsim3d.train.restore import restore
 
     out = Path(args.out)
@@ -74,8 +85,12 @@ def run(args: argparse.Namespace) -> int:
         structure = StructureEffects(*map(any, zip(*((change.inserts, change.removes) for change in changes))))
         spec = replace(spec, structure=structure)
     restored = replace(restored, plan=restored.simulator.plan(replace(spec, outputs=OutputEffects())))
-    prediction = predict(restored, scene, context, n_future, args.start, edits)
-    images = as_bytes(render_steps(restored, prediction.particles, scene, cams, args.start))
+    checkpoint = located(args.checkpoint)
+    setting = load_speed(checkpoint if checkpoint.is_dir() else checkpoint.parent, restored, args.speed)
+    runner = Runner(restored, setting)
+    prediction = runner.predict(scene, context, n_future, args.start, edits)
+    restored, first = replace(restored, simulator=runner.simulator, plan=runner.plan), args.start + runner.skipped
+    images = as_bytes(render_steps(restored, prediction.particles, scene, cams, first))
     part = out.with_name(f".{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     try:
@@ -83,13 +98,14 @@ def run(args: argparse.Namespace) -> int:
         for step, views in enumerate(images):
             for cam, image in zip(cams, views, strict=True):
                 cv2.imwrite(str(part / "frames" / f"cam_{cam}_{step:04d}.png"), image[..., ::-1])
-        truth = true_images(scene, cams, range(args.start, args.start + len(images)))
+        truth = true_images(scene, cams, range(first, first + len(images)))
         write_video(part / "rollout.mp4", comparison_frames(truth, images), scene.fps)
         write_gaussians(part / "gaussians", restored, prediction)
         os.replace(part, out)
     finally:
         shutil.rmtree(part, ignore_errors=True)
-    print(f"{prediction.n_encoded} steps encoded, {n_future} predicted; written: {out}")
+    rested = f" ({prediction.resting:.0%} of the particles at rest, not computed)" if prediction.resting else ""
+    print(f"{prediction.n_encoded} steps encoded, {n_future} predicted{rested}; written: {out}")
     return 0
 
 

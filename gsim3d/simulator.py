@@ -73,7 +73,9 @@ class Simulator(nn.Module):
         guard = self._guard("encode", on_bad, report)
         frames, spoiled = guard_frames(frames, guard.keywords["config"], guard.keywords["report"], "encode")
         particles = self.encoder(frames)
-        return guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled)))
+        particles = guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled)))
+        guard.keywords["report"].send()
+        return particles
 
     def plan(self, spec: EffectsSpec = EffectsSpec()) -> Plan:
         """What will be computed for ``spec``, and what will not.
@@ -107,6 +109,7 @@ class Simulator(nn.Module):
         plan, guard = plan or self.plan(), self._guard("step", on_bad, report)
         state = guard(self.prepare(state, plan))
         step = self._predict(state, plan=plan, generator=generator, guard=guard)
+        guard.keywords["report"].send()
         return append_step(state, step, plan.history)
 
     def rollout(
@@ -149,6 +152,7 @@ class Simulator(nn.Module):
             steps += self._roll(predict, state, end - begin, plan, generator, log)
             if end < n_steps:
                 state = last_steps(concatenate([state, *steps[begin:end][-plan.history :]]), plan.history)
+        guard.keywords["report"].send()
         return steps
 
     def _roll(self, predict, state: Particles, n_steps: int, plan: Plan, generator, log) -> list[Particles]:
@@ -216,8 +220,10 @@ class Simulator(nn.Module):
             plan: which images, and the degree of view-dependent colour; default colour as the model's, alpha and depth.
             cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
         """
-        particles = self._guard("render", on_bad, report, in_workspace=False)(particles)
-        return self.draw(particles, cameras, background, plan, cutoff=cutoff, on_bad=on_bad, report=report)
+        guard = self._guard("render", on_bad, report, in_workspace=False)
+        image = self.draw(guard(particles), cameras, background, plan, cutoff=cutoff, on_bad=on_bad, report=report)
+        guard.keywords["report"].send()
+        return image
 
     def draw(
         self,

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
 
@@ -30,6 +30,7 @@ LARGEST = torch.finfo(torch.float32).max
 ACTIONS = {"raise": "error", "drop": "dropped", "clamp": "clamped"}
 ADVICE = 'on_bad="drop" goes on without such rows, on_bad="clamp" bounds them'
 MAX_FINDINGS = 1000  # of a report, then only its total goes on counting
+MAX_QUIET = 1000  # records kept as they came
 
 
 def check_on_bad(on_bad: str) -> None:
@@ -123,18 +124,35 @@ def pack(tensors: list[Tensor]) -> Tensor:
     return flat[0] if len(flat) == 1 else torch.cat(flat)
 
 
-def unpack(packed: Tensor, like: list[Tensor]) -> list[Tensor]:
-    """Views of ``packed`` with the shapes and dtypes of ``like``, which :func:`pack` took."""
-    parts = packed.split([tensor.numel() for tensor in like])
-    return [part.view(tensor.dtype).view(tensor.shape) for part, tensor in zip(parts, like, strict=True)]
+class _Record(NamedTuple):
+    """Numbers of a guard on a GPU. read, counts: as of StabilityReport.record."""
+
+    numbers: Tensor
+    read: Callable[[Tensor], Reading]
+    counts: Sequence[int]
+
+
+class _Packed(NamedTuple):
+    """One record among others in ``packed`` on the host, from ``begin`` on."""
+
+    packed: Tensor
+    begin: int
+    shape: torch.Size
+    dtype: torch.dtype
+    read: Callable[[Tensor], Reading]
+
+    def reading(self) -> Reading:
+        own = self.packed[self.begin : self.begin + self.shape.numel()]
+        return self.read(own.view(self.dtype).view(self.shape))
 
 
 @dataclass
 class _Pending:
-    """Records on their way to the host: the copies are complete when the event is."""
+    """Records on their way to the host: the copy is complete when the event is; None: it has arrived."""
 
-    records: list[tuple[Tensor, Callable[[Tensor], Reading]]]
-    event: torch.cuda.Event
+    records: list[_Record]
+    packed: Tensor
+    event: torch.cuda.Event | None
 
 
 class StabilityReport:
@@ -164,8 +182,11 @@ class StabilityReport:
         self._total, self._raised = 0, 0
         self._errors: list[Finding] = []
         self._sentinels: dict[tuple[int, int], Sentinels] = {}
+        self._unsent: list[_Record] = []
+        self._stream: torch.cuda.Stream | None = None  # that computes what is unsent
         self._pending: deque[_Pending] = deque()
-        self._captured: list[tuple[Tensor, Callable[[Tensor], Reading]]] = []
+        self._quiet: list[_Packed] = []  # have no findings, and sentinels that nobody has asked for
+        self._captured: list[_Record] = []
 
     # ---- writing ----
 
@@ -183,41 +204,76 @@ class StabilityReport:
             if finding.action == "error":
                 self._errors.append(finding)
 
-    def record(self, numbers: Tensor, read: Callable[[Tensor], Reading]) -> None:
+    def record(
+        self,
+        numbers: Tensor,
+        read: Callable[[Tensor], Reading],
+        *,
+        counts: Sequence[int] = (),
+        at_once: bool = True,
+    ) -> None:
         """Takes what a guard counted: at once on the CPU, which also raises; on a GPU when its copy has arrived.
 
         Args:
             numbers: any small tensor of 64-bit numbers.
             read: what it says, from a copy on the host.
+            counts: places in ``numbers`` (row by row) that are all 0 where it says no findings; a GPU's record is then
+                read only when somebody asks for sentinels. Empty: it is read when it arrives.
+            at_once: copy it now; else with others by :meth:`send`, or when somebody reads.
         """
         if numbers.device.type != "cuda":
             self._take(read(numbers))
             self.poll()
         elif torch.cuda.is_current_stream_capturing():
-            self._captured.append((numbers, read))
+            self._captured.append(_Record(numbers, read, counts))
         else:
-            self._send([(numbers, read)])
+            stream = torch.cuda.current_stream(numbers.device)
+            if stream != self._stream:
+                self.send()
+            self._stream = stream
+            self._unsent.append(_Record(numbers, read, counts))
+            if at_once:
+                self.send()
 
-    def replayed(self, to: StabilityReport | None = None) -> None:
+    def send(self) -> None:
+        """Begins to copy to the host what has been recorded on a GPU, all in one, without waiting."""
+        if torch.compiler.is_compiling() or not self._unsent:
+            return
+        records, self._unsent = self._unsent, []
+        if self._stream == torch.cuda.current_stream():
+            self._send(records)
+        else:
+            with torch.cuda.stream(self._stream):
+                self._send(records)
+
+    def captured(self) -> list[Tensor]:
+        """The numbers that every replay of the CUDA graphs captured with this report overwrites."""
+        return [record.numbers for record in self._captured]
+
+    def replayed(self, to: StabilityReport | None = None, packed: Tensor | None = None) -> None:
         """Fetches the records of the CUDA graphs captured with this report, without waiting; call it after a replay.
 
         Args:
             to: report that is told of them, and of what this one has found so far; None: this one.
+            packed: what :meth:`captured` held, packed and on the host, where the caller has it already; nobody else may
+                change it.
         """
         target = self if to is None else to
-        if self._captured:
-            target._send(self._captured)
+        if self._captured and packed is not None:
+            target._pending.append(_Pending(self._captured, packed, None))
+        elif self._captured:
+            with torch.cuda.device(self._captured[0].numbers.device):
+                target._send(self._captured)
         if to is not None:
             to._take(Reading(self._found.values(), self._sentinels))
 
-    def _send(self, records: list[tuple[Tensor, Callable[[Tensor], Reading]]]) -> None:
-        packed = pack([numbers for numbers, _ in records])
+    def _send(self, records: list[_Record]) -> None:
+        packed = pack([record.numbers for record in records])
         copy = torch.empty(packed.shape, dtype=packed.dtype, pin_memory=True)
         copy.copy_(packed, non_blocking=True)
         event = torch.cuda.Event()
         event.record()
-        arriving = unpack(copy, [numbers for numbers, _ in records])
-        self._pending.append(_Pending([(a, read) for a, (_, read) in zip(arriving, records)], event))
+        self._pending.append(_Pending(records, copy, event))
 
     def _take(self, reading: Reading) -> None:
         for finding in reading.findings:
@@ -225,14 +281,33 @@ class StabilityReport:
         self._sentinels.update(reading.sentinels)
 
     def _collect(self, wait: bool) -> None:
+        self.send()
         while self._pending:
-            if wait:
-                self._pending[0].event.synchronize()
-            elif not self._pending[0].event.query():
+            event = self._pending[0].event
+            if wait and event is not None:
+                event.synchronize()
+            elif event is not None and not event.query():
                 return
-            arrived = self._pending.popleft()
-            for numbers, read in arrived.records:
-                self._take(read(numbers))
+            self._arrived(self._pending.popleft())
+
+    def _arrived(self, pending: _Pending) -> None:
+        numbers, begin = pending.packed.tolist(), 0
+        for record in pending.records:
+            shape = record.numbers.shape
+            packed = _Packed(pending.packed, begin, shape, record.numbers.dtype, record.read)
+            if record.counts and not any([numbers[begin + place] for place in record.counts]):
+                self._quiet.append(packed)
+            else:
+                self._read_quiet()  # steps in the order in which they came
+                self._take(packed.reading())
+            begin += shape.numel()
+        if len(self._quiet) > MAX_QUIET:
+            self._read_quiet()
+
+    def _read_quiet(self) -> None:
+        quiet, self._quiet = self._quiet, []
+        for packed in quiet:
+            self._take(packed.reading())
 
     # ---- reading ----
 
@@ -240,7 +315,7 @@ class StabilityReport:
         """Raises the first error that has arrived and was not raised yet; waits for nothing."""
         if torch.compiler.is_compiling():
             return
-        if self._pending and not torch.cuda.is_current_stream_capturing():
+        if (self._unsent or self._pending) and not torch.cuda.is_current_stream_capturing():
             self._collect(wait=False)
         with self._lock:
             new, self._errors = self._errors, []
@@ -274,6 +349,7 @@ class StabilityReport:
     def sentinels(self) -> dict[tuple[int, int], Sentinels]:
         """The sentinels of every (scene, step) that was simulated."""
         self._collect(wait=True)
+        self._read_quiet()
         return dict(sorted(self._sentinels.items()))
 
     def to_dict(self) -> dict:

@@ -176,10 +176,31 @@ class CloudTable:
 
 def take_runs(x: Tensor, runs: Sequence[tuple[int, int]]) -> Tensor:
     """The rows of ``runs`` one after another; a view where there is one run."""
-    pieces = [x[begin:end] for begin, end in runs]
+    pieces = split_rows(x, runs)
     if len(pieces) == 1:
         return pieces[0]
     return torch.cat(pieces) if pieces else x[:0]
+
+
+def split_rows(x: Tensor, runs: Sequence[tuple[int, int]]) -> list[Tensor]:
+    """Views of the rows of each of ``runs``.
+
+    Where runs ascend, the gradient of all of them is made at once; that of as many slices would be added up slice by
+    slice, each with zeros to the length of ``x``.
+    """
+    sizes, wanted, end = [], [], 0
+    for begin, until in runs:
+        if begin < end:
+            return [x[begin:until] for begin, until in runs]
+        sizes += [begin - end] if begin > end else []
+        wanted.append(len(sizes))
+        sizes.append(until - begin)
+        end = until
+    sizes += [x.shape[0] - end] if x.shape[0] > end else []
+    if len(sizes) < 2:
+        return [x[begin:until] for begin, until in runs]
+    pieces = x.split(sizes)
+    return [pieces[i] for i in wanted]
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ ROOMS = [
     {"generate"},
     {"train"},
     {"evaluate", "check_stability"},
+    {"pareto"},
     {"simulate", "show_plan", "infer_effects", "check_data", "import_released", "demo", "doctor"},
     {"__main__"},
 ]

@@ -162,6 +162,22 @@ def test_activation_behind_batch_norm(training, device):
         assert_close_relative_to_max(a, b, 1e-12)
 
 
+@pytest.mark.parametrize("n", [0, 1, 2, 60])
+def test_batch_norm_as_one_node_is_that_of_many(n, device):
+    torch.manual_seed(0)
+    one, many = (RowBatchNorm(24).double().to(device) for _ in range(2))
+    torch.nn.init.normal_(one.weight), torch.nn.init.normal_(one.bias)
+    many.load_state_dict(one.state_dict())
+    x = (3 + rows(n, dtype=torch.float64)).to(device).requires_grad_()
+    results = []
+    for layer, f in ((one, one.activated_in_training), (many, lambda x: torch.nn.functional.gelu(many(x)))):
+        out = f(x)
+        gradients = torch.autograd.grad(out.sin().sum(), [x, layer.weight, layer.bias])
+        results.append([out, *gradients, layer.running_mean, layer.running_var])
+    for a, b in zip(*results, strict=True):
+        assert_close_relative_to_max(a, b, 1e-12)
+
+
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_layers_under_autocast_err_no_more_than_torchs(dtype, devices):
     torch.manual_seed(0)

@@ -18,6 +18,8 @@ EPYC = "AMD EPYC (Zen 4), torch 2.13 CPU"
 H200 = "NVIDIA H200, torch 2.11"
 
 TOLERANCES = {
+    "decode_float32": Tolerance(3e-6, 1e-6, EPYC, "float32 products of up to 7 values, cubes of rotations, against float64"),
+    "decode_float64": Tolerance(1e-14, 1e-15, EPYC, "as decode_float32, in float64"),
     "generate_binding": Tolerance(1e-6, 1e-7, EPYC, "metres; MuJoCo stores the rest lattice in float32"),
     "generate_free_fall": Tolerance(1e-2, 4e-3, EPYC, "metres after 0.3 s: velocity is a step of 1/480 s ahead of position"),
     "generate_machines": Tolerance(2e-3, 5e-6, EPYC, "metres; heights are recorded to 5 digits, contact amplifies the last bits of others"),

@@ -1,11 +1,12 @@
 #!/usr/bin/env python
-"""Scores a simulator that comes with gsim3d, or is about to: held-out trajectories over the full horizon, and held-out sets.
+"""Scores a simulator that comes with gsim3d, or is about to: held-out trajectories and sets over the full horizon.
 
     python tools/score_shipped.py elastic-small --data runs/held_out --out runs/scores --device cuda
 
-Trajectories are made in DATA where they are not there: of the kind it was trained on (another seed), with unseen shapes,
-with several bodies, without ground, and on raised ground. Written to OUT: NAME.scores.json, and NAME.frames.png, a
-trajectory of each set, truth above prediction. LPIPS and FVD are measured where their weights are installed.
+Trajectories are made in DATA where they are not there: of the kind it was trained on (another seed), with unseen
+shapes, with several bodies, without ground, and on raised ground. Written to OUT: NAME.scores.json, and
+NAME.frames.png, a trajectory of each set, truth above prediction. LPIPS and FVD are measured where their weights are
+installed.
 """
 
 import argparse
@@ -22,6 +23,7 @@ from gsim3d.errors import InputError  # noqa: E402
 KIND = "held_out"  # of what it was trained on
 SETS = ("unseen", "several", "no-ground", "raised")
 SHOWN = 7  # frames of a trajectory in the picture
+TOGETHER = 7  # trajectories that are predicted at the same time
 
 
 def score(
@@ -43,6 +45,7 @@ def score(
     import cv2
     import numpy as np
 
+    from gsim3d.evaluate.protocol import predict_together, score_scene
     from gsim3d.evaluate.report import summarize, write_json
     from gsim3d.evaluate.scoring import measurable
     from gsim3d.generate import generate
@@ -62,16 +65,18 @@ def score(
             data / world / subset, world, preset="paper", n_trajectories=count, seed=HELD_OUT_SEED, **options
         )
         filmed, scores = time.monotonic(), []
-        for folder in made.folders:
-            found, row = score_one(restored, folder, metrics, with_frames=not scores)
-            scores.append(found)
-            rows += row
+        scenes = [restored.open_scene(folder) for folder in made.folders]
+        n_future = min(scene.n_steps for scene in scenes) - restored.data.history
+        for first in range(0, len(scenes), TOGETHER):
+            some = scenes[first : first + TOGETHER]
+            for scene, prediction in zip(some, predict_together(restored, some, n_future), strict=True):
+                if not scores:
+                    rows += frames_of(restored, scene, prediction)
+                scores.append(score_scene(restored, scene, n_future=n_future, metrics=metrics, prediction=prediction))
         sets[subset] = {"seconds": round(time.monotonic() - filmed, 1), **summarize(scores, missing)}
-        print(
-            f"{subset}: {count} trajectories, filmed in {filmed - begin:.0f} s, scored in {sets[subset]['seconds']:.0f} s: "
-            f"masked {sets[subset]['future.psnr_masked']:.2f}, constant {sets[subset]['constant.future.psnr_masked']:.2f} dB",
-            flush=True,
-        )
+        seconds = f"filmed in {filmed - begin:.0f} s, scored in {sets[subset]['seconds']:.0f} s"
+        model, still = (sets[subset][f"{method}future.psnr_masked"] for method in ("", "constant."))
+        print(f"{subset}: {count}, {seconds}: masked {model:.2f} dB, constant {still:.2f} dB", flush=True)
     out.mkdir(parents=True, exist_ok=True)
     scores = {"name": name, "checkpoint": restored.checkpoint.digest, "step": restored.checkpoint.state["step"], **sets}
     write_json(out / f"{name}.scores.json", scores)
@@ -79,23 +84,18 @@ def score(
     return scores
 
 
-def score_one(restored, folder: Path, metrics: tuple[str, ...], *, with_frames: bool) -> tuple:
-    """Scores of one trajectory; and, if asked, frames [2 H, SHOWN W, 3] of it, truth above prediction."""
+def frames_of(restored, scene, prediction) -> list:
+    """Two rows of frames [H, SHOWN W, 3] of a trajectory, truth above prediction."""
     import numpy as np
 
     from gsim3d.evaluate.pictures import as_bytes, true_images
-    from gsim3d.evaluate.protocol import default_views, predict, render_steps, score_scene
+    from gsim3d.evaluate.protocol import default_views, render_steps
 
-    scene = restored.open_scene(folder)
-    scores = score_scene(restored, scene, metrics=metrics)
-    if not with_frames:
-        return scores, []
-    context, target = default_views(restored, scene)
-    prediction = predict(restored, scene, context, scene.n_steps - restored.data.history)
-    steps = np.linspace(prediction.n_encoded, scene.n_steps - 1, SHOWN).round().astype(int).tolist()
-    truth = true_images(scene, target[:1], steps)[:, 0]
-    rendered = as_bytes(render_steps(restored, prediction.particles, scene, target[:1]))[steps, 0]
-    return scores, [np.concatenate(list(images), 1) for images in (truth, rendered)]
+    target = default_views(restored, scene)[1][:1]
+    steps = np.linspace(prediction.n_encoded, prediction.n_steps - 1, SHOWN).round().astype(int).tolist()
+    truth = true_images(scene, target, steps)[:, 0]
+    rendered = as_bytes(render_steps(restored, prediction.particles, scene, target))[steps, 0]
+    return [np.concatenate(list(images), 1) for images in (truth, rendered)]
 
 
 def main(arguments: list[str] | None = None) -> None:

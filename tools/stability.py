@@ -4,6 +4,8 @@
 python tools/stability.py                   run all cases here: CPU, and CUDA where there is a GPU
 python tools/stability.py --add FILE        add what another machine measured: stability.json of tools/gpu_check.sh, or
                                             GSIM3D_STABILITY_JSON=FILE pytest tests/stability
+python tools/stability.py --costs FILE      add what guards cost: docs/benchmarks.json, or on a GPU
+                                            tools/bench/results/stability.jsonl of tools/bench/stability.py
 python tools/stability.py --page            only write the page again
 """
 
@@ -22,6 +24,7 @@ from tests.stability.constants import CONSTANTS  # noqa: E402
 from tests.stability.setting import NAMES  # noqa: E402
 
 NUMBERS, PAGE = ROOT / "docs" / "stability.json", ROOT / "docs" / "stability.md"
+COSTS = ROOT / "docs" / "stability_costs.json"
 GUARDS = ("guards", "guards_core")  # of tests/mutants
 INTRODUCTION = """# Stability
 
@@ -89,7 +92,7 @@ def page(columns: dict) -> str:
             column, what = columns[name], "files and their readers" if name == "host" else name
             n_cases, n_tests = len(column["cases"]), sum(record["tests"] for record in column["cases"].values())
             text += f"- {what}: {column['machine']}, torch {column['torch']}, {n_tests} tests of {n_cases} cases.\n"
-    return text + "".join(rows_of(columns, group) for group in GROUPS) + bounds()
+    return text + "".join(rows_of(columns, group) for group in GROUPS) + costs() + bounds()
 
 
 def bounds() -> str:
@@ -121,6 +124,46 @@ the test beside it must fail.
     return text
 
 
+def costs() -> str:
+    """What guards add to a step on each machine where that was measured."""
+    rows = json.loads(COSTS.read_text())
+    text = """
+## What guards cost
+
+A rollout of 4 steps with one image, or from a CUDA graph with 4, under the default policy and without any guard, both
+in turns: processor time on one thread, or time between two events on a GPU. The cost is the median over pairs, with its
+quartiles.
+
+| machine | case | numbers | guarded ms | unguarded ms | cost | quartiles |
+| --- | --- | --- | ---: | ---: | ---: | ---: |
+"""
+    for row in rows:
+        low, high = row["quartiles"]
+        text += (
+            f"| {row['machine']}, torch {row['torch']} | {row['case']} | {row['dtype']} | {row['guarded_ms']:.2f} "
+            f"| {row['unguarded_ms']:.2f} | {row['cost']:.1%} | {low:.1%} to {high:.1%} |\n"
+        )
+    return text
+
+
+def with_costs(known: list[dict], file: Path) -> list[dict]:
+    """``known`` rows, those of the same machine replaced by what ``file`` holds of tools/bench/stability.py."""
+    if file.suffix == ".jsonl":
+        rows = [row for line in file.read_text().splitlines() if "cost" in (row := json.loads(line))]
+        rows = [
+            {**row, "machine": row["gpu"], "guarded_ms": row["ours_ms"], "unguarded_ms": row["peer_ms"]} for row in rows
+        ]
+    else:
+        record = json.loads(file.read_text())["stability"]
+        times = ({"guarded_ms": row["gsim3d"]["ms"], "unguarded_ms": row["plain"]["ms"]} for row in record["results"])
+        place = {"machine": record["machine"], "torch": record["torch"]}
+        rows = [{"dtype": "float32", **row, **ms, **place} for row, ms in zip(record["results"], times)]
+    names = ("machine", "torch", "case", "dtype", "guarded_ms", "unguarded_ms", "cost", "quartiles")
+    rows = [{name: row[name] for name in names} for row in rows]
+    machines = {row["machine"] for row in rows}
+    return [row for row in known if row["machine"] not in machines] + rows
+
+
 def add(columns: dict, measured: dict) -> dict:
     """What was measured replaces the same cases of the same columns."""
     merged = {name: {**column, "cases": dict(column["cases"])} for name, column in columns.items()}
@@ -141,10 +184,14 @@ def run() -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--add", metavar="FILE", help="run nothing, add these results")
+    parser.add_argument("--costs", metavar="FILE", type=Path, help="run nothing, add what guards cost")
     parser.add_argument("--page", action="store_true", help="run nothing, write the page from the stored numbers")
     args = parser.parse_args()
     columns = json.loads(NUMBERS.read_text()) if NUMBERS.exists() else {}
-    if not args.page:
+    if args.costs:
+        known = json.loads(COSTS.read_text()) if COSTS.exists() else []
+        COSTS.write_text(json.dumps(with_costs(known, args.costs), indent=1) + "\n")
+    elif not args.page:
         columns = add(columns, json.loads(Path(args.add).read_text()) if args.add else run())
         NUMBERS.write_text(json.dumps(columns, indent=1, sort_keys=True) + "\n")
     PAGE.write_text(page(columns))

@@ -4,10 +4,10 @@
     python tools/train_shipped.py elastic --minutes 8 --state runs/elastic --out runs/elastic --device cuda
 
 One sitting: processes film trajectories on all spare cores, training begins with the first 64 and goes on with what is
-there; near the end the learning rate falls, the state is written, and held-out trajectories are predicted, scored and
-filmed. Called again, the next sitting goes on with weights, optimizer and the next trajectories; what is kept and what
-is rounded stands in gsim3d/train/sittings.py. A sitting that is killed loses what came after its last save, two minutes
-or less.
+there, while fewer of them film; near the end the learning rate falls, the state is written, and held-out trajectories
+are predicted, scored and filmed. Called again, the next sitting goes on with weights, optimizer and the next
+trajectories; what is kept and what is rounded stands in gsim3d/train/sittings.py. A sitting that is killed loses what
+came after its last save, two minutes or less.
 
 Written to OUT: the state, NAME.scores.json (held-out trajectories over the full horizon) and NAME.mp4 (truth above
 prediction).
@@ -30,6 +30,7 @@ WORLDS = ("elastic", "cloth", "rigid")
 REPORT_SHARE, REPORT_MOST = 0.15, 60.0  # of a sitting, seconds: for held-out predictions at its end
 FILMED = 3  # held-out trajectories in the video
 SPARE_CORES = 2  # that the training process keeps
+LATER_SHARE = 3  # once training has begun one process in so many films: its host thread needs the cores' speed
 HELD_OUT_PROCESSES = 2
 
 
@@ -67,6 +68,7 @@ def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: st
                 "processes": processes,
                 "seconds_before": waited,
             }
+            filming.slow_down(max(1, processes // LATER_SHARE))
             held_out = film_held_out(recipe, Path(scratch) / "held_out")
             try:
                 train(trainer, filming, progress, sitting, end=end, out=out, name=name, say=say)
@@ -96,22 +98,22 @@ def report(weights: Path, held_out: Path, out: Path, name: str, device: str, dea
 
     from gsim3d.data import find_scenes
     from gsim3d.evaluate.pictures import as_bytes, comparison_frames, true_images
-    from gsim3d.evaluate.protocol import default_views, predict, render_steps, score_scene
+    from gsim3d.evaluate.protocol import default_views, predict_together, render_steps, score_scene
     from gsim3d.evaluate.report import summarize, table, write_json
     from gsim3d.interop import write_video
     from gsim3d.train.restore import restore
 
     restored = restore(weights, device)
     scores, rows = [], []
-    for folder in find_scenes(held_out):
+    scenes = [restored.open_scene(folder) for folder in find_scenes(held_out)]
+    n_future = min(scene.n_steps for scene in scenes) - restored.data.history
+    for scene, prediction in zip(scenes, predict_together(restored, scenes, n_future), strict=True):
         start = time.monotonic()
-        scene = restored.open_scene(folder)
-        scores.append(score_scene(restored, scene))
+        scores.append(score_scene(restored, scene, n_future=n_future, prediction=prediction))
         if len(rows) < FILMED:
-            context, target = default_views(restored, scene)
-            prediction = predict(restored, scene, context, scene.n_steps - restored.data.history)
+            _, target = default_views(restored, scene)
             shown = as_bytes(render_steps(restored, prediction.particles, scene, target[:1]))
-            rows.append((true_images(scene, target[:1], range(scene.n_steps)), shown))
+            rows.append((true_images(scene, target[:1], range(len(shown))), shown))
         if time.monotonic() + (time.monotonic() - start) > deadline:
             break
     summary = {"checkpoint": restored.checkpoint.digest, **summarize(scores)}

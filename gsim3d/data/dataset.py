@@ -152,6 +152,7 @@ def _join_cameras(cameras: list[Cameras], image_cloud: list[int]) -> Cameras:
 class Window:
     """Consecutive steps of one scene: the first ``n_context`` are given, the rest is to be predicted.
 
+    lead: steps behind the given ones that are predicted and not looked at.
     context_cams, target_cams: camera numbers for each step (targets at every step, context at the given ones).
     """
 
@@ -160,7 +161,10 @@ class Window:
     n_context: int
     context_cams: tuple[tuple[int, ...], ...]
     target_cams: tuple[tuple[int, ...], ...]
+    lead: int = 0
 
     @property
-    def steps(self) -> range:
-        return range(self.start, self.start + len(self.target_cams))
+    def steps(self) -> list[int]:
+        """Those that are looked at."""
+        places = range(self.start, self.start + len(self.target_cams))
+        return [step if k < self.n_context else step + self.lead for k, step in enumerate(places)]

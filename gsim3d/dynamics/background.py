@@ -210,10 +210,11 @@ class _JointAttention(torch.autograd.Function):
         scale = q.shape[-1] ** -0.5
         out, stats = _ops.patch_attention.default(q, k, v, *_lists(patches), scale)
         other, other_stats = _ops.patch_attention.default(q, other_k, other_v, *_lists(other_patches), scale)
-        stats, share = _joined(stats, other_stats, scale)
+        largest, total, share = _joined(stats, other_stats, scale)
         out = (out * (1 - share) + other * share).to(out.dtype)  # lerp would round by how threads share the rows
-        ctx.save_for_backward(q, k, v, other_k, other_v, out, stats)
-        ctx.patches, ctx.scale = (patches, other_patches), scale
+        if any(ctx.needs_input_grad):
+            ctx.save_for_backward(q, k, v, other_k, other_v, out, torch.stack([largest, total], -1))
+            ctx.patches, ctx.scale = (patches, other_patches), scale
         return out
 
     @staticmethod
@@ -228,8 +229,8 @@ class _JointAttention(torch.autograd.Function):
         return mine[0] + others[0], *mine[1:], *others[1:], None, None
 
 
-def _joined(stats: Tensor, other: Tensor, scale: float) -> tuple[Tensor, Tensor]:
-    """The stats of one softmax over the keys of both, and the share [..., 1] of the other keys in it.
+def _joined(stats: Tensor, other: Tensor, scale: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The two stats of one softmax over the keys of both, and the share [..., 1] of the other keys in it.
 
     Stats: the largest product of a query and a key, and the sum of exponentials relative to it, 0 of no keys.
     """
@@ -239,7 +240,7 @@ def _joined(stats: Tensor, other: Tensor, scale: float) -> tuple[Tensor, Tensor]
     other_total = other_total * ((other_top - largest) * scale).exp()
     both = total * ((top - largest) * scale).exp() + other_total
     share = other_total / both.clamp(min=torch.finfo(both.dtype).tiny)
-    return torch.stack([largest, both], -1), share[..., None]
+    return largest, both, share[..., None]
 
 
 def _lists(patches: PatchTable) -> tuple[Tensor, ...]:

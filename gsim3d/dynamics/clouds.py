@@ -11,19 +11,31 @@ from collections.abc import Sequence
 import torch
 from torch.nn import functional as F
 
-from gsim3d.types import CloudTable, Particles
+from gsim3d.types import CloudTable, Particles, split_rows
 
 
 def newest_clouds(clouds: CloudTable) -> list[int]:
     """The last cloud of each scene that has one."""
-    places = list(zip(clouds.scenes, clouds.steps))
+    return _newest(clouds.scenes, clouds.steps)
+
+
+def _newest(scenes: Sequence[int], steps: Sequence[int]) -> list[int]:
+    places = list(zip(scenes, steps))
     if any(b <= a for a, b in zip(places, places[1:])):
         raise ValueError(
             "particles: clouds must be sorted by (scene, step), each once; "
-            f"got scenes {list(clouds.scenes)}, steps {list(clouds.steps)}"
+            f"got scenes {list(scenes)}, steps {list(steps)}"
         )
-    scenes = clouds.scenes
     return [q for q in range(len(scenes)) if q + 1 == len(scenes) or scenes[q + 1] != scenes[q]]
+
+
+def _last(scenes: Sequence[int], steps: Sequence[int], n_steps: int) -> list[int]:
+    """The last ``n_steps`` clouds of each scene."""
+    kept, begin = [], 0
+    for last in _newest(scenes, steps):
+        kept += range(max(begin, last + 1 - n_steps), last + 1)
+        begin = last + 1
+    return kept
 
 
 def append_step(history: Particles, step: Particles, max_steps: int) -> Particles:
@@ -31,15 +43,12 @@ def append_step(history: Particles, step: Particles, max_steps: int) -> Particle
 
     Scenes without a cloud in ``step`` stay as they are.
     """
-    return last_steps(concatenate([history, step]), max_steps)
+    return concatenate([history, step], max_steps)
 
 
 def last_steps(particles: Particles, n_steps: int) -> Particles:
     """The last ``n_steps`` clouds of each scene."""
-    newest, kept, begin = newest_clouds(particles.clouds), [], 0
-    for last in newest:
-        kept += range(max(begin, last + 1 - n_steps), last + 1)
-        begin = last + 1
+    kept = _last(particles.clouds.scenes, particles.clouds.steps, n_steps)
     return particles if len(kept) == particles.n_clouds else particles.select_clouds(kept)
 
 
@@ -60,23 +69,29 @@ def alike(parts: Sequence[Particles]) -> list[Particles]:
     return list(parts)
 
 
-def concatenate(parts: Sequence[Particles]) -> Particles:
-    """The clouds of several particle sets of the same scenes in one, sorted by (scene, step)."""
+def concatenate(parts: Sequence[Particles], max_steps: int | None = None) -> Particles:
+    """The clouds of several particle sets of the same scenes in one, sorted by (scene, step); with ``max_steps`` only the
+    last of each scene, each once."""
     parts = alike(parts)
     tables = [part.clouds for part in parts]
     places = [(table.scenes[q], table.steps[q], p, q) for p, table in enumerate(tables) for q in range(len(table))]
     places.sort(key=lambda place: place[:2])
+    if max_steps is not None:
+        scenes, steps = [place[0] for place in places], [place[1] for place in places]
+        places = [places[i] for i in _last(scenes, steps, max_steps)]
     table = CloudTable.make(
         (tables[p].count(q) for _, _, p, q in places),
         (scene for scene, *_ in places),
         (step for _, step, *_ in places),
         parts[0].cu_rows.device,
     )
-    pieces = [(p, *tables[p].row_runs([q])[0]) for *_, p, q in places]
-    fields = {
-        name: torch.cat([getattr(parts[p], name)[begin:end] for p, begin, end in pieces]) if pieces else value
-        for name, value in parts[0].row_fields().items()
-    }
+    taken = [sorted(q for *_, of, q in places if of == p) for p in range(len(parts))]
+    runs = [[table.row_runs([q])[0] for q in clouds] for table, clouds in zip(tables, taken, strict=True)]
+    order = {cloud: i for i, cloud in enumerate((p, q) for p, clouds in enumerate(taken) for q in clouds)}
+    fields = {}
+    for name, value in parts[0].row_fields().items():
+        pieces = [rows for part, of in zip(parts, runs, strict=True) for rows in split_rows(getattr(part, name), of)]
+        fields[name] = torch.cat([pieces[order[p, q]] for *_, p, q in places]) if places else value
     return parts[0].with_clouds(table, **fields)
 
 

@@ -11,6 +11,7 @@ from gsim3d.stability import LARGEST
 PREDICTS = ("from_newest", "from_previous", "absolute")
 BACKGROUNDS = ("symmetric", "asymmetric")
 STEM_KERNEL, BLOCK_KERNEL = 5, 3  # edges of the convolutions, in cells
+MAX_HISTORY_BITS = 32  # that the geometry counts
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,10 @@ class DynamicsConfig:
             raise ValueError(f'DynamicsConfig: norm must be "layer" or "batch"; got {self.norm!r}')
         if self.predicts not in PREDICTS:
             raise ValueError(f"DynamicsConfig: predicts must be one of {', '.join(PREDICTS)}; got {self.predicts!r}")
+        if not 0 <= self.history_bits <= MAX_HISTORY_BITS:
+            raise ValueError(
+                f"DynamicsConfig: history_bits must be from 0 to {MAX_HISTORY_BITS}; got {self.history_bits}"
+            )
         if self.background not in BACKGROUNDS:
             raise ValueError(
                 f"DynamicsConfig: background must be one of {', '.join(BACKGROUNDS)}; got {self.background!r}"

@@ -31,6 +31,7 @@ class Dynamics(nn.Module):
         super().__init__()
         self.config = config
         self.layout = StateLayout.of(config)
+        self.rounds = False
         self.net = PointTransformer(self.layout.in_channels, self.layout.out_channels, config)
 
     def geometry(
@@ -40,6 +41,7 @@ class Dynamics(nn.Module):
         generator: torch.Generator | None = None,
         capacity: PyramidCapacity | None = None,
         curves: tuple[tuple[int, ...], ...] | None = None,
+        rounded: bool = False,
     ) -> Pyramid:
         """All that the network reads of the positions, as integers.
 
@@ -47,6 +49,7 @@ class Dynamics(nn.Module):
             history, generator: as :meth:`forward`.
             capacity: sizes of the result, so that nothing waits for the device; None: what the positions need.
             curves: of each stage, as of a background that is read; None: drawn from ``generator``.
+            rounded: as of :func:`gsim3d.ops.build_pyramid`.
         """
         clouds = history.clouds
         slots, history_bits = self._slots(clouds, newest_clouds(clouds))
@@ -59,6 +62,7 @@ class Dynamics(nn.Module):
             self.config.pyramid_spec(history_bits),
             curves=self._draw_curves(generator) if curves is None else curves,
             capacity=capacity,
+            rounded=rounded,
         )
 
     def remember(self, background: Particles, *, generator: torch.Generator | None = None) -> Background:
@@ -110,11 +114,14 @@ class Dynamics(nn.Module):
         newest = newest_clouds(clouds)
         if pyramid is None:
             curves = None if background is None else background.curves
-            pyramid = self.geometry(history, generator=generator, curves=curves)
-        if pyramid.found is not None and self.training and self.config.norm == "batch":
+            rounded = background is None and self._rounds(history)
+            pyramid = self.geometry(history, generator=generator, curves=curves, rounded=rounded)
+        n_data = [stage.n_data for stage in pyramid.stages]
+        if pyramid.found is not None and self.training and self.config.norm == "batch" and None in n_data:
             raise ValueError('Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"')
         features, is_awake = self.layout.pack(history), None
-        everyone = pyramid.found is None and pyramid.rows.shape[0] == history.n_rows
+        n_awake = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
+        everyone = n_awake == history.n_rows
         if not everyone:  # rows of the pyramid <-> rows of the history; those that sleep become 0
             features = ops.pool_mean(features, pyramid.rows, pyramid.cu_rows, check=False)
         draws = generator if self.training else None
@@ -138,6 +145,13 @@ class Dynamics(nn.Module):
             for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes))
         ]
         return steps[0] if len(steps) == 1 else concatenate(steps)
+
+    def _rounds(self, history: Particles) -> bool:
+        """Whether the network sees rows that are none, so that its matrix products have few sizes. On a GPU the first
+        product of every size costs the host as much time as several launches, and each call has its own sizes."""
+        if torch.compiler.is_compiling():
+            return False
+        return self.training and history.means.is_cuda if self.rounds is None else self.rounds
 
     def _forward_in_parts(
         self, history: Particles, generator: torch.Generator | None, changes: Mapping[str, str] | None

@@ -175,8 +175,8 @@ class Block(nn.Module):
         """
         if not self.training or generator is None or self.drop_path == 0:
             return [None, None]
-        draws = [torch.rand(x.shape[0], 1, generator=generator, device=generator.device) for _ in range(2)]
-        return [(draw >= self.drop_path).to(x) / (1 - self.drop_path) for draw in draws]
+        draws = torch.rand(2, x.shape[0], 1, generator=generator, device=generator.device)
+        return list((draws >= self.drop_path).to(x).div_(1 - self.drop_path).unbind())
 
 
 def scaled(x: Tensor, keep: Tensor | None) -> Tensor:
@@ -216,7 +216,7 @@ class Stem(nn.Module):
         self.norm = make_norm(config.norm, channels)
 
     def forward(self, x: Tensor, stage: Stage, beside: Beside | None = None) -> Tensor:
-        return self.norm.activated(self.conv(x, stage, beside))
+        return self.norm.activated(self.conv(x, stage, beside), stage.n_data)
 
 
 class Pool(nn.Module):
@@ -229,7 +229,7 @@ class Pool(nn.Module):
 
     def forward(self, x: Tensor, stage: Stage) -> Tensor:
         cluster = stage.cluster
-        return self.norm.activated(ops.pool_max(self.proj(x), cluster.rows, cluster.cu_rows, check=False))
+        return self.norm.activated(ops.pool_max(self.proj(x), cluster.rows, cluster.cu_rows, check=False), stage.n_data)
 
 
 class Merge(nn.Module):
@@ -288,10 +288,10 @@ class Unpool(nn.Module):
         self.skip = RowLinear(skip_channels, out_channels)
         self.skip_norm = make_norm(norm, out_channels)
 
-    def forward(self, x: Tensor, skip: Tensor, coarse: Stage) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor, skip: Tensor, stage: Stage, coarse: Stage) -> tuple[Tensor, Tensor]:
         """Both together, and the skip branch alone."""
-        below = self.proj_norm.activated(self.proj(x))
-        skip = self.skip_norm.activated(self.skip(skip))
+        below = self.proj_norm.activated(self.proj(x), coarse.n_data)
+        skip = self.skip_norm.activated(self.skip(skip), stage.n_data)
         cluster = coarse.cluster
         return skip + ops.unpool(below, cluster.rows, cluster.cu_rows, skip.shape[0], check=False), skip
 
@@ -316,7 +316,7 @@ class DecoderStage(nn.Module):
         generator: torch.Generator | None,
         beside: Beside | None = None,
     ) -> Tensor:
-        x, skip = self.unpool(x, skip, coarse)
+        x, skip = self.unpool(x, skip, stage, coarse)
         return run_blocks(self.blocks, x, skip if self.stale_conv else x, stage, generator, beside)
 
 

@@ -4,7 +4,8 @@ A row is quiet after ``patience`` steps in which it changed by no more than ``ep
 once all its rows are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of ``halo``
 metres. A cube sleeps while no row in it or in one of its 26 neighbours is restless, and wakes in the step after one has
 become so. A row that moves by less than ``halo`` a step is in a neighbouring cube one step before it can be in the
-sleeping one: whom it may meet is awake by then. Rows asleep are a background to those awake, so "approx" needs a model of
+sleeping one: whom it may meet is awake by then. Who falls asleep is asked every ``patience`` steps only, since others
+asleep make another background. Rows asleep are a background to those awake, so "approx" needs a model of
 ``background="asymmetric"``.
 
 A row that sleeps misses changes of up to ``eps`` a step. Where a simulation that never sleeps would change no row of a
@@ -61,6 +62,7 @@ class Sleepers:
         self.reach = rule.eps * grid_size
         self.asleep = torch.zeros(newest.n_rows, dtype=torch.bool, device=newest.means.device)
         self.steps_at_rest = torch.zeros_like(self.asleep, dtype=torch.int64)
+        self.n_steps = 0
 
     @torch.no_grad()
     def look(self, before: Particles, after: Particles) -> None:
@@ -74,10 +76,12 @@ class Sleepers:
         restless = self.steps_at_rest < self.patience
         scene = after.cloud_scene[after.row_cloud()]
         if self.rule.policy == "exact":
-            self.asleep = ~torch.isin(scene, scene[restless])
+            may_sleep = ~torch.isin(scene, scene[restless])
         else:
             stirred = _near(_cubes(after, scene, self.rule.halo), restless & (after.activity != ASLEEP))
-            self.asleep = ~stirred & ~restless & (after.activity != FROZEN)
+            may_sleep = ~stirred & ~restless & (after.activity != FROZEN)
+        self.n_steps += 1
+        self.asleep = may_sleep if self.n_steps % self.patience == 0 else may_sleep & self.asleep
 
 
 def _largest_change(before: Tensor, after: Tensor) -> Tensor:

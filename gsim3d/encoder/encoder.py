@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from gsim3d.encoder.checks import check_frames
 from gsim3d.encoder.cnn import CNN
@@ -86,17 +87,22 @@ class Encoder(nn.Module):
     ) -> Particles:
         """Puts the images of all parts in the order of clouds and drops masked pixels."""
         device, n_pixels = frames.images.device, frames.images.shape[2] * frames.images.shape[3]
-        encoded = torch.cat(images_of_parts)
-        place = torch.empty_like(order)
-        place[encoded] = torch.arange(order.shape[0], device=device)
-        kept = frames.masks[order].flatten() if frames.masks is not None else None
+        place = None
+        if len(parts) > 1:
+            place = torch.empty_like(order)
+            place[torch.cat(images_of_parts)] = torch.arange(order.shape[0], device=device)
+        kept, kept_rows, row_of_pixel = None, None, None
+        if frames.masks is not None:
+            kept = frames.masks[order].flatten()
+            kept_rows = kept.nonzero()[:, 0]
+            row_of_pixel = torch.where(kept, kept.cumsum(0) - 1, kept_rows.shape[0])
 
         def rows(name: str) -> Tensor | None:
             values = [getattr(part, name) for part in parts]
             if any(value is None for value in values):
                 return None
-            joined = (values[0] if len(values) == 1 else torch.cat(values)[place[order]]).flatten(0, 1)
-            return joined if kept is None else joined[kept]
+            joined = (values[0] if place is None else torch.cat(values)[place[order]]).flatten(0, 1)
+            return joined if kept is None else _Kept.apply(joined, kept_rows, row_of_pixel)
 
         if frames.masks is None:
             per_image = torch.full_like(order, n_pixels)
@@ -114,6 +120,24 @@ class Encoder(nn.Module):
             cu_rows=cu_rows,
             cloud_scene=frames.cloud_scene,
             cloud_step=frames.cloud_step,
-            activity=activity if kept is None else activity[kept],
+            activity=activity if kept is None else activity[kept_rows],
             origin=frames.origin,
         )
+
+
+class _Kept(torch.autograd.Function):
+    """Some rows of x, each once. The gradient takes rows too, where torch would add them to zeros and sort them for that.
+
+    rows: which, int64. place: of each row of x its place among ``rows``, or their number.
+    """
+
+    @staticmethod
+    def forward(ctx, x: Tensor, rows: Tensor, place: Tensor) -> Tensor:
+        ctx.save_for_backward(place)
+        return x.index_select(0, rows)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:
+        (place,) = ctx.saved_tensors
+        return torch.cat([grad, grad.new_zeros(1, *grad.shape[1:])]).index_select(0, place), None, None

@@ -21,14 +21,14 @@ from torch import Tensor
 
 from gsim3d.data import Scene, make_frames
 from gsim3d.data.recording import BACKGROUND
-from gsim3d.dynamics import concatenate
+from gsim3d.dynamics import RestLog, concatenate
 from gsim3d.edits import Edit
 from gsim3d.errors import InputError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.scoring import PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.layers import exact_convolutions
 from gsim3d.train.restore import Restored
-from gsim3d.train.samples import context_cameras, spread_views, thin_background
+from gsim3d.train.samples import context_cameras, spread_views, thinned
 from gsim3d.types import DYNAMIC, Particles
 
 METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant")
@@ -40,11 +40,13 @@ class Prediction:
 
     particles: one cloud a step, the first ``n_encoded`` of them encoded.
     context_cams: cameras whose images were the input.
+    resting: share of the predicted particles that rested and were not computed.
     """
 
     particles: Particles
     n_encoded: int
     context_cams: tuple[int, ...]
+    resting: float = 0.0
 
     @property
     def n_steps(self) -> int:
@@ -93,8 +95,8 @@ def predict(
         raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
     encoded = encode_steps(restored, scene, context_cams, start)
     with exact_convolutions():
-        steps = restored.simulator.rollout(encoded, n_future, restored.plan, edits=edits)
-    return Prediction(concatenate([encoded, *steps]), restored.data.history, tuple(context_cams))
+        steps = restored.simulator.rollout(encoded, n_future, restored.plan, edits=edits, log=(log := RestLog()))
+    return Prediction(concatenate([encoded, *steps]), restored.data.history, tuple(context_cams), log.resting_share)
 
 
 @torch.no_grad()
@@ -106,9 +108,27 @@ def encode_steps(restored: Restored, scene: Scene, context_cams: Sequence[int], 
         raise InputError(f"{scene.path}: {n_encoded} steps from step {start} on do not fit its {scene.n_steps} steps")
     masked = scene.has_segmentation()
     frames = make_frames([scene], [list(context_cams)], [range(start, start + n_encoded)], masked=masked)
-    frames = thin_background(frames, restored.data.background_stride).to(restored.device)
+    frames = thinned(frames, restored.data).to(restored.device)
     with exact_convolutions():
         return restored.simulator.encode(frames)
+
+
+@torch.no_grad()
+def predict_together(restored: Restored, scenes: Sequence[Scene], n_future: int) -> list[Prediction]:
+    """:func:`predict` of several scenes from their first steps and default views, in one rollout."""
+    for scene in scenes:
+        restored.check_scene(scene)
+    contexts = [default_views(restored, scene)[0] for scene in scenes]
+    n_encoded, masked = restored.data.history, all(scene.has_segmentation() for scene in scenes)
+    frames = make_frames(scenes, contexts, [range(n_encoded)] * len(scenes), masked=masked)
+    with exact_convolutions():
+        encoded = restored.simulator.encode(thinned(frames, restored.data).to(restored.device))
+        together = concatenate([encoded, *restored.simulator.rollout(encoded, n_future, restored.plan)])
+    n_steps = n_encoded + n_future
+    return [
+        Prediction(together.select_clouds(range(b * n_steps, (b + 1) * n_steps)), n_encoded, context)
+        for b, context in enumerate(contexts)
+    ]
 
 
 @torch.no_grad()

@@ -19,6 +19,7 @@ from gsim3d.ops.curve import (
     curve_encode,
     curve_sort,
 )
+from gsim3d.ops.decode import decode_gaussians
 from gsim3d.ops.patch_attn import patch_attention
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
@@ -43,6 +44,7 @@ __all__ = [
     "cuda_compiled",
     "curve_encode",
     "curve_sort",
+    "decode_gaussians",
     "norm_gelu",
     "patch_attention",
     "plane_sweep",

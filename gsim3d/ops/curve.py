@@ -188,6 +188,7 @@ class Stage:
     kernel_maps: dict[int, KernelMap]
     cluster: Segments | None
     time_index: Tensor | None
+    n_data: int | None = None  # rows that the data has, the first ones; None: not known to the host
 
     @property
     def n_rows(self) -> int:
@@ -203,7 +204,7 @@ class Pyramid:
     """rows: int64 [N0], the input rows that take part, ascending; cu_rows: int64 [N0 + 1], row i of stage 0 is input row
     rows[cu_rows[i]]; stages: finest first.
 
-    found: of a pyramid of given capacity, int64: 0 where it fits (see :meth:`PyramidCapacity.fits`), then the counts that
+    found: of a pyramid of given capacity, or of rounded sizes, int64: 0 where it fits (see :meth:`PyramidCapacity.fits`), then the counts that
     the data has. Sizes are then those of the capacity. Behind the data follow rows that nothing reads: no cluster, patch
     or pair lists them, each is a voxel of its own, pooled to 0; ``rows`` lists those that sleep. Everything is such a row
     where a count exceeds its capacity.
@@ -276,6 +277,7 @@ def build_pyramid(
     *,
     curves: tuple[tuple[int, ...], ...] | None = None,
     capacity: PyramidCapacity | None = None,
+    rounded: bool = False,
 ) -> Pyramid:
     """All geometry of a call of the dynamics network.
 
@@ -295,6 +297,8 @@ def build_pyramid(
         spec: the network's strides, windows, patch and kernel sizes.
         curves: per stage the curve (index into CURVES) of each of the four serialization rows; default (0, 1, 2, 3).
         capacity: sizes of the results; None: what the data needs.
+        rounded: sizes are what the data needs and up to one part in 32 more, so that many calls share few sizes, which
+            libraries of matrix products choose an algorithm for; not with ``capacity``.
     Returns:
         Pyramid; tensors int64 on the device of ``positions``. On CUDA the call waits once, for the sizes; with
         ``capacity`` never: a CUDA graph can capture it, and ``Pyramid.found`` tells later whether the data fitted.
@@ -320,6 +324,8 @@ def build_pyramid(
         _check_spec(spec, curves)
         if not (capacity is None or isinstance(capacity, PyramidCapacity)):
             raise TypeError(f"build_pyramid: capacity must be a PyramidCapacity; got {type(capacity).__name__}")
+        if not isinstance(rounded, bool):
+            raise TypeError(f"build_pyramid: rounded must be true or false; got {rounded!r}")
     if curves is None:
         curves = ((0, 1, 2, 3),) * spec.n_stages
     cu_kernels = [0]
@@ -341,9 +347,14 @@ def build_pyramid(
         cu_kernels,
         spec.release,
         () if capacity is None else capacity.sizes,
+        rounded,
     )
+    counts = None
+    if rounded and not torch.compiler.is_compiling():
+        each = len(PyramidCapacity.COUNTS)
+        counts = arrays[-1].tolist()[1 : 1 + each * spec.n_stages : each]
     with Branches(positions) as beside:
-        return _assemble(arrays, spec, capacity is not None, beside)
+        return _assemble(arrays, spec, counts, capacity is not None or rounded, beside)
 
 
 def _check_spec(spec: PyramidSpec, curves: tuple[tuple[int, ...], ...] | None) -> None:
@@ -378,8 +389,11 @@ def _kernel_map(size: int, voxels: Voxels, taps: tuple[Tensor, Tensor, Tensor], 
     return KernelMap(size, *taps, plan)
 
 
-def _assemble(arrays: list[Tensor], spec: PyramidSpec, has_found: bool, beside: Branches) -> Pyramid:
-    """Names the flat results, in the order that csrc/gsim3d/curve/pyramid.h states."""
+def _assemble(
+    arrays: list[Tensor], spec: PyramidSpec, counts: list[int] | None, has_found: bool, beside: Branches
+) -> Pyramid:
+    """Names the flat results, in the order that csrc/gsim3d/curve/pyramid.h states. ``counts``: rows of data of each
+    stage, where that is not all and the host knows it."""
     left = list(arrays)
     left.reverse()
     take = left.pop
@@ -391,7 +405,8 @@ def _assemble(arrays: list[Tensor], spec: PyramidSpec, has_found: bool, beside: 
         patches = tuple(PatchTable(order[r], kv_rows[r], cu_q, cu_k) for r in range(4))
         voxels = Voxels(take(), take(), take())
         kernel_maps = {size: _kernel_map(size, voxels, (take(), take(), take()), beside) for size in sizes}
-        stages.append(Stage(grid, cloud, cu_clouds, order, patches, voxels, kernel_maps, cluster, time_index))
+        n_data = counts[len(stages)] if counts else None if has_found else grid.shape[0]
+        stages.append(Stage(grid, cloud, cu_clouds, order, patches, voxels, kernel_maps, cluster, time_index, n_data))
     return Pyramid(rows, cu_rows, tuple(stages), take() if has_found else None)
 
 
@@ -422,6 +437,7 @@ def _(
     cu_kernels,
     release,
     capacity,
+    rounded=False,
 ):
     given = iter(capacity)
     new_size = torch.library.get_ctx().new_dynamic_size if not capacity else None
@@ -448,5 +464,6 @@ def _(
         for kernel_size in kernel_sizes[cu_kernels[s] : cu_kernels[s + 1]]:
             n_pairs = next(pairs) if capacity else new_size()
             arrays += [(n_pairs,), (n_pairs,), (kernel_size**3 + 1,)]
-    arrays += [(1 + len(capacity),)] if capacity else []
+    if capacity or rounded:
+        arrays.append((1 + len(PyramidCapacity.COUNTS) * len(patch_sizes) + len(kernel_sizes),))
     return [cu_rows.new_empty(shape) for shape in arrays]

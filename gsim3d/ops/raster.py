@@ -171,7 +171,9 @@ def rasterize_gaussians(
     if watch:
         action = "error" if on_bad == "raise" else "dropped"
         read = partial(_unusable, names=(*names, "scales", "scales", "cameras"), action=action)
-        (StabilityReport() if report is None else report).record(out[7], read)
+        (StabilityReport() if report is None else report).record(
+            out[7], read, counts=range(0, out[7].numel(), 2)
+        )
     return Rendering(out[0], out[1], out[2], None if features is None else out[3])
 
 

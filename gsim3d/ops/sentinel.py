@@ -1,9 +1,9 @@
-"""Which rows of a state cannot be used, and how its sums stand: one look, read without waiting for the device."""
+"""Which rows of a state cannot be used, what stands in for them, and how its sums stand: one look, without waiting."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,18 +19,20 @@ MAX_FIELDS = 8
 SUMS = ("awake", "kinetic_energy", "opacity_mass", "low_x", "low_y", "low_z", "high_x", "high_y", "high_z")
 
 
-@dataclass(frozen=True)
-class Watched:
+class Watched(NamedTuple):
     """What watch_rows saw.
 
     status: int32 [N], 0 where a row can be used; bit f: field f is out of its bounds; OUTSIDE; FAST.
     record: float64 [Q, 2 (F + 2) + 9], of every cloud: count and first row (-1: none) of each of the F fields, of
         OUTSIDE and of FAST; then SUMS over its awake rows of status 0 (bounds: 3.4e38 and -3.4e38 where there are
         none), but ``opacity_mass`` over all rows whose opacity is in bounds.
+    fields, activity: the rows mended; None where that was not asked for.
     """
 
     status: Tensor
     record: Tensor
+    fields: tuple[Tensor, ...] | None = None
+    activity: Tensor | None = None
 
 
 def watch_rows(
@@ -42,14 +44,20 @@ def watch_rows(
     origin: Tensor,
     activity: Tensor,
     grid_size: float = 0.0,
-    previous: Tensor | None = None,
+    previous: Sequence[Tensor] | None = None,
     max_step: float = LARGEST,
+    neutral: Sequence[float] | None = None,
+    check: bool = True,
 ) -> Watched:
-    """Looks once at all rows of packed clouds.
+    """Looks once at all rows of packed clouds, and mends them where it is told how.
 
     Row n is out of the bounds of field f unless ``low_f <= x <= high_f`` for all its values (NaN never is). It is
     OUTSIDE unless ``0 <= (means - origin) / grid_size < 2^16`` on all axes, and FAST if it moved further than
     ``max_step`` from ``previous``; both only where its position is in bounds.
+
+    In the mended copy rows with a status sleep. Those out of bounds of a field, or FAST, have the numbers of
+    ``previous``; without it their position is ``origin``, and a field's first number that of ``neutral``, followed by
+    zeros. The opacity of rows out of bounds is 0. Rows that sleep already stay as they are.
 
     Args:
         fields: 2 to 8 tensors with N rows, float32 or float64: positions [N, 3], opacities [N], and others of any shape.
@@ -59,11 +67,13 @@ def watch_rows(
         origin: float64 [B, 3] metres, lower corner of each scene's workspace.
         activity: uint8 [N] as in Particles; rows of 2 are asleep and not looked at: their status is 0.
         grid_size: metres, edge of a cell; 0: no row is OUTSIDE.
-        previous: [N, 3] positions one step before; None: no row is FAST, and the kinetic energy is 0.
+        previous: the fields one step before, all finite; None: no row is FAST, and the kinetic energy is 0.
         max_step: metres.
+        neutral: one number a field; None: nothing is mended.
+        check: look at the types of the arguments; a model that makes them itself leaves it out.
     Returns:
         Watched, on the device of the rows.
-    Gradients: none. Determinism: equal bits for any number of threads; on a GPU from run to run.
+    Gradients: none, of mended rows neither. Determinism: equal bits for any number of threads; on a GPU from run to run.
     Raises:
         ValueError, TypeError: an argument is malformed; the message names it. On a GPU offsets are not looked at.
 
@@ -74,30 +84,52 @@ def watch_rows(
         >>> watched.status.tolist(), watched.record[0, :2].tolist()
         ([0, 1], [1.0, 1.0])
     """
-    clouds = {"cu_rows": cu_rows, "cloud_scene": cloud_scene, "origin": origin, "activity": activity}
-    if not torch.compiler.is_compiling():
-        _check_arguments(fields, bounds, clouds if previous is None else {**clouds, "previous": previous})
+    if check and not torch.compiler.is_compiling():
+        clouds = {"cu_rows": cu_rows, "cloud_scene": cloud_scene, "origin": origin, "activity": activity}
+        _check_arguments(fields, bounds, previous, neutral, clouds)
         check_real("watch_rows", grid_size=grid_size, max_step=max_step)
-    low, high = ([pair[end] for pair in bounds] for end in (0, 1))
-    fields = [field.detach() for field in fields]
-    previous = None if previous is None else previous.detach()
-    return Watched(
-        *torch.ops.gsim3d.watch_rows(
-            fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_size, max_step
-        )
+    status, record, mended = torch.ops.gsim3d.watch_rows(
+        _detached(fields),
+        [low for low, _ in bounds],
+        [high for _, high in bounds],
+        cu_rows,
+        cloud_scene,
+        origin,
+        activity,
+        _detached(previous or ()),
+        grid_size,
+        max_step,
+        [] if neutral is None else list(neutral),
     )
+    return Watched(status, record, tuple(mended[1:]), mended[0]) if mended else Watched(status, record)
+
+
+def _detached(fields: Sequence[Tensor]) -> list[Tensor]:
+    return [field.detach() if field.requires_grad else field for field in fields]
 
 
 def _check_arguments(
-    fields: Sequence[Tensor], bounds: Sequence[tuple[float, float]], others: dict[str, Tensor]
+    fields: Sequence[Tensor],
+    bounds: Sequence[tuple[float, float]],
+    previous: Sequence[Tensor] | None,
+    neutral: Sequence[float] | None,
+    clouds: dict[str, Tensor],
 ) -> None:
-    """Types, and the number of bounds; shapes and dtypes are the kernel's."""
-    for name, value in {"fields": fields, "bounds": bounds}.items():
+    """Types, and how many there are; shapes and dtypes are the kernel's."""
+    lists = {"fields": fields, "bounds": bounds, "previous": previous, "neutral": neutral}
+    for name, value in lists.items():
+        if value is None and name in ("previous", "neutral"):
+            continue
         if not isinstance(value, (tuple, list)):
             raise TypeError(f"watch_rows: {name} must be a tuple or a list; got {type(value).__name__}")
-    check_tensors("watch_rows", **{f"fields[{f}]": field for f, field in enumerate(fields)}, **others)
-    if len(bounds) != len(fields):
-        raise ValueError(f"watch_rows: bounds must be one pair for each of {len(fields)} fields; got {len(bounds)}")
+        if len(value) != len(fields):
+            raise ValueError(
+                f"watch_rows: {name} must have one entry for each of {len(fields)} fields; got {len(value)}"
+            )
+    tensors = {f"fields[{f}]": field for f, field in enumerate(fields)}
+    tensors |= {f"previous[{f}]": field for f, field in enumerate(previous or ())}
+    check_tensors("watch_rows", **tensors, **clouds)
+    check_real("watch_rows", **{f"neutral[{f}]": value for f, value in enumerate(neutral or ())})
     for f, pair in enumerate(bounds):
         if not isinstance(pair, (tuple, list)) or len(pair) != 2:
             raise TypeError(f"watch_rows: bounds[{f}] must be a pair (lowest, highest); got {pair!r}")
@@ -105,10 +137,11 @@ def _check_arguments(
 
 
 @torch.library.register_fake("gsim3d::watch_rows")
-def _(fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_size, max_step):
+def _(fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_size, max_step, neutral):
     columns = 2 * (len(fields) + 2) + len(SUMS)
     n_rows, n_clouds = fields[0].shape[0], cu_rows.shape[0] - 1
     return (
         fields[0].new_empty(n_rows, dtype=torch.int32),
         fields[0].new_empty(n_clouds, columns, dtype=torch.float64),
+        [x.new_empty(x.shape) for x in (activity, *fields)] if neutral else [],
     )

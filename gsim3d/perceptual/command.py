@@ -39,8 +39,9 @@ def run(args: argparse.Namespace) -> int:
     import tempfile
     from pathlib import Path
 
-    from gsim3d.perceptual.weights import SETS, SOURCES, read_published, store
+    from gsim3d.perceptual.weights import SETS, SOURCES, check_cache, read_published, store
 
+    check_cache()
     names = SETS[args.metric]
     with tempfile.TemporaryDirectory(prefix="gsim3d-weights-") as folder:
         files = [Path(file) for file in args.files or ()]

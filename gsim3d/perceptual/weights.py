@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tarfile
+import tempfile
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -90,6 +91,20 @@ def cache_folder() -> Path:
     # The XDG specification: a relative path is to be ignored.
     base = Path(shared) if os.path.isabs(shared) else Path.home() / ".cache"
     return base / "gsim3d" / "weights"
+
+
+def check_cache() -> None:
+    """Raises InputError where nothing can be written into the cache; leaves no trace."""
+    folder = cache_folder()
+    try:
+        while not folder.exists():
+            folder = folder.parent
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise InputError(
+            f"{cache_folder()}: weights cannot be kept there: {folder}: {error.strerror}; "
+            "GSIM3D_CACHE_DIR names another folder"
+        ) from None
 
 
 def installed(name: str) -> bool:

@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -32,6 +33,7 @@ from gsim3d.types import ASLEEP, CloudTable, Frames, Particles
 FACTOR = 1.3  # room for geometry over what was observed: little costs captures, much costs time in every step
 ROWS_FACTOR = 1.15  # likewise, for the particles of a cloud
 ROW_UNIT = 256  # rows of a cloud are a multiple of it
+MOST_KINDS = 2  # of steps whose graphs are kept at a time
 LEARNED = ("means", "opacities", "dynamic_latents", "static_latents")  # of encoded particles, what has gradients
 
 
@@ -60,6 +62,7 @@ class CapturedLoss:
         precision: makes the context in which a part ("dynamics", "renderer") computes.
 
     Attributes:
+        parameters: those whose gradients it returns.
         alone: a context in which no other thread uses the GPU, which a capture does not allow.
         captures: how often a graph was made.
     """
@@ -81,18 +84,11 @@ class CapturedLoss:
         ):
             wanted = 'drop_path 0, shuffle_orders false, norm "layer", explicit false and a symmetric background'
             raise InputError(f"captured: the model must have {wanted}")
-        self._simulator, self._plan, self._loss, self._precision = simulator, plan, loss, precision
-        self._parameters = [*simulator.dynamics.parameters(), *simulator.renderer.parameters()]
-        self._kind: tuple | None = None
-        self._rows, self._capacities = 0, []
+        self.simulator, self.plan, self.loss, self.precision = simulator, plan, loss, precision
+        self.parameters = [*simulator.dynamics.parameters(), *simulator.renderer.parameters()]
         self.alone: AbstractContextManager = nullcontext()
-        self._release()
         self.captures = 0
-
-    @property
-    def parameters(self) -> list[Tensor]:
-        """Those whose gradients it returns."""
-        return self._parameters
+        self._steps: dict[tuple, _Step] = {}
 
     def __call__(self, particles: Particles, batch: Batch, weights: Tensor, report: StabilityReport) -> Gradients:
         """Of ``particles``, which the encoder made of ``batch``; gradients are overwritten by the next call.
@@ -102,12 +98,36 @@ class CapturedLoss:
             report: is told what the simulator's guards find; rows that cannot be used sleep.
         """
         table = particles.clouds
+        kind = (table.scenes, table.steps, batch.n_lead, batch.n_future, len(batch.targets.cameras))
         largest = max(table.count(q) for q in range(len(table)))
-        kind = (table.scenes, table.steps, batch.n_future, len(batch.targets.cameras), particles.means.device)
-        if kind != self._kind or largest > self._rows:
-            self._release()
-            self._kind, self._rows, self._capacities = kind, _rounded_up(ROWS_FACTOR * largest), []
-            self._allocate(particles, batch, weights)
+        step = self._steps.pop(kind, None)
+        if step is None or largest > step.rows:
+            step = None  # its memory goes back first
+            while len(self._steps) >= MOST_KINDS:
+                del self._steps[next(iter(self._steps))]
+            step = _Step(self, _rounded_up(ROWS_FACTOR * largest), particles, batch, weights)
+        self._steps[kind] = step  # now the newest
+        return step(particles, batch, weights, report)
+
+
+class _Step:
+    """A step of one kind, with ``rows`` rows a cloud."""
+
+    def __init__(self, owner: CapturedLoss, rows: int, particles: Particles, batch: Batch, weights: Tensor):
+        self._owner, self.rows, self._capacities = owner, rows, []
+        self._graph = self._records = None
+        table, device = particles.clouds, particles.means.device
+        known = CloudTable.make([rows] * len(table), table.scenes, table.steps, device)
+        fields = {name: x.new_zeros(rows * len(table), *x.shape[1:]) for name, x in particles.row_fields().items()}
+        for name in LEARNED:
+            fields[name].requires_grad_()
+        self._state = particles.with_clouds(known, **fields, origin=particles.origin.clone())
+        targets = batch.targets
+        self._targets = dataclasses.replace(targets.map(torch.clone), cameras=targets.cameras.map(torch.clone))
+        self._n_lead, self._n_future, self._weights = batch.n_lead, batch.n_future, weights.clone()
+        self._first_rows = torch.arange(len(table), device=device) * rows
+
+    def __call__(self, particles: Particles, batch: Batch, weights: Tensor, report: StabilityReport) -> Gradients:
         places = self._load(particles, batch, weights)
         if not self._capacities:
             self._capacities = self._observed()
@@ -117,9 +137,9 @@ class CapturedLoss:
             numbers = found.tolist()
             if all([capacity.fits(row) for capacity, row in zip(self._capacities, numbers, strict=True)]):
                 break
-            self._release()
-            self._capacities = [c.grown(row, FACTOR) for c, row in zip(self._capacities, numbers, strict=True)]
-            self._capacities = [c.grown((0, *o.sizes)) for c, o in zip(self._capacities, self._observed(), strict=True)]
+            self._graph = self._records = loss = errors = gradients = found = None  # their memory goes back first
+            grown = (c.grown(row, FACTOR) for c, row in zip(self._capacities, numbers, strict=True))
+            self._capacities = [c.grown((0, *o.sizes), 1) for c, o in zip(grown, self._observed(), strict=True)]
             self._capture()
         records.replayed(report)
         n = len(LEARNED)
@@ -128,17 +148,26 @@ class CapturedLoss:
 
     # ---- what runs ----
 
+    def _rollout(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> list[Particles]:
+        """The simulated steps that are looked at."""
+        owner, state = self._owner, self._state
+        rollout = partial(owner.simulator.rollout, plan=owner.plan, geometry=geometry, report=report, on_bad="drop")
+        with owner.precision("dynamics"):
+            if self._n_lead:
+                with torch.no_grad():
+                    state = concatenate([state, *rollout(state, self._n_lead)])
+            return rollout(state, self._n_future)
+
     def _compute(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> tuple:
-        simulator, options = self._simulator, {"report": report, "on_bad": "drop"}
+        owner = self._owner
         leaves = [getattr(self._state, name) for name in LEARNED]
-        with self._precision("dynamics"):
-            steps = simulator.rollout(self._state, self._n_future, self._plan, geometry=geometry, **options)
-        with self._precision("renderer"):
-            images = simulator.draw(
-                concatenate([self._state, *steps]), self._targets.cameras, plan=self._plan, **options
+        particles = concatenate([self._state, *self._rollout(geometry, report)])
+        with owner.precision("renderer"):
+            images = owner.simulator.draw(
+                particles, self._targets.cameras, plan=owner.plan, report=report, on_bad="drop"
             ).color
-        loss, errors = self._loss(images, self._targets, self._weights)
-        gradients = torch.autograd.grad(loss, [*leaves, *self._parameters], allow_unused=True)
+        loss, errors = owner.loss(images, self._targets, self._weights)
+        gradients = torch.autograd.grad(loss, [*leaves, *owner.parameters], allow_unused=True)
         return loss.detach(), errors, gradients
 
     def _observed(self) -> list[PyramidCapacity]:
@@ -146,13 +175,12 @@ class CapturedLoss:
         needed = []
 
         def geometry(history: Particles) -> Pyramid:
-            pyramid = self._simulator.dynamics.geometry(history)
+            pyramid = self._owner.simulator.dynamics.geometry(history)
             needed.append(PyramidCapacity.of(pyramid, history.n_rows, FACTOR))
             return pyramid
 
-        with torch.no_grad(), self._precision("dynamics"):
-            options = {"report": StabilityReport(), "on_bad": "drop"}
-            self._simulator.rollout(self._state, self._n_future, self._plan, geometry=geometry, **options)
+        with torch.no_grad():
+            self._rollout(geometry, StabilityReport())
         return needed
 
     def _given(self, report: StabilityReport) -> tuple:
@@ -160,14 +188,14 @@ class CapturedLoss:
         sizes, found = iter(self._capacities), []
 
         def geometry(history: Particles) -> Pyramid:
-            found.append(self._simulator.dynamics.geometry(history, capacity=next(sizes)))
+            found.append(self._owner.simulator.dynamics.geometry(history, capacity=next(sizes)))
             return found[-1]
 
         loss, errors, gradients = self._compute(geometry, report)
         return loss, errors, gradients, torch.stack([pyramid.found for pyramid in found])
 
     def _capture(self) -> None:
-        self.captures += 1
+        self._owner.captures += 1
         if self._state.means.device.type != "cuda":
             return
         torch.cuda.empty_cache()
@@ -177,7 +205,7 @@ class CapturedLoss:
             capturing = torch.cuda.is_current_stream_capturing()
             return self._given(self._records if capturing else StabilityReport())
 
-        with self.alone:
+        with self._owner.alone:
             self._graph = Captured(function, self._state.means.device)
 
     def _replay(self) -> tuple:
@@ -185,26 +213,6 @@ class CapturedLoss:
             records = StabilityReport()
             return *self._given(records), records
         return *self._graph(), self._records
-
-    def _release(self) -> None:
-        """Gives the graph's memory back."""
-        self._graph = self._records = None
-
-    # ---- what goes in ----
-
-    def _allocate(self, particles: Particles, batch: Batch, weights: Tensor) -> None:
-        table, device = particles.clouds, particles.means.device
-        n_rows = self._rows * len(table)
-        known = CloudTable.make([self._rows] * len(table), table.scenes, table.steps, device)
-        fields = {name: x.new_zeros(n_rows, *x.shape[1:]) for name, x in particles.row_fields().items()}
-        self._state = particles.with_clouds(known, **fields, origin=particles.origin.clone())
-        for name in LEARNED:
-            fields[name].requires_grad_()
-        targets = batch.targets
-        self._targets = dataclasses.replace(targets.map(torch.clone), cameras=targets.cameras.map(torch.clone))
-        self._n_future, self._weights = batch.n_future, weights.clone()
-        clouds = torch.arange(len(table), device=device)
-        self._first_rows = clouds * self._rows
 
     @torch.no_grad()
     def _load(self, particles: Particles, batch: Batch, weights: Tensor) -> Tensor:

@@ -25,6 +25,8 @@ class StageConfig:
 
     steps: optimizer steps.
     horizon: simulated steps after the encoded ones; 0 trains encoder and renderer alone.
+    lead: in every other optimizer step, on average, so many steps are simulated before these, without loss and
+        gradients: the model learns to go on from its own states, which a long rollout needs.
     history: encoded steps; 0: as many as the data section says.
     batch: scenes a step, of all processes together.
     target_views: images of each step that the loss compares.
@@ -35,6 +37,7 @@ class StageConfig:
 
     steps: int
     horizon: int = 0
+    lead: int = 0
     history: int = 0
     batch: int = 1
     target_views: int = 5
@@ -43,8 +46,10 @@ class StageConfig:
     warm_up: float = 0.01
 
     def __post_init__(self):
-        _at_least(self, steps=1, horizon=0, history=0, batch=1, target_views=1)
+        _at_least(self, steps=1, horizon=0, lead=0, history=0, batch=1, target_views=1)
         _at_least(self, from_start=0, learning_rate=0, warm_up=0)
+        if self.lead and not self.horizon:
+            raise InputError("lead: needs a horizon of 1 or more")
 
 
 @dataclass(frozen=True)
@@ -59,10 +64,13 @@ class DataConfig:
     context_cameras: the cameras they come from; empty: all but ``target_only_cameras``.
     target_only_cameras: cameras that are never an input; a loss may look at them.
     background_stride: of pixels that show what never moves, those on every n-th row and column become particles.
+    body_stride: likewise, of pixels that show what may move.
     thawed: of every scene's background a share drawn from 0 to this one is shown to the dynamics as movable, by cubes:
         so a model with an asymmetric background learns that rows at rest may be awake or asleep.
     resize: (width, height) pixels: films are scaled to cover it and cropped around the centre; empty: as filmed.
     near_far: metres, the depth range of all scenes; empty: each scene's own.
+    targets_apart: targets come from cameras that are no input of their window. Else a model may learn to show each
+        input to its own camera only: particles right before it, too small to be seen by others.
     unit_cameras: lengths are in units of the largest coordinate of a scene's cameras.
     """
 
@@ -73,13 +81,16 @@ class DataConfig:
     context_cameras: tuple[int, ...] = ()
     target_only_cameras: tuple[int, ...] = ()
     background_stride: int = 1
+    body_stride: int = 1
     thawed: float = 0.0
     resize: tuple[int, ...] = ()
     near_far: tuple[float, ...] = ()
+    targets_apart: bool = False
     unit_cameras: bool = False
 
     def __post_init__(self):
-        _at_least(self, history=1, shortest_history=0, context_views=1, fewest_views=0, background_stride=1)
+        _at_least(self, history=1, shortest_history=0, context_views=1, fewest_views=0)
+        _at_least(self, background_stride=1, body_stride=1)
         if not 0 <= self.thawed <= 1:
             raise InputError(f"data.thawed: must be from 0 to 1; got {self.thawed}")
         for least, most in (("shortest_history", "history"), ("fewest_views", "context_views")):

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from gsim3d.generate.cameras import workspace_origin
 from gsim3d.generate.film import film, start_filming
 from gsim3d.generate.world import World
 from gsim3d.train.config import DataConfig, StageConfig
-from gsim3d.train.samples import Batch, draw_windows, thin_background
+from gsim3d.train.samples import Batch, draw_windows, thinned
 from gsim3d.types import Cameras, Frames
 
 QUEUED = 2  # trajectories that wait for each process that films
@@ -83,15 +84,16 @@ class FilmStore:
             known = self.films[: min(self.count, self.capacity)]
             windows = draw_windows(known, data, stage, seed, step, samples)
             n_context = windows[0].n_context
-            context = self._frames(windows, [window.context_cams for window in windows], n_context)
-            targets = self._frames(windows, [window.target_cams for window in windows], n_context + stage.horizon)
-        return Batch(thin_background(context, data.background_stride), targets, n_context, stage.horizon)
+            frames = partial(self._frames, windows, data.near_far or (self._near, self._far))
+            context = frames([window.context_cams for window in windows], n_context)
+            targets = frames([window.target_cams for window in windows], n_context + stage.horizon)
+        return Batch(thinned(context, data), targets, n_context, stage.horizon, windows[0].lead)
 
-    def _frames(self, windows: Sequence[Window], cams: Sequence, n_steps: int) -> Frames:
+    def _frames(self, windows: Sequence[Window], depths: tuple[float, float], cams: Sequence, n_steps: int) -> Frames:
         """The first ``n_steps`` steps of the windows, seen by the cameras of each step."""
         n_views, (n_frames, n_cams, height, width) = len(cams[0][0]), self._shape
         places = [
-            ((window.scene.slot * n_frames + window.start + step) * n_cams + cam, cam)
+            ((window.scene.slot * n_frames + window.steps[step]) * n_cams + cam, cam)
             for window, by_step in zip(windows, cams, strict=True)
             for step in range(n_steps)
             for cam in by_step[step]
@@ -106,8 +108,8 @@ class FilmStore:
             cameras=Cameras(
                 self._viewmats[cam],
                 self._Ks[cam],
-                depth * self._near,
-                depth * self._far,
+                depth * depths[0],
+                depth * depths[1],
                 cloud.repeat_interleave(n_views),
                 width,
                 height,
@@ -127,12 +129,13 @@ class Filming:
     each number is filmed once. Use as a context; leaving it ends the processes.
 
     Attributes:
-        next: the smallest number that no process has begun.
+        next: the smallest number that no process was given.
     """
 
     def __init__(self, world: World, store: FilmStore, first: int, processes: int, cache: str | Path | None = None):
         self._world, self._store, self.next = world, store, first
         self._processes, self._names = processes, world.object_names()
+        self._wanted, self._begun = processes * QUEUED, 0
         self._cache = Path(tempfile.mkdtemp(prefix="films_", dir=cache))
         self._running = True
         self._failure: BaseException | None = None
@@ -144,8 +147,7 @@ class Filming:
         threads = os.environ.get("OMP_NUM_THREADS")
         os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that start now
         try:
-            for _ in range(self._processes * QUEUED):
-                self._begin()
+            self._begin()
         finally:
             os.environ.pop("OMP_NUM_THREADS") if threads is None else os.environ.update(OMP_NUM_THREADS=threads)
         return self
@@ -169,17 +171,23 @@ class Filming:
         self.check()
         return bool(done)
 
+    def slow_down(self, processes: int) -> None:
+        """From now on no more than ``processes`` film, so that the others' cores are free."""
+        self._wanted = processes
+
     def check(self) -> None:
         """Raises what a process raised."""
         if self._failure is not None:
             raise self._failure
 
     def _begin(self) -> None:
-        number, names = self.next, self._names
-        self.next += 1
-        scene = names[number % len(names)], number // len(names)
-        job = self._pool.submit(film, self._world, scene, str(self._cache / f"{number}.npy"))
-        job.add_done_callback(self._take)
+        """Hands out trajectories until as many are being filmed as wanted."""
+        while self._begun < self._wanted:
+            number, names = self.next, self._names
+            self.next, self._begun = number + 1, self._begun + 1
+            scene = names[number % len(names)], number // len(names)
+            job = self._pool.submit(film, self._world, scene, str(self._cache / f"{number}.npy"))
+            job.add_done_callback(self._take)
 
     def _take(self, job: Future) -> None:
         """Moves what a process has filmed into the store; called in a thread of the pool."""
@@ -189,6 +197,7 @@ class Filming:
             file = Path(job.result())
             self._store.put(np.load(file))
             file.unlink()
+            self._begun -= 1
             self._begin()
         except BaseException as error:  # told to the thread that trains
             self._failure = self._failure or error

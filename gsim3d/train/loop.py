@@ -28,6 +28,7 @@ from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.captured import CapturedLoss
+from gsim3d.train.checks import check_history, check_sharing
 from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import Log, memory_gib, plain, progress_note
 from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
@@ -43,7 +44,7 @@ from gsim3d.train.samples import (
     draw_batch,
     history_at,
     spread_views,
-    thin_background,
+    thinned,
 )
 from gsim3d.train.schedule import one_cycle
 from gsim3d.train.settings import from_dict, to_dict
@@ -91,9 +92,9 @@ class Trainer:
         self.plan = self.simulator.plan(self.plan_spec)
         if not self.plan_spec.outputs.rgb:
             raise InputError("effects: outputs.rgb is off, but the loss compares colours; leave it on")
-        _check_history(config, self.plan)
+        check_history(config, self.plan)
         check_thawing(config.data, self.simulator.config.dynamics)
-        _check_sharing(config, self.processes.count, self.simulator.config.dynamics.norm)
+        check_sharing(config, self.processes.count, self.simulator.config.dynamics.norm)
         self.perceptual = load("lpips_vgg", partial(LPIPS, "vgg")).to(device) if config.loss.perceptual else None
         self.parameters = dict(self.simulator.named_parameters())
         settings = config.optimizer
@@ -223,7 +224,7 @@ class Trainer:
     def _whole_batch(self, batch: int) -> tuple[float, Tensor, list[Tensor | None], list[Seen]]:
         """Loss, errors by step and gradients of the whole batch; what was seen in each of its parts."""
         scale = self.scale.value
-        norms_scale = scale if self.step % self.config.log_every == 0 else None
+        norms_scale = scale if self._is_logged else None
         if self.shared is not None:
             parts = self._shared_gradients(self.processes.share(batch))
             loss, errors, gradients, watch, n_samples, error = parts
@@ -250,14 +251,13 @@ class Trainer:
         named = dict(zip(self.parameters, gradients, strict=True))
         for name, parameter in self.parameters.items():
             parameter.grad = named[name]
-        is_logged = self.step % self.config.log_every == 0
-        if is_logged:
+        if self._is_logged:
             entry["grad_norm_by_module"] = norms_by_module(named)
         entry["loss"] = loss
         entry["grad_norm"] = torch.nn.utils.clip_grad_norm_(
             self.parameters.values(), self.config.optimizer.clip_norm or math.inf
         ).item()
-        if is_logged and (by_step := mean_of_norms([part.norms for part in seen])):
+        if self._is_logged and (by_step := mean_of_norms([part.norms for part in seen])):
             entry["grad_norm_by_step"] = by_step
         entry["particles"] = sum(part.n_rows for part in seen) / max(1, sum(part.n_clouds for part in seen))
         if total := sum(part.n_unusable for part in seen):
@@ -269,6 +269,10 @@ class Trainer:
         if not math.isfinite(entry["grad_norm"]):
             return f"the gradient is not finite, first that of {first_not_finite(named.items())}"
         return None
+
+    @property
+    def _is_logged(self) -> bool:
+        return self.step % self.config.log_every == 0
 
     def _stop_if_diverged(self, entry: dict) -> None:
         n, limit = self.n_skipped_in_a_row, self.config.optimizer.max_skipped
@@ -401,10 +405,16 @@ class Trainer:
                 rng = generator(self.config.seed, self.step, sample, "thawed")
                 particles = thaw(particles, self.config.data.thawed, self.plan_spec, rng)
             with precision.of("dynamics", self.device):
+                begin = particles
+                if batch.n_lead:
+                    with torch.no_grad():
+                        ahead = simulator.rollout(particles, batch.n_lead, self.plan, generator=noise, **options)
+                        begin = concatenate([particles, *ahead])
                 steps = simulator.rollout(
-                    particles, batch.n_future, self.plan, generator=noise, wrap=again("steps", noise), **options
+                    begin, batch.n_future, self.plan, generator=noise, wrap=again("steps", noise), **options
                 )
-            watch.follow(steps)
+            if self._is_logged:
+                watch.follow(steps)
             particles = concatenate([particles, *steps])
         with precision.of("renderer", self.device):
             render = again("images")(
@@ -428,7 +438,7 @@ class Trainer:
         )
         self.simulator.eval()
         try:
-            frames = thin_background(frames, data.background_stride).to(self.device)
+            frames = thinned(frames, data).to(self.device)
             state = self.simulator.encode(frames, on_bad="drop")
             if stage.horizon:
                 later = self.simulator.rollout(state, stage.horizon, self.plan, on_bad="drop")
@@ -574,24 +584,6 @@ def _mean(results: list) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:
         known = [part for part in parts if part is not None]
         means.append(sum(known[1:], known[0]) / len(results) if known else None)
     return sum(losses) / len(results), sum(errors) / len(results), means
-
-
-def _check_sharing(config: TrainConfig, n_processes: int, norm: str) -> None:
-    if config.workers and norm == "batch":
-        raise InputError("workers: must be 0 for a model with batch normalisation, which needs all samples at once")
-    if config.captured and (n_processes > 1 or config.workers or config.recompute):
-        raise InputError("captured: needs one process, workers 0 and nothing to recompute")
-    if config.workers and n_processes > 1:
-        raise InputError(f"workers: must be 0 in {n_processes} processes, which share the samples of a step themselves")
-    for i, stage in enumerate(config.stages):
-        if stage.batch < n_processes:
-            raise InputError(f"stages[{i}].batch: {stage.batch} samples are too few for {n_processes} processes")
-
-
-def _check_history(config: TrainConfig, plan: Plan) -> None:
-    for history in {config.data.history, *(stage.history for stage in config.stages if stage.horizon)}:
-        if history > plan.history:
-            raise InputError(f"data.history: {history} steps, but this model sees up to {plan.history}")
 
 
 def _psnr(errors: Tensor) -> float:

@@ -7,6 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
+from torch.nn.modules.module import (
+    register_module_buffer_registration_hook,
+    register_module_parameter_registration_hook,
+)
+from torch.overrides import TorchFunctionMode
 
 from gsim3d import presets
 from gsim3d.data import Scene
@@ -85,6 +91,45 @@ def build_simulator(config: ModelConfig, seed: int) -> Simulator:
         return Simulator(config)
 
 
+class _WithoutFirstWeights(TorchFunctionMode):
+    """Within it tensors without memory stay as they are; else torch would import its compiler to fill them."""
+
+    def __torch_function__(self, function, types, args=(), kwargs=None):
+        if function.__name__.endswith(("normal_", "uniform_")):
+            return args[0] if args else kwargs["tensor"]
+        return function(*args, **(kwargs or {}))
+
+
+def first_weights(simulator: Simulator, spec: EffectsSpec, weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The simulator's own weights that no effect of ``spec`` reads, so that they need not be among ``weights``."""
+    lacks = set(simulator.plan(spec).unused).difference(weights)
+    return {name: value for name, value in simulator.state_dict().items() if name in lacks}
+
+
+def check_sizes(config: ModelConfig, spec: EffectsSpec, weights: dict[str, Tensor]) -> None:
+    """Raises RuntimeError where ``config`` describes other weights than those, before it takes memory for its own."""
+    n_most, n_made = sum(value.numel() for value in weights.values()), 0
+
+    def count(_module, _name, value):
+        nonlocal n_made
+        n_made += 1 if value is None else max(1, value.numel())
+        if n_made > 2 * n_most:  # some are made more than once
+            raise RuntimeError(f"it has more than twice their {n_most} numbers")
+
+    n_blocks = sum(config.dynamics.encoder_depths) + sum(config.dynamics.decoder_depths)
+    if n_blocks > len(weights):
+        raise RuntimeError(f"it has {n_blocks} blocks in its dynamics; the weights are {len(weights)} tensors")
+    hooks = [register_module_parameter_registration_hook(count), register_module_buffer_registration_hook(count)]
+    try:
+        with torch.device("meta"), _WithoutFirstWeights():
+            simulator = Simulator(config)
+    finally:
+        for hook in hooks:
+            hook.remove()
+    sizes = {name: torch.empty_like(value, device="meta") for name, value in weights.items()}
+    simulator.load_state_dict({**first_weights(simulator, spec, weights), **sizes})
+
+
 def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: EffectsSpec) -> dict:
     """The content of a checkpoint's config.yaml."""
     return {
@@ -129,17 +174,16 @@ def _restored(path: str | Path, saved: checkpoint.Checkpoint, device: str) -> Re
         raise InputError(f"{path}: data.image_size must be [width, height]; got {list(image_size)}")
     try:
         model = from_dict(ModelConfig, without_old_switches(saved.config["model"]), "model")
-        simulator = build_simulator(model, seed=0)
         settings = from_dict(DataConfig, data, "data")
         spec = EffectsSpec.from_dict(saved.config.get("effects", {}).get("spec"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    plan = simulator.plan(spec)
     try:
-        lacks = set(plan.unused).difference(saved.weights)  # what no effect reads need not be there
-        own = {name: value for name, value in simulator.state_dict().items() if name in lacks}
+        check_sizes(model, spec, saved.weights)
+        simulator = build_simulator(model, seed=0)
+        own = first_weights(simulator, spec, saved.weights)
         simulator.load_state_dict({**own, **saved.weights})
     except RuntimeError as error:
         raise InputError(f"{path}: the weights do not fit the model: {str(error).splitlines()[-1].strip()}") from None
-    simulator.absent = frozenset(lacks)
-    return Restored(simulator.eval().to(device), settings, image_size, plan, saved)
+    simulator.absent = frozenset(own)
+    return Restored(simulator.eval().to(device), settings, image_size, simulator.plan(spec), saved)

@@ -17,16 +17,17 @@ from gsim3d.types import Frames
 
 @dataclass(frozen=True)
 class Batch:
-    """Windows of B scenes, all of n_context + n_future steps.
+    """Windows of B scenes, all of n_context + n_lead + n_future steps.
 
     context: input images of the first n_context steps of each.
-    targets: images of all steps; image i shows cloud b * (n_context + n_future) + t.
+    targets: images of these and of the last n_future; image i shows cloud b * (n_context + n_future) + t.
     """
 
     context: Frames
     targets: Frames
     n_context: int
     n_future: int
+    n_lead: int = 0
 
     def to(self, device: str | torch.device) -> Batch:
         return dataclasses.replace(self, context=self.context.to(device), targets=self.targets.to(device))
@@ -48,10 +49,10 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, stages: Sequence[Sta
                 f"{first.width}x{first.height}; data.resize brings all to one size"
             )
         for stage in stages:
-            n_steps = (stage.history or data.history) + stage.horizon
+            n_steps = (stage.history or data.history) + stage.lead + stage.horizon
             if scene.n_steps < n_steps:
                 raise InputError(f"{scene.path}: {scene.n_steps} steps; windows of {n_steps} steps do not fit")
-            if scene.n_cams < stage.target_views:
+            if scene.n_cams - data.targets_apart * data.context_views < stage.target_views:
                 raise InputError(f"{scene.path}: {scene.n_cams} cameras; {stage.target_views} target views do not fit")
         if len(context_cameras(scene, data)) < data.context_views:
             raise InputError(f"{scene.path}: too few cameras for {data.context_views} context views")
@@ -79,12 +80,12 @@ def draw_batch(
     windows = draw_windows(scenes, data, stage, seed, step, samples)
     n_context = windows[0].n_context
     chosen = [window.scene for window in windows]
-    steps = [list(window.steps) for window in windows]
+    steps = [window.steps for window in windows]
     masked = all(scene.has_segmentation() for scene in chosen)
     context_cams = [window.context_cams for window in windows]
     context = make_frames(chosen, context_cams, [s[:n_context] for s in steps], masked=masked)
     targets = make_frames(chosen, [window.target_cams for window in windows], steps, masked=masked)
-    return Batch(thin_background(context, data.background_stride), targets, n_context, stage.horizon)
+    return Batch(thinned(context, data), targets, n_context, stage.horizon, windows[0].lead)
 
 
 def draw_windows(
@@ -101,18 +102,30 @@ def history_at(data: DataConfig, stage: StageConfig, seed: int, step: int) -> in
     return stage.history or _drawn(data.shortest_history, data.history, seed, step, "history")
 
 
+def lead_at(stage: StageConfig, seed: int, step: int) -> int:
+    """Steps that all samples of an optimizer step simulate ahead of their horizon."""
+    return stage.lead * int(generator(seed, step, 0, "lead").integers(2)) if stage.lead else 0
+
+
 def _drawn(least: int, most: int, seed: int, step: int, purpose: str) -> int:
     """Any whole number from ``least`` to ``most``, the same for all samples of a step; ``most`` where least is 0."""
     return int(generator(seed, step, 0, f"number of {purpose}").integers(least, most + 1)) if least else most
 
 
-def thin_background(frames: Frames, stride: int) -> Frames:
-    """``frames`` of whose fixed pixels only those on every ``stride``-th row and column become particles."""
-    if stride == 1 or frames.masks is None or frames.dynamic is None:
+def thinned(frames: Frames, data: DataConfig) -> Frames:
+    """``frames`` of which those pixels become particles that the strides of ``data`` leave."""
+    fixed, moving = data.background_stride, data.body_stride
+    if fixed == moving == 1 or frames.masks is None or frames.dynamic is None:
         return frames
-    kept = torch.zeros(frames.masks.shape[1:], dtype=torch.bool, device=frames.masks.device)
+    kept = torch.where(frames.dynamic, _every(moving, frames.masks), _every(fixed, frames.masks))
+    return dataclasses.replace(frames, masks=frames.masks & kept)
+
+
+def _every(stride: int, like: Tensor) -> Tensor:
+    """bool [H, W]: every n-th row and column of images [I, H, W]."""
+    kept = torch.zeros(like.shape[1:], dtype=torch.bool, device=like.device)
     kept[stride // 2 :: stride, stride // 2 :: stride] = True
-    return dataclasses.replace(frames, masks=frames.masks & (kept | frames.dynamic))
+    return kept
 
 
 def spread_views(cameras: Sequence[int], count: int, turn: int) -> tuple[int, ...]:
@@ -126,15 +139,16 @@ def _draw_window(
 ) -> Window:
     rng = generator(seed, step, sample, "window")
     scene = scenes[int(rng.integers(len(scenes)))]
-    n_steps = n_context + stage.horizon
-    last_start = scene.n_steps - n_steps
+    n_steps, lead = n_context + stage.horizon, lead_at(stage, seed, step)
+    last_start = scene.n_steps - n_steps - lead
     start = int(rng.integers(last_start + 1))
     if rng.random() < stage.from_start:
         start = 0
     views = generator(seed, step, sample, "views")
     cameras = context_cameras(scene, data)
     context = spread_views(cameras, data.context_views, int(views.integers(len(cameras))))
+    seen = [cam for cam in range(scene.n_cams) if not (data.targets_apart and cam in context)]
     targets = tuple(
-        tuple(int(cam) for cam in views.permutation(scene.n_cams)[: stage.target_views]) for _ in range(n_steps)
+        tuple(seen[place] for place in views.permutation(len(seen))[: stage.target_views]) for _ in range(n_steps)
     )
-    return Window(scene, start, n_context, (context,) * n_context, targets)
+    return Window(scene, start, n_context, (context,) * n_context, targets, lead)

@@ -47,6 +47,23 @@ def test_every_problem_of_every_scene(data, capsys):
     assert out.is_file()
 
 
+def test_nothing_is_written_without_being_asked(data, capsys, monkeypatch):
+    monkeypatch.chdir(data.parent)
+    assert main(["check-data", "data"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "3 scenes read, no problem; --out draws a picture of the cameras"
+    assert [path.name for path in data.parent.iterdir()] == ["data"]
+
+
+def test_quiet_prints_problems_only(data, capsys):
+    (data / "films/cameras.json").write_text("{")
+    assert main(["check-data", str(data), "--quiet"]) == 1
+    printed = capsys.readouterr()
+    lines = printed.out.splitlines()
+    assert lines[0].startswith(f"{data / 'films'}: ") and lines[1].startswith("  problem: ")
+    assert all(line.startswith("  problem: ") for line in lines[1:-1]) and lines[-1].startswith("3 scenes read, ")
+    assert printed.err == ""
+
+
 def test_nothing_to_draw(tmp_path, capsys):
     (tmp_path / "cameras.json").write_text("[]")
     assert main(["check-data", str(tmp_path), "--out", str(tmp_path / "sheet.png")]) == 1

@@ -192,6 +192,31 @@ def test_batch_norm_uses_running_statistics_in_evaluation_and_survives_one_row()
     assert all(torch.isfinite(b).all() for b in dynamics.buffers()) and len(before) == len(list(dynamics.buffers()))
 
 
+@pytest.mark.parametrize("norm", ["layer", "batch"])
+@pytest.mark.parametrize("sleeper", [False, True])
+def test_rows_that_are_none_change_nothing_in_training(norm, sleeper, device):
+    """Where the geometry is rounded the network sees more rows; they reach no statistics and no gradient."""
+    dynamics, results = make_dynamics(dataclasses.replace(TINY, norm=norm)).train().double().to(device), []
+    history = make_history((97, 113)).to(device)
+    history = dataclasses.replace(history, **{k: v.double() for k, v in history.row_fields().items() if k != "activity"})
+    if sleeper:
+        history.means[7] = torch.nan
+    start = {name: value.clone() for name, value in dynamics.state_dict().items()}
+    for rounds in (False, True):
+        dynamics.rounds = rounds
+        dynamics.load_state_dict(start)
+        stages = dynamics.geometry(history, rounded=rounds).stages
+        assert any(stage.n_rows > stage.n_data for stage in stages) == rounds
+        latents = history.dynamic_latents.clone().requires_grad_()
+        step = dynamics(dataclasses.replace(history, dynamic_latents=latents))
+        loss = step.means.nan_to_num().sin().sum() + step.dynamic_latents.square().sum()
+        gradients = torch.autograd.grad(loss, [latents, *dynamics.parameters()])
+        results.append([step.means.nan_to_num(), step.dynamic_latents, *gradients, *dynamics.buffers()])
+    largest = max(gradient.abs().max() for gradient in results[0][2:])
+    for exact, rounded in zip(*results, strict=True):
+        assert (rounded - exact).abs().max() <= 1e-12 * max(1, largest)
+
+
 def test_rollout_feeds_steps_back_and_carries_gradients_to_the_start():
     dynamics, history = make_dynamics(), make_history((20, 25))
     means = history.means.clone().requires_grad_()

@@ -14,8 +14,8 @@ from gsim3d.ops.curve import CURVES
 from gsim3d.quirks import Quirks
 from gsim3d.types import ASLEEP, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
-from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history
-from tests.effects.resting import ASYMMETRIC, make_scenes, make_simulator
+from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
+from tests.effects.resting import ASYMMETRIC, make_scenes, make_simulator, newest_rows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -201,6 +201,19 @@ def test_scenes_of_a_batch_do_not_change_each_other():
             assert_same_bits(getattr(together, name)[begin : begin + alone.n_rows], value, name)
 
 
+def test_neither_the_order_of_rows_nor_the_place_of_a_scene_matters():
+    config = dataclasses.replace(ASYMMETRIC, position_features=False)
+    dynamics, history = make_dynamics(config, dtype=torch.float64), make_scenes(torch.float64)
+    step = dynamics(history)
+    mixed, order = permute_rows(history)
+    newest = torch.nonzero(newest_rows(history))[:, 0]
+    place = torch.zeros(history.n_rows, dtype=torch.int64).index_copy(0, newest, torch.arange(newest.shape[0]))
+    assert_close_relative_to_max(dynamics(mixed).means, step.means[place[order[newest]]], 1e-12)
+    by = torch.tensor([16.0, -8.0, 4.0], dtype=torch.float64)
+    moved = dynamics(dataclasses.replace(history, means=history.means + by, origin=history.origin + by))
+    assert_close_relative_to_max(moved.means - by, step.means, 1e-12)
+
+
 def test_asleep_rows_are_in_neither_part():
     dynamics, history = make_dynamics(ASYMMETRIC), make_history((60, 60), frozen_share=0.5)
     asleep = torch.arange(120) % 4 == 0
@@ -220,15 +233,32 @@ def test_room_changes_no_bit(room):
     assert_same_particles(dynamics(parts.moving, pyramid=given, background=background), expected)
 
 
-def test_a_captured_rollout_has_the_same_bits_also_of_another_background():
-    simulator, state = make_simulator(), make_scenes()
-    captured = CapturedRollout(simulator, state, 3)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@torch.no_grad()
+def test_a_captured_rollout_has_the_same_bits_also_of_another_background(device, dtype):
+    simulator, state = make_simulator().to(device), make_scenes().to(device)
     turned = dataclasses.replace(state, static_latents=state.static_latents.flip(1))
     frozen = (state.activity == FROZEN)[:, None]
     moved = dataclasses.replace(state, means=torch.where(frozen, 0.3 + 0.4 * state.means.flip(1), state.means))
-    for given in (state, turned, moved, state):
-        for step, expected in zip(captured(given).steps, simulator.rollout(given, 3), strict=True):
-            assert_same_particles(step, expected)
+    with torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
+        captured = CapturedRollout(simulator, state, 3)
+        for given in (state, turned, moved, state):
+            for step, expected in zip(captured(given).steps, simulator.rollout(given, 3), strict=True):
+                assert_same_particles(step, expected)
+
+
+@torch.no_grad()
+def test_a_background_is_made_anew_where_weights_have_changed(device):
+    simulator, state = make_simulator().to(device), make_scenes().to(device)
+    captured = CapturedRollout(simulator, state, 2)
+    before = captured(state).steps[1].means
+    for parameter in simulator.dynamics.parameters():
+        parameter.mul_(1.1)
+    captured.reload()
+    after = captured(state).steps
+    assert not torch.equal(after[1].means, before)
+    for step, expected in zip(after, simulator.rollout(state, 2), strict=True):
+        assert_same_particles(step, expected)
 
 
 def test_a_background_without_room_for_another_is_made_anew():
@@ -247,6 +277,24 @@ def test_a_rollout_repeats_bit_by_bit():
     simulator = make_simulator()
     for one, other in zip(*(simulator.rollout(make_scenes(), 3) for _ in range(2)), strict=True):
         assert_same_particles(one, other)
+
+
+def test_a_gpu_gives_what_the_cpu_gives(devices):
+    results = []
+    for device in devices:
+        simulator, state = make_simulator(dtype=torch.float64).to(device), make_scenes(torch.float64).to(device)
+        state = dataclasses.replace(state, static_latents=state.static_latents.requires_grad_())
+        steps = simulator.rollout(state, 3)
+        loss = sum(step.means.square().sum() + step.dynamic_latents.square().sum() for step in steps)
+        grads = torch.autograd.grad(
+            loss, [state.static_latents, simulator.dynamics.net.encoder[0].blocks[0].mlp.fc1.weight]
+        )
+        with torch.no_grad():  # through blocks in few launches
+            results.append(
+                [*(t.cpu() for t in grads), *(s.means.cpu() for s in (*steps, *simulator.rollout(state, 3)))]
+            )
+    for one, other in zip(*results, strict=True):
+        assert_close_relative_to_max(other, one, 1e-9)
 
 
 def test_joint_attention_has_the_same_bits_for_any_number_of_threads():

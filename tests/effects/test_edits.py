@@ -7,7 +7,7 @@ import pytest
 import torch
 import yaml
 
-from gsim3d.dynamics import append_step, last_steps
+from gsim3d.dynamics import RestLog, append_step, last_steps
 from gsim3d.edits import (
     Duplicate,
     Edit,
@@ -20,7 +20,7 @@ from gsim3d.edits import (
     Throw,
     load_edits,
 )
-from gsim3d.effects import DynamicsEffects, EffectsSpec, StructureEffects
+from gsim3d.effects import DynamicsEffects, EffectsSpec, Sleep, StructureEffects
 from gsim3d.errors import InputError
 from gsim3d.types import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -181,16 +181,33 @@ def test_two_scenes_are_merged():
         future(simulator, here, 1, [Edit(0, Insert("all", both))])
 
 
-def test_an_edit_on_the_way_is_a_rollout_from_the_edited_state():
-    simulator, state, _ = encoded()
-    edits = [Edit(2, Duplicate("moving", (0.4, 0.0, 0.0))), Edit(2, Remove(Selection("frozen")))]
-    steps = future(simulator, state, 4, edits)
-    plain = future(simulator, state, 2)
+@pytest.mark.parametrize(("model", "policy"), [("latent", None), ("latent", "exact"), ("asymmetric", "approx")])
+def test_an_edit_on_the_way_is_a_rollout_from_the_edited_state(model, policy):
+    """Also where a background is remembered, and where somebody may sleep."""
+    simulator, state, _ = encoded(MODELS[model])
+    sleep = DynamicsEffects(sleep=None if policy is None else Sleep(policy, eps=0.5))
+    spec = dataclasses.replace(EDITABLE, dynamics=sleep)
+    edits = [
+        Edit(2, Duplicate("moving", (0.4, 0.0, 0.0))),
+        Edit(2, Remove(Selection("frozen", ((-9.0, -9.0, -9.0), (0.0, 9.0, 9.0))))),
+        Edit(2, Move("frozen", (0.0, 0.0, 0.2))),
+    ]
+    steps = future(simulator, state, 4, edits, spec)
+    plain = future(simulator, state, 2, spec=spec)
     middle = append_step(append_step(state, plain[0], 4), plain[1], 4)
-    rest = future(simulator, edited(simulator, middle, *[edit.operation for edit in edits]), 2)
+    rest = future(simulator, edited(simulator, middle, *[edit.operation for edit in edits]), 2, spec=spec)
     assert [step.cloud_step.tolist() for step in steps] == [[2], [3], [4], [5]]
     for step, expected in zip(steps, [*plain, *rest], strict=True):
         assert_same_bits(step.means, expected.means)
+
+
+def test_an_edit_wakes_a_scene_that_sleeps():
+    simulator, state, _ = encoded()
+    spec = dataclasses.replace(EDITABLE, dynamics=DynamicsEffects(sleep=Sleep("exact", eps=1e6, patience=1)))
+    log, edit = RestLog(), Edit(8, Throw("moving", (0.0, 0.0, 0.05)))
+    with torch.no_grad():
+        simulator.rollout(state, 10, simulator.plan(spec), edits=[edit], log=log)
+    assert log.moving[7] == 0 < log.moving[8], "asleep after as many steps as the model sees, until it is thrown"
 
 
 def test_a_box_means_what_is_inside():
@@ -248,6 +265,7 @@ def test_files(tmp_path):
         ("step: 0", "must hold a list; got dict"),
         ("- 3", "edit 0 must be a mapping; got 3"),
         ("- {op: move}", "edit 0: step must be a whole number; got None"),
+        ("- {step: 2, op: [move]}", "edit 0 at step 2: op must be one of remove, move"),
         ("- {step: 2, op: explode}", "edit 0 at step 2: op must be one of remove, move"),
         ("- {step: 2, op: move, to: [0, 0, 1]}", "edit 0 at step 2, move: unknown key to; known: of, by"),
         ("- {step: 2, op: move, by: [0, 1]}", r"edit 0 at step 2, move: by must be a list of 3; got \[0, 1\]"),

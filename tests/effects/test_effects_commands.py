@@ -108,12 +108,22 @@ def test_simulate_applies_edits(capsys, work, tmp_path):  # noqa: F811
 
 def test_simulate_computes_what_a_file_asks_for(capsys, work, tmp_path):  # noqa: F811
     EffectsSpec(DynamicsEffects("masked_out")).save(tmp_path / "spec.yaml")
-    scene = work / "data" / "ball" / "0000"
-    options = ["--steps", "1", "--cameras", "3", "--effects", tmp_path / "spec.yaml", "--out", tmp_path / "out"]
-    code, _, err = call(capsys, "simulate", work / "run", scene, *options)
+    scene, options = work / "data" / "ball" / "0000", ["--steps", "1", "--cameras", "3"]
+    masked = ["--effects", tmp_path / "spec.yaml"]
+    for out, more in (("plain", []), ("masked", masked)):
+        code, _, err = call(capsys, "simulate", work / "run", scene, *options, *more, "--out", tmp_path / out)
+        assert code == 0, err
+    plain, masked = (read_ply(tmp_path / out / "gaussians" / "step_0002.ply") for out in ("plain", "masked"))
+    assert 0 < masked.means.shape[0] < plain.means.shape[0]
+
+
+def test_simulate_tells_how_much_rested(capsys, work, tmp_path):  # noqa: F811
+    scene, file = work / "data" / "ball" / "0000", tmp_path / "effects.yaml"
+    file.write_text("dynamics: {sleep: {eps: 1000000.0, patience: 2}}")
+    options = ["--steps", "4", "--cameras", "0", "--effects", file, "--out", tmp_path / "out"]
+    code, out, err = call(capsys, "simulate", work / "run", scene, *options)
     assert code == 0, err
-    given, predicted = (read_ply(tmp_path / "out" / "gaussians" / f"step_{i:04d}.ply").means.shape[0] for i in (1, 2))
-    assert predicted < given
+    assert "4 predicted (50% of the particles at rest, not computed)" in out
 
 
 @pytest.mark.parametrize(

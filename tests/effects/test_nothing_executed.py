@@ -22,11 +22,11 @@ EFFECTS = {
         "asymmetric", {}, {"dynamics": {"background": "masked_out"}}, {"gsim3d.sparse_conv.default": 5},
     ),
     "sleep": ("latent", {"dynamics": {"sleep": {}}}, {}, {}),
-    "view-dependent colour": ("latent", {}, {"appearance": {"view_dependent": 0}}, {"aten.bmm.default": 3}),
+    "view-dependent colour": ("latent", {}, {"appearance": {"view_dependent": 0}}, {}),
     "changing features": ("latent", {}, {"appearance": {"changing": "none"}}, {"aten.tanh.default": 2}),
     "changing opacities": ("explicit", {}, {"appearance": {"opacity_changes": False}}, {"aten.clamp.default": 2}),
     "feature images": ("latent", {"outputs": {"features": True}}, {}, {"aten.cat.default": 1}),
-    "colour images": ("latent", {"outputs": ALL_IMAGES}, {"outputs": {"rgb": False, **ALL_IMAGES}}, {"aten.bmm.default": 3}),
+    "colour images": ("latent", {"outputs": ALL_IMAGES}, {"outputs": {"rgb": False, **ALL_IMAGES}}, {"gsim3d.decode_gaussians.default": 1}),
 }  # fmt: skip
 
 

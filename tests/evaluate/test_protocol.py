@@ -22,6 +22,7 @@ from gsim3d.evaluate.protocol import (
     constant_velocity,
     default_views,
     predict,
+    predict_together,
     render_steps,
     score_scene,
 )
@@ -58,6 +59,20 @@ def test_default_views(restored, scene):
     assert default_views(restored, scene) == ((0, 2), (3,))
     free = dataclasses.replace(restored, data=DataConfig(context_views=2))
     assert default_views(free, scene) == ((0, 2), (1, 3, 4))
+
+
+def test_scenes_predicted_together_are_those_predicted_alone(restored, scene, tmp_path, device):
+    restored = moved_to(device, restored)
+    scenes = [scene, Scene.open(write_scene(tmp_path / "0001", seed=1))]
+    for one, together in zip(scenes, predict_together(restored, scenes, 3), strict=True):
+        alone = predict(restored, one, default_views(restored, one)[0], 3)
+        assert (together.n_encoded, together.context_cams) == (alone.n_encoded, alone.context_cams)
+        images = [render_steps(restored, p.particles, one, [3, 1]) for p in (together, alone)]
+        torch.testing.assert_close(*images, rtol=0, atol=1e-5 if device.type == "cpu" else 1e-3)
+        scores = [score_scene(restored, one, n_future=3, prediction=p).values for p in (together, alone)]
+        for method, metrics in scores[0].items():
+            for metric, values in metrics.items():
+                torch.testing.assert_close(values, scores[1][method][metric], rtol=1e-3, atol=1e-3, equal_nan=True)
 
 
 def test_views_that_are_named(restored, scene):

@@ -103,7 +103,41 @@ def test_malformed_clouds_of_given_sizes_are_told_later(devices):
         capacity.fits(given.found.tolist())
 
 
+def check_rounded(arguments, spec):
+    exact, given = (build_pyramid(**arguments, spec=spec, rounded=rounded) for rounded in (False, True))
+    n_rows = len(arguments["positions"])
+    assert given.found.tolist() == [0, *counts_of(exact)]
+    assert [s.n_data for s in given.stages] == [s.n_data for s in exact.stages] == [s.n_rows for s in exact.stages]
+    per_stage = 4 * spec.n_stages
+    for i, (size, count) in enumerate(zip(counts_of(given), counts_of(exact), strict=True)):
+        is_cloud, is_rows = i < per_stage and i % 4 == 1, i < per_stage and i % 4 == 0
+        assert count <= size <= (n_rows if i == 0 else count if is_cloud else count * 33 / 32)
+        assert i == 0 or is_cloud or size == n_rows * is_rows or size % max(1, 2 ** (size.bit_length() - 6)) == 0
+    assert_holds(given, exact, n_rows)
+
+
+def test_rounded_sizes_hold_the_same_data(device):
+    check_rounded(on(device, scene()), SPEC)
+
+
+def test_rounded_sizes_are_no_given_ones():
+    capacity = PyramidCapacity.of(build_pyramid(**scene(), spec=SPEC), 151)
+    with pytest.raises(ValueError, match="rounded must be false where a capacity is given"):
+        build_pyramid(**scene(), spec=SPEC, capacity=capacity, rounded=True)
+    with pytest.raises(TypeError, match="rounded must be true or false; got 1"):
+        build_pyramid(**scene(), spec=SPEC, rounded=1)
+
+
 # 4 CPU against CUDA
+
+
+@pytest.mark.parametrize("spec", [LARGE, ONE_CELL, AT_ONCE], ids=["large", "one cell", "at once"])
+def test_devices_agree_on_rounded_sizes(spec, devices):
+    arguments = large_scene()
+    on_cpu, on_cuda = (flat(build_pyramid(**on(d, arguments), spec=spec, rounded=True)) for d in devices)
+    for expected, actual in zip(on_cpu, on_cuda, strict=True):
+        assert actual.device.type == "cuda" and torch.equal(actual.cpu(), expected)
+    check_rounded(on(devices[1], arguments), spec)
 
 
 @pytest.mark.parametrize("release", [False, True], ids=["ours", "release"])

@@ -10,6 +10,7 @@ from tests.oracle import sentinel as oracle
 
 DTYPES = [torch.float32, torch.float64]
 BOUNDS = [(-3e38, 3e38), (0.0, 1.0), (-3.5, 3.5), (0.0, 1.0), (-4.0, 4.0)]
+NEUTRAL = [0.0, 0.0, 1.0, 0.0, 0.5]
 CLOUDS = [0, 0, 7, 2500, 2500, 5000]
 
 
@@ -31,17 +32,19 @@ def state(clouds=CLOUDS, dtype=torch.float32, seed=0, device="cpu"):
         "origin": torch.zeros(2, 3, dtype=torch.float64),
         "activity": torch.randint(0, 3, (n,), generator=g).to(torch.uint8),
         "grid_size": 3.6 / 2**16,
-        "previous": (fields[0] + 0.1 * normal(n, 3)).to(dtype),
         "max_step": 0.3,
     }
     options = {k: v.to(device) if isinstance(v, torch.Tensor) else v for k, v in options.items()}
+    previous = [fields[0] + 0.1 * normal(n, 3), *(normal(*field.shape) for field in fields[1:])]
+    options["previous"] = [field.to(device, dtype) for field in previous]
     return [field.to(device) for field in fields], BOUNDS, torch.tensor(clouds, device=device), options
 
 
 def look(arguments):
+    """(status, record, mended activity and fields)"""
     fields, bounds, cu_rows, options = arguments
-    watched = watch_rows(fields, bounds, cu_rows, **options)
-    return watched.status, watched.record
+    watched = watch_rows(fields, bounds, cu_rows, neutral=NEUTRAL, **options)
+    return watched.status, watched.record, watched.activity, *watched.fields
 
 
 def assert_same_record(actual, expected, n_fields):
@@ -60,13 +63,41 @@ def assert_same_record(actual, expected, n_fields):
 def test_equals_the_oracle(clouds, dtype, device):
     fields, bounds, cu_rows, options = state(clouds, dtype)
     expected_status, expected = oracle.watch_rows(fields, bounds, cu_rows, **options)
-    status, record = look(state(clouds, dtype, device=device))
+    status, record, *_ = look(state(clouds, dtype, device=device))
     assert_same_bits(status.cpu(), expected_status)
     assert_same_record(record, expected, len(fields))
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("clouds", [CLOUDS, [0, *range(1, 40), 1030, 1030, 2047, 4100]])
+@pytest.mark.parametrize("knows_previous", [True, False])
+def test_mends_as_the_oracle(clouds, dtype, knows_previous, device):
+    fields, bounds, cu_rows, options = state(clouds, dtype)
+    previous = options["previous"] if knows_previous else None
+    options |= {"origin": torch.tensor([[0.1, -0.2, 0.3], [-0.05, 0.7, 0.0]], dtype=torch.float64)}
+    status, _ = oracle.watch_rows(fields, bounds, cu_rows, **options | {"previous": previous})
+    clouds = {name: options[name] for name in ("cloud_scene", "origin", "activity")}
+    expected = oracle.mended(fields, status, NEUTRAL, cu_rows, previous=previous, **clouds)
+    fields, bounds, cu_rows, moved = state(clouds=cu_rows.tolist(), dtype=dtype, device=device)
+    moved |= {"origin": options["origin"].to(device), "previous": moved["previous"] if knows_previous else None}
+    _, _, *mended = look((fields, bounds, cu_rows, moved))
+    for actual, wanted, before in zip(mended, expected, (moved["activity"], *fields), strict=True):
+        assert_same_bits(actual.cpu(), wanted)
+        assert actual.data_ptr() != before.data_ptr() or not before.numel()
+    assert bool((expected[0] != options["activity"]).any()) and bool((expected[1] != fields[0].cpu()).any())
+
+
+def test_rows_are_mended_only_if_asked():
+    fields, bounds, cu_rows, options = state()
+    watched = watch_rows(fields, bounds, cu_rows, **options)
+    assert watched.fields is None and watched.activity is None
+    assert_same_bits(watched.status, look(state())[0])
+
+
 def test_what_is_counted():
-    means = torch.tensor([[0.5, 0.5, 0.5], [0.5, float("nan"), 0.5], [-0.1, 0.5, 0.5], [0.9, 0.5, 0.5], [3.0, 0.5, 0.5]])
+    means = torch.tensor(
+        [[0.5, 0.5, 0.5], [0.5, float("nan"), 0.5], [-0.1, 0.5, 0.5], [0.9, 0.5, 0.5], [3.0, 0.5, 0.5]]
+    )
     opacities = torch.tensor([0.25, 0.5, 0.5, 1.0, 2.0])
     watched = watch_rows(
         [means, opacities],
@@ -76,7 +107,7 @@ def test_what_is_counted():
         origin=torch.zeros(1, 3, dtype=torch.float64),
         activity=torch.tensor([0, 0, 1, 0, 2], dtype=torch.uint8),
         grid_size=1.0,
-        previous=torch.tensor([[0.5, 0.5, 0.1]] + [[0.5, 0.5, 0.5]] * 4),
+        previous=[torch.tensor([[0.5, 0.5, 0.1]] + [[0.5, 0.5, 0.5]] * 4), opacities],
         max_step=0.7,
     )
     assert watched.status.tolist() == [0, 1, OUTSIDE, 0, 0]
@@ -93,7 +124,7 @@ def test_what_is_counted():
         cloud_scene=torch.zeros(1, dtype=torch.int64),
         origin=torch.zeros(1, 3, dtype=torch.float64),
         activity=torch.zeros(5, dtype=torch.uint8),
-        previous=torch.full((5, 3), 0.5),
+        previous=[torch.full((5, 3), 0.5), opacities],
         max_step=0.5,
     )
     assert fast.status.tolist() == [0, 1, FAST, 0, FAST | 2]
@@ -123,7 +154,7 @@ def test_any_offsets_stay_in_bounds_on_cuda(devices):
     for offsets in ([0, -5, 9999, 3, 5000, 4000], [5000, 0, 0, 0, 0, 5000], [2**60] * 6):
         look((fields, bounds, torch.tensor(offsets, device=devices[1]), options))
     options["cloud_scene"] = options["cloud_scene"] + 2**40
-    status, _ = look((fields, bounds, cu_rows, options))
+    status = look((fields, bounds, cu_rows, options))[0]
     assert not bool((status & OUTSIDE).any())
 
 
@@ -135,7 +166,8 @@ def test_opcheck(device):
     low, high = map(list, zip(*bounds))
     names = ("cloud_scene", "origin", "activity", "previous", "grid_size", "max_step")
     arguments = (fields, low, high, cu_rows, *(options[name] for name in names))
-    torch.library.opcheck(torch.ops.gsim3d.watch_rows, arguments)
+    for neutral in ([], NEUTRAL):
+        torch.library.opcheck(torch.ops.gsim3d.watch_rows, (*arguments, neutral))
 
 
 # 6 torch.compile
@@ -145,9 +177,11 @@ def test_compiles(device):
     fields, bounds, cu_rows, options = state([0, 3, 9], device=device)
 
     def f(means):
-        return watch_rows([means, *fields[1:]], bounds, cu_rows, **options).status + 0
+        watched = watch_rows([means, *fields[1:]], bounds, cu_rows, neutral=NEUTRAL, **options)
+        return watched.status + 0, watched.fields[2]
 
-    assert_same_bits(torch.compile(f, fullgraph=True)(fields[0]), f(fields[0]))
+    for a, b in zip(torch.compile(f, fullgraph=True)(fields[0]), f(fields[0]), strict=True):
+        assert_same_bits(a, b)
 
 
 # 7 edges
@@ -160,7 +194,7 @@ def test_any_number_of_threads():
 
 @pytest.mark.parametrize("clouds", [[0], [0, 0], [0, 0, 0]])
 def test_no_rows(clouds, device):
-    status, record = look(state(clouds, device=device))
+    status, record, *_ = look(state(clouds, device=device))
     assert status.shape == (0,) and record.shape == (len(clouds) - 1, 2 * 7 + 9)
     assert bool((record[:, 0:14:2] == 0).all()) and bool((record[:, 1:14:2] == -1).all())
 
@@ -175,8 +209,8 @@ def test_a_strided_field(device):
 
 def test_gradients_pass_by():
     fields, bounds, cu_rows, options = state()
-    watched = watch_rows([field.requires_grad_() for field in fields], bounds, cu_rows, **options)
-    assert not watched.record.requires_grad
+    watched = watch_rows([field.requires_grad_() for field in fields], bounds, cu_rows, neutral=NEUTRAL, **options)
+    assert not any(out.requires_grad for out in (watched.record, *watched.fields))
 
 
 # 8 error messages
@@ -192,14 +226,26 @@ def test_gradients_pass_by():
         (lambda f, o: ([*f[:2], f[2][:4], *f[3:]], o), r"fields must have N=5000 rows; got \[4, 5\]"),
         (lambda f, o: (f, o | {"origin": o["origin"].float()}), "origin must be float64; got float32"),
         (lambda f, o: (f, o | {"activity": o["activity"].long()}), "activity must be uint8; got int64"),
-        (lambda f, o: (f, o | {"previous": o["previous"][:9]}), r"previous must be \[N, 3\]"),
-        (lambda f, o: (f, o | {"cloud_scene": o["cloud_scene"] + 1}), r"cloud_scene must be in \[0, B\) with B=2; got 2"),
+        (
+            lambda f, o: (f, o | {"previous": o["previous"][:4]}),
+            "previous must have one entry for each of 5 fields; got 4",
+        ),
+        (
+            lambda f, o: (f, o | {"previous": [x[:9] for x in o["previous"]]}),
+            r"previous\[0\] must have the shape of its field, \[5000, 3\]; got \[9, 3\]",
+        ),
+        (lambda f, o: (f, o | {"neutral": [0.0]}), "neutral must have one entry for each of 5 fields; got 1"),
+        (
+            lambda f, o: (f, o | {"cloud_scene": o["cloud_scene"] + 1}),
+            r"cloud_scene must be in \[0, B\) with B=2; got 2",
+        ),
     ],
 )
 def test_errors_name_what_is_wrong(change, message):
     fields, bounds, cu_rows, options = state()
     fields, options = change(fields, options)
     with pytest.raises(ValueError, match="watch_rows: .*" + message):
+        options["previous"] = options["previous"] if len(fields) == 5 else None
         watch_rows(fields, bounds[: len(fields)], cu_rows, **options)
 
 

@@ -25,7 +25,7 @@ def watch_rows(fields, bounds, cu_rows, cloud_scene, origin, activity, grid_size
             status |= torch.where(finite & ~inside, OUTSIDE, 0).to(torch.int32)
         squared = torch.zeros(n, dtype=torch.float64, device=means.device)
         if previous is not None:
-            squared = (means.double() - previous.double()).square().sum(1)
+            squared = (means.double() - previous[0].double()).square().sum(1)
             status |= torch.where(finite & ~(squared <= max_step**2), FAST, 0).to(torch.int32)
         shown = status & 2 == 0
         status = torch.where(is_asleep, 0, status)
@@ -48,3 +48,22 @@ def watch_rows(fields, bounds, cu_rows, cloud_scene, origin, activity, grid_size
                 start = torch.full((n_clouds,), rest, dtype=torch.float64, device=means.device)
                 sums[:, column + axis] = start.scatter_reduce(0, cloud, values, reduce)
         return status, record
+
+
+def mended(fields, status, neutral, cu_rows, cloud_scene, origin, activity, previous=None):
+    """(activity, *fields) of rows of which those with a status sleep."""
+    faulty, goes_back = status & (OUTSIDE - 1) != 0, status & (OUTSIDE - 1 | FAST) != 0
+    rows = [torch.where(status != 0, ASLEEP, activity)]
+    for f, field in enumerate(fields):
+        if previous is None:
+            before = torch.zeros_like(field).reshape(len(field), -1)
+            before[:, :1] = neutral[f]
+            if f == 0:
+                counts = cu_rows[1:] - cu_rows[:-1]
+                before = origin[cloud_scene.repeat_interleave(counts)]
+            before = before.reshape(field.shape).to(field)
+        else:
+            before = previous[f]
+        row = torch.where(goes_back.reshape(-1, *[1] * (field.dim() - 1)), before, field)
+        rows.append(torch.where(faulty, 0.0, row) if f == 1 else row)
+    return rows

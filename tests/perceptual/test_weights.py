@@ -150,6 +150,27 @@ def test_a_broken_cache_is_named_and_mended_by_installing_again(source):
     weights.load("lpips_alex", lambda: LPIPS("alex"))
 
 
+@pytest.mark.parametrize("blocked", ["cache", "cache/weights"])
+def test_a_cache_that_cannot_be_written_is_named_before_the_download(source, tmp_path, monkeypatch, capsys, blocked):
+    file = tmp_path / blocked
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("no folder")
+    monkeypatch.setattr("subprocess.run", lambda *a, **k: pytest.fail("something was started"))
+    assert main(["weights", "lpips"]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == "" and len(printed.err.splitlines()) == 1
+    assert f"{tmp_path / 'cache' / 'weights'}: weights cannot be kept there: {file}: Not a directory" in printed.err
+    assert "GSIM3D_CACHE_DIR names another folder" in printed.err
+
+
+def test_looking_at_the_cache_leaves_no_trace(source, tmp_path):
+    weights.check_cache()
+    assert not (tmp_path / "cache").exists()
+    weights.store("lpips_alex", source[1])
+    weights.check_cache()
+    assert [file.name for file in weights.cache_folder().iterdir()] == ["lpips_alex.safetensors"]
+
+
 def test_where_the_cache_is(monkeypatch, tmp_path):
     monkeypatch.delenv("GSIM3D_CACHE_DIR", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))

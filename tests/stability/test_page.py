@@ -81,3 +81,18 @@ def test_new_results_replace_old_ones_of_the_same_column_only(tool):
     old = {"cpu float32": column("a", R01=1, R02=2), "cuda float32": column("b", R01=3)}
     merged = tool.add(old, {"cpu float32": column("c", R02=4)})
     assert merged == {"cpu float32": column("c", R01=1, R02=4), "cuda float32": column("b", R01=3)}
+
+
+def test_costs_of_a_machine_replace_its_old_ones(tool, tmp_path):
+    row = {"case": "tiny", "dtype": "bfloat16", "cost": 0.004, "quartiles": [0.001, 0.007], "torch": "2"}
+    gpu = tmp_path / "stability.jsonl"
+    measured = {**row, "gpu": "H", "ours_ms": 1.004, "peer_ms": 1.0}
+    gpu.write_text(f"{json.dumps(measured)}\n{json.dumps({'case': 'the op alone', 'gpu': 'H'})}\n")
+    known = [{**row, "machine": machine, "guarded_ms": 3.0, "unguarded_ms": 2.0} for machine in ("C", "H")]
+    merged = tool.with_costs(known, gpu)
+    assert merged == [known[0], {**known[1], "guarded_ms": 1.004, "unguarded_ms": 1.0}]
+    side = {"gsim3d": {"ms": 5.0}, "plain": {"ms": 4.0}}
+    cpu = tmp_path / "benchmarks.json"
+    cpu.write_text(json.dumps({"stability": {"machine": "C", "torch": "2", "results": [{**row, **side}]}}))
+    merged = tool.with_costs(merged, cpu)
+    assert [(r["machine"], r["guarded_ms"], r["unguarded_ms"]) for r in merged] == [("H", 1.004, 1.0), ("C", 5.0, 4.0)]

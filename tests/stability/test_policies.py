@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import pickle
+from functools import partial
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from gsim3d import presets
 from gsim3d.dynamics import last_steps
 from gsim3d.errors import HardCaseError, InputError
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.stability import StabilityConfig, StabilityReport, pack, unpack
+from gsim3d.stability import Reading, Sentinels, StabilityConfig, StabilityReport, _Record, pack
 from gsim3d.types import ASLEEP
 from tests.asserts import assert_same_bits
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
@@ -118,6 +119,35 @@ def test_gradients_of_dropped_rows_are_zero_and_of_all_others_finite(simulator, 
     grad, *others = torch.autograd.grad(image.square().sum(), [latents, *parameters], allow_unused=True)
     assert grad[-1].abs().max() == 0 and bool(torch.isfinite(grad).all()) and grad.abs().max() > 0
     assert all(bool(torch.isfinite(other).all()) for other in others if other is not None)
+
+
+@pytest.mark.parametrize("knows_previous", [False, True])
+def test_rows_are_mended_alike_with_and_without_gradients(simulator, state, knows_previous):
+    """The kernel mends where nobody asks for gradients, torch where somebody does."""
+    newest, generator = last_steps(state, 1), torch.Generator().manual_seed(0)
+    shapes = {"quats": (4,), "scales": (3,), "sh": (4, 3)}
+    explicit = {name: torch.rand(newest.n_rows, *shape, generator=generator) for name, shape in shapes.items()}
+    newest = dataclasses.replace(newest, **{name: value.to(newest.means) for name, value in explicit.items()})
+    bad = newest
+    cases = [
+        *BAD,
+        *((name, value, "") for name in shapes for value in (NAN, -INF)),
+        ("means", 90.0, ""),
+        ("means", 9e3, ""),
+    ]
+    for row, (name, value, _) in enumerate(cases):
+        bad = with_value(bad, name, row, value)
+    guard = simulator._guard("rollout", "drop", StabilityReport())
+    options = {"previous": newest} if knows_previous else {}
+    expected = guard(bad, **options)
+    leaves = {name: value.clone().requires_grad_() for name, value in bad.row_fields().items() if name != "activity"}
+    actual = guard(dataclasses.replace(bad, **leaves), **options)
+    for name, value in expected.row_fields().items():
+        assert not value.requires_grad and getattr(actual, name).requires_grad == (name != "activity")
+        assert_same_bits(getattr(actual, name).detach(), value)
+    assert_finite(expected)
+    asleep = (expected.activity == ASLEEP).nonzero()[:, 0].tolist()
+    assert asleep == [row for row in range(len(cases)) if knows_previous or row != len(cases) - 2]
 
 
 def kick_row(simulator, row, call, kick):
@@ -352,13 +382,46 @@ def test_a_report_is_a_table_plain_data_and_forgets(simulator, state):
     assert report.findings == () and report.sentinels == {}
 
 
+def replayed(*records):
+    """A report that a replay told of records (numbers, counts), and the list of those that it has read."""
+    source, target, seen = StabilityReport(), StabilityReport(), []
+
+    def read(numbers, place):
+        seen.append(numbers)
+        return Reading([], {(0, place): Sentinels(place, 0.0, 0.0, 0.0)})
+
+    source._captured = [
+        _Record(numbers, partial(read, place=place), counts) for place, (numbers, counts) in enumerate(records)
+    ]
+    source.replayed(target, pack(source.captured()).clone())
+    return target, seen
+
+
 def test_records_travel_as_one():
     generator = torch.Generator().manual_seed(0)
     counts, sums = torch.arange(6).reshape(3, 2), torch.randn(2, 5, generator=generator, dtype=torch.float64)
     sums[1, 2] = INF
     for records in ([counts, sums, torch.empty(0, 2, dtype=torch.int64), -counts], [sums]):
-        for a, b in zip(unpack(pack(records).clone(), records), records, strict=True):
+        report, seen = replayed(*((numbers, ()) for numbers in records))
+        assert report.total == 0
+        for a, b in zip(seen, records, strict=True):
             assert_same_bits(a, b)
+
+
+def test_records_without_findings_are_read_when_somebody_asks():
+    bad = torch.tensor([[0.0, 7.0], [2.0, 8.0]], dtype=torch.float64)
+    good = bad * torch.tensor([0.0, 1.0], dtype=torch.float64)
+    report, seen = replayed((good, (0, 2)), (good + 1, ()))
+    assert report.total == 0
+    assert len(seen) == 2  # in the order in which they came
+    report, seen = replayed((good, (0, 2)), (good, (0, 2)))
+    assert report.total == 0 and not seen
+    assert report.sentinels == {(0, place): Sentinels(place, 0.0, 0.0, 0.0) for place in (0, 1)}
+    assert_same_bits(seen[1], good)
+    report, seen = replayed((bad, (0, 2)), (good, (0, 2)))
+    assert report.total == 0
+    assert len(seen) == 1
+    assert_same_bits(seen[0], bad)
 
 
 def test_drawing_is_rendering_without_a_look(simulator, state):

@@ -50,6 +50,7 @@ def test_what_is_left_out_comes_from_the_base():
         ({"optimizer": 3}, r"^optimizer: must be a mapping"),
         ({"stages": 3}, r"^stages: must be a list"),
         ({"stages": []}, r"stages: at least one"),
+        ({"stages": [{"steps": 1, "lead": 2}]}, r"stages\[0\]: lead: needs a horizon"),
         ({"stages": [{"steps": 0}]}, r"stages\[0\]: steps must be at least 1"),
         ({"data": {"context_cameras": [1], "target_only_cameras": [1]}}, r"share a camera"),
     ],

@@ -22,7 +22,7 @@ from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageCo
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.losses import image_loss, time_weights
 from gsim3d.train.restore import restore
-from gsim3d.train.samples import draw_batch, spread_views, thin_background
+from gsim3d.train.samples import draw_batch, spread_views, thinned
 from tests.tiny_scenes import write_scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -284,15 +284,17 @@ def test_views_are_spread_evenly():
     assert spread_views([0, 1, 3, 4], 4, 3) == (0, 1, 3, 4)
 
 
-def test_thinning_keeps_all_of_the_body(folder):
+def test_thinning_by_strides(folder):
     frames = draw_batch(scenes(folder), DataConfig(context_views=2), CONFIG.stages[0], 0, 0, [0]).context
-    thinned = thin_background(frames, 2)
+    sparse = thinned(frames, DataConfig(background_stride=2))
     body = frames.dynamic & frames.masks
-    assert torch.equal(thinned.masks & frames.dynamic, body)
+    assert torch.equal(sparse.masks & frames.dynamic, body)
     ground = frames.masks & ~frames.dynamic
-    share = (thinned.masks & ~frames.dynamic).sum() / ground.sum()
+    share = (sparse.masks & ~frames.dynamic).sum() / ground.sum()
     assert 0.15 < share < 0.35
-    assert thin_background(frames, 1) is frames
+    assert thinned(frames, DataConfig()) is frames
+    of_body = thinned(frames, DataConfig(body_stride=2)).masks
+    assert torch.equal(of_body & ~frames.dynamic, ground) and 0.1 < (of_body & body).sum() / body.sum() < 0.4
 
 
 def test_deterministic_mode_is_left_as_it_was():

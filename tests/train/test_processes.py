@@ -12,12 +12,14 @@ import torch
 import yaml
 
 from gsim3d.errors import InputError
+from gsim3d.layers import RowBatchNorm
 from gsim3d.train import checkpoint
 from gsim3d.train.config import StageConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.processes import Processes, joined
 from gsim3d.train.restore import build_simulator, model_config
 from gsim3d.train.settings import to_dict
+from tests.asserts import assert_close_relative_to_max
 from tests.train.test_loop import CONFIG, assert_same_checkpoint, curve, scenes
 from tests.train.test_watch import spoil
 from tests.tiny_scenes import write_scenes
@@ -59,10 +61,22 @@ def train_together(rank: int, folder, out) -> None:
 
             trainer.simulator.encode = broken
         trainer.run(progress=False)
+        torch.save(normalised(slice(rank, None, 2)), out / f"rows_{rank}.pt")
         state = {name: value.double().sum().item() for name, value in trainer.simulator.state_dict().items()}
         assert processes.gather(state)[0] == state
         with pytest.raises(InputError, match="CONFIG: not the same in all processes"):
             Trainer(dataclasses.replace(LAYER, seed=rank), scenes(folder), out / "other", processes=processes)
+
+
+def normalised(part: slice) -> list[torch.Tensor]:
+    """Of some of 31 rows: what batch normalisation makes of them in training, gradients and running statistics."""
+    torch.manual_seed(0)
+    layer, x = RowBatchNorm(5).double(), torch.randn(31, 5, dtype=torch.float64)
+    torch.nn.init.normal_(layer.weight), torch.nn.init.normal_(layer.bias)
+    x = x[part].requires_grad_()
+    out = layer.activated_in_training(x)
+    gradients = torch.autograd.grad(out.sin().sum(), [x, layer.weight, layer.bias])
+    return [out.detach(), *gradients, layer.running_mean, layer.running_var]
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +127,18 @@ def test_two_processes_give_the_curve_of_one(folder, together, tmp_path, name):
         sum((a[key] - b[key]).double().square().sum() for key in a) for a, b in ((alone, start), (alone, two))
     )
     assert (apart / moved).sqrt() < TOLERANCE["weights"]
+
+
+def test_batch_norm_as_one_node_counts_the_rows_of_all(together):
+    out, x, weight, bias, *running = normalised(slice(None))
+    parts = [torch.load(together / f"rows_{rank}.pt", weights_only=True) for rank in range(2)]
+    for rank, part in enumerate(parts):
+        for ours, all_rows in zip(part[:2], (out, x), strict=True):
+            assert_close_relative_to_max(ours, all_rows[rank::2], 1e-13)
+        for ours, of_all in zip(part[4:], running, strict=True):
+            assert_close_relative_to_max(ours, of_all, 1e-13)
+    for k, whole in ((2, weight), (3, bias)):
+        assert_close_relative_to_max(parts[0][k] + parts[1][k], whole, 1e-13)
 
 
 def test_two_processes_resume_exactly(together):

@@ -1,12 +1,18 @@
 """tools/slurm and tools/bench/training.py: what can be known without a cluster and a GPU."""
 
 import importlib.util
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
+
+from gsim3d import presets
+from gsim3d.dynamics import last_steps
+from gsim3d.simulator import Simulator
 
 ROOT = Path(__file__).parents[2]
 
@@ -35,27 +41,79 @@ def test_the_slurm_script_starts_torchrun_on_every_node(tmp_path):
     assert subprocess.run(command, env=environment, capture_output=True).returncode == 2
 
 
-@pytest.mark.parametrize("masked", [True, False])
-def test_synthetic_batches_have_their_true_size(masked, monkeypatch):
+@pytest.fixture
+def bench(monkeypatch):
+    """The module tools/bench/training.py."""
     monkeypatch.syspath_prepend(str(ROOT / "tools" / "bench"))
     spec = importlib.util.spec_from_file_location("bench_training", ROOT / "tools" / "bench" / "training.py")
-    bench = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, spec.name, bench)
-    spec.loader.exec_module(bench)
-    batch = bench.synthetic_batch(2, 32, masked)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_synthetic_batches_have_their_true_size(masked, bench):
+    batch, places = bench.synthetic_batch(2, 32, masked)
     assert (batch.n_context, batch.n_future) == (4, 12)
-    assert batch.context.images.shape == (2 * 4 * 4, 3, 32, 32) and batch.targets.images.shape == (
-        2 * 16 * 5,
-        3,
-        32,
-        32,
-    )
+    assert batch.context.images.shape == (2 * 4 * 4, 3, 32, 32)
+    assert batch.targets.images.shape == (2 * 16 * 5, 3, 32, 32)
     assert batch.context.cloud_scene.tolist() == [0] * 4 + [1] * 4 and batch.target_step().unique().numel() == 16
-    assert (batch.context.masks is None) == (not masked)
-    assert not batch.context.images[0].equal(batch.context.images[4 * 3])  # the ball falls
-    if masked:
-        assert 0.1 < batch.context.masks.float().mean() < 0.6
-        assert (
-            0.01 < batch.context.dynamic.float().mean() < 0.2
-            and not (batch.context.dynamic & ~batch.context.masks).any()
-        )
+    assert not batch.context.images[0].equal(batch.context.images[4 * 3])  # the body sinks
+    context = batch.context
+    assert 0.2 < context.dynamic.float().mean() < 0.3
+    assert places.shape == ((int(context.dynamic.sum()) if masked else 2 * 16 * 32 * 32), 3)
+    assert (context.masks is None) == (not masked) and (not masked or context.masks.equal(context.dynamic))
+
+
+def test_the_film_shows_where_its_particles_are(bench):
+    """A pixel's place projects into its middle, and lies on the body or on the ground."""
+    scene, size = bench.surface_scene, 32
+    _, body, places = scene.film(2, size)
+    viewmats = scene.poses().float()[:, None, None]
+    seen = (viewmats[..., :3, :3] @ places[..., None])[..., 0] + viewmats[..., :3, 3]
+    pixels = (scene.intrinsics(size).float() @ (seen / seen[..., 2:])[..., None])[..., 0]
+    middle = torch.stack(torch.meshgrid(*[torch.arange(size) + 0.5] * 2, indexing="xy"), -1)
+    assert (pixels[..., :2] - middle).abs().max() < 1e-3
+    assert places[~body][:, 2].abs().max() < 1e-5 and places[~body][:, :2].norm(dim=-1).max() < scene.DISC_RADIUS
+    center = torch.tensor([0, 0, scene.FIRST_HEIGHT - 2 * scene.FALL])
+    radii = ((places[body] - center) / torch.tensor(scene.HALF_AXES)).norm(dim=-1)
+    assert (radii - 1).abs().max() < 1e-4
+    assert scene.NEAR < seen[..., 2].min() and seen[..., 2].max() < scene.FAR
+
+
+def test_particles_of_the_benchmark_sink_with_the_body(bench, tmp_path):
+    """Encoded particles lie where the film shows the body, and simulated ones move as it does, within a millimetre."""
+    scene, config = bench.surface_scene, presets.tiny()
+    torch.manual_seed(0)
+    simulator = Simulator(config).eval()
+    frames, places = scene.frames(1, [scene.evenly(2)] * 2, 32, masked=True)
+    scene.as_if_trained(simulator, places)
+    with torch.no_grad():
+        state = simulator.encode(frames)
+        steps = simulator.rollout(state, 2)
+    assert state.means.equal(places)
+    moved = steps[1].means - last_steps(state, 1).means
+    assert (moved - torch.tensor([0, 0, -2 * scene.FALL])).abs().max() < 1e-3
+    scales = simulator.renderer(steps[1]).scales
+    assert (scales / scene.WIDTH - 1).abs().max() < 0.05
+
+
+def test_rows_of_other_cases_are_kept(bench, tmp_path):
+    file = tmp_path / "rows.json"
+    bench.keep_rows(file, [{"case": "a", "processes": 1, "seconds": 1}, {"case": "a", "processes": 2, "seconds": 2}])
+    bench.keep_rows(file, [{"case": "a", "processes": 2, "seconds": 3}])
+    assert [row["seconds"] for row in json.loads(file.read_text())] == [1, 3]
+
+
+def test_the_page_shows_the_steps_that_were_measured(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "tools" / "bench"))
+    report = importlib.import_module("report")
+    page = (ROOT / "docs" / "training.md").read_text()
+    row = {"case": "kept", "processes": 1, "batch": 4, "particles": 17000, "seconds": 0.876, "gib": 61.25}
+    row |= {"efficiency": None, "gpu": "a GPU", "torch": "2.11", "commit": "abc", "date": "2026-11-21"}
+    both = report.with_steps(page, [{**row, "processes": 2, "efficiency": 0.934}, row])
+    assert "| kept | 1 | 4 | 17000 | 0.88 | 61.2 | - |\n| kept | 2 | 4 | 17000 | 0.88 | 61.2 | 93% |\n" in both
+    begin, end = report.STEPS_MARKS
+    assert both.partition(begin)[0] == page.partition(begin)[0] and both.partition(end)[2] == page.partition(end)[2]
+    assert report.with_steps(both, json.loads(report.STEPS.read_text()) if report.STEPS.exists() else []) == page

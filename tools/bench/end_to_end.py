@@ -7,14 +7,17 @@ are the calls as Python makes them.
 
 The dynamics read the scene of which the authors' release was once recorded on an H200 (its own network code, spconv 2.3.8,
 random weights, 129 input and 67 output channels, voxels of 4 mm): a ground disc and an ellipsoid that sinks 4 cm a step;
-masked means the ellipsoid alone.
+masked means the ellipsoid alone. Encoder, rollouts and training see a film of it, with particles at their true places
+(surface_scene.py).
 """
 
-import dataclasses
-import math
+import argparse
+import tempfile
 from functools import partial
 
+import surface_scene
 import torch
+import training
 from harness import Bench
 
 from gsim3d import presets
@@ -22,9 +25,11 @@ from gsim3d.dynamics import Dynamics
 from gsim3d.graphs import Captured, CapturedRollout, rounded
 from gsim3d.ops import PyramidCapacity
 from gsim3d.simulator import Simulator
-from gsim3d.types import Cameras, Frames, Particles
+from gsim3d.train.loop import deterministic
+from gsim3d.train.processes import Processes
+from gsim3d.types import Cameras, Particles
 
-SIZE, NEAR, FAR = 128, 1.2, 4.0
+SIZE = 128
 RELEASE = "authors' release, recorded"
 RECORDED = {  # (steps of history, masked) -> forward, forward and backward [ms]
     (4, True): (56.2, 103.0),
@@ -33,21 +38,6 @@ RECORDED = {  # (steps of history, masked) -> forward, forward and backward [ms]
     (2, False): (50.6, 124.0),
 }
 TARGET = {(4, False): (15, 50), (2, False): (10, 35), (4, True): (4, 12), (2, True): (3, 9)}
-
-
-def recorded_scene(n_steps: int, n: int, moving_share: float) -> torch.Tensor:
-    """[T, n, 3] metres."""
-    g = torch.Generator(device="cuda").manual_seed(0)
-    n_body = int(n * moving_share)
-    n_ground = n - n_body
-    angle = 6.2832 * torch.rand(n_ground, device="cuda", generator=g)
-    radius = 1.5 * torch.rand(n_ground, device="cuda", generator=g).sqrt()
-    height = 0.003 * torch.rand(n_ground, device="cuda", generator=g)
-    ground = torch.stack([radius * angle.cos(), radius * angle.sin(), height], -1)
-    direction = torch.randn(n_body, 3, device="cuda", generator=g)
-    body = direction / direction.norm(dim=-1, keepdim=True) * torch.tensor([0.25, 0.2, 0.22], device="cuda")
-    lift = torch.tensor([0.0, 0.0, 1.0], device="cuda")
-    return torch.stack([torch.cat([ground, body + (0.9 - 0.04 * t) * lift]) for t in range(n_steps)])
 
 
 def particles_at(means: torch.Tensor, latents: int = 64) -> Particles:
@@ -69,41 +59,6 @@ def particles_at(means: torch.Tensor, latents: int = 64) -> Particles:
     )
 
 
-def ring(n_views: int, n_clouds: int) -> Cameras:
-    """Cameras on a circle that look at the middle; each cloud is seen by all of them."""
-    poses = []
-    for view in range(n_views):
-        angle = 2 * math.pi * view / n_views
-        center = torch.tensor([2.2 * math.cos(angle), 2.2 * math.sin(angle), 1.2], dtype=torch.float64)
-        forward = torch.nn.functional.normalize(torch.tensor([0.0, 0.0, 0.4], dtype=torch.float64) - center, dim=0)
-        right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-        right = torch.nn.functional.normalize(right, dim=0)
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        pose[:3, 3] = -pose[:3, :3] @ center
-        poses.append(pose.float())
-    n = n_views * n_clouds
-    K = torch.tensor([[1.2 * SIZE, 0.0, SIZE / 2], [0.0, 1.2 * SIZE, SIZE / 2], [0.0, 0.0, 1.0]])
-    bounds = torch.full((n,), NEAR), torch.full((n,), FAR)
-    clouds = torch.arange(n_clouds).repeat_interleave(n_views)
-    return Cameras(torch.stack(poses).repeat(n_clouds, 1, 1), K.repeat(n, 1, 1), *bounds, clouds, SIZE, SIZE).to("cuda")
-
-
-def random_frames(n_scenes: int, n_steps: int, n_views: int, kept: float) -> Frames:
-    """``kept``: share of pixels that become particles."""
-    n_clouds = n_scenes * n_steps
-    g = torch.Generator(device="cuda").manual_seed(2)
-    size = (n_clouds * n_views, SIZE, SIZE)
-    return Frames(
-        images=torch.rand(size[0], 3, SIZE, SIZE, device="cuda", generator=g),
-        cameras=ring(n_views, n_clouds),
-        cloud_scene=torch.arange(n_scenes, device="cuda").repeat_interleave(n_steps),
-        cloud_step=torch.arange(n_steps, device="cuda").repeat(n_scenes),
-        origin=torch.full((n_scenes, 3), -4.0, dtype=torch.float64, device="cuda"),
-        masks=torch.rand(size, device="cuda", generator=g) < kept if kept < 1 else None,
-    )
-
-
 def peak_gib(f) -> float:
     torch.cuda.reset_peak_memory_stats()
     f()
@@ -111,8 +66,9 @@ def peak_gib(f) -> float:
     return torch.cuda.max_memory_allocated() / 2**30
 
 
-def measure(bench: Bench, case: str, f, dtype: torch.dtype, *, peers=None, target_ratio=None) -> None:
-    """The autocast context stays open, as in a rollout: weights are rounded once."""
+def measure(bench: Bench, case: str, f, dtype: torch.dtype, *, name=None, peers=None, target_ratio=None) -> None:
+    """The autocast context stays open, as in a rollout: weights are rounded once. ``name``: of the dtype, for what chooses
+    its own."""
     with torch.autocast("cuda", dtype, enabled=dtype != torch.float32):
         memory = None
         try:
@@ -121,14 +77,14 @@ def measure(bench: Bench, case: str, f, dtype: torch.dtype, *, peers=None, targe
             print(f"{case}: out of memory")
         if memory is None:  # behind the handler, which keeps what the failed call made
             return torch.cuda.empty_cache()
-        name = str(dtype).removeprefix("torch.")
+        name = name or str(dtype).removeprefix("torch.")
         bench.gpu(f"{case}, {memory:.1f} GiB", name, f, peers or {}, target_ratio=target_ratio, tolerance=None, capture=False)
 
 
 def dynamics(bench: Bench, n_steps: int, masked: bool, dtype: torch.dtype) -> None:
     torch.manual_seed(0)
     model = Dynamics(presets.paper_latent(n_steps, 64).dynamics).cuda().eval()
-    state = particles_at(recorded_scene(n_steps, 16384 if masked else 65536, 1.0 if masked else 0.2))
+    state = particles_at(surface_scene.points(n_steps, 16384 if masked else 65536, 1.0 if masked else 0.2))
     state = state.with_clouds(state.clouds)
     inference = model if dtype == torch.float32 else rounded(model, dtype)
     capacity = PyramidCapacity.of(model.geometry(state), state.n_rows)
@@ -155,15 +111,17 @@ def dynamics(bench: Bench, n_steps: int, masked: bool, dtype: torch.dtype) -> No
 
 def whole(bench: Bench, dtype: torch.dtype) -> None:
     torch.manual_seed(0)
+    frames, places = surface_scene.frames(1, [surface_scene.evenly(4)] * 4, SIZE, masked=False)
     simulator = Simulator(presets.paper_latent(4, 64)).cuda().eval()
-    frames, cameras = random_frames(1, 4, 4, 1.0), ring(9, 1)
+    surface_scene.as_if_trained(simulator, places.cuda())
+    frames, cameras = frames.to("cuda"), seen_by(surface_scene.evenly(9))
 
     with torch.no_grad():
         measure(bench, "encode 4 steps x 4 views, 128 px", lambda: simulator.encode(frames).means, dtype)
         state = simulator.encode(frames)
         newest = simulator.rollout(state, 1)[0]
         measure(bench, "render 9 views of 65k particles, 128 px", lambda: simulator.render(newest, cameras).color, dtype)
-        view = ring(1, 1)
+        view = seen_by([0])
         measure(bench, "step + one 128 px view, 65k particles a step",
                 lambda: simulator.render(simulator.rollout(state, 1)[0], view).color, dtype)  # fmt: skip
         for n_steps in (1, 12):
@@ -172,31 +130,19 @@ def whole(bench: Bench, dtype: torch.dtype) -> None:
             measure(bench, f"{n_steps} x (step + one 128 px view), captured", lambda: captured(state), dtype)
 
 
-def training(bench: Bench, dtype: torch.dtype) -> None:
-    """4 past steps, 12 future ones fed back, 4 scenes, 4 input and 9 target views, a quarter of the pixels kept; blocks are
-    computed again in the backward pass, as the authors do."""
-    torch.manual_seed(0)
-    n_scenes, n_past, n_future, n_views = 4, 4, 12, 9
-    model = presets.paper_latent(n_past, 64)
-    model = dataclasses.replace(model, dynamics=dataclasses.replace(model.dynamics, checkpointing=True))
-    simulator = Simulator(model).cuda().train()
-    optimizer = torch.optim.AdamW(simulator.parameters(), lr=1e-5)
-    frames = random_frames(n_scenes, n_past, 4, 0.25)
-    targets = ring(n_views, n_scenes)
-    truth = torch.rand(n_scenes * n_views, SIZE, SIZE, 3, device="cuda")
+def seen_by(cams: list[int]) -> Cameras:
+    """These cameras see one cloud."""
+    return surface_scene.cameras(cams, torch.zeros(len(cams), dtype=torch.int64), SIZE).to("cuda")
 
-    def step():
-        torch.clear_autocast_cache()  # the weights have changed
-        optimizer.zero_grad(set_to_none=True)
-        state = simulator.encode(frames)
-        steps = simulator.rollout(state, n_future)
-        last = state.select_clouds(torch.arange(n_past - 1, n_scenes * n_past, n_past, device="cuda"))
-        loss = sum((simulator.render(s, targets).color - truth).square().mean() for s in [last, *steps])
-        loss.backward()
-        optimizer.step()
-        return loss.detach()
 
-    measure(bench, "training step 4-1-12, batch 4, masked", step, dtype, peers={"authors' paper (H100)": 4300.0}, target_ratio=4)
+def training_step(bench: Bench) -> None:
+    """A step of `gsim3d train`, as training.py measures it, with everything kept for the backward pass."""
+    options = argparse.Namespace(device="cuda", preset="paper_latent", batch=4, size=SIZE)
+    with tempfile.TemporaryDirectory() as folder, deterministic():
+        trainer = training.make_trainer("kept", options, Processes(), folder)
+        case = "training step 4-1-12, batch 4, masked"
+        measure(bench, case, trainer.train_step, torch.float32, name="bfloat16", peers={"authors' paper (H100)": 4300.0},
+                target_ratio=4)  # fmt: skip
 
 
 def main():
@@ -205,7 +151,7 @@ def main():
         raise SystemExit("end_to_end measures the full-size model, which needs a GPU: add --device cuda")
     for n_steps, masked in RECORDED:
         dynamics(bench, n_steps, masked, torch.bfloat16)
-    training(bench, torch.bfloat16)
+    training_step(bench)
     whole(bench, torch.bfloat16)
     for n_steps, masked in RECORDED:
         dynamics(bench, n_steps, masked, torch.float32)

@@ -5,7 +5,7 @@
     python tools/bench/report.py raster pool      run these again, keep the other numbers
     python tools/bench/report.py --page           only write the page again, with what tools/gpu_check.sh bench measured
 
-Let nothing else run meanwhile.
+It also puts what tools/bench/training.py measured on a GPU into docs/training.md. Let nothing else run meanwhile.
 """
 
 import argparse
@@ -21,10 +21,12 @@ from pathlib import Path
 from harness import RESULTS, commit
 
 ROOT = Path(__file__).resolve().parents[2]
-OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster"]
+OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "decode"]
 GUARDS, EFFECTS = "stability", "effects"
 NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
 EFFECTS_PAGE, MARKS = ROOT / "docs" / "effects.md", ("<!-- table -->\n", "<!-- end of table -->\n")
+STEPS, STEPS_PAGE = RESULTS / "training.json", ROOT / "docs" / "training.md"
+STEPS_MARKS = "<!-- steps: written by tools/bench/report.py -->\n", "<!-- end of steps -->"
 INTRODUCTION = """# Benchmarks
 
 Written by `python tools/bench/report.py`; do not edit. Every case first compares the results of both sides, then times
@@ -133,6 +135,31 @@ def costs(r: dict) -> str:
     return text
 
 
+def steps_table(rows: list[dict]) -> str:
+    """What training.py measured, as a table."""
+    if not rows:
+        return "Not measured yet.\n"
+    first = rows[0]
+    text = f"{first['gpu']}, torch {first['torch']}, commit {first['commit']}, {first['date']}; medians.\n\n"
+    text += "| case | processes | batch | particles a step | s a step | peak GiB | efficiency |\n"
+    text += "| --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
+    for row in sorted(rows, key=lambda row: row["processes"]):
+        efficiency = f"{row['efficiency']:.0%}" if row["efficiency"] else "-"
+        text += (
+            f"| {row['case']} | {row['processes']} | {row['batch']} | {row['particles']} | {row['seconds']:.2f} "
+            f"| {row['gib']:.1f} | {efficiency} |\n"
+        )
+    return text
+
+
+def with_steps(page: str, rows: list[dict]) -> str:
+    """``page`` with the table of ``rows`` between its marks."""
+    begin, end = STEPS_MARKS
+    head, _, rest = page.partition(begin)
+    _, _, tail = rest.partition(end)
+    return head + begin + steps_table(rows) + end + tail
+
+
 def effects(r: dict) -> str:
     """The table of docs/effects.md."""
     text = (
@@ -159,6 +186,8 @@ def main() -> None:
         records[op] = run(op)
         NUMBERS.write_text(json.dumps(records, indent=1) + "\n")
     PAGE.write_text(page(records))
+    steps = json.loads(STEPS.read_text()) if STEPS.exists() else []
+    STEPS_PAGE.write_text(with_steps(STEPS_PAGE.read_text(), steps))
     if EFFECTS in records:
         before, rest = EFFECTS_PAGE.read_text().split(MARKS[0])
         table = MARKS[0] + effects(records[EFFECTS]) + MARKS[1]

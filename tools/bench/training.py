@@ -4,41 +4,60 @@
     torchrun --nproc-per-node 4 tools/bench/training.py --device cuda --case recomputed  # this batch for each process
 
 The step is the one of `gsim3d train`: encode, 12 steps fed back, images of 5 views at all 16 steps, gradients,
-clipping, AdamW. A ball falls on a ground disc, seen by 12 cameras; masked means that pixels of neither are no
-particles. With several processes every one gets ``--batch`` scenes, so that the time of a step against that of one
-process is the efficiency of scaling.
+clipping, AdamW, averaged weights; with drop path, shuffled curves and deterministic algorithms. The film, the masks and
+where particles lie are those of surface_scene.py. With several processes every one gets ``--batch`` scenes; the efficiency
+of scaling is the time of a step in one process, measured before they begin, over the time in all of them.
 """
 
+from __future__ import annotations
+
 import argparse
-import dataclasses
+import collections
 import json
-import math
+import os
+import re
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import surface_scene
 import torch
+from harness import RESULTS, commit
 from torch.profiler import ProfilerActivity, profile
 
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
 from gsim3d.train.log import memory_gib
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.precision import PrecisionConfig
-from gsim3d.train.processes import joined
+from gsim3d.train.processes import Processes, joined
 from gsim3d.train.samples import Batch
-from gsim3d.types import Cameras, Frames
 
-N_CAMS, N_PAST, N_FUTURE, N_VIEWS, N_TARGETS = 12, 4, 12, 4, 5
-NEAR, FAR, RADIUS, GROUND = 1.5, 8.0, 0.3, 1.0  # metres
+N_PAST, N_FUTURE, N_VIEWS, N_TARGETS = 4, 12, 4, 5
 PUBLISHED = "the paper: 4.3 s a step and less than 20 GB (H100)"
 LEAN = PrecisionConfig(encoder="bf16", dynamics="bf16", renderer="bf16")
-CASES = {  # name -> (masked, blocks computed again, parts computed again)
-    "kept": (True, False, ()),
-    "blocks": (True, True, ()),
-    "recomputed": (True, False, ("encoder", "steps")),
-    "unmasked": (False, True, ("encoder", "steps", "images")),
+FIXED = {"norm": "layer", "drop_path": 0.0, "shuffle_orders": False}  # what a captured step asks of a model
+
+
+@dataclass(frozen=True)
+class Case:
+    """masked: the body alone. dynamics, recompute, captured: of the configuration."""
+
+    masked: bool = True
+    dynamics: dict = field(default_factory=dict)
+    recompute: tuple[str, ...] = ()
+    captured: bool = False
+
+
+CASES = {
+    "kept": Case(),
+    "captured": Case(dynamics=FIXED, captured=True),
+    "blocks": Case(dynamics={"checkpointing": True}),
+    "recomputed": Case(recompute=("encoder", "steps")),
+    "unmasked": Case(masked=False, dynamics={"checkpointing": True}, recompute=("encoder", "steps", "images")),
 }
 
 
@@ -50,7 +69,7 @@ class SyntheticScene:
     name: str = "synthetic"
     path: str = "synthetic"
     n_steps: int = N_PAST + N_FUTURE
-    n_cams: int = N_CAMS
+    n_cams: int = surface_scene.N_CAMS
 
     @property
     def width(self) -> int:
@@ -59,127 +78,171 @@ class SyntheticScene:
     height = width
 
 
-def ring() -> torch.Tensor:
-    """float64 [12, 4, 4] world-to-camera: cameras on a circle look at the middle."""
-    poses = torch.eye(4, dtype=torch.float64).repeat(N_CAMS, 1, 1)
-    for cam in range(N_CAMS):
-        angle = 2 * math.pi * cam / N_CAMS
-        place = torch.tensor([2.5 * math.cos(angle), 2.5 * math.sin(angle), 1.4], dtype=torch.float64)
-        forward = torch.nn.functional.normalize(torch.tensor([0, 0, 0.4]) - place, dim=0)
-        right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0, 0, 1.0]).double()), dim=0)
-        poses[cam, :3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        poses[cam, :3, 3] = -poses[cam, :3, :3] @ place
-    return poses
-
-
-def film(viewmats: torch.Tensor, K: torch.Tensor, size: int, height: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Images [I, 3, size, size] and labels [I, size, size] of a ball at ``height`` above a chequered disc."""
-    x = (torch.arange(size, dtype=torch.float64) + 0.5).expand(size, size)
-    y = x.T
-    rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1)
-    rays = torch.nn.functional.normalize(rays @ viewmats[:, None, :3, :3], dim=-1)
-    origin = -(viewmats[:, :3, :3].transpose(1, 2) @ viewmats[:, :3, 3:])[:, None, None, :, 0]
-    reach = -origin[..., 2:] / rays[..., 2:].clamp(max=-1e-6)
-    ground = (origin + rays * reach)[..., :2]
-    labels = ((rays[..., 2] < 0) & (ground.norm(dim=-1) < GROUND)).to(torch.uint8)
-    checks = (ground * 4).floor().sum(-1, keepdim=True) % 2
-    images = torch.where(labels[..., None] == 1, 0.4 + 0.3 * checks, 0.0).expand(*labels.shape, 3).clone()
-    to_center = torch.tensor([0, 0, height]) - origin
-    along = (rays * to_center).sum(-1, keepdim=True)
-    off = to_center.square().sum(-1, keepdim=True) - along.square()
-    hit = ((off < RADIUS**2) & (along > 0))[..., 0]
-    normal = (rays * (along - (RADIUS**2 - off).clamp(min=0).sqrt()) - to_center) / RADIUS
-    images[hit], labels[hit] = 0.5 + 0.5 * normal[hit], 3
-    return images.permute(0, 3, 1, 2).float(), labels
-
-
-def synthetic_batch(n_scenes: int, size: int, masked: bool) -> Batch:
-    viewmats, n_steps = ring(), N_PAST + N_FUTURE
-    K = torch.tensor([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1]], dtype=torch.float64)
-    films = [film(viewmats, K, size, max(RADIUS, 1 - 0.008 * step**2)) for step in range(n_steps)]
-
-    def frames(n: int, views: list[list[int]]) -> Frames:
-        images, labels = (
-            torch.cat([films[t][kind][views[t]] for t in range(n)]).repeat(n_scenes, *[1] * dims)
-            for kind, dims in ((0, 3), (1, 2))
-        )
-        seen = torch.cat([torch.tensor(views[t]) for t in range(n)]).repeat(n_scenes)
-        n_images = seen.shape[0]
-        cameras = Cameras(
-            viewmats=viewmats[seen].float(),
-            Ks=K.float().repeat(n_images, 1, 1),
-            near=torch.full((n_images,), NEAR),
-            far=torch.full((n_images,), FAR),
-            image_cloud=torch.arange(n_scenes * n).repeat_interleave(len(views[0])),
-            width=size,
-            height=size,
-        )
-        return Frames(
-            images=images,
-            cameras=cameras,
-            cloud_scene=torch.arange(n_scenes).repeat_interleave(n),
-            cloud_step=torch.arange(n).repeat(n_scenes),
-            origin=torch.full((n_scenes, 3), -4.0, dtype=torch.float64),
-            masks=labels > 0 if masked else None,
-            dynamic=labels == 3 if masked else None,
-        )
-
+def synthetic_batch(n_scenes: int, size: int, masked: bool) -> tuple[Batch, torch.Tensor]:
+    """A batch, and the places of the particles of its encoded steps."""
     generator = torch.Generator().manual_seed(0)
-    targets = [torch.randperm(N_CAMS, generator=generator)[:N_TARGETS].tolist() for _ in range(n_steps)]
-    context = [[cam * N_CAMS // N_VIEWS for cam in range(N_VIEWS)]] * N_PAST
-    return Batch(frames(N_PAST, context), frames(n_steps, targets), N_PAST, N_FUTURE)
+    targets = [
+        torch.randperm(surface_scene.N_CAMS, generator=generator)[:N_TARGETS].tolist() for _ in range(N_PAST + N_FUTURE)
+    ]
+    context, places = surface_scene.frames(n_scenes, [surface_scene.evenly(N_VIEWS)] * N_PAST, size, masked)
+    return Batch(context, surface_scene.frames(n_scenes, targets, size, masked)[0], N_PAST, N_FUTURE), places
 
 
-def measure(name: str, args: argparse.Namespace, processes) -> dict:
-    """Time, memory and loss of a few steps."""
-    masked, blocks, recompute = CASES[name]
+def make_trainer(name: str, args: argparse.Namespace, processes: Processes, folder: str) -> Trainer:
+    """The trainer of a case, which sees the same batch in every step."""
+    case = CASES[name]
     config = TrainConfig(
         stages=(StageConfig(steps=1000, horizon=N_FUTURE, batch=args.batch * processes.count, target_views=N_TARGETS),),
         preset=args.preset,
-        model={"dynamics": {"checkpointing": blocks}},
+        model={"dynamics": case.dynamics},
         data=DataConfig(history=N_PAST, context_views=N_VIEWS),
         precision=LEAN,
-        recompute=recompute,
+        recompute=case.recompute,
+        captured=case.captured,
     )
-    batch = synthetic_batch(args.batch, args.size, masked)
-    with tempfile.TemporaryDirectory() as folder, deterministic():
-        trainer = Trainer(config, [SyntheticScene(args.size)], folder, device=args.device, processes=processes)
-        trainer.simulator.train()
-        trainer._draw = lambda step, samples: batch
-        seconds, entry = [], {}
-        for _ in range(args.warm_up + args.steps):
-            processes.gather(None)
-            start = time.perf_counter()
-            entry = trainer.train_step()  # reads the loss, so the device has finished
-            seconds.append(time.perf_counter() - start)
+    batch, places = synthetic_batch(args.batch, args.size, case.masked)
+    trainer = Trainer(config, [SyntheticScene(args.size)], folder, device=args.device, processes=processes)
+    surface_scene.as_if_trained(trainer.simulator, places.to(args.device))
+    trainer.simulator.train()
+    trainer._draw = lambda step, samples: batch
+    return trainer
+
+
+def timed_steps(trainer: Trainer, args: argparse.Namespace, processes: Processes) -> tuple[float, dict]:
+    """Median seconds of a step, and what the last one logged."""
+    seconds, entry = [], {}
+    for _ in range(args.warm_up + args.steps):
+        processes.gather(None)
+        start = time.perf_counter()
+        entry = trainer.train_step()  # reads the loss, so the device has finished
+        if args.device == "cuda":
+            torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - start)
         if "skipped" in entry:
-            raise SystemExit(f"{name}: {entry['skipped']}")
+            raise SystemExit(f"training: {entry['skipped']}")
+    return statistics.median(seconds[args.warm_up :]), entry
+
+
+def measure(name: str, args: argparse.Namespace, processes: Processes) -> dict:
+    """Time, memory and loss of a few steps."""
+    with tempfile.TemporaryDirectory() as folder, deterministic():
+        trainer = make_trainer(name, args, processes, folder)
+        seconds, entry = timed_steps(trainer, args, processes)
         memory = max(processes.gather(memory_gib(args.device)))
-        if args.top and processes.count == 1:
-            print_profile(trainer, args.device, args.top)
-    return {
+        if processes.count == 1:
+            if args.stages:
+                print_stages(trainer, args.device)
+            if args.top:
+                print_kernels(trainer, args.top)
+    row = {
         "case": name,
+        "preset": args.preset,
         "processes": processes.count,
         "batch": args.batch * processes.count,
-        "seconds": round(statistics.median(seconds[args.warm_up :]), 4),
-        "gib": round(memory, 2),
         "particles": round(entry["particles"]),
+        "seconds": round(seconds, 4),
+        "gib": round(memory, 2),
         "loss": entry["loss"],
     }
+    if args.device == "cuda":
+        row |= {"gpu": torch.cuda.get_device_name(), "torch": torch.__version__, "commit": commit()}
+        row["date"] = time.strftime("%Y-%m-%d", time.gmtime())
+    return row
 
 
-def print_profile(trainer: Trainer, device: str, n_rows: int) -> None:
-    """The operators and kernels that took longest in one more step."""
-    activities = [ProfilerActivity.CPU] + [ProfilerActivity.CUDA] * (device == "cuda")
-    with profile(activities=activities) as traced:
+def alone(args: argparse.Namespace) -> dict[str, float]:
+    """Seconds of a step of each case in one process, a child of this one; nothing where there is just one anyway."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1 or int(os.environ.get("RANK", "0")) > 0:
+        return {}
+    environment = {k: v for k, v in os.environ.items() if k not in ("WORLD_SIZE", "RANK", "LOCAL_RANK")}
+    options = {"device": args.device, "preset": args.preset, "batch": args.batch, "size": args.size}
+    options |= {"steps": args.steps, "warm-up": args.warm_up}
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "rows.json"
+        command = [sys.executable, __file__, *(f"--{name}={value}" for name, value in options.items())]
+        subprocess.run([*command, "--json", str(file), "--case", *args.case], env=environment, check=True)
+        return {row["case"]: row["seconds"] for row in json.loads(file.read_text())} if file.exists() else {}
+
+
+class Stages:
+    """When one step came to the ends of its parts: on the device, and in Python, which runs ahead; and its memory."""
+
+    def __init__(self, trainer: Trainer, device: str):
+        self._device, self._marks, self._forward = device, [], True
+        simulator = trainer.simulator
+        self._end(trainer, "_batch", "batch")
+        self._end(simulator, "encode", "encode", lambda state: self._reached(state, "steps backward"))
+        self._end(simulator, "rollout", "steps", lambda steps: self._reached(steps[-1], "images backward"))
+        self._end(simulator, "render", "images")
+        look_at = trainer._look_at
+
+        def after_gradients(*arguments):
+            self.mark("encoder backward")
+            return look_at(*arguments)
+
+        trainer._look_at = after_gradients
+
+    def mark(self, name: str) -> None:
+        event, gib = None, memory_gib(self._device)
+        if self._device == "cuda":
+            event = torch.cuda.Event(enable_timing=True)
+            event.record()
+            torch.cuda.reset_peak_memory_stats()
+        self._marks.append((name, event, time.perf_counter(), gib))
+
+    def rows(self) -> list[tuple[str, float, float, float]]:
+        """(part, milliseconds on the device, milliseconds of Python, GiB at most)."""
+        if self._device == "cuda":
+            torch.cuda.synchronize()
+        rows = []
+        for (_, before, earlier, _), (name, event, later, gib) in zip(self._marks, self._marks[1:]):
+            host = 1e3 * (later - earlier)
+            rows.append((name, before.elapsed_time(event) if event else host, host, gib))
+        return rows
+
+    def _end(self, owner, attribute: str, name: str, then=lambda result: None) -> None:
+        """Marks the end of the first call of a method; later ones belong to a backward pass that computes again."""
+        called, done = getattr(owner, attribute), []
+
+        def method(*arguments, **options):
+            result = called(*arguments, **options)
+            if not done:
+                done.append(True)
+                self.mark(name)
+                then(result)
+            return result
+
+        setattr(owner, attribute, method)
+
+    def _reached(self, particles, name: str) -> None:
+        """Marks when the gradient has come back to ``particles``."""
+        particles.dynamic_latents.register_hook(lambda gradient: self.mark(name))
+
+
+def print_stages(trainer: Trainer, device: str) -> None:
+    stages = Stages(trainer, device)
+    stages.mark("start")
+    trainer.train_step()
+    stages.mark("clipping, AdamW, averages")
+    for name, on_device, host, gib in stages.rows():
+        print(f"    {name:<28}{on_device:9.1f} ms, issued in {host:9.1f} ms, {gib:6.1f} GiB", flush=True)
+
+
+def print_kernels(trainer: Trainer, n_rows: int) -> None:
+    """The kernels that took longest in one more step."""
+    with profile(activities=[ProfilerActivity.CUDA]) as traced:
         trainer.train_step()
-    averages = traced.key_averages()
-    for key in [f"self_{side}_time_total" for side in (["cpu"] + ["device"] * (device == "cuda"))]:
-        longest = sorted(averages, key=lambda event, key=key: -getattr(event, key))[:n_rows]
-        total = sum(getattr(event, key) for event in averages)
-        print(f"    {key}: {total / 1e6:.3f} s")
-        for event in longest:
-            print(f"    {getattr(event, key) / 1e6:9.3f} s {event.count:7d} x {event.key[:90]}")
+        torch.cuda.synchronize()
+    times = collections.defaultdict(lambda: [0.0, 0])
+    for event in traced.events():
+        name = re.sub(r"void |at::native::|gsim3d::|cuda::|\(anonymous namespace\)::|<unnamed>::", "", event.name)
+        if "CUDA" in str(event.device_type):
+            times[name[:110]][0] += event.device_time
+            times[name[:110]][1] += 1
+    total, launches = (sum(column) for column in zip(*times.values(), strict=True))
+    print(f"    {total / 1e3:.1f} ms of kernels and copies, {launches} launches")
+    for name, (spent, count) in sorted(times.items(), key=lambda item: -item[1][0])[:n_rows]:
+        print(f"    {spent / 1e3:9.2f} ms {count:6d} x {spent / count:8.1f} us  {name}", flush=True)
 
 
 def main() -> None:
@@ -191,15 +254,21 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128, help="pixels")
     parser.add_argument("--steps", type=int, default=3, help="that are timed; the median is shown")
     parser.add_argument("--warm-up", type=int, default=2, help="steps before them")
-    parser.add_argument(
-        "--top", type=int, default=0, help="of one process, also show what took longest in one more step"
-    )
-    parser.add_argument("--json", type=Path, help="append the rows to this file")
+    parser.add_argument("--stages", action="store_true", help="of one process, also time the parts of one more step")
+    parser.add_argument("--top", type=int, default=0, help="of one process, also list so many kernels of one more step")
+    parser.add_argument("--json", type=Path, help="write the rows here; on a GPU default tools/bench/results")
     args = parser.parse_args()
+    rows, file = [], args.json
+    if file is None and args.device == "cuda":
+        file = RESULTS / "training.json"
+    before = alone(args)
     with joined(args.device) as processes:
         say = print if processes.is_first else lambda *_, **__: None
         say(f"{args.preset}, {N_PAST}-1-{N_FUTURE}, bf16, {args.size} px; {PUBLISHED}")
-        say(f"{'case':<12}{'processes':>10}{'batch':>7}{'particles':>11}{'s a step':>10}{'peak GiB':>10}{'loss':>10}")
+        say(
+            f"{'case':<12}{'processes':>10}{'batch':>7}{'particles':>11}{'s a step':>10}{'peak GiB':>10}{'loss':>10}"
+            f"{'efficiency':>12}"
+        )
         for name in args.case:
             if args.device == "cuda":
                 torch.cuda.empty_cache()
@@ -211,14 +280,25 @@ def main() -> None:
                     raise
                 say(f"{name:<12} out of memory")
                 continue
+            row["efficiency"] = round(before[name] / row["seconds"], 4) if name in before else None
+            efficiency = f"{row['efficiency']:.0%}" if name in before else "-"
             say(
                 f"{name:<12}{row['processes']:>10}{row['batch']:>7}{row['particles']:>11}{row['seconds']:>10.3f}"
-                f"{row['gib']:>10.1f}{row['loss']:>10.5f}",
+                f"{row['gib']:>10.1f}{row['loss']:>10.5f}{efficiency:>12}",
                 flush=True,
             )
-            if args.json and processes.is_first:
-                with open(args.json, "a") as file:
-                    file.write(json.dumps(row) + "\n")
+            rows.append(row)
+            if file is not None and processes.is_first:
+                keep_rows(file, rows)
+
+
+def keep_rows(file: Path, rows: list[dict]) -> None:
+    """Writes ``rows`` in place of those of the same case and number of processes."""
+    new = {(row["case"], row["processes"]) for row in rows}
+    known = json.loads(file.read_text()) if file.exists() else []
+    kept = [row for row in known if (row["case"], row["processes"]) not in new]
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("[\n" + ",\n".join(json.dumps(row) for row in [*kept, *rows]) + "\n]\n")
 
 
 if __name__ == "__main__":

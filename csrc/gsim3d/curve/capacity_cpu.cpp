@@ -148,21 +148,24 @@ void build_given(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const 
                  const Workspace& workspace, const Parallel& parallel) {
   check_capacity(spec, clouds.n_rows);
   PyramidSpec fitting = spec;
-  fitting.capacity = nullptr;
+  fitting.capacity = nullptr, fitting.rounded = false;
   Fitted fitted;
   build_pyramid(clouds, fitting, {&Fitted::append, &fitted}, workspace, parallel);
 
   const std::vector<Stage> stages = stages_of(fitted.arrays.data() + 2, spec);
   const Array counts = counts_of(stages);
+  Array rounded = counts;
+  round_counts(rounded.data(), spec.n_stages, size(&rounded), clouds.n_rows);
+  const int64_t* capacity = spec.rounded ? rounded.data() : spec.capacity;
   bool fits = true;
-  for (size_t i = 0; i < counts.size(); ++i) fits &= counts[i] <= spec.capacity[i];
+  for (size_t i = 0; i < counts.size(); ++i) fits &= counts[i] <= capacity[i];
   const Copier copier(arrays);
   copy_rows(fitted.arrays[0], fits ? counts[0] : 0, clouds.n_rows, copier);
   for (int64_t s = 0, k = 0; s < spec.n_stages; ++s) {
     const int64_t at = capacity_at(s, Counted::kRows);
-    copy_stage(stages[s], counts.data() + at, spec.capacity + at, fits, copier);
+    copy_stage(stages[s], counts.data() + at, capacity + at, fits, copier);
     for (const Map& map : stages[s].maps) {
-      const int64_t n = fits ? size(map.tap_in) : 0, to_n = spec.capacity[capacity_of_pairs(spec.n_stages, k++)];
+      const int64_t n = fits ? size(map.tap_in) : 0, to_n = capacity[capacity_of_pairs(spec.n_stages, k++)];
       copier.list(map.tap_in, 1, n, to_n, zero);
       copier.list(map.tap_out, 1, n, to_n, zero);
       copier.list(map.cu_taps, 1, fits ? size(map.cu_taps) : 0, size(map.cu_taps), zero);

@@ -67,7 +67,7 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
                                   std::vector<int64_t> strides, std::vector<int64_t> merge_windows,
                                   std::vector<int64_t> patch_sizes, std::vector<int64_t> curves,
                                   std::vector<int64_t> kernel_sizes, std::vector<int64_t> cu_kernels, bool release,
-                                  std::vector<int64_t> capacity) {
+                                  std::vector<int64_t> capacity, bool rounded) {
   const char* op = "build_pyramid";
   const int64_t n_stages = static_cast<int64_t>(patch_sizes.size());
   const auto check_length = [&](const char* name, const std::vector<int64_t>& list, int64_t length) {
@@ -84,6 +84,7 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
         op, ": cu_kernels must ascend from 0 to len(kernel_sizes)=", kernel_sizes.size());
   if (!capacity.empty()) check_length("capacity", capacity, capacity_of_pairs(n_stages, cu_kernels.back()));
 
+  check(!rounded || capacity.empty(), op, ": rounded must be false where a capacity is given");
   check_shape(op, "positions", positions_, {-1, 3}, "[N, 3]");
   check_dtype(op, "cu_rows", cu_rows_, ScalarType::Long);
   check_dtype(op, "cloud_scene", cloud_scene_, ScalarType::Long);
@@ -103,7 +104,7 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
   const Tensor cloud_slot = rows_of(cloud_slot_), origin = rows_of(origin_);
   const PyramidSpec spec{grid_size,     slot_bits,           n_stages,          strides.data(), merge_windows.data(),
                          patch_sizes.data(), curves.data(), kernel_sizes.data(), cu_kernels.data(), release,
-                         capacity.empty() ? nullptr : capacity.data()};
+                         capacity.empty() ? nullptr : capacity.data(), rounded};
   TensorArrays arrays{cu_rows, {}};
   TensorWorkspace workspace(cu_rows);
   dispatch_float(op, "positions", positions, [&]<typename T>() {

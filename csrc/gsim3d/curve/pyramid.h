@@ -6,6 +6,8 @@
 // geometry does not depend on what else is in the call, except with `release`.
 #pragma once
 
+#include <algorithm>
+#include <bit>
 #include <cstdint>
 #include <initializer_list>
 
@@ -44,6 +46,9 @@ struct PyramidSpec {
   bool release;  // as published: cells truncated from the minimum over all clouds, depth from the extent, ties by row
   // Null: arrays fit what they hold. Else their sizes, known before the data: capacity_at of every count.
   const int64_t* capacity = nullptr;
+  // Sizes are rounded up from what the data has, so that calls with similar data have the same ones; otherwise as with
+  // `capacity`, which is null then.
+  bool rounded = false;
 };
 
 // What `capacity` and `found` count: rows, clouds, patches and keys of every stage, then the pairs of every kernel map.
@@ -53,6 +58,19 @@ constexpr int64_t capacity_at(int64_t stage, Counted what) {
 }
 constexpr int64_t capacity_of_pairs(int64_t n_stages, int64_t kernel) {
   return capacity_at(n_stages, Counted::kRows) + kernel;
+}
+
+// The sizes of a rounded pyramid, in place, from what was counted: at most one part in 32 more. Clouds stay as they are.
+inline void round_counts(int64_t* counts, int64_t n_stages, int64_t n_counts, int64_t n_rows) {
+  constexpr int64_t kEach = capacity_at(1, Counted::kRows);
+  for (int64_t i = 0; i < n_counts; ++i) {
+    const bool of_stage = i < capacity_of_pairs(n_stages, 0);
+    if (of_stage && i % kEach == static_cast<int64_t>(Counted::kClouds)) continue;
+    const auto step = std::max<int64_t>(1, static_cast<int64_t>(std::bit_floor(static_cast<uint64_t>(counts[i])) / 32));
+    counts[i] = (counts[i] + step - 1) / step * step;
+    if (of_stage && i % kEach == static_cast<int64_t>(Counted::kRows)) counts[i] = std::min(counts[i], n_rows);
+  }
+  counts[0] = n_rows;
 }
 
 // Reasons why a pyramid of given sizes is empty: bits of found[0].
@@ -85,7 +103,7 @@ namespace cpu {
 //     row_voxel [N], voxel_rows [N], cu_voxel_rows [V + 1]: rows of equal (cloud, cell); voxels by (cloud, x, y, z)
 //     for every kernel size K: tap_in [L], tap_out [L], cu_taps [K^3 + 1]: voxel tap_in lies at (kx, ky, kz) - K / 2
 //                           cells from tap_out, tap = (kx K + ky) K + kz; both ascend inside a tap; centre empty
-// and with spec.capacity at last found [1 + counts]: problems, then the counts that the data has. Then N, C, P, M, L
+// and with spec.capacity or spec.rounded at last found [1 + counts]: problems, then the counts that the data has. Then N, C, P, M, L
 // are those of the capacity (N0 = n_rows), V is N + 1, and behind what the data has follow rows that nothing reads: in
 // orders they stay at their places, each is a voxel of its own, `rows` lists those that sleep; the last voxels,
 // patches, clouds and clusters are empty (offsets stay at the end), other entries are 0. Where a count exceeds its
@@ -95,7 +113,7 @@ template <typename T>
 void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,
                    const Workspace& workspace, const Parallel& parallel);
 
-// build_pyramid with spec.capacity.
+// build_pyramid with spec.capacity or spec.rounded.
 template <typename T>
 void build_given(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,
                  const Workspace& workspace, const Parallel& parallel);

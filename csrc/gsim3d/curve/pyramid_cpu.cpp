@@ -299,7 +299,7 @@ void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, cons
                    const Workspace& workspace, const Parallel& parallel) {
   check_spec(spec);
   check_clouds(clouds, spec);
-  if (spec.capacity) return build_given(clouds, spec, arrays, workspace, parallel);
+  if (spec.capacity || spec.rounded) return build_given(clouds, spec, arrays, workspace, parallel);
   int64_t slot_bits = spec.slot_bits;
   const int64_t* rows = nullptr;
   Stage stage = first_stage(clouds, spec, &rows, arrays, workspace, parallel);

@@ -408,12 +408,25 @@ Results append_results(const PyramidSpec& spec, const int64_t* counts, const int
       results.most = std::max(results.most, n_taps + 1);
     }
   }
-  if (spec.capacity)
+  if (spec.capacity || spec.rounded)
     results.found = arrays.append({1 + capacity_of_pairs(spec.n_stages, spec.cu_kernels[spec.n_stages])});
   return results;
 }
 
-// Arrays of the sizes that the device has counted, which it is asked for.
+// Arrays of the sizes that the caller has given, and a pyramid that fits them.
+template <typename T>
+Results append_given(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const int64_t* capacity,
+                     const Scratch& scratch, const Arrays& arrays, Stream stream) {
+  std::vector<int64_t> n_voxels;
+  for (int64_t s = 0; s < spec.n_stages; ++s) n_voxels.push_back(capacity[capacity_at(s, Counted::kRows)] + 1);
+  Results results = append_results(spec, capacity, n_voxels.data(), scratch, arrays);
+  launch(kOp, settle_counts_kernel, 1, kThreads, 0, stream, scratch.build, scratch.capacity, results.found);
+  launch(kOp, write_sleepers_kernel, blocks_of(clouds.n_rows), kThreads, 0, stream, scratch.build, scratch.intake,
+         clouds.n_rows, results.found, results.stages[0].input_rows);
+  return results;
+}
+
+// Arrays of the sizes that the device has counted, which it is asked for, or of these sizes rounded.
 template <typename T>
 Results append_counted(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Scratch& scratch,
                        const Arrays& arrays, Stream stream) {
@@ -431,20 +444,14 @@ Results append_counted(const PyramidClouds<T>& clouds, const PyramidSpec& spec, 
     n_voxels.push_back(own[kVoxels]);
   }
   for (int64_t k = 0; k < n_maps; ++k) counts.push_back(2 * found[pairs_at(n_stages, k)]);
+  if (spec.rounded) {
+    round_counts(counts.data(), n_stages, static_cast<int64_t>(counts.size()), clouds.n_rows);
+    Tables tables(reinterpret_cast<char*>(scratch.capacity));
+    tables.add(counts, scratch.capacity);
+    tables.send(stream);
+    return append_given(clouds, spec, counts.data(), scratch, arrays, stream);
+  }
   return append_results(spec, counts.data(), n_voxels.data(), scratch, arrays);
-}
-
-// Arrays of the sizes that the caller has given, and a pyramid that fits them.
-template <typename T>
-Results append_given(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Scratch& scratch,
-                     const Arrays& arrays, Stream stream) {
-  std::vector<int64_t> n_voxels;
-  for (int64_t s = 0; s < spec.n_stages; ++s) n_voxels.push_back(spec.capacity[capacity_at(s, Counted::kRows)] + 1);
-  Results results = append_results(spec, spec.capacity, n_voxels.data(), scratch, arrays);
-  launch(kOp, settle_counts_kernel, 1, kThreads, 0, stream, scratch.build, scratch.capacity, results.found);
-  launch(kOp, write_sleepers_kernel, blocks_of(clouds.n_rows), kThreads, 0, stream, scratch.build, scratch.intake,
-         clouds.n_rows, results.found, results.stages[0].input_rows);
-  return results;
 }
 
 }  // namespace
@@ -507,7 +514,7 @@ void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, cons
   count_pairs(build, scratch.n_map_counts, workspace, stream);
   count_patches(build, stream);
 
-  const Results results = spec.capacity ? append_given(clouds, spec, scratch, arrays, stream)
+  const Results results = spec.capacity ? append_given(clouds, spec, spec.capacity, scratch, arrays, stream)
                                          : append_counted(clouds, spec, scratch, arrays, stream);
   Tables places(scratch.results);
   places.add(results.stages, scratch.stage_results);

@@ -1,4 +1,4 @@
-// One look at the rows of a state: which of them cannot be used, and sums over each cloud.
+// One look at the rows of a state: which of them cannot be used, what stands in for them, and sums over each cloud.
 //
 // A row's status has bit f where a value of field f is below low[f], above high[f] or NaN; kOutside where its position
 // is in no cell [0, 2^16) of its scene's workspace, kFast where it moved further than max_step. Field 0 is the
@@ -29,8 +29,8 @@ struct WatchedRows {
   const T* fields[kMaxWatchedFields];  // [n_rows, width[f]]
   int64_t width[kMaxWatchedFields];    // 3, 1, ...
   T low[kMaxWatchedFields], high[kMaxWatchedFields];
-  int n_fields;               // 2 to kMaxWatchedFields
-  const T* previous;          // [n_rows, 3] positions one step before, or null
+  int n_fields;                          // 2 to kMaxWatchedFields
+  const T* previous[kMaxWatchedFields];  // [n_rows, width[f]] one step before, or all null
   const uint8_t* activity;    // [n_rows]
   const int64_t* cu_rows;     // [n_clouds + 1]
   const int64_t* cloud_scene;  // [n_clouds] in [0, n_scenes)
@@ -40,10 +40,20 @@ struct WatchedRows {
   double max_step;   // metres
 };
 
+// The same rows, of which those with a status sleep. One with a fault of a field, or kFast, has the numbers of one
+// step before; where there was none the corner of its workspace, and `neutral` followed by zeros. Opacity is 0 after a
+// fault.
+template <typename T>
+struct MendedRows {
+  T* fields[kMaxWatchedFields];  // [n_rows, width[f]]
+  uint8_t* activity;             // [n_rows]; null: nothing is mended
+  T neutral[kMaxWatchedFields];
+};
+
 namespace cpu {
 
 template <typename T>
-void watch_rows(const WatchedRows<T>& rows,
+void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended,
                 int32_t* status,  // [n_rows]
                 double* record,   // [n_clouds, watched_columns(n_fields)]
                 const Workspace& workspace, const Parallel& parallel);
@@ -54,7 +64,8 @@ void watch_rows(const WatchedRows<T>& rows,
 namespace cuda {
 
 template <typename T>
-void watch_rows(const WatchedRows<T>& rows, int32_t* status, double* record, const Workspace& workspace, Stream stream);
+void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* record,
+                const Workspace& workspace, Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

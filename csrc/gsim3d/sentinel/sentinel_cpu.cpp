@@ -41,13 +41,20 @@ bool all_in_bounds(const WatchedRows<T>& rows, int64_t begin, int64_t end) {
 }
 
 template <typename T>
-void look_at_rows(const WatchedRows<T>& rows, int64_t cloud, int64_t begin, int64_t end, int32_t* status,
-                  double* record) {
+void look_at_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int64_t cloud, int64_t begin, int64_t end,
+                  int32_t* status, double* record) {
   const int n_kinds = rows.n_fields + 2, columns = watched_columns(rows.n_fields);
   for (int c = 0; c < columns; ++c) record[c] = start_of(c, rows.n_fields, rows.n_rows);
   double* sums = record + 2 * n_kinds;
   const double* origin = rows.origin + 3 * rows.cloud_scene[cloud];
-  const bool clean = all_in_bounds(rows, begin, end);
+  const bool clean = all_in_bounds(rows, begin, end), mends = mended.activity != nullptr;
+  if (mends) {
+    std::copy(rows.activity + begin, rows.activity + end, mended.activity + begin);
+    for (int f = 0; f < rows.n_fields; ++f) {
+      const int64_t first = begin * rows.width[f];
+      std::copy(rows.fields[f] + first, rows.fields[f] + end * rows.width[f], mended.fields[f] + first);
+    }
+  }
   for (int64_t row = begin; row < end; ++row) {
     const RowState state = look_at_row(rows, row, clean ? 0 : faults_of_fields(rows, row), origin);
     const bool asleep = rows.activity[row] == kAsleep;
@@ -63,6 +70,7 @@ void look_at_rows(const WatchedRows<T>& rows, int64_t cloud, int64_t begin, int6
       }
       continue;
     }
+    if (mends) mend_row(rows, mended, state.status, origin, row);
     for (int k = 0; k < n_kinds; ++k)
       if (state.status & bit_of(k, rows.n_fields)) {
         record[2 * k] += 1;
@@ -74,8 +82,8 @@ void look_at_rows(const WatchedRows<T>& rows, int64_t cloud, int64_t begin, int6
 }  // namespace
 
 template <typename T>
-void watch_rows(const WatchedRows<T>& rows, int32_t* status, double* record, const Workspace& workspace,
-                const Parallel& parallel) {
+void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* record,
+                const Workspace& workspace, const Parallel& parallel) {
   check_rows(rows);
   const int columns = watched_columns(rows.n_fields);
   const int64_t n_pieces = (rows.n_rows + kPiece - 1) / kPiece;
@@ -86,7 +94,7 @@ void watch_rows(const WatchedRows<T>& rows, int32_t* status, double* record, con
     int64_t cloud = std::upper_bound(rows.cu_rows, rows.cu_rows + rows.n_clouds + 1, begin) - rows.cu_rows - 1;
     for (; cloud < rows.n_clouds && rows.cu_rows[cloud] < end; ++cloud) {
       const int64_t from = std::max(begin, rows.cu_rows[cloud]), to = std::min(end, rows.cu_rows[cloud + 1]);
-      if (from < to) look_at_rows(rows, cloud, from, to, status, partial + (piece + cloud) * columns);
+      if (from < to) look_at_rows(rows, mended, cloud, from, to, status, partial + (piece + cloud) * columns);
     }
   });
   for (int64_t q = 0; q < rows.n_clouds; ++q) {
@@ -101,7 +109,8 @@ void watch_rows(const WatchedRows<T>& rows, int32_t* status, double* record, con
 }
 
 #define GSIM3D_INSTANTIATE(T) \
-  template void watch_rows<T>(const WatchedRows<T>&, int32_t*, double*, const Workspace&, const Parallel&);
+  template void watch_rows<T>(const WatchedRows<T>&, const MendedRows<T>&, int32_t*, double*, const Workspace&, \
+                              const Parallel&);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 #undef GSIM3D_INSTANTIATE

@@ -1,5 +1,5 @@
-// A block looks at a piece of rows and leaves a partial record of each cloud in it; a second kernel joins the partial
-// records of a cloud in order.
+// A block looks at a piece of rows, copies them, mends its copy and leaves a partial record of each cloud in the piece;
+// a second kernel joins the partial records of a cloud in order.
 #include <algorithm>
 
 #include "gsim3d/core/cuda_utils.cuh"
@@ -11,29 +11,104 @@ namespace {
 using namespace sentinel;  // NOLINT: this file is its other half
 
 constexpr const char* kWatch = "watch_rows";
-constexpr int kThreads = 256, kWarps = kThreads / kWarp;
-constexpr int64_t kPiece = 1024;  // rows of a block
-constexpr int kTeams = kThreads / kWarp;  // that share the partial records of a cloud
+constexpr int kPiece = 128;  // rows of a block, one a thread; few, so that small states too fill a GPU
+constexpr int kWarps = kPiece / kWarp;
+constexpr int kBatch = 4;             // packs that a thread reads before it looks at the first
+constexpr int kTeams = 1024 / kWarp;  // that share the partial records of a cloud
 static_assert(watched_columns(kMaxWatchedFields) <= kWarp);
 
-// Joins the values of all threads in a fixed tree; thread 0 gets the result.
-__device__ double join_block(Join how, double value) {
-  __shared__ double of_warp[kWarps];
-  for (int step = kWarp / 2; step > 0; step /= 2) value = join(how, value, __shfl_down_sync(kFullWarp, value, step));
-  __syncthreads();
-  if (threadIdx.x % kWarp == 0) of_warp[threadIdx.x / kWarp] = value;
-  __syncthreads();
-  if (threadIdx.x == 0)
-    for (int w = 1; w < kWarps; ++w) value = join(how, value, of_warp[w]);
-  return value;
+template <typename T>
+struct alignas(16) Pack {
+  static constexpr int kSize = 16 / sizeof(T);
+  T values[kSize];
+};
+
+// One field of a piece as a run of numbers, 16 bytes a read where its addresses allow it: copies it and says whether a
+// number that this thread read is out of bounds.
+template <typename T>
+__device__ bool look_at_field(const T* __restrict__ values, T* __restrict__ copy, int64_t count, T low, T high) {
+  constexpr int kSize = Pack<T>::kSize;
+  const bool aligned = (reinterpret_cast<uintptr_t>(values) | reinterpret_cast<uintptr_t>(copy)) % sizeof(Pack<T>) == 0;
+  const int64_t n_packs = aligned ? count / kSize : 0;
+  const auto* packs = reinterpret_cast<const Pack<T>*>(values);
+  bool good = true;
+  for (int64_t first = threadIdx.x; first < n_packs; first += kBatch * kPiece) {
+    Pack<T> read[kBatch];
+#pragma unroll
+    for (int b = 0; b < kBatch; ++b) {
+      if (first + b * kPiece < n_packs) read[b] = packs[first + b * kPiece];
+    }
+#pragma unroll
+    for (int b = 0; b < kBatch; ++b) {
+      const int64_t at = first + b * kPiece;
+      if (at < n_packs) {
+        if (copy != nullptr) reinterpret_cast<Pack<T>*>(copy)[at] = read[b];
+#pragma unroll
+        for (int i = 0; i < kSize; ++i) good &= read[b].values[i] >= low && read[b].values[i] <= high;
+      }
+    }
+  }
+  for (int64_t i = n_packs * kSize + threadIdx.x; i < count; i += kPiece) {
+    const T value = values[i];
+    if (copy != nullptr) copy[i] = value;
+    good &= value >= low && value <= high;
+  }
+  return !good;
 }
 
+// What rows of one cloud in a piece add up to.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) look_kernel(WatchedRows<T> rows, int32_t* status, double* partial) {
+struct Sums {
+  double added[3] = {0, 0, 0};
+  T low[3], high[3];
+
+  __device__ Sums() {
+    for (int i = 0; i < 3; ++i) low[i] = static_cast<T>(kLargest), high[i] = static_cast<T>(-kLargest);
+  }
+  // Of a warp, in a fixed tree; lane 0 has it.
+  __device__ void join_warp() {
+#pragma unroll
+    for (int step = kWarp / 2; step > 0; step /= 2) {
+#pragma unroll
+      for (int i = 0; i < 3; ++i) {
+        added[i] += __shfl_down_sync(kFullWarp, added[i], step);
+        low[i] = min(low[i], __shfl_down_sync(kFullWarp, low[i], step));
+        high[i] = max(high[i], __shfl_down_sync(kFullWarp, high[i], step));
+      }
+    }
+  }
+  __device__ void store(double* sums) const {
+    for (int i = 0; i < 3; ++i) {
+      sums[i] = added[i];
+      sums[3 + i] = static_cast<double>(low[i]), sums[6 + i] = static_cast<double>(high[i]);
+    }
+  }
+};
+
+template <typename T>
+__global__ void __launch_bounds__(kPiece)
+    look_kernel(const __grid_constant__ WatchedRows<T> rows, const __grid_constant__ MendedRows<T> mended,
+                int32_t* status, double* partial) {
+  constexpr int kKinds = kMaxWatchedFields + 2;
+  __shared__ int32_t counts[kKinds], firsts[kKinds];
+  __shared__ double of_warp[kWarps][kWatchedSums];
   const int n_fields = rows.n_fields, n_kinds = n_fields + 2, columns = watched_columns(n_fields);
-  const int64_t begin = blockIdx.x * kPiece, end = min(rows.n_rows, begin + kPiece);
-  for (int64_t row = begin + threadIdx.x; row < end; row += kThreads) status[row] = 0;  // also those of no cloud
-  __syncthreads();
+  const int64_t begin = static_cast<int64_t>(blockIdx.x) * kPiece, end = min(rows.n_rows, begin + kPiece);
+  const int64_t row = begin + threadIdx.x;
+  const bool mends = mended.activity != nullptr;
+  bool bad = false;
+  for (int f = 0; f < n_fields; ++f) {
+    const int64_t width = rows.width[f], first = begin * width;
+    bad |= look_at_field(rows.fields[f] + first, mends ? mended.fields[f] + first : nullptr, (end - begin) * width,
+                         rows.low[f], rows.high[f]);
+  }
+  const bool any_bad = __syncthreads_or(bad);  // also: what is mended is copied already
+  const int32_t faults = any_bad && row < end ? faults_of_fields(rows, row) : 0;
+  const uint8_t activity = row < end ? rows.activity[row] : kAsleep;
+  if (row < end) {  // offsets that do not fit leave rows without a cloud
+    status[row] = 0;
+    if (mends) mended.activity[row] = activity;
+  }
   int64_t low = 0, high = rows.n_clouds;  // the last cloud that begins at or before the piece
   while (high - low > 1) {
     const int64_t middle = (low + high) / 2;
@@ -43,47 +118,49 @@ __global__ void __launch_bounds__(kThreads) look_kernel(WatchedRows<T> rows, int
     const Range of_cloud = range_of(rows.cu_rows, cloud, rows.n_rows);
     const int64_t from = max(begin, of_cloud.begin), to = min(end, of_cloud.end);
     if (from >= to) continue;
-    const int64_t scene = rows.cloud_scene[cloud];
-    const double* origin = inside(scene, rows.n_scenes) ? rows.origin + 3 * scene : nullptr;
-    double sums[kWatchedSums];
-    for (int i = 0; i < kWatchedSums; ++i) sums[i] = start_of(2 * n_kinds + i, n_fields, rows.n_rows);
-    int32_t seen = 0;
-    for (int64_t row = from + threadIdx.x; row < to; row += kThreads) {
-      const RowState state = look_at_row(rows, row, faults_of_fields(rows, row), origin);
-      const bool asleep = rows.activity[row] == kAsleep;
-      status[row] = asleep ? 0 : state.status;
-      if (!(state.status & 2)) sums[2] += static_cast<double>(rows.fields[1][row]);
-      if (asleep) continue;
-      seen |= state.status;
-      if (state.status) continue;
-      sums[0] += 1;
-      sums[1] += state.energy;
-      for (int i = 0; i < 3; ++i) {
-        const auto position = static_cast<double>(rows.fields[0][row * 3 + i]);
-        sums[3 + i] = min(sums[3 + i], position), sums[6 + i] = max(sums[6 + i], position);
+    __syncthreads();
+    if (threadIdx.x < n_kinds) counts[threadIdx.x] = 0, firsts[threadIdx.x] = kPiece;
+    __syncthreads();
+    Sums<T> sums;
+    if (row >= from && row < to) {
+      const int64_t scene = rows.cloud_scene[cloud];
+      const double* origin = inside(scene, rows.n_scenes) ? rows.origin + 3 * scene : nullptr;
+      const RowState state = look_at_row(rows, row, faults, origin);
+      if (!(state.status & 2)) sums.added[2] = static_cast<double>(rows.fields[1][row]);
+      if (activity != kAsleep && state.status == 0) {
+        sums.added[0] = 1, sums.added[1] = state.energy;
+        for (int i = 0; i < 3; ++i) sums.low[i] = sums.high[i] = rows.fields[0][row * 3 + i];
+      } else if (activity != kAsleep) {
+        status[row] = state.status;
+        if (mends) mend_row(rows, mended, state.status, origin, row);
+        for (int k = 0; k < n_kinds; ++k) {
+          if (!(state.status & bit_of(k, n_fields))) continue;
+          atomicAdd(&counts[k], 1), atomicMin(&firsts[k], static_cast<int>(threadIdx.x));
+        }
       }
     }
-    double* record = partial + (blockIdx.x + cloud) * columns;
-    for (int i = 0; i < kWatchedSums; ++i) {
-      const double sum = join_block(join_of(2 * n_kinds + i, n_fields), sums[i]);
-      if (threadIdx.x == 0) record[2 * n_kinds + i] = sum;
+    sums.join_warp();
+    if (threadIdx.x % kWarp == 0) sums.store(of_warp[threadIdx.x / kWarp]);
+    __syncthreads();
+    const int column = threadIdx.x, kind = column / 2;
+    if (column >= columns) continue;
+    double value = 0;
+    if (kind >= n_kinds) {
+      value = of_warp[0][column - 2 * n_kinds];
+      for (int w = 1; w < kWarps; ++w) value = join(join_of(column, n_fields), value, of_warp[w][column - 2 * n_kinds]);
+    } else if (column % 2 == 0) {
+      value = counts[kind];
+    } else {
+      value = static_cast<double>(firsts[kind] == kPiece ? rows.n_rows : begin + firsts[kind]);
     }
-    const bool any = __syncthreads_or(seen);
-    for (int k = 0; k < n_kinds; ++k) {
-      double count = 0, first = static_cast<double>(rows.n_rows);
-      if (any) {
-        for (int64_t row = from + threadIdx.x; row < to; row += kThreads)
-          if (status[row] & bit_of(k, n_fields)) count += 1, first = min(first, static_cast<double>(row));
-        count = join_block(Join::kSum, count), first = join_block(Join::kLeast, first);
-      }
-      if (threadIdx.x == 0) record[2 * k] = count, record[2 * k + 1] = first;
-    }
+    partial[(blockIdx.x + cloud) * columns + column] = value;
   }
 }
 
 // A block takes a cloud, a lane a column, a warp a run of the cloud's partial records.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) join_kernel(WatchedRows<T> rows, const double* partial, double* record) {
+__global__ void __launch_bounds__(kTeams* kWarp)
+    join_kernel(WatchedRows<T> rows, const double* __restrict__ partial, double* record) {
   __shared__ double of_team[kTeams][kWarp];
   const int columns = watched_columns(rows.n_fields), column = threadIdx.x % kWarp, team = threadIdx.x / kWarp;
   for (int64_t cloud = blockIdx.x; cloud < rows.n_clouds; cloud += gridDim.x) {
@@ -111,20 +188,20 @@ __global__ void __launch_bounds__(kThreads) join_kernel(WatchedRows<T> rows, con
 }  // namespace
 
 template <typename T>
-void watch_rows(const WatchedRows<T>& rows, int32_t* status, double* record, const Workspace& workspace,
-                Stream stream) {
-  const int64_t n_pieces = (rows.n_rows + kPiece - 1) / kPiece;
+void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* record,
+                const Workspace& workspace, Stream stream) {
+  const int64_t n_pieces = blocks_for(kWatch, rows.n_rows, kPiece);
   const int64_t n_partial = (n_pieces + rows.n_clouds) * watched_columns(rows.n_fields);
   double* partial = workspace.take<double>(n_partial);
-  check(n_pieces <= INT32_MAX, kWatch, ": at most 2^41 rows; got ", rows.n_rows);
   fill_zero(kWatch, partial, n_partial, stream);  // offsets that do not ascend leave some out
-  launch(kWatch, look_kernel<T>, static_cast<unsigned>(n_pieces), kThreads, 0, stream, rows, status, partial);
-  launch(kWatch, join_kernel<T>, static_cast<unsigned>(std::min<int64_t>(rows.n_clouds, 1 << 16)), kThreads, 0, stream,
-         rows, static_cast<const double*>(partial), record);
+  launch(kWatch, look_kernel<T>, static_cast<unsigned>(n_pieces), kPiece, 0, stream, rows, mended, status, partial);
+  launch(kWatch, join_kernel<T>, static_cast<unsigned>(std::min<int64_t>(rows.n_clouds, 1 << 16)), kTeams * kWarp, 0,
+         stream, rows, static_cast<const double*>(partial), record);
 }
 
-#define GSIM3D_INSTANTIATE(T) \
-  template void watch_rows<T>(const WatchedRows<T>&, int32_t*, double*, const Workspace&, Stream);
+#define GSIM3D_INSTANTIATE(T)                                                                                     \
+  template void watch_rows<T>(const WatchedRows<T>&, const MendedRows<T>&, int32_t*, double*, const Workspace&, \
+                              Stream);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 #undef GSIM3D_INSTANTIATE

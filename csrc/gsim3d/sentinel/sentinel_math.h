@@ -1,4 +1,4 @@
-// What is wrong with one row, and how columns of records are joined. For host and device.
+// What is wrong with one row, what stands in for it, and how columns of records are joined. For host and device.
 #pragma once
 
 #include <cmath>
@@ -43,16 +43,39 @@ GSIM3D_HD RowState look_at_row(const WatchedRows<T>& rows, int64_t row, int32_t 
     }
     state.status |= within ? 0 : kOutside;
   }
-  if (rows.previous != nullptr) {
+  if (rows.previous[0] != nullptr) {
     double squared = 0;
     for (int i = 0; i < 3; ++i) {
-      const double step = static_cast<double>(position[i]) - static_cast<double>(rows.previous[row * 3 + i]);
+      const double step = static_cast<double>(position[i]) - static_cast<double>(rows.previous[0][row * 3 + i]);
       squared += step * step;
     }
     state.status |= squared <= rows.max_step * rows.max_step ? 0 : kFast;
     state.energy = squared / 2;
   }
   return state;
+}
+
+// Rows outside the workspace keep their numbers.
+GSIM3D_HD bool keeps_numbers(int32_t status) { return (status & ((kOutside - 1) | kFast)) == 0; }
+
+// Number i of field f in place of a row's own.
+template <typename T>
+GSIM3D_HD T stand_in(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t status, const double* origin,
+                     int f, int64_t row, int64_t i) {
+  if (f == 1 && (status & (kOutside - 1))) return 0;
+  if (rows.previous[f] != nullptr) return rows.previous[f][row * rows.width[f] + i];
+  if (f == 0) return origin == nullptr ? T{0} : static_cast<T>(origin[i]);
+  return i == 0 ? mended.neutral[f] : T{0};
+}
+
+template <typename T>
+GSIM3D_HD void mend_row(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t status, const double* origin,
+                        int64_t row) {
+  if (status != 0) mended.activity[row] = kAsleep;
+  if (keeps_numbers(status)) return;
+  for (int f = 0; f < rows.n_fields; ++f)
+    for (int64_t i = 0; i < rows.width[f]; ++i)
+      mended.fields[f][row * rows.width[f] + i] = stand_in(rows, mended, status, origin, f, row, i);
 }
 
 // The bit of kind k: the fields, kOutside, kFast.

@@ -1,21 +1,27 @@
 #include "gsim3d/sentinel/sentinel.h"
 
-#include <optional>
+#include <string>
+#include <vector>
 
 #include "gsim3d/torch/torch_utils.h"
 
 namespace gsim3d::binding {
 namespace {
 
-std::tuple<Tensor, Tensor> watch_rows(std::vector<Tensor> fields, std::vector<double> low, std::vector<double> high,
-                                      const Tensor& cu_rows_, const Tensor& cloud_scene_, const Tensor& origin_,
-                                      const Tensor& activity_, const std::optional<Tensor>& previous_,
-                                      double grid_size, double max_step) {
+// The mended activity and fields, or nothing where `neutral` holds no numbers.
+std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
+    std::vector<Tensor> fields, std::vector<double> low, std::vector<double> high, const Tensor& cu_rows_,
+    const Tensor& cloud_scene_, const Tensor& origin_, const Tensor& activity_, std::vector<Tensor> previous,
+    double grid_size, double max_step, std::vector<double> neutral) {
   const char* op = "watch_rows";
   const auto n_fields = static_cast<int64_t>(fields.size());
   check(n_fields >= 2 && n_fields <= kMaxWatchedFields, op, ": fields must be 2 to ", kMaxWatchedFields,
         " tensors, positions and opacities first; got ", n_fields);
   check(low.size() == fields.size() && high.size() == fields.size(), op, ": low and high must have one bound a field");
+  check(previous.empty() || previous.size() == fields.size(), op, ": previous must have one tensor a field; got ",
+        previous.size(), " for ", n_fields);
+  check(neutral.empty() || neutral.size() == fields.size(), op, ": neutral must have one number a field; got ",
+        neutral.size(), " for ", n_fields);
   check_shape(op, "fields[0]", fields[0], {-1, 3}, "[N, 3]");
   const int64_t n = fields[0].size(0);
   check_shape(op, "fields[1]", fields[1], {n}, "[N]");
@@ -38,38 +44,50 @@ std::tuple<Tensor, Tensor> watch_rows(std::vector<Tensor> fields, std::vector<do
   check_dtype(op, "activity", activity, ScalarType::Byte);
   for (const Tensor* tensor : {&cu_rows, &cloud_scene, &origin, &activity})
     check_device(op, "clouds and origin", *tensor, fields[0]);
-  std::optional<Tensor> previous;
-  if (previous_) {
-    previous = rows_of(*previous_);
-    check_shape(op, "previous", *previous, {n, 3}, "[N, 3]");
-    check_dtype(op, "previous", *previous, fields[0].scalar_type());
-    check_device(op, "previous", *previous, fields[0]);
+  for (size_t f = 0; f < previous.size(); ++f) {
+    const std::string name = "previous[" + std::to_string(f) + "]";
+    check(previous[f].sizes() == fields[f].sizes(), op, ": ", name, " must have the shape of its field, ",
+          shape_of(fields[f]), "; got ", shape_of(previous[f]));
+    check_dtype(op, name.c_str(), previous[f], fields[0].scalar_type());
+    check_device(op, name.c_str(), previous[f], fields[0]);
+    previous[f] = rows_of(previous[f]);
   }
   Tensor status = empty(fields[0], {n}, ScalarType::Int);
   Tensor record = empty(fields[0], {n_clouds, watched_columns(static_cast<int>(n_fields))}, ScalarType::Double);
+  std::vector<Tensor> made;
+  if (!neutral.empty()) {
+    made.push_back(empty(activity, {n}));
+    for (const Tensor& field : fields) made.push_back(torch::stable::new_empty(field, field.sizes()));
+  }
   TensorWorkspace workspace(fields[0]);
   dispatch_float(op, "fields", fields[0], [&]<typename T>() {
     WatchedRows<T> rows{};
+    MendedRows<T> mended{};
     for (int64_t f = 0; f < n_fields; ++f) {
       rows.fields[f] = data<T>(fields[f]);
       rows.width[f] = 1;
       for (int64_t d = 1; d < fields[f].dim(); ++d) rows.width[f] *= fields[f].size(d);
       rows.low[f] = static_cast<T>(low[f]), rows.high[f] = static_cast<T>(high[f]);
+      rows.previous[f] = previous.empty() ? nullptr : data<T>(previous[f]);
+      if (made.empty()) continue;
+      mended.fields[f] = mutable_data<T>(made[f + 1]);
+      mended.neutral[f] = static_cast<T>(neutral[f]);
     }
+    mended.activity = made.empty() ? nullptr : mutable_data<uint8_t>(made[0]);
     rows.n_fields = static_cast<int>(n_fields);
-    rows.previous = previous ? data<T>(*previous) : nullptr;
     rows.activity = data<uint8_t>(activity);
     rows.cu_rows = data<int64_t>(cu_rows), rows.cloud_scene = data<int64_t>(cloud_scene);
     rows.origin = data<double>(origin);
     rows.n_rows = n, rows.n_clouds = n_clouds, rows.n_scenes = origin.size(0);
     rows.grid_size = grid_size, rows.max_step = max_step;
-    auto* out = mutable_data<double>(record);
+    auto* seen = mutable_data<int32_t>(status);
+    auto* sums = mutable_data<double>(record);
     if constexpr (kWithCuda)
       if (fields[0].is_cuda())
-        return cuda::watch_rows<T>(rows, mutable_data<int32_t>(status), out, workspace, current_stream(fields[0]));
-    cpu::watch_rows<T>(rows, mutable_data<int32_t>(status), out, workspace, torch_parallel());
+        return cuda::watch_rows<T>(rows, mended, seen, sums, workspace, current_stream(fields[0]));
+    cpu::watch_rows<T>(rows, mended, seen, sums, workspace, torch_parallel());
   });
-  return {status, record};
+  return {status, record, made};
 }
 
 void kernels(auto& m) { m.impl("watch_rows", TORCH_BOX(&watch_rows)); }

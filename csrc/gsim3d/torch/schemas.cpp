@@ -11,7 +11,7 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "build_pyramid(Tensor positions, Tensor cu_rows, Tensor cloud_scene, Tensor cloud_slot, Tensor origin, "
       "float grid_size, "
       "int slot_bits, int[] strides, int[] merge_windows, int[] patch_sizes, int[] curves, int[] kernel_sizes, "
-      "int[] cu_kernels, bool release, int[] capacity) -> Tensor[]");
+      "int[] cu_kernels, bool release, int[] capacity, bool rounded=False) -> Tensor[]");
 
   // sparse_conv: submanifold convolution over voxels; weight [C_out, K, K, K, C_in]. A plan is the order of rows and
   // the sources of their taps on CUDA, made once for all convolutions with a map.
@@ -76,10 +76,19 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "norm_gelu_backward(Tensor grad, Tensor x, Tensor mean, Tensor scale, Tensor bias) -> (Tensor x, Tensor scale, "
       "Tensor bias)");
 
-  // sentinel: which rows cannot be used, and sums over clouds.
+  // decode: what a network says about shapes and colours of Gaussians -> rotations, scales, harmonics in the world.
+  m.def(
+      "decode_gaussians(Tensor raw, Tensor readings, int degree, float scale_min, float scale_max) -> (Tensor quats, "
+      "Tensor scales, Tensor sh)");
+  m.def(
+      "decode_gaussians_backward(Tensor grad_quats, Tensor grad_scales, Tensor grad_sh, Tensor raw, Tensor readings, "
+      "int degree, float scale_min, float scale_max) -> Tensor");
+
+  // sentinel: which rows cannot be used, what stands in for them, and sums over clouds.
   m.def(
       "watch_rows(Tensor[] fields, float[] low, float[] high, Tensor cu_rows, Tensor cloud_scene, Tensor origin, "
-      "Tensor activity, Tensor? previous, float grid_size, float max_step) -> (Tensor status, Tensor record)");
+      "Tensor activity, Tensor[] previous, float grid_size, float max_step, float[] neutral) -> (Tensor status, Tensor "
+      "record, Tensor[] mended)");
 
   // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
   m.def(

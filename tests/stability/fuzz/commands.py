@@ -32,13 +32,16 @@ RIGHT = {
     "check-data": "{good}/data --out {out}.png",
     "train": "{good}/train.yaml --data {good}/data --out {out} --until 1",
     "simulate": "{good}/model.safetensors {good}/data/ball/0000 --out {out} --steps 1",
+    "plan": "{good}/data/ball/0000 {good}/model.safetensors",
+    "effects": "infer {good}/data/ball/0000 {good}/model.safetensors --out {out}.yaml",
+    "pareto": "{good}/model.safetensors {good}/data --out {out} --quiet",
     "evaluate": "{good}/model.safetensors {good}/data --out {out} --steps 1",
     "weights": "lpips --from {good}/train.yaml",
     "import": "{good}/model.safetensors --config {good}/train.yaml --out {out}",
     "demo": "--out {out}",
     "doctor": "--stability {good}/model.safetensors --out {out} --steps 1",
 }
-FREE = ("check-data", "train", "evaluate", "doctor")  # their outputs have a default
+FREE = ("check-data", "train", "effects", "evaluate", "doctor")  # their outputs have a default
 OUTPUTS = ("out", "export", "cache")
 NO_NUMBER = ("", "x", "nan", "inf", "-inf", "1e400", "0x10", "1,5", "--", "²", "1" * 5000)
 NO_WHOLE_NUMBER = (*NO_NUMBER, "-1", "1.5", "1e3")
@@ -79,11 +82,11 @@ def _wrong(action: argparse.Action, rng: random.Random) -> str:
 def _make(command: str, rng: random.Random, folder: Path) -> list[str]:
     """Right arguments with a wrong one. Paths of the input's own folder are written {out} and {file}."""
     arguments = RIGHT[command].split()
-    action = rng.choice(_options(command))
-    option = action.option_strings[-1]
-    wrong = [option, *[_wrong(action, rng) for _ in range(action.nargs if isinstance(action.nargs, int) else 1)]]
-    kind = rng.random()
-    if kind < 0.7:
+    options, kind = _options(command), rng.random()
+    if kind < 0.7 and options:
+        action = rng.choice(options)
+        option = action.option_strings[-1]
+        wrong = [option, *[_wrong(action, rng) for _ in range(action.nargs if isinstance(action.nargs, int) else 1)]]
         if option in arguments:
             place = arguments.index(option)
             arguments[place : place + 2] = wrong

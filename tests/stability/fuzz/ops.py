@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from gsim3d import ops
-from gsim3d.types import Cameras
+from gsim3d.harmonics import readings
+from gsim3d.types import ASLEEP, Cameras
 from tests.stability.fuzz.engine import Failure, Target, finite
 from tests.stability.fuzz.poison import mutate, tensor
 
@@ -190,31 +191,52 @@ def _call_residual_norm(a: Arguments):
 def _watch_rows(rng: random.Random) -> Arguments:
     n, clouds, dtype = _size(rng), rng.choice((0, 1, 2, 3)), _dtype(rng)
     n = n if clouds else 0
-    previous = tensor(rng, n, 3, dtype=dtype)
+    shapes = (n, 3), (n,), (n, *rng.choice(((), (2,), (0,), (2, 3))))
+    previous = {f"previous[{f}]": tensor(rng, *shape, dtype=dtype) for f, shape in enumerate(shapes)}
     return {
-        "fields[0]": tensor(rng, n, 3, dtype=dtype).abs(),
-        "fields[1]": tensor(rng, n, dtype=dtype).sigmoid(),
-        "fields[2]": tensor(rng, n, *rng.choice(((), (2,), (0,), (2, 3))), dtype=dtype),
+        "fields[0]": tensor(rng, *shapes[0], dtype=dtype).abs(),
+        "fields[1]": tensor(rng, *shapes[1], dtype=dtype).sigmoid(),
+        "fields[2]": tensor(rng, *shapes[2], dtype=dtype),
         "bounds": ((-10.0, 10.0), (0.0, 1.0), (-9.0, 9.0)),
         "cu_rows": _offsets(rng, n, clouds),
         "cloud_scene": torch.arange(clouds) // 2,
         "origin": torch.zeros((clouds + 1) // 2, 3, dtype=torch.float64),
         "activity": torch.tensor([rng.randrange(3) for _ in range(n)], dtype=torch.uint8),
         "grid_size": rng.choice((0.0, 0.1)),
-        "previous": rng.choice((None, previous)),
         "max_step": 1.0,
+        "neutral": rng.choice((None, [0.0, 0.0, 1.0])),
+        **rng.choice(({}, previous)),
     }
 
 
 def _call_watch_rows(a: Arguments):
     fields = [a[f"fields[{f}]"] for f in range(3)]
-    return ops.watch_rows(fields, **{name: value for name, value in a.items() if not name.startswith("fields")})
+    previous = [a[f"previous[{f}]"] for f in range(3)] if "previous[0]" in a else None
+    others = {name: value for name, value in a.items() if "[" not in name}
+    watched = ops.watch_rows(fields, previous=previous, **others)
+    awake = a["activity"] != ASLEEP  # who sleeps is not looked at
+    if watched.fields is None or not all(bool(field.isfinite().all()) for field in previous or ()):
+        return watched.status, watched.record
+    return watched.status, watched.record, *(field[awake] for field in watched.fields)
 
 
 def _norm_gelu(rng: random.Random) -> Arguments:
     channels, dtype = rng.choice((1, 4, 33)), _dtype(rng)
     columns = {name: tensor(rng, channels, dtype=dtype) for name in ("mean", "scale", "bias")}
     return {"x": tensor(rng, _size(rng), channels, dtype=dtype), **columns}
+
+
+def _decode(rng: random.Random) -> Arguments:
+    degree = rng.randrange(4)
+    raw = tensor(rng, _size(rng), 3 * (degree + 1) ** 2 + 7, dtype=_dtype(rng))
+    return {"raw": raw, "degree": rng.randint(0, degree), "scale_min": 0.001, "scale_max": 0.1}
+
+
+def _call_decode(a: Arguments):
+    raw = a["raw"]
+    wide = torch.float64 if isinstance(raw, Tensor) and raw.dtype == torch.float64 else torch.float32
+    device = raw.device if isinstance(raw, Tensor) and not raw.is_meta else torch.device("cpu")
+    return ops.decode_gaussians(**a, readings=readings(wide, device))
 
 
 def _cameras(rng: random.Random, images: int) -> dict[str, Tensor]:
@@ -303,6 +325,7 @@ OPS: dict[str, tuple[Callable[[random.Random], Arguments], Callable[[Arguments],
     "residual_norm": (_residual_norm, _call_residual_norm),
     "watch_rows": (_watch_rows, _call_watch_rows),
     "norm_gelu": (_norm_gelu, lambda a: ops.norm_gelu(**a)),
+    "decode_gaussians": (_decode, _call_decode),
     "plane_sweep": (_plane_sweep, lambda a: ops.plane_sweep(**a)),
     "sweep_geometry": (_sweep_geometry, lambda a: ops.sweep_geometry(**a)),
     "rasterize_gaussians": (_raster, _call_raster),

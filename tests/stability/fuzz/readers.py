@@ -28,6 +28,7 @@ import yaml
 from gsim3d import check_stability
 from gsim3d.data import Scene
 from gsim3d.data.check import check_scene
+from gsim3d.edits import load_edits
 from gsim3d.effects import EffectsSpec
 from gsim3d.errors import HardCaseError, InputError
 from gsim3d.evaluate.predictions import Predictions
@@ -164,6 +165,16 @@ def _read_effects(folder: Path, what: str) -> None:
         raise Failure("a specification does not come back as it was")
 
 
+def _write_edits(folder: Path) -> None:
+    edits = [
+        {"step": 0, "op": "remove", "of": "frozen"},
+        {"step": 2, "op": "throw", "of": {"which": "all", "box": [[0, 0, 0], [1, 1, 1]]}, "velocity": [0, 0.5, 0]},
+        {"step": 3, "op": "rotate", "axis": [0, 0, 1], "degrees": 90.0},
+        {"step": 3, "op": "insert", "scene": "other", "by": [0.25, 0, 0]},
+    ]
+    (folder / "edits.yaml").write_text(yaml.safe_dump(edits))
+
+
 ARRAYS = {"params": {"conv": {"kernel": np.ones((3, 3), np.float32), "bias": np.zeros(3, np.float32)}}}
 MEMBER = "fuzzed/weights.ckpt"
 
@@ -256,6 +267,7 @@ READERS = {
         ),
         _read_effects,
     ),
+    "edits": Reader(_write_edits, lambda folder, what: load_edits(folder / "edits.yaml", lambda scene: None)),
     "weights": Reader(_write_weights, _read_weights),
     "predictions": Reader(partial(_write_predictions, video=False), _read_predictions, (), "predicted"),
     "predictions_video": Reader(partial(_write_predictions, video=True), _read_predictions, (), "predicted"),

@@ -1,0 +1,83 @@
+"""What a network says about the shape and colour of Gaussians -> rotations, scales and colours in the world."""
+
+import torch
+from torch import Tensor
+
+from gsim3d.ops import _load  # noqa: F401
+from gsim3d.ops._arguments import check_numbers, check_real, check_tensors, check_whole
+
+
+def decode_gaussians(
+    raw: Tensor, readings: Tensor, *, degree: int, scale_min: float, scale_max: float, check: bool = True
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotation, scale and colour of Gaussians whose colours are predicted in their own frame.
+
+    The rotation is normalised, the identity where it is shorter than 1e-6; scales are
+    ``scale_min + (scale_max - scale_min) * sigmoid``; harmonics of degree l > 0 are damped by ``0.1 / 4^l`` and turn with
+    the rotation.
+
+    Args:
+        raw: [N, 3 K + 7], K = 1, 4, 9 or 16: harmonics (3, K), rotation (x, y, z, w), scales; float32 or float64, on CUDA
+            also float16 and bfloat16 (computed in float32).
+        readings: [128], :func:`gsim3d.harmonics.readings`, float32; float64 with float64 rows.
+        degree: of the harmonics that are returned, at most that of ``raw``.
+        scale_min, scale_max: metres, 0 to 1e15.
+        check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
+    Returns:
+        quats [N, 4] (w, x, y, z), scales [N, 3], sh [N, (degree + 1)^2, 3]; float32, float64 with float64 rows.
+    Gradients: ``raw``, once.
+    Raises:
+        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        ValueError, TypeError: an argument is malformed; the message names it.
+
+    Example:
+        >>> raw = torch.tensor([[0.5, 0.5, 0.5, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0]])
+        >>> decode_gaussians(raw, torch.zeros(128), degree=0, scale_min=0.0, scale_max=1.0)[:2]
+        (tensor([[1., 0., 0., 0.]]), tensor([[0.5000, 0.5000, 0.5000]]))
+    """
+    if check:
+        check_tensors("decode_gaussians", raw=raw, readings=readings)
+        check_whole("decode_gaussians", degree=degree)
+        check_real("decode_gaussians", scale_min=scale_min, scale_max=scale_max)
+        check_numbers("decode_gaussians", raw=raw, readings=readings)
+    return torch.ops.gsim3d.decode_gaussians(raw, readings, degree, scale_min, scale_max)
+
+
+@torch.library.register_fake("gsim3d::decode_gaussians")
+def _(raw, readings, degree, scale_min, scale_max):
+    n = raw.shape[0]
+    return readings.new_empty(n, 4), readings.new_empty(n, 3), readings.new_empty(n, (degree + 1) ** 2, 3)
+
+
+@torch.library.register_fake("gsim3d::decode_gaussians_backward")
+def _(grad_quats, grad_scales, grad_sh, raw, readings, degree, scale_min, scale_max):
+    return raw.new_empty(raw.shape)
+
+
+def _setup(ctx, inputs, output):
+    raw, readings, *ctx.numbers = inputs
+    ctx.save_for_backward(raw, readings)
+
+
+def _backward(ctx, *grads):
+    grad_raw = torch.ops.gsim3d.decode_gaussians_backward(*grads, *ctx.saved_tensors, *ctx.numbers)
+    return grad_raw, None, None, None, None
+
+
+torch.library.register_autograd("gsim3d::decode_gaussians", _backward, setup_context=_setup)
+_library = torch.library.Library("gsim3d", "FRAGMENT")
+
+
+def _autocast(device: str):
+    keys = torch._C.DispatchKeySet(getattr(torch._C.DispatchKey, f"Autocast{device.upper()}"))
+
+    def rule(raw, readings, *numbers):
+        raw = raw.float() if device == "cpu" and raw.dtype != torch.float64 else raw
+        with torch._C._ExcludeDispatchKeyGuard(keys):
+            return torch.ops.gsim3d.decode_gaussians(raw, readings, *numbers)
+
+    return rule
+
+
+for _device in ("cpu", "cuda"):
+    _library.impl("decode_gaussians", _autocast(_device), f"Autocast{_device.upper()}")

@@ -1,0 +1,1 @@
+"""What accuracy costs in time: a trained simulator under many settings, measured."""

@@ -1,0 +1,175 @@
+"""Finds the fastest setting that keeps a promise, and keeps it for later runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from gsim3d.errors import InputError
+from gsim3d.evaluate.report import write_json
+from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.pareto.measure import Comparison, Effort, Point, Subject, compare, points_of, ties, time_points
+from gsim3d.pareto.settings import KNOBS, Knob, Setting
+from gsim3d.pareto.timing import Clock, DeviceClock
+from gsim3d.train.restore import Restored
+
+# preset -> share of the reference's gain over the constant baseline, in dB, that it keeps at least
+PROMISES = {"exact": None, "balanced": 0.999, "fast": 0.99}
+SPEEDS = "speeds.json"
+OF_IMAGES = ("image size and decoded frames",)  # what is simulated is tuned, not what is looked at
+
+
+def autotune(
+    subject: Subject,
+    *,
+    max_ms: float | None = None,
+    min_agreement_psnr: float | None = None,
+    knobs: Sequence[Knob] = KNOBS,
+    effort: Effort = Effort(),
+) -> Point:
+    """The best setting within a limit: with ``max_ms`` the most accurate one whose step takes at most as long; with
+    ``min_agreement_psnr`` the fastest one that agrees with the reference that well. Measured on ``subject``.
+
+    Args:
+        knobs: that may be turned.   effort: how long to measure; at least 3 rounds tell differences from noise.
+    Raises:
+        InputError: not exactly one limit, or no setting keeps it; the message says how near one came.
+    """
+    if (max_ms is None) == (min_agreement_psnr is None):
+        raise InputError("autotune: give either max_ms or min_agreement_psnr")
+    clock, comparison = DeviceClock(subject.restored.device), Comparison(subject)
+    points = points_of(subject.restored, knobs)
+    compare(comparison, points)
+    time_points(subject, points, clock, effort)
+    if max_ms is not None:
+        return _most_accurate(subject, comparison, points, max_ms, clock, effort)
+
+    def keeps(point: Point) -> bool:
+        return point.agreement.psnr >= min_agreement_psnr
+
+    return fastest(subject, comparison, points, keeps, clock, effort)
+
+
+def tune(
+    subject: Subject, comparison: Comparison, points: Sequence[Point], clock: Clock, effort: Effort
+) -> dict[str, Point]:
+    """The setting of each preset, from measured ``points``, of which the first is the reference."""
+    reference = points[0]
+
+    def keeping(share: float) -> Callable[[Point], bool]:
+        return lambda point: keeps_gain(comparison, point, reference, share)
+
+    found = {"exact": reference}
+    for name, share in PROMISES.items():
+        if share is not None:
+            found[name] = fastest(subject, comparison, points, keeping(share), clock, effort)
+    return found
+
+
+def keeps_gain(comparison: Comparison, point: Point, reference: Point, share: float) -> bool:
+    """Whether ``point`` keeps this share of the reference's gain in dB over the constant baseline, at its rendered steps."""
+    every = point.setting.every
+    at_same_steps = {metric: values[::every] for metric, values in reference.by_step.items()}
+    whole, kept = comparison.gain(at_same_steps, every), comparison.gain(point.by_step, every)
+    return whole is not None and kept is not None and kept >= whole - (1 - share) * abs(whole)
+
+
+def fastest(
+    subject: Subject,
+    comparison: Comparison,
+    points: Sequence[Point],
+    keeps: Callable[[Point], bool],
+    clock: Clock,
+    effort: Effort,
+) -> Point:
+    """The reference with every turn that keeps the promise and saves time, added one by one and measured together."""
+    reference = points[0]
+    useful = [p for p in points[1:] if p.knob not in OF_IMAGES and _faster(p, reference) and keeps(p)]
+    best = reference
+    for point in sorted(useful, key=lambda p: p.step_seconds):
+        changes = point.setting.to_dict()
+        if set(changes) & set(best.setting.to_dict()):
+            continue
+        if best is reference:
+            best = point
+            continue
+        both = Point(dataclasses.replace(best.setting, **changes), "together", "model")
+        compare(comparison, [both])
+        if not both.failure and keeps(both):
+            time_points(subject, [both], clock, effort)
+            if _faster(both, best):
+                best = both
+    return best
+
+
+def _faster(point: Point, than: Point) -> bool:
+    return not point.failure and point.step_seconds < than.step_seconds and not ties(point, than)
+
+
+def _most_accurate(
+    subject: Subject, comparison: Comparison, points: Sequence[Point], max_ms: float, clock: Clock, effort: Effort
+) -> Point:
+    usable = [p for p in points if not p.failure]
+    within = [p for p in usable if 1e3 * p.step_seconds <= max_ms]
+    if within:
+        return max(within, key=lambda p: p.agreement.psnr)
+    # None alone is fast enough: the nearest to the reference first, turns are added until one is.
+    best = points[0]
+    for point in sorted(usable, key=lambda p: -p.agreement.psnr):
+        if set(point.setting.to_dict()) & set(best.setting.to_dict()) or not _faster(point, points[0]):
+            continue
+        both = Point(dataclasses.replace(best.setting, **point.setting.to_dict()), "together", "model")
+        compare(comparison, [both])
+        if both.failure:
+            continue
+        time_points(subject, [both], clock, effort)
+        if _faster(both, best):
+            best = both
+        if 1e3 * best.step_seconds <= max_ms:
+            return best
+    raise InputError(
+        f"autotune: no setting takes at most {max_ms:g} ms a step; the fastest takes {1e3 * best.step_seconds:.3g}"
+    )
+
+
+def save_speeds(folder: Path, restored: Restored, presets: dict[str, Point]) -> Path:
+    """Keeps the tuned presets of a checkpoint on its device in ``folder``/speeds.json, beside those of others."""
+    path = folder / SPEEDS
+    known = _read(path) if path.is_file() else {}
+    digest, device = restored.checkpoint.digest, restored.device.type
+    settings = {name: point.setting.to_dict() for name, point in presets.items()}
+    write_json(path, {**known, digest: {**known.get(digest, {}), device: settings}})
+    return path
+
+
+def load_speed(folder: Path, restored: Restored, preset: str) -> Setting:
+    """The setting of a preset that was tuned for a checkpoint on this kind of device.
+
+    Raises:
+        InputError: it was not tuned; the message says how to.
+    """
+    if preset not in PROMISES:
+        raise InputError(f"--speed: must be one of {', '.join(PROMISES)}; got {preset!r}")
+    if preset == "exact":
+        return Setting()
+    path, device = folder / SPEEDS, restored.device.type
+    found = _read(path) if path.is_file() else {}
+    for key in (restored.checkpoint.digest, device, preset):
+        found = found.get(key)
+        if not isinstance(found, dict):
+            raise InputError(
+                f"--speed {preset}: this checkpoint is not tuned for {device} (in {path}); run gsim3d pareto CHECKPOINT first"
+            )
+    return Setting.from_dict(found)
+
+
+def _read(path: Path) -> dict:
+    try:
+        content = json.loads(read_file(path, MAX_TEXT))
+    except ValueError as error:
+        raise InputError(f"{path} cannot be read: {error}") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path} must hold a mapping of checkpoints")
+    return content

@@ -1,0 +1,181 @@
+"""Runs a trained simulator as a setting says."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gsim3d.data import Scene, make_frames
+from gsim3d.dynamics import RestLog, concatenate, last_steps
+from gsim3d.edits import Edit
+from gsim3d.errors import InputError
+from gsim3d.evaluate.protocol import Prediction
+from gsim3d.graphs import CapturedRollout
+from gsim3d.layers import exact_convolutions
+from gsim3d.pareto.settings import Setting
+from gsim3d.simulator import Simulator
+from gsim3d.train.precision import PrecisionConfig
+from gsim3d.train.restore import Restored
+from gsim3d.train.samples import thinned
+from gsim3d.types import DYNAMIC, Cameras, Frames, Particles
+
+
+class Runner:
+    """A trained simulator under one setting.
+
+        runner = Runner(restored, Setting(history=2))
+        state = runner.encode(runner.frames([scene], [context]))
+        state = runner.step(state)
+        images = runner.images(last_steps(state, 1), cameras)
+
+    Raises:
+        InputError: the model cannot do what the setting asks for.
+    """
+
+    def __init__(self, restored: Restored, setting: Setting = Setting()):
+        self.restored, self.setting, self.device = restored, setting, restored.device
+        self.simulator = _changed(restored.simulator, setting)
+        spec = restored.plan.spec
+        dynamics = dataclasses.replace(
+            spec.dynamics,
+            history=setting.history or spec.dynamics.history,
+            background=setting.background or spec.dynamics.background,
+        )
+        appearance = spec.appearance
+        if setting.sh_degree is not None:
+            appearance = dataclasses.replace(appearance, view_dependent=setting.sh_degree)
+        self.plan = self.simulator.plan(dataclasses.replace(spec, dynamics=dynamics, appearance=appearance))
+        self.n_encoded = min(setting.history or restored.data.history, restored.data.history)
+
+    @property
+    def skipped(self) -> int:
+        """First input steps that a history shorter than the training's leaves out."""
+        return self.restored.data.history - self.n_encoded
+
+    def frames(self, scenes: Sequence[Scene], context: Sequence[Sequence[int]], start: int = 0) -> Frames:
+        """Input images: of the steps from ``start`` that the training's history has, the last ones."""
+        steps = [range(start + self.skipped, start + self.restored.data.history)] * len(scenes)
+        if self.setting.context_views is not None:
+            context = [_spread(cams, self.setting.context_views) for cams in context]
+        masked = all(scene.has_segmentation() for scene in scenes)
+        frames = make_frames(scenes, [list(cams) for cams in context], steps, masked=masked)
+        return thinned(frames, self.restored.data).to(self.device)
+
+    @torch.no_grad()
+    def encode(self, frames: Frames) -> Particles:
+        """The state from which to simulate."""
+        with self._precision("encoder"):
+            return self.simulator.prepare(self._most_opaque(self.simulator.encode(frames)), self.plan)
+
+    @torch.no_grad()
+    def step(self, state: Particles) -> Particles:
+        """The state one call of the dynamics later."""
+        with self._precision("dynamics"):
+            return self.simulator.step(state, self.plan)
+
+    @torch.no_grad()
+    def images(self, particles: Particles, cameras: Cameras) -> Tensor:
+        """[I, H, W, 3] in [0, 1] of particles as :meth:`step` made them."""
+        with self._precision("renderer"):
+            rendering = self.simulator.draw(
+                particles, self._smaller(cameras), plan=self.plan, cutoff=self.setting.cutoff
+            )
+        return rendering.color.float().clamp(0, 1)
+
+    @torch.no_grad()
+    def predict(
+        self, scene: Scene, context: Sequence[int], n_future: int, start: int = 0, edits: Sequence[Edit] = ()
+    ) -> Prediction:
+        """As :func:`gsim3d.evaluate.protocol.predict`, of the steps from ``start + skipped`` on. Errors likewise."""
+        self.restored.check_scene(scene)
+        if not 0 <= start <= scene.n_steps - self.restored.data.history:
+            raise InputError(f"{scene.path}: the input steps from step {start} on do not fit its {scene.n_steps} steps")
+        if n_future < 1:
+            raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
+        encoded = self.encode(self.frames([scene], [context], start))
+        log = RestLog()
+        with self._precision("dynamics"):
+            if self.setting.captured and not edits:
+                steps = CapturedRollout(self.simulator, encoded, n_future, self.plan)(encoded).steps
+            else:
+                steps = self.simulator.rollout(encoded, n_future, self.plan, edits=edits, log=log)
+        return Prediction(concatenate([encoded, *steps]), self.n_encoded, tuple(context), log.resting_share)
+
+    def newest(self, state: Particles) -> Particles:
+        """The last step of every scene."""
+        return last_steps(state, 1)
+
+    def enlarged(self, images: Tensor, height: int, width: int) -> Tensor:
+        """Images of a setting that shrinks them, in their full size."""
+        if images.shape[1:3] == (height, width):
+            return images
+        return F.interpolate(images.permute(0, 3, 1, 2), (height, width), mode="bilinear").permute(0, 2, 3, 1)
+
+    def captured(self, state: Particles, n_steps: int, cameras: Cameras) -> CapturedRollout:
+        """The rollout of ``state`` as a graph, in the precision of the dynamics."""
+        with self._precision("dynamics"):
+            return CapturedRollout(
+                self.simulator, state, n_steps, self.plan, cameras=self._smaller(cameras), copies=False
+            )
+
+    @contextlib.contextmanager
+    def _precision(self, part: str) -> Iterator[None]:
+        precision = getattr(self.setting, part)
+        tf32 = precision == "tf32"
+        autocast = PrecisionConfig(**{part: "fp32" if tf32 else precision}).of(part, self.device.type)
+        before = torch.backends.cuda.matmul.allow_tf32
+        convolutions = exact_convolutions()
+        if tf32:
+            convolutions = torch.backends.cudnn.flags(
+                enabled=True, benchmark=False, deterministic=True, allow_tf32=True
+            )
+        try:
+            torch.backends.cuda.matmul.allow_tf32 = tf32
+            with autocast, convolutions:
+                yield
+        finally:
+            torch.backends.cuda.matmul.allow_tf32 = before
+
+    def _most_opaque(self, particles: Particles) -> Particles:
+        """The share that the setting keeps of the moving and of the other particles of each cloud."""
+        if self.setting.kept == 1:
+            return particles
+        group = 2 * particles.row_cloud() + (particles.activity == DYNAMIC)
+        order = torch.argsort(particles.opacities, descending=True, stable=True)
+        order = order[torch.argsort(group[order], stable=True)]
+        counts = torch.bincount(group, minlength=2 * particles.n_clouds)
+        rank = torch.arange(len(order), device=order.device) - (counts.cumsum(0) - counts)[group[order]]
+        kept = torch.zeros_like(group, dtype=torch.bool)
+        kept[order] = rank < (counts[group[order]] * self.setting.kept).ceil()
+        return particles.select_rows(kept)
+
+    def _smaller(self, cameras: Cameras) -> Cameras:
+        factor = self.setting.shrink
+        if factor == 1:
+            return cameras
+        width, height = math.ceil(cameras.width / factor), math.ceil(cameras.height / factor)
+        scale = torch.tensor([width / cameras.width, height / cameras.height, 1.0], device=cameras.Ks.device)
+        return dataclasses.replace(cameras, Ks=cameras.Ks * scale[:, None], width=width, height=height)
+
+
+def _spread(cams: Sequence[int], count: int) -> list[int]:
+    return [cams[k * len(cams) // count] for k in range(min(count, len(cams)))]
+
+
+def _changed(simulator: Simulator, setting: Setting) -> Simulator:
+    """``simulator``, or one with its weights in another geometry."""
+    dynamics = simulator.config.dynamics
+    patches = tuple(min(size, setting.patch_size or size) for size in dynamics.patch_sizes)
+    changed = dataclasses.replace(dynamics, grid_size=dynamics.grid_size * setting.grid, patch_sizes=patches)
+    if changed == dynamics:
+        return simulator
+    device = next(simulator.parameters()).device
+    other = Simulator(dataclasses.replace(simulator.config, dynamics=changed))
+    other.load_state_dict(simulator.state_dict())
+    return other.to(device).train(simulator.training)

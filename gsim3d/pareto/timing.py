@@ -1,0 +1,291 @@
+"""Where the time of a call goes: stages told apart by the ops they run, medians of many repeats, memory and energy."""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+
+from gsim3d.simulator import Simulator
+
+STAGES = (
+    "encode",
+    "serialise",
+    "convolution",
+    "attention",
+    "pooling",
+    "dense layers",
+    "state and guards",
+    "head",
+    "sort and raster",
+)
+STAGE_OF_OP = {
+    "build_pyramid": "serialise",
+    "sparse_conv_plan": "serialise",
+    "sparse_conv": "convolution",
+    "patch_attention": "attention",
+    "pool_max": "pooling",
+    "pool_mean": "pooling",
+    "unpool": "pooling",
+    "rasterize_gaussians": "sort and raster",
+}
+WARM_UP, REPEATS = 3, 20
+ADDS_UP = 0.03  # the stages of a call may differ from the whole by this share
+
+
+class Clock(Protocol):
+    """What a stopwatch reads."""
+
+    def wait(self) -> None:
+        """Returns once the device has done everything asked of it."""
+
+    def now(self) -> float:
+        """Seconds of the host."""
+
+    def mark(self) -> Any:
+        """The point in the device's work that has been asked for so far."""
+
+    def seconds(self, first: Any, last: Any) -> float:
+        """Between two marks that the device has passed."""
+
+    def delay(self, seconds: float) -> None:
+        """Keeps the device busy."""
+
+
+class DeviceClock:
+    """The clock of the CPU or a GPU, whose marks are events.
+
+    waits: False leaves out the wait for the device, which a timing must never do: see :mod:`gsim3d.pareto.self_check`.
+    """
+
+    def __init__(self, device: torch.device | str, waits: bool = True):
+        self._gpu = torch.device(device) if torch.device(device).type == "cuda" else None
+        self._waits = waits
+
+    def wait(self) -> None:
+        if self._gpu is not None and self._waits:
+            torch.cuda.synchronize(self._gpu)
+
+    def now(self) -> float:
+        return time.perf_counter()
+
+    def mark(self) -> Any:
+        if self._gpu is None:
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record(torch.cuda.current_stream(self._gpu))
+        return event
+
+    def seconds(self, first: Any, last: Any) -> float:
+        if self._gpu is None:
+            return last - first
+        last.synchronize()
+        return first.elapsed_time(last) / 1e3
+
+    def delay(self, seconds: float) -> None:
+        if self._gpu is None:
+            end = time.perf_counter() + seconds
+            while time.perf_counter() < end:
+                pass
+        else:
+            kilohertz = torch.cuda.get_device_properties(self._gpu).clock_rate
+            torch.cuda._sleep(int(seconds * 1e3 * kilohertz))
+
+
+class Stopwatch:
+    """Splits the time of a call into stages; a stage within another counts as itself only.
+
+        stopwatch = Stopwatch(clock)
+        with stopwatch.running():
+            with stopwatch.stage("encode"):
+                ...
+        stopwatch.seconds                      # {"encode": ..., "state and guards": ...}
+
+    delays: stage -> seconds to waste the first time that it is entered in each run; shows what the stopwatch sees.
+    """
+
+    def __init__(self, clock: Clock, delays: dict[str, float] | None = None):
+        self.seconds: dict[str, float] = {}
+        self._clock, self._delays = clock, delays or {}
+        self._marks: list[tuple[str, Any]] = []
+        self._open: list[str] = []
+
+    @contextmanager
+    def running(self, rest: str = "state and guards") -> Iterator[None]:
+        """One call. ``rest``: the stage of everything outside any other."""
+        self._marks, self._open, self._due = [], [], dict(self._delays)
+        self._enter(rest)
+        try:
+            yield
+        finally:
+            self._marks.append(("", self._clock.mark()))
+            self._clock.wait()
+            totals: dict[str, float] = defaultdict(float)
+            for (name, begin), (_, end) in zip(self._marks, self._marks[1:]):
+                totals[name] += self._clock.seconds(begin, end)
+            self.seconds, self._open = dict(totals), []
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        self._enter(name)
+        try:
+            yield
+        finally:
+            self._leave()
+
+    def _enter(self, name: str) -> None:
+        if not self._open or self._open[-1] != name:
+            self._marks.append((name, self._clock.mark()))
+        self._open.append(name)
+        if name in self._due:
+            self._clock.delay(self._due.pop(name))
+
+    def _leave(self) -> None:
+        if self._open.pop() != self._open[-1]:
+            self._marks.append((self._open[-1], self._clock.mark()))
+
+
+@contextmanager
+def watched(simulator: Simulator, stopwatch: Stopwatch) -> Iterator[None]:
+    """Within it, every call of ``simulator`` tells ``stopwatch`` its stages; ops are recognised wherever they are called."""
+    hooks = []
+    rooms = {simulator.encoder: "encode", simulator.dynamics.net: "dense layers", simulator.renderer: "head"}
+    for module, name in rooms.items():
+        hooks.append(module.register_forward_pre_hook(lambda *_, name=name: stopwatch._enter(name)))
+        hooks.append(module.register_forward_hook(lambda *_: stopwatch._leave(), always_call=True))
+    ops = torch.ops.gsim3d
+    known = {name: getattr(ops, name) for name in STAGE_OF_OP}
+    for name, op in known.items():
+        setattr(ops, name, _TimedOp(op, STAGE_OF_OP[name], stopwatch))
+    try:
+        yield
+    finally:
+        for name, op in known.items():
+            setattr(ops, name, op)
+        for hook in hooks:
+            hook.remove()
+
+
+class _TimedOp:
+    """An op of torch.ops that tells the stopwatch when it runs; what is an overload of it does so too."""
+
+    def __init__(self, op: Any, stage: str, stopwatch: Stopwatch):
+        self._op, self._stage, self._stopwatch = op, stage, stopwatch
+
+    def __call__(self, *args, **kwargs):
+        if self._stopwatch._open and self._stopwatch._open[-1] == "encode":  # all of the encoder is one stage
+            return self._op(*args, **kwargs)
+        with self._stopwatch.stage(self._stage):
+            return self._op(*args, **kwargs)
+
+    def __getattr__(self, name: str):
+        value = getattr(self._op, name)
+        return _TimedOp(value, self._stage, self._stopwatch) if name == "default" else value
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of one call: all repeats, in order; stages by name, medians of repeats in which they were watched."""
+
+    repeats: tuple[float, ...]
+    stages: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.repeats)
+
+    @property
+    def p95(self) -> float:
+        ordered = sorted(self.repeats)
+        return ordered[min(len(ordered) - 1, round(0.95 * (len(ordered) - 1)))]
+
+    @property
+    def unexplained(self) -> float:
+        """How far the stages' sum is from the whole, as a share of the whole; 0 without stages."""
+        return abs(sum(self.stages.values()) / self.median - 1) if self.stages else 0.0
+
+
+def time_call(call: Callable[[], Any], clock: Clock, repeats: int = REPEATS, warm_up: int = WARM_UP) -> Timing:
+    """Times ``call``, each time from an idle device to an idle device; the first ``warm_up`` do not count."""
+    seconds = []
+    for n in range(warm_up + repeats):
+        clock.wait()
+        start = clock.now()
+        call()
+        clock.wait()
+        if n >= warm_up:
+            seconds.append(clock.now() - start)
+    return Timing(tuple(seconds))
+
+
+def time_stages(
+    call: Callable[[], Any],
+    simulators: Sequence[Simulator],
+    clock: Clock,
+    repeats: int = REPEATS,
+    warm_up: int = WARM_UP,
+    delays: dict[str, float] | None = None,
+) -> Timing:
+    """As :func:`time_call`, and the stages of it: plain and watched calls take turns, so that both see the same machine."""
+    seconds, stages = [], defaultdict(list)
+    stopwatch = Stopwatch(clock, delays)
+    for n in range(warm_up + repeats):
+        clock.wait()
+        start = clock.now()
+        call()
+        clock.wait()
+        plain = clock.now() - start
+        with _all_watched(simulators, stopwatch), stopwatch.running():
+            call()
+        if n >= warm_up:
+            seconds.append(plain)
+            for name in STAGES:
+                stages[name].append(stopwatch.seconds.get(name, 0.0))
+    medians = {name: statistics.median(values) for name, values in stages.items()}
+    return Timing(tuple(seconds), {name: value for name, value in medians.items() if value > 0})
+
+
+@contextmanager
+def _all_watched(simulators: Sequence[Simulator], stopwatch: Stopwatch) -> Iterator[None]:
+    if not simulators:
+        yield
+        return
+    with watched(simulators[0], stopwatch), _all_watched(simulators[1:], stopwatch):
+        yield
+
+
+@contextmanager
+def peak_memory(device: torch.device) -> Iterator[Callable[[], int]]:
+    """A function that says how many bytes the block needed at most: of the GPU, or of the whole process so far."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        yield lambda: torch.cuda.max_memory_allocated(device)
+    else:
+        yield lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+@contextmanager
+def energy(device: torch.device) -> Iterator[Callable[[], float | None]]:
+    """A function that says how many joules the GPU used in the block; None where that cannot be read."""
+    start = _millijoules(device)
+    yield lambda: None if start is None else (_millijoules(device) - start) / 1e3
+
+
+def _millijoules(device: torch.device) -> int | None:
+    if device.type != "cuda":
+        return None
+    try:
+        import pynvml
+
+        pynvml.nvmlInit()
+        return pynvml.nvmlDeviceGetTotalEnergyConsumption(pynvml.nvmlDeviceGetHandleByIndex(device.index or 0))
+    except Exception:  # no package, no right or no counter: every way to fail means that it cannot be read
+        return None

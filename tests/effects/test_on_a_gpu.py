@@ -1,0 +1,64 @@
+"""Every effect, edit and mixed batch gives on a GPU what it gives on the CPU, in float64."""
+
+import torch
+
+from gsim3d.by_scene import render_by_scene, rollout_by_scene
+from gsim3d.edits import Duplicate, Edit, Move, Recolor, Remove, Rotate, Throw
+from gsim3d.effects import EffectsSpec
+from tests.asserts import assert_close_relative_to_max
+from tests.effects.models import MODELS, Case
+from tests.effects.test_different_specs_in_one_batch import SPECS
+from tests.effects.test_nothing_executed import EFFECTS
+
+EDITS = [
+    Edit(0, Recolor("moving", (0.8, 0.2, 0.1))),
+    Edit(0, Rotate("moving", axis=(0.0, 0.0, 1.0), degrees=30.0)),
+    Edit(1, Duplicate("moving", (0.3, 0.0, 0.0))),
+    Edit(1, Throw("moving", (0.0, 0.0, 0.02))),
+    Edit(1, Move("frozen", (0.0, 0.0, 0.1))),
+    Edit(2, Remove("frozen")),
+]
+ON = EffectsSpec.from_dict({"structure": {"insert": True, "remove": True}, "outputs": {"depth": True}})
+
+
+def cases(devices, model="latent", steps=(2,), n_steps=1):
+    for device in devices:
+        case = Case(MODELS[model], steps, n_steps)
+        case.simulator.double().to(device)
+        case.state = case.state.map(lambda t: t.double() if t.is_floating_point() else t).to(device)
+        case.cameras = case.cameras.to(device)
+        yield case
+
+
+def assert_equal(results, what):
+    (cpu_steps, cpu_image), (cuda_steps, cuda_image) = results
+    for step, other in zip(cuda_steps, cpu_steps, strict=True):
+        for name, value in other.row_fields().items():
+            assert_close_relative_to_max(getattr(step, name).cpu(), value, 1e-9, f"{what}: {name}")
+    for name, value in cpu_image._asdict().items():
+        if value is not None:
+            assert_close_relative_to_max(getattr(cuda_image, name).cpu(), value, 1e-9, f"{what}: {name}")
+
+
+def test_effects(devices):
+    for name, (model, on, off, _) in EFFECTS.items():
+        for values in (on, off):
+            results = [case(EffectsSpec.from_dict(values)) for case in cases(devices, model)]
+            assert_equal(results, f"{name}, {values}")
+
+
+def test_edits(devices):
+    for model in ("latent", "explicit"):
+        results = [case(ON, edits=EDITS) for case in cases(devices, model, n_steps=3)]
+        assert results[0][0][0].n_rows < results[0][0][1].n_rows > results[0][0][2].n_rows
+        assert_equal(results, model)
+
+
+@torch.no_grad()
+def test_different_specs_in_one_batch(devices):
+    results = []
+    for case in cases(devices, steps=(2, 3, 1, 2)):
+        plans = [case.simulator.plan(spec) for spec in SPECS]
+        steps = rollout_by_scene(case.simulator, case.state, 2, plans)
+        results.append((steps, render_by_scene(case.simulator, steps[-1], case.cameras, None, plans)))
+    assert_equal(results, "batch")

@@ -1,0 +1,51 @@
+"""Many scenes at once, and a training step with the checkpoint's own configuration."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gsim3d.pareto import report
+from gsim3d.pareto.regimes import throughput, training_step
+from gsim3d.pareto.settings import Setting
+from gsim3d.pareto.timing import DeviceClock
+from gsim3d.train.checkpoint import Checkpoint
+from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.settings import to_dict
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_scenes_of_a_batch_look_as_alone(subject):
+    runner = subject.runner()
+    frames = runner.frames(subject.scenes, [views[0] for views in subject.views])
+    images = runner.images(runner.newest(runner.step(runner.encode(frames))), subject.cameras_of([0, 1], 0))
+    for number in range(2):
+        newest = runner.newest(runner.step(subject.start(runner, number)))
+        alone = runner.images(newest, subject.cameras(number, 0))
+        torch.testing.assert_close(images[number : number + 1], alone, rtol=0, atol=1e-5)
+
+
+def test_throughput_counts_all_scenes(subject):
+    found = throughput(subject, Setting(), DeviceClock("cpu"), repeats=2, n_scenes=3)
+    assert found.n_scenes == 3
+    assert found.steps_a_second == pytest.approx(3 / found.timing.median)
+
+
+def test_a_training_step_of_the_last_stage(subject):
+    assert "does not hold the configuration" in training_step(subject, DeviceClock("cpu")).problem
+    stages = (StageConfig(steps=5, horizon=1), StageConfig(steps=5, horizon=2, batch=2, target_views=1))
+    config = TrainConfig(stages=stages, data=DataConfig(history=2, context_views=2, background_stride=2), seed=3)
+
+    def trained(config):
+        saved = Checkpoint({}, {"train": to_dict(config)})
+        copy = dataclasses.replace(subject.restored, checkpoint=saved)
+        changed = type(subject)(copy, subject.scenes)
+        return training_step(changed, DeviceClock("cpu"), repeats=1)
+
+    step = trained(config)
+    assert (step.batch, step.horizon) == (2, 2) and step.timing.median > 0
+    long = dataclasses.replace(config, stages=(StageConfig(steps=5, horizon=50),))
+    assert "do not fit" in trained(long).problem
+    found = report.regimes_as_dict([], step)["training"]
+    assert found["step_ms"]["median"] == pytest.approx(1e3 * step.timing.median)
