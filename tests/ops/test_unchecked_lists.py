@@ -244,8 +244,11 @@ def test_rasterizer(which, wrong, dtype, devices):
 def test_watched_rows(offsets, dtype, devices):
     fields, bounds, cu_rows, options = state(dtype=dtype, device=devices[1])
     cu_rows = OFFSETS[offsets](cu_rows)
-    status, record = look((fields, bounds, cu_rows, options))
+    status, record, activity, *mended = look((fields, bounds, cu_rows, options))
     rows = torch.arange(len(status), device=status.device)
     watched = is_named(torch.cat(listed(rows, cu_rows)), len(rows))
     assert not status[~watched].any() and not (status == torch.iinfo(status.dtype).max).any()
     assert not record.isnan().any()
+    assert torch.equal(activity[~watched], options["activity"][~watched])
+    for field, own in zip(mended, fields, strict=True):
+        assert torch.equal(field[~watched].nan_to_num(), own[~watched].nan_to_num())
