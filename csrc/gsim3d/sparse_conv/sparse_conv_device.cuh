@@ -68,11 +68,9 @@ struct Values {
   }
 };
 
-constexpr int32_t kUnlisted = -2;
-
 // Rows in the order in which tiles take them, and where the taps of each read.
 struct RowPlan {
-  const int32_t* order;    // [pitch], the row at each place; -1: none; kUnlisted - row: one that no list has
+  const int32_t* order;    // [pitch], the row at each place; -1: none
   const int32_t* sources;  // [taps, pitch], -1: none; the centre's are not listed
   const uint32_t* active;  // [pitch / kConvGroupRows, words], by bit the taps that a group of places has
   int32_t pitch;           // a multiple of kConvPlanStep

@@ -69,13 +69,9 @@ __global__ void __launch_bounds__(kThreads)
   ranks[i] = static_cast<uint64_t>(i / window) << bits | gray_rank(key) >> (kKeyBits - bits);
 }
 
-constexpr uint32_t kNowhere = ~uint32_t{0};
-
-// index[place] of voxel_rows lies at this place; without an index all lie where they are. place_of_row: the first place
-// of each row, of which there may be several or none where the lists are malformed.
+// index[place] of voxel_rows lies at this place; without an index all lie where they are.
 __global__ void __launch_bounds__(kThreads)
-    place_rows(Sources sources, const uint32_t* index, int32_t pitch, int32_t* order, int32_t* places,
-               uint32_t* place_of_row) {
+    place_rows(Sources sources, const uint32_t* index, int32_t pitch, int32_t* order, int32_t* places) {
   const int32_t place = blockIdx.x * kThreads + threadIdx.x;
   if (place >= pitch) return;
   int64_t row = -1;
@@ -84,21 +80,7 @@ __global__ void __launch_bounds__(kThreads)
     row = sources.voxel_rows[i];
     places[i] = place;
   }
-  const bool listed = inside(row, sources.n_rows);
-  order[place] = listed ? static_cast<int32_t>(row) : -1;
-  if (listed) atomicMin(place_of_row + row, static_cast<uint32_t>(place));
-}
-
-// Rows without a place get the places without a row, or with one that lies at another already: there are as many. From
-// the place that has the row's number a path leads over rows and places of the same number to such a place, and no two
-// paths meet.
-__global__ void __launch_bounds__(kThreads)
-    place_unlisted_rows(int32_t n_rows, const uint32_t* place_of_row, int32_t* order) {
-  const int32_t row = blockIdx.x * kThreads + threadIdx.x;
-  if (row >= n_rows || place_of_row[row] != kNowhere) return;
-  int32_t place = row;
-  while (order[place] >= 0 && place_of_row[order[place]] == static_cast<uint32_t>(place)) place = order[place];
-  order[place] = kUnlisted - row;
+  order[place] = inside(row, sources.n_rows) ? static_cast<int32_t>(row) : -1;
 }
 
 __global__ void __launch_bounds__(kThreads)
@@ -158,12 +140,8 @@ void make_row_plan(const char* op, const SparseConvMap& map, bool transposed, in
     sort_rows(op, sort, workspace, stream);
   }
   int32_t* places = workspace.take<int32_t>(map.n_rows);
-  uint32_t* place_of_row = workspace.take<uint32_t>(map.n_rows);
-  if (map.n_rows > 0)
-    check_cuda(cudaMemsetAsync(place_of_row, 0xff, sizeof(uint32_t) * map.n_rows, native(stream)), op);
   launch(op, place_rows, blocks_for(op, plan.pitch, kThreads), kThreads, 0, stream, sources, index, plan.pitch, order,
-         places, place_of_row);
-  launch(op, place_unlisted_rows, row_blocks, kThreads, 0, stream, map.n_rows, place_of_row, order);
+         places);
   if (plan.pitch > 0)
     check_cuda(cudaMemsetAsync(table, 0xff, sizeof(int32_t) * taps * plan.pitch, native(stream)), op);
   fill_zero(op, active, plan.pitch / kConvGroupRows * plan.words, stream);

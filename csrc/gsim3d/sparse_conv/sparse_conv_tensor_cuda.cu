@@ -292,14 +292,10 @@ __device__ __forceinline__ void multiply_stage(Factor a, Factor b, Sums<kColumns
 }
 
 // The row at a place; -1: none.
-struct PlacedRow {
-  int32_t row;
-  bool listed;  // or its result is 0
-};
 template <typename E>
-__device__ __forceinline__ PlacedRow row_at(const Convolution<E>& conv, int64_t place) {
-  const int32_t entry = conv.plan.order[place], row = entry < 0 ? kUnlisted - entry : entry;
-  return {inside(row, conv.values.n_rows) ? row : -1, entry >= 0};
+__device__ __forceinline__ int32_t row_at(const Convolution<E>& conv, int64_t place) {
+  const int32_t row = conv.plan.order[place];
+  return inside(row, conv.values.n_rows) ? row : -1;
 }
 
 // What a row gets of its voxel's sum.
@@ -345,8 +341,7 @@ __device__ __forceinline__ void exchange(uint32_t (&x)[4]) {
 }
 
 template <typename E, int kColumns>
-__device__ void write_sums(const Convolution<E>& conv, Sums<kColumns>& sums, const PlacedRow (&placed)[2], int32_t n0) {
-  const int32_t rows[2] = {placed[0].row, placed[1].row};
+__device__ void write_sums(const Convolution<E>& conv, Sums<kColumns>& sums, const int32_t (&rows)[2], int32_t n0) {
   const int t = threadIdx.x % 4;
   if (conv.bias != nullptr)
 #pragma unroll
@@ -358,12 +353,6 @@ __device__ void write_sums(const Convolution<E>& conv, Sums<kColumns>& sums, con
         sums[j][e] += bias;
         sums[j][2 + e] += bias;
       }
-  if (!placed[0].listed || !placed[1].listed) {
-#pragma unroll
-    for (auto& sum : sums)
-#pragma unroll
-      for (int e = 0; e < 4; ++e) sum[e] = placed[e / 2].listed ? sum[e] : 0.0f;
-  }
   const bool whole = conv.c_write % kChunk == 0;
 #pragma unroll
   for (int h = 0; h < 2; ++h) {
@@ -408,11 +397,11 @@ __device__ void multiply_tile(const Tile<E, S>& tile, int group, int64_t columns
   const Convolution<E>& conv = tile.conv;
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp % 4;
   const int64_t place = tile.first_place + group * kGroupRows + warp * 16 + lane / 4;
-  const PlacedRow rows[2] = {row_at(conv, place), row_at(conv, place + 8)};
+  const int32_t rows[2] = {row_at(conv, place), row_at(conv, place + 8)};
   float shares[2] = {1, 1};
   if (conv.share != Share::kWhole) {
 #pragma unroll
-    for (int h = 0; h < 2; ++h) shares[h] = share_of(conv, rows[h].row);
+    for (int h = 0; h < 2; ++h) shares[h] = share_of(conv, rows[h]);
   }
   const Factor a = factor_at(shared_address(tile.memory.a[0]) + group * (kGroupRows * kRowBytes));
   const Factor b = factor_at(shared_address(tile.memory.b[0]));
@@ -500,8 +489,7 @@ __global__ void __launch_bounds__(kAdders)
     add_parts(Convolution<E> conv, const float* partials, int32_t splits, int64_t columns) {
   const int64_t i = (static_cast<int64_t>(blockIdx.x) * kAdders + threadIdx.x) * 4, place = i / columns;
   if (place >= conv.plan.pitch) return;
-  const PlacedRow placed = row_at(conv, place);
-  const int32_t row = placed.row, c = static_cast<int32_t>(i % columns);
+  const int32_t row = row_at(conv, place), c = static_cast<int32_t>(i % columns);
   if (row < 0 || c >= conv.c_write) return;
   float4 sum{0, 0, 0, 0};
   const int64_t step = int64_t{conv.plan.pitch} * columns;
@@ -514,8 +502,8 @@ __global__ void __launch_bounds__(kAdders)
 #pragma unroll
   for (int e = 0; e < 4; ++e)
     if (c + e < conv.c_write)
-      conv.y[wide_product(row, conv.c_write) + c + e] = static_cast<E>(
-          placed.listed ? four[e] + (conv.bias != nullptr ? static_cast<float>(conv.bias[c + e]) : 0.0f) : 0.0f);
+      conv.y[wide_product(row, conv.c_write) + c + e] =
+          static_cast<E>(four[e] + (conv.bias != nullptr ? static_cast<float>(conv.bias[c + e]) : 0.0f));
 }
 
 }  // namespace
