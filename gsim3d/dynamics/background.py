@@ -341,7 +341,9 @@ def _overlapping(
     patch = torch.where((patch >= 0) & of_scene & is_row, patch, n_patches)
     order, _ = ops.curve_sort(patch)
     cu_q = torch.searchsorted(patch.gather(1, order), _counting(n_patches + 1, order))
-    return _in_parts(order, cu_q, places)
+    if order.shape[1] > places.patch_size:
+        return _in_parts(order, cu_q, places)
+    return tuple(PatchTable(*lists, places.cu_k) for lists in zip(order, places.kv_rows, cu_q, strict=True))
 
 
 def _in_parts(order: Tensor, cu_q: Tensor, places: Places) -> tuple[PatchTable, ...]:
