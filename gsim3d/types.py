@@ -282,7 +282,8 @@ class Particles(_Tensors):
         """Keeps ``rows`` (bool [N]); clouds stay, even where they become empty."""
         kept = torch.zeros(self.n_rows + 1, dtype=torch.int64, device=rows.device)
         kept[1:] = torch.cumsum(rows, 0)
-        fields = {name: value[rows] for name, value in self.row_fields().items()}
+        chosen = rows.nonzero()[:, 0]  # once: a GPU is waited for
+        fields = {name: value[chosen] for name, value in self.row_fields().items()}
         return dataclasses.replace(self, **fields, cu_rows=kept[self.cu_rows])
 
     def select_clouds(self, clouds: Sequence[int] | Tensor) -> Particles:

@@ -38,9 +38,9 @@ RUN = TrainConfig(
     model={"dynamics": {"zero_init": False}},  # else blocks learn nothing before the last layer has
     data=DataConfig(history=2, context_views=4, target_only_cameras=(2, 7), background_stride=2),
     stages=(
-        StageConfig(steps=800, history=1, batch=2, target_views=2, learning_rate=2e-3),
+        StageConfig(steps=700, history=1, batch=2, target_views=2, learning_rate=2e-3),
         StageConfig(steps=1200, horizon=4, batch=2, target_views=2, from_start=0.4, learning_rate=1e-3),
-        StageConfig(steps=1200, horizon=8, batch=2, target_views=2, from_start=0.4, learning_rate=1e-3),
+        StageConfig(steps=1100, horizon=8, batch=2, target_views=2, from_start=0.4, learning_rate=1e-3),
     ),
     loss=LossConfig(body_weight=2.0),
     optimizer=OptimizerConfig(ema_decay=0.98),

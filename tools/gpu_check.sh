@@ -13,7 +13,7 @@ set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PYTHON="${PYTHON:-python3}"
 STATE=build/gpu_check
-OPS=(curve sparse_conv patch_attn pool row_norm plane_sweep raster sentinel decode)
+OPS=(curve sparse_conv patch_attn pool row_norm plane_sweep raster decode)
 
 say() { printf '\033[1m%s\033[0m\n' "$*" >&2; }
 die() { say "$*"; exit 1; }
@@ -91,7 +91,7 @@ run_sanitize() {
 }
 run_bench() {
   local failed=0 file
-  for file in "${OPS[@]}" end_to_end effects sleeping; do
+  for file in "${OPS[@]}" end_to_end stability sleeping effects training; do
     [ -f "tools/bench/$file.py" ] || continue
     step "bench_$file" "$PYTHON" "tools/bench/$file.py" --device cuda || failed=1
     cat "$STATE/bench_$file.log"

@@ -5,14 +5,15 @@
 
 Trajectories are made in DATA where they are not there: of the kind it was trained on (another seed), with unseen
 shapes, with several bodies, without ground, and on raised ground. Written to OUT: NAME.scores.json, and
-NAME.frames.png, a trajectory of each set, truth above prediction. LPIPS and FVD are measured where their weights are
-installed.
+NAME.frames.png, a trajectory of each set, truth above prediction. Of its own kind LPIPS and FVD are measured, too,
+where their weights are installed. --sets measures some of the sets anew and keeps what the file says of the others.
 """
 
 import argparse
+import json
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -34,12 +35,14 @@ def score(
     *,
     device: str,
     counts: tuple[int, int],
+    subsets: Sequence[str] = (),
     changes: Mapping = MappingProxyType({}),
 ) -> dict:
     """Writes and returns the scores of ``name``.
 
     Args:
         counts: trajectories of its own kind, and of each other set.
+        subsets: to be measured; none: all that the world has.
         changes: of the options of the preset.
     """
     import cv2
@@ -47,7 +50,7 @@ def score(
 
     from gsim3d.evaluate.protocol import predict_together, score_scene
     from gsim3d.evaluate.report import summarize, write_json
-    from gsim3d.evaluate.scoring import measurable
+    from gsim3d.evaluate.scoring import PLAIN_METRICS, measurable
     from gsim3d.generate import generate
     from gsim3d.generate.worlds import HELD_OUT
     from gsim3d.train.restore import restore
@@ -55,9 +58,15 @@ def score(
 
     restored = restore(checkpoint, device)
     world = name.split("-")[0]
-    metrics, missing = measurable()
+    file = out / f"{name}.scores.json"
+    head = {"name": name, "checkpoint": restored.checkpoint.digest, "step": restored.checkpoint.state["step"]}
     sets, rows = {}, []
-    for subset in (KIND, *(subset for subset in SETS if world in HELD_OUT[subset])):
+    if subsets and file.is_file():
+        sets = json.loads(file.read_text())
+        if sets["checkpoint"] != head["checkpoint"]:
+            raise InputError(f"{file}: of other weights; measure all sets")
+    for subset in subsets or (KIND, *(subset for subset in SETS if world in HELD_OUT[subset])):
+        metrics, missing = measurable(None if subset == KIND else PLAIN_METRICS)
         begin = time.monotonic()
         count = counts[0] if subset == KIND else counts[1]
         options = {**changes, **({} if subset == KIND else {"subset": subset})}
@@ -78,10 +87,10 @@ def score(
         model, still = (sets[subset][f"{method}future.psnr_masked"] for method in ("", "constant."))
         print(f"{subset}: {count}, {seconds}: masked {model:.2f} dB, constant {still:.2f} dB", flush=True)
     out.mkdir(parents=True, exist_ok=True)
-    scores = {"name": name, "checkpoint": restored.checkpoint.digest, "step": restored.checkpoint.state["step"], **sets}
-    write_json(out / f"{name}.scores.json", scores)
-    cv2.imwrite(str(out / f"{name}.frames.png"), np.concatenate(rows)[..., ::-1])
-    return scores
+    write_json(file, {**sets, **head})
+    if not subsets:
+        cv2.imwrite(str(out / f"{name}.frames.png"), np.concatenate(rows)[..., ::-1])
+    return {**sets, **head}
 
 
 def frames_of(restored, scene, prediction) -> list:
@@ -105,10 +114,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the trajectories; made if absent")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--trajectories", type=int, nargs=2, default=(14, 7), metavar=("OWN", "OTHERS"))
+    parser.add_argument("--sets", nargs="+", choices=(KIND, *SETS), default=(), help="default: all")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     args = parser.parse_args(arguments)
     counts = tuple(args.trajectories)
-    score(args.checkpoint or args.name, args.name, args.data, args.out, device=args.device, counts=counts)
+    given = {"device": args.device, "counts": counts, "subsets": args.sets}
+    score(args.checkpoint or args.name, args.name, args.data, args.out, **given)
 
 
 if __name__ == "__main__":

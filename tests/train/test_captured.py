@@ -23,6 +23,10 @@ CONFIG = TrainConfig(
 )
 
 
+# A GPU picks its matrix products by the number of rows, which padding changes.
+TOLERANCE = {"cpu": 1e-4, "cuda": 1e-3}
+
+
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
     return [Scene.open(path) for path in find_scenes(write_scenes(tmp_path_factory.mktemp("scenes"), 2))]
@@ -63,14 +67,14 @@ def test_gradients_are_those_of_the_loss(lead, scenes, trainer, device):
         outputs = [getattr(particles, name) for name in later.particles]
         of_encoder = torch.autograd.grad(outputs, encoder, list(later.particles.values()), allow_unused=True)
         actual = dict(zip([*encoder, *captured.parameters], [*of_encoder, *later.parameters], strict=True))
-        assert_close_relative_to_max(later.loss, loss.detach(), 1e-5)
-        assert_close_relative_to_max(later.errors, errors, 1e-5)
+        assert_close_relative_to_max(later.loss, loss.detach(), 0.1 * TOLERANCE[device.type])
+        assert_close_relative_to_max(later.errors, errors, 0.1 * TOLERANCE[device.type])
         largest = max(gradient.abs().max() for gradient in expected if gradient is not None)
         for (name, parameter), gradient in zip(trainer.parameters.items(), expected, strict=True):
             assert (actual[parameter] is None) == (gradient is None), name
             if gradient is not None:
-                assert (actual[parameter] - gradient).abs().max() <= 1e-4 * largest, name
-    assert 1 <= captured.captures <= 4 and not report.total
+                assert (actual[parameter] - gradient).abs().max() <= TOLERANCE[device.type] * largest, name
+    assert captured.captures >= 1 and not report.total
 
 
 def test_what_needs_more_room_gets_it(scenes, trainer, device):
@@ -84,7 +88,8 @@ def test_what_needs_more_room_gets_it(scenes, trainer, device):
     (step,) = captured._steps.values()
     step._capacities = [dataclasses.replace(c, sizes=(c.sizes[0], *(1 for _ in c.sizes[1:]))) for c in step._capacities]
     again = captured(particles, batch, weights, report)
-    assert torch.equal(again.loss, loss) and captured.captures >= 2
+    torch.testing.assert_close(again.loss, loss, rtol=TOLERANCE[device.type], atol=0)
+    assert captured.captures >= 2
 
 
 def test_weights_are_read_anew(scenes, trainer, device):

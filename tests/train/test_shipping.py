@@ -78,6 +78,20 @@ def test_all_sets_are_scored_over_the_full_horizon(scored):
     assert (scored / "scores" / f"{NAME}.frames.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_some_sets_are_measured_anew(scored, tmp_path):
+    file = tmp_path / f"{NAME}.scores.json"
+    before = json.loads((scored / "scores" / file.name).read_text())
+    file.write_text(json.dumps({**before, "raised": {"n_scenes": 5}, "unseen": {"n_scenes": 6}}))
+    weights = next((scored / "state").glob("*.weights.safetensors"))
+    given = {"device": "cpu", "counts": (2, 1), "changes": {**OPTIONS, "objects": ("ball",)}, "subsets": ["raised"]}
+    tool("score_shipped").score(weights, NAME, scored / "films", tmp_path, **given)
+    after = json.loads(file.read_text())
+    assert after["raised"]["n_scenes"] == 1 and after["unseen"] == {"n_scenes": 6}
+    file.write_text(json.dumps({**before, "checkpoint": "0"}))
+    with pytest.raises(InputError, match="of other weights"):
+        tool("score_shipped").score(weights, NAME, scored / "films", tmp_path, **given)
+
+
 def test_a_state_becomes_a_simulator_with_card_and_page(scored, package, tmp_path):
     (tmp_path / "wrong.md").write_text("It floats.\n")
     paths = ["--state", str(scored / "state"), "--scores", str(scored / "scores")]

@@ -153,8 +153,17 @@ __device__ __forceinline__ void own_queries(const Backward<T>& args, int64_t blo
     const Range q_range = range_of(table.cu_q, share.patch, table.n_q_listed);
     const Range k_range = range_of(table.cu_k, share.patch, table.n_k_listed);
     const int64_t n_keys = k_range.end - k_range.begin, n_tiles = (n_keys + S::kTileRows - 1) / S::kTileRows;
-    bool loaded = false, plain = false;
-    for (int64_t group = q_range.begin + share.split * S::kGroup; n_tiles > 0 && group < q_range.end;
+    if (n_tiles == 0 || q_range.begin + share.split * S::kGroup >= q_range.end) continue;
+    const auto load_tile = [&](int64_t tile) {
+      const int64_t* rows = table.kv_rows + k_range.begin + tile * S::kTileRows;
+      const int n = static_cast<int>(min(n_keys - tile * S::kTileRows, int64_t{S::kTileRows}));
+      __syncthreads();
+      return copy_tiles<D, kThreads, S::kTileRows>({args.k, args.v}, rows, n, table.n_k, share.head, {keys, values},
+                                                   valid);
+    };
+    // The one tile of a patch is on its way while the first queries are read, and then stays.
+    bool arriving = n_tiles == 1, all_valid = arriving && load_tile(0), plain = false;
+    for (int64_t group = q_range.begin + share.split * S::kGroup; group < q_range.end;
          group += args.division.splits * S::kGroup) {
       const int64_t first = group + threadIdx.x / kWarp * 16 * S::kRowTiles;
       const bool active = first < q_range.end;
@@ -162,14 +171,14 @@ __device__ __forceinline__ void own_queries(const Backward<T>& args, int64_t blo
       const bool fast = active && warp.load(args, first, q_range.end, share.head);
       for (int64_t tile = 0; tile < n_tiles; ++tile) {
         const int n = static_cast<int>(min(n_keys - tile * S::kTileRows, int64_t{S::kTileRows}));
-        if (n_tiles > 1 || !loaded) {
-          const int64_t* rows = table.kv_rows + k_range.begin + tile * S::kTileRows;
-          __syncthreads();
-          const bool all_valid =
-              copy_tiles<D, kThreads>({args.k, args.v}, rows, n, table.n_k, share.head, {keys, values}, valid);
+        if (n_tiles > 1) {
+          all_valid = load_tile(tile);
+          arriving = true;
+        }
+        if (arriving) {
           wait_for_copies();
           plain = __syncthreads_and(all_valid) != 0;
-          loaded = true;
+          arriving = false;
         }
         if (!active) continue;
         int step = 0;
@@ -213,7 +222,7 @@ __device__ __forceinline__ void own_keys(const Backward<T>& args, int64_t block,
         QueryNumbers* listed = args.numbers + share.head * table.n_q_listed + begin;
         if (n_tiles > 1 || !loaded) {
           __syncthreads();
-          copy_tiles<D, kThreads>({args.q, args.grad}, table.q_rows + begin, n, table.n_q, share.head,
+          copy_tiles<D, kThreads, S::kTileRows>({args.q, args.grad}, table.q_rows + begin, n, table.n_q, share.head,
                                   {queries, grads}, nullptr);
           bool fast = true;
           for (int r = threadIdx.x; r < (n + kStep - 1) / kStep * kStep; r += kThreads) {

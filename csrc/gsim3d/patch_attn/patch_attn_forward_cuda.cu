@@ -23,7 +23,7 @@ struct Shape {
   static constexpr int kGroup = kWarps * 16 * kRowTiles;     // queries of a block at a time
   static constexpr int kTileRows = 16384 / D;                // keys in shared memory
   static constexpr int kTileBytes = kTileRows * D * 2;
-  static constexpr int kParts = 4, kPartRows = kTileRows / kParts;  // work starts when a part has arrived
+  static constexpr int kParts = 4;  // work starts when one has arrived
   static constexpr size_t kSharedBytes = 2 * kTileBytes + kTileRows;
 };
 
@@ -46,16 +46,24 @@ class Warp {
   __device__ __forceinline__ Warp(const Forward<T>& args, uint32_t keys, uint32_t values, const uint8_t* valid)
       : slope_(args.slope), valid_(valid), keys_(keys), values_(values) {}
 
+  // Asks for queries, for which start() waits.
   __device__ __forceinline__ void load_queries(const Forward<T>& args, int64_t first, int64_t end, int64_t head) {
 #pragma unroll
     for (int m = 0; m < M; ++m) {
       const RowPair<T> rows = find_rows(args.q, args.table.q_rows, first + 16 * m, end, args.table.n_q, head);
 #pragma unroll
-      for (int s = 0; s < D / 16; ++s) {
-        load_fragment(rows, s, q_[m][s]);
-        if (args.sign < 0) negate(q_[m][s]);
-      }
+      for (int s = 0; s < D / 16; ++s) load_fragment(rows, s, q_[m][s]);
     }
+  }
+
+  __device__ __forceinline__ void start(float sign) {
+    if (sign < 0) {
+#pragma unroll
+      for (int m = 0; m < M; ++m)
+#pragma unroll
+        for (int s = 0; s < D / 16; ++s) negate(q_[m][s]);
+    }
+    reset();
   }
 
   __device__ __forceinline__ void reset() {
@@ -159,14 +167,24 @@ class Warp {
     return __all_sync(kFullWarp, good);
   }
 
-  __device__ __forceinline__ void store(const Forward<T>& args, int64_t first, int64_t end, int64_t head) const {
-    const int t = threadIdx.x % 4;
+  // Asks for the rows that store() writes.
+  __device__ __forceinline__ void load_rows(const Forward<T>& args, int64_t first, int64_t end) {
 #pragma unroll
     for (int m = 0; m < M; ++m)
 #pragma unroll
       for (int h = 0; h < 2; ++h) {
         const int64_t i = first + 16 * m + threadIdx.x % kWarp / 4 + 8 * h;
-        const int64_t row = i < end ? args.table.q_rows[i] : -1;
+        rows_[m][h] = i < end ? args.table.q_rows[i] : -1;
+      }
+  }
+
+  __device__ __forceinline__ void store(const Forward<T>& args, int64_t head) const {
+    const int t = threadIdx.x % 4;
+#pragma unroll
+    for (int m = 0; m < M; ++m)
+#pragma unroll
+      for (int h = 0; h < 2; ++h) {
+        const int64_t row = rows_[m][h];
         if (!inside(row, args.table.n_q)) continue;
         const int64_t place = row * args.division.heads + head;
         const float sum = sum_[m][2 * h], share = sum == 0 ? 0.0f : 1.0f / sum;
@@ -196,6 +214,7 @@ class Warp {
   const uint8_t* valid_;
   uint32_t keys_, values_;
   uint32_t q_[M][D / 16][4];
+  int64_t rows_[M][2];
   float out_[M][D / 8][4], sum_[M][4], largest_[M][2];
 };
 
@@ -219,26 +238,22 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
     };
     const auto load_tile = [&](int64_t tile) {
       const int64_t* rows = table.kv_rows + k_range.begin + tile * S::kTileRows;
-      const int n = tile_size(tile);
-      bool all_valid = true;
       __syncthreads();
-      for (int r = 0; r < S::kTileRows; r += S::kPartRows) {
-        const uint32_t offset = r * D * sizeof(T);
-        all_valid &= copy_tiles<D, kThreads>({args.k, args.v}, rows + r, min(n - r, S::kPartRows), table.n_k,
-                                             share.head, {keys + offset, values + offset}, valid + r);
-      }
+      const bool all_valid = copy_tiles<D, kThreads, S::kTileRows, S::kParts>(
+          {args.k, args.v}, rows, tile_size(tile), table.n_k, share.head, {keys, values}, valid);
       return __syncthreads_and(all_valid) != 0;
     };
 
+    const int64_t step = args.division.splits * S::kGroup;
+    int64_t group = q_range.begin + share.split * S::kGroup;
+    int64_t first = group + threadIdx.x / kWarp * 16 * S::kRowTiles;  // of the warp
+    Warp<T, D> warp(args, keys, values, valid);
+    warp.load_queries(args, first, q_range.end, share.head);
     // The one tile of a patch is on its way while the first queries are read, and then stays.
     bool arriving = n_tiles == 1, plain = arriving && load_tile(0);
-    for (int64_t group = q_range.begin + share.split * S::kGroup; group < q_range.end;
-         group += args.division.splits * S::kGroup) {
-      const int64_t first = group + threadIdx.x / kWarp * 16 * S::kRowTiles;
+    for (; group < q_range.end; group += step) {
       const bool active = first < q_range.end;
-      Warp<T, D> warp(args, keys, values, valid);
-      if (active) warp.load_queries(args, first, q_range.end, share.head);
-      warp.reset();
+      warp.start(args.sign);
       bool good = true;
       for (int64_t tile = 0; tile < n_tiles; ++tile) {
         if (n_tiles > 1) {
@@ -271,8 +286,11 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
             for (int step = 0; step * kStep < tile_size(tile); ++step) warp.careful_step(step);
         }
       }
+      warp.load_rows(args, first, q_range.end);
+      first += step;
+      warp.load_queries(args, first, q_range.end, share.head);
       wait_for_previous();  // rows that no patch lists are being set to 0
-      if (active) warp.store(args, first, q_range.end, share.head);
+      if (active) warp.store(args, share.head);
     }
   }
   wait_for_previous();

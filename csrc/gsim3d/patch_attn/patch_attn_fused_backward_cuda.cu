@@ -105,7 +105,7 @@ __global__ void __launch_bounds__(kThreads, 1) fused_kernel(Backward<T> args, fl
         QueryNumbers* listed = args.numbers + share.head * table.n_q_listed + begin;
         if (n_tiles > 1 || first_keys) {
           __syncthreads();
-          copy_tiles<D, kThreads>({args.q, args.grad}, table.q_rows + begin, n, table.n_q, share.head,
+          copy_tiles<D, kThreads, kQueries>({args.q, args.grad}, table.q_rows + begin, n, table.n_q, share.head,
                                   {queries, grads}, nullptr);
           bool fast = true;
           for (int r = threadIdx.x; r < n_steps * kStep; r += kThreads) {

@@ -30,31 +30,38 @@ struct TileLayout {
   }
 };
 
-// Queues a group of copies: the listed rows of one head of two matrices into two tiles; rows beyond n up to the next
-// multiple of kStep, and rows outside [0, n_rows), become 0. Where `valid` is given, it gets a byte for each row:
-// whether it takes part. Returns whether all n rows that this thread saw do.
-template <int D, int kThreads, typename T>
+// Queues copies: the listed rows of one head of two matrices into two tiles of at most kRows rows, a group of copies
+// for each of kParts parts of the tiles; rows beyond n up to the next multiple of kStep, and rows outside [0, n_rows),
+// become 0. Where `valid` is given, it gets a byte for each row: whether it takes part. Returns whether all n rows that
+// this thread saw do.
+template <int D, int kThreads, int kRows, int kParts = 1, typename T>
 __device__ __forceinline__ bool copy_tiles(const HeadRows<T> (&x)[2], const int64_t* rows, int n, int64_t n_rows,
                                            int64_t head, const uint32_t (&tiles)[2], uint8_t* valid) {
   // A thread keeps its chunk of a row, and its place in a group of eight rows.
   constexpr int kChunks = TileLayout<D>::kChunks, kRowsAtOnce = kThreads / kChunks;
-  static_assert(kRowsAtOnce % 8 == 0);
-  const int c = threadIdx.x % kChunks, padded = (n + kStep - 1) / kStep * kStep;
-  const T* from[2] = {x[0].at(0, head) + 8 * c, x[1].at(0, head) + 8 * c};
-  bool all = true;
-  uint32_t to = 16 * TileLayout<D>::chunk(threadIdx.x / kChunks, c);
-#pragma unroll 4
-  for (int r = threadIdx.x / kChunks; r < padded; r += kRowsAtOnce) {
-    const int64_t row = r < n ? rows[r] : -1;
-    const bool wanted = inside(row, n_rows);
+  constexpr int kTurns = kRows / kRowsAtOnce;
+  static_assert(kRowsAtOnce % 8 == 0 && kRows % kRowsAtOnce == 0 && kTurns % kParts == 0);
+  const int c = threadIdx.x % kChunks, first = threadIdx.x / kChunks, padded = (n + kStep - 1) / kStep * kStep;
+  int64_t listed[kTurns];  // all are on their way before the first copy waits for its row
 #pragma unroll
-    for (int i = 0; i < 2; ++i)
-      copy_async(tiles[i] + to, wanted ? from[i] + row * x[i].row_stride : x[i].data, wanted);
-    if (valid != nullptr && c == 0) valid[r] = wanted;
-    all = all && (wanted || r >= n);
-    to += kRowsAtOnce * D * sizeof(T);
+  for (int i = 0; i < kTurns; ++i) listed[i] = first + i * kRowsAtOnce < n ? rows[first + i * kRowsAtOnce] : -1;
+  const T* from[2] = {x[0].at(0, head) + 8 * c, x[1].at(0, head) + 8 * c};
+  const uint32_t to = 16 * TileLayout<D>::chunk(first, c);
+  bool all = true;
+#pragma unroll
+  for (int i = 0; i < kTurns; ++i) {
+    const int r = first + i * kRowsAtOnce;
+    if (r < padded) {
+      const bool wanted = inside(listed[i], n_rows);
+#pragma unroll
+      for (int j = 0; j < 2; ++j)
+        copy_async(tiles[j] + to + i * kRowsAtOnce * D * static_cast<int>(sizeof(T)),
+                   wanted ? from[j] + listed[i] * x[j].row_stride : x[j].data, wanted);
+      if (valid != nullptr && c == 0) valid[r] = wanted;
+      all = all && (wanted || r >= n);
+    }
+    if ((i + 1) % (kTurns / kParts) == 0) commit_copies();
   }
-  commit_copies();
   return all;
 }
 
