@@ -48,11 +48,21 @@ class RowLinear(nn.Linear):
     def some(self, x: Tensor, outputs: Sequence[tuple[int, int]]) -> Tensor:
         """The channels in ``outputs``, (first, one behind the last) of each run; the others are not computed."""
         x = x.to(product_dtype(x))
-        weight, bias = (
-            value[outputs[0][0] : outputs[0][1]] if len(outputs) == 1 else torch.cat([value[a:b] for a, b in outputs])
-            for value in (self.weight, self.bias)
-        )
-        return row_linear(x, weight.to(x.dtype), bias.to(x.dtype))
+        return row_linear(x, *self._some_weights(outputs, x.dtype))
+
+    def _some_weights(self, outputs: Sequence[tuple[int, int]], dtype: torch.dtype) -> Sequence[Tensor]:
+        """Weight and bias of ``outputs``; without gradients they are kept until a weight changes."""
+        tensors = self.weight, self.bias
+        passing = torch.is_grad_enabled() or torch.compiler.is_compiling() or self.weight.is_inference()
+        if passing or (self.weight.is_cuda and torch.cuda.is_current_stream_capturing()):
+            return [torch.cat([t[a:b] for a, b in outputs]).to(dtype) for t in tensors]
+        key = (dtype, *outputs, *(key for t in tensors for key in (t.data_ptr(), t._version)))
+        known, some = self.__dict__.get("_some", (None, ()))
+        if known != key:
+            with torch.inference_mode(False), torch.no_grad():
+                some = [torch.cat([t[a:b] for a, b in outputs]).to(dtype) for t in tensors]
+            self.__dict__["_some"] = key, some
+        return some
 
 
 class _RowLinear(torch.autograd.Function):

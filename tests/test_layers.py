@@ -193,3 +193,21 @@ def test_layers_under_autocast_err_no_more_than_torchs(dtype, devices):
     for a, b, truth in zip(ours, torchs, exact, strict=True):
         error, allowed = ((t.float() - truth).abs().max().item() for t in (a, b))
         assert error <= 2 * allowed + 1e-3 * truth.abs().max().item()
+
+
+def test_some_outputs_follow_the_weights():
+    """Kept without gradients until a weight changes, and never behind a gradient."""
+    layer, x = RowLinear(5, 9), torch.rand(20, 5)
+    runs, columns = [(0, 2), (4, 5), (7, 9)], [0, 1, 4, 7, 8]
+    for _ in range(2):
+        with torch.no_grad():
+            first = layer.some(x, runs)
+            assert_close_relative_to_max(first, layer(x)[:, columns], 1e-6)
+            assert_same_bits(layer.some(x, runs), first)
+            assert_close_relative_to_max(layer.some(x, runs[:1]), layer(x)[:, :2], 1e-6)
+            layer.weight.mul_(2)
+            layer.bias.add_(1)
+    layer.some(x, runs).sum().backward()
+    used = torch.zeros(9, dtype=torch.bool)
+    used[columns] = True
+    assert torch.equal(layer.weight.grad.any(1), used) and torch.equal(layer.bias.grad > 0, used)

@@ -25,6 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d import ops
+from gsim3d.branches import Branches
 from gsim3d.ops.curve import CURVES, KernelMap, PatchTable, Pyramid, PyramidSpec, Stage, Voxels
 from gsim3d.types import Particles
 
@@ -33,6 +34,7 @@ DEPTH = 16  # levels of the curves at stage 0, and bits of a cell along an axis
 SPACE_BITS = 3 * DEPTH  # below the scene in a key
 NOWHERE = torch.iinfo(torch.int64).max  # a key behind all others
 ALL_CURVES = (0, 1, 2, 3)
+MOST_EXPONENT = 70.0  # beyond it one softmax has all the weight in float32; sums of exponentials stay finite
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,8 @@ class Background:
     def readers(self, pyramid: Pyramid, particles: Particles) -> list[Reader]:
         """What a call over moving ``particles`` is given, for each stage; nothing waits for the device."""
         rooms = zip(self.places, pyramid.stages, row_scenes(pyramid, particles), self.depths, self.curves)
-        return [Reader(self, *room) for room in rooms]
+        with Branches(particles.means) as beside:  # many launches over few rows, and no stage waits for another
+            return [beside.run(Reader, self, *room) for room in rooms]
 
     def map(self, f: Callable[[Tensor, int], Tensor]) -> Background:
         """The same background with ``f`` applied to every tensor and its kind (KEYS, LISTS, OFFSETS or ROWS)."""
@@ -210,10 +213,10 @@ class _JointAttention(torch.autograd.Function):
         scale = q.shape[-1] ** -0.5
         out, stats = _ops.patch_attention.default(q, k, v, *_lists(patches), scale)
         other, other_stats = _ops.patch_attention.default(q, other_k, other_v, *_lists(other_patches), scale)
-        largest, total, share = _joined(stats, other_stats, scale)
-        out = (out * (1 - share) + other * share).to(out.dtype)  # lerp would round by how threads share the rows
+        # lerp would round by how threads share the rows
+        out = (out + (other - out) * _share_of_other(stats, other_stats, scale)).to(out.dtype)
         if any(ctx.needs_input_grad):
-            ctx.save_for_backward(q, k, v, other_k, other_v, out, torch.stack([largest, total], -1))
+            ctx.save_for_backward(q, k, v, other_k, other_v, out, _joined(stats, other_stats, scale))
             ctx.patches, ctx.scale = (patches, other_patches), scale
         return out
 
@@ -229,18 +232,23 @@ class _JointAttention(torch.autograd.Function):
         return mine[0] + others[0], *mine[1:], *others[1:], None, None
 
 
-def _joined(stats: Tensor, other: Tensor, scale: float) -> tuple[Tensor, Tensor, Tensor]:
-    """The two stats of one softmax over the keys of both, and the share [..., 1] of the other keys in it.
+# Stats of an attention: the largest product of a query and a key, and the sum of exponentials relative to it, 0 of no keys.
 
-    Stats: the largest product of a query and a key, and the sum of exponentials relative to it, 0 of no keys.
-    """
+
+def _share_of_other(stats: Tensor, other: Tensor, scale: float) -> Tensor:
+    """[..., 1], of the other keys in one softmax over the keys of both; in as few launches as there may be."""
+    (top, total), (other_top, other_total) = stats.split(1, -1), other.split(1, -1)
+    other_total = ((other_top - top) * scale).clamp(max=MOST_EXPONENT).exp() * other_total
+    return other_total / (other_total + total).clamp(min=torch.finfo(total.dtype).tiny)
+
+
+def _joined(stats: Tensor, other: Tensor, scale: float) -> Tensor:
+    """Of one softmax over the keys of both."""
     (top, total), (other_top, other_total) = stats.unbind(-1), other.unbind(-1)
     other_top = torch.where(other_total > 0, other_top, top)
     largest = torch.maximum(top, other_top)
-    other_total = other_total * ((other_top - largest) * scale).exp()
-    both = total * ((top - largest) * scale).exp() + other_total
-    share = other_total / both.clamp(min=torch.finfo(both.dtype).tiny)
-    return largest, both, share[..., None]
+    sums = (total * ((top - largest) * scale).exp(), other_total * ((other_top - largest) * scale).exp())
+    return torch.stack([largest, sum(sums)], -1)
 
 
 def _lists(patches: PatchTable) -> tuple[Tensor, ...]:
@@ -335,7 +343,9 @@ def _overlapping(
     patch = torch.where((patch >= 0) & of_scene & is_row, patch, n_patches)
     order, _ = ops.curve_sort(patch)
     cu_q = torch.searchsorted(patch.gather(1, order), _counting(n_patches + 1, order))
-    return _in_parts(order, cu_q, places)
+    if order.shape[1] > places.patch_size:
+        return _in_parts(order, cu_q, places)
+    return tuple(PatchTable(*lists, places.cu_k) for lists in zip(order, places.kv_rows, cu_q, strict=True))
 
 
 def _in_parts(order: Tensor, cu_q: Tensor, places: Places) -> tuple[PatchTable, ...]:

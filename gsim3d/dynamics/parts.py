@@ -62,6 +62,8 @@ class Parts:
         later = CloudTable.make(counts, table.scenes, (s + ahead for s in table.steps), self.newest.cu_rows.device)
         if step is None:
             return self.newest.with_clouds(later)
+        if self.rows.shape[0] == self.newest.n_rows:  # all move
+            return step.with_clouds(later)
         fields = self.newest.row_fields()
         del fields["static_latents"]
         changed = {name: value.index_copy(0, self.rows, getattr(step, name)) for name, value in fields.items()}

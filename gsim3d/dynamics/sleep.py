@@ -69,14 +69,15 @@ class Sleepers:
         """Notes what a step changed, and decides who sleeps in the next."""
         at_rest = _largest_change(before.means, after.means) <= self.reach
         for name, value in after.row_fields().items():
-            if name not in ("means", "activity", "static_latents"):
+            if name not in ("means", "activity", "static_latents", "turns", "paint"):
                 at_rest &= _largest_change(getattr(before, name), value) <= self.rule.eps
         at_rest |= (after.activity == ASLEEP) & (before.activity == ASLEEP)
         self.steps_at_rest = torch.where(at_rest, self.steps_at_rest + 1, 0)
         restless = self.steps_at_rest < self.patience
         scene = after.cloud_scene[after.row_cloud()]
         if self.rule.policy == "exact":
-            may_sleep = ~torch.isin(scene, scene[restless])
+            n_restless = torch.zeros(after.origin.shape[0], dtype=torch.int64, device=scene.device)
+            may_sleep = n_restless.index_add_(0, scene, restless.long())[scene] == 0
         else:
             stirred = _near(_cubes(after, scene, self.rule.halo), restless & (after.activity != ASLEEP))
             may_sleep = ~stirred & ~restless & (after.activity != FROZEN)

@@ -72,24 +72,28 @@ __device__ int64_t pixel_of(const RasterScene<T>& s, const Quarter& quarter, int
   return x < s.width && y < s.height ? (quarter.image * s.height + y) * s.width + x : -1;
 }
 
-// Values of the batch, by entry, two of them in one load. With x, y counted from the first pixel's centre,
+// Values of the batch, by entry, four of them in one load. With x, y counted from the first pixel's centre,
 // alpha = 2^(strength - u^2 - v^2), u = ux x + uy y + u0, v = vy y + v0.
-enum Field { kUxUy, kU0Vy, kV0Strength, kRedGreen, kBlueDepth, kFields };
-
 template <typename T>
-struct alignas(2 * sizeof(T)) Two {
-  T a, b;
+struct Batch {
+  struct alignas(4 * sizeof(T)) Shape {
+    T ux, uy, u0, vy;
+  } shapes[kWarp];
+  struct alignas(4 * sizeof(T)) Value {
+    T red, green, blue, depth;
+  } values[kWarp];
+  struct alignas(2 * sizeof(T)) Rest {
+    T v0, strength;
+  } rests[kWarp];
 };
-template <typename T>
-using Batch = Two<T>[kFields][kWarp];
 
 template <typename T>
 __device__ void put(const Record<T>& r, const Quarter& quarter, int lane, Batch<T>& batch) {
   const T x = r.x - (T(quarter.x0) + T(0.5)), y = r.y - (T(quarter.y0) + T(0.5));
   const T uy = -r.tight * r.slope;
-  batch[kUxUy][lane] = {r.tight, uy}, batch[kU0Vy][lane] = {-(r.tight * x + uy * y), r.loose};
-  batch[kV0Strength][lane] = {-r.loose * y, r.strength};
-  batch[kRedGreen][lane] = {r.red, r.green}, batch[kBlueDepth][lane] = {r.blue, r.z};
+  batch.shapes[lane] = {r.tight, uy, -(r.tight * x + uy * y), r.loose};
+  batch.values[lane] = {r.red, r.green, r.blue, r.z};
+  batch.rests[lane] = {-r.loose * y, r.strength};
 }
 
 // The same value, which the compiler would otherwise find anew for every entry. All lanes take part.
@@ -101,27 +105,27 @@ __device__ __forceinline__ T in_register(T value) {
 // alpha of entry j at (x, y) before it is cut.
 template <typename T>
 __device__ __forceinline__ T alpha_at(const Batch<T>& batch, int j, T x, T y) {
-  const Two<T> ux_uy = batch[kUxUy][j], u0_vy = batch[kU0Vy][j], v0_strength = batch[kV0Strength][j];
-  const T u = ux_uy.a * x + (ux_uy.b * y + u0_vy.a), v = u0_vy.b * y + v0_strength.a;
-  return fast_exp2(v0_strength.b - u * u - v * v);
+  const auto shape = batch.shapes[j];
+  const auto rest = batch.rests[j];
+  const T u = shape.ux * x + (shape.uy * y + shape.u0), v = shape.vy * y + rest.v0;
+  return fast_exp2(rest.strength - u * u - v * v);
 }
 
-// Pixels of the quarter that the record may reach: calls put(row, bits of the columns). May err outwards only.
-template <typename T, typename F>
-__device__ void cover(const Record<T>& r, const Quarter& quarter, const F& put) {
-  const int x0 = max(r.x0 - quarter.x0, 0), x1 = min(r.x1 - quarter.x0, kQuarter);
-  const int y0 = max(r.y0 - quarter.y0, 0), y1 = min(r.y1 - quarter.y0, kQuarter);
-  const T x = r.x - (T(quarter.x0) + T(0.5)), y = r.y - (T(quarter.y0) + T(0.5));
+// Pixels of the quarter that the record may reach, for each row the bits of its columns. May err outwards only. The
+// record's bounds say no more: within a quarter, what they leave out is out of reach.
+template <typename T>
+__device__ void cover(const Record<T>& r, const Quarter& quarter, uint32_t (&spans)[kQuarter]) {
   constexpr double kLog2MaxRatio = 7.994353436858858;  // log2(255)
-  const T inverse = fast_reciprocal(r.tight * r.tight);
-  const T most = (r.strength + T(kLog2MaxRatio + kLevelSlack)) * inverse, decay = r.loose * r.loose * inverse;
+  const T x = r.x - (T(quarter.x0) + T(0.5)), y = r.y - (T(quarter.y0) + T(0.5));
+  const T width = fast_reciprocal(r.tight), most = (r.strength + T(kLog2MaxRatio + kLevelSlack)) * width * width;
+  const T decay = r.loose * width, first_decay = -decay * y, first_centre = x - r.slope * y;
 #pragma unroll
   for (int row = 0; row < kQuarter; ++row) {
-    const T dy = T(row) - y, square = most - decay * dy * dy;
-    const T centre = x + r.slope * dy, reach = fast_sqrt(max_of(square, T(0))) + T(kPixelSlack);
-    const int from = max(ceil_to_int(centre - reach), x0), to = min(floor_to_int(centre + reach) + 1, x1);
-    if (row >= y0 && row < y1 && square >= 0 && from < to)
-      put(row, (1u << to) - (1u << from));
+    const T centre = first_centre + r.slope * T(row), lost = first_decay + decay * T(row);
+    const T reach = fast_sqrt(max_of(most - lost * lost, T(0)));
+    const uint32_t from = min(ceil_to_whole(centre - T(kPixelSlack) - reach), uint32_t{kQuarter});
+    const uint32_t to = min(floor_to_whole(centre + T(1 + kPixelSlack) + reach), uint32_t{kQuarter});
+    spans[row] = (1u << to) - (1u << from);
   }
 }
 
@@ -172,13 +176,15 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
     for (int c = 0; c < kFeatures; ++c) features[k][c] = 0;
   }
 
-  // The records of a batch are fetched while the batch before is blended, their numbers another batch earlier.
-  uint32_t pair = 0, next_pair = lane < quarter.n ? pairs[lane] : 0;
+  // The records of a batch are fetched while the batch before is blended, their numbers another batch earlier. The
+  // first entry goes to the last lane: the highest bit is the one that is found fastest.
+  const int place = kWarp - 1 - lane;
+  uint32_t pair = 0, next_pair = place < quarter.n ? pairs[place] : 0;
   Record<T> record{};
   const auto fetch = [&](int32_t base) {
     pair = next_pair;
-    if (base + lane < quarter.n) record = job.records[pair];
-    if (base + kWarp + lane < quarter.n) next_pair = pairs[base + kWarp + lane];
+    if (base + place < quarter.n) load_record(job.records + pair, record);
+    if (base + kWarp + place < quarter.n) next_pair = pairs[base + kWarp + place];
   };
   fetch(0);
   const T x = in_register(T(column)), y[kPixels] = {in_register(T(row)), in_register(T(row + 1))};
@@ -187,9 +193,12 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
     if (__all_sync(kFullWarp, closed)) break;
     uint32_t bits = 0;
     __syncwarp();
-    if (base + lane < quarter.n) {
+    if (base + place < quarter.n) {
       put(record, quarter, lane, shared.batch);
-      cover(record, quarter, [&](int row, uint32_t span) { bits |= span << (row / kPixels * kQuarter); });
+      uint32_t spans[kQuarter];
+      cover(record, quarter, spans);
+#pragma unroll
+      for (int row = 0; row < kQuarter; ++row) bits |= spans[row] << (row / kPixels * kQuarter);
       if constexpr (kPass) {
         const T* row = features_of(job, quarter.image, pair) + channel;
         for (int c = 0; c < kFeatures; ++c) shared.features[c][lane] = c < n_channels ? row[c] : T(0);
@@ -200,36 +209,37 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
     uint32_t mine = transpose_bits(bits, lane);
     if (closed) mine = 0;
     while (mine) {
-      const int j = __ffs(mine) - 1;
-      mine &= mine - 1;
+      const int j = kWarp - 1 - __clz(mine);
+      mine ^= 1u << j;
       const Batch<T>& batch = shared.batch;
-      T weight[kPixels];
+      T weight[kPixels], left[kPixels];
       bool ends = false;
 #pragma unroll
       for (int k = 0; k < kPixels; ++k) {
         const T raw = min_of(alpha_at(batch, j, x, y[k]), T(kMaxAlpha));
         const T alpha = kFade ? fade(raw) : raw;
         weight[k] = (kFade ? light[k].floor < 1 : raw >= light[k].floor) ? alpha * light[k].rest : T(0);
-        ends |= light[k].rest - weight[k] < T(kMinTransmittance);
+        left[k] = light[k].rest - weight[k];
+        ends |= left[k] < T(kMinTransmittance);
       }
       if (ends) {
 #pragma unroll
         for (int k = 0; k < kPixels; ++k) {
-          if (light[k].rest - weight[k] >= T(kMinTransmittance)) continue;
-          light[k].floor = kClosed, light[k].last = base + j, weight[k] = 0;
+          if (left[k] >= T(kMinTransmittance)) continue;
+          light[k].floor = kClosed, light[k].last = base + kWarp - 1 - j, weight[k] = 0, left[k] = light[k].rest;
         }
         if (light[0].floor > 1 && light[1].floor > 1) mine = 0;
       }
 #pragma unroll
       for (int k = 0; k < kPixels; ++k) {
-        light[k].rest -= weight[k];
+        light[k].rest = left[k];
         if constexpr (kPass) {
           for (int c = 0; c < kFeatures; ++c) features[k][c] += weight[k] * shared.features[c][j];
         } else {
-          const Two<T> red_green = batch[kRedGreen][j], blue_depth = batch[kBlueDepth][j];
+          const auto value = batch.values[j];
           T(&sums)[4] = light[k].sums;
-          sums[0] += weight[k] * red_green.a, sums[1] += weight[k] * red_green.b;
-          sums[2] += weight[k] * blue_depth.a, sums[3] += weight[k] * blue_depth.b;
+          sums[0] += weight[k] * value.red, sums[1] += weight[k] * value.green;
+          sums[2] += weight[k] * value.blue, sums[3] += weight[k] * value.depth;
         }
       }
     }

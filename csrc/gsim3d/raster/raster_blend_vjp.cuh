@@ -170,7 +170,7 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
   Record<T> record{};
   const auto fetch = [&](int32_t base) {
     pair = next_pair;
-    if (base >= 0 && base + lane < n_used) record = job.records[pair], slot_begin = job.slot_begin[pair];
+    if (base >= 0 && base + lane < n_used) load_record(job.records + pair, record), slot_begin = job.slot_begin[pair];
     if (base >= kWarp) next_pair = pairs[base - kWarp + lane];
   };
   fetch(base);
@@ -181,9 +181,10 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
     uint32_t bits[kHalves] = {};
     if (used) {
       put(record, quarter, lane, shared.batch);
-      cover(record, quarter, [&](int row, uint32_t span) {
-        bits[row / kHalfRows] |= span << (row % kHalfRows * kQuarter);
-      });
+      uint32_t spans[kQuarter];
+      cover(record, quarter, spans);
+#pragma unroll
+      for (int row = 0; row < kQuarter; ++row) bits[row / kHalfRows] |= spans[row] << (row % kHalfRows * kQuarter);
     }
     const T from_x = T(quarter.x0 + kQuarter / 2) - record.x, from_y = T(quarter.y0 + kQuarter / 2) - record.y;
     const T slope = record.slope;
@@ -210,11 +211,15 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
           kWithFeatures ? pixel_of(s, quarter, lane % kQuarter, lane / kQuarter + half * kHalfRows) : 0;
       if constexpr (kWithFeatures) dot_features(s, grads, entry_features, pixel, mine, lane, shared);
       const PixelGrad<T> g = shared.grad[half * kWarp + lane];
+      // The alpha of the next entry is on the way while this one is in work.
+      int next = kWarp - 1 - __clz(mine | 1);
+      T next_full = alpha_at(shared.batch, next, x, y);
       while (mine) {
-        const int j = kWarp - 1 - __clz(mine);
+        const int j = next;
+        const T full = next_full;
         mine ^= 1u << j;
+        next = kWarp - 1 - __clz(mine | 1), next_full = alpha_at(shared.batch, next, x, y);
         Share<T>& share = shared.shares[lane][j];
-        const T full = alpha_at(shared.batch, j, x, y);
         const T raw = full >= T(kMinAlpha) ? full : T(0);  // an entry that does not count leaves zeros
         T alpha = min_of(raw, T(kMaxAlpha));
         T slope_of_alpha = raw <= T(kMaxAlpha) ? raw : T(0);
@@ -222,9 +227,9 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
         const T inverse = fast_reciprocal(T(1) - alpha);
         const T light = at.light * inverse, weight = alpha * light;
         T total = kWithFeatures ? share.v : T(0);
-        const Two<T> red_green = shared.batch[kRedGreen][j], blue_depth = shared.batch[kBlueDepth][j];
-        total += g.value[0] * red_green.a, total += g.value[1] * red_green.b;
-        total += g.value[2] * blue_depth.a, total += g.value[3] * blue_depth.b;
+        const auto value = shared.batch.values[j];
+        total += g.value[0] * value.red, total += g.value[1] * value.green;
+        total += g.value[2] * value.blue, total += g.value[3] * value.depth;
         share = {(light * total - at.sum * inverse) * slope_of_alpha, weight};
         at.light = light;
         at.sum += weight * total;

@@ -4,8 +4,15 @@
 namespace gsim3d::cuda {
 namespace {
 
+// The first block plans, the others clear the counters.
 template <typename T>
 __global__ void __launch_bounds__(kOneBlock) plan_kernel(Job<T> job) {
+  if (blockIdx.x > 0) {
+    const int64_t n = n_counters(job);
+    const int64_t step = (gridDim.x - 1) * int64_t{kOneBlock};
+    for (int64_t i = (blockIdx.x - 1) * int64_t{kOneBlock} + threadIdx.x; i < n; i += step) job.counters[i] = 0;
+    return;
+  }
   plan(job);
   __syncthreads();
   choose_images(job);
@@ -27,9 +34,9 @@ __global__ void __launch_bounds__(kBlock, 8) scatter_kernel(Job<T> job) {
   scatter_rows(job);
 }
 
-template <typename T>
-__global__ void __launch_bounds__(kSortBlock, 4) sort_kernel(Job<T> job) {
-  sort_lists<kSortBlock>(job, reinterpret_cast<Entry<T>*>(dynamic_memory));
+template <typename T, int kThreads>
+__global__ void __launch_bounds__(kThreads, 1024 / kThreads) sort_kernel(Job<T> job) {
+  sort_lists<kThreads>(job, reinterpret_cast<Entry<T>*>(dynamic_memory));
 }
 
 template <typename T, bool kFade, bool kWithFeatures>
@@ -69,9 +76,7 @@ void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, 
   const Job<T> further = further_job(job, scratch);
 
   const int64_t n_tiles = scene.n_images * job.n_tiles;
-  fill_zero(kRaster, reinterpret_cast<unsigned char*>(job.slot_count),
-            scene.n_images * 16 + n_tiles * static_cast<int64_t>(sizeof(uint32_t)), stream);
-  launch(kRaster, plan_kernel<T>, 1, kOneBlock, 0, stream, job);
+  launch(kRaster, plan_kernel<T>, 1 + grid_for(n_counters(job), 4 * kOneBlock), kOneBlock, 0, stream, job);
   dispatch_sh(scene.sh_terms, [&](auto terms) {
     constexpr int kTerms = decltype(terms)::value;
     launch(kRaster, project_kernel<T, kTerms>, grid_of_chunks(scene), kBlock, kRowBytes<T, kTerms>, stream, job);
@@ -79,7 +84,15 @@ void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, 
   launch(kRaster, offsets_kernel<T>, 1, kOneBlock, 0, stream, job);
   // It also puts tiles in order, which their kernels need when there are no rows, too.
   launch(kRaster, scatter_kernel<T>, std::max(1u, grid_of_chunks(scene)), kBlock, 0, stream, job);
-  launch(kRaster, sort_kernel<T>, grid_for(n_tiles, 1), kSortBlock, kSortBytes<T, kSortBlock>, stream, job);
+  const auto sort = [&](auto threads) {
+    constexpr int kThreads = decltype(threads)::value;
+    launch(kRaster, sort_kernel<T, kThreads>, grid_for(n_tiles, 1), kThreads, kSortBytes<T, kThreads>, stream, job);
+  };
+  constexpr int64_t kFewRows = 512;  // of a cloud for each tile: most lists are short
+  if (scene.n_rows < kFewRows * scene.n_clouds * job.n_tiles)
+    sort(std::integral_constant<int, kSortBlock / 2>{});
+  else
+    sort(std::integral_constant<int, kSortBlock>{});
   dispatch_blend(scene, [&](auto fade, auto with_features) {
     constexpr bool kFade = decltype(fade)::value, kWithFeatures = decltype(with_features)::value;
     launch(kRaster, blend_kernel<T, kFade, kWithFeatures>, grid_for(n_tiles * kQuarters, 1), kWarp,

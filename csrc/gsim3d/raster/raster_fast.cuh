@@ -25,10 +25,10 @@ __device__ __forceinline__ double fast_exp2(double x) { return exp2(x); }
 __device__ __forceinline__ double fast_sqrt(double x) { return sqrt(x); }
 __device__ __forceinline__ double fast_reciprocal(double x) { return 1 / x; }
 
-// Saturating; NaN gives 0 or the least integer.
-__device__ __forceinline__ int ceil_to_int(float x) { return __float2int_ru(x); }
-__device__ __forceinline__ int ceil_to_int(double x) { return __double2int_ru(x); }
-__device__ __forceinline__ int floor_to_int(float x) { return __float2int_rd(x); }
-__device__ __forceinline__ int floor_to_int(double x) { return __double2int_rd(x); }
+// Saturating: 0 for what is negative.
+__device__ __forceinline__ uint32_t ceil_to_whole(float x) { return __float2uint_ru(x); }
+__device__ __forceinline__ uint32_t ceil_to_whole(double x) { return __double2uint_ru(x); }
+__device__ __forceinline__ uint32_t floor_to_whole(float x) { return __float2uint_rd(x); }
+__device__ __forceinline__ uint32_t floor_to_whole(double x) { return __double2uint_rd(x); }
 
 }  // namespace gsim3d::raster

@@ -50,7 +50,8 @@ void take_group(Job<T>& job, Arena& kept, Arena& scratch) {
   job.order = kept.take<uint32_t>(n_tiles);
   job.lists = kept.take<List>(n_tiles * kQuarters);
   job.listed = kept.take<uint32_t>(job.limits.slots);
-  job.slot_count = scratch.take<unsigned long long>(n_images + (2 * n_images + n_tiles + 1) / 2);
+  job.counters = scratch.take<uint32_t>(n_counters(job));
+  job.slot_count = reinterpret_cast<unsigned long long*>(job.counters);
   job.slot_cursor = reinterpret_cast<uint32_t*>(job.slot_count + n_images);
   job.list_cursor = job.slot_cursor + n_images;
   job.cursor = job.list_cursor + n_images;

@@ -9,6 +9,7 @@
 
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 
 #include "gsim3d/core/cuda_utils.cuh"
 #include "gsim3d/raster/raster.h"
@@ -23,6 +24,7 @@ constexpr int kBlock = 128;  // threads of a block in the phases that many block
 constexpr int kQuarter = 8;  // pixels
 constexpr int kQuarters = 4;
 constexpr int kBins = 64;  // of tiles by the lengths of their lists
+constexpr int kBinWidth = 64;  // entries
 constexpr int32_t kNoImage = INT32_MAX;
 
 // What a tile needs of one Gaussian in one image. alpha = 2^(strength - (tight u)^2 - (loose dy)^2), u = dx - slope dy.
@@ -34,6 +36,20 @@ struct alignas(16) Record {
   T red, green, blue;
   uint16_t y0, y1;
 };
+
+// A record in words of 16 bytes, into which the compiler would not put fields of different types.
+template <typename T>
+__device__ __forceinline__ void store_record(const Record<T>& record, Record<T>* to) {
+  uint4 words[sizeof(Record<T>) / sizeof(uint4)];
+  memcpy(words, &record, sizeof(record));
+  for (size_t i = 0; i < sizeof(record) / sizeof(uint4); ++i) reinterpret_cast<uint4*>(to)[i] = words[i];
+}
+template <typename T>
+__device__ __forceinline__ void load_record(const Record<T>* from, Record<T>& record) {
+  uint4 words[sizeof(Record<T>) / sizeof(uint4)];
+  for (size_t i = 0; i < sizeof(record) / sizeof(uint4); ++i) words[i] = reinterpret_cast<const uint4*>(from)[i];
+  memcpy(&record, words, sizeof(record));
+}
 
 // Squares [x0, x1) x [y0, y1) of an image: tiles or quarters.
 struct Squares {
@@ -57,7 +73,7 @@ __device__ __forceinline__ uint32_t quarters_of_tile(const Squares& quarters, in
   return (2 * y >= quarters.y0 ? columns : 0u) | (2 * y + 1 < quarters.y1 ? columns << 2 : 0u);
 }
 
-// What an entry says beside its depth: the pair, which ascends with the row, and the quarters that its bounds touch.
+// What an entry says beside its depth: the pair, which ascends with the row, and the quarters that it touches.
 __device__ __forceinline__ uint32_t word_of(uint32_t pair, uint32_t quarters) { return pair << kQuarters | quarters; }
 __device__ __forceinline__ uint32_t pair_of(uint32_t word) { return word >> kQuarters; }
 
@@ -151,6 +167,7 @@ struct Job {
   List* lists;             // [n_images * n_tiles, kQuarters]
   uint32_t* listed;        // [slots] pairs, list by list in order of depth
   uint32_t* cursor;        // [n_images * n_tiles] counts, then write positions
+  uint32_t* counters;      // `cursor` and all that end in _count or _cursor: zeros when a group starts
   unsigned long long* slot_count;  // [n_images] slots of all pairs, then those of the images before
   uint32_t* slot_cursor;   // [n_images] handed out
   uint32_t* tile_begin;    // [n_images * n_tiles + 1] into entries
@@ -164,6 +181,12 @@ struct Job {
   }
 };
 
+// Words of Job::counters.
+template <typename T>
+GSIM3D_HD int64_t n_counters(const Job<T>& job) {
+  return job.scene.n_images * (2 + 1 + 1 + job.n_tiles);
+}
+
 // ---- plan: cameras and the images of each cloud; one block --------------------------------------------------------
 
 template <typename T>
@@ -174,24 +197,32 @@ __device__ bool camera_is_good(const T* viewmat, const T* K) {
   return good && K[0] > 0 && K[4] > 0 && K[3] == 0 && K[6] == 0 && K[7] == 0 && K[8] == 1;
 }
 
+// Inclusive sum over the lanes of a warp.
+template <typename V>
+__device__ V warp_sum(V value) {
+  for (int step = 1; step < kWarp; step *= 2) {
+    const V other = __shfl_up_sync(kFullWarp, value, step);
+    if (static_cast<int>(threadIdx.x % kWarp) >= step) value += other;
+  }
+  return value;
+}
+
 // Inclusive sum over the threads of a block of up to 1024; `total` is the sum over all of them.
 __device__ inline uint64_t block_sum(uint64_t value, uint64_t& total) {
   __shared__ uint64_t warp_sums[kWarp];
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
-  for (int step = 1; step < kWarp; step *= 2) {
-    const uint64_t other = __shfl_up_sync(kFullWarp, value, step);
-    if (lane >= step) value += other;
-  }
+  value = warp_sum(value);
   __syncthreads();
   if (lane == kWarp - 1) warp_sums[warp] = value;
   __syncthreads();
-  uint64_t before = 0;
-  total = 0;
-  for (int w = 0; w < static_cast<int>(blockDim.x) / kWarp; ++w) {
-    before += w < warp ? warp_sums[w] : 0;
-    total += warp_sums[w];
+  const int n_warps = static_cast<int>(blockDim.x) / kWarp;
+  if (warp == 0) {
+    const uint64_t sum = warp_sum(lane < n_warps ? warp_sums[lane] : 0);
+    warp_sums[lane] = sum;
   }
-  return value + before;
+  __syncthreads();
+  total = warp_sums[n_warps - 1];
+  return value + (warp > 0 ? warp_sums[warp - 1] : 0);
 }
 
 template <typename T>

@@ -420,7 +420,7 @@ constexpr double kPixelSlack = 0.01;
 constexpr double kLog2eHalf = 0.72134752044448170;  // alpha = opacity 2^(-kLog2eHalf d^T Sigma^-1 d)
 
 // [x0, x1) x [y0, y1)
-struct PixelRect {
+struct alignas(8) PixelRect {
   uint16_t x0 = 0, x1 = 0, y0 = 0, y1 = 0;
 };
 

@@ -1,8 +1,7 @@
 // Inside of the CUDA rasterizer: records of all pairs, and the number of entries of every tile.
 #pragma once
 
-#include "gsim3d/raster/raster_fast.cuh"
-#include "gsim3d/raster/raster_lists.cuh"
+#include "gsim3d/raster/raster_walk.cuh"
 
 namespace gsim3d::raster {
 
@@ -53,42 +52,6 @@ __device__ PixelRect make_record(const RasterScene<T>& s, const Camera<T>& camer
   return bounds;
 }
 
-// Inclusive sum over the lanes of a warp.
-template <typename V>
-__device__ V warp_sum(V value) {
-  for (int step = 1; step < kWarp; step *= 2) {
-    const V other = __shfl_up_sync(kFullWarp, value, step);
-    if (static_cast<int>(threadIdx.x % kWarp) >= step) value += other;
-  }
-  return value;
-}
-
-// The tiles of 32 records, shared evenly among the lanes of their warp. All lanes take part.
-struct WarpTiles {
-  Squares mine;
-  int n, end;  // tiles of the lane's record, and of all records up to it
-  int total;
-
-  __device__ explicit WarpTiles(const Squares& squares) : mine(squares), n(squares.count()), end(warp_sum(n)) {
-    total = __shfl_sync(kFullWarp, end, kWarp - 1);
-  }
-
-  struct Place {
-    int owner;  // lane of the record, or -1
-    int x, y;
-  };
-  __device__ Place at(int i) const {
-    int owner = 0;  // the first lane whose sum exceeds i
-    for (int step = kWarp / 2; step > 0; step /= 2)
-      if (__shfl_sync(kFullWarp, end, owner + step - 1) <= i) owner += step;
-    const int begin = __shfl_sync(kFullWarp, end - n, owner), width = __shfl_sync(kFullWarp, mine.x1 - mine.x0, owner);
-    const int x0 = __shfl_sync(kFullWarp, mine.x0, owner), y0 = __shfl_sync(kFullWarp, mine.y0, owner);
-    const bool used = i < total;
-    const int place = used ? i - begin : 0, row = used ? place / width : 0;
-    return {used ? owner : -1, x0 + place - row * width, y0 + row};
-  }
-};
-
 // A chunk of rows of a matrix with kColumns columns in shared memory, read and written by the block as a whole.
 template <typename T, int kColumns>
 class SharedRows {
@@ -119,11 +82,26 @@ class SharedRows {
 template <int kTerms>
 constexpr int kColorColumns = kTerms > 0 ? kTerms * 3 : 3;
 
+// Counts the entries of every tile that the bounds of a warp touch.
+template <typename T>
+__device__ void count_tiles(const Job<T>& job, uint32_t* counts, const PixelRect& bounds, Walked<Nothing>* memory) {
+  WarpTiles<Nothing> tiles(bounds, memory);
+  tiles.share({});
+  for (int base = 0; base < tiles.total; base += kWarp) {
+    const auto place = tiles.at(base);
+    const auto tile = static_cast<uint32_t>(place.y * job.tiles_x + place.x);
+    const unsigned same = tiles.lanes_of(tile, place.used);
+    if (__ffs(same) - 1 == static_cast<int>(threadIdx.x % kWarp))
+      atomicAdd(counts + tile, static_cast<uint32_t>(__popc(same)));
+  }
+}
+
 // `memory`: SharedRows of the colours.
 template <typename T, int kTerms>
 __device__ void project_rows(const Job<T>& job, unsigned char* memory) {
   const RasterScene<T>& s = job.scene;
   constexpr int kColumns = kColorColumns<kTerms>;
+  __shared__ Walked<Nothing> walked[kBlock];
   const SharedRows<T, kColumns> colors(memory);
   const int64_t last = job.group->last, n_chunks = count_chunks(job);
   const int lane = threadIdx.x % kWarp;
@@ -146,19 +124,12 @@ __device__ void project_rows(const Job<T>& job, unsigned char* memory) {
       if (may_show) {
         Record<T> record;
         bounds = make_record<T, kTerms>(s, view.camera, gaussian, level, strength, coefficients, record);
-        if (bounds.x0 < bounds.x1) job.records[pair] = record, job.depths[pair] = record.z;
+        if (bounds.x0 < bounds.x1) store_record(record, job.records + pair), job.depths[pair] = record.z;
       }
       if (rows.inside) job.bounds[pair] = bounds;
-      uint32_t* counts = job.cursor + image * job.n_tiles;
-      const WarpTiles shared(squares_of(bounds, kTile));
-      for (int base = 0; base < shared.total; base += kWarp) {
-        const auto [owner, x, y] = shared.at(base + lane);
-        const uint32_t tile = owner < 0 ? ~0u : static_cast<uint32_t>(y * job.tiles_x + x);
-        const unsigned same = __match_any_sync(kFullWarp, tile);
-        if (owner >= 0 && __ffs(same) - 1 == lane) atomicAdd(counts + tile, static_cast<uint32_t>(__popc(same)));
-      }
-      const uint32_t slots = warp_sum<uint32_t>(squares_of(bounds, kQuarter).count());
-      if (lane == kWarp - 1 && slots) atomicAdd(job.slot_count + image, static_cast<unsigned long long>(slots));
+      count_tiles(job, job.cursor + image * job.n_tiles, bounds, walked + threadIdx.x / kWarp * kWarp);
+      const uint32_t slots = __reduce_add_sync(kFullWarp, static_cast<uint32_t>(squares_of(bounds, kQuarter).count()));
+      if (lane == 0 && slots) atomicAdd(job.slot_count + image, static_cast<unsigned long long>(slots));
     }
   }
 }

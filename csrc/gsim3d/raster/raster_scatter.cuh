@@ -26,22 +26,27 @@ __device__ int64_t images_by_slots(const Job<T>& job, int64_t first, int64_t las
 }
 
 // The bin of a tile by the length of its list; long lists come first.
+__device__ __forceinline__ uint32_t bin_of(uint32_t length) {
+  return kBins - 1 - min(length / kBinWidth, uint32_t{kBins - 1});
+}
 template <typename T>
 __device__ uint32_t bin_of(const Job<T>& job, int64_t tile) {
-  constexpr uint32_t kBinWidth = 64;
-  const uint32_t length = job.tile_begin[tile + 1] - job.tile_begin[tile];
-  return kBins - 1 - min(length / kBinWidth, uint32_t{kBins - 1});
+  return bin_of(job.tile_begin[tile + 1] - job.tile_begin[tile]);
 }
 
 template <typename T>
 __device__ void find_offsets(const Job<T>& job) {
+  constexpr int kItems = 8;  // tiles of a thread
+  __shared__ uint32_t bins[kWarp][kBins];  // by warp, so that few threads meet at one
   Group& group = *job.group;
   const int64_t begin = group.tile_begin, end = group.last * job.n_tiles;  // read before thread 0 writes the group
   const int64_t by_slots = group.resumed ? begin : images_by_slots(job, group.first, group.last);
   const uint64_t max_of_images = job.limits.entries;
   const uint64_t max_of_part = min(job.limits.entries, job.limits.slots / kQuarters);
-  uint64_t before = 0, images_fit = 0, tiles_fit = 0;
-  constexpr int kItems = 8;
+  uint32_t* const of_warp = bins[threadIdx.x / kWarp];
+  for (int i = threadIdx.x; i < kWarp * kBins; i += blockDim.x) bins[0][i] = 0;
+  uint64_t before = 0;
+  uint32_t fit[2] = {};  // tiles, whole images
   for (int64_t base = begin; base < end; base += int64_t{blockDim.x} * kItems) {
     const int64_t mine = base + int64_t{threadIdx.x} * kItems;
     uint32_t counts[kItems];
@@ -51,36 +56,37 @@ __device__ void find_offsets(const Job<T>& job) {
       sum += counts[i];
     }
     uint64_t position = before + block_sum(sum, total) - sum;
+    int64_t to_image_end = job.n_tiles - mine % job.n_tiles;
     for (int i = 0; i < kItems; ++i) {
       if (mine + i >= end) break;
       job.tile_begin[mine + i] = job.cursor[mine + i] = static_cast<uint32_t>(position);
       position += counts[i];
-      tiles_fit += position <= max_of_part ? 1 : 0;
-      images_fit += position <= max_of_images && (mine + i + 1) % job.n_tiles == 0 ? 1 : 0;
+      atomicAdd(of_warp + bin_of(counts[i]), 1u);
+      fit[0] += position <= max_of_part ? 1 : 0;
+      if (--to_image_end == 0) fit[1] += position <= max_of_images ? 1 : 0, to_image_end = job.n_tiles;
     }
     before += total;
     if (mine < end && mine + kItems >= end) job.tile_begin[end] = static_cast<uint32_t>(position);
   }
-  block_sum(tiles_fit, tiles_fit);
-  block_sum(images_fit, images_fit);
-  const int64_t whole = min((group.first + static_cast<int64_t>(images_fit)) * job.n_tiles, by_slots);
-  const int64_t stop =
-      whole > begin ? whole : min(begin + static_cast<int64_t>(tiles_fit), (group.first + 1) * job.n_tiles);
-
-  __shared__ uint32_t bins[kBins];
-  if (threadIdx.x < kBins) bins[threadIdx.x] = 0;
-  __syncthreads();
-  for (int64_t base = begin; base < stop; base += blockDim.x) {
-    const int64_t tile = base + threadIdx.x;
-    const uint32_t bin = tile < stop ? bin_of(job, tile) : kBins;
-    const unsigned same = __match_any_sync(kFullWarp, bin);
-    if (bin < kBins && __ffs(same) - 1 == static_cast<int>(threadIdx.x % kWarp))
-      atomicAdd(bins + bin, static_cast<uint32_t>(__popc(same)));
+  uint64_t all_fit;
+  block_sum(uint64_t{fit[1]} << 32 | fit[0], all_fit);
+  const auto tiles_fit = static_cast<int64_t>(all_fit & 0xffffffffu), images_fit = static_cast<int64_t>(all_fit >> 32);
+  const int64_t whole = min((group.first + images_fit) * job.n_tiles, by_slots);
+  const int64_t stop = whole > begin ? whole : min(begin + tiles_fit, (group.first + 1) * job.n_tiles);
+  if (stop < end) {  // the bins hold tiles that do not fit
+    __syncthreads();
+    for (int i = threadIdx.x; i < kWarp * kBins; i += blockDim.x) bins[0][i] = 0;
+    __syncthreads();
+    for (int64_t tile = begin + threadIdx.x; tile < stop; tile += blockDim.x)
+      atomicAdd(of_warp + bin_of(job, tile), 1u);
   }
   __syncthreads();
   if (threadIdx.x < kWarp) {
     const int lane = threadIdx.x;
-    const uint32_t a = bins[2 * lane], b = bins[2 * lane + 1], earlier = warp_sum(a + b) - a - b;
+    uint32_t a = 0, b = 0;
+    for (int w = 0; w < static_cast<int>(blockDim.x) / kWarp; ++w)
+      a += bins[w][2 * lane], b += bins[w][2 * lane + 1];
+    const uint32_t earlier = warp_sum(a + b) - a - b;
     job.bins[2 * lane] = earlier, job.bins[2 * lane + 1] = earlier + a;
   }
   if (threadIdx.x != 0) return;
@@ -113,8 +119,16 @@ __device__ void find_order(const Job<T>& job) {
 // ---- scatter: every record writes its entries; their order is whatever it is --------------------------------------
 
 template <typename T>
+struct Scattered {
+  uint32_t pair;
+  T z;
+  Ellipse<T> ellipse;  // where many tiles are touched
+};
+
+template <typename T>
 __device__ void scatter_rows(const Job<T>& job) {
-  constexpr int kAtOnce = 4;  // entries of a lane that wait for their places together
+  constexpr int kMost = 4;  // entries of a lane that wait for their places together
+  __shared__ Walked<Scattered<T>> walked[kBlock];
   const Group group = *job.group;
   const int64_t n_chunks = count_chunks(job);
   const int lane = threadIdx.x % kWarp;
@@ -133,17 +147,19 @@ __device__ void scatter_rows(const Job<T>& job) {
     while (next < group.last) {
       const int64_t image = next, pair = next_pair;
       const PixelRect bounds = next_bounds;
-      const T z = next_z;
+      Scattered<T> scattered;
+      scattered.pair = static_cast<uint32_t>(pair), scattered.z = next_z;
       next = job.views[next].next;
       fetch();
-      const Squares tiles = squares_of(bounds, kTile), quarters = squares_of(bounds, kQuarter);
-      const int n = group.n_slots(tiles, quarters), end = warp_sum(n);
-      const WarpTiles shared(tiles);
-      if (shared.total == 0) continue;
+      WarpTiles<Scattered<T>> tiles(bounds, walked + threadIdx.x / kWarp * kWarp);
+      if (tiles.total == 0) continue;
+      const int n = group.n_slots(squares_of(bounds, kTile), squares_of(bounds, kQuarter)), end = warp_sum(n);
       uint32_t slot = 0;
       if (lane == kWarp - 1)
         slot = job.first_slot(image, group) + atomicAdd(job.slot_cursor + image, static_cast<uint32_t>(end));
-      uint32_t* const cursor = job.cursor + image * job.n_tiles;
+      if (tiles.many() && bounds.x0 < bounds.x1) scattered.ellipse = Ellipse<T>(job.records[pair]);
+      tiles.share(scattered);
+      const int64_t first_tile = image * job.n_tiles;
       // Entries base .. base + kCount * 32 - 1 of the warp.
       const auto put = [&](int base, auto count) {
         constexpr int kCount = decltype(count)::value;
@@ -152,20 +168,15 @@ __device__ void scatter_rows(const Job<T>& job) {
         unsigned same[kCount];  // lanes with an entry of the same tile
 #pragma unroll
         for (int k = 0; k < kCount; ++k) {
-          const auto [owner, x, y] = shared.at(base + k * kWarp + lane);
-          const int from = max(owner, 0);
-          const uint32_t word = word_of(__shfl_sync(kFullWarp, static_cast<uint32_t>(pair), from), 0) |
-                                quarters_of_tile({__shfl_sync(kFullWarp, quarters.x0, from),
-                                                  __shfl_sync(kFullWarp, quarters.x1, from),
-                                                  __shfl_sync(kFullWarp, quarters.y0, from),
-                                                  __shfl_sync(kFullWarp, quarters.y1, from)}, x, y);
-          entry[k] = Entry<T>::make(__shfl_sync(kFullWarp, z, from), word);
-          const auto tile = static_cast<uint32_t>(y * job.tiles_x + x);
-          const bool used = owner >= 0 && group.has(image * job.n_tiles + tile);
-          same[k] = __match_any_sync(kFullWarp, used ? tile : ~0u);
-          if (!used) same[k] = 0;
+          const auto place = tiles.at(base + k * kWarp);
+          const Scattered<T>& owner = place.owner->load;
+          const uint32_t quarters =
+              tiles.many() ? owner.ellipse.touched(place.quarters, place.x, place.y) : place.quarters;
+          entry[k] = Entry<T>::make(owner.z, word_of(owner.pair, quarters));
+          const auto tile = static_cast<uint32_t>(place.y * job.tiles_x + place.x);
+          same[k] = tiles.lanes_of(tile, place.used && group.has(first_tile + tile));
           if (__ffs(same[k]) - 1 == lane)
-            position[k] = atomicAdd(cursor + tile, static_cast<uint32_t>(__popc(same[k])));
+            position[k] = atomicAdd(job.cursor + first_tile + tile, static_cast<uint32_t>(__popc(same[k])));
         }
 #pragma unroll
         for (int k = 0; k < kCount; ++k) {
@@ -174,9 +185,9 @@ __device__ void scatter_rows(const Job<T>& job) {
         }
       };
       int base = 0;
-      for (; base + kAtOnce * kWarp <= shared.total; base += kAtOnce * kWarp)
-        put(base, std::integral_constant<int, kAtOnce>{});
-      for (; base < shared.total; base += kWarp) put(base, std::integral_constant<int, 1>{});
+      for (; base + kMost * kWarp / 2 < tiles.total; base += kMost * kWarp)
+        put(base, std::integral_constant<int, kMost>{});
+      for (; base < tiles.total; base += kMost * kWarp / 2) put(base, std::integral_constant<int, kMost / 2>{});
       slot = __shfl_sync(kFullWarp, slot, kWarp - 1);
       if (n > 0) job.slot_begin[pair] = slot + end - n;
     }

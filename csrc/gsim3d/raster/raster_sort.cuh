@@ -8,7 +8,7 @@
 
 namespace gsim3d::raster {
 
-constexpr int kSortBlock = 256;  // threads of the kernel that only sorts
+constexpr int kSortBlock = 256;  // threads of the kernel that only sorts; half of them for short lists
 template <typename T>
 constexpr int kSortItems = 128 / sizeof(Entry<T>);  // of a thread
 template <typename T, int kThreads>
@@ -209,37 +209,48 @@ __device__ Entry<T>* sort_long(Entry<T>* list, Entry<T>* other, int64_t n, Entry
   return list;
 }
 
-// Writes the lists of the quarters: the pairs of word(0), word(1), ... that touch them. A quarter is shared by as many
-// warps as there are for each.
+// Writes the lists of the quarters: the pairs of word(0), word(1), ... that touch them. A warp takes a run of words.
 template <int kThreads, typename T, typename F>
 __device__ void list_quarters(const Job<T>& job, int64_t tile, int64_t n, const F& word) {
-  constexpr int kParts = kThreads / kWarp / kQuarters;
+  constexpr int kParts = kThreads / kWarp;
   __shared__ uint32_t counts[kParts][kQuarters], begins[kQuarters];
-  const int lane = threadIdx.x % kWarp, quarter = threadIdx.x / kWarp % kQuarters;
-  const int part = threadIdx.x / kWarp / kQuarters;
+  const int lane = threadIdx.x % kWarp, part = threadIdx.x / kWarp;
   const int64_t share = (n + kParts * kWarp - 1) / (kParts * kWarp) * kWarp;
   const int64_t from = min(n, part * share), end = min(n, from + share);
-  uint32_t count = 0;
-  for (int64_t i = from + lane; i < end; i += kWarp) count += word(i) >> quarter & 1;
-  count = __reduce_add_sync(kFullWarp, count);
-  if (lane == 0) counts[part][quarter] = count;
+  uint32_t count[kQuarters] = {};
+  for (int64_t i = from + lane; i < end; i += kWarp) {
+    const uint32_t mine = word(i);
+#pragma unroll
+    for (int q = 0; q < kQuarters; ++q) count[q] += mine >> q & 1;
+  }
+#pragma unroll
+  for (int q = 0; q < kQuarters; ++q) {
+    const uint32_t all = __reduce_add_sync(kFullWarp, count[q]);
+    if (lane == q) counts[part][q] = all;
+  }
   __syncthreads();
   if (threadIdx.x < kQuarters) {
     uint32_t all = 0;
-    for (int p = 0; p < kParts; ++p) all += counts[p][threadIdx.x];
+    for (int p = 0; p < kParts; ++p) {
+      const uint32_t of_part = counts[p][threadIdx.x];
+      counts[p][threadIdx.x] = all, all += of_part;
+    }
     const int64_t image = tile / job.n_tiles;
     begins[threadIdx.x] = job.first_slot(image, *job.group) + atomicAdd(job.list_cursor + image, all);
     job.lists[tile * kQuarters + threadIdx.x] = {begins[threadIdx.x], all};
   }
   __syncthreads();
-  uint32_t* to = job.listed + begins[quarter];
-  for (int p = 0; p < part; ++p) to += counts[p][quarter];
+#pragma unroll
+  for (int q = 0; q < kQuarters; ++q) count[q] = begins[q] + counts[part][q];
   for (int64_t base = from; base < end; base += kWarp) {
     const uint32_t mine = base + lane < end ? word(base + lane) : 0;
-    const bool hit = mine >> quarter & 1;
-    const unsigned hits = __ballot_sync(kFullWarp, hit);
-    if (hit) to[__popc(hits & ((1u << lane) - 1))] = pair_of(mine);
-    to += __popc(hits);
+#pragma unroll
+    for (int q = 0; q < kQuarters; ++q) {
+      const bool hit = mine >> q & 1;
+      const unsigned hits = __ballot_sync(kFullWarp, hit);
+      if (hit) job.listed[count[q] + __popc(hits & ((1u << lane) - 1))] = pair_of(mine);
+      count[q] += __popc(hits);
+    }
   }
 }
 
