@@ -105,8 +105,8 @@ namespace cpu {
 //     for every kernel size K: tap_in [L], tap_out [L], cu_taps [K^3 + 1]: voxel tap_in lies at (kx, ky, kz) - K / 2
 //                           cells from tap_out, tap = (kx K + ky) K + kz; both ascend inside a tap; centre empty
 // and with spec.capacity or spec.rounded at last found [1 + counts]: problems, then the counts that the data has. Then
-// N, C, P, M, L are those of the capacity (N0 = n_rows), V is N + 1, and behind what the data has follow rows that nothing reads: in
-// orders they stay at their places, each is a voxel of its own, `rows` lists those that sleep; the last voxels,
+// N, C, P, M, L are those of the capacity (N0 = n_rows), V is N + 1, and behind what the data has follow rows that
+// nothing reads: in orders they stay at their places, each is a voxel of its own, `rows` lists those that sleep; the last voxels,
 // patches, clouds and clusters are empty (offsets stay at the end), other entries are 0. Where a count exceeds its
 // capacity, there are such rows only.
 // T is float or double. Throws ArgumentError where clouds or spec are malformed.
