@@ -1,7 +1,7 @@
 """What is given up where frozen rows read only each other, and where rows sleep: measured against computing everything.
 
-    compare_backgrounds(simulator, state, 12, cameras)   # an asymmetric model beside its symmetric twin
-    compare_sleep(simulator, state, 12, plan, cameras)   # a plan with sleep beside one without
+compare_backgrounds(simulator, state, 12, cameras)   # an asymmetric model beside its symmetric twin
+compare_sleep(simulator, state, 12, plan, cameras)   # a plan with sleep beside one without
 """
 
 from __future__ import annotations

@@ -25,6 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d import ops
+from gsim3d.branches import Branches
 from gsim3d.ops.curve import CURVES, KernelMap, PatchTable, Pyramid, PyramidSpec, Stage, Voxels
 from gsim3d.types import Particles
 
@@ -107,7 +108,8 @@ class Background:
     def readers(self, pyramid: Pyramid, particles: Particles) -> list[Reader]:
         """What a call over moving ``particles`` is given, for each stage; nothing waits for the device."""
         rooms = zip(self.places, pyramid.stages, row_scenes(pyramid, particles), self.depths, self.curves)
-        return [Reader(self, *room) for room in rooms]
+        with Branches(particles.means) as beside:  # many launches over few rows, and no stage waits for another
+            return [beside.run(Reader, self, *room) for room in rooms]
 
     def map(self, f: Callable[[Tensor, int], Tensor]) -> Background:
         """The same background with ``f`` applied to every tensor and its kind (KEYS, LISTS, OFFSETS or ROWS)."""
@@ -341,7 +343,9 @@ def _overlapping(
     patch = torch.where((patch >= 0) & of_scene & is_row, patch, n_patches)
     order, _ = ops.curve_sort(patch)
     cu_q = torch.searchsorted(patch.gather(1, order), _counting(n_patches + 1, order))
-    return _in_parts(order, cu_q, places)
+    if order.shape[1] > places.patch_size:
+        return _in_parts(order, cu_q, places)
+    return tuple(PatchTable(*lists, places.cu_k) for lists in zip(order, places.kv_rows, cu_q, strict=True))
 
 
 def _in_parts(order: Tensor, cu_q: Tensor, places: Places) -> tuple[PatchTable, ...]:

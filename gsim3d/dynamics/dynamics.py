@@ -31,7 +31,7 @@ class Dynamics(nn.Module):
         super().__init__()
         self.config = config
         self.layout = StateLayout.of(config)
-        self.rounds = False
+        self.rounds = None  # whether geometry is rounded in training; None: on a GPU
         self.net = PointTransformer(self.layout.in_channels, self.layout.out_channels, config)
 
     def geometry(
@@ -147,8 +147,8 @@ class Dynamics(nn.Module):
         return steps[0] if len(steps) == 1 else concatenate(steps)
 
     def _rounds(self, history: Particles) -> bool:
-        """Whether the network sees rows that are none, so that its matrix products have few sizes. On a GPU the first
-        product of every size costs the host as much time as several launches, and each call has its own sizes."""
+        """Whether the network sees rows that are none, so that its matrix products have few sizes: cuBLAS chooses an
+        algorithm on the host for every new one, and clouds that move have new ones at each step."""
         if torch.compiler.is_compiling():
             return False
         return self.training and history.means.is_cuda if self.rounds is None else self.rounds

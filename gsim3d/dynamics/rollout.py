@@ -60,7 +60,9 @@ def rollout_in_parts(
             if steps:  # all that the model sees was simulated when somebody falls asleep first
                 history = last_steps(concatenate(steps[-max_steps:]), max_steps)
             asleep = None if sleepers is None else sleepers.asleep
-            parts, begin = Parts.of(history, asymmetric=remember is not None, asleep=asleep if steps else None), len(steps)
+            parts, begin = Parts.of(history, asymmetric=remember is not None, asleep=asleep if steps else None), len(
+                steps
+            )
             moving, background = parts.moving, None
             if parts.background is not None and not parts.nothing_moves:
                 background = remember(parts.background)

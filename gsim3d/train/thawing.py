@@ -16,7 +16,9 @@ from gsim3d.types import DYNAMIC, FROZEN, Particles
 
 def check_thawing(data: DataConfig, dynamics: DynamicsConfig) -> None:
     if data.thawed and not dynamics.is_asymmetric:
-        raise InputError('data.thawed: needs a model of background "asymmetric"; another does not tell frozen rows apart')
+        raise InputError(
+            'data.thawed: needs a model of background "asymmetric"; another does not tell frozen rows apart'
+        )
 
 
 def thaw(particles: Particles, most: float, spec: EffectsSpec, rng: np.random.Generator) -> Particles:

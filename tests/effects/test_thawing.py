@@ -56,7 +56,8 @@ def test_the_share_is_drawn_up_to_the_given_one():
         shares.append((thawed_rows(state, after).sum() / (state.activity == FROZEN).sum()).item())
     assert abs(np.mean(shares) - 0.25) < 0.05 and max(shares) < 0.8
     assert_same_bits(
-        thaw(state, 0.5, SPEC, np.random.default_rng(1)).activity, thaw(state, 0.5, SPEC, np.random.default_rng(1)).activity
+        thaw(state, 0.5, SPEC, np.random.default_rng(1)).activity,
+        thaw(state, 0.5, SPEC, np.random.default_rng(1)).activity,
     )
 
 

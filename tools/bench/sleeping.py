@@ -72,7 +72,8 @@ def simulator(n_steps: int, device: str) -> Simulator:
     torch.manual_seed(0)
     model = presets.paper_latent(n_steps, 64) if device == "cuda" else presets.tiny()
     dynamics = dataclasses.replace(model.dynamics, background="asymmetric", norm="layer", max_step=0.001)
-    return Simulator(dataclasses.replace(model, dynamics=dynamics)).to(device).eval()
+    renderer = dataclasses.replace(model.renderer, initial_scale=0.01)  # about half a pixel
+    return Simulator(dataclasses.replace(model, dynamics=dynamics, renderer=renderer)).to(device).eval()
 
 
 def agreement(model: Simulator, state: Particles, n_steps: int, device: str) -> float:
