@@ -241,7 +241,7 @@ def _held(
     step: int,
     scene: Scene,
     cams: Sequence[int],
-    start: int,
+    start: int = 0,
 ) -> Tensor:
     """Images of the predicted steps that would be seen if everything stood still as it is at cloud ``step``."""
     later = range(prediction.n_encoded, prediction.n_steps)
