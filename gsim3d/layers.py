@@ -219,7 +219,7 @@ class RowBatchNorm(nn.Module):
 
 
 class _BatchNormGelu(torch.autograd.Function):
-    """Normalised by statistics of all rows, scaled, shifted, activated: torch would keep and add up five tensors of rows."""
+    """Normalised by statistics of all rows, scaled, shifted, activated: torch would keep and add five tensors of rows."""
 
     @staticmethod
     def forward(ctx, x, weight, bias, mean, rsqrt, n_rows, n_data):
@@ -256,7 +256,7 @@ def _statistics(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _statistics_at_once(x: Tensor) -> tuple[Tensor, Tensor, Tensor | int]:
-    """As :func:`_statistics`, without gradients, on a GPU in one pass; of rows of all processes, at least 1 is counted."""
+    """As :func:`_statistics`, without gradients, on a GPU in one pass; at least one row is counted."""
     n_rows = x.shape[0]
     if n_rows == 0:
         mean, var = torch.zeros(2, x.shape[1], dtype=torch.promote_types(x.dtype, torch.float32), device=x.device)
@@ -316,6 +316,24 @@ def widened(x: Tensor) -> Tensor:
 def make_norm(kind: str, channels: int) -> nn.Module:
     """"layer" or "batch"."""
     return RowLayerNorm(channels) if kind == "layer" else RowBatchNorm(channels)
+
+
+@contextlib.contextmanager
+def tf32_only_if_asked():
+    """A context in which a GPU's float32 convolutions use TF32 only if matrix products may.
+
+    Torch has a switch for each, and that of convolutions is on unless somebody turns it off. How TF32 rounds depends on
+    the algorithm, which cuDNN chooses by the number of images: a scene would differ from itself in a larger batch.
+    """
+    products, cudnn = torch.backends.cuda.matmul, torch.backends.cudnn
+    unasked = cudnn.conv.fp32_precision == "tf32" and products.fp32_precision != "tf32"
+    if unasked:
+        cudnn.allow_tf32 = False
+    try:
+        yield
+    finally:
+        if unasked:
+            cudnn.allow_tf32 = True
 
 
 def exact_convolutions():

@@ -10,10 +10,13 @@ from gsim3d.layers import (
     _combine,
     _statistics,
     at_hand,
+    exact_convolutions,
     product_dtype,
     round_at_once,
     rounded_weights,
+    tf32_only_if_asked,
 )
+from gsim3d.train.loop import deterministic
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 
 
@@ -189,10 +192,30 @@ def test_layers_under_autocast_err_no_more_than_torchs(dtype, devices):
     exact = run(lambda x: torch.nn.functional.gelu(norm(torch.nn.functional.linear(x, linear.weight, linear.bias))))
     with torch.autocast("cuda", dtype):
         ours = run(lambda x: norm.activated(linear(x)))
-        torchs = run(lambda x: torch.nn.functional.gelu(norm(torch.nn.functional.linear(x, linear.weight, linear.bias))))
+        torchs = run(
+            lambda x: torch.nn.functional.gelu(norm(torch.nn.functional.linear(x, linear.weight, linear.bias)))
+        )
     for a, b, truth in zip(ours, torchs, exact, strict=True):
         error, allowed = ((t.float() - truth).abs().max().item() for t in (a, b))
         assert error <= 2 * allowed + 1e-3 * truth.abs().max().item()
+
+
+@pytest.mark.parametrize("context", [tf32_only_if_asked, deterministic])
+def test_convolutions_use_tf32_only_if_asked(context):
+    cudnn = torch.backends.cudnn
+    assert cudnn.conv.fp32_precision == "tf32"  # which torch chooses, and nobody asked for
+    for inner in (tf32_only_if_asked, exact_convolutions):
+        with context(), inner():
+            assert cudnn.conv.fp32_precision != "tf32"
+        with exact_convolutions(), context():
+            assert cudnn.conv.fp32_precision != "tf32"
+    torch.backends.cuda.matmul.allow_tf32 = True
+    try:
+        with context():
+            assert cudnn.conv.fp32_precision == "tf32"
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = False
+    assert cudnn.conv.fp32_precision == "tf32" and cudnn.allow_tf32
 
 
 def test_some_outputs_follow_the_weights():

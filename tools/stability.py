@@ -39,13 +39,12 @@ or `"clamp"`; a `StabilityReport` counts what, where and how many. `gsim3d/stabi
 
 Every case below is a test that is named after it (`test_r01_...`), forward and backward. Most of them run beside an
 ordinary scene in the same call, which must not notice: its rows have equal bits in float32 on the CPU, and everywhere
-as long as the sizes of the call are the same. (In float64 and on a GPU, BLAS rounds a product by its number of rows:
-rows in calls of different sizes are equal to rounding.)
+as long as the sizes of the call are the same. (In float64 and on a GPU, BLAS and cuDNN round by the number of rows or
+images: rows in calls of different sizes are equal to rounding. That of TF32 is large, and torch lets convolutions use
+it unless told otherwise; the encoder and training do only where matrix products may, too.)
 
-Known gaps, on a GPU only: the float32 plane sweep rounds all features of a call by the largest of them, so that a scene
-with huge features costs the others precision; encoding a part of a batch differs from encoding all of it by up to
-3e-3, which the law "split the batch" refuses; and index lists that the CPU refuses are not looked at, so that `unpool`
-and `sparse_conv` can return numbers that are not finite for them.
+Index lists that the CPU refuses are not looked at on a GPU, which would have to be waited for: entries out of range
+take no part, nothing else is read or written, and rows that no entry names are 0.
 
 The measured cells hold the largest error, relative to the largest expected value, against a float64 reference that
 knows nothing of gsim3d, or against the same computation in float64 on the CPU; in brackets the bound that the test

@@ -12,6 +12,7 @@ from gsim3d.encoder.config import EncoderConfig
 from gsim3d.encoder.depth import DepthPredictor, Views
 from gsim3d.encoder.heads import ParticleHeads, PixelParticles
 from gsim3d.encoder.transformer import MultiViewTransformer
+from gsim3d.layers import tf32_only_if_asked
 from gsim3d.types import DYNAMIC, FROZEN, Frames, Particles
 
 
@@ -46,12 +47,18 @@ class Encoder(nn.Module):
     def forward(self, frames: Frames) -> Particles:
         """Particles of every cloud: its images in ascending order, pixels row by row, those outside ``masks`` left out.
 
-        Gradients: ``frames.images`` and the parameters.
+        On a GPU it computes in float32 unless autocast, or torch's switch for TF32 in matrix products, says otherwise.
+
+        Gradients: ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
         Raises:
             InputError: sizes do not fit the network's strides or each other; the message names the argument.
             HardCaseError: an image or camera is not finite; the message names scene, step and tensor.
         """
         check_frames(frames, self.config)
+        with tf32_only_if_asked():
+            return self._encode(frames)
+
+    def _encode(self, frames: Frames) -> Particles:
         n_clouds = frames.cloud_scene.shape[0]
         image_cloud = frames.cameras.image_cloud
         n_views = torch.bincount(image_cloud, minlength=n_clouds)

@@ -35,6 +35,7 @@ def patch_attention(
     Raises:
         HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: a shape, dtype, head dim, scale or table is malformed; the message names the argument.
+            CUDA does not look into the table: rows out of range take no part.
     Source: Dao et al. 2022 (FlashAttention), applied to the patches of Point Transformer V3 (Wu et al. 2024).
 
     Example:

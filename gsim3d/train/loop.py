@@ -21,6 +21,7 @@ from gsim3d.data import Scene, generator, make_frames
 from gsim3d.dynamics import concatenate
 from gsim3d.effects import EffectsSpec
 from gsim3d.errors import HardCaseError, InputError
+from gsim3d.layers import tf32_only_if_asked
 from gsim3d.perceptual.lpips import LPIPS
 from gsim3d.perceptual.weights import load
 from gsim3d.plans import Plan
@@ -551,7 +552,7 @@ def _fixed_settings(settings: dict) -> dict:
 
 @contextmanager
 def deterministic() -> Iterator[None]:
-    """Within it torch uses deterministic algorithms only."""
+    """Within it torch uses deterministic algorithms only, and TF32 only if asked."""
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     before = torch.are_deterministic_algorithms_enabled()
     fill = torch.utils.deterministic.fill_uninitialized_memory
@@ -560,7 +561,8 @@ def deterministic() -> Iterator[None]:
     torch.utils.deterministic.fill_uninitialized_memory = False  # costs time and changes no result of a correct op
     torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = True, False
     try:
-        yield
+        with tf32_only_if_asked():
+            yield
     finally:
         torch.use_deterministic_algorithms(before)
         torch.utils.deterministic.fill_uninitialized_memory = fill

@@ -174,6 +174,21 @@ def test_training_twice_gives_the_same_bits():
         assert_same_bits(a, b)
 
 
+@pytest.mark.parametrize("asked", [False, True])
+def test_tf32_is_used_only_where_matrix_products_use_it(asked):
+    products, convolutions = torch.backends.cuda.matmul, torch.backends.cudnn.conv
+    encoder, seen = make_encoder(), []
+    encoder.cnn.conv1.register_forward_pre_hook(lambda *_: seen.append(convolutions.fp32_precision))
+    before = products.allow_tf32
+    products.allow_tf32 = asked
+    try:
+        encoder(make_frames([0, 0]))
+    finally:
+        products.allow_tf32 = before
+    assert [precision == "tf32" for precision in seen] == [asked]
+    assert convolutions.fp32_precision == "tf32" and torch.backends.cudnn.allow_tf32
+
+
 def test_untrained_depth_is_near_the_middle_of_disparity_with_translucent_particles():
     torch.manual_seed(0)
     frames = make_frames([0, 0, 0])

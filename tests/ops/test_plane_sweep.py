@@ -166,6 +166,7 @@ def test_cuda_gives_the_same_bits_every_time(case, devices):
 LARGE = {
     "pairs in pieces": dict(sources=((1,) * 6, (0,) * 6), channels=3, depths=8, size=(128, 128)),
     "pixels in pieces": dict(sources=((), (0,)), channels=1, depths=2, size=(256, 256)),
+    "tiles in pieces": dict(sources=((1,), (0,)), channels=2, depths=8, size=(400, 400)),
     "channels in blocks": dict(channels=260, size=(9, 16)),
 }
 
@@ -174,7 +175,84 @@ LARGE = {
 def test_large_sweeps_on_cuda(case, devices):
     arguments = make(**LARGE[case], dtype=torch.float32)
     for cpu, cuda, name in zip(*(run(arguments, device) for device in devices), ("cost", "gradient"), strict=True):
-        assert_close_relative_to_max(cuda, cpu, "plane_sweep_large", name)
+        limit = "plane_sweep_tiles_in_pieces" if case == "tiles in pieces" else "plane_sweep_large"
+        assert_close_relative_to_max(cuda, cpu, limit, name)
+
+
+def scene_of(arguments, first, last):
+    """Images first .. last - 1 alone; their sources lie among them."""
+    features, A, b, inverse_depths, src_images, cu_src = arguments
+    begin, end = int(cu_src[first]), int(cu_src[last])
+    alone = [features[first:last], A[begin:end], b[begin:end], inverse_depths[first:last]]
+    return [*alone, src_images[begin:end] - first, cu_src[first : last + 1] - begin]
+
+
+def scaled_scenes(n_scenes, scales, **options):
+    """Scenes of four images that all see each other; scene i has features times the i-th of the scales, in turn."""
+    sources = [[4 * s + (v + k) % 4 for k in (1, 2, 3)] for s in range(n_scenes) for v in range(4)]
+    features, *geometry = make(sources, dtype=torch.float32, **options)
+    scale = torch.tensor(scales, dtype=torch.float32)[torch.arange(n_scenes) % len(scales)]
+    return [features * scale.repeat_interleave(4)[:, None, None, None], *geometry]
+
+
+def with_cotangent(arguments, cotangent, device):
+    features, *geometry = (t.to(device) for t in arguments)
+    return gradients(lambda f: plane_sweep(f, *geometry, check=False), [features], cotangent.to(device))
+
+
+@pytest.mark.parametrize("scales", [(1.0,), (1.0, 1e9, 1e-9)])
+def test_a_scene_has_the_same_bits_alone_and_beside_others(scales, device):
+    arguments = scaled_scenes(3, scales)
+    cotangent = cotangent_of([arguments[0], None, None, arguments[3]])
+    cotangent[4:8] *= 1e9
+    together = with_cotangent(arguments, cotangent, device)
+    for first in (0, 4, 8):
+        images = slice(first, first + 4)
+        alone = with_cotangent(scene_of(arguments, first, first + 4), cotangent[images], device)
+        for x, expected, name in zip(together, alone, ("cost", "gradient"), strict=True):
+            assert_same_bits(x[images], expected, name)
+
+
+def test_a_scene_has_the_same_bits_in_a_batch_that_takes_several_launches(devices):
+    """More pairs than are kept at once, and tiles that see more source pixels than one launch keeps of them."""
+    arguments = scaled_scenes(8, (1.0, 30.0), channels=4, depths=64, size=(48, 64))
+    zoom = torch.tensor([[3.0, 0, -2 * 32], [0, 3, -2 * 24], [0, 0, 1]])
+    arguments[1], arguments[2] = zoom @ arguments[1], (zoom @ arguments[2][..., None])[..., 0]
+    cotangent = cotangent_of([arguments[0], None, None, arguments[3]])
+    together = with_cotangent(arguments, cotangent, devices[1])
+    for first in range(0, 32, 4):
+        images = slice(first, first + 4)
+        part = scene_of(arguments, first, first + 4), cotangent[images]
+        for x, expected, name in zip(together, with_cotangent(*part, devices[1]), ("cost", "gradient"), strict=True):
+            assert_same_bits(x[images], expected, name)
+    for actual, expected in zip(with_cotangent(*part, devices[1]), with_cotangent(*part, devices[0]), strict=True):
+        assert_close_relative_to_max(actual, expected, "plane_sweep_large")
+
+
+def test_images_of_other_magnitudes_in_one_scene(device):
+    """Each image's cost and gradient is as precise as it would be without its neighbours' sizes."""
+    arguments = make(((1, 2), (2, 0, 3), (3,), (0, 1)), channels=40, depths=16, size=(12, 17))
+    arguments[0] *= torch.tensor([1.0, 1e8, 1e-8, 1e3])[:, None, None, None]
+    cotangent = cotangent_of([arguments[0], None, None, arguments[3]])
+    cotangent *= torch.tensor([1e3, 1e-9, 1e5, 1.0])[:, None, None, None]
+    expected = with_cotangent(arguments, cotangent, torch.device("cpu"))
+    single = [t.float() if t.is_floating_point() else t for t in arguments]
+    for actual, exact, name in zip(with_cotangent(single, cotangent.float(), device), expected, ("cost", "gradient")):
+        for i in range(4):
+            assert_close_relative_to_max(actual[i], exact[i], "plane_sweep_grad_float32", f"{name} of image {i}")
+
+
+def test_features_at_the_ends_of_the_number_range(device):
+    """One image's smallness makes up for another's size."""
+    arguments = make(((1,), (0,)), channels=6, dtype=torch.float32)
+    arguments[0] *= torch.tensor([1e-30, 1e32])[:, None, None, None]
+    cotangent = cotangent_of([arguments[0], None, None, arguments[3]])
+    expected = with_cotangent(in_double(arguments), cotangent.double(), torch.device("cpu"))
+    features, *geometry = (t.to(device) for t in arguments)
+    actual = gradients(lambda f: plane_sweep(f, *geometry, check=False), [features], cotangent)
+    for x, exact in zip(actual, expected, strict=True):
+        for i in range(2):
+            assert_close_relative_to_max(x[i], exact[i], "plane_sweep_grad_float32")
 
 
 def test_cuda_skips_what_is_out_of_range(devices):

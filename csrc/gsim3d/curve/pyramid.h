@@ -60,7 +60,8 @@ constexpr int64_t capacity_of_pairs(int64_t n_stages, int64_t kernel) {
   return capacity_at(n_stages, Counted::kRows) + kernel;
 }
 
-// The sizes of a rounded pyramid, in place, from what was counted: at most one part in 32 more. Clouds stay as they are.
+// The sizes of a rounded pyramid, in place, from what was counted: at most one part in 32 more. Clouds stay as they
+// are.
 inline void round_counts(int64_t* counts, int64_t n_stages, int64_t n_counts, int64_t n_rows) {
   constexpr int64_t kEach = capacity_at(1, Counted::kRows);
   for (int64_t i = 0; i < n_counts; ++i) {
@@ -103,9 +104,9 @@ namespace cpu {
 //     row_voxel [N], voxel_rows [N], cu_voxel_rows [V + 1]: rows of equal (cloud, cell); voxels by (cloud, x, y, z)
 //     for every kernel size K: tap_in [L], tap_out [L], cu_taps [K^3 + 1]: voxel tap_in lies at (kx, ky, kz) - K / 2
 //                           cells from tap_out, tap = (kx K + ky) K + kz; both ascend inside a tap; centre empty
-// and with spec.capacity or spec.rounded at last found [1 + counts]: problems, then the counts that the data has. Then N, C, P, M, L
-// are those of the capacity (N0 = n_rows), V is N + 1, and behind what the data has follow rows that nothing reads: in
-// orders they stay at their places, each is a voxel of its own, `rows` lists those that sleep; the last voxels,
+// and with spec.capacity or spec.rounded at last found [1 + counts]: problems, then the counts that the data has. Then
+// N, C, P, M, L are those of the capacity (N0 = n_rows), V is N + 1, and behind what the data has follow rows that
+// nothing reads: in orders they stay at their places, each is a voxel of its own, `rows` lists those that sleep; the last voxels,
 // patches, clouds and clusters are empty (offsets stay at the end), other entries are 0. Where a count exceeds its
 // capacity, there are such rows only.
 // T is float or double. Throws ArgumentError where clouds or spec are malformed.

@@ -12,7 +12,8 @@
 
 namespace gsim3d::cuda {
 
-// What the weights and slopes of a query need. A slot whose row is out of range has log_sum = inf: its weights are 0.
+// What the weights and slopes of a query need. A slot whose row is out of range, and a query that saw no key, has
+// log_sum = inf: its weights are 0.
 struct alignas(16) QueryNumbers {
   float largest, log_sum, delta, shift;  // shift: of fast_weight
 
@@ -49,6 +50,7 @@ __device__ __forceinline__ QueryNumbers numbers_of(const Backward<T>& args, int6
     }
   }
   const float2 pair = *reinterpret_cast<const float2*>(args.stats + 2 * (row * args.size.heads + head));
+  if (pair.y == 0) return QueryNumbers::none();
   const float log_sum = log2f(pair.y);
   return {pair.x, log_sum, delta, -fmaf(pair.x, args.slope, log_sum)};
 }

@@ -65,7 +65,7 @@ class QueryWarp {
         if (inside(row, n_q)) {
           const float2 pair = *reinterpret_cast<const float2*>(args.stats + 2 * (row * args.size.heads + head));
           const float log_sum = log2f(pair.y);
-          x = {pair.x, log_sum, delta[h], -fmaf(pair.x, args.slope, log_sum)};
+          if (pair.y != 0) x = {pair.x, log_sum, delta[h], -fmaf(pair.x, args.slope, log_sum)};
         }
         if (i < end) args.numbers[head * args.table.n_q_listed + i] = x;  // all four lanes, so that each may read it
         fast = fast && x.is_fast(args.slope);

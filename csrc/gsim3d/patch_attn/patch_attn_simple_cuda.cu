@@ -248,7 +248,13 @@ __global__ void __launch_bounds__(kThreads) forward_kernel(Work<T> work) {
   });
 }
 
-// Gradients are divided by the sum of weights, so that the weights need not be; delta = <out, that gradient>.
+// What gradients are divided by instead of the weights; 0 for a query that saw no key.
+template <typename C>
+__device__ __forceinline__ C one_by(C sum_of_weights) {
+  return sum_of_weights == 0 ? C(0) : C(1) / sum_of_weights;
+}
+
+// delta = <out, the divided gradient>.
 template <typename T, int L>
 __global__ void __launch_bounds__(kThreads) query_kernel(Work<T> work) {
   using C = Sum<T>;
@@ -273,7 +279,7 @@ __global__ void __launch_bounds__(kThreads) query_kernel(Work<T> work) {
       load_row<L>(wanted ? work.grad.at(rows[r], head) : nullptr, part, dim, grad[r]);
       load_row<L>(wanted ? work.out_rows.at(rows[r], head) : nullptr, part, dim, result[r]);
       largest[r] = wanted ? work.stats[2 * place] : C(0);
-      const C one_by_sum = wanted ? C(1) / work.stats[2 * place + 1] : C(0);
+      const C one_by_sum = wanted ? one_by(work.stats[2 * place + 1]) : C(0);
 #pragma unroll
       for (C& x : grad[r]) x *= one_by_sum;
       delta[r] = dot<L>(grad[r], result[r]);
@@ -327,7 +333,7 @@ __global__ void __launch_bounds__(kThreads) key_kernel(Work<T> work) {
         const int n = static_cast<int>(min(queries.end - first, int64_t{S::kTileRows}));
         __syncthreads();
         tile.fill(work.q, work.grad, table.q_rows + first, n, table.n_q, share.head, dim,
-                  [&](int64_t r) { return C(1) / work.stats[2 * (r * heads + share.head) + 1]; });
+                  [&](int64_t r) { return one_by(work.stats[2 * (r * heads + share.head) + 1]); });
         for (int r = threadIdx.x; r < n; r += kThreads) {
           const int64_t query = table.q_rows[first + r];
           tile.largest[r] = inside(query, table.n_q) ? work.stats[2 * (query * heads + share.head)] : C(0);

@@ -9,21 +9,22 @@ namespace {
 // A 16 x 16 matrix of halves as multiply_add takes it: four pairs of a lane side by side.
 constexpr int kFragment = 8 * kWarp;
 
-// Features as halves, and what they were scaled by.
+// Features as halves, and what their scales are undone by.
 struct SweepHalves {
-  const __half* rows;       // [n_images, n_pixels, 2, channels], high and low
-  const __half* tiles;      // [n_images, n_tiles, channels / 16, 2, 2, kFragment]: high, low; 16 channels x 16 pixels
-  const uint32_t* largest;  // [kParts] of the features
+  const __half* rows;     // [n_images, n_pixels, 2, channels], high and low
+  const __half* tiles;    // [n_images, n_tiles, channels / 16, 2, 2, kFragment]: high, low; 16 channels x 16 pixels
+  const float* inverses;  // [n_images]
 };
 
-// largest[b]: bits of the largest finite magnitude among the values of block b.
-__global__ void __launch_bounds__(512) largest_kernel(const float* __restrict__ values, int64_t n,
+// largest[image, part]: bits of the largest finite magnitude among the values of a part of the image.
+__global__ void __launch_bounds__(512) largest_kernel(const float* __restrict__ values, int64_t n /* of an image */,
                                                       uint32_t* __restrict__ largest) {
   __shared__ uint32_t shared[16];
   uint32_t own = 0;
-  const int64_t step = int64_t{kParts} * 512;
+  values += int64_t{blockIdx.x / kParts} * n;
+  constexpr int64_t step = int64_t{kParts} * 512;
   constexpr int kLoads = 8;
-  for (int64_t first = blockIdx.x * 512 + threadIdx.x; first < n; first += kLoads * step) {
+  for (int64_t first = blockIdx.x % kParts * 512 + threadIdx.x; first < n; first += kLoads * step) {
     uint32_t loaded[kLoads];
 #pragma unroll
     for (int load = 0; load < kLoads; ++load)
@@ -43,17 +44,19 @@ __global__ void __launch_bounds__(512) largest_kernel(const float* __restrict__ 
 // A block takes 32 channels of a tile of [n_images, channels, n_pixels]. tiles: null where nobody wants them.
 __global__ void __launch_bounds__(kTileThreads)
     to_halves_kernel(const float* __restrict__ features, int64_t channels, TileSizes s,
-                     const uint32_t* __restrict__ largest, __half* __restrict__ rows, __half* __restrict__ tiles) {
+                     const uint32_t* __restrict__ largest, float* __restrict__ inverses, __half* __restrict__ rows,
+                     __half* __restrict__ tiles) {
   __shared__ float held[32][kTile + 1];
   const int64_t image = blockIdx.x / s.n_tiles;
   const int32_t tile = blockIdx.x % s.n_tiles, first = blockIdx.y * 32;
   const int lane = threadIdx.x % kWarp, eighth = threadIdx.x % 8 * 4, row = threadIdx.x / 8;
   const TilePixel pixel(tile, s);
-  const float scale = HalfScale(largest_of(largest)).scale;
+  const HalfScale scale(largest_of(largest + image * kParts));
+  if (tile == 0 && first == 0 && threadIdx.x == 0) inverses[image] = scale.inverse;
   for (int c = threadIdx.x / kWarp; c < 32; c += kTileWarps) {
     const bool here = pixel.here && first + c < channels;
     const int64_t plane = image * channels + first + c;
-    held[c][lane] = here ? features[plane * s.n_pixels + pixel.v * s.width + pixel.u] * scale : 0.0f;
+    held[c][lane] = here ? features[plane * s.n_pixels + pixel.v * s.width + pixel.u] * scale.scale : 0.0f;
   }
   __syncthreads();
   const int32_t u = tile % s.columns * kTileWidth + row % kTileWidth;
@@ -80,14 +83,16 @@ __global__ void __launch_bounds__(kTileThreads)
 // Halves of the features, and on demand tile by tile.
 SweepHalves make_halves(const char* op, const float* features, const PlaneSweep<float>& sweep, const TileSizes& s,
                         bool with_tiles, const Workspace& workspace, Stream stream) {
-  uint32_t* largest = workspace.take<uint32_t>(kParts);
+  uint32_t* largest = workspace.take<uint32_t>(sweep.n_images * kParts);
+  float* inverses = workspace.take<float>(sweep.n_images);
   __half* rows = workspace.take<__half>(sweep.n_images * s.n_pixels * 2 * s.channels);
   __half* tiles = with_tiles ? workspace.take<__half>(sweep.n_images * s.n_tiles * kTile * 2 * s.channels) : nullptr;
-  launch(op, largest_kernel, kParts, 512, 0, stream, features, sweep.n_images * sweep.channels * s.n_pixels, largest);
+  launch(op, largest_kernel, blocks_for(op, sweep.n_images * kParts, 1), 512, 0, stream, features,
+         sweep.channels * s.n_pixels, largest);
   launch(op, to_halves_kernel,
          dim3(blocks_for(op, sweep.n_images * s.n_tiles, 1), static_cast<unsigned>(s.channels / 32)), kTileThreads, 0,
-         stream, features, sweep.channels, s, largest, rows, tiles);
-  return {rows, tiles, largest};
+         stream, features, sweep.channels, s, largest, inverses, rows, tiles);
+  return {rows, tiles, inverses};
 }
 
 }  // namespace

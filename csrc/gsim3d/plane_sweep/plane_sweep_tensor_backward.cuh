@@ -16,13 +16,84 @@ constexpr int kTotalStride = kRun * kRuns + 4;
 constexpr int kCapacity = 832;  // of a tile, for all pixels that most tiles touch
 constexpr int64_t kKeptBytes = int64_t{768} << 20;
 
+// What a launch takes over from the one before it and leaves to the next: sums of pairs that did not fit one launch.
+struct Relay {
+  float* memory;  // [blocks, slots(), kTileThreads]
+  bool first, last;
+
+  static constexpr int kSums = 32;  // of a thread
+  __host__ __device__ static constexpr int slots(bool whole) { return whole ? kSums : 2 * kSums + 3; }
+  __device__ __forceinline__ float* of_thread(int64_t block) const {
+    return memory + block * slots(first && last) * kTileThreads + threadIdx.x;
+  }
+};
+
+// A thread's sums over pairs, in registers as long as one pair has the same unit as the next. Where units differ what
+// there is moves to memory, and so what the sums are does not depend on how pairs are shared among launches.
+class PairSums {
+ public:
+  float scaled[2][4][4] = {};
+  int turn = 0;
+
+  __device__ __forceinline__ PairSums(const Relay& relay, int64_t block)
+      : memory_(relay.of_thread(block)), begun_(!relay.first), moved_(!relay.first) {
+    if (relay.first) return;
+    for_sums([&](int i, float& sum) { sum = slot(kSums + i); });
+    unit_ = Unit(slot(2 * kSums), slot(2 * kSums + 1));
+    turn = __float_as_int(slot(2 * kSums + 2));
+  }
+
+  // Before the products of a pair.
+  __device__ __forceinline__ void start(const Unit& unit) {
+    if (begun_ && unit != unit_) {
+      for_sums([&](int i, float& sum) {
+        slot(i) = (moved_ ? slot(i) : 0.0f) + unit_(sum);
+        sum = 0;
+      });
+      moved_ = true;
+    }
+    begun_ = true;
+    unit_ = unit;
+  }
+
+  __device__ __forceinline__ void leave() {
+    for_sums([&](int i, float& sum) {
+      if (!moved_) slot(i) = 0;
+      slot(kSums + i) = sum;
+    });
+    slot(2 * kSums) = unit_.lesser;
+    slot(2 * kSums + 1) = unit_.greater;
+    slot(2 * kSums + 2) = __int_as_float(turn);
+  }
+
+  // The sums become what they stand for; 0 is positive.
+  __device__ __forceinline__ void finish() {
+    for_sums([&](int i, float& sum) { sum = (moved_ ? slot(i) : 0.0f) + unit_(sum); });
+  }
+
+ private:
+  static constexpr int kSums = Relay::kSums;
+
+  template <typename F>
+  __device__ __forceinline__ void for_sums(const F& f) {
+#pragma unroll
+    for (int i = 0; i < kSums; ++i) f(i, scaled[i / 16][i / 4 % 4][i % 4]);
+  }
+  __device__ __forceinline__ float& slot(int i) const { return memory_[i * kTileThreads]; }
+
+  float* memory_;
+  Unit unit_{1.0f, 1.0f};
+  bool begun_, moved_;
+};
+
 // Gradients of the scores of tiles [first_tile, first_tile + n_tiles) of every image with the sources of pairs
 // [first_pair, first_pair + n_pairs), for ranks [first_rank, first_rank + capacity) of what a tile touches.
 struct KeptScores {
   __half* rows;       // [n_pairs, n_tiles, capacity, 2, kTile], high and low
   uint32_t* runs;     // [n_pairs, height * columns, n_tiles]: who is touched in a run, above that the first one's rank
-  int32_t* counts;    // [n_pairs, n_tiles], how much a tile touches
+  int32_t* counts;    // [all pairs, all tiles], how much a tile touches
   int32_t* longest;   // the largest of them
+  float* inverses;    // [n_images], what the scale of an image's gradients is undone by
   int64_t first_pair, n_pairs;
   int32_t first_tile, n_tiles, first_rank, capacity;
 
@@ -30,8 +101,8 @@ struct KeptScores {
   __device__ __forceinline__ __half* rows_of(int64_t pair, int32_t tile) const {
     return rows + ((pair - first_pair) * n_tiles + tile - first_tile) * capacity * 2 * kTile;
   }
-  __device__ __forceinline__ int32_t* count_of(int64_t pair, int32_t tile) const {
-    return counts + (pair - first_pair) * n_tiles + tile - first_tile;
+  __device__ __forceinline__ int32_t* count_of(const TileSizes& s, int64_t pair, int32_t tile) const {
+    return counts + pair * s.n_tiles + tile;
   }
   __device__ __forceinline__ uint32_t* runs_of(const TileSizes& s, int64_t pair, int32_t run) const {
     return runs + ((pair - first_pair) * s.height * s.columns + run) * n_tiles;
@@ -187,7 +258,7 @@ int64_t backward_bytes(const TileSizes& s) {
 }
 
 // The power of two for gradients of scores: n_depths gradients of costs add up to what half precision holds.
-__device__ __forceinline__ HalfScale score_gradient_scale(const uint32_t* __restrict__ largest,
+__device__ __forceinline__ HalfScale score_gradient_scale(const uint32_t* __restrict__ largest /* of the image */,
                                                           const PlaneSweep<float>& sweep) {
   const float per_cost = static_cast<float>(sweep.n_depths) * rsqrtf(static_cast<float>(sweep.channels));
   return HalfScale(fminf(largest_of(largest) * per_cost, 0x1p126f));
@@ -197,7 +268,7 @@ __device__ __forceinline__ HalfScale score_gradient_scale(const uint32_t* __rest
 // references get.
 __global__ void __launch_bounds__(kTileThreads, 2)
     tile_gradients_kernel(const float* __restrict__ grad, const uint32_t* __restrict__ largest_grad, SweepHalves halves,
-                          PlaneSweep<float> sweep, TileSizes s, KeptScores kept, bool add,
+                          PlaneSweep<float> sweep, TileSizes s, KeptScores kept, Relay relay,
                           float* __restrict__ grad_features) {
   extern __shared__ __align__(16) char shared[];
   if (kept.over()) return;
@@ -215,27 +286,29 @@ __global__ void __launch_bounds__(kTileThreads, 2)
   const TilePixel pixel(tile, s);
   const float* own_grad = grad + image * s.n_depths * s.n_pixels + pixel.v * s.width + pixel.u;
   const Range pairs = range_of(sweep.cu_src, image, sweep.n_pairs);
-  const HalfScale scale = score_gradient_scale(largest_grad, sweep);
+  const HalfScale scale = score_gradient_scale(largest_grad + image * kParts, sweep);
+  if (tile == kept.first_tile && blockIdx.y == 0 && threadIdx.x == 0) kept.inverses[image] = scale.inverse;
   const float grad_scale = cost_scale<float>(pairs, sweep.channels) * scale.scale;
   memory.fill_depths(sweep, image);
-  float sums[2][4][4] = {};
+  PairSums sums(relay, (blockIdx.y * sweep.n_images + image) * s.n_tiles + tile);
   bool gathers = kept.first_rank == 0;
 
   const int64_t end_pair = min(pairs.end, kept.first_pair + kept.n_pairs);
   for (int64_t pair = max(pairs.begin, kept.first_pair); pair < end_pair; ++pair) {
     const int64_t source = sweep.src_images[pair];
     if (!inside(source, sweep.n_images)) continue;
-    if (kept.first_rank > 0 && *kept.count_of(pair, tile) <= kept.first_rank) continue;
+    if (kept.first_rank > 0 && *kept.count_of(s, pair, tile) <= kept.first_rank) continue;
     const TileLines lines(sweep, pair, pixel);
     const int32_t count = mark_lines(lines, memory.depths, 0, s.n_depths, s, flags, memory.sums, memory.words);
-    if (blockIdx.y == 0 && kept.first_rank == 0) {
+    if (blockIdx.y == 0) {
       keep_runs(memory.words, s, kept, pair, tile);
-      if (threadIdx.x == 0) {
-        *kept.count_of(pair, tile) = count;
+      if (kept.first_rank == 0 && threadIdx.x == 0) {
+        *kept.count_of(s, pair, tile) = count;
         atomicMax(kept.longest, count);
       }
     }
     gathers = true;
+    sums.start(Unit(scale.inverse, halves.inverses[source]));
     const int32_t end = min(count, kept.first_rank + kept.capacity);
     for (int32_t first = kept.first_rank; first < end; first += kScored) {
       const int32_t rows = min(end - first, kScored);
@@ -248,12 +321,14 @@ __global__ void __launch_bounds__(kTileThreads, 2)
       __syncthreads();
       if (warp < groups * ways)
         gather_features(halves.rows + source * s.n_pixels * 2 * s.channels + channel, s.channels, memory.list, rows,
-                        grads, warp / groups, ways, sums);
+                        grads, warp / groups, ways, sums.scaled);
       __syncthreads();
     }
   }
 
-  if (!gathers) return;
+  if (!relay.last) return sums.leave();
+  if (relay.first && !gathers) return;
+  sums.finish();
   float* total = grads;  // [channels, kScoreStride]
   const int g = lane / 4, t = lane % 4;
   for (int way = 0; way < ways; ++way) {
@@ -265,26 +340,25 @@ __global__ void __launch_bounds__(kTileThreads, 2)
 #pragma unroll
           for (int e = 0; e < 4; ++e) {
             float& sum = total[(warp % groups * 32 + 4 * g + 2 * m + e / 2) * kScoreStride + n * 8 + 2 * t + e % 2];
-            sum = way > 0 ? sum + sums[m][n][e] : sums[m][n][e];
+            sum = way > 0 ? sum + sums.scaled[m][n][e] : sums.scaled[m][n][e];
           }
     }
     __syncthreads();
   }
-  const float feature_scale = HalfScale(largest_of(halves.largest)).inverse;
   if (!pixel.here) return;
   for (int32_t c = warp; c < groups * 32; c += kTileWarps) {
     if (first_channel + c >= sweep.channels) break;
     float& to = grad_features[(image * sweep.channels + first_channel + c) * s.n_pixels + pixel.v * s.width + pixel.u];
-    const float sum = total[c * kScoreStride + lane] * scale.inverse * feature_scale;
-    to = add ? to + sum : sum;
+    const float sum = total[c * kScoreStride + lane];
+    to = kept.first_rank > 0 ? to + sum : sum;
   }
 }
 
 // A block owns kRuns runs of source pixels and adds what the kept scores give them, by pairs, then by tiles. A warp
 // takes 32 channels and every `ways`-th tile.
 __global__ void __launch_bounds__(kTileThreads, 2)
-    source_gradients_kernel(const uint32_t* __restrict__ largest_grad, SweepHalves halves, PlaneSweep<float> sweep,
-                            TileSizes s, KeptScores kept, int32_t blocks_per_image, float* __restrict__ grad_features) {
+    source_gradients_kernel(SweepHalves halves, PlaneSweep<float> sweep, TileSizes s, KeptScores kept, Relay relay,
+                            int32_t blocks_per_image, float* __restrict__ grad_features) {
   __shared__ float total[kChannels * kTotalStride];
   if (kept.over()) return;
   const int64_t image = blockIdx.x / blocks_per_image;
@@ -294,25 +368,31 @@ __global__ void __launch_bounds__(kTileThreads, 2)
   const int groups = min(s.channels - first_channel, kChannels) / 32, ways = kTileWarps / groups;
   const int32_t channel = first_channel + warp % groups * 32;
   const int way = warp / groups;
-  float sums[2][kRuns][4] = {};
-  int turn = 0;
+  PairSums sums(relay, int64_t{blockIdx.y} * gridDim.x + blockIdx.x);
+  static_assert(kRuns == 4);
+  bool gathers = false;
   for (int64_t begin = kept.first_pair; begin < kept.first_pair + kept.n_pairs; begin += kWarp) {
     const bool ours = begin + lane < kept.first_pair + kept.n_pairs && sweep.src_images[begin + lane] == image;
     for (unsigned waiting = __ballot_sync(kFullWarp, ours); waiting; waiting &= waiting - 1) {
       const int64_t pair = begin + __ffs(waiting) - 1, owner = owner_of(sweep, pair);
       if (owner < 0) continue;
+      sums.start(Unit(kept.inverses[owner], halves.inverses[owner]));
       for (int32_t first = 0; first < kept.n_tiles; first += kWarp) {
         uint32_t runs[kRuns], any = 0;
+        bool reaches = first + lane < kept.n_tiles;
+        if (kept.first_rank > 0 && reaches)
+          reaches = *kept.count_of(s, pair, kept.first_tile + first + lane) > kept.first_rank;
 #pragma unroll
         for (int i = 0; i < kRuns; ++i) {
-          const bool here = first + lane < kept.n_tiles && top + i < s.height;
+          const bool here = reaches && top + i < s.height;
           runs[i] = here ? kept.runs_of(s, pair, (top + i) * s.columns + column)[first + lane] : 0;
           const int32_t rank = runs[i] >> kRun;
           if (rank + kRun <= kept.first_rank || rank >= kept.first_rank + kept.capacity) runs[i] = 0;
           any |= runs[i] & ((1u << kRun) - 1);
         }
-        for (unsigned hits = __ballot_sync(kFullWarp, any != 0); hits; hits &= hits - 1, ++turn) {
-          if (turn % ways != way) continue;
+        for (unsigned hits = __ballot_sync(kFullWarp, any != 0); hits; hits &= hits - 1, ++sums.turn) {
+          gathers = true;
+          if (sums.turn % ways != way) continue;
           const int hit = __ffs(hits) - 1;
           const int32_t tile = kept.first_tile + first + hit;
           const uint4* own = reinterpret_cast<const uint4*>(halves.tiles) +
@@ -342,8 +422,10 @@ __global__ void __launch_bounds__(kTileThreads, 2)
             if (!touched[i]) continue;
 #pragma unroll
             for (int m = 0; m < 2; ++m) {
-              multiply_add(sums[m][i], fragments[m][0], fragments[m][2], {high[i].x, high[i].y}, {low[i].x, low[i].y});
-              multiply_add(sums[m][i], fragments[m][1], fragments[m][3], {high[i].z, high[i].w}, {low[i].z, low[i].w});
+              multiply_add(sums.scaled[m][i], fragments[m][0], fragments[m][2], {high[i].x, high[i].y},
+                           {low[i].x, low[i].y});
+              multiply_add(sums.scaled[m][i], fragments[m][1], fragments[m][3], {high[i].z, high[i].w},
+                           {low[i].z, low[i].w});
             }
           }
         }
@@ -351,6 +433,9 @@ __global__ void __launch_bounds__(kTileThreads, 2)
     }
   }
 
+  if (!relay.last) return sums.leave();
+  if (relay.first && !gathers) return;
+  sums.finish();
   for (int w = 0; w < ways; ++w) {
     if (way == w) {
 #pragma unroll
@@ -361,18 +446,16 @@ __global__ void __launch_bounds__(kTileThreads, 2)
           for (int e = 0; e < 4; ++e) {
             const int c = warp % groups * 32 + m * 16 + e / 2 * 8 + g;
             float& sum = total[c * kTotalStride + i * kRun + 2 * t + e % 2];
-            sum = w > 0 ? sum + sums[m][i][e] : sums[m][i][e];
+            sum = w > 0 ? sum + sums.scaled[m][i][e] : sums.scaled[m][i][e];
           }
     }
     __syncthreads();
   }
-  const float grad_scale = score_gradient_scale(largest_grad, sweep).inverse;
-  const float feature_scale = HalfScale(largest_of(halves.largest)).inverse;
   for (int32_t i = threadIdx.x; i < groups * 32 * kRuns * kRun; i += kTileThreads) {
     const int32_t c = i / (kRuns * kRun), at = i % (kRuns * kRun), x = column * kRun + at % kRun, y = top + at / kRun;
     if (x >= s.width || y >= s.height || first_channel + c >= sweep.channels) continue;
     grad_features[(image * sweep.channels + first_channel + c) * s.n_pixels + y * s.width + x] +=
-        total[c * kTotalStride + at] * grad_scale * feature_scale;
+        total[c * kTotalStride + at];
   }
 }
 

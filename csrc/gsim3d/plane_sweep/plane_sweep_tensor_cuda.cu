@@ -100,6 +100,7 @@ __global__ void __launch_bounds__(kTileThreads, 2)
   const int64_t image_size = int64_t{s.n_pixels} * 2 * s.channels;
   const Range pairs = range_of(sweep.cu_src, image, sweep.n_pairs);
   memory.fill_depths(sweep, image);
+  const float own_inverse = halves.inverses[image];
   int32_t held = -1;  // the first of the channels in `own`
 
   for (int32_t first_depth = 0; first_depth < s.n_depths; first_depth += kDepths * kTileWarps) {
@@ -109,6 +110,7 @@ __global__ void __launch_bounds__(kTileThreads, 2)
       const int64_t source = sweep.src_images[pair];
       if (!inside(source, sweep.n_images)) continue;
       const TileLines lines(sweep, pair, pixel);
+      const float source_inverse = halves.inverses[source];  // on its way while the lines are marked
       const int32_t count =
           mark_lines(lines, memory.depths, first_depth, end_depth, s, flags, memory.sums, memory.words);
       for (int32_t first = 0; first < count; first += kScored) {
@@ -127,6 +129,7 @@ __global__ void __launch_bounds__(kTileThreads, 2)
                      scores);
         }
         __syncthreads();
+        const Unit unit(own_inverse, source_inverse);
 #pragma unroll
         for (int j = 0; j < kDepths; ++j) {
           const int32_t k = first_depth + warp + j * kTileWarps;
@@ -139,19 +142,18 @@ __global__ void __launch_bounds__(kTileThreads, 2)
           };
           const uint32_t above = rank_of(memory.words, top) - first;
           const uint32_t below = rank_of(memory.words, top + s.stride) - first;
-          costs[j] += interpolate(score(above), score(above + 1), score(below), score(below + 1), place.fx, place.fy);
+          costs[j] +=
+              unit(interpolate(score(above), score(above + 1), score(below), score(below + 1), place.fx, place.fy));
         }
         __syncthreads();
       }
     }
-    const HalfScale scale(largest_of(halves.largest));
     const float mean = pairs.begin < pairs.end ? cost_scale<float>(pairs, sweep.channels) : 0.0f;
 #pragma unroll
     for (int j = 0; j < kDepths; ++j) {
       const int32_t k = first_depth + warp + j * kTileWarps;
       if (k < end_depth && pixel.here)
-        cost[(image * s.n_depths + k) * s.n_pixels + pixel.v * s.width + pixel.u] =
-            costs[j] * scale.inverse * mean * scale.inverse;
+        cost[(image * s.n_depths + k) * s.n_pixels + pixel.v * s.width + pixel.u] = costs[j] * mean;
     }
   }
 }
@@ -185,27 +187,36 @@ void tensor_sweep_vjp(const char* op, const float* grad, const float* features, 
   const unsigned blocks_of_channels = static_cast<unsigned>((s.channels + kChannels - 1) / kChannels);
   const int32_t blocks_per_image = (s.height + kRuns - 1) / kRuns * s.columns;
   const SweepHalves halves = make_halves(op, features, sweep, s, true, workspace, stream);
-  uint32_t* largest_grad = workspace.take<uint32_t>(kParts);
-  launch(op, largest_kernel, kParts, 512, 0, stream, grad, sweep.n_images * s.n_depths * s.n_pixels, largest_grad);
+  uint32_t* largest_grad = workspace.take<uint32_t>(sweep.n_images * kParts);
+  launch(op, largest_kernel, blocks_for(op, sweep.n_images * kParts, 1), 512, 0, stream, grad,
+         int64_t{s.n_depths} * s.n_pixels, largest_grad);
   KeptScores kept{workspace.take<__half>(pairs * tiles * capacity * 2 * kTile),
-                  workspace.take<uint32_t>(pairs * tiles * n_runs), workspace.take<int32_t>(pairs * tiles),
-                  workspace.take<int32_t>(1)};
+                  workspace.take<uint32_t>(pairs * tiles * n_runs),
+                  workspace.take<int32_t>(sweep.n_pairs * s.n_tiles),
+                  workspace.take<int32_t>(1),
+                  workspace.take<float>(sweep.n_images)};
   kept.capacity = static_cast<int32_t>(capacity);
   fill_zero(op, kept.longest, 1, stream);
-  if (!whole) fill_zero(op, grad_features, sweep.n_images * sweep.channels * s.n_pixels, stream);
-  for (kept.first_pair = 0; kept.first_pair < sweep.n_pairs; kept.first_pair += pairs) {
-    kept.n_pairs = std::min(pairs, sweep.n_pairs - kept.first_pair);
-    for (int64_t tile = 0; tile < s.n_tiles; tile += tiles) {
-      kept.first_tile = static_cast<int32_t>(tile);
-      kept.n_tiles = static_cast<int32_t>(std::min(tiles, s.n_tiles - tile));
-      for (int64_t rank = 0; rank < most; rank += capacity) {
-        kept.first_rank = static_cast<int32_t>(rank);
+  // A block has one tile, or one block of an image; of sums in memory only those of one kernel at once where no
+  // launch leaves any to the next.
+  const int64_t slots = int64_t{Relay::slots(whole)} * kTileThreads * blocks_of_channels * sweep.n_images;
+  float* of_tiles = workspace.take<float>(slots * (whole ? std::max(s.n_tiles, blocks_per_image) : s.n_tiles));
+  float* of_sources = whole ? of_tiles : workspace.take<float>(slots * blocks_per_image);
+  for (int64_t rank = 0; rank < most; rank += capacity) {
+    kept.first_rank = static_cast<int32_t>(rank);
+    for (kept.first_pair = 0; kept.first_pair < sweep.n_pairs; kept.first_pair += pairs) {
+      kept.n_pairs = std::min(pairs, sweep.n_pairs - kept.first_pair);
+      const bool first = kept.first_pair == 0, last = kept.first_pair + kept.n_pairs == sweep.n_pairs;
+      for (int64_t tile = 0; tile < s.n_tiles; tile += tiles) {
+        kept.first_tile = static_cast<int32_t>(tile);
+        kept.n_tiles = static_cast<int32_t>(std::min(tiles, s.n_tiles - tile));
         launch(op, tile_gradients_kernel, dim3(blocks_for(op, sweep.n_images * kept.n_tiles, 1), blocks_of_channels),
-               kTileThreads, bytes, stream, grad, largest_grad, halves, sweep, s, kept, !whole || rank > 0,
+               kTileThreads, bytes, stream, grad, largest_grad, halves, sweep, s, kept, Relay{of_tiles, first, last},
                grad_features);
         launch(op, source_gradients_kernel,
                dim3(blocks_for(op, sweep.n_images * blocks_per_image, 1), blocks_of_channels), kTileThreads, 0, stream,
-               largest_grad, halves, sweep, s, kept, blocks_per_image, grad_features);
+               halves, sweep, s, kept, Relay{of_sources, first && tile == 0, last && tile + tiles >= s.n_tiles},
+               blocks_per_image, grad_features);
       }
     }
   }

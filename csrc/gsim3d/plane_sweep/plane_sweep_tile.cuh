@@ -5,8 +5,8 @@
 // and scores of the tile with that list are a dense product. Source pixels are counted in a table with a border of one
 // pixel around the image: whatever a sample inside meets is in the table, and pixels of the border have feature 0.
 //
-// A number is kept as the sum of two halves after all have been scaled by one power of two, so that the largest lies
-// below 2^14: 22 bits of what is not far smaller than the largest.
+// A number is kept as the sum of two halves after all of its image have been scaled by one power of two, so that the
+// largest lies below 2^14: 22 bits of what is not far smaller than the largest.
 #pragma once
 
 #include <cuda_fp16.h>
@@ -211,15 +211,24 @@ struct HalfScale {
   }
 };
 
-// Largest finite magnitudes of parts of an array.
-constexpr int kParts = 8 * kWarp;
+// What products of two scaled numbers are multiplied by. The smaller factor comes first: nothing overflows on the way
+// that does not in the end.
+struct Unit {
+  float lesser, greater;
+
+  __device__ __forceinline__ Unit(float a, float b) : lesser(fminf(a, b)), greater(fmaxf(a, b)) {}
+  __device__ __forceinline__ float operator()(float product) const { return product * lesser * greater; }
+  __device__ __forceinline__ bool operator!=(const Unit& other) const {
+    return lesser != other.lesser || greater != other.greater;
+  }
+};
+
+// Parts of an image whose largest finite magnitudes are found apart from each other: one for each lane.
+constexpr int kParts = kWarp;
 
 // By a whole warp.
-__device__ __forceinline__ float largest_of(const uint32_t* __restrict__ parts) {
-  uint32_t largest = 0;
-#pragma unroll
-  for (int i = 0; i < kParts; i += kWarp) largest = max(largest, parts[i + threadIdx.x % kWarp]);
-  return __uint_as_float(__reduce_max_sync(kFullWarp, largest));
+__device__ __forceinline__ float largest_of(const uint32_t* __restrict__ parts /* of the image */) {
+  return __uint_as_float(__reduce_max_sync(kFullWarp, parts[threadIdx.x % kWarp]));
 }
 
 __device__ __forceinline__ float4 load4(const float* from) { return *reinterpret_cast<const float4*>(from); }

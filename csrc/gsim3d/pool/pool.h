@@ -62,7 +62,7 @@ void unpool_vjp(const T* grad, const Segments& segments, int64_t channels, T* gr
 
 }  // namespace cpu
 
-// The same functions on the device of `stream`. A row outside [0, n_rows) is skipped.
+// The same functions on the device of `stream`. A row outside [0, n_rows) is skipped, one that is not listed becomes 0.
 namespace cuda {
 
 template <typename T>

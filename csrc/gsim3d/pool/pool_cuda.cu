@@ -108,8 +108,7 @@ __global__ void sum_by_warp_kernel(const T* __restrict__ x, Segments segments, i
   }
 }
 
-// Every row of a segment gets the segment's value, divided by its size for the mean; rows listed behind the last
-// segment get 0.
+// Every row of a segment gets the segment's value, divided by its size for the mean.
 template <typename T, int N, bool kMean>
 __global__ void spread_kernel(const T* __restrict__ x, Segments segments, int64_t channels, T* __restrict__ out) {
   Place at;
@@ -123,11 +122,6 @@ __global__ void spread_kernel(const T* __restrict__ x, Segments segments, int64_
   for (int64_t i = range.begin; i < range.end; ++i) {
     const int64_t row = segments.rows[i];
     if (inside(row, segments.n_rows)) store(out + row * channels + at.channel, value);
-  }
-  const int64_t end = max(segments.cu_rows[segments.n_segments], int64_t{0});
-  for (int64_t i = end + at.segment; i < segments.n_listed; i += segments.n_segments) {
-    const int64_t row = segments.rows[i];
-    if (inside(row, segments.n_rows)) store(out + row * channels + at.channel, Pack<T, N>{});
   }
 }
 
@@ -153,8 +147,7 @@ void add_up(const char* op, const T* x, const Segments& segments, int64_t channe
 
 template <typename T, bool kMean>
 void spread(const char* op, const T* x, const Segments& segments, int64_t channels, T* out, Stream stream) {
-  if (segments.n_listed != segments.n_rows || segments.n_segments == 0)
-    fill_zero(op, out, segments.n_rows * channels, stream);
+  fill_zero(op, out, segments.n_rows * channels, stream);  // rows that no segment has are known to the device only
   by_width<T>(channels, x, out, [&]<int N>() {
     launch(op, spread_kernel<T, N, kMean>, blocks_for(op, segments.n_segments * (channels / N), kThreads), kThreads, 0,
            stream, x, segments, channels, out);

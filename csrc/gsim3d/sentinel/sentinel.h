@@ -60,7 +60,7 @@ void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended,
 
 }  // namespace cpu
 
-// Offsets and scenes are not checked; none is read out of bounds.
+// Offsets and scenes are not checked; none is read out of bounds, and the status of a row of no cloud is 0.
 namespace cuda {
 
 template <typename T>

@@ -191,7 +191,9 @@ template <typename T>
 void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* record,
                 const Workspace& workspace, Stream stream) {
   const int64_t n_pieces = blocks_for(kWatch, rows.n_rows, kPiece);
-  double* partial = workspace.take<double>((n_pieces + rows.n_clouds) * watched_columns(rows.n_fields));
+  const int64_t n_partial = (n_pieces + rows.n_clouds) * watched_columns(rows.n_fields);
+  double* partial = workspace.take<double>(n_partial);
+  fill_zero(kWatch, partial, n_partial, stream);  // offsets that do not ascend leave some out
   launch(kWatch, look_kernel<T>, static_cast<unsigned>(n_pieces), kPiece, 0, stream, rows, mended, status, partial);
   launch(kWatch, join_kernel<T>, static_cast<unsigned>(std::min<int64_t>(rows.n_clouds, 1 << 16)), kTeams * kWarp, 0,
          stream, rows, static_cast<const double*>(partial), record);

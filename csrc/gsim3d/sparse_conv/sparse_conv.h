@@ -76,7 +76,8 @@ void sparse_conv_vjp_weight(const T* grad,  // [n_rows, c_out]
 
 }  // namespace cpu
 
-// As on the CPU, with device memory and on a stream. Indices are not checked: pairs and rows out of range take no part.
+// As on the CPU, with device memory and on a stream. Indices are not checked: pairs and rows out of range take no part,
+// and rows that are not listed become 0.
 namespace cuda {
 
 // The tables of a map for 16-bit convolutions, which make them anew where the map has none.

@@ -299,6 +299,7 @@ template <typename E, bool kGradient>
 void convolve(const char* op, const E* x, const E* weight, const E* bias, const SparseConvMap& map, int64_t c_in,
               int64_t c_out, E* y, const Workspace& workspace, Stream stream) {
   check_sizes(op, map, c_in, c_out);
+  fill_zero(op, y, map.n_rows * (kGradient ? c_in : c_out), stream);  // rows that no list has
   const int64_t taps = taps_of(map);
   const Padded<E> rows = padded(op, x, map.n_rows, kGradient ? c_out : c_in, workspace, stream);
   const Padded<E> weights =
