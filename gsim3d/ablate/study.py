@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from gsim3d.ablate.rows import Row
-from gsim3d.ablate.table import as_dict, markdown
+from gsim3d.ablate.table import METHODS, PSNRS, as_dict, markdown
 from gsim3d.data import Scene, split_scenes
 from gsim3d.effects import EffectsSpec
 from gsim3d.errors import HardCaseError, InputError
@@ -25,13 +25,11 @@ from gsim3d.train.config import TrainConfig
 from gsim3d.train.log import LOG
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import check_device, model_config, restore
-from gsim3d.train.samples import check_scenes
+from gsim3d.train.samples import check_scenes, context_cameras, spread_views
 from gsim3d.train.settings import to_dict
 from gsim3d.train.thawing import check_thawing
 
 SCORE = "score.json"
-METRICS = ("psnr", "psnr_masked")
-BASELINES = ("constant", "copy")
 
 
 class Study:
@@ -40,7 +38,8 @@ class Study:
     Args:
         base: the run that rows change.
         rows: to train; the others are compared with the first one.
-        folders: of all scenes; those that `gsim3d train` holds out are scored, over the same steps for all rows.
+        folders: of all scenes; those that `gsim3d train` holds out are scored, over the same steps and from the same cameras for
+            all rows.
         n_seeds: runs of each row, which differ in their seed.
         device: "cpu" or "cuda".
     Raises:
@@ -64,6 +63,7 @@ class Study:
         self.configs = {row.name: self._checked(row) for row in rows}
         self.n_given = max(config.data.history for config in self.configs.values())
         self.n_future = min(horizon(scene, self.n_given, None) for scene in self.test)
+        self.targets = [self._targets(scene) for scene in self.test]
 
     def _checked(self, row: Row) -> TrainConfig:
         """The row's run, all of its model written out; everything that can be known before training is checked."""
@@ -72,12 +72,19 @@ class Study:
             model, effects = model_config(config), EffectsSpec.from_dict(config.effects)
             config = dataclasses.replace(config, model=to_dict(model), effects=effects.to_dict())
             check_scenes(self.train, config.data, config.stages)
+            check_scenes(self.test, config.data, ())
             check_history(config, make_plan(effects, model))
             check_thawing(config.data, model.dynamics)
             check_sharing(config, 1, model.dynamics.norm)
         except InputError as error:
             raise InputError(f"row {row.name}: {error}") from None
         return config
+
+    def _targets(self, scene: Scene) -> list[int]:
+        """Cameras that are no input of any row, as far as there are any."""
+        kept = list(self.base.data.target_only_cameras)
+        inputs = {cam for config in self.configs.values() for cam in _context(scene, config)}
+        return kept or sorted(set(range(scene.n_cams)) - inputs) or list(range(scene.n_cams))
 
     def same_as(self, name: str) -> str:
         """The first row whose run is that of the row ``name``: itself, where no earlier one is the same."""
@@ -115,6 +122,7 @@ class Study:
             "train": to_dict(config),
             "scenes": [[scene.name for scene in part] for part in (self.train, self.test)],
             "steps": [self.n_given, self.n_future],
+            "cameras": self.targets,
         }
         known = _read(folder / SCORE)
         if all(known.get(name) == value for name, value in asked.items()):
@@ -123,18 +131,22 @@ class Study:
         trainer.run(progress=progress)
         restored = restore(folder, self.device)
         start = self.n_given - config.data.history
+        same = {"start": start, "n_future": self.n_future, "metrics": tuple(PSNRS)}
         scores = [
-            score_scene(restored, scene, start=start, n_future=self.n_future, metrics=METRICS) for scene in self.test
+            score_scene(restored, scene, context_cams=_context(scene, config), target_cams=cams, **same)
+            for scene, cams in zip(self.test, self.targets, strict=True)
         ]
         summary = summarize(scores)
         result = {
-            f"{prefix}{metric}": summary.get(f"{prefix}future.{metric}")
-            for prefix in ("", *(f"{method}." for method in BASELINES))
-            for metric in METRICS
+            f"{method}{metric}": summary.get(f"{method}future.{metric}") for metric in PSNRS for method in METHODS
         }
         result["step_seconds"] = _step_seconds(folder, config)
         write_json(folder / SCORE, {**asked, "device": self.device, "result": result})
         return result
+
+
+def _context(scene: Scene, config: TrainConfig) -> list[int]:
+    return spread_views(context_cameras(scene, config.data), config.data.context_views, 0)
 
 
 def _read(file: Path) -> dict:

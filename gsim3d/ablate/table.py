@@ -15,15 +15,9 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 ENOUGH = 3  # runs of a row that tell a difference from chance
-VALUES = (
-    "psnr_masked",
-    "constant.psnr_masked",
-    "copy.psnr_masked",
-    "psnr",
-    "constant.psnr",
-    "copy.psnr",
-    "step_seconds",
-)
+PSNRS = {"psnr_masked": "PSNR masked", "psnr": "PSNR", "psnr_body": "PSNR body"}
+METHODS = ("", "constant.", "copy.")
+VALUES = (*(f"{method}{metric}" for metric in PSNRS for method in METHODS), "step_seconds")
 
 
 def as_dict(study: Study, results: dict[str, list[dict]], command: str) -> dict:
@@ -82,21 +76,14 @@ def _compared(row: dict, first: dict, metric: str) -> dict:
 def markdown(content: dict) -> str:
     """The table for people, and what a reader of it must know."""
     rows, n_seeds = content["rows"], content["seeds"]
-    head = [
-        "row",
-        "what differs",
-        "PSNR masked",
-        "constant, copy",
-        "PSNR",
-        "constant, copy",
-        f"against {rows[0]['row']}",
-    ]
-    lines = [_line([*head, "s a step", "paper"]), _line(["---"] * (len(head) + 2))]
+    head = ["row", "what differs", *(cell for label in PSNRS.values() for cell in (label, "constant, copy"))]
+    head += [f"against {rows[0]['row']}", "s a step", "paper"]
+    lines = [_line(head), _line(["---"] * len(head))]
     for row in rows:
         cells = [row["row"], row["differs"]]
-        for metric in ("psnr_masked", "psnr"):
-            held = ", ".join(_number(row.get(f"{baseline}.{metric}")) for baseline in ("constant", "copy"))
-            cells += [_number(row.get(metric)), held]
+        for metric in PSNRS:
+            values = [_number(row.get(f"{method}{metric}")) for method in METHODS]
+            cells += [values[0], ", ".join(values[1:])]
         seconds = row.get("step_seconds")
         cells += [_against(row), "-" if seconds is None else f"{seconds:.3g}", row["paper"] or "-"]
         lines.append(_line(cells))
@@ -104,9 +91,9 @@ def markdown(content: dict) -> str:
     lines += [
         "",
         f"Base run: preset {base['preset']}, {sum(stage['steps'] for stage in base['stages'])} optimizer steps, "
-        f"{scenes['trained']} scenes; scored on {scenes['held_out']} held-out scenes, {steps['predicted']} steps predicted "
-        f"after step {steps['before']}, {n_seeds} {'seed' if n_seeds == 1 else 'seeds'}, {content['machine']['device']}. "
-        "PSNR in dB, means over the seeds; masked: without background; constant: the row's own last encoded particles held "
+        f"{scenes['trained']} scenes trained on, {scenes['held_out']} held out and scored; {steps['predicted']} steps predicted "
+        f"after the first {steps['before']}; {n_seeds} {'seed' if n_seeds == 1 else 'seeds'}, {content['machine']['device']}. "
+        "PSNR in dB, means over the seeds; masked: without background; body: what may move; constant: the row's own last encoded particles held "
         "still; copy: the last given image. Seconds are those of an optimizer step, the median of the last stage. The "
         "paper's numbers are PSNR of its own data and budget (docs/accuracy-time.md says where they contradict each other): "
         "compare differences, not values.",
@@ -136,7 +123,7 @@ def _against(row: dict) -> str:
         return "failed" if any("failure" in run for run in row["runs"]) else "-"
     if row["tie"]:
         return f"tie (within {row['spread']:.2f})"
-    return f"{row['difference']:+.2f}"
+    return f"{round(row['difference'], 2) + 0.0:+.2f}"
 
 
 def _line(cells: list[str]) -> str:

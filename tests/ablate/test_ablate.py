@@ -121,6 +121,13 @@ def test_rows_of_other_histories_are_scored_over_the_same_steps(folders, tmp_pat
     assert "is latent" in markdown(content) and not (tmp_path / "history-2").exists()
 
 
+def test_rows_of_other_views_are_seen_by_cameras_that_none_was_given(folders):
+    base = dataclasses.replace(BASE, data=dataclasses.replace(BASE.data, target_only_cameras=()))
+    assert Study(base, rows_named("latent"), folders).targets == [[1, 3, 4]]  # inputs are 0 and 2
+    assert Study(base, rows_named("latent,views-3"), folders).targets == [[4]]  # and 0, 1, 3
+    assert study(folders, "latent,views-1").targets == [[3]]
+
+
 def test_differences_within_the_spread_of_seeds_are_a_tie(folders):
     asked = study(folders, "latent,no-tem,rollout-2", n_seeds=3)
 
