@@ -122,7 +122,7 @@ def test_devices_raise_alike(devices):
     grid, cloud = torch.zeros(2, 3, dtype=torch.int64), torch.zeros(2, dtype=torch.int64)
     with pytest.raises(ValueError, match=r"depth must be in \[1, 16\]; got 17"):
         curve_encode(grid.to(devices[1]), None, "z", depth=17)
-    with pytest.raises(ValueError, match="cloud must be on cuda:0 like the first argument; got cpu"):
+    with pytest.raises(TypeError, match="cloud is on cpu, but grid on cuda:0"):
         curve_encode(grid.to(devices[1]), cloud, "z")
 
 

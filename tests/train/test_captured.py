@@ -61,6 +61,7 @@ def test_gradients_are_those_of_the_loss(lead, scenes, trainer, device):
         batch = batch.to(device)
         loss, errors = trainer.loss(batch)
         expected = torch.autograd.grad(loss, list(trainer.parameters.values()), allow_unused=True)
+        loss = loss.detach()  # a capture waits for the stream of every graph that is kept
         particles = trainer.simulator.encode(batch.context)
         later = captured(particles, batch, trainer.step_weights(batch), report)
         encoder = list(trainer.simulator.encoder.parameters())
@@ -87,9 +88,11 @@ def test_what_needs_more_room_gets_it(scenes, trainer, device):
     captured(near, batch, weights, report)  # few cells, then many
     (step,) = captured._steps.values()
     step._capacities = [dataclasses.replace(c, sizes=(c.sizes[0], *(1 for _ in c.sizes[1:]))) for c in step._capacities]
+    step._capture()  # a graph with room for next to nothing
+    made = captured.captures
     again = captured(particles, batch, weights, report)
     torch.testing.assert_close(again.loss, loss, rtol=TOLERANCE[device.type], atol=0)
-    assert captured.captures >= 2
+    assert captured.captures > made
 
 
 def test_weights_are_read_anew(scenes, trainer, device):

@@ -103,6 +103,7 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
   const T scale = cost_scale<T>(pairs, sweep.channels);
   const int64_t end = min(pairs.end, lines.first_pair + lines.n_pairs);
   for (int64_t pair = max(pairs.begin, lines.first_pair); pair < end; ++pair) {
+    if (owner_of(sweep, pair) != image) continue;  // of images whose pairs overlap, one keeps its lines
     __syncwarp();
     const bool known = inside(sweep.src_images[pair], sweep.n_images);
     const int32_t count = known ? trace(sweep, s, image, pair, pixel, line) : 0;
@@ -157,7 +158,7 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, sizeof(T) == 4 ? 3 : 2)
   const int64_t end = min(pairs.end, lines.first_pair + lines.n_pairs);
   for (int64_t pair = max(pairs.begin, lines.first_pair); pair < end; ++pair) {
     const int64_t source = sweep.src_images[pair];
-    if (!inside(source, sweep.n_images)) continue;
+    if (!inside(source, sweep.n_images) || owner_of(sweep, pair) != image) continue;
     const T* from = pixels.at(s, source, 0) + channel;
     int32_t held = 0;
     const auto flush = [&] {
