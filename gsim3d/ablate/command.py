@@ -9,10 +9,10 @@ Every row is the base run with one thing changed, trained on the same scenes for
 that `gsim3d train` holds out, all rows over the same steps. The base run is CONFIG (as of gsim3d train) or, without it,
 the paper's history, views and horizon at the size of --preset. --list names the rows.
 
-Written to DIR: ablation.md and ablation.json (one table: PSNR beside baselines, seconds a step, the paper's number), and
-a run folder ROW/seed_N for each training. Stopped and started again, it goes on where it was; rows that are done stay, and
-more rows or seeds may be asked for later. Differences are against the first row; with --seeds, those smaller than what the
-seed alone does are a tie.
+Written to DIR: ablation.md and ablation.json (one table: PSNR beside baselines, seconds a step, the paper's number) and
+a run folder ROW/seed_N for each training. Stopped and started again, it goes on where it was; rows that are done stay.
+More rows or seeds may be asked for later; the table has those of the last call. Differences are against its first row;
+with --seeds, those that are not larger than what the seed alone does are a tie. How to read it: docs/accuracy-time.md.
 
 examples:
   gsim3d ablate --list

@@ -19,7 +19,7 @@ DEFAULT_ROWS = ("latent", "explicit", "no-tem")
 
 @dataclass(frozen=True)
 class Row:
-    """differs: from the base run, in words.   paper: the published PSNR [dB], where it is known, with what is odd in it."""
+    """differs: from the base run, in words.   paper: the published PSNR [dB] where known, and what is odd in it."""
 
     name: str
     differs: str
@@ -28,7 +28,7 @@ class Row:
 
 
 def base_run(preset: str = "tiny") -> TrainConfig:
-    """The run that rows change where none is given: the paper's history, views and horizon as far as the preset goes."""
+    """The run that rows change where none is given: the paper's history and horizon as far as the preset goes."""
     config = TrainConfig(preset=preset)
     history = min(HISTORY, 2 ** model_config(config).dynamics.history_bits)
     rate = LEARNING_RATES.get(preset, StageConfig.learning_rate)
@@ -37,7 +37,7 @@ def base_run(preset: str = "tiny") -> TrainConfig:
 
 
 def with_steps(config: TrainConfig, n_steps: int) -> TrainConfig:
-    """The run in ``n_steps`` optimizer steps, shared by its stages as before. Raises InputError where they are too few."""
+    """The run in ``n_steps`` optimizer steps, shared by its stages as before. Raises InputError: they are too few."""
     if n_steps < len(config.stages):
         raise InputError(f"--steps: must be at least {len(config.stages)}, one for each stage; got {n_steps}")
     before = config.n_steps

@@ -38,8 +38,8 @@ class Study:
     Args:
         base: the run that rows change.
         rows: to train; the others are compared with the first one.
-        folders: of all scenes; those that `gsim3d train` holds out are scored, over the same steps and from the same cameras for
-            all rows.
+        folders: of all scenes; those that `gsim3d train` holds out are scored, over the same steps and from the same
+            cameras for all rows.
         n_seeds: runs of each row, which differ in their seed.
         device: "cpu" or "cuda".
     Raises:
@@ -128,6 +128,8 @@ class Study:
         if all(known.get(name) == value for name, value in asked.items()):
             return known["result"]
         trainer = Trainer(config, self.train, folder, device=self.device)
+        if not trainer.same_scenes:
+            raise InputError(f"{folder}: was trained on fewer scenes than are given now; use another folder")
         trainer.run(progress=progress)
         restored = restore(folder, self.device)
         start = self.n_given - config.data.history

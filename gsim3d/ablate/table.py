@@ -18,14 +18,19 @@ ENOUGH = 3  # runs of a row that tell a difference from chance
 PSNRS = {"psnr_masked": "PSNR masked", "psnr": "PSNR", "psnr_body": "PSNR body"}
 METHODS = ("", "constant.", "copy.")
 VALUES = (*(f"{method}{metric}" for metric in PSNRS for method in METHODS), "step_seconds")
+EXPLAINED = """\
+PSNR in dB, means over the seeds; masked: without background; body: what may move; constant: the row's own last encoded
+particles held still; copy: the last given image. Seconds are those of an optimizer step, the median of the last stage.
+The paper's numbers are PSNR of its own data and budget (docs/accuracy-time.md says where they contradict each other):
+compare differences, not values."""
 
 
 def as_dict(study: Study, results: dict[str, list[dict]], command: str) -> dict:
     """What ablation.json holds.
 
-    Of each row: what differs, the paper's number, ``runs`` (by seed) and their means; ``difference`` to the first row in
-    dB of masked PSNR (of all pixels where scenes have no masks), ``spread``: how far apart runs of one row are at most,
-    of either row; ``tie``: whether the difference is within it, null with one seed. ``same_as``: the row that it is.
+    Of each row: what differs, the paper's number, ``runs`` (by seed) and their means; ``difference`` to the first row
+    in dB of masked PSNR (of all pixels where scenes have no masks); ``spread``: how far apart runs of one row are at
+    most, of either row; ``tie``: whether the difference is within it, null with one seed; ``same_as``: the row it is.
 
     Args:
         results: by the name of a row whose run is its own, by seed; those that are done.
@@ -87,26 +92,22 @@ def markdown(content: dict) -> str:
         seconds = row.get("step_seconds")
         cells += [_against(row), "-" if seconds is None else f"{seconds:.3g}", row["paper"] or "-"]
         lines.append(_line(cells))
-    base, scenes, steps = content["base"], content["scenes"], content["steps"]
-    lines += [
-        "",
-        f"Base run: preset {base['preset']}, {sum(stage['steps'] for stage in base['stages'])} optimizer steps, "
-        f"{scenes['trained']} scenes trained on, {scenes['held_out']} held out and scored; {steps['predicted']} steps predicted "
-        f"after the first {steps['before']}; {n_seeds} {'seed' if n_seeds == 1 else 'seeds'}, {content['machine']['device']}. "
-        "PSNR in dB, means over the seeds; masked: without background; body: what may move; constant: the row's own last encoded particles held "
-        "still; copy: the last given image. Seconds are those of an optimizer step, the median of the last stage. The "
-        "paper's numbers are PSNR of its own data and budget (docs/accuracy-time.md says where they contradict each other): "
-        "compare differences, not values.",
-        "",
-        _of_ties(n_seeds),
-        "",
-        f"Made by `{content['command']}`",
-    ]
+    lines += ["", _conditions(content), "", EXPLAINED, "", _of_ties(n_seeds), "", f"Made by `{content['command']}`"]
     for row in rows:
         for run in row["runs"]:
             if "failure" in run:
                 lines += ["", f"{row['row']} failed: {run['failure']}"]
     return "\n".join(lines) + "\n"
+
+
+def _conditions(content: dict) -> str:
+    base, scenes, steps, n_seeds = (content[name] for name in ("base", "scenes", "steps", "seeds"))
+    budget = sum(stage["steps"] for stage in base["stages"])
+    return (
+        f"Base run: preset {base['preset']}, {budget} optimizer steps; {scenes['trained']} scenes trained on, "
+        f"{scenes['held_out']} held out and scored; {steps['predicted']} steps predicted after the first "
+        f"{steps['before']}; {n_seeds} {'seed' if n_seeds == 1 else 'seeds'}; {content['machine']['device']}."
+    )
 
 
 def _of_ties(n_seeds: int) -> str:

@@ -183,3 +183,7 @@ def test_a_folder_of_another_run_is_refused(folders, tmp_path):
     other = Study(with_steps(BASE, 3), rows_named("latent"), folders)
     with pytest.raises(InputError, match="was started with another 'stages'"):
         other.run(tmp_path, "c", progress=False, say=quiet)
+    fewer = Study(BASE, rows_named("latent"), folders[:2])
+    fewer.run(tmp_path / "fewer", "c", progress=False, say=quiet)
+    with pytest.raises(InputError, match="was trained on fewer scenes than are given now"):
+        study(folders, "latent").run(tmp_path / "fewer", "c", progress=False, say=quiet)
