@@ -57,7 +57,7 @@ tests() {
   "$PYTHON" -c 'import xdist' 2>/dev/null && parallel=(-n "$(($(nproc) < 14 ? $(nproc) : 14))" --dist load)
   # What the hard cases measured: python tools/stability.py --add FILE puts it into docs/stability.md.
   GSIM3D_REQUIRE_CUDA=1 GSIM3D_STABILITY_JSON="$STATE/stability.json" OMP_NUM_THREADS=1 \
-    "$PYTHON" -m pytest -q "${parallel[@]}" tests -m "gpu and not slow"
+    "$PYTHON" -m pytest -q "${parallel[@]}" tests/stability tests -m "gpu and not slow"
 }
 
 sanitize() {

@@ -4,6 +4,7 @@ The GPU's cases are voxels of a closed surface in random order: "surface" is one
 about 10 occupied cells of 27 around each (itself included); "sparse" has points far apart, as at the finest stage.
 """
 
+import dataclasses
 import math
 import time
 
@@ -102,6 +103,13 @@ def tables_of(cells: torch.Tensor) -> tuple[Voxels, KernelMap]:
     return voxels, KernelMap(KERNEL, torch.cat(tap_in), torch.cat(tap_out), torch.tensor(counts, device=cells.device))
 
 
+def with_plan(voxels: Voxels, kernel_map: KernelMap) -> KernelMap:
+    """The map with its plan, which all blocks of a stage share, like spconv's cached map."""
+    taps = kernel_map.tap_in, kernel_map.tap_out, kernel_map.cu_taps
+    plan = torch.ops.gsim3d.sparse_conv_plan(voxels.row_voxel, voxels.rows, voxels.cu_rows, *taps, kernel_map.kernel_size)
+    return dataclasses.replace(kernel_map, plan=plan)
+
+
 def spconv_form(cells: torch.Tensor, channels: int, dtype: torch.dtype):
     """spconv's SubMConv3d as a function of (x, weight, bias), its map cached; None where spconv cannot do it."""
     if dtype == torch.bfloat16:
@@ -144,6 +152,7 @@ def gpu(bench):
     ):
         cells = surface_cells(n, kind)
         voxels, kernel_map = tables_of(cells)
+        planned = with_plan(voxels, kernel_map)
         generator = torch.Generator(device="cuda").manual_seed(channels)
         x = 0.5 * torch.randn(n, channels, generator=generator, device="cuda")
         weight = torch.randn(channels, KERNEL, KERNEL, KERNEL, channels, generator=generator, device="cuda")
@@ -154,7 +163,7 @@ def gpu(bench):
             forms["spconv"] = spconv
 
         def ours(x, weight, bias):
-            return sparse_conv(x, weight, bias, voxels, kernel_map)
+            return sparse_conv(x, weight, bias, voxels, planned)
 
         runs = with_gradients(inputs, ours, *forms.values())
         exact, wide = [], [t.double() for t in inputs]

@@ -48,8 +48,8 @@ std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
   for (size_t f = 0; f < previous.size(); ++f) {
     const std::string name = "previous[" + std::to_string(f) + "]";
     const auto own = previous[f].sizes(), wanted = fields[f].sizes();
-    check(std::equal(own.begin(), own.end(), wanted.begin(), wanted.end()), op, ": ", name, " must have the shape of its field, ",
-          shape_of(fields[f]), "; got ", shape_of(previous[f]));
+    check(std::equal(own.begin(), own.end(), wanted.begin(), wanted.end()), op, ": ", name,
+          " must have the shape of its field, ", shape_of(fields[f]), "; got ", shape_of(previous[f]));
     check_dtype(op, name.c_str(), previous[f], fields[0].scalar_type());
     check_device(op, name.c_str(), previous[f], fields[0]);
     previous[f] = rows_of(previous[f]);
