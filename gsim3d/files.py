@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import sys
 import types
 import typing
@@ -14,6 +15,12 @@ import yaml
 from gsim3d.errors import InputError
 
 MAX_TEXT = 256 * 2**20  # bytes of a description or of settings
+
+
+def sha256_of(path: Path) -> str:
+    """The hash of a file's bytes, in hex."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_file(path: str | Path, most: int) -> bytes:

@@ -231,9 +231,9 @@ def test_weights_of_another_model_are_refused(capsys, work, tmp_path):
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     code, _, err = call(capsys, "evaluate", run, work / "data")
     assert code == 2 and "config.yaml: missing, truncated or changed" in err
-    from gsim3d.train.checkpoint import _sha256
+    from gsim3d.files import sha256_of
 
-    state["sha256"]["config.yaml"] = _sha256(folder / "config.yaml")
+    state["sha256"]["config.yaml"] = sha256_of(folder / "config.yaml")
     (folder / "state.json").write_text(json.dumps(state))
     code, _, err = call(capsys, "evaluate", run, work / "data")
     assert code == 2 and "the weights do not fit the model" in err and len(err.splitlines()) == 1

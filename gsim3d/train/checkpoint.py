@@ -13,7 +13,6 @@ Nothing here is a pickle: reading a checkpoint runs no code.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
@@ -30,7 +29,7 @@ from torch import Tensor
 
 from gsim3d import __version__
 from gsim3d.errors import InputError
-from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.files import MAX_TEXT, read_file, sha256_of
 from gsim3d.pretrained import located
 from gsim3d.train.settings import load_yaml
 
@@ -111,7 +110,7 @@ def _write_files(part: Path, checkpoint: Checkpoint) -> None:
     state = {
         **checkpoint.state,
         "versions": {"gsim3d": __version__, "torch": str(torch.__version__), "python": platform.python_version()},
-        "sha256": {path.name: _sha256(path) for path in sorted(part.iterdir())},
+        "sha256": {path.name: sha256_of(path) for path in sorted(part.iterdir())},
     }
     (part / STATE).write_text(json.dumps(state, indent=1))
     for path in [*part.iterdir(), part]:
@@ -125,7 +124,7 @@ def exists(run: str | Path) -> bool:
 
 def digest_of(folder: Path) -> str:
     """The hash that names the checkpoint in ``folder``: that of its state, which holds the hashes of all its files."""
-    return _sha256(folder / STATE)
+    return sha256_of(folder / STATE)
 
 
 def load(path: str | Path) -> Checkpoint:
@@ -176,7 +175,7 @@ def _load_folder(path: Path) -> Checkpoint:
         raise InputError(f"{path / STATE}: not a checkpoint's state, the checkpoint is broken") from None
     for name, expected in hashes.items():
         file = path / Path(name).name
-        if not file.is_file() or _sha256(file) != expected:
+        if not file.is_file() or sha256_of(file) != expected:
             raise InputError(f"{file}: missing, truncated or changed since it was written")
     if not {CONFIG, _WEIGHTS["model"]} <= set(hashes):
         raise InputError(f"{path}: the checkpoint holds no {CONFIG} or no {_WEIGHTS['model']}")
@@ -211,7 +210,7 @@ def _load_single(path: Path) -> Checkpoint:
         config, state = json.loads(metadata["gsim3d_config"]), json.loads(metadata["gsim3d_state"])
     except (safetensors.SafetensorError, KeyError, ValueError):
         raise InputError(f"{path}: not a gsim3d checkpoint file") from None
-    return Checkpoint(model=_read_tensors(path), config=_known_format(config, path), state=state, digest=_sha256(path))
+    return Checkpoint(model=_read_tensors(path), config=_known_format(config, path), state=state, digest=sha256_of(path))
 
 
 def _known_format(config: dict, where: Path) -> dict:
@@ -228,11 +227,6 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
         return load_file(path)
     except (safetensors.SafetensorError, OSError) as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
-
-
-def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -17,7 +17,6 @@ not the one that was never stopped, bit by bit, as one of ``gsim3d train`` is.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import os
 import shutil
@@ -30,7 +29,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import InputError
-from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.files import MAX_TEXT, read_file, sha256_of
 from gsim3d.train import checkpoint
 from gsim3d.train.log import LOG
 from gsim3d.train.loop import Trainer
@@ -75,7 +74,7 @@ def load_progress(folder: str | Path, name: str) -> Progress:
         raise InputError(f"{file}: not the state of a run: {error}") from None
     for part, digest in progress.files.items():
         path = file.parent / Path(part).name
-        if not path.is_file() or _sha256(path) != digest:
+        if not path.is_file() or sha256_of(path) != digest:
             raise InputError(f"{path}: missing, cut off or changed since it was written")
     return progress
 
@@ -127,11 +126,11 @@ def save_state(trainer: Trainer, folder: str | Path, name: str, progress: Progre
         DIFFERENCE: {key: value - averaged[key].float() for key, value in trainer.simulator.state_dict().items()},
         SQUARES: squares,
     }
-    files = {weights.name: _sha256(weights)}
+    files = {weights.name: sha256_of(weights)}
     for part, tensors in parts.items():
         path = folder / f"{start}.{part}.safetensors"
         _write(path, safetensors.torch.save({k: v.to("cpu", torch.bfloat16).contiguous() for k, v in tensors.items()}))
-        files[path.name] = _sha256(path)
+        files[path.name] = sha256_of(path)
     if (log := trainer.out / LOG).is_file():
         _write(folder / f"{name}.{LOG}", log.read_bytes())
     done = dataclasses.replace(
@@ -155,11 +154,6 @@ def _named(progress: Progress, part: str) -> str:
 
 def _read(folder: Path, progress: Progress, part: str) -> dict[str, Tensor]:
     return safetensors.torch.load_file(folder / _named(progress, part))
-
-
-def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _write(path: Path, content: bytes) -> None:

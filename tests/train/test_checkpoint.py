@@ -12,6 +12,7 @@ import safetensors
 import torch
 
 from gsim3d.errors import InputError
+from gsim3d.files import sha256_of
 from gsim3d.train import checkpoint
 from gsim3d.train.checkpoint import Checkpoint
 
@@ -141,7 +142,7 @@ def test_another_format_is_refused(tmp_path):
     config = (folder / "config.yaml").read_text().replace("format: 1", "format: 99")
     (folder / "config.yaml").write_text(config)
     state = json.loads((folder / "state.json").read_text())
-    state["sha256"]["config.yaml"] = checkpoint._sha256(folder / "config.yaml")
+    state["sha256"]["config.yaml"] = sha256_of(folder / "config.yaml")
     (folder / "state.json").write_text(json.dumps(state))
     with pytest.raises(InputError, match="format 99"):
         checkpoint.load(folder)

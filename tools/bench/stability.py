@@ -13,6 +13,7 @@ import json
 import math
 import statistics
 from contextlib import contextmanager
+from functools import partial
 
 import torch
 from harness import RESULTS, Bench, commit, event_ms, summary, worst_error
@@ -175,32 +176,14 @@ def look(bench: Bench):
     previous = [fields[0] + 0.01, *fields[1:]]
     bounds = [(-math.inf, math.inf), (0.0, 1.0), (-1e4, 1e4), (-1e4, 1e4)]
 
+    clouds = {"cloud_scene": zero, "origin": origin, "activity": activity, "grid_size": 0.01, "previous": previous}
+    watch = partial(ops.watch_rows, fields, bounds, cu_rows, **clouds)
+
     def ours():
-        watched = ops.watch_rows(
-            fields,
-            bounds,
-            cu_rows,
-            cloud_scene=zero,
-            origin=origin,
-            activity=activity,
-            grid_size=0.01,
-            previous=previous,
-        )
-        return watched.record[0, 12:15].float()
+        return watch().record[0, 12:15].float()
 
     def mended():
-        watched = ops.watch_rows(
-            fields,
-            bounds,
-            cu_rows,
-            cloud_scene=zero,
-            origin=origin,
-            activity=activity,
-            grid_size=0.01,
-            previous=previous,
-            neutral=[0.0] * 4,
-        )
-        return watched.fields[2]
+        return watch(neutral=[0.0] * 4).fields[2]
 
     def plain():
         good = torch.stack([((x >= a) & (x <= b)).reshape(n, -1).all(1) for x, (a, b) in zip(fields, bounds)]).all(0)
