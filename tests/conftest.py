@@ -34,7 +34,7 @@ def pytest_collection_modifyitems(items):
     few = int(os.environ.get("GSIM3D_FEW", 0))
     for item in items:
         values = item.callspec.params.values() if hasattr(item, "callspec") else ()
-        if "devices" in item.fixturenames or any("cuda" in str(value) for value in values):
+        if {"devices", "gpus"} & set(item.fixturenames) or any("cuda" in str(value) for value in values):
             item.add_marker(pytest.mark.gpu)
     if few:
         of_test = defaultdict(list)
@@ -55,6 +55,15 @@ def device(request) -> torch.device:
 def devices() -> tuple[torch.device, torch.device]:
     """(cpu, cuda), for tests that compare both; skipped, or failed with GSIM3D_REQUIRE_CUDA=1, without CUDA."""
     return torch.device("cpu"), cuda_device()
+
+
+@pytest.fixture
+def gpus() -> tuple[torch.device, torch.device]:
+    """Two GPUs of one machine, of which the first is the current one; skipped where there is one at most."""
+    cuda_device()
+    if torch.cuda.device_count() < 2:
+        pytest.skip("one GPU")
+    return torch.device("cuda:0"), torch.device("cuda:1")
 
 
 @pytest.fixture(scope="module")

@@ -363,3 +363,11 @@ def test_a_rollout_and_its_gradients_repeat_bit_by_bit(device):
         runs = [images_and_gradients(device, torch.float32) for _ in range(2)]
     for i, (a, b) in enumerate(zip(*runs, strict=True)):
         assert_same_bits(a, b, f"output {i}")
+
+
+def test_a_gpu_that_is_not_the_current_one_gives_the_same_bits(gpus):
+    with deterministic():
+        first, second = (images_and_gradients(gpu, torch.float32) for gpu in gpus)
+    assert second[0].device == gpus[1] and torch.cuda.current_device() == 0
+    for i, (actual, expected) in enumerate(zip(second, first, strict=True)):
+        assert_same_bits(actual, expected, f"output {i}")
