@@ -105,7 +105,7 @@ class Sleepers:
 
 def _largest(change: Tensor) -> Tensor:
     """[N] of [N, ...], the largest size in each row."""
-    return change.abs() if change.dim() == 1 else torch.linalg.vector_norm(change.flatten(1), torch.inf, dim=1)
+    return change.abs().flatten(1).amax(1) if change.dim() > 1 else change.abs()
 
 
 def _cubes(particles: Particles, scene: Tensor, edge: float) -> Tensor:
