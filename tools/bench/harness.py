@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 MIN_ROUNDS, MAX_ROUNDS = 5, 200
-PAIRS, MAX_PAIRS = 25, 400  # of timings of a cost; more than 25 of what is fast on a GPU
+PAIRS, MAX_PAIRS = 25, 400  # of timings of a cost; more than 25 of what is fast
 GPU_ROUNDS = 20  # or MIN_ROUNDS of what takes long
 RESULTS = Path(__file__).parent / "results"  # one JSON line for each row measured on a GPU
 
@@ -222,14 +222,16 @@ class Bench:
         """
         on_gpu = self.device.type == "cuda"
         for _ in range(2):
-            error = 0.0 if tolerance is None else worst_error(run(), plain())
+            results = run(), plain()
+            error = 0.0 if tolerance is None else worst_error(*results)
             assert error <= (tolerance or 0.0), f"{self.op}, {case}: results differ by {error:.1e} of the largest value"
         torch.set_num_threads(1)
         times: dict = {run: [], plain: []}
-        most = MAX_PAIRS if on_gpu else PAIRS
-        while len(times[run]) < PAIRS or (sum(map(sum, times.values())) < 2 * self.args.seconds and len(times[run]) < most):
+        spent = 0.0
+        while len(times[run]) < PAIRS or (spent < 2 * self.args.seconds and len(times[run]) < MAX_PAIRS):
             for f in (run, plain) if len(times[run]) % 2 else (plain, run):
                 times[f].append(event_ms(f) / 1e3 if on_gpu else processor_seconds(f))
+                spent += times[f][-1]
         torch.set_num_threads(self.args.threads)
         low, share, high = statistics.quantiles((a / b - 1 for a, b in zip(*times.values())), n=4, method="inclusive")
         a, b = summary(times[run]), summary(times[plain])
