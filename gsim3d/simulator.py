@@ -37,7 +37,7 @@ from gsim3d.dynamics import (
 )
 from gsim3d.edits import Edit, by_step
 from gsim3d.effects import EffectsSpec, OutputEffects, UnsupportedEffect
-from gsim3d.encoder import Encoder, pixel_rows
+from gsim3d.encoder import Encoder, Room, pixel_rows
 from gsim3d.guards import drop_rows, guard_frames, guard_particles
 from gsim3d.harmonics import SH_0
 from gsim3d.ops.curve import Pyramid
@@ -67,13 +67,21 @@ class Simulator(nn.Module):
         self.absent: frozenset[str] = frozenset()
 
     def encode(
-        self, frames: Frames, *, on_bad: OnBad | None = None, report: StabilityReport | None = None
+        self,
+        frames: Frames,
+        *,
+        on_bad: OnBad | None = None,
+        report: StabilityReport | None = None,
+        room: Room | None = None,
     ) -> Particles:
-        """Particles of all clouds of ``frames``: each pixel that the masks keep becomes one."""
+        """Particles of all clouds of ``frames``: each pixel that the masks keep becomes one.
+
+        room: as of ``encoder``.
+        """
         guard = self._guard("encode", on_bad, report)
         frames, spoiled = guard_frames(frames, guard.keywords["config"], guard.keywords["report"], "encode")
-        particles = self.encoder(frames)
-        particles = guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled)))
+        particles = self.encoder(frames, room)
+        particles = guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled, room)))
         guard.keywords["report"].send()
         return particles
 

@@ -2,5 +2,6 @@
 
 from gsim3d.encoder.config import EncoderConfig
 from gsim3d.encoder.encoder import Encoder, pixel_rows
+from gsim3d.encoder.room import Room
 
-__all__ = ["Encoder", "EncoderConfig", "pixel_rows"]
+__all__ = ["Encoder", "EncoderConfig", "Room", "pixel_rows"]

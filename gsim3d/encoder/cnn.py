@@ -1,5 +1,8 @@
 """The CNN that looks at each image alone."""
 
+import functools
+
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -46,8 +49,15 @@ class CNN(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, images: Tensor) -> Tensor:
-        mean, std = images.new_tensor(IMAGE_MEAN)[:, None, None], images.new_tensor(IMAGE_STD)[:, None, None]
+        mean, std = _statistics(images.dtype, images.device)
         x = F.relu(F.instance_norm(self.conv1((images - mean) / std)))
         for stage in self.stages:
             x = stage(x)
         return self.conv2(x)
+
+
+@functools.lru_cache(maxsize=None)
+def _statistics(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Mean and deviation [3, 1, 1] of the images that the network expects."""
+    with torch.inference_mode(False):
+        return tuple(torch.tensor(v, dtype=dtype, device=device)[:, None, None] for v in (IMAGE_MEAN, IMAGE_STD))

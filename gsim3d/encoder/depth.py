@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +16,9 @@ from gsim3d.encoder.unet import UNet, repeat_pixels
 from gsim3d.layers import widened
 from gsim3d.quirks import Quirks
 
+if TYPE_CHECKING:
+    from gsim3d.encoder.room import ViewGeometry
+
 INITIAL_OPACITY = 0.5  # of an untrained encoder: views of the same surface blend, and gradients reach what lies behind
 INITIAL_OUTPUT = 0.01  # scale of the untrained disparity correction and opacity logit
 
@@ -24,7 +28,7 @@ class Views:
     """Images and cameras of n clouds with V views each; I = n * V, views of one cloud one after another.
 
     images [I, 3, H, W] in [0, 1], Ks [I, 3, 3] float64 pixels, viewmats [I, 4, 4] float64 world-to-camera,
-    near and far [I] metres.
+    near and far [I] metres. geometry: what follows from the cameras; None: made where it is needed.
     """
 
     images: Tensor
@@ -33,6 +37,7 @@ class Views:
     near: Tensor
     far: Tensor
     n_views: int
+    geometry: ViewGeometry | None = None
 
 
 @dataclass(frozen=True)
@@ -104,12 +109,18 @@ class CostVolume(nn.Module):
         steps = torch.linspace(0, 1, self.n_depths, dtype=torch.float64, device=like.device)
         return (far[:, None] + steps * (near - far)[:, None]).to(like.dtype)
 
+    def sweep_geometry(self, views: Views) -> tuple[Tensor, Tensor]:
+        """Homographies and translations between all views of a cloud, float64."""
+        src_images, cu_src = all_pairs(len(views.Ks) // views.n_views, views.n_views, views.Ks.device)
+        Ks = feature_intrinsics(views.Ks, self.factor, self.quirks)
+        target = Ks.repeat_interleave(views.n_views - 1, 0) if self.quirks.reference_intrinsics else Ks[src_images]
+        return ops.sweep_geometry(Ks, views.viewmats, src_images, cu_src, Ks_target=target)
+
     def correlation(self, features: Tensor, views: Views, disparities: Tensor) -> Tensor:
         """[I, C, h, w] features -> [I, D, h, w] mean correlation with the other views."""
         src_images, cu_src = all_pairs(features.shape[0] // views.n_views, views.n_views, features.device)
-        Ks = feature_intrinsics(views.Ks, self.factor, self.quirks)
-        target = Ks.repeat_interleave(views.n_views - 1, 0) if self.quirks.reference_intrinsics else Ks[src_images]
-        geometry = ops.sweep_geometry(Ks, views.viewmats, src_images, cu_src, Ks_target=target)
+        known = views.geometry
+        geometry = self.sweep_geometry(views) if known is None else (known.homographies, known.translations)
         geometry = (g.to(features.dtype) for g in geometry)
         return ops.plane_sweep(features, *geometry, disparities, src_images, cu_src, check=False)
 

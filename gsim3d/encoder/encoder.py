@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
@@ -10,14 +12,20 @@ from gsim3d.encoder.checks import check_frames
 from gsim3d.encoder.cnn import CNN
 from gsim3d.encoder.config import EncoderConfig
 from gsim3d.encoder.depth import DepthPredictor, Views
-from gsim3d.encoder.heads import ParticleHeads, PixelParticles
+from gsim3d.encoder.heads import ParticleHeads, PixelParticles, PixelRays
+from gsim3d.encoder.room import Places, Room, ViewGeometry
 from gsim3d.encoder.transformer import MultiViewTransformer
+from gsim3d.errors import InputError
 from gsim3d.layers import tf32_only_if_asked
-from gsim3d.types import DYNAMIC, FROZEN, Frames, Particles
+from gsim3d.types import ASLEEP, DYNAMIC, FROZEN, CloudTable, Frames, Particles
 
 
-def pixel_rows(frames: Frames, values: Tensor) -> Tensor:
-    """``values`` [I, H, W] of the pixels that become particles, in the order of their rows."""
+def pixel_rows(frames: Frames, values: Tensor, room: Room | None = None) -> Tensor:
+    """``values`` [I, H, W] of the pixels that become particles, in the order of their rows; 0 in rows of ``room`` that
+    have none."""
+    if room is not None:
+        places = Places.of(frames, room)
+        return torch.where(places.is_one, values.flatten()[places.pixel], 0)
     order = torch.argsort(frames.cameras.image_cloud, stable=True)
     flat = values[order].flatten()
     return flat if frames.masks is None else flat[frames.masks[order].flatten()]
@@ -44,19 +52,67 @@ class Encoder(nn.Module):
         self.heads = ParticleHeads(config)
         self.to(memory_format=torch.channels_last)  # convolutions with few channels are faster on it, on CPU and GPU
 
-    def forward(self, frames: Frames) -> Particles:
+    def forward(self, frames: Frames, room: Room | None = None) -> Particles:
         """Particles of every cloud: its images in ascending order, pixels row by row, those outside ``masks`` left out.
 
         On a GPU it computes in float32 unless autocast, or torch's switch for TF32 in matrix products, says otherwise.
 
+        Args:
+            room: of :meth:`room`, for frames like these in all but their numbers. Nothing then waits for the device, and
+                nothing is checked; particles that have no row are left out.
         Gradients: ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
         Raises:
             InputError: sizes do not fit the network's strides or each other; the message names the argument.
             HardCaseError: an image or camera is not finite; the message names scene, step and tensor.
         """
+        if room is not None:
+            with tf32_only_if_asked():
+                return self._encode_into(frames, room)
         check_frames(frames, self.config)
         with tf32_only_if_asked():
             return self._encode(frames)
+
+    @torch.no_grad()
+    def room(self, frames: Frames, size: int) -> Room:
+        """Room for ``size`` rows a cloud. It is made of the cameras; images and masks may then be others.
+
+        Raises:
+            InputError, HardCaseError: as :meth:`forward`; or clouds have different numbers of views.
+        """
+        check_frames(frames, self.config)
+        n_clouds, cameras = frames.cloud_scene.shape[0], frames.cameras
+        n_views = len(cameras) // n_clouds
+        ordered = torch.arange(n_clouds, device=cameras.image_cloud.device).repeat_interleave(n_views)
+        if not torch.equal(ordered, cameras.image_cloud):
+            raise InputError("Encoder.room: cameras.image_cloud must ascend, with as many views for each cloud")
+        views = _views(frames, n_views)
+        geometry = ViewGeometry(PixelRays.of(views), *self.depth.cost_volume.sweep_geometry(views))
+        scenes, steps = torch.stack([frames.cloud_scene, frames.cloud_step]).tolist()
+        return Room(CloudTable.make([size] * n_clouds, scenes, steps, frames.images.device), geometry)
+
+    def _encode_into(self, frames: Frames, room: Room) -> Particles:
+        n_views, places = len(frames.cameras) // len(room.clouds), Places.of(frames, room)
+        part = self._predict(_views(frames, n_views, room.geometry), frames.origin[_scene_of_image(frames)])
+        (cu_rows, cloud_scene, cloud_step), known = room.clouds.tensors, room.clouds
+        fields = {}
+        for name in PixelParticles.__dataclass_fields__:
+            values = getattr(part, name)
+            if values is not None:
+                values = _Kept.apply(values.flatten(0, 1), places.pixel, places.row)
+                fields[name] = torch.where(places.is_one.reshape(-1, *[1] * (values.dim() - 1)), values, 0)
+        activity = torch.full_like(places.pixel, DYNAMIC, dtype=torch.uint8)
+        if frames.dynamic is not None:
+            activity.masked_fill_(~frames.dynamic.flatten()[places.pixel], FROZEN)
+        activity.masked_fill_(~places.is_one, ASLEEP)
+        return Particles(
+            **fields,
+            cu_rows=cu_rows,
+            cloud_scene=cloud_scene,
+            cloud_step=cloud_step,
+            activity=activity,
+            origin=frames.origin,
+            known=known,
+        )
 
     def _encode(self, frames: Frames) -> Particles:
         n_clouds = frames.cloud_scene.shape[0]
@@ -73,13 +129,14 @@ class Encoder(nn.Module):
 
     def _encode_images(self, frames: Frames, images: Tensor, n_views: int) -> PixelParticles:
         """Images of clouds with ``n_views`` views each, cloud by cloud."""
-        cameras = frames.cameras.select(images)
-        pixels = frames.images[images].contiguous(memory_format=torch.channels_last)
-        views = Views(pixels, cameras.Ks.double(), cameras.viewmats.double(), cameras.near, cameras.far, n_views)
+        chosen = dataclasses.replace(frames, images=frames.images[images], cameras=frames.cameras.select(images))
+        return self._predict(_views(chosen, n_views), frames.origin[_scene_of_image(chosen)])
+
+    def _predict(self, views: Views, origin: Tensor) -> PixelParticles:
+        """origin: [I, 3], of the scene that each image shows."""
         cnn_features = self.cnn(views.images)
-        view_features = self.transformer(cnn_features.unflatten(0, (-1, n_views))).flatten(0, 1)
+        view_features = self.transformer(cnn_features.unflatten(0, (-1, views.n_views))).flatten(0, 1)
         depth = self.depth(view_features, cnn_features, views)
-        origin = frames.origin[frames.cloud_scene[cameras.image_cloud]]
         return self.heads(depth, views, origin * 0 if self.config.quirks.world_moments else origin)
 
     def _assemble(
@@ -123,6 +180,16 @@ class Encoder(nn.Module):
             activity=activity if kept is None else activity[kept_rows],
             origin=frames.origin,
         )
+
+
+def _views(frames: Frames, n_views: int, geometry: ViewGeometry | None = None) -> Views:
+    cameras, images = frames.cameras, frames.images.contiguous(memory_format=torch.channels_last)
+    Ks, viewmats = cameras.Ks.double(), cameras.viewmats.double()
+    return Views(images, Ks, viewmats, cameras.near, cameras.far, n_views, geometry)
+
+
+def _scene_of_image(frames: Frames) -> Tensor:
+    return frames.cloud_scene[frames.cameras.image_cloud]
 
 
 class _Kept(torch.autograd.Function):

@@ -98,7 +98,7 @@ class ParticleHeads(nn.Module):
 
     def forward(self, depth: Depth, views: Views, origin: Tensor) -> PixelParticles:
         """origin: [I, 3] world point from which the moments of viewing rays are taken."""
-        geometry = PixelRays.of(views)
+        geometry = PixelRays.of(views) if views.geometry is None else views.geometry.rays
         raw = widened(self.to_gaussians(depth.features))
         raw_offset = raw[:, :2]
         means = geometry.centers.to(raw.dtype)[:, :, None, None] + depth.depth * self._rays(geometry, raw_offset)

@@ -1,10 +1,10 @@
-"""Loss and gradients of simulated steps as one CUDA graph.
+"""Loss and gradients of a training step as one CUDA graph.
 
-A training step through a rollout launches tens of thousands of small kernels; a GPU would wait for Python most of the
-time. Everything behind the encoder (rollout, images, loss and their gradients) is captured once for each kind of batch
-and replayed with other particles. A graph has fixed sizes: each cloud gets as many rows as the largest, those without a
-particle sleep, and geometry has room for more than was observed. Where a batch needs more, the graph is made anew, so
-results never depend on the room.
+A training step launches tens of thousands of small kernels; a GPU would wait for Python most of the time. All of it
+(encoder, rollout, images, loss and their gradients) is captured once for each kind of batch and replayed with other
+images. A graph has fixed sizes: each cloud gets as many rows as the largest, those without a particle sleep, and
+geometry has room for more than was observed. Where a batch needs more, the graph is made anew, so results never depend
+on the room.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.dynamics import concatenate
+from gsim3d.encoder import Room
 from gsim3d.errors import InputError
 from gsim3d.graphs import Captured
 from gsim3d.ops import PyramidCapacity
@@ -28,30 +29,45 @@ from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport
 from gsim3d.train.samples import Batch
-from gsim3d.types import ASLEEP, CloudTable, Frames, Particles
+from gsim3d.types import Frames, Particles
 
 FACTOR = 1.3  # room for geometry over what was observed: little costs captures, much costs time in every step
 ROWS_FACTOR = 1.15  # likewise, for the particles of a cloud
 ROW_UNIT = 256  # rows of a cloud are a multiple of it
 MOST_KINDS = 2  # of steps whose graphs are kept at a time
-LEARNED = ("means", "opacities", "dynamic_latents", "static_latents")  # of encoded particles, what has gradients
 
 
 @dataclass(frozen=True)
 class Gradients:
-    """loss: a number.   errors: [S], of each step.
+    """loss: a number.   errors: [S], of each step.   norm: of all gradients together.
 
-    particles: gradients of LEARNED, by name.   parameters: gradients of ``CapturedLoss.parameters``, or None.
+    parameters: gradients of ``CapturedLoss.parameters``, or None.
     """
 
     loss: Tensor
     errors: Tensor
-    particles: dict[str, Tensor]
+    norm: Tensor
     parameters: tuple[Tensor | None, ...]
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """A batch and what the host must know of it before its graph can run. counts: particles of each cloud."""
+
+    batch: Batch
+    counts: tuple[int, ...]
+    room: Room
+
+    @property
+    def kind(self) -> tuple:
+        """What batches have in common that one graph serves."""
+        batch, table = self.batch, self.room.clouds
+        images = len(batch.context.cameras), len(batch.targets.cameras)
+        return table.scenes, table.steps, batch.n_lead, batch.n_future, images
+
+
 class CapturedLoss:
-    """The loss of batches of one kind, and its gradients, from particles and targets.
+    """The loss of batches of one kind, and its gradients.
 
     Without a GPU the same is computed call by call.
 
@@ -59,10 +75,10 @@ class CapturedLoss:
         simulator: that is trained; without drop path and shuffled curves, whose draws a graph would repeat.
         plan: what a step computes.
         loss: (images [I, H, W, 3], targets, weights of the steps) -> loss and errors by step.
-        precision: makes the context in which a part ("dynamics", "renderer") computes.
+        precision: makes the context in which a part ("encoder", "dynamics", "renderer") computes.
 
     Attributes:
-        parameters: those whose gradients it returns.
+        parameters: those whose gradients it returns, all of the simulator.
         alone: a context in which no other thread uses the GPU, which a capture does not allow.
         captures: how often a graph was made.
     """
@@ -85,55 +101,61 @@ class CapturedLoss:
             wanted = 'drop_path 0, shuffle_orders false, norm "layer", explicit false and a symmetric background'
             raise InputError(f"captured: the model must have {wanted}")
         self.simulator, self.plan, self.loss, self.precision = simulator, plan, loss, precision
-        self.parameters = [*simulator.dynamics.parameters(), *simulator.renderer.parameters()]
+        self.parameters = list(simulator.parameters())
         self.alone: AbstractContextManager = nullcontext()
         self.captures = 0
         self._steps: dict[tuple, _Step] = {}
 
-    def __call__(self, particles: Particles, batch: Batch, weights: Tensor, report: StabilityReport) -> Gradients:
-        """Of ``particles``, which the encoder made of ``batch``; gradients are overwritten by the next call.
+    @torch.no_grad()
+    def prepare(self, batch: Batch) -> Prepared:
+        """Waits for the device; may be called while a graph runs.
+
+        Raises:
+            InputError, HardCaseError: the encoder cannot read the batch.
+        """
+        context = batch.context
+        n_clouds, (n_images, _, *size) = context.cloud_scene.shape[0], context.images.shape
+        if context.masks is None:
+            counts = [n_images // n_clouds * math.prod(size)] * n_clouds
+        else:
+            counts = context.masks.reshape(n_clouds, -1).sum(1).tolist()
+        return Prepared(batch, tuple(counts), self.simulator.encoder.room(context, max(counts)))
+
+    def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
+        """Gradients are overwritten by the next call.
 
         Args:
             weights: of the steps.
-            report: is told what the simulator's guards find; rows that cannot be used sleep.
+            report: is told what the simulator's guards find; rows of a rollout that cannot be used sleep.
         """
-        table = particles.clouds
-        kind = (table.scenes, table.steps, batch.n_lead, batch.n_future, len(batch.targets.cameras))
-        largest = max(table.count(q) for q in range(len(table)))
+        kind, largest = prepared.kind, max(prepared.counts)
         step = self._steps.pop(kind, None)
         if step is None or largest > step.rows:
             step = None  # its memory goes back first
             while len(self._steps) >= MOST_KINDS:
                 del self._steps[next(iter(self._steps))]
-            step = _Step(self, _rounded_up(ROWS_FACTOR * largest), particles, batch, weights)
+            step = _Step(self, _rounded_up(ROWS_FACTOR * largest), prepared.batch, weights)
         self._steps[kind] = step  # now the newest
-        return step(particles, batch, weights, report)
+        return step(prepared, weights, report)
 
 
 class _Step:
     """A step of one kind, with ``rows`` rows a cloud."""
 
-    def __init__(self, owner: CapturedLoss, rows: int, particles: Particles, batch: Batch, weights: Tensor):
-        self._owner, self.rows, self._capacities = owner, rows, []
+    def __init__(self, owner: CapturedLoss, rows: int, batch: Batch, weights: Tensor):
+        self._owner, self.rows, self._capacities, self._is_ready = owner, rows, [], False
         self._graph = self._records = None
-        table, device = particles.clouds, particles.means.device
-        known = CloudTable.make([rows] * len(table), table.scenes, table.steps, device)
-        fields = {name: x.new_zeros(rows * len(table), *x.shape[1:]) for name, x in particles.row_fields().items()}
-        for name in LEARNED:
-            fields[name].requires_grad_()
-        self._state = particles.with_clouds(known, **fields, origin=particles.origin.clone())
-        targets = batch.targets
-        self._targets = dataclasses.replace(targets.map(torch.clone), cameras=targets.cameras.map(torch.clone))
+        self._context, self._targets = _own(batch.context), _own(batch.targets)
+        self._room = owner.simulator.encoder.room(batch.context, rows)
         self._n_lead, self._n_future, self._weights = batch.n_lead, batch.n_future, weights.clone()
-        self._first_rows = torch.arange(len(table), device=device) * rows
 
-    def __call__(self, particles: Particles, batch: Batch, weights: Tensor, report: StabilityReport) -> Gradients:
-        places = self._load(particles, batch, weights)
-        if not self._capacities:
+    def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
+        self._load(prepared, weights)
+        if not self._is_ready:
             self._capacities = self._observed()
             self._capture()
         while True:
-            loss, errors, gradients, found, records = self._replay()
+            loss, errors, norm, gradients, found, records = self._replay()
             numbers = found.tolist()
             if all([capacity.fits(row) for capacity, row in zip(self._capacities, numbers, strict=True)]):
                 break
@@ -142,15 +164,21 @@ class _Step:
             self._capacities = [c.grown((0, *o.sizes), 1) for c, o in zip(grown, self._observed(), strict=True)]
             self._capture()
         records.replayed(report)
-        n = len(LEARNED)
-        of_rows = {name: g.index_select(0, places) for name, g in zip(LEARNED, gradients[:n], strict=True)}
-        return Gradients(loss, errors, of_rows, tuple(gradients[n:]))
+        return Gradients(loss, errors, norm, gradients)
 
     # ---- what runs ----
 
-    def _rollout(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> list[Particles]:
+    def _encode(self, report: StabilityReport) -> Particles:
+        with self._owner.precision("encoder"):
+            return self._owner.simulator.encode(self._context, room=self._room, report=report)
+
+    def _rollout(
+        self, state: Particles, geometry: Callable[[Particles], Pyramid], report: StabilityReport
+    ) -> list[Particles]:
         """The simulated steps that are looked at."""
-        owner, state = self._owner, self._state
+        owner = self._owner
+        if not self._n_future:
+            return []
         rollout = partial(owner.simulator.rollout, plan=owner.plan, geometry=geometry, report=report, on_bad="drop")
         with owner.precision("dynamics"):
             if self._n_lead:
@@ -160,16 +188,18 @@ class _Step:
 
     def _compute(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> tuple:
         owner = self._owner
-        leaves = [getattr(self._state, name) for name in LEARNED]
-        particles = concatenate([self._state, *self._rollout(geometry, report)])
+        state = self._encode(report)
+        particles = concatenate([state, *self._rollout(state, geometry, report)])
         with owner.precision("renderer"):
             images = owner.simulator.draw(
                 particles, self._targets.cameras, plan=owner.plan, report=report, on_bad="drop"
             ).color
         loss, errors = owner.loss(images, self._targets, self._weights)
-        gradients = torch.autograd.grad(loss, [*leaves, *owner.parameters], allow_unused=True)
-        return loss.detach(), errors, gradients
+        gradients = torch.autograd.grad(loss, owner.parameters, allow_unused=True)
+        norm = torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
+        return loss.detach(), errors, norm, gradients
 
+    @torch.no_grad()
     def _observed(self) -> list[PyramidCapacity]:
         """What the geometry of each step needs, with room."""
         needed = []
@@ -179,8 +209,8 @@ class _Step:
             needed.append(PyramidCapacity.of(pyramid, history.n_rows, FACTOR))
             return pyramid
 
-        with torch.no_grad():
-            self._rollout(geometry, StabilityReport())
+        if self._n_future:
+            self._rollout(self._encode(StabilityReport()), geometry, StabilityReport())
         return needed
 
     def _given(self, report: StabilityReport) -> tuple:
@@ -191,22 +221,23 @@ class _Step:
             found.append(self._owner.simulator.dynamics.geometry(history, capacity=next(sizes)))
             return found[-1]
 
-        loss, errors, gradients = self._compute(geometry, report)
-        return loss, errors, gradients, torch.stack([pyramid.found for pyramid in found])
+        computed = self._compute(geometry, report)
+        return *computed, torch.stack([p.found for p in found]) if found else self._weights.new_empty(0)
 
     def _capture(self) -> None:
         self._owner.captures += 1
-        if self._state.means.device.type != "cuda":
-            return
-        torch.cuda.empty_cache()
-        self._records = StabilityReport()
+        self._is_ready = False
+        if self._weights.device.type == "cuda":
+            torch.cuda.empty_cache()
+            self._records = StabilityReport()
 
-        def function() -> tuple:
-            capturing = torch.cuda.is_current_stream_capturing()
-            return self._given(self._records if capturing else StabilityReport())
+            def function() -> tuple:
+                capturing = torch.cuda.is_current_stream_capturing()
+                return self._given(self._records if capturing else StabilityReport())
 
-        with self._owner.alone:
-            self._graph = Captured(function, self._state.means.device)
+            with self._owner.alone:
+                self._graph = Captured(function, self._weights.device)
+        self._is_ready = True
 
     def _replay(self) -> tuple:
         if self._graph is None:
@@ -215,24 +246,20 @@ class _Step:
         return *self._graph(), self._records
 
     @torch.no_grad()
-    def _load(self, particles: Particles, batch: Batch, weights: Tensor) -> Tensor:
-        """Copies a batch to where the graph reads it; the rows there of the particles' rows."""
-        cloud = particles.row_cloud()
-        places = (
-            torch.arange(particles.n_rows, device=cloud.device) - particles.cu_rows[cloud] + self._first_rows[cloud]
-        )
-        state = self._state
-        state.activity.fill_(ASLEEP)
-        state.opacities.zero_()
-        for name, value in state.row_fields().items():
-            value.index_copy_(0, places, getattr(particles, name).detach().to(value.dtype))
-        state.origin.copy_(particles.origin)
+    def _load(self, prepared: Prepared, weights: Tensor) -> None:
+        """Copies a batch to where the graph reads it."""
+        self._room.copy_(prepared.room)
         self._weights.copy_(weights)
-        for own, given in ((self._targets, batch.targets), (self._targets.cameras, batch.targets.cameras)):
-            for name, value in vars(given).items():
-                if isinstance(value, Tensor):
-                    getattr(own, name).copy_(value)
-        return places
+        batch = prepared.batch
+        for own, given in ((self._context, batch.context), (self._targets, batch.targets)):
+            for mine, value in ((own, given), (own.cameras, given.cameras)):
+                for name, tensor in vars(value).items():
+                    if isinstance(tensor, Tensor):
+                        getattr(mine, name).copy_(tensor)
+
+
+def _own(frames: Frames) -> Frames:
+    return dataclasses.replace(frames.map(torch.clone), cameras=frames.cameras.map(torch.clone))
 
 
 def _rounded_up(rows: float) -> int:

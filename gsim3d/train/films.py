@@ -67,7 +67,7 @@ class FilmStore:
         )
         self._near, self._far = rig.near, rig.far
         self._origin = torch.from_numpy(workspace_origin(rig)).to(device)
-        self.lock = threading.Lock()  # held while films come or are read
+        self.lock = threading.RLock()  # held while films come or are read
         self.films = [
             Film(slot, Path(f"film_{slot}"), *self._shape[:2], rig.size, rig.size) for slot in range(capacity)
         ]

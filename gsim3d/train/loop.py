@@ -27,7 +27,7 @@ from gsim3d.perceptual.weights import load
 from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
-from gsim3d.train.captured import CapturedLoss
+from gsim3d.train.captured import CapturedLoss, Gradients, Prepared
 from gsim3d.train.checks import check_history, check_sharing
 from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import Log, memory_gib, plain, progress_note
@@ -104,6 +104,7 @@ class Trainer:
             betas=(settings.beta1, settings.beta2),
             eps=settings.eps,
             weight_decay=settings.weight_decay,
+            fused=device == "cuda",
         )
         self.average = {k: v.clone() for k, v in self.simulator.state_dict().items()} if settings.ema_decay else {}
         self.scale = LossScale(FIRST_SCALE if config.precision.scales_loss else 1.0)
@@ -191,8 +192,8 @@ class Trainer:
         n_context = history_at(self.config.data, stage, self.config.seed, self.step)
         errors = torch.full((n_context + stage.horizon,), math.nan)
         try:
-            loss, errors, gradients, seen = self._whole_batch(stage.batch)
-            problem = self._look_at(entry, loss, gradients, seen)
+            loss, errors, gradients, norm, seen = self._whole_batch(stage.batch)
+            problem = self._look_at(entry, loss, gradients, norm, seen)
         except HardCaseError as error:
             problem = str(error)
         if problem is None:
@@ -221,11 +222,16 @@ class Trainer:
         """Of the step at ``place`` of a stage."""
         return one_cycle(place, stage.steps, stage.learning_rate, stage.warm_up)
 
-    def _whole_batch(self, batch: int) -> tuple[float, Tensor, list[Tensor | None], list[Seen]]:
-        """Loss, errors by step and gradients of the whole batch; what was seen in each of its parts."""
-        scale = self.scale.value
+    def _whole_batch(self, batch: int) -> tuple[float, Tensor, Sequence[Tensor | None], Tensor, list[Seen]]:
+        """Loss, errors by step, gradients of the whole batch and their norm; what was seen in each of its parts."""
+        scale, norm = self.scale.value, None
         norms_scale = scale if self._is_logged else None
-        if self.shared is not None:
+        if self.captured is not None:
+            watch = StepWatch()
+            found = self._captured_gradients(list(range(batch)), watch)
+            gradients, norm, seen = found.parameters, found.norm / scale, [watch.seen(norms_scale)]
+            loss, errors = found.loss.item() / scale, found.errors.cpu()
+        elif self.shared is not None:
             parts = self._shared_gradients(self.processes.share(batch))
             loss, errors, gradients, watch, n_samples, error = parts
             seen = Seen(error=error) if error else watch.seen(norms_scale)
@@ -244,9 +250,13 @@ class Trainer:
             loss, seen = loss.item(), [watch.seen(norms_scale) for *_, watch in results]
         if scale != 1:
             gradients = [None if gradient is None else gradient / scale for gradient in gradients]
-        return loss, errors, gradients, list(seen)
+        if norm is None:
+            norm = torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
+        return loss, errors, gradients, norm, list(seen)
 
-    def _look_at(self, entry: dict, loss: float, gradients: list[Tensor | None], seen: list[Seen]) -> str | None:
+    def _look_at(
+        self, entry: dict, loss: float, gradients: Sequence[Tensor | None], norm: Tensor, seen: list[Seen]
+    ) -> str | None:
         """Hands the gradients to the optimizer, clipped, and fills in ``entry``; why they cannot be used, or None."""
         named = dict(zip(self.parameters, gradients, strict=True))
         for name, parameter in self.parameters.items():
@@ -254,9 +264,10 @@ class Trainer:
         if self._is_logged:
             entry["grad_norm_by_module"] = norms_by_module(named)
         entry["loss"] = loss
-        entry["grad_norm"] = torch.nn.utils.clip_grad_norm_(
-            self.parameters.values(), self.config.optimizer.clip_norm or math.inf
-        ).item()
+        torch.nn.utils.clip_grads_with_norm_(
+            self.parameters.values(), self.config.optimizer.clip_norm or math.inf, norm
+        )
+        entry["grad_norm"] = norm.item()
         if self._is_logged and (by_step := mean_of_norms([part.norms for part in seen])):
             entry["grad_norm_by_step"] = by_step
         entry["particles"] = sum(part.n_rows for part in seen) / max(1, sum(part.n_clouds for part in seen))
@@ -303,26 +314,18 @@ class Trainer:
         """Loss, errors by step, the gradient of the loss for every parameter (None where it has no part), and what was
         seen on the way."""
         watch, batch = StepWatch(), self._batch(samples)
-        if self.captured is not None and batch.n_future:
-            return *self._captured_gradients(batch, watch), watch
         loss, errors = self.loss(batch, samples[0], watch)
         gradients = torch.autograd.grad(loss * self.scale.value, list(self.parameters.values()), allow_unused=True)
         return loss.detach(), errors, gradients, watch
 
-    def _captured_gradients(self, batch: Batch, watch: StepWatch) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...]]:
-        """Loss, errors and gradients, all behind the encoder from a CUDA graph; the next call overwrites them."""
-        scale, encoder = self.scale.value, list(self.simulator.encoder.parameters())
-        with self.config.precision.of("encoder", self.device):
-            particles = self.simulator.encode(batch.context, report=watch.report)
-        watch.count(particles)
-        later = self.captured(particles, batch, self.step_weights(batch) * scale, watch.report)
-        outputs = {name: getattr(particles, name) for name in later.particles}
-        learned = [name for name, value in outputs.items() if value.requires_grad]
-        gradients = torch.autograd.grad(
-            [outputs[name] for name in learned], encoder, [later.particles[name] for name in learned], allow_unused=True
-        )
-        known = dict(zip([*encoder, *self.captured.parameters], [*gradients, *later.parameters], strict=True))
-        return later.loss / scale, later.errors, tuple(known[parameter] for parameter in self.parameters.values())
+    def _captured_gradients(self, samples: list[int], watch: StepWatch) -> Gradients:
+        """Loss, errors and gradients from a CUDA graph, times the scale; the next call overwrites them."""
+        prepared = self._prepared(samples)
+        watch.count(sum(prepared.counts), len(prepared.counts))
+        return self.captured(prepared, self.step_weights(prepared.batch) * self.scale.value, watch.report)
+
+    def _prepared(self, samples: list[int]) -> Prepared:
+        return self.captured.prepare(self._batch(samples))
 
     def _shared_gradients(self, samples: list[int]) -> tuple:
         """As :meth:`_gradients`, but gradients are those of the samples of all processes; and how many samples are this
@@ -399,7 +402,7 @@ class Trainer:
 
         with precision.of("encoder", self.device):
             particles = again("encoder")(lambda context: simulator.encode(context, **options))(batch.context)
-        watch.count(particles)
+        watch.count(particles.n_rows, particles.n_clouds)
         if batch.n_future:
             if self.config.data.thawed:
                 rng = generator(self.config.seed, self.step, sample, "thawed")
@@ -503,8 +506,7 @@ class Trainer:
         for key, value in saved.optimizer.items():
             kind, name = key.split(".", 1)
             if name in self.parameters:
-                # AdamW counts its steps on the host.
-                self.optimizer.state[self.parameters[name]][kind] = value if kind == "step" else value.to(self.device)
+                self.optimizer.state[self.parameters[name]][kind] = value.to(self.device)
         self.step, self.n_skipped = saved.state["step"], saved.state["n_skipped"]
         self.n_skipped_in_a_row = saved.state.get("n_skipped_in_a_row", 0)
         self.seconds, self.parent = saved.state["seconds"], saved.digest
@@ -515,13 +517,11 @@ class Trainer:
         if not self.average:
             return
         with torch.no_grad():
-            weights = self.simulator.state_dict()
-            averaged = [name for name, value in weights.items() if value.is_floating_point()]
-            torch._foreach_lerp_(
-                [self.average[name] for name in averaged], [weights[name] for name in averaged], 1 - decay
-            )
-            for name in weights.keys() - set(averaged):
-                self.average[name].copy_(weights[name])
+            buffers = dict(self.simulator.named_buffers())
+            weights = self.parameters | {name: x for name, x in buffers.items() if x.is_floating_point()}
+            torch._foreach_lerp_([self.average[name] for name in weights], list(weights.values()), 1 - decay)
+            for name in buffers.keys() - weights.keys():
+                self.average[name].copy_(buffers[name])
 
 
 class _Loss(nn.Module):

@@ -5,11 +5,16 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import torch
+
 from gsim3d.errors import HardCaseError
+from gsim3d.train.captured import Prepared
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.films import Filming, FilmStore
 from gsim3d.train.log import memory_gib
@@ -110,6 +115,8 @@ class SittingTrainer(Trainer):
         super().__init__(config, store.films[:1], out, device=device)
         self.store = store
         self.first_step, self.begin, self.end = 0, 0.0, math.inf
+        self._side = torch.cuda.Stream() if device == "cuda" else None
+        self._next: tuple[int, Future] | None = None
         if self.captured is not None:
             self.captured.alone = store.lock
 
@@ -126,8 +133,32 @@ class SittingTrainer(Trainer):
         return stage.learning_rate * rise * (LAST_RATE + (1 - LAST_RATE) * fall)
 
     def _batch(self, samples: list[int]) -> Batch:
-        stage, _ = self.config.stage_of(self.step)
-        return self.store.draw(self.config.data, stage, self.config.seed, self.step, samples)
+        return self._draw(self.step, samples)
+
+    def _draw(self, step: int, samples: Sequence[int]) -> Batch:
+        stage, _ = self.config.stage_of(step)
+        return self.store.draw(self.config.data, stage, self.config.seed, step, samples)
+
+    def _prepared(self, samples: list[int]) -> Prepared:
+        """Drawn while the GPU computed the step before."""
+        ahead = self._next if self._next is not None and self._next[0] == self.step else self._begin_to_draw(self.step)
+        self._next = self._begin_to_draw(self.step + 1)
+        # The last one was copied by a step that is over: only now may its memory be used anew.
+        self._read = ahead[1].result()
+        return self._read
+
+    def _begin_to_draw(self, step: int) -> tuple[int, Future]:
+        return step, self._reader.submit(self._draw_beside, step)
+
+    @torch.no_grad()
+    def _draw_beside(self, step: int) -> Prepared:
+        """Draws a batch on a stream of its own."""
+        stage, _ = self.config.stage_of(step)
+        with self.store.lock, torch.cuda.stream(self._side):
+            prepared = self.captured.prepare(self._draw(step, range(stage.batch)))
+            if self._side is not None:
+                self._side.synchronize()
+        return prepared
 
 
 def train(

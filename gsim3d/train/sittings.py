@@ -98,7 +98,7 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
         for key, value in squares.items():
             parameter = trainer.parameters[key]
             trainer.optimizer.state[parameter] = {
-                "step": torch.tensor(float(progress.step)),
+                "step": torch.tensor(float(progress.step), device=parameter.device),
                 "exp_avg": torch.zeros_like(parameter),
                 "exp_avg_sq": value.to(parameter),
             }

@@ -43,9 +43,9 @@ class StepWatch:
         self._n_unusable: int | None = None
         self._squares: list[list[Tensor]] = []
 
-    def count(self, encoded: Particles) -> None:
-        """Notes how many particles the samples have."""
-        self._n_rows, self._n_clouds = encoded.n_rows, encoded.n_clouds
+    def count(self, n_rows: int, n_clouds: int) -> None:
+        """Notes how many particles the encoder made, and in how many clouds."""
+        self._n_rows, self._n_clouds = n_rows, n_clouds
 
     def close(self) -> None:
         """Counts no further findings: what the backward pass computes again would be counted twice."""

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from gsim3d.encoder import Encoder, EncoderConfig
+from gsim3d.encoder import Encoder, EncoderConfig, pixel_rows
 from gsim3d.encoder.depth import Views, feature_intrinsics, upsample, upsampling_matrix
 from gsim3d.encoder.camera_frame import quat_multiply, rotation_to_quat
 from gsim3d.encoder.heads import PixelRays, explicit_gaussians
@@ -15,7 +15,7 @@ from gsim3d.errors import HardCaseError, InputError
 from gsim3d.harmonics import rotate_harmonics
 from gsim3d.quirks import Quirks
 from gsim3d.renderer import rotation_matrices, unit_quats
-from gsim3d.types import DYNAMIC, FROZEN, Frames
+from gsim3d.types import ASLEEP, DYNAMIC, FROZEN, Frames
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.encoder.scenes import ROW_FIELDS, SIZE, image_rows, make_encoder, make_frames, select
 
@@ -372,3 +372,39 @@ def test_errors_name_what_is_wrong(fault, error, message):
 def test_config_errors(changes, message):
     with pytest.raises(InputError, match=message):
         EncoderConfig(**changes)
+
+
+def test_particles_in_given_room_are_those_of_their_clouds():
+    """Other images and cameras than those that the room was made of; two clouds of two views."""
+    encoder, frames = make_encoder(), make_frames([0, 0, 1, 1])
+    chance = torch.rand(frames.images[:, :2].shape, generator=torch.Generator().manual_seed(3))
+    share = torch.tensor([0.3, 0.3, 0.5, 0.5])[:, None, None]
+    frames = dataclasses.replace(frames, masks=chance[:, 0] < share, dynamic=chance[:, 1] < 0.5)
+    room = encoder.room(make_frames([0, 0, 1, 1], seed=5), 300)
+    cameras = dataclasses.replace(frames.cameras, near=frames.cameras.near * 1.1)
+    frames = dataclasses.replace(frames, cameras=cameras)
+    room.copy_(encoder.room(frames, 300))
+    whole, placed = encoder(frames), encoder(frames, room)
+    counts = whole.cu_rows.diff().tolist()
+    assert placed.clouds.starts == (0, 300, 600) and 0 < min(counts) < max(counts) < 300
+    rows = torch.cat([torch.arange(counts[0]), 300 + torch.arange(counts[1])])
+    others = torch.ones(600, dtype=torch.bool).index_fill(0, rows, False)
+    for name in (*ROW_FIELDS, "activity"):
+        assert torch.equal(getattr(placed, name)[rows], getattr(whole, name)), name
+    assert placed.activity[others].eq(ASLEEP).all() and placed.opacities[others].eq(0).all()
+    assert torch.equal(pixel_rows(frames, frames.dynamic, room)[rows], pixel_rows(frames, frames.dynamic))
+    weight = torch.randn(whole.means.shape, generator=torch.Generator().manual_seed(4))
+    parameters = list(encoder.parameters())
+    expected = torch.autograd.grad((whole.means * weight).sum(), parameters, allow_unused=True)
+    actual = torch.autograd.grad((placed.means[rows] * weight).sum(), parameters, allow_unused=True)
+    for a, b in zip(actual, expected, strict=True):
+        assert (a is None) == (b is None)
+        assert a is None or torch.equal(a, b)
+    few = encoder(frames, encoder.room(frames, 100))  # what has no room is left out
+    assert torch.equal(few.means[:100], whole.means[:100]) and few.activity.ne(ASLEEP).all()
+
+
+def test_room_is_for_clouds_of_equal_views_in_order():
+    for clouds in ([0, 0, 1], [1, 0]):
+        with pytest.raises(InputError, match="image_cloud"):
+            make_encoder().room(make_frames(clouds), 100)

@@ -47,60 +47,69 @@ def captured_loss(trainer):
     )
 
 
-def batches(scenes, count, lead=0):
-    stage = dataclasses.replace(CONFIG.stages[0], lead=lead)
+def batches(scenes, count, **changes):
+    stage = dataclasses.replace(CONFIG.stages[0], **changes)
     return [draw_batch(scenes, CONFIG.data, stage, 0, step, [0, 1]) for step in range(count)]
 
 
-@pytest.mark.parametrize("lead", [0, 2])
-def test_gradients_are_those_of_the_loss(lead, scenes, trainer, device):
+def run(captured, batch, trainer, report=None, factor=1.0):
+    weights = factor * trainer.step_weights(batch)
+    return captured(captured.prepare(batch), weights, StabilityReport() if report is None else report)
+
+
+@pytest.mark.parametrize("stage", [{}, {"lead": 2}, {"horizon": 0}], ids=["rollout", "lead", "encoded"])
+def test_gradients_are_those_of_the_loss(stage, scenes, trainer, device):
     captured, report = captured_loss(trainer), StabilityReport()
-    drawn = batches(scenes, 4, lead)
-    assert {batch.n_lead for batch in drawn} == {0, lead}
+    drawn = batches(scenes, 4, **stage)
+    assert {batch.n_lead for batch in drawn} == {0, stage.get("lead", 0)}
     for batch in drawn:
         batch = batch.to(device)
         loss, errors = trainer.loss(batch)
         expected = torch.autograd.grad(loss, list(trainer.parameters.values()), allow_unused=True)
         loss = loss.detach()  # a capture waits for the stream of every graph that is kept
-        particles = trainer.simulator.encode(batch.context)
-        later = captured(particles, batch, trainer.step_weights(batch), report)
-        encoder = list(trainer.simulator.encoder.parameters())
-        outputs = [getattr(particles, name) for name in later.particles]
-        of_encoder = torch.autograd.grad(outputs, encoder, list(later.particles.values()), allow_unused=True)
-        actual = dict(zip([*encoder, *captured.parameters], [*of_encoder, *later.parameters], strict=True))
-        assert_close_relative_to_max(later.loss, loss.detach(), 0.1 * TOLERANCE[device.type])
-        assert_close_relative_to_max(later.errors, errors, 0.1 * TOLERANCE[device.type])
+        actual = run(captured, batch, trainer, report)
+        assert_close_relative_to_max(actual.loss, loss, 0.1 * TOLERANCE[device.type])
+        assert_close_relative_to_max(actual.errors, errors, 0.1 * TOLERANCE[device.type])
         largest = max(gradient.abs().max() for gradient in expected if gradient is not None)
-        for (name, parameter), gradient in zip(trainer.parameters.items(), expected, strict=True):
-            assert (actual[parameter] is None) == (gradient is None), name
+        for name, gradient, wanted in zip(trainer.parameters, actual.parameters, expected, strict=True):
+            assert (gradient is None) == (wanted is None), name
             if gradient is not None:
-                assert (actual[parameter] - gradient).abs().max() <= TOLERANCE[device.type] * largest, name
+                assert (gradient - wanted).abs().max() <= TOLERANCE[device.type] * largest, name
+        squares = sum(gradient.double().square().sum() for gradient in actual.parameters if gradient is not None)
+        assert actual.norm.item() == pytest.approx(squares.sqrt().item(), rel=1e-5)
     assert captured.captures >= 1 and not report.total
 
 
 def test_what_needs_more_room_gets_it(scenes, trainer, device):
-    captured, report = captured_loss(trainer), StabilityReport()
+    captured = captured_loss(trainer)
     batch = batches(scenes, 1)[0].to(device)
-    particles, weights = trainer.simulator.encode(batch.context), trainer.step_weights(batch)
-    first = captured(particles, batch, weights, report)
-    loss = first.loss.clone()
-    near = dataclasses.replace(particles, means=particles.means * 0.01)
-    captured(near, batch, weights, report)  # few cells, then many
+    loss = run(captured, batch, trainer).loss.clone()
     (step,) = captured._steps.values()
     step._capacities = [dataclasses.replace(c, sizes=(c.sizes[0], *(1 for _ in c.sizes[1:]))) for c in step._capacities]
     step._capture()  # a graph with room for next to nothing
     made = captured.captures
-    again = captured(particles, batch, weights, report)
-    torch.testing.assert_close(again.loss, loss, rtol=TOLERANCE[device.type], atol=0)
+    torch.testing.assert_close(run(captured, batch, trainer).loss, loss, rtol=TOLERANCE[device.type], atol=0)
     assert captured.captures > made
+    fewer = dataclasses.replace(batch.context, masks=batch.context.masks & ~batch.context.dynamic)
+    captured = captured_loss(trainer)
+    run(captured, dataclasses.replace(batch, context=fewer), trainer)
+    (before,) = (step.rows for step in captured._steps.values())
+    torch.testing.assert_close(run(captured, batch, trainer).loss, loss, rtol=TOLERANCE[device.type], atol=0)
+    (after,) = (step.rows for step in captured._steps.values())
+    assert max(captured.prepare(batch).counts) <= after and before <= after
 
 
 def test_weights_are_read_anew(scenes, trainer, device):
-    captured, report = captured_loss(trainer), StabilityReport()
+    captured = captured_loss(trainer)
     batch = batches(scenes, 1)[0].to(device)
-    particles, weights = trainer.simulator.encode(batch.context), trainer.step_weights(batch)
-    once, twice = (captured(particles, batch, factor * weights, report).loss.item() for factor in (1, 2))
+    once, twice = (run(captured, batch, trainer, factor=factor).loss.item() for factor in (1, 2))
     assert twice == pytest.approx(2 * once, rel=1e-5)
+    with torch.no_grad():
+        for parameter in trainer.simulator.encoder.parameters():
+            parameter.mul_(0.9)
+    other, _ = trainer.loss(batch)
+    assert run(captured, batch, trainer).loss.item() == pytest.approx(other.item(), rel=TOLERANCE[device.type])
+    assert abs(other.item() / once - 1) > 1e-4
 
 
 def test_training_from_graphs_is_training(scenes, tmp_path, device):

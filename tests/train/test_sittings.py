@@ -11,12 +11,15 @@ import torch
 
 from gsim3d.data import Scene, find_scenes
 from gsim3d.errors import InputError
+from gsim3d.data.recording import BACKGROUND, FIXED, MOVING
 from gsim3d.generate import generate
+from gsim3d.generate.cameras import two_rings
 from gsim3d.generate.film import film
 from gsim3d.generate.worlds import build_world
 from gsim3d.train import shipped
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
 from gsim3d.train.films import Filming, FilmStore
+from gsim3d.train.loop import deterministic
 from gsim3d.train.restore import restore
 from gsim3d.train.samples import draw_batch
 from gsim3d.train.shipped import RECIPES, SittingTrainer, train
@@ -90,6 +93,41 @@ def test_what_a_process_raises_is_told(world, tmp_path):
     with Filming(world, store, 0, 1, tmp_path) as filming:
         with pytest.raises(RuntimeError, match="size"):
             filming.wait_for(1, seconds=60)
+
+
+class Painted:
+    """Cameras of a world whose films are painted, not simulated."""
+
+    n_frames, size = 6, 32
+
+    def rig(self):
+        return two_rings(12, self.size, 1.5, 5.0, distance=3.2, target_height=0.7, elevations=(18.0, 42.0), fov=42.0)
+
+    def film(self, seed):
+        rng = np.random.default_rng(seed)
+        film = rng.integers(0, 255, (self.n_frames, 12, self.size, self.size, 4), dtype=np.uint8)
+        film[..., 3] = BACKGROUND
+        film[..., self.size // 2 :, :, 3] = FIXED
+        for step in range(self.n_frames):
+            film[step, :, 4 + step : 14 + step, 10:20, 3] = MOVING
+        return film
+
+
+def test_batches_drawn_ahead_are_those_of_their_steps(tmp_path, device):
+    store = FilmStore(Painted(), 2, device.type)
+    for seed in range(2):
+        store.put(Painted().film(seed))
+    ahead, plain = (SittingTrainer(CONFIG, store, tmp_path / name, device.type) for name in "ab")
+    ahead.captured = ahead._capture()
+    ahead.begin_sitting(time.monotonic() + 1e4), plain.begin_sitting(time.monotonic() + 1e4)
+    with deterministic():
+        for step in range(4):
+            samples = list(range(CONFIG.stage_of(step)[0].batch))
+            assert torch.equal(ahead._prepared(samples).batch.targets.images, plain._batch(samples).targets.images)
+            a, b = ahead.train_step(), plain.train_step()
+            assert ahead._next[0] == step + 1 and a["particles"] == b["particles"]
+            assert a["loss"] == pytest.approx(b["loss"], rel=1e-3)
+    assert ahead.captured.captures == 2  # one for each kind of step
 
 
 class NoFilming:
