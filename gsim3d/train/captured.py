@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gsim3d.dynamics import concatenate
 from gsim3d.encoder import Room
@@ -161,7 +162,9 @@ class _Step:
                 break
             self._graph = self._records = loss = errors = gradients = found = None  # their memory goes back first
             grown = (c.grown(row, FACTOR) for c, row in zip(self._capacities, numbers, strict=True))
-            self._capacities = [c.grown((0, *o.sizes), 1) for c, o in zip(grown, self._observed(), strict=True)]
+            # What was too small for one step will soon be too small for others.
+            most = [max(sizes) for sizes in zip(*(capacity.sizes for capacity in self._observed()), strict=True)]
+            self._capacities = [capacity.grown((0, *most), 1) for capacity in grown]
             self._capture()
         records.replayed(report)
         return Gradients(loss, errors, norm, gradients)
@@ -173,9 +176,13 @@ class _Step:
             return self._owner.simulator.encode(self._context, room=self._room, report=report)
 
     def _rollout(
-        self, state: Particles, geometry: Callable[[Particles], Pyramid], report: StabilityReport
+        self,
+        state: Particles,
+        geometry: Callable[[Particles], Pyramid],
+        report: StabilityReport,
+        wrap: Callable[[Callable], Callable] | None = None,
     ) -> list[Particles]:
-        """The simulated steps that are looked at."""
+        """The simulated steps that are looked at; ``wrap`` as of Simulator.rollout."""
         owner = self._owner
         if not self._n_future:
             return []
@@ -184,18 +191,34 @@ class _Step:
             if self._n_lead:
                 with torch.no_grad():
                     state = concatenate([state, *rollout(state, self._n_lead)])
-            return rollout(state, self._n_future)
+            return rollout(state, self._n_future, wrap=wrap)
 
     def _compute(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> tuple:
-        owner = self._owner
+        owner, dynamics, of_calls = self._owner, self._owner.simulator.dynamics, []
+
+        def with_own_weights(predict: Callable[[Particles], Particles]) -> Callable[[Particles], Particles]:
+            def call(state: Particles) -> Particles:
+                with _aliased(dynamics) as aliases:
+                    of_calls.append(aliases)
+                    return predict(state)
+
+            return call
+
         state = self._encode(report)
-        particles = concatenate([state, *self._rollout(state, geometry, report)])
+        particles = concatenate([state, *self._rollout(state, geometry, report, with_own_weights)])
         with owner.precision("renderer"):
             images = owner.simulator.draw(
                 particles, self._targets.cameras, plan=owner.plan, report=report, on_bad="drop"
             ).color
         loss, errors = owner.loss(images, self._targets, self._weights)
-        gradients = torch.autograd.grad(loss, owner.parameters, allow_unused=True)
+        once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]
+        gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
+        known = dict(zip(once, gradients))
+        if of_calls:
+            n = len(of_calls[0])
+            parts = [gradients[begin : begin + n] for begin in range(len(once), len(gradients), n)]
+            known |= zip(dynamics.parameters(), _sums(parts[::-1]), strict=True)
+        gradients = tuple(known.get(parameter) for parameter in owner.parameters)
         norm = torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
         return loss.detach(), errors, norm, gradients
 
@@ -256,6 +279,36 @@ class _Step:
                 for name, tensor in vars(value).items():
                     if isinstance(tensor, Tensor):
                         getattr(mine, name).copy_(tensor)
+
+
+@contextmanager
+def _aliased(module: nn.Module) -> Iterator[list[Tensor]]:
+    """Within it the parameters of ``module`` are others in the same memory, in the order of ``parameters()``.
+
+    Calls that share weights would have the gradients of each weight added call by call: thousands of small kernels. Those
+    of aliases are added at once.
+    """
+    places = [(part, name, value) for part in module.modules() for name, value in part._parameters.items() if value is not None]
+    aliases = [value.detach().requires_grad_() for _, _, value in places]
+    try:
+        for (part, name, _), alias in zip(places, aliases, strict=True):
+            part._parameters[name] = alias
+        yield aliases
+    finally:
+        for part, name, value in places:
+            part._parameters[name] = value
+
+
+def _sums(parts: Sequence[Sequence[Tensor | None]]) -> list[Tensor | None]:
+    """Sums over ``parts``, in their order, of each of as many tensors; None: zero."""
+    total = list(parts[0])
+    for part in parts[1:]:
+        both = [k for k, (a, b) in enumerate(zip(total, part, strict=True)) if a is not None and b is not None]
+        added = torch._foreach_add([total[k] for k in both], [part[k] for k in both]) if both else []
+        total = [b if a is None else a for a, b in zip(total, part, strict=True)]
+        for k, value in zip(both, added, strict=True):
+            total[k] = value
+    return total
 
 
 def _own(frames: Frames) -> Frames:
