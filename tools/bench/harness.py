@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 MIN_ROUNDS, MAX_ROUNDS = 5, 200
-PAIRS, MAX_PAIRS = 25, 400  # of timings of a cost; more than 25 of what is fast
+PAIRS, MAX_PAIRS = 15, 400  # of timings of a cost; more than 15 of what is fast
 GPU_ROUNDS = 20  # or MIN_ROUNDS of what takes long
 RESULTS = Path(__file__).parent / "results"  # one JSON line for each row measured on a GPU
 
