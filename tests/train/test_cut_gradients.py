@@ -64,6 +64,14 @@ def test_the_share_that_is_never_trained_is_the_published_one(tool):
     )
 
 
+def test_out_of_minutes_it_stops_and_goes_on(tool, folder, tmp_path, capsys):
+    arguments = ["--data", str(folder), "--out", str(tmp_path), "--seeds", "1"]
+    tool.main([*arguments, "--minutes", "1e-9"], RUN)
+    assert "cut_0: call again to go on" in capsys.readouterr().out and not (tmp_path / "metrics.json").exists()
+    tool.main(arguments, RUN)
+    assert "| cut | " in capsys.readouterr().out and (tmp_path / "metrics.json").exists()
+
+
 def test_the_table_compares_both_over_the_seeds(tool, folder, tmp_path, capsys):
     arguments = ["--data", str(folder), "--out", str(tmp_path), "--seeds", "2"]
     tool.main(arguments, RUN)

@@ -1,0 +1,56 @@
+"""Runs side by side: results by name, errors as they were raised, and a process that is killed is told."""
+
+import os
+import time
+
+import pytest
+import torch
+
+from gsim3d.errors import HardCaseError, InputError
+from gsim3d.train.side_by_side import last_entry, side_by_side
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def work(folder, action):
+    if action == "raise":
+        raise HardCaseError("step 7 is not finite", step=7)
+    if action == "die":
+        os._exit(9)
+    if action == "wait":
+        time.sleep(600)
+    return folder, action, torch.get_num_threads(), os.getpid()
+
+
+def jobs(tmp_path, *actions):
+    return {f"job {i}": (tmp_path / str(i), action) for i, action in enumerate(actions)}
+
+
+@pytest.mark.parametrize("together", [1, 2])
+def test_every_job_is_done_once(together, tmp_path):
+    given, said = jobs(tmp_path, "a", "b", "c"), []
+    done = dict(side_by_side(work, given, together, said.append))
+    assert {name: result[:2] for name, result in done.items()} == given
+    assert said == ([*given] if together == 1 else [])
+    processes = {result[3] for result in done.values()}
+    if together == 1:
+        assert processes == {os.getpid()}
+    else:
+        assert os.getpid() not in processes
+        assert all(result[2] == max(1, len(os.sched_getaffinity(0)) // 2) for result in done.values())
+
+
+@pytest.mark.parametrize("action, error", [("raise", HardCaseError), ("die", InputError)])
+def test_what_a_job_raises_ends_the_others(action, error, tmp_path):
+    begin = time.monotonic()
+    with pytest.raises(error, match="step 7 is not finite" if action == "raise" else "processes was killed"):
+        list(side_by_side(work, jobs(tmp_path, "wait", action), 2))
+    assert time.monotonic() - begin < 60
+
+
+def test_a_log_whose_last_line_is_cut_says_nothing(tmp_path):
+    assert last_entry(tmp_path) == {}
+    (tmp_path / "metrics.jsonl").write_text('{"step": 3}\n{"step": 4}\n')
+    assert last_entry(tmp_path) == {"step": 4}
+    (tmp_path / "metrics.jsonl").write_text('{"step": 3}\n{"st')
+    assert last_entry(tmp_path) == {}
