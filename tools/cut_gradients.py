@@ -33,6 +33,7 @@ from gsim3d.simulator import Simulator  # noqa: E402
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig  # noqa: E402
 from gsim3d.train.loop import Trainer  # noqa: E402
 from gsim3d.train.restore import restore  # noqa: E402
+from gsim3d.train.settings import to_dict  # noqa: E402
 from gsim3d.train.side_by_side import side_by_side  # noqa: E402
 
 RUN = TrainConfig(
@@ -74,18 +75,18 @@ def train_and_score(
     None where training did not come to its end by ``end``, on the clock of time.monotonic.
     """
     train, test = ([Scene.open(folder, fitting=config.data.fitting) for folder in part] for part in folders)
-    trainer = Trainer(config, train, out, device=device)
-    if is_cut:
-        cut(trainer.simulator)
-    trainer.run(end=end, progress=progress)
-    if trainer.step < config.n_steps:
-        return None
-    restored = restore(out, device)
+    asked = {"train": to_dict(config), "scenes": [[scene.name for scene in part] for part in (train, test)]}
     file = out / "metrics.json"
     known = json.loads(file.read_text()) if file.is_file() else {}
-    if known.get("checkpoint") != restored.checkpoint.digest:
-        scores = [score_scene(restored, scene, metrics=("psnr", "psnr_masked")) for scene in test]
-        known = {"checkpoint": restored.checkpoint.digest, **summarize(scores)}
+    if any(known.get(name) != value for name, value in asked.items()):
+        trainer = Trainer(config, train, out, device=device)
+        if is_cut:
+            cut(trainer.simulator)
+        trainer.run(end=end, progress=progress)
+        if trainer.step < config.n_steps:
+            return None
+        restored = restore(out, device)
+        known = asked | summarize([score_scene(restored, scene, metrics=("psnr", "psnr_masked")) for scene in test])
         write_json(file, known)
     return {name: known[name] for name in MEASURED} | {"constant": known["constant.future.psnr_masked"]}
 

@@ -10,9 +10,9 @@ import json
 import multiprocessing
 import os
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ def side_by_side(
         together: jobs at a time, each in a process with its share of the cores; 1: here, one after another.
         say: is told what begins here, and now and then how far those in processes are.
     Raises:
-        What a job raised, or InputError where a process was killed; the others are ended then, and go on from their
+        What a job raised, or InputError where its process was killed; the others are ended then, and go on from their
         last checkpoints when they are called again.
     """
     together = min(together, len(jobs))
@@ -44,24 +44,45 @@ def side_by_side(
                 say(name)
             yield name, function(*arguments)
         return
-    n_threads = max(1, len(os.sched_getaffinity(0)) // together)
-    context, over = multiprocessing.get_context("spawn"), threading.Event()
-    pool = ProcessPoolExecutor(together, context, _begin, (n_threads,))
-    names = {pool.submit(function, *arguments): name for name, arguments in jobs.items()}
-    folders = {name: Path(arguments[0]) for name, arguments in jobs.items()}
-    if say is not None:
-        threading.Thread(target=_tell, args=(folders, over, say), daemon=True).start()
+    context, n_threads = multiprocessing.get_context("spawn"), max(1, len(os.sched_getaffinity(0)) // together)
+    waiting, running = list(jobs), {}
     try:
-        for job in as_completed(names):
-            folders.pop(names[job])
-            yield names[job], job.result()
-    except BrokenProcessPool:
-        raise InputError(f"--together: one of {together} processes was killed; call again, with fewer") from None
+        while waiting or running:
+            while waiting and len(running) < together:
+                name = waiting.pop(0)
+                receiver, sender = context.Pipe(duplex=False)
+                process = context.Process(target=_work, args=(sender, n_threads, function, jobs[name]), daemon=True)
+                process.start()
+                sender.close()
+                running[receiver] = name, process
+            ready = wait(list(running), TELL_EVERY)
+            if not ready and say is not None:
+                say(_progress({name: Path(jobs[name][0]) for name, _ in running.values()}))
+            for receiver in ready:
+                name, process = running.pop(receiver)
+                try:
+                    result, error = receiver.recv()
+                except EOFError:
+                    raise InputError(f"{name}: its process was killed; call again, with fewer --together") from None
+                process.join()
+                if error is not None:
+                    raise error
+                yield name, result
     finally:
-        over.set()
-        for process in list((pool._processes or {}).values()):
+        for _, process in running.values():
             process.terminate()  # checkpoints are whole at any time
-        pool.shutdown(wait=True, cancel_futures=True)
+            process.join()
+
+
+def _work(sender: Connection, n_threads: int, function: Callable, arguments: tuple) -> None:
+    torch.set_num_threads(n_threads)
+    parent = multiprocessing.parent_process()  # if it is killed, nobody waits for this process
+    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+    try:
+        sender.send((function(*arguments), None))
+    except Exception as error:
+        error.add_note(traceback.format_exc())
+        sender.send((None, error))
 
 
 def last_entry(run: Path) -> dict:
@@ -72,19 +93,12 @@ def last_entry(run: Path) -> dict:
         return {}
 
 
-def _tell(folders: dict[str, Path], over: threading.Event, say: Callable[[str], None]) -> None:
-    while not over.wait(TELL_EVERY):
-        entries = [(name, last_entry(folder)) for name, folder in list(folders.items())]
-        say(", ".join(f"{name} {_short(entry)}" for name, entry in entries if entry))
+def _progress(folders: dict[str, Path]) -> str:
+    entries = {name: last_entry(folder) for name, folder in folders.items()}
+    return ", ".join(f"{name}: {_short(entry)}" for name, entry in entries.items() if entry)
 
 
 def _short(entry: dict) -> str:
     decibels = entry.get("future_psnr", entry.get("past_psnr"))
     known = f" {decibels:.1f} dB" if isinstance(decibels, float) else ""
-    return f"{entry['step']}{known} {entry['machine']['step_seconds']:.2f} s"
-
-
-def _begin(n_threads: int) -> None:
-    torch.set_num_threads(n_threads)
-    parent = multiprocessing.parent_process()  # if it is killed, nobody waits for this process
-    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+    return f"step {entry['step']}{known} {entry['machine']['step_seconds']:.2f} s"
