@@ -171,22 +171,27 @@ def predicted_cost(plan: Plan, model: ModelConfig, work: Workload) -> dict[str, 
     background = plan.spec.dynamics.background
     moving = work.moving + (work.frozen if background == "dynamic" else 0)
     frozen = work.frozen if background in ("frozen", "asymmetric") else 0
-    computed = moving + (0 if _is_asymmetric(plan.spec, model) else frozen)
-    drawn = moving + frozen
+    beside = frozen if _is_asymmetric(plan.spec, model) else 0
+    computed, drawn = moving + frozen - beside, moving + frozen
     renderer, outputs = model.renderer, plan.spec.outputs
     harmonics = 3 * (plan.sh_degree + 1) ** 2 if outputs.rgb else 0
     hidden = 4 * renderer.latents
     channels = 3 * outputs.rgb + outputs.depth + renderer.latents * outputs.features
     splats = min(drawn, SPLATS_A_PIXEL) * work.pixels
     return {
-        "dynamics": _network(model.dynamics, computed * plan.history, plan.history) if moving else 0.0,
+        "dynamics": _network(model.dynamics, computed * plan.history, plan.history, beside) if moving else 0.0,
         "gaussians": float(drawn * hidden * (renderer.latents + harmonics + 7)),
         "images": float(work.views * (drawn * (PROJECTION + harmonics) + splats * (BLENDING + channels))),
     }
 
 
-def _network(config: DynamicsConfig, rows: float, history: int) -> float:
-    """Multiply-adds of the dynamics network on ``rows`` rows of stage 0."""
+def background_cost(plan: Plan, model: ModelConfig, work: Workload) -> float:
+    """Multiply-adds, counted likewise, of a background that is made once a rollout; 0 where every step computes it."""
+    return _network(model.dynamics, work.frozen, 1) if _is_asymmetric(plan.spec, model) and work.frozen else 0.0
+
+
+def _network(config: DynamicsConfig, rows: float, history: int, beside: float = 0.0) -> float:
+    """Multiply-adds of the dynamics network on ``rows`` rows of stage 0, which see ``beside`` others that rest."""
     from gsim3d.dynamics.state import StateLayout
 
     layout, channels = StateLayout.of(config), config.encoder_channels
@@ -196,21 +201,23 @@ def _network(config: DynamicsConfig, rows: float, history: int) -> float:
     for s in range(config.n_stages):
         if s > 0:
             total += rows * channels[s - 1] * channels[s]
-            rows = rows / config.strides[s - 1] ** SURFACE / 2 ** merged[s]
-        at_stage.append(rows)
-        total += config.encoder_depths[s] * _block(config, rows, channels[s], config.patch_sizes[s])
+            fewer = config.strides[s - 1] ** SURFACE
+            rows, beside = rows / fewer / 2 ** merged[s], beside / fewer
+        at_stage.append((rows, beside))
+        total += config.encoder_depths[s] * _block(config, rows, beside, channels[s], config.patch_sizes[s])
     below = channels[-1]
     for s in reversed(range(config.n_stages - 1)):
-        width = config.decoder_channels[s]
-        total += at_stage[s + 1] * below * width + at_stage[s] * channels[s] * width
-        total += config.decoder_depths[s] * _block(config, at_stage[s], width, config.patch_sizes[s])
+        width, (rows, beside) = config.decoder_channels[s], at_stage[s]
+        total += at_stage[s + 1][0] * below * width + rows * channels[s] * width
+        total += config.decoder_depths[s] * _block(config, rows, beside, width, config.patch_sizes[s])
         below = width
-    return float(total + at_stage[0] / history * below * (below + layout.out_channels))
+    return float(total + rows / history * below * (below + layout.out_channels))
 
 
-def _block(config: DynamicsConfig, rows: float, channels: int, patch: int) -> float:
+def _block(config: DynamicsConfig, rows: float, beside: float, channels: int, patch: int) -> float:
+    """A row attends to its own patch, and to one of those that rest."""
     dense = (BLOCK_KERNEL**SURFACE + 1 + 4 + 2 * config.mlp_ratio) * channels**2
-    return rows * (dense + 2 * min(rows, patch) * channels)
+    return rows * (dense + 2 * (min(rows, patch) + min(beside, patch)) * channels)
 
 
 def in_columns(rows: list[tuple[str, ...]]) -> str:
