@@ -16,6 +16,7 @@ from gsim3d.errors import HardCaseError, InputError
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.evaluate.report import summarize, write_json
 from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.graphs import CaptureError
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.log import LOG
 from gsim3d.train.loop import Trainer
@@ -86,7 +87,7 @@ def attempt(folder: Path, trial: Trial, end: float, progress: bool) -> dict:
     """:meth:`Trial.run`, or why there is nothing to score."""
     try:
         return trial.run(folder, end, progress)
-    except HardCaseError as error:
+    except (HardCaseError, CaptureError) as error:
         return {"failure": str(error)}
     except torch.OutOfMemoryError:
         return {"failure": "out of memory"}

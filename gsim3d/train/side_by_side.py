@@ -31,7 +31,7 @@ def side_by_side(
 
     Args:
         function: of a module, as a process that starts anew finds it there; its first argument is a run folder.
-        together: jobs at a time, each in a process with its share of the cores; 1: here, one after another.
+        together: jobs at a time, each in a process with its share of the cores, on one GPU after another; 1: here.
         say: is told what begins here, and now and then how far those in processes are.
     Raises:
         What a job raised, or InputError where its process was killed; the others are ended then, and go on from their
@@ -45,37 +45,42 @@ def side_by_side(
             yield name, function(*arguments)
         return
     context, n_threads = multiprocessing.get_context("spawn"), max(1, len(os.sched_getaffinity(0)) // together)
-    waiting, running = list(jobs), {}
+    waiting, running, places = list(jobs), {}, list(range(together))
     try:
         while waiting or running:
-            while waiting and len(running) < together:
-                name = waiting.pop(0)
+            while waiting and places:
+                name, place = waiting.pop(0), places.pop(0)
                 receiver, sender = context.Pipe(duplex=False)
-                process = context.Process(target=_work, args=(sender, n_threads, function, jobs[name]), daemon=True)
+                process = context.Process(
+                    target=_work, args=(sender, place, n_threads, function, jobs[name]), daemon=True
+                )
                 process.start()
                 sender.close()
-                running[receiver] = name, process
+                running[receiver] = name, process, place
             ready = wait(list(running), TELL_EVERY)
             if not ready and say is not None:
-                say(_progress({name: Path(jobs[name][0]) for name, _ in running.values()}))
+                say(_progress({name: Path(jobs[name][0]) for name, *_ in running.values()}))
             for receiver in ready:
-                name, process = running.pop(receiver)
+                name, process, place = running.pop(receiver)
                 try:
                     result, error = receiver.recv()
                 except EOFError:
                     raise InputError(f"{name}: its process was killed; call again, with fewer --together") from None
                 process.join()
+                places.append(place)
                 if error is not None:
                     raise error
                 yield name, result
     finally:
-        for _, process in running.values():
+        for _, process, _ in running.values():
             process.terminate()  # checkpoints are whole at any time
             process.join()
 
 
-def _work(sender: Connection, n_threads: int, function: Callable, arguments: tuple) -> None:
+def _work(sender: Connection, place: int, n_threads: int, function: Callable, arguments: tuple) -> None:
     torch.set_num_threads(n_threads)
+    if torch.cuda.is_available():
+        torch.cuda.set_device(place % torch.cuda.device_count())
     parent = multiprocessing.parent_process()  # if it is killed, nobody waits for this process
     threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
     try:
