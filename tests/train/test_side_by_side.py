@@ -2,7 +2,10 @@
 
 import multiprocessing
 import os
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -19,6 +22,7 @@ def work(folder, action):
     if action == "die":
         os._exit(9)
     if action == "wait":
+        folder.write_text(str(os.getpid()))
         time.sleep(600)
     return folder, action, torch.get_num_threads(), os.getpid()
 
@@ -46,6 +50,37 @@ def test_what_a_job_raises_ends_the_others(action, error, tmp_path):
     with pytest.raises(error, match="step 7 is not finite" if action == "raise" else "job 1: its process was killed"):
         list(side_by_side(work, jobs(tmp_path, "wait", action), 2))
     assert not multiprocessing.active_children()
+
+
+def test_nobody_goes_on_when_the_caller_is_killed(tmp_path):
+    script = (
+        "from pathlib import Path\n"
+        "from gsim3d.train.side_by_side import side_by_side\n"
+        "from tests.train.test_side_by_side import jobs, work\n"
+        f"list(side_by_side(work, jobs(Path({str(tmp_path)!r}), 'wait', 'wait'), 2))"
+    )
+    caller = subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parents[2])
+    try:
+        wait_until(lambda: all((tmp_path / name).exists() and (tmp_path / name).read_text() for name in "01"))
+    finally:
+        caller.kill()
+        caller.wait()
+    workers = [int((tmp_path / name).read_text()) for name in "01"]
+    wait_until(lambda: not any(is_running(worker) for worker in workers))
+
+
+def wait_until(condition):
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def is_running(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def test_a_log_whose_last_line_is_cut_says_nothing(tmp_path):
