@@ -27,8 +27,8 @@ def read_file(path: str | Path, most: int) -> bytes:
     """The bytes of a file.
 
     Raises:
-        InputError: it is missing, no file (pipes and devices are not opened), has more than ``most`` bytes, or cannot be
-            read; the message names it.
+        InputError: it is missing, no file (pipes and devices are not opened), has more than ``most`` bytes, or cannot
+            be read; the message names it.
     """
     path = Path(path)
     try:

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         imported = import_released(source, settings)
     except InputError as error:
-        # Messages about the file start with its name, those about shapes with "weights", those about settings with a key.
+        # Messages about the file start with its name, about shapes with "weights", about settings with a key.
         message = str(error).replace("weights:", f"{source}:", 1) if str(error).startswith("weights:") else str(error)
         raise InputError(message if message.startswith(str(source)) else f"{args.config}: {message}") from None
     config, effects = imported.config, imported.config.effects

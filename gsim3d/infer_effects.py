@@ -10,8 +10,8 @@ film's begin, middle and end are compared with it: what it is worth is how many 
 the time of a step and its images that it takes. The smallest settings within the tolerance are taken together; while
 together they lose more, the one that is worth most comes back.
 
-It is the model that is measured: where its predictions are hardly better than particles held still (the first line tells
-both), it has not learned what the effects are for, and the proposal says little about the scene. Times of a few
+It is the model that is measured: where its predictions are hardly better than particles held still (the first line
+tells both), it has not learned what the effects are for, and the proposal says little about the scene. Times of a few
 milliseconds waver; let nothing else run.
 
 examples:
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def propose(base, settings: dict, trial, measured: tuple[float, float], tolerance: float):
-    """Rows of a table, the smallest spec that loses at most ``tolerance`` dB of ``measured``, and what it was measured at.
+    """Rows of a table, the smallest spec that loses at most ``tolerance`` dB of ``measured``, and its own measurement.
 
     Args:
         settings: of :func:`smaller`.

@@ -8,7 +8,8 @@
 #   tools/gpu_check.sh bench                every op and the whole model against its peers: tools/bench/results/*.jsonl
 #
 # A step that passed on these sources is not repeated: started again, the check goes on where it stopped (remove
-# build/gpu_check to start over). Uses `python3`, or $PYTHON; needs torch with CUDA, nvcc, pytest; works without a network.
+# build/gpu_check to start over). Uses `python3`, or $PYTHON; needs torch with CUDA, nvcc, pytest; works without a
+# network.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PYTHON="${PYTHON:-python3}"
@@ -108,7 +109,8 @@ case "$phase" in
 esac
 MACHINE="$("$PYTHON" -c 'import torch; print(torch.__version__, torch.cuda.get_device_name())' 2>/dev/null)" ||
   die "$PYTHON has no torch that sees a GPU: activate one, or set PYTHON"
-command -v nvcc >/dev/null || [ -n "${CUDA_HOME:-}" ] || die "nvcc was not found: install the CUDA toolkit, or set CUDA_HOME"
+command -v nvcc >/dev/null || [ -n "${CUDA_HOME:-}" ] ||
+  die "nvcc was not found: install the CUDA toolkit, or set CUDA_HOME"
 mkdir -p "$STATE"
 export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}"
 KEY="$(key)"

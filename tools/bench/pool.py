@@ -58,9 +58,17 @@ def gpu(bench):
         "mean": (
             x,
             lambda x: pool_mean(x, rows, cu_rows),
-            {"scatter_reduce": lambda x: x.new_zeros(m, channels).scatter_reduce(0, wide, x, "mean", include_self=False)},
+            {
+                "scatter_reduce": lambda x: x.new_zeros(m, channels).scatter_reduce(
+                    0, wide, x, "mean", include_self=False
+                )
+            },
         ),
-        "unpool": (small, lambda x: unpool(x, rows, cu_rows, n), {"index_select": lambda x: x.index_select(0, cluster)}),
+        "unpool": (
+            small,
+            lambda x: unpool(x, rows, cu_rows, n),
+            {"index_select": lambda x: x.index_select(0, cluster)},
+        ),
     }
     for name, (value, ours, forms) in cases.items():
         bench.gpu(f"{name}, 256k x 64 rows to {m}: fwd", "float32", lambda: ours(value),

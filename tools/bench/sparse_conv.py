@@ -106,7 +106,9 @@ def tables_of(cells: torch.Tensor) -> tuple[Voxels, KernelMap]:
 def with_plan(voxels: Voxels, kernel_map: KernelMap) -> KernelMap:
     """The map with its plan, which all blocks of a stage share, like spconv's cached map."""
     taps = kernel_map.tap_in, kernel_map.tap_out, kernel_map.cu_taps
-    plan = torch.ops.gsim3d.sparse_conv_plan(voxels.row_voxel, voxels.rows, voxels.cu_rows, *taps, kernel_map.kernel_size)
+    plan = torch.ops.gsim3d.sparse_conv_plan(
+        voxels.row_voxel, voxels.rows, voxels.cu_rows, *taps, kernel_map.kernel_size
+    )
     return dataclasses.replace(kernel_map, plan=plan)
 
 

@@ -5,8 +5,8 @@
 
 The step is the one of `gsim3d train`: encode, 12 steps fed back, images of 5 views at all 16 steps, gradients,
 clipping, AdamW, averaged weights; with drop path, shuffled curves and deterministic algorithms. The film, the masks and
-where particles lie are those of surface_scene.py. With several processes every one gets ``--batch`` scenes; the efficiency
-of scaling is the time of a step in one process, measured before they begin, over the time in all of them.
+where particles lie are those of surface_scene.py. With several processes every one gets ``--batch`` scenes; the
+efficiency of scaling is the time of a step in one process, measured before they begin, over the time in all of them.
 """
 
 from __future__ import annotations
