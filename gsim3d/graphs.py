@@ -233,7 +233,7 @@ class CapturedRollout:
 
     def _rollout(self, geometry, report: StabilityReport) -> Predicted:
         """The rollout of the graph's own state."""
-        plan, rest = _with_background_as_it_is(self._plan), self._rest
+        plan, rest = with_background_as_it_is(self._plan), self._rest
         options, renderings = {"geometry": geometry, "report": report}, []
         with torch.no_grad(), self._autocast():
             if rest is None:
@@ -414,7 +414,7 @@ def _gaps(table: CloudTable) -> list[int | None]:
     return [b[1] - a[1] if a[0] == b[0] else None for a, b in zip(places, places[1:])]
 
 
-def _with_background_as_it_is(plan: Plan) -> Plan:
+def with_background_as_it_is(plan: Plan) -> Plan:
     """``plan`` for a state that is prepared already."""
     if plan.spec.dynamics.background not in ("masked_out", "dynamic"):
         return plan
