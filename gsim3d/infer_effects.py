@@ -10,8 +10,8 @@ film's begin, middle and end are compared with it: what it is worth is how many 
 the time of a step and its images that it takes. The smallest settings within the tolerance are taken together; while
 together they lose more, the one that is worth most comes back.
 
-It is the model that is measured: where its predictions are hardly better than particles held still (the first line tells
-both), it has not learned what the effects are for, and the proposal says little about the scene. Times of a few
+It is the model that is measured: where its predictions are hardly better than particles held still (the first line
+tells both), it has not learned what the effects are for, and the proposal says little about the scene. Times of a few
 milliseconds waver; let nothing else run.
 
 examples:
@@ -38,16 +38,12 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from gsim3d.effects import FILE
-    from gsim3d.errors import InputError
+    from gsim3d.files import new_place
     from gsim3d.plans import in_columns
     from gsim3d.train.restore import restore
 
     tolerance = _decibels(args.tolerance)
-    out = Path(args.out or Path(args.scene) / FILE)
-    if out.exists():
-        raise InputError(f"--out: {out} exists already; name another file or remove it")
-    if not out.parent.is_dir():
-        raise InputError(f"--out: the folder {out.parent} does not exist")
+    out = new_place(args.out or Path(args.scene) / FILE, "file")
     restored = restore(args.checkpoint, args.device)
     scene = restored.open_scene(args.scene)
     trial = _Trial(restored, scene)
@@ -66,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def propose(base, settings: dict, trial, measured: tuple[float, float], tolerance: float):
-    """Rows of a table, the smallest spec that loses at most ``tolerance`` dB of ``measured``, and what it was measured at.
+    """Rows of a table, the smallest spec that loses at most ``tolerance`` dB of ``measured``, and its own measurement.
 
     Args:
         settings: of :func:`smaller`.

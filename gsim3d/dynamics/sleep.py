@@ -1,11 +1,11 @@
 """Rows that came to rest are not computed until something near them moves.
 
-A row is quiet after ``patience`` steps in which it changed by no more than ``eps``. By the policy "exact" a scene sleeps
-once all its rows are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of ``halo``
-metres. A cube sleeps while no row in it or in one of its 26 neighbours is restless, and wakes in the step after one has
-become so. A row that moves by less than ``halo`` a step is in a neighbouring cube one step before it can be in the
-sleeping one: whom it may meet is awake by then. Who falls asleep is asked every ``patience`` steps only, since others
-asleep make another background. Rows asleep are a background to those awake, so "approx" needs a model of
+A row is quiet after ``patience`` steps in which it changed by no more than ``eps``. By the policy "exact" a scene
+sleeps once all its rows are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of
+``halo`` metres. A cube sleeps while no row in it or in one of its 26 neighbours is restless, and wakes in the step
+after one has become so. A row that moves by less than ``halo`` a step is in a neighbouring cube one step before it can
+be in the sleeping one: whom it may meet is awake by then. Who falls asleep is asked every ``patience`` steps only,
+since others asleep make another background. Rows asleep are a background to those awake, so "approx" needs a model of
 ``background="asymmetric"``.
 
 A row that sleeps misses changes of up to ``eps`` a step. Where a simulation that never sleeps would change no row of a
@@ -78,7 +78,9 @@ class Sleepers:
         Waits for the device only where somebody sleeps or may fall asleep now.
         """
         self.n_steps += 1
-        moved = (after.activity != before.activity) > self.rule.eps  # who vanishes from the sight of others changed by 1
+        moved = (
+            after.activity != before.activity
+        ) > self.rule.eps  # who vanishes from the sight of others changed by 1
         for name in sorted(self.changing):
             allowed = self.reach if name == "means" else self.rule.eps
             moved |= _largest(getattr(after, name) - getattr(before, name)) > allowed

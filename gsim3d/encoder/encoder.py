@@ -99,7 +99,8 @@ class Encoder(nn.Module):
             values = getattr(part, name)
             if values is not None:
                 values = _Kept.apply(values.flatten(0, 1), places.pixel, places.row)
-                fields[name] = torch.where(places.is_one.reshape(-1, *[1] * (values.dim() - 1)), values, 0)
+                nothing = torch.eye(1, 4, dtype=values.dtype, device=values.device) if name == "quats" else 0
+                fields[name] = torch.where(places.is_one.reshape(-1, *[1] * (values.dim() - 1)), values, nothing)
         activity = torch.full_like(places.pixel, DYNAMIC, dtype=torch.uint8)
         if frames.dynamic is not None:
             activity.masked_fill_(~frames.dynamic.flatten()[places.pixel], FROZEN)
@@ -193,7 +194,7 @@ def _scene_of_image(frames: Frames) -> Tensor:
 
 
 class _Kept(torch.autograd.Function):
-    """Some rows of x, each once. The gradient takes rows too, where torch would add them to zeros and sort them for that.
+    """Some rows of x, each once. The gradient takes rows too; torch would sort them and add them to zeros.
 
     rows: which, int64. place: of each row of x its place among ``rows``, or their number.
     """

@@ -20,17 +20,17 @@ from itertools import chain
 import torch
 from torch import Tensor, nn
 
-from gsim3d.dynamics import concatenate
+from gsim3d.dynamics import DynamicsConfig, concatenate
 from gsim3d.encoder import Room
 from gsim3d.errors import InputError
-from gsim3d.graphs import Captured
+from gsim3d.graphs import Captured, with_background_as_it_is
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
 from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport
 from gsim3d.train.samples import Batch
-from gsim3d.types import Frames, Particles
+from gsim3d.types import ASLEEP, DYNAMIC, Frames, Particles
 
 FACTOR = 1.3  # room for geometry over what was observed: little costs captures, much costs time in every step
 ROWS_FACTOR = 1.15  # likewise, for the particles of a cloud
@@ -67,6 +67,13 @@ class Prepared:
         return table.scenes, table.steps, batch.n_lead, batch.n_future, images
 
 
+def check_capturable(config: DynamicsConfig) -> None:
+    """Raises InputError for a model whose training steps no graph can repeat."""
+    if config.drop_path or config.shuffle_orders or config.norm == "batch" or config.is_asymmetric:
+        wanted = 'drop_path 0, shuffle_orders false, norm "layer" and a symmetric background'
+        raise InputError(f"captured: the model must have {wanted}")
+
+
 class CapturedLoss:
     """The loss of batches of one kind, and its gradients.
 
@@ -91,16 +98,7 @@ class CapturedLoss:
         loss: Callable[[Tensor, Frames, Tensor], tuple[Tensor, Tensor]],
         precision: Callable[[str], torch.autocast],
     ):
-        config = simulator.config.dynamics
-        if (
-            config.drop_path
-            or config.shuffle_orders
-            or config.norm == "batch"
-            or config.explicit
-            or config.is_asymmetric
-        ):
-            wanted = 'drop_path 0, shuffle_orders false, norm "layer", explicit false and a symmetric background'
-            raise InputError(f"captured: the model must have {wanted}")
+        check_capturable(simulator.config.dynamics)
         self.simulator, self.plan, self.loss, self.precision = simulator, plan, loss, precision
         self.parameters = list(simulator.parameters())
         self.alone: AbstractContextManager = nullcontext()
@@ -183,10 +181,12 @@ class _Step:
         wrap: Callable[[Callable], Callable] | None = None,
     ) -> list[Particles]:
         """The simulated steps that are looked at; ``wrap`` as of Simulator.rollout."""
-        owner = self._owner
+        owner, plan = self._owner, self._owner.plan
         if not self._n_future:
             return []
-        rollout = partial(owner.simulator.rollout, plan=owner.plan, geometry=geometry, report=report, on_bad="drop")
+        if plan.spec.dynamics.background == "masked_out":
+            state, plan = _without_background(state), with_background_as_it_is(plan)
+        rollout = partial(owner.simulator.rollout, plan=plan, geometry=geometry, report=report, on_bad="drop")
         with owner.precision("dynamics"):
             if self._n_lead:
                 with torch.no_grad():
@@ -309,6 +309,13 @@ def _sums(parts: Sequence[Sequence[Tensor | None]]) -> list[Tensor | None]:
         for k, value in zip(both, added, strict=True):
             total[k] = value
     return total
+
+
+def _without_background(state: Particles) -> Particles:
+    """As if only what may move were there, in as many rows."""
+    left_out = state.activity != DYNAMIC
+    opacities = torch.where(left_out, 0.0, state.opacities)
+    return dataclasses.replace(state, activity=torch.where(left_out, ASLEEP, state.activity), opacities=opacities)
 
 
 def _own(frames: Frames) -> Frames:

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from gsim3d.ablate.rows import ROWS
 from gsim3d.data import Scene, find_scenes
 from gsim3d.errors import InputError
 from gsim3d.stability import StabilityReport
@@ -32,9 +33,12 @@ def scenes(tmp_path_factory):
     return [Scene.open(path) for path in find_scenes(write_scenes(tmp_path_factory.mktemp("scenes"), 2))]
 
 
-@pytest.fixture
-def trainer(scenes, tmp_path, device):
-    trainer = Trainer(CONFIG, scenes, tmp_path, device=device.type)
+KINDS = {"latent": CONFIG, **{name: ROWS[name].change(CONFIG) for name in ("explicit", "background-masked")}}
+
+
+@pytest.fixture(params=["latent"])
+def trainer(scenes, tmp_path, device, request):
+    trainer = Trainer(KINDS[request.param], scenes, tmp_path, device=device.type)
     with torch.no_grad():
         for parameter in trainer.simulator.dynamics.net.head.parameters():
             parameter.normal_(0, 0.02, generator=torch.Generator(parameter.device).manual_seed(0))
@@ -57,7 +61,12 @@ def run(captured, batch, trainer, report=None, factor=1.0):
     return captured(captured.prepare(batch), weights, StabilityReport() if report is None else report)
 
 
-@pytest.mark.parametrize("stage", [{}, {"lead": 2}, {"horizon": 0}], ids=["rollout", "lead", "encoded"])
+@pytest.mark.parametrize(
+    "stage, trainer",
+    [({}, "latent"), ({"lead": 2}, "latent"), ({"horizon": 0}, "latent"), ({}, "explicit"), ({"lead": 2}, "background-masked")],
+    ids=["rollout", "lead", "encoded", "explicit", "masked"],
+    indirect=["trainer"],
+)
 def test_gradients_are_those_of_the_loss(stage, scenes, trainer, device):
     captured, report = captured_loss(trainer), StabilityReport()
     drawn = batches(scenes, 4, **stage)

@@ -2,11 +2,11 @@
 
     python tools/bench/effects.py [--device cuda]
 
-"off" rows compare an effect that a plan switched off with a model that was built without it (wanted: at most 1.01 times its
-time), "idle" rows an effect that is on and has nothing to do with one that is off (at most 1.05 times); both give the same
-bits. "on" rows compare an effect with the same plan without it: this is its price; on a GPU that of a captured rollout of a
-large scene, for there calls as Python makes them are launches for the most part. Weights are random, times do not depend
-on them.
+"off" rows compare an effect that a plan switched off with a model that was built without it (wanted: at most 1.01 times
+its time), "idle" rows an effect that is on and has nothing to do with one that is off (at most 1.05 times); both give
+the same bits. "on" rows compare an effect with the same plan without it: this is its price; on a GPU that of a captured
+rollout of a large scene, for there calls as Python makes them are launches for the most part. Weights are random, times
+do not depend on them.
 """
 
 import copy
@@ -85,7 +85,9 @@ def rows(config, n: int, device: str):
     plain = rollout(simulator, state, {}), images(simulator, large, {})
     flat = {"appearance": {"view_dependent": 0}}
     yield "off: time merging", rollout(one, first, {}), rollout(without_merging(one), first, {}), OFF
-    yield "off: view-dependent colour", images(simulator, large, flat), images(of_degree_zero(simulator), large, {}), OFF
+    yield "off: view-dependent colour", images(simulator, large, flat), images(
+        of_degree_zero(simulator), large, {}
+    ), OFF
     yield "idle: insertion, removal, actions, contact", rollout(simulator, state, HALF_ON), plain[0], IDLE
     yield "idle: sleep", rollout(simulator, state, {"dynamics": {"sleep": {"eps": 0.0}}}), plain[0], IDLE
     yield "idle: depth and alpha images", images(simulator, large, EVERY_IMAGE), plain[1], IDLE
@@ -97,7 +99,9 @@ def rows(config, n: int, device: str):
     ):
         without = rollout(simulator, state, less) if device == "cpu" else captured(simulator, many, less)
         yield f"on: {case}", whole, without, None
-    yield f"on: view-dependent colour, degree {config.renderer.sh_degree}", plain[1], images(simulator, large, flat), None
+    yield f"on: view-dependent colour, degree {config.renderer.sh_degree}", plain[1], images(
+        simulator, large, flat
+    ), None
     features = images(simulator, large, {"outputs": {"features": True}})
     yield f"on: feature images, {config.renderer.latents} channels", features, plain[1], None
     depth = images(simulator, large, {"outputs": {"rgb": False, "depth": True}})

@@ -1,6 +1,6 @@
 """What the benchmarks of the ops share: check first, then time gsim3d and its peer in turns and print both.
 
-    bench = Bench("pool")                                # reads the command line: --device, --json, --threads, --seconds
+    bench = Bench("pool")                                # reads the command line (--help)
     bench.compare("64k rows", ours, plain)               # CPU: callables without arguments; results must agree
     bench.compare("64k rows, fwd+bwd", *with_gradients(inputs, ours_of, plain_of))
     bench.gpu("64k rows", "float32", ours, {"torch": plain}, target_ratio=5, limit_ms=0.04)      # --device cuda
@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 MIN_ROUNDS, MAX_ROUNDS = 5, 200
-PAIRS, MAX_PAIRS = 25, 400  # of timings of a cost; more than 25 of what is fast
+PAIRS, MAX_PAIRS = 15, 400  # of timings of a cost; more than 15 of what is fast
 GPU_ROUNDS = 20  # or MIN_ROUNDS of what takes long
 RESULTS = Path(__file__).parent / "results"  # one JSON line for each row measured on a GPU
 
@@ -76,7 +76,9 @@ def summary(seconds: list[float]) -> dict:
 
 
 def commit() -> str:
-    done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True)
+    done = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True
+    )
     return done.stdout.strip() or "unknown"
 
 
@@ -87,6 +89,16 @@ def event_ms(f) -> float:
     end.record()
     end.synchronize()
     return start.elapsed_time(end)
+
+
+def best_seconds(f, repeats: int = 3) -> float:
+    """Of the fastest of a few calls."""
+    best = float("inf")
+    for _ in range(repeats):
+        start = time.perf_counter()
+        f()
+        best = min(best, time.perf_counter() - start)
+    return best
 
 
 def processor_seconds(f) -> float:
@@ -126,7 +138,8 @@ class Bench:
         self.device = torch.device(self.args.device)
         if self.args.device == "cuda":
             print(f"{op}: {torch.cuda.get_device_name()}, torch {torch.__version__}")
-            print(f"{'case':<52}{'gsim3d ms':>10}{'graph':>9}{'peer ms':>10}{'graph':>9}{'ratio':>8}{'target':>8}{'error':>9}")
+            names = ("gsim3d ms", "graph", "peer ms", "graph", "ratio", "target", "error")
+            print(f"{'case':<52}" + "".join(f"{name:>{n}}" for name, n in zip(names, (10, 9, 10, 9, 8, 8, 9))))
             return
         print(f"{op}: {platform.machine()}, torch {torch.__version__}, {self.args.threads} threads")
         columns = f"{'gsim3d ms':>11}{'best':>10}{'torch ms':>11}{'best':>10}"
@@ -155,10 +168,10 @@ class Bench:
 
     def gpu(self, case: str, dtype: str, ours, peers: dict, *, target_ratio=None, limit_ms=None, tolerance=1e-5,
             capture=True) -> None:  # fmt: skip
-        """``peers``: name -> callable, the fastest counts, or the milliseconds once recorded of a peer that cannot run here;
-        empty where there is none. ``tolerance`` bounds the error
-        against each peer, relative to the largest value; None where the caller has compared the results by its own rule.
-        ``capture``: also try a CUDA graph (a capture that fails leaves torch's random generator unusable)."""
+        """``peers``: name -> callable, the fastest counts, or the milliseconds once recorded of a peer that cannot run
+        here; empty where there is none. ``tolerance`` bounds the error against each peer, relative to the largest
+        value; None where the caller has compared the results by its own rule. ``capture``: also try a CUDA graph (a
+        capture that fails leaves torch's random generator unusable)."""
         recorded = {name: peer for name, peer in peers.items() if not callable(peer)}
         peers = {name: peer for name, peer in peers.items() if callable(peer)}
         error = None
@@ -211,10 +224,17 @@ class Bench:
         file.write_text("".join(json.dumps(row) + "\n" for row in self.results))
 
     def cost(
-        self, case: str, run, plain, *, dtype: str = "float32", tolerance: float | None = 0.0, limit: float | None = None
+        self,
+        case: str,
+        run,
+        plain,
+        *,
+        dtype: str = "float32",
+        tolerance: float | None = 0.0,
+        limit: float | None = None,
     ) -> None:
-        """What ``run`` costs over ``plain``, both sides in turns, one ahead and then the other; the cost is the median over
-        pairs, between its quartiles. On the CPU of processor time on one thread, so that a busy machine matters little.
+        """What ``run`` costs over ``plain``, both sides in turns, one ahead and then the other; the cost is the median
+        over pairs, between its quartiles. On the CPU of processor time on one thread, whatever else runs.
 
         Args:
             tolerance: of the results, which are compared twice; None: they are others.

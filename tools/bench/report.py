@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Runs the benchmark of every op on the CPU and writes docs/benchmarks.md (and docs/benchmarks.json, the numbers behind it).
+"""Runs the benchmark of every op on the CPU and writes docs/benchmarks.md (and docs/benchmarks.json, its numbers).
 
     python tools/bench/report.py                  all ops
     python tools/bench/report.py raster pool      run these again, keep the other numbers
@@ -37,8 +37,9 @@ GPU = """
 ## On a GPU
 
 Medians of repeated calls between two events, as a program makes them: Python and launches included. "graph" is the same
-call replayed from a CUDA graph, "-" where it cannot be captured. "limit" is what the chip's rates allow by a count of bytes
-and operations; "wanted" is the ratio to the peer that we aim at. How each kernel got there: [performance log](performance-log.md).
+call replayed from a CUDA graph, "-" where it cannot be captured. "limit" is what the chip's rates allow by a count of
+bytes and operations; "wanted" is the ratio to the peer that we aim at. How each kernel got there:
+[performance log](performance-log.md).
 """
 CPU = """
 ## On the CPU
@@ -51,8 +52,8 @@ float32. "torch" is the best form of the op in plain torch that we found (vector
 COSTS = """
 ### What guards cost
 
-A rollout and an image with the default policy for numbers that cannot be used ([stability](stability.md)) and without any
-guard: processor time on one thread, both sides in turns; the cost is the median over pairs, with its quartiles.
+A rollout and an image with the default policy for numbers that cannot be used ([stability](stability.md)) and without
+any guard: processor time on one thread, both sides in turns; the cost is the median over pairs, with its quartiles.
 """
 
 
@@ -68,7 +69,8 @@ def gpu_tables() -> str:
         if not rows:
             continue
         first = rows[0]
-        text += f"\n### {first['op']} on {first['gpu']}\n\ntorch {first['torch']}, commit {first['commit']}, {first['date']}.\n"
+        text += f"\n### {first['op']} on {first['gpu']}\n\n"
+        text += f"torch {first['torch']}, commit {first['commit']}, {first['date']}.\n"
         text += cost_table([row for row in rows if "cost" in row])
         text += peer_table([row for row in rows if "cost" not in row])
     return text
@@ -184,7 +186,9 @@ def effects(r: dict) -> str:
     on_gpu = ""
     if rows:
         first = rows[0]
-        on_gpu = f"\n{first['gpu']}, torch {first['torch']}, commit {first['commit']}, {first['date']}.\n{cost_table(rows)}"
+        on_gpu = (
+            f"\n{first['gpu']}, torch {first['torch']}, commit {first['commit']}, {first['date']}.\n{cost_table(rows)}"
+        )
     return f"{where}\n{cost_table(r['results'])}{on_gpu}"
 
 

@@ -3,8 +3,8 @@
     python tools/bench/stability.py [--device cuda] [--seconds 5]
 
 Guards are one look at all rows where a state enters and after every step, and the counts of the rasterizer. The peer is
-the same without guards; results are the same bits. On a GPU of eager calls, which wait for Python, and of replays of two
-CUDA graphs.
+the same without guards; results are the same bits. On a GPU of eager calls, which wait for Python, and of replays of
+two CUDA graphs.
 """
 
 import math
