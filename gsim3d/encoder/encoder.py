@@ -58,8 +58,8 @@ class Encoder(nn.Module):
         On a GPU it computes in float32 unless autocast, or torch's switch for TF32 in matrix products, says otherwise.
 
         Args:
-            room: of :meth:`room`, for frames like these in all but their numbers. Nothing then waits for the device, and
-                nothing is checked; particles that have no row are left out.
+            room: of :meth:`room`, for frames like these in all but their numbers. Nothing then waits for the device,
+                and nothing is checked; particles that have no row are left out.
         Gradients: ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
         Raises:
             InputError: sizes do not fit the network's strides or each other; the message names the argument.

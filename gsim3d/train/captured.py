@@ -285,10 +285,15 @@ class _Step:
 def _aliased(module: nn.Module) -> Iterator[list[Tensor]]:
     """Within it the parameters of ``module`` are others in the same memory, in the order of ``parameters()``.
 
-    Calls that share weights would have the gradients of each weight added call by call: thousands of small kernels. Those
-    of aliases are added at once.
+    Calls that share weights would have the gradients of each weight added call by call, in thousands of small kernels;
+    those of aliases are added at once.
     """
-    places = [(part, name, value) for part in module.modules() for name, value in part._parameters.items() if value is not None]
+    places = [
+        (part, name, value)
+        for part in module.modules()
+        for name, value in part._parameters.items()
+        if value is not None
+    ]
     aliases = [value.detach().requires_grad_() for _, _, value in places]
     try:
         for (part, name, _), alias in zip(places, aliases, strict=True):

@@ -63,7 +63,13 @@ def run(captured, batch, trainer, report=None, factor=1.0):
 
 @pytest.mark.parametrize(
     "stage, trainer",
-    [({}, "latent"), ({"lead": 2}, "latent"), ({"horizon": 0}, "latent"), ({}, "explicit"), ({"lead": 2}, "background-masked")],
+    [
+        ({}, "latent"),
+        ({"lead": 2}, "latent"),
+        ({"horizon": 0}, "latent"),
+        ({}, "explicit"),
+        ({"lead": 2}, "background-masked"),
+    ],
     ids=["rollout", "lead", "encoded", "explicit", "masked"],
     indirect=["trainer"],
 )
