@@ -67,6 +67,7 @@ def _recipe(
     strides: tuple[int, int] = (3, 2),
     batch: int = 4,
     capacity: int = 600,
+    first_films: int = FIRST_FILMS,
 ) -> Recipe:
     """strides: of the pixels of ground and bodies.   batch: where 12 steps are simulated.   Others as in Recipe."""
     stage = partial(StageConfig, target_views=4, begin_within=begin_within)
@@ -99,14 +100,17 @@ def _recipe(
         captured=True,
         log_every=20,
     )
-    return Recipe(world, train, capacity=capacity)
+    return Recipe(world, train, capacity=capacity, first_films=first_films)
 
 
 RECIPES = {
     # Bodies fall for half a second and then hardly move.
     "elastic": _recipe("elastic", (1.9, 4.8), lead=24, begin_within=24),
-    # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories.
-    "cloth": _recipe("cloth", (1.6, 4.8), lead=24, begin_within=0, strides=(4, 2), batch=3, capacity=400),
+    # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories, which take
+    # twice as long to film.
+    "cloth": _recipe(
+        "cloth", (1.6, 4.8), lead=24, begin_within=0, strides=(4, 2), batch=3, capacity=400, first_films=32
+    ),
     "rigid": _recipe("rigid", (1.7, 5.0), lead=12, begin_within=12),
 }
 
