@@ -67,7 +67,6 @@ def _recipe(
     strides: tuple[int, int] = (3, 2),
     batch: int = 4,
     capacity: int = 600,
-    first_films: int = FIRST_FILMS,
 ) -> Recipe:
     """strides: of the pixels of ground and bodies.   batch: where 12 steps are simulated.   Others as in Recipe."""
     stage = partial(StageConfig, target_views=4, begin_within=begin_within)
@@ -93,24 +92,21 @@ def _recipe(
             stage(steps=1_000_000, horizon=12, lead=lead, batch=batch, from_start=0.2, learning_rate=5e-4),
         ),
         # The weights of 12 steps add up to six times their balance. Far more than 1 for the encoded ones, and rollouts
-        # that are wrong blur what is encoded: images were no sharper after 2000 steps than after 500.
+        # that are wrong blur what is encoded: images were hardly sharper after 2000 steps than after 500.
         loss=LossConfig(body_weight=3.0, balance=0.15),
         optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.995),
         precision=PrecisionConfig(encoder="bf16", dynamics="bf16"),
         captured=True,
         log_every=20,
     )
-    return Recipe(world, train, capacity=capacity, first_films=first_films)
+    return Recipe(world, train, capacity=capacity)
 
 
 RECIPES = {
     # Bodies fall for half a second and then hardly move.
     "elastic": _recipe("elastic", (1.9, 4.8), lead=24, begin_within=24),
-    # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories, which take
-    # twice as long to film.
-    "cloth": _recipe(
-        "cloth", (1.6, 4.8), lead=24, begin_within=0, strides=(4, 2), batch=3, capacity=400, first_films=32
-    ),
+    # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories.
+    "cloth": _recipe("cloth", (1.6, 4.8), lead=24, begin_within=0, strides=(4, 2), batch=3, capacity=400),
     "rigid": _recipe("rigid", (1.7, 5.0), lead=12, begin_within=12),
 }
 
