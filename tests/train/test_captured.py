@@ -100,7 +100,10 @@ def test_what_needs_more_room_gets_it(scenes, trainer, device):
     batch = batches(scenes, 1)[0].to(device)
     loss = run(captured, batch, trainer).loss.clone()
     (step,) = captured._steps.values()
-    step._capacities = [dataclasses.replace(c, sizes=(c.sizes[0], *(1 for _ in c.sizes[1:]))) for c in step._capacities]
+    for part in step._parts:
+        part._capacities = [
+            dataclasses.replace(c, sizes=(c.sizes[0], *(1 for _ in c.sizes[1:]))) for c in part._capacities
+        ]
     step._capture()  # a graph with room for next to nothing
     made = captured.captures
     torch.testing.assert_close(run(captured, batch, trainer).loss, loss, rtol=TOLERANCE[device.type], atol=0)
