@@ -52,9 +52,9 @@ def patch_attention(
         check_numbers("patch_attention", q=q, k=k, v=v)
     if scale is None:
         scale = q.shape[-1] ** -0.5 if q.dim() and q.shape[-1] else 1.0
-    return torch.ops.gsim3d.patch_attention(
-        q, k, v, table.q_rows, table.kv_rows, table.cu_q, table.cu_k, float(scale)
-    )[0]
+    return torch.ops.gsim3d.patch_attention(q, k, v, table.q_rows, table.kv_rows, table.cu_q, table.cu_k, float(scale))[
+        0
+    ]
 
 
 @torch.library.register_fake("gsim3d::patch_attention")
