@@ -185,7 +185,8 @@ class Reader:
         )
 
     def convolved(self, conv: nn.Module, x: Tensor, out: Tensor) -> Tensor:
-        return out + self.background.fields[conv].index_select(0, self.cells[conv.kernel_size]).to(out.dtype)
+        field = self.background.fields[conv].to(out.dtype)
+        return ops.add_cells(out, field, self.cells[conv.kernel_size], check=False)
 
     def attended(self, attention: nn.Module, q: Tensor, k: Tensor, v: Tensor, patches: PatchTable, row: int) -> Tensor:
         keys, values = self.background.keys[attention].to(q.dtype), self.background.values[attention].to(q.dtype)

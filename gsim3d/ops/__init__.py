@@ -5,7 +5,7 @@ Every op runs on CPU (and CUDA where compiled), is deterministic, differentiable
 """
 
 from gsim3d.ops._load import cuda_compiled
-from gsim3d.ops.background import find_cells, overlapping_patches, row_scenes
+from gsim3d.ops.background import add_cells, find_cells, overlapping_patches, row_scenes
 from gsim3d.ops.curve import (
     CURVES,
     KernelMap,
@@ -41,6 +41,7 @@ __all__ = [
     "Stage",
     "Voxels",
     "Watched",
+    "add_cells",
     "build_pyramid",
     "cuda_compiled",
     "curve_encode",

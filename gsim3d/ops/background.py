@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
-from gsim3d.ops._arguments import check_tensors, check_whole
+from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole
+from gsim3d.ops._autocast import follow_autocast
 from gsim3d.ops.curve import PatchTable, Segments
 
 
@@ -58,6 +59,32 @@ def find_cells(cells: Tensor, scene: Tensor, grid: Tensor) -> Tensor:
     return torch.ops.gsim3d.find_cells(cells, scene, grid)
 
 
+def add_cells(x: Tensor, field: Tensor, places: Tensor, *, check: bool = True) -> Tensor:
+    """``x[i] + field[places[i]]``: what rows read of the cells that they lie in.
+
+    Args:
+        x: [N, C], float32 or float64, on CUDA also float16 and bfloat16. Under ``torch.autocast`` CUDA computes in its
+            dtype and the CPU in float32.
+        field: [D, C], dtype of ``x``.
+        places: int64 [N] in [0, D), as of :func:`find_cells`. On CUDA a row with another one is copied.
+        check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
+    Returns:
+        [N, C], dtype of ``x``.
+    Gradients: ``x`` and ``field``; sums over the rows of a cell have one order.
+    Raises:
+        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        ValueError, TypeError: an argument is malformed; the message names it.
+
+    Example:
+        >>> add_cells(torch.ones(2, 1), torch.tensor([[5.0], [7.0]]), torch.tensor([1, 0])).flatten()
+        tensor([8., 6.])
+    """
+    if check:
+        check_tensors("add_cells", x=x, field=field, places=places)
+        check_numbers("add_cells", x=x, field=field)
+    return torch.ops.gsim3d.add_cells(x, field, places)
+
+
 def overlapping_patches(
     first: Tensor, kv_rows: Tensor, cu_k: Tensor, codes: Tensor, order: Tensor, cu_clouds: Tensor, *, patch_size: int
 ) -> tuple[PatchTable, ...]:
@@ -105,6 +132,30 @@ def _(cloud_scene, cu_input, rows, cu_rows):
 @torch.library.register_fake("gsim3d::find_cells")
 def _(cells, scene, grid):
     return cells.new_empty(scene.shape)
+
+
+@torch.library.register_fake("gsim3d::add_cells")
+def _(x, field, places):
+    return x.new_empty(x.shape)
+
+
+def _setup(ctx, inputs, output):
+    _, field, places = inputs
+    ctx.save_for_backward(places)
+    ctx.n_cells = field.shape[0]
+
+
+def _backward(ctx, grad):
+    (places,) = ctx.saved_tensors
+    of_field = None
+    if ctx.needs_input_grad[1]:  # sums without atomics
+        of_field = torch.ops.aten.embedding_dense_backward(grad.contiguous(), places, ctx.n_cells, -1, False)
+    return grad, of_field, None
+
+
+torch.library.register_autograd("gsim3d::add_cells", _backward, setup_context=_setup)
+torch.library.register_autocast("gsim3d::add_cells", "cpu", torch.float32)
+follow_autocast("add_cells")
 
 
 @torch.library.register_fake("gsim3d::overlapping_patches")

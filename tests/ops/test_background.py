@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from gsim3d.ops import Segments, find_cells, overlapping_patches, row_scenes
-from tests.asserts import assert_same_bits_for_any_threads
+from gsim3d.errors import HardCaseError
+from gsim3d.ops import Segments, add_cells, find_cells, overlapping_patches, row_scenes
+from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads, gradients
 
 NOWHERE = torch.iinfo(torch.int64).max
 SCENE = 48  # bits below the scene in a key
@@ -108,7 +109,13 @@ def assert_equal(actual, expected):
         assert a.dtype == torch.int64 and torch.equal(a.cpu(), b), f"list {i}"
 
 
-# 1 against plain Python (2, 3: no gradients)
+def rows_and_field(n_rows=70, n_cells=9, channels=16, dtype=torch.float64, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    x, field, cotangent = (torch.randn(n, channels, generator=g).to(dtype) for n in (n_rows, n_cells, n_rows))
+    return x, field, torch.randint(0, n_cells, (n_rows,), generator=g), cotangent
+
+
+# 1 against plain Python
 @pytest.mark.parametrize("seed", range(3))
 def test_scenes(seed, device):
     scenes, cu, stages = chain(seed=seed)
@@ -147,7 +154,58 @@ def test_patches(shape, device):
         assert table.cu_q.diff().max() <= size
 
 
+# 1, 2 forward and gradient of what is added
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("n_rows, n_cells, channels", [(70, 9, 16), (5000, 40, 24), (33, 50, 5), (3, 1, 1)])
+def test_cells_are_added(n_rows, n_cells, channels, dtype, device):
+    if device.type == "cpu" and dtype.itemsize == 2:
+        pytest.skip("the CPU computes in float32 and float64")
+    x, field, places, cotangent = rows_and_field(n_rows, n_cells, channels, dtype)
+    moved = places.to(device)
+    out, grad_x, grad_field = gradients(
+        lambda x, field: add_cells(x, field, moved), [x.to(device), field.to(device)], cotangent
+    )
+    assert out.dtype == dtype
+    assert_same_bits(out.cpu(), x + field[places])
+    assert_same_bits(grad_x.cpu(), cotangent)
+    expected = torch.zeros(n_cells, channels, dtype=torch.float64).index_add_(0, places, cotangent.double())
+    limit = {torch.float64: 1e-14, torch.float32: 1e-5}.get(dtype, 1e-2)
+    assert_close_relative_to_max(grad_field, expected, limit)
+
+
+# 3 gradcheck
+def test_gradcheck():
+    x, field, places, _ = rows_and_field(7, 3, 2)
+    torch.autograd.gradcheck(lambda x, field: add_cells(x, field, places), [x.requires_grad_(), field.requires_grad_()])
+
+
 # 4 CPU against CUDA
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("n_rows", [2000, 9000])
+def test_gradients_have_the_same_bits_in_every_run(n_rows, dtype, devices):
+    x, field, places, cotangent = (t.to(devices[1]) for t in rows_and_field(n_rows, 30, 64, dtype))
+    runs = [gradients(lambda x, field: add_cells(x, field, places), [x, field], cotangent) for _ in range(4)]
+    for run in runs[1:]:
+        for a, b in zip(run, runs[0], strict=True):
+            assert_same_bits(a, b)
+
+
+def test_autocast(device):
+    x, field, places, _ = (t.to(device) for t in rows_and_field(dtype=torch.float32))
+    with torch.autocast(device.type, torch.bfloat16):
+        out = add_cells(x.bfloat16(), field, places)
+    assert out.dtype == (torch.bfloat16 if device.type == "cuda" else torch.float32)
+    assert_same_bits(out, x.bfloat16().to(out.dtype) + field.to(out.dtype)[places])
+
+
+def test_a_row_whose_cell_is_out_of_range_is_copied(devices):
+    x, field, places, _ = (t.to(devices[1]) for t in rows_and_field(dtype=torch.float32))
+    wrong = torch.where(torch.arange(70, device=devices[1]) % 2 == 0, places, 2**40 * places - 1)
+    out = add_cells(x, field, wrong)
+    assert_same_bits(out[1::2], x[1::2])
+    assert_same_bits(out[::2], add_cells(x, field, places)[::2])
+
+
 @pytest.mark.parametrize(
     "shape", [{"counts": (9000, 8000), "scenes": (0, 0), "n_patches": 40, "patch_size": 1024, "span": 2**40}]
 )
@@ -168,6 +226,8 @@ def test_opcheck(device):
         "find_cells": cells_and_rows(),
         "overlapping_patches": (*arguments, size),
     }
+    x, field, places, _ = rows_and_field(12, 4, 3)
+    calls["add_cells"] = (x.requires_grad_(), field.requires_grad_(), places)
     for name, given in calls.items():
         given = [
             [y.to(device) for y in x] if isinstance(x, list) else x.to(device) if x is not size else x for x in given
@@ -191,6 +251,14 @@ def test_compiled_equals_eager():
     compiled = torch.compile(places, fullgraph=True, backend="aot_eager")
     given = (arguments, scenes, cu, stages, cells)
     assert_equal(compiled(*given), places(*given))
+
+
+def test_compiled_gradients():
+    x, field, places, cotangent = rows_and_field()
+    compiled = torch.compile(lambda x, field: add_cells(x.sin(), field, places), fullgraph=True, backend="aot_eager")
+    expected = gradients(lambda x, field: add_cells(x.sin(), field, places), [x, field], cotangent)
+    for a, b in zip(gradients(compiled, [x, field], cotangent), expected, strict=True):
+        assert_close_relative_to_max(a, b, 1e-14)
 
 
 # 7 edges
@@ -230,6 +298,8 @@ def test_same_results_for_any_threads():
     arguments, size = overlap(counts=(20000,), scenes=(0,), patch_size=100)
     scenes, cu, stages = chain()
     assert_same_bits_for_any_threads(lambda: (*lists(overlapping_patches(*arguments, patch_size=size)),))
+    x, field, places, cotangent = rows_and_field(9000, 50, 32, torch.float32)
+    assert_same_bits_for_any_threads(lambda: gradients(lambda *y: add_cells(*y, places), [x, field], cotangent))
     assert_same_bits_for_any_threads(
         lambda: (*row_scenes(scenes, cu, stages), find_cells(*cells_and_rows(n_rows=9000)))
     )
@@ -260,6 +330,33 @@ def test_malformed_patches_raise(message):
         arguments[i] = value
     with pytest.raises(ValueError, match=f"overlapping_patches: {message}"):
         overlapping_patches(*arguments, patch_size=size)
+
+
+@pytest.mark.parametrize(
+    "i, value, message",
+    [
+        (0, torch.zeros(3), r"x must be \[N, C\]"),
+        (1, torch.zeros(9, 16), "field must be float64; got float32"),
+        (1, torch.zeros(9, 5).double(), r"field must be \[D, C\] = \[\*, 16\]; got \[9, 5\]"),
+        (2, torch.zeros(9, dtype=torch.int64), r"places must be \[N\] = \[70\]; got \[9\]"),
+        (2, torch.full((70,), 9), r"places must be in \[0, D\) with D=9; got 9 at 0"),
+        (2, torch.zeros(70), "places must be int64; got float32"),
+    ],
+)
+def test_malformed_additions_raise(i, value, message):
+    arguments = list(rows_and_field()[:3])
+    arguments[i] = value
+    with pytest.raises(ValueError, match=f"add_cells: {message}"):
+        add_cells(*arguments)
+
+
+@pytest.mark.parametrize("which, name", [(0, "x"), (1, "field")])
+def test_poison_is_refused_on_the_cpu(which, name):
+    arguments = list(rows_and_field()[:3])
+    arguments[which][3, 2] = float("nan")
+    with pytest.raises(HardCaseError, match=f"add_cells: {name} must be finite"):
+        add_cells(*arguments)
+    assert add_cells(*arguments, check=False).isnan().any()
 
 
 def test_other_malformed_arguments_raise():

@@ -65,6 +65,14 @@ void find_cells(const int64_t* cells,  // [n_cells] ascending, n_cells >= 1
                 int64_t* places,  // [n]
                 const Parallel& parallel);
 
+// out[i] = x[i] + field[places[i]], rows of `channels` numbers. Throws ArgumentError where a place is not in [0, n_cells).
+template <typename T>
+void add_cells(const T* x,      // [n, channels]
+               const T* field,  // [n_cells, channels]
+               const int64_t* places, int64_t n, int64_t n_cells, int64_t channels,
+               T* out,  // [n, channels]
+               const Parallel& parallel);
+
 // A row belongs to the last patch of its scene that begins no later than its code. Throws ArgumentError unless the
 // lists are well formed.
 void overlapping_patches(const Overlap& overlap, const Parts& parts, const Workspace& workspace,
@@ -78,6 +86,10 @@ namespace cuda {
 void row_scenes(const RowChain& chain, Stream stream);
 void find_cells(const int64_t* cells, int64_t n_cells, const int64_t* scene, const int64_t* grid, int64_t n,
                 int64_t* places, Stream stream);
+// T may be Float16 or BFloat16; a row whose place is out of range is copied.
+template <typename T>
+void add_cells(const T* x, const T* field, const int64_t* places, int64_t n, int64_t n_cells, int64_t channels, T* out,
+               Stream stream);
 void overlapping_patches(const Overlap& overlap, const Parts& parts, const Workspace& workspace, Stream stream);
 
 }  // namespace cuda

@@ -87,6 +87,23 @@ void find_cells(const int64_t* cells, int64_t n_cells, const int64_t* scene, con
   });
 }
 
+template <typename T>
+void add_cells(const T* x, const T* field, const int64_t* places, int64_t n, int64_t n_cells, int64_t channels, T* out,
+               const Parallel& parallel) {
+  for (int64_t i = 0; i < n; ++i)
+    check(places[i] >= 0 && places[i] < n_cells, "add_cells: places must be in [0, D) with D=", n_cells, "; got ",
+          places[i], " at ", i);
+  parallel.range(n, kGrain, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i)
+      for (int64_t c = 0; c < channels; ++c) out[i * channels + c] = x[i * channels + c] + field[places[i] * channels + c];
+  });
+}
+
+template void add_cells<float>(const float*, const float*, const int64_t*, int64_t, int64_t, int64_t, float*,
+                               const Parallel&);
+template void add_cells<double>(const double*, const double*, const int64_t*, int64_t, int64_t, int64_t, double*,
+                                const Parallel&);
+
 void overlapping_patches(const Overlap& overlap, const Parts& parts, const Workspace& workspace,
                          const Parallel& parallel) {
   check_overlap(overlap);

@@ -1,7 +1,10 @@
 // Rows of a cloud come in the order of their codes, so the patches around them ascend: where a cloud's rows of a patch
 // begin is written by the row that is first there, and nothing has to be sorted.
+#include <algorithm>
+
 #include "gsim3d/background/background_math.h"
 #include "gsim3d/core/cuda_utils.cuh"
+#include "gsim3d/core/half.cuh"
 
 namespace gsim3d::cuda {
 namespace {
@@ -20,6 +23,29 @@ __global__ void __launch_bounds__(kThreads)
                       const int64_t* __restrict__ grid, int64_t n, int64_t* __restrict__ places) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (i < n) places[i] = background::place_of(cells, n_cells, background::cell_key(scene[i], grid + 3 * i));
+}
+
+// N channels of a row at once.
+template <typename T, int N>
+struct alignas(sizeof(T) * N) Pack {
+  T lane[N];
+};
+
+template <typename T, int N>
+__global__ void __launch_bounds__(kThreads)
+    add_cells_kernel(const T* __restrict__ x, const T* __restrict__ field, const int64_t* __restrict__ places, int64_t n,
+                     int64_t n_cells, int64_t packs, T* __restrict__ out) {
+  const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x, row = i / packs;
+  if (row >= n) return;
+  const int64_t place = places[row];
+  auto sum = reinterpret_cast<const Pack<T, N>*>(x)[i];
+  if (inside(place, n_cells)) {
+    const auto there = reinterpret_cast<const Pack<T, N>*>(field)[place * packs + i - row * packs];
+#pragma unroll
+    for (int j = 0; j < N; ++j)
+      sum.lane[j] = static_cast<T>(static_cast<Sum<T>>(sum.lane[j]) + static_cast<Sum<T>>(there.lane[j]));
+  }
+  reinterpret_cast<Pack<T, N>*>(out)[i] = sum;
 }
 
 // Queries of one curve on their way to parts. A bucket is a patch, or behind the last one the rows without a patch.
@@ -187,6 +213,30 @@ void find_cells(const int64_t* cells, int64_t n_cells, const int64_t* scene, con
   launch("find_cells", find_cells_kernel, blocks_for("find_cells", n, kThreads), kThreads, 0, stream, cells, n_cells,
          scene, grid, n, places);
 }
+
+template <typename T>
+void add_cells(const T* x, const T* field, const int64_t* places, int64_t n, int64_t n_cells, int64_t channels, T* out,
+               Stream stream) {
+  const char* op = "add_cells";
+  const auto run = [&]<int N>() {
+    const int64_t packs = channels / N;
+    launch(op, add_cells_kernel<Native<T>, N>, blocks_for(op, n * packs, kThreads), kThreads, 0, stream,
+           reinterpret_cast<const Native<T>*>(x), reinterpret_cast<const Native<T>*>(field), places, n, n_cells, packs,
+           reinterpret_cast<Native<T>*>(out));
+  };
+  constexpr int kPack = 16 / sizeof(T);
+  const auto bits = reinterpret_cast<uintptr_t>(x) | reinterpret_cast<uintptr_t>(field) | reinterpret_cast<uintptr_t>(out);
+  if (bits % 16 == 0 && channels % kPack == 0) run.template operator()<kPack>();
+  else run.template operator()<1>();
+}
+
+#define GSIM3D_INSTANTIATE(T) \
+  template void add_cells<T>(const T*, const T*, const int64_t*, int64_t, int64_t, int64_t, T*, Stream);
+GSIM3D_INSTANTIATE(float)
+GSIM3D_INSTANTIATE(double)
+GSIM3D_INSTANTIATE(Float16)
+GSIM3D_INSTANTIATE(BFloat16)
+#undef GSIM3D_INSTANTIATE
 
 void overlapping_patches(const Overlap& overlap, const Parts& parts, const Workspace& workspace, Stream stream) {
   Cut cut{overlap, parts, overlap.n_parts(), overlap.n_patches + 1};

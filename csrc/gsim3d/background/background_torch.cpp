@@ -1,7 +1,9 @@
 #include "gsim3d/background/background.h"
 
+#include <type_traits>
 #include <vector>
 
+#include "gsim3d/core/half.h"
 #include "gsim3d/torch/torch_utils.h"
 
 namespace gsim3d::binding {
@@ -69,6 +71,33 @@ Tensor find_cells(const Tensor& cells_, const Tensor& scene_, const Tensor& grid
   return places;
 }
 
+Tensor add_cells(const Tensor& x_, const Tensor& field_, const Tensor& places_) {
+  const char* op = "add_cells";
+  check_shape(op, "x", x_, {-1, -1}, "[N, C]");
+  check_shape(op, "field", field_, {-1, x_.size(1)}, "[D, C]");
+  check_shape(op, "places", places_, {x_.size(0)}, "[N]");
+  check_dtype(op, "field", field_, x_.scalar_type());
+  check_device(op, "field", field_, x_);
+  const Tensor x = rows_of(x_), field = rows_of(field_), places = integers(op, "places", places_, x_);
+  const int64_t n = x.size(0), n_cells = field.size(0), channels = x.size(1);
+  Tensor out = empty(x, {n, channels});
+  const auto run = [&]<typename T>() {
+    if constexpr (kWithCuda)
+      if (x.is_cuda())
+        return cuda::add_cells(data<T>(x), data<T>(field), data<int64_t>(places), n, n_cells, channels,
+                               mutable_data<T>(out), current_stream(x));
+    if constexpr (std::is_floating_point_v<T>)
+      cpu::add_cells(data<T>(x), data<T>(field), data<int64_t>(places), n, n_cells, channels, mutable_data<T>(out),
+                     torch_parallel());
+  };
+  if constexpr (kWithCuda) {
+    if (x.is_cuda() && x.scalar_type() == ScalarType::Half) return run.template operator()<Float16>(), out;
+    if (x.is_cuda() && x.scalar_type() == ScalarType::BFloat16) return run.template operator()<BFloat16>(), out;
+  }
+  dispatch_float(op, "x", x, run);
+  return out;
+}
+
 std::tuple<Tensor, Tensor, Tensor, Tensor> overlapping_patches(const Tensor& first_, const Tensor& kv_rows_,
                                                                const Tensor& cu_k_, const Tensor& codes_,
                                                                const Tensor& order_, const Tensor& cu_clouds_,
@@ -107,6 +136,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> overlapping_patches(const Tensor& fir
 void kernels(auto& m) {
   m.impl("row_scenes", TORCH_BOX(&row_scenes));
   m.impl("find_cells", TORCH_BOX(&find_cells));
+  m.impl("add_cells", TORCH_BOX(&add_cells));
   m.impl("overlapping_patches", TORCH_BOX(&overlapping_patches));
 }
 

@@ -99,6 +99,7 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   m.def(
       "row_scenes(Tensor cloud_scene, Tensor cu_input, Tensor[] rows, Tensor[] cu_rows) -> Tensor[]");
   m.def("find_cells(Tensor cells, Tensor scene, Tensor grid) -> Tensor");
+  m.def("add_cells(Tensor x, Tensor field, Tensor places) -> Tensor");
   m.def(
       "overlapping_patches(Tensor first, Tensor kv_rows, Tensor cu_k, Tensor codes, Tensor order, Tensor cu_clouds, int "
       "patch_size) -> (Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k)");
