@@ -161,5 +161,5 @@ follow_autocast("add_cells")
 @torch.library.register_fake("gsim3d::overlapping_patches")
 def _(first, kv_rows, cu_k, codes, order, cu_clouds, patch_size):
     curves, n_parts = first.shape[0], first.shape[1] + codes.shape[1] // patch_size
-    sizes = (codes.shape[1], n_parts * patch_size, n_parts + 1, n_parts + 1)
+    sizes = (codes.shape[1], kv_rows.shape[1] + codes.shape[1], n_parts + 1, n_parts + 1)
     return tuple(first.new_empty(curves, size) for size in sizes)

@@ -94,7 +94,7 @@ def tables_by_loops(first, kv_rows, cu_k, codes, order, cu_clouds, patch_size):
                 queries, listed = queries + part, listed + its_keys
                 counts_q, counts_k = counts_q + [len(part)], counts_k + [len(its_keys)]
         more = [0] * (n_parts - len(counts_q))
-        listed += [0] * (n_parts * patch_size - len(listed))
+        listed += [0] * (kv_rows.shape[1] + codes.shape[1] - len(listed))
         lists = [queries + nobody + rows[n_real:], listed]
         results.append((*map(torch.tensor, lists), offsets(counts_q + more), offsets(counts_k + more)))
     return results
@@ -375,7 +375,7 @@ def test_other_malformed_arguments_raise():
     scenes, cu, stages = chain()
     with pytest.raises(ValueError, match=r"row_scenes: cu_input must be \[Q \+ 1\] = \[6\]; got \[5\]"):
         row_scenes(scenes, cu[1:], stages)
-    with pytest.raises(ValueError, match="row_scenes: rows must have at most 8 stages; got 9"):
+    with pytest.raises(ValueError, match="row_scenes: stages must be at most 8; got 9"):
         row_scenes(scenes, cu, stages[:1] * 9)
-    with pytest.raises(ValueError, match="row_scenes: rows must be int64; got int32"):
+    with pytest.raises(ValueError, match=r"row_scenes: stages\[0\].rows must be int64; got int32"):
         row_scenes(scenes, cu, [Segments(stages[0].rows.int(), stages[0].cu_rows)])

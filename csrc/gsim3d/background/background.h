@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "gsim3d/core/parallel.h"
+#include "gsim3d/core/platform.h"
 #include "gsim3d/core/stream.h"
 #include "gsim3d/core/workspace.h"
 
@@ -37,8 +38,11 @@ struct Overlap {
   const int64_t* cu_clouds;  // [n_clouds + 1]; rows behind are none
   int64_t n_rows, n_clouds;
 
-  // Patches in parts of at most patch_size queries: so many there can be.
-  int64_t n_parts() const { return n_patches + n_rows / patch_size; }
+  // Patches in parts of at most patch_size queries: so many there can be, and so many keys do they list at most. (What
+  // a patch has beyond its first part are whole parts, no longer than their queries are many.)
+  GSIM3D_HD int64_t n_parts() const { return n_patches + n_rows / patch_size; }
+  GSIM3D_HD int64_t n_listed() const { return n_keys + n_rows; }
+  GSIM3D_HD int64_t parts_of(int64_t n_queries) const { return n_queries > 0 ? 1 + (n_queries - 1) / patch_size : 0; }
 };
 
 // Part p of a curve: queries q_rows[cu_q[p]] .. and keys kv_rows[cu_k[p]] .. A patch of many queries becomes several
@@ -46,7 +50,7 @@ struct Overlap {
 // and code. Behind the last part offsets repeat, q_rows lists the rows without a patch, and kv_rows is 0.
 struct Parts {
   int64_t* q_rows;   // [n_curves, n_rows]
-  int64_t* kv_rows;  // [n_curves, n_parts * patch_size]
+  int64_t* kv_rows;  // [n_curves, n_listed]
   int64_t* cu_q;     // [n_curves, n_parts + 1]
   int64_t* cu_k;     // [n_curves, n_parts + 1]
 };

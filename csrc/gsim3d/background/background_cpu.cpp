@@ -41,13 +41,13 @@ void check_overlap(const Overlap& overlap) {
 
 // Of one curve. `patch` [n_rows] and `begin` [n_patches + 2] are scratch.
 void cut(const Overlap& overlap, const Parts& parts, int64_t curve, int64_t* patch, int64_t* begin) {
-  const int64_t n_patches = overlap.n_patches, n_parts = overlap.n_parts(), size = overlap.patch_size;
+  const int64_t n_patches = overlap.n_patches, n_parts = overlap.n_parts(), n_listed = overlap.n_listed();
   const int64_t n_real = overlap.cu_clouds[overlap.n_clouds];
   const int64_t* codes = overlap.codes + curve * overlap.n_rows;
   const int64_t* order = overlap.order + curve * overlap.n_rows;
   const int64_t* keys = overlap.kv_rows + curve * overlap.n_keys;
   int64_t* q_rows = parts.q_rows + curve * overlap.n_rows;
-  int64_t* kv_rows = parts.kv_rows + curve * n_parts * size;
+  int64_t* kv_rows = parts.kv_rows + curve * n_listed;
   int64_t* cu_q = parts.cu_q + curve * (n_parts + 1);
   int64_t* cu_k = parts.cu_k + curve * (n_parts + 1);
 
@@ -59,13 +59,13 @@ void cut(const Overlap& overlap, const Parts& parts, int64_t curve, int64_t* pat
   for (int64_t p = 0; p <= n_patches; ++p) begin[p + 1] += begin[p];
   int64_t part = 0, n_keys = 0;
   for (int64_t p = 0; p < n_patches; ++p)
-    for (int64_t q = begin[p]; q < begin[p + 1]; q += size) {
-      cu_q[part] = q, cu_k[part++] = n_keys;
+    for (int64_t i = 0; i < overlap.parts_of(begin[p + 1] - begin[p]); ++i) {
+      cu_q[part] = begin[p] + i * overlap.patch_size, cu_k[part++] = n_keys;
       n_keys = std::copy(keys + overlap.cu_k[p], keys + overlap.cu_k[p + 1], kv_rows + n_keys) - kv_rows;
     }
   std::fill(cu_q + part, cu_q + n_parts + 1, begin[n_patches]);
   std::fill(cu_k + part, cu_k + n_parts + 1, n_keys);
-  std::fill(kv_rows + n_keys, kv_rows + n_parts * size, int64_t{0});
+  std::fill(kv_rows + n_keys, kv_rows + n_listed, int64_t{0});
   for (int64_t i = 0; i < n_real; ++i) q_rows[begin[patch[i]]++] = order[i];
   std::copy(order + n_real, order + overlap.n_rows, q_rows + n_real);
 }
@@ -94,8 +94,13 @@ void add_cells(const T* x, const T* field, const int64_t* places, int64_t n, int
     check(places[i] >= 0 && places[i] < n_cells, "add_cells: places must be in [0, D) with D=", n_cells, "; got ",
           places[i], " at ", i);
   parallel.range(n, kGrain, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i)
-      for (int64_t c = 0; c < channels; ++c) out[i * channels + c] = x[i * channels + c] + field[places[i] * channels + c];
+    for (int64_t i = begin; i < end; ++i) {
+      const T* own = x + i * channels;
+      const T* there = field + places[i] * channels;
+      T* sum = out + i * channels;
+#pragma omp simd
+      for (int64_t c = 0; c < channels; ++c) sum[c] = own[c] + there[c];
+    }
   });
 }
 

@@ -145,7 +145,7 @@ __global__ void __launch_bounds__(kCutThreads) make_parts_kernel(Cut cut) {
     const int64_t p = first + threadIdx.x;
     const bool valid = p < overlap.n_patches;
     const int64_t queries = valid ? begin_of(p) : 0, n = valid ? begin_of(p + 1) - queries : 0;
-    const int64_t n_parts = (n + overlap.patch_size - 1) / overlap.patch_size;
+    const int64_t n_parts = overlap.parts_of(n);
     Range keys{0, 0};
     if (valid) keys = range_of(overlap.cu_k, p, overlap.n_keys);
     const int64_t per_part = keys.end - keys.begin;
@@ -172,7 +172,7 @@ __global__ void __launch_bounds__(kThreads) write_parts_kernel(Cut cut) {
   const Overlap& overlap = cut.overlap;
   const int64_t curve = blockIdx.y;
   if (blockIdx.x < cut.n_parts) {
-    const int64_t room = cut.n_parts * overlap.patch_size;
+    const int64_t room = overlap.n_listed();
     const int64_t* cu_k = cut.parts.cu_k + curve * (cut.n_parts + 1);
     int64_t* kv_rows = cut.parts.kv_rows + curve * room;
     const int64_t p = cut.parent[curve * cut.n_parts + blockIdx.x];

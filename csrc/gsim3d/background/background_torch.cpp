@@ -1,5 +1,6 @@
 #include "gsim3d/background/background.h"
 
+#include <string>
 #include <type_traits>
 #include <vector>
 
@@ -20,7 +21,7 @@ std::vector<Tensor> row_scenes(const Tensor& cloud_scene, const Tensor& cu_input
                                std::vector<Tensor> cu_rows) {
   const char* op = "row_scenes";
   const auto n_stages = static_cast<int64_t>(rows.size());
-  check(n_stages <= kMaxChain, op, ": rows must have at most ", kMaxChain, " stages; got ", n_stages);
+  check(n_stages <= kMaxChain, op, ": stages must be at most ", kMaxChain, "; got ", n_stages);
   check(rows.size() == cu_rows.size(), op, ": cu_rows must have one entry a stage; got ", cu_rows.size(), " for ",
         n_stages);
   const Tensor scenes = integers(op, "cloud_scene", cloud_scene, cloud_scene);
@@ -31,10 +32,11 @@ std::vector<Tensor> row_scenes(const Tensor& cloud_scene, const Tensor& cu_input
   chain.n_stages = n_stages;
   std::vector<Tensor> found;
   for (int64_t s = 0; s < n_stages; ++s) {
-    rows[s] = integers(op, "rows", rows[s], cloud_scene);
-    cu_rows[s] = integers(op, "cu_rows", cu_rows[s], cloud_scene);
-    check_shape(op, "rows", rows[s], {-1}, "[R]");
-    check(cu_rows[s].dim() == 1 && cu_rows[s].size(0) >= 1, op, ": cu_rows must be [M + 1]; got ",
+    const std::string stage = "stages[" + std::to_string(s) + "]", listed = stage + ".rows", cu = stage + ".cu_rows";
+    rows[s] = integers(op, listed.c_str(), rows[s], cloud_scene);
+    cu_rows[s] = integers(op, cu.c_str(), cu_rows[s], cloud_scene);
+    check_shape(op, listed.c_str(), rows[s], {-1}, "[R]");
+    check(cu_rows[s].dim() == 1 && cu_rows[s].size(0) >= 1, op, ": ", cu, " must be [M + 1]; got ",
           shape_of(cu_rows[s]));
     chain.rows[s] = data<int64_t>(rows[s]), chain.cu_rows[s] = data<int64_t>(cu_rows[s]);
     chain.n_listed[s] = rows[s].size(0), chain.n_rows[s] = cu_rows[s].size(0) - 1;
@@ -119,7 +121,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> overlapping_patches(const Tensor& fir
                         first.size(1),        kv_rows.size(1),        patch_size,          data<int64_t>(codes),
                         data<int64_t>(order), data<int64_t>(cu_clouds), codes.size(1),     cu_clouds.size(0) - 1};
   const int64_t n_parts = overlap.n_parts();
-  Tensor q_rows = empty(first, {n_curves, overlap.n_rows}), keys = empty(first, {n_curves, n_parts * patch_size});
+  Tensor q_rows = empty(first, {n_curves, overlap.n_rows}), keys = empty(first, {n_curves, overlap.n_listed()});
   Tensor cu_q = empty(first, {n_curves, n_parts + 1}), cu_keys = empty(first, {n_curves, n_parts + 1});
   const Parts parts{mutable_data<int64_t>(q_rows), mutable_data<int64_t>(keys), mutable_data<int64_t>(cu_q),
                     mutable_data<int64_t>(cu_keys)};
