@@ -9,8 +9,8 @@
 A state holds the last steps of each scene (:class:`gsim3d.types.Particles`, clouds sorted by scene and step). Scenes
 are packed, not padded: particle counts, numbers of views and lengths of history may all differ.
 
-Every call takes ``on_bad``, the policy for numbers that cannot be used (:mod:`gsim3d.stability`; default the model's), and
-``report``, which counts them (default ``simulator.report``).
+Every call takes ``on_bad``, the policy for numbers that cannot be used (:mod:`gsim3d.stability`; default the model's),
+and ``report``, which counts them (default ``simulator.report``).
 """
 
 from __future__ import annotations
@@ -87,7 +87,9 @@ class Simulator(nn.Module):
         names = (name for name, _ in self.named_parameters())
         unused = unused_parameters(plan, self.config, names)
         if needed := sorted(self.absent.difference(unused)):
-            raise UnsupportedEffect(f"unsupported effects: they read {', '.join(needed)}, which the weights do not have")
+            raise UnsupportedEffect(
+                f"unsupported effects: they read {', '.join(needed)}, which the weights do not have"
+            )
         return dataclasses.replace(plan, unused=unused)
 
     def step(
@@ -157,16 +159,19 @@ class Simulator(nn.Module):
 
     def _roll(self, predict, state: Particles, n_steps: int, plan: Plan, generator, log) -> list[Particles]:
         """:meth:`rollout` of a state that is prepared, without edits."""
-        config, rule = self.config.dynamics, plan.spec.dynamics.sleep
+        config, rule, sleepers = self.config.dynamics, plan.spec.dynamics.sleep, None
         if rule is None and not config.is_asymmetric:
             return rollout(predict, state, n_steps, plan.history)
+        if rule is not None:
+            changing = [name for name, who in self._changes(plan).items() if who != "none"]
+            sleepers = Sleepers(rule, last_steps(state, 1), config.grid_size, plan.history, changing)
         return rollout_in_parts(
             predict,
             state,
             n_steps,
             plan.history,
             remember=partial(self.dynamics.remember, generator=generator) if config.is_asymmetric else None,
-            sleepers=None if rule is None else Sleepers(rule, last_steps(state, 1), config.grid_size, plan.history),
+            sleepers=sleepers,
             log=log,
         )
 
@@ -251,6 +256,11 @@ class Simulator(nn.Module):
         asked = (outputs.rgb, outputs.alpha, outputs.depth, outputs.features)
         return Rendering(*(made if wanted else None for made, wanted in zip(image, asked, strict=True)))
 
+    def _changes(self, plan: Plan) -> dict[str, str]:
+        """Of each field that the dynamics predicts, whose values a step changes."""
+        appearance = plan.spec.appearance
+        return self.dynamics.layout.changes(appearance.changing, appearance.opacity_changes is not False)
+
     def _colors(self, particles: Particles) -> Tensor:
         """[N, 3], of the Gaussians, seen from nowhere in particular."""
         return 0.5 + SH_0 * self.renderer(particles, sh_degree=0).sh[:, 0]
@@ -288,8 +298,7 @@ class Simulator(nn.Module):
 
         background: what rests while ``state`` moves; None: all there is, is in the state.
         """
-        appearance = plan.spec.appearance
-        changes = self.dynamics.layout.changes(appearance.changing, appearance.opacity_changes is not False)
+        changes = self._changes(plan)
         pyramid = None if geometry is None else geometry(state)
         options = {"pyramid": pyramid, "background": background, "changes": changes}
         step = self.dynamics(state, generator=generator, **options)

@@ -36,19 +36,18 @@ class Parts:
                 latents do), and only whole scenes may be asleep.
             asleep: bool, rows of the newest clouds that rest as well. The clouds of a scene then have the same rows.
         """
-        newest = last_steps(history, 1)
+        newest, background = last_steps(history, 1), None
+        if not asymmetric and asleep is None:
+            return cls(newest, _awake(history), None, torch.arange(newest.n_rows, device=newest.means.device))
         rests = history.activity == FROZEN if asymmetric else torch.zeros_like(history.activity, dtype=torch.bool)
         if asleep is not None:
             rests = rests | _in_every_cloud(history, newest, asleep)
-        moving = history.select_rows(~rests)
-        table, last = moving.clouds, newest_clouds(moving.clouds)
-        awake = {table.scenes[q] for q in last if table.count(q) > 0}
+        moving = _awake(history.select_rows(~rests))
         newest_rests = last_steps(_marked(history, rests), 1).activity > 0
-        background = None
         if asymmetric:
+            awake = set(moving.clouds.scenes)
             background = newest.select_rows(newest_rests & (newest.activity != ASLEEP))
             background = background.select_clouds([q for q, s in enumerate(newest.clouds.scenes) if s in awake])
-        moving = moving.select_clouds([q for q, scene in enumerate(table.scenes) if scene in awake])
         return cls(newest, moving, background, torch.nonzero(~newest_rests)[:, 0])
 
     @property
@@ -68,6 +67,14 @@ class Parts:
         del fields["static_latents"]
         changed = {name: value.index_copy(0, self.rows, getattr(step, name)) for name, value in fields.items()}
         return self.newest.with_clouds(later, **changed)
+
+
+def _awake(moving: Particles) -> Particles:
+    """The clouds of scenes whose newest one has rows."""
+    table = moving.clouds
+    awake = {table.scenes[q] for q in newest_clouds(table) if table.count(q) > 0}
+    kept = [q for q, scene in enumerate(table.scenes) if scene in awake]
+    return moving if len(kept) == len(table) else moving.select_clouds(kept)
 
 
 def _in_every_cloud(history: Particles, newest: Particles, asleep: Tensor) -> Tensor:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch
-
 from gsim3d.dynamics.background import Background
 from gsim3d.dynamics.clouds import append_step, concatenate, last_steps, single_steps
 from gsim3d.dynamics.parts import Parts
@@ -56,19 +54,17 @@ def rollout_in_parts(
     history, steps, parts = last_steps(history, max_steps), [], None
     log = RestLog() if log is None else log
     while len(steps) < n_steps:
-        if parts is None or (sleepers is not None and not torch.equal(asleep, sleepers.asleep)):
+        if parts is None:
+            asleep, begin = None, len(steps)
             if steps:  # all that the model sees was simulated when somebody falls asleep first
-                history = last_steps(concatenate(steps[-max_steps:]), max_steps)
-            asleep = None if sleepers is None else sleepers.asleep
-            parts, begin = Parts.of(history, asymmetric=remember is not None, asleep=asleep if steps else None), len(
-                steps
-            )
+                history, asleep = last_steps(concatenate(steps[-max_steps:]), max_steps), sleepers.asleep
+            parts = Parts.of(history, asymmetric=remember is not None, asleep=asleep)
             moving, background = parts.moving, None
             if parts.background is not None and not parts.nothing_moves:
                 background = remember(parts.background)
                 log.remembered += 1
             log.n_rows = parts.newest.n_rows
-        predicted = [None]
+        predicted, others_sleep = [None], False
         if not parts.nothing_moves:
             predicted = predict(moving, background)
             moving = append_step(moving, predicted, max_steps)
@@ -78,6 +74,7 @@ def rollout_in_parts(
             before = steps[-1] if steps else parts.newest
             steps.append(parts.whole(step, len(steps) + 1 - begin))
             log.moving.append(parts.rows.shape[0])
-            if sleepers is not None:
-                sleepers.look(before, steps[-1])
+            if sleepers is not None and len(steps) < n_steps:
+                others_sleep |= sleepers.look(before, steps[-1])
+        parts = None if others_sleep else parts
     return steps[:n_steps]

@@ -1,11 +1,11 @@
 """Rows that came to rest are not computed until something near them moves.
 
-A row is quiet after ``patience`` steps in which it changed by no more than ``eps``. By the policy "exact" a scene sleeps
-once all its rows are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of ``halo``
-metres. A cube sleeps while no row in it or in one of its 26 neighbours is restless, and wakes in the step after one has
-become so. A row that moves by less than ``halo`` a step is in a neighbouring cube one step before it can be in the
-sleeping one: whom it may meet is awake by then. Who falls asleep is asked every ``patience`` steps only, since others
-asleep make another background. Rows asleep are a background to those awake, so "approx" needs a model of
+A row is quiet after ``patience`` steps in which it changed by no more than ``eps``. By the policy "exact" a scene
+sleeps once all its rows are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of
+``halo`` metres. A cube sleeps while no row in it or in one of its 26 neighbours is restless, and wakes in the step
+after one has become so. A row that moves by less than ``halo`` a step is in a neighbouring cube one step before it can
+be in the sleeping one: whom it may meet is awake by then. Who falls asleep is asked every ``patience`` steps only,
+since others asleep make another background. Rows asleep are a background to those awake, so "approx" needs a model of
 ``background="asymmetric"``.
 
 A row that sleeps misses changes of up to ``eps`` a step. Where a simulation that never sleeps would change no row of a
@@ -15,6 +15,7 @@ network was shown the same state in all steps of its history and changed nothing
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import torch
@@ -23,6 +24,7 @@ from torch import Tensor
 from gsim3d.effects import Sleep
 from gsim3d.types import ASLEEP, FROZEN, Particles
 
+NEVER_PREDICTED = {"activity", "static_latents", "turns", "paint"}
 CUBE_BITS = 16  # of a cube along an axis; cubes further out share the outermost
 
 
@@ -55,38 +57,57 @@ class Sleepers:
         newest: one cloud a scene, the rows that are looked after; all are awake.
         grid_size: metres, edge of a cell.
         history: steps that the model sees: who falls asleep has been the same in all of them.
+        changing: fields that a step may change; None: all but those that no model predicts.
     """
 
-    def __init__(self, rule: Sleep, newest: Particles, grid_size: float, history: int):
+    def __init__(
+        self, rule: Sleep, newest: Particles, grid_size: float, history: int, changing: Iterable[str] | None = None
+    ):
         self.rule, self.patience = rule, max(rule.patience, history)
         self.reach = rule.eps * grid_size
+        self.changing = newest.row_fields().keys() - NEVER_PREDICTED if changing is None else set(changing)
         self.asleep = torch.zeros(newest.n_rows, dtype=torch.bool, device=newest.means.device)
-        self.steps_at_rest = torch.zeros_like(self.asleep, dtype=torch.int64)
+        self.anybody = False  # sleeps
+        self.moved_last = torch.zeros_like(self.asleep, dtype=torch.int64)
         self.n_steps = 0
 
     @torch.no_grad()
-    def look(self, before: Particles, after: Particles) -> None:
-        """Notes what a step changed, and decides who sleeps in the next."""
-        at_rest = _largest_change(before.means, after.means) <= self.reach
-        for name, value in after.row_fields().items():
-            if name not in ("means", "activity", "static_latents", "turns", "paint"):
-                at_rest &= _largest_change(getattr(before, name), value) <= self.rule.eps
-        at_rest |= (after.activity == ASLEEP) & (before.activity == ASLEEP)
-        self.steps_at_rest = torch.where(at_rest, self.steps_at_rest + 1, 0)
-        restless = self.steps_at_rest < self.patience
-        scene = after.cloud_scene[after.row_cloud()]
-        if self.rule.policy == "exact":
-            n_restless = torch.zeros(after.origin.shape[0], dtype=torch.int64, device=scene.device)
-            may_sleep = n_restless.index_add_(0, scene, restless.long())[scene] == 0
-        else:
-            stirred = _near(_cubes(after, scene, self.rule.halo), restless & (after.activity != ASLEEP))
-            may_sleep = ~stirred & ~restless & (after.activity != FROZEN)
+    def look(self, before: Particles, after: Particles) -> bool:
+        """Notes what a step changed, and decides who sleeps in the next: whether these are others than before.
+
+        Waits for the device only where somebody sleeps or may fall asleep now.
+        """
         self.n_steps += 1
-        self.asleep = may_sleep if self.n_steps % self.patience == 0 else may_sleep & self.asleep
+        moved = (
+            after.activity != before.activity
+        ) > self.rule.eps  # who vanishes from the sight of others changed by 1
+        for name in sorted(self.changing):
+            allowed = self.reach if name == "means" else self.rule.eps
+            moved |= _largest(getattr(after, name) - getattr(before, name)) > allowed
+        self.moved_last.masked_fill_(moved, self.n_steps)
+        may_fall_asleep = self.n_steps % self.patience == 0
+        if not (may_fall_asleep or self.anybody):
+            return False
+        may_sleep = self._may_sleep(after)
+        asleep = may_sleep if may_fall_asleep else may_sleep & self.asleep
+        if torch.equal(asleep, self.asleep):
+            return False
+        self.asleep, self.anybody = asleep, bool(asleep.any())
+        return True
+
+    def _may_sleep(self, particles: Particles) -> Tensor:
+        restless = self.moved_last > self.n_steps - self.patience
+        scene = particles.cloud_scene[particles.row_cloud()]
+        if self.rule.policy == "exact":
+            n_restless = torch.zeros(particles.origin.shape[0], dtype=torch.int64, device=scene.device)
+            return n_restless.index_add_(0, scene, restless.long())[scene] == 0
+        stirred = _near(_cubes(particles, scene, self.rule.halo), restless & (particles.activity != ASLEEP))
+        return ~stirred & ~restless & (particles.activity != FROZEN)
 
 
-def _largest_change(before: Tensor, after: Tensor) -> Tensor:
-    return (after - before).abs().flatten(1).amax(1) if after.dim() > 1 else (after - before).abs()
+def _largest(change: Tensor) -> Tensor:
+    """[N] of [N, ...], the largest size in each row."""
+    return change.abs().flatten(1).amax(1) if change.dim() > 1 else change.abs()
 
 
 def _cubes(particles: Particles, scene: Tensor, edge: float) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from gsim3d.dynamics import RestLog, Sleepers, concatenate, last_steps, rollout_in_parts
 from gsim3d.effects import DynamicsEffects, EffectsSpec, Sleep
 from gsim3d.errors import InputError
-from gsim3d.types import FROZEN, Particles
+from gsim3d.types import ASLEEP, FROZEN, Particles
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, float_fields, make_history
 from tests.effects.resting import ASYMMETRIC, make_scenes, make_simulator
@@ -118,6 +118,20 @@ def test_an_action_on_a_sleeping_scene_wakes_it():
     assert log.calls == 4 and (after[-1].means > 0.03).all()
 
 
+def test_a_row_that_the_others_no_longer_see_is_a_change():
+    """A guard takes one row out in the second step: nothing moved, and yet the others see another scene."""
+    history, calls = at([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[0.0] * 3] * 2), []
+
+    def predict(moving, background):
+        calls.append(1)
+        step = billiards(moving, background)
+        gone = torch.tensor([0, ASLEEP if len(calls) >= 2 else 0], dtype=torch.uint8)
+        return dataclasses.replace(step, activity=gone)
+
+    _, log = simulate(history, 12, Sleep("exact", eps=0.0, patience=3), predict, asymmetric=False)
+    assert log.calls == len(calls) == 6, "asleep at the first third step before which three changed nothing"
+
+
 @pytest.mark.parametrize("policy", ["exact", "approx"])
 def test_what_sleep_misses_is_at_most_eps_a_step(policy):
     history = at([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[9e-5, 0.0, 0.0], [0.0, -8e-5, 0.0]])
@@ -170,8 +184,9 @@ def test_rows_asleep_are_read_as_a_background():
 
     class Some(Sleepers):
         def look(self, before, after):
-            self.steps_at_rest += 1
-            self.asleep = asleep & (self.steps_at_rest >= 4)
+            self.n_steps += 1
+            self.asleep = asleep & (self.n_steps >= 4)
+            return self.n_steps == 4
 
     steps = rollout_in_parts(
         lambda moving, background: dynamics(moving, background=background),
