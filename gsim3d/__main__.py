@@ -16,11 +16,20 @@ COMMANDS = {
     "simulate": ("gsim3d.simulate", "predict the future of one scene: video and .ply"),
     "plan": ("gsim3d.show_plan", "which effects of a scene are computed, which are not, and what that costs"),
     "effects": ("gsim3d.infer_effects", "find out which effects a scene needs"),
-    "evaluate": ("gsim3d.evaluate.command", "measure predictions on a data set, by step, beside baselines and other models"),
+    "evaluate": (
+        "gsim3d.evaluate.command",
+        "measure predictions on a data set, by step, beside baselines and other models",
+    ),
     "pareto": ("gsim3d.pareto.command", "what accuracy costs in time: a report, and settings that keep a promise"),
-    "ablate": ("gsim3d.ablate.command", "the paper's ablations: the same training with one thing changed, in one table"),
+    "ablate": (
+        "gsim3d.ablate.command",
+        "the paper's ablations: the same training with one thing changed, in one table",
+    ),
     "weights": ("gsim3d.perceptual.command", "install the weights of LPIPS and FVD"),
-    "import": ("gsim3d.import_released", "bring a checkpoint of the authors' release over: same weights, same predictions"),
+    "import": (
+        "gsim3d.import_released",
+        "bring a checkpoint of the authors' release over: same weights, same predictions",
+    ),
     "demo": ("gsim3d.demo", "all of it at a small size, in minutes on a CPU"),
     "doctor": ("gsim3d.doctor", "what is installed, what was compiled, and whether every kernel works here"),
 }

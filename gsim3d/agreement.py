@@ -24,7 +24,8 @@ from gsim3d.types import FROZEN, Cameras, Particles
 class SleepError:
     """Of every step, against never sleeping.
 
-    moved: metres, the largest distance between the two places of a row.   psnr: dB between their images, inf where equal.
+    moved: metres, the largest distance between the two places of a row.
+    psnr: dB between their images, inf where equal.
     log: what was computed.
     """
 
@@ -38,8 +39,8 @@ class BackgroundError:
     """Of every step, an asymmetric background against the same weights with a symmetric one.
 
     moved: metres, mean distance between the two places of a moving row.   psnr: dB between their images.
-    shadow: mean change of a latent of the background in the symmetric one: of what may fall on it, such as a shadow; in the
-        asymmetric one it does not change.
+    shadow: mean change of a latent of the background in the symmetric one: of what may fall on it, such as a shadow; in
+        the asymmetric one it does not change.
     shadow_psnr: dB between images of the symmetric one with and without these changes: what the background alone loses.
     """
 

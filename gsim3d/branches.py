@@ -18,8 +18,8 @@ N_STREAMS = 4  # what more branches than these are given is queued behind one of
 class Branches:
     """A context; what is run in it is done when the context is left, and may be read only then.
 
-    While a graph is captured, :meth:`run` makes nodes that wait for the work before them, not the other way round. Else,
-    and on the CPU, everything runs in order. The numbers are the same.
+    While a graph is captured, :meth:`run` makes nodes that wait for the work before them, not the other way round.
+    Else, and on the CPU, everything runs in order. The numbers are the same.
 
     Args:
         like: on the device of the work.

@@ -1,4 +1,4 @@
-"""``gsim3d doctor --stability``: laws and hard cases on one's own model and scenes, a report, and a file for each failure."""
+"""``gsim3d doctor --stability``: laws and hard cases on one's own model and scenes: a report, a file a failure."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def open_subject(path: str | Path | None, device: str = "cpu") -> Subject:
 
 
 def sample_of_scenes(subject: Subject, folders: Sequence[Path]) -> tuple[Sample | None, list[str]]:
-    """The first steps and evenly spread views of up to two scenes that load; and what is wrong with those that do not."""
+    """The first steps and evenly spread views of up to two scenes that load; what is wrong with those that do not."""
     scenes, problems = [], []
     for folder in folders:
         if len(scenes) == MAX_SCENES:

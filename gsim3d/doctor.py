@@ -1,4 +1,4 @@
-"""``gsim3d doctor``: what is installed, what was compiled, what is missing and how to get it, and a self-test of every op."""
+"""``gsim3d doctor``: what is installed, compiled and missing, how to get it, and a self-test of every op."""
 
 import argparse
 import importlib
@@ -12,8 +12,8 @@ Without options: what is installed and compiled, and every op against plain torc
 
 With --stability: does the model keep its laws (the same scene moved, turned, reordered, repeated, split, or with a far
 particle more has the same future), and does it stay finite on hard input made of your scenes (black images, one view,
-numbers that are none, crowds, strange cameras, a long rollout, gradients)? Each failure names camera, particle and step,
-and leaves a file in DIR/failures that makes it happen again. The report is DIR/report.md and DIR/report.json.
+numbers that are none, crowds, strange cameras, a long rollout, gradients)? Each failure names camera, particle and
+step, and leaves a file in DIR/failures that makes it happen again. The report is DIR/report.md and DIR/report.json.
 
 examples:
   gsim3d doctor
@@ -44,10 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--stability",
         nargs="*",
         metavar="PATH",
-        help="check laws and hard cases instead: of a checkpoint, of a scene or folder of scenes, of both, or, without a "
-        "path, of random weights on random images",
+        help="check laws and hard cases instead: of a checkpoint, of a scene or folder of scenes, of both, or, without "
+        "a path, of random weights on random images",
     )
-    group.add_argument("--out", metavar="DIR", default="runs/stability", help="folder of the report (default: %(default)s)")
+    group.add_argument(
+        "--out", metavar="DIR", default="runs/stability", help="folder of the report (default: %(default)s)"
+    )
     group.add_argument("--steps", type=int, default=100, help="length of the long rollout (default: %(default)s)")
     group.add_argument("--only", nargs="+", metavar="CHECK", default=(), help="checks to make (default: all)")
     group.add_argument("--replay", metavar="FILE", help="make the check again that FILE, from a report, reproduces")
@@ -142,7 +144,9 @@ def _compiled() -> bool:
         _row("FAIL", "gsim3d._ops", str(error).splitlines()[0])
         return False
     cuda = ops.cuda_compiled()
-    _row("ok", "gsim3d._ops", f"CPU kernels ({torch.get_num_threads()} threads)" + (" and CUDA kernels" if cuda else ""))
+    _row(
+        "ok", "gsim3d._ops", f"CPU kernels ({torch.get_num_threads()} threads)" + (" and CUDA kernels" if cuda else "")
+    )
     if torch.cuda.is_available():
         _row("ok" if cuda else "-", "GPU", torch.cuda.get_device_name())
     if not cuda:

@@ -112,7 +112,7 @@ class Move(Operation):
 
 @dataclass(frozen=True)
 class Rotate(Operation):
-    """They are turned by ``degrees`` about an axis through ``about`` (default: the middle of each scene's); so is their speed."""
+    """They are turned by ``degrees`` about an axis through ``about`` (default: each scene's middle), their speed too."""
 
     axis: Vector = (0.0, 0.0, 1.0)
     degrees: float = 0.0

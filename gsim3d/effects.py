@@ -54,10 +54,10 @@ class Contact:
 class Sleep:
     """When particles at rest are skipped.
 
-    policy: "exact": a scene sleeps as a whole; "approx": cubes of it sleep (:mod:`gsim3d.dynamics.sleep` has the bounds).
-    eps: cells that a particle at rest moves in one step at most, along each axis; its latents change by as much at most.
+    policy: "exact": a scene sleeps as a whole; "approx": cubes of it do (:mod:`gsim3d.dynamics.sleep` has the bounds).
+    eps: cells that a particle at rest moves in a step at most, along each axis, and its latents change at most.
     patience: steps at rest before it sleeps, at least those that the model sees.
-    halo: metres, edge of the cubes, and the speed a step up to which nobody wakes too late.
+    halo: metres, edge of the cubes, and the change of speed in a step up to which nobody wakes too late.
     """
 
     policy: str = "exact"
@@ -140,7 +140,7 @@ class OutputEffects:
 
 @dataclass(frozen=True)
 class EffectsSpec:
-    """Everything absent is off; what makes up the model (history, view_dependent, opacity_changes) is then the model's own.
+    """Everything absent is off; what makes up the model (history, view_dependent, opacity_changes) is the model's own.
 
     Example:
         >>> spec = EffectsSpec.from_dict({"dynamics": {"background": "masked_out", "history": 2}})

@@ -6,8 +6,8 @@
 
 A graph repeats the same kernels on the same memory, so that nothing in it may have a size that depends on particles:
 geometry is made with given sizes (:class:`gsim3d.ops.PyramidCapacity`), observed in a first rollout and multiplied by
-``factor``. Particles that need more are noticed by a flag that is read when the replay is over; the rollout is then captured
-anew with room for them, and repeated.
+``factor``. Particles that need more are noticed by a flag that is read when the replay is over; the rollout is then
+captured anew with room for them, and repeated.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ class CaptureError(RuntimeError):
 
 
 class Predicted(NamedTuple):
-    """steps: one Particles a step, as of :meth:`gsim3d.simulator.Simulator.rollout`. renderings: one a step; none without
-    cameras."""
+    """steps: one Particles a step, as of :meth:`gsim3d.simulator.Simulator.rollout`. renderings: one a step; none
+    without cameras."""
 
     steps: list[Particles]
     renderings: list[Rendering]
@@ -97,11 +97,11 @@ class CapturedRollout:
 
     The graph belongs to the numbers of rows, scenes and steps of ``state``, to the plan, to autocast as it is when the
     object is made, and to the model in evaluation. Under autocast the weights of matrix products and convolutions are
-    rounded once, into a copy: call :meth:`reload` after the model has changed. Without it the graph reads the model's own.
+    rounded once, into a copy: call :meth:`reload` after the model has changed. Else the graph reads the model's own.
 
-    With a model of ``background="asymmetric"`` the graph advances what moves, as many rows in every call. The background
-    is computed beside the graph whenever it has changed (call :meth:`reload` after the model has); where it needs more
-    room the graph is made anew. A graph knows no sleep: it advances the same rows always.
+    With a model of ``background="asymmetric"`` the graph advances what moves, as many rows in every call. The
+    background is computed beside the graph whenever it has changed (call :meth:`reload` after the model has); where it
+    needs more room the graph is made anew. A graph knows no sleep: it advances the same rows always.
 
     On the CPU there are no graphs: calls run the same steps one by one, with the same sizes and the same results.
 
@@ -142,7 +142,9 @@ class CapturedRollout:
         if not factor >= 1:
             raise InputError(f"CapturedRollout: factor must be at least 1; got {factor}")
         if cameras is not None and simulator.config.renderer.quirks != Quirks():
-            raise InputError("CapturedRollout: cameras cannot be rendered as published inside a graph; render the steps")
+            raise InputError(
+                "CapturedRollout: cameras cannot be rendered as published inside a graph; render the steps"
+            )
         self._simulator, self._n_steps, self._factor, self._copies = simulator, n_steps, factor, copies
         self._plan, self._drawn = plan or simulator.plan(), plan
         self._report = simulator.report if report is None else report
@@ -231,7 +233,7 @@ class CapturedRollout:
 
     def _rollout(self, geometry, report: StabilityReport) -> Predicted:
         """The rollout of the graph's own state."""
-        plan, rest = _with_background_as_it_is(self._plan), self._rest
+        plan, rest = with_background_as_it_is(self._plan), self._rest
         options, renderings = {"geometry": geometry, "report": report}, []
         with torch.no_grad(), self._autocast():
             if rest is None:
@@ -241,7 +243,9 @@ class CapturedRollout:
                 steps = [rest.parts.whole(step, 1 + i) for i, step in enumerate(moving)]
             if self._cameras is not None:
                 for step in steps:
-                    renderings.append(self._model.draw(step, self._cameras, self._background, self._drawn, report=report))
+                    renderings.append(
+                        self._model.draw(step, self._cameras, self._background, self._drawn, report=report)
+                    )
         return Predicted(steps, renderings)
 
     def _autocast(self) -> torch.autocast:
@@ -321,7 +325,9 @@ class CapturedRollout:
         own = self._rest.parts
         self._check(parts.moving, own.moving.clouds, " in what moves")
         background = parts.background.row_fields()
-        changed = self._is_stale or not all(torch.equal(background[n], x) for n, x in own.background.row_fields().items())
+        changed = self._is_stale or not all(
+            torch.equal(background[n], x) for n, x in own.background.row_fields().items()
+        )
         for mine, given in ((own.newest, parts.newest), (own.background, parts.background)):
             _copy(mine, given)
         own.rows.copy_(parts.rows)
@@ -338,7 +344,8 @@ class CapturedRollout:
         if (table.starts, table.scenes) != (own.starts, own.scenes):
             raise InputError(
                 f"CapturedRollout: state must have the rows and scenes of the first one{where}, clouds that start at "
-                f"rows {list(own.starts)} of scenes {list(own.scenes)}; got {list(table.starts)} of {list(table.scenes)}"
+                f"rows {list(own.starts)} of scenes {list(own.scenes)}; got {list(table.starts)} "
+                f"of {list(table.scenes)}"
             )
         if _gaps(table) != _gaps(own):
             raise InputError(
@@ -407,7 +414,7 @@ def _gaps(table: CloudTable) -> list[int | None]:
     return [b[1] - a[1] if a[0] == b[0] else None for a, b in zip(places, places[1:])]
 
 
-def _with_background_as_it_is(plan: Plan) -> Plan:
+def with_background_as_it_is(plan: Plan) -> Plan:
     """``plan`` for a state that is prepared already."""
     if plan.spec.dynamics.background not in ("masked_out", "dynamic"):
         return plan

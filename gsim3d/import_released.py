@@ -30,20 +30,17 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from gsim3d.errors import InputError
+    from gsim3d.files import new_place
     from gsim3d.interop.released_import import import_released
     from gsim3d.train import checkpoint
     from gsim3d.train.settings import load_yaml, to_dict
 
-    out = Path(args.out)
-    if out.exists():
-        raise InputError(f"--out: {out} exists already; name another folder or remove it")
-    if not out.absolute().parent.is_dir():
-        raise InputError(f"--out: the folder {out.absolute().parent} does not exist")
+    out = new_place(args.out)
     source, settings = Path(args.checkpoint), load_yaml(args.config)
     try:
         imported = import_released(source, settings)
     except InputError as error:
-        # Messages about the file start with its name, those about shapes with "weights", those about settings with a key.
+        # Messages about the file start with its name, about shapes with "weights", about settings with a key.
         message = str(error).replace("weights:", f"{source}:", 1) if str(error).startswith("weights:") else str(error)
         raise InputError(message if message.startswith(str(source)) else f"{args.config}: {message}") from None
     config, effects = imported.config, imported.config.effects

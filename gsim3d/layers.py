@@ -162,7 +162,7 @@ class RowBatchNorm(nn.Module):
     """Normalises each channel by statistics over rows; running statistics in evaluation.
 
     Differs from ``nn.BatchNorm1d`` in three ways: one row or none is fine (running statistics are then kept),
-    statistics are float32 or wider, and processes combine theirs in the order of their ranks, so a run repeats bit by bit.
+    statistics are float32 or wider; processes combine theirs in the order of their ranks: a run repeats bit by bit.
     """
 
     EPS = 1e-3
@@ -219,7 +219,7 @@ class RowBatchNorm(nn.Module):
 
 
 class _BatchNormGelu(torch.autograd.Function):
-    """Normalised by statistics of all rows, scaled, shifted, activated: torch would keep and add five tensors of rows."""
+    """Normalised by statistics of all rows, scaled, shifted, activated; torch would keep and add five such tensors."""
 
     @staticmethod
     def forward(ctx, x, weight, bias, mean, rsqrt, n_rows, n_data):
@@ -309,7 +309,7 @@ def _combine(parts: tuple[Tensor, ...], n_channels: int) -> tuple[Tensor, Tensor
 
 
 def widened(x: Tensor) -> Tensor:
-    """What 16-bit layers computed, as float32: positions, depths and all that is added up over steps are never 16-bit."""
+    """What 16-bit layers computed, as float32: positions, depths and what is added up over steps are never 16-bit."""
     return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
 
 

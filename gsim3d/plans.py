@@ -1,4 +1,4 @@
-"""From what a scene calls for to what is computed: which effects are kept, which are skipped and why, and what that costs."""
+"""From what a scene calls for to what is computed: which effects are kept, which are skipped and why, and the cost."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from gsim3d.effects import EffectsSpec, UnsupportedEffect
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
 
-# Of a surface in a grid, a convolution of K^3 taps finds about K^2 neighbours, and a coarser grid keeps 1 / stride^2 rows.
+# Of a surface in a grid, a convolution of K^3 taps finds about K^2 neighbours; a coarser grid keeps 1 / stride^2 rows.
 SURFACE = 2
 SPLATS_A_PIXEL = 30  # that are blended where there is a surface; multiply-adds of each, and of projecting a Gaussian
 BLENDING, PROJECTION = 12, 250
+BLENDED = "nothing: the one pass blends it in any case"
 
 
 @dataclass(frozen=True)
@@ -83,14 +84,15 @@ def make_plan(spec: EffectsSpec, model: ModelConfig) -> Plan:
         ("frozen background", background in ("frozen", "asymmetric"), "particles marked frozen are seen, and stay",
          f"background is {background}", "rows of the background in every step of the dynamics"),
         ("background made once", _is_asymmetric(spec, model), "in this model frozen particles see only each other",
-         "in this model frozen particles see all" if not model.dynamics.is_asymmetric else f"background is {background}",
+         f"background is {background}" if model.dynamics.is_asymmetric else "in this model frozen particles see all",
          "features of the background at every stage, kept for a rollout"),
         ("sleep", dynamics.sleep is not None, "particles at rest are skipped", "dynamics.sleep is absent",
          "counters of rest, results of sleepers"),
         ("actions", False, "", _absent("dynamics.actions", dynamics.actions, "no names"), "embeddings of actions"),
         ("contact pairs", False, "", _absent("dynamics.contact", dynamics.contact, "no pairs"), "groups of bodies"),
         ("view-dependent colour", sh_degree > 0, f"harmonics of degree {sh_degree}",
-         "degree 0 is asked for or all the model has", "rows of the head for harmonics, their rotation, view directions"),
+         "degree 0 is asked for or all the model has",
+         "rows of the head for harmonics, their rotation, view directions"),
         ("changing features", appearance.changing != "none", f"of {appearance.changing} particles",
          "appearance.changing is none", "columns of the dynamics' last layer, new latents"),
         ("changing opacities", predicts_opacity and appearance.opacity_changes is not False, "this model predicts them",
@@ -98,9 +100,10 @@ def make_plan(spec: EffectsSpec, model: ModelConfig) -> Plan:
          "a column of the dynamics' last layer, new opacities"),
         ("insertion", structure.insert, "edits may add particles", "structure.insert is off", "copies of the history"),
         ("removal", structure.remove, "edits may remove particles", "structure.remove is off", "copies of the history"),
-        ("colour images", outputs.rgb, "outputs.rgb", "outputs.rgb is off", "harmonics of the head, an image of 3 channels"),
-        ("depth images", outputs.depth, "a channel of the same pass", "outputs.depth is off", "an image of 1 channel"),
-        ("alpha images", outputs.alpha, "a channel of the same pass", "outputs.alpha is off", "an image of 1 channel"),
+        ("colour images", outputs.rgb, "outputs.rgb", "outputs.rgb is off",
+         "harmonics of the head, an image of 3 channels"),
+        ("depth images", outputs.depth, "a channel of the same pass", "outputs.depth is off", BLENDED),
+        ("alpha images", outputs.alpha, "a channel of the same pass", "outputs.alpha is off", BLENDED),
         ("feature images", outputs.features, "channels of the same pass", "outputs.features is off",
          "rows of latents, an image of their channels"),
     ]  # fmt: skip
@@ -132,8 +135,12 @@ def _check_supported(spec: EffectsSpec, model: ModelConfig) -> None:
         "appearance.opacity_changes": (
             spec.appearance.opacity_changes and not model.dynamics.explicit, "this model holds opacities"
         ),
-        "outputs": (not (outputs.rgb or outputs.depth or outputs.alpha or outputs.features), "there is no image to make"),
-        "outputs.features": (outputs.features and model.renderer.latents == 0, "this model's particles have no latents"),
+        "outputs": (
+            not (outputs.rgb or outputs.depth or outputs.alpha or outputs.features), "there is no image to make"
+        ),
+        "outputs.features": (
+            outputs.features and model.renderer.latents == 0, "this model's particles have no latents"
+        ),
         "outputs without colour": (not outputs.rgb and published, "the published renderer draws colour"),
         "outputs.features with quirks": (outputs.features and published, "the published renderer draws none"),
     }  # fmt: skip
@@ -157,7 +164,7 @@ def unused_parameters(plan: Plan, model: ModelConfig, names: Iterable[str]) -> t
 
 
 def _merged_bits(config: DynamicsConfig, history: int) -> tuple[int, ...]:
-    """Of each stage; steps are counted back from the newest, so that it has its place in every table that the model has."""
+    """Of each stage; steps are counted back from the newest: it has its place in every table that the model has."""
     bits = config.history_bits if config.slots_from_newest else (history - 1).bit_length()
     return config.pyramid_spec(bits).merged_bits()
 
@@ -171,22 +178,27 @@ def predicted_cost(plan: Plan, model: ModelConfig, work: Workload) -> dict[str, 
     background = plan.spec.dynamics.background
     moving = work.moving + (work.frozen if background == "dynamic" else 0)
     frozen = work.frozen if background in ("frozen", "asymmetric") else 0
-    computed = moving + (0 if _is_asymmetric(plan.spec, model) else frozen)
-    drawn = moving + frozen
+    beside = frozen if _is_asymmetric(plan.spec, model) else 0
+    computed, drawn = moving + frozen - beside, moving + frozen
     renderer, outputs = model.renderer, plan.spec.outputs
     harmonics = 3 * (plan.sh_degree + 1) ** 2 if outputs.rgb else 0
     hidden = 4 * renderer.latents
     channels = 3 * outputs.rgb + outputs.depth + renderer.latents * outputs.features
     splats = min(drawn, SPLATS_A_PIXEL) * work.pixels
     return {
-        "dynamics": _network(model.dynamics, computed * plan.history, plan.history) if moving else 0.0,
+        "dynamics": _network(model.dynamics, computed * plan.history, plan.history, beside) if moving else 0.0,
         "gaussians": float(drawn * hidden * (renderer.latents + harmonics + 7)),
         "images": float(work.views * (drawn * (PROJECTION + harmonics) + splats * (BLENDING + channels))),
     }
 
 
-def _network(config: DynamicsConfig, rows: float, history: int) -> float:
-    """Multiply-adds of the dynamics network on ``rows`` rows of stage 0."""
+def background_cost(plan: Plan, model: ModelConfig, work: Workload) -> float:
+    """Multiply-adds, counted likewise, of a background that is made once a rollout; 0 where every step computes it."""
+    return _network(model.dynamics, work.frozen, 1) if _is_asymmetric(plan.spec, model) and work.frozen else 0.0
+
+
+def _network(config: DynamicsConfig, rows: float, history: int, beside: float = 0.0) -> float:
+    """Multiply-adds of the dynamics network on ``rows`` rows of stage 0, which see ``beside`` others that rest."""
     from gsim3d.dynamics.state import StateLayout
 
     layout, channels = StateLayout.of(config), config.encoder_channels
@@ -196,21 +208,23 @@ def _network(config: DynamicsConfig, rows: float, history: int) -> float:
     for s in range(config.n_stages):
         if s > 0:
             total += rows * channels[s - 1] * channels[s]
-            rows = rows / config.strides[s - 1] ** SURFACE / 2 ** merged[s]
-        at_stage.append(rows)
-        total += config.encoder_depths[s] * _block(config, rows, channels[s], config.patch_sizes[s])
+            fewer = config.strides[s - 1] ** SURFACE
+            rows, beside = rows / fewer / 2 ** merged[s], beside / fewer
+        at_stage.append((rows, beside))
+        total += config.encoder_depths[s] * _block(config, rows, beside, channels[s], config.patch_sizes[s])
     below = channels[-1]
     for s in reversed(range(config.n_stages - 1)):
-        width = config.decoder_channels[s]
-        total += at_stage[s + 1] * below * width + at_stage[s] * channels[s] * width
-        total += config.decoder_depths[s] * _block(config, at_stage[s], width, config.patch_sizes[s])
+        width, (rows, beside) = config.decoder_channels[s], at_stage[s]
+        total += at_stage[s + 1][0] * below * width + rows * channels[s] * width
+        total += config.decoder_depths[s] * _block(config, rows, beside, width, config.patch_sizes[s])
         below = width
-    return float(total + at_stage[0] / history * below * (below + layout.out_channels))
+    return float(total + rows / history * below * (below + layout.out_channels))
 
 
-def _block(config: DynamicsConfig, rows: float, channels: int, patch: int) -> float:
+def _block(config: DynamicsConfig, rows: float, beside: float, channels: int, patch: int) -> float:
+    """A row attends to its own patch, and to one of those that rest."""
     dense = (BLOCK_KERNEL**SURFACE + 1 + 4 + 2 * config.mlp_ratio) * channels**2
-    return rows * (dense + 2 * min(rows, patch) * channels)
+    return rows * (dense + 2 * (min(rows, patch) + min(beside, patch)) * channels)
 
 
 def in_columns(rows: list[tuple[str, ...]]) -> str:

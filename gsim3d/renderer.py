@@ -78,7 +78,7 @@ class GaussianHead(nn.Module):
                 self.fc2.bias[-3:] = math.log(share / (1 - share))
 
     def forward(self, particles: Particles, *, sh_degree: int | None = None, rgb: bool = True) -> Gaussians:
-        """The Gaussians of all rows; ``sh_degree``: leave out colours of higher degrees; ``rgb``: False: all of them."""
+        """The Gaussians of all rows; ``sh_degree``: without colours of higher degrees; not ``rgb``: without any."""
         n_harmonics = (self.config.n_harmonics if sh_degree is None else (sh_degree + 1) ** 2) if rgb else 0
         sh, quats, scales = self._shape_and_color(particles, n_harmonics)
         return Gaussians(particles.means, quats, scales, particles.opacities, sh, particles.cu_rows)

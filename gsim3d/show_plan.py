@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d import presets
     from gsim3d.data import Scene
     from gsim3d.effects import EffectsSpec, OutputEffects
-    from gsim3d.plans import in_columns, predicted_cost
+    from gsim3d.plans import background_cost, in_columns, predicted_cost
     from gsim3d.train.config import DataConfig
     from gsim3d.train.restore import build_simulator, restore
 
@@ -62,6 +62,8 @@ def run(args: argparse.Namespace) -> int:
     total, most_total = sum(ours.values()), sum(all_on.values())
     rows.append(("all", f"{total / 1e6:.1f}", f"{most_total / 1e6:.1f}", f"{total / max(most_total, 1.0):.2f}"))
     print(in_columns(rows))
+    if once := background_cost(plan, simulator.config, work):
+        print(f"and of the background, once a rollout: {once / 1e6:.1f}")
     return 0
 
 

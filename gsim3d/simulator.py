@@ -9,8 +9,8 @@
 A state holds the last steps of each scene (:class:`gsim3d.types.Particles`, clouds sorted by scene and step). Scenes
 are packed, not padded: particle counts, numbers of views and lengths of history may all differ.
 
-Every call takes ``on_bad``, the policy for numbers that cannot be used (:mod:`gsim3d.stability`; default the model's), and
-``report``, which counts them (default ``simulator.report``).
+Every call takes ``on_bad``, the policy for numbers that cannot be used (:mod:`gsim3d.stability`; default the model's),
+and ``report``, which counts them (default ``simulator.report``).
 """
 
 from __future__ import annotations
@@ -87,7 +87,9 @@ class Simulator(nn.Module):
         names = (name for name, _ in self.named_parameters())
         unused = unused_parameters(plan, self.config, names)
         if needed := sorted(self.absent.difference(unused)):
-            raise UnsupportedEffect(f"unsupported effects: they read {', '.join(needed)}, which the weights do not have")
+            raise UnsupportedEffect(
+                f"unsupported effects: they read {', '.join(needed)}, which the weights do not have"
+            )
         return dataclasses.replace(plan, unused=unused)
 
     def step(

@@ -238,7 +238,16 @@ class Particles(_Tensors):
     known: CloudTable | None = None  # see clouds
 
     ROW_FIELDS = (
-        "means", "opacities", "dynamic_latents", "static_latents", "activity", "quats", "scales", "sh", "turns", "paint",
+        "means",
+        "opacities",
+        "dynamic_latents",
+        "static_latents",
+        "activity",
+        "quats",
+        "scales",
+        "sh",
+        "turns",
+        "paint",
     )
 
     @property
@@ -251,7 +260,7 @@ class Particles(_Tensors):
 
     @property
     def clouds(self) -> CloudTable:
-        """The clouds as the host knows them. Only the first look at clouds that came as tensors waits for the device."""
+        """The clouds as the host knows them. Only the first look at clouds given as tensors waits for the device."""
         tensors = (self.cu_rows, self.cloud_scene, self.cloud_step)
         if self.known is None or any(a is not b for a, b in zip(self.known.tensors, tensors)):
             object.__setattr__(self, "known", CloudTable.read(*tensors))

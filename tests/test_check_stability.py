@@ -1,4 +1,4 @@
-"""gsim3d doctor --stability: laws and hard cases on a user's model and scenes, a report, files that reproduce failures."""
+"""gsim3d doctor --stability: laws and hard cases on a user's model and scenes, a report, files for every failure."""
 
 import dataclasses
 import json

@@ -119,7 +119,17 @@ def test_evaluate_takes_other_views_and_metrics_and_options_anywhere(capsys, wor
 
 
 def test_both_devices_predict(capsys, work, tmp_path, device):
-    evaluate = ["evaluate", work / "run", work / "data", "--steps", "2", "--metrics", "psnr", "--out", tmp_path / "m.json"]
+    evaluate = [
+        "evaluate",
+        work / "run",
+        work / "data",
+        "--steps",
+        "2",
+        "--metrics",
+        "psnr",
+        "--out",
+        tmp_path / "m.json",
+    ]
     assert call(capsys, *evaluate, "--device", device)[0] == 0
     simulate = ["simulate", work / "run", work / "data" / "ball" / "0000", "--out", tmp_path / "out", "--steps", "1"]
     assert call(capsys, *simulate, "--device", device)[0] == 0

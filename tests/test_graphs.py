@@ -269,7 +269,9 @@ def test_only_a_gpu_has_graphs():
 
 
 def test_compile_of_a_rollout(device):
-    simulator, state = make_simulator(device, torch.float32), make_state(device=device, dtype=torch.float32, sizes=((9, 8),))
+    simulator, state = make_simulator(device, torch.float32), make_state(
+        device=device, dtype=torch.float32, sizes=((9, 8),)
+    )
     state, plan, sizes = state.with_clouds(state.clouds), simulator.plan(), []
 
     def observe(history):
@@ -329,7 +331,9 @@ def test_models_that_cannot_be_captured():
     with pytest.raises(InputError, match="must be in evaluation mode"):
         CapturedRollout(make_simulator().train(), make_state(), 1)
     rooms = ("encoder", "dynamics", "renderer")
-    published = {room: dataclasses.replace(getattr(CONFIG, room), quirks=Quirks(three_sigma_tiles=True)) for room in rooms}
+    published = {
+        room: dataclasses.replace(getattr(CONFIG, room), quirks=Quirks(three_sigma_tiles=True)) for room in rooms
+    }
     with pytest.raises(InputError, match="cannot be rendered as published"):
         CapturedRollout(make_simulator(**published), make_state(), 1, cameras=make_cameras())
 
@@ -339,7 +343,10 @@ def test_models_that_cannot_be_captured():
     [
         (lambda s: make_state(sizes=((20, 14), (9, 0, 12))), r"clouds that start at rows \[0, 20, 35, 44, 44, 56\]"),
         (lambda s: dataclasses.replace(s, cloud_step=s.cloud_step * 2), "steps as far apart"),
-        (lambda s: dataclasses.replace(s, static_latents=s.static_latents[:, :2]), r"state.static_latents must be \[56, 3\]"),
+        (
+            lambda s: dataclasses.replace(s, static_latents=s.static_latents[:, :2]),
+            r"state.static_latents must be \[56, 3\]",
+        ),
         (lambda s: dataclasses.replace(s, static_latents=None), r"state.static_latents must be \[56, 3\]"),
     ],
 )

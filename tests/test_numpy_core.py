@@ -82,7 +82,9 @@ def test_rasterize_gaussians(dtype):
     images = _core.rasterize_gaussians(means, quats, scales, opacities, colors, viewmats, Ks, 18, 15, background)
     tensors = [torch.from_numpy(x) for x in (means, quats, scales, opacities)]
     one = torch.ones(1)
-    cameras = Cameras(torch.from_numpy(viewmats), torch.from_numpy(Ks), one, one, torch.zeros(1, dtype=torch.int64), 18, 15)
+    cameras = Cameras(
+        torch.from_numpy(viewmats), torch.from_numpy(Ks), one, one, torch.zeros(1, dtype=torch.int64), 18, 15
+    )
     expected = ops.rasterize_gaussians(
         *tensors, cameras, colors=torch.from_numpy(colors), background=torch.from_numpy(background)
     )
@@ -108,7 +110,9 @@ def test_constants_say_what_the_kernels_do():
         (lambda: _core.curve_encode(np.zeros((2, 2), int), [0, 0], 0), r"grid must be \[\*, 3\]; got \[2, 2\]"),
         (lambda: _core.curve_encode([[1 << 17, 0, 0]], [0], 0), "curve_encode: grid"),
         (
-            lambda: _core.plane_sweep(np.zeros((1, 1, 2, 2)), np.zeros((1, 3, 3)), np.zeros((1, 3)), [[1.0]], [4], [0, 1]),
+            lambda: _core.plane_sweep(
+                np.zeros((1, 1, 2, 2)), np.zeros((1, 3, 3)), np.zeros((1, 3)), [[1.0]], [4], [0, 1]
+            ),
             "plane_sweep: src_images",
         ),
         (

@@ -44,7 +44,11 @@ def test_command_exists(words):
     elif words[0] == "gsim3d" or words[:3] == ["python", "-m", "gsim3d"]:
         arguments = words[1:] if words[0] == "gsim3d" else words[3:]
         text = subprocess.run(
-            [sys.executable, "-m", "gsim3d", arguments[0], "--help"], cwd=ROOT, capture_output=True, text=True, check=True
+            [sys.executable, "-m", "gsim3d", arguments[0], "--help"],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
         ).stdout
         for word in arguments[1:]:
             if word.startswith("--"):

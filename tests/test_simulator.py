@@ -355,7 +355,9 @@ def test_cuda_equals_cpu(devices):
     cpu, cuda = (images_and_gradients(device, torch.float64) for device in devices)
     assert_close_relative_to_max(cuda[0], cpu[0], 1e-9, "images")
     # Together: a bias in front of a norm has no gradient but rounding.
-    assert_close_relative_to_max(*(torch.cat([g.flatten() for g in grads[1:]]) for grads in (cuda, cpu)), 1e-9, "gradients")
+    assert_close_relative_to_max(
+        *(torch.cat([g.flatten() for g in grads[1:]]) for grads in (cuda, cpu)), 1e-9, "gradients"
+    )
 
 
 def test_a_rollout_and_its_gradients_repeat_bit_by_bit(device):

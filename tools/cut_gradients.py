@@ -1,23 +1,24 @@
 """What it costs that the published training cuts gradients: the same runs with gradients cut and kept.
 
     gsim3d generate elastic --preset mini --out runs/data
-    python tools/cut_gradients.py --data runs/data --out runs/cut --device cuda --together
+    python tools/cut_gradients.py --data runs/data --out runs/cut --device cuda --together 6
     python tools/cut_gradients.py --picture runs/cut docs/cut-gradients.png
 
 The release wraps attention, MLPs and the depth predictor in re-entrant checkpoints, which pass on no gradient of
 tensors inside dictionaries: attention and MLP of every block, their norms and the latents of the encoder keep their
 random first values. Here these branches are detached, which has the same effect, in one run of each pair; both runs
-of a pair have the same first weights and see the same samples in the same order. Stopped and started again, it goes
-on where it was.
+of a pair have the same first weights and see the same samples in the same order. Stopped, or out of --minutes, and
+started again, it goes on where it was.
 """
 
 import argparse
 import dataclasses
 import json
-import os
+import math
 import statistics
-import subprocess
 import sys
+import time
+from functools import partial
 from pathlib import Path
 
 from torch import nn
@@ -32,6 +33,8 @@ from gsim3d.simulator import Simulator  # noqa: E402
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig  # noqa: E402
 from gsim3d.train.loop import Trainer  # noqa: E402
 from gsim3d.train.restore import restore  # noqa: E402
+from gsim3d.train.settings import to_dict  # noqa: E402
+from gsim3d.train.side_by_side import side_by_side  # noqa: E402
 
 RUN = TrainConfig(
     preset="tiny",
@@ -64,19 +67,26 @@ def _detached(module: nn.Module, inputs: tuple, output):
     return output.detach()
 
 
-def train_and_score(config: TrainConfig, folders: tuple, out: Path, is_cut: bool, device: str) -> dict[str, float]:
-    """Trains in the folder ``out``, from where it was left; what held-out scenes say."""
+def train_and_score(
+    out: Path, config: TrainConfig, folders: tuple, is_cut: bool, device: str, end: float, progress: bool
+) -> dict[str, float] | None:
+    """Trains in the folder ``out``, from where it was left; what held-out scenes say.
+
+    None where training did not come to its end by ``end``, on the clock of time.monotonic.
+    """
     train, test = ([Scene.open(folder, fitting=config.data.fitting) for folder in part] for part in folders)
-    trainer = Trainer(config, train, out, device=device)
-    if is_cut:
-        cut(trainer.simulator)
-    trainer.run()
-    restored = restore(out, device)
+    asked = {"train": to_dict(config), "scenes": [[scene.name for scene in part] for part in (train, test)]}
     file = out / "metrics.json"
     known = json.loads(file.read_text()) if file.is_file() else {}
-    if known.get("checkpoint") != restored.checkpoint.digest:
-        scores = [score_scene(restored, scene, metrics=("psnr", "psnr_masked")) for scene in test]
-        known = {"checkpoint": restored.checkpoint.digest, **summarize(scores)}
+    if any(known.get(name) != value for name, value in asked.items()):
+        trainer = Trainer(config, train, out, device=device)
+        if is_cut:
+            cut(trainer.simulator)
+        trainer.run(end=end, progress=progress)
+        if trainer.step < config.n_steps:
+            return None
+        restored = restore(out, device)
+        known = asked | summarize([score_scene(restored, scene, metrics=("psnr", "psnr_masked")) for scene in test])
         write_json(file, known)
     return {name: known[name] for name in MEASURED} | {"constant": known["constant.future.psnr_masked"]}
 
@@ -131,31 +141,14 @@ def draw(results: dict, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def train_together(args: argparse.Namespace, names: list[str]) -> None:
-    """All runs at the same time, a process each, with logs beside them."""
-    args.out.mkdir(parents=True, exist_ok=True)
-    running = {}
-    for name in names:
-        command = [sys.executable, __file__, "--data", args.data, "--out", args.out, "--device", args.device]
-        environment = {**os.environ, "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // len(names)))}
-        with open(args.out / f"{name}.log", "w") as log:
-            running[name] = subprocess.Popen(
-                [str(word) for word in (*command, "--only", name)], stdout=log, stderr=log, env=environment
-            )
-    failed = [name for name, process in running.items() if process.wait()]
-    if failed:
-        last = (args.out / f"{failed[0]}.log").read_text().splitlines()[-1:]
-        raise SystemExit(f"cut_gradients: {', '.join(failed)} failed, the first with: {' '.join(last)}")
-
-
 def main(arguments: list[str] | None = None, config: TrainConfig = RUN) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", help="folder with scenes")
     parser.add_argument("--out", type=Path, help="folder for the runs")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--together", action="store_true", help="all runs at the same time")
-    parser.add_argument("--only", metavar="RUN", help="one of them, such as cut_0")
+    parser.add_argument("--together", type=int, default=1, metavar="N", help="runs at a time, a process each")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="train no longer; the next call goes on")
     parser.add_argument(
         "--picture", nargs=2, type=Path, metavar=("OUT", "FILE"), help="draw what OUT/metrics.json says"
     )
@@ -165,20 +158,25 @@ def main(arguments: list[str] | None = None, config: TrainConfig = RUN) -> None:
         return
     if args.data is None or args.out is None:
         parser.error("--data and --out are needed")
-    folders = split_scenes(find_scenes(args.data))
+    end = time.monotonic() + 60 * args.minutes
+    folders, say = split_scenes(find_scenes(args.data)), partial(print, flush=True)
     runs = {f"{kind}_{seed}": (kind, seed) for seed in range(args.seeds) for kind in ("kept", "cut")}
-    if args.together:
-        train_together(args, list(runs))
+    common = (args.device, end, args.together == 1)
+    jobs = {
+        name: (args.out / name, dataclasses.replace(config, seed=seed), folders, kind == "cut", *common)
+        for name, (kind, seed) in runs.items()
+    }
+    scores = {}
+    for name, found in side_by_side(train_and_score, jobs, args.together, say):
+        scores[name] = found
+        say(f"{name}: {'call again to go on' if found is None else found}")
+    if None in scores.values():
+        return
     results: dict[str, list] = {"kept": [], "cut": []}
-    for name, (kind, seed) in runs.items():
-        if args.only in (None, name):
-            print(f"seed {seed}, gradients {kind}", flush=True)
-            run = dataclasses.replace(config, seed=seed)
-            scores = train_and_score(run, folders, args.out / name, kind == "cut", args.device)
-            results[kind].append({**scores, "curve": curve(args.out / name)})
-    if not args.only:
-        print(table(results))
-        write_json(args.out / "metrics.json", results)
+    for name, (kind, _) in runs.items():
+        results[kind].append({**scores[name], "curve": curve(args.out / name)})
+    print(table(results))
+    write_json(args.out / "metrics.json", results)
 
 
 if __name__ == "__main__":

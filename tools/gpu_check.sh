@@ -8,12 +8,13 @@
 #   tools/gpu_check.sh bench                every op and the whole model against its peers: tools/bench/results/*.jsonl
 #
 # A step that passed on these sources is not repeated: started again, the check goes on where it stopped (remove
-# build/gpu_check to start over). Uses `python3`, or $PYTHON; needs torch with CUDA, nvcc, pytest; works without a network.
+# build/gpu_check to start over). Uses `python3`, or $PYTHON; needs torch with CUDA, nvcc, pytest; works without a
+# network.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PYTHON="${PYTHON:-python3}"
 STATE=build/gpu_check
-OPS=(curve sparse_conv patch_attn pool row_norm plane_sweep raster decode)
+OPS=(curve sparse_conv patch_attn pool row_norm plane_sweep raster decode background)
 
 say() { printf '\033[1m%s\033[0m\n' "$*" >&2; }
 die() { say "$*"; exit 1; }
@@ -63,9 +64,10 @@ tests() {
 sanitize() {
   local tool="$1" file="$2"
   # Without torch's memory pool every tensor is an allocation that the tool watches; a graph cannot be captured so.
-  # It slows kernels a hundred times, so that it sees some cases of every test, not all.
-  GSIM3D_FEW=3 GSIM3D_REQUIRE_CUDA=1 PYTORCH_NO_CUDA_MEMORY_CACHING=1 OMP_NUM_THREADS=1 compute-sanitizer --tool "$tool" \
-    --error-exitcode 9 "$PYTHON" -m pytest -q -p no:cacheprovider "$file" -m gpu -k "not compile and not graph and not opcheck"
+  # It slows kernels a hundred times, so that it sees our kernels alone, and some cases of every test.
+  GSIM3D_FEW=3 GSIM3D_REQUIRE_CUDA=1 PYTORCH_NO_CUDA_MEMORY_CACHING=1 OMP_NUM_THREADS=1 \
+    compute-sanitizer --tool "$tool" --kernel-name kns=gsim3d --kernel-name kns=3cub --error-exitcode 9 \
+    "$PYTHON" -m pytest -q -p no:cacheprovider "$file" -m gpu -k "not compile and not graph and not opcheck"
 }
 
 run_build() { step build compile; }
@@ -107,7 +109,8 @@ case "$phase" in
 esac
 MACHINE="$("$PYTHON" -c 'import torch; print(torch.__version__, torch.cuda.get_device_name())' 2>/dev/null)" ||
   die "$PYTHON has no torch that sees a GPU: activate one, or set PYTHON"
-command -v nvcc >/dev/null || [ -n "${CUDA_HOME:-}" ] || die "nvcc was not found: install the CUDA toolkit, or set CUDA_HOME"
+command -v nvcc >/dev/null || [ -n "${CUDA_HOME:-}" ] ||
+  die "nvcc was not found: install the CUDA toolkit, or set CUDA_HOME"
 mkdir -p "$STATE"
 export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}"
 KEY="$(key)"

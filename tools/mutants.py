@@ -6,9 +6,9 @@
     python tools/mutants.py guards          guards of hard cases in Python: nothing is compiled (guards_core: in C++)
     python tools/mutants.py --list
 
-Each mutant is {"file", "old", "new", "test"}: `old` must occur exactly once in `file`; `test` is a pytest node. The work
-is done in a copy of the repository, so the tree and its build are left alone. Prints one line a mutant; exit code 1 if
-any survives.
+Each mutant is {"file", "old", "new", "test"}: `old` must occur exactly once in `file`; `test` is a pytest node. The
+work is done in a copy of the repository, so the tree and its build are left alone. Prints one line a mutant; exit code
+1 if any survives.
 """
 
 import argparse
@@ -84,8 +84,11 @@ def main() -> int:
         for number, mutant in enumerate(mutants, 1):
             verdict = judge(tree, mutant)
             survivors += verdict != "killed"
-            print(f"{number:>3}/{len(mutants)} {mutant['op']:<12} {verdict:<10} {mutant['old'].strip()[:60]}  [{mutant['test']}]",
-                  flush=True)
+            print(
+                f"{number:>3}/{len(mutants)} {mutant['op']:<12} {verdict:<10} {mutant['old'].strip()[:60]}",
+                f" [{mutant['test']}]",
+                flush=True,
+            )
     print(f"{len(mutants) - survivors} killed, {survivors} survived")
     return 1 if survivors else 0
 

@@ -11,13 +11,14 @@ the paper's history, views and horizon at the size of --preset. --list names the
 
 Written to DIR: ablation.md and ablation.json (one table: PSNR beside baselines, seconds a step, the paper's number) and
 a run folder ROW/seed_N for each training. Stopped and started again, it goes on where it was; rows that are done stay.
+--steps is what every run gets; --minutes stops this call, and the next one goes on.
 More rows or seeds may be asked for later; the table has those of the last call. Differences are against its first row;
 with --seeds, those that are not larger than what the seed alone does are a tie. How to read it: docs/accuracy-time.md.
 
 examples:
   gsim3d ablate --list
   gsim3d ablate runs/data --out runs/ablation --steps 600
-  gsim3d ablate runs/data --rows latent,no-tem,rollout-2 --seeds 3 --out runs/ablation --device cuda
+  gsim3d ablate runs/data --rows latent,no-tem,rollout-2 --seeds 3 --together 9 --out runs/ablation --device cuda
   gsim3d ablate runs/data --config train.yaml --rows latent,grid-half,grid-double --out runs/grids
 """
 
@@ -36,6 +37,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--steps", type=int, metavar="N", help="optimizer steps of each run (default: the base run's)")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of each row (default: 1)")
+    parser.add_argument(
+        "--together",
+        type=int,
+        default=1,
+        metavar="N",
+        help="runs at a time, a process each: a small model leaves most of a GPU idle (default: 1)",
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=float("inf"), metavar="M", help="train no longer; the next call goes on"
+    )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default: cpu)")
     parser.add_argument("--list", action="store_true", help="print the rows and exit")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
@@ -45,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
     import dataclasses
     import shlex
     import sys
+    from functools import partial
     from pathlib import Path
 
     from gsim3d.ablate.rows import DEFAULT_ROWS, ROWS, base_run, rows_named, with_steps
@@ -57,6 +69,10 @@ def run(args: argparse.Namespace) -> int:
     for name in ("data", "out"):
         if getattr(args, name) is None:
             raise InputError(f"{'DATA' if name == 'data' else '--out'} is needed (see gsim3d ablate --help)")
+    if args.together < 1:
+        raise InputError(f"--together must be at least 1; got {args.together}")
+    if not args.minutes > 0:
+        raise InputError(f"--minutes must be positive; got {args.minutes}")
     rows = rows_named(",".join(DEFAULT_ROWS) if args.rows is None else args.rows)
 
     from gsim3d.ablate.study import Study
@@ -75,6 +91,8 @@ def run(args: argparse.Namespace) -> int:
     if out.exists() and not out.is_dir():
         raise InputError(f"--out: {out} is not a folder")
     study = Study(base, rows, find_scenes(args.data), n_seeds=args.seeds, device=args.device)
-    content = study.run(out, shlex.join(["gsim3d", "ablate", *sys.argv[2:]]), progress=not args.quiet)
+    command = shlex.join(["gsim3d", "ablate", *sys.argv[2:]])
+    limits = {"together": args.together, "minutes": args.minutes}
+    content = study.run(out, command, **limits, progress=not args.quiet, say=partial(print, flush=True))
     print(markdown(content), f"written: {out / 'ablation.md'}, {out / 'ablation.json'}", sep="\n")
     return 1 if any("failure" in run for row in content["rows"] for run in row["runs"]) else 0

@@ -1,35 +1,31 @@
-"""Trains and scores rows one after another, from where it was left, and keeps one table of what is done."""
+"""Trains and scores rows, from where it was left, and keeps one table of what is done."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
+import math
 import os
-import statistics
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import torch
-
 from gsim3d.ablate.rows import Row
-from gsim3d.ablate.table import METHODS, PSNRS, as_dict, markdown
+from gsim3d.ablate.table import as_dict, markdown, told
+from gsim3d.ablate.trial import Trial, attempt, context
 from gsim3d.data import Scene, split_scenes
 from gsim3d.effects import EffectsSpec
-from gsim3d.errors import HardCaseError, InputError
-from gsim3d.evaluate.protocol import horizon, score_scene
-from gsim3d.evaluate.report import summarize, write_json
-from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.errors import InputError
+from gsim3d.evaluate.protocol import horizon
+from gsim3d.evaluate.report import write_json
 from gsim3d.plans import make_plan
+from gsim3d.train.captured import check_capturable
 from gsim3d.train.checks import check_history, check_sharing
 from gsim3d.train.config import TrainConfig
-from gsim3d.train.log import LOG
-from gsim3d.train.loop import Trainer
-from gsim3d.train.restore import check_device, model_config, restore
-from gsim3d.train.samples import check_scenes, context_cameras, spread_views
+from gsim3d.train.restore import check_device, model_config
+from gsim3d.train.samples import check_scenes
 from gsim3d.train.settings import to_dict
+from gsim3d.train.side_by_side import side_by_side
 from gsim3d.train.thawing import check_thawing
-
-SCORE = "score.json"
 
 
 class Study:
@@ -76,6 +72,8 @@ class Study:
             check_history(config, make_plan(effects, model))
             check_thawing(config.data, model.dynamics)
             check_sharing(config, 1, model.dynamics.norm)
+            if config.captured:
+                check_capturable(model.dynamics)
         except InputError as error:
             raise InputError(f"row {row.name}: {error}") from None
         return config
@@ -83,85 +81,55 @@ class Study:
     def _targets(self, scene: Scene) -> list[int]:
         """Cameras that are no input of any row, as far as there are any."""
         kept = list(self.base.data.target_only_cameras)
-        inputs = {cam for config in self.configs.values() for cam in _context(scene, config)}
+        inputs = {cam for config in self.configs.values() for cam in context(scene, config)}
         return kept or sorted(set(range(scene.n_cams)) - inputs) or list(range(scene.n_cams))
 
     def same_as(self, name: str) -> str:
         """The first row whose run is that of the row ``name``: itself, where no earlier one is the same."""
         return next(other for other, config in self.configs.items() if config == self.configs[name])
 
-    def run(self, out: Path, command: str, *, progress: bool = True, say: Callable[[str], None] = print) -> dict:
+    def run(
+        self,
+        out: Path,
+        command: str,
+        *,
+        together: int = 1,
+        minutes: float = math.inf,
+        progress: bool = True,
+        say: Callable[[str], None] = print,
+    ) -> dict:
         """Trains and scores what is not done yet in the folder ``out``; what ablation.json holds.
 
         A row that diverges or has no memory is told in the table, and tried again by the next call.
+
+        Args:
+            together: runs at a time, each in a process of its own.
+            minutes: after which training stops; the next call goes on there.
+            progress: whether bars, or lines where runs go together, say how far they are.
         """
+        end = time.monotonic() + 60 * minutes
         out.mkdir(parents=True, exist_ok=True)
         names = list(dict.fromkeys(self.same_as(row.name) for row in self.rows))
-        results: dict[str, list[dict]] = {}
-        runs = [(seed, name) for seed in range(self.n_seeds) for name in names]
-        for n, (seed, name) in enumerate(runs, 1):
-            say(f"[{n}/{len(runs)}] {name}, seed {seed}")
-            config = dataclasses.replace(self.configs[name], seed=self.configs[name].seed + seed)
-            try:
-                result = self._one(config, out / name / f"seed_{seed}", progress)
-            except HardCaseError as error:
-                result = {"failure": str(error)}
-            except torch.OutOfMemoryError:
-                result = {"failure": "out of memory"}
-            results.setdefault(name, []).append(result)
-            content = as_dict(self, results, command)
+        runs = {f"{name}, seed {seed}": (name, seed) for seed in range(self.n_seeds) for name in names}
+        jobs = {
+            text: (out / name / f"seed_{seed}", self._trial(name, seed), end, progress and together == 1)
+            for text, (name, seed) in runs.items()
+        }
+        results: dict[str, dict[int, dict]] = {name: {} for name in names}
+        for n, (text, result) in enumerate(side_by_side(attempt, jobs, together, say if progress else None), 1):
+            name, seed = runs[text]
+            results[name][seed] = {"seed": seed, **result}
+            say(f"[{n}/{len(runs)}] {text}: {told(result)}")
+            by_seed = {name: [known[seed] for seed in sorted(known)] for name, known in results.items()}
+            content = as_dict(self, by_seed, command)
             write_json(out / "ablation.json", content)
             part = out / ".ablation.md.part"
             part.write_text(markdown(content))
             os.replace(part, out / "ablation.md")
         return content
 
-    def _one(self, config: TrainConfig, folder: Path, progress: bool) -> dict:
-        """What one run scores."""
-        asked = {
-            "train": to_dict(config),
-            "scenes": [[scene.name for scene in part] for part in (self.train, self.test)],
-            "steps": [self.n_given, self.n_future],
-            "cameras": self.targets,
-        }
-        known = _read(folder / SCORE)
-        if all(known.get(name) == value for name, value in asked.items()):
-            return known["result"]
-        trainer = Trainer(config, self.train, folder, device=self.device)
-        if not trainer.same_scenes:
-            raise InputError(f"{folder}: was trained on fewer scenes than are given now; use another folder")
-        trainer.run(progress=progress)
-        restored = restore(folder, self.device)
-        start = self.n_given - config.data.history
-        same = {"start": start, "n_future": self.n_future, "metrics": tuple(PSNRS)}
-        scores = [
-            score_scene(restored, scene, context_cams=_context(scene, config), target_cams=cams, **same)
-            for scene, cams in zip(self.test, self.targets, strict=True)
-        ]
-        summary = summarize(scores)
-        result = {
-            f"{method}{metric}": summary.get(f"{method}future.{metric}") for metric in PSNRS for method in METHODS
-        }
-        result["step_seconds"] = _step_seconds(folder, config)
-        write_json(folder / SCORE, {**asked, "device": self.device, "result": result})
-        return result
-
-
-def _context(scene: Scene, config: TrainConfig) -> list[int]:
-    return spread_views(context_cameras(scene, config.data), config.data.context_views, 0)
-
-
-def _read(file: Path) -> dict:
-    try:
-        known = json.loads(read_file(file, MAX_TEXT)) if file.is_file() else {}
-    except ValueError:  # nothing but time is lost
-        known = {}
-    return known if isinstance(known, dict) and isinstance(known.get("result"), dict) else {}
-
-
-def _step_seconds(run: Path, config: TrainConfig) -> float | None:
-    """Of an optimizer step: the median of those logged in the last stage."""
-    first = config.n_steps - config.stages[-1].steps
-    entries = [json.loads(line) for line in (run / LOG).read_text().splitlines()]
-    spent = [entry["machine"]["step_seconds"] for entry in entries if entry["step"] >= first]
-    return statistics.median(spent) if spent else None
+    def _trial(self, name: str, seed: int) -> Trial:
+        config = self.configs[name]
+        config = dataclasses.replace(config, seed=config.seed + seed)
+        folders = ([scene.path for scene in part] for part in (self.train, self.test))
+        return Trial(config, *folders, self.targets, self.n_given, self.n_future, self.device)

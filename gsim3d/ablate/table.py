@@ -19,21 +19,22 @@ PSNRS = {"psnr_masked": "PSNR masked", "psnr": "PSNR", "psnr_body": "PSNR body"}
 METHODS = ("", "constant.", "copy.")
 VALUES = (*(f"{method}{metric}" for metric in PSNRS for method in METHODS), "step_seconds")
 EXPLAINED = """\
-PSNR in dB, means over the seeds; masked: without background; body: what may move; constant: the row's own last encoded
-particles held still; copy: the last given image. Seconds are those of an optimizer step, the median of the last stage.
-The paper's numbers are PSNR of its own data and budget (docs/accuracy-time.md says where they contradict each other):
-compare differences, not values."""
+PSNR in dB, means over the seeds and their standard deviation; masked: without background; body: what may move;
+constant: the row's own last encoded particles held still; copy: the last given image. Seconds are those of an optimizer
+step, the median of the last stage, with other runs beside it where --together says so. The paper's numbers are PSNR of
+its own data and budget (docs/accuracy-time.md says where they contradict each other): compare differences, not values."""
 
 
 def as_dict(study: Study, results: dict[str, list[dict]], command: str) -> dict:
     """What ablation.json holds.
 
-    Of each row: what differs, the paper's number, ``runs`` (by seed) and their means; ``difference`` to the first row
-    in dB of masked PSNR (of all pixels where scenes have no masks); ``spread``: how far apart runs of one row are at
-    most, of either row; ``tie``: whether the difference is within it, null with one seed; ``same_as``: the row it is.
+    Of each row: what differs, the paper's number, ``runs`` (a seed each) and means of those that were scored;
+    ``difference`` to the first row in dB of masked PSNR (of all pixels where scenes have no masks); ``spread``: how far
+    apart runs of one row are at most, of either row; ``tie``: whether the difference is within it, null with one seed;
+    ``same_as``: the row it is.
 
     Args:
-        results: by the name of a row whose run is its own, by seed; those that are done.
+        results: runs by the name of a row whose run is its own, as far as there are any.
     """
     rows = []
     for row in study.rows:
@@ -42,7 +43,7 @@ def as_dict(study: Study, results: dict[str, list[dict]], command: str) -> dict:
         if same != row.name:
             entry["same_as"] = same
         runs = results.get(same, [])
-        rows.append({**entry, "runs": runs, **_means([run for run in runs if "failure" not in run])})
+        rows.append({**entry, "runs": runs, **_means(_scored(runs))})
     first = rows[0]
     metric = "psnr_masked" if first.get("psnr_masked") is not None else "psnr"
     for row in rows[1:]:
@@ -60,6 +61,19 @@ def as_dict(study: Study, results: dict[str, list[dict]], command: str) -> dict:
     }
 
 
+def told(run: dict) -> str:
+    """What a run came to, in a few words."""
+    if "failure" in run:
+        return f"failed: {run['failure']}"
+    if "trained" in run:
+        return f"{run['trained']} of {run['of']} optimizer steps; call again to go on"
+    return ", ".join(f"{label} {run[metric]:.2f}" for metric, label in PSNRS.items() if run.get(metric) is not None)
+
+
+def _scored(runs: list[dict]) -> list[dict]:
+    return [run for run in runs if "failure" not in run and "trained" not in run]
+
+
 def _means(runs: list[dict]) -> dict:
     """Of every value that all runs have."""
     known = [name for name in VALUES if runs and all(run.get(name) is not None for run in runs)]
@@ -71,7 +85,7 @@ def _compared(row: dict, first: dict, metric: str) -> dict:
         return {}
     difference, spreads = row[metric] - first[metric], []
     for runs in (row["runs"], first["runs"]):
-        values = [run[metric] for run in runs if "failure" not in run]
+        values = [run[metric] for run in _scored(runs)]
         if len(values) < 2:
             return {"difference": difference, "spread": None, "tie": None}
         spreads.append(max(values) - min(values))
@@ -88,15 +102,15 @@ def markdown(content: dict) -> str:
         cells = [row["row"], row["differs"]]
         for metric in PSNRS:
             values = [_number(row.get(f"{method}{metric}")) for method in METHODS]
-            cells += [values[0], ", ".join(values[1:])]
+            cells += [values[0] + _deviation(row, metric), ", ".join(values[1:])]
         seconds = row.get("step_seconds")
         cells += [_against(row), "-" if seconds is None else f"{seconds:.3g}", row["paper"] or "-"]
         lines.append(_line(cells))
     lines += ["", _conditions(content), "", EXPLAINED, "", _of_ties(n_seeds), "", f"Made by `{content['command']}`"]
     for row in rows:
         for run in row["runs"]:
-            if "failure" in run:
-                lines += ["", f"{row['row']} failed: {run['failure']}"]
+            if "same_as" not in row and run not in _scored(row["runs"]):
+                lines += ["", f"{row['row']}, seed {run['seed']}: {told(run)}"]
     return "\n".join(lines) + "\n"
 
 
@@ -125,6 +139,11 @@ def _against(row: dict) -> str:
     if row["tie"]:
         return f"tie (within {row['spread']:.2f})"
     return f"{round(row['difference'], 2) + 0.0:+.2f}"
+
+
+def _deviation(row: dict, metric: str) -> str:
+    values = [run[metric] for run in _scored(row["runs"]) if run.get(metric) is not None]
+    return f" ± {statistics.stdev(values):.2f}" if len(values) > 1 else ""
 
 
 def _line(cells: list[str]) -> str:

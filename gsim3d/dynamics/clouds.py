@@ -70,8 +70,8 @@ def alike(parts: Sequence[Particles]) -> list[Particles]:
 
 
 def concatenate(parts: Sequence[Particles], max_steps: int | None = None) -> Particles:
-    """The clouds of several particle sets of the same scenes in one, sorted by (scene, step); with ``max_steps`` the last
-    of each scene, each once."""
+    """The clouds of several particle sets of the same scenes in one, sorted by (scene, step); with ``max_steps`` the
+    last of each scene, each once."""
     parts = alike(parts)
     tables = [part.clouds for part in parts]
     places = [(table.scenes[q], table.steps[q], p, q) for p, table in enumerate(tables) for q in range(len(table))]

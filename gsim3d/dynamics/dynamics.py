@@ -22,9 +22,9 @@ class Dynamics(nn.Module):
     """Predicts how particles change in one step.
 
     The network reads all steps of a history at once; each row of the newest step gets an increment. Steps are counted
-    back from the newest, so one model serves any history of 1 to ``2 ** config.history_bits`` steps. Scenes do not change
-    each other (in training with ``norm="batch"`` they do). Rows that are asleep, outside the 2^16 cells from the scene's
-    origin, or at no finite place, keep their state and nobody sees them.
+    back from the newest, so one model serves any history of 1 to ``2 ** config.history_bits`` steps. Scenes do not
+    change each other (in training with ``norm="batch"`` they do). Rows that are asleep, outside the 2^16 cells from the
+    scene's origin, or at no finite place, keep their state and nobody sees them.
     """
 
     def __init__(self, config: DynamicsConfig):
@@ -118,7 +118,9 @@ class Dynamics(nn.Module):
             pyramid = self.geometry(history, generator=generator, curves=curves, rounded=rounded)
         n_data = [stage.n_data for stage in pyramid.stages]
         if pyramid.found is not None and self.training and self.config.norm == "batch" and None in n_data:
-            raise ValueError('Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"')
+            raise ValueError(
+                'Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"'
+            )
         features, is_awake = self.layout.pack(history), None
         n_awake = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
         everyone = n_awake == history.n_rows
@@ -141,7 +143,9 @@ class Dynamics(nn.Module):
         table = state.clouds
         counts = [table.count(q) for q in range(len(table))]
         steps = [
-            step.with_clouds(CloudTable.make(counts, table.scenes, (s + 1 + i for s in table.steps), state.cu_rows.device))
+            step.with_clouds(
+                CloudTable.make(counts, table.scenes, (s + 1 + i for s in table.steps), state.cu_rows.device)
+            )
             for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes))
         ]
         return steps[0] if len(steps) == 1 else concatenate(steps)

@@ -1,8 +1,8 @@
 """A block of the network for GPUs: the same numbers as its modules, in few launches and with one node of autograd.
 
-The residual stream is float32; what matrix products, convolution and attention read has the dtype of ``torch.autocast``.
-Everything between them is done by ``residual_norm`` in one pass over the rows. Gradients are written out below, for a
-backward pass in as few launches.
+The residual stream is float32; what matrix products, convolution and attention read has the dtype of
+``torch.autocast``. Everything between them is done by ``residual_norm`` in one pass over the rows. Gradients are
+written out below, for a backward pass in as few launches.
 """
 
 from __future__ import annotations
@@ -38,7 +38,15 @@ class Plan(NamedTuple):
 
     def geometry(self) -> tuple:
         voxels, taps = self.stage.voxels, self.stage.kernel_maps[self.kernel_size]
-        return (voxels.row_voxel, voxels.rows, voxels.cu_rows, taps.tap_in, taps.tap_out, taps.cu_taps, self.reads_lowest)
+        return (
+            voxels.row_voxel,
+            voxels.rows,
+            voxels.cu_rows,
+            taps.tap_in,
+            taps.tap_out,
+            taps.cu_taps,
+            self.reads_lowest,
+        )
 
     def conv_plan(self) -> Tensor | None:
         return self.stage.kernel_maps[self.kernel_size].plan
@@ -95,12 +103,12 @@ def run_block(
 ):
     """(x, what the next convolution reads) behind a ``point_transformer.Block``.
 
-    x [N, C]; conv_input [N, C] in the dtype of the products; keeps: factors [N, 1] of the rows' branches or None; beside:
-    what else the rows read, a ``background.Reader``, without gradients only.
+    x [N, C]; conv_input [N, C] in the dtype of the products; keeps: factors [N, 1] of the rows' branches or None;
+    beside: what else the rows read, a ``background.Reader``, without gradients only.
     """
     conv, attention, mlp, position = block.position.conv, block.attention, block.mlp, block.position
-    plan = Plan(stage, stage.patches[row], conv.kernel_size, conv.duplicates == "first", attention.heads, block.norm1.eps,
-                recompute)  # fmt: skip
+    plan = Plan(stage, stage.patches[row], conv.kernel_size, conv.duplicates == "first", attention.heads,
+                block.norm1.eps, recompute)  # fmt: skip
     layers = (conv, position.linear, attention.qkv, attention.proj, mlp.fc1, mlp.fc2)
     norms = (position.norm, block.norm1, block.norm2)
     rounded = [t for layer in layers for t in rounded_weights(layer, conv_input.dtype)]
@@ -124,7 +132,9 @@ class _Reads(NamedTuple):
     row: int
 
 
-def _forward(plan: Plan, w: Weights, x: Tensor, conv_input: Tensor, keep_attention, keep_mlp, reads: _Reads | None = None):
+def _forward(
+    plan: Plan, w: Weights, x: Tensor, conv_input: Tensor, keep_attention, keep_mlp, reads: _Reads | None = None
+):
     """(sum,) or (sum, sum in the dtype of the products); Kept."""
     place = _ops.sparse_conv.default(conv_input, w.conv, w.conv_bias, *plan.geometry(), plan.conv_plan())
     if reads is not None:
@@ -147,8 +157,8 @@ def _forward(plan: Plan, w: Weights, x: Tensor, conv_input: Tensor, keep_attenti
         out = (sum2 + (branch if keep_mlp is None else branch * keep_mlp),)
     else:
         out = _ops.residual_norm.default(sum2, branch, keep_mlp, None, None, None, None, plan.eps)[:2]
-    return out, Kept(place, position, sum1, normed1, position_stats, stats1, qkv, attended, attention_stats, sum2, normed2,
-                     stats2, hidden, activated)  # fmt: skip
+    return out, Kept(place, position, sum1, normed1, position_stats, stats1, qkv, attended, attention_stats, sum2,
+                     normed2, stats2, hidden, activated)  # fmt: skip
 
 
 def _heads(qkv: Tensor, heads: int) -> tuple[Tensor, ...]:

@@ -95,7 +95,11 @@ class StateLayout:
         return torch.cat(columns, 1)
 
     def advance(
-        self, particles: Particles, prediction: Tensor, awake: Tensor | None = None, changes: Mapping[str, str] | None = None
+        self,
+        particles: Particles,
+        prediction: Tensor,
+        awake: Tensor | None = None,
+        changes: Mapping[str, str] | None = None,
     ) -> list[Particles]:
         """The particles after 1, 2, ... ``steps_per_call`` steps.
 

@@ -126,7 +126,7 @@ class Encoder(nn.Module):
 
 
 class _Kept(torch.autograd.Function):
-    """Some rows of x, each once. The gradient takes rows too, where torch would add them to zeros and sort them for that.
+    """Some rows of x, each once. The gradient takes rows too; torch would sort them and add them to zeros.
 
     rows: which, int64. place: of each row of x its place among ``rows``, or their number.
     """

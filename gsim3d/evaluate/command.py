@@ -84,8 +84,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="FILE",
-        help="JSON file (default: metrics.json beside the checkpoint's files, in the folder of the predictions, or, of a "
-        "simulator that comes with gsim3d, in the current folder)",
+        help="JSON file (default: metrics.json beside the checkpoint's files, in the folder of the predictions, or, of "
+        "a simulator that comes with gsim3d, in the current folder)",
     )
 
 

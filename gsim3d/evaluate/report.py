@@ -135,8 +135,8 @@ def markdown(summary: dict, dataset: str) -> str:
             if any(f"{key}.{m}" in summary for m in by_step):
                 lines.append(_row([name, method, *(_number(summary.get(f"{key}.{m}"), m) for m in by_step)]))
     lines += ["", f"{summary['n_scenes']} scenes; {summary['n_encoded_steps']} steps given, "
-              f"{summary['n_future_steps']} predicted. Mean over steps of the mean over scenes ± mean over steps of the "
-              "standard deviation between scenes. Masked: without background; body: what may move."]  # fmt: skip
+              f"{summary['n_future_steps']} predicted. Mean over steps of the mean over scenes ± mean over steps of "
+              "the standard deviation between scenes. Masked: without background; body: what may move."]  # fmt: skip
     return "\n".join([*lines, *(f"\n{note}" for note in notes(summary))]) + "\n"
 
 

@@ -8,7 +8,7 @@ _autocast = torch._C.DispatchKeySet(torch._C.DispatchKey.AutocastCUDA)
 
 
 def follow_autocast(name: str) -> None:
-    """Under ``torch.autocast("cuda")`` casts the op's floating-point arguments to its dtype; as in torch not float64."""
+    """Under ``torch.autocast("cuda")`` casts the op's floating-point arguments to its dtype, but float64, as torch."""
     op = getattr(torch.ops.gsim3d, name).default
 
     def kernel(*arguments):

@@ -201,13 +201,13 @@ class Stage:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """rows: int64 [N0], the input rows that take part, ascending; cu_rows: int64 [N0 + 1], row i of stage 0 is input row
-    rows[cu_rows[i]]; stages: finest first.
+    """rows: int64 [N0], the input rows that take part, ascending; cu_rows: int64 [N0 + 1], row i of stage 0 is input
+    row rows[cu_rows[i]]; stages: finest first.
 
-    found: of a pyramid of given capacity, or of rounded sizes, int64: 0 where it fits (see :meth:`PyramidCapacity.fits`), then the counts that
-    the data has. Sizes are then those of the capacity. Behind the data follow rows that nothing reads: no cluster, patch
-    or pair lists them, each is a voxel of its own, pooled to 0; ``rows`` lists those that sleep. Everything is such a row
-    where a count exceeds its capacity.
+    found: of a pyramid of given capacity, or of rounded sizes, int64: 0 where it fits (see
+    :meth:`PyramidCapacity.fits`), then the counts that the data has. Sizes are then those of the capacity. Behind the
+    data follow rows that nothing reads: no cluster, patch or pair lists them, each is a voxel of its own, pooled to 0;
+    ``rows`` lists those that sleep. Everything is such a row where a count exceeds its capacity.
     """
 
     rows: Tensor
@@ -262,7 +262,8 @@ class PyramidCapacity:
         """
         if found[0] & self.MALFORMED:
             raise ValueError(
-                "build_pyramid: cu_rows, cloud_scene, cloud_slot or origin is malformed; a call without capacity names it"
+                "build_pyramid: cu_rows, cloud_scene, cloud_slot or origin is malformed; a call without "
+                "capacity names it"
             )
         return not found[0] & self.TOO_LARGE
 

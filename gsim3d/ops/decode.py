@@ -13,12 +13,12 @@ def decode_gaussians(
     """Rotation, scale and colour of Gaussians whose colours are predicted in their own frame.
 
     The rotation is normalised, the identity where it is shorter than 1e-6; scales are
-    ``scale_min + (scale_max - scale_min) * sigmoid``; harmonics of degree l > 0 are damped by ``0.1 / 4^l`` and turn with
-    the rotation.
+    ``scale_min + (scale_max - scale_min) * sigmoid``; harmonics of degree l > 0 are damped by ``0.1 / 4^l`` and turn
+    with the rotation.
 
     Args:
-        raw: [N, 3 K + 7], K = 1, 4, 9 or 16: harmonics (3, K), rotation (x, y, z, w), scales; float32 or float64, on CUDA
-            also float16 and bfloat16 (computed in float32).
+        raw: [N, 3 K + 7], K = 1, 4, 9 or 16: harmonics (3, K), rotation (x, y, z, w), scales; float32 or float64, on
+            CUDA also float16 and bfloat16 (computed in float32).
         readings: [128], :func:`gsim3d.harmonics.readings`, float32; float64 with float64 rows.
         degree: of the harmonics that are returned, at most that of ``raw``.
         scale_min, scale_max: metres, 0 to 1e15.

@@ -15,7 +15,7 @@ def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) ->
     Args:
         x: features [N, C], float32 or float64.
         rows: int64 [R], the rows of segment 0, then of segment 1, ...; each row at most once.
-        cu_rows: int64 [M + 1], ascending offsets into ``rows`` from 0 to at most R; rows listed behind are in no segment.
+        cu_rows: int64 [M + 1], ascending offsets into ``rows`` from 0 to at most R; rows listed behind are in none.
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [M, C], dtype of ``x``.

@@ -91,7 +91,7 @@ def rasterize_gaussians(
             touches, as the published model's renderer does; "smooth" fades alpha between 2/255 and 1/255, so that the
             result is differentiable everywhere: for tests of gradients.
         on_bad: what happens to a row that cannot be used (:mod:`gsim3d.stability`). "raise": an error on the CPU, left
-            out on a GPU; "drop": left out, its gradients are 0; "clamp": bounded, NaN counts as 0 (a rotation: identity).
+            out on a GPU; "drop": left out, its gradients are 0; "clamp": bounded, NaN counts as 0 (rotation: identity).
         report: counts such rows by image; on a GPU its ``check()`` raises what "raise" could not. Without one a GPU
             does not count.
     Returns:
@@ -104,7 +104,8 @@ def rasterize_gaussians(
         images; what exceeds it is rendered in further groups of images, slower.
     Raises:
         HardCaseError: ``on_bad`` is "raise" on the CPU, and a number is not finite or beyond 1e15 (rotations: of any
-            length), an opacity outside [0, 1], a scale negative, or a projection overflows; names argument, row and camera.
+            length), an opacity outside [0, 1], a scale negative, or a projection overflows; names argument, row
+            and camera.
         ValueError: a shape, dtype, offset or camera is not as above. On a GPU an image whose camera or cloud is not
             shows its background, and a background that is not finite is black.
     Source: Zwicker et al. 2002 (EWA splatting), Kerbl et al. 2023 (3D Gaussian splatting); conventions of gsplat.
@@ -207,7 +208,8 @@ def _clamped(rows: dict[str, Tensor], report: StabilityReport | None) -> dict[st
 
 def _counted(counts: Tensor, names: list[str]) -> Reading:
     return Reading(
-        [Finding("not finite or out of range", OP, name, "clamped", n) for name, n in zip(names, counts.tolist()) if n], {}
+        [Finding("not finite or out of range", OP, name, "clamped", n) for name, n in zip(names, counts.tolist()) if n],
+        {},
     )
 
 

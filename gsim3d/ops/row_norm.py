@@ -18,8 +18,8 @@ def row_norm(
 ) -> Tensor:
     """Normalises every row over its channels, scales, shifts and adds ``residual``.
 
-    ``out = (x - mean(x)) / sqrt(var(x) + eps) * weight + bias + residual``, mean and variance over a row. A row's result
-    has the same bits whatever rows it is packed with.
+    ``out = (x - mean(x)) / sqrt(var(x) + eps) * weight + bias + residual``, mean and variance over a row. A row's
+    result has the same bits whatever rows it is packed with.
 
     Args:
         x: [N, C], float32 or float64, on CUDA also float16 and bfloat16 (computed in float32) and then C at most 1024.
@@ -28,8 +28,8 @@ def row_norm(
         eps: at least 1e-30, keeps rows of equal values finite.
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
-        [N, C], dtype of ``residual``, else of ``x``. Under ``torch.autocast`` CUDA returns autocast's dtype where there is
-        no residual, ready for the matrix product that follows; the CPU computes in float32.
+        [N, C], dtype of ``residual``, else of ``x``. Under ``torch.autocast`` CUDA returns autocast's dtype where there
+        is no residual, ready for the matrix product that follows; the CPU computes in float32.
     Gradients: ``x``, ``weight``, ``bias``, ``residual``, once; sums over rows have one order.
     Raises:
         HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
@@ -79,7 +79,8 @@ def residual_norm(
         ValueError, TypeError: an argument is malformed; the message names it.
 
     Example:
-        >>> total, out = residual_norm(torch.ones(1, 2), torch.tensor([[1.0, 3.0]]), norm=(torch.ones(2), torch.zeros(2)))
+        >>> norm = torch.ones(2), torch.zeros(2)
+        >>> total, out = residual_norm(torch.ones(1, 2), torch.tensor([[1.0, 3.0]]), norm=norm)
         >>> total, out.round(decimals=3)
         (tensor([[2., 4.]]), tensor([[-1.,  1.]]))
     """
@@ -103,7 +104,11 @@ def _(x, weight, bias, residual, eps, dtype):
 
 @torch.library.register_fake("gsim3d::row_norm_backward")
 def _(grad, x, weight, stats):
-    return torch.empty_like(x, memory_format=torch.contiguous_format), torch.empty_like(weight), torch.empty_like(weight)
+    return (
+        torch.empty_like(x, memory_format=torch.contiguous_format),
+        torch.empty_like(weight),
+        torch.empty_like(weight),
+    )
 
 
 def _setup(ctx, inputs, output):

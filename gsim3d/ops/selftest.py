@@ -148,7 +148,10 @@ def _plane_sweep(device: str) -> float:
     def reference(features: Tensor) -> Tensor:
         costs = []
         for image, source in ((0, 1), (1, 0)):
-            q = torch.einsum("ij,hwj->hwi", A[image].float(), pixels) / depths[image, :, None, None, None] + b[image].float()
+            q = (
+                torch.einsum("ij,hwj->hwi", A[image].float(), pixels) / depths[image, :, None, None, None]
+                + b[image].float()
+            )
             xy = q[..., :2] / q[..., 2:].clamp_min(1e-3)
             xy = 2 * xy / torch.tensor([width - 1, height - 1]) - 1
             warped = torch.nn.functional.grid_sample(
@@ -174,7 +177,9 @@ def _raster(device: str) -> float:
         image, transmittance = torch.zeros(size, size, 3), torch.ones(size, size)
         for i in range(n):
             x, y, z = means[i]
-            J = torch.stack([torch.stack([focal / z, 0 * z, -focal * x / z**2]), torch.stack([0 * z, focal / z, -focal * y / z**2])])
+            J = torch.stack(
+                [torch.stack([focal / z, 0 * z, -focal * x / z**2]), torch.stack([0 * z, focal / z, -focal * y / z**2])]
+            )
             conic = torch.linalg.inv(J @ torch.diag(scales[i] ** 2) @ J.T + 0.3 * torch.eye(2))
             offset = torch.stack(torch.meshgrid(pixel, pixel, indexing="xy"), -1) - torch.stack(
                 [focal * x / z + K[0, 2], focal * y / z + K[1, 2]]

@@ -60,7 +60,7 @@ def watch_rows(
     zeros. The opacity of rows out of bounds is 0. Rows that sleep already stay as they are.
 
     Args:
-        fields: 2 to 8 tensors with N rows, float32 or float64: positions [N, 3], opacities [N], and others of any shape.
+        fields: 2 to 8 tensors with N rows, float32 or float64: positions [N, 3], opacities [N], others of any shape.
         bounds: lowest and highest value of each.
         cu_rows: int64 [Q + 1], rows of cloud q are cu_rows[q] .. cu_rows[q + 1].
         cloud_scene: int64 [Q] in [0, B).
@@ -73,14 +73,15 @@ def watch_rows(
         check: look at the types of the arguments; a model that makes them itself leaves it out.
     Returns:
         Watched, on the device of the rows.
-    Gradients: none, of mended rows neither. Determinism: equal bits for any number of threads; on a GPU from run to run.
+    Gradients: none, of mended rows neither. Determinism: equal bits for any number of threads; on a GPU in every run.
     Raises:
         ValueError, TypeError: an argument is malformed; the message names it. On a GPU offsets are not looked at.
 
     Example:
         >>> means, zero = torch.tensor([[0.5, 0.5, 0.5], [0.5, float("nan"), 0.5]]), torch.zeros(1, dtype=torch.int64)
         >>> watched = watch_rows([means, torch.ones(2)], [(-9, 9), (0, 1)], torch.tensor([0, 2]), cloud_scene=zero,
-        ...                      origin=torch.zeros(1, 3, dtype=torch.float64), activity=torch.zeros(2, dtype=torch.uint8))
+        ...                      origin=torch.zeros(1, 3, dtype=torch.float64),
+        ...                      activity=torch.zeros(2, dtype=torch.uint8))
         >>> watched.status.tolist(), watched.record[0, :2].tolist()
         ([0, 1], [1.0, 1.0])
     """

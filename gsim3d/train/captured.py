@@ -19,35 +19,44 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gsim3d.dynamics import concatenate
+from gsim3d.dynamics import DynamicsConfig, concatenate
 from gsim3d.errors import InputError
-from gsim3d.graphs import Captured
+from gsim3d.graphs import Captured, with_background_as_it_is
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
 from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport
 from gsim3d.train.samples import Batch
-from gsim3d.types import ASLEEP, CloudTable, Frames, Particles
+from gsim3d.types import ASLEEP, DYNAMIC, CloudTable, Frames, Particles
 
 FACTOR = 1.3  # room for geometry over what was observed: little costs captures, much costs time in every step
 ROWS_FACTOR = 1.15  # likewise, for the particles of a cloud
 ROW_UNIT = 256  # rows of a cloud are a multiple of it
 MOST_KINDS = 2  # of steps whose graphs are kept at a time
-LEARNED = ("means", "opacities", "dynamic_latents", "static_latents")  # of encoded particles, what has gradients
+# Of encoded particles, what has gradients; a latent model has the first four only.
+LEARNED = ("means", "opacities", "dynamic_latents", "static_latents", "quats", "scales", "sh")
 
 
 @dataclass(frozen=True)
 class Gradients:
     """loss: a number.   errors: [S], of each step.
 
-    particles: gradients of LEARNED, by name.   parameters: gradients of ``CapturedLoss.parameters``, or None.
+    particles: gradients of those of LEARNED that have one, by name.
+    parameters: gradients of ``CapturedLoss.parameters``, or None.
     """
 
     loss: Tensor
     errors: Tensor
     particles: dict[str, Tensor]
     parameters: tuple[Tensor | None, ...]
+
+
+def check_capturable(config: DynamicsConfig) -> None:
+    """Raises InputError for a model whose training steps no graph can repeat."""
+    if config.drop_path or config.shuffle_orders or config.norm == "batch" or config.is_asymmetric:
+        wanted = 'drop_path 0, shuffle_orders false, norm "layer" and a symmetric background'
+        raise InputError(f"captured: the model must have {wanted}")
 
 
 class CapturedLoss:
@@ -74,16 +83,7 @@ class CapturedLoss:
         loss: Callable[[Tensor, Frames, Tensor], tuple[Tensor, Tensor]],
         precision: Callable[[str], torch.autocast],
     ):
-        config = simulator.config.dynamics
-        if (
-            config.drop_path
-            or config.shuffle_orders
-            or config.norm == "batch"
-            or config.explicit
-            or config.is_asymmetric
-        ):
-            wanted = 'drop_path 0, shuffle_orders false, norm "layer", explicit false and a symmetric background'
-            raise InputError(f"captured: the model must have {wanted}")
+        check_capturable(simulator.config.dynamics)
         self.simulator, self.plan, self.loss, self.precision = simulator, plan, loss, precision
         self.parameters = [*simulator.dynamics.parameters(), *simulator.renderer.parameters()]
         self.alone: AbstractContextManager = nullcontext()
@@ -119,7 +119,10 @@ class _Step:
         table, device = particles.clouds, particles.means.device
         known = CloudTable.make([rows] * len(table), table.scenes, table.steps, device)
         fields = {name: x.new_zeros(rows * len(table), *x.shape[1:]) for name, x in particles.row_fields().items()}
-        for name in LEARNED:
+        if "quats" in fields:
+            fields["quats"][:, 0] = 1
+        self._learned = [name for name in LEARNED if name in fields]
+        for name in self._learned:
             fields[name].requires_grad_()
         self._state = particles.with_clouds(known, **fields, origin=particles.origin.clone())
         targets = batch.targets
@@ -142,16 +145,22 @@ class _Step:
             self._capacities = [c.grown((0, *o.sizes), 1) for c, o in zip(grown, self._observed(), strict=True)]
             self._capture()
         records.replayed(report)
-        n = len(LEARNED)
-        of_rows = {name: g.index_select(0, places) for name, g in zip(LEARNED, gradients[:n], strict=True)}
+        n = len(self._learned)
+        of_rows = {
+            name: gradient.index_select(0, places)
+            for name, gradient in zip(self._learned, gradients[:n], strict=True)
+            if gradient is not None
+        }
         return Gradients(loss, errors, of_rows, tuple(gradients[n:]))
 
     # ---- what runs ----
 
     def _rollout(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> list[Particles]:
         """The simulated steps that are looked at."""
-        owner, state = self._owner, self._state
-        rollout = partial(owner.simulator.rollout, plan=owner.plan, geometry=geometry, report=report, on_bad="drop")
+        owner, state, plan = self._owner, self._state, self._owner.plan
+        if plan.spec.dynamics.background == "masked_out":
+            state, plan = _without_background(state), with_background_as_it_is(plan)
+        rollout = partial(owner.simulator.rollout, plan=plan, geometry=geometry, report=report, on_bad="drop")
         with owner.precision("dynamics"):
             if self._n_lead:
                 with torch.no_grad():
@@ -160,7 +169,7 @@ class _Step:
 
     def _compute(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> tuple:
         owner = self._owner
-        leaves = [getattr(self._state, name) for name in LEARNED]
+        leaves = [getattr(self._state, name) for name in self._learned]
         particles = concatenate([self._state, *self._rollout(geometry, report)])
         with owner.precision("renderer"):
             images = owner.simulator.draw(
@@ -233,6 +242,13 @@ class _Step:
                 if isinstance(value, Tensor):
                     getattr(own, name).copy_(value)
         return places
+
+
+def _without_background(state: Particles) -> Particles:
+    """As if only what may move were there, in as many rows."""
+    left_out = state.activity != DYNAMIC
+    opacities = torch.where(left_out, 0.0, state.opacities)
+    return dataclasses.replace(state, activity=torch.where(left_out, ASLEEP, state.activity), opacities=opacities)
 
 
 def _rounded_up(rows: float) -> int:

@@ -210,7 +210,9 @@ def _load_single(path: Path) -> Checkpoint:
         config, state = json.loads(metadata["gsim3d_config"]), json.loads(metadata["gsim3d_state"])
     except (safetensors.SafetensorError, KeyError, ValueError):
         raise InputError(f"{path}: not a gsim3d checkpoint file") from None
-    return Checkpoint(model=_read_tensors(path), config=_known_format(config, path), state=state, digest=sha256_of(path))
+    return Checkpoint(
+        model=_read_tensors(path), config=_known_format(config, path), state=state, digest=sha256_of(path)
+    )
 
 
 def _known_format(config: dict, where: Path) -> dict:

@@ -30,7 +30,9 @@ class StageConfig:
     history: encoded steps; 0: as many as the data section says.
     batch: scenes a step, of all processes together.
     target_views: images of each step that the loss compares.
-    from_start: share of the windows that begin at a scene's first step; the others begin anywhere.
+    begin_within: windows begin at one of so many first steps of a scene; 0: anywhere. Bodies that have come to rest
+        teach little.
+    from_start: share of the windows that begin at a scene's first step, whatever else is drawn.
     learning_rate: peak, reached after ``warm_up`` of the stage's steps, then falling (one cycle a stage).
     warm_up: share of the stage's steps.
     """
@@ -41,13 +43,14 @@ class StageConfig:
     history: int = 0
     batch: int = 1
     target_views: int = 5
+    begin_within: int = 0
     from_start: float = 0.0
     learning_rate: float = 2e-4
     warm_up: float = 0.01
 
     def __post_init__(self):
         _at_least(self, steps=1, horizon=0, lead=0, history=0, batch=1, target_views=1)
-        _at_least(self, from_start=0, learning_rate=0, warm_up=0)
+        _at_least(self, begin_within=0, from_start=0, learning_rate=0, warm_up=0)
         if self.lead and not self.horizon:
             raise InputError("lead: needs a horizon of 1 or more")
 

@@ -140,11 +140,18 @@ class Trainer:
         return CapturedLoss(self.simulator, self.plan, self.loss_of_images, precision)
 
     def run(
-        self, *, until: int | None = None, progress: bool = True, tensorboard: bool = False, profile: bool = False
+        self,
+        *,
+        until: int | None = None,
+        end: float = math.inf,
+        progress: bool = True,
+        tensorboard: bool = False,
+        profile: bool = False,
     ) -> None:
         """Trains to the end of the configuration, or to optimizer step ``until``, and saves there.
 
         Args:
+            end: on the clock of time.monotonic; then it saves and stops. For one process.
             tensorboard: also log for TensorBoard, with a sample video at each checkpoint.
             profile: write a trace of two steps.
         Raises:
@@ -159,7 +166,8 @@ class Trainer:
             check_profile(until - self.step)
         tracer = profiler(self.out, self.processes.rank) if profile else nullcontext()
         with bar, deterministic(), self.log.opened(tensorboard=tensorboard), tracer:
-            while self.step < until:
+            stops = self.step >= until
+            while not stops:
                 start = time.perf_counter()
                 entry = self.train_step()
                 spent = time.perf_counter() - start
@@ -172,7 +180,8 @@ class Trainer:
                 bar.update()
                 if profile:
                     tracer.step()
-                if self.step % self.config.checkpoint_every == 0 or self.step == until:
+                stops = self.step == until or time.monotonic() >= end
+                if self.step % self.config.checkpoint_every == 0 or stops:
                     self.save()
                     if self.log.board is not None:
                         self.log.board.video(self.sample_video(), self.step)

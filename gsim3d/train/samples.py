@@ -140,8 +140,8 @@ def _draw_window(
     rng = generator(seed, step, sample, "window")
     scene = scenes[int(rng.integers(len(scenes)))]
     n_steps, lead = n_context + stage.horizon, lead_at(stage, seed, step)
-    last_start = scene.n_steps - n_steps - lead
-    start = int(rng.integers(last_start + 1))
+    n_starts = scene.n_steps - n_steps - lead + 1
+    start = int(rng.integers(min(n_starts, stage.begin_within or n_starts)))
     if rng.random() < stage.from_start:
         start = 0
     views = generator(seed, step, sample, "views")

@@ -11,6 +11,8 @@ from gsim3d.ablate.study import Study
 from gsim3d.ablate.table import as_dict, markdown
 from gsim3d.data import find_scenes
 from gsim3d.errors import HardCaseError, InputError
+from gsim3d.graphs import CaptureError
+from gsim3d.train.captured import check_capturable
 from gsim3d.train.config import DataConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import build_simulator, model_config
@@ -112,6 +114,32 @@ def test_killed_between_and_within_rows_the_table_is_that_of_one_sitting(folders
     assert len(calls) == 5  # nothing is trained again
 
 
+def test_side_by_side_and_in_two_calls_the_table_is_that_of_one_after_another(folders, tmp_path):
+    asked, out, said = study(folders, "latent", n_seeds=2), tmp_path / "together", []
+    expected = asked.run(tmp_path / "one", "c", progress=False, say=quiet)
+    late = asked.run(out, "c", minutes=1e-9, progress=False, say=said.append)
+    assert late["rows"][0]["runs"] == [{"seed": seed, "trained": 0, "of": 2} for seed in (0, 1)]
+    assert "latent, seed 1: 0 of 2 optimizer steps; call again to go on" in (out / "ablation.md").read_text()
+    content = asked.run(out, "c", together=2, say=said.append)
+    assert scores(content) == scores(expected)
+    assert [run["seed"] for run in content["rows"][0]["runs"]] == [0, 1]
+    assert len(said) == 4 and said[-1].startswith("[2/2] latent, seed ")
+
+
+def test_a_base_run_that_no_graph_can_repeat_is_refused_before_anything_is_trained(folders):
+    base = dataclasses.replace(BASE, captured=True, model={"dynamics": {"drop_path": 0.1}})
+    with pytest.raises(InputError, match="row latent: captured: the model must have drop_path 0"):
+        Study(base, rows_named("latent"), folders)
+
+
+@pytest.mark.parametrize("preset", ["tiny", "small"])
+def test_every_row_of_a_small_base_run_can_come_from_graphs(preset):
+    for row in ROWS.values():
+        config = row.change(base_run(preset))
+        assert config.captured
+        check_capturable(model_config(config).dynamics)
+
+
 def test_rows_of_other_histories_are_scored_over_the_same_steps(folders, tmp_path):
     content = study(folders, "latent,history-1,history-2").run(tmp_path, "c", progress=False, say=quiet)
     assert content["steps"] == {"before": 2, "predicted": 4}
@@ -135,29 +163,31 @@ def test_differences_within_the_spread_of_seeds_are_a_tie(folders):
         return [{**dict.fromkeys(KEYS, value), "copy.psnr_masked": None, "step_seconds": 0.1} for value in values]
 
     results = {"latent": runs(20.0, 20.5, 20.1), "no-tem": runs(20.4, 20.7, 20.6), "rollout-2": runs(18.0, 18.1, 18.2)}
-    results["rollout-2"].append({"failure": "step 7 is not finite"})
+    results["rollout-2"].append({"seed": 3, "failure": "step 7 is not finite"})
     content = as_dict(asked, results, "gsim3d ablate x")
     tie, lower = content["rows"][1:]
     assert tie["tie"] is True and tie["spread"] == pytest.approx(0.5) and not lower["tie"]
     lines = markdown(content).splitlines()
     assert "| tie (within 0.50) |" in lines[3] and "| -2.10 |" in lines[4]
-    assert "rollout-2 failed: step 7 is not finite" in lines
+    assert "rollout-2, seed 3: failed: step 7 is not finite" in lines
+    assert "| 18.10 ± 0.10 |" in lines[4]
     single = as_dict(asked, {name: found[:1] for name, found in results.items()}, "c")
     assert single["rows"][1]["tie"] is None and "| +0.40 |" in markdown(single)
 
 
-def test_a_row_that_fails_is_told_and_the_others_go_on(folders, tmp_path, monkeypatch):
+@pytest.mark.parametrize("error", [HardCaseError, CaptureError])
+def test_a_row_that_fails_is_told_and_the_others_go_on(error, folders, tmp_path, monkeypatch):
     step = Trainer.train_step
 
     def diverging(trainer):
         if not trainer.config.model["dynamics"]["time_embedding"]:
-            raise HardCaseError("20 steps in a row were skipped")
+            raise error("20 steps in a row were skipped")
         return step(trainer)
 
     monkeypatch.setattr(Trainer, "train_step", diverging)
     content = study(folders, "no-tem,latent").run(tmp_path, "c", progress=False, say=quiet)
-    assert content["rows"][0]["runs"] == [{"failure": "20 steps in a row were skipped"}]
-    assert content["rows"][1]["psnr"] > 0 and "no-tem failed: 20 steps in a row" in markdown(content)
+    assert content["rows"][0]["runs"] == [{"seed": 0, "failure": "20 steps in a row were skipped"}]
+    assert content["rows"][1]["psnr"] > 0 and "no-tem, seed 0: failed: 20 steps in a row" in markdown(content)
 
 
 def test_the_command_lists_rows_and_says_what_is_wrong(folders, tmp_path, capsys):
@@ -169,6 +199,8 @@ def test_the_command_lists_rows_and_says_what_is_wrong(folders, tmp_path, capsys
         ([data, "--rows", "latent,none", "--out", out], "--rows: 'none' does not exist; rows: latent, explicit"),
         ([data, "--rows", "latent,latent", "--out", out], "named twice"),
         ([data, "--seeds", "0", "--out", out], "--seeds must be at least 1"),
+        ([data, "--together", "0", "--out", out], "--together must be at least 1"),
+        ([data, "--minutes", "0", "--out", out], "--minutes must be positive"),
         ([data], "--out is needed"),
         ([str(folders[0]), "--out", out], "two are needed"),
         ([data, "--config", str(tmp_path / "long.yaml"), "--out", out], "row latent: "),

@@ -100,7 +100,9 @@ def test_batch_norm_refuses_to_count_rows_that_are_none():
 @pytest.mark.parametrize("asleep", [False, True])
 def test_devices_agree_on_given_sizes(asleep, devices):
     dynamics = make_dynamics(TINY, dtype=torch.float64)
-    history = batch([make_history((40, 30), dtype=torch.float64), make_history((300, 200, 100), 1, dtype=torch.float64)])
+    history = batch(
+        [make_history((40, 30), dtype=torch.float64), make_history((300, 200, 100), 1, dtype=torch.float64)]
+    )
     history = some_asleep(history) if asleep else history
     expected = dynamics(history)
     dynamics, history = dynamics.to(devices[1]), history.to(devices[1])

@@ -135,7 +135,9 @@ def test_the_whole_network_equals_its_modules_on_a_gpu(devices):
                 module.fused = fused
         step = model(history)
         parameters = list(model.parameters())
-        results.append([step.means, *torch.autograd.grad(step.means.sum() + step.dynamic_latents.square().sum(), parameters)])
+        results.append(
+            [step.means, *torch.autograd.grad(step.means.sum() + step.dynamic_latents.square().sum(), parameters)]
+        )
     for a, b in zip(*results, strict=True):
         assert_close_relative_to_max(a, b, "fused_network_float32")
 

@@ -1,4 +1,4 @@
-"""A history of one step merges nothing; harmonics of degree 0 see no directions; depth is a channel, not a second pass."""
+"""A history of one step merges nothing; harmonics of degree 0 see no directions; depth is a channel, no second pass."""
 
 import pytest
 import torch

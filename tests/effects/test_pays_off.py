@@ -1,4 +1,4 @@
-"""What rests is not computed: the work of a step falls with the share of rows at rest, by counts; times are benchmarks."""
+"""What rests is not computed: counted, a step takes less the more of a scene is at rest; times are benchmarks."""
 
 import dataclasses
 
@@ -8,9 +8,11 @@ import torch
 from gsim3d.dynamics import Parts
 from gsim3d.dynamics.background import Reader
 from gsim3d.dynamics.point_transformer import Attention
+from gsim3d.effects import DynamicsEffects, EffectsSpec
+from gsim3d.plans import Workload, background_cost, predicted_cost
 from gsim3d.types import FROZEN
-from tests.dynamics.scenes import make_history
-from tests.effects.resting import make_simulator
+from tests.dynamics.scenes import TINY, make_history
+from tests.effects.resting import ASYMMETRIC, make_simulator
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -18,23 +20,25 @@ N_ROWS = 400
 
 
 def multiply_adds(net, call):
-    """Of all matrix products, of convolutions (a tap for every row that is there), and of attention."""
-    counted = []
+    """Of all matrix products and convolutions (a tap for every row that is there); of attention to own patches; of
+    attention to a background."""
+    counted = [0, 0, 0]
 
     def product(module, inputs, output):
-        counted.append(inputs[0].shape[0] * module.weight.numel())
+        counted[0] += inputs[0].shape[0] * module.weight.numel()
 
     def attention(module, inputs, output):
         x, patches, row, beside = inputs
         tables = [patches] + ([beside.patches[row]] if isinstance(beside, Reader) else [])
-        counted.extend(2 * x.shape[1] * (t.cu_q.diff() * t.cu_k.diff()).sum().item() for t in tables)
+        for i, table in enumerate(tables):
+            counted[1 + i] += 2 * x.shape[1] * (table.cu_q.diff() * table.cu_k.diff()).sum().item()
 
     hooks = [module.register_forward_hook(product) for module in net._products]
     hooks += [module.register_forward_hook(attention) for module in net.modules() if isinstance(module, Attention)]
     call()
     for hook in hooks:
         hook.remove()
-    return sum(counted)
+    return counted
 
 
 def test_pays_off_the_more_rests_the_less_is_computed():
@@ -44,7 +48,7 @@ def test_pays_off_the_more_rests_the_less_is_computed():
         activity = torch.where(torch.arange(N_ROWS) < share * N_ROWS, FROZEN, 0).to(torch.uint8).repeat(4)
         parts = Parts.of(dataclasses.replace(history, activity=activity), asymmetric=True)
         background = dynamics.remember(parts.background)
-        work.append(multiply_adds(dynamics.net, lambda: dynamics(parts.moving, background=background)))
+        work.append(sum(multiply_adds(dynamics.net, lambda: dynamics(parts.moving, background=background))))
     assert work[0] > 1.3 * work[1] and work[0] > 4 * work[2] and work[2] > 4 * work[3] > 0
 
 
@@ -52,5 +56,28 @@ def test_a_background_costs_less_than_a_step_in_which_it_moves():
     simulator, history = make_simulator(), make_history((N_ROWS,) * 4, frozen_share=1.0)
     dynamics, net = simulator.dynamics, simulator.dynamics.net
     thawed = dataclasses.replace(history, activity=torch.zeros_like(history.activity))
-    made = multiply_adds(net, lambda: dynamics.remember(Parts.of(history, asymmetric=True).newest))
-    assert 3 * made < multiply_adds(net, lambda: dynamics(thawed))
+    made = sum(multiply_adds(net, lambda: dynamics.remember(Parts.of(history, asymmetric=True).newest)))
+    assert 3 * made < sum(multiply_adds(net, lambda: dynamics(thawed)))
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_the_predicted_cost_knows_the_second_patch(share):
+    """On a ground whose points are a cell apart it tells what moving rows pay for seeing those that rest."""
+    simulator, n = make_simulator(), 48
+    ground = torch.cartesian_prod(torch.arange(n), torch.arange(n), torch.tensor([3])) * ASYMMETRIC.grid_size
+    history = make_history((n * n,), frozen_share=0.0)
+    rests = torch.arange(n * n) < share * n * n
+    history = dataclasses.replace(history, means=ground, activity=torch.where(rests, FROZEN, 0).to(torch.uint8))
+    parts, dynamics = Parts.of(history, asymmetric=True), simulator.dynamics
+    background = dynamics.remember(parts.background)
+    *_, counted = multiply_adds(dynamics.net, lambda: dynamics(parts.moving, background=background))
+    plan = simulator.plan(EffectsSpec(dynamics=DynamicsEffects(history=1)))
+    moving, resting = int((~rests).sum()), int(rests.sum())
+    beside, alone = (
+        predicted_cost(plan, simulator.config, Workload(moving, frozen))["dynamics"] for frozen in (resting, 0)
+    )
+    assert beside - alone == pytest.approx(counted, rel=0.2)
+    assert background_cost(plan, simulator.config, Workload(moving, resting)) > 0
+    assert background_cost(plan, simulator.config, Workload(moving, 0)) == 0
+    symmetric = make_simulator(TINY)
+    assert background_cost(symmetric.plan(), symmetric.config, Workload(moving, resting)) == 0

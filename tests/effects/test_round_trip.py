@@ -49,6 +49,14 @@ def test_json_and_yaml():
         assert EffectsSpec.from_dict(yaml.safe_load(yaml.safe_dump(plain))) == spec
 
 
+@pytest.mark.parametrize("name", ["effects.yaml", "effects.json"])
+def test_files(tmp_path, name):
+    for spec in SPECS[::7]:
+        spec.save(tmp_path / name)
+        assert EffectsSpec.load(tmp_path / name) == spec
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+
+
 def test_hashes_tell_all_specs_apart_and_do_not_depend_on_order():
     assert len({spec.hash for spec in SPECS}) == len(set(SPECS)) == len(SPECS) == 5 * 3 * 3 * 2
     for spec in SPECS:
@@ -57,7 +65,7 @@ def test_hashes_tell_all_specs_apart_and_do_not_depend_on_order():
 
 
 def test_the_hash_is_the_same_on_any_machine():
-    assert EffectsSpec().hash == "c3aa9744214caf6e"
+    assert EffectsSpec().hash == EffectsSpec.from_dict({"version": 1}).hash == "c3aa9744214caf6e"
 
 
 def test_a_scene_ships_its_spec(tmp_path):

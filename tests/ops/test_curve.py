@@ -99,7 +99,7 @@ def test_sort_on_cuda(n, values, devices):
         "sorted": torch.arange(5 * n).reshape(5, n),
         "equal": torch.full((5, n), -5),
         "extremes": torch.where(torch.rand(5, n, generator=generator) < 0.5, -(2**63), high),
-        # Most keys differ in their high digits; two in a thousand differ in low digits only, and stand together in the order.
+        # Most keys differ in their high digits; two in a thousand differ in low ones only and stand together.
         "crowds": torch.where(
             torch.rand(5, n, generator=generator) < 0.002,
             torch.randint(0, 90, (5, n), generator=generator) << torch.arange(0, 10, 2)[:, None],

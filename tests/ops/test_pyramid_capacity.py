@@ -180,7 +180,9 @@ def test_a_graph_makes_the_pyramid_of_other_positions(devices):
 def test_compile_of_given_sizes():
     capacity = PyramidCapacity.of(build_pyramid(**scene(), spec=SPEC), 151)
     compiled = torch.compile(
-        lambda arguments: flat(build_pyramid(**arguments, spec=SPEC, capacity=capacity)), fullgraph=True, backend="aot_eager"
+        lambda arguments: flat(build_pyramid(**arguments, spec=SPEC, capacity=capacity)),
+        fullgraph=True,
+        backend="aot_eager",
     )
     expected = flat(build_pyramid(**scene(), spec=SPEC, capacity=capacity))
     for a, b in zip(compiled(scene()), expected, strict=True):

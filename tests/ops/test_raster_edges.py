@@ -310,7 +310,9 @@ def test_bad_rows_are_bounded(device, name, value, message):
 def test_a_gpu_raises_where_the_report_is_read(devices):
     report = StabilityReport()
     change(four_rows(), "means", 2, NAN).to(devices[1]).render(report=report)
-    with pytest.raises(HardCaseError, match=r"rasterize_gaussians: means: not finite or beyond 1e15 at row 2 \(camera 0\)"):
+    with pytest.raises(
+        HardCaseError, match=r"rasterize_gaussians: means: not finite or beyond 1e15 at row 2 \(camera 0\)"
+    ):
         report.check()
 
 

@@ -43,7 +43,10 @@ def gradients(f, values, cotangents, parts):
     leaves = [v.detach().clone().requires_grad_(not (parts[0] and i == 2)) for i, v in enumerate(values)]
     outs = call(f, parts)(*leaves)
     wanted = [leaf for leaf in leaves if leaf.requires_grad]
-    return [*(o.detach() for o in outs), *torch.autograd.grad(outs, wanted, [c.to(o) for c, o in zip(cotangents, outs)])]
+    return [
+        *(o.detach() for o in outs),
+        *torch.autograd.grad(outs, wanted, [c.to(o) for c, o in zip(cotangents, outs)]),
+    ]
 
 
 def cotangents_of(n, channels):

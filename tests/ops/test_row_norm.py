@@ -50,7 +50,9 @@ def test_gradcheck(residual):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_cuda_equals_cpu(shape, devices):
     cotangent = inputs(*shape, dtype=torch.float32, seed=1)[0]
-    cpu, cuda = (gradients(row_norm, [t.to(d) for t in inputs(*shape, dtype=torch.float32)], cotangent) for d in devices)
+    cpu, cuda = (
+        gradients(row_norm, [t.to(d) for t in inputs(*shape, dtype=torch.float32)], cotangent) for d in devices
+    )
     for a, b in zip(cuda, cpu):
         assert_close_relative_to_max(a, b, "row_norm_float32")
 

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from gsim3d.ablate.rows import ROWS
 from gsim3d.data import Scene, find_scenes
 from gsim3d.errors import InputError
 from gsim3d.stability import StabilityReport
@@ -32,9 +33,12 @@ def scenes(tmp_path_factory):
     return [Scene.open(path) for path in find_scenes(write_scenes(tmp_path_factory.mktemp("scenes"), 2))]
 
 
-@pytest.fixture
-def trainer(scenes, tmp_path, device):
-    trainer = Trainer(CONFIG, scenes, tmp_path, device=device.type)
+KINDS = {"latent": CONFIG, **{name: ROWS[name].change(CONFIG) for name in ("explicit", "background-masked")}}
+
+
+@pytest.fixture(params=["latent"])
+def trainer(scenes, tmp_path, device, request):
+    trainer = Trainer(KINDS[request.param], scenes, tmp_path, device=device.type)
     with torch.no_grad():
         for parameter in trainer.simulator.dynamics.net.head.parameters():
             parameter.normal_(0, 0.02, generator=torch.Generator(parameter.device).manual_seed(0))
@@ -52,7 +56,9 @@ def batches(scenes, count, lead=0):
     return [draw_batch(scenes, CONFIG.data, stage, 0, step, [0, 1]) for step in range(count)]
 
 
-@pytest.mark.parametrize("lead", [0, 2])
+@pytest.mark.parametrize(
+    "lead, trainer", [(0, "latent"), (2, "latent"), (0, "explicit"), (2, "background-masked")], indirect=["trainer"]
+)
 def test_gradients_are_those_of_the_loss(lead, scenes, trainer, device):
     captured, report = captured_loss(trainer), StabilityReport()
     drawn = batches(scenes, 4, lead)

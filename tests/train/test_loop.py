@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 import torch
@@ -100,6 +101,15 @@ def test_stopped_and_resumed_equals_never_stopped(folder, finished, tmp_path):
         Trainer(CONFIG, scenes(folder), tmp_path).run(until=until, progress=False)
     assert curve(tmp_path) == curve(finished)
     assert_same_checkpoint(tmp_path, finished)
+
+
+def test_out_of_time_it_saves_after_the_step_and_goes_on(folder, finished, tmp_path):
+    for steps in (1, 2):
+        trainer = Trainer(CONFIG, scenes(folder), tmp_path)
+        trainer.run(end=time.monotonic(), progress=False)
+        assert trainer.step == steps
+    Trainer(CONFIG, scenes(folder), tmp_path).run(progress=False)
+    assert curve(tmp_path) == curve(finished)
 
 
 def test_killed_after_the_last_checkpoint_repeats_those_steps(folder, finished, tmp_path):

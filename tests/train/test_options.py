@@ -10,10 +10,10 @@ import torch
 
 from gsim3d.errors import InputError
 from gsim3d.train import checkpoint
-from gsim3d.train.config import DataConfig
+from gsim3d.train.config import DataConfig, StageConfig
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.precision import STEPS_TO_DOUBLE, LossScale, PrecisionConfig
-from gsim3d.train.samples import draw_batch
+from gsim3d.train.samples import draw_batch, draw_windows
 from gsim3d.train.settings import from_dict
 from gsim3d.train.watch import StepWatch
 from tests.train.test_loop import CONFIG, curve, scenes
@@ -188,3 +188,20 @@ def test_the_log_tells_time_memory_and_particles(folder, tmp_path):
     batch = draw_batch(scenes(folder), CONFIG.data, CONFIG.stages[0], 0, 0, [0, 1])
     assert lines[0]["particles"] == pytest.approx(batch.context.masks.sum().item() / 2)
     assert math.isfinite(checkpoint.load(tmp_path).state["seconds"])
+
+
+@pytest.mark.parametrize("within, lead, starts", [(0, 0, 9), (3, 0, 3), (50, 0, 9), (6, 4, 5)])
+def test_windows_begin_within_the_steps_asked_for(within, lead, starts):
+    """Windows of 2 + 4 steps, or 4 more, in a scene of 14: what is asked for is bounded by what fits."""
+
+    class Long:
+        n_steps, n_cams = 14, 6
+
+    stage = StageConfig(steps=1, horizon=4, history=2, lead=lead, begin_within=within, target_views=1)
+    drawn = {True: set(), False: set()}
+    for step in range(60):
+        (window,) = draw_windows([Long()], DataConfig(context_views=2), stage, 0, step, [0])
+        drawn[window.lead > 0].add(window.steps[0])
+    assert drawn[lead > 0] == set(range(starts))
+    always = dataclasses.replace(stage, from_start=1.0)
+    assert draw_windows([Long()], DataConfig(context_views=2), always, 0, 3, [0])[0].steps[0] == 0

@@ -98,7 +98,9 @@ def test_a_run_that_only_skips_stops_and_can_go_on_with_another_rate(folder, tmp
     with pytest.raises(HardCaseError) as caught:
         trainer.run(progress=False)
     message = str(caught.value)
-    assert message.startswith("training: 3 steps in a row were skipped up to step 5, the last because the loss is not finite")
+    assert message.startswith(
+        "training: 3 steps in a row were skipped up to step 5, the last because the loss is not finite"
+    )
     assert "optimizer.clip_norm" in message and str(tmp_path) in message and caught.value.step == 5
     assert [line["step"] for line in curve(tmp_path) if "skipped" in line] == [3, 4, 5]
     saved = checkpoint.load(tmp_path)

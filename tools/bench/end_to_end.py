@@ -2,13 +2,13 @@
 
     python tools/bench/end_to_end.py --device cuda
 
-"captured" rows are replays of a CUDA graph of the same call, geometry included, with sizes 1.25 times those needed; the others
-are the calls as Python makes them.
+"captured" rows are replays of a CUDA graph of the same call, geometry included, with sizes 1.25 times those needed; the
+others are the calls as Python makes them.
 
-The dynamics read the scene of which the authors' release was once recorded on an H200 (its own network code, spconv 2.3.8,
-random weights, 129 input and 67 output channels, voxels of 4 mm): a ground disc and an ellipsoid that sinks 4 cm a step;
-masked means the ellipsoid alone. Encoder, rollouts and training see a film of it, with particles at their true places
-(surface_scene.py).
+The dynamics read the scene of which the authors' release was once recorded on an H200 (its own network code, spconv
+2.3.8, random weights, 129 input and 67 output channels, voxels of 4 mm): a ground disc and an ellipsoid that sinks 4 cm
+a step; masked means the ellipsoid alone. Encoder, rollouts and training see a film of it, with particles at their true
+places (surface_scene.py).
 """
 
 import argparse
@@ -67,8 +67,8 @@ def peak_gib(f) -> float:
 
 
 def measure(bench: Bench, case: str, f, dtype: torch.dtype, *, name=None, peers=None, target_ratio=None) -> None:
-    """The autocast context stays open, as in a rollout: weights are rounded once. ``name``: of the dtype, for what chooses
-    its own."""
+    """The autocast context stays open, as in a rollout: weights are rounded once. ``name``: of the dtype, for what
+    chooses its own."""
     with torch.autocast("cuda", dtype, enabled=dtype != torch.float32):
         memory = None
         try:
@@ -78,7 +78,9 @@ def measure(bench: Bench, case: str, f, dtype: torch.dtype, *, name=None, peers=
         if memory is None:  # behind the handler, which keeps what the failed call made
             return torch.cuda.empty_cache()
         name = name or str(dtype).removeprefix("torch.")
-        bench.gpu(f"{case}, {memory:.1f} GiB", name, f, peers or {}, target_ratio=target_ratio, tolerance=None, capture=False)
+        bench.gpu(
+            f"{case}, {memory:.1f} GiB", name, f, peers or {}, target_ratio=target_ratio, tolerance=None, capture=False
+        )
 
 
 def dynamics(bench: Bench, n_steps: int, masked: bool, dtype: torch.dtype) -> None:
@@ -95,7 +97,9 @@ def dynamics(bench: Bench, n_steps: int, masked: bool, dtype: torch.dtype) -> No
 
     def both(capacity=None):
         out = model(state, pyramid=model.geometry(state, capacity=capacity))
-        return torch.autograd.grad(out.means.sum() + out.dynamic_latents.sum(), list(model.parameters()), allow_unused=True)
+        return torch.autograd.grad(
+            out.means.sum() + out.dynamic_latents.sum(), list(model.parameters()), allow_unused=True
+        )
 
     name = f"dynamics T={n_steps}, {'16k masked' if masked else '65k'} points a step"
     graphs = partial(forward, inference, capacity), partial(both, capacity)
@@ -120,7 +124,9 @@ def whole(bench: Bench, dtype: torch.dtype) -> None:
         measure(bench, "encode 4 steps x 4 views, 128 px", lambda: simulator.encode(frames).means, dtype)
         state = simulator.encode(frames)
         newest = simulator.rollout(state, 1)[0]
-        measure(bench, "render 9 views of 65k particles, 128 px", lambda: simulator.render(newest, cameras).color, dtype)
+        measure(
+            bench, "render 9 views of 65k particles, 128 px", lambda: simulator.render(newest, cameras).color, dtype
+        )
         view = seen_by([0])
         measure(bench, "step + one 128 px view, 65k particles a step",
                 lambda: simulator.render(simulator.rollout(state, 1)[0], view).color, dtype)  # fmt: skip

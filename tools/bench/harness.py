@@ -1,9 +1,10 @@
 """What the benchmarks of the ops share: check first, then time gsim3d and its peer in turns and print both.
 
-    bench = Bench("pool")                                # reads the command line: --device, --json, --threads, --seconds
+    bench = Bench("pool")                                # reads the command line (--help)
     bench.compare("64k rows", ours, plain)               # CPU: callables without arguments; results must agree
     bench.compare("64k rows, fwd+bwd", *with_gradients(inputs, ours_of, plain_of))
     bench.gpu("64k rows", "float32", ours, {"torch": plain}, target_ratio=5, limit_ms=0.04)      # --device cuda
+    bench.cost("sleep", with_it, without_it, limit=1.05)    # either device: what one form of a call costs over another
     bench.finish()
 
 Numbers are medians, "best" is the fastest round; the spread is the distance between the quartiles as a part of the
@@ -25,7 +26,7 @@ import torch
 from torch import Tensor
 
 MIN_ROUNDS, MAX_ROUNDS = 5, 200
-PAIRS = 25  # of timings of a cost
+PAIRS, MAX_PAIRS = 15, 400  # of timings of a cost; more than 15 of what is fast
 GPU_ROUNDS = 20  # or MIN_ROUNDS of what takes long
 RESULTS = Path(__file__).parent / "results"  # one JSON line for each row measured on a GPU
 
@@ -75,7 +76,9 @@ def summary(seconds: list[float]) -> dict:
 
 
 def commit() -> str:
-    done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True)
+    done = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True
+    )
     return done.stdout.strip() or "unknown"
 
 
@@ -86,6 +89,22 @@ def event_ms(f) -> float:
     end.record()
     end.synchronize()
     return start.elapsed_time(end)
+
+
+def best_seconds(f, repeats: int = 3) -> float:
+    """Of the fastest of a few calls."""
+    best = float("inf")
+    for _ in range(repeats):
+        start = time.perf_counter()
+        f()
+        best = min(best, time.perf_counter() - start)
+    return best
+
+
+def processor_seconds(f) -> float:
+    start = time.process_time()
+    f()
+    return time.process_time() - start
 
 
 def graph_of(f):
@@ -119,7 +138,8 @@ class Bench:
         self.device = torch.device(self.args.device)
         if self.args.device == "cuda":
             print(f"{op}: {torch.cuda.get_device_name()}, torch {torch.__version__}")
-            print(f"{'case':<52}{'gsim3d ms':>10}{'graph':>9}{'peer ms':>10}{'graph':>9}{'ratio':>8}{'target':>8}{'error':>9}")
+            names = ("gsim3d ms", "graph", "peer ms", "graph", "ratio", "target", "error")
+            print(f"{'case':<52}" + "".join(f"{name:>{n}}" for name, n in zip(names, (10, 9, 10, 9, 8, 8, 9))))
             return
         print(f"{op}: {platform.machine()}, torch {torch.__version__}, {self.args.threads} threads")
         columns = f"{'gsim3d ms':>11}{'best':>10}{'torch ms':>11}{'best':>10}"
@@ -148,10 +168,10 @@ class Bench:
 
     def gpu(self, case: str, dtype: str, ours, peers: dict, *, target_ratio=None, limit_ms=None, tolerance=1e-5,
             capture=True) -> None:  # fmt: skip
-        """``peers``: name -> callable, the fastest counts, or the milliseconds once recorded of a peer that cannot run here;
-        empty where there is none. ``tolerance`` bounds the error
-        against each peer, relative to the largest value; None where the caller has compared the results by its own rule.
-        ``capture``: also try a CUDA graph (a capture that fails leaves torch's random generator unusable)."""
+        """``peers``: name -> callable, the fastest counts, or the milliseconds once recorded of a peer that cannot run
+        here; empty where there is none. ``tolerance`` bounds the error against each peer, relative to the largest
+        value; None where the caller has compared the results by its own rule. ``capture``: also try a CUDA graph (a
+        capture that fails leaves torch's random generator unusable)."""
         recorded = {name: peer for name, peer in peers.items() if not callable(peer)}
         peers = {name: peer for name, peer in peers.items() if callable(peer)}
         error = None
@@ -183,41 +203,64 @@ class Bench:
         medians |= recorded
         peer = min(medians, key=medians.get) if medians else None
         row = {
-            "op": self.op, "case": case, "dtype": dtype, "ours_ms": ours_ms, "ours_graph_ms": graph_ms["gsim3d"],
-            "peer": peer, "peer_ms": medians.get(peer), "peer_graph_ms": graph_ms.get(peer), "peers_ms": medians,
-            "target_ratio": target_ratio, "limit_ms": limit_ms, "gpu": torch.cuda.get_device_name(),
-            "torch": torch.__version__, "commit": commit(), "spread": (high - low) / ours_ms, "error": error,
-            "date": datetime.date.today().isoformat(),
+            "dtype": dtype, "ours_ms": ours_ms, "ours_graph_ms": graph_ms["gsim3d"], "peer": peer,
+            "peer_ms": medians.get(peer), "peer_graph_ms": graph_ms.get(peer), "peers_ms": medians,
+            "target_ratio": target_ratio, "limit_ms": limit_ms, "spread": (high - low) / ours_ms, "error": error,
         }  # fmt: skip
         cells = [ours_ms, graph_ms["gsim3d"], row["peer_ms"], row["peer_graph_ms"]]
         text = "".join(f"{'-' if v is None else format(v, '.3f'):>{w}}" for v, w in zip(cells, (10, 9, 10, 9)))
         ratio = "-" if peer is None else f"{row['peer_ms'] / ours_ms:.1f}x"
         wanted = "-" if target_ratio is None else f"{target_ratio:g}x"
-        print(f"{case + ' ' + dtype:<52}{text}{ratio:>8}{wanted:>8}{'-' if error is None else format(error, '.0e'):>9}", flush=True)
-        self.results.append(row)
-        file = self.args.json or RESULTS / f"{self.op}.jsonl"  # after each row: a benchmark may be cut short
+        error_text = "-" if error is None else format(error, ".0e")
+        print(f"{case + ' ' + dtype:<52}{text}{ratio:>8}{wanted:>8}{error_text:>9}", flush=True)
+        self._store(case, row)
+
+    def _store(self, case: str, row: dict) -> None:
+        """Notes a row of a GPU, at once: a benchmark may be cut short."""
+        made = {"gpu": torch.cuda.get_device_name(), "torch": torch.__version__, "commit": commit()}
+        self.results.append({"op": self.op, "case": case, **row, **made, "date": datetime.date.today().isoformat()})
+        file = self.args.json or RESULTS / f"{self.op}.jsonl"
         file.parent.mkdir(exist_ok=True)
         file.write_text("".join(json.dumps(row) + "\n" for row in self.results))
 
-    def cost(self, case: str, run, plain, *, tolerance: float | None = 0.0) -> None:
-        """What ``run`` costs over ``plain``: processor time on one thread, both sides in turns, so that a busy machine
-        matters little; the cost is the median over pairs. ``tolerance``: of the results; None: they are others."""
-        if tolerance is not None:
-            error = worst_error(run(), plain())
-            assert error <= tolerance, f"{self.op}, {case}: results differ by {error:.1e} of the largest value"
+    def cost(
+        self,
+        case: str,
+        run,
+        plain,
+        *,
+        dtype: str = "float32",
+        tolerance: float | None = 0.0,
+        limit: float | None = None,
+    ) -> None:
+        """What ``run`` costs over ``plain``, both sides in turns, one ahead and then the other; the cost is the median
+        over pairs, between its quartiles. On the CPU of processor time on one thread, whatever else runs.
+
+        Args:
+            tolerance: of the results, which are compared twice; None: they are others.
+            limit: wanted at most, times the time of ``plain``.
+        """
+        on_gpu = self.device.type == "cuda"
+        for _ in range(2):
+            results = run(), plain()
+            error = 0.0 if tolerance is None else worst_error(*results)
+            assert error <= (tolerance or 0.0), f"{self.op}, {case}: results differ by {error:.1e} of the largest value"
         torch.set_num_threads(1)
         times: dict = {run: [], plain: []}
-        for pair in range(PAIRS):
-            for f in (run, plain) if pair % 2 else (plain, run):
-                start = time.process_time()
-                f()
-                times[f].append(time.process_time() - start)
+        spent = 0.0
+        while len(times[run]) < PAIRS or (spent < 2 * self.args.seconds and len(times[run]) < MAX_PAIRS):
+            for f in (run, plain) if len(times[run]) % 2 else (plain, run):
+                times[f].append(event_ms(f) / 1e3 if on_gpu else processor_seconds(f))
+                spent += times[f][-1]
         torch.set_num_threads(self.args.threads)
-        ratios = [a / b - 1 for a, b in zip(times[run], times[plain])]
-        low, share, high = statistics.quantiles(ratios, n=4, method="inclusive")
+        low, share, high = statistics.quantiles((a / b - 1 for a, b in zip(*times.values())), n=4, method="inclusive")
         a, b = summary(times[run]), summary(times[plain])
-        print(f"{case:<44}{a['ms']:>11.2f}{b['ms']:>11.2f} cost {share:.2%} ({low:.2%} to {high:.2%})", flush=True)
-        self.results.append({"case": case, "gsim3d": a, "plain": b, "cost": share, "quartiles": [low, high]})
+        print(f"{case:<52}{a['ms']:>10.3f}{b['ms']:>10.3f} cost {share:.2%} ({low:.2%} to {high:.2%})", flush=True)
+        cost = {"cost": share, "quartiles": [low, high], "limit": limit}
+        if on_gpu:
+            self._store(case, {"dtype": dtype, "ours_ms": a["ms"], "peer_ms": b["ms"], "pairs": a["rounds"], **cost})
+        else:
+            self.results.append({"case": case, "gsim3d": a, "plain": b, **cost})
 
     def finish(self) -> None:
         if self.args.device == "cpu" and self.args.json:

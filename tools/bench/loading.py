@@ -3,9 +3,10 @@
 
     python tools/bench/loading.py FOLDER [--cache DIR]
 
-FOLDER holds scenes, as `gsim3d generate` makes them. A step is the paper's: 4 samples of 4 given and 12 predicted steps,
-4 input views, 5 target views; batches are drawn as training draws them, ready for the device. Prints images a second
-and the longest training step that one reader could not keep up with; CPU seconds do not depend on what else runs.
+FOLDER holds scenes, as `gsim3d generate` makes them. A step is the paper's: 4 samples of 4 given and 12 predicted
+steps, 4 input views, 5 target views; batches are drawn as training draws them, ready for the device. Prints images a
+second and the longest training step that one reader could not keep up with; CPU seconds do not depend on what else
+runs.
 """
 
 import argparse
@@ -53,7 +54,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         cache = args.cache or Path(temporary)
         print(
-            f"{len(folders)} scenes; {BATCH * (HISTORY * CONTEXT_VIEWS + (HISTORY + HORIZON) * TARGET_VIEWS)} images a step"
+            f"{len(folders)} scenes; "
+            f"{BATCH * (HISTORY * CONTEXT_VIEWS + (HISTORY + HORIZON) * TARGET_VIEWS)} images a step"
         )
         print(f"{'images from':<24}{'workers':>8}{'images/s':>14}{'CPU ms/image':>16}{'CPU s/step':>14}")
         for name, folder in (("memory", None), ("decoded files", cache)):

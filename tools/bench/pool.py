@@ -1,9 +1,8 @@
 """Pooling of feature rows over clusters and the way back, against the fastest plain torch form of each."""
 
-import time
 
 import torch
-from harness import Bench, with_gradients
+from harness import Bench, best_seconds, with_gradients
 
 from gsim3d.ops import pool_max, pool_mean, unpool
 
@@ -28,15 +27,6 @@ def inverted(rows, cu_rows):
     return torch.empty_like(rows).index_copy(0, rows, torch.arange(len(sizes)).repeat_interleave(sizes))
 
 
-def seconds(f, repeats: int = 3) -> float:
-    best = float("inf")
-    for _ in range(repeats):
-        start = time.perf_counter()
-        f()
-        best = min(best, time.perf_counter() - start)
-    return best
-
-
 def gpu(bench):
     """A quarter of 256k rows to a cluster; torch's forms as in the networks that use scatter or segment reductions."""
     n, channels = 262144, 64
@@ -58,9 +48,17 @@ def gpu(bench):
         "mean": (
             x,
             lambda x: pool_mean(x, rows, cu_rows),
-            {"scatter_reduce": lambda x: x.new_zeros(m, channels).scatter_reduce(0, wide, x, "mean", include_self=False)},
+            {
+                "scatter_reduce": lambda x: x.new_zeros(m, channels).scatter_reduce(
+                    0, wide, x, "mean", include_self=False
+                )
+            },
         ),
-        "unpool": (small, lambda x: unpool(x, rows, cu_rows, n), {"index_select": lambda x: x.index_select(0, cluster)}),
+        "unpool": (
+            small,
+            lambda x: unpool(x, rows, cu_rows, n),
+            {"index_select": lambda x: x.index_select(0, cluster)},
+        ),
     }
     for name, (value, ours, forms) in cases.items():
         bench.gpu(f"{name}, 256k x 64 rows to {m}: fwd", "float32", lambda: ours(value),
@@ -108,10 +106,10 @@ def main():
         }
         for name, (value, ours, *forms) in cases.items():
             title = f"{name}, {n // 1024}k x {channels} rows to {m}"
-            plain = min(forms, key=lambda f: seconds(lambda: f(value)))
+            plain = min(forms, key=lambda f: best_seconds(lambda: f(value)))
             bench.compare(f"{title}: fwd", lambda: ours(value), lambda: plain(value))
             runs = with_gradients([value], ours, *forms)
-            bench.compare(f"{title}: fwd+bwd", runs[0], min(runs[1:], key=seconds))
+            bench.compare(f"{title}: fwd+bwd", runs[0], min(runs[1:], key=best_seconds))
     bench.finish()
 
 

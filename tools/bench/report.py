@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Runs the benchmark of every op on the CPU and writes docs/benchmarks.md (and docs/benchmarks.json, the numbers behind it).
+"""Runs the benchmark of every op on the CPU and writes docs/benchmarks.md (and docs/benchmarks.json, its numbers).
 
     python tools/bench/report.py                  all ops
     python tools/bench/report.py raster pool      run these again, keep the other numbers
@@ -21,7 +21,7 @@ from pathlib import Path
 from harness import RESULTS, commit
 
 ROOT = Path(__file__).resolve().parents[2]
-OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "decode"]
+OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "decode", "background"]
 GUARDS, EFFECTS = "stability", "effects"
 NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
 EFFECTS_PAGE, MARKS = ROOT / "docs" / "effects.md", ("<!-- table -->\n", "<!-- end of table -->\n")
@@ -37,8 +37,9 @@ GPU = """
 ## On a GPU
 
 Medians of repeated calls between two events, as a program makes them: Python and launches included. "graph" is the same
-call replayed from a CUDA graph, "-" where it cannot be captured. "limit" is what the chip's rates allow by a count of bytes
-and operations; "wanted" is the ratio to the peer that we aim at. How each kernel got there: [performance log](performance-log.md).
+call replayed from a CUDA graph, "-" where it cannot be captured. "limit" is what the chip's rates allow by a count of
+bytes and operations; "wanted" is the ratio to the peer that we aim at. How each kernel got there:
+[performance log](performance-log.md).
 """
 CPU = """
 ## On the CPU
@@ -51,8 +52,8 @@ float32. "torch" is the best form of the op in plain torch that we found (vector
 COSTS = """
 ### What guards cost
 
-A rollout and an image with the default policy for numbers that cannot be used ([stability](stability.md)) and without any
-guard: processor time on one thread, both sides in turns; the cost is the median over pairs, with its quartiles.
+A rollout and an image with the default policy for numbers that cannot be used ([stability](stability.md)) and without
+any guard: processor time on one thread, both sides in turns; the cost is the median over pairs, with its quartiles.
 """
 
 
@@ -61,26 +62,50 @@ def number(value, digits: int = 3) -> str:
 
 
 def gpu_tables() -> str:
-    files = sorted(RESULTS.glob("*.jsonl"))
+    files = sorted(file for file in RESULTS.glob("*.jsonl") if file.stem != EFFECTS)  # these are on their own page
     text = GPU if files else ""
     for file in files:
         rows = [json.loads(line) for line in file.read_text().splitlines()]
         if not rows:
             continue
         first = rows[0]
+        text += f"\n### {first['op']} on {first['gpu']}\n\n"
+        text += f"torch {first['torch']}, commit {first['commit']}, {first['date']}.\n"
+        text += cost_table([row for row in rows if "cost" in row])
+        text += peer_table([row for row in rows if "cost" not in row])
+    return text
+
+
+def peer_table(rows: list[dict]) -> str:
+    if not rows:
+        return ""
+    text = (
+        "\n| case | dtype | gsim3d ms | graph | peer | peer ms | graph | ratio | wanted | limit ms | spread |\n"
+        "| --- | --- | ---: | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
+    )
+    for row in rows:
+        ratio = "-" if row["peer_ms"] is None else f"{row['peer_ms'] / row['ours_ms']:.1f}x"
+        wanted = "-" if row["target_ratio"] is None else f"{row['target_ratio']:g}x"
         text += (
-            f"\n### {first['op']} on {first['gpu']}\n\ntorch {first['torch']}, commit {first['commit']}, {first['date']}.\n\n"
-            "| case | dtype | gsim3d ms | graph | peer | peer ms | graph | ratio | wanted | limit ms | spread |\n"
-            "| --- | --- | ---: | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
+            f"| {row['case']} | {row['dtype']} | {number(row['ours_ms'])} | {number(row['ours_graph_ms'])} "
+            f"| {row['peer'] or '-'} | {number(row['peer_ms'])} | {number(row['peer_graph_ms'])} | {ratio} | {wanted} "
+            f"| {number(row['limit_ms'])} | {row['spread']:.0%} |\n"
         )
-        for row in rows:
-            ratio = "-" if row["peer_ms"] is None else f"{row['peer_ms'] / row['ours_ms']:.1f}x"
-            wanted = "-" if row["target_ratio"] is None else f"{row['target_ratio']:g}x"
-            text += (
-                f"| {row['case']} | {row['dtype']} | {number(row['ours_ms'])} | {number(row['ours_graph_ms'])} "
-                f"| {row['peer'] or '-'} | {number(row['peer_ms'])} | {number(row['peer_graph_ms'])} | {ratio} | {wanted} "
-                f"| {number(row['limit_ms'])} | {row['spread']:.0%} |\n"
-            )
+    return text
+
+
+def cost_table(rows: list[dict]) -> str:
+    """Of what :meth:`Bench.cost` measured, on either device."""
+    if not rows:
+        return ""
+    text = "\n| case | with ms | without ms | cost | quartiles | wanted |\n| --- | ---: | ---: | ---: | ---: | ---: |\n"
+    for row in rows:
+        low, high = row["quartiles"]
+        wanted = "-" if row.get("limit") is None else f"{row['limit'] - 1:.0%}"
+        both = (row["ours_ms"], row["peer_ms"]) if "ours_ms" in row else (row["gsim3d"]["ms"], row["plain"]["ms"])
+        ms = " | ".join(f"{value:.2f}" for value in both)
+        case = f"{row['case']}, {row['dtype']}" if "dtype" in row else row["case"]
+        text += f"| {case} | {ms} | {row['cost']:.1%} | {low:.1%} to {high:.1%} | {wanted} |\n"
     return text
 
 
@@ -124,15 +149,8 @@ def page(records: dict[str, dict]) -> str:
 
 
 def costs(r: dict) -> str:
-    text = (
-        f"{COSTS}\n{r['machine']}, torch {r['torch']}, Python {r['python']}, commit {r['commit']}, {r['date']}.\n\n"
-        "| case | guarded ms | unguarded ms | cost | quartiles |\n| --- | ---: | ---: | ---: | ---: |\n"
-    )
-    for row in r["results"]:
-        low, high = row["quartiles"]
-        ms = f"{row['gsim3d']['ms']:.1f} | {row['plain']['ms']:.1f}"
-        text += f"| {row['case']} | {ms} | {row['cost']:.1%} | {low:.1%} to {high:.1%} |\n"
-    return text
+    where = f"{r['machine']}, torch {r['torch']}, Python {r['python']}, commit {r['commit']}, {r['date']}."
+    return f"{COSTS}\n{where}\n{cost_table(r['results'])}"
 
 
 def steps_table(rows: list[dict]) -> str:
@@ -161,17 +179,17 @@ def with_steps(page: str, rows: list[dict]) -> str:
 
 
 def effects(r: dict) -> str:
-    """The table of docs/effects.md."""
-    text = (
-        f"{r['machine']}, one thread, torch {r['torch']}, Python {r['python']}, commit {r['commit']}, {r['date']}.\n\n"
-        "| effect | with ms | without ms | cost | quartiles | wanted |\n| --- | ---: | ---: | ---: | ---: | ---: |\n"
-    )
-    for row in r["results"]:
-        low, high = row["quartiles"]
-        wanted = "-" if row["limit"] is None else f"{row['limit'] - 1:.0%}"
-        ms = f"{row['gsim3d']['ms']:.1f} | {row['plain']['ms']:.1f}"
-        text += f"| {row['case']} | {ms} | {row['cost']:.1%} | {low:.1%} to {high:.1%} | {wanted} |\n"
-    return text
+    """The tables of docs/effects.md."""
+    where = f"{r['machine']}, one thread, torch {r['torch']}, Python {r['python']}, commit {r['commit']}, {r['date']}."
+    file = RESULTS / f"{EFFECTS}.jsonl"
+    rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    on_gpu = ""
+    if rows:
+        first = rows[0]
+        on_gpu = (
+            f"\n{first['gpu']}, torch {first['torch']}, commit {first['commit']}, {first['date']}.\n{cost_table(rows)}"
+        )
+    return f"{where}\n{cost_table(r['results'])}{on_gpu}"
 
 
 def main() -> None:

@@ -9,7 +9,10 @@ from gsim3d.ops import row_norm
 
 def inputs(n: int, channels: int, device) -> list[torch.Tensor]:
     g = torch.Generator().manual_seed(0)
-    return [torch.randn(*shape, generator=g).to(device) for shape in ((n, channels), (channels,), (channels,), (n, channels))]
+    return [
+        torch.randn(*shape, generator=g).to(device)
+        for shape in ((n, channels), (channels,), (channels,), (n, channels))
+    ]
 
 
 def plain(x, weight, bias, residual):
@@ -25,8 +28,8 @@ def main():
         title = f"{n // 1024}k x {channels}, with residual"
         if cuda:
             limit = n * channels * 4 / 4.2e9  # milliseconds for one pass over the rows at the memory's speed
-            bench.gpu(f"{title}: fwd", "float32", lambda: row_norm(*values), {"layer_norm + add": lambda: plain(*values)},
-                      limit_ms=3 * limit)  # fmt: skip
+            peers = {"layer_norm + add": lambda: plain(*values)}
+            bench.gpu(f"{title}: fwd", "float32", lambda: row_norm(*values), peers, limit_ms=3 * limit)
             bench.gpu(f"{title}: fwd+bwd", "float32", runs[0], {"layer_norm + add": runs[1]}, limit_ms=6 * limit)
         else:
             bench.compare(f"{title}: fwd", lambda: row_norm(*values), lambda: plain(*values))

@@ -3,10 +3,10 @@
     python tools/bench/sleeping.py                  # small, on the CPU
     python tools/bench/sleeping.py --device cuda    # 65k points, captured, with and without one 128 px view
 
-The scene is a ground disc and an ellipsoid that sinks; those of its rows that are nearest to the middle move, the rest is
-the background of a model with ``background="asymmetric"``. The peer of every row ("torch" on the CPU) is the same model
-when nothing rests. Weights are random: times do not depend on them. "agreement" is the PSNR between the last images of a
-rollout whose background is computed once and of one that computes it in every step.
+The scene is a ground disc and an ellipsoid that sinks; those of its rows that are nearest to the middle move, the rest
+is the background of a model with ``background="asymmetric"``. The peer of every row ("torch" on the CPU) is the same
+model when nothing rests. Weights are random: times do not depend on them. "agreement" is the PSNR between the last
+images of a rollout whose background is computed once and of one that computes it in every step.
 """
 
 import dataclasses

@@ -3,20 +3,16 @@
     python tools/bench/stability.py [--device cuda] [--seconds 5]
 
 Guards are one look at all rows where a state enters and after every step, and the counts of the rasterizer. The peer is
-the same without guards; results are the same bits. Both sides run in turns, first one ahead and then the other; the
-cost is the median over pairs, between its quartiles. On a GPU a time is that between two events around a call: of eager
-calls, which wait for Python, and of replays of two CUDA graphs.
+the same without guards; results are the same bits. On a GPU of eager calls, which wait for Python, and of replays of
+two CUDA graphs.
 """
 
-import datetime
-import json
 import math
-import statistics
 from contextlib import contextmanager
 from functools import partial
 
 import torch
-from harness import RESULTS, Bench, commit, event_ms, summary, worst_error
+from harness import Bench
 
 import gsim3d.guards
 import gsim3d.simulator
@@ -26,7 +22,6 @@ from gsim3d.stability import StabilityReport
 from gsim3d.types import Cameras, Particles
 
 STEPS = 4  # of a rollout
-MIN_PAIRS, MAX_PAIRS = 25, 400  # of timings on a GPU
 
 
 def state_of(simulator: Simulator, n: int, device: torch.device) -> Particles:
@@ -113,33 +108,6 @@ def replays_of(simulator: Simulator, state: Particles, cameras: Cameras):
     return replay_of(guarded), replay_of(plain)
 
 
-def cost_on_gpu(bench: Bench, case: str, dtype: str, run, plain):
-    """Prints and stores what guards add to ``plain``, a share of its time."""
-    for _ in range(2):
-        assert worst_error(run(), plain()) == 0, f"{case}: guards change results"
-    times: dict = {run: [], plain: []}
-    spent = 0.0
-    while len(times[run]) < MIN_PAIRS or (spent < 2e3 * bench.args.seconds and len(times[run]) < MAX_PAIRS):
-        for f in (run, plain) if len(times[run]) % 2 else (plain, run):
-            times[f].append(event_ms(f))
-            spent += times[f][-1]
-    low, share, high = statistics.quantiles((a / b - 1 for a, b in zip(*times.values())), n=4, method="inclusive")
-    guarded, unguarded = (summary([ms / 1e3 for ms in values]) for values in times.values())
-    ms = f"{guarded['ms']:>10.3f}{'-':>9}{unguarded['ms']:>10.3f}"
-    print(f"{case + ' ' + dtype:<52}{ms} cost {share:.2%} ({low:.2%} to {high:.2%})", flush=True)
-    row = {
-        "op": bench.op, "case": case, "dtype": dtype, "cost": share, "quartiles": [low, high],
-        "ours_ms": guarded["ms"], "ours_graph_ms": None, "peer": "no guards", "peer_ms": unguarded["ms"],
-        "peer_graph_ms": None, "target_ratio": None, "limit_ms": None, "gpu": torch.cuda.get_device_name(),
-        "torch": torch.__version__, "commit": commit(), "spread": guarded["spread"],
-        "date": datetime.date.today().isoformat(),
-    }  # fmt: skip
-    bench.results.append(row)
-    file = bench.args.json or RESULTS / f"{bench.op}.jsonl"
-    file.parent.mkdir(exist_ok=True)
-    file.write_text("".join(json.dumps(row) + "\n" for row in bench.results))
-
-
 def main():
     bench = Bench("stability")
     on_gpu = bench.device.type == "cuda"
@@ -153,11 +121,10 @@ def main():
         state, cameras = state_of(simulator, n, bench.device), camera(bench.device)
         run = run_of(simulator, state, cameras)
         case = f"{name}, {n} particles: {STEPS} steps"
-        if not on_gpu:
-            bench.cost(case + ", 1 image", run, without_guards(run))
-            continue
-        cost_on_gpu(bench, case + ", 1 image", "float32", run, without_guards(run))
-        cost_on_gpu(bench, case + f", {STEPS} images, captured", "bfloat16", *replays_of(simulator, state, cameras))
+        bench.cost(case + ", 1 image", run, without_guards(run))
+        if on_gpu:
+            captured = replays_of(simulator, state, cameras)
+            bench.cost(case + f", {STEPS} images, captured", *captured, dtype="bfloat16")
     if on_gpu:
         look(bench)
     bench.finish()

@@ -4,10 +4,10 @@ As points it is the scene of which the authors' release was recorded; as a film,
 quarter of their pixels and the ground in all others. Masked means the body alone: 16k particles a step from 4 views of
 128 px, 6 mm apart, as the points are.
 
-What a step costs depends on where particles lie, and untrained weights would scatter them. So :func:`as_if_trained` keeps
-all of a model's work and gradients, but puts encoded particles onto the surfaces that the pixels show, and lets the last
-layers predict little more than that bodies sink on and that Gaussians are as wide as 0.7 pixels (untrained they are 5 cm
-wide, and each is in sight of a quarter of all pixels).
+What a step costs depends on where particles lie, and untrained weights would scatter them. So :func:`as_if_trained`
+keeps all of a model's work and gradients, but puts encoded particles onto the surfaces that the pixels show, and lets
+the last layers predict little more than that bodies sink on and that Gaussians are as wide as 0.7 pixels (untrained
+they are 5 cm wide, and each is in sight of a quarter of all pixels).
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ def cameras(cams: Sequence[int], image_cloud: Tensor, size: int) -> Cameras:
 
 
 def film(step: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """What the 12 cameras see: images [12, 3, size, size], where the body is [12, size, size], and the places in the world
-    that the pixels show [12, size, size, 3]."""
+    """What the 12 cameras see: images [12, 3, size, size], where the body is [12, size, size], and the places in the
+    world that the pixels show [12, size, size, 3]."""
     viewmats, K = poses(), intrinsics(size)
     x = (torch.arange(size, dtype=torch.float64) + 0.5).expand(size, size)
     rays = torch.stack([(x - K[0, 2]) / K[0, 0], (x.T - K[1, 2]) / K[1, 1], torch.ones_like(x)], -1)

@@ -5,14 +5,15 @@
 
 The step is the one of `gsim3d train`: encode, 12 steps fed back, images of 5 views at all 16 steps, gradients,
 clipping, AdamW, averaged weights; with drop path, shuffled curves and deterministic algorithms. The film, the masks and
-where particles lie are those of surface_scene.py. With several processes every one gets ``--batch`` scenes; the efficiency
-of scaling is the time of a step in one process, measured before they begin, over the time in all of them.
+where particles lie are those of surface_scene.py. With several processes every one gets ``--batch`` scenes; the
+efficiency of scaling is the time of a step in one process, measured before they begin, over the time in all of them.
 """
 
 from __future__ import annotations
 
 import argparse
 import collections
+import functools
 import json
 import os
 import re
@@ -78,6 +79,7 @@ class SyntheticScene:
     height = width
 
 
+@functools.cache  # drawing the film takes longer than steps do
 def synthetic_batch(n_scenes: int, size: int, masked: bool) -> tuple[Batch, torch.Tensor]:
     """A batch, and the places of the particles of its encoded steps."""
     generator = torch.Generator().manual_seed(0)

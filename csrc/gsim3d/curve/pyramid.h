@@ -106,9 +106,9 @@ namespace cpu {
 //                           cells from tap_out, tap = (kx K + ky) K + kz; both ascend inside a tap; centre empty
 // and with spec.capacity or spec.rounded at last found [1 + counts]: problems, then the counts that the data has. Then
 // N, C, P, M, L are those of the capacity (N0 = n_rows), V is N + 1, and behind what the data has follow rows that
-// nothing reads: in orders they stay at their places, each is a voxel of its own, `rows` lists those that sleep; the last voxels,
-// patches, clouds and clusters are empty (offsets stay at the end), other entries are 0. Where a count exceeds its
-// capacity, there are such rows only.
+// nothing reads: in orders they stay at their places, each is a voxel of its own, `rows` lists those that sleep; the
+// last voxels, patches, clouds and clusters are empty (offsets stay at the end), other entries are 0. Where a count
+// exceeds its capacity, there are such rows only.
 // T is float or double. Throws ArgumentError where clouds or spec are malformed.
 template <typename T>
 void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const Arrays& arrays,

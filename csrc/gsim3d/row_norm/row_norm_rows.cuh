@@ -22,7 +22,7 @@ constexpr int64_t kMostRows = 16;    // of one group of lanes where rows are sum
 constexpr int64_t kManyBlocks = 512; // occupy a large GPU
 constexpr int kReduceRows = 32;      // partial sums that one block of the last reduction adds side by side
 
-// Rows of one group of lanes, `groups` of them a block and `columns` blocks side by side: the borders of sums over rows.
+// Rows of one group of lanes, `groups` of them a block, `columns` blocks side by side: the borders of sums over rows.
 // The same for the same sizes, whatever the GPU. Few rows are spread over many blocks, for each row waits for memory.
 inline int rows_of_group(int64_t n_rows, int64_t groups, unsigned columns = 1, int64_t blocks = kManyBlocks) {
   const int64_t at_once = groups * std::max<int64_t>(1, blocks / std::max(1u, columns));

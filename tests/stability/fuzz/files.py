@@ -13,9 +13,10 @@ from typing import Any
 import yaml
 
 VALUES = (
-    None, True, False, 0, -1, 1, 2, 1e-300, 1e300, math.nan, math.inf, -math.inf, 2**31, 2**63, -(2**63), 10**400, "", "x",
-    "nan", "-1", "../..", "/etc/passwd", "../../../../../../etc/passwd", "a" * 5000, "\x00", "\ud800", [], {}, [[]], [1] * 1000,
-    {"x": 1}, [None], [[1, 2], [3]], "{cam_ix}{cam_ix.__class__}", "{n_step:999999999d}", "%s%s%s",
+    None, True, False, 0, -1, 1, 2, 1e-300, 1e300, math.nan, math.inf, -math.inf, 2**31, 2**63, -(2**63), 10**400,
+    "", "x", "nan", "-1", "../..", "/etc/passwd", "../../../../../../etc/passwd", "a" * 5000, "\x00", "\ud800",
+    [], {}, [[]], [1] * 1000, {"x": 1}, [None], [[1, 2], [3]], "{cam_ix}{cam_ix.__class__}", "{n_step:999999999d}",
+    "%s%s%s",
 )  # fmt: skip
 OTHER_FILES = (
     b"",

@@ -232,8 +232,8 @@ def _write_sample(folder: Path) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Reader:
-    """write: good files into a folder.   read: (folder, what was damaged).   descriptions: files that say what the others
-    hold.   among: where damage is done, below the folder."""
+    """write: good files into a folder.   read: (folder, what was damaged).   descriptions: files that say what the
+    others hold.   among: where damage is done, below the folder."""
 
     write: Write
     read: Callable[[Path, str], Any]
