@@ -17,7 +17,7 @@ from torch.utils import cpp_extension
 
 ROOT = Path(__file__).parent
 # one op, one folder
-OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "sentinel", "decode"]
+OPS = "curve sparse_conv patch_attn pool row_norm plane_sweep raster sentinel decode background".split()
 CPU_FLAGS = ["-O3", "-std=c++20", "-fopenmp-simd", "-ffp-contract=off", "-fvisibility=hidden", "-Wall"]
 if platform.machine() in ("x86_64", "AMD64"):
     CPU_FLAGS.append("-march=x86-64-v3")  # a fixed baseline: the same bits on every machine, no -march=native

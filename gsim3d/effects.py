@@ -57,7 +57,7 @@ class Sleep:
     policy: "exact": a scene sleeps as a whole; "approx": cubes of it do (:mod:`gsim3d.dynamics.sleep` has the bounds).
     eps: cells that a particle at rest moves in a step at most, along each axis, and its latents change at most.
     patience: steps at rest before it sleeps, at least those that the model sees.
-    halo: metres, edge of the cubes, and the speed a step up to which nobody wakes too late.
+    halo: metres, edge of the cubes, and the change of speed in a step up to which nobody wakes too late.
     """
 
     policy: str = "exact"

@@ -1,4 +1,4 @@
-"""Files that somebody else may have written, read with bounded memory."""
+"""Files that somebody else may have written, read with bounded memory; and places for new ones."""
 
 from __future__ import annotations
 
@@ -21,6 +21,20 @@ def sha256_of(path: Path) -> str:
     """The hash of a file's bytes, in hex."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def new_place(out: str | Path, kind: str = "folder") -> Path:
+    """Where a command will write a file or folder.
+
+    Raises:
+        InputError: something is there, or the folder around it is not; the message starts with ``--out``.
+    """
+    out = Path(out)
+    if out.exists():
+        raise InputError(f"--out: {out} exists already; name another {kind} or remove it")
+    if not out.absolute().parent.is_dir():
+        raise InputError(f"--out: the folder {out.absolute().parent} does not exist")
+    return out
 
 
 def read_file(path: str | Path, most: int) -> bytes:

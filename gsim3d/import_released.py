@@ -30,15 +30,12 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from gsim3d.errors import InputError
+    from gsim3d.files import new_place
     from gsim3d.interop.released_import import import_released
     from gsim3d.train import checkpoint
     from gsim3d.train.settings import load_yaml, to_dict
 
-    out = Path(args.out)
-    if out.exists():
-        raise InputError(f"--out: {out} exists already; name another folder or remove it")
-    if not out.absolute().parent.is_dir():
-        raise InputError(f"--out: the folder {out.absolute().parent} does not exist")
+    out = new_place(args.out)
     source, settings = Path(args.checkpoint), load_yaml(args.config)
     try:
         imported = import_released(source, settings)

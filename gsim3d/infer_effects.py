@@ -38,16 +38,12 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from gsim3d.effects import FILE
-    from gsim3d.errors import InputError
+    from gsim3d.files import new_place
     from gsim3d.plans import in_columns
     from gsim3d.train.restore import restore
 
     tolerance = _decibels(args.tolerance)
-    out = Path(args.out or Path(args.scene) / FILE)
-    if out.exists():
-        raise InputError(f"--out: {out} exists already; name another file or remove it")
-    if not out.parent.is_dir():
-        raise InputError(f"--out: the folder {out.parent} does not exist")
+    out = new_place(args.out or Path(args.scene) / FILE, "file")
     restored = restore(args.checkpoint, args.device)
     scene = restored.open_scene(args.scene)
     trial = _Trial(restored, scene)

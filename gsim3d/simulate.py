@@ -51,7 +51,6 @@ def run(args: argparse.Namespace) -> int:
     import shutil
     from dataclasses import replace
     from functools import partial
-    from pathlib import Path
 
     import cv2
 
@@ -60,17 +59,14 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.errors import InputError
     from gsim3d.evaluate.pictures import as_bytes, comparison_frames, true_images, write_gaussians
     from gsim3d.evaluate.protocol import default_views, render_steps
+    from gsim3d.files import new_place
     from gsim3d.interop import write_video
     from gsim3d.pareto.autotune import load_speed
     from gsim3d.pareto.runner import Runner
     from gsim3d.pretrained import located
     from gsim3d.train.restore import restore
 
-    out = Path(args.out)
-    if out.exists():
-        raise InputError(f"--out: {out} exists already; name another folder or remove it")
-    if not out.absolute().parent.is_dir():
-        raise InputError(f"--out: the folder {out.absolute().parent} does not exist")
+    out = new_place(args.out)
     restored = restore(args.checkpoint, args.device)
     scene = restored.open_scene(args.scene)
     context, target = default_views(restored, scene, args.context)

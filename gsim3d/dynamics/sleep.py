@@ -2,10 +2,10 @@
 
 A row is quiet after ``patience`` steps in which it changed by no more than ``eps``. By the policy "exact" a scene
 sleeps once all its rows are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of
-``halo`` metres. A cube sleeps while no row in it or in one of its 26 neighbours is restless, and wakes in the step
-after one has become so. A row that moves by less than ``halo`` a step is in a neighbouring cube one step before it can
-be in the sleeping one: whom it may meet is awake by then. Who falls asleep is asked every ``patience`` steps only,
-since others asleep make another background. Rows asleep are a background to those awake, so "approx" needs a model of
+``halo`` metres. A cube sleeps while no row that is restless is in it or in one of its 26 neighbours, or will be in the
+next step if it moves on as in the last; else it wakes at once. A row that moves by less than ``halo`` a step, or
+steadily, is met by nobody asleep. Who falls asleep is asked every ``patience`` steps only, since others asleep make
+another background. Rows asleep are a background to those awake, so "approx" needs a model of
 ``background="asymmetric"``.
 
 A row that sleeps misses changes of up to ``eps`` a step. Where a simulation that never sleeps would change no row of a
@@ -22,10 +22,11 @@ import torch
 from torch import Tensor
 
 from gsim3d.effects import Sleep
-from gsim3d.types import ASLEEP, FROZEN, Particles
+from gsim3d.types import ASLEEP, FROZEN, Particles, constant
 
 NEVER_PREDICTED = {"activity", "static_latents", "turns", "paint"}
 CUBE_BITS = 16  # of a cube along an axis; cubes further out share the outermost
+WEIGHTS = (1 << 3 * CUBE_BITS, 1 << 2 * CUBE_BITS, 1 << CUBE_BITS, 1)  # of scene, x, y, z in the number of a cube
 
 
 @dataclass
@@ -88,21 +89,23 @@ class Sleepers:
         may_fall_asleep = self.n_steps % self.patience == 0
         if not (may_fall_asleep or self.anybody):
             return False
-        may_sleep = self._may_sleep(after)
+        may_sleep = self._may_sleep(before, after)
         asleep = may_sleep if may_fall_asleep else may_sleep & self.asleep
         if torch.equal(asleep, self.asleep):
             return False
         self.asleep, self.anybody = asleep, bool(asleep.any())
         return True
 
-    def _may_sleep(self, particles: Particles) -> Tensor:
+    def _may_sleep(self, before: Particles, after: Particles) -> Tensor:
         restless = self.moved_last > self.n_steps - self.patience
-        scene = particles.cloud_scene[particles.row_cloud()]
+        scene = after.cloud_scene[after.row_cloud()]
         if self.rule.policy == "exact":
-            n_restless = torch.zeros(particles.origin.shape[0], dtype=torch.int64, device=scene.device)
+            n_restless = torch.zeros(after.origin.shape[0], dtype=torch.int64, device=scene.device)
             return n_restless.index_add_(0, scene, restless.long())[scene] == 0
-        stirred = _near(_cubes(particles, scene, self.rule.halo), restless & (particles.activity != ASLEEP))
-        return ~stirred & ~restless & (particles.activity != FROZEN)
+        both = after.means, 2 * after.means - before.means
+        here, ahead = (_cubes(places, after.origin, scene, self.rule.halo) for places in both)
+        stirs = restless & (after.activity != ASLEEP)
+        return ~_near(here, torch.cat([here[stirs], ahead[stirs]])) & ~restless & (after.activity != FROZEN)
 
 
 def _largest(change: Tensor) -> Tensor:
@@ -110,18 +113,15 @@ def _largest(change: Tensor) -> Tensor:
     return change.abs().flatten(1).amax(1) if change.dim() > 1 else change.abs()
 
 
-def _cubes(particles: Particles, scene: Tensor, edge: float) -> Tensor:
-    """int64 [N, 4]: scene and cube of every row."""
-    place = torch.floor((particles.means.double() - particles.origin[scene]) / edge).nan_to_num()
-    place = place.clamp(1, 2**CUBE_BITS - 2).long()  # a cube further out would have neighbours elsewhere
-    return torch.cat([scene[:, None], place], 1)
+def _cubes(places: Tensor, origin: Tensor, scene: Tensor, edge: float) -> Tensor:
+    """int64 [N], the scene and cube of every row as one number."""
+    cubes = torch.floor((places.double() - origin[scene]) / edge).nan_to_num()
+    cubes = cubes.clamp(1, 2**CUBE_BITS - 2).long()  # a cube further out would have neighbours elsewhere
+    return (torch.cat([scene[:, None], cubes], 1) * constant(WEIGHTS, scene.device)).sum(1)
 
 
-def _near(cubes: Tensor, restless: Tensor) -> Tensor:
-    """bool [N]: rows whose cube or a neighbour of it holds a row that is restless."""
-    weights = torch.tensor([1 << 3 * CUBE_BITS, 1 << 2 * CUBE_BITS, 1 << CUBE_BITS, 1], device=cubes.device)
+def _near(cubes: Tensor, stirred: Tensor) -> Tensor:
+    """bool [N]: rows whose cube is one of ``stirred`` or a neighbour of it."""
     steps = torch.arange(-1, 2, device=cubes.device)
-    offsets = torch.cartesian_prod(steps, steps, steps) @ weights[1:]
-    keys = (cubes * weights).sum(1)
-    stirred = torch.unique(keys[restless])[:, None] + offsets
-    return torch.isin(keys, stirred)
+    offsets = torch.cartesian_prod(steps, steps, steps) @ constant(WEIGHTS, cubes.device)[1:]
+    return torch.isin(cubes, torch.unique(stirred)[:, None] + offsets)

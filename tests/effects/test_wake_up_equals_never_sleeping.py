@@ -84,6 +84,24 @@ def test_waking_in_time_gives_the_trajectory_of_never_sleeping(speed, direction)
     assert log.resting_share > 0.4 and min(log.moving) < max(log.moving) == len(turned)
 
 
+@pytest.mark.parametrize("speed", [0.5, 3.0, 10.0])
+def test_whom_a_fast_row_will_reach_in_the_next_step_is_awake_before(speed):
+    """Seven places on its way: after each step those are awake where it is, and where it will be; the others sleep."""
+    step = speed * HALO
+    places = [[0.0, 0.0, 0.0]] + [[step * k, 1.5 * HALO, 0.0] for k in range(1, 8)]
+    before = at(places, [[0.0] * 3] * 8)
+    sleepers = Sleepers(Sleep("approx", eps=1e-6, patience=1, halo=HALO), before, grid_size=0.01, history=1)
+    for k in range(1, 7):
+        means = before.means.clone()
+        means[0, 0] = step * k
+        after = dataclasses.replace(before, means=means)
+        sleepers.look(before, after)
+        before = after
+        awake = (~sleepers.asleep).nonzero()[:, 0].tolist()
+        assert {0, k, k + 1} <= set(awake)
+        assert speed < 1 or awake == [0, k, k + 1]
+
+
 def test_who_is_shot_too_fast_for_the_halo_is_woken_too_late():
     history = at([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[4 * REACH, 0.0, 0.0], [0.0] * 3])
     rule = Sleep("approx", eps=1e-6, patience=1, halo=REACH / 8)

@@ -1,9 +1,8 @@
 """Pooling of feature rows over clusters and the way back, against the fastest plain torch form of each."""
 
-import time
 
 import torch
-from harness import Bench, with_gradients
+from harness import Bench, best_seconds, with_gradients
 
 from gsim3d.ops import pool_max, pool_mean, unpool
 
@@ -26,15 +25,6 @@ def inverted(rows, cu_rows):
     """The cluster of each row."""
     sizes = cu_rows.diff()
     return torch.empty_like(rows).index_copy(0, rows, torch.arange(len(sizes)).repeat_interleave(sizes))
-
-
-def seconds(f, repeats: int = 3) -> float:
-    best = float("inf")
-    for _ in range(repeats):
-        start = time.perf_counter()
-        f()
-        best = min(best, time.perf_counter() - start)
-    return best
 
 
 def gpu(bench):
@@ -116,10 +106,10 @@ def main():
         }
         for name, (value, ours, *forms) in cases.items():
             title = f"{name}, {n // 1024}k x {channels} rows to {m}"
-            plain = min(forms, key=lambda f: seconds(lambda: f(value)))
+            plain = min(forms, key=lambda f: best_seconds(lambda: f(value)))
             bench.compare(f"{title}: fwd", lambda: ours(value), lambda: plain(value))
             runs = with_gradients([value], ours, *forms)
-            bench.compare(f"{title}: fwd+bwd", runs[0], min(runs[1:], key=seconds))
+            bench.compare(f"{title}: fwd+bwd", runs[0], min(runs[1:], key=best_seconds))
     bench.finish()
 
 

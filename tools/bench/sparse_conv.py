@@ -6,10 +6,9 @@ about 10 occupied cells of 27 around each (itself included); "sparse" has points
 
 import dataclasses
 import math
-import time
 
 import torch
-from harness import Bench, with_gradients
+from harness import Bench, best_seconds, with_gradients
 
 from gsim3d.ops import KernelMap, PyramidSpec, Voxels, build_pyramid, sparse_conv
 
@@ -61,15 +60,6 @@ def gather_all_multiply(voxels, kernel_map):
         return torch.addmm(bias, padded.index_select(0, table).reshape(n, -1), weight.reshape(weight.shape[0], -1).T)
 
     return plain
-
-
-def seconds(f, repeats: int = 3) -> float:
-    best = float("inf")
-    for _ in range(repeats):
-        start = time.perf_counter()
-        f()
-        best = min(best, time.perf_counter() - start)
-    return best
 
 
 def surface_cells(n: int, kind: str, seed: int = 3) -> torch.Tensor:
@@ -207,10 +197,10 @@ def main():
 
         forms = [form(voxels, kernel_map) for form in (gather_multiply_scatter, gather_all_multiply)]
         title = f"{n // 1024}k x {channels}, {len(kernel_map.tap_in) / n:.1f} neighbours"
-        plain = min(forms, key=lambda f: seconds(lambda: f(*inputs)))
+        plain = min(forms, key=lambda f: best_seconds(lambda: f(*inputs)))
         bench.compare(f"{title}: fwd", lambda: ours(*inputs), lambda: plain(*inputs))
         runs = with_gradients(inputs, ours, *forms)
-        bench.compare(f"{title}: fwd+bwd", runs[0], min(runs[1:], key=seconds))
+        bench.compare(f"{title}: fwd+bwd", runs[0], min(runs[1:], key=best_seconds))
     bench.finish()
 
 
