@@ -7,7 +7,10 @@ import gsim3d.ops  # noqa: F401
 
 OPS = sorted({name.split(".")[0] for name in torch._C._dispatch_get_all_op_names() if name.startswith("gsim3d::")})
 # positions or indices in, integers out, or nothing at all: nothing to differentiate
-INTEGER_OPS = ("gsim3d::curve_", "gsim3d::build_pyramid", "gsim3d::sparse_conv_plan", "gsim3d::watch_rows")
+INTEGER_OPS = tuple(
+    f"gsim3d::{name}"
+    for name in "curve_ build_pyramid sparse_conv_plan watch_rows row_scenes find_cells overlapping_patches".split()
+)
 
 
 def has_kernel(op: str, key: str) -> bool:

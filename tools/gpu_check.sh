@@ -14,7 +14,7 @@ set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PYTHON="${PYTHON:-python3}"
 STATE=build/gpu_check
-OPS=(curve sparse_conv patch_attn pool row_norm plane_sweep raster decode)
+OPS=(curve sparse_conv patch_attn pool row_norm plane_sweep raster decode background)
 
 say() { printf '\033[1m%s\033[0m\n' "$*" >&2; }
 die() { say "$*"; exit 1; }

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from gsim3d.pareto.report import machine
+from gsim3d.pareto import machine
 from gsim3d.train.settings import to_dict
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def as_dict(study: Study, results: dict[str, list[dict]], command: str) -> dict:
     return {
         "format": FORMAT,
         "command": command,
-        "machine": machine(torch.device(study.device)),
+        "machine": machine.facts(torch.device(study.device)),
         "base": to_dict(study.base),
         "scenes": {"trained": len(study.train), "held_out": len(study.test)},
         "steps": {"before": study.n_given, "predicted": study.n_future},

@@ -26,15 +26,13 @@ from torch import Tensor, nn
 
 from gsim3d import ops
 from gsim3d.branches import Branches
-from gsim3d.ops.curve import CURVES, KernelMap, PatchTable, Pyramid, PyramidSpec, Stage, Voxels
+from gsim3d.ops.curve import CURVES, KernelMap, PatchTable, Pyramid, PyramidSpec, Segments, Stage, Voxels
 from gsim3d.types import Particles
 
-_ops = torch.ops.gsim3d
 DEPTH = 16  # levels of the curves at stage 0, and bits of a cell along an axis
 SPACE_BITS = 3 * DEPTH  # below the scene in a key
 NOWHERE = torch.iinfo(torch.int64).max  # a key behind all others
 ALL_CURVES = (0, 1, 2, 3)
-MOST_EXPONENT = 70.0  # beyond it one softmax has all the weight in float32; sums of exponentials stay finite
 
 
 @dataclass(frozen=True)
@@ -180,89 +178,28 @@ class Reader:
         curves: tuple[int, ...],
     ):
         self.background = background
-        self.cells = {size: _cell_of(cells, _cell_keys(scene, stage.grid)) for size, cells in places.cells.items()}
-        self.patches = _overlapping(places, stage, scene, depth, curves)
+        self.cells = {size: ops.find_cells(cells, scene, stage.grid) for size, cells in places.cells.items()}
+        codes, at = _codes(stage, scene, depth, curves), (stage.order, stage.cu_clouds)
+        self.patches = ops.overlapping_patches(
+            places.first, places.kv_rows, places.cu_k, codes, *at, patch_size=places.patch_size
+        )
 
     def convolved(self, conv: nn.Module, x: Tensor, out: Tensor) -> Tensor:
-        return out + self.background.fields[conv].index_select(0, self.cells[conv.kernel_size]).to(out.dtype)
+        field = self.background.fields[conv].to(out.dtype)
+        return ops.add_cells(out, field, self.cells[conv.kernel_size], check=False)
 
     def attended(self, attention: nn.Module, q: Tensor, k: Tensor, v: Tensor, patches: PatchTable, row: int) -> Tensor:
         keys, values = self.background.keys[attention].to(q.dtype), self.background.values[attention].to(q.dtype)
-        return joint_attention(q, k, v, keys, values, patches, self.patches[row])
+        return ops.joint_attention(q, k, v, keys, values, patches, self.patches[row], check=False)
 
 
 def row_scenes(pyramid: Pyramid, particles: Particles) -> list[Tensor]:
     """int64 [N] for each stage: the scene of every row, anything for rows of a given capacity that are none."""
-    input_scene = particles.cloud_scene[particles.row_cloud()]
-    scenes = [_first_of(input_scene, pyramid.rows, pyramid.cu_rows)]
-    for stage in pyramid.stages[1:]:
-        scenes.append(_first_of(scenes[-1], stage.cluster.rows, stage.cluster.cu_rows))
-    return scenes
-
-
-def joint_attention(
-    q: Tensor, k: Tensor, v: Tensor, other_k: Tensor, other_v: Tensor, patches: PatchTable, other_patches: PatchTable
-) -> Tensor:
-    """Attention of every query to its keys in both tables, in one softmax; arguments as :func:`ops.patch_attention`."""
-    return _JointAttention.apply(q, k, v, other_k, other_v, patches, other_patches)
-
-
-class _JointAttention(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, q, k, v, other_k, other_v, patches, other_patches):
-        scale = q.shape[-1] ** -0.5
-        out, stats = _ops.patch_attention.default(q, k, v, *_lists(patches), scale)
-        other, other_stats = _ops.patch_attention.default(q, other_k, other_v, *_lists(other_patches), scale)
-        # lerp would round by how threads share the rows
-        out = (out + (other - out) * _share_of_other(stats, other_stats, scale)).to(out.dtype)
-        if any(ctx.needs_input_grad):
-            ctx.save_for_backward(q, k, v, other_k, other_v, out, _joined(stats, other_stats, scale))
-            ctx.patches, ctx.scale = (patches, other_patches), scale
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        q, k, v, other_k, other_v, out, stats = ctx.saved_tensors
-        # Each table's part of the gradient follows from its own keys and the result over both.
-        mine, others = (
-            _ops.patch_attention_backward.default(grad, q, *keys, out, stats, *_lists(table), ctx.scale)
-            for keys, table in zip(((k, v), (other_k, other_v)), ctx.patches, strict=True)
-        )
-        return mine[0] + others[0], *mine[1:], *others[1:], None, None
-
-
-# Stats of an attention: the largest product of a query and a key, and the sum of exponentials relative to it, 0 of no keys.
-
-
-def _share_of_other(stats: Tensor, other: Tensor, scale: float) -> Tensor:
-    """[..., 1], of the other keys in one softmax over the keys of both; in as few launches as there may be."""
-    (top, total), (other_top, other_total) = stats.split(1, -1), other.split(1, -1)
-    other_total = ((other_top - top) * scale).clamp(max=MOST_EXPONENT).exp() * other_total
-    return other_total / (other_total + total).clamp(min=torch.finfo(total.dtype).tiny)
-
-
-def _joined(stats: Tensor, other: Tensor, scale: float) -> Tensor:
-    """Of one softmax over the keys of both."""
-    (top, total), (other_top, other_total) = stats.unbind(-1), other.unbind(-1)
-    other_top = torch.where(other_total > 0, other_top, top)
-    largest = torch.maximum(top, other_top)
-    sums = (total * ((top - largest) * scale).exp(), other_total * ((other_top - largest) * scale).exp())
-    return torch.stack([largest, sum(sums)], -1)
-
-
-def _lists(patches: PatchTable) -> tuple[Tensor, ...]:
-    return patches.q_rows, patches.kv_rows, patches.cu_q, patches.cu_k
+    pooled = [Segments(pyramid.rows, pyramid.cu_rows), *(stage.cluster for stage in pyramid.stages[1:])]
+    return ops.row_scenes(particles.cloud_scene, particles.cu_rows, pooled)
 
 
 # ---- places ----
-
-
-def _first_of(values: Tensor, rows: Tensor, cu_rows: Tensor) -> Tensor:
-    """The value of the first row of each segment; of empty ones, any."""
-    if rows.shape[0] == 0:
-        return values[:0]
-    return values[rows[cu_rows[:-1].clamp(max=rows.shape[0] - 1)]]
 
 
 def _cell_keys(scene: Tensor, grid: Tensor) -> Tensor:
@@ -323,58 +260,6 @@ def _field(stage: Stage, scene: Tensor, depth: int, kernel_size: int) -> Field:
     cu_taps = torch.nn.functional.pad(inside.sum(1).cumsum(0), (1, 0))
     each = torch.arange(cells.shape[0] + 1, device=keys.device)
     return Field(cells, occupied, Voxels(each[:-1], each[:-1], each), KernelMap(kernel_size, tap_in, tap_out, cu_taps))
-
-
-def _cell_of(cells: Tensor, keys: Tensor) -> Tensor:
-    """The place of each key among ``cells``; the last one, which is nowhere, where it is not among them."""
-    at = torch.searchsorted(cells, keys)
-    return torch.where(cells[at] == keys, at, cells.shape[0] - 1)
-
-
-def _overlapping(
-    places: Places, stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]
-) -> tuple[PatchTable, ...]:
-    """The patches of the background with the moving rows that lie in their intervals, of each serialization."""
-    n_patches = places.first.shape[1]
-    codes = _codes(stage, scene, depth, curves)
-    patch = torch.searchsorted(places.first, codes, right=True) - 1
-    of_scene = places.first.gather(1, patch.clamp(min=0)) >> SPACE_BITS == scene
-    is_row = torch.arange(stage.n_rows, device=scene.device) < stage.cu_clouds[-1]
-    patch = torch.where((patch >= 0) & of_scene & is_row, patch, n_patches)
-    order, _ = ops.curve_sort(patch)
-    cu_q = torch.searchsorted(patch.gather(1, order), _counting(n_patches + 1, order))
-    if order.shape[1] > places.patch_size:
-        return _in_parts(order, cu_q, places)
-    return tuple(PatchTable(*lists, places.cu_k) for lists in zip(order, places.kv_rows, cu_q, strict=True))
-
-
-def _in_parts(order: Tensor, cu_q: Tensor, places: Places) -> tuple[PatchTable, ...]:
-    """Tables of patches that have at most ``patch_size`` queries each: a GPU's blocks share patches, not queries.
-
-    order, cu_q: [4, N] and [4, P + 1], the queries of every patch of ``places``, any number. A patch of many becomes parts,
-    which all list its keys. The number of parts is the largest there can be; the last ones are empty.
-    """
-    size, n_parts = places.patch_size, cu_q.shape[1] - 1 + order.shape[1] // places.patch_size
-    cu_parts = _offsets((cu_q.diff(dim=1) + size - 1) // size)
-    part = _counting(n_parts + 1, order)
-    patch = torch.searchsorted(cu_parts, part, right=True) - 1
-    begin = cu_q.gather(1, patch) + (part - cu_parts.gather(1, patch)) * size
-    begin = torch.minimum(begin, cu_q[:, -1:])
-    n_keys = torch.nn.functional.pad(places.cu_k.diff(), (0, 1))[patch[:, :-1]]
-    cu_k, slot = _offsets(n_keys), _counting(n_parts * size, order)
-    at = (torch.searchsorted(cu_k, slot, right=True) - 1).clamp(max=n_parts - 1)
-    source = places.cu_k[patch.gather(1, at)] + slot - cu_k.gather(1, at)
-    kv_rows = places.kv_rows.gather(1, source.clamp(max=places.kv_rows.shape[1] - 1))
-    return tuple(PatchTable(*lists) for lists in zip(order, kv_rows, begin, cu_k, strict=True))
-
-
-def _offsets(counts: Tensor) -> Tensor:
-    return torch.nn.functional.pad(counts.cumsum(1), (1, 0))
-
-
-def _counting(n: int, like: Tensor) -> Tensor:
-    """0 to n - 1 for each row of ``like``."""
-    return torch.arange(n, device=like.device).expand(like.shape[0], n).contiguous()
 
 
 # ---- room ----

@@ -5,6 +5,7 @@ Every op runs on CPU (and CUDA where compiled), is deterministic, differentiable
 """
 
 from gsim3d.ops._load import cuda_compiled
+from gsim3d.ops.background import add_cells, find_cells, overlapping_patches, row_scenes
 from gsim3d.ops.curve import (
     CURVES,
     KernelMap,
@@ -20,7 +21,7 @@ from gsim3d.ops.curve import (
     curve_sort,
 )
 from gsim3d.ops.decode import decode_gaussians
-from gsim3d.ops.patch_attn import patch_attention
+from gsim3d.ops.patch_attn import joint_attention, patch_attention
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
 from gsim3d.ops.raster import Rendering, rasterize_gaussians
@@ -40,12 +41,16 @@ __all__ = [
     "Stage",
     "Voxels",
     "Watched",
+    "add_cells",
     "build_pyramid",
     "cuda_compiled",
     "curve_encode",
     "curve_sort",
     "decode_gaussians",
+    "find_cells",
+    "joint_attention",
     "norm_gelu",
+    "overlapping_patches",
     "patch_attention",
     "plane_sweep",
     "pool_max",
@@ -53,6 +58,7 @@ __all__ = [
     "rasterize_gaussians",
     "residual_norm",
     "row_norm",
+    "row_scenes",
     "sparse_conv",
     "sweep_geometry",
     "unpool",

@@ -52,9 +52,54 @@ def patch_attention(
         check_numbers("patch_attention", q=q, k=k, v=v)
     if scale is None:
         scale = q.shape[-1] ** -0.5 if q.dim() and q.shape[-1] else 1.0
-    return torch.ops.gsim3d.patch_attention(
-        q, k, v, table.q_rows, table.kv_rows, table.cu_q, table.cu_k, float(scale)
-    )[0]
+    return torch.ops.gsim3d.patch_attention(q, k, v, table.q_rows, table.kv_rows, table.cu_q, table.cu_k, float(scale))[
+        0
+    ]
+
+
+def joint_attention(
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    other_k: Tensor,
+    other_v: Tensor,
+    table: PatchTable,
+    other_table: PatchTable,
+    *,
+    scale: float | None = None,
+    check: bool = True,
+) -> Tensor:
+    """Softmax attention of every query row over the key rows of its patches in two tables, in one softmax.
+
+    Args:
+        q, k, v, table: as in :func:`patch_attention`.
+        other_k, other_v: keys and values [No, H, D] of the other table.
+        other_table: patches of the same queries; a patch may have nearly all of them.
+        scale, check: as in :func:`patch_attention`.
+    Returns:
+        [Nq, H, D], dtype of ``q``; 0 for a query row without keys.
+    Gradients: ``q``, keys and values, once.
+    Determinism, Raises: as :func:`patch_attention`. In 16 bits the result over the first table is rounded before the
+        other joins it.
+
+    Example:
+        >>> rows, cu = torch.tensor([0, 1]), torch.tensor([0, 2])
+        >>> x, table = torch.ones(2, 1, 4), PatchTable(rows, rows, cu, cu)
+        >>> joint_attention(x, x, 2 * x, x, 4 * x, table, table)[:, 0, 0]
+        tensor([3., 3.])
+    """
+    if check:
+        tables = {"": table, "other_": other_table}
+        names = ("q_rows", "kv_rows", "cu_q", "cu_k")
+        lists = {f"{p}{name}": getattr(t, name) for p, t in tables.items() for name in names}
+        numbers = {"q": q, "k": k, "v": v, "other_k": other_k, "other_v": other_v}
+        check_tensors("joint_attention", **numbers, **lists)
+        check_real("joint_attention", **({} if scale is None else {"scale": scale}))
+        check_numbers("joint_attention", **numbers)
+    if scale is None:
+        scale = q.shape[-1] ** -0.5 if q.dim() and q.shape[-1] else 1.0
+    lists = (x for t in (table, other_table) for x in (t.q_rows, t.kv_rows, t.cu_q, t.cu_k))
+    return torch.ops.gsim3d.joint_attention(q, k, v, other_k, other_v, *lists, float(scale))[0]
 
 
 @torch.library.register_fake("gsim3d::patch_attention")
@@ -87,6 +132,33 @@ def _backward(ctx, grad, _grad_stats):
     return *grads, None, None, None, None, None
 
 
-torch.library.register_autograd("gsim3d::patch_attention", _backward, setup_context=_setup)
-torch.library.register_autocast("gsim3d::patch_attention", "cpu", torch.float32)
-follow_autocast("patch_attention")
+@torch.library.register_fake("gsim3d::joint_attention")
+def _(q, k, v, other_k, other_v, *lists_and_scale):
+    stats_dtype = torch.promote_types(q.dtype, torch.float32)
+    return q.new_empty(q.shape), q.new_empty(q.shape[0], q.shape[1], 2, dtype=stats_dtype)
+
+
+def _joint_setup(ctx, inputs, output):
+    ctx.set_materialize_grads(False)
+    ctx.mark_non_differentiable(output[1])
+    *tensors, ctx.scale = inputs
+    ctx.save_for_backward(*tensors, *output)
+
+
+def _joint_backward(ctx, grad, _grad_stats):
+    if grad is None:
+        return (None,) * 14
+    q, *keys, out, stats = ctx.saved_tensors
+    # Each table's part of the gradient follows from its own keys and the result over both.
+    own, other = (
+        torch.ops.gsim3d.patch_attention_backward(grad, q, *kv, out, stats, *lists, ctx.scale)
+        for kv, lists in ((keys[:2], keys[4:8]), (keys[2:4], keys[8:]))
+    )
+    return own[0] + other[0], *own[1:], *other[1:], *(None,) * 9
+
+
+_rules = {"patch_attention": (_backward, _setup), "joint_attention": (_joint_backward, _joint_setup)}
+for _name, (_gradients, _context) in _rules.items():
+    torch.library.register_autograd(f"gsim3d::{_name}", _gradients, setup_context=_context)
+    torch.library.register_autocast(f"gsim3d::{_name}", "cpu", torch.float32)
+    follow_autocast(_name)

@@ -10,15 +10,17 @@ from pathlib import Path
 from gsim3d.errors import InputError
 from gsim3d.evaluate.report import write_json
 from gsim3d.files import MAX_TEXT, read_file
-from gsim3d.pareto.measure import Comparison, Effort, Point, Subject, compare, points_of, ties, time_points
+from gsim3d.pareto.measure import Comparison, Effort, Point, measure, points_of, ties
 from gsim3d.pareto.settings import KNOBS, Knob, Setting
+from gsim3d.pareto.subject import Subject
 from gsim3d.pareto.timing import Clock, DeviceClock
 from gsim3d.train.restore import Restored
 
 # preset -> share of the reference's gain over the constant baseline, in dB, that it keeps at least
 PROMISES = {"exact": None, "balanced": 0.999, "fast": 0.99}
 SPEEDS = "speeds.json"
-OF_IMAGES = ("image size and decoded frames",)  # what is simulated is tuned, not what is looked at
+# What is simulated is tuned, not what is looked at nor what is trained; a command compiles longer than it then runs.
+NOT_TUNED = ("image size and decoded frames", "steps a call", "model size", "training steps", "compile")
 
 
 def autotune(
@@ -39,22 +41,20 @@ def autotune(
     """
     if (max_ms is None) == (min_agreement_psnr is None):
         raise InputError("autotune: give either max_ms or min_agreement_psnr")
-    clock, comparison = DeviceClock(subject.restored.device), Comparison(subject)
-    points = points_of(subject.restored, knobs)
-    compare(comparison, points)
-    time_points(subject, points, clock, effort)
+    clock = DeviceClock(subject.device)
+    comparison = Comparison(subject, clock=None if effort.apart else clock)
+    points, _ = points_of(subject, knobs, effort)
+    measure(comparison, points, clock, effort)
     if max_ms is not None:
-        return _most_accurate(subject, comparison, points, max_ms, clock, effort)
+        return _most_accurate(comparison, points, max_ms, clock, effort)
 
     def keeps(point: Point) -> bool:
         return point.agreement.psnr >= min_agreement_psnr
 
-    return fastest(subject, comparison, points, keeps, clock, effort)
+    return fastest(comparison, points, keeps, clock, effort)
 
 
-def tune(
-    subject: Subject, comparison: Comparison, points: Sequence[Point], clock: Clock, effort: Effort
-) -> dict[str, Point]:
+def tune(comparison: Comparison, points: Sequence[Point], clock: Clock, effort: Effort) -> dict[str, Point]:
     """The setting of each preset, from measured ``points``, of which the first is the reference."""
     reference = points[0]
 
@@ -64,20 +64,17 @@ def tune(
     found = {"exact": reference}
     for name, share in PROMISES.items():
         if share is not None:
-            found[name] = fastest(subject, comparison, points, keeping(share), clock, effort)
+            found[name] = fastest(comparison, points, keeping(share), clock, effort)
     return found
 
 
 def keeps_gain(comparison: Comparison, point: Point, reference: Point, share: float) -> bool:
-    """Whether ``point`` keeps this share of the reference's gain in dB over the constant baseline, at its rendered steps."""
-    every = point.setting.every
-    at_same_steps = {metric: values[::every] for metric, values in reference.by_step.items()}
-    whole, kept = comparison.gain(at_same_steps, every), comparison.gain(point.by_step, every)
-    return whole is not None and kept is not None and kept >= whole - (1 - share) * abs(whole)
+    """Whether ``point`` keeps this share of the reference's gain over the constant baseline, at its rendered steps."""
+    kept = comparison.share_kept(point, reference)
+    return kept is not None and kept >= share
 
 
 def fastest(
-    subject: Subject,
     comparison: Comparison,
     points: Sequence[Point],
     keeps: Callable[[Point], bool],
@@ -86,22 +83,30 @@ def fastest(
 ) -> Point:
     """The reference with every turn that keeps the promise and saves time, added one by one and measured together."""
     reference = points[0]
-    useful = [p for p in points[1:] if p.knob not in OF_IMAGES and _faster(p, reference) and keeps(p)]
+    useful = [p for p in points[1:] if p.knob not in NOT_TUNED and _faster(p, reference) and keeps(p)]
     best = reference
     for point in sorted(useful, key=lambda p: p.step_seconds):
-        changes = point.setting.to_dict()
-        if set(changes) & set(best.setting.to_dict()):
-            continue
         if best is reference:
             best = point
             continue
-        both = Point(dataclasses.replace(best.setting, **changes), "together", "model")
-        compare(comparison, [both])
-        if not both.failure and keeps(both):
-            time_points(subject, [both], clock, effort)
-            if _faster(both, best):
-                best = both
+        both = _both(best, point)
+        if both is None:
+            continue
+        measure(comparison, [both], clock, effort)
+        if not both.failure and keeps(both) and _faster(both, best):
+            best = both
     return best
+
+
+def _both(best: Point, point: Point) -> Point | None:
+    """The settings of two points in one; None where both turn the same knob, or cannot be had together."""
+    changes = point.setting.to_dict()
+    if set(changes) & set(best.setting.to_dict()):
+        return None
+    try:
+        return Point(dataclasses.replace(best.setting, **changes), "together", "model")
+    except InputError:
+        return None
 
 
 def _faster(point: Point, than: Point) -> bool:
@@ -109,22 +114,21 @@ def _faster(point: Point, than: Point) -> bool:
 
 
 def _most_accurate(
-    subject: Subject, comparison: Comparison, points: Sequence[Point], max_ms: float, clock: Clock, effort: Effort
+    comparison: Comparison, points: Sequence[Point], max_ms: float, clock: Clock, effort: Effort
 ) -> Point:
-    usable = [p for p in points if not p.failure]
+    usable = [p for p in points if not p.failure and p.knob not in NOT_TUNED]
     within = [p for p in usable if 1e3 * p.step_seconds <= max_ms]
     if within:
         return max(within, key=lambda p: p.agreement.psnr)
     # None alone is fast enough: the nearest to the reference first, turns are added until one is.
     best = points[0]
     for point in sorted(usable, key=lambda p: -p.agreement.psnr):
-        if set(point.setting.to_dict()) & set(best.setting.to_dict()) or not _faster(point, points[0]):
+        both = _both(best, point)
+        if both is None or not _faster(point, points[0]):
             continue
-        both = Point(dataclasses.replace(best.setting, **point.setting.to_dict()), "together", "model")
-        compare(comparison, [both])
+        measure(comparison, [both], clock, effort)
         if both.failure:
             continue
-        time_points(subject, [both], clock, effort)
         if _faster(both, best):
             best = both
         if 1e3 * best.step_seconds <= max_ms:

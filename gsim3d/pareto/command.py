@@ -6,19 +6,28 @@ import argparse
 
 from gsim3d.pretrained import CHECKPOINT_HELP
 
+SLOW_METRICS = ("lpips_vgg", "fvd")  # seconds a setting
+HURRIED_REPEATS = 5  # of a batch, in a quick report on a CPU
+QUICK_FRAMES = 40  # of new scenes: given steps, those simulated without loss, and the horizon of the training
+REST = 10  # of the progress bar, behind the settings
+
 EPILOG = """\
 Turns every knob that the model has, one at a time: precision, graph capture, input views and steps, particles kept,
-patch and grid size, image size, ... For each setting: how far it is from the reference run of the same checkpoint
-(float32, nothing left out) and from the truth, and what a step takes, by stage. Written to DIR: report.html (one page,
-needs no network), report.json, report.csv, a PNG of each figure. Beside the checkpoint: speeds.json, the fastest settings
-that keep 99.9 % ("balanced") and 99 % ("fast") of the reference's gain over particles that hold still, for
-`gsim3d simulate --speed`.
+sleep, patch and grid size, image size, ... For each setting: how far it is from the reference run of the same
+checkpoint (float32, nothing left out) and from the truth, and what a step takes, by stage. Written to DIR: report.html
+(one page, needs no network), report.json, report.csv, a PNG of each figure. Beside the checkpoint: speeds.json, the
+fastest settings that keep 99.9 % ("balanced") and 99 % ("fast") of the reference's gain over particles that hold still,
+for `gsim3d simulate --speed`.
 
-Without DATA, held-out scenes of the mini preset are generated in DIR/data (needs pip install 'gsim3d[generate]').
+Without DATA, held-out scenes are generated in DIR/data (needs pip install 'gsim3d[generate]'): of the world and preset
+that a simulator that comes with gsim3d was trained on, else soft bodies of the mini preset.
+
+LPIPS and FVD are measured where `gsim3d weights` has installed them; quick leaves out the slow ones, lpips_vgg and fvd.
 
 examples:
   gsim3d pareto runs/model runs/data --out runs/pareto
   gsim3d pareto runs/model runs/data --preset full --device cuda --self-check --out runs/pareto
+  gsim3d pareto runs/model runs/data --others runs/two_a_call runs/larger --out runs/pareto
 """
 
 
@@ -33,6 +42,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--knobs", nargs="+", metavar="KNOB", help="turn only these (default: all)")
     parser.add_argument(
+        "--metrics", nargs="+", metavar="METRIC", help="of the task error, as of gsim3d evaluate (default: see below)"
+    )
+    parser.add_argument(
+        "--others",
+        nargs="+",
+        default=[],
+        metavar="CHECKPOINT",
+        help="of knobs that need training: drawn beside this one",
+    )
+    parser.add_argument(
         "--self-check", action="store_true", help="check the timing itself first; the report says how it went"
     )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to simulate (default: cpu)")
@@ -42,17 +61,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     import shlex
     import sys
+    from dataclasses import replace
     from pathlib import Path
 
     from tqdm import tqdm
 
     from gsim3d.errors import InputError
     from gsim3d.evaluate.pictures import pyplot
-    from gsim3d.pareto import autotune, report
-    from gsim3d.pareto.measure import FULL, QUICK, Comparison, Subject, compare, points_of, time_points
-    from gsim3d.pareto.regimes import throughput, training_step
+    from gsim3d.evaluate.scoring import measurable
+    from gsim3d.pareto import autotune, budget, machine, report
+    from gsim3d.pareto.measure import FULL, QUICK, QUICK_ON_CPU, Comparison, measure, n_runs, points_of
     from gsim3d.pareto.self_check import self_check
     from gsim3d.pareto.settings import KNOBS
+    from gsim3d.pareto.subject import Subject
     from gsim3d.pareto.timing import DeviceClock
     from gsim3d.pretrained import located
     from gsim3d.train.restore import restore
@@ -61,56 +82,110 @@ def run(args: argparse.Namespace) -> int:
     known = {knob.name: knob for knob in KNOBS}
     if unknown := sorted(set(args.knobs or ()) - set(known)):
         raise InputError(f"--knobs: {unknown[0]!r} does not exist; knobs: {', '.join(map(repr, known))}")
+    metrics, not_measured = measurable(args.metrics)
+    quick = args.preset == "quick"
+    if quick and args.metrics is None:
+        metrics = tuple(name for name in metrics if name not in SLOW_METRICS)
+        not_measured |= dict.fromkeys(
+            set(SLOW_METRICS) - set(not_measured), "slow: named with --metrics, or --preset full"
+        )
     restored = restore(args.checkpoint, args.device)
     out = Path(args.out)
     if out.exists() and not out.is_dir():
         raise InputError(f"--out: {out} is not a folder")
-    effort = {"quick": QUICK, "full": FULL}[args.preset]
+    effort = replace((QUICK if args.device == "cuda" else QUICK_ON_CPU) if quick else FULL, metrics=metrics)
+    if args.knobs:
+        effort = replace(effort, fewest_turns=False, slow_turns=True)
+    log = budget.log_of(args.checkpoint)
+    training = None if log is None else budget.read_log(log)
     scenes = _scenes(args, restored, out, effort.n_scenes)
-    subject, clock = Subject(restored, scenes, effort.n_steps), DeviceClock(restored.device)
-    points = points_of(restored, [known[name] for name in args.knobs] if args.knobs else KNOBS)
+    subject = Subject(restored, scenes, effort.n_steps, _others(args, budget.earlier_checkpoints(args.checkpoint)))
+    clock = DeviceClock(restored.device)
+    knobs = [known[name] for name in args.knobs] if args.knobs else KNOBS
+    points, not_turned = points_of(subject, knobs, effort)
+    if training is not None:
+        not_turned.pop("training steps", None)  # the figure of the training shows it
     out.mkdir(parents=True, exist_ok=True)
     checks = []
     if args.self_check:
         blind = DeviceClock(restored.device, waits=False) if args.device == "cuda" else None
         checks = self_check(subject, clock, blind)
         print(*checks, sep="\n")
-    comparison = Comparison(subject)
-    with tqdm(total=len(points) * (1 + effort.n_rounds), unit="run", disable=args.quiet) as bar:
+    comparison = Comparison(subject, metrics, None if effort.apart else clock)
+    with tqdm(total=n_runs(points, effort) + REST, unit="run", disable=args.quiet) as bar:
 
-        def progress(doing: str) -> None:
+        def progress(doing: str, runs: int = 1) -> None:
             bar.set_description(doing[:60], refresh=False)
-            bar.update()
+            bar.update(runs)
 
-        compare(comparison, points, progress)
+        measure(comparison, points, clock, effort, progress)
         if points[0].failure:
             raise InputError(f"{args.checkpoint}: the reference run has no result: {points[0].failure}")
-        time_points(subject, points, clock, effort, progress=progress)
-    presets = autotune.tune(subject, comparison, points, clock, effort)
-    points += [point for point in presets.values() if not any(point is p for p in points)]
-    kept = {point.setting: point for point in presets.values()}
-    throughputs = [throughput(subject, setting, clock) for setting in kept]
+        progress("presets", 0)
+        presets = autotune.tune(comparison, points, clock, effort)
+        points += [point for point in presets.values() if not any(point is p for p in points)]
+        progress("many scenes, training", REST // 2)
+        regimes = _regimes(subject, presets, clock, quick)
+        progress("written", REST - REST // 2)
     conditions = {
-        "regimes": report.regimes_as_dict(throughputs, training_step(subject, clock)),
+        "regimes": regimes,
         "command": shlex.join(["gsim3d", "pareto", *sys.argv[2:]]),
-        "machine": report.machine(restored.device),
+        "machine": machine.facts(restored.device),
         "subject": {
             "checkpoint": restored.checkpoint.digest,
             "scenes": len(scenes),
             "steps": subject.n_steps,
             "image": f"{restored.image_size[0]} x {restored.image_size[1]} pixels",
             "views": len(subject.views[0][1]),
+            "history": restored.data.history,
+            "steps_a_call": {
+                name: other.simulator.config.dynamics.steps_per_call
+                for name, other in {"": restored, **subject.others}.items()
+            },
         },
         "self_check": [str(check) for check in checks],
-        "presets": {name: point.setting.to_dict() for name, point in presets.items()},
+        "not_turned": not_turned,
+        "not_measured": not_measured,
     }
-    files = report.write(out, points, comparison, conditions)
+    content, files = report.write(out, points, comparison, conditions, presets, training)
     files.append(_keep_speeds(located(args.checkpoint), out, restored, presets))
-    print(report.table(report.as_dict(points, comparison, conditions)))
+    print(report.table(content))
     for name, point in presets.items():
         print(f"--speed {name}: {point.setting.name}, {1e3 * point.step_seconds:.2f} ms a step")
     print("written: " + ", ".join(str(path) for path in files))
     return 0 if all(check.holds for check in checks) else 1
+
+
+def _others(args: argparse.Namespace, earlier: dict) -> dict:
+    """Checkpoints to draw beside this one: those named, and earlier ones of its run."""
+    from pathlib import Path
+
+    from gsim3d.errors import InputError
+    from gsim3d.train.restore import restore
+
+    named = {Path(given).name or str(given): given for given in args.others}
+    if len(named) < len(args.others):
+        raise InputError("--others: two have the same name; rename one")
+    return {name: restore(given, args.device) for name, given in {**earlier, **named}.items()}
+
+
+def _regimes(subject, presets: dict, clock, quick: bool) -> dict:
+    """Many scenes at once, training, and what a GPU does."""
+    from dataclasses import replace
+
+    from gsim3d.pareto import regimes, report
+
+    on_cpu = subject.device.type == "cpu"
+    hurried = quick and on_cpu
+    kept = list(dict.fromkeys(point.setting for point in presets.values()))
+    repeats = HURRIED_REPEATS if hurried else 20
+    throughputs = [regimes.throughput(subject, setting, clock, repeats) for setting in kept]
+    training = regimes.training_step(subject, clock, 1 if hurried else 3, hurried)
+    work = []
+    if not on_cpu:
+        plain = list(dict.fromkeys(replace(setting, captured=False) for setting in kept))
+        work = [(setting.name, regimes.gpu_work(subject, setting, clock)) for setting in plain]
+    return report.regimes_as_dict(throughputs, training, work)
 
 
 def _keep_speeds(checkpoint, out, restored, presets: dict):
@@ -120,28 +195,47 @@ def _keep_speeds(checkpoint, out, restored, presets: dict):
     try:
         return autotune.save_speeds(checkpoint if checkpoint.is_dir() else checkpoint.parent, restored, presets)
     except OSError as error:
-        print(
-            f"{error.filename or checkpoint}: {error.strerror}; copy {autotune.SPEEDS} there for gsim3d simulate --speed"
-        )
+        print(f"{error.filename or checkpoint}: {error.strerror}; copy {autotune.SPEEDS} there, for gsim3d simulate")
         return autotune.save_speeds(out, restored, presets)
 
 
 def _scenes(args: argparse.Namespace, restored, out, count: int | None) -> list:
     """Held-out scenes of DATA, or new ones."""
+    quick = args.preset == "quick"
     from gsim3d.data import find_scenes, split_scenes
 
     if args.data is None:
         from gsim3d.generate import generate
+        from gsim3d.train.shipped import HELD_OUT_SEED
 
+        world, preset, options = _world(args.checkpoint, quick)
         folders = generate(
             out / "data",
-            preset="mini",
+            world,
+            preset=preset,
             image_size=restored.image_size[0],
             n_trajectories=count,
-            seed=1,
+            seed=HELD_OUT_SEED,
             progress=not args.quiet,
+            **options,
         ).folders
     else:
         folders = find_scenes(args.data)
         folders = split_scenes(folders)[1] or folders
     return [restored.open_scene(folder) for folder in folders[:count]]
+
+
+def _world(checkpoint: str, quick: bool) -> tuple[str, str, dict]:
+    """(world, preset, options) of scenes as a simulator that comes with gsim3d saw them; of others, soft bodies."""
+    import json
+
+    from gsim3d.generate.worlds import WORLDS
+    from gsim3d.pretrained import FOLDER, located
+
+    path = located(checkpoint)
+    if not path.is_relative_to(FOLDER) or not (recipe := path.parent / "recipe.json").is_file():
+        return "elastic", "mini", {}
+    world = json.loads(recipe.read_text())["world"]
+    if world["world"] not in WORLDS:
+        return "elastic", "mini", {}
+    return world["world"], world["preset"], {"n_frames": min(QUICK_FRAMES, world["n_frames"])} if quick else {}

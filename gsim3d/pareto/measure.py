@@ -12,16 +12,14 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gsim3d.data import Scene
-from gsim3d.data.recording import BACKGROUND
-from gsim3d.errors import HardCaseError, InputError
-from gsim3d.evaluate.metrics import PSNR_CAP, SSIM_WINDOW, mean_of_counted, psnr, ssim
-from gsim3d.evaluate.protocol import default_views, horizon
+from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr
+from gsim3d.evaluate.scoring import METRICS, PLAIN_METRICS, SceneScores, SceneTruth
+from gsim3d.pareto.predict import Predicted, Unusable, predict_together, timing_of
 from gsim3d.pareto.runner import Runner
-from gsim3d.pareto.settings import KNOBS, Knob, Setting
+from gsim3d.pareto.settings import KNOBS, Knob, Setting, turned
+from gsim3d.pareto.subject import Subject
 from gsim3d.pareto.timing import Clock, Timing, peak_memory, time_call, time_stages
-from gsim3d.train.restore import Restored
-from gsim3d.types import DYNAMIC, Cameras, Particles
+from gsim3d.perceptual.fvd import MIN_CLIPS, frechet_distance
 
 
 @dataclass(frozen=True)
@@ -29,8 +27,13 @@ class Effort:
     """How long to measure.
 
     n_rounds: times that all settings are gone through, each in another order; at least 3 say how far two medians of the
-        same thing are apart.   repeats: of a call in each round.   n_steps: of the rollout that is compared.
-    n_scenes: that are compared.
+        same thing are apart.   repeats: steps that are timed in each round, and encodings of the reference's input.
+    n_steps: of the rollout that is compared.   n_scenes: that are compared.
+    encodings: in each round, of inputs that are not the reference's; None: as many as of that.
+    fewest_turns: of every knob as few as it says.   slow_turns: of slow knobs as well.
+    metrics: of the task error.
+    apart: steps are timed apart from the rollouts that are compared; False: on the way, which is faster, where marks
+        cost nothing, on a CPU; the reference is then gone through three times.
     """
 
     n_rounds: int = 3
@@ -38,9 +41,15 @@ class Effort:
     n_steps: int | None = None
     n_scenes: int | None = None
     warm_up: int = 1
+    encodings: int | None = None
+    fewest_turns: bool = False
+    slow_turns: bool = True
+    metrics: tuple[str, ...] = PLAIN_METRICS
+    apart: bool = True
 
 
-QUICK, FULL = Effort(n_steps=12, n_scenes=2), Effort(repeats=10, n_scenes=16)
+QUICK, FULL = Effort(n_steps=12, n_scenes=2, slow_turns=False), Effort(repeats=10, n_scenes=16)
+QUICK_ON_CPU = dataclasses.replace(QUICK, encodings=1, fewest_turns=True, apart=False)
 
 
 @dataclass(frozen=True)
@@ -60,9 +69,11 @@ class Agreement:
 class Point:
     """One setting. Times in seconds: ``encode`` of the input, ``step`` of one simulated step and its images.
 
-    failure: why there is nothing else, or "".   task: metric -> mean over steps of the mean over scenes, against the truth.
+    failure: why there is nothing else, or "".
+    task: metric -> mean over steps of the mean over scenes, against the truth.
     by_step: metric -> a value for each rendered step.   once: seconds before the first step (capture).
-    peak: bytes, of the GPU; of the process, so far, on a CPU.
+    peak: bytes, of the GPU; of the process, so far, on a CPU.   resting: share of the rows that slept.
+    noise: share by which the times of one thing differ on this machine, where it was measured once only.
     """
 
     setting: Setting
@@ -76,6 +87,8 @@ class Point:
     step: list[Timing] = field(default_factory=list)
     once: float = 0.0
     peak: int = 0
+    resting: float = 0.0
+    noise: float = 0.0
 
     @property
     def step_seconds(self) -> float:
@@ -85,7 +98,7 @@ class Point:
     def spread(self) -> float:
         """Seconds between the slowest and the fastest round."""
         medians = [timing.median for timing in self.step]
-        return max(medians) - min(medians)
+        return max(max(medians) - min(medians), self.noise * self.step_seconds)
 
     def stages(self) -> dict[str, float]:
         """Seconds of a step, by stage: medians over rounds."""
@@ -97,158 +110,132 @@ def median_of(timings: Sequence[Timing]) -> float:
     return statistics.median(seconds for timing in timings for seconds in timing.repeats)
 
 
-class Subject:
-    """What is measured: a simulator, and scenes that it has not seen.
-
-    Args:
-        scenes: with the same cameras.
-        n_steps: to predict; default to the end of the shortest film.
-    """
-
-    def __init__(self, restored: Restored, scenes: Sequence[Scene], n_steps: int | None = None):
-        self.restored, self.scenes = restored, list(scenes)
-        for scene in self.scenes:
-            restored.check_scene(scene)
-        self.views = [default_views(restored, scene) for scene in self.scenes]
-        n_given = restored.data.history
-        self.n_steps = min(horizon(scene, n_given, None) for scene in self.scenes)
-        self.n_steps = min(self.n_steps, n_steps or self.n_steps)
-        self.first = n_given
-
-    def runner(self, setting: Setting = Setting()) -> Runner:
-        return Runner(self.restored, setting)
-
-    def start(self, runner: Runner, number: int) -> Particles:
-        """The encoded state of scene ``number``."""
-        return runner.encode(runner.frames([self.scenes[number]], [self.views[number][0]]))
-
-    def cameras(self, number: int, step: int) -> Cameras:
-        """The target views of scene ``number`` at predicted step ``step``, counted from 0."""
-        scene, (_, targets) = self.scenes[number], self.views[number]
-        return scene.cameras_at(list(targets), [self.first + step]).to(self.restored.device)
-
-    def cameras_of(self, numbers: Sequence[int], step: int) -> Cameras:
-        """The target views of several scenes, cloud after cloud."""
-        parts = [self.cameras(number, step) for number in numbers]
-        tensors = {
-            name: torch.cat([getattr(part, name) for part in parts]) for name in ("viewmats", "Ks", "near", "far")
-        }
-        clouds = torch.cat([part.image_cloud + cloud for cloud, part in enumerate(parts)])
-        return dataclasses.replace(parts[0], image_cloud=clouds, **tensors)
-
-    def truth(self, number: int, steps: Sequence[int]) -> tuple[Tensor, Tensor | None]:
-        """([S, V, H, W, 3] in [0, 1], bool [S, V, H, W] of what is no background) of predicted steps."""
-        scene, targets = self.scenes[number], list(self.views[number][1])
-        filmed = [self.first + step for step in steps]
-        images = scene.images(targets, filmed).permute(0, 1, 3, 4, 2).to(self.restored.device).float() / 255
-        if not scene.has_segmentation():
-            return images, None
-        return images, (scene.segmentation(targets, filmed) != BACKGROUND).to(self.restored.device)
-
-
-@dataclass(frozen=True)
-class Predicted:
-    """Of one scene: images of each rendered step [S, V, H, W, 3], and what may move of every step: places [n, 3]."""
-
-    steps: tuple[int, ...]
-    images: Tensor
-    moving: list[Tensor]
-
-
-class Unusable(Exception):
-    """A setting has no result; the message says why."""
-
-
-def predict(subject: Subject, runner: Runner, number: int) -> Predicted:
-    """The whole horizon of one scene.
-
-    Raises:
-        Unusable: memory ran out, or a number is not finite; the message names the step.
-    """
-    step, scene = 0, subject.scenes[number]
-    steps, images, moving = [], [], []
-    try:
-        state = subject.start(runner, number)
-        for step in range(subject.n_steps):
-            state = runner.step(state)
-            newest = runner.newest(state)
-            moving.append(newest.means[newest.activity == DYNAMIC])
-            if not newest.means.isfinite().all():
-                raise Unusable(f"particles are not finite at step {step + 1}")
-            if step % runner.setting.every:
-                continue
-            image = runner.enlarged(runner.images(newest, subject.cameras(number, step)), scene.height, scene.width)
-            if not image.isfinite().all():
-                raise Unusable(f"images are not finite at step {step + 1}")
-            steps.append(step)
-            images.append(image)
-    except torch.OutOfMemoryError:
-        raise Unusable(f"out of memory at step {step + 1}") from None
-    except (HardCaseError, InputError) as error:
-        raise Unusable(f"step {step + 1}: {error}") from None
-    return Predicted(tuple(steps), torch.stack(images), moving)
-
-
 class Comparison:
-    """Compares settings with the reference and with the truth; the reference's own predictions are made once."""
+    """Compares settings with the reference and with the truth; the reference's own predictions are made once.
 
-    def __init__(self, subject: Subject):
-        self.subject = subject
+    metrics: of the task error, as :func:`gsim3d.evaluate.scoring.measurable`.
+    not_measured: metric -> why it has no value.   clock: times steps on the way; None: nothing is timed.
+    noise: as of Point, once the reference was timed three times.   spent: seconds by stage, of each setting.
+    """
+
+    def __init__(self, subject: Subject, metrics: Sequence[str] = PLAIN_METRICS, clock: Clock | None = None):
+        self.subject, self.metrics, self.clock, self.noise = subject, tuple(metrics), clock, 0.0
+        self.not_measured: dict[str, str] = {}
+        self.spent: dict[Setting, list[dict[str, float]]] = {}
+        self._truths: dict[tuple[int, tuple[int, ...], tuple[str, ...]], SceneTruth] = {}
 
     @cached_property
     def reference(self) -> list[Predicted]:
-        runner = self.subject.runner()
-        return [predict(self.subject, runner, number) for number in range(len(self.subject.scenes))]
+        return self._run_reference()
+
+    def _run_reference(self) -> list[Predicted]:
+        runner, predictions = self.subject.runner(), []
+        for number in range(len(self.subject.scenes)):
+            predictions += predict_together(self.subject, [runner], number, self.clock)
+            if isinstance(predictions[-1], Unusable):
+                raise predictions[-1]
+        return predictions
+
+    def reference_times(self, warm_up: int) -> list[Timing]:
+        """Of three runs of the reference, one of them made now; tells :attr:`noise`."""
+        runs = [self.reference, self._run_reference(), self._run_reference()]
+        timings = [timing_of([spent for p in run for spent in p.spent], warm_up) for run in runs]
+        medians = [timing.median for timing in timings]
+        self.noise = (max(medians) - min(medians)) / statistics.median(medians)
+        return timings
 
     @cached_property
     def constant(self) -> dict[str, list[float | None]]:
         """Scores by step of the last encoded particles, held still."""
         subject, runner, scores = self.subject, self.subject.runner(), []
+        wanted = [name for name in self.metrics if METRICS[name].by_step and METRICS[name].weights is None]
         for number in range(len(subject.scenes)):
             newest = runner.newest(subject.start(runner, number))
             steps = range(subject.n_steps)
             images = torch.stack([runner.images(newest, subject.cameras(number, step)) for step in steps])
-            scores.append(self._scores(number, Predicted(tuple(steps), images, [])))
+            scores.append(self._scores(number, Predicted(tuple(steps), images, []), wanted))
         return _mean_over(scores)[1]
 
-    def of(self, setting: Setting) -> tuple[Agreement, dict, dict]:
-        """(agreement, task error, task error by step) of one setting. Raises Unusable."""
-        subject, runner = self.subject, self.subject.runner(setting)
-        differences, distances, scores = [], [], []
+    def of(self, setting: Setting) -> Found:
+        """What one setting gets wrong. Raises Unusable."""
+        found = self.of_all([setting])[0]
+        if isinstance(found, Unusable):
+            raise found
+        return found
+
+    def of_all(self, settings: Sequence[Setting]) -> list[Found | Unusable]:
+        """As :meth:`of`, of settings that differ in how they draw only."""
+        subject, runners = self.subject, [self.subject.runner(setting) for setting in settings]
+        cell = subject.restored.simulator.config.dynamics.grid_size
+        found: list[list | Unusable] = [[] for _ in settings]
         for number, reference in enumerate(self.reference):
-            predicted = predict(subject, runner, number)
-            differences.append(_psnr(predicted.images, reference.images[list(predicted.steps)]))
-            distances.append(_distances(predicted, reference, subject.restored.simulator.config.dynamics.grid_size))
-            scores.append(self._scores(number, predicted))
-        images = torch.cat(differences)
-        known = all(distance is not None for distance in distances)
-        apart = torch.cat(distances) if known else torch.zeros(0)
-        agreement = Agreement(
-            float(images.mean()),
-            float(images.min()),
-            float(apart.mean()) if len(apart) else None,
-            float(apart.max()) if len(apart) else None,
-        )
-        return agreement, *_mean_over(scores)
+            left = [n for n, known in enumerate(found) if isinstance(known, list)]
+            if not left:
+                break
+            predictions = [reference]
+            if list(settings) != [Setting()]:
+                predictions = predict_together(subject, [runners[n] for n in left], number, self.clock)
+            for n, predicted in zip(left, predictions, strict=True):
+                if isinstance(predicted, Unusable):
+                    found[n] = predicted
+                    continue
+                differences = _psnr(predicted.images, reference.images[list(predicted.steps)])
+                distances = _distances(predicted, reference, cell)
+                scores = self._scores(number, predicted, self.metrics)
+                found[n].append((differences, distances, scores, predicted))
+        return [known if isinstance(known, Unusable) else _found(known) for known in found]
 
     def gain(self, by_step: dict[str, list[float | None]], every: int = 1) -> float | None:
-        """How many dB better than the constant baseline at the rendered steps, without the background where it is known."""
+        """How many dB better than the constant baseline at the rendered steps, without background where it is known."""
         metric = "psnr_masked" if "psnr_masked" in self.constant else "psnr"
         pairs = zip(by_step[metric], self.constant[metric][::every], strict=True)
         gains = [ours - constant for ours, constant in pairs if ours is not None and constant is not None]
         return statistics.fmean(gains) if gains else None
 
-    def _scores(self, number: int, predicted: Predicted) -> dict[str, Tensor]:
-        """metric -> [S], means over views."""
-        truth, counted = self.subject.truth(number, predicted.steps)
-        shape = predicted.images.shape[:2]
-        a, b = predicted.images.flatten(0, 1), truth.flatten(0, 1)
-        scores = {"psnr": psnr(a, b)}
-        if counted is not None:
-            scores["psnr_masked"] = psnr(a, b, counted.flatten(0, 1))
-        if min(a.shape[1:3]) >= SSIM_WINDOW:
-            scores["ssim"] = ssim(a, b)
-        return {name: values.reshape(shape).nanmean(1).cpu() for name, values in scores.items()}
+    def share_kept(self, point: Point, reference: Point) -> float | None:
+        """Share of the reference's gain that ``point`` keeps, at its rendered steps; 1 less what it loses."""
+        if not point.by_step or not reference.by_step:
+            return None
+        every = point.setting.every
+        at_same_steps = {metric: values[::every] for metric, values in reference.by_step.items()}
+        whole, kept = self.gain(at_same_steps, every), self.gain(point.by_step, every)
+        return None if not whole or kept is None else 1 - (whole - kept) / abs(whole)
+
+    def _scores(self, number: int, predicted: Predicted, metrics: Sequence[str]) -> SceneScores:
+        key = number, predicted.steps, tuple(metrics)
+        if key not in self._truths:
+            name = self.subject.scenes[number].name
+            self._truths[key] = SceneTruth(name, *self.subject.truth(number, predicted.steps), 0, metrics)
+        truth = self._truths[key]
+        if len(predicted.steps) == self.subject.n_steps:
+            self.not_measured.update(truth.not_measured)
+        return truth.score([("", predicted.images)])
+
+
+@dataclass(frozen=True)
+class Found:
+    """What one setting gets wrong; fields as of Point."""
+
+    agreement: Agreement
+    task: dict[str, float | None]
+    by_step: dict[str, list[float | None]]
+    resting: float
+    spent: list[dict[str, float]]
+
+
+def _found(of_scenes: list[tuple]) -> Found:
+    differences, distances, scores, predicted = zip(*of_scenes, strict=True)
+    images = torch.cat(differences)
+    known = all(distance is not None for distance in distances)
+    apart = torch.cat(distances) if known else torch.zeros(0)
+    agreement = Agreement(
+        float(images.mean()),
+        float(images.min()),
+        float(apart.mean()) if len(apart) else None,
+        float(apart.max()) if len(apart) else None,
+    )
+    resting = statistics.fmean(p.resting for p in predicted)
+    return Found(agreement, *_mean_over(scores), resting, [spent for p in predicted for spent in p.spent])
 
 
 def _psnr(images: Tensor, reference: Tensor) -> Tensor:
@@ -263,31 +250,77 @@ def _distances(predicted: Predicted, reference: Predicted, cell: float) -> Tenso
     return torch.cat([(a - b).double().norm(dim=1) / cell for a, b in pairs]).cpu()
 
 
-def _mean_over(scores: list[dict[str, Tensor]]) -> tuple[dict[str, float | None], dict[str, list[float | None]]]:
-    """Means over scenes, then over steps; and means over scenes by step."""
-    by_step = {name: torch.stack([s[name] for s in scores]).nanmean(0) for name in scores[0]}
-    whole = {name: mean_of_counted(values) for name, values in by_step.items()}
-    return whole, {name: [None if v != v else v for v in values.tolist()] for name, values in by_step.items()}
+def _mean_over(scores: Sequence[SceneScores]) -> tuple[dict[str, float | None], dict[str, list[float | None]]]:
+    """Means over scenes, then over steps, FVD of all clips; and means over scenes by step."""
+    values = [score.values[""] for score in scores]
+    by_step = {name: torch.stack([s[name] for s in values]).nanmean(0) for name in values[0]}
+    whole = {name: mean_of_counted(steps) for name, steps in by_step.items()}
+    clips = [torch.cat([score.clips[of] for score in scores]) for of in ("truth", "") if scores[0].clips]
+    if clips and len(clips[0]) >= MIN_CLIPS:
+        whole["fvd"] = frechet_distance(*clips)
+    return whole, {name: [None if v != v else v for v in steps.tolist()] for name, steps in by_step.items()}
 
 
-def points_of(restored: Restored, knobs: Sequence[Knob] = KNOBS) -> list[Point]:
-    """The reference, and every turn of every knob that this simulator has here."""
-    points = [Point(Setting(), "reference", "exact")]
-    for knob in knobs:
-        points += [Point(setting, knob.name, knob.kind) for setting in knob.turns(restored, restored.device)]
-    return points
+def points_of(
+    subject: Subject, knobs: Sequence[Knob] = KNOBS, effort: Effort = Effort()
+) -> tuple[list[Point], dict[str, str]]:
+    """The reference, and every turn of every knob that this simulator has here; and what the other knobs need."""
+    settings, missing = turned(subject, knobs, fewest=effort.fewest_turns, slow=effort.slow_turns)
+    turns = [Point(setting, knob.name, knob.kind) for setting, knob in settings.items()]
+    return [Point(Setting(), "reference", "exact"), *turns], missing
+
+
+def measure(
+    comparison: Comparison,
+    points: Sequence[Point],
+    clock: Clock,
+    effort: Effort,
+    progress: Callable[[str], None] = lambda doing: None,
+) -> None:
+    """Fills in what ``points`` get wrong and what they cost, or why they have no result."""
+    compare(comparison, points, progress)
+    reference = next((point for point in points if point.setting == Setting()), None)
+    if reference is not None and reference.failure:
+        return
+    apart = [point for point in points if effort.apart or point.setting.compiled]
+    if not effort.apart:
+        if reference is not None:
+            reference.step = comparison.reference_times(effort.warm_up)
+        for point in points:
+            if point in apart or point.failure:
+                continue
+            point.noise = comparison.noise
+            point.step = point.step or [timing_of(comparison.spent[point.setting], effort.warm_up)]
+    time_points(comparison.subject, apart, clock, effort, progress=progress)
+    time_encodings(comparison.subject, points, clock, effort, progress)
+
+
+def n_runs(points: Sequence[Point], effort: Effort) -> int:
+    """How often :func:`measure` tells its progress."""
+    apart = sum(effort.apart or point.setting.compiled for point in points)
+    return len(points) + effort.n_rounds * (apart + len({point.setting.given for point in points}))
 
 
 def compare(
     comparison: Comparison, points: Sequence[Point], progress: Callable[[str], None] = lambda doing: None
 ) -> None:
     """Fills in what ``points`` get wrong, or why they have no result."""
+    groups: dict[Setting, list[Point]] = {}
     for point in points:
-        progress(f"error: {point.setting.name}")
-        try:
-            point.agreement, point.task, point.by_step = comparison.of(point.setting)
-        except Unusable as problem:
-            point.failure = str(problem)
+        groups.setdefault(point.setting.undrawn, []).append(point)
+    order = list(dict.fromkeys(undrawn.given for undrawn in groups))  # what is encoded alike, one after another
+    for undrawn in sorted(groups, key=lambda undrawn: order.index(undrawn.given)):
+        group = groups[undrawn]
+        with peak_memory(comparison.subject.device) as peak:
+            all_found = comparison.of_all([point.setting for point in group])
+        for point, found in zip(group, all_found, strict=True):
+            progress(f"error: {point.setting.name}")
+            if isinstance(found, Unusable):
+                point.failure = str(found)
+            else:
+                point.agreement, point.task, point.peak = found.agreement, found.task, peak()
+                point.by_step, point.resting = found.by_step, found.resting
+                comparison.spent[point.setting] = found.spent
 
 
 def time_points(
@@ -298,7 +331,7 @@ def time_points(
     seed: int = 0,
     progress: Callable[[str], None] = lambda doing: None,
 ) -> None:
-    """Fills in what ``points`` without failure cost, in rounds, each in another order."""
+    """Fills in what a step of ``points`` without failure costs, in rounds, each in another order."""
     for n in range(effort.n_rounds):
         order = list(points)
         random.Random(seed + n).shuffle(order)
@@ -311,44 +344,74 @@ def time_points(
                     point.failure = "out of memory while timed"
 
 
+def time_encodings(
+    subject: Subject,
+    points: Sequence[Point],
+    clock: Clock,
+    effort: Effort,
+    progress: Callable[[str], None] = lambda doing: None,
+) -> None:
+    """Fills in what the input of ``points`` costs: once for those whose input is the same, in rounds."""
+    timings: dict[Setting, list[Timing]] = {point.setting.given: [] for point in points}
+    for n in range(effort.n_rounds):
+        for given, known in timings.items():
+            progress(f"time, round {n + 1}: encoding of {given.name}")
+            if any(not point.failure and point.setting.given == given for point in points):
+                known.append(_time_encoding(subject, given, clock, effort))
+    for point in points:
+        point.encode = timings[point.setting.given]
+
+
+def _time_encoding(subject: Subject, given: Setting, clock: Clock, effort: Effort) -> Timing:
+    runner = subject.runner(given)
+    frames = subject.frames(runner, 0)
+    repeats = effort.repeats if given == Setting() else effort.encodings or effort.repeats
+    return time_call(lambda: runner.seen(frames), clock, repeats, effort.warm_up if effort.apart else 0)
+
+
 def _time(subject: Subject, point: Point, clock: Clock, effort: Effort) -> None:
     """One round of one point."""
-    runner, cameras = subject.runner(point.setting), subject.cameras(0, 0)
-    frames = runner.frames(subject.scenes[:1], [subject.views[0][0]])
-    options = {"repeats": effort.repeats, "warm_up": effort.warm_up}
-    with peak_memory(subject.restored.device) as peak:
-        point.encode.append(time_call(lambda: runner.encode(frames), clock, **options))
-        state, every = runner.encode(frames), point.setting.every
+    runner, setting = subject.runner(point.setting), point.setting
+    state, cameras, span = subject.start(runner, 0), subject.cameras(0, 0), runner.span(subject.n_steps)
+    on_host = subject.device.type == "cpu"
+    repeats = max(2, -(-effort.repeats // span)) if on_host else effort.repeats
 
-        def call() -> None:
-            for n in range(every):
-                newest = runner.newest(runner.step(state))
-                if n == 0:
-                    runner.images(newest, cameras)
+    def call() -> None:
+        for n, newest in enumerate(runner.steps(state, span)):
+            if n % setting.every == 0:
+                runner.images(newest, cameras)
 
-        if point.setting.captured:
-            point.step.append(_time_graph(subject, point, runner, frames, clock, effort))
+    with peak_memory(subject.device) as peak:
+        if setting.captured:
+            captured = _capture(subject, point, runner, clock, span)
+            timing = time_call(lambda: captured(state), clock, repeats, effort.warm_up)
+        elif setting.compiled:
+            point.once = point.once or _compile(call, clock)
+            timing = time_call(call, clock, repeats, effort.warm_up)
         else:
-            timing = time_stages(call, [runner.simulator], clock, **options)
-            point.step.append(
-                Timing(
-                    tuple(seconds / every for seconds in timing.repeats),
-                    {name: seconds / every for name, seconds in timing.stages.items()},
-                )
-            )
+            timing = time_stages(call, [runner.simulator], clock, repeats, effort.warm_up, alone=not on_host)
         point.peak = max(point.peak, peak())
+    each = tuple(seconds / span for seconds in timing.repeats)
+    point.step.append(Timing(each, {name: seconds / span for name, seconds in timing.stages.items()}))
 
 
-def _time_graph(subject: Subject, point: Point, runner: Runner, frames, clock: Clock, effort: Effort) -> Timing:
-    n_steps = min(subject.n_steps, 4)
-    state, cameras = runner.encode(frames), subject.cameras(0, 0)
+def _compile(call: Callable[[], None], clock: Clock) -> float:
+    """Seconds of a first call that compiles all anew."""
+    from torch._inductor.utils import fresh_cache
+
+    torch.compiler.reset()
+    with fresh_cache():
+        return time_call(call, clock, 1, 0).median
+
+
+def _capture(subject: Subject, point: Point, runner: Runner, clock: Clock, n_steps: int):
+    state, cameras = subject.start(runner, 0), subject.cameras(0, 0)
     clock.wait()
     start = clock.now()
     captured = runner.captured(state, n_steps, cameras)
     clock.wait()
     point.once = clock.now() - start
-    timing = time_call(lambda: captured(state), clock, effort.repeats, effort.warm_up)
-    return dataclasses.replace(timing, repeats=tuple(seconds / n_steps for seconds in timing.repeats))
+    return captured
 
 
 def front(points: Sequence[Point], error: Callable[[Point], float | None]) -> list[Point]:

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
+from collections import defaultdict
 from dataclasses import dataclass
 
+import torch
+
 from gsim3d.errors import InputError
-from gsim3d.pareto.measure import Subject
+from gsim3d.pareto.machine import energy
 from gsim3d.pareto.settings import Setting
+from gsim3d.pareto.subject import Subject
 from gsim3d.pareto.timing import Clock, Timing, time_call
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.settings import from_dict
 
 BATCH = 4
+LARGEST_KERNELS = 12  # that are listed
+SORTING = ("Sort", "sort")  # in the names of kernels that sort
+ENERGY_SECONDS = 1.0  # a counter of energy is read some ten times a second
 
 
 @dataclass(frozen=True)
@@ -52,14 +59,77 @@ class TrainingStep:
     problem: str = ""
 
 
-def training_step(subject: Subject, clock: Clock, repeats: int = 3) -> TrainingStep:
-    """Trains on the subject's scenes from new weights, and keeps nothing."""
+@dataclass(frozen=True)
+class Work:
+    """What a GPU does in a step and its images, in milliseconds.
+
+    whole_ms: from an idle device to an idle device.   busy_ms: in which at least one kernel ran.
+    gaps_ms: the rest, in which it waited for the host.   sorting_ms: of kernels that sort.
+    kernels: the largest, (name, ms, launches).
+    joules: of the whole board; None where its driver does not tell.
+    """
+
+    whole_ms: float
+    busy_ms: float
+    gaps_ms: float
+    sorting_ms: float
+    kernels: list[tuple[str, float, int]]
+    joules: float | None
+
+
+def gpu_work(subject: Subject, setting: Setting, clock: Clock) -> Work:
+    """Of one setting that is not captured, by torch's profiler."""
+    from torch.profiler import ProfilerActivity, profile
+
+    runner, cameras = subject.runner(setting), subject.cameras(0, 0)
+    state = subject.start(runner, 0)
+
+    def call() -> None:
+        runner.images(next(runner.steps(state, 1)), cameras)
+
+    whole = time_call(call, clock).median
+    with profile(activities=[ProfilerActivity.CUDA]) as seen:
+        call()
+        clock.wait()
+    on_gpu = [event for event in seen.events() if event.device_type == torch.autograd.DeviceType.CUDA]
+    spans = [(event.name, event.time_range.start / 1e3, event.time_range.end / 1e3) for event in on_gpu]
+    n_steps = max(1, int(ENERGY_SECONDS / whole))
+    with energy(subject.device) as used:
+        for _ in range(n_steps):
+            call()
+        clock.wait()
+        joules = used()
+    return work_of(spans, 1e3 * whole, None if joules is None else joules / n_steps)
+
+
+def work_of(spans: list[tuple[str, float, float]], whole_ms: float, joules: float | None) -> Work:
+    """From (kernel, begin, end) in milliseconds; kernels on several streams overlap."""
+    busy, end_before = 0.0, float("-inf")
+    totals: dict[str, list] = defaultdict(lambda: [0.0, 0])
+    for name, begin, end in sorted(spans, key=lambda span: span[1]):
+        busy += max(0.0, end - max(begin, end_before))
+        end_before = max(end, end_before)
+        totals[name][0] += end - begin
+        totals[name][1] += 1
+    kernels = sorted(((name, ms, count) for name, (ms, count) in totals.items()), key=lambda kernel: -kernel[1])
+    sorting = sum(ms for name, ms, _ in kernels if any(word in name for word in SORTING))
+    largest = [(name[:120], ms, count) for name, ms, count in kernels[:LARGEST_KERNELS]]
+    return Work(whole_ms, busy, max(0.0, whole_ms - busy), sorting, largest, joules)
+
+
+def training_step(subject: Subject, clock: Clock, repeats: int = 3, quick: bool = False) -> TrainingStep:
+    """Trains on the subject's scenes from new weights, and keeps nothing.
+
+    quick: one scene at a time, and only as many steps as get gradients.
+    """
     saved = subject.restored.checkpoint.config.get("train")
     if saved is None:
         return TrainingStep(problem="the checkpoint does not hold the configuration of its training")
     try:
         config = from_dict(TrainConfig, saved, "train")
         stage = dataclasses.replace(config.stages[-1], steps=10**6)
+        if quick:
+            stage = dataclasses.replace(stage, batch=1, lead=0)
         config = dataclasses.replace(config, stages=(stage,))
         with tempfile.TemporaryDirectory() as folder, deterministic():
             trainer = Trainer(config, subject.scenes, folder, device=subject.restored.device.type)

@@ -6,14 +6,16 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from gsim3d.data import Scene, make_frames
-from gsim3d.dynamics import RestLog, concatenate, last_steps
+from gsim3d.dynamics import RestLog, append_step, concatenate, last_steps
 from gsim3d.edits import Edit
+from gsim3d.effects import Sleep
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import Prediction
 from gsim3d.graphs import CapturedRollout
@@ -24,6 +26,9 @@ from gsim3d.train.precision import PrecisionConfig
 from gsim3d.train.restore import Restored
 from gsim3d.train.samples import thinned
 from gsim3d.types import DYNAMIC, Cameras, Frames, Particles
+
+N_CURVES = 4  # along which a cloud is cut into patches
+TOGETHER = 4  # steps that are timed together where the first costs more than those that follow
 
 
 class Runner:
@@ -46,11 +51,15 @@ class Runner:
             spec.dynamics,
             history=setting.history or spec.dynamics.history,
             background=setting.background or spec.dynamics.background,
+            sleep=None if setting.captured else self._sleep(spec.dynamics.sleep),
         )
         appearance = spec.appearance
         if setting.sh_degree is not None:
             appearance = dataclasses.replace(appearance, view_dependent=setting.sh_degree)
         self.plan = self.simulator.plan(dataclasses.replace(spec, dynamics=dynamics, appearance=appearance))
+        config = self.simulator.config.dynamics
+        # A background that rests, who sleeps, and several steps a call are the affair of a whole rollout.
+        self.at_once = setting.sleep is not None or config.is_asymmetric or config.steps_per_call > 1
         self.n_encoded = min(setting.history or restored.data.history, restored.data.history)
 
     @property
@@ -67,21 +76,54 @@ class Runner:
         frames = make_frames(scenes, [list(cams) for cams in context], steps, masked=masked)
         return thinned(frames, self.restored.data).to(self.device)
 
-    @torch.no_grad()
     def encode(self, frames: Frames) -> Particles:
         """The state from which to simulate."""
+        return self.chosen(self.seen(frames))
+
+    @torch.no_grad()
+    def seen(self, frames: Frames) -> Particles:
+        """All particles of ``frames``."""
         with self._precision("encoder"):
-            return self.simulator.prepare(self._most_opaque(self.simulator.encode(frames)), self.plan)
+            return self.simulator.encode(frames)
+
+    @torch.no_grad()
+    def chosen(self, particles: Particles) -> Particles:
+        """What of :meth:`seen` is simulated."""
+        return self.simulator.prepare(self._most_opaque(particles), self.plan)
 
     @torch.no_grad()
     def step(self, state: Particles) -> Particles:
         """The state one call of the dynamics later."""
         with self._precision("dynamics"):
-            return self.simulator.step(state, self.plan)
+            if self.setting.orders == 1:
+                return self.simulator.step(state, self.plan)
+            state = self.simulator.prepare(state, self.plan)
+            return append_step(state, self._averaged(state), self.plan.history)
+
+    def steps(self, state: Particles, n_steps: int, log: RestLog | None = None) -> Iterator[Particles]:
+        """The newest step of every scene, ``n_steps`` times. ``log`` is told what rested."""
+        if self.at_once:
+            with torch.no_grad(), self._precision("dynamics"):
+                steps = self.simulator.rollout(state, n_steps, self.plan, log=log)
+            yield from steps
+            return
+        for _ in range(n_steps):
+            state = self.step(state)
+            yield self.newest(state)
+
+    def span(self, n_steps: int) -> int:
+        """Steps that must be timed together, of ``n_steps`` that can be."""
+        setting, config = self.setting, self.simulator.config.dynamics
+        if setting.sleep is not None:
+            return n_steps
+        alone = not (setting.captured or config.is_asymmetric)
+        return max(setting.every, config.steps_per_call, 1 if alone else min(n_steps, TOGETHER))
 
     @torch.no_grad()
     def images(self, particles: Particles, cameras: Cameras) -> Tensor:
         """[I, H, W, 3] in [0, 1] of particles as :meth:`step` made them."""
+        if self.setting.least_opacity:
+            particles = particles.select_rows(particles.opacities >= self.setting.least_opacity)
         with self._precision("renderer"):
             rendering = self.simulator.draw(
                 particles, self._smaller(cameras), plan=self.plan, cutoff=self.setting.cutoff
@@ -104,7 +146,7 @@ class Runner:
             if self.setting.captured and not edits:
                 steps = CapturedRollout(self.simulator, encoded, n_future, self.plan)(encoded).steps
             else:
-                steps = self.simulator.rollout(encoded, n_future, self.plan, edits=edits, log=log)
+                steps = self._rollout(encoded, n_future, edits, log)
         return Prediction(concatenate([encoded, *steps]), self.n_encoded, tuple(context), log.resting_share)
 
     def newest(self, state: Particles) -> Particles:
@@ -142,6 +184,32 @@ class Runner:
         finally:
             torch.backends.cuda.matmul.allow_tf32 = before
 
+    def _rollout(self, state: Particles, n_steps: int, edits: Sequence[Edit], log: RestLog) -> list[Particles]:
+        if self.setting.orders == 1:
+            return self.simulator.rollout(state, n_steps, self.plan, edits=edits, log=log)
+        if edits:
+            raise InputError("setting: orders cannot be averaged while a scene is edited; use another --speed")
+        return list(self.steps(state, n_steps))
+
+    def _averaged(self, state: Particles) -> Particles:
+        """The next step, by several orders of the curves: the mean of what each predicts."""
+        predictions, n_stages = [], self.simulator.config.dynamics.n_stages
+        for k in range(0, N_CURVES, N_CURVES // self.setting.orders):
+            curves = (tuple((k + row) % N_CURVES for row in range(N_CURVES)),) * n_stages
+            geometry = partial(self.simulator.dynamics.geometry, curves=curves)
+            predictions += self.simulator.rollout(state, 1, self.plan, geometry=geometry)
+        rows = [prediction.row_fields() for prediction in predictions]
+        means = {name: torch.stack([row[name] for row in rows]).mean(0) for name in rows[0] if _adds_up(rows[0][name])}
+        if "quats" in means:
+            means["quats"] = F.normalize(means["quats"], dim=-1)
+        return dataclasses.replace(predictions[0], **means)
+
+    def _sleep(self, trained: Sleep | None) -> Sleep | None:
+        if self.setting.sleep is None:
+            return trained
+        policy = "approx" if self.simulator.config.dynamics.is_asymmetric else "exact"
+        return Sleep(policy=policy, eps=self.setting.sleep)
+
     def _most_opaque(self, particles: Particles) -> Particles:
         """The share that the setting keeps of the moving and of the other particles of each cloud."""
         if self.setting.kept == 1:
@@ -164,18 +232,25 @@ class Runner:
         return dataclasses.replace(cameras, Ks=cameras.Ks * scale[:, None], width=width, height=height)
 
 
+def _adds_up(values: Tensor) -> bool:
+    return values.is_floating_point()
+
+
 def _spread(cams: Sequence[int], count: int) -> list[int]:
     return [cams[k * len(cams) // count] for k in range(min(count, len(cams)))]
 
 
 def _changed(simulator: Simulator, setting: Setting) -> Simulator:
-    """``simulator``, or one with its weights in another geometry."""
+    """``simulator``, or one with its weights in another geometry, or compiled."""
     dynamics = simulator.config.dynamics
     patches = tuple(min(size, setting.patch_size or size) for size in dynamics.patch_sizes)
     changed = dataclasses.replace(dynamics, grid_size=dynamics.grid_size * setting.grid, patch_sizes=patches)
-    if changed == dynamics:
+    if changed == dynamics and not setting.compiled:
         return simulator
     device = next(simulator.parameters()).device
     other = Simulator(dataclasses.replace(simulator.config, dynamics=changed))
     other.load_state_dict(simulator.state_dict())
+    other.absent = simulator.absent
+    if setting.compiled:
+        other.dynamics.net.compile(dynamic=True)
     return other.to(device).train(simulator.training)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsim3d.pareto.measure import Effort, Point, Subject, time_points
+from gsim3d.pareto.measure import Effort, Point, time_points
 from gsim3d.pareto.settings import Setting
+from gsim3d.pareto.subject import Subject
 from gsim3d.pareto.timing import ADDS_UP, Clock, Timing, time_call, time_stages
 
 DELAY, TOLERANCE = 5e-3, 0.5e-3  # seconds that are injected, and by which stages may be wrong

@@ -7,7 +7,7 @@ import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -154,7 +154,7 @@ class Stopwatch:
 
 @contextmanager
 def watched(simulator: Simulator, stopwatch: Stopwatch) -> Iterator[None]:
-    """Within it, every call of ``simulator`` tells ``stopwatch`` its stages; ops are recognised wherever they are called."""
+    """Within it, calls of ``simulator`` tell ``stopwatch`` their stages; ops are known wherever they are called."""
     hooks = []
     rooms = {simulator.encoder: "encode", simulator.dynamics.net: "dense layers", simulator.renderer: "head"}
     for module, name in rooms.items():
@@ -232,20 +232,29 @@ def time_stages(
     repeats: int = REPEATS,
     warm_up: int = WARM_UP,
     delays: dict[str, float] | None = None,
+    *,
+    alone: bool = True,
 ) -> Timing:
-    """As :func:`time_call`, and the stages of it: plain and watched calls take turns, so that both see the same machine."""
+    """As :func:`time_call`, and the stages of it.
+
+    alone: plain and watched calls take turns, so that both see the same machine; False: the watched call is the one
+        that is timed, where marks cost next to nothing.
+    """
     seconds, stages = [], defaultdict(list)
     stopwatch = Stopwatch(clock, delays)
     for n in range(warm_up + repeats):
-        clock.wait()
-        start = clock.now()
-        call()
-        clock.wait()
-        plain = clock.now() - start
-        with _all_watched(simulators, stopwatch), stopwatch.running():
-            call()
+        with _all_watched([] if alone else simulators, stopwatch):
+            clock.wait()
+            start = clock.now()
+            with nullcontext() if alone else stopwatch.running():
+                call()
+            clock.wait()
+            whole = clock.now() - start
+        if alone:
+            with _all_watched(simulators, stopwatch), stopwatch.running():
+                call()
         if n >= warm_up:
-            seconds.append(plain)
+            seconds.append(whole)
             for name in STAGES:
                 stages[name].append(stopwatch.seconds.get(name, 0.0))
     medians = {name: statistics.median(values) for name, values in stages.items()}
@@ -270,22 +279,3 @@ def peak_memory(device: torch.device) -> Iterator[Callable[[], int]]:
         yield lambda: torch.cuda.max_memory_allocated(device)
     else:
         yield lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-
-
-@contextmanager
-def energy(device: torch.device) -> Iterator[Callable[[], float | None]]:
-    """A function that says how many joules the GPU used in the block; None where that cannot be read."""
-    start = _millijoules(device)
-    yield lambda: None if start is None else (_millijoules(device) - start) / 1e3
-
-
-def _millijoules(device: torch.device) -> int | None:
-    if device.type != "cuda":
-        return None
-    try:
-        import pynvml
-
-        pynvml.nvmlInit()
-        return pynvml.nvmlDeviceGetTotalEnergyConsumption(pynvml.nvmlDeviceGetHandleByIndex(device.index or 0))
-    except Exception:  # no package, no right or no counter: every way to fail means that it cannot be read
-        return None

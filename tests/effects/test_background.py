@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from gsim3d.dynamics import DynamicsConfig, Parts, RestLog, last_steps, rollout, rollout_in_parts
-from gsim3d.dynamics.background import Background, joint_attention
+from gsim3d.dynamics.background import Background
 from gsim3d.dynamics.point_transformer import SparseConv
 from gsim3d.graphs import CapturedRollout
-from gsim3d.ops import PatchTable, PyramidCapacity, curve_encode
+from gsim3d.ops import PatchTable, PyramidCapacity, curve_encode, joint_attention
 from gsim3d.ops.curve import CURVES
 from gsim3d.quirks import Quirks
 from gsim3d.types import ASLEEP, FROZEN

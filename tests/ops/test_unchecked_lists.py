@@ -9,9 +9,24 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.ops import KernelMap, PatchTable, Voxels, patch_attention, plane_sweep, pool_max, pool_mean, unpool
+from gsim3d.ops import (
+    KernelMap,
+    PatchTable,
+    Segments,
+    Voxels,
+    find_cells,
+    overlapping_patches,
+    patch_attention,
+    plane_sweep,
+    pool_max,
+    pool_mean,
+    row_scenes,
+    unpool,
+)
 from tests.asserts import gradients
 from tests.ops import raster_scene
+from tests.ops.test_background import cells_and_rows, chain, overlap
+from tests.ops.test_joint_attention import joint_case, results_of
 from tests.ops.test_patch_attn import cotangent_of, lists, random_case
 from tests.ops.test_plane_sweep import make, run
 from tests.ops.test_sentinel import look, state
@@ -175,6 +190,57 @@ def check_patch_attention(which, wrong, dim, heads, dtype, device):
     has_keys = is_named(torch.cat(answers), n_k) if answers else torch.zeros(n_k, dtype=torch.bool, device=out.device)
     assert not out[~has_queries].any() and not grad_q[~has_queries].any()
     assert not grad_k[~has_keys].any() and not grad_v[~has_keys].any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+@pytest.mark.parametrize("which, wrong", broken_tables())
+def test_joint_attention(which, wrong, dtype, devices):
+    """Of the table that joins; queries that it does not name have the bits of the other alone."""
+    for dim in (16, 32, 64, 48):
+        case = joint_case(dim=dim, dtype=dtype).to(devices[1])
+        own, other = case.tables
+        other = dataclasses.replace(
+            other, **{which: (OFFSETS if which.startswith("cu") else INDICES)[wrong](getattr(other, which))}
+        )
+        case = dataclasses.replace(case, tables=(own, other))
+        results = results_of(case)
+        assert_finite(results)
+        asks = is_named(torch.cat(listed(other.q_rows, other.cu_q)), len(case.q))
+        alone = patch_attention(*case.inputs[:3], own, scale=case.scale)
+        assert torch.equal(results[0][~asks], alone[~asks])
+
+
+OVERLAP = ("first", "kv_rows", "cu_k", "codes", "order", "cu_clouds")
+
+
+@pytest.mark.parametrize(
+    "which, wrong",
+    [(i, w) for i in (0, 1, 3, 4) for w in INDICES] + [(i, w) for i in (2, 5) for w in OFFSETS],
+    ids=lambda x: OVERLAP[x] if isinstance(x, int) else x,
+)
+def test_overlapping_patches(which, wrong, devices):
+    """Whatever the tables hold, attention can be given them."""
+    arguments, size = overlap()
+    spoil = (OFFSETS if which in (2, 5) else INDICES)[wrong]
+    arguments[which] = (
+        torch.stack([spoil(x) for x in arguments[which]]) if arguments[which].dim() > 1 else spoil(arguments[which])
+    )
+    case = random_case(((285, 150),), n_keys=1000, spare=0, dtype=torch.bfloat16).to(devices[1])
+    for table in overlapping_patches(*(x.to(devices[1]) for x in arguments), patch_size=size):
+        assert_finite(gradients(lambda *x: patch_attention(*x, table), case.inputs, cotangent_of(case)))
+
+
+@pytest.mark.parametrize("indices, offsets", broken_lists())
+def test_row_scenes_and_cells(indices, offsets, devices):
+    scenes, cu, stages = chain()
+    stages = [Segments(*(x.to(devices[1]) for x in broken(s.rows, s.cu_rows, indices, offsets))) for s in stages]
+    known = {0, *scenes.tolist()}
+    for found in row_scenes(scenes.to(devices[1]), cu.to(devices[1]), stages):
+        assert set(found.tolist()) <= known
+    cells, scene, grid = cells_and_rows()
+    spoil = INDICES[indices or "far"]
+    places = find_cells(*(x.to(devices[1]) for x in (spoil(cells), spoil(scene), grid)))
+    assert ((places >= 0) & (places < len(cells))).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])

@@ -6,7 +6,7 @@ import torch
 from gsim3d import presets
 from gsim3d.data import Scene
 from gsim3d.effects import EffectsSpec
-from gsim3d.pareto.measure import Subject
+from gsim3d.pareto.subject import Subject
 from gsim3d.train.checkpoint import Checkpoint
 from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import Restored, build_simulator

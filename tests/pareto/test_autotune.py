@@ -6,7 +6,7 @@ import pytest
 
 from gsim3d.errors import InputError
 from gsim3d.pareto import autotune
-from gsim3d.pareto.measure import Agreement, Comparison, Effort, Point, compare, time_points
+from gsim3d.pareto.measure import Agreement, Comparison, Effort, Point, measure
 from gsim3d.pareto.settings import KNOBS, Setting
 from gsim3d.pareto.timing import DeviceClock, Timing
 from gsim3d.train.checkpoint import Checkpoint
@@ -31,19 +31,18 @@ def points(subject, comparison):
         Setting(grid=2.0),
     ]
     points = [Point(s, "", "model") for s in settings]
-    compare(comparison, points)
-    time_points(subject, points, DeviceClock("cpu"), SHORT)
+    measure(comparison, points, DeviceClock("cpu"), SHORT)
     return points
 
 
 def test_every_preset_keeps_its_promise(subject, comparison, points):
     """Verified anew: the tuned setting is run again, and its gain compared with that of the reference."""
-    presets = autotune.tune(subject, comparison, points, DeviceClock("cpu"), SHORT)
+    presets = autotune.tune(comparison, points, DeviceClock("cpu"), SHORT)
     assert list(presets) == list(autotune.PROMISES)
     assert presets["exact"].setting == Setting()
     for name, share in (("balanced", 0.999), ("fast", 0.99)):
         every = presets[name].setting.every
-        gain = comparison.gain(comparison.of(presets[name].setting)[2], every)
+        gain = comparison.gain(comparison.of(presets[name].setting).by_step, every)
         reference = {metric: values[::every] for metric, values in points[0].by_step.items()}
         whole = comparison.gain(reference, every)
         assert gain >= whole - (1 - share) * abs(whole)
@@ -73,13 +72,13 @@ def test_turns_that_keep_the_promise_are_added_up(subject, comparison, monkeypat
     turns[2].failure = "out of memory"
     measured = []
 
-    def fill(_, points):
+    def fill(_, points, *others):
         measured.extend(point.setting for point in points)
         points[0].agreement = Agreement(55.0, 50.0, None, None)
+        points[0].step.append(Timing((4.0,)))
 
-    monkeypatch.setattr(autotune, "compare", fill)
-    monkeypatch.setattr(autotune, "time_points", lambda s, points, *_: points[0].step.append(Timing((4.0,))))
-    best = autotune.fastest(subject, comparison, [reference, *turns], lambda p: p.agreement.psnr >= 50, None, SHORT)
+    monkeypatch.setattr(autotune, "measure", fill)
+    best = autotune.fastest(comparison, [reference, *turns], lambda p: p.agreement.psnr >= 50, None, SHORT)
     assert best.setting == Setting(history=1, grid=2.0)
     assert measured == [Setting(history=1, grid=2.0)]
 
@@ -87,7 +86,7 @@ def test_turns_that_keep_the_promise_are_added_up(subject, comparison, monkeypat
 def test_limits_are_kept(subject):
     few = {"knobs": [knob for knob in KNOBS if knob.name in ("history", "grid size")], "effort": SHORT}
     tuned = autotune.autotune(subject, min_agreement_psnr=30.0, **few)
-    again = Comparison(subject).of(tuned.setting)[0]
+    again = Comparison(subject).of(tuned.setting).agreement
     assert again.psnr >= 30.0
     assert autotune.autotune(subject, max_ms=1e6, **few).setting == Setting()
     with pytest.raises(InputError, match="no setting takes at most 1e-06 ms"):

@@ -3,24 +3,29 @@
 import csv
 import json
 import re
+from html import escape
 
 import pytest
 
 from gsim3d.__main__ import main
-from gsim3d.pareto import report
-from gsim3d.pareto.measure import Comparison, Point, compare, time_points
+from gsim3d.ablate.rows import ROWS
+from gsim3d.pareto import budget, command, published, report
+from gsim3d.pareto.measure import Comparison, Point, measure
 from gsim3d.pareto.settings import Setting
 from gsim3d.pareto.timing import DeviceClock
 from tests.pareto.test_autotune import SHORT
+from tests.pareto.test_budget import write_log
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-REGIMES = {"throughput": [], "training": {"problem": "no configuration"}}
+REGIMES = {"throughput": [], "training": {"problem": "no configuration"}, "gpu": []}
 CONDITIONS = {
     "regimes": REGIMES,
     "command": "gsim3d pareto <x>",
     "machine": {"device": "here"},
-    "subject": {"steps": 4},
+    "subject": {"steps": 4, "history": 2, "steps_a_call": {"": 1}},
     "self_check": ["holds: a"],
+    "not_turned": {"fp8 products": "a GPU <sic>"},
+    "not_measured": {"fvd": "run gsim3d weights fvd"},
 }
 
 
@@ -33,16 +38,20 @@ def written(subject, tmp_path_factory):
         Point(Setting(history=1), "history", "model"),
         Point(Setting(every=2), "", "exact"),
     ]
-    compare(comparison, points)
-    time_points(subject, points, DeviceClock("cpu"), SHORT)
+    measure(comparison, points, DeviceClock("cpu"), SHORT)
     points.append(Point(Setting(kept=0.5), "kept", "model", failure="out of memory at step 3"))
-    return out, points, report.write(out, points, comparison, CONDITIONS)
+    presets = {"exact": points[0], "balanced": points[0], "fast": points[1]}
+    log = budget.read_log(write_log(tmp_path_factory.mktemp("run") / "metrics.jsonl", [10.0, 20.0, 30.0]))
+    content, files = report.write(out, points, comparison, CONDITIONS, presets, log)
+    assert content == json.loads((out / "report.json").read_text())
+    return out, points, files
 
 
 def test_every_file_is_there_and_complete(written):
     out, points, files = written
     assert {file.name for file in files} == {
-        "report.json", "report.csv", "report.html", "agreement.png", "task.png", "stages.png", "horizon.png"
+        "report.json", "report.csv", "report.html", "cost.png", "agreement.png", "task.png", "stages.png",
+        "horizon.png", "training.png",
     }  # fmt: skip
     assert sorted(file.name for file in out.iterdir()) == sorted(file.name for file in files)
     content = json.loads((out / "report.json").read_text())
@@ -60,10 +69,65 @@ def test_every_file_is_there_and_complete(written):
 
 def test_the_page_needs_nothing_from_elsewhere(written):
     page = (written[0] / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 6
     assert not re.findall(r"(?:src|href)=['\"](?!data:)", page) and "<script" not in page
     assert "gsim3d pareto &lt;x&gt;" in page and "out of memory at step 3" in page and "holds: a" in page
     assert "training step: not measured: no configuration" in page
+    assert "fp8 products: needs a GPU &lt;sic&gt;" in page and "fvd: run gsim3d weights fvd" in page
+    assert all(escape(line) in page for line in published.INCONSISTENT)
+    assert "Training: 40 steps in 0.2 h" in page
+    assert "<b>fast</b>: history 1" in page
+
+
+def test_presets_and_horizons_are_in_numbers(written):
+    content = json.loads((written[0] / "report.json").read_text())
+    reference, turned = content["points"][:2]
+    assert reference["kept"] == 1 and content["presets"]["exact"] == {
+        "number": 0, "setting": {}, "faster": 1.0, "kept": 1.0
+    }  # fmt: skip
+    lost = reference["gain_db"] - turned["gain_db"]
+    assert turned["kept"] == pytest.approx(1 - lost / abs(reference["gain_db"]))
+    assert content["presets"]["fast"]["kept"] == turned["kept"]
+    rows = content["horizons"]
+    assert [row["steps"] for row in rows] == [1, 2, 4]
+    assert rows[2]["reference"]["psnr"] == reference["by_step"]["psnr_masked"][3]
+    assert rows[2]["reference"]["ms"] == pytest.approx(
+        reference["encode_ms"]["median"] + 4 * reference["step_ms"]["median"]
+    )
+    assert rows[0]["constant_psnr"] == content["constant"]["psnr_masked"][0]
+
+
+def test_published_numbers_stand_beside_ours(written):
+    content = json.loads((written[0] / "report.json").read_text())
+    rows = {(row["what"], row["setting"]): row for row in content["published"]}
+    points = content["points"]
+    assert rows["modality", "4-4-1-3"]["published"].startswith("31.98")
+    assert rows["modality", "4-4-1-3"]["ours"] is None and "calls-4" in rows["modality", "4-4-1-3"]["how"]
+    assert rows["modality", "4-1-1-12"]["ours"] == points[0]["task"]["psnr_masked"]
+    at_test_time = rows["history, changed at test time", "1 of 4"]
+    assert at_test_time["published"] == "22.9" and at_test_time["ours"] == points[1]["task"]["psnr_masked"]
+    assert rows["speed", "2 given steps"]["ours"] == pytest.approx(1e3 / points[0]["step_ms"]["median"])
+    assert rows["speed", "4 given steps"]["ours"] is None
+    assert {row["published"] for row in content["published"]} >= {"25.4", "33.15", "32.59", "16", "20", "4.3"}
+
+
+def test_rows_of_ablations_that_are_named_exist():
+    named = {name for row in published.PUBLISHED for name in re.findall(r"--rows (\S+?),?(?:\s|$)", row.how)}
+    assert named and named <= set(ROWS)
+
+
+def test_held_out_scenes_are_of_the_world_of_the_training(tmp_path, monkeypatch):
+    """Of a simulator that comes with gsim3d; of any other checkpoint soft bodies."""
+    monkeypatch.setattr("gsim3d.pretrained.FOLDER", tmp_path)
+    (tmp_path / "cloth-small").mkdir()
+    (tmp_path / "cloth-small" / "model.safetensors").write_bytes(b"")
+    recipe = {"world": {"world": "cloth", "preset": "paper", "n_frames": 84}}
+    (tmp_path / "cloth-small" / "recipe.json").write_text(json.dumps(recipe))
+    assert command._world("cloth-small", True) == ("cloth", "paper", {"n_frames": command.QUICK_FRAMES})
+    assert command._world("cloth-small", False) == ("cloth", "paper", {})
+    assert command._world(str(tmp_path / "cloth-small" / "model.safetensors"), False) == ("cloth", "paper", {})
+    (tmp_path / "run").mkdir()
+    assert command._world(str(tmp_path / "run"), True) == ("elastic", "mini", {})
 
 
 def test_the_table_tells_failures_and_ties(written, subject):

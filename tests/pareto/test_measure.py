@@ -9,10 +9,13 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import predict as predict_plainly
 from gsim3d.evaluate.protocol import render_steps
 from gsim3d.pareto import measure
-from gsim3d.pareto.measure import Comparison, Effort, Point, Subject, Unusable, compare, front, points_of, time_points
+from gsim3d.pareto.measure import Comparison, Effort, Point, compare, front, time_encodings, time_points
+from gsim3d.pareto.predict import Unusable, predict
 from gsim3d.pareto.runner import Runner
-from gsim3d.pareto.settings import KINDS, KNOBS, Setting
+from gsim3d.pareto.settings import Setting
+from gsim3d.pareto.subject import Subject
 from gsim3d.pareto.timing import DeviceClock, Timing
+from gsim3d.perceptual.fvd import frechet_distance
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -32,14 +35,15 @@ def test_the_reference_is_what_simulate_predicts(subject):
     scene, (context, targets) = subject.scenes[0], subject.views[0]
     prediction = predict_plainly(subject.restored, scene, context, subject.n_steps)
     expected = render_steps(subject.restored, prediction.particles, scene, targets)[prediction.n_encoded :]
-    ours = measure.predict(subject, subject.runner(), 0)
+    ours = predict(subject, subject.runner(), 0)
     torch.testing.assert_close(ours.images, expected, rtol=0, atol=1e-6)
 
 
 def test_the_reference_agrees_with_itself(comparison):
-    agreement, task, by_step = comparison.of(Setting())
-    assert agreement == measure.Agreement(100.0, 100.0, 0.0, 0.0)
-    assert set(task) == {"psnr", "psnr_masked", "ssim"}
+    found = comparison.of(Setting())
+    task, by_step = found.task, found.by_step
+    assert found.agreement == measure.Agreement(100.0, 100.0, 0.0, 0.0)
+    assert set(task) == {"psnr", "psnr_masked", "psnr_body", "ssim"}
     assert len(by_step["psnr"]) == comparison.subject.n_steps
     gains = [ours - constant for ours, constant in zip(by_step["psnr_masked"], comparison.constant["psnr_masked"])]
     assert comparison.gain(by_step) == pytest.approx(sum(gains) / len(gains))
@@ -79,7 +83,7 @@ def _doubled(simulator):
     ],
 )
 def test_a_turned_knob_changes_what_it_should(comparison, setting, known):
-    agreement, _, _ = comparison.of(setting)
+    agreement = comparison.of(setting).agreement
     assert 5 < agreement.psnr < 100
     assert agreement.psnr_worst <= agreement.psnr
     if not known:
@@ -91,10 +95,11 @@ def test_a_turned_knob_changes_what_it_should(comparison, setting, known):
 
 
 def test_images_that_are_left_out_cost_no_agreement(comparison):
-    agreement, _, by_step = comparison.of(Setting(every=3))
+    found = comparison.of(Setting(every=3))
+    agreement, by_step = found.agreement, found.by_step
     assert agreement.psnr == 100
     assert len(by_step["psnr"]) == -(-comparison.subject.n_steps // 3)
-    whole = comparison.of(Setting())[2]
+    whole = comparison.of(Setting()).by_step
     assert by_step["psnr"] == whole["psnr"][::3]
     assert comparison.gain(by_step, 3) is not None
 
@@ -123,7 +128,7 @@ def test_a_run_that_is_not_finite_says_at_which_step(subject, monkeypatch):
 
     monkeypatch.setattr(Runner, "step", spoiled)
     with pytest.raises(Unusable, match="particles are not finite at step 2"):
-        measure.predict(subject, runner, 0)
+        predict(subject, runner, 0)
 
 
 def test_a_run_without_memory_is_drawn_as_failed(subject, monkeypatch):
@@ -138,16 +143,6 @@ def test_a_run_without_memory_is_drawn_as_failed(subject, monkeypatch):
     assert points[0].failure == "out of memory at step 1"
 
 
-def test_every_knob_is_declared_once(subject):
-    assert len({knob.name for knob in KNOBS}) == len(KNOBS)
-    assert {knob.kind for knob in KNOBS} <= set(KINDS)
-    points = points_of(subject.restored)
-    assert points[0].setting == Setting()
-    assert len({p.setting for p in points}) == len(points)
-    for point in points[1:]:
-        assert Setting.from_dict(point.setting.to_dict()) == point.setting
-
-
 def test_rounds_are_timed_in_another_order_each(subject):
     points = [
         Point(Setting(), "", "exact"),
@@ -159,11 +154,72 @@ def test_rounds_are_timed_in_another_order_each(subject):
     time_points(subject, points, DeviceClock("cpu"), effort, progress=told.append)
     rounds = [[name.split(": ")[1] for name in told[3 * n : 3 * n + 3]] for n in range(3)]
     assert len({tuple(r) for r in rounds}) > 1 and all(sorted(r) == sorted(rounds[0]) for r in rounds)
+    time_encodings(subject, points, DeviceClock("cpu"), effort)
+    assert points[0].encode is points[2].encode and points[0].encode is not points[1].encode  # two inputs
     for point in points:
         assert len(point.step) == len(point.encode) == 3
         assert all(len(timing.repeats) == 2 for timing in point.step)
         assert {"convolution", "attention", "serialise", "dense layers"} <= set(point.stages())
         assert point.peak > 0
+
+
+def test_steps_are_timed_on_the_way(subject):
+    """The reference three times, the others once; what is drawn otherwise only shares the simulation's time."""
+    settings = [Setting(), Setting(shrink=2), Setting(every=2), Setting(kept=0.1), Setting(sleep=1e-9)]
+    points = [Point(setting, "", "model") for setting in settings]
+    effort, clock, told = Effort(apart=False, warm_up=1, repeats=2, n_rounds=1), DeviceClock("cpu"), []
+    comparison = Comparison(subject, clock=clock)
+    measure.measure(comparison, points, clock, effort, told.append)
+    assert len(told) == measure.n_runs(points, effort)
+    n_all = subject.n_steps * len(subject.scenes)
+    assert [len(point.step) for point in points] == [3, 1, 1, 1, 1]
+    assert [len(point.step[0].repeats) for point in points] == [n_all - 1, n_all - 1, n_all // 2 - 1, n_all - 1, 1]
+    assert points[0].noise == comparison.noise and points[1].spread >= comparison.noise * points[1].step_seconds
+    for point in points:
+        assert {"convolution", "sort and raster"} <= set(point.stages())
+        assert sum(point.stages().values()) == pytest.approx(point.step_seconds, rel=0.5)
+    assert points[3].step_seconds < points[0].step_seconds
+
+
+def test_drawing_together_is_drawing_alone(subject):
+    settings = [Setting(), Setting(shrink=2), Setting(cutoff="tile3sigma"), Setting(every=3)]
+    together = Comparison(subject).of_all(settings)
+    for setting, found in zip(settings, together, strict=True):
+        alone = Comparison(subject).of(setting)
+        assert (alone.agreement, alone.by_step) == (found.agreement, found.by_step)
+
+
+def test_a_failure_to_draw_leaves_the_others(subject, monkeypatch):
+    images = Runner.images
+
+    def full(self, particles, cameras):
+        if self.setting.shrink == 2:
+            raise torch.OutOfMemoryError("too large")
+        return images(self, particles, cameras)
+
+    monkeypatch.setattr(Runner, "images", full)
+    points = [
+        Point(Setting(), "", "exact"),
+        Point(Setting(shrink=2), "", "exact"),
+        Point(Setting(every=2), "", "exact"),
+    ]
+    compare(Comparison(subject), points)
+    assert [point.failure for point in points] == ["", "out of memory at step 1", ""]
+
+
+def test_fvd_is_of_all_clips(subject, monkeypatch):
+    """One distance between the clips of all scenes; the features are made up."""
+    monkeypatch.setattr("gsim3d.perceptual.fvd.MIN_FRAMES", 2)
+    monkeypatch.setattr(
+        "gsim3d.perceptual.fvd.clip_features", lambda clips: clips.double().mean((2, 3)).flatten(1)[:, :6]
+    )
+    comparison = Comparison(subject, ("psnr", "fvd"))
+    task = comparison.of(Setting()).task
+    truth = [subject.truth(n, range(subject.n_steps))[0] for n in range(2)]
+    features = [images.transpose(0, 1).double().mean((2, 3)).flatten(1)[:, :6] for images in truth]
+    ours = [p.images.transpose(0, 1).double().mean((2, 3)).flatten(1)[:, :6] for p in comparison.reference]
+    assert task["fvd"] == pytest.approx(frechet_distance(torch.cat(features), torch.cat(ours)))
+    assert "fvd" not in comparison.of(Setting()).by_step
 
 
 def test_the_front_holds_what_nothing_beats():

@@ -21,7 +21,7 @@ from pathlib import Path
 from harness import RESULTS, commit
 
 ROOT = Path(__file__).resolve().parents[2]
-OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "decode"]
+OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "decode", "background"]
 GUARDS, EFFECTS = "stability", "effects"
 NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
 EFFECTS_PAGE, MARKS = ROOT / "docs" / "effects.md", ("<!-- table -->\n", "<!-- end of table -->\n")

@@ -163,8 +163,8 @@ py::array_t<T> patch_attention(const Array<T>& q, const Array<T>& k, const Array
     return gsim3d::HeadRows<T>{x.data(), x.shape(1) * x.shape(2), x.shape(2)};
   };
   py::array_t<T> out({q.shape(0), q.shape(1), q.shape(2)}), stats({q.shape(0), q.shape(1), py::ssize_t{2}});
-  gsim3d::cpu::patch_attention(heads(q), heads(k), heads(v), table, size, out.mutable_data(), stats.mutable_data(),
-                               gsim3d::thread_pool());
+  gsim3d::cpu::patch_attention(heads(q), heads(k), heads(v), table, size, false, out.mutable_data(),
+                               stats.mutable_data(), gsim3d::thread_pool());
   return out;
 }
 

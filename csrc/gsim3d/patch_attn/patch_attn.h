@@ -54,10 +54,11 @@ constexpr int64_t kMaxHeadDim = 128;
 void check_patch_table(const char* op, const PatchTable& table);
 void check_attention_size(const char* op, const AttentionSize& size);
 
-// A query row that no patch lists, or whose patch has no keys, gets 0.
+// A query row that no patch lists, or whose patch has no keys, gets 0. With `joins`, out and stats hold the attention
+// of the same queries to other keys, and become that to both in one softmax; such a row then keeps what it has.
 template <typename T>
 void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
-                     const AttentionSize& size,
+                     const AttentionSize& size, bool joins,
                      T* out,    // [n_q, H, D]
                      T* stats,  // [n_q, H, 2]: largest <query, key> of the patch (times -1 where scale < 0) and the sum
                                 // of exp(scale (<query, key> - largest)); what patch_attention_vjp needs
@@ -88,7 +89,7 @@ struct GradientRows {
 
 template <typename T>
 void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
-                     const AttentionSize& size, T* out, StatsOf<T>* stats, Stream stream);
+                     const AttentionSize& size, bool joins, T* out, StatsOf<T>* stats, Stream stream);
 
 template <typename T>
 void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v,

@@ -149,16 +149,16 @@ void check_attention_size(const char* op, const AttentionSize& size) {
 
 template <typename T>
 void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
-                     const AttentionSize& size, T* out, T* stats, const Parallel& parallel) {
-  if (table.cu_q[table.n_patches] < table.n_q) {
+                     const AttentionSize& size, bool joins, T* out, T* stats, const Parallel& parallel) {
+  if (!joins && table.cu_q[table.n_patches] < table.n_q) {
     clear(out, table.n_q * size.heads * size.dim, parallel);
     clear(stats, table.n_q * size.heads * 2, parallel);
   }
   const int64_t most_queries = queries_of_task(table, size.heads);
   if (simd::use_avx512())
-    run_tasks(avx512::Forward<T>{q, k, v, table, size, out, stats}, most_queries, parallel);
+    run_tasks(avx512::Forward<T>{q, k, v, table, size, joins, out, stats}, most_queries, parallel);
   else
-    run_tasks(baseline::Forward<T>{q, k, v, table, size, out, stats}, most_queries, parallel);
+    run_tasks(baseline::Forward<T>{q, k, v, table, size, joins, out, stats}, most_queries, parallel);
 }
 
 template <typename T>
@@ -197,7 +197,7 @@ void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const He
 
 #define GSIM3D_INSTANTIATE(T)                                                                                         \
   template void patch_attention<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const PatchTable&,     \
-                                   const AttentionSize&, T*, T*, const Parallel&);                                    \
+                                   const AttentionSize&, bool, T*, T*, const Parallel&);                              \
   template void patch_attention_vjp<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, \
                                        const T*, const T*, const PatchTable&, const AttentionSize&, T* const (&)[3],  \
                                        const Workspace&, const Parallel&);

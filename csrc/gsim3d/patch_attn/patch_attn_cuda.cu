@@ -96,14 +96,16 @@ __global__ void finish_kernel(PatchTable table, AttentionSize size, RowUses uses
 
 template <typename T>
 void patch_attention(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
-                     const AttentionSize& size, T* out, StatsOf<T>* stats, Stream stream) {
+                     const AttentionSize& size, bool joins, T* out, StatsOf<T>* stats, Stream stream) {
   const char* op = "patch_attention";
   if constexpr (sizeof(T) == 2)
     if (fits_tensor_cores<T>(size, q, k, v))
-      return tensor_forward(device(q), device(k), device(v), table, size, device(out), stats, stream);
-  fill_zero(op, out, table.n_q * size.heads * size.dim, stream);
-  fill_zero(op, stats, table.n_q * size.heads * 2, stream);
-  simple_forward(device(q), device(k), device(v), table, size, device(out), stats, stream);
+      return tensor_forward(device(q), device(k), device(v), table, size, joins, device(out), stats, stream);
+  if (!joins) {
+    fill_zero(op, out, table.n_q * size.heads * size.dim, stream);
+    fill_zero(op, stats, table.n_q * size.heads * 2, stream);
+  }
+  simple_forward(device(q), device(k), device(v), table, size, joins, device(out), stats, stream);
 }
 
 template <typename T>
@@ -138,7 +140,7 @@ void patch_attention_vjp(const HeadRows<T>& grad, const HeadRows<T>& q, const He
 
 #define GSIM3D_INSTANTIATE(T)                                                                                         \
   template void patch_attention<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const PatchTable&,     \
-                                   const AttentionSize&, T*, StatsOf<T>*, Stream);                                    \
+                                   const AttentionSize&, bool, T*, StatsOf<T>*, Stream);                              \
   template void patch_attention_vjp<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, \
                                        const T*, const StatsOf<T>*, const PatchTable&, const AttentionSize&,          \
                                        const GradientRows<T>&, const Workspace&, Stream);

@@ -33,6 +33,7 @@ struct Forward {
   PatchTable table;
   Division division;
   float slope, sign;
+  bool joins;
   T* out;        // [n_q, H, D]
   float* stats;  // [n_q, H, 2]
 };
@@ -178,6 +179,35 @@ class Warp {
       }
   }
 
+  // Goes on with the softmax that store() would overwrite. Rows without a key in this call are left out of it.
+  __device__ __forceinline__ void join(const Forward<T>& args, int64_t head) {
+    const int t = threadIdx.x % 4;
+#pragma unroll
+    for (int m = 0; m < M; ++m)
+#pragma unroll
+      for (int h = 0; h < 2; ++h) {
+        if (!inside(rows_[m][h], args.table.n_q)) continue;
+        const int64_t place = rows_[m][h] * args.division.heads + head;
+        const float2 other = *reinterpret_cast<const float2*>(args.stats + 2 * place);
+        float& sum = sum_[m][2 * h];
+        if (sum == 0) rows_[m][h] = -1;
+        if (sum == 0 || other.y == 0) continue;
+        const float top = other.x < largest_[m][h] ? largest_[m][h] : other.x;
+        const float own = careful_weight(largest_[m][h], top, slope_, 0.0f);
+        const float before = other.y * careful_weight(other.x, top, slope_, 0.0f);
+        sum = fmaf(sum, own, before);
+        largest_[m][h] = top;
+        const T* out = args.out + place * D + 2 * t;
+#pragma unroll
+        for (int c = 0; c < D / 8; ++c) {
+          const float2 there = unpack<T>(*reinterpret_cast<const uint32_t*>(out + 8 * c));
+          out_[m][c][2 * h] = fmaf(before, there.x, out_[m][c][2 * h] * own);
+          out_[m][c][2 * h + 1] = fmaf(before, there.y, out_[m][c][2 * h + 1] * own);
+        }
+      }
+    __syncwarp();  // lanes that share a row have read its stats
+  }
+
   __device__ __forceinline__ void store(const Forward<T>& args, int64_t head) const {
     const int t = threadIdx.x % 4;
 #pragma unroll
@@ -225,8 +255,10 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
   uint8_t* valid = reinterpret_cast<uint8_t*>(shared) + 2 * S::kTileBytes;
   const uint32_t keys = shared_address(shared), values = keys + S::kTileBytes;
   const PatchTable& table = args.table;
+  let_next_begin();
   for (int64_t i = blockIdx.x; i < args.division.n_shares; i += gridDim.x) {
-    const Share share = args.division.at(i);
+    const Share share = args.division.splits > 0 ? args.division.at(i)
+                                                 : share_by_queries<kThreads>(table, i, S::kGroup, args.division.heads);
     const Range q_range = range_of(table.cu_q, share.patch, table.n_q_listed);
     const Range k_range = range_of(table.cu_k, share.patch, table.n_k_listed);
     const int64_t n_keys = k_range.end - k_range.begin, n_tiles = (n_keys + S::kTileRows - 1) / S::kTileRows;
@@ -244,7 +276,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
       return __syncthreads_and(all_valid) != 0;
     };
 
-    const int64_t step = args.division.splits * S::kGroup;
+    const int64_t step = args.division.splits > 0 ? args.division.splits * S::kGroup : table.n_q_listed + S::kGroup;
     int64_t group = q_range.begin + share.split * S::kGroup;
     int64_t first = group + threadIdx.x / kWarp * 16 * S::kRowTiles;  // of the warp
     Warp<T, D> warp(args, keys, values, valid);
@@ -289,7 +321,8 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
       warp.load_rows(args, first, q_range.end);
       first += step;
       warp.load_queries(args, first, q_range.end, share.head);
-      wait_for_previous();  // rows that no patch lists are being set to 0
+      wait_for_previous();  // rows are being set to 0, or to what this call joins
+      if (active && args.joins) warp.join(args, share.head);
       if (active) warp.store(args, share.head);
     }
   }
@@ -310,9 +343,13 @@ template <typename T, int D>
 void run(Forward<T> args, int64_t heads, Stream stream) {
   args.division = divide(args.table.n_patches, args.table.n_q_listed, Shape<D>::kGroup, heads,
                          kBlocks * multiprocessors(kOp, stream));
-  const int64_t n_stats = args.table.n_q * heads, n_out = n_stats * D * sizeof(T) / sizeof(uint2);
-  launch(kOp, clear_kernel, multiprocessors(kOp, stream), kThreads, 0, stream, reinterpret_cast<uint2*>(args.out),
-         n_out, reinterpret_cast<uint2*>(args.stats), n_stats);
+  if (args.joins) {  // few patches may have nearly all queries
+    args.division = divide_by_queries(args.table.n_patches, args.table.n_q_listed, Shape<D>::kGroup, heads);
+  } else {
+    const int64_t n_stats = args.table.n_q * heads, n_out = n_stats * D * sizeof(T) / sizeof(uint2);
+    launch(kOp, clear_kernel, multiprocessors(kOp, stream), kThreads, 0, stream, reinterpret_cast<uint2*>(args.out),
+           n_out, reinterpret_cast<uint2*>(args.stats), n_stats);
+  }
   launch_overlapping(kOp, forward_kernel<T, D>, blocks_of(args.division), kThreads, Shape<D>::kSharedBytes, stream,
                      args);
 }
@@ -321,9 +358,9 @@ void run(Forward<T> args, int64_t heads, Stream stream) {
 
 template <typename T>
 void tensor_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
-                    const AttentionSize& size, T* out, float* stats, Stream stream) {
+                    const AttentionSize& size, bool joins, T* out, float* stats, Stream stream) {
   const patch_attn::Softmax<float> softmax(size.scale);
-  Forward<T> args{q, k, v, table, {}, softmax.slope, softmax.sign, out, stats};
+  Forward<T> args{q, k, v, table, {}, softmax.slope, softmax.sign, joins, out, stats};
   if (size.dim == 16) run<T, 16>(args, size.heads, stream);
   else if (size.dim == 32) run<T, 32>(args, size.heads, stream);
   else run<T, 64>(args, size.heads, stream);
@@ -331,8 +368,8 @@ void tensor_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T
 
 template void tensor_forward<__nv_bfloat16>(const HeadRows<__nv_bfloat16>&, const HeadRows<__nv_bfloat16>&,
                                             const HeadRows<__nv_bfloat16>&, const PatchTable&, const AttentionSize&,
-                                            __nv_bfloat16*, float*, Stream);
+                                            bool, __nv_bfloat16*, float*, Stream);
 template void tensor_forward<__half>(const HeadRows<__half>&, const HeadRows<__half>&, const HeadRows<__half>&,
-                                     const PatchTable&, const AttentionSize&, __half*, float*, Stream);
+                                     const PatchTable&, const AttentionSize&, bool, __half*, float*, Stream);
 
 }  // namespace gsim3d::cuda

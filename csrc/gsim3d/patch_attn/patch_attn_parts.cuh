@@ -12,7 +12,8 @@
 namespace gsim3d::cuda {
 
 // A block computes one head of some rows of one patch: of its `splits` blocks, block s takes groups s, s + splits, ...
-// of `group` rows. Heads are neighbours, so that blocks in flight read the same lines of memory.
+// of `group` rows, with splits = 0 group s alone. Heads are neighbours, so that blocks in flight read the same lines of
+// memory.
 struct Share {
   int64_t patch, head, split;
 };
@@ -38,6 +39,25 @@ inline Division divide(int64_t n_patches, int64_t n_listed, int64_t group, int64
     }
   }
   return {heads, best, n_patches * heads * best};
+}
+// Groups of all patches one after another, whatever number of queries each patch has. Patch p begins at group
+// cu_q[p] / group + p: it has as many places as it can have groups, the last of which may be empty.
+inline Division divide_by_queries(int64_t n_patches, int64_t n_listed, int64_t group, int64_t heads) {
+  const int64_t groups = n_patches > 0 ? n_listed / group + n_patches : 0;
+  return {heads, 0, groups * heads};
+}
+template <int kThreads>
+__device__ __forceinline__ Share share_by_queries(const PatchTable& table, int64_t i, int64_t group, int64_t heads) {
+  const int64_t place = i / heads;
+  const auto begin_of = [&](int64_t p) { return min(max(table.cu_q[p], int64_t{0}), table.n_q_listed) / group + p; };
+  int64_t count = 0;  // of patches that begin no later
+  for (int64_t first = 0; first < table.n_patches; first += kThreads) {
+    const int64_t p = first + threadIdx.x;
+    count += __syncthreads_count(p < table.n_patches && begin_of(p) <= place);
+    if (count < first + kThreads) break;
+  }
+  const int64_t patch = max(count - 1, int64_t{0});
+  return {patch, i % heads, max(place - begin_of(patch), int64_t{0})};
 }
 inline int64_t multiprocessors(const char* what, Stream stream) {
   int count = 0;

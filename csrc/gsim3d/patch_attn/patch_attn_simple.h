@@ -6,10 +6,10 @@
 
 namespace gsim3d::cuda {
 
-// Writes the rows of `out` and `stats` that some patch with keys lists.
+// Writes the rows of `out` and `stats` that some patch with keys lists; with `joins` what they hold takes part.
 template <typename T>
 void simple_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
-                    const AttentionSize& size, T* out, Sum<T>* stats, Stream stream);
+                    const AttentionSize& size, bool joins, T* out, Sum<T>* stats, Stream stream);
 
 // Writes the gradients of queries that some patch with keys lists, and those of all slots of kv_rows in patches.
 template <typename T>

@@ -134,6 +134,7 @@ struct Work {
   AttentionSize size;
   Division division;
   patch_attn::Softmax<Sum<T>> softmax;
+  bool joins;
   T* out;
   Sum<T>* stats;
   Sum<T>* deltas;  // [H, n_q_listed]
@@ -175,6 +176,20 @@ __device__ __forceinline__ void for_key_tiles(const Work<T>& work, const Tile<Su
     __syncthreads();
     body(n);
   }
+}
+
+// The running softmax of a query goes on with the result of another one, given as it is stored.
+template <typename C>
+__device__ __forceinline__ void join(C other_largest, C other_sum, const C (&other)[kDims],
+                                     const patch_attn::Softmax<C>& softmax, C& largest, C& sum, C (&result)[kDims]) {
+  if (other_sum == 0) return;
+  const C top = sum != 0 && other_largest < largest ? largest : other_largest;
+  const C own = sum == 0 ? C(0) : weight(largest - top, softmax);
+  const C before = other_sum * weight(other_largest - top, softmax);
+#pragma unroll
+  for (int i = 0; i < kDims; ++i) result[i] = fma(before, other[i], result[i] * own);
+  sum = sum * own + before;
+  largest = top;
 }
 
 template <typename T, int L>
@@ -239,8 +254,14 @@ __global__ void __launch_bounds__(kThreads) forward_kernel(Work<T> work) {
     });
 #pragma unroll
     for (int r = 0; r < R; ++r) {
-      if (rows[r] < 0) continue;
       const int64_t place = rows[r] * heads + head;
+      if (work.joins && rows[r] >= 0) {
+        C before[kDims];
+        load_row<L>(work.out + place * dim, part, dim, before);
+        join(work.stats[2 * place], work.stats[2 * place + 1], before, work.softmax, largest[r], sum[r], result[r]);
+      }
+      __syncwarp();  // lanes that share a row have read its stats
+      if (rows[r] < 0) continue;
       store_row<L>(work.out + place * dim, part, dim, result[r], sum[r] == 0 ? C(0) : C(1) / sum[r]);
       if (part == 0) work.stats[2 * place] = sum[r] == 0 ? C(0) : largest[r];
       if (part == 0) work.stats[2 * place + 1] = sum[r];
@@ -378,13 +399,14 @@ void with_lanes(int64_t dim, const F& f) {
 
 template <typename T>
 void simple_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
-                    const AttentionSize& size, T* out, Sum<T>* stats, Stream stream) {
+                    const AttentionSize& size, bool joins, T* out, Sum<T>* stats, Stream stream) {
   const char* op = "patch_attention";
   with_lanes(size.dim, [&]<int L>() {
     using S = Shape<Sum<T>, L>;
     const Division division = divide(table.n_patches, table.n_q_listed, S::kGroup, size.heads,
                                      4 * multiprocessors(op, stream));
-    const Work<T> work{{}, q, k, v, {}, table, size, division, patch_attn::Softmax<Sum<T>>(size.scale), out, stats};
+    const Work<T> work{{}, q,   k,    v, {}, table, size, division, patch_attn::Softmax<Sum<T>>(size.scale),
+                       joins, out, stats};
     launch(op, forward_kernel<T, L>, blocks_of(division), kThreads, S::kSharedBytes, stream, work);
   });
 }
@@ -396,7 +418,7 @@ void simple_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRo
   const char* op = "patch_attention_backward";
   const HeadRows<T> out_rows{out, size.heads * size.dim, size.dim};
   const int64_t resident = 4 * multiprocessors(op, stream);
-  Work<T> work{grad, q, k, v, out_rows, table, size, {}, patch_attn::Softmax<Sum<T>>(size.scale), nullptr,
+  Work<T> work{grad, q, k, v, out_rows, table, size, {}, patch_attn::Softmax<Sum<T>>(size.scale), false, nullptr,
                const_cast<Sum<T>*>(stats), workspace.take<Sum<T>>(size.heads * table.n_q_listed), gradients};
   with_lanes(size.dim, [&]<int L>() {
     using S = Shape<Sum<T>, L>;
@@ -409,7 +431,7 @@ void simple_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRo
 
 #define GSIM3D_INSTANTIATE(T)                                                                                        \
   template void simple_forward<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const PatchTable&,     \
-                                  const AttentionSize&, T*, Sum<T>*, Stream);                                       \
+                                  const AttentionSize&, bool, T*, Sum<T>*, Stream);                                 \
   template void simple_backward<T>(const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&, const HeadRows<T>&,   \
                                    const T*, const Sum<T>*, const PatchTable&, const AttentionSize&, \
                                    const Gradients<T>&, const Workspace&, Stream);

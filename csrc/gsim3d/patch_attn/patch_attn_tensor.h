@@ -6,10 +6,11 @@
 
 namespace gsim3d::cuda {
 
-// Rows of `out` and `stats` that no patch with keys lists become 0.
+// Rows of `out` and `stats` that no patch with keys lists become 0, or with `joins` stay as they are. Queued behind a
+// call with the same queries, one that joins begins before that has ended.
 template <typename T>
 void tensor_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
-                    const AttentionSize& size, T* out, float* stats, Stream stream);
+                    const AttentionSize& size, bool joins, T* out, float* stats, Stream stream);
 
 // Writes the gradients of queries that some patch with keys lists, and those of all slots of kv_rows in patches.
 template <typename T>

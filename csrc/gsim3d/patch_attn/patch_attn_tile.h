@@ -227,11 +227,12 @@ struct Forward {
   HeadRows<T> q, k, v;
   PatchTable table;
   AttentionSize size;
+  bool joins;
   T* out;
   T* stats;
 
   static int64_t scratch_size(int64_t n_keys, int64_t dim) {
-    return 2 * dim * whole_vectors(n_keys, kTile) + kTile * (2 * dim + kTile + 2);
+    return 2 * dim * whole_vectors(n_keys, kTile) + kTile * (2 * dim + kTile + 4);
   }
 
   // Queries [q_begin, q_end) of patch p, one head.
@@ -245,6 +246,7 @@ struct Forward {
     T* dots = result + dim * kTile;
     T* largest = dots + kTile * kTile;
     T* sum = largest + kTile;
+    if (joins && n_keys == 0) return;
     rows_to_panels(k, table.kv_rows + table.cu_k[p], n_keys, head, dim, keys);
     rows_to_panels(v, table.kv_rows + table.cu_k[p], n_keys, head, dim, values);
     for (int64_t begin = q_begin; begin < q_end; begin += kTile) {
@@ -261,6 +263,7 @@ struct Forward {
         softmax_step(m, columns, dim, softmax, dots, largest, sum, result);
         product<T, true, kTile, 1>(dim, columns, m, values + first * dim, dots, kTile, result, kTile);
       }
+      if (joins) join(rows, n, head, softmax, queries, result, largest, sum);
       for (int64_t i = 0; i < n; ++i) {
         T* pair = stats + (rows[i] * size.heads + head) * 2;
         pair[0] = sum[i] == T(0) ? T(0) : largest[i];
@@ -270,6 +273,31 @@ struct Forward {
       scale_panel(dim, largest, result);
       panel_to_rows(result, n, dim, ResultRows<T>{out, size, rows, head});
     }
+  }
+
+  // Adds what `out` and `stats` hold of the queries; `panel` and the two rows behind `sum` are scratch.
+  void join(const int64_t* rows, int64_t n, int64_t head, const Softmax<T>& softmax, T* panel, T* result, T* largest,
+            T* sum) const {
+    T* before = sum + kTile;  // differences to the largest of both, then weights
+    T* own = before + kTile;
+    std::fill_n(before, 2 * kTile, T(0));
+    for (int64_t i = 0; i < n; ++i) {
+      const T* pair = stats + (rows[i] * size.heads + head) * 2;
+      const T top = pair[1] == T(0) || pair[0] < largest[i] ? largest[i] : pair[0];
+      before[i] = pair[1] == T(0) ? T(0) : pair[0] - top;
+      own[i] = largest[i] - top;
+      largest[i] = top;
+    }
+    const Lanes<T> slope = fill(softmax.slope), lowest = fill(softmax.lowest);
+    for (int64_t i = 0; i < 2 * kTile; i += W<T>) store(before + i, weight<T>(load(before + i), slope, lowest));
+    for (int64_t i = 0; i < n; ++i) {
+      before[i] *= stats[(rows[i] * size.heads + head) * 2 + 1];
+      sum[i] = sum[i] * own[i] + before[i];
+    }
+    rows_to_panel(ListedRows<T>{{out, size.heads * size.dim, size.dim}, rows, head}, n, size.dim, panel);
+    scale_panel(size.dim, own, result);
+    scale_panel(size.dim, before, panel);
+    for (int64_t i = 0; i < size.dim * kTile; ++i) result[i] += panel[i];
   }
 };
 

@@ -77,6 +77,19 @@ Inputs inputs_of(const char* op, const Tensor& q, const Tensor& k, const Tensor&
   return in;
 }
 
+// Fills `out` and `stats`, or with `joins` goes on with what they hold.
+void attend(const char* op, const Inputs& in, bool joins, Tensor& out, Tensor& stats) {
+  dispatch(op, in.q, [&]<typename T>() {
+    if constexpr (kWithCuda)
+      if (in.q.is_cuda())
+        return cuda::patch_attention(view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v), in.table, in.size, joins,
+                                     mutable_data<T>(out), mutable_data<cuda::StatsOf<T>>(stats), current_stream(in.q));
+    if constexpr (kOnCpu<T>)
+      cpu::patch_attention(view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v), in.table, in.size, joins,
+                           mutable_data<T>(out), mutable_data<T>(stats), torch_parallel());
+  });
+}
+
 std::tuple<Tensor, Tensor> patch_attention(const Tensor& q, const Tensor& k, const Tensor& v, const Tensor& q_rows,
                                            const Tensor& kv_rows, const Tensor& cu_q, const Tensor& cu_k,
                                            double scale) {
@@ -84,15 +97,24 @@ std::tuple<Tensor, Tensor> patch_attention(const Tensor& q, const Tensor& k, con
   const Inputs in = inputs_of(op, q, k, v, q_rows, kv_rows, cu_q, cu_k, scale);
   Tensor out = empty(q, {q.size(0), q.size(1), q.size(2)});
   Tensor stats = empty(q, {q.size(0), q.size(1), 2}, stats_type(q));
-  dispatch(op, q, [&]<typename T>() {
-    if constexpr (kWithCuda)
-      if (q.is_cuda())
-        return cuda::patch_attention(view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v), in.table, in.size,
-                                     mutable_data<T>(out), mutable_data<cuda::StatsOf<T>>(stats), current_stream(q));
-    if constexpr (kOnCpu<T>)
-      cpu::patch_attention(view_of<T>(in.q), view_of<T>(in.k), view_of<T>(in.v), in.table, in.size,
-                           mutable_data<T>(out), mutable_data<T>(stats), torch_parallel());
-  });
+  attend(op, in, false, out, stats);
+  return {out, stats};
+}
+
+std::tuple<Tensor, Tensor> joint_attention(const Tensor& q, const Tensor& k, const Tensor& v, const Tensor& other_k,
+                                           const Tensor& other_v, const Tensor& q_rows, const Tensor& kv_rows,
+                                           const Tensor& cu_q, const Tensor& cu_k, const Tensor& other_q_rows,
+                                           const Tensor& other_kv_rows, const Tensor& other_cu_q,
+                                           const Tensor& other_cu_k, double scale) {
+  const char* op = "joint_attention";
+  const Inputs own = inputs_of(op, q, k, v, q_rows, kv_rows, cu_q, cu_k, scale);
+  const Inputs other =
+      inputs_of("joint_attention: other table", q, other_k, other_v, other_q_rows, other_kv_rows, other_cu_q, other_cu_k,
+                scale);
+  Tensor out = empty(q, {q.size(0), q.size(1), q.size(2)});
+  Tensor stats = empty(q, {q.size(0), q.size(1), 2}, stats_type(q));
+  attend(op, own, false, out, stats);
+  attend(op, other, true, out, stats);
   return {out, stats};
 }
 
@@ -174,6 +196,7 @@ Tensor patch_attention_backward_packed(const Tensor& grad, const Tensor& q, cons
 
 void kernels(auto& m) {
   m.impl("patch_attention", TORCH_BOX(&patch_attention));
+  m.impl("joint_attention", TORCH_BOX(&joint_attention));
   m.impl("patch_attention_backward", TORCH_BOX(&patch_attention_backward));
   m.impl("patch_attention_backward_packed", TORCH_BOX(&patch_attention_backward_packed));
 }

@@ -29,11 +29,16 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor cu_voxel_rows, Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first) -> (Tensor weight, Tensor "
       "bias)");
 
-  // patch_attn: attention inside patches of a serialized order, separate query and key tables; q, k, v [N, H, D].
+  // patch_attn: attention inside patches of a serialized order, separate query and key tables; q, k, v [N, H, D]. Joint:
+  // to the keys of two tables, in one softmax.
   m.def(
       "patch_attention(Tensor q, Tensor k, Tensor v, Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k, float "
       "scale) "
       "-> (Tensor out, Tensor stats)");
+  m.def(
+      "joint_attention(Tensor q, Tensor k, Tensor v, Tensor other_k, Tensor other_v, Tensor q_rows, Tensor kv_rows, "
+      "Tensor cu_q, Tensor cu_k, Tensor other_q_rows, Tensor other_kv_rows, Tensor other_cu_q, Tensor other_cu_k, float "
+      "scale) -> (Tensor out, Tensor stats)");
   m.def(
       "patch_attention_backward(Tensor grad, Tensor q, Tensor k, Tensor v, Tensor out, Tensor stats, Tensor q_rows, "
       "Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) -> (Tensor q, Tensor k, Tensor v)");
@@ -89,6 +94,15 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "watch_rows(Tensor[] fields, float[] low, float[] high, Tensor cu_rows, Tensor cloud_scene, Tensor origin, "
       "Tensor activity, Tensor[] previous, float grid_size, float max_step, float[] neutral) -> (Tensor status, Tensor "
       "record, Tensor[] mended)");
+
+  // background: where rows meet one that was computed before. Lists have an entry a stage; tables a row a curve.
+  m.def(
+      "row_scenes(Tensor cloud_scene, Tensor cu_input, Tensor[] rows, Tensor[] cu_rows) -> Tensor[]");
+  m.def("find_cells(Tensor cells, Tensor scene, Tensor grid) -> Tensor");
+  m.def("add_cells(Tensor x, Tensor field, Tensor places) -> Tensor");
+  m.def(
+      "overlapping_patches(Tensor first, Tensor kv_rows, Tensor cu_k, Tensor codes, Tensor order, Tensor cu_clouds, int "
+      "patch_size) -> (Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k)");
 
   // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
   m.def(

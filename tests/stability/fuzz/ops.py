@@ -142,6 +142,80 @@ def _call_patch_attention(a: Arguments):
     return ops.patch_attention(a["q"], a["k"], a["v"], table, scale=a["scale"])
 
 
+def _joint_attention(rng: random.Random) -> Arguments:
+    own = _patch_attention(rng)
+    n_k, n_list, (n_q, heads, dim) = _size(rng), rng.choice((0, 1, 9)), own["q"].shape
+    patches, n_list = rng.choice((1, 2, 5)), n_list if n_k else 0
+    return {
+        **own,
+        "other_k": tensor(rng, n_k, heads, dim, dtype=own["q"].dtype),
+        "other_v": tensor(rng, n_k, heads, dim, dtype=own["q"].dtype),
+        "other_q_rows": _permutation(rng, n_q),
+        "other_kv_rows": torch.tensor([rng.randrange(n_k) for _ in range(n_list)], dtype=torch.int64),
+        "other_cu_q": _offsets(rng, n_q, patches),
+        "other_cu_k": _offsets(rng, n_list, patches),
+    }
+
+
+def _call_joint_attention(a: Arguments):
+    table, other = (
+        ops.PatchTable(*(a[f"{prefix}{name}"] for name in ("q_rows", "kv_rows", "cu_q", "cu_k")))
+        for prefix in ("", "other_")
+    )
+    return ops.joint_attention(a["q"], a["k"], a["v"], a["other_k"], a["other_v"], table, other, scale=a["scale"])
+
+
+def _row_scenes(rng: random.Random) -> Arguments:
+    n, clouds = _size(rng), rng.choice((0, 1, 3))
+    n, stages, arguments = n if clouds else 0, rng.choice((0, 1, 2)), {}
+    below = n
+    for s in range(2):
+        segments = rng.choice((0, 1, 3)) if below else 0
+        rows = _permutation(rng, below)[: below if segments else 0]
+        arguments |= {f"stages[{s}].rows": rows, f"stages[{s}].cu_rows": _offsets(rng, len(rows), segments)}
+        below = segments
+    used = {name: value for name, value in arguments.items() if int(name[7]) < stages}
+    return {"cloud_scene": torch.arange(clouds) // 2, "cu_input": _offsets(rng, n, clouds), **used}
+
+
+def _call_row_scenes(a: Arguments):
+    stages = [ops.Segments(a[f"stages[{s}].rows"], a[f"stages[{s}].cu_rows"]) for s in range((len(a) - 2) // 2)]
+    return ops.row_scenes(a["cloud_scene"], a["cu_input"], stages)
+
+
+def _find_cells(rng: random.Random) -> Arguments:
+    n, cells = _size(rng), sorted(rng.randrange(2**62) for _ in range(rng.choice((0, 1, 9))))
+    grid = torch.tensor([[rng.randrange(2**16) for _ in range(3)] for _ in range(n)], dtype=torch.int64).reshape(n, 3)
+    scene = torch.tensor([rng.randrange(8) for _ in range(n)], dtype=torch.int64)
+    return {"cells": torch.tensor([*cells, 2**63 - 1]), "scene": scene, "grid": grid}
+
+
+def _add_cells(rng: random.Random) -> Arguments:
+    n, n_cells, channels, dtype = _size(rng), rng.choice((1, 5)), rng.choice((1, 4, 8)), _dtype(rng)
+    return {
+        "x": tensor(rng, n, channels, dtype=dtype),
+        "field": tensor(rng, n_cells, channels, dtype=dtype),
+        "places": torch.tensor([rng.randrange(n_cells) for _ in range(n)], dtype=torch.int64),
+    }
+
+
+def _overlapping_patches(rng: random.Random) -> Arguments:
+    n, curves, patches, size = _size(rng), rng.choice((1, 4)), rng.choice((0, 1, 3)), rng.choice((1, 4))
+    counts = [rng.randint(0, size) for _ in range(patches)]
+    keys, scene = sum(counts), rng.choice((0, 1)) << 48
+    codes = torch.tensor([rng.randrange(9) for _ in range(curves * n)], dtype=torch.int64).reshape(curves, n)
+    begins = [[0, *sorted(rng.randrange(9) for _ in range(patches - 1))][:patches] for _ in range(curves)]
+    return {
+        "first": torch.tensor(begins, dtype=torch.int64).reshape(curves, patches),
+        "kv_rows": torch.arange(curves * keys).reshape(curves, keys),
+        "cu_k": torch.tensor([0, *counts]).cumsum(0),
+        "codes": codes | scene,
+        "order": codes.argsort(dim=1, stable=True),
+        "cu_clouds": torch.tensor([0, n]),
+        "patch_size": size,
+    }
+
+
 def _pool(rng: random.Random) -> Arguments:
     n, segments = _size(rng), rng.choice((0, 1, 3))
     rows = _permutation(rng, n)[: n if segments else 0]
@@ -318,6 +392,11 @@ OPS: dict[str, tuple[Callable[[random.Random], Arguments], Callable[[Arguments],
     "build_pyramid": (_pyramid, _call_pyramid),
     "sparse_conv": (_sparse_conv, _call_sparse_conv),
     "patch_attention": (_patch_attention, _call_patch_attention),
+    "joint_attention": (_joint_attention, _call_joint_attention),
+    "row_scenes": (_row_scenes, _call_row_scenes),
+    "find_cells": (_find_cells, lambda a: ops.find_cells(**a)),
+    "add_cells": (_add_cells, lambda a: ops.add_cells(**a)),
+    "overlapping_patches": (_overlapping_patches, lambda a: ops.overlapping_patches(**a)),
     "pool_max": (_pool, lambda a: ops.pool_max(**a)),
     "pool_mean": (_pool, lambda a: ops.pool_mean(**a)),
     "unpool": (_unpool, lambda a: ops.unpool(**a)),
