@@ -52,5 +52,5 @@ class Branches:
 
 @functools.lru_cache(maxsize=None)
 def _streams(device: torch.device, parent: int) -> tuple[torch.cuda.Stream, ...]:
-    """Those that branch off from the stream ``parent`` alone: on shared ones, branches of branches would wait in turn."""
+    """Those that branch off from the stream ``parent`` alone; on shared ones, branches of branches would wait."""
     return tuple(torch.cuda.Stream(device) for _ in range(N_STREAMS))
