@@ -46,8 +46,10 @@ def check_compiler() -> None:
     error message would end the process."""
     command = shlex.split(os.environ.get("CXX", "c++"))
     try:
-        answer = [subprocess.run([*command, option], capture_output=True, text=True).stdout.strip()
-                  for option in ("--version", "-print-file-name=libstdc++.so")]
+        answer = [
+            subprocess.run([*command, option], capture_output=True, text=True).stdout.strip()
+            for option in ("--version", "-print-file-name=libstdc++.so")
+        ]
     except FileNotFoundError:
         raise SystemExit(f"the C++ compiler {command[0]} was not found: install one, or set CXX") from None
     if "Free Software Foundation" in answer[0] and not os.path.isabs(answer[1]):
@@ -70,8 +72,10 @@ def ops_extension():
     if cuda:
         os.environ.setdefault("TORCH_CUDA_ARCH_LIST", cuda_architectures())
         # torch's builder takes the operators of half types away; the core is compiled the same with and without torch
-        undo = [f"-U__CUDA_NO_{name}__" for name in
-                ("HALF_OPERATORS", "HALF_CONVERSIONS", "HALF2_OPERATORS", "BFLOAT16_CONVERSIONS")]
+        undo = [
+            f"-U__CUDA_NO_{name}__"
+            for name in ("HALF_OPERATORS", "HALF_CONVERSIONS", "HALF2_OPERATORS", "BFLOAT16_CONVERSIONS")
+        ]
         flags["nvcc"] = ["-O3", "-std=c++20", "--extended-lambda", "-lineinfo", *undo, *define]
     return make(
         "gsim3d._ops",

@@ -112,7 +112,7 @@ class Move(Operation):
 
 @dataclass(frozen=True)
 class Rotate(Operation):
-    """They are turned by ``degrees`` about an axis through ``about`` (default: each scene's middle), their speed too."""
+    """They turn by ``degrees`` about an axis through ``about`` (default: each scene's middle); so does their speed."""
 
     axis: Vector = (0.0, 0.0, 1.0)
     degrees: float = 0.0

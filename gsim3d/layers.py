@@ -314,7 +314,7 @@ def widened(x: Tensor) -> Tensor:
 
 
 def make_norm(kind: str, channels: int) -> nn.Module:
-    """"layer" or "batch"."""
+    """Of the ``kind`` "layer" or "batch"."""
     return RowLayerNorm(channels) if kind == "layer" else RowBatchNorm(channels)
 
 

@@ -25,9 +25,7 @@ class _Tensors:
 
     def map(self, f):
         """The same object with ``f`` applied to every tensor."""
-        return dataclasses.replace(
-            self, **{k: f(v) for k, v in vars(self).items() if isinstance(v, Tensor)}
-        )
+        return dataclasses.replace(self, **{k: f(v) for k, v in vars(self).items() if isinstance(v, Tensor)})
 
     def to(self, device):
         return self.map(lambda t: t.to(device))

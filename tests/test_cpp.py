@@ -45,8 +45,18 @@ def test_foreign_project_builds_against_the_install_tree(build, tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("nvcc") is None, reason="nvcc is not installed")
 def test_every_cuda_source_compiles(tmp_path):
-    run("cmake", "-G", "Ninja", "-S", ROOT, "-B", tmp_path, "-DGSIM3D_CUDA=ON", "-DGSIM3D_BUILD_TESTS=OFF",
-        "-DCMAKE_CUDA_ARCHITECTURES=90a-real")
+    run(
+        "cmake",
+        "-G",
+        "Ninja",
+        "-S",
+        ROOT,
+        "-B",
+        tmp_path,
+        "-DGSIM3D_CUDA=ON",
+        "-DGSIM3D_BUILD_TESTS=OFF",
+        "-DCMAKE_CUDA_ARCHITECTURES=90a-real",
+    )
     run("cmake", "--build", tmp_path, "--parallel", "2", "--target", "gsim3d_cuda")
     objects = {path.name.removesuffix(".o") for path in tmp_path.rglob("*.cu.o")}
     assert objects == {path.name for path in (ROOT / "csrc").rglob("*.cu")} and objects

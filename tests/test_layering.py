@@ -66,8 +66,7 @@ def test_imports_flow_one_way():
         f"{path.relative_to(ROOT)} imports gsim3d.{other}"
         for path in python_files()
         for other in imported_rooms(path)
-        if other != room_of(path) and LEVEL[other] >= LEVEL[room_of(path)]
-        and not (room_of(path) == "__main__")
+        if other != room_of(path) and LEVEL[other] >= LEVEL[room_of(path)] and not (room_of(path) == "__main__")
     ]
     assert not wrong, "\n".join(wrong)
 

@@ -41,9 +41,7 @@ def test_gaussians_keep_place_and_opacity_and_stay_in_their_limits():
 
 def test_a_head_without_latents_starts_at_identity_and_initial_scale():
     particles = make_history((5,))
-    zero = dataclasses.replace(
-        particles, dynamic_latents=torch.zeros(5, 4), static_latents=torch.zeros(5, 3)
-    )
+    zero = dataclasses.replace(particles, dynamic_latents=torch.zeros(5, 4), static_latents=torch.zeros(5, 3))
     head = make_head()
     torch.nn.init.zeros_(head.fc1.bias)
     gaussians = head(zero)

@@ -78,7 +78,7 @@ def train_and_score(
     asked = {"train": to_dict(config), "scenes": [[scene.name for scene in part] for part in (train, test)]}
     file = out / "metrics.json"
     known = json.loads(file.read_text()) if file.is_file() else {}
-    if any(known.get(name) != value for name, value in asked.items()):
+    if known.get("asked") != asked:
         trainer = Trainer(config, train, out, device=device)
         if is_cut:
             cut(trainer.simulator)
@@ -86,7 +86,8 @@ def train_and_score(
         if trainer.step < config.n_steps:
             return None
         restored = restore(out, device)
-        known = asked | summarize([score_scene(restored, scene, metrics=("psnr", "psnr_masked")) for scene in test])
+        scores = [score_scene(restored, scene, metrics=("psnr", "psnr_masked")) for scene in test]
+        known = {"asked": asked, **summarize(scores)}
         write_json(file, known)
     return {name: known[name] for name in MEASURED} | {"constant": known["constant.future.psnr_masked"]}
 

@@ -98,9 +98,7 @@ class Kept(NamedTuple):
     activated: Tensor
 
 
-def run_block(
-    block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keeps: list, recompute: bool, beside=None
-):
+def run_block(block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keeps: list, recompute: bool, beside=None):
     """(x, what the next convolution reads) behind a ``point_transformer.Block``.
 
     x [N, C]; conv_input [N, C] in the dtype of the products; keeps: factors [N, 1] of the rows' branches or None;

@@ -87,7 +87,7 @@ class UNet(nn.Module):
         super().__init__()
 
         def block(level: int, in_dim: int) -> list[nn.Module]:
-            return [ResBlock(in_dim, dim)] + ([ViewAttention(dim)] if 2**level in attention else [])
+            return [ResBlock(in_dim, dim)] + ([ViewAttention(dim)] if 2 ** level in attention else [])
 
         self.input_blocks = nn.ModuleList([nn.ModuleList([Stem(dim, dim, 3, 1, 1)])])
         for level in range(levels):

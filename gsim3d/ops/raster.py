@@ -172,9 +172,7 @@ def rasterize_gaussians(
     if watch:
         action = "error" if on_bad == "raise" else "dropped"
         read = partial(_unusable, names=(*names, "scales", "scales", "cameras"), action=action)
-        (StabilityReport() if report is None else report).record(
-            out[7], read, counts=range(0, out[7].numel(), 2)
-        )
+        (StabilityReport() if report is None else report).record(out[7], read, counts=range(0, out[7].numel(), 2))
     return Rendering(out[0], out[1], out[2], None if features is None else out[3])
 
 
@@ -308,9 +306,7 @@ def _backward(ctx, *grads):
         for grad, size in zip(grads, sizes, strict=False)
     ]
     viewmats_grad = ctx.needs_input_grad[7]
-    *grads, viewmats = torch.ops.gsim3d.rasterize_gaussians_backward(
-        *images, *saved, *ctx.options, viewmats_grad
-    )
+    *grads, viewmats = torch.ops.gsim3d.rasterize_gaussians_backward(*images, *saved, *ctx.options, viewmats_grad)
     return (*grads, viewmats if viewmats_grad else None, *[None] * 11)
 
 

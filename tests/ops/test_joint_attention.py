@@ -247,6 +247,16 @@ def test_one_table_may_have_all_the_weight(device, which, dtype):
             assert_close_relative_to_max(a, e, 1e-3 if dtype == torch.float32 else 1e-10, name)
 
 
+@pytest.mark.parametrize("dtype", DTYPES, ids=DTYPES.values())
+def test_a_table_without_keys_has_no_weight_whatever_the_logits(device, dtype):
+    """All logits are far below 0; many queries have keys in one table only."""
+    case = joint_case(dtype=dtype)
+    q, k, v, other_k, other_v = case.inputs
+    case = dataclasses.replace(case, inputs=(q.abs() * 100, -k.abs(), v, -other_k.abs(), other_v))
+    expected = case.attend_oracle()
+    assert_close_relative_to_max(case.to(device).attend(), expected, 1e-3 if dtype == torch.float32 else 1e-10)
+
+
 def test_order_of_the_tables_does_not_matter(device):
     case = joint_case().to(device)
     q, k, v, other_k, other_v = case.inputs

@@ -205,6 +205,7 @@ def test_gradcheck(scale):
 
 # ---- 4 CPU against CUDA --------------------------------------------------------------------------------------------
 
+
 @pytest.mark.parametrize("dtype", DTYPES, ids=DTYPES.values())
 @pytest.mark.parametrize("dim", [16, 20, 64])
 def test_devices_agree(devices, dim, dtype):
@@ -338,9 +339,7 @@ def test_non_contiguous(device):
     case = random_case(dtype=torch.float32, dim=20).to(device)
     expected = gradients(case.attend, case.inputs, cotangent_of(case))
     strided = [x.permute(2, 1, 0).contiguous().permute(2, 1, 0) for x in case.inputs]
-    doubled = dataclasses.replace(
-        case, table=PatchTable(*(torch.stack([t, t], 1)[:, 0] for t in lists(case.table)))
-    )
+    doubled = dataclasses.replace(case, table=PatchTable(*(torch.stack([t, t], 1)[:, 0] for t in lists(case.table))))
     leaves = [x.requires_grad_() for x in strided]
     out = doubled.attend(*leaves)
     cotangent = cotangent_of(case).float().to(device).permute(2, 0, 1).contiguous().permute(1, 2, 0)

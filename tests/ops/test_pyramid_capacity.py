@@ -10,7 +10,6 @@ import torch
 from gsim3d.ops import PyramidCapacity, build_pyramid
 from tests.ops.test_pyramid import AT_ONCE, LARGE, ONE_CELL, SHUFFLED, SPEC, flat, large_scene, on, scene
 
-
 # 1 forward against pyramids that fit
 
 
@@ -201,6 +200,7 @@ def test_given_sizes_without_rows(device):
 
 
 # 8 errors
+
 
 @pytest.mark.parametrize(
     "change, message",

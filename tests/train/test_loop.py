@@ -70,7 +70,6 @@ def test_training_on_a_device_repeats_and_resumes_bit_by_bit(folder, tmp_path, d
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
 
 
-
 def assert_same_checkpoint(a, b):
     a, b = checkpoint.load(a), checkpoint.load(b)
     for part in ("model", "ema", "optimizer"):

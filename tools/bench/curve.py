@@ -118,14 +118,31 @@ def gpu(bench):
         grid = (torch.rand(n, 3, generator=generator, device="cuda") * 60000).long()
         cloud = torch.zeros(n, dtype=torch.int64, device="cuda")
         codes = ours(grid, cloud)[0]
-        bench.gpu(f"4 sorts and inverses of {n // 1024}k", "int64", lambda: curve_sort(codes),
-                  {"torch.argsort": lambda: plain_sort(codes)}, tolerance=0)
-        bench.gpu(f"4 codes and their sorts, {n // 1024}k points", "int64", lambda: ours(grid, cloud),
-                  {"torch": lambda: plain(grid, cloud)}, tolerance=0, target_ratio=60, limit_ms=0.02 * n / 262144)
+        bench.gpu(
+            f"4 sorts and inverses of {n // 1024}k",
+            "int64",
+            lambda: curve_sort(codes),
+            {"torch.argsort": lambda: plain_sort(codes)},
+            tolerance=0,
+        )
+        bench.gpu(
+            f"4 codes and their sorts, {n // 1024}k points",
+            "int64",
+            lambda: ours(grid, cloud),
+            {"torch": lambda: plain(grid, cloud)},
+            tolerance=0,
+            target_ratio=60,
+            limit_ms=0.02 * n / 262144,
+        )
     positions = network_input(NETWORK).cuda()
     grid = torch.floor(positions.double() / NETWORK.grid_size).long()
-    bench.gpu(f"geometry of 5 stages, {len(grid)} points", "int64", lambda: our_pyramid(positions, NETWORK),
-              {"torch": lambda: plain_pyramid(grid, NETWORK)}, tolerance=0)
+    bench.gpu(
+        f"geometry of 5 stages, {len(grid)} points",
+        "int64",
+        lambda: our_pyramid(positions, NETWORK),
+        {"torch": lambda: plain_pyramid(grid, NETWORK)},
+        tolerance=0,
+    )
 
 
 def main():

@@ -128,10 +128,22 @@ def gpu_case(bench, n, heads, dim, dtype, gather, target_ratio, limits_ms):
     options = {"target_ratio": target_ratio, "tolerance": 1e-5 if dtype == torch.float32 else 2e-2}
     name_of_dtype = str(dtype).removeprefix("torch.")
     with torch.no_grad():
-        bench.gpu(f"{name}: fwd", name_of_dtype, lambda: ours(*inputs),
-                  {p: lambda f=f: f(*inputs) for p, f in peers.items()}, limit_ms=limits_ms[0], **options)
-    bench.gpu(f"{name}: fwd+bwd", name_of_dtype, both(ours), {p: both(f) for p, f in peers.items()},
-              limit_ms=limits_ms[1], **options)
+        bench.gpu(
+            f"{name}: fwd",
+            name_of_dtype,
+            lambda: ours(*inputs),
+            {p: lambda f=f: f(*inputs) for p, f in peers.items()},
+            limit_ms=limits_ms[0],
+            **options,
+        )
+    bench.gpu(
+        f"{name}: fwd+bwd",
+        name_of_dtype,
+        both(ours),
+        {p: both(f) for p, f in peers.items()},
+        limit_ms=limits_ms[1],
+        **options,
+    )
 
 
 def main():

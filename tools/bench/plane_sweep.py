@@ -83,8 +83,15 @@ def gpu(bench):
             ("fwd", lambda: ours(features), lambda: grid_sample(features), limits[size][0]),
             ("fwd+bwd", ours_both, plain_both, limits[size][1]),
         ):
-            bench.gpu(f"{case}: {name}", "float32", run, {"grid_sample": peer}, target_ratio=target, limit_ms=limit,
-                      tolerance=TOLERANCE)
+            bench.gpu(
+                f"{case}: {name}",
+                "float32",
+                run,
+                {"grid_sample": peer},
+                target_ratio=target,
+                limit_ms=limit,
+                tolerance=TOLERANCE,
+            )
 
 
 def main():

@@ -1,6 +1,5 @@
 """Pooling of feature rows over clusters and the way back, against the fastest plain torch form of each."""
 
-
 import torch
 from harness import Bench, best_seconds, with_gradients
 
@@ -61,12 +60,23 @@ def gpu(bench):
         ),
     }
     for name, (value, ours, forms) in cases.items():
-        bench.gpu(f"{name}, 256k x 64 rows to {m}: fwd", "float32", lambda: ours(value),
-                  {peer: lambda f=f: f(value) for peer, f in forms.items()}, tolerance=1e-6)
+        bench.gpu(
+            f"{name}, 256k x 64 rows to {m}: fwd",
+            "float32",
+            lambda: ours(value),
+            {peer: lambda f=f: f(value) for peer, f in forms.items()},
+            tolerance=1e-6,
+        )
         runs = with_gradients([value], ours, *forms.values())
         target = {"target_ratio": 5, "limit_ms": 0.04} if name == "max" else {}
-        bench.gpu(f"{name}, 256k x 64 rows to {m}: fwd+bwd", "float32", runs[0], dict(zip(forms, runs[1:])),
-                  tolerance=1e-6, **target)
+        bench.gpu(
+            f"{name}, 256k x 64 rows to {m}: fwd+bwd",
+            "float32",
+            runs[0],
+            dict(zip(forms, runs[1:])),
+            tolerance=1e-6,
+            **target,
+        )
 
 
 def main():
