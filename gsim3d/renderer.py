@@ -92,7 +92,7 @@ class GaussianHead(nn.Module):
         else:
             wanted = [(c * K, c * K + n_harmonics) for c in range(3)] if n_harmonics else []
             raw = self.fc2.some(hidden, [*wanted, (3 * K, 3 * K + 7)])
-        if n_harmonics and particles.turns is None and self.config.quirks == Quirks():
+        if particles.turns is None and self.config.quirks == Quirks():
             wide = torch.float64 if raw.dtype == torch.float64 else torch.float32
             quats, scales, sh = ops.decode_gaussians(
                 raw,
@@ -102,6 +102,8 @@ class GaussianHead(nn.Module):
                 scale_max=self.config.scale_max,
                 check=False,
             )
+            if n_harmonics == 0:
+                return None, quats, scales
             return sh if particles.paint is None else painted(sh, particles.paint), quats, scales
         sh, quats, scales = widened(raw).split([raw.shape[1] - 7, 4, 3], 1)
         quats = unit_quats(quats.roll(1, 1))

@@ -11,7 +11,7 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate.report import write_json
 from gsim3d.files import MAX_TEXT, read_file
 from gsim3d.pareto.measure import Comparison, Effort, Point, measure, points_of, ties
-from gsim3d.pareto.settings import KNOBS, Knob, Setting
+from gsim3d.pareto.settings import KNOBS, NOT_TUNED, Knob, Setting
 from gsim3d.pareto.subject import Subject
 from gsim3d.pareto.timing import Clock, DeviceClock
 from gsim3d.train.restore import Restored
@@ -19,8 +19,6 @@ from gsim3d.train.restore import Restored
 # preset -> share of the reference's gain over the constant baseline, in dB, that it keeps at least
 PROMISES = {"exact": None, "balanced": 0.999, "fast": 0.99}
 SPEEDS = "speeds.json"
-# What is simulated is tuned, not what is looked at nor what is trained; a command compiles longer than it then runs.
-NOT_TUNED = ("image size and decoded frames", "steps a call", "model size", "training steps", "compile")
 
 
 def autotune(
@@ -56,7 +54,7 @@ def autotune(
 
 def tune(comparison: Comparison, points: Sequence[Point], clock: Clock, effort: Effort) -> dict[str, Point]:
     """The setting of each preset, from measured ``points``, of which the first is the reference."""
-    reference = points[0]
+    reference, measured = points[0], {}
 
     def keeping(share: float) -> Callable[[Point], bool]:
         return lambda point: keeps_gain(comparison, point, reference, share)
@@ -64,7 +62,7 @@ def tune(comparison: Comparison, points: Sequence[Point], clock: Clock, effort: 
     found = {"exact": reference}
     for name, share in PROMISES.items():
         if share is not None:
-            found[name] = fastest(comparison, points, keeping(share), clock, effort)
+            found[name] = fastest(comparison, points, keeping(share), clock, effort, measured)
     return found
 
 
@@ -80,8 +78,13 @@ def fastest(
     keeps: Callable[[Point], bool],
     clock: Clock,
     effort: Effort,
+    measured: dict[Setting, Point] | None = None,
 ) -> Point:
-    """The reference with every turn that keeps the promise and saves time, added one by one and measured together."""
+    """The reference with every turn that keeps the promise and saves time, added one by one and measured together.
+
+    measured: what was measured together before; what is now, is added.
+    """
+    measured = {} if measured is None else measured
     reference = points[0]
     useful = [p for p in points[1:] if p.knob not in NOT_TUNED and _faster(p, reference) and keeps(p)]
     best = reference
@@ -92,7 +95,10 @@ def fastest(
         both = _both(best, point)
         if both is None:
             continue
-        measure(comparison, [both], clock, effort)
+        if both.setting not in measured:
+            measured[both.setting] = both
+            measure(comparison, [both], clock, effort)
+        both = measured[both.setting]
         if not both.failure and keeps(both) and _faster(both, best):
             best = both
     return best

@@ -27,6 +27,7 @@ LPIPS and FVD are measured where `gsim3d weights` has installed them; quick leav
 examples:
   gsim3d pareto runs/model runs/data --out runs/pareto
   gsim3d pareto runs/model runs/data --preset full --device cuda --self-check --out runs/pareto
+  gsim3d pareto elastic-small data/elastic-unseen --scenes all --out runs/pareto
   gsim3d pareto runs/model runs/data --others runs/two_a_call runs/larger --out runs/pareto
 """
 
@@ -36,6 +37,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     parser.add_argument("data", metavar="DATA", nargs="?", help="folder with scenes, or one scene folder")
+    parser.add_argument(
+        "--scenes",
+        choices=("test", "all"),
+        default="test",
+        help="which of DATA (default: test, the scenes that `gsim3d train` holds out; all: it is a held-out set)",
+    )
     parser.add_argument("--out", metavar="DIR", required=True, help="folder of the report; made if absent")
     parser.add_argument(
         "--preset", choices=("quick", "full"), default="quick", help="how long to measure (default: quick)"
@@ -221,7 +228,7 @@ def _scenes(args: argparse.Namespace, restored, out, count: int | None) -> list:
         ).folders
     else:
         folders = find_scenes(args.data)
-        folders = split_scenes(folders)[1] or folders
+        folders = folders if args.scenes == "all" else split_scenes(folders)[1] or folders
     return [restored.open_scene(folder) for folder in folders[:count]]
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
+from textwrap import wrap
 
-from gsim3d.evaluate.metrics import PSNR_CAP
 from gsim3d.evaluate.pictures import pyplot
 from gsim3d.pareto.budget import Training
 from gsim3d.pareto.measure import Comparison, Point, disagreement, front
-from gsim3d.pareto.settings import KINDS
+from gsim3d.pareto.settings import KINDS, NOT_TUNED
 from gsim3d.pareto.timing import STAGES
 
 COLORS = {"exact": "#2e8b57", "near-exact": "#1f5fbf", "model": "#c0504d", "needs-training": "#8064a2"}
@@ -20,7 +20,7 @@ AXES = {
     "task": ("PSNR against the truth [dB]", lambda p: p.task.get("psnr_masked", p.task.get("psnr"))),
 }
 PROMISED = {0.999: "99.9 % kept", 0.99: "99 % kept"}
-LEAST_LOSS = 1e-4  # of the gain; what is lost less, or won, is drawn there
+LEAST_LOSS, MOST_LOSS = 1e-4, 3.0  # of the gain; what is lost less, or won, and what is lost more is drawn there
 DPI = 110
 
 
@@ -38,27 +38,25 @@ def cost(points: Sequence[Point], comparison: Comparison, presets: dict[str, Poi
     usable = [p for p in points if shares.get(id(p)) is not None]
 
     def lost(point: Point) -> float:
-        return max(LEAST_LOSS, 1 - shares[id(point)])
+        return min(MOST_LOSS, max(LEAST_LOSS, 1 - shares[id(point)]))
 
-    plt = pyplot()
-    figure, axes = plt.subplots(figsize=(9.5, 6.2), layout="constrained")
-    best = front(usable, lost)
+    figure, axes = pyplot().subplots(figsize=(9.5, 6.4), layout="constrained")
+    best = front([p for p in usable if p.knob not in NOT_TUNED], lost)
     _draw(axes, points, usable, best, lost, labelled=[p for p in best if p not in presets.values()])
-    axes.set(xscale="log", yscale="log", xlabel="time of a simulated step and its images [ms]")
-    axes.set_ylabel("lost share of what the dynamics gains over particles held still")
-    whole = comparison.gain(points[0].by_step, 1) if points[0].by_step else None
-    top = max([0.02, *(1.6 * lost(p) for p in usable)])
-    axes.set_ylim(LEAST_LOSS / 1.8, top)
+    axes.set_ylabel("share of the gain that is lost")
+    axes.set_ylim(LEAST_LOSS / 1.8, 12 * MOST_LOSS)  # room for what is said of the presets
+    ticks = {LEAST_LOSS: "none", 1e-3: "0.1 %", 1e-2: "1 %", 0.1: "10 %", 1.0: "100 %", MOST_LOSS: "more"}
+    axes.set_yticks(list(ticks), list(ticks.values()))
+    axes.minorticks_off()
+    _plain_times(axes)
     for share, text in PROMISED.items():
         axes.axhline(1 - share, color="#444444", linewidth=1, linestyle="--", zorder=1)
         axes.text(1.005, 1 - share, text, transform=axes.get_yaxis_transform(), va="center", fontsize=9)
     axes.axhspan(LEAST_LOSS / 1.8, LEAST_LOSS * 1.25, color="#eef5ee", zorder=0)
-    axes.text(
-        0.005, LEAST_LOSS * 1.3, "nothing lost", transform=axes.get_yaxis_transform(), fontsize=8, color="#2e8b57"
-    )
     _mark_presets(axes, presets, points[0], lost, shares)
-    gain = "" if whole is None else f" (the whole gain: {whole:.2f} dB)"
-    axes.set_title(f"What 99.9 % and 99 % of the accuracy cost{gain}", fontsize=11)
+    gain = comparison.gain(points[0].by_step)
+    whole = "" if gain is None else f" (the gain: {gain:.2f} dB over particles held still)"
+    axes.set_title(f"What 99.9 % and 99 % of the model's gain cost{whole}", fontsize=11)
     return _png(figure)
 
 
@@ -67,15 +65,16 @@ def _mark_presets(axes, presets: dict[str, Point], reference: Point, lost, share
     for name, point in presets.items():
         if shares.get(id(point)) is not None:
             named.setdefault(id(point), (point, []))[1].append(name)
-    for place, (point, names) in enumerate(named.values()):
+    for place, (point, names) in enumerate(sorted(named.values(), key=lambda found: found[0].step_seconds)):
         x, y = 1e3 * point.step_seconds, lost(point)
         faster = reference.step_seconds / point.step_seconds
-        axes.plot(x, y, "*", color="#e0a030", markersize=20, markeredgecolor="#444444", zorder=5)
-        text = f"{' = '.join(names)}: {x:.3g} ms, {faster:.2f}x as fast"
+        axes.plot(x, y, "*", color="#e0a030", markersize=18, markeredgecolor="#444444", zorder=5)
+        text = f"{' = '.join(names)}: {x:.3g} ms a step"
         if point is not reference:
-            text += f"\n{point.setting.name}\nkeeps {100 * min(1, shares[id(point)]):.2f} %"
+            kept = f"keeps {100 * min(1, shares[id(point)]):.2f} %, {faster:.2f} times as fast"
+            text = "\n".join([text, *wrap(point.setting.name, 36), kept])
         axes.annotate(
-            text, (x, y), (0.02 + 0.36 * (place % 3), 0.965), textcoords="axes fraction", va="top", fontsize=8.5,
+            text, (x, y), (0.015 + 0.345 * place, 0.98), textcoords="axes fraction", va="top", fontsize=8.5,
             zorder=6,
             bbox={"boxstyle": "round", "facecolor": "#fff8e8", "edgecolor": "#e0a030"},
             arrowprops={"arrowstyle": "-", "color": "#e0a030", "linewidth": 1},
@@ -93,8 +92,8 @@ def scatter(points: Sequence[Point], axis: str) -> bytes:
         return 10 ** (-value(point) / 20)
 
     _draw(axes, points, usable, best, error, labelled=best)
-    axes.set(xscale="log", yscale="log", xlabel="time of a simulated step and its images [ms]")
     axes.set_ylabel("root mean squared error of images")
+    _plain_times(axes)
     second = axes.secondary_yaxis("right", functions=(_decibel, _error))
     second.set_ylabel(label)
     low, high = (_decibel(y) for y in reversed(axes.get_ylim()))
@@ -108,10 +107,16 @@ def scatter(points: Sequence[Point], axis: str) -> bytes:
 def _draw(axes, points: Sequence[Point], usable, best, error: Callable[[Point], float], labelled) -> None:
     """Points, the front through them, and what failed at the edge; numbers are those of the table."""
     number = {id(p): n for n, p in enumerate(points)}
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="time of a simulated step and its images [ms]; bars: rounds differ by so much",
+    )
     for point in usable:
         chosen = point in best or point is points[0]
         x, y, color = 1e3 * point.step_seconds, error(point), COLORS[point.kind] if chosen else GREY
         axes.plot(x, y, "o", color=color, markersize=8 if chosen else 5, zorder=4 if chosen else 3)
+        axes.errorbar(x, y, xerr=500 * point.spread, fmt="none", ecolor="#d0d0d0", zorder=2)
         text = f"{number[id(point)]}" + (f" {point.setting.name}" if point in labelled or point is points[0] else "")
         axes.annotate(
             text, (x, y), (5, 4), textcoords="offset points", fontsize=8 if chosen else 7, color=color, zorder=4
@@ -129,10 +134,19 @@ def _draw(axes, points: Sequence[Point], usable, best, error: Callable[[Point], 
     axes.legend(fontsize=7.5, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.1))
 
 
+def _plain_times(axes) -> None:
+    """Milliseconds as plain numbers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
 def _decibel(error):
     import numpy as np
 
-    return -20 * np.log10(np.maximum(error, 10 ** (-PSNR_CAP / 20)))
+    return -20 * np.log10(np.maximum(error, 1e-12))
 
 
 def _error(decibel):

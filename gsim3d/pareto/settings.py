@@ -304,3 +304,5 @@ KNOBS = (
         "a run folder with earlier checkpoints, or `--others`; the log has a figure of its own",
     ),
 )
+# What is simulated is tuned, not what is looked at nor what is trained; a command compiles longer than it then runs.
+NOT_TUNED = ("image size and decoded frames", "steps a call", "model size", "training steps", "compile")

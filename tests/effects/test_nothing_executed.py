@@ -26,10 +26,7 @@ EFFECTS = {
     "changing features": ("latent", {}, {"appearance": {"changing": "none"}}, {"aten.tanh.default": 2}),
     "changing opacities": ("explicit", {}, {"appearance": {"opacity_changes": False}}, {"aten.clamp.default": 2}),
     "feature images": ("latent", {"outputs": {"features": True}}, {}, {"aten.cat.default": 1}),
-    "colour images": (
-        "latent", {"outputs": ALL_IMAGES}, {"outputs": {"rgb": False, **ALL_IMAGES}},
-        {"gsim3d.decode_gaussians.default": 1},
-    ),
+    "colour images": ("latent", {"outputs": ALL_IMAGES}, {"outputs": {"rgb": False, **ALL_IMAGES}}, {}),
 }  # fmt: skip
 
 

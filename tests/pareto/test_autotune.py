@@ -81,6 +81,10 @@ def test_turns_that_keep_the_promise_are_added_up(subject, comparison, monkeypat
     best = autotune.fastest(comparison, [reference, *turns], lambda p: p.agreement.psnr >= 50, None, SHORT)
     assert best.setting == Setting(history=1, grid=2.0)
     assert measured == [Setting(history=1, grid=2.0)]
+    again = autotune.fastest(
+        comparison, [reference, *turns], lambda p: p.agreement.psnr >= 40, None, SHORT, {best.setting: best}
+    )
+    assert again is best and len(measured) == 1  # nothing is measured twice
 
 
 def test_limits_are_kept(subject):

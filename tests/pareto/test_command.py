@@ -1,15 +1,18 @@
 """The command on a real scene: one page without a network, and numbers that agree between its files."""
 
 import csv
+import importlib.util
 import json
 import re
 from html import escape
+from pathlib import Path
 
 import pytest
 
 from gsim3d.__main__ import main
 from gsim3d.ablate.rows import ROWS
 from gsim3d.pareto import budget, command, published, report
+from gsim3d.pareto.autotune import SPEEDS
 from gsim3d.pareto.measure import Comparison, Point, measure
 from gsim3d.pareto.settings import Setting
 from gsim3d.pareto.timing import DeviceClock
@@ -17,12 +20,20 @@ from tests.pareto.test_autotune import SHORT
 from tests.pareto.test_budget import write_log
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+ROOT = Path(__file__).parents[2]
 REGIMES = {"throughput": [], "training": {"problem": "no configuration"}, "gpu": []}
 CONDITIONS = {
     "regimes": REGIMES,
     "command": "gsim3d pareto <x>",
     "machine": {"device": "here"},
-    "subject": {"steps": 4, "history": 2, "steps_a_call": {"": 1}},
+    "subject": {
+        "checkpoint": "1f",
+        "scenes": 2,
+        "steps": 4,
+        "image": "32 x 32 pixels",
+        "history": 2,
+        "steps_a_call": {"": 1},
+    },
     "self_check": ["holds: a"],
     "not_turned": {"fp8 products": "a GPU <sic>"},
     "not_measured": {"fvd": "run gsim3d weights fvd"},
@@ -143,3 +154,22 @@ def test_wrong_arguments_are_one_line(capsys, tmp_path):
     error = capsys.readouterr().err.strip().splitlines()
     assert len(error) == 2 and "'volume' does not exist; knobs: 'precision'" in error[1]
     assert not (tmp_path / "out").exists()
+
+
+def test_a_report_goes_into_the_documentation(written, tmp_path, monkeypatch):
+    spec = importlib.util.spec_from_file_location("ship_report", ROOT / "tools" / "ship_report.py")
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    monkeypatch.setattr(tool, "DOCS", tmp_path)
+    page = tool.write_page("ball-small", {"cpu": written[0]}, tmp_path).read_text()
+    for picture in re.findall(r"\]\((\S+\.png)\)", page):
+        assert (tmp_path / picture).is_file()
+    assert page.count(".png)") == len(tool.PICTURES)
+    assert "gsim3d pareto <x>" in page and "failed: out of memory at step 3" in page and "holds: a" in page
+    assert "| 1 | history 1 | model |" in page
+    reports = {name: tmp_path / name for name in ("cpu", "h200")}
+    for (name, folder), device in zip(reports.items(), ("cpu", "cuda"), strict=True):
+        folder.mkdir()
+        (folder / SPEEDS).write_text(json.dumps({"1f": {device: {"fast": {"history": 1}}}}))
+    kept = json.loads(tool.keep_speeds(tmp_path, reports).read_text())
+    assert kept == {"1f": {"cpu": {"fast": {"history": 1}}, "cuda": {"fast": {"history": 1}}}}

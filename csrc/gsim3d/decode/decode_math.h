@@ -103,7 +103,8 @@ GSIM3D_HD void decode_row(const S* raw, int terms, const S* readings, S scale_mi
   const raster::Rotation<S> rotation = rotation_of_row(raw, terms);
   for (int i = 0; i < 4; ++i) quat[i] = rotation.unit[i];
   for (int i = 0; i < 3; ++i) scale[i] = scale_min + (scale_max - scale_min) * sigmoid(raw[3 * terms + 4 + i]);
-  for (int c = 0; c < 3; ++c) sh[c] = raw[c * terms];
+  if constexpr (kDegree >= 0)
+    for (int c = 0; c < 3; ++c) sh[c] = raw[c * terms];
   if constexpr (kDegree >= 1) turn_level<1>(raw, terms, readings, rotation.r, sh);
   if constexpr (kDegree >= 2) turn_level<2>(raw, terms, readings, rotation.r, sh);
   if constexpr (kDegree >= 3) turn_level<3>(raw, terms, readings, rotation.r, sh);
@@ -120,7 +121,7 @@ GSIM3D_HD void decode_row_vjp(S* raw, int terms, const S* readings, S scale_min,
   if constexpr (kDegree >= 3) turn_level_vjp<3>(raw, terms, readings, rotation.r, grad_sh, raw, grad_r);
   constexpr int kKept = (kDegree + 1) * (kDegree + 1);
   for (int c = 0; c < 3; ++c) {
-    raw[c * terms] = grad_sh[c];
+    if constexpr (kDegree >= 0) raw[c * terms] = grad_sh[c];
     for (int k = kKept; k < terms; ++k) raw[c * terms + k] = S(0);
   }
   raster::rotation_of_vjp(rotation, grad_r, by_rotation);
@@ -135,10 +136,11 @@ GSIM3D_HD void decode_row_vjp(S* raw, int terms, const S* readings, S scale_min,
   }
 }
 
-// Calls f.template operator()<kDegree>() for a degree of 0 to 3.
+// Calls f.template operator()<kDegree>() for a degree of -1 to 3.
 template <typename F>
 void with_degree(int degree, const F& f) {
   switch (degree) {
+    case -1: return f.template operator()<-1>();
     case 0: return f.template operator()<0>();
     case 1: return f.template operator()<1>();
     case 2: return f.template operator()<2>();

@@ -31,11 +31,11 @@ ScalarType wide_type(const Tensor& raw) {
 DecodeShape check_rows(const char* op, const Tensor& raw, const Tensor& readings, int64_t degree, double scale_min,
                        double scale_max) {
   check_shape(op, "raw", raw, {-1, -1}, "[N, C]");
-  check(degree >= 0 && degree <= kLargestDegree, op, ": degree must be 0 to 3; got ", degree);
-  int terms = 0;
-  for (int d = 0; d <= kLargestDegree; ++d)
+  check(degree >= -1 && degree <= kLargestDegree, op, ": degree must be -1 to 3; got ", degree);
+  int terms = -1;
+  for (int d = -1; d <= kLargestDegree; ++d)
     if (raw.size(1) == 3 * (d + 1) * (d + 1) + 7) terms = (d + 1) * (d + 1);
-  check(terms >= (degree + 1) * (degree + 1), op, ": raw must have 3 K + 7 columns with K = 1, 4, 9 or 16, at least ",
+  check(terms >= (degree + 1) * (degree + 1), op, ": raw must have 3 K + 7 columns with K = 0, 1, 4, 9 or 16, at least ",
         (degree + 1) * (degree + 1), "; got ", raw.size(1));
   check(scale_min >= 0 && scale_max >= scale_min && scale_max <= kLargestScale, op,
         ": scale_min and scale_max must rise from 0 to at most ", kLargestScale, "; got ", scale_min, " and ",

@@ -301,9 +301,9 @@ def _norm_gelu(rng: random.Random) -> Arguments:
 
 
 def _decode(rng: random.Random) -> Arguments:
-    degree = rng.randrange(4)
+    degree = rng.randrange(-1, 4)
     raw = tensor(rng, _size(rng), 3 * (degree + 1) ** 2 + 7, dtype=_dtype(rng))
-    return {"raw": raw, "degree": rng.randint(0, degree), "scale_min": 0.001, "scale_max": 0.1}
+    return {"raw": raw, "degree": rng.randint(-1, degree), "scale_min": 0.001, "scale_max": 0.1}
 
 
 def _call_decode(a: Arguments):
