@@ -27,7 +27,7 @@ class Branches:
 
     def __init__(self, like: Tensor):
         captured = like.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
-        self._streams = _streams(like.device, torch.cuda.current_stream(like.device).cuda_stream) if captured else ()
+        self._streams = _streams(like.device) if captured else ()
         self._count, self._read = 0, []
 
     def __enter__(self) -> Branches:
@@ -51,6 +51,5 @@ class Branches:
 
 
 @functools.lru_cache(maxsize=None)
-def _streams(device: torch.device, parent: int) -> tuple[torch.cuda.Stream, ...]:
-    """Those that branch off from the stream ``parent`` alone; on shared ones, branches of branches would wait."""
+def _streams(device: torch.device) -> tuple[torch.cuda.Stream, ...]:
     return tuple(torch.cuda.Stream(device) for _ in range(N_STREAMS))

@@ -11,21 +11,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, pairwise
+from itertools import chain
 
 import torch
 from torch import Tensor, nn
 
-from gsim3d.branches import Branches
 from gsim3d.dynamics import DynamicsConfig, concatenate
 from gsim3d.encoder import Room
-from gsim3d.encoder.heads import PixelRays
-from gsim3d.encoder.room import ViewGeometry
 from gsim3d.errors import InputError
 from gsim3d.graphs import Captured, with_background_as_it_is
 from gsim3d.ops import PyramidCapacity
@@ -34,15 +30,12 @@ from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport
 from gsim3d.train.samples import Batch
-from gsim3d.types import ASLEEP, DYNAMIC, CloudTable, Frames, Particles
+from gsim3d.types import ASLEEP, DYNAMIC, Frames, Particles
 
 FACTOR = 1.3  # room for geometry over what was observed: little costs captures, much costs time in every step
 ROWS_FACTOR = 1.15  # likewise, for the particles of a cloud
 ROW_UNIT = 256  # rows of a cloud are a multiple of it
 MOST_KINDS = 2  # of steps whose graphs are kept at a time
-CHAINS = int(
-    os.environ.get("CHAINS", "2")
-)  # parts of a batch that are simulated side by side: their kernels are too small for a GPU
 
 
 @dataclass(frozen=True)
@@ -149,175 +142,32 @@ class _Step:
     """A step of one kind, with ``rows`` rows a cloud."""
 
     def __init__(self, owner: CapturedLoss, rows: int, batch: Batch, weights: Tensor):
-        self._owner, self.rows, self._is_ready = owner, rows, False
+        self._owner, self.rows, self._capacities, self._is_ready = owner, rows, [], False
         self._graph = self._records = None
-        self._context, self._targets, self._weights = _own(batch.context), _own(batch.targets), weights.clone()
+        self._context, self._targets = _own(batch.context), _own(batch.targets)
         self._room = owner.simulator.encoder.room(batch.context, rows)
-        n_scenes = len(batch.context.origin)
-        n_parts = min(n_scenes, CHAINS) if batch.n_future else 1
-        bounds = [n_scenes * k // n_parts for k in range(n_parts + 1)]
-        shares = [_Share(begin, end, n_scenes) for begin, end in pairwise(bounds)]
-        self._parts = [_Part(owner, batch, share, *self._seen_by(share), self._weights) for share in shares]
+        self._n_lead, self._n_future, self._weights = batch.n_lead, batch.n_future, weights.clone()
 
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
         self._load(prepared, weights)
         if not self._is_ready:
-            for part in self._parts:
-                part.observe()
+            self._capacities = self._observed()
             self._capture()
         while True:
-            results, found, records = self._replay()
-            # All parts are asked: each takes the room that it needs.
-            if all([part.fits(numbers) for part, numbers in zip(self._parts, found.tolist(), strict=True)]):
+            loss, errors, norm, gradients, found, records = self._replay()
+            numbers = found.tolist()
+            if all([capacity.fits(row) for capacity, row in zip(self._capacities, numbers, strict=True)]):
                 break
-            self._graph = self._records = results = found = None  # their memory goes back first
+            self._graph = self._records = loss = errors = gradients = found = None  # their memory goes back first
+            grown = (c.grown(row, FACTOR) for c, row in zip(self._capacities, numbers, strict=True))
+            # What was too small for one step will soon be too small for others.
+            most = [max(sizes) for sizes in zip(*(capacity.sizes for capacity in self._observed()), strict=True)]
+            self._capacities = [capacity.grown((0, *most), 1) for capacity in grown]
             self._capture()
         records.replayed(report)
-        return Gradients(*results)
+        return Gradients(loss, errors, norm, gradients)
 
-    def _seen_by(self, share: _Share) -> tuple[Frames, Frames, Room]:
-        """What a part reads, in the memory of the whole."""
-        return share.of_frames(self._context), share.of_frames(self._targets), share.of_room(self._room)
-
-    def _compute(self, report: StabilityReport) -> tuple:
-        if len(self._parts) == 1:
-            loss, errors, gradients, found = self._parts[0].compute(report)
-            found = found[None]
-        else:
-            with Branches(self._weights) as beside:
-                parts = [beside.run(part.compute, report) for part in self._parts]
-            losses, errors, gradients, found = zip(*parts, strict=True)
-            loss, errors, found = sum(losses), sum(errors), torch.stack(found)
-            gradients = tuple(_sums(gradients))
-        norm = torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
-        return (loss, errors, norm, gradients), found
-
-    def _capture(self) -> None:
-        self._owner.captures += 1
-        self._is_ready = False
-        if self._weights.device.type == "cuda":
-            torch.cuda.empty_cache()
-            self._records = StabilityReport()
-
-            def function() -> tuple:
-                capturing = torch.cuda.is_current_stream_capturing()
-                return self._compute(self._records if capturing else StabilityReport())
-
-            with self._owner.alone:
-                self._graph = Captured(function, self._weights.device)
-        self._is_ready = True
-
-    def _replay(self) -> tuple:
-        if self._graph is None:
-            records = StabilityReport()
-            return *self._compute(records), records
-        return *self._graph(), self._records
-
-    @torch.no_grad()
-    def _load(self, prepared: Prepared, weights: Tensor) -> None:
-        """Copies a batch to where the graph reads it."""
-        self._room.copy_(prepared.room)
-        self._weights.copy_(weights)
-        batch = prepared.batch
-        for own, given in ((self._context, batch.context), (self._targets, batch.targets)):
-            for mine, value in ((own, given), (own.cameras, given.cameras)):
-                for name, tensor in vars(value).items():
-                    if isinstance(tensor, Tensor):
-                        getattr(mine, name).copy_(tensor)
-
-
-@dataclass(frozen=True)
-class _Share:
-    """Scenes from ``begin`` to ``end`` of ``n``, all of which have as many clouds and images."""
-
-    begin: int
-    end: int
-    n: int
-
-    def __call__(self, x: Sequence) -> Sequence:
-        return x[len(x) * self.begin // self.n : len(x) * self.end // self.n]
-
-    def of_frames(self, frames: Frames) -> Frames:
-        """Views of the tensors of ``frames``, but for numbers of scenes and clouds."""
-        first_cloud = len(frames.cloud_scene) * self.begin // self.n
-        cameras = frames.cameras.map(self)
-        cameras = dataclasses.replace(cameras, image_cloud=cameras.image_cloud - first_cloud)
-        return dataclasses.replace(frames.map(self), cameras=cameras, cloud_scene=self(frames.cloud_scene) - self.begin)
-
-    def of_room(self, room: Room) -> Room:
-        table, geometry = room.clouds, room.geometry
-        scenes, steps = [scene - self.begin for scene in self(table.scenes)], self(table.steps)
-        rays = PixelRays(*(self(x) for x in vars(geometry.rays).values()))
-        geometry = ViewGeometry(rays, self(geometry.homographies), self(geometry.translations))
-        return Room(CloudTable.make([room.size] * len(steps), scenes, steps, table.tensors[0].device), geometry)
-
-
-class _Part:
-    """Some scenes of a step: nothing of one part waits for another."""
-
-    def __init__(
-        self,
-        owner: CapturedLoss,
-        batch: Batch,
-        share: _Share,
-        context: Frames,
-        targets: Frames,
-        room: Room,
-        weights: Tensor,
-    ):
-        self._owner, self._context, self._targets, self._room = owner, context, targets, room
-        self._n_lead, self._n_future, self._weights = batch.n_lead, batch.n_future, weights
-        self._share = (share.end - share.begin) / share.n
-        self._capacities: list[PyramidCapacity] = []
-
-    def observe(self) -> None:
-        """Makes room for the geometry of what was loaded."""
-        self._capacities = self._observed()
-
-    def fits(self, found: list[list[int]]) -> bool:
-        """Whether there was room for what the geometry of each step found; if not, there will be."""
-        if all([capacity.fits(row) for capacity, row in zip(self._capacities, found, strict=True)]):
-            return True
-        grown = (c.grown(row, FACTOR) for c, row in zip(self._capacities, found, strict=True))
-        # What was too small for one step will soon be too small for others.
-        most = [max(sizes) for sizes in zip(*(capacity.sizes for capacity in self._observed()), strict=True)]
-        self._capacities = [capacity.grown((0, *most), 1) for capacity in grown]
-        return False
-
-    def compute(self, report: StabilityReport) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...], Tensor]:
-        """This part's share of loss, errors and gradients, with geometry of the sizes of this object; and what the
-        geometry of every step found."""
-        owner, dynamics, of_calls = self._owner, self._owner.simulator.dynamics, []
-        sizes, found = iter(self._capacities), []
-
-        def geometry(history: Particles) -> Pyramid:
-            found.append(dynamics.geometry(history, capacity=next(sizes)))
-            return found[-1]
-
-        def with_own_weights(predict: Callable[[Particles], Particles]) -> Callable[[Particles], Particles]:
-            def call(state: Particles) -> Particles:
-                with _aliased(dynamics) as aliases:
-                    of_calls.append(aliases)
-                    return predict(state)
-
-            return call
-
-        state = self._encode(report)
-        particles = concatenate([state, *self._rollout(state, geometry, report, with_own_weights)])
-        with owner.precision("renderer"):
-            options = {"plan": owner.plan, "report": report, "on_bad": "drop"}
-            images = owner.simulator.draw(particles, self._targets.cameras, **options).color
-        loss, errors = (self._share * x for x in owner.loss(images, self._targets, self._weights))
-        once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]
-        gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
-        known = dict(zip(once, gradients))
-        if of_calls:
-            n = len(of_calls[0])
-            by_call = [gradients[begin : begin + n] for begin in range(len(once), len(gradients), n)]
-            known |= zip(dynamics.parameters(), _sums(by_call[::-1]), strict=True)
-        gradients = tuple(known.get(parameter) for parameter in owner.parameters)
-        found = torch.stack([p.found for p in found]) if found else self._weights.new_empty(0)
-        return loss.detach(), errors, gradients, found
+    # ---- what runs ----
 
     def _encode(self, report: StabilityReport) -> Particles:
         with self._owner.precision("encoder"):
@@ -343,6 +193,35 @@ class _Part:
                     state = concatenate([state, *rollout(state, self._n_lead)])
             return rollout(state, self._n_future, wrap=wrap)
 
+    def _compute(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> tuple:
+        owner, dynamics, of_calls = self._owner, self._owner.simulator.dynamics, []
+
+        def with_own_weights(predict: Callable[[Particles], Particles]) -> Callable[[Particles], Particles]:
+            def call(state: Particles) -> Particles:
+                with _aliased(dynamics) as aliases:
+                    of_calls.append(aliases)
+                    return predict(state)
+
+            return call
+
+        state = self._encode(report)
+        particles = concatenate([state, *self._rollout(state, geometry, report, with_own_weights)])
+        with owner.precision("renderer"):
+            images = owner.simulator.draw(
+                particles, self._targets.cameras, plan=owner.plan, report=report, on_bad="drop"
+            ).color
+        loss, errors = owner.loss(images, self._targets, self._weights)
+        once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]
+        gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
+        known = dict(zip(once, gradients))
+        if of_calls:
+            n = len(of_calls[0])
+            parts = [gradients[begin : begin + n] for begin in range(len(once), len(gradients), n)]
+            known |= zip(dynamics.parameters(), _sums(parts[::-1]), strict=True)
+        gradients = tuple(known.get(parameter) for parameter in owner.parameters)
+        norm = torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
+        return loss.detach(), errors, norm, gradients
+
     @torch.no_grad()
     def _observed(self) -> list[PyramidCapacity]:
         """What the geometry of each step needs, with room."""
@@ -356,6 +235,50 @@ class _Part:
         if self._n_future:
             self._rollout(self._encode(StabilityReport()), geometry, StabilityReport())
         return needed
+
+    def _given(self, report: StabilityReport) -> tuple:
+        """With geometry of the sizes of this object."""
+        sizes, found = iter(self._capacities), []
+
+        def geometry(history: Particles) -> Pyramid:
+            found.append(self._owner.simulator.dynamics.geometry(history, capacity=next(sizes)))
+            return found[-1]
+
+        computed = self._compute(geometry, report)
+        return *computed, torch.stack([p.found for p in found]) if found else self._weights.new_empty(0)
+
+    def _capture(self) -> None:
+        self._owner.captures += 1
+        self._is_ready = False
+        if self._weights.device.type == "cuda":
+            torch.cuda.empty_cache()
+            self._records = StabilityReport()
+
+            def function() -> tuple:
+                capturing = torch.cuda.is_current_stream_capturing()
+                return self._given(self._records if capturing else StabilityReport())
+
+            with self._owner.alone:
+                self._graph = Captured(function, self._weights.device)
+        self._is_ready = True
+
+    def _replay(self) -> tuple:
+        if self._graph is None:
+            records = StabilityReport()
+            return *self._given(records), records
+        return *self._graph(), self._records
+
+    @torch.no_grad()
+    def _load(self, prepared: Prepared, weights: Tensor) -> None:
+        """Copies a batch to where the graph reads it."""
+        self._room.copy_(prepared.room)
+        self._weights.copy_(weights)
+        batch = prepared.batch
+        for own, given in ((self._context, batch.context), (self._targets, batch.targets)):
+            for mine, value in ((own, given), (own.cameras, given.cameras)):
+                for name, tensor in vars(value).items():
+                    if isinstance(tensor, Tensor):
+                        getattr(mine, name).copy_(tensor)
 
 
 @contextmanager

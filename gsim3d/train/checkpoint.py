@@ -245,3 +245,8 @@ def _sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def laid_out_as(weight: Tensor, value: Tensor) -> Tensor:
+    """``value`` with device and strides of ``weight``: few kernels update tensors that are alike, else one for each."""
+    return torch.empty_like(weight, dtype=value.dtype, requires_grad=False).copy_(value)

@@ -104,7 +104,6 @@ class Trainer:
             betas=(settings.beta1, settings.beta2),
             eps=settings.eps,
             weight_decay=settings.weight_decay,
-            fused=device == "cuda",
         )
         self.average = {k: v.clone() for k, v in self.simulator.state_dict().items()} if settings.ema_decay else {}
         self.scale = LossScale(FIRST_SCALE if config.precision.scales_loss else 1.0)
@@ -263,9 +262,7 @@ class Trainer:
             norm = torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
         return loss, errors, gradients, norm, list(seen)
 
-    def _look_at(
-        self, entry: dict, loss: float, gradients: Sequence[Tensor | None], norm: Tensor, seen: list[Seen]
-    ) -> str | None:
+    def _look_at(self, entry: dict, loss: float, gradients: Sequence, norm: Tensor, seen: list[Seen]) -> str | None:
         """Hands the gradients to the optimizer, clipped, and fills in ``entry``; why they cannot be used, or None."""
         named = dict(zip(self.parameters, gradients, strict=True))
         for name, parameter in self.parameters.items():
@@ -273,9 +270,8 @@ class Trainer:
         if self._is_logged:
             entry["grad_norm_by_module"] = norms_by_module(named)
         entry["loss"] = loss
-        torch.nn.utils.clip_grads_with_norm_(
-            self.parameters.values(), self.config.optimizer.clip_norm or math.inf, norm
-        )
+        limit = self.config.optimizer.clip_norm or math.inf
+        torch.nn.utils.clip_grads_with_norm_(self.parameters.values(), limit, norm)
         entry["grad_norm"] = norm.item()
         if self._is_logged and (by_step := mean_of_norms([part.norms for part in seen])):
             entry["grad_norm_by_step"] = by_step
@@ -511,11 +507,15 @@ class Trainer:
         self.same_scenes = known == names
         self.simulator.load_state_dict(saved.model)
         if self.average:
-            self.average = {name: value.to(self.device) for name, value in saved.ema.items()}
+            weights = self.simulator.state_dict()
+            self.average = {name: checkpoint.laid_out_as(weights[name], value) for name, value in saved.ema.items()}
         for key, value in saved.optimizer.items():
             kind, name = key.split(".", 1)
             if name in self.parameters:
-                self.optimizer.state[self.parameters[name]][kind] = value.to(self.device)
+                parameter = self.parameters[name]
+                # AdamW counts its steps on the host.
+                value = value if kind == "step" else checkpoint.laid_out_as(parameter, value)
+                self.optimizer.state[parameter][kind] = value
         self.step, self.n_skipped = saved.state["step"], saved.state["n_skipped"]
         self.n_skipped_in_a_row = saved.state.get("n_skipped_in_a_row", 0)
         self.seconds, self.parent = saved.state["seconds"], saved.digest

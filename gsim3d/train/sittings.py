@@ -94,13 +94,14 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
     )
     try:
         trainer.simulator.load_state_dict({key: value + difference[key] for key, value in averaged.items()})
-        trainer.average = {key: value.to(trainer.device) for key, value in averaged.items()}
+        weights = trainer.simulator.state_dict()
+        trainer.average = {key: checkpoint.laid_out_as(weights[key], value) for key, value in averaged.items()}
         for key, value in squares.items():
             parameter = trainer.parameters[key]
             trainer.optimizer.state[parameter] = {
-                "step": torch.tensor(float(progress.step), device=parameter.device),
+                "step": torch.tensor(float(progress.step)),
                 "exp_avg": torch.zeros_like(parameter),
-                "exp_avg_sq": value.to(parameter),
+                "exp_avg_sq": checkpoint.laid_out_as(parameter, value),
             }
     except (RuntimeError, KeyError) as error:
         raise InputError(

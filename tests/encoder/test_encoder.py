@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 from torch.nn import functional as F
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsim3d.encoder import Encoder, EncoderConfig, pixel_rows
 from gsim3d.encoder.depth import Views, feature_intrinsics, upsample, upsampling_matrix
@@ -408,3 +409,37 @@ def test_room_is_for_clouds_of_equal_views_in_order():
     for clouds in ([0, 0, 1], [1, 0]):
         with pytest.raises(InputError, match="image_cloud"):
             make_encoder().room(make_frames(clouds), 100)
+
+
+class Calls(TorchDispatchMode):
+    """Names of all operators that are called, of backward passes too."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = set()
+
+    def __torch_dispatch__(self, function, types, arguments=(), options=None):
+        self.names.add(function.overloadpacket.__name__)
+        return function(*arguments, **(options or {}))
+
+
+@pytest.mark.parametrize("explicit", [False, True])
+def test_nothing_waits_for_the_device_in_given_room(explicit):
+    """Nor is anything sent there: operators that read numbers or make tensors of them are not called."""
+    encoder, frames = make_encoder(explicit=explicit), make_frames([0, 0, 1, 1])
+    frames = dataclasses.replace(frames, masks=frames.images[:, 0] < 0.4, dynamic=frames.images[:, 1] < 0.5)
+    room = encoder.room(frames, 250)
+    encoder(frames, room)  # makes constants
+    waiting = {"_local_scalar_dense", "item", "equal", "nonzero", "_unique2", "masked_select", "lift_fresh"}
+    waiting |= {"linalg_inv_ex", "_linalg_check_errors", "is_nonzero", "repeat_interleave"}
+    waiting -= {"lift_fresh"} if explicit else set()  # a number written into a slice, which a GPU fills
+
+    def names(*arguments):
+        with Calls() as calls:
+            particles = encoder(frames, *arguments)
+            loss = sum(getattr(particles, name).square().sum() for name in ROW_FIELDS)
+            torch.autograd.grad(loss, list(encoder.parameters()), allow_unused=True)
+        return calls.names & waiting
+
+    assert not names(room)
+    assert {"_local_scalar_dense", "nonzero", "linalg_inv_ex"} <= names()
