@@ -120,7 +120,7 @@ def work_of(spans: list[tuple[str, float, float]], whole_ms: float, joules: floa
 def training_step(subject: Subject, clock: Clock, repeats: int = 3, quick: bool = False) -> TrainingStep:
     """Trains on the subject's scenes from new weights, and keeps nothing.
 
-    quick: one scene at a time, and only as many steps as get gradients.
+    quick: one scene at a time, only as many steps as get gradients, and none before it is timed.
     """
     saved = subject.restored.checkpoint.config.get("train")
     if saved is None:
@@ -134,7 +134,7 @@ def training_step(subject: Subject, clock: Clock, repeats: int = 3, quick: bool 
         with tempfile.TemporaryDirectory() as folder, deterministic():
             trainer = Trainer(config, subject.scenes, folder, device=subject.restored.device.type)
             trainer.simulator.train()
-            timing = time_call(trainer.train_step, clock, repeats, warm_up=1)
+            timing = time_call(trainer.train_step, clock, repeats, warm_up=0 if quick else 1)
     except InputError as error:
         return TrainingStep(problem=str(error))
     return TrainingStep(stage.batch, stage.horizon, timing)
