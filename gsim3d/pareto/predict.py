@@ -139,8 +139,8 @@ def _by_span(simulated: Sequence[Stages], shown: Sequence[Stages], span: int) ->
 
 
 def timing_of(spent: Sequence[Stages], warm_up: int) -> Timing:
-    """Of spans of all scenes; the first ``warm_up`` do not count where others are left."""
-    counted = spent[warm_up:] or spent
+    """Of spans of all scenes; the first ``warm_up`` do not count where most are left."""
+    counted = spent[warm_up:] if len(spent) > 2 * warm_up else spent
     names = dict.fromkeys(name for stages in counted for name in stages)
     medians = {name: statistics.median(stages.get(name, 0.0) for stages in counted) for name in names}
     return Timing(tuple(sum(stages.values()) for stages in counted), medians)
