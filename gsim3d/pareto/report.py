@@ -66,7 +66,7 @@ def as_dict(
         "kinds": KINDS,
         "points": rows,
         "presets": {name: _promise(point, points, rows) for name, point in presets.items()},
-        "horizons": _horizons(comparison, {"reference": reference, **presets}),
+        "horizons": _horizons(comparison, {**presets, "exact": reference}),
         "training": budget.as_dict(training),
     }
     return {**content, "published": published.beside(content)}
