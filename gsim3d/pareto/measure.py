@@ -12,8 +12,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr
 from gsim3d.evaluate.scoring import METRICS, PLAIN_METRICS, SceneScores, SceneTruth
+from gsim3d.graphs import CaptureError
 from gsim3d.pareto.predict import Predicted, Unusable, predict_together, timing_of
 from gsim3d.pareto.runner import Runner
 from gsim3d.pareto.settings import KNOBS, Knob, Setting, turned
@@ -342,6 +344,8 @@ def time_points(
                     _time(subject, point, clock, effort)
                 except torch.OutOfMemoryError:
                     point.failure = "out of memory while timed"
+                except (CaptureError, InputError) as error:
+                    point.failure = str(error)
 
 
 def time_encodings(
