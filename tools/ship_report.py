@@ -6,8 +6,8 @@ package.
     gsim3d pareto elastic-small DATA --scenes all --device cuda --self-check --out runs/h200
     python tools/ship_report.py elastic-small cpu=runs/cpu h200=runs/h200
 
-Every DIR holds report.json and the pictures, and speeds.json where `gsim3d pareto` could not write beside the checkpoint.
-Written: docs/cost-NAME.md and its pictures; NAME's speeds.json for `gsim3d simulate --speed`.
+Every DIR holds report.json and the pictures, and speeds.json where `gsim3d pareto` could not write beside the
+checkpoint. Written: docs/cost-NAME.md and its pictures; NAME's speeds.json for `gsim3d simulate --speed`.
 """
 
 import argparse
