@@ -139,9 +139,13 @@ class Comparison:
         return predictions
 
     def reference_times(self, warm_up: int) -> list[Timing]:
-        """Of three runs of the reference, one of them made now; tells :attr:`noise`."""
-        runs = [self.reference, self._run_reference(), self._run_reference()]
-        timings = [timing_of([spent for p in run for spent in p.spent], warm_up) for run in runs]
+        """Of three runs of the reference, those made so far among them; tells :attr:`noise`."""
+        runs = [[spent for predicted in self.reference for spent in predicted.spent]]
+        if (again := self.spent.get(Setting(), runs[0])) != runs[0]:  # beside settings that draw otherwise
+            runs.append(again)
+        while len(runs) < 3:
+            runs.append([spent for predicted in self._run_reference() for spent in predicted.spent])
+        timings = [timing_of(run, warm_up) for run in runs]
         medians = [timing.median for timing in timings]
         self.noise = (max(medians) - min(medians)) / statistics.median(medians)
         return timings
