@@ -107,6 +107,18 @@ def test_files_stay_small():
     assert not long, long
 
 
+def test_lines_stay_short():
+    long = [
+        f"{path.relative_to(ROOT)}:{number}"
+        for folder in ("gsim3d", "tests", "tools")
+        for path in (ROOT / folder).rglob("*")
+        if path.suffix in {".py", ".sh"}
+        for number, line in enumerate(path.read_text().splitlines(), 1)
+        if len(line) > 120
+    ]
+    assert not long, long
+
+
 def test_no_folder_of_tests_is_on_the_path():
     """Children inherit it: there a module of tests would hide one of the standard library that has its name."""
     folder = (ROOT / "tests").resolve()

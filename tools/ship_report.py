@@ -1,12 +1,12 @@
 #!/usr/bin/env python
-"""Puts reports of accuracy against time of a trained simulator into the documentation, and what they tuned into the package.
+"""Puts reports of accuracy against time of a trained simulator into the documentation, its speeds into the package.
 
     gsim3d pareto elastic-small --out runs/cpu                                    # on 2 CPU cores
     gsim3d pareto elastic-small DATA --scenes all --device cuda --self-check --out runs/h200
     python tools/ship_report.py elastic-small cpu=runs/cpu h200=runs/h200
 
-Every DIR holds report.json and the pictures, and speeds.json where `gsim3d pareto` could not write beside the checkpoint. Written:
-docs/cost-NAME.md and its pictures; NAME's speeds.json for `gsim3d simulate --speed`.
+Every DIR holds report.json and the pictures, and speeds.json where `gsim3d pareto` could not write beside the
+checkpoint. Written: docs/cost-NAME.md and its pictures; NAME's speeds.json for `gsim3d simulate --speed`.
 """
 
 import argparse
@@ -28,8 +28,8 @@ DOCS = ROOT / "docs"
 PICTURES = ("cost.png", "stages.png", "horizon.png")
 INTRO = """# What the accuracy of {name} costs
 
-Written by `python tools/ship_report.py`; do not edit. How to read it: [accuracy-time.md](accuracy-time.md); what the simulator
-is: [trained.md](trained.md). Every number can be made again by the command printed under it.
+Written by `python tools/ship_report.py`; do not edit. How to read it: [accuracy-time.md](accuracy-time.md); what the
+simulator is: [trained.md](trained.md). Every number can be made again by the command printed under it.
 """
 
 

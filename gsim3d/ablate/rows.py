@@ -32,7 +32,8 @@ class Row:
 
 
 def base_run(preset: str = "tiny") -> TrainConfig:
-    """The run that rows change where none is given: the paper's history, views and horizon as far as the preset goes."""
+    """The run that rows change where none is given: the paper's history, views and horizon as far as the preset
+    goes."""
     config = TrainConfig(preset=preset)
     history = min(HISTORY, 2 ** model_config(config).dynamics.history_bits)
     config = dataclasses.replace(config, data=dataclasses.replace(config.data, history=history))

@@ -88,10 +88,11 @@ def add_cells(x: Tensor, field: Tensor, places: Tensor, *, check: bool = True) -
 def overlapping_patches(
     first: Tensor, kv_rows: Tensor, cu_k: Tensor, codes: Tensor, order: Tensor, cu_clouds: Tensor, *, patch_size: int
 ) -> tuple[PatchTable, ...]:
-    """Attention of rows to patches that others were cut into: each asks the patch in whose interval of the curve it lies.
+    """Attention of rows to patches that others were cut into: each asks the patch in whose interval of the curve it
+    lies.
 
-    A patch of more than ``patch_size`` queries becomes several, which list the same keys: blocks of a GPU share patches.
-    Sizes follow from those of the arguments; the last patches are empty.
+    A patch of more than ``patch_size`` queries becomes several, which list the same keys: blocks of a GPU share
+    patches. Sizes follow from those of the arguments; the last patches are empty.
 
     Args:
         first: int64 [R, P], ascending along each of R curves: the code at which a patch begins, ``scene << 48 | code``.

@@ -170,7 +170,8 @@ def load_speed(folder: Path, restored: Restored, preset: str) -> Setting:
         found = found.get(key)
         if not isinstance(found, dict):
             raise InputError(
-                f"--speed {preset}: this checkpoint is not tuned for {device} (in {path}); run gsim3d pareto CHECKPOINT first"
+                f"--speed {preset}: this checkpoint is not tuned for {device} (in {path}); run "
+                "gsim3d pareto CHECKPOINT first"
             )
     return Setting.from_dict(found)
 

@@ -34,7 +34,8 @@ def page(content: dict, pictures: dict[str, bytes], regimes: Sequence[str]) -> s
         f"<figcaption>{CAPTIONS[name]}</figcaption></figure>"
         for name, data in pictures.items()
     }
-    facts = {**content["machine"], **content["subject"]}
+    subject = {name: value for name, value in content["subject"].items() if name != "steps_a_call"}
+    facts = {**content["machine"], **subject}
     parts = [
         f"<h1>What accuracy costs in time</h1><p>Made by <code>{escape(content['command'])}</code></p>",
         _promises(content),
@@ -123,9 +124,10 @@ def _settings(content: dict) -> str:
     return (
         f"<table><tr>{''.join(f'<th>{head}' for head in heads)}{''.join(rows)}</table><p>Bold: no other is both faster "
         f"and nearer to the reference. Time of one simulated step and its images, median and 95th percentile of "
-        f"{first.get('repeats', 0)} repeats, fewer where steps are timed together; <i>agreement</i> and <i>position</i> "
-        "(of what may move, the largest, in cells) are against the reference, the columns behind <i>kept</i> against "
-        "the film; <i>kept</i>: share of the reference's gain over particles held still, in dB. A tie is nearer to the "
+        f"{first.get('repeats', 0)} repeats, fewer where steps are timed together; <i>agreement</i> and "
+        "<i>position</i> (of what may move, the largest, in cells) are against the reference, the columns behind "
+        "<i>kept</i> against the film; <i>kept</i>: share of the reference's gain over particles held still, in dB. "
+        "A tie is nearer to the "
         "reference's time than two measurements of one thing. Stages of a step add up to it within "
         f"{ADDS_UP:.0%}, or report.json says by how much they do not.</p>"
         + _list(f"{kind}: {text}" for kind, text in content["kinds"].items())

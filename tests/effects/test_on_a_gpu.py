@@ -1,5 +1,6 @@
 """Every effect, edit and mixed batch gives on a GPU what it gives on the CPU, in float64."""
 
+import pytest
 import torch
 
 from gsim3d.by_scene import render_by_scene, rollout_by_scene
@@ -45,6 +46,23 @@ def test_effects(devices):
         for values in (on, off):
             results = [case(EffectsSpec.from_dict(values)) for case in cases(devices, model)]
             assert_equal(results, f"{name}, {values}")
+
+
+def launches(call) -> int:
+    """How many kernels, copies and fills the GPU is given."""
+    call()  # what is made once, as constants, is nobody's effect
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        call()
+        torch.cuda.synchronize()
+    return sum(event.device_type == torch.autograd.DeviceType.CUDA for event in profile.events())
+
+
+@pytest.mark.parametrize("name", ["time merging", "sleep", "changing features", "changing opacities", "feature images"])
+def test_what_is_off_launches_less(name, devices):
+    model, on, off, _ = EFFECTS[name]
+    *_, case = cases(devices, model)
+    counts = [launches(lambda: case(EffectsSpec.from_dict(values))) for values in (off, on)]
+    assert 0 < counts[0] < counts[1], counts
 
 
 def test_edits(devices):

@@ -41,7 +41,8 @@ class Case:
         return joint_attention(*(inputs or self.inputs), *self.tables, scale=self.scale)
 
     def groups(self):
-        """(queries, keys, keys of the other table) for each pair of patches that share queries, one of them maybe none."""
+        """(queries, keys, keys of the other table) for each pair of patches that share queries; one may be
+        none."""
         patch = torch.full((2, len(self.q)), -1)
         keys = [[], []]
         for which, table in enumerate(self.tables):

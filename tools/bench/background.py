@@ -1,6 +1,7 @@
 """What moving rows look up of a background, and attention to both, against the same in plain torch.
 
-Four clouds of moving rows in one place of a scene, whose other rows rest: on a GPU 26k of 65k a step, on the CPU a tenth.
+Four clouds of moving rows in one place of a scene, whose other rows rest: on a GPU 26k of 65k a step, on the CPU a
+tenth.
 """
 
 import torch

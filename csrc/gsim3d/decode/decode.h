@@ -11,8 +11,8 @@
 namespace gsim3d {
 
 // A row of the network holds harmonics (3, terms) in the Gaussian's frame, a rotation (x, y, z, w) and three scales
-// before their sigmoid. Of the colour, the harmonics up to `degree` are kept, which is at most that of the row; degree -1
-// has no terms.
+// before their sigmoid. Of the colour, the harmonics up to `degree` are kept, which is at most that of the row; degree
+// -1 has no terms.
 struct DecodeShape {
   int64_t n_rows;
   int terms, degree;
