@@ -115,9 +115,8 @@ class Ops(TorchDispatchMode):
 def test_nothing_in_a_graph_has_a_size_that_depends_on_numbers(row, scenes, tmp_path):
     config = ROWS[row].change(CONFIG)
     trainer = Trainer(config, scenes, tmp_path)
-    captured, batch = captured_loss(trainer), batches(scenes, 1)[0]
-    particles = trainer.simulator.encode(batch.context)
-    captured(particles, batch, trainer.step_weights(batch), StabilityReport())
+    captured = captured_loss(trainer)
+    run(captured, batches(scenes, 1)[0], trainer)
     (step,) = captured._steps.values()
     with Ops() as ops:
         step._given(StabilityReport())
