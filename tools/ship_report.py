@@ -1,6 +1,5 @@
 #!/usr/bin/env python
-"""Puts reports of accuracy against time of a trained simulator into the documentation, and what they tuned into the
-package.
+"""Puts reports of accuracy against time of a trained simulator into the documentation, its speeds into the package.
 
     gsim3d pareto elastic-small --out runs/cpu                                    # on 2 CPU cores
     gsim3d pareto elastic-small DATA --scenes all --device cuda --self-check --out runs/h200

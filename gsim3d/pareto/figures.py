@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
+from math import log10
 from textwrap import wrap
 
 from gsim3d.evaluate.pictures import pyplot
@@ -112,15 +113,18 @@ def _draw(axes, points: Sequence[Point], usable, best, error: Callable[[Point], 
         yscale="log",
         xlabel="time of a simulated step and its images [ms]; bars: rounds differ by so much",
     )
-    for point in usable:
+    placed: list[tuple[float, float]] = []
+    for point in sorted(usable, key=lambda p: (p not in labelled and p is not points[0], p.step_seconds)):
         chosen = point in best or point is points[0]
         x, y, color = 1e3 * point.step_seconds, error(point), COLORS[point.kind] if chosen else GREY
         axes.plot(x, y, "o", color=color, markersize=8 if chosen else 5, zorder=4 if chosen else 3)
         axes.errorbar(x, y, xerr=500 * point.spread, fmt="none", ecolor="#d0d0d0", zorder=2)
         text = f"{number[id(point)]}" + (f" {point.setting.name}" if point in labelled or point is points[0] else "")
-        axes.annotate(
-            text, (x, y), (5, 4), textcoords="offset points", fontsize=8 if chosen else 7, color=color, zorder=4
-        )
+        at = log10(x), log10(y)
+        near = sum(abs(at[0] - a) < 0.1 and abs(at[1] - b) < 0.15 for a, b in placed)
+        placed.append(at)
+        place = {"xytext": (5, 4 + 9 * near), "textcoords": "offset points", "fontsize": 8 if chosen else 7}
+        axes.annotate(text, (x, y), **place, color=color, zorder=4)
     line = sorted((1e3 * p.step_seconds, error(p)) for p in best)
     axes.plot(*zip(*line), "-", color="#444444", linewidth=1, zorder=2)
     failed = [p for p in points if p.failure]
@@ -171,14 +175,14 @@ def stages(points: Sequence[Point]) -> bytes:
 
 
 def horizon(points: Sequence[Point], comparison: Comparison, presets: dict[str, Point]) -> bytes:
-    """How the error against the truth grows with the horizon: of the reference, presets and the front."""
+    """How the error against the truth grows with the horizon: of the reference and the presets."""
     figure, axes = pyplot().subplots(figsize=(9.5, 4.5), layout="constrained")
-    for point in dict.fromkeys([points[0], *presets.values(), *on_front(points, "task")[:5]]):
+    for point in dict.fromkeys([points[0], *presets.values()]):
         metric = "psnr_masked" if "psnr_masked" in point.by_step else "psnr"
         every = point.setting.every
         names = [name for name, chosen in presets.items() if chosen is point and name != "exact"]
         label = point.setting.name + (f" ({', '.join(names)})" if names else "")
-        _curve(axes, point.by_step[metric], every, label=label, linewidth=2.2 if point is points[0] else 1.2)
+        _curve(axes, point.by_step[metric], every, label=label, linewidth=2.6 if point is points[0] else 1.3)
     metric = "psnr_masked" if "psnr_masked" in comparison.constant else "psnr"
     _curve(axes, comparison.constant[metric], 1, label="particles held still", color=GREY, linestyle="--")
     axes.set(xlabel="predicted step", ylabel=AXES["task"][0])
@@ -198,15 +202,12 @@ def training(log: Training) -> bytes:
         if any(v == v for v in values):
             axes.plot(log.hours, values, color=color, label=f"PSNR of {label}")
     reached = log.hours_to(0.99)
+    axes.set_xlim(0, 1.02 * log.hours[-1])
     if reached is not None:
+        side = "right" if reached > 0.5 * log.hours[-1] else "left"
         axes.axvline(reached, color="#444444", linewidth=1, linestyle="--")
-        axes.text(
-            reached,
-            0.02,
-            f" 99 % of the last PSNR after {reached:.3g} h",
-            transform=axes.get_xaxis_transform(),
-            fontsize=8,
-        )
+        text = f" 99 % of the last PSNR after {reached:.3g} h "
+        axes.text(reached, 0.02, text, transform=axes.get_xaxis_transform(), fontsize=8, ha=side)
     axes.set(xlabel="hours of training", ylabel="PSNR on training scenes [dB]")
     axes.legend(fontsize=8)
     return _png(figure)

@@ -84,9 +84,10 @@ def _nvml() -> ctypes.CDLL | None:
 @cache
 def _handle(device: torch.device) -> ctypes.c_void_p | None:
     library, handle = _nvml(), ctypes.c_void_p()
-    if library is None:
+    uuid = getattr(torch.cuda.get_device_properties(device), "uuid", None)
+    if library is None or uuid is None:
         return None
-    name = f"GPU-{torch.cuda.get_device_properties(device).uuid}".encode()
+    name = f"GPU-{uuid}".encode()
     return handle if library.nvmlDeviceGetHandleByUUID(name, ctypes.byref(handle)) == 0 else None
 
 

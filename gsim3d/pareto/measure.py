@@ -12,8 +12,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr
 from gsim3d.evaluate.scoring import METRICS, PLAIN_METRICS, SceneScores, SceneTruth
+from gsim3d.graphs import CaptureError
 from gsim3d.pareto.predict import Predicted, Unusable, predict_together, timing_of
 from gsim3d.pareto.runner import Runner
 from gsim3d.pareto.settings import KNOBS, Knob, Setting, turned
@@ -137,9 +139,13 @@ class Comparison:
         return predictions
 
     def reference_times(self, warm_up: int) -> list[Timing]:
-        """Of three runs of the reference, one of them made now; tells :attr:`noise`."""
-        runs = [self.reference, self._run_reference(), self._run_reference()]
-        timings = [timing_of([spent for p in run for spent in p.spent], warm_up) for run in runs]
+        """Of three runs of the reference, those made so far among them; tells :attr:`noise`."""
+        runs = [[spent for predicted in self.reference for spent in predicted.spent]]
+        if (again := self.spent.get(Setting(), runs[0])) != runs[0]:  # beside settings that draw otherwise
+            runs.append(again)
+        while len(runs) < 3:
+            runs.append([spent for predicted in self._run_reference() for spent in predicted.spent])
+        timings = [timing_of(run, warm_up) for run in runs]
         medians = [timing.median for timing in timings]
         self.noise = (max(medians) - min(medians)) / statistics.median(medians)
         return timings
@@ -342,6 +348,8 @@ def time_points(
                     _time(subject, point, clock, effort)
                 except torch.OutOfMemoryError:
                     point.failure = "out of memory while timed"
+                except (CaptureError, InputError) as error:
+                    point.failure = str(error)
 
 
 def time_encodings(

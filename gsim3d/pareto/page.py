@@ -34,7 +34,8 @@ def page(content: dict, pictures: dict[str, bytes], regimes: Sequence[str]) -> s
         f"<figcaption>{CAPTIONS[name]}</figcaption></figure>"
         for name, data in pictures.items()
     }
-    facts = {**content["machine"], **content["subject"]}
+    subject = {name: value for name, value in content["subject"].items() if name != "steps_a_call"}
+    facts = {**content["machine"], **subject}
     parts = [
         f"<h1>What accuracy costs in time</h1><p>Made by <code>{escape(content['command'])}</code></p>",
         _promises(content),

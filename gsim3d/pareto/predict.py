@@ -39,7 +39,7 @@ class Unusable(Exception):
     """A setting has no result; the message says why."""
 
 
-FAILURES = (Unusable, torch.OutOfMemoryError, HardCaseError, InputError, RuntimeError)
+FAILURES = (Unusable, torch.OutOfMemoryError, HardCaseError, InputError)
 
 
 def predict(subject: Subject, runner: Runner, number: int) -> Predicted:
@@ -64,6 +64,7 @@ def predict_together(
     step, scene, log = 0, subject.scenes[number], RestLog()
     drawn: list[dict[int, Tensor] | Unusable] = [{} for _ in runners]
     moving: list[Tensor] = []
+    failures = (Exception,) if runners[0].setting.compiled else FAILURES  # a compiler raises anything
     simulated, shown = _Timer(clock, runners[0]), [_Timer(clock, runner) for runner in runners]
     try:
         steps = runners[0].steps(subject.start(runners[0], number), subject.n_steps, log)
@@ -88,7 +89,7 @@ def predict_together(
                         raise Unusable(f"images are not finite at step {step + 1}")
                 except FAILURES as error:
                     drawn[n] = _told(error, step)
-    except FAILURES as error:
+    except failures as error:
         drawn = [_told(error, step)] * len(runners)
     return [
         (
@@ -139,21 +140,19 @@ def _by_span(simulated: Sequence[Stages], shown: Sequence[Stages], span: int) ->
 
 
 def timing_of(spent: Sequence[Stages], warm_up: int) -> Timing:
-    """Of spans of all scenes; the first ``warm_up`` do not count where others are left."""
-    counted = spent[warm_up:] or spent
+    """Of spans of all scenes; the first ``warm_up`` do not count where most are left."""
+    counted = spent[warm_up:] if len(spent) > 2 * warm_up else spent
     names = dict.fromkeys(name for stages in counted for name in stages)
     medians = {name: statistics.median(stages.get(name, 0.0) for stages in counted) for name in names}
     return Timing(tuple(sum(stages.values()) for stages in counted), medians)
 
 
 def _told(error: Exception, step: int) -> Unusable:
-    """Why a setting has no result, in a line; what nobody foresaw is raised as it is."""
+    """Why a setting has no result, in a line; what is none of the known failures is the compiler's."""
     if isinstance(error, Unusable):
         return error
     if isinstance(error, torch.OutOfMemoryError):
         return Unusable(f"out of memory at step {step + 1}")
     if isinstance(error, (HardCaseError, InputError)):
         return Unusable(f"step {step + 1}: {error}")
-    if type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
-        return Unusable(f"cannot be compiled: {type(error).__name__}: {(str(error).splitlines() or [''])[0][:120]}")
-    raise error
+    return Unusable(f"cannot be compiled: {type(error).__name__}: {(str(error).splitlines() or [''])[0][:120]}")

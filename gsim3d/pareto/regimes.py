@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 
 from gsim3d.errors import InputError
+from gsim3d.graphs import CaptureError
 from gsim3d.pareto.machine import energy
 from gsim3d.pareto.settings import Setting
 from gsim3d.pareto.subject import Subject
@@ -26,15 +27,15 @@ ENERGY_SECONDS = 1.0  # a counter of energy is read some ten times a second
 
 @dataclass(frozen=True)
 class Throughput:
-    """Simulated steps a second of all scenes of a batch together, images included."""
+    """Simulated steps a second of all scenes of a batch together, images included. timing: None: out of memory."""
 
     setting: Setting
     n_scenes: int
-    timing: Timing
+    timing: Timing | None
 
     @property
-    def steps_a_second(self) -> float:
-        return self.n_scenes / self.timing.median
+    def steps_a_second(self) -> float | None:
+        return None if self.timing is None else self.n_scenes / self.timing.median
 
 
 def throughput(
@@ -44,8 +45,11 @@ def throughput(
     runner = subject.runner(dataclasses.replace(setting, captured=False))
     numbers = [n % len(subject.scenes) for n in range(n_scenes)]
     frames = runner.frames([subject.scenes[n] for n in numbers], [subject.views[n][0] for n in numbers])
-    state, cameras = runner.encode(frames), subject.cameras_of(numbers, 0)
-    timing = time_call(lambda: runner.images(runner.newest(runner.step(state)), cameras), clock, repeats)
+    try:
+        state, cameras = runner.encode(frames), subject.cameras_of(numbers, 0)
+        timing = time_call(lambda: runner.images(runner.newest(runner.step(state)), cameras), clock, repeats)
+    except torch.OutOfMemoryError:
+        timing = None
     return Throughput(setting, n_scenes, timing)
 
 
@@ -77,8 +81,8 @@ class Work:
     joules: float | None
 
 
-def gpu_work(subject: Subject, setting: Setting, clock: Clock) -> Work:
-    """Of one setting that is not captured, by torch's profiler."""
+def gpu_work(subject: Subject, setting: Setting, clock: Clock) -> Work | None:
+    """Of one setting that is not captured, by torch's profiler; None where it may not look at the GPU."""
     from torch.profiler import ProfilerActivity, profile
 
     runner, cameras = subject.runner(setting), subject.cameras(0, 0)
@@ -93,6 +97,8 @@ def gpu_work(subject: Subject, setting: Setting, clock: Clock) -> Work:
         clock.wait()
     on_gpu = [event for event in seen.events() if event.device_type == torch.autograd.DeviceType.CUDA]
     spans = [(event.name, event.time_range.start / 1e3, event.time_range.end / 1e3) for event in on_gpu]
+    if not spans:
+        return None
     n_steps = max(1, int(ENERGY_SECONDS / whole))
     with energy(subject.device) as used:
         for _ in range(n_steps):
@@ -120,7 +126,7 @@ def work_of(spans: list[tuple[str, float, float]], whole_ms: float, joules: floa
 def training_step(subject: Subject, clock: Clock, repeats: int = 3, quick: bool = False) -> TrainingStep:
     """Trains on the subject's scenes from new weights, and keeps nothing.
 
-    quick: one scene at a time, and only as many steps as get gradients.
+    quick: one scene at a time, only as many steps as get gradients, and none before it is timed.
     """
     saved = subject.restored.checkpoint.config.get("train")
     if saved is None:
@@ -134,7 +140,9 @@ def training_step(subject: Subject, clock: Clock, repeats: int = 3, quick: bool 
         with tempfile.TemporaryDirectory() as folder, deterministic():
             trainer = Trainer(config, subject.scenes, folder, device=subject.restored.device.type)
             trainer.simulator.train()
-            timing = time_call(trainer.train_step, clock, repeats, warm_up=1)
-    except InputError as error:
+            timing = time_call(trainer.train_step, clock, repeats, warm_up=0 if quick else 1)
+    except (InputError, CaptureError) as error:
         return TrainingStep(problem=str(error))
+    except torch.OutOfMemoryError:
+        return TrainingStep(problem=f"out of memory, with {stage.batch} scenes")
     return TrainingStep(stage.batch, stage.horizon, timing)

@@ -66,7 +66,7 @@ def as_dict(
         "kinds": KINDS,
         "points": rows,
         "presets": {name: _promise(point, points, rows) for name, point in presets.items()},
-        "horizons": _horizons(comparison, {"reference": reference, **presets}),
+        "horizons": _horizons(comparison, {**presets, "exact": reference}),
         "training": budget.as_dict(training),
     }
     return {**content, "published": published.beside(content)}
@@ -105,7 +105,7 @@ def _horizons(comparison: Comparison, named: dict[str, Point]) -> list[dict]:
 
 
 def regimes_as_dict(
-    throughputs: Sequence[Throughput], training: TrainingStep, work: Sequence[tuple[str, Work]] = ()
+    throughputs: Sequence[Throughput], training: TrainingStep, work: Sequence[tuple[str, Work | None]] = ()
 ) -> dict:
     """The other ways to use the simulator, and what a GPU does in a step, for ``conditions``."""
     rows = [
@@ -113,21 +113,24 @@ def regimes_as_dict(
             "setting": t.setting.name,
             "scenes": t.n_scenes,
             "steps_a_second": t.steps_a_second,
-            "step_ms": _times([t.timing]),
+            "step_ms": None if t.timing is None else _times([t.timing]),
         }
         for t in throughputs
     ]
     step: dict = {"problem": training.problem}
     if training.timing is not None:
         step = {"batch": training.batch, "horizon": training.horizon, "step_ms": _times([training.timing])}
-    return {"throughput": rows, "training": step, "gpu": [{"setting": name, **vars(w)} for name, w in work]}
+    return {"throughput": rows, "training": step, "gpu": [{"setting": name, **vars(w)} for name, w in work if w]}
 
 
 def regimes_in_words(regimes: dict) -> list[str]:
-    lines = [
-        f"{row['setting']}: {row['steps_a_second']:.3g} steps a second of {row['scenes']} scenes together, with images"
-        for row in regimes["throughput"]
-    ]
+    lines = []
+    for row in regimes["throughput"]:
+        scenes = f"{row['scenes']} scenes together, with images"
+        rate = row["steps_a_second"]
+        lines.append(
+            f"{row['setting']}: " + (f"{rate:.3g} steps a second of {scenes}" if rate else f"out of memory: {scenes}")
+        )
     training = regimes["training"]
     if "problem" in training:
         lines.append(f"training step: not measured: {training['problem']}")

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 PRECISIONS = ("fp32", "tf32", "bf16", "fp16")
 PARTS = ("encoder", "dynamics", "renderer")
 KINDS = {
-    "exact": "may change results by rounding only",
+    "exact": "changes what is simulated by rounding only",
     "near-exact": "leaves out what is below a stated threshold",
     "model": "changes the function that the model computes",
     "needs-training": "needs a checkpoint of its own",

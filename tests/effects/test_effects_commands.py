@@ -1,13 +1,16 @@
 """gsim3d plan, gsim3d effects infer, and edits and specs of gsim3d simulate."""
 
+import dataclasses
 import re
 
 import pytest
 
+from gsim3d import presets
 from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec
 from gsim3d.infer_effects import propose, smaller
 from gsim3d.interop import read_ply
-from gsim3d.presets import paper_latent
+from gsim3d.train.restore import build_simulator
+from tests.effects.test_round_trip import saved
 from tests.test_commands import call, work  # noqa: F401
 from tests.tiny_scenes import write_scene
 
@@ -35,6 +38,18 @@ def test_plan_reads_the_spec_that_the_data_ship(capsys, tmp_path):
     (scene / "effects.yaml").write_text("dynamics: {history: 9}")
     code, out, err = call(capsys, "plan", scene)
     assert code == 2 and "unsupported effect dynamics.history: this model goes up to 2; got 9" in err
+
+
+def test_plan_tells_what_a_background_costs_once(capsys, tmp_path):
+    scene, tiny = write_scene(tmp_path / "ball" / "0000"), presets.tiny()
+    model = dataclasses.replace(tiny, dynamics=dataclasses.replace(tiny.dynamics, background="asymmetric"))
+    run = saved(tmp_path / "run", EffectsSpec(), build_simulator(model, 0).state_dict(), model)
+    code, out, err = call(capsys, "plan", scene, run)
+    assert code == 0, err
+    assert re.search(
+        r"^background made once +yes +in this model frozen particles see only each other", out, re.MULTILINE
+    )
+    assert float(re.search(r"^and of the background, once a rollout: (\d+\.\d)$", out, re.MULTILINE)[1]) > 0
 
 
 def test_infer_measures_every_effect_and_writes_the_smallest_spec(capsys, work, tmp_path):  # noqa: F811
@@ -68,7 +83,7 @@ def test_infer_measures_every_effect_and_writes_the_smallest_spec(capsys, work, 
 
 def test_infer_puts_back_what_is_worth_most_when_together_too_much_is_lost():
     """A measure that loses 0.05 dB for each of three effects, and 0.5 dB for the fourth."""
-    model, base = paper_latent(2), EffectsSpec()
+    model, base = presets.paper_latent(2), EffectsSpec()
 
     def trial(spec):
         history, degree = spec.dynamics.history or 2, spec.appearance.view_dependent

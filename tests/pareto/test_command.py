@@ -1,6 +1,7 @@
 """The command on a real scene: one page without a network, and numbers that agree between its files."""
 
 import csv
+import dataclasses
 import importlib.util
 import json
 import re
@@ -12,10 +13,13 @@ import pytest
 from gsim3d.__main__ import main
 from gsim3d.ablate.rows import ROWS
 from gsim3d.pareto import budget, command, published, report
+from gsim3d.pareto import measure as measuring
 from gsim3d.pareto.autotune import SPEEDS
 from gsim3d.pareto.measure import Comparison, Point, measure
 from gsim3d.pareto.settings import Setting
 from gsim3d.pareto.timing import DeviceClock
+from gsim3d.train import checkpoint
+from gsim3d.train.settings import to_dict
 from tests.pareto.test_autotune import SHORT
 from tests.pareto.test_budget import write_log
 
@@ -101,8 +105,8 @@ def test_presets_and_horizons_are_in_numbers(written):
     assert content["presets"]["fast"]["kept"] == turned["kept"]
     rows = content["horizons"]
     assert [row["steps"] for row in rows] == [1, 2, 4]
-    assert rows[2]["reference"]["psnr"] == reference["by_step"]["psnr_masked"][3]
-    assert rows[2]["reference"]["ms"] == pytest.approx(
+    assert rows[2]["exact"]["psnr"] == reference["by_step"]["psnr_masked"][3]
+    assert rows[2]["exact"]["ms"] == pytest.approx(
         reference["encode_ms"]["median"] + 4 * reference["step_ms"]["median"]
     )
     assert rows[0]["constant_psnr"] == content["constant"]["psnr_masked"][0]
@@ -146,6 +150,45 @@ def test_the_table_tells_failures_and_ties(written, subject):
     lines = report.table(content).splitlines()
     assert lines[1].startswith("reference") and "1.00x" in lines[1]
     assert lines[4].endswith("failed: out of memory at step 3")
+
+
+@pytest.fixture
+def run(subject, tmp_path):
+    """A run folder with two checkpoints and a log."""
+    restored = subject.restored
+    config = {
+        "model": to_dict(restored.simulator.config),
+        "data": {**to_dict(restored.data), "image_size": list(restored.image_size)},
+        "train": {},
+    }
+    for step in (10, 20):
+        saved = checkpoint.Checkpoint(restored.simulator.state_dict(), config, {"step": step})
+        checkpoint.save(tmp_path / "run", saved)
+    write_log(tmp_path / "run" / "metrics.jsonl", [10.0, 20.0])
+    return tmp_path / "run"
+
+
+def test_the_command_from_end_to_end(subject, run, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(measuring, "QUICK_ON_CPU", dataclasses.replace(measuring.QUICK_ON_CPU, repeats=2, n_rounds=1))
+    monkeypatch.setattr(command, "HURRIED_REPEATS", 1)
+    other, out = tmp_path / "other.safetensors", tmp_path / "out"
+    checkpoint.export(checkpoint.load(run), other)
+    data = str(subject.scenes[0].path.parent)
+    arguments = ["pareto", str(run), data, "--scenes", "all", "--out", str(out), "--quiet", "--others", str(other)]
+    arguments += ["--knobs", "history", "training steps", "horizon", "--metrics", "psnr", "psnr_masked"]
+    assert main(arguments) == 0
+    content = json.loads((out / "report.json").read_text())
+    names = ["reference", "history 1", "checkpoint step 000010", "checkpoint other.safetensors"]
+    assert [point["name"] for point in content["points"]][:4] == names
+    assert content["points"][2]["agreement"]["psnr"] == content["points"][3]["agreement"]["psnr"] == 100
+    assert set(content["points"][0]["task"]) == {"psnr", "psnr_masked"}
+    assert len(content["points"][0]["step_ms"]["stages"]) > 4 and content["points"][0]["step_ms"]["repeats"] >= 20
+    assert content["training"]["steps"] == [0, 20] and content["not_turned"] == {}
+    assert content["subject"]["scenes"] == 2 and "training step: not measured" in capsys.readouterr().out
+    speeds = json.loads((run / SPEEDS).read_text())
+    assert list(speeds[checkpoint.load(run).digest]["cpu"]) == ["exact", "balanced", "fast"]
+    assert all("checkpoint" not in setting for setting in speeds[checkpoint.load(run).digest]["cpu"].values())
 
 
 def test_wrong_arguments_are_one_line(capsys, tmp_path):

@@ -173,7 +173,7 @@ def test_steps_are_timed_on_the_way(subject):
     assert len(told) == measure.n_runs(points, effort)
     n_all = subject.n_steps * len(subject.scenes)
     assert [len(point.step) for point in points] == [3, 1, 1, 1, 1]
-    assert [len(point.step[0].repeats) for point in points] == [n_all - 1, n_all - 1, n_all // 2 - 1, n_all - 1, 1]
+    assert [len(point.step[0].repeats) for point in points] == [n_all - 1, n_all - 1, n_all // 2 - 1, n_all - 1, 2]
     assert points[0].noise == comparison.noise and points[1].spread >= comparison.noise * points[1].step_seconds
     for point in points:
         assert {"convolution", "sort and raster"} <= set(point.stages())

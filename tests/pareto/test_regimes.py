@@ -32,6 +32,25 @@ def test_throughput_counts_all_scenes(subject):
     assert found.steps_a_second == pytest.approx(3 / found.timing.median)
 
 
+def test_what_has_no_memory_is_told(subject, monkeypatch):
+    def full(*args, **options):
+        raise torch.OutOfMemoryError("too large")
+
+    monkeypatch.setattr("gsim3d.pareto.regimes.time_call", full)
+    many = throughput(subject, Setting(), DeviceClock("cpu"), n_scenes=3)
+    assert many.timing is None and many.steps_a_second is None
+    config = TrainConfig(
+        stages=(StageConfig(steps=5, horizon=1, target_views=1),), data=DataConfig(history=2, context_views=2)
+    )
+    saved = Checkpoint({}, {"train": to_dict(config)})
+    copy = type(subject)(dataclasses.replace(subject.restored, checkpoint=saved), subject.scenes)
+    step = training_step(copy, DeviceClock("cpu"))
+    assert step.problem == "out of memory, with 1 scenes"
+    regimes = report.regimes_as_dict([many], step, [("reference", None)])
+    assert report.regimes_in_words(regimes)[0] == "reference: out of memory: 3 scenes together, with images"
+    assert regimes["gpu"] == []
+
+
 def test_a_training_step_of_the_last_stage(subject):
     assert "does not hold the configuration" in training_step(subject, DeviceClock("cpu")).problem
     stages = (StageConfig(steps=5, horizon=1), StageConfig(steps=5, horizon=2, batch=2, target_views=1))
