@@ -277,6 +277,7 @@ def test_rows_without_any_patch(device):
     arguments[:3] = arguments[0][:, :0], arguments[1][:, :0], arguments[2][:1]
     for table, order in zip(overlapping_patches(*(x.to(device) for x in arguments), patch_size=size), arguments[4]):
         assert torch.equal(table.q_rows.cpu(), order) and not table.cu_q.any() and not table.cu_k.any()
+        assert not table.kv_rows.any()
 
 
 def test_a_rows_chain_that_ends_early_has_scene_0(device):

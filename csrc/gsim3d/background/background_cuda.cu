@@ -248,6 +248,7 @@ void overlapping_patches(const Overlap& overlap, const Parts& parts, const Works
   const unsigned row_blocks = blocks_for(kOverlap, overlap.n_rows, kThreads);
   launch(kOverlap, find_buckets_kernel, dim3(row_blocks, n_curves), kThreads, 0, stream, cut);
   launch(kOverlap, make_parts_kernel, n_curves, kCutThreads, 0, stream, cut);
+  if (cut.n_parts == 0) fill_zero(kOverlap, parts.kv_rows, overlap.n_curves * overlap.n_listed(), stream);
   launch(kOverlap, write_parts_kernel,
          dim3(blocks_for(kOverlap, cut.n_parts + static_cast<int64_t>(row_blocks), 1), n_curves), kThreads, 0, stream,
          cut);

@@ -33,7 +33,6 @@ struct Forward {
   PatchTable table;
   Division division;
   float slope, sign;
-  bool joins;
   T* out;        // [n_q, H, D]
   float* stats;  // [n_q, H, 2]
 };
@@ -248,17 +247,21 @@ class Warp {
   float out_[M][D / 8][4], sum_[M][4], largest_[M][2];
 };
 
-template <typename T, int D>
+// kJoins: goes on with the softmax that `out` and `stats` hold, over the same queries.
+template <typename T, int D, bool kJoins>
 __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> args) {
   using S = Shape<D>;
   extern __shared__ uint4 shared[];
   uint8_t* valid = reinterpret_cast<uint8_t*>(shared) + 2 * S::kTileBytes;
   const uint32_t keys = shared_address(shared), values = keys + S::kTileBytes;
   const PatchTable& table = args.table;
-  let_next_begin();
   for (int64_t i = blockIdx.x; i < args.division.n_shares; i += gridDim.x) {
-    const Share share = args.division.splits > 0 ? args.division.at(i)
-                                                 : share_by_queries<kThreads>(table, i, S::kGroup, args.division.heads);
+    Share share;
+    if constexpr (kJoins) {
+      share = share_by_queries<kThreads>(table, i, S::kGroup, args.division.heads);
+    } else {
+      share = args.division.at(i);
+    }
     const Range q_range = range_of(table.cu_q, share.patch, table.n_q_listed);
     const Range k_range = range_of(table.cu_k, share.patch, table.n_k_listed);
     const int64_t n_keys = k_range.end - k_range.begin, n_tiles = (n_keys + S::kTileRows - 1) / S::kTileRows;
@@ -276,7 +279,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
       return __syncthreads_and(all_valid) != 0;
     };
 
-    const int64_t step = args.division.splits > 0 ? args.division.splits * S::kGroup : table.n_q_listed + S::kGroup;
+    const int64_t step = args.division.splits * S::kGroup;
     int64_t group = q_range.begin + share.split * S::kGroup;
     int64_t first = group + threadIdx.x / kWarp * 16 * S::kRowTiles;  // of the warp
     Warp<T, D> warp(args, keys, values, valid);
@@ -321,8 +324,10 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
       warp.load_rows(args, first, q_range.end);
       first += step;
       warp.load_queries(args, first, q_range.end, share.head);
-      wait_for_previous();  // rows are being set to 0, or to what this call joins
-      if (active && args.joins) warp.join(args, share.head);
+      wait_for_previous();  // rows that no patch lists are being set to 0
+      if constexpr (kJoins) {
+        if (active) warp.join(args, share.head);
+      }
       if (active) warp.store(args, share.head);
     }
   }
@@ -340,18 +345,18 @@ __global__ void __launch_bounds__(kThreads) clear_kernel(uint2* out, int64_t n_o
 }
 
 template <typename T, int D>
-void run(Forward<T> args, int64_t heads, Stream stream) {
+void run(Forward<T> args, int64_t heads, bool joins, Stream stream) {
+  constexpr size_t kSharedBytes = Shape<D>::kSharedBytes;
+  if (joins) {  // few patches may have nearly all queries
+    args.division = divide_by_queries(args.table.n_patches, args.table.n_q_listed, Shape<D>::kGroup, heads);
+    return launch(kOp, forward_kernel<T, D, true>, blocks_of(args.division), kThreads, kSharedBytes, stream, args);
+  }
   args.division = divide(args.table.n_patches, args.table.n_q_listed, Shape<D>::kGroup, heads,
                          kBlocks * multiprocessors(kOp, stream));
-  if (args.joins) {  // few patches may have nearly all queries
-    args.division = divide_by_queries(args.table.n_patches, args.table.n_q_listed, Shape<D>::kGroup, heads);
-  } else {
-    const int64_t n_stats = args.table.n_q * heads, n_out = n_stats * D * sizeof(T) / sizeof(uint2);
-    launch(kOp, clear_kernel, multiprocessors(kOp, stream), kThreads, 0, stream, reinterpret_cast<uint2*>(args.out),
-           n_out, reinterpret_cast<uint2*>(args.stats), n_stats);
-  }
-  launch_overlapping(kOp, forward_kernel<T, D>, blocks_of(args.division), kThreads, Shape<D>::kSharedBytes, stream,
-                     args);
+  const int64_t n_stats = args.table.n_q * heads, n_out = n_stats * D * sizeof(T) / sizeof(uint2);
+  launch(kOp, clear_kernel, multiprocessors(kOp, stream), kThreads, 0, stream, reinterpret_cast<uint2*>(args.out),
+         n_out, reinterpret_cast<uint2*>(args.stats), n_stats);
+  launch_overlapping(kOp, forward_kernel<T, D, false>, blocks_of(args.division), kThreads, kSharedBytes, stream, args);
 }
 
 }  // namespace
@@ -360,10 +365,10 @@ template <typename T>
 void tensor_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
                     const AttentionSize& size, bool joins, T* out, float* stats, Stream stream) {
   const patch_attn::Softmax<float> softmax(size.scale);
-  Forward<T> args{q, k, v, table, {}, softmax.slope, softmax.sign, joins, out, stats};
-  if (size.dim == 16) run<T, 16>(args, size.heads, stream);
-  else if (size.dim == 32) run<T, 32>(args, size.heads, stream);
-  else run<T, 64>(args, size.heads, stream);
+  Forward<T> args{q, k, v, table, {}, softmax.slope, softmax.sign, out, stats};
+  if (size.dim == 16) run<T, 16>(args, size.heads, joins, stream);
+  else if (size.dim == 32) run<T, 32>(args, size.heads, joins, stream);
+  else run<T, 64>(args, size.heads, joins, stream);
 }
 
 template void tensor_forward<__nv_bfloat16>(const HeadRows<__nv_bfloat16>&, const HeadRows<__nv_bfloat16>&,

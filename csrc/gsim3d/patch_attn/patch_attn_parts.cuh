@@ -12,8 +12,7 @@
 namespace gsim3d::cuda {
 
 // A block computes one head of some rows of one patch: of its `splits` blocks, block s takes groups s, s + splits, ...
-// of `group` rows, with splits = 0 group s alone. Heads are neighbours, so that blocks in flight read the same lines of
-// memory.
+// of `group` rows. Heads are neighbours, so that blocks in flight read the same lines of memory.
 struct Share {
   int64_t patch, head, split;
 };
@@ -41,10 +40,11 @@ inline Division divide(int64_t n_patches, int64_t n_listed, int64_t group, int64
   return {heads, best, n_patches * heads * best};
 }
 // Groups of all patches one after another, whatever number of queries each patch has. Patch p begins at group
-// cu_q[p] / group + p: it has as many places as it can have groups, the last of which may be empty.
+// cu_q[p] / group + p: it has as many places as it can have groups, the last of which may be empty. A block computes one
+// group: the step to its next one is beyond any list.
 inline Division divide_by_queries(int64_t n_patches, int64_t n_listed, int64_t group, int64_t heads) {
   const int64_t groups = n_patches > 0 ? n_listed / group + n_patches : 0;
-  return {heads, 0, groups * heads};
+  return {heads, groups + 1, groups * heads};
 }
 template <int kThreads>
 __device__ __forceinline__ Share share_by_queries(const PatchTable& table, int64_t i, int64_t group, int64_t heads) {

@@ -134,7 +134,6 @@ struct Work {
   AttentionSize size;
   Division division;
   patch_attn::Softmax<Sum<T>> softmax;
-  bool joins;
   T* out;
   Sum<T>* stats;
   Sum<T>* deltas;  // [H, n_q_listed]
@@ -192,7 +191,8 @@ __device__ __forceinline__ void join(C other_largest, C other_sum, const C (&oth
   largest = top;
 }
 
-template <typename T, int L>
+// kJoins: goes on with the softmax that `out` and `stats` hold, over the same queries.
+template <typename T, int L, bool kJoins>
 __global__ void __launch_bounds__(kThreads) forward_kernel(Work<T> work) {
   using C = Sum<T>;
   using S = Shape<C, L>;
@@ -252,16 +252,21 @@ __global__ void __launch_bounds__(kThreads) forward_kernel(Work<T> work) {
         }
       }
     });
+    if constexpr (kJoins) {
 #pragma unroll
-    for (int r = 0; r < R; ++r) {
-      const int64_t place = rows[r] * heads + head;
-      if (work.joins && rows[r] >= 0) {
+      for (int r = 0; r < R; ++r) {
+        if (rows[r] < 0) continue;
+        const int64_t place = rows[r] * heads + head;
         C before[kDims];
         load_row<L>(work.out + place * dim, part, dim, before);
         join(work.stats[2 * place], work.stats[2 * place + 1], before, work.softmax, largest[r], sum[r], result[r]);
       }
       __syncwarp();  // lanes that share a row have read its stats
+    }
+#pragma unroll
+    for (int r = 0; r < R; ++r) {
       if (rows[r] < 0) continue;
+      const int64_t place = rows[r] * heads + head;
       store_row<L>(work.out + place * dim, part, dim, result[r], sum[r] == 0 ? C(0) : C(1) / sum[r]);
       if (part == 0) work.stats[2 * place] = sum[r] == 0 ? C(0) : largest[r];
       if (part == 0) work.stats[2 * place + 1] = sum[r];
@@ -405,9 +410,9 @@ void simple_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T
     using S = Shape<Sum<T>, L>;
     const Division division = divide(table.n_patches, table.n_q_listed, S::kGroup, size.heads,
                                      4 * multiprocessors(op, stream));
-    const Work<T> work{{}, q,   k,    v, {}, table, size, division, patch_attn::Softmax<Sum<T>>(size.scale),
-                       joins, out, stats};
-    launch(op, forward_kernel<T, L>, blocks_of(division), kThreads, S::kSharedBytes, stream, work);
+    const Work<T> work{{}, q, k, v, {}, table, size, division, patch_attn::Softmax<Sum<T>>(size.scale), out, stats};
+    const auto kernel = joins ? forward_kernel<T, L, true> : forward_kernel<T, L, false>;
+    launch(op, kernel, blocks_of(division), kThreads, S::kSharedBytes, stream, work);
   });
 }
 
@@ -418,7 +423,7 @@ void simple_backward(const HeadRows<T>& grad, const HeadRows<T>& q, const HeadRo
   const char* op = "patch_attention_backward";
   const HeadRows<T> out_rows{out, size.heads * size.dim, size.dim};
   const int64_t resident = 4 * multiprocessors(op, stream);
-  Work<T> work{grad, q, k, v, out_rows, table, size, {}, patch_attn::Softmax<Sum<T>>(size.scale), false, nullptr,
+  Work<T> work{grad, q, k, v, out_rows, table, size, {}, patch_attn::Softmax<Sum<T>>(size.scale), nullptr,
                const_cast<Sum<T>*>(stats), workspace.take<Sum<T>>(size.heads * table.n_q_listed), gradients};
   with_lanes(size.dim, [&]<int L>() {
     using S = Shape<Sum<T>, L>;

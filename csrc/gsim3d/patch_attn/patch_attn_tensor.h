@@ -6,8 +6,7 @@
 
 namespace gsim3d::cuda {
 
-// Rows of `out` and `stats` that no patch with keys lists become 0, or with `joins` stay as they are. Queued behind a
-// call with the same queries, one that joins begins before that has ended.
+// Rows of `out` and `stats` that no patch with keys lists become 0, or with `joins` stay as they are.
 template <typename T>
 void tensor_forward(const HeadRows<T>& q, const HeadRows<T>& k, const HeadRows<T>& v, const PatchTable& table,
                     const AttentionSize& size, bool joins, T* out, float* stats, Stream stream);
