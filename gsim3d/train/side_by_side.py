@@ -58,8 +58,9 @@ def side_by_side(
                 sender.close()
                 running[receiver] = name, process, place
             ready = wait(list(running), TELL_EVERY)
-            if not ready and say is not None:
-                say(_progress({name: Path(jobs[name][0]) for name, *_ in running.values()}))
+            told = "" if ready else _progress({name: jobs[name][0] for name, *_ in running.values()})
+            if told and say is not None:
+                say(told)
             for receiver in ready:
                 name, process, place = running.pop(receiver)
                 try:

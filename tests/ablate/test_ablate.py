@@ -123,7 +123,7 @@ def test_side_by_side_and_in_two_calls_the_table_is_that_of_one_after_another(fo
     content = asked.run(out, "c", together=2, say=said.append)
     assert scores(content) == scores(expected)
     assert [run["seed"] for run in content["rows"][0]["runs"]] == [0, 1]
-    assert len(said) == 4 and said[-1].startswith("[2/2] latent, seed ")
+    assert [line.split(", seed")[0] for line in said if line[0] == "["] == ["[1/2] latent", "[2/2] latent"] * 2
 
 
 def test_a_base_run_that_no_graph_can_repeat_is_refused_before_anything_is_trained(folders):

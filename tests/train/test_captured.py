@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsim3d.ablate.rows import ROWS
 from gsim3d.data import Scene, find_scenes
@@ -82,6 +83,35 @@ def test_gradients_are_those_of_the_loss(lead, scenes, trainer, device):
             if gradient is not None:
                 assert (actual[parameter] - gradient).abs().max() <= TOLERANCE[device.type] * largest, name
     assert captured.captures >= 1 and not report.total
+
+
+class Ops(TorchDispatchMode):
+    """Names of the ops that were called; those that index by a mask have another."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = set()
+
+    def __torch_dispatch__(self, op, types, args=(), kwargs=None):
+        masks = op.overloadpacket in (torch.ops.aten.index, torch.ops.aten.index_put) and any(
+            index is not None and index.dtype == torch.bool for index in args[1]
+        )
+        self.names.add("index by a mask" if masks else op.overloadpacket.__name__)
+        return op(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("row", ["latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2"])
+def test_nothing_in_a_graph_has_a_size_that_depends_on_numbers(row, scenes, tmp_path):
+    config = ROWS[row].change(CONFIG)
+    trainer = Trainer(config, scenes, tmp_path)
+    captured, batch = captured_loss(trainer), batches(scenes, 1)[0]
+    particles = trainer.simulator.encode(batch.context)
+    captured(particles, batch, trainer.step_weights(batch), StabilityReport())
+    (step,) = captured._steps.values()
+    with Ops() as ops:
+        step._given(StabilityReport())
+    assert len(ops.names) > 50
+    assert not ops.names & {"index by a mask", "nonzero", "masked_select", "unique_dim", "_unique2", "is_nonzero"}
 
 
 def test_what_needs_more_room_gets_it(scenes, trainer, device):
