@@ -47,7 +47,8 @@ def throughput(
     frames = runner.frames([subject.scenes[n] for n in numbers], [subject.views[n][0] for n in numbers])
     try:
         state, cameras = runner.encode(frames), subject.cameras_of(numbers, 0)
-        timing = time_call(lambda: runner.images(runner.newest(runner.step(state)), cameras), clock, repeats)
+        warm_up = max(1, repeats // 7)
+        timing = time_call(lambda: runner.images(runner.newest(runner.step(state)), cameras), clock, repeats, warm_up)
     except torch.OutOfMemoryError:
         timing = None
     return Throughput(setting, n_scenes, timing)
