@@ -99,8 +99,8 @@ class Point:
     @property
     def spread(self) -> float:
         """Seconds between the slowest and the fastest round."""
-        medians = [timing.median for timing in self.step]
-        return max(max(medians) - min(medians), self.noise * self.step_seconds)
+        rounds = [timing.steady for timing in self.step]
+        return max(max(rounds) - min(rounds), self.noise * self.step_seconds)
 
     def stages(self) -> dict[str, float]:
         """Seconds of a step, by stage: medians over rounds."""
@@ -146,8 +146,8 @@ class Comparison:
         while len(runs) < 3:
             runs.append([spent for predicted in self._run_reference() for spent in predicted.spent])
         timings = [timing_of(run, warm_up) for run in runs]
-        medians = [timing.median for timing in timings]
-        self.noise = (max(medians) - min(medians)) / statistics.median(medians)
+        rounds = [timing.steady for timing in timings]
+        self.noise = (max(rounds) - min(rounds)) / statistics.median(rounds)
         return timings
 
     @cached_property

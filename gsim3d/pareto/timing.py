@@ -202,6 +202,12 @@ class Timing:
         return statistics.median(self.repeats)
 
     @property
+    def steady(self) -> float:
+        """Mean of the middle half: repeats of two scenes have two levels, between which a median jumps."""
+        ordered, cut = sorted(self.repeats), len(self.repeats) // 4
+        return statistics.fmean(ordered[cut : len(ordered) - cut])
+
+    @property
     def p95(self) -> float:
         ordered = sorted(self.repeats)
         return ordered[min(len(ordered) - 1, round(0.95 * (len(ordered) - 1)))]

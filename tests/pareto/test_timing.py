@@ -73,6 +73,14 @@ def test_warm_up_does_not_count():
     assert timing.median == 2.0 and timing.p95 == 4.0
 
 
+def test_two_levels_do_not_look_like_noise():
+    """A scene of 1 s and one of 2 s: the median of both jumps where the mean of the middle half hardly moves."""
+    first, second = Timing((1.0, 1.0, 1.0, 2.0, 2.0, 2.0, 2.0)), Timing((1.0, 1.0, 1.0, 1.0, 2.0, 2.0, 2.0))
+    assert abs(first.median - second.median) == 1.0
+    assert abs(first.steady - second.steady) < 0.25
+    assert Timing((3.0,)).steady == 3.0 and Timing((1.0, 2.0, 3.0, 100.0)).steady == 2.5
+
+
 def test_ops_are_put_back():
     before = torch.ops.gsim3d.unpool
     with pytest.raises(KeyError, match="fails"):
