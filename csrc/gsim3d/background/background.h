@@ -69,7 +69,8 @@ void find_cells(const int64_t* cells,  // [n_cells] ascending, n_cells >= 1
                 int64_t* places,  // [n]
                 const Parallel& parallel);
 
-// out[i] = x[i] + field[places[i]], rows of `channels` numbers. Throws ArgumentError where a place is not in [0, n_cells).
+// out[i] = x[i] + field[places[i]], rows of `channels` numbers. Throws ArgumentError where a place is not in
+// [0, n_cells).
 template <typename T>
 void add_cells(const T* x,      // [n, channels]
                const T* field,  // [n_cells, channels]

@@ -33,8 +33,8 @@ struct alignas(sizeof(T) * N) Pack {
 
 template <typename T, int N>
 __global__ void __launch_bounds__(kThreads)
-    add_cells_kernel(const T* __restrict__ x, const T* __restrict__ field, const int64_t* __restrict__ places, int64_t n,
-                     int64_t n_cells, int64_t packs, T* __restrict__ out) {
+    add_cells_kernel(const T* __restrict__ x, const T* __restrict__ field, const int64_t* __restrict__ places,
+                     int64_t n, int64_t n_cells, int64_t packs, T* __restrict__ out) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x, row = i / packs;
   if (row >= n) return;
   const int64_t place = places[row];
@@ -225,7 +225,8 @@ void add_cells(const T* x, const T* field, const int64_t* places, int64_t n, int
            reinterpret_cast<Native<T>*>(out));
   };
   constexpr int kPack = 16 / sizeof(T);
-  const auto bits = reinterpret_cast<uintptr_t>(x) | reinterpret_cast<uintptr_t>(field) | reinterpret_cast<uintptr_t>(out);
+  const auto address = [](const void* p) { return reinterpret_cast<uintptr_t>(p); };
+  const auto bits = address(x) | address(field) | address(out);
   if (bits % 16 == 0 && channels % kPack == 0) run.template operator()<kPack>();
   else run.template operator()<1>();
 }

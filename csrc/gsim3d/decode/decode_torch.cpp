@@ -36,7 +36,8 @@ DecodeShape check_rows(const char* op, const Tensor& raw, const Tensor& readings
   for (int d = -1; d <= kLargestDegree; ++d)
     if (raw.size(1) == 3 * (d + 1) * (d + 1) + 7) terms = (d + 1) * (d + 1);
   check(terms >= (degree + 1) * (degree + 1), op,
-        ": raw must have 3 K + 7 columns with K = 0, 1, 4, 9 or 16, at least ", (degree + 1) * (degree + 1), "; got ", raw.size(1));
+        ": raw must have 3 K + 7 columns with K = 0, 1, 4, 9 or 16, at least ", (degree + 1) * (degree + 1),
+        "; got ", raw.size(1));
   check(scale_min >= 0 && scale_max >= scale_min && scale_max <= kLargestScale, op,
         ": scale_min and scale_max must rise from 0 to at most ", kLargestScale, "; got ", scale_min, " and ",
         scale_max);

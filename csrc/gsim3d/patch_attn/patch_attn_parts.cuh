@@ -40,8 +40,8 @@ inline Division divide(int64_t n_patches, int64_t n_listed, int64_t group, int64
   return {heads, best, n_patches * heads * best};
 }
 // Groups of all patches one after another, whatever number of queries each patch has. Patch p begins at group
-// cu_q[p] / group + p: it has as many places as it can have groups, the last of which may be empty. A block computes one
-// group: the step to its next one is beyond any list.
+// cu_q[p] / group + p: it has as many places as it can have groups, the last of which may be empty. A block computes
+// one group: the step to its next one is beyond any list.
 inline Division divide_by_queries(int64_t n_patches, int64_t n_listed, int64_t group, int64_t heads) {
   const int64_t groups = n_patches > 0 ? n_listed / group + n_patches : 0;
   return {heads, groups + 1, groups * heads};

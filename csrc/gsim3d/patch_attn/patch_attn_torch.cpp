@@ -109,8 +109,8 @@ std::tuple<Tensor, Tensor> joint_attention(const Tensor& q, const Tensor& k, con
   const char* op = "joint_attention";
   const Inputs own = inputs_of(op, q, k, v, q_rows, kv_rows, cu_q, cu_k, scale);
   const Inputs other =
-      inputs_of("joint_attention: other table", q, other_k, other_v, other_q_rows, other_kv_rows, other_cu_q, other_cu_k,
-                scale);
+      inputs_of("joint_attention: other table", q, other_k, other_v, other_q_rows, other_kv_rows, other_cu_q,
+                other_cu_k, scale);
   Tensor out = empty(q, {q.size(0), q.size(1), q.size(2)});
   Tensor stats = empty(q, {q.size(0), q.size(1), 2}, stats_type(q));
   attend(op, own, false, out, stats);

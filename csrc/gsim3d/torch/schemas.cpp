@@ -29,16 +29,16 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor cu_voxel_rows, Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first) -> (Tensor weight, Tensor "
       "bias)");
 
-  // patch_attn: attention inside patches of a serialized order, separate query and key tables; q, k, v [N, H, D]. Joint:
-  // to the keys of two tables, in one softmax.
+  // patch_attn: attention inside patches of a serialized order, separate query and key tables; q, k, v [N, H, D].
+  // Joint: to the keys of two tables, in one softmax.
   m.def(
       "patch_attention(Tensor q, Tensor k, Tensor v, Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k, float "
       "scale) "
       "-> (Tensor out, Tensor stats)");
   m.def(
       "joint_attention(Tensor q, Tensor k, Tensor v, Tensor other_k, Tensor other_v, Tensor q_rows, Tensor kv_rows, "
-      "Tensor cu_q, Tensor cu_k, Tensor other_q_rows, Tensor other_kv_rows, Tensor other_cu_q, Tensor other_cu_k, float "
-      "scale) -> (Tensor out, Tensor stats)");
+      "Tensor cu_q, Tensor cu_k, Tensor other_q_rows, Tensor other_kv_rows, Tensor other_cu_q, Tensor other_cu_k, "
+      "float scale) -> (Tensor out, Tensor stats)");
   m.def(
       "patch_attention_backward(Tensor grad, Tensor q, Tensor k, Tensor v, Tensor out, Tensor stats, Tensor q_rows, "
       "Tensor kv_rows, Tensor cu_q, Tensor cu_k, float scale) -> (Tensor q, Tensor k, Tensor v)");
@@ -101,8 +101,8 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   m.def("find_cells(Tensor cells, Tensor scene, Tensor grid) -> Tensor");
   m.def("add_cells(Tensor x, Tensor field, Tensor places) -> Tensor");
   m.def(
-      "overlapping_patches(Tensor first, Tensor kv_rows, Tensor cu_k, Tensor codes, Tensor order, Tensor cu_clouds, int "
-      "patch_size) -> (Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k)");
+      "overlapping_patches(Tensor first, Tensor kv_rows, Tensor cu_k, Tensor codes, Tensor order, Tensor cu_clouds, "
+      "int patch_size) -> (Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k)");
 
   // plane_sweep: multi-view stereo cost volume; features [I, C, h, w] -> cost [I, D, h, w].
   m.def(
