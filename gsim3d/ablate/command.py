@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 
 EPILOG = """\
 Every row is the base run with one thing changed, trained on the same scenes for as many steps and scored on the scenes
@@ -44,9 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="runs at a time, a process each: a small model leaves most of a GPU idle (default: 1)",
     )
-    parser.add_argument(
-        "--minutes", type=float, default=float("inf"), metavar="M", help="train no longer; the next call goes on"
-    )
+    parser.add_argument("--minutes", type=float, metavar="M", help="train no longer; the next call goes on")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default: cpu)")
     parser.add_argument("--list", action="store_true", help="print the rows and exit")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
@@ -71,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"{'DATA' if name == 'data' else '--out'} is needed (see gsim3d ablate --help)")
     if args.together < 1:
         raise InputError(f"--together must be at least 1; got {args.together}")
-    if not args.minutes > 0:
-        raise InputError(f"--minutes must be positive; got {args.minutes}")
+    if args.minutes is not None and not 0 < args.minutes < math.inf:
+        raise InputError(f"--minutes must be positive and finite; got {args.minutes}")
     rows = rows_named(",".join(DEFAULT_ROWS) if args.rows is None else args.rows)
 
     from gsim3d.ablate.study import Study
@@ -92,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--out: {out} is not a folder")
     study = Study(base, rows, find_scenes(args.data), n_seeds=args.seeds, device=args.device)
     command = shlex.join(["gsim3d", "ablate", *sys.argv[2:]])
-    limits = {"together": args.together, "minutes": args.minutes}
+    limits = {"together": args.together, "minutes": math.inf if args.minutes is None else args.minutes}
     content = study.run(out, command, **limits, progress=not args.quiet, say=partial(print, flush=True))
     print(markdown(content), f"written: {out / 'ablation.md'}, {out / 'ablation.json'}", sep="\n")
     return 1 if any("failure" in run for row in content["rows"] for run in row["runs"]) else 0

@@ -201,6 +201,7 @@ def test_the_command_lists_rows_and_says_what_is_wrong(folders, tmp_path, capsys
         ([data, "--seeds", "0", "--out", out], "--seeds must be at least 1"),
         ([data, "--together", "0", "--out", out], "--together must be at least 1"),
         ([data, "--minutes", "0", "--out", out], "--minutes must be positive"),
+        ([data, "--minutes", "inf", "--out", out], "--minutes must be positive and finite"),
         ([data], "--out is needed"),
         ([str(folders[0]), "--out", out], "two are needed"),
         ([data, "--config", str(tmp_path / "long.yaml"), "--out", out], "row latent: "),
