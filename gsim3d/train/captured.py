@@ -29,6 +29,7 @@ from gsim3d.ops.curve import Pyramid
 from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport
+from gsim3d.train.checkpoint import laid_out_as
 from gsim3d.train.samples import Batch
 from gsim3d.types import ASLEEP, DYNAMIC, Frames, Particles
 
@@ -88,6 +89,7 @@ class CapturedLoss:
     Attributes:
         parameters: those whose gradients it returns, all of the simulator.
         alone: a context in which no other thread uses the GPU, which a capture does not allow.
+        meanwhile: is called in every call, while the graph runs: what else the host has to do delays no kernel then.
         captures: how often a graph was made.
     """
 
@@ -102,6 +104,7 @@ class CapturedLoss:
         self.simulator, self.plan, self.loss, self.precision = simulator, plan, loss, precision
         self.parameters = list(simulator.parameters())
         self.alone: AbstractContextManager = nullcontext()
+        self.meanwhile: Callable[[], None] = lambda: None
         self.captures = 0
         self._steps: dict[tuple, _Step] = {}
 
@@ -153,8 +156,9 @@ class _Step:
         if not self._is_ready:
             self._capacities = self._observed()
             self._capture()
+        loss, errors, norm, gradients, found, records = self._replay()
+        self._owner.meanwhile()
         while True:
-            loss, errors, norm, gradients, found, records = self._replay()
             numbers = found.tolist()
             if all([capacity.fits(row) for capacity, row in zip(self._capacities, numbers, strict=True)]):
                 break
@@ -164,6 +168,7 @@ class _Step:
             most = [max(sizes) for sizes in zip(*(capacity.sizes for capacity in self._observed()), strict=True)]
             self._capacities = [capacity.grown((0, *most), 1) for capacity in grown]
             self._capture()
+            loss, errors, norm, gradients, found, records = self._replay()
         records.replayed(report)
         return Gradients(loss, errors, norm, gradients)
 
@@ -218,7 +223,10 @@ class _Step:
             n = len(of_calls[0])
             parts = [gradients[begin : begin + n] for begin in range(len(once), len(gradients), n)]
             known |= zip(dynamics.parameters(), _sums(parts[::-1]), strict=True)
-        gradients = tuple(known.get(parameter) for parameter in owner.parameters)
+        gradients = tuple(
+            None if (gradient := known.get(parameter)) is None else laid_out_as(parameter, gradient)
+            for parameter in owner.parameters
+        )
         norm = torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
         return loss.detach(), errors, norm, gradients
 

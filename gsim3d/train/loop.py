@@ -6,6 +6,7 @@ import math
 import os
 import time
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
@@ -32,6 +33,7 @@ from gsim3d.train.checks import check_history, check_sharing
 from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import Log, memory_gib, plain, progress_note
 from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
+from gsim3d.train.optimizer import Optimizer
 from gsim3d.train.precision import FIRST_SCALE, LossScale
 from gsim3d.train.processes import Processes
 from gsim3d.train.profile import check_profile, profiler
@@ -97,15 +99,10 @@ class Trainer:
         check_sharing(config, self.processes.count, self.simulator.config.dynamics.norm)
         self.perceptual = load("lpips_vgg", partial(LPIPS, "vgg")).to(device) if config.loss.perceptual else None
         self.parameters = dict(self.simulator.named_parameters())
-        settings = config.optimizer
-        self.optimizer = torch.optim.AdamW(
-            self.parameters.values(),
-            lr=0.0,
-            betas=(settings.beta1, settings.beta2),
-            eps=settings.eps,
-            weight_decay=settings.weight_decay,
-        )
-        self.average = {k: v.clone() for k, v in self.simulator.state_dict().items()} if settings.ema_decay else {}
+        self.buffers = dict(self.simulator.named_buffers())
+        self.optimizer = Optimizer(list(self.parameters.values()), config.optimizer)
+        averaged = self.simulator.state_dict() if config.optimizer.ema_decay else {}
+        self.average = {name: value.clone() for name, value in averaged.items()}
         self.scale = LossScale(FIRST_SCALE if config.precision.scales_loss else 1.0)
         self.step = self.n_skipped = self.n_skipped_in_a_row = 0
         self.seconds = 0.0
@@ -195,7 +192,7 @@ class Trainer:
         """
         stage, place = self.config.stage_of(self.step)
         rate = self.learning_rate(stage, place)
-        statistics = [(buffer, buffer.clone()) for buffer in self.simulator.buffers()]
+        statistics = [(buffer, buffer.clone()) for buffer in self.buffers.values()]
         entry = {"step": self.step, "loss": math.nan, "learning_rate": rate, "grad_norm": math.nan}
         n_context = history_at(self.config.data, stage, self.config.seed, self.step)
         errors = torch.full((n_context + stage.horizon,), math.nan)
@@ -205,9 +202,7 @@ class Trainer:
         except HardCaseError as error:
             problem = str(error)
         if problem is None:
-            for group in self.optimizer.param_groups:
-                group["lr"] = rate
-            self.optimizer.step()
+            self.optimizer.update(gradients, norm, rate)
             self._update_average()
             self.n_skipped_in_a_row = 0
         else:
@@ -263,15 +258,11 @@ class Trainer:
         return loss, errors, gradients, norm, list(seen)
 
     def _look_at(self, entry: dict, loss: float, gradients: Sequence, norm: Tensor, seen: list[Seen]) -> str | None:
-        """Hands the gradients to the optimizer, clipped, and fills in ``entry``; why they cannot be used, or None."""
+        """Fills in ``entry``; why the gradients cannot be used, or None."""
         named = dict(zip(self.parameters, gradients, strict=True))
-        for name, parameter in self.parameters.items():
-            parameter.grad = named[name]
         if self._is_logged:
             entry["grad_norm_by_module"] = norms_by_module(named)
         entry["loss"] = loss
-        limit = self.config.optimizer.clip_norm or math.inf
-        torch.nn.utils.clip_grads_with_norm_(self.parameters.values(), limit, norm)
         entry["grad_norm"] = norm.item()
         if self._is_logged and (by_step := mean_of_norms([part.norms for part in seen])):
             entry["grad_norm_by_step"] = by_step
@@ -509,13 +500,13 @@ class Trainer:
         if self.average:
             weights = self.simulator.state_dict()
             self.average = {name: checkpoint.laid_out_as(weights[name], value) for name, value in saved.ema.items()}
+        moments = defaultdict(dict)
         for key, value in saved.optimizer.items():
             kind, name = key.split(".", 1)
-            if name in self.parameters:
-                parameter = self.parameters[name]
-                # AdamW counts its steps on the host.
-                value = value if kind == "step" else checkpoint.laid_out_as(parameter, value)
-                self.optimizer.state[parameter][kind] = value
+            moments[name][kind] = value
+        for name, parameter in self.parameters.items():
+            if name in moments:
+                self.optimizer.restore(parameter, moments[name])
         self.step, self.n_skipped = saved.state["step"], saved.state["n_skipped"]
         self.n_skipped_in_a_row = saved.state.get("n_skipped_in_a_row", 0)
         self.seconds, self.parent = saved.state["seconds"], saved.digest
@@ -526,11 +517,10 @@ class Trainer:
         if not self.average:
             return
         with torch.no_grad():
-            buffers = dict(self.simulator.named_buffers())
-            weights = self.parameters | {name: x for name, x in buffers.items() if x.is_floating_point()}
+            weights = self.parameters | {name: x for name, x in self.buffers.items() if x.is_floating_point()}
             torch._foreach_lerp_([self.average[name] for name in weights], list(weights.values()), 1 - decay)
-            for name in buffers.keys() - weights.keys():
-                self.average[name].copy_(buffers[name])
+            for name in self.buffers.keys() - weights.keys():
+                self.average[name].copy_(self.buffers[name])
 
 
 class _Loss(nn.Module):

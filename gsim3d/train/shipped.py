@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from gsim3d.errors import HardCaseError
-from gsim3d.train.captured import Prepared
+from gsim3d.train.captured import CapturedLoss, Prepared
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.films import Filming, FilmStore
 from gsim3d.train.log import memory_gib
@@ -85,7 +85,7 @@ def _recipe(
         ),
         stages=(
             # Images alone first: steps of many scenes and few kernels, and nothing of them comes back from a rollout.
-            stage(steps=1500, history=1, batch=16, learning_rate=1e-3),
+            stage(steps=2500, history=1, batch=16, learning_rate=1e-3),
             stage(steps=200, horizon=2, batch=2 * batch, learning_rate=1e-3),
             stage(steps=300, horizon=6, batch=batch, from_start=0.2, learning_rate=8e-4),
             stage(steps=400, horizon=12, batch=batch, from_start=0.2, learning_rate=6e-4),
@@ -115,13 +115,16 @@ class SittingTrainer(Trainer):
     """Trains on what a store holds, at a rate that follows the clock: it rises, stays and falls in every sitting."""
 
     def __init__(self, config: TrainConfig, store: FilmStore, out: Path, device: str):
-        super().__init__(config, store.films[:1], out, device=device)
         self.store = store
+        super().__init__(config, store.films[:1], out, device=device)
         self.first_step, self.begin, self.end = 0, 0.0, math.inf
         self._side = torch.cuda.Stream() if device == "cuda" else None
         self._next: tuple[int, Future] | None = None
-        if self.captured is not None:
-            self.captured.alone = store.lock
+
+    def _capture(self) -> CapturedLoss:
+        captured = super()._capture()
+        captured.alone, captured.meanwhile = self.store.lock, self._draw_next
+        return captured
 
     def begin_sitting(self, end: float) -> None:
         """From now to ``end``, on the clock of time.monotonic."""
@@ -145,10 +148,12 @@ class SittingTrainer(Trainer):
     def _prepared(self, samples: list[int]) -> Prepared:
         """Drawn while the GPU computed the step before."""
         ahead = self._next if self._next is not None and self._next[0] == self.step else self._begin_to_draw(self.step)
-        self._next = self._begin_to_draw(self.step + 1)
         # The last one was copied by a step that is over: only now may its memory be used anew.
         self._read = ahead[1].result()
         return self._read
+
+    def _draw_next(self) -> None:
+        self._next = self._begin_to_draw(self.step + 1)
 
     def _begin_to_draw(self, step: int) -> tuple[int, Future]:
         return step, self._reader.submit(self._draw_beside, step)

@@ -97,12 +97,9 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
         weights = trainer.simulator.state_dict()
         trainer.average = {key: checkpoint.laid_out_as(weights[key], value) for key, value in averaged.items()}
         for key, value in squares.items():
-            parameter = trainer.parameters[key]
-            trainer.optimizer.state[parameter] = {
-                "step": torch.tensor(float(progress.step)),
-                "exp_avg": torch.zeros_like(parameter),
-                "exp_avg_sq": checkpoint.laid_out_as(parameter, value),
-            }
+            parameter, step = trainer.parameters[key], torch.tensor(float(progress.step))
+            moments = {"step": step, "exp_avg": torch.zeros_like(parameter), "exp_avg_sq": value}
+            trainer.optimizer.restore(parameter, moments)
     except (RuntimeError, KeyError) as error:
         raise InputError(
             f"{folder}: the state of {name} is of another model: {str(error).splitlines()[-1].strip()}"

@@ -83,11 +83,12 @@ def mean_of_norms(parts: Sequence[Sequence[float]]) -> list[float]:
 
 def norms_by_module(gradients: Mapping[str, Tensor | None]) -> dict[str, float]:
     """The norm of the gradients of all parameters of each part of a model, by the first word of their names."""
-    squares: dict[str, list[Tensor]] = {}
+    parts: dict[str, list[Tensor]] = {}
     for name, gradient in gradients.items():
         if gradient is not None:
-            squares.setdefault(name.split(".")[0], []).append(gradient.detach().double().square().sum())
-    return {name: math.sqrt(torch.stack(values).sum().item()) for name, values in squares.items()}
+            parts.setdefault(name.split(".")[0], []).append(gradient.detach())
+    norms = {name: torch.stack(torch._foreach_norm(values, 2, torch.double)) for name, values in parts.items()}
+    return {name: math.sqrt(values.square().sum().item()) for name, values in norms.items()}
 
 
 def first_not_finite(gradients: Iterable[tuple[str, Tensor | None]]) -> str | None:

@@ -91,6 +91,7 @@ def test_gradients_are_those_of_the_loss(stage, scenes, trainer, device):
             assert (gradient is None) == (wanted is None), name
             if gradient is not None:
                 assert (gradient - wanted).abs().max() <= TOLERANCE[device.type] * largest, name
+                assert gradient.stride() == trainer.parameters[name].stride(), name
         squares = sum(gradient.double().square().sum() for gradient in actual.parameters if gradient is not None)
         assert actual.norm.item() == pytest.approx(squares.sqrt().item(), rel=1e-5)
     assert captured.captures >= 1 and not report.total
