@@ -54,9 +54,6 @@ class Stepping:
     def __call__(self) -> None:
         if self._stopwatch is None:
             return self._run()
-        if self._graph is not None:
-            with self._stopwatch.running():
-                return self._run()
         with watched(self.runner.simulator, self._stopwatch), self._stopwatch.running():
             self._run()
 

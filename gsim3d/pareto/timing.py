@@ -187,7 +187,7 @@ class GraphStopwatch(Stopwatch):
     @contextmanager
     def capturing(self, rest: str = REST) -> Iterator[None]:
         """The one capture of the graph; what is run before it, to try it out, has no marks."""
-        self._marks, self._open, self._due = [], [rest], dict(self._delays)
+        self._marks, self._open, self._due, self._behind = [], [rest], dict(self._delays), None
         try:
             yield
         finally:
@@ -195,12 +195,19 @@ class GraphStopwatch(Stopwatch):
 
     @contextmanager
     def running(self, rest: str = REST) -> Iterator[None]:
-        """One replay."""
-        begin = self._clock.mark()
+        """One replay, and what the host launches behind it, such as images that a graph cannot draw."""
+        self._open, self._behind, begin = [rest], [], self._clock.mark()
         try:
             yield
         finally:
-            self._add_up([(rest, begin), *self._marks, ("", self._clock.mark())])
+            end, self._open = self._clock.mark(), []
+            self._add_up([(rest, begin), *self._marks, *self._behind, ("", end)])
+
+    def _note(self, name: str) -> None:
+        if self._counts():
+            self._marks.append((name, self._clock.mark()))
+        elif self._behind is not None:
+            self._behind.append((name, self._clock.mark()))
 
     def _counts(self) -> bool:
         return bool(self._open) and self._clock.capturing()

@@ -265,7 +265,7 @@ GRAPHS = [
 
 @pytest.mark.parametrize("setting", GRAPHS, ids=lambda setting: setting.name)
 def test_what_is_replayed_is_what_the_setting_says(subject, setting, monkeypatch):
-    """Drawn by the graph where it can, else behind it: as many images, of the same particles, as launched one by one."""
+    """Drawn by the graph where it can, else behind it: as many images of the same particles as without one."""
     drawn = []
     monkeypatch.setattr(Runner, "images", lambda self, particles, cameras: drawn.append(particles.means.clone()))
     stepping = Stepping(subject, setting, DeviceClock("cpu"))
