@@ -30,7 +30,7 @@ WORLDS = ("elastic", "cloth", "rigid")
 REPORT_SHARE, REPORT_MOST = 0.15, 60.0  # of a sitting, seconds: for held-out predictions at its end
 FILMED = 3  # held-out trajectories in the video
 SPARE_CORES = 2  # that the training process keeps
-LATER_SHARE = 3  # once training has begun one process in so many films: its host thread needs the cores' speed
+LATER_SHARE = 2  # once training has begun one process in so many films: its host thread needs a free core
 HELD_OUT_PROCESSES = 2
 
 

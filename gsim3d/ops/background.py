@@ -12,6 +12,8 @@ from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole
 from gsim3d.ops._autocast import follow_autocast
 from gsim3d.ops.curve import PatchTable, Segments
 
+RUN = 64  # rows that are summed one after another
+
 
 def row_scenes(cloud_scene: Tensor, cu_input: Tensor, stages: Sequence[Segments]) -> list[Tensor]:
     """The scene of every row of every stage: that of the first row that it pools.
@@ -70,7 +72,7 @@ def add_cells(x: Tensor, field: Tensor, places: Tensor, *, check: bool = True) -
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [N, C], dtype of ``x``.
-    Gradients: ``x`` and ``field``; sums over the rows of a cell have one order.
+    Gradients: ``x`` and ``field``, once; sums over the rows of a cell have one order.
     Raises:
         HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it.
@@ -148,10 +150,17 @@ def _setup(ctx, inputs, output):
 
 def _backward(ctx, grad):
     (places,) = ctx.saved_tensors
-    of_field = None
-    if ctx.needs_input_grad[1]:  # sums without atomics
-        of_field = torch.ops.aten.embedding_dense_backward(grad.contiguous(), places, ctx.n_cells, -1, False)
-    return grad, of_field, None
+    return grad, _sum_by_cell(grad, places, ctx.n_cells) if ctx.needs_input_grad[1] else None, None
+
+
+def _sum_by_cell(x: Tensor, places: Tensor, n_cells: int) -> Tensor:
+    """[n_cells, C], in one order and without atomics: a cell that has most rows is summed in runs, then over them."""
+    found, rows = places.sort(stable=True)
+    cu_cells = torch.searchsorted(found, torch.arange(n_cells + 1, device=places.device))
+    cuts = torch.cat([cu_cells, torch.arange(0, places.shape[0], RUN, device=places.device)]).sort().values
+    runs = torch.ops.gsim3d.unpool_backward(x.to(torch.promote_types(x.dtype, torch.float32)), rows, cuts)
+    each = torch.arange(runs.shape[0], device=places.device)
+    return torch.ops.gsim3d.unpool_backward(runs, each, torch.searchsorted(cuts, cu_cells)).to(x.dtype)
 
 
 torch.library.register_autograd("gsim3d::add_cells", _backward, setup_context=_setup)

@@ -85,7 +85,7 @@ def _recipe(
         ),
         stages=(
             # Images alone first: steps of many scenes and few kernels, and nothing of them comes back from a rollout.
-            stage(steps=1500, history=1, batch=16, learning_rate=1e-3),
+            stage(steps=2500, history=1, batch=16, learning_rate=1e-3),
             stage(steps=200, horizon=2, batch=2 * batch, learning_rate=1e-3),
             stage(steps=300, horizon=6, batch=batch, from_start=0.2, learning_rate=8e-4),
             stage(steps=400, horizon=12, batch=batch, from_start=0.2, learning_rate=6e-4),

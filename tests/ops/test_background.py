@@ -156,7 +156,9 @@ def test_patches(shape, device):
 
 # 1, 2 forward and gradient of what is added
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("n_rows, n_cells, channels", [(70, 9, 16), (5000, 40, 24), (33, 50, 5), (3, 1, 1)])
+@pytest.mark.parametrize(
+    "n_rows, n_cells, channels", [(70, 9, 16), (5000, 40, 24), (33, 50, 5), (3, 1, 1), (0, 4, 3), (200, 1, 33)]
+)
 def test_cells_are_added(n_rows, n_cells, channels, dtype, device):
     if device.type == "cpu" and dtype.itemsize == 2:
         pytest.skip("the CPU computes in float32 and float64")
@@ -204,6 +206,16 @@ def test_a_row_whose_cell_is_out_of_range_is_copied(devices):
     out = add_cells(x, field, wrong)
     assert_same_bits(out[1::2], x[1::2])
     assert_same_bits(out[::2], add_cells(x, field, places)[::2])
+
+
+@pytest.mark.parametrize("far", [lambda i: 9 + i, lambda i: -1 - i, lambda i: 2**31 - 1 + i, lambda i: -(2**62) + i])
+def test_a_row_whose_cell_is_out_of_range_gives_its_gradient_to_none(far, devices):
+    x, field, places, cotangent = (t.to(devices[1]) for t in rows_and_field(700, dtype=torch.float64))
+    i = torch.arange(700, device=devices[1])
+    actual = gradients(lambda *y: add_cells(*y, torch.where(i % 2 == 0, places, far(i))), [x, field], cotangent)
+    expected = gradients(lambda *y: add_cells(*y, places[::2]), [x[::2], field], cotangent[::2])
+    assert_same_bits(actual[1], cotangent)
+    assert_close_relative_to_max(actual[2], expected[2], 1e-14)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from tests.asserts import (
     assert_same_bits,
     assert_same_bits_for_any_threads,
     gradients,
-    relative_to_max,
 )
 from tests.oracle import patch_attn as oracle
 from tests.ops.test_patch_attn import DIMS, DTYPES, RAGGED, cotangent_of, lists, offsets, random_case
@@ -150,12 +149,15 @@ SHAPES = {
 @pytest.mark.parametrize("dtype", LOW_PRECISION, ids=LOW_PRECISION.values())
 @pytest.mark.parametrize("shape, dim", [(s, d) for s in SHAPES for d in (16, 32, 64)] + [("ragged", 8), ("ragged", 48)])
 def test_low_precision_errs_no_more_than_torch(devices, shape, dim, dtype):
-    """Against float64, at most twice the error of plain torch in the same dtype."""
+    """Against float64, and plain torch in the same dtype. Of a patch with two keys each gradient is one product: which
+    of the two errs more in its worst number is a matter of luck, by a factor of two either way."""
     case = joint_case(*SHAPES[shape], n_keys=1100, dim=dim, dtype=dtype)
     wide, plain = case.to(torch.float64), results_of(case, case.attend_plainly)
     exact = results_of(wide, wide.attend_oracle)
     for name, a, b, e in zip(NAMES, results_of(case.to(devices[1])), plain, exact, strict=True):
-        assert a.dtype == dtype and relative_to_max(a, e) <= 2 * relative_to_max(b, e), name
+        ours, theirs = (x.double().cpu() - e for x in (a, b))
+        assert a.dtype == dtype and ours.square().mean() <= 1.5**2 * theirs.square().mean(), name
+        assert ours.abs().max() <= 3 * theirs.abs().max(), name
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, *LOW_PRECISION], ids=["float32", *LOW_PRECISION.values()])
