@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from gsim3d.encoder.config import EncoderConfig
-from gsim3d.layers import RowLayerNorm
+from gsim3d.layers import RowLayerNorm, widened
 from gsim3d.quirks import Quirks
 
 MASKED = -100.0  # added to a score that must not count; finite, so that a row of masked keys stays finite
@@ -166,7 +166,7 @@ class MultiViewTransformer(nn.Module):
         n, n_views, dim, height, width = x.shape
         windows = Windows(height, width, self.split)
         code = sine_position_code(windows.rows, windows.cols, dim, x).reshape(windows.rows, windows.cols, dim)
-        x = x.permute(0, 1, 3, 4, 2) + code.repeat(self.split, self.split, 1)
+        x = widened(x.permute(0, 1, 3, 4, 2) + code.repeat(self.split, self.split, 1))
         for i, layer in enumerate(self.layers):
             shifted = i % 2 == 1 and self.split > 1
             within = windows.shift_mask(x)[None] if shifted else None
