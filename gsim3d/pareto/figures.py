@@ -45,6 +45,7 @@ def cost(points: Sequence[Point], comparison: Comparison, presets: dict[str, Poi
     best = front([p for p in usable if p.knob not in NOT_TUNED], lost)
     _draw(axes, points, usable, best, lost, labelled=[p for p in best if p not in presets.values()])
     axes.set_ylabel("share of the gain that is lost")
+    axes.autoscale(enable=False, axis="y")  # of equal losses there is no range to scale to
     axes.set_ylim(LEAST_LOSS / 1.8, 12 * MOST_LOSS)  # room for what is said of the presets
     ticks = {LEAST_LOSS: "none", 1e-3: "0.1 %", 1e-2: "1 %", 0.1: "10 %", 1.0: "100 %", MOST_LOSS: "more"}
     axes.set_yticks(list(ticks), list(ticks.values()))

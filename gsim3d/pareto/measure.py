@@ -54,6 +54,7 @@ class Effort:
 QUICK = Effort(n_steps=12, n_scenes=2, encodings=3, fewest_turns=True, slow_turns=False)
 QUICK_ON_CPU = dataclasses.replace(QUICK, encodings=1, apart=False)
 FULL = Effort(repeats=10, n_scenes=16)
+FEWEST = 3  # repeats of a round where the time is nearly over
 COMPILE_SECONDS = 120.0  # that a setting may be compiled
 
 
@@ -144,12 +145,12 @@ class Comparison:
                 raise predictions[-1]
         return predictions
 
-    def reference_times(self, warm_up: int) -> list[Timing]:
-        """Of three runs of the reference, those made so far among them; tells :attr:`noise`."""
+    def reference_times(self, warm_up: int, n_runs: int = 3) -> list[Timing]:
+        """Of ``n_runs`` of the reference, those made so far among them; tells :attr:`noise`."""
         runs = [[spent for predicted in self.reference for spent in predicted.spent]]
         if (again := self.spent.get(Setting(), runs[0])) != runs[0]:  # beside settings that draw otherwise
             runs.append(again)
-        while len(runs) < 3:
+        while len(runs) < n_runs:
             runs.append([spent for predicted in self._run_reference() for spent in predicted.spent])
         timings = [timing_of(run, warm_up) for run in runs]
         rounds = [timing.steady for timing in timings]
@@ -310,12 +311,14 @@ def measure(
     apart = [point for point in points if effort.apart or point.setting.compiled]
     if not effort.apart:
         if reference is not None:
-            reference.step = comparison.reference_times(effort.warm_up)
+            reference.step = comparison.reference_times(effort.warm_up, 2 if limit.is_over(ROUNDS) else 3)
         for point in points:
             if point in apart or point.failure:
                 continue
             point.noise = comparison.noise
             point.step = point.step or [timing_of(comparison.spent[point.setting], effort.warm_up)]
+    if limit.is_over(ROUNDS):
+        effort = dataclasses.replace(effort, repeats=min(effort.repeats, FEWEST), encodings=1)
     ready: dict[Setting, Stepping] = {}
     for n in range(effort.n_rounds):
         if n and limit.is_over(ROUNDS):

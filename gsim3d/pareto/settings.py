@@ -281,7 +281,7 @@ def _others(knob: str) -> Callable[[Subject], list[Setting]]:
 KNOBS = (
     Knob("precision", "model", _precisions, "a GPU: on a CPU there is only float32"),
     Knob("fp8 products", "model", _fp8, "wider layers, see below"),
-    Knob("compile", "exact", _compiled, "a compiler; minutes, so `quick` leaves it out", slow=True),
+    Knob("compile", "exact", _compiled, "a compiler; up to 2 minutes, so `quick` leaves it out", slow=True),
     Knob("graph capture", "exact", _captured, "a GPU"),
     Knob("context views", "model", _views, "more than one context view"),
     Knob("history", "model", _history, "a model of more than one step of history"),
