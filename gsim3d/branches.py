@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 N_STREAMS = 4  # what more branches than these are given is queued behind one of them
+MANY_STREAMS = 8
 
 
 class Branches:
@@ -23,11 +24,12 @@ class Branches:
 
     Args:
         like: on the device of the work.
+        n_streams: at most ``MANY_STREAMS``, for long chains of small kernels.
     """
 
-    def __init__(self, like: Tensor):
+    def __init__(self, like: Tensor, n_streams: int = N_STREAMS):
         captured = like.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
-        self._streams = _streams(like.device) if captured else ()
+        self._streams = _streams(like.device)[:n_streams] if captured else ()
         self._count, self._read = 0, []
 
     def __enter__(self) -> Branches:
@@ -52,4 +54,4 @@ class Branches:
 
 @functools.lru_cache(maxsize=None)
 def _streams(device: torch.device) -> tuple[torch.cuda.Stream, ...]:
-    return tuple(torch.cuda.Stream(device) for _ in range(N_STREAMS))
+    return tuple(torch.cuda.Stream(device) for _ in range(MANY_STREAMS))

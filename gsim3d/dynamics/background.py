@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d import ops
-from gsim3d.branches import Branches
+from gsim3d.branches import MANY_STREAMS, Branches
 from gsim3d.ops.curve import CURVES, KernelMap, PatchTable, Pyramid, PyramidSpec, Segments, Stage, Voxels
 from gsim3d.types import Particles
 
@@ -105,9 +105,12 @@ class Background:
 
     def readers(self, pyramid: Pyramid, particles: Particles) -> list[Reader]:
         """What a call over moving ``particles`` is given, for each stage; nothing waits for the device."""
-        rooms = zip(self.places, pyramid.stages, row_scenes(pyramid, particles), self.depths, self.curves)
-        with Branches(particles.means) as beside:  # many launches over few rows, and no stage waits for another
-            return [beside.run(Reader, self, *room) for room in rooms]
+        scenes = row_scenes(pyramid, particles)
+        rooms = list(zip(self.places, pyramid.stages, scenes, self.depths, self.curves))
+        with Branches(particles.means, MANY_STREAMS) as beside:  # many launches over few rows; none waits for another
+            patches = [beside.run(_overlap, *room) for room in rooms]
+            cells = [beside.run(_cells_of_rows, *room[:3]) for room in rooms]
+        return [Reader(self, *of_stage) for of_stage in zip(cells, patches, strict=True)]
 
     def map(self, f: Callable[[Tensor, int], Tensor]) -> Background:
         """The same background with ``f`` applied to every tensor and its kind (KEYS, LISTS, OFFSETS or ROWS)."""
@@ -168,21 +171,8 @@ class Recorder:
 class Reader:
     """Adds to one stage of a call over moving rows what they read of the background."""
 
-    def __init__(
-        self,
-        background: Background,
-        places: Places,
-        stage: Stage,
-        scene: Tensor,
-        depth: int,
-        curves: tuple[int, ...],
-    ):
-        self.background = background
-        self.cells = {size: ops.find_cells(cells, scene, stage.grid) for size, cells in places.cells.items()}
-        codes, at = _codes(stage, scene, depth, curves), (stage.order, stage.cu_clouds)
-        self.patches = ops.overlapping_patches(
-            places.first, places.kv_rows, places.cu_k, codes, *at, patch_size=places.patch_size
-        )
+    def __init__(self, background: Background, cells: dict[int, Tensor], patches: tuple[PatchTable, ...]):
+        self.background, self.cells, self.patches = background, cells, patches
 
     def convolved(self, conv: nn.Module, x: Tensor, out: Tensor) -> Tensor:
         field = self.background.fields[conv].to(out.dtype)
@@ -197,6 +187,20 @@ def row_scenes(pyramid: Pyramid, particles: Particles) -> list[Tensor]:
     """int64 [N] for each stage: the scene of every row, anything for rows of a given capacity that are none."""
     pooled = [Segments(pyramid.rows, pyramid.cu_rows), *(stage.cluster for stage in pyramid.stages[1:])]
     return ops.row_scenes(particles.cloud_scene, particles.cu_rows, pooled)
+
+
+def _cells_of_rows(places: Places, stage: Stage, scene: Tensor) -> dict[int, Tensor]:
+    """Where the rows of a stage find the fields, by kernel size."""
+    return {size: ops.find_cells(cells, scene, stage.grid) for size, cells in places.cells.items()}
+
+
+def _overlap(
+    places: Places, stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]
+) -> tuple[PatchTable, ...]:
+    """The patches of the background around the rows of a stage, along each curve."""
+    codes, at = _codes(stage, scene, depth, curves), (stage.order, stage.cu_clouds)
+    background = places.first, places.kv_rows, places.cu_k
+    return ops.overlapping_patches(*background, codes, *at, patch_size=places.patch_size)
 
 
 # ---- places ----

@@ -194,8 +194,13 @@ def run_blocks(
     stage: Stage,
     generator: torch.Generator | None,
     beside: Beside | None = None,
+    *,
+    for_products: bool = False,
 ) -> Tensor:
-    """x behind ``blocks``; the first convolution reads ``conv_input``, the others what the block before them made."""
+    """x behind ``blocks``; the first convolution reads ``conv_input``, the others what the block before them made.
+
+    ``for_products``: only products read the result, so that without gradients it may have their dtype.
+    """
     x = widened(x)
     for i, block in enumerate(blocks):
         row = i % len(stage.patches)
@@ -203,7 +208,7 @@ def run_blocks(
             x, conv_input = block.advance(x, conv_input, stage, row, generator, beside)
         else:
             x = conv_input = block(x, stage, row, conv_input=conv_input, generator=generator, beside=beside)
-    return x
+    return conv_input if for_products and len(blocks) > 0 and not torch.is_grad_enabled() else x
 
 
 class Stem(nn.Module):
@@ -275,11 +280,11 @@ class EncoderStage(nn.Module):
             x = self.pool(x, stage)
         if self.merge is not None and self.merge.marks(stage):
             x = self.merge(x, stage)
-        return run_blocks(self.blocks, x, x, stage, generator, beside)
+        return run_blocks(self.blocks, x, x, stage, generator, beside, for_products=True)
 
 
 class Unpool(nn.Module):
-    """Features of the coarser rows, added to those the encoder had at this stage."""
+    """Features of the coarser rows, added to what :meth:`lift` makes of those that the encoder had at this stage."""
 
     def __init__(self, in_channels: int, skip_channels: int, out_channels: int, norm: str):
         super().__init__()
@@ -288,10 +293,12 @@ class Unpool(nn.Module):
         self.skip = RowLinear(skip_channels, out_channels)
         self.skip_norm = make_norm(norm, out_channels)
 
+    def lift(self, skip: Tensor, stage: Stage) -> Tensor:
+        return self.skip_norm.activated(self.skip(skip), stage.n_data)
+
     def forward(self, x: Tensor, skip: Tensor, stage: Stage, coarse: Stage) -> tuple[Tensor, Tensor]:
-        """Both together, and the skip branch alone."""
+        """Both together, and ``skip``."""
         below = self.proj_norm.activated(self.proj(x), coarse.n_data)
-        skip = self.skip_norm.activated(self.skip(skip), stage.n_data)
         cluster = coarse.cluster
         return skip + ops.unpool(below, cluster.rows, cluster.cu_rows, skip.shape[0], check=False), skip
 
@@ -305,7 +312,7 @@ class DecoderStage(nn.Module):
         self.blocks = nn.ModuleList(
             Block(channels[index], config.decoder_heads[index], drop_path, config) for drop_path in drop_paths
         )
-        self.stale_conv = config.quirks.stale_decoder_conv
+        self.stale_conv, self.is_last = config.quirks.stale_decoder_conv, index == 0
 
     def forward(
         self,
@@ -317,7 +324,8 @@ class DecoderStage(nn.Module):
         beside: Beside | None = None,
     ) -> Tensor:
         x, skip = self.unpool(x, skip, stage, coarse)
-        return run_blocks(self.blocks, x, skip if self.stale_conv else x, stage, generator, beside)
+        conv_input = skip if self.stale_conv else x
+        return run_blocks(self.blocks, x, conv_input, stage, generator, beside, for_products=not self.is_last)
 
 
 class Head(nn.Module):
@@ -379,9 +387,12 @@ class PointTransformer(nn.Module):
         self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None, besides: Sequence[Beside | None]
     ) -> Tensor:
         stages, skips = pyramid.stages, []
-        for encoder, stage, beside in zip(self.encoder, stages, besides, strict=True):
-            x = encoder(x, stage, generator, beside)
-            skips.append(x)
+        with Branches(x) as branches:
+            for s, (encoder, stage, beside) in enumerate(zip(self.encoder, stages, besides, strict=True)):
+                x = encoder(x, stage, generator, beside)
+                if s < len(self.decoder):  # made beside the deeper stages
+                    lift = self.decoder[s].unpool.lift
+                    skips.append(lift(x, stage) if torch.is_grad_enabled() else branches.run(lift, x, stage))
         for s in reversed(range(len(self.decoder))):
             x = self.decoder[s](x, skips[s], stages[s], stages[s + 1], generator, besides[s])
         return x

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsim3d.branches import Branches
+from gsim3d.branches import MANY_STREAMS, Branches
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_real, check_tensors, check_whole
 
@@ -354,7 +354,7 @@ def build_pyramid(
     if rounded and not torch.compiler.is_compiling():
         each = len(PyramidCapacity.COUNTS)
         counts = arrays[-1].tolist()[1 : 1 + each * spec.n_stages : each]
-    with Branches(positions) as beside:
+    with Branches(positions, MANY_STREAMS) as beside:
         return _assemble(arrays, spec, counts, capacity is not None or rounded, beside)
 
 

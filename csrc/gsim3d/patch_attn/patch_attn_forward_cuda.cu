@@ -255,6 +255,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
   uint8_t* valid = reinterpret_cast<uint8_t*>(shared) + 2 * S::kTileBytes;
   const uint32_t keys = shared_address(shared), values = keys + S::kTileBytes;
   const PatchTable& table = args.table;
+  if constexpr (!kJoins) let_next_begin();  // what joins needs the result only where it stores
   for (int64_t i = blockIdx.x; i < args.division.n_shares; i += gridDim.x) {
     Share share;
     if constexpr (kJoins) {
@@ -324,7 +325,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks) forward_kernel(Forward<T> a
       warp.load_rows(args, first, q_range.end);
       first += step;
       warp.load_queries(args, first, q_range.end, share.head);
-      wait_for_previous();  // rows that no patch lists are being set to 0
+      wait_for_previous();  // rows that no patch lists are being set to 0, or the softmax to join is being made
       if constexpr (kJoins) {
         if (active) warp.join(args, share.head);
       }
@@ -349,7 +350,8 @@ void run(Forward<T> args, int64_t heads, bool joins, Stream stream) {
   constexpr size_t kSharedBytes = Shape<D>::kSharedBytes;
   if (joins) {  // few patches may have nearly all queries
     args.division = divide_by_queries(args.table.n_patches, args.table.n_q_listed, Shape<D>::kGroup, heads);
-    return launch(kOp, forward_kernel<T, D, true>, blocks_of(args.division), kThreads, kSharedBytes, stream, args);
+    return launch_overlapping(kOp, forward_kernel<T, D, true>, blocks_of(args.division), kThreads, kSharedBytes, stream,
+                              args);
   }
   args.division = divide(args.table.n_patches, args.table.n_q_listed, Shape<D>::kGroup, heads,
                          kBlocks * multiprocessors(kOp, stream));

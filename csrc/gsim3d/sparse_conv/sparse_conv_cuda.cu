@@ -32,11 +32,19 @@ struct alignas(sizeof(E) * kVector) Vector {
   E values[kVector];
 };
 
+// Memory to clear, in units of 16 bytes.
+struct Clear {
+  uint4* to = nullptr;
+  int64_t count = 0;
+};
+
 // One value for each voxel of several rows; a thread has kVector columns of a voxel and takes its rows in order.
+// Clears what a later kernel fills.
 template <typename E, int kVector>
 __global__ void __launch_bounds__(kThreads)
-    combine_rows(const E* x, Sources sources, int32_t channels, VoxelValue kind, E* shared) {
+    combine_rows(const E* x, Sources sources, int32_t channels, VoxelValue kind, E* shared, Clear clear) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x, across = channels / kVector;
+  for (int64_t j = i; j < clear.count; j += static_cast<int64_t>(gridDim.x) * kThreads) clear.to[j] = {};
   const int64_t voxel = i / across, c = i % across * kVector;
   if (voxel >= sources.n_voxels) return;
   const int32_t source = sources.of(voxel);
@@ -235,19 +243,25 @@ Padded<E> padded(const char* op, const E* data, int64_t n, int64_t channels, con
   return {copy, wanted};
 }
 
-// Rows of `channels` columns, and for voxels of several rows one value each.
+// Rows of `channels` columns, and for voxels of several rows one value each. Clears `cleared` numbers from `to` on.
 template <typename E>
-Values<E> values_of(const char* op, const E* x, const SparseConvMap& map, int64_t channels, VoxelValue kind,
-                    const Workspace& workspace, Stream stream) {
-  const int64_t n_slots = slots_of(map);
+Values<E> values_of(const char* op, const E* x, const SparseConvMap& map, int64_t channels, VoxelValue kind, E* to,
+                    int64_t cleared, const Workspace& workspace, Stream stream) {
+  const int64_t n_slots = slots_of(map), bytes = cleared * static_cast<int64_t>(sizeof(E));
+  const bool combines = n_slots > 0 && channels > 0;
+  Clear clear;  // one launch does both
+  if (combines && map.n_voxels > 0 && aligned(to) && bytes % kAlignment == 0)
+    clear = {reinterpret_cast<uint4*>(to), bytes / kAlignment};
+  else
+    fill_zero(op, to, cleared, stream);
   E* shared = nullptr;
-  if (n_slots > 0 && channels > 0) {
+  if (combines) {
     shared = workspace.take<E>(n_slots * channels);
     constexpr int kVector = kAlignment / sizeof(E);
     const bool vectors = channels % kVector == 0 && aligned(x);
     launch(op, vectors ? combine_rows<E, kVector> : combine_rows<E, 1>,
            blocks_for(op, map.n_voxels * (vectors ? channels / kVector : channels), kThreads), kThreads, 0, stream, x,
-           sources_of(map), channels, kind, shared);
+           sources_of(map), channels, kind, shared, clear);
   }
   return {x, shared, static_cast<int32_t>(map.n_rows), static_cast<int32_t>(map.n_rows + n_slots),
           static_cast<int32_t>(channels)};
@@ -299,14 +313,14 @@ template <typename E, bool kGradient>
 void convolve(const char* op, const E* x, const E* weight, const E* bias, const SparseConvMap& map, int64_t c_in,
               int64_t c_out, E* y, const Workspace& workspace, Stream stream) {
   check_sizes(op, map, c_in, c_out);
-  fill_zero(op, y, map.n_rows * (kGradient ? c_in : c_out), stream);  // rows that no list has
   const int64_t taps = taps_of(map);
   const Padded<E> rows = padded(op, x, map.n_rows, kGradient ? c_out : c_in, workspace, stream);
   const Padded<E> weights =
       kGradient ? Padded<E>{weight, c_in} : padded(op, weight, c_out * taps, c_in, workspace, stream);
   const VoxelValue kind = kGradient ? VoxelValue::kSum : map.first ? VoxelValue::kFirst : VoxelValue::kMean;
   const bool whole = !kGradient || slots_of(map) == 0;
-  Convolution<E> conv{values_of(op, rows.data, map, rows.channels, kind, workspace, stream),
+  const int64_t n_results = map.n_rows * (kGradient ? c_in : c_out);  // 0 for rows that no list has
+  Convolution<E> conv{values_of(op, rows.data, map, rows.channels, kind, y, n_results, workspace, stream),
                       weights.data,
                       bias,
                       map.row_voxel,
@@ -386,9 +400,9 @@ void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map,
   const bool direct = kIsHalf<E> && plan.n_chunks * plan.centre_parts == 1 && right.channels == c_in;
   const int64_t n_blocks = plan.n_chunks * (plan.centre_parts + taps - 1);
   const OuterProducts<E> products{
-      values_of(op, left.data, map, left.channels, VoxelValue::kSum, workspace, stream),
-      values_of(op, right.data, map, right.channels, map.first ? VoxelValue::kFirst : VoxelValue::kMean, workspace,
-                stream),
+      values_of<E>(op, left.data, map, left.channels, VoxelValue::kSum, nullptr, 0, workspace, stream),
+      values_of<E>(op, right.data, map, right.channels, map.first ? VoxelValue::kFirst : VoxelValue::kMean, nullptr, 0,
+                   workspace, stream),
       sources_of(map),
       map.tap_in,
       map.tap_out,
