@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from gsim3d import ops
 from gsim3d.encoder.config import EncoderConfig
+from gsim3d.encoder.layout import GroupNorm, by_pixel, for_convolution
 from gsim3d.encoder.unet import UNet, repeat_pixels
 from gsim3d.layers import widened
 from gsim3d.quirks import Quirks
@@ -95,7 +96,7 @@ class CostVolume(nn.Module):
         in_dim = depths + config.feature_dim
         self.factor, self.quirks = config.downscale_factor, config.quirks
         self.n_depths = depths
-        self.refine_in = nn.Sequential(nn.Conv2d(in_dim, dim, 3, 1, 1), nn.GroupNorm(8, dim), nn.GELU())
+        self.refine_in = nn.Sequential(nn.Conv2d(in_dim, dim, 3, 1, 1), GroupNorm(8, dim), nn.GELU())
         self.unet = UNet(dim, config.cost_unet_levels, config.cost_unet_attention)
         self.refine_out = nn.Conv2d(dim, depths, 3, 1, 1)
         self.residual = nn.Conv2d(in_dim, depths, 1)
@@ -128,8 +129,9 @@ class CostVolume(nn.Module):
         """[I, C, h, w] -> expected disparity and largest probability, both [I, 1, h, w]."""
         features = widened(features)
         disparities = self.disparities(views, features)
-        x = torch.cat([self.correlation(features, views, disparities), features], 1)
-        scores = self.refine_out(self.unet(self.refine_in(x), views.n_views)) + self.residual(x)
+        x = for_convolution(torch.cat([self.correlation(features, views, disparities), features], 1))
+        refined = for_convolution(self.unet(self.refine_in(x), views.n_views))
+        scores = self.refine_out(refined) + self.residual(x)
         probability = widened(self.head(scores)).softmax(1)
         expected = (probability * disparities[:, :, None, None]).sum(1, keepdim=True)
         return expected, probability.amax(1, keepdim=True)
@@ -145,7 +147,7 @@ class DepthPredictor(nn.Module):
         self.cost_volume = CostVolume(config)
         self.upsampler = nn.Conv2d(2 * config.feature_dim, upsampled, 3, 1, 1)
         self.proj_feature = nn.Conv2d(upsampled, dim, 3, 1, 1)
-        self.refine_in = nn.Sequential(nn.Conv2d(3 + dim + 2, dim, 3, 1, 1), nn.GroupNorm(4, dim), nn.GELU())
+        self.refine_in = nn.Sequential(nn.Conv2d(3 + dim + 2, dim, 3, 1, 1), GroupNorm(4, dim), nn.GELU())
         self.refine_unet = UNet(dim, config.refine_unet_levels, config.refine_unet_attention)
         self.to_disparity = nn.Sequential(
             nn.Conv2d(dim, config.disparity_dim, 3, 1, 1), nn.GELU(), nn.Conv2d(config.disparity_dim, 2, 3, 1, 1)
@@ -161,9 +163,10 @@ class DepthPredictor(nn.Module):
         coarse = upsample(coarse.double(), self.factor, self.quirks).to(coarse.dtype)
         confidence = repeat_pixels(confidence, self.factor)
         fine = self.upsampler(torch.cat([view_features, cnn_features], 1))
-        fine = F.gelu(upsample(fine, self.factor, self.quirks))
-        x = self.refine_in(torch.cat([views.images, self.proj_feature(fine), coarse, confidence], 1))
-        x = self.refine_unet(x, views.n_views)
+        fine = for_convolution(F.gelu(upsample(fine, self.factor, self.quirks)))
+        x = torch.cat([views.images, self.proj_feature(fine), coarse, confidence], 1)
+        x = self.refine_in(for_convolution(x))
+        x = by_pixel(self.refine_unet(x, views.n_views))
         correction, opacity_logit = widened(self.to_disparity(x)).split(1, 1)
         lowest, highest = (1 / bound.to(x.dtype)[:, None, None, None] for bound in (views.far, views.near))
         disparity = (coarse + correction).clamp(lowest, highest)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from gsim3d.encoder import camera_frame
 from gsim3d.encoder.config import EncoderConfig
 from gsim3d.encoder.depth import Depth, Views
+from gsim3d.encoder.layout import for_convolution
 from gsim3d.harmonics import degree_damping, turn_predicted_harmonics
 from gsim3d.layers import widened
 from gsim3d.rotations import unit_quats
@@ -63,7 +64,8 @@ class Conditioning(nn.Module):
 
     def forward(self, x: Tensor, depth: Tensor, opacity_logit: Tensor, raw_offset: Tensor, rays: Tensor) -> Tensor:
         """x [I, F, H, W]; depth and opacity_logit [I, 1, H, W]; raw_offset [I, 2, H, W]; rays [I, 6, H, W]."""
-        scale, shift = self.net(torch.cat([depth, opacity_logit, raw_offset, rays], 1)).chunk(2, 1)
+        seen = for_convolution(torch.cat([depth, opacity_logit, raw_offset, rays], 1))
+        scale, shift = self.net(seen).chunk(2, 1)
         return x * (1 + F.softplus(scale)) + shift
 
 

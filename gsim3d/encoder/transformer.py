@@ -5,8 +5,10 @@ import math
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from gsim3d.encoder.config import EncoderConfig
+from gsim3d.layers import RowLayerNorm, widened
 from gsim3d.quirks import Quirks
 
 MASKED = -100.0  # added to a score that must not count; finite, so that a row of masked keys stays finite
@@ -36,18 +38,18 @@ class Windows:
         self.shift = (self.rows // 2, self.cols // 2)
 
     def cut(self, x: Tensor, shifted: bool) -> Tensor:
-        """[n, V, h, w, C] -> [n, K * K, V * rows * cols, C]."""
-        n, n_views, k = x.shape[0], x.shape[1], self.split
+        """[n, V, h, w, C] -> [n * V, K * K, rows * cols, C]."""
+        k = self.split
         if shifted:
             x = x.roll((-self.shift[0], -self.shift[1]), (2, 3))
-        x = x.reshape(n, n_views, k, self.rows, k, self.cols, -1).permute(0, 2, 4, 1, 3, 5, 6)
-        return x.reshape(n, k * k, n_views * self.rows * self.cols, -1)
+        x = x.reshape(-1, k, self.rows, k, self.cols, x.shape[-1]).transpose(2, 3)
+        return x.reshape(-1, k * k, self.rows * self.cols, x.shape[-1])
 
-    def join(self, x: Tensor, shifted: bool) -> Tensor:
+    def join(self, x: Tensor, n_views: int, shifted: bool) -> Tensor:
         """The way back."""
-        n, k = x.shape[0], self.split
-        x = x.reshape(n, k, k, -1, self.rows, self.cols, x.shape[-1]).permute(0, 3, 1, 4, 2, 5, 6)
-        x = x.reshape(n, -1, self.height, self.width, x.shape[-1])
+        k = self.split
+        x = x.reshape(-1, k, k, self.rows, self.cols, x.shape[-1]).transpose(2, 3)
+        x = x.reshape(-1, n_views, self.height, self.width, x.shape[-1])
         return x.roll(self.shift, (2, 3)) if shifted else x
 
     def shift_mask(self, like: Tensor) -> Tensor:
@@ -62,26 +64,54 @@ class Windows:
         labels = self.cut((3 * row_band[:, None] + col_band)[None, None, ..., None], False)[0, ..., 0]
         return (labels[:, :, None] != labels[:, None, :]).to(like.dtype) * MASKED
 
-    def cross_mask(self, like: Tensor, n_views: int, shifted: bool, quirks: Quirks) -> Tensor:
-        """[1 or K * K, V * L, V * L]: each view sees the others."""
-        tokens = self.rows * self.cols
-        others = ~torch.eye(n_views, dtype=torch.bool, device=like.device)
-        if not shifted:
-            return _between_views(like.new_zeros(1, n_views, tokens, n_views, tokens), others)
+    def cross_mask(self, like: Tensor, n_views: int, quirks: Quirks) -> Tensor:
+        """[1 or V, K * K, L, (V - 1) * L], between the pixels of a view and those of the others, in the order of
+        :class:`OtherViews`, in shifted windows."""
         mask = self.shift_mask(like)
-        spread = mask[:, None, :, None].expand(-1, n_views, -1, n_views, -1)
-        if quirks.tiled_shift_mask:
-            view = torch.arange(n_views, device=like.device)
-            rank = view[None] - (view[None] > view[:, None]).long()  # of a key view among the others of a query view
-            position = torch.arange(tokens, device=like.device)
-            column = (position * (n_views - 1) + rank[..., None]) % tokens  # [V, V, L]
-            spread = mask[:, :, column].permute(0, 2, 1, 3, 4)
-        return _between_views(spread, others)
+        if not quirks.tiled_shift_mask:
+            return mask.repeat(1, 1, n_views - 1)[None]
+        view, position = torch.arange(n_views, device=like.device), torch.arange(mask.shape[1], device=like.device)
+        other = (view[:, None] + view[1:]) % n_views
+        rank = other - (other > view[:, None]).long()  # of a key view among the others of a query view
+        column = (position * (n_views - 1) + rank[..., None]) % len(position)  # [V, V - 1, L]
+        return mask[:, :, column].permute(2, 0, 1, 3, 4).flatten(3)
 
 
-def _between_views(mask: Tensor, visible: Tensor) -> Tensor:
-    mask = mask.masked_fill(~visible[None, :, None, :, None], -math.inf)
-    return mask.reshape(mask.shape[0], mask.shape[1] * mask.shape[2], -1)
+class OtherViews(torch.autograd.Function):
+    """[n * V, K * K, L, C] -> [n * V, K * K, (V - 1) * L, C]: what the other views show in the same window, from the
+    next one on. Its gradient is a plain sum, in one order."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, n_views: int) -> Tensor:
+        ctx.n_views = n_views
+        n_images, n_windows, length, dim = x.shape
+        image, window, offset = _grid(n_images, n_windows, range(1, n_views), x)
+        rows = _turned(image, offset, n_views) * n_windows + window
+        return x.reshape(-1, length * dim)[rows.flatten()].view(n_images, n_windows, -1, dim)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
+        n_views = ctx.n_views
+        n_images, n_windows, length, dim = grad.shape
+        image, window, offset = _grid(n_images, n_windows, range(1, n_views), grad)
+        rows = (_turned(image, -offset, n_views) * n_windows + window) * (n_views - 1) + offset - 1
+        length //= n_views - 1
+        shown = grad.reshape(-1, length * dim)[rows.flatten()]
+        return shown.view(n_images, n_windows, n_views - 1, length, dim).sum(2), None
+
+
+def _grid(n_images: int, n_windows: int, offsets: range, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Numbers of images, windows and offsets, to be broadcast."""
+    image, window = torch.arange(n_images, device=like.device), torch.arange(n_windows, device=like.device)
+    offset = torch.arange(offsets.start, offsets.stop, device=like.device)
+    return image[:, None, None], window[:, None], offset
+
+
+def _turned(image: Tensor, offset: Tensor, n_views: int) -> Tensor:
+    """The image that is ``offset`` views behind ``image`` in its cloud."""
+    view = image % n_views
+    return image - view + (view + offset) % n_views
 
 
 class Attention(nn.Module):
@@ -93,21 +123,24 @@ class Attention(nn.Module):
         self.k_proj = nn.Linear(dim, dim, bias=False)
         self.v_proj = nn.Linear(dim, dim, bias=False)
         self.merge = nn.Linear(dim, dim, bias=False)
-        self.norm1 = nn.LayerNorm(dim)
+        self.norm1 = RowLayerNorm(dim)
         if mlp_dim:
             self.mlp = nn.Sequential(
                 nn.Linear(2 * dim, mlp_dim, bias=False), nn.GELU(), nn.Linear(mlp_dim, dim, bias=False)
             )
-            self.norm2 = nn.LayerNorm(dim)
+            self.norm2 = RowLayerNorm(dim)
         else:
             self.mlp = None
 
     def forward(self, x: Tensor, source: Tensor, attend) -> Tensor:
         """x asks, source answers; attend(q, k, v) knows who sees whom."""
-        message = self.norm1(self.merge(attend(self.q_proj(x), self.k_proj(source), self.v_proj(source))))
-        if self.mlp is not None:
-            message = self.norm2(self.mlp(torch.cat([x, message], -1)))
-        return x + message
+        message = self.merge(attend(self.q_proj(x), self.k_proj(source), self.v_proj(source))).flatten(0, -2)
+        rows = x.flatten(0, -2)
+        if self.mlp is None:
+            return self.norm1(message, rows).view(x.shape)
+        message = self.norm1(message)
+        message = self.mlp(torch.cat([rows.to(message.dtype), message], -1))
+        return self.norm2(message, rows).view(x.shape)
 
 
 class Layer(nn.Module):
@@ -133,21 +166,24 @@ class MultiViewTransformer(nn.Module):
         n, n_views, dim, height, width = x.shape
         windows = Windows(height, width, self.split)
         code = sine_position_code(windows.rows, windows.cols, dim, x).reshape(windows.rows, windows.cols, dim)
-        x = x.permute(0, 1, 3, 4, 2) + code.repeat(self.split, self.split, 1)
+        x = widened(x.permute(0, 1, 3, 4, 2) + code.repeat(self.split, self.split, 1))
         for i, layer in enumerate(self.layers):
             shifted = i % 2 == 1 and self.split > 1
-            within = windows.shift_mask(x)[:, None] if shifted else None
+            within = windows.shift_mask(x)[None] if shifted else None
 
             def attend_self(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-                q, k, v = (windows.cut(t, shifted).unflatten(2, (n_views, -1)) for t in (q, k, v))
-                return windows.join(F.scaled_dot_product_attention(q, k, v, within).flatten(2, 3), shifted)
+                q, k, v = (windows.cut(t, shifted) for t in (q, k, v))
+                return windows.join(F.scaled_dot_product_attention(q, k, v, within), n_views, shifted)
 
             def attend_others(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
                 if n_views == 1:
                     return torch.zeros_like(v)
-                mask = windows.cross_mask(x, n_views, shifted, self.quirks)
+                mask = windows.cross_mask(x, n_views, self.quirks) if shifted else None
+                if mask is not None and mask.shape[0] > 1:
+                    mask = mask.repeat(n, 1, 1, 1)
                 q, k, v = (windows.cut(t, shifted) for t in (q, k, v))
-                return windows.join(F.scaled_dot_product_attention(q, k, v, mask), shifted)
+                k, v = (OtherViews.apply(t, n_views) for t in (k, v))
+                return windows.join(F.scaled_dot_product_attention(q, k, v, mask), n_views, shifted)
 
             # Other views are read as they entered the layer, before they looked at themselves.
             x = layer.cross_attn_ffn(layer.self_attn(x, x, attend_self), x, attend_others)

@@ -4,14 +4,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from gsim3d.encoder.layout import GroupNorm, for_convolution
+
 HEAD_DIM = 32  # channels of one attention head, as far as there are that many
 
 
-def norm(channels: int) -> nn.GroupNorm:
-    return nn.GroupNorm(8 if channels % 8 == 0 else 4, channels)
+def norm(channels: int) -> GroupNorm:
+    return GroupNorm(8 if channels % 8 == 0 else 4, channels)
 
 
-def zero_norm(channels: int) -> nn.GroupNorm:
+def zero_norm(channels: int) -> GroupNorm:
     """A norm that silences its branch until training opens it."""
     layer = norm(channels)
     nn.init.zeros_(layer.weight)
@@ -21,7 +23,8 @@ def zero_norm(channels: int) -> nn.GroupNorm:
 def repeat_pixels(x: Tensor, factor: int) -> Tensor:
     """[N, C, h, w] -> [N, C, factor h, factor w]: every pixel becomes a square; its gradient is a plain sum."""
     n, c, h, w = x.shape
-    return x[:, :, :, None, :, None].expand(n, c, h, factor, w, factor).reshape(n, c, h * factor, w * factor)
+    x = x.permute(0, 2, 3, 1)[:, :, None, :, None].expand(n, h, factor, w, factor, c)
+    return x.reshape(n, h * factor, w * factor, c).permute(0, 3, 1, 2)
 
 
 class ResBlock(nn.Module):
@@ -32,7 +35,7 @@ class ResBlock(nn.Module):
         self.skip_connection = nn.Conv2d(in_dim, out_dim, 1) if in_dim != out_dim else nn.Identity()
 
     def forward(self, x: Tensor, n_views: int) -> Tensor:
-        return self.skip_connection(x) + self.out_layers(self.in_layers(x))
+        return self.skip_connection(x) + self.out_layers(for_convolution(self.in_layers(x)))
 
 
 class ViewAttention(nn.Module):
@@ -103,7 +106,7 @@ class UNet(nn.Module):
         self.out = nn.Sequential(nn.Conv2d(dim, dim, 3, 1, 1), norm(dim), nn.SiLU())
 
     def forward(self, x: Tensor, n_views: int) -> Tensor:
-        skips = []
+        x, skips = for_convolution(x), []
         for entry in self.input_blocks:
             for module in entry:
                 x = module(x, n_views)

@@ -10,6 +10,7 @@ from pathlib import Path
 from gsim3d.errors import InputError
 from gsim3d.evaluate.report import write_json
 from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.pareto.limit import PRESETS, TimeLimit
 from gsim3d.pareto.measure import Comparison, Effort, Point, measure, points_of, ties
 from gsim3d.pareto.settings import KNOBS, NOT_TUNED, Knob, Setting
 from gsim3d.pareto.subject import Subject
@@ -52,7 +53,14 @@ def autotune(
     return fastest(comparison, points, keeps, clock, effort)
 
 
-def tune(comparison: Comparison, points: Sequence[Point], clock: Clock, effort: Effort) -> dict[str, Point]:
+def tune(
+    comparison: Comparison,
+    points: Sequence[Point],
+    clock: Clock,
+    effort: Effort,
+    progress: Callable[[str], None] = lambda doing: None,
+    limit: TimeLimit = TimeLimit(),
+) -> dict[str, Point]:
     """The setting of each preset, from measured ``points``, of which the first is the reference."""
     reference, measured = points[0], {}
 
@@ -62,7 +70,7 @@ def tune(comparison: Comparison, points: Sequence[Point], clock: Clock, effort: 
     found = {"exact": reference}
     for name, share in PROMISES.items():
         if share is not None:
-            found[name] = fastest(comparison, points, keeping(share), clock, effort, measured)
+            found[name] = fastest(comparison, points, keeping(share), clock, effort, measured, progress, limit)
     return found
 
 
@@ -79,25 +87,28 @@ def fastest(
     clock: Clock,
     effort: Effort,
     measured: dict[Setting, Point] | None = None,
+    progress: Callable[[str], None] = lambda doing: None,
+    limit: TimeLimit = TimeLimit(),
 ) -> Point:
     """The reference with every turn that keeps the promise and saves time, added one by one and measured together.
 
-    measured: what was measured together before; what is now, is added.
+    measured: what was measured together before; what is now, is added.   limit: once it is over nothing more is.
     """
     measured = {} if measured is None else measured
-    reference = points[0]
-    useful = [p for p in points[1:] if p.knob not in NOT_TUNED and _faster(p, reference) and keeps(p)]
-    best = reference
-    for point in sorted(useful, key=lambda p: p.step_seconds):
-        if best is reference:
-            best = point
-            continue
+    useful = [p for p in points[1:] if p.knob not in NOT_TUNED and _saves(p, points) and keeps(p)]
+    if not useful:
+        return points[0]
+    useful.sort(key=lambda p: p.step_seconds)
+    best = max((p for p in useful if p is useful[0] or ties(p, useful[0])), key=lambda p: p.agreement.psnr)
+    for point in useful:
         both = _both(best, point)
         if both is None:
             continue
         if both.setting not in measured:
+            if limit.is_over(PRESETS):
+                break
             measured[both.setting] = both
-            measure(comparison, [both], clock, effort)
+            measure(comparison, [both], clock, effort, progress)
         both = measured[both.setting]
         if not both.failure and keeps(both) and _faster(both, best):
             best = both
@@ -106,13 +117,20 @@ def fastest(
 
 def _both(best: Point, point: Point) -> Point | None:
     """The settings of two points in one; None where both turn the same knob, or cannot be had together."""
-    changes = point.setting.to_dict()
-    if set(changes) & set(best.setting.to_dict()):
+    changes, before = point.setting.to_dict(), best.setting.to_dict()
+    if set(changes) & set(before) - {"captured"} or set(changes) <= set(before):
         return None
     try:
         return Point(dataclasses.replace(best.setting, **changes), "together", "model")
     except InputError:
         return None
+
+
+def _saves(point: Point, points: Sequence[Point]) -> bool:
+    """Whether what ``point`` turns saves time, and not only the graph that it is replayed from."""
+    graph = next((p for p in points if p.setting == Setting(captured=True) and not p.failure), points[0])
+    from_graph = point.setting.captured and point is not graph
+    return _faster(point, points[0]) and (not from_graph or _faster(point, graph))
 
 
 def _faster(point: Point, than: Point) -> bool:

@@ -10,6 +10,8 @@ SLOW_METRICS = ("lpips_vgg", "fvd")  # seconds a setting
 HURRIED_REPEATS = 5  # of a batch, in a quick report on a CPU
 QUICK_FRAMES = 40  # of new scenes: given steps, those simulated without loss, and the horizon of the training
 REST = 10  # of the progress bar, behind the settings
+SELF_CHECK = 0.1  # of the time is for each part of the self-check, where there is a limit
+NO_REGIMES = {"throughput": [], "training": {"problem": "not yet"}, "gpu": []}
 
 EPILOG = """\
 Turns every knob that the model has, one at a time: precision, graph capture, input views and steps, particles kept,
@@ -61,6 +63,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--self-check", action="store_true", help="check the timing itself first; the report says how it went"
     )
+    parser.add_argument(
+        "--minutes",
+        type=float,
+        metavar="M",
+        help="end in about so many; the report says what there was no time for (default: no limit)",
+    )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to simulate (default: cpu)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -77,14 +85,18 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.evaluate.pictures import pyplot
     from gsim3d.evaluate.scoring import measurable
     from gsim3d.pareto import autotune, budget, machine, report
+    from gsim3d.pareto.limit import REGIMES, TimeLimit
     from gsim3d.pareto.measure import FULL, QUICK, QUICK_ON_CPU, Comparison, measure, n_runs, points_of
-    from gsim3d.pareto.self_check import self_check
+    from gsim3d.pareto.self_check import MOST_SECONDS, self_check
     from gsim3d.pareto.settings import KNOBS
     from gsim3d.pareto.subject import Subject
     from gsim3d.pareto.timing import DeviceClock
     from gsim3d.pretrained import located
     from gsim3d.train.restore import restore
 
+    if args.minutes is not None and not 0 < args.minutes < 1e6:
+        raise InputError(f"--minutes: must be above 0; got {args.minutes}")
+    limit = TimeLimit(None if args.minutes is None else 60 * args.minutes)
     pyplot()
     known = {knob.name: knob for knob in KNOBS}
     if unknown := sorted(set(args.knobs or ()) - set(known)):
@@ -113,54 +125,80 @@ def run(args: argparse.Namespace) -> int:
     if training is not None:
         not_turned.pop("training steps", None)  # the figure of the training shows it
     out.mkdir(parents=True, exist_ok=True)
-    checks = []
-    if args.self_check:
-        blind = DeviceClock(restored.device, waits=False) if args.device == "cuda" else None
-        checks = self_check(subject, clock, blind)
-        print(*checks, sep="\n")
-    comparison = Comparison(subject, metrics, None if effort.apart else clock)
     with tqdm(total=n_runs(points, effort) + REST, unit="run", disable=args.quiet) as bar:
 
         def progress(doing: str, runs: int = 1) -> None:
             bar.set_description(doing[:60], refresh=False)
             bar.update(runs)
+            bar.refresh()
 
-        measure(comparison, points, clock, effort, progress)
+        checks = []
+        if args.self_check:
+            blind = DeviceClock(restored.device, waits=False) if args.device == "cuda" else None
+            most = limit.left(SELF_CHECK)
+            checks = self_check(subject, clock, blind, lambda doing: progress(doing, 0), min(MOST_SECONDS, most), most)
+            tqdm.write("\n".join(map(str, checks)))
+        comparison = Comparison(subject, metrics, None if effort.apart else clock)
+        conditions = {
+            "regimes": NO_REGIMES,
+            "command": shlex.join(["gsim3d", "pareto", *sys.argv[2:]]),
+            "machine": machine.facts(restored.device),
+            "subject": _facts(subject),
+            "self_check": [str(check) for check in checks],
+            "not_turned": not_turned,
+            "not_measured": not_measured,
+        }
+
+        def keep(n_rounds: int) -> None:
+            """What is known so far, in case that the command is ended."""
+            unfinished = {**conditions, "unfinished": f"ended after {n_rounds} of {effort.n_rounds} rounds"}
+            report.write_numbers(out, report.as_dict(_in_time(points), comparison, unfinished, {"exact": points[0]}))
+
+        measure(comparison, points, clock, effort, progress, limit, keep)
         if points[0].failure:
             raise InputError(f"{args.checkpoint}: the reference run has no result: {points[0].failure}")
-        progress("presets", 0)
-        presets = autotune.tune(comparison, points, clock, effort)
+        points = _in_time(points, not_turned)
+        doing = "combinations for the presets"
+        presets = autotune.tune(comparison, points, clock, effort, lambda what: progress(f"{doing}: {what}", 0), limit)
         points += [point for point in presets.values() if not any(point is p for p in points)]
         progress("many scenes, training", REST // 2)
-        regimes = _regimes(subject, presets, clock, quick)
-        progress("written", REST - REST // 2)
-    conditions = {
-        "regimes": regimes,
-        "command": shlex.join(["gsim3d", "pareto", *sys.argv[2:]]),
-        "machine": machine.facts(restored.device),
-        "subject": {
-            "checkpoint": restored.checkpoint.digest,
-            "scenes": len(scenes),
-            "steps": subject.n_steps,
-            "image": f"{restored.image_size[0]} x {restored.image_size[1]} pixels",
-            "views": len(subject.views[0][1]),
-            "history": restored.data.history,
-            "steps_a_call": {
-                name: other.simulator.config.dynamics.steps_per_call
-                for name, other in {"": restored, **subject.others}.items()
-            },
-        },
-        "self_check": [str(check) for check in checks],
-        "not_turned": not_turned,
-        "not_measured": not_measured,
-    }
-    content, files = report.write(out, points, comparison, conditions, presets, training)
+        conditions["regimes"] = _regimes(subject, presets, clock, quick, lambda: limit.is_over(REGIMES))
+        progress("pictures", REST - REST // 2)
+        content, files = report.write(out, points, comparison, conditions, presets, training)
     files.append(_keep_speeds(located(args.checkpoint), out, restored, presets))
     print(report.table(content))
     for name, point in presets.items():
         print(f"--speed {name}: {point.setting.name}, {1e3 * point.step_seconds:.2f} ms a step")
     print("written: " + ", ".join(str(path) for path in files))
     return 0 if all(check.holds for check in checks) else 1
+
+
+def _facts(subject) -> dict:
+    """What is measured, for the report."""
+    restored = subject.restored
+    return {
+        "checkpoint": restored.checkpoint.digest,
+        "scenes": len(subject.scenes),
+        "steps": subject.n_steps,
+        "image": f"{restored.image_size[0]} x {restored.image_size[1]} pixels",
+        "views": len(subject.views[0][1]),
+        "history": restored.data.history,
+        "steps_a_call": {
+            name: other.simulator.config.dynamics.steps_per_call
+            for name, other in {"": restored, **subject.others}.items()
+        },
+    }
+
+
+def _in_time(points: list, not_turned: dict | None = None) -> list:
+    """Points that there was time for; what of the others' knobs was left out is added to ``not_turned``."""
+    from gsim3d.pareto.limit import LEFT_OUT
+
+    for point in points:
+        if not_turned is not None and point.failure == LEFT_OUT:
+            before = not_turned.get(point.knob, "more time than --minutes gave, for ")
+            not_turned[point.knob] = before + ", " * (not before.endswith(" ")) + point.setting.name
+    return [point for point in points if point.failure != LEFT_OUT]
 
 
 def _others(args: argparse.Namespace, earlier: dict) -> dict:
@@ -176,22 +214,19 @@ def _others(args: argparse.Namespace, earlier: dict) -> dict:
     return {name: restore(given, args.device) for name, given in {**earlier, **named}.items()}
 
 
-def _regimes(subject, presets: dict, clock, quick: bool) -> dict:
-    """Many scenes at once, training, and what a GPU does."""
-    from dataclasses import replace
-
+def _regimes(subject, presets: dict, clock, quick: bool, is_late) -> dict:
+    """Many scenes at once, training, and what a GPU does; of that, what there is time for."""
     from gsim3d.pareto import regimes, report
 
     on_cpu = subject.device.type == "cpu"
     hurried = quick and on_cpu
     kept = list(dict.fromkeys(point.setting for point in presets.values()))
     repeats = HURRIED_REPEATS if hurried else 20
-    throughputs = [regimes.throughput(subject, setting, clock, repeats) for setting in kept]
-    training = regimes.training_step(subject, clock, 1 if hurried else 3, hurried)
-    work = []
-    if not on_cpu:
-        plain = list(dict.fromkeys(replace(setting, captured=False) for setting in kept))
-        work = [(setting.name, regimes.gpu_work(subject, setting, clock)) for setting in plain]
+    throughputs = [regimes.throughput(subject, setting, clock, repeats) for setting in kept if not is_late()]
+    training = regimes.TrainingStep(problem="--minutes left no time")
+    if not is_late():
+        training = regimes.training_step(subject, clock, 1 if hurried else 3, hurried)
+    work = [] if on_cpu else [(s.name, regimes.gpu_work(subject, s, clock)) for s in kept if not is_late()]
     return report.regimes_as_dict(throughputs, training, work)
 
 

@@ -16,11 +16,12 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr
 from gsim3d.evaluate.scoring import METRICS, PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.graphs import CaptureError
-from gsim3d.pareto.predict import Predicted, Unusable, predict_together, timing_of
-from gsim3d.pareto.runner import Runner
+from gsim3d.pareto.limit import COMPARE, LEFT_OUT, ROUNDS, TimeLimit
+from gsim3d.pareto.predict import Predicted, Unusable, predict_together, timing_of, told
 from gsim3d.pareto.settings import KNOBS, Knob, Setting, turned
+from gsim3d.pareto.stepping import Stepping, TooLong, bytes_held, compile_once
 from gsim3d.pareto.subject import Subject
-from gsim3d.pareto.timing import Clock, Timing, peak_memory, time_call, time_stages
+from gsim3d.pareto.timing import STAGES, Clock, GraphStopwatch, Timing, peak_memory, time_call, time_stages
 from gsim3d.perceptual.fvd import MIN_CLIPS, frechet_distance
 
 
@@ -50,8 +51,10 @@ class Effort:
     apart: bool = True
 
 
-QUICK, FULL = Effort(n_steps=12, n_scenes=2, slow_turns=False), Effort(repeats=10, n_scenes=16)
-QUICK_ON_CPU = dataclasses.replace(QUICK, encodings=1, fewest_turns=True, apart=False)
+QUICK = Effort(n_steps=12, n_scenes=2, encodings=3, fewest_turns=True, slow_turns=False)
+QUICK_ON_CPU = dataclasses.replace(QUICK, encodings=1, apart=False)
+FULL = Effort(repeats=10, n_scenes=16)
+COMPILE_SECONDS = 120.0  # that a setting may be compiled
 
 
 @dataclass(frozen=True)
@@ -103,9 +106,10 @@ class Point:
         return max(max(rounds) - min(rounds), self.noise * self.step_seconds)
 
     def stages(self) -> dict[str, float]:
-        """Seconds of a step, by stage: medians over rounds."""
-        names = dict.fromkeys(name for timing in self.step for name in timing.stages)
-        return {name: statistics.median(timing.stages.get(name, 0.0) for timing in self.step) for name in names}
+        """Seconds of a step, by stage: medians over rounds in which they were watched."""
+        watched = [timing.stages for timing in self.step if timing.stages]
+        names = dict.fromkeys(name for stages in watched for name in stages)
+        return {name: statistics.median(stages.get(name, 0.0) for stages in watched) for name in names}
 
 
 def median_of(timings: Sequence[Timing]) -> float:
@@ -118,12 +122,14 @@ class Comparison:
     metrics: of the task error, as :func:`gsim3d.evaluate.scoring.measurable`.
     not_measured: metric -> why it has no value.   clock: times steps on the way; None: nothing is timed.
     noise: as of Point, once the reference was timed three times.   spent: seconds by stage, of each setting.
+    encodings: timings of each input so far.
     """
 
     def __init__(self, subject: Subject, metrics: Sequence[str] = PLAIN_METRICS, clock: Clock | None = None):
         self.subject, self.metrics, self.clock, self.noise = subject, tuple(metrics), clock, 0.0
         self.not_measured: dict[str, str] = {}
         self.spent: dict[Setting, list[dict[str, float]]] = {}
+        self.encodings: dict[Setting, list[Timing]] = {}
         self._truths: dict[tuple[int, tuple[int, ...], tuple[str, ...]], SceneTruth] = {}
 
     @cached_property
@@ -282,12 +288,25 @@ def measure(
     clock: Clock,
     effort: Effort,
     progress: Callable[[str], None] = lambda doing: None,
+    limit: TimeLimit = TimeLimit(),
+    after_round: Callable[[int], None] = lambda n_rounds: None,
 ) -> None:
-    """Fills in what ``points`` get wrong and what they cost, or why they have no result."""
-    compare(comparison, points, progress)
+    """Fills in what ``points`` get wrong and what they cost, or why they have no result.
+
+    limit: of what would take longer, less is measured: at least one round of whatever was compared.
+    after_round: is told how many rounds of all settings are over.
+    """
+    subject = comparison.subject
+    compare(comparison, [point for point in points if not point.setting.compiled], progress, limit)
     reference = next((point for point in points if point.setting == Setting()), None)
     if reference is not None and reference.failure:
         return
+    for point in points:
+        if point.setting.compiled:
+            seconds = min(COMPILE_SECONDS, limit.left(COMPARE))
+            progress(f"compiling, {seconds:.0f} s at most: {point.setting.name}")
+            _compile(subject, point, clock, seconds)
+            compare(comparison, [point], progress, limit)
     apart = [point for point in points if effort.apart or point.setting.compiled]
     if not effort.apart:
         if reference is not None:
@@ -297,34 +316,50 @@ def measure(
                 continue
             point.noise = comparison.noise
             point.step = point.step or [timing_of(comparison.spent[point.setting], effort.warm_up)]
-    time_points(comparison.subject, apart, clock, effort, progress=progress)
-    time_encodings(comparison.subject, points, clock, effort, progress)
+    ready: dict[Setting, Stepping] = {}
+    for n in range(effort.n_rounds):
+        if n and limit.is_over(ROUNDS):
+            break
+        time_points(subject, apart, clock, effort, progress=progress, rounds=(n,), ready=ready)
+        time_encodings(subject, points, clock, effort, progress, (n,), comparison.encodings)
+        after_round(n + 1)
 
 
 def n_runs(points: Sequence[Point], effort: Effort) -> int:
     """How often :func:`measure` tells its progress."""
     apart = sum(effort.apart or point.setting.compiled for point in points)
-    return len(points) + effort.n_rounds * (apart + len({point.setting.given for point in points}))
+    compiled = sum(point.setting.compiled for point in points)
+    return len(points) + compiled + effort.n_rounds * (apart + len({point.setting.given for point in points}))
 
 
 def compare(
-    comparison: Comparison, points: Sequence[Point], progress: Callable[[str], None] = lambda doing: None
+    comparison: Comparison,
+    points: Sequence[Point],
+    progress: Callable[[str], None] = lambda doing: None,
+    limit: TimeLimit = TimeLimit(),
 ) -> None:
     """Fills in what ``points`` get wrong, or why they have no result."""
     groups: dict[Setting, list[Point]] = {}
     for point in points:
         groups.setdefault(point.setting.undrawn, []).append(point)
     order = list(dict.fromkeys(undrawn.given for undrawn in groups))  # what is encoded alike, one after another
+    on_host = comparison.subject.device.type == "cpu"
     for undrawn in sorted(groups, key=lambda undrawn: order.index(undrawn.given)):
-        group = groups[undrawn]
-        with peak_memory(comparison.subject.device) as peak:
-            all_found = comparison.of_all([point.setting for point in group])
-        for point, found in zip(group, all_found, strict=True):
+        group = [point for point in groups[undrawn] if not point.failure]
+        for point in groups[undrawn]:
             progress(f"error: {point.setting.name}")
+        if limit.is_over(COMPARE) and undrawn != Setting():
+            for point in group:
+                point.failure = LEFT_OUT
+            continue
+        with peak_memory(comparison.subject.device) as peak:
+            all_found = comparison.of_all([point.setting for point in group]) if group else []
+        for point, found in zip(group, all_found, strict=True):
             if isinstance(found, Unusable):
                 point.failure = str(found)
             else:
-                point.agreement, point.task, point.peak = found.agreement, found.task, peak()
+                point.agreement, point.task = found.agreement, found.task
+                point.peak = peak() if on_host else 0  # a GPU's memory also holds what the comparison needs
                 point.by_step, point.resting = found.by_step, found.resting
                 comparison.spent[point.setting] = found.spent
 
@@ -336,16 +371,22 @@ def time_points(
     effort: Effort,
     seed: int = 0,
     progress: Callable[[str], None] = lambda doing: None,
+    rounds: Sequence[int] | None = None,
+    ready: dict[Setting, Stepping] | None = None,
 ) -> None:
-    """Fills in what a step of ``points`` without failure costs, in rounds, each in another order."""
-    for n in range(effort.n_rounds):
+    """Fills in what a step of ``points`` without failure costs, in rounds, each in another order.
+
+    rounds: numbers of those that are gone through; default all.   ready: graphs that were captured in earlier ones.
+    """
+    ready = {} if ready is None else ready
+    for n in range(effort.n_rounds) if rounds is None else rounds:
         order = list(points)
         random.Random(seed + n).shuffle(order)
         for point in order:
             progress(f"time, round {n + 1}: {point.setting.name}")
             if not point.failure:
                 try:
-                    _time(subject, point, clock, effort)
+                    _time(subject, point, clock, effort, ready)
                 except torch.OutOfMemoryError:
                     point.failure = "out of memory while timed"
                 except (CaptureError, InputError) as error:
@@ -358,16 +399,22 @@ def time_encodings(
     clock: Clock,
     effort: Effort,
     progress: Callable[[str], None] = lambda doing: None,
+    rounds: Sequence[int] | None = None,
+    known: dict[Setting, list[Timing]] | None = None,
 ) -> None:
-    """Fills in what the input of ``points`` costs: once for those whose input is the same, in rounds."""
-    timings: dict[Setting, list[Timing]] = {point.setting.given: [] for point in points}
-    for n in range(effort.n_rounds):
-        for given, known in timings.items():
+    """Fills in what the input of ``points`` costs: once for those whose input is the same, in rounds.
+
+    rounds: as of :func:`time_points`.   known: timings so far by input, which are added to; enough are not repeated.
+    """
+    known = {} if known is None else known
+    for n in range(effort.n_rounds) if rounds is None else rounds:
+        for given in dict.fromkeys(point.setting.given for point in points):
             progress(f"time, round {n + 1}: encoding of {given.name}")
-            if any(not point.failure and point.setting.given == given for point in points):
-                known.append(_time_encoding(subject, given, clock, effort))
+            timings = known.setdefault(given, [])
+            if len(timings) <= n and any(not p.failure and p.setting.given == given for p in points):
+                timings.append(_time_encoding(subject, given, clock, effort))
     for point in points:
-        point.encode = timings[point.setting.given]
+        point.encode = known[point.setting.given]
 
 
 def _time_encoding(subject: Subject, given: Setting, clock: Clock, effort: Effort) -> Timing:
@@ -377,49 +424,59 @@ def _time_encoding(subject: Subject, given: Setting, clock: Clock, effort: Effor
     return time_call(lambda: runner.seen(frames), clock, repeats, effort.warm_up if effort.apart else 0)
 
 
-def _time(subject: Subject, point: Point, clock: Clock, effort: Effort) -> None:
+def _time(subject: Subject, point: Point, clock: Clock, effort: Effort, ready: dict[Setting, Stepping]) -> None:
     """One round of one point."""
-    runner, setting = subject.runner(point.setting), point.setting
-    state, cameras, span = subject.start(runner, 0), subject.cameras(0, 0), runner.span(subject.n_steps)
-    on_host = subject.device.type == "cpu"
-    repeats = max(2, -(-effort.repeats // span)) if on_host else effort.repeats
-
-    def call() -> None:
-        for n, newest in enumerate(runner.steps(state, span)):
-            if n % setting.every == 0:
-                runner.images(newest, cameras)
-
-    with peak_memory(subject.device) as peak:
+    setting, on_host = point.setting, subject.device.type == "cpu"
+    if not on_host and _is_crowded(subject.device):
+        ready.clear()
+    with peak_memory(subject.device, bytes_held(subject, setting)) as peak:
+        stepping = ready.get(setting) or Stepping(subject, setting, clock)
+        repeats = max(2, -(-effort.repeats // stepping.span)) if on_host else effort.repeats
         if setting.captured:
-            captured = _capture(subject, point, runner, clock, span)
-            timing = time_call(lambda: captured(state), clock, repeats, effort.warm_up)
+            ready[setting], point.once = stepping, point.once or stepping.once
+            timing = time_call(stepping, clock, repeats, effort.warm_up)
         elif setting.compiled:
-            point.once = point.once or _compile(call, clock)
-            timing = time_call(call, clock, repeats, effort.warm_up)
+            timing = time_call(stepping, clock, repeats, effort.warm_up)
         else:
-            timing = time_stages(call, [runner.simulator], clock, repeats, effort.warm_up, alone=not on_host)
+            timing = time_stages(
+                stepping, [stepping.runner.simulator], clock, repeats, effort.warm_up, alone=not on_host
+            )
         point.peak = max(point.peak, peak())
+    if setting.captured and not point.step:
+        timing = Timing(timing.repeats, _stages_of_graph(subject, setting, clock, repeats))
+    span = stepping.span
     each = tuple(seconds / span for seconds in timing.repeats)
     point.step.append(Timing(each, {name: seconds / span for name, seconds in timing.stages.items()}))
 
 
-def _compile(call: Callable[[], None], clock: Clock) -> float:
-    """Seconds of a first call that compiles all anew."""
-    from torch._inductor.utils import fresh_cache
+def _stages_of_graph(subject: Subject, setting: Setting, clock: Clock, repeats: int) -> dict[str, float]:
+    """Medians, of a graph of its own, since marks are a part of it."""
+    stopwatch = GraphStopwatch(clock)
+    marked, seen = Stepping(subject, setting, clock, stopwatch=stopwatch), []
+    for n in range(1 + repeats):
+        marked()
+        if n:
+            seen.append(stopwatch.seconds)
+    return {name: statistics.median(stages.get(name, 0.0) for stages in seen) for name in STAGES if name in seen[0]}
 
-    torch.compiler.reset()
-    with fresh_cache():
-        return time_call(call, clock, 1, 0).median
+
+def _is_crowded(device: torch.device) -> bool:
+    """Whether captured graphs should give back their memory."""
+    free, total = torch.cuda.mem_get_info(device)
+    return free < total / 2
 
 
-def _capture(subject: Subject, point: Point, runner: Runner, clock: Clock, n_steps: int):
-    state, cameras = subject.start(runner, 0), subject.cameras(0, 0)
-    clock.wait()
-    start = clock.now()
-    captured = runner.captured(state, n_steps, cameras)
-    clock.wait()
-    point.once = clock.now() - start
-    return captured
+def _compile(subject: Subject, point: Point, clock: Clock, seconds: float) -> None:
+    """Compiles what ``point`` runs, or says why not."""
+    if seconds <= 0:
+        point.failure = LEFT_OUT
+        return
+    try:
+        point.once = compile_once(Stepping(subject, point.setting, clock), clock, seconds)
+    except TooLong:
+        point.failure = f"not compiled after {seconds:.3g} s"
+    except Exception as error:  # a compiler raises anything
+        point.failure = str(told(error, 0))
 
 
 def front(points: Sequence[Point], error: Callable[[Point], float | None]) -> list[Point]:

@@ -88,9 +88,9 @@ def predict_together(
                     if not drawn[n][step].isfinite().all():
                         raise Unusable(f"images are not finite at step {step + 1}")
                 except FAILURES as error:
-                    drawn[n] = _told(error, step)
+                    drawn[n] = told(error, step)
     except failures as error:
-        drawn = [_told(error, step)] * len(runners)
+        drawn = [told(error, step)] * len(runners)
     return [
         (
             images
@@ -147,7 +147,7 @@ def timing_of(spent: Sequence[Stages], warm_up: int) -> Timing:
     return Timing(tuple(sum(stages.values()) for stages in counted), medians)
 
 
-def _told(error: Exception, step: int) -> Unusable:
+def told(error: Exception, step: int) -> Unusable:
     """Why a setting has no result, in a line; what is none of the known failures is the compiler's."""
     if isinstance(error, Unusable):
         return error

@@ -27,7 +27,9 @@ def _psnr(row: dict | None) -> float | None:
 
 
 def _row(content: dict, **setting) -> dict | None:
-    return next((row for row in content["points"] if row["setting"] == setting), None)
+    """The row of a setting, replayed from a graph where it was so too."""
+    rows = [row for row in content["points"] if {**row["setting"], "captured": True} == {**setting, "captured": True}]
+    return next((row for row in reversed(rows) if "failure" not in row), rows[0] if rows else None)
 
 
 def _with(**setting) -> Callable[[dict], float | None]:

@@ -13,6 +13,7 @@ from gsim3d.errors import InputError
 from gsim3d.graphs import CaptureError
 from gsim3d.pareto.machine import energy
 from gsim3d.pareto.settings import Setting
+from gsim3d.pareto.stepping import Stepping
 from gsim3d.pareto.subject import Subject
 from gsim3d.pareto.timing import Clock, Timing, time_call
 from gsim3d.train.config import TrainConfig
@@ -27,11 +28,12 @@ ENERGY_SECONDS = 1.0  # a counter of energy is read some ten times a second
 
 @dataclass(frozen=True)
 class Throughput:
-    """Simulated steps a second of all scenes of a batch together, images included. timing: None: out of memory."""
+    """Simulated steps a second of all scenes of a batch together, images included; or why they cannot be had."""
 
     setting: Setting
     n_scenes: int
     timing: Timing | None
+    problem: str = ""
 
     @property
     def steps_a_second(self) -> float | None:
@@ -41,16 +43,16 @@ class Throughput:
 def throughput(
     subject: Subject, setting: Setting, clock: Clock, repeats: int = 20, n_scenes: int = BATCH
 ) -> Throughput:
-    """Of a batch of ``n_scenes``, the subject's scenes in turn."""
-    runner = subject.runner(dataclasses.replace(setting, captured=False))
+    """Of a batch of ``n_scenes``, the subject's scenes in turn, from a graph where the setting is."""
     numbers = [n % len(subject.scenes) for n in range(n_scenes)]
-    frames = runner.frames([subject.scenes[n] for n in numbers], [subject.views[n][0] for n in numbers])
     try:
-        state, cameras = runner.encode(frames), subject.cameras_of(numbers, 0)
-        warm_up = max(1, repeats // 7)
-        timing = time_call(lambda: runner.images(runner.newest(runner.step(state)), cameras), clock, repeats, warm_up)
+        stepping = Stepping(subject, setting, clock, numbers, None if setting.captured else 1)
+        timing = time_call(stepping, clock, repeats, max(1, repeats // 7))
     except torch.OutOfMemoryError:
-        timing = None
+        return Throughput(setting, n_scenes, None, "out of memory")
+    except (CaptureError, InputError) as error:
+        return Throughput(setting, n_scenes, None, str(error))
+    timing = Timing(tuple(seconds / stepping.span for seconds in timing.repeats))
     return Throughput(setting, n_scenes, timing)
 
 
@@ -66,7 +68,7 @@ class TrainingStep:
 
 @dataclass(frozen=True)
 class Work:
-    """What a GPU does in a step and its images, in milliseconds.
+    """What a GPU does in a step and its images, in milliseconds: means of steps that are run together.
 
     whole_ms: from an idle device to an idle device.   busy_ms: in which at least one kernel ran.
     gaps_ms: the rest, in which it waited for the host.   sorting_ms: of kernels that sort.
@@ -78,39 +80,35 @@ class Work:
     busy_ms: float
     gaps_ms: float
     sorting_ms: float
-    kernels: list[tuple[str, float, int]]
+    kernels: list[tuple[str, float, float]]
     joules: float | None
 
 
 def gpu_work(subject: Subject, setting: Setting, clock: Clock) -> Work | None:
-    """Of one setting that is not captured, by torch's profiler; None where it may not look at the GPU."""
+    """Of one setting, by torch's profiler; None where it may not look at the GPU."""
     from torch.profiler import ProfilerActivity, profile
 
-    runner, cameras = subject.runner(setting), subject.cameras(0, 0)
-    state = subject.start(runner, 0)
-
-    def call() -> None:
-        runner.images(next(runner.steps(state, 1)), cameras)
-
-    whole = time_call(call, clock).median
+    stepping = Stepping(subject, setting, clock)
+    whole = time_call(stepping, clock).median / stepping.span
     with profile(activities=[ProfilerActivity.CUDA]) as seen:
-        call()
+        stepping()
         clock.wait()
     on_gpu = [event for event in seen.events() if event.device_type == torch.autograd.DeviceType.CUDA]
     spans = [(event.name, event.time_range.start / 1e3, event.time_range.end / 1e3) for event in on_gpu]
     if not spans:
         return None
-    n_steps = max(1, int(ENERGY_SECONDS / whole))
+    n_calls = max(1, int(ENERGY_SECONDS / (whole * stepping.span)))
     with energy(subject.device) as used:
-        for _ in range(n_steps):
-            call()
+        for _ in range(n_calls):
+            stepping()
         clock.wait()
         joules = used()
-    return work_of(spans, 1e3 * whole, None if joules is None else joules / n_steps)
+    each = None if joules is None else joules / (n_calls * stepping.span)
+    return work_of(spans, 1e3 * whole, each, stepping.span)
 
 
-def work_of(spans: list[tuple[str, float, float]], whole_ms: float, joules: float | None) -> Work:
-    """From (kernel, begin, end) in milliseconds; kernels on several streams overlap."""
+def work_of(spans: list[tuple[str, float, float]], whole_ms: float, joules: float | None, n_steps: int = 1) -> Work:
+    """From (kernel, begin, end) in milliseconds of ``n_steps``; kernels on several streams overlap."""
     busy, end_before = 0.0, float("-inf")
     totals: dict[str, list] = defaultdict(lambda: [0.0, 0])
     for name, begin, end in sorted(spans, key=lambda span: span[1]):
@@ -118,7 +116,9 @@ def work_of(spans: list[tuple[str, float, float]], whole_ms: float, joules: floa
         end_before = max(end, end_before)
         totals[name][0] += end - begin
         totals[name][1] += 1
-    kernels = sorted(((name, ms, count) for name, (ms, count) in totals.items()), key=lambda kernel: -kernel[1])
+    busy /= n_steps
+    means = ((name, ms / n_steps, count / n_steps) for name, (ms, count) in totals.items())
+    kernels = sorted(means, key=lambda kernel: -kernel[1])
     sorting = sum(ms for name, ms, _ in kernels if any(word in name for word in SORTING))
     largest = [(name[:120], ms, count) for name, ms, count in kernels[:LARGEST_KERNELS]]
     return Work(whole_ms, busy, max(0.0, whole_ms - busy), sorting, largest, joules)

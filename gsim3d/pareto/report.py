@@ -30,7 +30,8 @@ def as_dict(
     """What report.json holds; times in milliseconds, memory in MiB.
 
     Args:
-        conditions: what was measured, where and how; "subject", "regimes", "not_turned" among it.
+        conditions: what was measured, where and how; "subject", "regimes", "not_turned" among it; "unfinished": why it
+            is not all that there will be.
     """
     best = {name: {id(p) for p in figures.on_front(points, name)} for name in figures.AXES}
     reference, rows = points[0], []
@@ -114,6 +115,7 @@ def regimes_as_dict(
             "scenes": t.n_scenes,
             "steps_a_second": t.steps_a_second,
             "step_ms": None if t.timing is None else _times([t.timing]),
+            "problem": t.problem,
         }
         for t in throughputs
     ]
@@ -129,7 +131,8 @@ def regimes_in_words(regimes: dict) -> list[str]:
         scenes = f"{row['scenes']} scenes together, with images"
         rate = row["steps_a_second"]
         lines.append(
-            f"{row['setting']}: " + (f"{rate:.3g} steps a second of {scenes}" if rate else f"out of memory: {scenes}")
+            f"{row['setting']}: "
+            + (f"{rate:.3g} steps a second of {scenes}" if rate else f"{row['problem']}: {scenes}")
         )
     training = regimes["training"]
     if "problem" in training:
@@ -168,17 +171,24 @@ def write(
     }
     if training is not None:
         pictures["training.png"] = figures.training(training)
-    write_json(folder / "report.json", content)
-    files = {
-        "report.csv": _csv(content).encode(),
-        **pictures,
-        "report.html": page(content, pictures, regimes_in_words(content["regimes"])).encode(),
-    }
+    numbers = write_numbers(folder, content)
+    files = {**pictures, "report.html": page(content, pictures, regimes_in_words(content["regimes"])).encode()}
     for name, text in files.items():
-        part = folder / f".{name}.part"
-        part.write_bytes(text)
-        os.replace(part, folder / name)
-    return content, [folder / "report.json", *(folder / name for name in files)]
+        _put(folder / name, text)
+    return content, [*numbers, *(folder / name for name in files)]
+
+
+def write_numbers(folder: Path, content: dict) -> list[Path]:
+    """Writes report.json and report.csv of what :func:`as_dict` gave, and names them."""
+    write_json(folder / "report.json", content)
+    _put(folder / "report.csv", _csv(content).encode())
+    return [folder / "report.json", folder / "report.csv"]
+
+
+def _put(file: Path, content: bytes) -> None:
+    part = file.with_name(f".{file.name}.part")
+    part.write_bytes(content)
+    os.replace(part, file)
 
 
 def _csv(content: dict) -> str:

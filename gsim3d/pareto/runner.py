@@ -21,6 +21,7 @@ from gsim3d.evaluate.protocol import Prediction
 from gsim3d.graphs import CapturedRollout
 from gsim3d.layers import exact_convolutions
 from gsim3d.pareto.settings import Setting
+from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
 from gsim3d.train.precision import PrecisionConfig
 from gsim3d.train.restore import Restored
@@ -159,12 +160,18 @@ class Runner:
             return images
         return F.interpolate(images.permute(0, 3, 1, 2), (height, width), mode="bilinear").permute(0, 2, 3, 1)
 
+    @property
+    def draws_in_graph(self) -> bool:
+        """Whether a graph of the rollout can draw as well: it does so in its own precision, and as the model does."""
+        setting, quirks = self.setting, self.simulator.config.renderer.quirks
+        as_the_model = setting.cutoff == "exact" and not setting.least_opacity and quirks == Quirks()
+        return as_the_model and setting.every == 1 and setting.renderer == setting.dynamics
+
     def captured(self, state: Particles, n_steps: int, cameras: Cameras) -> CapturedRollout:
-        """The rollout of ``state`` as a graph, in the precision of the dynamics."""
+        """The rollout of ``state`` as a graph, in the precision of the dynamics; it draws where it can."""
+        drawn = self._smaller(cameras) if self.draws_in_graph else None
         with self._precision("dynamics"):
-            return CapturedRollout(
-                self.simulator, state, n_steps, self.plan, cameras=self._smaller(cameras), copies=False
-            )
+            return CapturedRollout(self.simulator, state, n_steps, self.plan, cameras=drawn, copies=False)
 
     @contextlib.contextmanager
     def _precision(self, part: str) -> Iterator[None]:

@@ -84,8 +84,8 @@ class Setting:
 
     @property
     def _needs_python(self) -> list[str]:
-        """What of it a graph cannot repeat: it knows no sleep, one order, and draws as the model does."""
-        changed = {name: getattr(self, name) for name in ("compiled", "sleep", "orders", "cutoff", "least_opacity")}
+        """What of it a graph cannot repeat: it knows no sleep, and one order of the curves."""
+        changed = {name: getattr(self, name) for name in ("compiled", "sleep", "orders")}
         defaults = {f.name: f.default for f in dataclasses.fields(self)}
         return [name for name, value in changed.items() if value != defaults[name]]
 
@@ -175,8 +175,18 @@ def turned(
             continue
         if fewest and knob.kind != "needs-training" and len(found) > knob.few:
             found = [found[0], found[-1]][-knob.few :]
-        settings.update(dict.fromkeys(found, knob))
+        settings.update((_as_run(setting, subject), knob) for setting in found)
     return settings, missing
+
+
+def _as_run(setting: Setting, subject: Subject) -> Setting:
+    """On a GPU from a graph where it can be: else it waits for the host, and no knob makes that faster."""
+    if subject.device.type != "cuda":
+        return setting
+    try:
+        return dataclasses.replace(setting, captured=True)
+    except InputError:
+        return setting
 
 
 def _require(name: str, value: object, fine: bool, what: str) -> None:
@@ -195,8 +205,8 @@ def _powers_below(limit: int, least: int = 1) -> list[int]:
 def _precisions(subject: Subject) -> list[Setting]:
     if subject.device.type != "cuda":
         return []
-    whole = [Setting(p, p, p) for p in PRECISIONS[1:]]
-    return whole + [Setting(**{part: "bf16"}) for part in PARTS]
+    parts = [Setting(**{part: "bf16"}) for part in PARTS]
+    return [Setting("tf32", "tf32", "tf32"), Setting("fp16", "fp16", "fp16"), *parts, Setting("bf16", "bf16", "bf16")]
 
 
 def _fp8(subject: Subject) -> str:
@@ -208,7 +218,7 @@ def _compiled(subject: Subject) -> list[Setting] | str:
 
 
 def _captured(subject: Subject) -> list[Setting]:
-    return [Setting(captured=True), Setting("bf16", "bf16", "bf16", captured=True)] * (subject.device.type == "cuda")
+    return [Setting(captured=True)] * (subject.device.type == "cuda")
 
 
 def _views(subject: Subject) -> list[Setting]:

@@ -36,6 +36,7 @@ STAGE_OF_OP = {
     "unpool": "pooling",
     "rasterize_gaussians": "sort and raster",
 }
+REST = "state and guards"  # of everything that is in no other stage
 WARM_UP, REPEATS = 3, 20
 ADDS_UP = 0.03  # the stages of a call may differ from the whole by this share
 
@@ -50,7 +51,10 @@ class Clock(Protocol):
         """Seconds of the host."""
 
     def mark(self) -> Any:
-        """The point in the device's work that has been asked for so far."""
+        """The point in the device's work that has been asked for so far; in a capture, in the work of every replay."""
+
+    def capturing(self) -> bool:
+        """Whether what is asked for now becomes part of a graph."""
 
     def seconds(self, first: Any, last: Any) -> float:
         """Between two marks that the device has passed."""
@@ -79,9 +83,12 @@ class DeviceClock:
     def mark(self) -> Any:
         if self._gpu is None:
             return time.perf_counter()
-        event = torch.cuda.Event(enable_timing=True)
+        event = torch.cuda.Event(enable_timing=True, external=self.capturing())
         event.record(torch.cuda.current_stream(self._gpu))
         return event
+
+    def capturing(self) -> bool:
+        return self._gpu is not None and torch.cuda.is_current_stream_capturing()
 
     def seconds(self, first: Any, last: Any) -> float:
         if self._gpu is None:
@@ -118,7 +125,7 @@ class Stopwatch:
         self._open: list[str] = []
 
     @contextmanager
-    def running(self, rest: str = "state and guards") -> Iterator[None]:
+    def running(self, rest: str = REST) -> Iterator[None]:
         """One call. ``rest``: the stage of everything outside any other."""
         self._marks, self._open, self._due = [], [], dict(self._delays)
         self._enter(rest)
@@ -126,11 +133,8 @@ class Stopwatch:
             yield
         finally:
             self._marks.append(("", self._clock.mark()))
-            self._clock.wait()
-            totals: dict[str, float] = defaultdict(float)
-            for (name, begin), (_, end) in zip(self._marks, self._marks[1:]):
-                totals[name] += self._clock.seconds(begin, end)
-            self.seconds, self._open = dict(totals), []
+            self._open = []
+            self._add_up(self._marks)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -142,14 +146,71 @@ class Stopwatch:
 
     def _enter(self, name: str) -> None:
         if not self._open or self._open[-1] != name:
-            self._marks.append((name, self._clock.mark()))
+            self._note(name)
         self._open.append(name)
-        if name in self._due:
+        if name in self._due and self._counts():
             self._clock.delay(self._due.pop(name))
 
     def _leave(self) -> None:
-        if self._open.pop() != self._open[-1]:
-            self._marks.append((self._open[-1], self._clock.mark()))
+        name = self._open.pop()
+        if self._open and name != self._open[-1]:
+            self._note(self._open[-1])
+
+    def _note(self, name: str) -> None:
+        if self._counts():
+            self._marks.append((name, self._clock.mark()))
+
+    def _counts(self) -> bool:
+        return True
+
+    def _add_up(self, marks: list[tuple[str, Any]]) -> None:
+        self._clock.wait()
+        totals: dict[str, float] = defaultdict(float)
+        for (name, begin), (_, end) in zip(marks, marks[1:]):
+            totals[name] += self._clock.seconds(begin, end)
+        self.seconds = dict(totals)
+
+
+class GraphStopwatch(Stopwatch):
+    """Splits the time of a CUDA graph: marks and delays become part of it, and every replay passes them.
+
+        stopwatch = GraphStopwatch(clock)
+        with watched(simulator, stopwatch), stopwatch.capturing():
+            graph = CapturedRollout(simulator, ...)
+        with stopwatch.running():
+            graph(state)
+        stopwatch.seconds
+
+    The host is not in it: a GPU that waits for no launch shows in each stage what that stage takes.
+    """
+
+    @contextmanager
+    def capturing(self, rest: str = REST) -> Iterator[None]:
+        """The one capture of the graph; what is run before it, to try it out, has no marks."""
+        self._marks, self._open, self._due, self._behind = [], [rest], dict(self._delays), None
+        try:
+            yield
+        finally:
+            self._open = []
+
+    @contextmanager
+    def running(self, rest: str = REST) -> Iterator[None]:
+        """One replay, and what the host launches behind it, such as images that a graph cannot draw."""
+        self._open, self._behind, begin = [rest], [], self._clock.mark()
+        try:
+            yield
+        finally:
+            end, self._open = self._clock.mark(), []
+            self._add_up([(rest, begin), *self._marks, *self._behind, ("", end)])
+
+    def _note(self, name: str) -> None:
+        if self._counts():
+            self._marks.append((name, self._clock.mark()))
+        elif self._behind is not None:
+            self._behind.append((name, self._clock.mark()))
+
+    def _counts(self) -> bool:
+        return bool(self._open) and self._clock.capturing()
 
 
 @contextmanager
@@ -277,11 +338,13 @@ def _all_watched(simulators: Sequence[Simulator], stopwatch: Stopwatch) -> Itera
 
 
 @contextmanager
-def peak_memory(device: torch.device) -> Iterator[Callable[[], int]]:
-    """A function that says how many bytes the block needed at most: of the GPU, or of the whole process so far."""
+def peak_memory(device: torch.device, held: int = 0) -> Iterator[Callable[[], int]]:
+    """A function that says how many bytes the block needed at most: of the GPU beyond what lay there before, and
+    ``held`` of that; of a CPU the whole process so far."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
         torch.cuda.reset_peak_memory_stats(device)
-        yield lambda: torch.cuda.max_memory_allocated(device)
+        before = torch.cuda.memory_allocated(device)
+        yield lambda: torch.cuda.max_memory_allocated(device) - before + held
     else:
         yield lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -4,17 +4,28 @@ import torch
 from torch import nn
 
 
+class Mark:
+    """A point in the device's work; of a graph, passed in every replay."""
+
+    at = None
+
+
 class FakeClock:
     """A device that works through what it is asked for while the host runs on; ``wait`` lets the host catch up.
 
-    noise: shares added to the work, one after another.
+    host_share: seconds that the host takes to ask for a second of work.   launch: seconds that it takes beside.
     """
 
-    def __init__(self, waits=True, host_share=1.0):
-        self.host, self.device, self.waits, self.host_share = 0.0, 0.0, waits, host_share
+    def __init__(self, waits=True, host_share=1.0, launch=0.0):
+        self.host, self.device, self.waits, self.host_share, self.launch = 0.0, 0.0, waits, host_share, launch
+        self.program = None
 
     def work(self, seconds):
-        self.device = max(self.device, self.host) + seconds
+        if self.program is not None:
+            self.program.append(seconds)
+            return
+        self.host += self.launch
+        self._does(seconds)
         self.host += seconds * self.host_share
 
     def wait(self):
@@ -25,13 +36,42 @@ class FakeClock:
         return self.host
 
     def mark(self):
-        return max(self.device, self.host)
+        mark = Mark()
+        if self.program is not None:
+            self.program.append(mark)
+        else:
+            mark.at = max(self.device, self.host)
+        return mark
+
+    def capturing(self):
+        return self.program is not None
 
     def seconds(self, first, last):
-        return last - first
+        return last.at - first.at
 
     def delay(self, seconds):
         self.work(seconds)
+
+    def _does(self, item):
+        if isinstance(item, Mark):
+            item.at = self.device
+        else:
+            self.device = max(self.device, self.host) + item
+
+
+class FakeGraph:
+    """What a function asks of a clock's device, as one launch."""
+
+    def __init__(self, function, clock):
+        function()  # tried out before, as of a real one
+        self.clock, clock.program = clock, []
+        function()
+        self.program, clock.program = clock.program, None
+
+    def __call__(self):
+        self.clock.device = max(self.clock.device, self.clock.host)
+        for item in self.program:
+            self.clock._does(item)
 
 
 class _Works(nn.Module):

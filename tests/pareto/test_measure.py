@@ -1,6 +1,8 @@
 """Errors against the reference and the truth, settings that fail, and what is on the front."""
 
 import dataclasses
+import signal
+import time
 
 import pytest
 import torch
@@ -9,10 +11,12 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import predict as predict_plainly
 from gsim3d.evaluate.protocol import render_steps
 from gsim3d.pareto import measure
+from gsim3d.pareto.limit import LEFT_OUT, TimeLimit
 from gsim3d.pareto.measure import Comparison, Effort, Point, compare, front, time_encodings, time_points
 from gsim3d.pareto.predict import Unusable, predict
 from gsim3d.pareto.runner import Runner
 from gsim3d.pareto.settings import Setting
+from gsim3d.pareto.stepping import Stepping
 from gsim3d.pareto.subject import Subject
 from gsim3d.pareto.timing import DeviceClock, Timing
 from gsim3d.perceptual.fvd import frechet_distance
@@ -248,3 +252,80 @@ def test_a_wrong_setting_is_told():
 def test_a_subject_is_as_short_as_asked(subject):
     assert Subject(subject.restored, subject.scenes, 2).n_steps == 2
     assert subject.n_steps == subject.scenes[0].n_steps - 2
+
+
+GRAPHS = [
+    Setting(captured=True),
+    Setting(captured=True, kept=0.5),
+    Setting(captured=True, cutoff="tile3sigma"),
+    Setting(captured=True, every=3),
+    Setting(captured=True, shrink=2),
+]
+
+
+@pytest.mark.parametrize("setting", GRAPHS, ids=lambda setting: setting.name)
+def test_what_is_replayed_is_what_the_setting_says(subject, setting, monkeypatch):
+    """Drawn by the graph where it can, else behind it: as many images of the same particles as without one."""
+    drawn = []
+    monkeypatch.setattr(Runner, "images", lambda self, particles, cameras: drawn.append(particles.means.clone()))
+    stepping = Stepping(subject, setting, DeviceClock("cpu"))
+    stepping()
+    launched = Stepping(subject, dataclasses.replace(setting, captured=False), DeviceClock("cpu"), span=stepping.span)
+    runner = launched.runner
+    if stepping.runner.draws_in_graph:
+        assert not drawn
+        rendered = stepping._graph(stepping.state)
+        drawn += [step.means for step in rendered.steps]
+        assert len(rendered.renderings) == stepping.span == 4
+        assert rendered.renderings[0].color.shape[1] == -(-32 // setting.shrink)
+    expected = [newest.means for n, newest in enumerate(runner.steps(launched.state, 4)) if n % setting.every == 0]
+    assert len(drawn) == len(expected)
+    for ours, right in zip(drawn, expected, strict=True):
+        torch.testing.assert_close(ours, right, rtol=0, atol=1e-5)
+
+
+def test_graphs_are_captured_once(subject):
+    points = [Point(setting, "", "model") for setting in (Setting(), *GRAPHS[:2])]
+    ready = {}
+    effort, clock = Effort(n_rounds=1, repeats=2, warm_up=0), DeviceClock("cpu")
+    time_points(subject, points, clock, effort, rounds=(0,), ready=ready)
+    captured = dict(ready)
+    time_points(subject, points, clock, effort, rounds=(1,), ready=ready)
+    assert set(captured) == set(GRAPHS[:2]) and all(ready[setting] is captured[setting] for setting in captured)
+    assert all(point.once > 0 for point in points[1:]) and points[0].once == 0
+    assert [len(point.step) for point in points] == [2, 2, 2]
+    assert all(point.stages() for point in points)  # of a graph in its first round
+
+
+def test_a_time_limit_leaves_out_what_comes_last(subject):
+    """The reference and one round are always there, and a round tells what it found."""
+    seconds = iter([0.0, *[0.1] * 2, *[50.0] * 100])
+    limit = TimeLimit(100.0, lambda: next(seconds))
+    points = [
+        Point(Setting(), "", "exact"),
+        Point(Setting(kept=0.5), "", "model"),
+        Point(Setting(grid=2.0), "", "model"),
+    ]
+    told = []
+    measure.measure(
+        Comparison(subject), points, DeviceClock("cpu"), Effort(n_rounds=3, repeats=2, warm_up=0), told.append, limit,
+        lambda n: told.append(n),
+    )  # fmt: skip
+    assert [point.failure for point in points] == ["", "", LEFT_OUT]
+    assert len(points[0].step) == len(points[1].step) >= 1 and not points[2].step
+    assert 1 in told
+
+
+def test_what_compiles_too_long_is_ended(subject, monkeypatch):
+    """With its reason, and the alarm is put back."""
+    monkeypatch.setattr("gsim3d.pareto.stepping._end_compilers", lambda: None)
+    monkeypatch.setattr(Stepping, "__call__", lambda self: time.sleep(60))
+    point, before = Point(Setting(compiled=True), "compile", "exact"), signal.getsignal(signal.SIGALRM)
+    start = time.monotonic()
+    measure._compile(subject, point, DeviceClock("cpu"), 0.2)
+    assert time.monotonic() - start < 30 and point.failure == "not compiled after 0.2 s"
+    assert signal.getsignal(signal.SIGALRM) is before and signal.getitimer(signal.ITIMER_REAL)[0] == 0
+    monkeypatch.setattr(Stepping, "__call__", lambda self: None)
+    point.failure = ""
+    measure._compile(subject, point, DeviceClock("cpu"), 30.0)
+    assert not point.failure and point.once > 0
