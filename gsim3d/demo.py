@@ -100,7 +100,7 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, *, progress: boo
     out.mkdir(parents=True, exist_ok=True)
     seconds = _Stopwatch(out / "seconds.json")
 
-    from gsim3d.data import Scene, split_scenes
+    from gsim3d.data import split_scenes
     from gsim3d.evaluate.pictures import pyplot
     from gsim3d.generate import generate
 
@@ -113,13 +113,14 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, *, progress: boo
         train_folders, folders = split_scenes(folders)
         print(f"training on {len(train_folders)} scenes; {len(folders)} are held out", flush=True)
         _train(out, config.train, train_folders, progress, seconds)
-    test = [Scene.open(folder) for folder in folders]
     print("predicting the held-out scenes", flush=True)
     with seconds.measure("evaluation"):
-        summary, predictor = _evaluate(out, test, config.simulator or out / "model")
+        predictor = _Predictor(config.simulator or out / "model")
+        scenes = [predictor.restored.open_scene(folder) for folder in folders]
+        summary = _evaluate(out, predictor, scenes)
     print("pictures", flush=True)
     with seconds.measure("pictures"):
-        _pictures(out, predictor, test, summary)
+        _pictures(out, predictor, scenes, summary)
     _report(out, summary, seconds.total, time.perf_counter() - start)
     return summary
 
@@ -178,11 +179,10 @@ class _Predictor:
         return self._known[scene.path]
 
 
-def _evaluate(out: Path, scenes: list, simulator: str | Path) -> tuple[dict, _Predictor]:
+def _evaluate(out: Path, predictor: _Predictor, scenes: list) -> dict:
     from gsim3d.evaluate.protocol import score_scene
     from gsim3d.evaluate.report import summarize, write_json
 
-    predictor = _Predictor(simulator)
     digest, file = predictor.restored.checkpoint.digest, out / "metrics.json"
     try:
         summary = json.loads(file.read_text())
@@ -192,7 +192,7 @@ def _evaluate(out: Path, scenes: list, simulator: str | Path) -> tuple[dict, _Pr
         scores = [score_scene(predictor.restored, scene, prediction=predictor(scene)) for scene in scenes]
         summary = {"checkpoint": digest, **summarize(scores)}
         write_json(file, summary)
-    return summary, predictor
+    return summary
 
 
 def _pictures(out: Path, predictor: _Predictor, scenes: list, summary: dict) -> None:

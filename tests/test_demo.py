@@ -44,6 +44,17 @@ def test_everything_is_written(finished):
     assert b"vp09" in (out / "rollout.mp4").read_bytes()
 
 
+def test_scenes_are_fitted_to_the_simulator(tmp_path):
+    """One that was trained with a depth range of its own predicts as well in a demo that does not train."""
+    train = small_config().train
+    train = dataclasses.replace(train, data=dataclasses.replace(train.data, near_far=(2.0, 4.5)))
+    learned = run_demo(tmp_path / "learned", dataclasses.replace(small_config(), train=train), progress=False)
+    given = DemoConfig(data=DATA, simulator=str(tmp_path / "learned" / "model.safetensors"))
+    summary = run_demo(tmp_path / "given", given, progress=False)
+    ((name, scores),) = learned["scenes"].items()
+    assert summary["scenes"][name] == scores and summary["n_scenes"] == 2
+
+
 def test_a_second_call_repeats_nothing(finished, capsys):
     out, summary = finished
     before = {name: (out / name).stat().st_mtime_ns for name in FILES}

@@ -263,7 +263,7 @@ class Merge(nn.Module):
 class EncoderStage(nn.Module):
     def __init__(self, index: int, drop_paths: list[float], config: DynamicsConfig):
         super().__init__()
-        channels = config.encoder_channels
+        channels, self.is_last = config.encoder_channels, config.n_stages == 1
         self.pool = Pool(channels[index - 1], channels[index], config.norm) if index > 0 else None
         window = config.merge_windows[index - 1] if index > 0 else 1
         n_merged = 2 ** config.pyramid_spec(config.history_bits).merged_bits()[index]
@@ -280,7 +280,7 @@ class EncoderStage(nn.Module):
             x = self.pool(x, stage)
         if self.merge is not None and self.merge.marks(stage):
             x = self.merge(x, stage)
-        return run_blocks(self.blocks, x, x, stage, generator, beside, for_products=True)
+        return run_blocks(self.blocks, x, x, stage, generator, beside, for_products=not self.is_last)
 
 
 class Unpool(nn.Module):

@@ -57,11 +57,16 @@ class Restored:
         return scene
 
     def check_scene(self, scene: Scene) -> None:
-        """Raises InputError where the scene's images have another size than those of the training."""
+        """Raises InputError where the scene's images or depths are others than those of the training."""
         if (scene.width, scene.height) != self.image_size:
             raise InputError(
                 f"{scene.path}: images of {scene.width}x{scene.height} pixels; the model was trained on "
                 f"{self.image_size[0]}x{self.image_size[1]} (trained with data: {{resize: [W, H]}}, it would fit them)"
+            )
+        if self.data.near_far and (scene.near, scene.far) != tuple(self.data.near_far):
+            raise InputError(
+                f"{scene.path}: depths from {scene.near:g} to {scene.far:g}; the model was trained on "
+                f"{self.data.near_far[0]:g} to {self.data.near_far[1]:g}: open the scene with open_scene, which fits it"
             )
 
 

@@ -251,6 +251,9 @@ def test_scores_are_the_same_on_both_devices(restored, scene, devices):
 def test_what_does_not_fit_is_named(restored, scene):
     with pytest.raises(InputError, match="the model was trained on 64x64"):
         predict(dataclasses.replace(restored, image_size=(64, 64)), scene, (0, 2), 1)
+    near_only = dataclasses.replace(restored.data, near_far=(scene.near, scene.far - 0.5))
+    with pytest.raises(InputError, match="open the scene with open_scene"):
+        predict(dataclasses.replace(restored, data=near_only), scene, (0, 2), 1)
     with pytest.raises(InputError, match="at least 1"):
         predict(restored, scene, (0, 2), 0)
     with pytest.raises(InputError, match="from step 5"):
