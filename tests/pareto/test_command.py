@@ -184,11 +184,48 @@ def test_the_command_from_end_to_end(subject, run, tmp_path, capsys, monkeypatch
     assert content["points"][2]["agreement"]["psnr"] == content["points"][3]["agreement"]["psnr"] == 100
     assert set(content["points"][0]["task"]) == {"psnr", "psnr_masked"}
     assert len(content["points"][0]["step_ms"]["stages"]) > 4 and content["points"][0]["step_ms"]["repeats"] >= 20
-    assert content["training"]["steps"] == [0, 20] and content["not_turned"] == {}
+    assert content["training"]["steps"] == [0, 20] and content["not_turned"] == {} and "unfinished" not in content
     assert content["subject"]["scenes"] == 2 and "training step: not measured" in capsys.readouterr().out
     speeds = json.loads((run / SPEEDS).read_text())
     assert list(speeds[checkpoint.load(run).digest]["cpu"]) == ["exact", "balanced", "fast"]
     assert all("checkpoint" not in setting for setting in speeds[checkpoint.load(run).digest]["cpu"].values())
+
+
+def test_what_was_measured_before_an_end_is_kept(subject, run, tmp_path, monkeypatch):
+    def ended(*args, **options):
+        raise KeyboardInterrupt
+
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(measuring, "QUICK_ON_CPU", dataclasses.replace(measuring.QUICK_ON_CPU, repeats=2, n_rounds=2))
+    monkeypatch.setattr(command, "HURRIED_REPEATS", 1)
+    monkeypatch.setattr("gsim3d.pareto.autotune.tune", ended)
+    data, out = str(subject.scenes[0].path.parent), tmp_path / "out"
+    arguments = ["pareto", str(run), data, "--scenes", "all", "--out", str(out), "--quiet", "--knobs", "history"]
+    with pytest.raises((KeyboardInterrupt, SystemExit)):
+        raise SystemExit(main(arguments))
+    content = json.loads((out / "report.json").read_text())
+    assert content["unfinished"] == "ended after 2 of 2 rounds"
+    assert [point["name"] for point in content["points"]] == ["reference", "history 1"]
+    assert all(point["step_ms"]["median"] > 0 for point in content["points"])
+    rows = list(csv.DictReader((out / "report.csv").open()))
+    assert [row["setting"] for row in rows] == ["reference", "history 1"]
+
+
+def test_what_there_is_no_time_for_is_named(subject, run, tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(measuring, "QUICK_ON_CPU", dataclasses.replace(measuring.QUICK_ON_CPU, repeats=2, n_rounds=1))
+    data, out = str(subject.scenes[0].path.parent), tmp_path / "out"
+    arguments = ["pareto", str(run), data, "--scenes", "all", "--out", str(out), "--quiet", "--minutes", "1e-4"]
+    assert main([*arguments, "--self-check", "--knobs", "history", "grid size"]) == 1
+    content = json.loads((out / "report.json").read_text())
+    assert [point["name"] for point in content["points"]] == ["reference"]
+    assert content["not_turned"] == {
+        "history": "more time than --minutes gave, for history 1",
+        "grid size": "more time than --minutes gave, for grid 0.5, grid 2",
+    }
+    assert content["regimes"]["training"]["problem"] == "--minutes left no time"
+    assert len(content["self_check"]) == 1 and "not checked" in content["self_check"][0]
+    assert main([*arguments[:-1], "0"]) == 2
 
 
 def test_wrong_arguments_are_one_line(capsys, tmp_path):
