@@ -273,11 +273,6 @@ class Timing:
         ordered = sorted(self.repeats)
         return ordered[min(len(ordered) - 1, round(0.95 * (len(ordered) - 1)))]
 
-    @property
-    def unexplained(self) -> float:
-        """How far the stages' sum is from the whole, as a share of the whole; 0 without stages."""
-        return abs(sum(self.stages.values()) / self.median - 1) if self.stages else 0.0
-
 
 def time_call(call: Callable[[], Any], clock: Clock, repeats: int = REPEATS, warm_up: int = WARM_UP) -> Timing:
     """Times ``call``, each time from an idle device to an idle device; the first ``warm_up`` do not count."""
@@ -298,7 +293,6 @@ def time_stages(
     clock: Clock,
     repeats: int = REPEATS,
     warm_up: int = WARM_UP,
-    delays: dict[str, float] | None = None,
     *,
     alone: bool = True,
 ) -> Timing:
@@ -308,7 +302,7 @@ def time_stages(
         that is timed, where marks cost next to nothing.
     """
     seconds, stages = [], defaultdict(list)
-    stopwatch = Stopwatch(clock, delays)
+    stopwatch = Stopwatch(clock)
     for n in range(warm_up + repeats):
         with _all_watched([] if alone else simulators, stopwatch):
             clock.wait()

@@ -6,6 +6,7 @@ import pytest
 
 from gsim3d.errors import InputError
 from gsim3d.pareto import autotune
+from gsim3d.pareto.limit import TimeLimit
 from gsim3d.pareto.measure import Agreement, Comparison, Effort, Point, measure
 from gsim3d.pareto.settings import KNOBS, Setting
 from gsim3d.pareto.timing import DeviceClock, Timing
@@ -85,6 +86,45 @@ def test_turns_that_keep_the_promise_are_added_up(subject, comparison, monkeypat
         comparison, [reference, *turns], lambda p: p.agreement.psnr >= 40, None, SHORT, {best.setting: best}
     )
     assert again is best and len(measured) == 1  # nothing is measured twice
+
+
+def test_a_turn_must_save_more_than_its_graph_does(comparison, monkeypatch):
+    """All that is replayed is faster than the launched reference; what saves nothing beside the graph is not tried."""
+    points = [
+        at(Setting(), 10.0, 100.0),
+        at(Setting(captured=True), 6.0, 100.0),
+        at(Setting(captured=True, patch_size=64), 5.9, 60.0, other_round=6.1),
+        at(Setting(captured=True, history=1), 4.0, 60.0),
+        at(Setting(captured=True, kept=0.5), 5.0, 50.0),
+    ]
+    measured = []
+
+    def fill(_, points, *others):
+        measured.append(points[0].setting)
+        points[0].agreement, points[0].step = Agreement(50.0, 50.0, None, None), [Timing((3.0,))]
+
+    monkeypatch.setattr(autotune, "measure", fill)
+    best = autotune.fastest(comparison, points, lambda p: True, None, SHORT)
+    assert best.setting == Setting(captured=True, history=1, kept=0.5) and measured == [best.setting]
+    only = autotune.fastest(comparison, points[:3], lambda p: True, None, SHORT)
+    assert only is points[1]
+
+
+def test_what_ties_with_the_fastest_is_chosen_by_agreement(comparison):
+    points = [
+        at(Setting(), 10.0, 100.0),
+        at(Setting(history=1), 5.0, 40.0, other_round=5.2),
+        at(Setting("bf16", "bf16", "bf16", history=1), 5.1, 60.0, other_round=5.3),
+    ]
+    assert autotune.fastest(comparison, points, lambda p: True, None, SHORT) is points[2]
+
+
+def test_nothing_is_tried_when_the_time_is_over(comparison, monkeypatch):
+    monkeypatch.setattr(autotune, "measure", lambda *args: pytest.fail("measured"))
+    points = [at(Setting(), 10.0, 100.0), at(Setting(history=1), 6.0, 60.0), at(Setting(grid=2.0), 8.0, 70.0)]
+    over = TimeLimit(1.0, iter([0.0, *[2.0] * 9]).__next__)
+    best = autotune.fastest(comparison, points, lambda p: True, None, SHORT, limit=over)
+    assert best is points[1]
 
 
 def test_limits_are_kept(subject):

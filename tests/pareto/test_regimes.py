@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from gsim3d.graphs import CapturedRollout, CaptureError
 from gsim3d.pareto import report
 from gsim3d.pareto.regimes import throughput, training_step
 from gsim3d.pareto.settings import Setting
@@ -30,6 +31,32 @@ def test_throughput_counts_all_scenes(subject):
     found = throughput(subject, Setting(), DeviceClock("cpu"), repeats=2, n_scenes=3)
     assert found.n_scenes == 3
     assert found.steps_a_second == pytest.approx(3 / found.timing.median)
+
+
+def test_a_batch_is_replayed_where_the_setting_is(subject, monkeypatch):
+    """Four steps of all scenes a replay, and each counts."""
+    replays, call = [], CapturedRollout.__call__
+
+    def counted(self, state, cameras=None):
+        replays.append((len(state.clouds.scenes), self._n_steps))
+        return call(self, state, cameras)
+
+    monkeypatch.setattr(CapturedRollout, "__call__", counted)
+    found = throughput(subject, Setting(captured=True), DeviceClock("cpu"), repeats=2, n_scenes=3)
+    assert replays == [(3 * subject.restored.data.history, 4)] * 3  # one of them to warm up
+    assert len(found.timing.repeats) == 2 and found.steps_a_second == pytest.approx(3 / found.timing.median)
+    replays.clear()
+    throughput(subject, Setting(), DeviceClock("cpu"), repeats=2, n_scenes=2)
+    assert not replays
+
+
+def test_a_batch_that_cannot_be_captured_is_told(subject, monkeypatch):
+    def fails(*args, **options):
+        raise CaptureError("Captured: no")
+
+    monkeypatch.setattr("gsim3d.pareto.runner.CapturedRollout", fails)
+    found = throughput(subject, Setting(captured=True), DeviceClock("cpu"))
+    assert found.problem == "Captured: no" and found.steps_a_second is None
 
 
 def test_what_has_no_memory_is_told(subject, monkeypatch):

@@ -13,7 +13,7 @@ from gsim3d.pareto import products
 from gsim3d.pareto.measure import QUICK_ON_CPU, Comparison, Effort, Point, compare, points_of, time_points
 from gsim3d.pareto.predict import Unusable, predict
 from gsim3d.pareto.runner import Runner
-from gsim3d.pareto.settings import KINDS, KNOBS, SLOW, Setting
+from gsim3d.pareto.settings import KINDS, KNOBS, SLOW, Setting, turned
 from gsim3d.pareto.subject import Subject
 from gsim3d.pareto.timing import DeviceClock
 from gsim3d.train.restore import build_simulator
@@ -153,6 +153,21 @@ def test_weak_gaussians_are_not_drawn(subject):
     expected = runner.images(newest.select_rows(newest.opacities >= least), cameras)
     torch.testing.assert_close(fewer, expected, rtol=0, atol=0)
     assert not torch.equal(fewer, whole)
+
+
+def test_on_a_gpu_settings_are_replayed_where_they_fit_a_graph():
+    """A setting that the host launches is as slow as the host, whatever it saves."""
+
+    class OnGpu:
+        device = torch.device("cuda")
+
+    chosen = knobs("precision", "particles kept", "cutoff of Gaussians", "sleep", "image size and decoded frames")
+    settings, missing = turned(OnGpu(), [*chosen, *knobs("graph capture")])
+    launched = [setting for setting in settings if not setting.captured]
+    assert {setting.name for setting in launched} == {"sleep 0.001", "sleep 0.01", "sleep 0.1"}
+    assert settings[Setting(captured=True)].name == "graph capture" and not missing
+    ends, _ = turned(OnGpu(), knobs("precision"), fewest=True)
+    assert [setting.name for setting in ends] == ["graph captured, precision tf32", "graph captured, precision bf16"]
 
 
 def test_a_graph_does_not_fit_everything():
