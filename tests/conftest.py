@@ -30,8 +30,12 @@ def cuda_device() -> torch.device:
 
 
 def pytest_collection_modifyitems(items):
-    """Marks the tests that use the GPU: ``-m gpu`` selects them. GSIM3D_FEW=N keeps N cases of each such test."""
+    """Marks the tests that use the GPU: ``-m gpu`` selects them.
+
+    GSIM3D_FEW=N keeps N cases of each such test, GSIM3D_PART=I/N of them the I-th of N parts (from 0).
+    """
     few = int(os.environ.get("GSIM3D_FEW", 0))
+    part, n_parts = map(int, os.environ.get("GSIM3D_PART", "0/1").split("/"))
     for item in items:
         values = item.callspec.params.values() if hasattr(item, "callspec") else ()
         if {"devices", "gpus"} & set(item.fixturenames) or any("cuda" in str(value) for value in values):
@@ -41,8 +45,15 @@ def pytest_collection_modifyitems(items):
         for item in items:
             if item.get_closest_marker("gpu"):
                 of_test[item.path, item.originalname].append(item)
-        kept = {id(cases[k * len(cases) // few]) for cases in of_test.values() for k in range(few)}
+        kept = {id(case) for cases in of_test.values() for case in spread(cases, few)}
         items[:] = [item for item in items if id(item) in kept]
+    items[:] = items[part::n_parts]
+
+
+def spread(cases: list, n: int) -> list:
+    """``n`` of them at most, from all over the list, and so that what changes fastest along it is seen to change."""
+    parts = (cases[k * len(cases) // n : (k + 1) * len(cases) // n] for k in range(n))
+    return [part[k % len(part)] for k, part in enumerate(parts) if part]
 
 
 @pytest.fixture(params=["cpu", "cuda"])

@@ -5,43 +5,78 @@
 #   tools/gpu_check.sh build                the extension with its CUDA kernels, in place
 #   tools/gpu_check.sh test                 the tests that use the GPU; tools/test.sh has the others
 #   tools/gpu_check.sh sanitize             compute-sanitizer (memcheck, racecheck) on the tests of the ops
-#   tools/gpu_check.sh bench                every op and the whole model against its peers: tools/bench/results/*.jsonl
+#   tools/gpu_check.sh bench                every op and the whole model against its peers: tools/bench/results
 #
 # A step that passed on these sources is not repeated: started again, the check goes on where it stopped (remove
-# build/gpu_check to start over). Uses `python3`, or $PYTHON; needs torch with CUDA, nvcc, pytest; works without a
-# network.
+# build/gpu_check to start over). Its last line names what passed, failed and was not run. Uses `python3`, or $PYTHON;
+# needs torch with CUDA, nvcc, pytest; works without a network.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PYTHON="${PYTHON:-python3}"
 STATE=build/gpu_check
 OPS=(curve sparse_conv patch_attn pool row_norm plane_sweep raster decode background)
+# Tests whose checks take longest come first, longest first, in so many parts: racecheck, then memcheck.
+LONG=(unchecked_lists:4:2 raster_edges:4:2 pyramid:3:2 sparse_conv:3:2 plane_sweep:2:1 joint_attention:2:1
+  pyramid_capacity:2:2 raster:2:1 patch_attn:2:1 patch_attn_cuda:2:1)
 
 say() { printf '\033[1m%s\033[0m\n' "$*" >&2; }
 die() { say "$*"; exit 1; }
-usage() { sed -n '2,12s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; }
+usage() { sed -n '2,13s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; }
 
-# What a result holds for: sources, tests, torch and the GPU.
+# What a result holds for: sources, tests, torch and the GPU. Benchmarks write their results among them.
 key() {
-  { find setup.py csrc gsim3d tests tools -type f -not -name '*.so' -not -name '*.pyc' -not -name '*.jsonl' -print0 |
-      sort -z | xargs -0 cat; echo "$MACHINE"; } | cksum | cut -d ' ' -f 1
+  { find setup.py csrc gsim3d tests tools \( -name __pycache__ -o -path tools/bench/results \) -prune -o \
+      -type f -not -name '*.so' -print0 | sort -z | xargs -0 cat; echo "$MACHINE"; } | cksum | cut -d ' ' -f 1
 }
 
 # step NAME COMMAND...: runs it once for these sources, with its output in $STATE/NAME.log.
 step() {
-  local name="$1" started=$SECONDS
+  local name="$1" started=$SECONDS code
   shift
-  if [ "$(cat "$STATE/$name.done" 2>/dev/null)" = "$KEY" ]; then
+  if is_now "$name" done; then
     say "$name: passed before"
     return 0
   fi
-  if "$@" >"$STATE/$name.log" 2>&1; then
-    echo "$KEY" >"$STATE/$name.done"
-    say "$name: passed in $((SECONDS - started)) s; $(tail -n 1 "$STATE/$name.log")"
-  else
-    say "$name: FAILED after $((SECONDS - started)) s; the end of $STATE/$name.log:"
-    tail -n 40 "$STATE/$name.log" >&2
-    return 1
-  fi
+  rm -f "$STATE/$name.failed"
+  "$@" >"$STATE/$name.log" 2>&1
+  code=$?
+  case $code in
+    0)
+      echo "$KEY" >"$STATE/$name.done"
+      say "$name: passed in $((SECONDS - started)) s; $(tail -n 1 "$STATE/$name.log")" ;;
+    130 | 143) say "$name: stopped after $((SECONDS - started)) s" ;;  # told to: SIGINT, SIGTERM
+    *)
+      echo "$KEY" >"$STATE/$name.failed"
+      say "$name: FAILED after $((SECONDS - started)) s; the end of $STATE/$name.log:"
+      tail -n 40 "$STATE/$name.log" >&2 ;;
+  esac
+  return $code
+}
+
+# is_now NAME done|failed: whether NAME did so on these sources.
+is_now() { [ "$(cat "$STATE/$1.$2" 2>/dev/null)" = "$KEY" ]; }
+
+# The steps of a phase behind the build, one a line.
+steps_of() {
+  local name phase
+  case "$1" in
+    test) echo test ;;
+    sanitize) sanitized | cut -d ' ' -f 1 ;;
+    bench) for name in "${OPS[@]}" end_to_end stability sleeping effects training; do echo "bench_$name"; done ;;
+    all) for phase in test sanitize bench; do steps_of "$phase"; done ;;
+  esac
+}
+
+# The last line; its status is 0 where all passed.
+summary() {
+  local name passed=0 failed="" missing=""
+  for name in build $(steps_of "$1"); do
+    if is_now "$name" done; then passed=$((passed + 1))
+    elif is_now "$name" failed; then failed+=" $name"
+    else missing+=" $name"; fi
+  done
+  say "gpu_check $1: $passed passed; failed:${failed:- none}; not run:${missing:- none}"
+  [ -z "$failed$missing" ]
 }
 
 compile() {
@@ -52,57 +87,81 @@ compile() {
   MAX_JOBS="${MAX_JOBS:-$(nproc)}" GSIM3D_CUDA=1 "$PYTHON" setup.py build_ext --inplace
 }
 
-# Tests run side by side where pytest-xdist is installed; they share the GPU.
+at_once() { echo "$(($(nproc) < 14 ? $(nproc) : 14))"; }  # they share one GPU
+
+# Tests run side by side where pytest-xdist is installed.
 tests() {
   local parallel=()
-  "$PYTHON" -c 'import xdist' 2>/dev/null && parallel=(-n "$(($(nproc) < 14 ? $(nproc) : 14))" --dist load)
+  "$PYTHON" -c 'import xdist' 2>/dev/null && parallel=(-n "$(at_once)" --dist load)
   # What the hard cases measured: python tools/stability.py --add FILE puts it into docs/stability.md.
   GSIM3D_REQUIRE_CUDA=1 GSIM3D_STABILITY_JSON="$STATE/stability.json" OMP_NUM_THREADS=1 \
     "$PYTHON" -m pytest -q "${parallel[@]}" tests/stability tests -m "gpu and not slow"
 }
 
+# The sanitizer's steps in their order, one a line: NAME TOOL FILE PART.
+sanitized() {
+  local long name race memory file
+  for long in "${LONG[@]}"; do
+    IFS=: read -r name race memory <<<"$long"
+    parts racecheck "$name" "$race"
+    parts memcheck "$name" "$memory"
+  done
+  for file in tests/ops/test_*.py; do
+    name="${file##*/test_}"
+    name="${name%.py}"
+    [[ " ${LONG[*]}" == *" $name:"* ]] && continue
+    parts racecheck "$name" 1
+    parts memcheck "$name" 1
+  done
+}
+parts() {
+  local tool="$1" name="$2" count="$3" part
+  for ((part = 0; part < count; part++)); do
+    echo "${tool}_test_$name$([ "$count" = 1 ] || echo "_$part") $tool tests/ops/test_$name.py $part/$count"
+  done
+}
+
 sanitize() {
-  local tool="$1" file="$2"
+  local tool="$1" file="$2" part="$3" wanted="gpu and not unsanitized"
+  [ "$tool" = racecheck ] && wanted+=" and not unraced"
   # Without torch's memory pool every tensor is an allocation that the tool watches; a graph cannot be captured so.
   # It slows kernels a hundred times, so that it sees our kernels alone, and some cases of every test.
-  GSIM3D_FEW=3 GSIM3D_REQUIRE_CUDA=1 PYTORCH_NO_CUDA_MEMORY_CACHING=1 OMP_NUM_THREADS=1 \
+  GSIM3D_FEW=3 GSIM3D_PART="$part" GSIM3D_REQUIRE_CUDA=1 PYTORCH_NO_CUDA_MEMORY_CACHING=1 OMP_NUM_THREADS=1 \
     compute-sanitizer --tool "$tool" --kernel-name kns=gsim3d --kernel-name kns=3cub --error-exitcode 9 \
-    "$PYTHON" -m pytest -q -p no:cacheprovider "$file" -m gpu -k "not compile and not graph and not opcheck"
+    "$PYTHON" -m pytest -q -p no:cacheprovider --durations 10 "$file" -m "$wanted" \
+    -k "not compile and not graph and not opcheck"
 }
 
 run_build() { step build compile; }
 run_test() { step test tests; }
 run_sanitize() {
   command -v compute-sanitizer >/dev/null || die "compute-sanitizer was not found: it comes with the CUDA toolkit"
-  local failed=0 tool file name
-  # Few at a time, for they wait for one GPU; the longest first.
-  for file in $(ls -S tests/ops/test_*.py); do
-    for tool in memcheck racecheck; do
-      while [ "$(jobs -rp | wc -l)" -ge 14 ]; do wait -n; done
-      step "${tool}_$(basename "$file" .py)" sanitize "$tool" "$file" &
-    done
-  done
+  local name tool file part
+  set -m  # a group of processes for each job: what stops this script can stop them
+  while read -r name tool file part; do
+    while [ "$(jobs -rp | wc -l)" -ge "$(at_once)" ]; do wait -n; done
+    step "$name" sanitize "$tool" "$file" "$part" </dev/null &
+  done < <(sanitized)
   wait
-  for file in tests/ops/test_*.py; do
-    for tool in memcheck racecheck; do
-      name="${tool}_$(basename "$file" .py)"
-      [ "$(cat "$STATE/$name.done" 2>/dev/null)" = "$KEY" ] || failed=1
-    done
-  done
-  return $failed
+  set +m
 }
 run_bench() {
-  local failed=0 file
-  for file in "${OPS[@]}" end_to_end stability sleeping effects training; do
-    [ -f "tools/bench/$file.py" ] || continue
-    step "bench_$file" "$PYTHON" "tools/bench/$file.py" --device cuda || failed=1
-    cat "$STATE/bench_$file.log"
+  local name
+  for name in $(steps_of bench); do
+    step "$name" "$PYTHON" "tools/bench/${name#bench_}.py" --device cuda
+    cat "$STATE/$name.log"
   done
-  return $failed
 }
 
-phase="${1:-}"
-case "$phase" in
+stop() {
+  local group
+  for group in $(jobs -rp); do kill -- "-$group" 2>/dev/null; done
+  summary "$PHASE"
+  exit 143
+}
+
+PHASE="${1:-}"
+case "$PHASE" in
   build | test | sanitize | bench | all) ;;
   -h | --help) usage; exit 0 ;;
   *) usage >&2; exit 2 ;;
@@ -115,11 +174,10 @@ mkdir -p "$STATE"
 export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}"
 KEY="$(key)"
 say "$MACHINE, $(nproc) cores"
-run_build || exit 1
-[ "$phase" = build ] && exit 0
-result=0
-for part in test sanitize bench; do
-  if [ "$phase" = "$part" ] || [ "$phase" = all ]; then "run_$part" || result=1; fi
-done
-[ $result = 0 ] && say "gpu_check $phase: all passed" || say "gpu_check $phase: something failed, see above"
-exit $result
+trap stop INT TERM
+if run_build; then
+  for phase in test sanitize bench; do
+    if [ "$PHASE" = "$phase" ] || [ "$PHASE" = all ]; then "run_$phase"; fi
+  done
+fi
+summary "$PHASE"

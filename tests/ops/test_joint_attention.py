@@ -160,6 +160,7 @@ def test_low_precision_errs_no_more_than_torch(devices, shape, dim, dtype):
         assert ours.abs().max() <= 3 * theirs.abs().max(), name
 
 
+@pytest.mark.unraced("runs the kernels of other tests five times")
 @pytest.mark.parametrize("dtype", [torch.float32, *LOW_PRECISION], ids=["float32", *LOW_PRECISION.values()])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_cuda_gives_the_same_bits_in_every_run(devices, shape, dtype):

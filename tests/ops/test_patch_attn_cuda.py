@@ -30,6 +30,7 @@ def plain_attention(case, q, k, v):
     return out
 
 
+@pytest.mark.unraced("the tool dies of torch's own 16-bit products")
 @pytest.mark.parametrize("dtype", LOW_PRECISION, ids=LOW_PRECISION.values())
 @pytest.mark.parametrize("scale", [None, -0.6, 4.0])
 @pytest.mark.parametrize(

@@ -171,6 +171,7 @@ LARGE = {
 }
 
 
+@pytest.mark.unraced("launches the kernels of other tests several times")
 @pytest.mark.parametrize("case", LARGE)
 def test_large_sweeps_on_cuda(case, devices):
     arguments = make(**LARGE[case], dtype=torch.float32)
@@ -213,6 +214,7 @@ def test_a_scene_has_the_same_bits_alone_and_beside_others(scales, device):
             assert_same_bits(x[images], expected, name)
 
 
+@pytest.mark.unraced("launches the kernels of other tests several times")
 def test_a_scene_has_the_same_bits_in_a_batch_that_takes_several_launches(devices):
     """More pairs than are kept at once, and tiles that see more source pixels than one launch keeps of them."""
     arguments = scaled_scenes(8, (1.0, 30.0), channels=4, depths=64, size=(48, 64))

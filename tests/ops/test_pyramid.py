@@ -177,6 +177,7 @@ def test_devices_agree_at_any_size(n_scenes, steps, rows, devices):
         assert torch.equal(actual.cpu(), expected)
 
 
+@pytest.mark.unsanitized("runs the kernels of test_devices_agree five times")
 def test_cuda_gives_the_same_bits_every_time(devices):
     arguments = on(devices[1], large_scene())
     first = flat(build_pyramid(**arguments, spec=LARGE))
@@ -185,6 +186,7 @@ def test_cuda_gives_the_same_bits_every_time(devices):
             assert torch.equal(actual, expected)
 
 
+@pytest.mark.unsanitized("runs the kernels of test_devices_agree twice")
 def test_other_streams(devices):
     arguments = on(devices[1], large_scene())
     first = flat(build_pyramid(**arguments, spec=LARGE))

@@ -72,6 +72,7 @@ def test_given_sizes_hold_the_same_data(curves, factor, device):
     assert_holds(given, exact, 151)
 
 
+@pytest.mark.unsanitized("runs the kernels of test_devices_agree_on_given_sizes many times")
 def test_what_does_not_fit_leaves_nothing(device):
     arguments = on(device, scene())
     exact = build_pyramid(**arguments, spec=SPEC)

@@ -113,6 +113,7 @@ def test_unused_inputs_have_no_gradient(device):
 # ---- 3 gradcheck in float64, all inputs together -------------------------------------------------------------------
 
 
+@pytest.mark.unsanitized("runs the kernels of test_any_number_of_features thousands of times")
 @pytest.mark.parametrize("sh_terms", [0, 4, 16])
 def test_gradcheck(device, sh_terms):
     scene = random_scene(
@@ -142,6 +143,7 @@ def test_devices_agree(devices, sh_terms):
         assert_close_relative_to_max(a, e, "raster_grad_float32", name)
 
 
+@pytest.mark.unsanitized("runs the kernels of test_any_limits on many more rows")
 def test_same_bits_every_time_on_cuda(devices):
     # Overlapping Gaussians, so that thousands of threads work on one tile and on one row.
     scene = random_scene(n=20_000, width=64, height=48, sh_terms=4, dtype=torch.float32, seed=2).to(devices[1])
@@ -267,6 +269,7 @@ def test_same_bits_for_any_threads():
     assert_same_bits_for_any_threads(lambda: (*scene.render(), *gradients(scene.render, scene)))
 
 
+@pytest.mark.unsanitized("runs the kernels of test_any_limits on many more rows")
 def test_images_do_not_see_each_other(device):
     # Enough pairs of rows and images for several groups of images.
     scene = random_scene(n=60_000, clouds=2, images=6, width=33, height=20, sh_terms=0, dtype=torch.float32).to(device)

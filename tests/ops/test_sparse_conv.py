@@ -1,5 +1,6 @@
 """Sparse convolution, in the eight sections that every op has."""
 
+import itertools
 import os
 import subprocess
 import sys
@@ -128,6 +129,17 @@ def test_cuda_equals_cpu(duplicates, devices):
 
 
 LOW_PRECISION = [torch.float16, torch.bfloat16]
+LOW_PRECISION_CASES = [
+    (700, 9, 3, 64, 64),  # neighbours in most taps, a few shared voxels
+    (1500, 60, 3, 64, 48),  # hardly any neighbours
+    (900, 6, 3, 128, 128),  # most voxels are shared
+    (700, 9, 3, 192, 264),  # several stages of channels, several blocks of outputs
+    (300, 5, 5, 129, 40),  # rows that are no multiples of 16 bytes
+    (300, 5, 3, 16, 33),
+    (200, 4, 1, 8, 130),
+    (9000, 24, 3, 40, 64),  # tiles that no other block shares
+    (33000, 60, 3, 72, 72),  # large tiles
+]
 
 
 def gathered_convolution(voxels, kernel_map, duplicates):
@@ -152,23 +164,11 @@ def gathered_convolution(voxels, kernel_map, duplicates):
     return plain
 
 
+@pytest.mark.unraced("the tool dies of torch's own 16-bit products")
 @pytest.mark.parametrize("planned", [False, True])
 @pytest.mark.parametrize("dtype", LOW_PRECISION)
 @pytest.mark.parametrize("duplicates", RULES)
-@pytest.mark.parametrize(
-    "n, side, kernel_size, c_in, c_out",
-    [
-        (700, 9, 3, 64, 64),  # neighbours in most taps, a few shared voxels
-        (1500, 60, 3, 64, 48),  # hardly any neighbours
-        (900, 6, 3, 128, 128),  # most voxels are shared
-        (700, 9, 3, 192, 264),  # several stages of channels, several blocks of outputs
-        (300, 5, 5, 129, 40),  # rows that are no multiples of 16 bytes
-        (300, 5, 3, 16, 33),
-        (200, 4, 1, 8, 130),
-        (9000, 24, 3, 40, 64),  # tiles that no other block shares
-        (33000, 60, 3, 72, 72),  # large tiles
-    ],
-)
+@pytest.mark.parametrize("n, side, kernel_size, c_in, c_out", LOW_PRECISION_CASES)
 def test_low_precision_errs_no_more_than_torch(n, side, kernel_size, c_in, c_out, duplicates, dtype, planned, devices):
     """Against float64, at most twice the error of plain torch in the same dtype."""
     tables = geometry(random_cells(n, side), kernel_size, devices[1])
@@ -195,6 +195,18 @@ def test_weight_gradients_of_low_precision_are_float32(n, side, channels, dtype,
     for a, e in zip(actual, exact, strict=True):
         assert a.dtype == torch.float32
         assert_close_relative_to_max(a, e, 1e-5)
+
+
+@pytest.mark.parametrize("dtype", LOW_PRECISION)
+def test_low_precision_gives_the_same_bits_in_every_run(dtype, devices):
+    """All that the test against torch computes, without torch's own products: racecheck sees every kernel here."""
+    for n, side, kernel_size, c_in, c_out in LOW_PRECISION_CASES:
+        tables = geometry(random_cells(n, side), kernel_size, devices[1])
+        *inputs, cotangent = (t.to(devices[1]) for t in parameters(n, c_in, c_out, kernel_size, dtype))
+        for duplicates, chosen in itertools.product(RULES, (tables, with_plan(*tables))):
+            first, second = (gradients(convolution(*chosen, duplicates), inputs, cotangent) for _ in range(2))
+            for a, b in zip(first, second, strict=True):
+                assert_same_bits(a, b)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, *LOW_PRECISION])

@@ -99,6 +99,51 @@ def test_particles_of_the_benchmark_sink_with_the_body(bench, tmp_path):
     assert (scales / scene.WIDTH - 1).abs().max() < 0.05
 
 
+@pytest.mark.parametrize("masked", [True, False])
+def test_rows_behind_the_particles_stay_where_they_are(masked, bench):
+    """A captured step has as many rows for every cloud, more than there are particles."""
+    scene = bench.surface_scene
+    torch.manual_seed(0)
+    simulator = Simulator(presets.tiny()).eval()
+    frames, places = scene.frames(1, [scene.evenly(2)] * 2, 32, masked)
+    counts = [len(places) // 2] * 2
+    if masked:
+        frames.masks[0, :, :16] = False  # clouds of different sizes
+        counts = frames.masks.reshape(2, -1).sum(1).tolist()
+        places = scene.frames(1, [scene.evenly(2)] * 2, 32, False)[1][frames.masks.flatten()]
+        assert counts[0] < counts[1]
+    room = simulator.encoder.room(frames, max(counts) + 5)
+    with torch.no_grad():
+        before = simulator.encode(frames, room=room)
+        state = scene.as_if_trained(simulator, places).encode(frames, room=room)
+    for q, (begin, end) in enumerate(state.cu_rows.unfold(0, 2, 1).tolist()):
+        middle = begin + counts[q]
+        assert end - begin == max(counts) + 5
+        assert state.means[begin:middle].equal(places.split(counts)[q])
+        assert state.means[middle:end].equal(before.means[middle:end])
+
+
+@pytest.mark.parametrize("error, is_failed", [(RuntimeError("broken"), True), (torch.cuda.OutOfMemoryError(), False)])
+def test_a_case_that_fails_leaves_the_others(error, is_failed, bench, monkeypatch, tmp_path, capsys):
+    def measure(name, args, processes):
+        if name == "captured":
+            raise error
+        row = {"case": name, "processes": 1, "batch": 1, "particles": 7, "seconds": 1.0, "gib": 1.0, "loss": 0.5}
+        return row
+
+    file = tmp_path / "rows.json"
+    monkeypatch.setattr(bench, "measure", measure)
+    monkeypatch.setattr(sys, "argv", ["training.py", "--json", str(file), "--case", "kept", "captured", "blocks"])
+    if is_failed:
+        with pytest.raises(SystemExit, match="training: captured failed"):
+            bench.main()
+        assert "broken" in capsys.readouterr().err
+    else:
+        bench.main()
+        assert "captured     out of memory" in capsys.readouterr().out
+    assert [row["case"] for row in json.loads(file.read_text())] == ["kept", "blocks"]
+
+
 def test_rows_of_other_cases_are_kept(bench, tmp_path):
     file = tmp_path / "rows.json"
     bench.keep_rows(file, [{"case": "a", "processes": 1, "seconds": 1}, {"case": "a", "processes": 2, "seconds": 2}])

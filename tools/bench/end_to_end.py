@@ -13,6 +13,7 @@ places (surface_scene.py).
 
 import argparse
 import tempfile
+import traceback
 from functools import partial
 
 import surface_scene
@@ -157,13 +158,24 @@ def main():
     bench = Bench("end_to_end")
     if bench.device.type != "cuda":
         raise SystemExit("end_to_end measures the full-size model, which needs a GPU: add --device cuda")
-    for n_steps, masked in RECORDED:
-        dynamics(bench, n_steps, masked, torch.bfloat16)
-    training_step(bench)
-    whole(bench, torch.bfloat16)
-    for n_steps, masked in RECORDED:
-        dynamics(bench, n_steps, masked, torch.float32)
+    parts = [partial(dynamics, bench, *case, torch.bfloat16) for case in RECORDED]
+    parts += [partial(training_step, bench), partial(whole, bench, torch.bfloat16)]
+    parts += [partial(dynamics, bench, *case, torch.float32) for case in RECORDED]
+    n_failed = sum(not is_done(part) for part in parts)
     bench.finish()
+    if n_failed:
+        raise SystemExit(f"end_to_end: {n_failed} parts failed, see above")
+
+
+def is_done(part) -> bool:
+    """Whether ``part`` ran to its end: the others are measured all the same."""
+    try:
+        part()
+    except Exception:
+        traceback.print_exc()
+        torch.cuda.empty_cache()
+        return False
+    return True
 
 
 if __name__ == "__main__":

@@ -120,13 +120,28 @@ def evenly(n_views: int) -> list[int]:
     return [view * N_CAMS // n_views for view in range(n_views)]
 
 
+def _true_places(frames: Frames, particles: Particles, places: Tensor) -> Tensor:
+    """``places`` for the rows that are a pixel's; where clouds have more rows than pixels, the others stay where they
+    are. A CUDA graph may capture it."""
+    n_clouds, pixels = len(frames.cloud_scene), frames.images[:, 0]
+    kept = torch.ones_like(pixels, dtype=torch.bool) if frames.masks is None else frames.masks
+    counts = kept.reshape(n_clouds, -1).sum(1)
+    row = torch.arange(particles.n_rows, device=places.device)
+    cloud = torch.searchsorted(particles.cu_rows[1:], row, right=True)
+    number = row - particles.cu_rows[cloud]
+    place = (counts.cumsum(0) - counts)[cloud] + number
+    is_one = (number < counts[cloud])[:, None]
+    return torch.where(is_one, places[place.clamp(max=len(places) - 1)], particles.means.detach())
+
+
 def as_if_trained(simulator: Simulator, places: Tensor) -> Simulator:
     """``simulator``, changed: what it encodes lies at ``places``, whatever depth it predicts; bodies sink."""
     encode = simulator.encode
 
     def encode_truly(frames: Frames, **options) -> Particles:
         particles = encode(frames, **options)
-        return dataclasses.replace(particles, means=places + (particles.means - particles.means.detach()))
+        found = particles.means.detach()
+        return dataclasses.replace(particles, means=_true_places(frames, particles, places) + (particles.means - found))
 
     simulator.encode = encode_truly
     dynamics, first = simulator.dynamics, 0

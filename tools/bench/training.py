@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -260,7 +261,7 @@ def main() -> None:
     parser.add_argument("--top", type=int, default=0, help="of one process, also list so many kernels of one more step")
     parser.add_argument("--json", type=Path, help="write the rows here; on a GPU default tools/bench/results")
     args = parser.parse_args()
-    rows, file = [], args.json
+    rows, failed, file = [], [], args.json
     if file is None and args.device == "cuda":
         file = RESULTS / "training.json"
     before = alone(args)
@@ -277,10 +278,14 @@ def main() -> None:
                 torch.cuda.reset_peak_memory_stats()
             try:
                 row = measure(name, args, processes)
-            except torch.cuda.OutOfMemoryError:
-                if processes.count > 1:
+            except Exception as error:
+                if processes.count > 1:  # the others wait for this one
                     raise
-                say(f"{name:<12} out of memory")
+                if isinstance(error, torch.cuda.OutOfMemoryError):
+                    say(f"{name:<12} out of memory", flush=True)
+                else:
+                    traceback.print_exc()
+                    failed.append(name)
                 continue
             row["efficiency"] = round(before[name] / row["seconds"], 4) if name in before else None
             efficiency = f"{row['efficiency']:.0%}" if name in before else "-"
@@ -292,6 +297,8 @@ def main() -> None:
             rows.append(row)
             if file is not None and processes.is_first:
                 keep_rows(file, rows)
+    if failed:
+        raise SystemExit(f"training: {', '.join(failed)} failed, see above")
 
 
 def keep_rows(file: Path, rows: list[dict]) -> None:
