@@ -90,6 +90,11 @@ class Setting:
         return [name for name, value in changed.items() if value != defaults[name]]
 
     @property
+    def fits_a_graph(self) -> bool:
+        """Whether what it changes can be replayed from a CUDA graph."""
+        return not self._needs_python
+
+    @property
     def name(self) -> str:
         """What differs from the reference, in words."""
         changed = self.to_dict()
@@ -181,12 +186,8 @@ def turned(
 
 def _as_run(setting: Setting, subject: Subject) -> Setting:
     """On a GPU from a graph where it can be: else it waits for the host, and no knob makes that faster."""
-    if subject.device.type != "cuda":
-        return setting
-    try:
-        return dataclasses.replace(setting, captured=True)
-    except InputError:
-        return setting
+    on_gpu = subject.device.type == "cuda"
+    return dataclasses.replace(setting, captured=True) if on_gpu and setting.fits_a_graph else setting
 
 
 def _require(name: str, value: object, fine: bool, what: str) -> None:

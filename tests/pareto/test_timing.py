@@ -33,9 +33,10 @@ def test_a_stage_within_another_counts_as_itself_only():
     assert stopwatch.seconds == pytest.approx({"state and guards": 0.0, "dense layers": 3.0, "attention": 5.0})
 
 
-def test_stages_of_a_graph_are_those_of_every_replay():
-    """The host is not in them, and what is run before the capture has no marks."""
-    clock = FakeClock(launch=4e-3)
+@pytest.mark.parametrize("cost", [0.0, 0.2e-3])
+def test_stages_of_a_graph_are_those_of_every_replay(cost):
+    """Neither the host nor the marks are in them, and what is run before the capture has no marks."""
+    clock = FakeClock(launch=4e-3, cost=cost)
     simulator, stopwatch = FakeSimulator(clock), GraphStopwatch(clock)
     with watched(simulator, stopwatch), stopwatch.capturing():
         graph = FakeGraph(simulator, clock)
