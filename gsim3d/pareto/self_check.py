@@ -16,6 +16,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from gsim3d.errors import InputError
+from gsim3d.graphs import CaptureError
 from gsim3d.pareto.settings import Setting
 from gsim3d.pareto.stepping import Stepping
 from gsim3d.pareto.subject import Subject
@@ -242,9 +244,10 @@ def self_check(
         seconds: after which each of the two parts ends, once it has the fewest rounds that can be judged.
         most: seconds that these may take; where they would take longer, nothing is checked.
     """
-    on_gpu = subject.device.type == "cuda"
-    from_graph = on_gpu and subject.runner(Setting(captured=True)).draws_in_graph
-    reference = Setting(captured=from_graph)
+    progress("self-check: stages")
+    bare = _reference(subject, clock)
+    reference = bare.runner.setting
+    from_graph = reference.captured
 
     def watched(delays: dict[str, float]) -> Callable[[], dict[str, float]]:
         stopwatch = (GraphStopwatch if from_graph else Stopwatch)(clock, delays)
@@ -257,8 +260,6 @@ def self_check(
 
         return stages
 
-    progress("self-check: stages")
-    bare = Stepping(subject, reference, clock, span=1)
     checks = check_stages(watched, bare, bare.launch, clock, blind, seconds=seconds, most=most)
     if len(checks) == 1:
         return checks
@@ -269,3 +270,14 @@ def self_check(
         settings = [*graphs, Setting()]
     calls = {setting.name: Stepping(subject, setting, clock, span=1) for setting in settings}
     return [*checks, *check_order(calls, [Setting().name] if from_graph else [], clock, seconds)]
+
+
+def _reference(subject: Subject, clock: Clock) -> Stepping:
+    """The reference's step, on a GPU from a graph that draws too, where there can be one."""
+    captured = Setting(captured=True)
+    if subject.device.type == "cuda" and subject.runner(captured).draws_in_graph:
+        try:
+            return Stepping(subject, captured, clock, span=1)
+        except (CaptureError, InputError):
+            pass
+    return Stepping(subject, Setting(), clock, span=1)

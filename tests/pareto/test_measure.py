@@ -341,3 +341,13 @@ def test_what_compiles_too_long_is_ended(subject, monkeypatch):
     assert not point.failure and point.once > 0
     measure._compile(subject, point, DeviceClock("cpu"), 0.05)
     assert point.failure == LEFT_OUT
+
+
+def test_what_the_stages_of_a_graph_leave_are_gaps_of_the_host(subject):
+    """Of a setting that is launched; one that is replayed has none, and one that fits no graph has no stages."""
+    whole, clock = Timing((5.0, 5.0)), DeviceClock("cpu")
+    launched = measure._stages_of_graph(subject, Setting(), clock, whole)
+    assert sum(launched.values()) == pytest.approx(5.0) and launched["host gaps"] > 1.0
+    assert {"convolution", "sort and raster"} <= set(launched)
+    assert "host gaps" not in measure._stages_of_graph(subject, Setting(captured=True), clock, whole)
+    assert measure._stages_of_graph(subject, Setting(orders=2), clock, whole) == {}
