@@ -27,8 +27,9 @@ STAGES_DELAYED = ("convolution", "attention", "sort and raster")
 DELAY, DELAY_SHARE = 5e-3, 0.3  # that is injected: seconds, or of a step where that is more
 TOLERANCE = 0.1  # of the delay, by which stages may be wrong
 NOISE = 0.03  # by which the order of settings may move a median
-CERTAIN = 0.99  # of an interval of a median
-LEAST_ROUNDS, MOST_ROUNDS, MOST_SECONDS = 8, 60, 12.0  # of each of the two parts of the check
+CERTAIN = 0.95  # of an interval of a median
+LEAST_ROUNDS = 9  # of which one to each side may be an outlier
+MOST_ROUNDS, MOST_SECONDS = 60, 15.0  # of each of the two parts of the check
 VISIT = 7  # steps of a setting that are timed in turn, as in a round of the report
 PLAIN, WHOLE, ALONE, BLIND = "watched", "unwatched", "delay alone", "without waiting"  # what a round has
 
@@ -56,7 +57,7 @@ class Interval:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Interval:
-        """By order: with ``CERTAIN``, whatever their distribution; of fewer than 8 values without ends."""
+        """By order: with ``CERTAIN``, whatever their distribution; of fewer than 6 values without ends."""
         ordered, n = sorted(values), len(values)
         below, rank = 0.0, 0  # chance that no more than ``rank`` values are on one side of the median
         while (below := below + math.comb(n, rank) / 2**n) <= (1 - CERTAIN) / 2:
