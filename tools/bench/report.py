@@ -10,21 +10,26 @@ It also puts what tools/bench/training.py measured on a GPU into docs/training.m
 
 import argparse
 import datetime
+import itertools
 import json
 import os
 import platform
+import re
+import statistics
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
+import targets
 from harness import RESULTS, commit
 
 ROOT = Path(__file__).resolve().parents[2]
 OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "decode", "background"]
-GUARDS, EFFECTS = "stability", "effects"
+GUARDS, EFFECTS, SLEEPING = "stability", "effects", "sleeping"
 NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
 EFFECTS_PAGE, MARKS = ROOT / "docs" / "effects.md", ("<!-- table -->\n", "<!-- end of table -->\n")
+REST_MARKS = "<!-- rest -->\n", "<!-- end of rest -->\n"
 STEPS, STEPS_PAGE = RESULTS / "training.json", ROOT / "docs" / "training.md"
 STEPS_MARKS = "<!-- steps: written by tools/bench/report.py -->\n", "<!-- end of steps -->"
 INTRODUCTION = """# Benchmarks
@@ -61,18 +66,32 @@ def number(value, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
+def rows_of(op: str) -> list[dict]:
+    """What tools/gpu_check.sh bench measured."""
+    file = RESULTS / f"{op}.jsonl"
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def of_one_run(row: dict) -> tuple[str, str, str, str]:
+    return row["gpu"], row["torch"], row["commit"], row["date"]
+
+
+def runs(rows: list[dict]):
+    """(where and when, rows) of each run that ``rows``, in their order, are of."""
+    for (gpu, torch, made_of, day), found in itertools.groupby(rows, of_one_run):
+        yield f"{gpu}, torch {torch}, commit {made_of}, {day}", list(found)
+
+
 def gpu_tables() -> str:
-    files = sorted(file for file in RESULTS.glob("*.jsonl") if file.stem != EFFECTS)  # these are on their own page
-    text = GPU if files else ""
-    for file in files:
-        rows = [json.loads(line) for line in file.read_text().splitlines()]
-        if not rows:
-            continue
-        first = rows[0]
-        text += f"\n### {first['op']} on {first['gpu']}\n\n"
-        text += f"torch {first['torch']}, commit {first['commit']}, {first['date']}.\n"
-        text += cost_table([row for row in rows if "cost" in row])
-        text += peer_table([row for row in rows if "cost" not in row])
+    ops = sorted(file.stem for file in RESULTS.glob("*.jsonl") if file.stem != EFFECTS)  # these are on their own page
+    text = GPU + targets.table([row for op in ops for row in rows_of(op)]) if ops else ""
+    for op in ops:
+        rows = rows_of(op)
+        text += f"\n### {op} on a GPU\n" if rows else ""
+        for where, found in runs(rows):
+            text += f"\n{where}.\n"
+            text += cost_table([row for row in found if "cost" in row])
+            text += peer_table([row for row in found if "cost" not in row])
     return text
 
 
@@ -157,39 +176,73 @@ def steps_table(rows: list[dict]) -> str:
     """What training.py measured, as a table."""
     if not rows:
         return "Not measured yet.\n"
-    first = rows[0]
-    text = f"{first['gpu']}, torch {first['torch']}, commit {first['commit']}, {first['date']}; medians.\n\n"
-    text += "| case | processes | batch | particles a step | s a step | peak GiB | efficiency |\n"
-    text += "| --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
-    for row in sorted(rows, key=lambda row: row["processes"]):
-        efficiency = f"{row['efficiency']:.0%}" if row["efficiency"] else "-"
-        text += (
-            f"| {row['case']} | {row['processes']} | {row['batch']} | {row['particles']} | {row['seconds']:.2f} "
-            f"| {row['gib']:.1f} | {efficiency} |\n"
-        )
+    text = ""
+    for where, found in runs(rows):
+        text += f"{chr(10) if text else ''}{where}; medians.\n\n"
+        text += "| case | processes | batch | particles a step | s a step | peak GiB | efficiency |\n"
+        text += "| --- | ---: | ---: | ---: | ---: | ---: | ---: |\n"
+        for row in sorted(found, key=lambda row: row["processes"]):
+            efficiency = f"{row['efficiency']:.0%}" if row["efficiency"] else "-"
+            text += (
+                f"| {row['case']} | {row['processes']} | {row['batch']} | {row['particles']} | {row['seconds']:.2f} "
+                f"| {row['gib']:.1f} | {efficiency} |\n"
+            )
     return text
 
 
 def with_steps(page: str, rows: list[dict]) -> str:
     """``page`` with the table of ``rows`` between its marks."""
-    begin, end = STEPS_MARKS
-    head, _, rest = page.partition(begin)
-    _, _, tail = rest.partition(end)
-    return head + begin + steps_table(rows) + end + tail
+    return between(page, STEPS_MARKS, steps_table(rows))
 
 
 def effects(r: dict) -> str:
     """The tables of docs/effects.md."""
     where = f"{r['machine']}, one thread, torch {r['torch']}, Python {r['python']}, commit {r['commit']}, {r['date']}."
-    file = RESULTS / f"{EFFECTS}.jsonl"
-    rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-    on_gpu = ""
-    if rows:
-        first = rows[0]
-        on_gpu = (
-            f"\n{first['gpu']}, torch {first['torch']}, commit {first['commit']}, {first['date']}.\n{cost_table(rows)}"
-        )
+    on_gpu = "".join(f"\n{where}.\n{cost_table(found)}" for where, found in runs(rows_of(EFFECTS)))
     return f"{where}\n{cost_table(r['results'])}{on_gpu}"
+
+
+def resting(rows: list[dict]) -> str:
+    """The table of what rests: a step by its share, with a view and without."""
+    steps: dict[str, dict] = {}
+    for row in rows:
+        if found := re.fullmatch(r"(\d+) x \(step( \+ one 128 px view)?\), (\d+%) of .* rest", row["case"]):
+            n, view = int(found[1]), bool(found[2])
+            for share, ms in ((found[3], row["ours_ms"]), ("0%", row["peer_ms"])):
+                steps.setdefault(share, {}).setdefault(view, []).append((ms / n, row["peer_ms"] / n))
+    if not steps:
+        return ""
+    text = "\n| at rest | ms a step | nothing rests | faster | with one 128 px view, ms | faster | steps a second |\n"
+    text += "| ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n"
+    for share in sorted(steps, key=lambda share: int(share[:-1])):
+        cells = []
+        for view in (False, True):  # of nothing at rest there are several medians
+            cells.append([statistics.median(values) for values in zip(*steps[share][view])])
+        (ms, awake), (seen, seen_awake) = cells
+        text += f"| {share} | {ms:.2f} | {awake:.2f} | {awake / ms:.2f}x | {seen:.2f} | {seen_awake / seen:.2f}x "
+        text += f"| {1e3 / seen:.0f} |\n"
+    for row in rows:
+        if row["case"].startswith("the background") and "90%" in steps:
+            ms, awake = (statistics.median(values) for values in zip(*steps["90%"][False]))
+            text += f"\n{row['case'].capitalize()}: {row['ours_ms']:.1f} ms, once a rollout and as Python calls it; "
+            text += f"at 90% it is saved again after {row['ours_ms'] / (awake - ms):.1f} captured steps.\n"
+    return text
+
+
+def rest(rows: list[dict]) -> str:
+    return "".join(f"{where}.\n{resting(found)}" for where, found in runs(rows)) or "Not measured yet.\n"
+
+
+def between(page: str, marks: tuple[str, str], text: str) -> str:
+    """``page`` with ``text`` between its marks."""
+    begin, end = marks
+    before, _, after = page.partition(begin)
+    return before + begin + text + end + after.partition(end)[2]
+
+
+def effects_page(page: str, record: dict) -> str:
+    """``page`` with what effects cost and what rest saves."""
+    return between(between(page, MARKS, effects(record)), REST_MARKS, rest(rows_of(SLEEPING)))
 
 
 def main() -> None:
@@ -207,9 +260,7 @@ def main() -> None:
     steps = json.loads(STEPS.read_text()) if STEPS.exists() else []
     STEPS_PAGE.write_text(with_steps(STEPS_PAGE.read_text(), steps))
     if EFFECTS in records:
-        before, rest = EFFECTS_PAGE.read_text().split(MARKS[0])
-        table = MARKS[0] + effects(records[EFFECTS]) + MARKS[1]
-        EFFECTS_PAGE.write_text(before + table + rest.split(MARKS[1])[1])
+        EFFECTS_PAGE.write_text(effects_page(EFFECTS_PAGE.read_text(), records[EFFECTS]))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,79 @@
+"""Pages of benchmarks are what was measured: every row, of its own commit, nothing written by hand."""
+
+import importlib
+import json
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+RUN = {"gpu": "a GPU", "torch": "2.11", "date": "2026-11-22"}
+
+
+@pytest.fixture
+def report(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "tools" / "bench"))
+    return importlib.import_module("report")
+
+
+@pytest.fixture
+def records(report):
+    return json.loads(report.NUMBERS.read_text())
+
+
+def test_the_pages_are_what_was_measured(report, records):
+    assert report.PAGE.read_text() == report.page(records)
+    effects = report.EFFECTS_PAGE.read_text()
+    assert effects == report.effects_page(effects, records[report.EFFECTS])
+    steps = report.STEPS_PAGE.read_text()
+    assert steps == report.with_steps(steps, json.loads(report.STEPS.read_text()))
+
+
+def test_every_row_is_on_a_page(report):
+    page = report.PAGE.read_text() + report.EFFECTS_PAGE.read_text()
+    for file in report.RESULTS.glob("*.jsonl"):
+        rows = report.rows_of(file.stem)
+        assert rows and all(row["op"] == file.stem and row["commit"] != "unknown" for row in rows), file.name
+        for row in rows:
+            assert page.count(f"| {row['case']}{', ' if 'cost' in row else ' | '}{row['dtype']} |"), row["case"]
+
+
+def test_rows_of_two_runs_stand_in_two_tables(report):
+    row = {"case": "a", "cost": 0.02, "quartiles": [0.01, 0.03], "ours_ms": 1.02, "peer_ms": 1.0, **RUN}
+    found = list(report.runs([{**row, "commit": "aaa"}, {**row, "commit": "aaa"}, {**row, "commit": "bbb"}]))
+    assert [(where.split(", ")[2], len(rows)) for where, rows in found] == [("commit aaa", 2), ("commit bbb", 1)]
+
+
+def test_what_rest_saves(report):
+    def rows(view, *times):
+        shares = zip((50, 90), times)
+        return [
+            {"case": f"4 x (step{view}), {share}% of 65k points rest", "ours_ms": ms, "peer_ms": awake}
+            for share, (ms, awake) in shares
+        ]
+
+    table = report.resting(
+        rows("", (24.0, 40.0), (10.0, 42.0))
+        + rows(" + one 128 px view", (28.0, 44.0), (16.0, 48.0))
+        + [{"case": "the background, 59k points", "ours_ms": 40.0}]
+    )
+    assert "| 0% | 10.25 | 10.25 | 1.00x | 11.50 | 1.00x | 87 |" in table
+    assert "| 50% | 6.00 | 10.00 | 1.67x | 7.00 | 1.57x | 143 |" in table
+    assert "| 90% | 2.50 | 10.50 | 4.20x | 4.00 | 3.00x | 250 |" in table
+    assert "40.0 ms, once a rollout and as Python calls it; at 90% it is saved again after 5.0" in table
+
+
+def test_a_target_is_held_where_each_of_its_times_is(report):
+    targets = report.targets
+    row = {"op": "raster", "dtype": "float32", "peer_ms": 4.0, "commit": "aaa", "ours_ms": 2.0}
+    both = [{**row, "case": f"1 view, 1080p, 1M, SH0: {part}"} for part in ("fwd", "fwd+bwd")]
+    held = [{**both[0], "ours_graph_ms": 0.7}, {**both[1], "ours_graph_ms": 1.9}]
+    assert "| 0.700 / 1.900 | 2.000 / 2.000 | 2.0 / 2.0x | aaa | yes |" in targets.table(held)
+    missed = targets.table([held[0], {**both[1], "ours_graph_ms": 2.2}])
+    assert "| misses by 10.0% |" in missed and "0 of 1 are held." in missed
+    assert targets.measured(held[:1]) == [] and targets.table([]) == ""
+
+
+def test_every_target_was_measured(report):
+    rows = [row for file in report.RESULTS.glob("*.jsonl") for row in report.rows_of(file.stem)]
+    assert len(report.targets.measured(rows)) == len(report.targets.TARGETS)
