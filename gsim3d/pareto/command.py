@@ -162,7 +162,7 @@ def run(args: argparse.Namespace) -> int:
         points = _in_time(points, not_turned)
         doing = "combinations for the presets"
         presets = autotune.tune(comparison, points, clock, effort, lambda what: progress(f"{doing}: {what}", 0), limit)
-        points += [point for point in presets.values() if not any(point is p for p in points)]
+        points = list(dict.fromkeys([*points, *presets.values()]))
         progress("many scenes, training", REST // 2)
         conditions["regimes"] = _regimes(subject, presets, clock, quick, lambda: limit.is_over(REGIMES))
         progress("pictures", REST - REST // 2)

@@ -269,7 +269,7 @@ def self_check(
     if from_graph:
         graphs = [reference, Setting(kept=0.5, captured=True), Setting("bf16", "bf16", "bf16", captured=True)]
         settings = [*graphs, Setting()]
-    calls = {setting.name: Stepping(subject, setting, clock, span=1) for setting in settings}
+    calls = {setting.name: Stepping(subject, setting, clock) for setting in settings}
     return [*checks, *check_order(calls, [Setting().name] if from_graph else [], clock, seconds)]
 
 
