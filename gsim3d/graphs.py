@@ -115,6 +115,7 @@ class CapturedRollout:
         factor: room for geometry over what the rollout of ``state`` needs, at least 1.
         copies: results are copies; False: the graph's own memory, which the next call overwrites.
         report: is told what the simulator's guards find; default ``simulator.report``.
+        cutoff: of Gaussians, as of :meth:`Simulator.draw`.
     Raises:
         InputError: an argument does not fit; the message names it.
 
@@ -134,6 +135,7 @@ class CapturedRollout:
         factor: float = FACTOR,
         copies: bool = True,
         report: StabilityReport | None = None,
+        cutoff: str = "exact",
     ):
         if simulator.training:
             raise InputError("CapturedRollout: simulator must be in evaluation mode; call simulator.eval()")
@@ -149,7 +151,7 @@ class CapturedRollout:
         self._plan, self._drawn = plan or simulator.plan(), plan
         self._report = simulator.report if report is None else report
         self._report.poll()
-        self._background = background
+        self._background, self._cutoff = background, cutoff
         if self._plan.spec.dynamics.sleep is not None:
             raise InputError("CapturedRollout: plan must be one without dynamics.sleep; a graph knows no sleep")
         prepared = simulator.prepare(state, self._plan)
@@ -242,10 +244,8 @@ class CapturedRollout:
                 moving = self._model.advance(self._state, rest.background, self._n_steps, plan, **options)
                 steps = [rest.parts.whole(step, 1 + i) for i, step in enumerate(moving)]
             if self._cameras is not None:
-                for step in steps:
-                    renderings.append(
-                        self._model.draw(step, self._cameras, self._background, self._drawn, report=report)
-                    )
+                drawn = {"plan": self._drawn, "cutoff": self._cutoff, "report": report}
+                renderings += [self._model.draw(step, self._cameras, self._background, **drawn) for step in steps]
         return Predicted(steps, renderings)
 
     def _autocast(self) -> torch.autocast:

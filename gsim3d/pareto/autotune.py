@@ -128,9 +128,10 @@ def _both(best: Point, point: Point) -> Point | None:
 
 def _saves(point: Point, points: Sequence[Point]) -> bool:
     """Whether what ``point`` turns saves time, and not only the graph that it is replayed from."""
-    graph = next((p for p in points if p.setting == Setting(captured=True) and not p.failure), points[0])
-    from_graph = point.setting.captured and point is not graph
-    return _faster(point, points[0]) and (not from_graph or _faster(point, graph))
+    graph = next((p for p in points if p.setting == Setting(captured=True) and not p.failure), None)
+    if graph is None or not point.setting.captured or point is graph:
+        return _faster(point, points[0])
+    return _faster(point, graph) and point.step_seconds < points[0].step_seconds
 
 
 def _faster(point: Point, than: Point) -> bool:

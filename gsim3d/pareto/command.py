@@ -121,21 +121,23 @@ def run(args: argparse.Namespace) -> int:
     subject = Subject(restored, scenes, effort.n_steps, _others(args, budget.earlier_checkpoints(args.checkpoint)))
     clock = DeviceClock(restored.device)
     knobs = [known[name] for name in args.knobs] if args.knobs else KNOBS
-    points, not_turned = points_of(subject, knobs, effort)
-    if training is not None:
-        not_turned.pop("training steps", None)  # the figure of the training shows it
     out.mkdir(parents=True, exist_ok=True)
-    with tqdm(total=n_runs(points, effort) + REST, unit="run", disable=args.quiet) as bar:
+    with tqdm(total=REST, unit="run", disable=args.quiet) as bar:
 
         def progress(doing: str, runs: int = 1) -> None:
             bar.set_description(doing[:60], refresh=False)
             bar.update(runs)
             bar.refresh()
 
+        progress("first input, and which knobs there are", 0)
+        points, not_turned = points_of(subject, knobs, effort)
+        if training is not None:
+            not_turned.pop("training steps", None)  # the figure of the training shows it
+        bar.total += n_runs(points, effort)
         checks = []
         if args.self_check:
             blind = DeviceClock(restored.device, waits=False) if args.device == "cuda" else None
-            most = limit.left(SELF_CHECK)
+            most = limit.part(SELF_CHECK)
             checks = self_check(subject, clock, blind, lambda doing: progress(doing, 0), min(MOST_SECONDS, most), most)
             tqdm.write("\n".join(map(str, checks)))
         comparison = Comparison(subject, metrics, None if effort.apart else clock)
@@ -160,7 +162,7 @@ def run(args: argparse.Namespace) -> int:
         points = _in_time(points, not_turned)
         doing = "combinations for the presets"
         presets = autotune.tune(comparison, points, clock, effort, lambda what: progress(f"{doing}: {what}", 0), limit)
-        points += [point for point in presets.values() if not any(point is p for p in points)]
+        points = list(dict.fromkeys([*points, *presets.values()]))
         progress("many scenes, training", REST // 2)
         conditions["regimes"] = _regimes(subject, presets, clock, quick, lambda: limit.is_over(REGIMES))
         progress("pictures", REST - REST // 2)

@@ -14,7 +14,18 @@ from gsim3d.pareto.settings import KINDS, NOT_TUNED
 from gsim3d.pareto.timing import STAGES
 
 COLORS = {"exact": "#2e8b57", "near-exact": "#1f5fbf", "model": "#c0504d", "needs-training": "#8064a2"}
-STAGE_COLORS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52", "#8172b3", "#937860", "#da8bc3", "#8c8c8c", "#ccb974")
+STAGE_COLORS = (
+    "#4c72b0",
+    "#dd8452",
+    "#55a868",
+    "#c44e52",
+    "#8172b3",
+    "#937860",
+    "#da8bc3",
+    "#8c8c8c",
+    "#ccb974",
+    "#eeeeee",
+)
 GREY, RED = "#a8a8a8", "#c00000"
 AXES = {
     "agreement": ("PSNR against the reference [dB]", lambda p: p.agreement.psnr if p.agreement else None),

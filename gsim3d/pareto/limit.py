@@ -21,5 +21,9 @@ class TimeLimit:
         """Seconds until ``share`` of it is used."""
         return share * self._seconds - (self._now() - self._start)
 
+    def part(self, share: float) -> float:
+        """Seconds that ``share`` of it is, whatever is used."""
+        return share * self._seconds
+
     def is_over(self, share: float = 1.0) -> bool:
         return self.left(share) <= 0

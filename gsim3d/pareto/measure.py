@@ -21,7 +21,7 @@ from gsim3d.pareto.predict import Predicted, Unusable, predict_together, timing_
 from gsim3d.pareto.settings import KNOBS, Knob, Setting, turned
 from gsim3d.pareto.stepping import Stepping, TooLong, bytes_held, compile_once
 from gsim3d.pareto.subject import Subject
-from gsim3d.pareto.timing import STAGES, Clock, GraphStopwatch, Timing, peak_memory, time_call, time_stages
+from gsim3d.pareto.timing import GAPS, STAGES, Clock, GraphStopwatch, Timing, peak_memory, time_call, time_stages
 from gsim3d.perceptual.fvd import MIN_CLIPS, frechet_distance
 
 
@@ -55,7 +55,7 @@ QUICK = Effort(n_steps=12, n_scenes=2, encodings=3, fewest_turns=True, slow_turn
 QUICK_ON_CPU = dataclasses.replace(QUICK, encodings=1, apart=False)
 FULL = Effort(repeats=10, n_scenes=16)
 FEWEST = 3  # repeats of a round where the time is nearly over
-COMPILE_SECONDS = 120.0  # that a setting may be compiled
+COMPILE_SECONDS, LEAST_COMPILE = 120.0, 20.0  # that a setting may be compiled; what is not worth to be begun
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,13 @@ class Point:
 
     @property
     def spread(self) -> float:
-        """Seconds between the slowest and the fastest round."""
-        rounds = [timing.steady for timing in self.step]
+        """Seconds between the slowest and the fastest round: two measurements of one thing."""
+        timings = self.step
+        if len(timings) == 1 and not self.noise:  # of a single round, between its halves
+            seconds = timings[0].repeats
+            half = len(seconds) // 2
+            timings = [Timing(part) for part in (seconds[:half], seconds[half:]) if part]
+        rounds = [timing.steady for timing in timings]
         return max(max(rounds) - min(rounds), self.noise * self.step_seconds)
 
     def stages(self) -> dict[str, float]:
@@ -438,29 +443,37 @@ def _time(subject: Subject, point: Point, clock: Clock, effort: Effort, ready: d
         if setting.captured:
             ready[setting], point.once = stepping, point.once or stepping.once
             timing = time_call(stepping, clock, repeats, effort.warm_up)
-        elif setting.compiled:
+        elif setting.compiled or (not on_host and setting.fits_a_graph):
             timing = time_call(stepping, clock, repeats, effort.warm_up)
         else:
             timing = time_stages(
                 stepping, [stepping.runner.simulator], clock, repeats, effort.warm_up, alone=not on_host
             )
         point.peak = max(point.peak, peak())
-    if setting.captured and not point.step:
-        timing = Timing(timing.repeats, _stages_of_graph(subject, setting, clock, repeats))
+    if not timing.stages and setting.fits_a_graph and not point.step:
+        timing = Timing(timing.repeats, _stages_of_graph(subject, setting, clock, timing))
     span = stepping.span
     each = tuple(seconds / span for seconds in timing.repeats)
     point.step.append(Timing(each, {name: seconds / span for name, seconds in timing.stages.items()}))
 
 
-def _stages_of_graph(subject: Subject, setting: Setting, clock: Clock, repeats: int) -> dict[str, float]:
-    """Medians, of a graph of its own, since marks are a part of it."""
-    stopwatch = GraphStopwatch(clock)
-    marked, seen = Stepping(subject, setting, clock, stopwatch=stopwatch), []
-    for n in range(1 + repeats):
+def _stages_of_graph(subject: Subject, setting: Setting, clock: Clock, timing: Timing) -> dict[str, float]:
+    """Medians of a call, of a graph of its own, since marks are a part of it. Where ``timing`` is of calls that the
+    host launches, the GPU does the same, and waits for the host the rest of the time. None of what fits no graph."""
+    stopwatch, span = GraphStopwatch(clock), subject.runner(setting).span(subject.n_steps)
+    try:
+        marked = Stepping(subject, dataclasses.replace(setting, captured=True), clock, span=span, stopwatch=stopwatch)
+    except (CaptureError, InputError):
+        return {}
+    seen = []
+    for n in range(1 + len(timing.repeats)):
         marked()
         if n:
             seen.append(stopwatch.seconds)
-    return {name: statistics.median(stages.get(name, 0.0) for stages in seen) for name in STAGES if name in seen[0]}
+    stages = {name: statistics.median(stages.get(name, 0.0) for stages in seen) for name in STAGES if name in seen[0]}
+    if not setting.captured:
+        stages[GAPS] = max(0.0, timing.median - sum(stages.values()))
+    return stages
 
 
 def _is_crowded(device: torch.device) -> bool:
@@ -471,7 +484,7 @@ def _is_crowded(device: torch.device) -> bool:
 
 def _compile(subject: Subject, point: Point, clock: Clock, seconds: float) -> None:
     """Compiles what ``point`` runs, or says why not."""
-    if seconds <= 0:
+    if seconds < LEAST_COMPILE:
         point.failure = LEFT_OUT
         return
     try:

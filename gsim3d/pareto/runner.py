@@ -162,16 +162,18 @@ class Runner:
 
     @property
     def draws_in_graph(self) -> bool:
-        """Whether a graph of the rollout can draw as well: it does so in its own precision, and as the model does."""
+        """Whether a graph of the rollout can draw as well: all rows of every step, in the precision of the dynamics."""
         setting, quirks = self.setting, self.simulator.config.renderer.quirks
-        as_the_model = setting.cutoff == "exact" and not setting.least_opacity and quirks == Quirks()
-        return as_the_model and setting.every == 1 and setting.renderer == setting.dynamics
+        all_of_it = not setting.least_opacity and setting.every == 1
+        return all_of_it and quirks == Quirks() and setting.renderer == setting.dynamics
 
     def captured(self, state: Particles, n_steps: int, cameras: Cameras) -> CapturedRollout:
         """The rollout of ``state`` as a graph, in the precision of the dynamics; it draws where it can."""
         drawn = self._smaller(cameras) if self.draws_in_graph else None
         with self._precision("dynamics"):
-            return CapturedRollout(self.simulator, state, n_steps, self.plan, cameras=drawn, copies=False)
+            return CapturedRollout(
+                self.simulator, state, n_steps, self.plan, cameras=drawn, copies=False, cutoff=self.setting.cutoff
+            )
 
     @contextlib.contextmanager
     def _precision(self, part: str) -> Iterator[None]:

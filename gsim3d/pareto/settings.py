@@ -90,6 +90,11 @@ class Setting:
         return [name for name, value in changed.items() if value != defaults[name]]
 
     @property
+    def fits_a_graph(self) -> bool:
+        """Whether what it changes can be replayed from a CUDA graph."""
+        return not self._needs_python
+
+    @property
     def name(self) -> str:
         """What differs from the reference, in words."""
         changed = self.to_dict()
@@ -143,7 +148,8 @@ class Knob:
 
     turns: settings of a simulator on its device, each with only this knob turned; none, or why there is none.
     needs: what must be there, trained or built first, where ``turns`` gives nothing.
-    few: turns in a report that takes the fewest, the last ones.   slow: takes minutes to turn.
+    few: turns in a report that takes the fewest: the last one, both ends, or what is evenly between them too.
+    slow: takes minutes to turn.
     shown: the report has it, but not as settings of its own.
     """
 
@@ -164,7 +170,7 @@ def turned(
 ) -> tuple[dict[Setting, Knob], dict[str, str]]:
     """(settings of all knobs, {knob that has none: what it needs}).
 
-    fewest: as few as Knob says: both ends, or the last one; of knobs that need training all.   slow: slow ones as well.
+    fewest: as few as Knob says; of knobs that need training all.   slow: slow ones as well.
     """
     settings, missing = {}, {}
     for knob in knobs:
@@ -174,19 +180,16 @@ def turned(
                 missing[knob.name] = found or knob.needs
             continue
         if fewest and knob.kind != "needs-training" and len(found) > knob.few:
-            found = [found[0], found[-1]][-knob.few :]
+            apart = (len(found) - 1) / max(1, knob.few - 1)
+            found = [found[-1 - int(n * apart)] for n in reversed(range(knob.few))]
         settings.update((_as_run(setting, subject), knob) for setting in found)
     return settings, missing
 
 
 def _as_run(setting: Setting, subject: Subject) -> Setting:
     """On a GPU from a graph where it can be: else it waits for the host, and no knob makes that faster."""
-    if subject.device.type != "cuda":
-        return setting
-    try:
-        return dataclasses.replace(setting, captured=True)
-    except InputError:
-        return setting
+    on_gpu = subject.device.type == "cuda"
+    return dataclasses.replace(setting, captured=True) if on_gpu and setting.fits_a_graph else setting
 
 
 def _require(name: str, value: object, fine: bool, what: str) -> None:
@@ -205,8 +208,9 @@ def _powers_below(limit: int, least: int = 1) -> list[int]:
 def _precisions(subject: Subject) -> list[Setting]:
     if subject.device.type != "cuda":
         return []
-    parts = [Setting(**{part: "bf16"}) for part in PARTS]
-    return [Setting("tf32", "tf32", "tf32"), Setting("fp16", "fp16", "fp16"), *parts, Setting("bf16", "bf16", "bf16")]
+    whole = [Setting(p, p, p) for p in PRECISIONS[1:]]
+    encoder, dynamics, renderer = (Setting(**{part: "bf16"}) for part in PARTS)
+    return [whole[0], encoder, renderer, dynamics, whole[2], whole[1]]  # tf32, bf16 of the dynamics, and bf16 if few
 
 
 def _fp8(subject: Subject) -> str:
@@ -279,7 +283,7 @@ def _others(knob: str) -> Callable[[Subject], list[Setting]]:
 
 
 KNOBS = (
-    Knob("precision", "model", _precisions, "a GPU: on a CPU there is only float32"),
+    Knob("precision", "model", _precisions, "a GPU: on a CPU there is only float32", few=3),
     Knob("fp8 products", "model", _fp8, "wider layers, see below"),
     Knob("compile", "exact", _compiled, "a compiler; up to 2 minutes, so `quick` leaves it out", slow=True),
     Knob("graph capture", "exact", _captured, "a GPU"),

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import torch
 
+from gsim3d.graphs import Captured
 from gsim3d.simulator import Simulator
 
 STAGES = (
@@ -25,6 +26,7 @@ STAGES = (
     "state and guards",
     "head",
     "sort and raster",
+    "host gaps",
 )
 STAGE_OF_OP = {
     "build_pyramid": "serialise",
@@ -36,7 +38,8 @@ STAGE_OF_OP = {
     "unpool": "pooling",
     "rasterize_gaussians": "sort and raster",
 }
-REST = "state and guards"  # of everything that is in no other stage
+REST, GAPS = "state and guards", "host gaps"  # everything in no other stage; a GPU that waits for the host
+CHAIN, REPLAYS = 64, 9  # kernels between which marks are made, to tell what a mark takes
 WARM_UP, REPEATS = 3, 20
 ADDS_UP = 0.03  # the stages of a call may differ from the whole by this share
 
@@ -56,6 +59,9 @@ class Clock(Protocol):
     def capturing(self) -> bool:
         """Whether what is asked for now becomes part of a graph."""
 
+    def mark_cost(self) -> float:
+        """Seconds that a mark in a graph adds to it."""
+
     def seconds(self, first: Any, last: Any) -> float:
         """Between two marks that the device has passed."""
 
@@ -71,7 +77,7 @@ class DeviceClock:
 
     def __init__(self, device: torch.device | str, waits: bool = True):
         self._gpu = torch.device(device) if torch.device(device).type == "cuda" else None
-        self._waits = waits
+        self._waits, self._mark_cost = waits, None
 
     def wait(self) -> None:
         if self._gpu is not None and self._waits:
@@ -89,6 +95,33 @@ class DeviceClock:
 
     def capturing(self) -> bool:
         return self._gpu is not None and torch.cuda.is_current_stream_capturing()
+
+    def mark_cost(self) -> float:
+        if self._gpu is None:
+            return 0.0
+        if self._mark_cost is None:
+            marked, plain = self._chain(marks=True), self._chain(marks=False)
+            found = [(self._of(marked) - self._of(plain)) / CHAIN for _ in range(REPLAYS)]
+            self._mark_cost = max(0.0, statistics.median(found))
+        return self._mark_cost
+
+    def _chain(self, marks: bool) -> Captured:
+        """A graph of small kernels one after another between two marks, and with or without a mark behind each."""
+        cell = torch.zeros((), device=self._gpu)
+
+        def chain() -> list[Any]:
+            made = [self.mark()]
+            for _ in range(CHAIN):
+                cell.add_(1)
+                if marks:
+                    made.append(self.mark())
+            return [*made, self.mark()]
+
+        return Captured(chain, self._gpu)
+
+    def _of(self, graph: Captured) -> float:
+        marks = graph()
+        return self.seconds(marks[0], marks[-1])
 
     def seconds(self, first: Any, last: Any) -> float:
         if self._gpu is None:
@@ -181,7 +214,8 @@ class GraphStopwatch(Stopwatch):
             graph(state)
         stopwatch.seconds
 
-    The host is not in it: a GPU that waits for no launch shows in each stage what that stage takes.
+    The host is not in it: a GPU that waits for no launch shows in each stage what that stage takes. What the marks
+    themselves take is measured apart and taken off.
     """
 
     @contextmanager
@@ -202,6 +236,9 @@ class GraphStopwatch(Stopwatch):
         finally:
             end, self._open = self._clock.mark(), []
             self._add_up([(rest, begin), *self._marks, *self._behind, ("", end)])
+            for name, _ in [(rest, begin), *self._marks][: len(self._marks)]:  # each ends at a mark in the graph
+                self.seconds[name] -= self._clock.mark_cost()
+            self.seconds = {name: max(0.0, seconds) for name, seconds in self.seconds.items()}
 
     def _note(self, name: str) -> None:
         if self._counts():

@@ -14,11 +14,12 @@ class FakeClock:
     """A device that works through what it is asked for while the host runs on; ``wait`` lets the host catch up.
 
     host_share: seconds that the host takes to ask for a second of work.   launch: seconds that it takes beside.
+    cost: seconds that a mark takes in a graph.
     """
 
-    def __init__(self, waits=True, host_share=1.0, launch=0.0):
+    def __init__(self, waits=True, host_share=1.0, launch=0.0, cost=0.0):
         self.host, self.device, self.waits, self.host_share, self.launch = 0.0, 0.0, waits, host_share, launch
-        self.program = None
+        self.program, self.cost = None, cost
 
     def work(self, seconds):
         if self.program is not None:
@@ -46,6 +47,9 @@ class FakeClock:
     def capturing(self):
         return self.program is not None
 
+    def mark_cost(self):
+        return self.cost
+
     def seconds(self, first, last):
         return last.at - first.at
 
@@ -55,6 +59,7 @@ class FakeClock:
     def _does(self, item):
         if isinstance(item, Mark):
             item.at = self.device
+            self.device += self.cost
         else:
             self.device = max(self.device, self.host) + item
 

@@ -236,6 +236,9 @@ def test_near_times_are_a_tie():
     a.step.append(Timing((1.2,)))  # rounds of a are 0.2 s apart
     assert measure.ties(a, b)
     assert not measure.ties(timed(1.0, 20.0), timed(1.5, 20.0))
+    single = timed(1.0, 20.0)
+    single.step = [Timing((1.0, 1.0, 1.2, 1.2))]  # without another round its halves tell
+    assert single.spread == pytest.approx(0.2) and measure.ties(single, timed(1.15, 20.0))
 
 
 def test_a_wrong_setting_is_told():
@@ -263,6 +266,10 @@ GRAPHS = [
 ]
 
 
+def launched_images(subject, setting, particles):
+    return subject.runner(dataclasses.replace(setting, captured=False)).images(particles, subject.cameras(0, 0))
+
+
 @pytest.mark.parametrize("setting", GRAPHS, ids=lambda setting: setting.name)
 def test_what_is_replayed_is_what_the_setting_says(subject, setting, monkeypatch):
     """Drawn by the graph where it can, else behind it: as many images of the same particles as without one."""
@@ -277,7 +284,9 @@ def test_what_is_replayed_is_what_the_setting_says(subject, setting, monkeypatch
         rendered = stepping._graph(stepping.state)
         drawn += [step.means for step in rendered.steps]
         assert len(rendered.renderings) == stepping.span == 4
-        assert rendered.renderings[0].color.shape[1] == -(-32 // setting.shrink)
+        monkeypatch.undo()
+        image, alone = rendered.renderings[0].color, launched_images(subject, setting, rendered.steps[0])
+        torch.testing.assert_close(image.clamp(0, 1), alone, rtol=0, atol=1e-5)
     expected = [newest.means for n, newest in enumerate(runner.steps(launched.state, 4)) if n % setting.every == 0]
     assert len(drawn) == len(expected)
     for ours, right in zip(drawn, expected, strict=True):
@@ -319,6 +328,7 @@ def test_a_time_limit_leaves_out_what_comes_last(subject):
 def test_what_compiles_too_long_is_ended(subject, monkeypatch):
     """With its reason, and the alarm is put back."""
     monkeypatch.setattr("gsim3d.pareto.stepping._end_compilers", lambda: None)
+    monkeypatch.setattr(measure, "LEAST_COMPILE", 0.1)
     monkeypatch.setattr(Stepping, "__call__", lambda self: time.sleep(60))
     point, before = Point(Setting(compiled=True), "compile", "exact"), signal.getsignal(signal.SIGALRM)
     start = time.monotonic()
@@ -329,3 +339,15 @@ def test_what_compiles_too_long_is_ended(subject, monkeypatch):
     point.failure = ""
     measure._compile(subject, point, DeviceClock("cpu"), 30.0)
     assert not point.failure and point.once > 0
+    measure._compile(subject, point, DeviceClock("cpu"), 0.05)
+    assert point.failure == LEFT_OUT
+
+
+def test_what_the_stages_of_a_graph_leave_are_gaps_of_the_host(subject):
+    """Of a setting that is launched; one that is replayed has none, and one that fits no graph has no stages."""
+    whole, clock = Timing((5.0, 5.0)), DeviceClock("cpu")
+    launched = measure._stages_of_graph(subject, Setting(), clock, whole)
+    assert sum(launched.values()) == pytest.approx(5.0) and launched["host gaps"] > 1.0
+    assert {"convolution", "sort and raster"} <= set(launched)
+    assert "host gaps" not in measure._stages_of_graph(subject, Setting(captured=True), clock, whole)
+    assert measure._stages_of_graph(subject, Setting(orders=2), clock, whole) == {}

@@ -1,18 +1,20 @@
 """Many scenes at once, and a training step with the checkpoint's own configuration."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from gsim3d.graphs import CapturedRollout, CaptureError
 from gsim3d.pareto import report
-from gsim3d.pareto.regimes import throughput, training_step
+from gsim3d.pareto.regimes import _steady_steps, throughput, training_step
 from gsim3d.pareto.settings import Setting
 from gsim3d.pareto.timing import DeviceClock
 from gsim3d.train.checkpoint import Checkpoint
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
 from gsim3d.train.settings import to_dict
+from tests.pareto.fakes import FakeClock
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -95,3 +97,22 @@ def test_a_training_step_of_the_last_stage(subject):
     assert "do not fit" in trained(long).problem
     found = report.regimes_as_dict([], step)["training"]
     assert found["step_ms"]["median"] == pytest.approx(1e3 * step.timing.median)
+
+
+class CapturingTrainer:
+    """Captures a graph in the first steps, which takes seconds."""
+
+    def __init__(self, clock, n_captures):
+        self.clock, self.captured, self.left = clock, SimpleNamespace(captures=0), n_captures
+
+    def train_step(self):
+        new = self.left > 0
+        self.left -= new
+        self.captured.captures += new
+        self.clock.work(7.0 if new else 0.2)
+
+
+def test_captures_are_no_training_steps():
+    clock = FakeClock()
+    assert _steady_steps(CapturingTrainer(clock, 3), clock, 3, 1).repeats == pytest.approx((0.2, 0.2, 0.2))
+    assert _steady_steps(CapturingTrainer(clock, 1000), clock, 3, 1) is None

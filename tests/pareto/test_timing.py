@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from gsim3d.graphs import Captured
 from gsim3d.pareto.timing import DeviceClock, GraphStopwatch, Stopwatch, Timing, time_call, time_stages, watched
 from tests.pareto.fakes import FakeClock, FakeGraph, FakeSimulator
 
@@ -33,9 +34,10 @@ def test_a_stage_within_another_counts_as_itself_only():
     assert stopwatch.seconds == pytest.approx({"state and guards": 0.0, "dense layers": 3.0, "attention": 5.0})
 
 
-def test_stages_of_a_graph_are_those_of_every_replay():
-    """The host is not in them, and what is run before the capture has no marks."""
-    clock = FakeClock(launch=4e-3)
+@pytest.mark.parametrize("cost", [0.0, 0.2e-3])
+def test_stages_of_a_graph_are_those_of_every_replay(cost):
+    """Neither the host nor the marks are in them, and what is run before the capture has no marks."""
+    clock = FakeClock(launch=4e-3, cost=cost)
     simulator, stopwatch = FakeSimulator(clock), GraphStopwatch(clock)
     with watched(simulator, stopwatch), stopwatch.capturing():
         graph = FakeGraph(simulator, clock)
@@ -87,3 +89,23 @@ def test_the_clock_of_a_device(device):
     clock.wait()
     assert 0.01 < clock.seconds(first, last) < 10
     assert clock.now() - start > 0.01
+
+
+def test_marks_and_delays_are_part_of_a_graph(device):
+    """And are passed in every replay; what a mark takes is little."""
+    clock = DeviceClock(device)
+    assert not clock.capturing()
+    if torch.device(device).type == "cpu":
+        assert clock.mark_cost() == 0.0
+        return
+
+    def delayed():
+        first = clock.mark()
+        clock.delay(0.01)
+        return first, clock.mark()
+
+    graph = Captured(delayed, device)
+    for _ in range(2):
+        first, last = graph()
+        assert 0.005 < clock.seconds(first, last) < 0.1
+    assert 0 <= clock.mark_cost() < 1e-4
