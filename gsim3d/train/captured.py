@@ -91,6 +91,7 @@ class CapturedLoss:
         alone: a context in which no other thread uses the GPU, which a capture does not allow.
         meanwhile: is called in every call, while the graph runs: what else the host has to do delays no kernel then.
         captures: how often a graph was made.
+        most: sizes of geometry that any simulated step needed so far, by scenes and times of the encoded clouds.
     """
 
     def __init__(
@@ -106,6 +107,7 @@ class CapturedLoss:
         self.alone: AbstractContextManager = nullcontext()
         self.meanwhile: Callable[[], None] = lambda: None
         self.captures = 0
+        self.most: dict[tuple, tuple[int, ...]] = {}
         self._steps: dict[tuple, _Step] = {}
 
     @torch.no_grad()
@@ -136,7 +138,7 @@ class CapturedLoss:
             step = None  # its memory goes back first
             while len(self._steps) >= MOST_KINDS:
                 del self._steps[next(iter(self._steps))]
-            step = _Step(self, _rounded_up(ROWS_FACTOR * largest), prepared.batch, weights)
+            step = _Step(self, _rounded_up(ROWS_FACTOR * largest), prepared, weights)
         self._steps[kind] = step  # now the newest
         return step(prepared, weights, report)
 
@@ -144,9 +146,10 @@ class CapturedLoss:
 class _Step:
     """A step of one kind, with ``rows`` rows a cloud."""
 
-    def __init__(self, owner: CapturedLoss, rows: int, batch: Batch, weights: Tensor):
+    def __init__(self, owner: CapturedLoss, rows: int, prepared: Prepared, weights: Tensor):
         self._owner, self.rows, self._capacities, self._is_ready = owner, rows, [], False
         self._graph = self._records = None
+        batch, self._clouds = prepared.batch, prepared.kind[:2]
         self._context, self._targets = _own(batch.context), _own(batch.targets)
         self._room = owner.simulator.encoder.room(batch.context, rows)
         self._n_lead, self._n_future, self._weights = batch.n_lead, batch.n_future, weights.clone()
@@ -154,7 +157,7 @@ class _Step:
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
         self._load(prepared, weights)
         if not self._is_ready:
-            self._capacities = self._observed()
+            self._make_room(self._observed())
             self._capture()
         loss, errors, norm, gradients, found, records = self._replay()
         self._owner.meanwhile()
@@ -163,14 +166,22 @@ class _Step:
             if all([capacity.fits(row) for capacity, row in zip(self._capacities, numbers, strict=True)]):
                 break
             self._graph = self._records = loss = errors = gradients = found = None  # their memory goes back first
-            grown = (c.grown(row, FACTOR) for c, row in zip(self._capacities, numbers, strict=True))
-            # What was too small for one step will soon be too small for others.
-            most = [max(sizes) for sizes in zip(*(capacity.sizes for capacity in self._observed()), strict=True)]
-            self._capacities = [capacity.grown((0, *most), 1) for capacity in grown]
+            grown = [c.grown(row, FACTOR) for c, row in zip(self._capacities, numbers, strict=True)]
+            observed = zip(grown, self._observed(), strict=True)  # behind what did not fit, found is of other particles
+            self._make_room([c.grown((0, *seen.sizes), 1) for c, seen in observed])
             self._capture()
             loss, errors, norm, gradients, found, records = self._replay()
         records.replayed(report)
         return Gradients(loss, errors, norm, gradients)
+
+    def _make_room(self, needed: Sequence[PyramidCapacity]) -> None:
+        """What was too small for one simulated step, of whatever kind, will soon be too small for others."""
+        if not needed:
+            return
+        known = self._owner.most.get(self._clouds)
+        sizes = [capacity.sizes for capacity in needed] + ([known] if known else [])
+        self._owner.most[self._clouds] = most = tuple(map(max, zip(*sizes, strict=True)))
+        self._capacities = [capacity.grown((0, *most), 1) for capacity in needed]
 
     # ---- what runs ----
 

@@ -125,6 +125,18 @@ def test_nothing_in_a_graph_has_a_size_that_depends_on_numbers(row, scenes, tmp_
     assert not ops.names & {"index by a mask", "nonzero", "masked_select", "unique_dim", "_unique2", "is_nonzero"}
 
 
+def test_room_that_one_kind_of_step_needed_is_there_for_others(scenes, trainer, device):
+    captured = captured_loss(trainer)
+    run(captured, batches(scenes, 1)[0].to(device), trainer)
+    ((clouds, most),) = captured.most.items()
+    captured.most[clouds] = (most[0], *(size + 100 for size in most[1:]))
+    led = next(batch for batch in batches(scenes, 9, lead=2) if batch.n_lead)
+    run(captured, led.to(device), trainer)
+    step = list(captured._steps.values())[-1]
+    assert captured.captures == 2 and len(step._capacities) == led.n_lead + led.n_future
+    assert all(capacity.sizes[-1] == captured.most[clouds][-1] >= most[-1] + 100 for capacity in step._capacities)
+
+
 def test_what_needs_more_room_gets_it(scenes, trainer, device):
     captured = captured_loss(trainer)
     batch = batches(scenes, 1)[0].to(device)
