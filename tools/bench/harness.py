@@ -167,11 +167,12 @@ class Bench:
         return result
 
     def gpu(self, case: str, dtype: str, ours, peers: dict, *, target_ratio=None, limit_ms=None, tolerance=1e-5,
-            capture=True) -> None:  # fmt: skip
+            capture=True, graphs: dict | None = None) -> None:  # fmt: skip
         """``peers``: name -> callable, the fastest counts, or the milliseconds once recorded of a peer that cannot run
         here; empty where there is none. ``tolerance`` bounds the error against each peer, relative to the largest
         value; None where the caller has compared the results by its own rule. ``capture``: also try a CUDA graph (a
-        capture that fails leaves torch's random generator unusable)."""
+        capture that fails leaves torch's random generator unusable). ``graphs``: instead, replays of those that the
+        sides have already, "gsim3d" for ours."""
         recorded = {name: peer for name, peer in peers.items() if not callable(peer)}
         peers = {name: peer for name, peer in peers.items() if callable(peer)}
         error = None
@@ -193,7 +194,7 @@ class Bench:
             for name, f in sides.items():
                 times[name].append(event_ms(f))
             spent = time.perf_counter() - start
-        replays = {name: graph_of(f) if capture else None for name, f in sides.items()}
+        replays = graphs or {name: graph_of(f) if capture else None for name, f in sides.items()}
         graph_ms = {
             name: None if replay is None else statistics.median(event_ms(replay) for _ in range(30))
             for name, replay in replays.items()

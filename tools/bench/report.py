@@ -25,8 +25,9 @@ import targets
 from harness import RESULTS, commit
 
 ROOT = Path(__file__).resolve().parents[2]
-OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "decode", "background"]
 GUARDS, EFFECTS, SLEEPING = "stability", "effects", "sleeping"
+OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "decode", "background"]
+OPS.append(SLEEPING)
 NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
 EFFECTS_PAGE, MARKS = ROOT / "docs" / "effects.md", ("<!-- table -->\n", "<!-- end of table -->\n")
 REST_MARKS = "<!-- rest -->\n", "<!-- end of rest -->\n"
@@ -203,30 +204,38 @@ def effects(r: dict) -> str:
 
 
 def resting(rows: list[dict]) -> str:
-    """The table of what rests: a step by its share, with a view and without."""
+    """The table of what rests: a step by its share, with a view and without, from a graph and in a call."""
     steps: dict[str, dict] = {}
     for row in rows:
         if found := re.fullmatch(r"(\d+) x \(step( \+ one 128 px view)?\), (\d+%) of .* rest", row["case"]):
             n, view = int(found[1]), bool(found[2])
-            for share, ms in ((found[3], row["ours_ms"]), ("0%", row["peer_ms"])):
-                steps.setdefault(share, {}).setdefault(view, []).append((ms / n, row["peer_ms"] / n))
+            ours, awake = ([row[f"{side}_graph_ms"], row[f"{side}_ms"]] for side in ("ours", "peer"))
+            for share, times in ((found[3], ours), ("0%", awake)):
+                each = [None if ms is None else ms / n for ms in (*times, *awake)]
+                steps.setdefault(share, {}).setdefault(view, []).append(each)
     if not steps:
         return ""
-    text = "\n| at rest | ms a step | nothing rests | faster | with one 128 px view, ms | faster | steps a second |\n"
-    text += "| ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n"
-    for share in sorted(steps, key=lambda share: int(share[:-1])):
-        cells = []
-        for view in (False, True):  # of nothing at rest there are several medians
-            cells.append([statistics.median(values) for values in zip(*steps[share][view])])
-        (ms, awake), (seen, seen_awake) = cells
-        text += f"| {share} | {ms:.2f} | {awake:.2f} | {awake / ms:.2f}x | {seen:.2f} | {seen_awake / seen:.2f}x "
-        text += f"| {1e3 / seen:.0f} |\n"
+    text = f"\nCalls of {n} steps.\n\n| at rest | graph, ms a step | faster | call, ms a step | faster "
+    text += "| with one 128 px view: graph | call | faster | steps a second |\n"
+    text += "| ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n"
+    medians = {share: {view: _medians(found) for view, found in views.items()} for share, views in steps.items()}
+    for share in sorted(medians, key=lambda share: int(share[:-1])):
+        graph, call, graph_awake, awake = medians[share][False]
+        seen_graph, seen, _, seen_awake = medians[share][True]
+        faster = "-" if graph is None else f"{graph_awake / graph:.2f}x"
+        text += f"| {share} | {number(graph, 2)} | {faster} | {call:.2f} | {awake / call:.2f}x "
+        text += f"| {number(seen_graph, 2)} | {seen:.2f} | {seen_awake / seen:.2f}x | {1e3 / seen:.0f} |\n"
     for row in rows:
-        if row["case"].startswith("the background") and "90%" in steps:
-            ms, awake = (statistics.median(values) for values in zip(*steps["90%"][False]))
+        if row["case"].startswith("the background") and "90%" in medians:
+            _, ms, _, awake = medians["90%"][False]
             text += f"\n{row['case'].capitalize()}: {row['ours_ms']:.1f} ms, once a rollout and as Python calls it; "
             text += f"at 90% it is saved again after {row['ours_ms'] / (awake - ms):.1f} captured steps.\n"
     return text
+
+
+def _medians(rows: list[list[float | None]]) -> list[float | None]:
+    """By column; of nothing at rest there are several rows."""
+    return [None if None in values else statistics.median(values) for values in zip(*rows)]
 
 
 def rest(rows: list[dict]) -> str:

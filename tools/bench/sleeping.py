@@ -87,25 +87,26 @@ def agreement(model: Simulator, state: Particles, n_steps: int, device: str) -> 
 
 
 @torch.no_grad()
-def on_gpu(bench: Bench, n: int = 65536, n_steps: int = 4, horizon: int = 4) -> None:
+def on_gpu(bench: Bench, n: int = 65536, n_steps: int = 4, horizon: int = 12) -> None:
     model = simulator(n_steps, "cuda")
 
     def captured(share, cameras):
         state = scene(model, n_steps, n, share, "cuda")
         rollout = CapturedRollout(model, state, horizon, cameras=cameras, copies=False)
-        return lambda: rollout(state)
+        return (lambda: rollout(state)), rollout._graph
 
     with torch.autocast("cuda", torch.bfloat16):
         for what, cameras, limit in (
             ("step", None, None),
             ("step + one 128 px view", view("cuda"), LIMIT_MS * horizon),
         ):
-            awake = captured(0.0, cameras)
+            awake, graph_awake = captured(0.0, cameras)
             for share in SHARES:
                 case = f"{horizon} x ({what}), {share:.0%} of 65k points rest"
                 options = {"limit_ms": limit, "target_ratio": 3 if share == 0.9 else None}
-                ours = captured(share, cameras)
-                bench.gpu(case, "bfloat16", ours, {"nothing rests": awake}, tolerance=None, capture=False, **options)
+                ours, graph = captured(share, cameras)
+                options["graphs"] = {"gsim3d": graph, "nothing rests": graph_awake}
+                bench.gpu(case, "bfloat16", ours, {"nothing rests": awake}, tolerance=None, **options)
         rests = Parts.of(scene(model, n_steps, n, 0.9, "cuda"), asymmetric=True).background
         bench.gpu("the background, 59k points", "bfloat16", lambda: model.dynamics.remember(rests), {}, capture=False)
         decibels = agreement(model, scene(model, n_steps, n, 0.9, "cuda"), horizon, "cuda")
