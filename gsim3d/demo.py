@@ -31,7 +31,7 @@ With --train, the main job at a small size, also
   data/          instead of held_out/: smaller scenes, of which a few are held out
   model/         checkpoints and log of the training; model.safetensors beside it is the result in one file
 
-One to three minutes on 2 cores; 7 to 9 minutes with --train. Stopped and started again, it goes on where it was.
+One to three minutes on 2 cores; 7 to 10 minutes with --train. Stopped and started again, it goes on where it was.
 
 examples:
   gsim3d demo --out runs/demo
