@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsim3d.ops.sentinel import CELLS, FAST, OUTSIDE, watch_rows
+from gsim3d.ops.sentinel import CELLS, FAST, OUTSIDE, joined, watch_rows
 from gsim3d.stability import ACTIONS, LARGEST, Finding, Reading, Sentinels, StabilityConfig, StabilityReport
 from gsim3d.types import ASLEEP, CloudTable, Frames, Particles
 
@@ -85,6 +85,7 @@ def guard_particles(
     looks = (_looks_at if torch.compiler.is_compiling() else _recent_looks)(tuple(fields), config, max_opacity)
     before = None if previous is None else [getattr(previous, name) for name in fields]
     clamps = config.on_bad == "clamp"
+    is_told = particles.means.is_cuda and not torch.compiler.is_compiling()  # the report, later
     # the copies that the kernel mends carry no gradients
     in_kernel = not clamps and not (torch.is_grad_enabled() and _have_gradients(fields.values(), before or ()))
     watched = watch_rows(
@@ -98,16 +99,17 @@ def guard_particles(
         previous=before,
         max_step=config.max_speed,
         neutral=looks.neutral if in_kernel else None,
+        join=not is_told,
         check=False,
     )
     if not torch.compiler.is_compiling():
         read = partial(_read, particles.clouds, where, looks, previous is not None)
         counts = _places_of_counts(*watched.record.shape, len(looks.kinds))
-        report.record(watched.record, read, counts=counts, at_once=False)
+        report.record(watched.record, read, counts=counts, at_once=False, join=joined if is_told else None)
         if watched.status.device.type == "cpu" and not bool(watched.status.any()):
             return particles
     if watched.fields is not None:
-        return dataclasses.replace(particles, **dict(zip(fields, watched.fields)), activity=watched.activity)
+        return _with_rows(particles, dict(zip(fields, watched.fields)) | {"activity": watched.activity})
     mend = _clamp if clamps else _put_to_sleep
     return mend(particles, fields, looks.bounds, watched.status, config, grid_size, previous)
 
@@ -172,6 +174,15 @@ def _read(clouds: CloudTable, where: str, looks: _Looks, moved: bool, record: Te
 def _places_of_counts(n_clouds: int, n_columns: int, n_kinds: int) -> tuple[int, ...]:
     """Where a record of watch_rows holds how many rows were bad."""
     return tuple(q * n_columns + 2 * k for q in range(n_clouds) for k in range(n_kinds))
+
+
+def _with_rows(particles: Particles, fields: dict[str, Tensor]) -> Particles:
+    """dataclasses.replace, which calls __init__, in a quarter of the time."""
+    if torch.compiler.is_compiling():
+        return dataclasses.replace(particles, **fields)
+    made = object.__new__(Particles)
+    vars(made).update(vars(particles), **fields)
+    return made
 
 
 def _have_gradients(*groups: Iterable[Tensor]) -> bool:

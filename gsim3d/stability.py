@@ -18,7 +18,8 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from itertools import groupby
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -125,11 +126,21 @@ def pack(tensors: list[Tensor]) -> Tensor:
 
 
 class _Record(NamedTuple):
-    """Numbers of a guard on a GPU. read, counts: as of StabilityReport.record."""
+    """Numbers of a guard on a GPU. read, counts, join: as of StabilityReport.record."""
 
-    numbers: Tensor
+    numbers: Any
     read: Callable[[Tensor], Reading]
     counts: Sequence[int]
+    join: Callable[[Sequence[Any]], Tensor] | None = None
+
+
+def _numbers_of(records: Iterable[_Record]) -> list[Tensor]:
+    """All numbers in the order of the records; those that one function joins are in one tensor."""
+    numbers = []
+    for join, group in groupby(records, key=lambda record: record.join):
+        own = [record.numbers for record in group]
+        numbers += own if join is None else [join(own)]
+    return numbers
 
 
 class _Packed(NamedTuple):
@@ -211,6 +222,7 @@ class StabilityReport:
         *,
         counts: Sequence[int] = (),
         at_once: bool = True,
+        join: Callable[[Sequence[Any]], Tensor] | None = None,
     ) -> None:
         """Takes what a guard counted: at once on the CPU, which also raises; on a GPU when its copy has arrived.
 
@@ -220,18 +232,20 @@ class StabilityReport:
             counts: places in ``numbers`` (row by row) that are all 0 where it says no findings; a GPU's record is then
                 read only when somebody asks for sentinels. Empty: it is read when it arrives.
             at_once: copy it now; else with others by :meth:`send`, or when somebody reads.
+            join: makes one tensor of several such ``numbers``, parts on a GPU with the shape, dtype and device of what
+                they make, when they are copied. None: they are whole.
         """
         if numbers.device.type != "cuda":
             self._take(read(numbers))
             self.poll()
         elif torch.cuda.is_current_stream_capturing():
-            self._captured.append(_Record(numbers, read, counts))
+            self._captured.append(_Record(numbers, read, counts, join))
         else:
             stream = torch.cuda.current_stream(numbers.device)
             if stream != self._stream:
                 self.send()
             self._stream = stream
-            self._unsent.append(_Record(numbers, read, counts))
+            self._unsent.append(_Record(numbers, read, counts, join))
             if at_once:
                 self.send()
 
@@ -247,8 +261,9 @@ class StabilityReport:
                 self._send(records)
 
     def captured(self) -> list[Tensor]:
-        """The numbers that every replay of the CUDA graphs captured with this report overwrites."""
-        return [record.numbers for record in self._captured]
+        """The numbers that every replay of the CUDA graphs captured with this report overwrites; asked for while one is
+        captured, they are put together in it."""
+        return _numbers_of(self._captured)
 
     def replayed(self, to: StabilityReport | None = None, packed: Tensor | None = None) -> None:
         """Fetches the records of the CUDA graphs captured with this report, without waiting; call it after a replay.
@@ -268,7 +283,7 @@ class StabilityReport:
             to._take(Reading(self._found.values(), self._sentinels))
 
     def _send(self, records: list[_Record]) -> None:
-        packed = pack([record.numbers for record in records])
+        packed = pack(_numbers_of(records))
         copy = torch.empty(packed.shape, dtype=packed.dtype, pin_memory=True)
         copy.copy_(packed, non_blocking=True)
         event = torch.cuda.Event()

@@ -9,7 +9,9 @@ OPS = sorted({name.split(".")[0] for name in torch._C._dispatch_get_all_op_names
 # positions or indices in, integers out, or nothing at all: nothing to differentiate
 INTEGER_OPS = tuple(
     f"gsim3d::{name}"
-    for name in "curve_ build_pyramid sparse_conv_plan watch_rows row_scenes find_cells overlapping_patches".split()
+    for name in (
+        "curve_ build_pyramid sparse_conv_plan watch_rows join_parts row_scenes find_cells overlapping_patches"
+    ).split()
 )
 
 

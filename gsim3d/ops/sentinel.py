@@ -16,7 +16,19 @@ from gsim3d.stability import LARGEST
 CELLS = 2**16  # of a workspace along each axis
 OUTSIDE, FAST = 1 << 29, 1 << 30  # bits of a status
 MAX_FIELDS = 8
+PIECES = {"cpu": 1024, "cuda": 128}  # rows of a part
 SUMS = ("awake", "kinetic_energy", "opacity_mass", "low_x", "low_y", "low_z", "high_x", "high_y", "high_z")
+
+
+class Unjoined(NamedTuple):
+    """A record of watch_rows in parts: :func:`joined` puts those of many looks together at once."""
+
+    parts: Tensor
+    cu_rows: Tensor
+    n_rows: int
+    shape: torch.Size  # of the record
+    dtype: torch.dtype
+    device: torch.device
 
 
 class Watched(NamedTuple):
@@ -30,7 +42,7 @@ class Watched(NamedTuple):
     """
 
     status: Tensor
-    record: Tensor
+    record: Tensor | Unjoined
     fields: tuple[Tensor, ...] | None = None
     activity: Tensor | None = None
 
@@ -47,6 +59,7 @@ def watch_rows(
     previous: Sequence[Tensor] | None = None,
     max_step: float = LARGEST,
     neutral: Sequence[float] | None = None,
+    join: bool = True,
     check: bool = True,
 ) -> Watched:
     """Looks once at all rows of packed clouds, and mends them where it is told how.
@@ -70,6 +83,7 @@ def watch_rows(
         previous: the fields one step before, all finite; None: no row is FAST, and the kinetic energy is 0.
         max_step: metres.
         neutral: one number a field; None: nothing is mended.
+        join: False: the record is left Unjoined.
         check: look at the types of the arguments; a model that makes them itself leaves it out.
     Returns:
         Watched, on the device of the rows.
@@ -101,8 +115,18 @@ def watch_rows(
         grid_size,
         max_step,
         [] if neutral is None else list(neutral),
+        join,
     )
+    if not join:
+        shape = torch.Size((cu_rows.shape[0] - 1, record.shape[1]))
+        record = Unjoined(record, cu_rows, fields[0].shape[0], shape, record.dtype, record.device)
     return Watched(status, record, tuple(mended[1:]), mended[0]) if mended else Watched(status, record)
+
+
+def joined(records: Sequence[Unjoined]) -> Tensor:
+    """float64 [M], the numbers of ``records`` one after another, in one launch."""
+    parts, cu_rows, n_rows, *_ = zip(*records, strict=True)
+    return torch.ops.gsim3d.join_parts(list(parts), list(cu_rows), list(n_rows))
 
 
 def _detached(fields: Sequence[Tensor]) -> list[Tensor]:
@@ -138,11 +162,19 @@ def _check_arguments(
 
 
 @torch.library.register_fake("gsim3d::watch_rows")
-def _(fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_size, max_step, neutral):
+def _(fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_size, max_step, neutral, joined=True):
     columns = 2 * (len(fields) + 2) + len(SUMS)
-    n_rows, n_clouds = fields[0].shape[0], cu_rows.shape[0] - 1
+    n_rows, n_records = fields[0].shape[0], cu_rows.shape[0] - 1
+    if not joined:
+        n_records = max(0, n_records - 1 + -(-n_rows // PIECES[fields[0].device.type]))
     return (
         fields[0].new_empty(n_rows, dtype=torch.int32),
-        fields[0].new_empty(n_clouds, columns, dtype=torch.float64),
+        fields[0].new_empty(n_records, columns, dtype=torch.float64),
         [x.new_empty(x.shape) for x in (activity, *fields)] if neutral else [],
     )
+
+
+@torch.library.register_fake("gsim3d::join_parts")
+def _(parts, cu_rows, n_rows):
+    total = sum((offsets.shape[0] - 1) * own.shape[1] for own, offsets in zip(parts, cu_rows, strict=True))
+    return parts[0].new_empty(total)

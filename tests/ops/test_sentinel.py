@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsim3d.ops import watch_rows
-from gsim3d.ops.sentinel import FAST, OUTSIDE, SUMS
+from gsim3d.ops.sentinel import FAST, OUTSIDE, SUMS, joined
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
 from tests.oracle import sentinel as oracle
 
@@ -158,6 +158,33 @@ def test_any_offsets_stay_in_bounds_on_cuda(devices):
     assert not bool((status & OUTSIDE).any())
 
 
+@pytest.mark.parametrize("clouds", [[0, 3, 9], [0, 0, 7, 2500, 2500, 5000], [0], [0, 0]])
+def test_records_of_several_looks_are_joined_at_once(clouds, device):
+    looks = [state(q, seed=seed, device=device) for seed, q in enumerate((clouds, [0, 10, 9000], clouds))]
+    looks[1] = (looks[1][0][:2], looks[1][1][:2], looks[1][2], looks[1][3] | {"previous": None})
+    parts = [watch_rows(fields, bounds, cu_rows, join=False, **options) for fields, bounds, cu_rows, options in looks]
+    whole = [watch_rows(fields, bounds, cu_rows, **options) for fields, bounds, cu_rows, options in looks]
+    for a, b in zip(parts, whole, strict=True):
+        assert a.record.shape == b.record.shape and a.record.dtype == b.record.dtype
+        assert a.record.device == b.record.device
+    assert_same_bits(joined([look.record for look in parts]), torch.cat([look.record.reshape(-1) for look in whole]))
+
+
+def test_more_looks_than_a_launch_takes(device):
+    fields, bounds, cu_rows, options = state([0, 3, 9], device=device)
+    one = watch_rows(fields, bounds, cu_rows, join=False, **options).record
+    records = joined([one] * 70).view(70, *one.shape)
+    assert_same_bits(records[69], watch_rows(fields, bounds, cu_rows, **options).record)
+    assert_same_bits(records, records[:1].expand_as(records))
+
+
+def test_offsets_that_descend_count_nothing_on_cuda(devices):
+    fields, bounds, cu_rows, options = state(device=devices[1])
+    descending = torch.tensor([0, 4000, 300, 5000, 5000, 5000], device=devices[1])
+    record = watch_rows(fields, bounds, descending, **options).record
+    assert bool((record[:, 0:14:2] == 0).all()) and bool((record[:, 1:14:2] == -1).all())
+
+
 # 5 opcheck
 
 
@@ -168,6 +195,9 @@ def test_opcheck(device):
     arguments = (fields, low, high, cu_rows, *(options[name] for name in names))
     for neutral in ([], NEUTRAL):
         torch.library.opcheck(torch.ops.gsim3d.watch_rows, (*arguments, neutral))
+    torch.library.opcheck(torch.ops.gsim3d.watch_rows, (*arguments, [], False))
+    parts = torch.ops.gsim3d.watch_rows(*arguments, [], False)[1]
+    torch.library.opcheck(torch.ops.gsim3d.join_parts, ([parts, parts], [cu_rows, cu_rows], [9, 9]))
 
 
 # 6 torch.compile
@@ -247,6 +277,22 @@ def test_errors_name_what_is_wrong(change, message):
     with pytest.raises(ValueError, match="watch_rows: .*" + message):
         options["previous"] = options["previous"] if len(fields) == 5 else None
         watch_rows(fields, bounds[: len(fields)], cu_rows, **options)
+
+
+def test_parts_that_do_not_fit():
+    fields, bounds, cu_rows, options = state()
+    record = watch_rows(fields, bounds, cu_rows, join=False, **options).record
+    for wrong, message in (
+        (record._replace(n_rows=9000), "parts must be as watch_rows left them, 13 of 9000 rows; got"),
+        (record._replace(parts=record.parts[:, 1:]), "parts must be as watch_rows left them"),
+        (record._replace(parts=record.parts.float()), "parts must be float64; got float32"),
+        (record._replace(cu_rows=cu_rows.int()), "cu_rows must be int64; got int32"),
+        (record._replace(cu_rows=cu_rows.flip(0)), "cu_rows must run from 0 to N=5000; got 5000"),
+    ):
+        with pytest.raises(ValueError, match="join_parts: " + message):
+            joined([record, wrong])
+    with pytest.raises(ValueError, match="join_parts: parts must be of one look at least"):
+        torch.ops.gsim3d.join_parts([record.parts], [], [5000])
 
 
 def test_offsets_that_do_not_fit():

@@ -10,7 +10,6 @@
 
 #include "gsim3d/core/parallel.h"
 #include "gsim3d/core/stream.h"
-#include "gsim3d/core/workspace.h"
 
 namespace gsim3d {
 
@@ -50,22 +49,48 @@ struct MendedRows {
   T neutral[kMaxWatchedFields];
 };
 
+// What looks leave of their sums: a partial record of every piece of rows, and of every cloud in it. A piece and a
+// cloud that share rows ascend in one and never descend in the other, so that their sum names the pair.
+constexpr int64_t watched_parts(int64_t n_rows, int64_t n_clouds, int64_t piece) {
+  const int64_t most = (n_rows + piece - 1) / piece + n_clouds - 1;
+  return most > 0 ? most : 0;
+}
+
+// The parts of one look, and where its record goes.
+struct Parts {
+  const double* parts;     // [watched_parts(n_rows, n_clouds, kWatchedPiece), watched_columns(n_fields)]
+  const int64_t* cu_rows;  // [n_clouds + 1]
+  double* record;          // [n_clouds, watched_columns(n_fields)]
+  int64_t n_rows, n_clouds;
+  int n_fields;
+};
+
 namespace cpu {
+
+constexpr int64_t kWatchedPiece = 1024;  // rows
 
 template <typename T>
 void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended,
                 int32_t* status,  // [n_rows]
-                double* record,   // [n_clouds, watched_columns(n_fields)]
-                const Workspace& workspace, const Parallel& parallel);
+                double* parts,    // as in Parts
+                const Parallel& parallel);
+
+// Throws ArgumentError unless offsets ascend from 0 to n_rows.
+void join_parts(const Parts& look);
 
 }  // namespace cpu
 
-// Offsets and scenes are not checked; none is read out of bounds, and the status of a row of no cloud is 0.
+// Offsets and scenes are not checked; none is read out of bounds, the status of a row of no cloud is 0, and where
+// offsets descend a record counts nothing.
 namespace cuda {
 
+constexpr int64_t kWatchedPiece = 128;  // few rows, so that small states too fill a GPU
+
 template <typename T>
-void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* record,
-                const Workspace& workspace, Stream stream);
+void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* parts,
+                Stream stream);
+
+void join_parts(const Parts* looks, int64_t n_looks, Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

@@ -10,19 +10,23 @@ namespace {
 
 using namespace sentinel;  // NOLINT: this file is its other half
 
-constexpr int64_t kPiece = 1024;  // rows
+constexpr int64_t kPiece = kWatchedPiece;
+
+void check_offsets(const char* op, const int64_t* cu_rows, int64_t n_clouds, int64_t n_rows) {
+  check(cu_rows[0] == 0 && cu_rows[n_clouds] == n_rows, op, ": cu_rows must run from 0 to N=", n_rows, "; got ",
+        cu_rows[0], " .. ", cu_rows[n_clouds]);
+  for (int64_t q = 0; q < n_clouds; ++q)
+    check(cu_rows[q] <= cu_rows[q + 1], op, ": cu_rows must not descend; got ", cu_rows[q], " then ", cu_rows[q + 1],
+          " at ", q);
+}
 
 template <typename T>
 void check_rows(const WatchedRows<T>& r) {
   constexpr const char* kOp = "watch_rows";
-  check(r.cu_rows[0] == 0 && r.cu_rows[r.n_clouds] == r.n_rows, kOp, ": cu_rows must run from 0 to N=", r.n_rows,
-        "; got ", r.cu_rows[0], " .. ", r.cu_rows[r.n_clouds]);
-  for (int64_t q = 0; q < r.n_clouds; ++q) {
-    check(r.cu_rows[q] <= r.cu_rows[q + 1], kOp, ": cu_rows must not descend; got ", r.cu_rows[q], " then ",
-          r.cu_rows[q + 1], " at ", q);
+  check_offsets(kOp, r.cu_rows, r.n_clouds, r.n_rows);
+  for (int64_t q = 0; q < r.n_clouds; ++q)
     check(r.cloud_scene[q] >= 0 && r.cloud_scene[q] < r.n_scenes, kOp, ": cloud_scene must be in [0, B) with B=",
           r.n_scenes, "; got ", r.cloud_scene[q], " at ", q);
-  }
 }
 
 // Whether every value of rows [begin, end) is in bounds; quick, as it nearly always is.
@@ -82,35 +86,37 @@ void look_at_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int64
 }  // namespace
 
 template <typename T>
-void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* record,
-                const Workspace& workspace, const Parallel& parallel) {
+void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* parts,
+                const Parallel& parallel) {
   check_rows(rows);
   const int columns = watched_columns(rows.n_fields);
   const int64_t n_pieces = (rows.n_rows + kPiece - 1) / kPiece;
-  // (piece, cloud) pairs that share rows ascend in one and never descend in the other: their sum names each.
-  double* partial = workspace.take<double>((n_pieces + rows.n_clouds) * columns);
   parallel.chunks(n_pieces, [&](int64_t piece) {
     const int64_t begin = piece * kPiece, end = std::min(rows.n_rows, begin + kPiece);
     int64_t cloud = std::upper_bound(rows.cu_rows, rows.cu_rows + rows.n_clouds + 1, begin) - rows.cu_rows - 1;
     for (; cloud < rows.n_clouds && rows.cu_rows[cloud] < end; ++cloud) {
       const int64_t from = std::max(begin, rows.cu_rows[cloud]), to = std::min(end, rows.cu_rows[cloud + 1]);
-      if (from < to) look_at_rows(rows, mended, cloud, from, to, status, partial + (piece + cloud) * columns);
+      if (from < to) look_at_rows(rows, mended, cloud, from, to, status, parts + (piece + cloud) * columns);
     }
   });
-  for (int64_t q = 0; q < rows.n_clouds; ++q) {
-    const int64_t begin = rows.cu_rows[q], end = rows.cu_rows[q + 1];
+}
+
+void join_parts(const Parts& look) {
+  check_offsets("join_parts", look.cu_rows, look.n_clouds, look.n_rows);
+  const int columns = watched_columns(look.n_fields);
+  for (int64_t q = 0; q < look.n_clouds; ++q) {
+    const int64_t begin = look.cu_rows[q], end = look.cu_rows[q + 1];
     for (int c = 0; c < columns; ++c) {
-      double value = start_of(c, rows.n_fields, rows.n_rows);
+      double value = start_of(c, look.n_fields, look.n_rows);
       for (int64_t piece = begin / kPiece; begin < end && piece <= (end - 1) / kPiece; ++piece)
-        value = join(join_of(c, rows.n_fields), value, partial[(piece + q) * columns + c]);
-      record[q * columns + c] = finished(c, rows.n_fields, rows.n_rows, value);
+        value = join(join_of(c, look.n_fields), value, look.parts[(piece + q) * columns + c]);
+      look.record[q * columns + c] = finished(c, look.n_fields, look.n_rows, value);
     }
   }
 }
 
 #define GSIM3D_INSTANTIATE(T) \
-  template void watch_rows<T>(const WatchedRows<T>&, const MendedRows<T>&, int32_t*, double*, const Workspace&, \
-                              const Parallel&);
+  template void watch_rows<T>(const WatchedRows<T>&, const MendedRows<T>&, int32_t*, double*, const Parallel&);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 #undef GSIM3D_INSTANTIATE

@@ -1,5 +1,5 @@
 // A block looks at a piece of rows, copies them, mends its copy and leaves a partial record of each cloud in the piece;
-// a second kernel joins the partial records of a cloud in order.
+// a second kernel joins the partial records of a cloud in order, of many looks at once.
 #include <algorithm>
 
 #include "gsim3d/core/cuda_utils.cuh"
@@ -11,7 +11,7 @@ namespace {
 using namespace sentinel;  // NOLINT: this file is its other half
 
 constexpr const char* kWatch = "watch_rows";
-constexpr int kPiece = 128;  // rows of a block, one a thread; few, so that small states too fill a GPU
+constexpr int kPiece = kWatchedPiece;  // rows of a block, one a thread
 constexpr int kWarps = kPiece / kWarp;
 constexpr int kBatch = 4;             // packs that a thread reads before it looks at the first
 constexpr int kTeams = 1024 / kWarp;  // that share the partial records of a cloud
@@ -88,7 +88,7 @@ struct Sums {
 template <typename T>
 __global__ void __launch_bounds__(kPiece)
     look_kernel(const __grid_constant__ WatchedRows<T> rows, const __grid_constant__ MendedRows<T> mended,
-                int32_t* status, double* partial) {
+                int32_t* status, double* parts) {
   constexpr int kKinds = kMaxWatchedFields + 2;
   __shared__ int32_t counts[kKinds], firsts[kKinds];
   __shared__ double of_warp[kWarps][kWatchedSums];
@@ -153,33 +153,42 @@ __global__ void __launch_bounds__(kPiece)
     } else {
       value = static_cast<double>(firsts[kind] == kPiece ? rows.n_rows : begin + firsts[kind]);
     }
-    partial[(blockIdx.x + cloud) * columns + column] = value;
+    parts[(blockIdx.x + cloud) * columns + column] = value;
   }
 }
 
-// A block takes a cloud, a lane a column, a warp a run of the cloud's partial records.
-template <typename T>
-__global__ void __launch_bounds__(kTeams* kWarp)
-    join_kernel(WatchedRows<T> rows, const double* __restrict__ partial, double* record) {
+constexpr int kLooks = 32;  // of a launch
+struct Looks {
+  Parts of[kLooks];
+};
+
+// A block takes a cloud of a look, a lane a column, a warp a run of the cloud's partial records.
+__global__ void __launch_bounds__(kTeams* kWarp) join_kernel(const __grid_constant__ Looks looks) {
   __shared__ double of_team[kTeams][kWarp];
-  const int columns = watched_columns(rows.n_fields), column = threadIdx.x % kWarp, team = threadIdx.x / kWarp;
-  for (int64_t cloud = blockIdx.x; cloud < rows.n_clouds; cloud += gridDim.x) {
-    const Range of_cloud = range_of(rows.cu_rows, cloud, rows.n_rows);
+  const Parts& look = looks.of[blockIdx.y];
+  const int columns = watched_columns(look.n_fields), column = threadIdx.x % kWarp, team = threadIdx.x / kWarp;
+  bool ascends = true;  // else some pairs of a piece and a cloud have no partial record
+  for (int64_t q = threadIdx.x; q < look.n_clouds; q += kTeams * kWarp)
+    ascends &= look.cu_rows[q] <= look.cu_rows[q + 1];
+  ascends = __syncthreads_and(ascends);
+  for (int64_t cloud = blockIdx.x; cloud < look.n_clouds; cloud += gridDim.x) {
+    const Range of_cloud = range_of(look.cu_rows, cloud, look.n_rows);
     const int64_t first = of_cloud.begin / kPiece;
-    const int64_t n = of_cloud.begin < of_cloud.end ? (of_cloud.end - 1) / kPiece - first + 1 : 0;
+    const int64_t n = ascends && of_cloud.begin < of_cloud.end ? (of_cloud.end - 1) / kPiece - first + 1 : 0;
     const int64_t share = (n + kTeams - 1) / kTeams, from = team * share, to = min(n, from + share);
     double value = 0;
     if (column < columns) {
-      const Join how = join_of(column, rows.n_fields);
-      value = start_of(column, rows.n_fields, rows.n_rows);
+      const Join how = join_of(column, look.n_fields);
+      value = start_of(column, look.n_fields, look.n_rows);
 #pragma unroll 4
-      for (int64_t i = from; i < to; ++i) value = join(how, value, partial[(first + i + cloud) * columns + column]);
+      for (int64_t i = from; i < to; ++i)
+        value = join(how, value, look.parts[(first + i + cloud) * columns + column]);
     }
     of_team[team][column] = value;
     __syncthreads();
     if (team == 0 && column < columns) {
-      for (int t = 1; t < kTeams; ++t) value = join(join_of(column, rows.n_fields), value, of_team[t][column]);
-      record[cloud * columns + column] = finished(column, rows.n_fields, rows.n_rows, value);
+      for (int t = 1; t < kTeams; ++t) value = join(join_of(column, look.n_fields), value, of_team[t][column]);
+      look.record[cloud * columns + column] = finished(column, look.n_fields, look.n_rows, value);
     }
     __syncthreads();
   }
@@ -188,20 +197,25 @@ __global__ void __launch_bounds__(kTeams* kWarp)
 }  // namespace
 
 template <typename T>
-void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* record,
-                const Workspace& workspace, Stream stream) {
-  const int64_t n_pieces = blocks_for(kWatch, rows.n_rows, kPiece);
-  const int64_t n_partial = (n_pieces + rows.n_clouds) * watched_columns(rows.n_fields);
-  double* partial = workspace.take<double>(n_partial);
-  fill_zero(kWatch, partial, n_partial, stream);  // offsets that do not ascend leave some out
-  launch(kWatch, look_kernel<T>, static_cast<unsigned>(n_pieces), kPiece, 0, stream, rows, mended, status, partial);
-  launch(kWatch, join_kernel<T>, static_cast<unsigned>(std::min<int64_t>(rows.n_clouds, 1 << 16)), kTeams * kWarp, 0,
-         stream, rows, static_cast<const double*>(partial), record);
+void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* parts,
+                Stream stream) {
+  launch(kWatch, look_kernel<T>, blocks_for(kWatch, rows.n_rows, kPiece), kPiece, 0, stream, rows, mended, status,
+         parts);
 }
 
-#define GSIM3D_INSTANTIATE(T)                                                                                     \
-  template void watch_rows<T>(const WatchedRows<T>&, const MendedRows<T>&, int32_t*, double*, const Workspace&, \
-                              Stream);
+void join_parts(const Parts* all, int64_t n_looks, Stream stream) {
+  for (int64_t first = 0; first < n_looks; first += kLooks) {
+    Looks looks{};
+    const int64_t n = std::min<int64_t>(n_looks - first, kLooks);
+    int64_t most = 0;
+    for (int64_t i = 0; i < n; ++i) looks.of[i] = all[first + i], most = std::max(most, all[first + i].n_clouds);
+    const dim3 blocks(static_cast<unsigned>(std::min<int64_t>(most, 1 << 16)), static_cast<unsigned>(n));
+    launch("join_parts", join_kernel, blocks, kTeams * kWarp, 0, stream, looks);
+  }
+}
+
+#define GSIM3D_INSTANTIATE(T) \
+  template void watch_rows<T>(const WatchedRows<T>&, const MendedRows<T>&, int32_t*, double*, Stream);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 #undef GSIM3D_INSTANTIATE

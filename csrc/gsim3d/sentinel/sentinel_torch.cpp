@@ -9,11 +9,57 @@
 namespace gsim3d::binding {
 namespace {
 
+constexpr int64_t watched_piece(bool is_cuda) { return is_cuda ? cuda::kWatchedPiece : cpu::kWatchedPiece; }
+
+// Records of looks, one after another.
+Tensor join_parts(std::vector<Tensor> parts, std::vector<Tensor> cu_rows, std::vector<int64_t> n_rows) {
+  const char* op = "join_parts";
+  check(!parts.empty() && parts.size() == cu_rows.size() && parts.size() == n_rows.size(), op,
+        ": parts must be of one look at least, cu_rows and n_rows of as many; got ", parts.size(), ", ",
+        cu_rows.size(), " and ", n_rows.size());
+  std::vector<Parts> looks;
+  int64_t total = 0;
+  for (size_t i = 0; i < parts.size(); ++i) {
+    parts[i] = rows_of(parts[i]), cu_rows[i] = rows_of(cu_rows[i]);
+    check_dtype(op, "parts", parts[i], ScalarType::Double);
+    check_dtype(op, "cu_rows", cu_rows[i], ScalarType::Long);
+    check_device(op, "parts", parts[i], parts[0]);
+    check_device(op, "cu_rows", cu_rows[i], parts[0]);
+    check(cu_rows[i].dim() == 1 && cu_rows[i].size(0) >= 1, op, ": cu_rows must be [Q + 1]; got ",
+          shape_of(cu_rows[i]));
+    check(n_rows[i] >= 0, op, ": n_rows must not be negative; got ", n_rows[i]);
+    const int64_t n_clouds = cu_rows[i].size(0) - 1;
+    const int64_t n_parts = watched_parts(n_rows[i], n_clouds, watched_piece(parts[0].is_cuda()));
+    const int64_t columns = parts[i].dim() == 2 ? parts[i].size(1) : 0;
+    const int64_t n_fields = (columns - kWatchedSums) / 2 - 2;
+    check(n_fields >= 2 && n_fields <= kMaxWatchedFields && columns == watched_columns(static_cast<int>(n_fields)) &&
+              parts[i].size(0) == n_parts,
+          op, ": parts must be as watch_rows left them, ", n_parts, " of ", n_rows[i], " rows; got ",
+          shape_of(parts[i]));
+    looks.push_back({data<double>(parts[i]), data<int64_t>(cu_rows[i]), nullptr, n_rows[i], n_clouds,
+                     static_cast<int>(n_fields)});
+    total += n_clouds * columns;
+  }
+  Tensor records = empty(parts[0], {total}, ScalarType::Double);
+  double* record = mutable_data<double>(records);
+  for (Parts& look : looks) {
+    look.record = record;
+    record += look.n_clouds * watched_columns(look.n_fields);
+  }
+  if constexpr (kWithCuda)
+    if (parts[0].is_cuda()) {
+      cuda::join_parts(looks.data(), static_cast<int64_t>(looks.size()), current_stream(parts[0]));
+      return records;
+    }
+  for (const Parts& look : looks) cpu::join_parts(look);
+  return records;
+}
+
 // The mended activity and fields, or nothing where `neutral` holds no numbers.
 std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
     std::vector<Tensor> fields, std::vector<double> low, std::vector<double> high, const Tensor& cu_rows_,
     const Tensor& cloud_scene_, const Tensor& origin_, const Tensor& activity_, std::vector<Tensor> previous,
-    double grid_size, double max_step, std::vector<double> neutral) {
+    double grid_size, double max_step, std::vector<double> neutral, bool joined) {
   const char* op = "watch_rows";
   const auto n_fields = static_cast<int64_t>(fields.size());
   check(n_fields >= 2 && n_fields <= kMaxWatchedFields, op, ": fields must be 2 to ", kMaxWatchedFields,
@@ -55,13 +101,14 @@ std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
     previous[f] = rows_of(previous[f]);
   }
   Tensor status = empty(fields[0], {n}, ScalarType::Int);
-  Tensor record = empty(fields[0], {n_clouds, watched_columns(static_cast<int>(n_fields))}, ScalarType::Double);
+  const int64_t columns = watched_columns(static_cast<int>(n_fields));
+  const int64_t n_parts = watched_parts(n, n_clouds, watched_piece(fields[0].is_cuda()));
+  Tensor parts = empty(fields[0], {n_parts, columns}, ScalarType::Double);
   std::vector<Tensor> made;
   if (!neutral.empty()) {
     made.push_back(empty(activity, {n}));
-    for (const Tensor& field : fields) made.push_back(torch::stable::new_empty(field, field.sizes()));
+    for (const Tensor& field : fields) made.push_back(empty_as(field));
   }
-  TensorWorkspace workspace(fields[0]);
   dispatch_float(op, "fields", fields[0], [&]<typename T>() {
     WatchedRows<T> rows{};
     MendedRows<T> mended{};
@@ -83,16 +130,28 @@ std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
     rows.n_rows = n, rows.n_clouds = n_clouds, rows.n_scenes = origin.size(0);
     rows.grid_size = grid_size, rows.max_step = max_step;
     auto* seen = mutable_data<int32_t>(status);
-    auto* sums = mutable_data<double>(record);
+    auto* sums = mutable_data<double>(parts);
     if constexpr (kWithCuda)
-      if (fields[0].is_cuda())
-        return cuda::watch_rows<T>(rows, mended, seen, sums, workspace, current_stream(fields[0]));
-    cpu::watch_rows<T>(rows, mended, seen, sums, workspace, torch_parallel());
+      if (fields[0].is_cuda()) return cuda::watch_rows<T>(rows, mended, seen, sums, current_stream(fields[0]));
+    cpu::watch_rows<T>(rows, mended, seen, sums, torch_parallel());
   });
+  if (!joined) return {status, parts, made};
+  Tensor record = empty(fields[0], {n_clouds, columns}, ScalarType::Double);
+  const Parts look{data<double>(parts),         data<int64_t>(cu_rows), mutable_data<double>(record), n, n_clouds,
+                   static_cast<int>(n_fields)};
+  if constexpr (kWithCuda)
+    if (record.is_cuda()) {
+      cuda::join_parts(&look, 1, current_stream(record));
+      return {status, record, made};
+    }
+  cpu::join_parts(look);
   return {status, record, made};
 }
 
-void kernels(auto& m) { m.impl("watch_rows", TORCH_BOX(&watch_rows)); }
+void kernels(auto& m) {
+  m.impl("watch_rows", TORCH_BOX(&watch_rows));
+  m.impl("join_parts", TORCH_BOX(&join_parts));
+}
 
 }  // namespace
 

@@ -92,8 +92,9 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   // sentinel: which rows cannot be used, what stands in for them, and sums over clouds.
   m.def(
       "watch_rows(Tensor[] fields, float[] low, float[] high, Tensor cu_rows, Tensor cloud_scene, Tensor origin, "
-      "Tensor activity, Tensor[] previous, float grid_size, float max_step, float[] neutral) -> (Tensor status, Tensor "
-      "record, Tensor[] mended)");
+      "Tensor activity, Tensor[] previous, float grid_size, float max_step, float[] neutral, bool joined=True) -> "
+      "(Tensor status, Tensor record, Tensor[] mended)");
+  m.def("join_parts(Tensor[] parts, Tensor[] cu_rows, int[] n_rows) -> Tensor");
 
   // background: where rows meet one that was computed before. Lists have an entry a stage; tables a row a curve.
   m.def(
