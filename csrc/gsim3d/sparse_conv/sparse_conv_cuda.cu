@@ -1,5 +1,4 @@
 #include <algorithm>
-#include <cstdlib>
 
 #include "gsim3d/sparse_conv/sparse_conv_device.cuh"
 
@@ -382,7 +381,7 @@ WeightPlan plan_of(const SparseConvMap& map, int64_t c_in, int64_t c_out) {
   WeightPlan plan{kChunkMin, 0, 1};
   const auto blocks = [&] { return map.n_voxels / plan.chunk_voxels * (others + ratio) * tiles; };
   const auto pairs_per_block = [&] { return pairs * plan.chunk_voxels / std::max<int64_t>(1, map.n_voxels * others); };
-  while (plan.chunk_voxels < kChunkMax && (blocks() > (getenv("CONV_BLOCKS") ? atoi(getenv("CONV_BLOCKS")) : kWeightBlocks) || pairs_per_block() < kPairsPerBlock))
+  while (plan.chunk_voxels < kChunkMax && (blocks() > kWeightBlocks || pairs_per_block() < kPairsPerBlock))
     plan.chunk_voxels *= 2;
   while (2 * plan.centre_parts <= ratio && plan.chunk_voxels / plan.centre_parts > kChunkMin) plan.centre_parts *= 2;
   plan.n_chunks = (map.n_voxels + plan.chunk_voxels - 1) / plan.chunk_voxels;

@@ -1,45 +1,37 @@
 // The weight gradient on tensor cores: for every block of pairs of a tap, grads^T inputs of the gathered rows.
-#include <cstdlib>
-
 #include "gsim3d/sparse_conv/sparse_conv_device.cuh"
 #include "gsim3d/sparse_conv/sparse_conv_mma.cuh"
 
 namespace gsim3d::cuda::conv {
 namespace {
 
+constexpr int kThreads = 256;
 constexpr int kDepth = 64;     // pairs of one stage
 constexpr int kListed = 1024;  // pairs whose rows are looked up at a time
-constexpr int kHalf = 64;      // columns of a staged row: 128 bytes
+constexpr int kStages = 3;
+constexpr int kHalf = 64;  // columns of a staged row: 128 bytes
 constexpr int kRowBytes = 128, kHalfBytes = kDepth * kRowBytes;
 
-// Each group of four warps has 64 outputs and all inputs of a block, or, of a block with 64 of both, 32 inputs.
-template <int kOut_, int kIn_, int kBlocksOnSm_>
-struct Shape {
-  static constexpr int kOut = kOut_, kIn = kIn_, kBlocksOnSm = kBlocksOnSm_;
-  static constexpr bool kNarrow = kOut == kHalf;
-  static constexpr int kThreads = kNarrow ? 256 : kOut / kHalf * 128;
-  static constexpr int kGroupIn = kNarrow ? 32 : kIn;
-  static constexpr int kOpen = kBlocksOnSm == 1 ? 1 : 0;  // stages whose products are under way behind a stage's start
-  static constexpr int kStages = 3 + kOpen;
-};
-
-template <typename E, typename S>
+template <typename E, int kSide>
 struct alignas(128) Memory {  // at a multiple of 1024 bytes
-  E grads[S::kStages][S::kOut * kDepth];
-  E inputs[S::kStages][S::kIn * kDepth];
+  E grads[kStages][kSide * kDepth];
+  E inputs[kStages][kSide * kDepth];
   const E* grad_rows[kListed];  // null: no pair
   const E* input_rows[kListed];
 };
 
-// The sums of a warp, 16 outputs by kGroupIn inputs, as the tensor cores lay them out.
-template <typename S>
-using Sums = float[S::kGroupIn / 8][4];
+// The sums of a warp, 16 outputs by eight inputs each, as the tensor cores lay them out. Of a wide block each group of
+// four warps has 64 outputs and all inputs, of a narrow one all outputs and 32 inputs.
+template <int kSide>
+constexpr int kSums = kSide == kHalf ? 4 : kSide / 8;
+template <int kSide>
+using Sums = float[kSums<kSide>][4];
 
 // A thread copies 16 bytes of every kApart-th row of a stage, for one of the factors. Sixty-four columns of all rows
 // lie together.
-template <typename E, int kColumns, int kThreads>
+template <typename E, int kSide>
 struct Copy {
-  static constexpr int kChunks = kColumns / 8, kApart = kThreads / kChunks;
+  static constexpr int kChunks = kSide / 8, kApart = kThreads / kChunks;
   static_assert(kApart % 8 == 0);  // the rows of a thread have one permutation of chunks
   const int row;
   const uint32_t to;
@@ -59,15 +51,15 @@ struct Copy {
     for (int i = 0; i < kDepth / kApart; ++i) {
       const E* from = rows[row + i * kApart];
       const bool real = from != nullptr;
-      copy_async(to + stage * kColumns / kHalf * kHalfBytes + i * kApart * kRowBytes,
+      copy_async(to + stage * kSide / kHalf * kHalfBytes + i * kApart * kRowBytes,
                  (real ? from : anywhere) + column, real && inside);
     }
   }
 };
 
-// Queues sums += grads^T inputs over a stage at these addresses. The sums are there after finish_stages.
-template <typename E, typename S>
-__device__ __forceinline__ void start_stage(Factor grads, Factor inputs, Sums<S>& sums) {
+// Queues sums += grads^T inputs over a stage at these addresses. The sums are there after finish_stage.
+template <typename E, int kSide>
+__device__ __forceinline__ void start_stage(Factor grads, Factor inputs, Sums<kSide>& sums) {
 #ifdef __CUDA_ARCH_FEAT_SM90_ALL
   fence_sums(sums);
   start_group_products();
@@ -86,7 +78,7 @@ __device__ __forceinline__ void start_stage(Factor grads, Factor inputs, Sums<S>
     uint32_t left[4];
     load_matrices_transposed(a + k * kRowBytes, left);
 #pragma unroll
-    for (int j = 0; j < S::kGroupIn / 8; j += 2) {
+    for (int j = 0; j < kSums<kSide>; j += 2) {
       uint32_t right[4];
       load_matrices_transposed((b ^ (j % 8 * 16)) + j / 8 * kHalfBytes + k * kRowBytes, right);
       multiply_add<E>(left, right[0], right[1], sums[j]);
@@ -96,45 +88,34 @@ __device__ __forceinline__ void start_stage(Factor grads, Factor inputs, Sums<S>
 #endif
 }
 
-// Waits until the products of at most the last kOpen stages are under way.
-template <int kOpen, int kGroups>
-__device__ __forceinline__ void finish_stages(float (&sums)[kGroups][4]) {
+template <int kGroups>
+__device__ __forceinline__ void finish_stage(float (&sums)[kGroups][4]) {
 #ifdef __CUDA_ARCH_FEAT_SM90_ALL
-  wait_for_group_products<kOpen>();
+  wait_for_group_products<0>();
   fence_sums(sums);
 #endif
 }
 
-// Of 27 taps without the centre: faces, edges and corners of 3 x 3 x 3 cells. Faces have the most pairs; blocks that
-// are begun last should have few.
-__constant__ uint8_t kLongestFirst[26] = {4, 10, 12, 13, 15, 21, 1, 3, 5, 7, 9, 11, 14,
-                                                    16, 18, 20, 22, 24, 0, 2, 6, 8, 17, 19, 23, 25};
-
-// The i-th block of pairs that is begun.
-template <typename E>
-__device__ int64_t block_in_order(const OuterProducts<E>& products, int64_t i, int sorted) {
-  if (!sorted) return i;
-  const int32_t unit = static_cast<int32_t>(i % products.blocks_per_chunk()) - products.centre_parts;
-  return products.taps == 27 && unit >= 0 ? i - unit + kLongestFirst[unit] : i;
-}
-
-// One block: kOut x kIn of the outer products of a block of pairs.
-template <typename E, typename S>
-__global__ void __launch_bounds__(S::kThreads, S::kBlocksOnSm)
-    multiply_pairs(OuterProducts<E> products, int32_t tiles, int32_t column_tiles, int order) {
+// One block: kSide x kSide of the outer products of a block of pairs. All tiles of a block of pairs are begun one after
+// another: they read the same rows.
+template <typename E, int kSide>
+__global__ void __launch_bounds__(kThreads, 2)
+    multiply_pairs(OuterProducts<E> products, int32_t tiles, int32_t column_tiles) {
+  constexpr bool kNarrow = kSide == kHalf;
+  constexpr int kStageBytes = kSide / kHalf * kHalfBytes;
   extern __shared__ __align__(1024) char raw[];
-  auto& memory = *reinterpret_cast<Memory<E, S>*>(raw);
+  auto& memory = *reinterpret_cast<Memory<E, kSide>*>(raw);
   const int thread = threadIdx.x, lane = thread % kWarp, warp = thread / kWarp, group = warp / 4;
-  const int32_t tile = order == 2 ? blockIdx.x / (gridDim.x / tiles) : blockIdx.x % tiles;
-  const int32_t co = tile / column_tiles * S::kOut, ci = tile % column_tiles * S::kIn;
-  const int64_t index = order == 2 ? blockIdx.x % (gridDim.x / tiles) : block_in_order(products, blockIdx.x / tiles, order == 0);
+  const int32_t tile = blockIdx.x % tiles, co = tile / column_tiles * kSide, ci = tile % column_tiles * kSide;
+  const int64_t index = blockIdx.x / tiles;
   const PairBlock block = pair_block(products, index);
 
   const uint32_t grads = shared_address(memory.grads), inputs = shared_address(memory.inputs);
-  const Copy<E, S::kOut, S::kThreads> left(grads, thread, co, products.c_out, products.grads.rows);
-  const Copy<E, S::kIn, S::kThreads> right(inputs, thread, ci, products.c_in, products.inputs.rows);
-  const Factor group_grads = factor_at(grads + (S::kNarrow ? 0 : group * kHalfBytes));
-  const Factor group_inputs = factor_at(inputs + (S::kNarrow ? group * kRowBytes / 2 : 0), kHalfBytes);
+  const Copy<E, kSide> left(grads, thread, co, products.c_out, products.grads.rows);
+  const Copy<E, kSide> right(inputs, thread, ci, products.c_in, products.inputs.rows);
+  const Factor group_grads = factor_at(grads + (kNarrow ? 0 : group * kHalfBytes));
+  const Factor group_inputs =
+      kNarrow ? factor_at(inputs + group * kRowBytes / 2) : factor_at(inputs, kHalfBytes);
 
   int32_t n_listed = 0;
   const auto copy_stage = [&](int32_t p0, int stage) {
@@ -145,42 +126,37 @@ __global__ void __launch_bounds__(S::kThreads, S::kBlocksOnSm)
     close_copies();
   };
 
-  constexpr int kAhead = S::kStages - 1 - S::kOpen;  // stages that are copied while one is multiplied
-  Sums<S> sums{};
+  Sums<kSide> sums{};
   for (int64_t begin = block.pairs.begin; begin < block.pairs.end; begin += kListed) {
     n_listed = static_cast<int32_t>(min(block.pairs.end - begin, int64_t{kListed}));
-    finish_stages<0>(sums);
     __syncthreads();
-    for (int32_t i = thread; i < (n_listed + kDepth - 1) / kDepth * kDepth; i += S::kThreads) {
+    for (int32_t i = thread; i < (n_listed + kDepth - 1) / kDepth * kDepth; i += kThreads) {
       const PairSources rows = i < n_listed ? pair_sources(products, block.tap, begin + i) : PairSources{-1, -1};
       memory.grad_rows[i] = rows.out < 0 ? nullptr : products.grads.at(rows.out);
       memory.input_rows[i] = rows.out < 0 ? nullptr : products.inputs.at(rows.in);
     }
     __syncthreads();
-    for (int stage = 0; stage < kAhead; ++stage) copy_stage(stage * kDepth, stage);
-    for (int32_t p0 = 0, stage = 0; p0 < n_listed; p0 += kDepth, stage = stage + 1 == S::kStages ? 0 : stage + 1) {
-      wait_for_copies<kAhead - 1>();
+    for (int stage = 0; stage < kStages - 1; ++stage) copy_stage(stage * kDepth, stage);
+    for (int32_t p0 = 0, stage = 0; p0 < n_listed; p0 += kDepth, stage = stage + 1 == kStages ? 0 : stage + 1) {
+      wait_for_copies<kStages - 2>();
       publish_copies();
-      if constexpr (S::kOpen > 0) finish_stages<S::kOpen>(sums);
       __syncthreads();
-      start_stage<E, S>(moved(group_grads, stage * S::kOut / kHalf * kHalfBytes),
-                        moved(group_inputs, stage * S::kIn / kHalf * kHalfBytes), sums);
-      copy_stage(p0 + kAhead * kDepth, (stage + kAhead) % S::kStages);
-      if constexpr (S::kOpen == 0) finish_stages<0>(sums);
+      start_stage<E, kSide>(moved(group_grads, stage * kStageBytes), moved(group_inputs, stage * kStageBytes), sums);
+      copy_stage(p0 + (kStages - 1) * kDepth, stage == 0 ? kStages - 1 : stage - 1);
+      finish_stage(sums);
     }
     wait_for_copies<0>();
   }
-  finish_stages<0>(sums);
 
   const bool direct = products.partials == nullptr;
   float* to = direct ? static_cast<float*>(products.result) : products.partials + index * products.c_out * products.c_in;
   const int32_t n_rows = direct ? products.result_rows : products.c_out;
-  const int32_t first_out = co + (S::kNarrow ? 0 : group * kHalf) + warp % 4 * 16 + lane / 4;
-  const int32_t first_in = ci + (S::kNarrow ? group * kHalf / 2 : 0) + lane % 4 * 2;
+  const int32_t first_out = co + (kNarrow ? 0 : group * kHalf) + warp % 4 * 16 + lane / 4;
+  const int32_t first_in = ci + (kNarrow ? group * kHalf / 2 : 0) + lane % 4 * 2;
 #pragma unroll
   for (int h = 0; h < 2; ++h)
 #pragma unroll
-    for (int j = 0; j < S::kGroupIn / 8; ++j) {
+    for (int j = 0; j < kSums<kSide>; ++j) {
       const int32_t o = first_out + h * 8, n = first_in + j * 8;
       const float low = sums[j][2 * h], high = sums[j][2 * h + 1];
       if (o >= n_rows || n >= products.c_in) continue;  // c_in is even
@@ -193,24 +169,20 @@ __global__ void __launch_bounds__(S::kThreads, S::kBlocksOnSm)
     }
 }
 
-int env(const char* n, int d) { const char* v = getenv(n); return v ? atoi(v) : d; }
-
 }  // namespace
 
 template <typename E>
 void outer_products_tensor(const char* op, const OuterProducts<E>& products, int64_t n_blocks, Stream stream) {
-  const auto queue = [&]<typename S>() {
-    const int64_t columns = blocks_for(op, products.c_in, S::kIn);
-    const int64_t tiles = blocks_for(op, products.c_out, S::kOut) * columns;
-    launch(op, multiply_pairs<E, S>, blocks_for(op, n_blocks * tiles, 1), S::kThreads, sizeof(Memory<E, S>), stream,
-           products, tiles, columns, env("CONV_ORDER", 0));
+  const auto queue = [&]<int kSide>() {
+    const int64_t columns = blocks_for(op, products.c_in, kSide);
+    const int64_t tiles = blocks_for(op, products.c_out, kSide) * columns;
+    launch(op, multiply_pairs<E, kSide>, blocks_for(op, n_blocks * tiles, 1), kThreads, sizeof(Memory<E, kSide>),
+           stream, products, tiles, columns);
   };
-  if (products.c_out >= 256 && env("CONV_TALL", 0))
-    queue.template operator()<Shape<256, 128, 1>>();
-  else if (products.c_in > 64 || products.c_out > 64)
-    queue.template operator()<Shape<128, 128, 2>>();
+  if (products.c_in > 64 || products.c_out > 64)
+    queue.template operator()<128>();
   else
-    queue.template operator()<Shape<64, 64, 2>>();
+    queue.template operator()<64>();
 }
 
 template void outer_products_tensor<__half>(const char*, const OuterProducts<__half>&, int64_t, Stream);
