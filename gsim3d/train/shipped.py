@@ -229,9 +229,10 @@ def train(
 
 def line(entry: dict, machine: dict) -> str:
     """What is said of a step."""
-    future = f" future {entry['future_psnr']:.2f}" if isinstance(entry.get("future_psnr"), float) else ""
+    known = {name: entry.get(f"{name}_psnr") for name in ("past", "future")}
+    decibels = " ".join(f"{name} {value:.2f}" for name, value in known.items() if isinstance(value, float))
     numbers = (
-        f"step {entry['step']:6d}  loss {entry['loss']:.5f}  past {entry['past_psnr']:.2f}{future} dB  "
+        f"step {entry['step']:6d}  loss {entry['loss']:.5f}  {decibels} dB  "
         f"norm {entry['grad_norm']:.3f}  rate {entry['learning_rate']:.1e}  {machine['step_seconds']:.3f} s  "
         f"{machine['memory_gib']:.1f} GiB  {entry['particles']:.0f} particles  {entry['trajectories']} trajectories  "
         f"{entry['captures']} captures"
