@@ -173,8 +173,7 @@ class TrainConfig:
     model: changes of the preset, nested like the model section of a checkpoint's config.yaml.
     effects: what a scene calls for, as :class:`gsim3d.effects.EffectsSpec` reads it.
     stages: run one after another.
-    in_turn: so many of the last stages take turns: they are run one after another ``rounds`` times.
-    rounds: see there.
+    in_turn, rounds: stages behind these that take turns: all of them one after another, so many times.
     precision: "fp32", "bf16" or "fp16" for each part of the model.
     recompute: parts of a step that the backward pass computes again instead of keeping them, which saves memory and
         changes no bit: "encoder", "steps" (all of a simulated step), "images". Beside "steps",
@@ -191,7 +190,7 @@ class TrainConfig:
 
     stages: tuple[StageConfig, ...] = (StageConfig(steps=1000), StageConfig(steps=4000, horizon=12))
     preset: str = "tiny"
-    in_turn: int = 0
+    in_turn: tuple[StageConfig, ...] = ()
     rounds: int = 1
     model: dict = dataclasses.field(default_factory=dict)
     effects: dict = dataclasses.field(default_factory=dict)
@@ -208,31 +207,24 @@ class TrainConfig:
     log_every: int = 10
 
     def __post_init__(self):
-        _at_least(self, in_turn=0, rounds=1)
-        _at_least(self, seed=0, workers=0, checkpoint_every=1, keep_checkpoints=1, log_every=1)
+        _at_least(self, rounds=1, seed=0, workers=0, checkpoint_every=1, keep_checkpoints=1, log_every=1)
         if not self.stages:
             raise InputError("stages: at least one is needed")
-        if self.in_turn > len(self.stages):
-            raise InputError(f"in_turn: must be at most the number of stages, {len(self.stages)}; got {self.in_turn}")
-        if self.rounds > 1 and not self.in_turn:
-            raise InputError("rounds: in_turn must say how many of the last stages take turns")
+
+    @property
+    def all_stages(self) -> tuple[StageConfig, ...]:
+        return (*self.stages, *self.in_turn)
 
     @property
     def n_steps(self) -> int:
-        once, in_turn = self._once_and_in_turn
-        return _count(once) + self.rounds * _count(in_turn)
-
-    @property
-    def _once_and_in_turn(self) -> tuple[tuple[StageConfig, ...], tuple[StageConfig, ...]]:
-        first = len(self.stages) - self.in_turn
-        return self.stages[:first], self.stages[first:]
+        return _count(self.stages) + self.rounds * _count(self.in_turn)
 
     def stage_of(self, step: int) -> tuple[StageConfig, int]:
         """The stage that optimizer step ``step`` belongs to, and the step's place in it."""
-        once, in_turn = self._once_and_in_turn
-        if _count(once) <= step < self.n_steps:
-            step = _count(once) + (step - _count(once)) % _count(in_turn)
-        for stage in self.stages:
+        once = _count(self.stages)
+        if once <= step < self.n_steps:
+            step = once + (step - once) % _count(self.in_turn)
+        for stage in self.all_stages:
             if step < stage.steps:
                 return stage, step
             step -= stage.steps

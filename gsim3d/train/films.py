@@ -126,16 +126,20 @@ class FilmStore:
 class Filming:
     """Processes that simulate and film one trajectory after another, from number ``first`` on, into a store.
 
-    Trajectory n is the n-th of the world's list (one of each object in turn), whatever its ``n_trajectories`` says;
-    each number is filmed once. Use as a context; leaving it ends the processes.
+    Trajectory n is the n-th of the worlds' list (one of each object in turn), whatever ``n_trajectories`` says; each
+    number is filmed once. Use as a context; leaving it ends the processes.
 
+    Args:
+        worlds: take turns, from one round of the objects to the next; all have the cameras and objects of the first.
     Attributes:
         next: the smallest number that no process was given.
     """
 
-    def __init__(self, world: World, store: FilmStore, first: int, processes: int, cache: str | Path | None = None):
-        self._world, self._store, self.next = world, store, first
-        self._processes, self._names = processes, world.object_names()
+    def __init__(
+        self, worlds: Sequence[World], store: FilmStore, first: int, processes: int, cache: str | Path | None = None
+    ):
+        self._worlds, self._store, self.next = worlds, store, first
+        self._processes, self._names = processes, worlds[0].object_names()
         self._wanted, self._begun = processes * QUEUED, 0
         self._cache = Path(tempfile.mkdtemp(prefix="films_", dir=cache))
         self._running = True
@@ -187,7 +191,8 @@ class Filming:
             number, names = self.next, self._names
             self.next, self._begun = number + 1, self._begun + 1
             scene = names[number % len(names)], number // len(names)
-            job = self._pool.submit(film, self._world, scene, str(self._cache / f"{number}.npy"))
+            world = self._worlds[scene[1] % len(self._worlds)]
+            job = self._pool.submit(film, world, scene, str(self._cache / f"{number}.npy"))
             job.add_done_callback(self._take)
 
     def _take(self, job: Future) -> None:

@@ -80,7 +80,7 @@ class Trainer:
     ):
         check_device(device)
         self.device, self.processes = device, processes or Processes()
-        check_scenes(scenes, config.data, config.stages)
+        check_scenes(scenes, config.data, config.all_stages)
         self.config, self.scenes, self.out = config, list(scenes), Path(out)
         self.plan_spec = EffectsSpec.from_dict(config.effects)
         self.simulator = build_simulator(model_config(config), config.seed).to(device)
@@ -540,7 +540,8 @@ class _Loss(nn.Module):
 def _fixed_settings(settings: dict) -> dict:
     """Of a run's settings those that must stay, as far as parts of them may change."""
     fixed = {**settings, "workers": bool(settings.get("workers"))}
-    for name, free in (("optimizer", FREE_OF_OPTIMIZER), ("stages", FREE_OF_STAGES)):
+    parts_of = {"optimizer": FREE_OF_OPTIMIZER, "stages": FREE_OF_STAGES, "in_turn": FREE_OF_STAGES}
+    for name, free in parts_of.items():
         parts = settings.get(name) or []
         kept = [
             {k: v for k, v in part.items() if k not in free} for part in ([parts] if name == "optimizer" else parts)
