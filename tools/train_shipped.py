@@ -3,7 +3,7 @@
 
     python tools/train_shipped.py elastic --minutes 8 --state runs/elastic --out runs/elastic --device cuda
 
-One sitting: processes film trajectories on all spare cores, training begins with the first 64 and goes on with what is
+One sitting: processes film trajectories on all spare cores, training begins with the first 32 and goes on with what is
 there, while fewer of them film; near the end the learning rate falls, the state is written, and held-out trajectories
 are predicted, scored and filmed. Called again, the next sitting goes on with weights, optimizer and the next
 trajectories; what is kept and what is rounded stands in gsim3d/train/sittings.py. A sitting that is killed loses what

@@ -25,7 +25,7 @@ from gsim3d.train.precision import PrecisionConfig
 from gsim3d.train.samples import Batch
 from gsim3d.train.sittings import Progress, save_state
 
-FIRST_FILMS = 64  # before training begins
+FIRST_FILMS = 32  # before training begins
 SEED, HELD_OUT_SEED = 20261121, 77  # of the trajectories; `gsim3d generate` without --seed makes others
 WARM_UP = 40  # steps at the beginning of a sitting
 COOL_DOWN = 0.25  # of a sitting's training, in which the learning rate falls to LAST_RATE of its peak
@@ -66,16 +66,7 @@ MODEL = {
 }
 
 
-# Hidden from four given steps is of which material a body is, and so how high it will jump; most of what remains to be
-# learned is how to see it sharply and to move it as a whole. Gradients of a whole step cost the encoder's share each
-# time, so that both are learned in turn: encoder and renderer from images of many scenes, the dynamics alone.
-TURN = 20, 30  # steps of each
-
-
-# Hidden from four given steps is of which material a body is, and so how high it will jump; most of what remains to be
-# learned is how to see it sharply and to move it as a whole. Gradients of a whole step cost the encoder's share each
-# time, so that both are learned in turn: encoder and renderer from images of many scenes, the dynamics alone.
-TURN = 20, 30  # steps of each
+TURN = 40, 20  # steps of images, of the dynamics alone
 
 
 def _recipe(
@@ -84,20 +75,27 @@ def _recipe(
     begin_within: int,
     *,
     strides: tuple[int, int] = (3, 2),
-    batch: int = 8,
+    batch: int = 4,
+    rollout: tuple[int, int] = (30, 10),
     capacity: int = 600,
     before: tuple[StageConfig, ...] | None = None,
     in_turn: tuple[dict, ...] = ({},),
 ) -> Recipe:
-    """strides: of the pixels of ground and bodies.   batch: where long rollouts are simulated.   Others as in Recipe.
+    """A recipe in which encoder and renderer learn from images of many scenes, and in turn with them the dynamics.
 
-    before: stages that a state has behind it; None: those of a new one.
+    A joint step would go back through the encoder for each rollout, which takes longer than a rollout of 12 steps.
+
+    begin_within: of images; windows of rollouts begin within twice as many steps.
+    strides: of the pixels of ground and bodies.   batch: where long rollouts are simulated.
+    rollout: their steps, and through how many of them gradients flow back.
+    before: stages that come first; None: of images alone, which are steps of many scenes and few kernels, and to which
+        nothing comes back from a rollout.
+    Others as in Recipe.
     """
-    stage = partial(StageConfig, target_views=4)
-    images = partial(stage, history=1, batch=16)
-    dynamics = partial(stage, dynamics_alone=True, target_views=3)
-    if before is None:
-        before = (images(steps=2500, begin_within=begin_within, learning_rate=1e-3),)
+    stage = partial(StageConfig, target_views=4, begin_within=begin_within)
+    images = partial(stage, history=1, batch=16, learning_rate=1e-3)
+    dynamics = partial(stage, dynamics_alone=True, target_views=3, begin_within=2 * begin_within)
+    horizon, cut = rollout
     train = TrainConfig(
         preset="small",
         model=MODEL,
@@ -112,23 +110,16 @@ def _recipe(
             targets_apart=True,
         ),
         stages=(
-            *before,
-            # How things move at this moment, of many scenes, before what becomes of it.
-            dynamics(steps=1000, horizon=4, batch=2 * batch, from_start=0.1, learning_rate=8e-4),
+            *((images(steps=2500),) if before is None else before),
+            # How things move right now, before what becomes of it: what is rendered in the wrong place teaches to blur.
+            dynamics(steps=1200, horizon=4, batch=2 * batch, from_start=0.1, learning_rate=8e-4),
         ),
         in_turn=(
-            images(steps=TURN[0], learning_rate=1e-3),
-            dynamics(
-                steps=TURN[1],
-                horizon=24,
-                cut=12,
-                batch=batch,
-                begin_within=2 * begin_within,
-                from_start=0.2,
-                learning_rate=6e-4,
-            ),
+            images(steps=TURN[0]),
+            dynamics(steps=TURN[1], horizon=horizon, cut=cut, batch=batch, from_start=0.25, learning_rate=6e-4),
         ),
         rounds=100_000,
+        # A score counts the last step like the first.
         loss=LossConfig(body_weight=3.0, balance=0.15, discount=0.95),
         optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.995),
         precision=PrecisionConfig(encoder="bf16", dynamics="bf16"),
@@ -138,8 +129,9 @@ def _recipe(
     return Recipe(world, train, in_turn=in_turn, capacity=capacity)
 
 
-def _first_elastic() -> tuple[StageConfig, ...]:
-    """How `elastic-small` was trained up to step 6,380, all parts together; then images again, of raised grounds too."""
+def _before_elastic() -> tuple[StageConfig, ...]:
+    """How `elastic-small` was trained up to step 6,380: all parts together, with a discount of 0.87, on a ground that
+    was always as high. Then images of other grounds, too."""
     stage = partial(StageConfig, target_views=4, begin_within=24)
     return (
         stage(steps=2500, history=1, batch=16, learning_rate=1e-3),
@@ -151,14 +143,13 @@ def _first_elastic() -> tuple[StageConfig, ...]:
     )
 
 
+RAISED = {"ground_height": (0.0, 0.3)}
 RECIPES = {
     # Bodies fall for half a second and then hardly move.
-    "elastic": _recipe(
-        "elastic", (1.9, 4.8), 24, before=_first_elastic(), in_turn=({}, {}, {"ground_height": (0.0, 0.3)})
-    ),
+    "elastic": _recipe("elastic", (1.9, 4.8), 24, before=_before_elastic(), in_turn=({}, {}, RAISED)),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories.
-    "cloth": _recipe("cloth", (1.6, 4.8), 0, strides=(4, 2), batch=6, capacity=400),
-    "rigid": _recipe("rigid", (1.7, 5.0), 12),
+    "cloth": _recipe("cloth", (1.6, 4.8), 0, strides=(4, 2), batch=3, capacity=400),
+    "rigid": _recipe("rigid", (1.7, 5.0), 12, rollout=(24, 12), in_turn=({}, {}, RAISED)),
 }
 
 
