@@ -106,7 +106,8 @@ A gsim3d simulator of the world `{world["world"]}`: `gsim3d simulate {name} SCEN
 - **Sees** {data["history"]} steps from {data["context_views"]} calibrated cameras at {world["image_size"]} pixels with
   masks, {world["fps"]:g} steps a second; predicts particles, drawn as 3D Gaussians from any view.
 - **Trained on** {used:,} trajectories of {world["n_frames"]} steps and {world["n_cams"]} cameras, made by
-  `gsim3d generate {world["world"]} --preset paper --seed {world["seed"]}`{changed}, never the same twice; from images alone.
+  `gsim3d generate {world["world"]} --preset paper --seed {world["seed"]}`{changed}, never the same twice;
+  from images alone.
 - **Budget** {recipe["steps"]:,} optimizer steps in {recipe["training_seconds"]:,.0f} s of training,
   {len(recipe["sittings"])} sittings, on {" and ".join(devices)}; {recipe["skipped_steps"]} steps were skipped.
 - **Weights** averaged, bfloat16. `config.yaml` has all settings, `training.jsonl` a part of the log, `recipe.json` the
