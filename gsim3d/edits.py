@@ -22,51 +22,19 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.dynamics.clouds import alike, newest_clouds, with_look
+from gsim3d.dynamics.clouds import LOOKS, alike, newest_clouds, with_look
 from gsim3d.dynamics.state import rotate_left
 from gsim3d.errors import InputError
 from gsim3d.files import read_yaml, typed
 from gsim3d.harmonics import painted, rotate_harmonics
 from gsim3d.rotations import quat_product, rotation_matrices
-from gsim3d.types import DYNAMIC, FROZEN, CloudTable, Particles
+from gsim3d.selections import Selection, Vector, newest_rows
+from gsim3d.types import FROZEN, CloudTable, Particles
 
-Vector = tuple[float, float, float]
-Box = tuple[Vector, Vector]
 Colors = Callable[[Particles], Tensor]  # particles -> [N, 3], their colours
 
-WHICH = ("all", "moving", "frozen")
 GREY = (0.2126, 0.7152, 0.0722)  # how bright red, green and blue look
 DARKEST = 0.05  # grey value; what is darker is not brightened further than from this to the colour asked for
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Which particles. which: "moving", "frozen" (the ground) or "all".   box: lowest and highest corner [metres]."""
-
-    which: str = "moving"
-    box: Box | None = None
-
-    def __post_init__(self):
-        if self.which not in WHICH:
-            raise InputError(f"of must be one of {', '.join(WHICH)}; got {self.which!r}")
-
-    def rows(self, particles: Particles) -> Tensor:
-        """bool [N].
-
-        Raises:
-            InputError: the newest steps have none.
-        """
-        activity = {"moving": DYNAMIC, "frozen": FROZEN}.get(self.which)
-        rows = torch.ones_like(particles.activity, dtype=torch.bool)
-        if activity is not None:
-            rows = particles.activity == activity
-        if self.box is not None:
-            low, high = torch.tensor(self.box, device=rows.device, dtype=particles.means.dtype)
-            rows = rows & ((particles.means >= low) & (particles.means <= high)).all(1)
-        if not bool(rows[_newest_rows(particles)].any()):
-            place = "" if self.box is None else f" in the box {[list(corner) for corner in self.box]}"
-            raise InputError(f"no particle is meant: there are none that are {self.which}{place}")
-        return rows
 
 
 @dataclass(frozen=True)
@@ -173,7 +141,7 @@ class Recolor(Operation):
 
     def apply(self, state, colors):
         rows = self.of.rows(state)
-        newest = rows & _newest_rows(state)
+        newest = rows & newest_rows(state)
         grey = state.means.new_tensor(GREY)
         mean = (colors(state)[newest] @ grey).mean().clamp(min=DARKEST)
         paint = torch.outer(state.means.new_tensor(self.color) / mean, grey).expand(state.n_rows, 3, 3)
@@ -198,7 +166,8 @@ class Duplicate(Operation):
 
 @dataclass(frozen=True)
 class Insert(Operation):
-    """Of another scene they are added, ``by`` [metres] away from their place there; its newest step is now.
+    """Of another scene they are added, ``by`` [metres] away from their place there; its newest step is now. Nobody of
+    them is held.
 
     particles: one scene, encoded or simulated by the same model. In a file ``scene`` names its folder.
     """
@@ -209,12 +178,12 @@ class Insert(Operation):
     inserts: ClassVar[bool] = True
 
     def apply(self, state, colors):
-        rows, given = self.of.rows(self.particles), self.particles
+        rows, given = self.of.rows(self.particles), dataclasses.replace(self.particles, held=None)
         if len(newest_clouds(given.clouds)) != 1:
             raise InputError("particles must be of one scene")
         for field, value in given.row_fields().items():
             mine = getattr(state, field)
-            if field not in ("turns", "paint") and (mine is None or mine.shape[1:] != value.shape[1:]):
+            if field not in LOOKS and (mine is None or mine.shape[1:] != value.shape[1:]):
                 raise InputError(f"particles.{field} must be as those of the state; were they made by another model?")
         given = _moved(given, rows, self.by).select_rows(rows).to(state.means.device)
         table, newest = state.clouds, {
@@ -295,25 +264,15 @@ def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Partic
     if not isinstance(op, str) or op not in OPERATIONS:
         raise InputError(f"{where} at step {step}: op must be one of {', '.join(OPERATIONS)}; got {op!r}")
     where = f"{where} at step {step}, {op}"
-    if isinstance(values.get("of"), str):
-        values["of"] = {"which": values["of"]}
     kind, given = OPERATIONS[op], {}
     if kind is Insert:
         if "particles" in values or not isinstance(values.get("scene"), str):
             raise InputError(f"{where}: scene must name a scene folder; got {values.get('scene')!r}")
-        given["particles"] = encode(folder / values.pop("scene"))
-    try:
-        return Edit(step, dataclasses.replace(typed(kind, values, where), **given))
-    except InputError as error:
-        raise InputError(str(error) if str(error).startswith(where) else f"{where}: {error}") from None
-
-
-def _newest_rows(particles: Particles) -> Tensor:
-    """bool [N], rows of the newest cloud of each scene."""
-    table = particles.clouds
-    newest = set(newest_clouds(table))
-    marks = torch.tensor([q in newest for q in range(len(table))], dtype=torch.bool, device=particles.cu_rows.device)
-    return marks[particles.row_cloud()]
+        try:
+            given["particles"] = encode(folder / values.pop("scene"))
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+    return Edit(step, dataclasses.replace(typed(kind, values, where), **given))
 
 
 def _changed(state: Particles, rows: Tensor, fields: dict[str, Tensor]) -> Particles:
@@ -332,7 +291,7 @@ def _moved(state: Particles, rows: Tensor, by: Vector) -> Particles:
 def _middles(state: Particles, rows: Tensor) -> Tensor:
     """[N, 3], for each row the mean place of those ``rows`` of the newest cloud of its scene."""
     scene = state.cloud_scene[state.row_cloud()]
-    chosen = rows & _newest_rows(state)
+    chosen = rows & newest_rows(state)
     one = F.one_hot(scene, int(scene.max()) + 1).to(state.means)
     sums = (one * chosen[:, None]).mT @ torch.cat([state.means, torch.ones_like(state.means[:, :1])], 1)
     return (sums[:, :3] / sums[:, 3:].clamp(min=1))[scene]

@@ -15,6 +15,7 @@ import yaml
 
 from gsim3d.errors import InputError
 from gsim3d.files import read_yaml, typed
+from gsim3d.selections import Selection
 
 VERSION = 1
 FILE = "effects.yaml"  # of a scene or of a whole data set, in its folder
@@ -104,14 +105,19 @@ class AppearanceEffects:
 
     view_dependent: degree of the harmonics, 0 to 3; None: the model's.
     changing: whose dynamic latents change with time: "all" (a shadow may fall on the background), "dynamic" or "none".
+    held: bodies whose latents do not, whatever ``changing`` says: who is there when a rollout starts, by kind and box
+        as in edits, stays held wherever it goes.
     opacity_changes: opacities change with time; None: where the model predicts it (explicit models do).
     """
 
     view_dependent: int | None = None
     changing: str = "all"
     opacity_changes: bool | None = None
+    held: tuple[Selection, ...] = ()
 
     def __post_init__(self):
+        held = (Selection(of) if isinstance(of, str) else of for of in self.held)
+        object.__setattr__(self, "held", tuple(held))
         _one_of("appearance.changing", self.changing, CHANGING)
         if self.view_dependent not in (None, 0, 1, 2, 3):
             raise InputError(f"effects: appearance.view_dependent must be 0 to 3; got {self.view_dependent}")
@@ -196,7 +202,7 @@ class EffectsSpec:
     @property
     def hash(self) -> str:
         """16 hex digits that two equal specs share, on any machine."""
-        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()[:16]
+        return hashlib.sha256(json.dumps(_whole(self.to_dict()), sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _one_of(name: str, value: Any, allowed: tuple[str, ...]) -> None:
@@ -222,4 +228,15 @@ def _differences(value: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return {f.name: _plain(v) for f in dataclasses.fields(value) if (v := getattr(value, f.name)) is not None}
     return [_plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _whole(value: Any) -> Any:
+    """``value`` with integers for numbers that are whole: 1 and 1.0 are equal, and so must their hashes be."""
+    if isinstance(value, dict):
+        return {name: _whole(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_whole(item) for item in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value

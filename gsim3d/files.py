@@ -73,7 +73,8 @@ def read_yaml(path: str | Path, subject: str) -> Any:
 
 
 def typed(cls: type, values: Any, subject: str, where: str = "") -> Any:
-    """An object of the dataclass ``cls`` from plain values, whose types are those of its fields.
+    """An object of the dataclass ``cls`` from plain values, whose types are those of its fields. Where a dataclass has
+    an attribute ``alone``, a text by itself is the field of this name.
 
     Raises:
         InputError: a key is unknown or a value of another type; the message starts with ``subject`` and names the key.
@@ -84,7 +85,13 @@ def typed(cls: type, values: Any, subject: str, where: str = "") -> Any:
     hints = {field.name: hints[field.name] for field in dataclasses.fields(cls)}
     if unknown := [name for name in values if name not in hints]:
         raise InputError(f"{subject}: unknown key {where}{unknown[0]}; known: {', '.join(hints)}")
-    return cls(**{name: _value(hints[name], value, subject, where + name) for name, value in values.items()})
+    fields = {name: _value(hints[name], value, subject, where + name) for name, value in values.items()}
+    try:
+        return cls(**fields)
+    except InputError as error:
+        if str(error).startswith(subject):
+            raise
+        raise InputError(": ".join(filter(None, (subject, where.rstrip("."), str(error))))) from None
 
 
 def _value(hint: Any, value: Any, subject: str, where: str) -> Any:
@@ -94,6 +101,8 @@ def _value(hint: Any, value: Any, subject: str, where: str) -> Any:
             return None
         hint = typing.get_args(hint)[0]
     if dataclasses.is_dataclass(hint):
+        if isinstance(value, str) and hasattr(hint, "alone"):
+            value = {hint.alone: value}
         return typed(hint, value, subject, f"{where}.")
     if typing.get_origin(hint) is tuple:
         items = typing.get_args(hint)

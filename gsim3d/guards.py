@@ -80,7 +80,7 @@ def guard_particles(
     fields = {
         name: value
         for name, value in particles.row_fields().items()
-        if name != "activity" and (changed is None or name in changed or name in ALWAYS)
+        if name not in ("activity", "held") and (changed is None or name in changed or name in ALWAYS)
     }
     looks = (_looks_at if torch.compiler.is_compiling() else _recent_looks)(tuple(fields), config, max_opacity)
     before = None if previous is None else [getattr(previous, name) for name in fields]

@@ -46,6 +46,7 @@ from gsim3d.plans import Plan, make_plan, unused_parameters
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
 from gsim3d.renderer import GaussianHead, render, render_as_published
+from gsim3d.selections import rows_of_any
 from gsim3d.stability import OnBad, StabilityReport, check_on_bad
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames, Particles
 
@@ -184,8 +185,14 @@ class Simulator(nn.Module):
         )
 
     def prepare(self, state: Particles, plan: Plan) -> Particles:
-        """What the dynamics reads of ``state``: its last steps, with the background as the plan wants it."""
-        background = plan.spec.dynamics.background
+        """What the dynamics reads of ``state``: its last steps, with the background as the plan wants it, and marks on
+        the bodies that it names."""
+        background, appearance = plan.spec.dynamics.background, plan.spec.appearance
+        held = () if appearance.changing == "none" else appearance.held
+        if held and state.held is None:
+            state = dataclasses.replace(state, held=rows_of_any(held, state, "effects: appearance.held"))
+        elif not held and state.held is not None:
+            state = dataclasses.replace(state, held=None)
         if background == "masked_out":
             state = state.select_rows(state.activity == DYNAMIC)
         if background == "dynamic":

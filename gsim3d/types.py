@@ -215,6 +215,8 @@ class Particles(_Tensors):
     quats [N, 4] (w, x, y, z), scales [N, 3] metres, sh [N, K, 3]: only in explicit models.
     turns [N, 4] (w, x, y, z), paint [N, 3, 3]: only where an edit turned or painted particles whose look is latent
         (:mod:`gsim3d.edits`): what is drawn is turned further, and its colours go through the matrix.
+    held: bool [N], rows whose changing latents and colours stay; only where a spec of effects names bodies
+        (``appearance.held``). Rollouts hand it on; None in a state: the next one asks who is meant.
 
     Rows of two encoded steps are not aligned (each step sees other pixels); rows of two simulated steps are.
     """
@@ -233,6 +235,7 @@ class Particles(_Tensors):
     sh: Tensor | None = None
     turns: Tensor | None = None
     paint: Tensor | None = None
+    held: Tensor | None = None
     known: CloudTable | None = None  # see clouds
 
     ROW_FIELDS = (
@@ -246,6 +249,7 @@ class Particles(_Tensors):
         "sh",
         "turns",
         "paint",
+        "held",
     )
 
     @property

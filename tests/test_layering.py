@@ -11,6 +11,7 @@ ROOT = Path(__file__).parent.parent
 ROOMS = [
     {"errors", "quirks"},
     {"types", "stability", "files", "pretrained", "branches"},
+    {"selections"},
     {"ops", "effects", "harmonics", "rotations"},
     {"layers", "guards"},
     {"encoder", "dynamics", "renderer"},

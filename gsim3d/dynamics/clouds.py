@@ -13,6 +13,8 @@ from torch.nn import functional as F
 
 from gsim3d.types import CloudTable, Particles, split_rows
 
+LOOKS = ("turns", "paint", "held")  # fields that only some particles have
+
 
 def newest_clouds(clouds: CloudTable) -> list[int]:
     """The last cloud of each scene that has one."""
@@ -53,17 +55,21 @@ def last_steps(particles: Particles, n_steps: int) -> Particles:
 
 
 def with_look(particles: Particles, name: str) -> Particles:
-    """``particles`` with the field ``name``, "turns" or "paint", which changes nothing where there was none."""
+    """``particles`` with the field ``name``, one of ``LOOKS``, which changes nothing where there was none."""
     if getattr(particles, name) is not None:
         return particles
     like = particles.means.new_ones(particles.n_rows, 1)
-    identity = F.pad(like, (0, 3)) if name == "turns" else torch.diag_embed(like.expand(-1, 3))
-    return dataclasses.replace(particles, **{name: identity})
+    identity = {
+        "turns": lambda: F.pad(like, (0, 3)),
+        "paint": lambda: torch.diag_embed(like.expand(-1, 3)),
+        "held": lambda: torch.zeros_like(particles.activity, dtype=torch.bool),
+    }
+    return dataclasses.replace(particles, **{name: identity[name]()})
 
 
 def alike(parts: Sequence[Particles]) -> list[Particles]:
-    """``parts`` with the same fields: what some have of "turns" and "paint", all have."""
-    for name in ("turns", "paint"):
+    """``parts`` with the same fields: what some have of ``LOOKS``, all have."""
+    for name in LOOKS:
         if any(getattr(part, name) is not None for part in parts):
             parts = [with_look(part, name) for part in parts]
     return list(parts)

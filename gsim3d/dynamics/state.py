@@ -17,6 +17,7 @@ from gsim3d.types import FROZEN, Particles
 
 SCALE_STEP_SHARE = 1 / 6  # of the range of scales, the most that one step changes a scale
 POSITION_CHANNELS = 6
+FEATURES = ("dynamic_latents", "sh")  # that rows which are held keep
 SMALL_ANGLE_SQUARED = 1e-8  # radians^2; smaller rotations are their series: a square root has no gradient at 0
 
 
@@ -61,7 +62,7 @@ class StateLayout:
         """
         quirk = self.config.steps_per_call == 1 and self.config.quirks.frozen_rows_turn
         who = {name: "dynamic" for name, _ in self.outputs}
-        who |= {name: features for name in ("dynamic_latents", "sh") if name in who}
+        who |= {name: features for name in FEATURES if name in who}
         if "opacities" in who and not opacities:
             who["opacities"] = "none"
         if "quats" in who and quirk:
@@ -104,7 +105,7 @@ class StateLayout:
         """The particles after 1, 2, ... ``steps_per_call`` steps.
 
         Args:
-            particles: N rows, the newest state.
+            particles: N rows, the newest state; those that are ``held`` keep their latents and colours.
             prediction: [N, channels], the outputs that change.
             awake: bool [N], rows that change at all; None: all.
             changes: of :meth:`changes`; None: all that is predicted.
@@ -120,6 +121,8 @@ class StateLayout:
         later = {}
         for (name, _), part in zip(outputs, parts, strict=True):
             share = everywhere if changes[name] == "all" else moves
+            if particles.held is not None and name in FEATURES:
+                share = share.masked_fill(particles.held[:, None], 0)
             later[name] = self.later_values(name, getattr(particles, name), part, share)
         return [
             dataclasses.replace(particles, **{name: values[step] for name, values in later.items()})

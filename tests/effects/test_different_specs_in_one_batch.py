@@ -15,7 +15,11 @@ SPECS = [
     EffectsSpec(DynamicsEffects("masked_out", history=2), outputs=OutputEffects(depth=True)),
     EffectsSpec(appearance=AppearanceEffects(0, "none"), outputs=OutputEffects(depth=True)),
     EffectsSpec(DynamicsEffects("masked_out", history=2), outputs=OutputEffects(depth=True)),
-    EffectsSpec(DynamicsEffects("dynamic", history=1, sleep=Sleep()), outputs=OutputEffects(depth=True)),
+    EffectsSpec(
+        DynamicsEffects("dynamic", history=1, sleep=Sleep()),
+        AppearanceEffects(held=("frozen",)),
+        outputs=OutputEffects(depth=True),
+    ),
 ]
 
 

@@ -24,6 +24,7 @@ EFFECTS = {
     "sleep": ("latent", {"dynamics": {"sleep": {}}}, {}, {}),
     "view-dependent colour": ("latent", {}, {"appearance": {"view_dependent": 0}}, {}),
     "changing features": ("latent", {}, {"appearance": {"changing": "none"}}, {"aten.tanh.default": 2}),
+    "held bodies": ("latent", {"appearance": {"held": ["frozen"]}}, {}, {"aten.masked_fill.Scalar": 2}),
     "changing opacities": ("explicit", {}, {"appearance": {"opacity_changes": False}}, {"aten.clamp.default": 2}),
     "feature images": ("latent", {"outputs": {"features": True}}, {}, {"aten.cat.default": 1}),
     "colour images": ("latent", {"outputs": ALL_IMAGES}, {"outputs": {"rgb": False, **ALL_IMAGES}}, {}),
@@ -74,7 +75,7 @@ def test_nobody_keeps_a_log_of_rest_without_sleep_or_background(monkeypatch):
     monkeypatch.setattr(case.simulator, "_colors", refuse)
     steps, image = case(EffectsSpec())
     assert len(steps) == 2 and image.alpha is None and image.depth is None and image.features is None
-    assert steps[0].turns is None and steps[0].paint is None
+    assert steps[0].turns is None and steps[0].paint is None and steps[0].held is None
     with pytest.raises(AssertionError, match="although it is off"):
         case(EffectsSpec.from_dict({"dynamics": {"sleep": {}}}))
 

@@ -57,7 +57,10 @@ def launches(call) -> int:
     return sum(event.device_type == torch.autograd.DeviceType.CUDA for event in profile.events())
 
 
-@pytest.mark.parametrize("name", ["time merging", "sleep", "changing features", "changing opacities", "feature images"])
+LAUNCHED = ["time merging", "sleep", "changing features", "held bodies", "changing opacities", "feature images"]
+
+
+@pytest.mark.parametrize("name", LAUNCHED)
 def test_what_is_off_launches_less(name, devices):
     model, on, off, _ = EFFECTS[name]
     *_, case = cases(devices, model)

@@ -20,6 +20,7 @@ from gsim3d.effects import (
     UnsupportedEffect,
 )
 from gsim3d.errors import InputError
+from gsim3d.selections import Selection
 from gsim3d.train import checkpoint
 from gsim3d.train.restore import build_simulator, restore
 from gsim3d.train.settings import to_dict
@@ -35,7 +36,12 @@ ROOMS = {
         DynamicsEffects("dynamic", sleep=Sleep()),
         DynamicsEffects(sleep=Sleep("approx", 1e-4, 7)),
     ],
-    "appearance": [AppearanceEffects(), AppearanceEffects(0, "none", False), AppearanceEffects(3, "dynamic", True)],
+    "appearance": [
+        AppearanceEffects(),
+        AppearanceEffects(0, "none", False),
+        AppearanceEffects(3, "dynamic", True),
+        AppearanceEffects(held=("moving", Selection("all", ((0.0, 0.5, -1.0), (1.0, 2.0, 3.0))))),
+    ],
     "structure": [StructureEffects(), StructureEffects(True, False), StructureEffects(True, True)],
     "outputs": [OutputEffects(), OutputEffects(False, True, True, True)],
 }
@@ -58,10 +64,18 @@ def test_files(tmp_path, name):
 
 
 def test_hashes_tell_all_specs_apart_and_do_not_depend_on_order():
-    assert len({spec.hash for spec in SPECS}) == len(set(SPECS)) == len(SPECS) == 5 * 3 * 3 * 2
+    assert len({spec.hash for spec in SPECS}) == len(set(SPECS)) == len(SPECS) == 5 * 4 * 3 * 2
     for spec in SPECS:
         backwards = dict(reversed(spec.to_dict().items()))
         assert EffectsSpec.from_dict(backwards).hash == spec.hash
+
+
+def test_whole_numbers_hash_as_what_they_are_equal_to():
+    specs = [
+        EffectsSpec.from_dict({"dynamics": {"sleep": {"eps": zero}}, "appearance": {"held": [{"box": box}]}})
+        for zero, box in ((0, [[0, 0, 0], [1, 1, 1]]), (0.0, [[0.0, -0.0, 0.0], [1.0, 1.0, 1.0]]))
+    ]
+    assert specs[0] == specs[1] and specs[0].hash == specs[1].hash != EffectsSpec().hash
 
 
 def test_the_hash_is_the_same_on_any_machine():
