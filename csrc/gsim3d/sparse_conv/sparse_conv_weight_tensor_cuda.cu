@@ -114,8 +114,7 @@ __global__ void __launch_bounds__(kThreads, 2)
   const Copy<E, kSide> left(grads, thread, co, products.c_out, products.grads.rows);
   const Copy<E, kSide> right(inputs, thread, ci, products.c_in, products.inputs.rows);
   const Factor group_grads = factor_at(grads + (kNarrow ? 0 : group * kHalfBytes));
-  const Factor group_inputs =
-      kNarrow ? factor_at(inputs + group * kRowBytes / 2) : factor_at(inputs, kHalfBytes);
+  const Factor group_inputs = kNarrow ? factor_at(inputs + group * kRowBytes / 2) : factor_at(inputs, kHalfBytes);
 
   int32_t n_listed = 0;
   const auto copy_stage = [&](int32_t p0, int stage) {
@@ -149,7 +148,8 @@ __global__ void __launch_bounds__(kThreads, 2)
   }
 
   const bool direct = products.partials == nullptr;
-  float* to = direct ? static_cast<float*>(products.result) : products.partials + index * products.c_out * products.c_in;
+  float* to = direct ? static_cast<float*>(products.result)
+                     : products.partials + index * products.c_out * products.c_in;
   const int32_t n_rows = direct ? products.result_rows : products.c_out;
   const int32_t first_out = co + (kNarrow ? 0 : group * kHalf) + warp % 4 * 16 + lane / 4;
   const int32_t first_in = ci + (kNarrow ? group * kHalf / 2 : 0) + lane % 4 * 2;
