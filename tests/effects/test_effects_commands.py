@@ -9,7 +9,10 @@ from gsim3d import presets
 from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec
 from gsim3d.infer_effects import propose, smaller
 from gsim3d.interop import read_ply
-from gsim3d.train.restore import build_simulator
+from gsim3d.pareto import autotune
+from gsim3d.pareto.part_times import PartTimes
+from gsim3d.show_plan import workload
+from gsim3d.train.restore import build_simulator, restore
 from tests.effects.test_round_trip import saved
 from tests.test_commands import call, work  # noqa: F401
 from tests.tiny_scenes import write_scene
@@ -55,6 +58,21 @@ def test_plan_tells_what_a_background_costs_once(capsys, tmp_path):
         r"^background made once +yes +in this model frozen particles see only each other", out, re.MULTILINE
     )
     assert float(re.search(r"^and of the background, once a rollout: (\d+\.\d)$", out, re.MULTILINE)[1]) > 0
+
+
+def test_plan_predicts_milliseconds_of_a_checkpoint_that_was_timed(capsys, work):  # noqa: F811
+    scene, run = work / "data" / "ball" / "0000", work / "run"
+    code, before, _ = call(capsys, "plan", scene, run)
+    assert code == 0 and "milliseconds" not in before
+    restored = restore(run)
+    times = PartTimes("a clock", workload(restored.open_scene(scene), restored.data), 8.0, 4.0, 2.0)
+    autotune.save_speeds(run, restored, {}, times)
+    code, out, _ = call(capsys, "plan", scene, run)
+    (run / autotune.SPEEDS).unlink()
+    assert code == 0 and out.startswith(before)
+    assert "predicted milliseconds on cpu, from those that gsim3d pareto measured (a clock)\n" in out
+    table = re.findall(r"^(\w+) +(\d+\.\d) +\d+\.\d +\d\.\d\d$", out[len(before) :], re.MULTILINE)
+    assert table == [("dynamics", "8.0"), ("gaussians", "4.0"), ("images", "2.0"), ("all", "14.0")]
 
 
 def test_infer_measures_every_effect_and_writes_the_smallest_spec(capsys, work, tmp_path):  # noqa: F811
