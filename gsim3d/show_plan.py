@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import argparse
 
+from gsim3d.pretrained import CHECKPOINT_HELP
+
 EPILOG = """\
-The spec is effects.yaml of the scene or of the data set around it, else that of the checkpoint; without a checkpoint
-the model is the preset tiny. Multiply-adds are predicted from the sizes of layers and the scene's masks, for matrix
-products, attention and splats: what they tell is how two plans compare (docs/effects.md).
+Without --effects the spec is effects.yaml of the scene or of the data set around it, else that of the checkpoint,
+which is what gsim3d simulate computes without --effects. Without a checkpoint the model is the preset tiny.
+Multiply-adds are predicted from the sizes of layers and the scene's masks, for matrix products, attention and splats:
+what they tell is how two plans compare (docs/effects.md). Where gsim3d pareto has timed the checkpoint, milliseconds
+are predicted from them.
 
 examples:
   gsim3d plan runs/data/ball/0000
   gsim3d plan runs/data/ball/0000 runs/model
+  gsim3d plan runs/data/ball/0000 elastic-small --effects effects.yaml
 """
 
 
@@ -19,7 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Shows which effects are computed, which are not and why, and what that costs."
     parser.epilog = EPILOG
     parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/data.md)")
-    parser.add_argument("checkpoint", metavar="CHECKPOINT", nargs="?", help="run folder, checkpoint or exported file")
+    parser.add_argument("checkpoint", metavar="CHECKPOINT", nargs="?", help=CHECKPOINT_HELP)
+    parser.add_argument("--effects", metavar="FILE", help="YAML file of what to compute (default: see below)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,7 +41,9 @@ def run(args: argparse.Namespace) -> int:
     simulator = build_simulator(presets.tiny(), seed=0) if restored is None else restored.simulator
     data = DataConfig() if restored is None else restored.data
     spec, source = EffectsSpec.of_scene(args.scene), "the scene's own"
-    if spec is None:
+    if args.effects is not None:
+        spec, source = EffectsSpec.load(args.effects), args.effects
+    elif spec is None:
         spec, source = EffectsSpec(), "none, so the model's own"
         if restored is not None:
             spec, source = restored.plan.spec, "the checkpoint's"
@@ -56,15 +64,30 @@ def run(args: argparse.Namespace) -> int:
     most = simulator.plan(EffectsSpec(outputs=OutputEffects(depth=True, alpha=True)))
     ours, all_on = (predicted_cost(p, simulator.config, work) for p in (plan, most))
     print("\npredicted multiply-adds of one step and one image, in millions")
-    rows = [("part", "this plan", "all that the model can", "share")]
-    for part, value in all_on.items():
-        rows.append((part, f"{ours[part] / 1e6:.1f}", f"{value / 1e6:.1f}", f"{ours[part] / max(value, 1.0):.2f}"))
-    total, most_total = sum(ours.values()), sum(all_on.values())
-    rows.append(("all", f"{total / 1e6:.1f}", f"{most_total / 1e6:.1f}", f"{total / max(most_total, 1.0):.2f}"))
-    print(in_columns(rows))
+    print(in_columns(_beside(ours, all_on, unit=1e6)))
     if once := background_cost(plan, simulator.config, work):
         print(f"and of the background, once a rollout: {once / 1e6:.1f}")
+    for device, times in ({} if restored is None else _times(args.checkpoint, restored)).items():
+        ours, all_on = (times.predicted(restored.plan, p, simulator.config, work) for p in (plan, most))
+        print(f"\npredicted milliseconds on {device}, from those that gsim3d pareto measured ({times.on})")
+        print(in_columns(_beside(ours, all_on)))
     return 0
+
+
+def _times(checkpoint: str, restored) -> dict:
+    """Device -> what a step of the checkpoint took there; empty where nobody measured it."""
+    from gsim3d.pareto.autotune import load_times
+    from gsim3d.pretrained import located
+
+    place = located(checkpoint)
+    return load_times(place if place.is_dir() else place.parent, restored)
+
+
+def _beside(ours: dict[str, float], all_on: dict[str, float], unit: float = 1.0) -> list[tuple[str, ...]]:
+    """Rows of a table: parts of a step under a plan, and under one with all that the model can."""
+    parts = [*((part, ours[part], all_on[part]) for part in all_on), ("all", sum(ours.values()), sum(all_on.values()))]
+    rows = ((p, f"{one / unit:.1f}", f"{most / unit:.1f}", f"{one / max(most, 1e-6):.2f}") for p, one, most in parts)
+    return [("part", "this plan", "all that the model can", "share"), *rows]
 
 
 def workload(scene, data):

@@ -25,9 +25,8 @@ from gsim3d import pretrained  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402
 from gsim3d.evaluate.pictures import write_curves  # noqa: E402
 from gsim3d.evaluate.report import markdown  # noqa: E402
-from gsim3d.generate.worlds import build_world  # noqa: E402
 from gsim3d.train import checkpoint  # noqa: E402
-from gsim3d.train.shipped import HELD_OUT_SEED, RECIPES, SEED  # noqa: E402
+from gsim3d.train.shipped import HELD_OUT_SEED, RECIPES  # noqa: E402
 from gsim3d.train.sittings import load_progress, weights_file  # noqa: E402
 
 PAGE = ROOT / "docs" / "trained.md"
@@ -74,7 +73,7 @@ def ship(name: str, state: Path, scores: Path, wrong: str) -> Path:
     (folder / "training.jsonl").write_text("".join(line + "\n" for line in kept))
     (folder / "scores.json").write_text(json.dumps(measured) + "\n")
     recipe = RECIPES[name.split("-")[0]]
-    world = build_world(recipe.world, "paper", {"seed": SEED, **recipe.options})
+    world = recipe.worlds()[0]
     described = {
         "steps": progress.step,
         "training_seconds": progress.seconds,
@@ -95,6 +94,10 @@ def card(name: str, recipe: dict, scores: dict, config: dict, wrong: str) -> str
     """The model card."""
     data, devices = config["data"], sorted({sitting["device"] for sitting in recipe["sittings"]})
     used = sum(sitting["trajectories"] for sitting in recipe["sittings"])
+    changes = [
+        json.dumps(options) for sitting in recipe["sittings"] for options in sitting.get("in_turn", ()) if options
+    ]
+    changed = f" (some with {', '.join(dict.fromkeys(changes))})" if changes else ""
     world = recipe["world"]
     return f"""# {name}
 
@@ -103,7 +106,8 @@ A gsim3d simulator of the world `{world["world"]}`: `gsim3d simulate {name} SCEN
 - **Sees** {data["history"]} steps from {data["context_views"]} calibrated cameras at {world["image_size"]} pixels with
   masks, {world["fps"]:g} steps a second; predicts particles, drawn as 3D Gaussians from any view.
 - **Trained on** {used:,} trajectories of {world["n_frames"]} steps and {world["n_cams"]} cameras, made by
-  `gsim3d generate {world["world"]} --preset paper --seed {world["seed"]}`, never the same twice; from images alone.
+  `gsim3d generate {world["world"]} --preset paper --seed {world["seed"]}`{changed}, never the same twice;
+  from images alone.
 - **Budget** {recipe["steps"]:,} optimizer steps in {recipe["training_seconds"]:,.0f} s of training,
   {len(recipe["sittings"])} sittings, on {" and ".join(devices)}; {recipe["skipped_steps"]} steps were skipped.
 - **Weights** averaged, bfloat16. `config.yaml` has all settings, `training.jsonl` a part of the log, `recipe.json` the

@@ -3,7 +3,7 @@
 
     python tools/train_shipped.py elastic --minutes 8 --state runs/elastic --out runs/elastic --device cuda
 
-One sitting: processes film trajectories on all spare cores, training begins with the first 64 and goes on with what is
+One sitting: processes film trajectories on all spare cores, training begins with the first 32 and goes on with what is
 there, while fewer of them film; near the end the learning rate falls, the state is written, and held-out trajectories
 are predicted, scored and filmed. Called again, the next sitting goes on with weights, optimizer and the next
 trajectories; what is kept and what is rounded stands in gsim3d/train/sittings.py. A sitting that is killed loses what
@@ -47,16 +47,15 @@ def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: st
 
     import torch
 
-    from gsim3d.generate.worlds import build_world
     from gsim3d.train.films import Filming, FilmStore
-    from gsim3d.train.shipped import SEED, SittingTrainer, train
+    from gsim3d.train.shipped import SittingTrainer, train
     from gsim3d.train.sittings import load_into, load_progress, weights_file
 
-    world = build_world(recipe.world, "paper", {"seed": SEED, **recipe.options})
+    worlds = recipe.worlds()
     progress = load_progress(state, name)
     with tempfile.TemporaryDirectory(prefix="sitting_") as scratch:
-        store = FilmStore(world, recipe.capacity, device)
-        with Filming(world, store, progress.next_trajectory, processes, scratch) as filming:
+        store = FilmStore(worlds[0], recipe.capacity, device)
+        with Filming(worlds, store, progress.next_trajectory, processes, scratch) as filming:
             trainer = SittingTrainer(recipe.train, store, Path(scratch) / "run", device)
             load_into(trainer, state, name, progress)
             if not filming.wait_for(recipe.first_films, end - time.monotonic()):
@@ -67,6 +66,7 @@ def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: st
                 "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
                 "processes": processes,
                 "seconds_before": waited,
+                "in_turn": list(recipe.in_turn),
             }
             filming.slow_down(max(1, processes // LATER_SHARE))
             held_out = film_held_out(recipe, Path(scratch) / "held_out")

@@ -12,6 +12,7 @@ from gsim3d.evaluate.report import write_json
 from gsim3d.files import MAX_TEXT, read_file
 from gsim3d.pareto.limit import PRESETS, TimeLimit
 from gsim3d.pareto.measure import Comparison, Effort, Point, measure, points_of, ties
+from gsim3d.pareto.part_times import PartTimes
 from gsim3d.pareto.settings import KNOBS, NOT_TUNED, Knob, Setting
 from gsim3d.pareto.subject import Subject
 from gsim3d.pareto.timing import Clock, DeviceClock
@@ -19,7 +20,7 @@ from gsim3d.train.restore import Restored
 
 # preset -> share of the reference's gain over the constant baseline, in dB, that it keeps at least
 PROMISES = {"exact": None, "balanced": 0.999, "fast": 0.99}
-SPEEDS = "speeds.json"
+SPEEDS, TIMES = "speeds.json", "measured"  # the file; the key of times in it, beside the presets of a device
 
 
 def autotune(
@@ -163,12 +164,15 @@ def _most_accurate(
     )
 
 
-def save_speeds(folder: Path, restored: Restored, presets: dict[str, Point]) -> Path:
-    """Keeps the tuned presets of a checkpoint on its device in ``folder``/speeds.json, beside those of others."""
+def save_speeds(folder: Path, restored: Restored, presets: dict[str, Point], times: PartTimes | None = None) -> Path:
+    """Keeps the tuned presets of a checkpoint on its device, and what its reference took, in ``folder``/speeds.json,
+    beside those of others."""
     path = folder / SPEEDS
     known = _read(path) if path.is_file() else {}
     digest, device = restored.checkpoint.digest, restored.device.type
     settings = {name: point.setting.to_dict() for name, point in presets.items()}
+    if times is not None:
+        settings[TIMES] = dataclasses.asdict(times)
     write_json(path, {**known, digest: {**known.get(digest, {}), device: settings}})
     return path
 
@@ -193,6 +197,14 @@ def load_speed(folder: Path, restored: Restored, preset: str) -> Setting:
                 "gsim3d pareto CHECKPOINT first"
             )
     return Setting.from_dict(found)
+
+
+def load_times(folder: Path, restored: Restored) -> dict[str, PartTimes]:
+    """Kind of device -> what the reference of a checkpoint took where it was measured; empty where it was not."""
+    path = folder / SPEEDS
+    devices = _read(path).get(restored.checkpoint.digest) if path.is_file() else None
+    known = {name: kept[TIMES] for name, kept in (devices or {}).items() if isinstance(kept, dict) and TIMES in kept}
+    return {name: PartTimes.from_dict(values, f"{path}: {name}: {TIMES}") for name, values in known.items()}
 
 
 def _read(path: Path) -> dict:

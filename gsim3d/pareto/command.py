@@ -19,7 +19,7 @@ sleep, patch and grid size, image size, ... For each setting: how far it is from
 checkpoint (float32, nothing left out) and from the truth, and what a step takes, by stage. Written to DIR: report.html
 (one page, needs no network), report.json, report.csv, a PNG of each figure. Beside the checkpoint: speeds.json, the
 fastest settings that keep 99.9 % ("balanced") and 99 % ("fast") of the reference's gain over particles that hold still,
-for `gsim3d simulate --speed`.
+for `gsim3d simulate --speed`, and the times of the reference, by which `gsim3d plan` predicts milliseconds.
 
 Without DATA, held-out scenes are generated in DIR/data (needs pip install 'gsim3d[generate]'): of the world and preset
 that a simulator that comes with gsim3d was trained on, else soft bodies of the mini preset.
@@ -87,6 +87,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.pareto import autotune, budget, machine, report
     from gsim3d.pareto.limit import REGIMES, TimeLimit
     from gsim3d.pareto.measure import FULL, QUICK, QUICK_ON_CPU, Comparison, measure, n_runs, points_of
+    from gsim3d.pareto.part_times import PartTimes
     from gsim3d.pareto.self_check import MOST_SECONDS, self_check
     from gsim3d.pareto.settings import KNOBS
     from gsim3d.pareto.subject import Subject
@@ -167,7 +168,7 @@ def run(args: argparse.Namespace) -> int:
         conditions["regimes"] = _regimes(subject, presets, clock, quick, lambda: limit.is_over(REGIMES))
         progress("pictures", REST - REST // 2)
         content, files = report.write(out, points, comparison, conditions, presets, training)
-    files.append(_keep_speeds(located(args.checkpoint), out, restored, presets))
+    files.append(_keep_speeds(located(args.checkpoint), out, restored, presets, PartTimes.of(subject, points[0])))
     print(report.table(content))
     for name, point in presets.items():
         print(f"--speed {name}: {point.setting.name}, {1e3 * point.step_seconds:.2f} ms a step")
@@ -232,15 +233,15 @@ def _regimes(subject, presets: dict, clock, quick: bool, is_late) -> dict:
     return report.regimes_as_dict(throughputs, training, work)
 
 
-def _keep_speeds(checkpoint, out, restored, presets: dict):
+def _keep_speeds(checkpoint, out, *kept):
     """Beside the checkpoint, where `gsim3d simulate --speed` looks; in ``out`` where nothing can be written there."""
     from gsim3d.pareto import autotune
 
     try:
-        return autotune.save_speeds(checkpoint if checkpoint.is_dir() else checkpoint.parent, restored, presets)
+        return autotune.save_speeds(checkpoint if checkpoint.is_dir() else checkpoint.parent, *kept)
     except OSError as error:
         print(f"{error.filename or checkpoint}: {error.strerror}; copy {autotune.SPEEDS} there, for gsim3d simulate")
-        return autotune.save_speeds(out, restored, presets)
+        return autotune.save_speeds(out, *kept)
 
 
 def _scenes(args: argparse.Namespace, restored, out, count: int | None) -> list:

@@ -135,10 +135,10 @@ def training_step(subject: Subject, clock: Clock, repeats: int = 3, quick: bool 
         return TrainingStep(problem="the checkpoint does not hold the configuration of its training")
     try:
         config = from_dict(TrainConfig, saved, "train")
-        stage = dataclasses.replace(config.stages[-1], steps=10**6)
+        stage = dataclasses.replace(config.all_stages[-1], steps=10**6)
         if quick:
             stage = dataclasses.replace(stage, batch=1, lead=0)
-        config = dataclasses.replace(config, stages=(stage,))
+        config = dataclasses.replace(config, stages=(stage,), in_turn=())
         with tempfile.TemporaryDirectory() as folder, deterministic():
             trainer = Trainer(config, subject.scenes, folder, device=subject.restored.device.type)
             trainer.simulator.train()

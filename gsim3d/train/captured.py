@@ -30,6 +30,7 @@ from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport
 from gsim3d.train.checkpoint import laid_out_as
+from gsim3d.train.parts import in_parts
 from gsim3d.train.samples import Batch
 from gsim3d.types import ASLEEP, DYNAMIC, Frames, Particles
 
@@ -65,7 +66,7 @@ class Prepared:
         """What batches have in common that one graph serves."""
         batch, table = self.batch, self.room.clouds
         images = len(batch.context.cameras), len(batch.targets.cameras)
-        return table.scenes, table.steps, batch.n_lead, batch.n_future, images
+        return table.scenes, table.steps, batch.n_lead, batch.n_future, batch.cut, batch.dynamics_alone, images
 
 
 def check_capturable(config: DynamicsConfig) -> None:
@@ -153,6 +154,7 @@ class _Step:
         self._context, self._targets = _own(batch.context), _own(batch.targets)
         self._room = owner.simulator.encoder.room(batch.context, rows)
         self._n_lead, self._n_future, self._weights = batch.n_lead, batch.n_future, weights.clone()
+        self._cut, self._dynamics_alone = batch.cut, batch.dynamics_alone
 
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
         self._load(prepared, weights)
@@ -186,7 +188,7 @@ class _Step:
     # ---- what runs ----
 
     def _encode(self, report: StabilityReport) -> Particles:
-        with self._owner.precision("encoder"):
+        with self._owner.precision("encoder"), torch.set_grad_enabled(not self._dynamics_alone):
             return self._owner.simulator.encode(self._context, room=self._room, report=report)
 
     def _rollout(
@@ -207,7 +209,7 @@ class _Step:
             if self._n_lead:
                 with torch.no_grad():
                     state = concatenate([state, *rollout(state, self._n_lead)])
-            return rollout(state, self._n_future, wrap=wrap)
+            return in_parts(partial(rollout, wrap=wrap), state, self._n_future, self._cut)
 
     def _compute(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> tuple:
         owner, dynamics, of_calls = self._owner, self._owner.simulator.dynamics, []
@@ -221,13 +223,15 @@ class _Step:
             return call
 
         state = self._encode(report)
-        particles = concatenate([state, *self._rollout(state, geometry, report, with_own_weights)])
+        steps = self._rollout(state, geometry, report, with_own_weights)
+        particles = concatenate(steps if self._dynamics_alone else [state, *steps])
         with owner.precision("renderer"):
             images = owner.simulator.draw(
                 particles, self._targets.cameras, plan=owner.plan, report=report, on_bad="drop"
             ).color
         loss, errors = owner.loss(images, self._targets, self._weights)
-        once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]
+        parts = () if self._dynamics_alone else (owner.simulator.encoder, owner.simulator.renderer)
+        once = [parameter for part in parts for parameter in part.parameters()]
         gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
         known = dict(zip(once, gradients))
         if of_calls:

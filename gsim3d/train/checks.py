@@ -14,12 +14,13 @@ def check_sharing(config: TrainConfig, n_processes: int, norm: str) -> None:
         raise InputError("captured: needs one process, workers 0 and nothing to recompute")
     if config.workers and n_processes > 1:
         raise InputError(f"workers: must be 0 in {n_processes} processes, which share the samples of a step themselves")
-    for i, stage in enumerate(config.stages):
-        if stage.batch < n_processes:
-            raise InputError(f"stages[{i}].batch: {stage.batch} samples are too few for {n_processes} processes")
+    for name in ("stages", "in_turn"):
+        for i, stage in enumerate(getattr(config, name)):
+            if stage.batch < n_processes:
+                raise InputError(f"{name}[{i}].batch: {stage.batch} samples are too few for {n_processes} processes")
 
 
 def check_history(config: TrainConfig, plan: Plan) -> None:
-    for history in {config.data.history, *(stage.history for stage in config.stages if stage.horizon)}:
+    for history in {config.data.history, *(stage.history for stage in config.all_stages if stage.horizon)}:
         if history > plan.history:
             raise InputError(f"data.history: {history} steps, but this model sees up to {plan.history}")

@@ -27,6 +27,11 @@ class StageConfig:
     horizon: simulated steps after the encoded ones; 0 trains encoder and renderer alone.
     lead: in every other optimizer step, on average, so many steps are simulated before these, without loss and
         gradients: the model learns to go on from its own states, which a long rollout needs.
+    cut: gradients flow back through so many simulated steps at most: a longer horizon is simulated in parts, each of
+        which begins where the one before ended; 0: through all.
+    dynamics_alone: only the dynamics learns. Encoder and renderer compute without gradients, and encoded steps are not
+        compared: a step costs less, so that there is time for more of them between those that train all parts. The
+        weights of the simulated steps add up to 1.
     history: encoded steps; 0: as many as the data section says.
     batch: scenes a step, of all processes together.
     target_views: images of each step that the loss compares.
@@ -40,6 +45,8 @@ class StageConfig:
     steps: int
     horizon: int = 0
     lead: int = 0
+    cut: int = 0
+    dynamics_alone: bool = False
     history: int = 0
     batch: int = 1
     target_views: int = 5
@@ -49,10 +56,11 @@ class StageConfig:
     warm_up: float = 0.01
 
     def __post_init__(self):
-        _at_least(self, steps=1, horizon=0, lead=0, history=0, batch=1, target_views=1)
+        _at_least(self, steps=1, horizon=0, lead=0, cut=0, history=0, batch=1, target_views=1)
         _at_least(self, begin_within=0, from_start=0, learning_rate=0, warm_up=0)
-        if self.lead and not self.horizon:
-            raise InputError("lead: needs a horizon of 1 or more")
+        for name in ("lead", "dynamics_alone"):
+            if getattr(self, name) and not self.horizon:
+                raise InputError(f"{name}: needs a horizon of 1 or more")
 
 
 @dataclass(frozen=True)
@@ -165,6 +173,7 @@ class TrainConfig:
     model: changes of the preset, nested like the model section of a checkpoint's config.yaml.
     effects: what a scene calls for, as :class:`gsim3d.effects.EffectsSpec` reads it.
     stages: run one after another.
+    in_turn, rounds: stages behind these that take turns: all of them one after another, so many times.
     precision: "fp32", "bf16" or "fp16" for each part of the model.
     recompute: parts of a step that the backward pass computes again instead of keeping them, which saves memory and
         changes no bit: "encoder", "steps" (all of a simulated step), "images". Beside "steps",
@@ -181,6 +190,8 @@ class TrainConfig:
 
     stages: tuple[StageConfig, ...] = (StageConfig(steps=1000), StageConfig(steps=4000, horizon=12))
     preset: str = "tiny"
+    in_turn: tuple[StageConfig, ...] = ()
+    rounds: int = 1
     model: dict = dataclasses.field(default_factory=dict)
     effects: dict = dataclasses.field(default_factory=dict)
     data: DataConfig = DataConfig()
@@ -196,18 +207,29 @@ class TrainConfig:
     log_every: int = 10
 
     def __post_init__(self):
-        _at_least(self, seed=0, workers=0, checkpoint_every=1, keep_checkpoints=1, log_every=1)
+        _at_least(self, rounds=1, seed=0, workers=0, checkpoint_every=1, keep_checkpoints=1, log_every=1)
         if not self.stages:
             raise InputError("stages: at least one is needed")
 
     @property
+    def all_stages(self) -> tuple[StageConfig, ...]:
+        return (*self.stages, *self.in_turn)
+
+    @property
     def n_steps(self) -> int:
-        return sum(stage.steps for stage in self.stages)
+        return _count(self.stages) + self.rounds * _count(self.in_turn)
 
     def stage_of(self, step: int) -> tuple[StageConfig, int]:
         """The stage that optimizer step ``step`` belongs to, and the step's place in it."""
-        for stage in self.stages:
+        once = _count(self.stages)
+        if once <= step < self.n_steps:
+            step = once + (step - once) % _count(self.in_turn)
+        for stage in self.all_stages:
             if step < stage.steps:
                 return stage, step
             step -= stage.steps
         raise IndexError("step lies after the last stage")
+
+
+def _count(stages: tuple[StageConfig, ...]) -> int:
+    return sum(stage.steps for stage in stages)

@@ -23,7 +23,7 @@ from gsim3d.generate.cameras import workspace_origin
 from gsim3d.generate.film import film, start_filming
 from gsim3d.generate.world import World
 from gsim3d.train.config import DataConfig, StageConfig
-from gsim3d.train.samples import Batch, draw_windows, thinned
+from gsim3d.train.samples import Batch, batch_of, draw_windows, first_target, thinned
 from gsim3d.types import Cameras, Frames
 
 QUEUED = 2  # trajectories that wait for each process that films
@@ -85,21 +85,22 @@ class FilmStore:
             windows = draw_windows(known, data, stage, seed, step, samples)
             n_context = windows[0].n_context
             frames = partial(self._frames, windows, data.near_far or (self._near, self._far))
-            context = frames([window.context_cams for window in windows], n_context)
-            targets = frames([window.target_cams for window in windows], n_context + stage.horizon)
-        return Batch(thinned(context, data), targets, n_context, stage.horizon, windows[0].lead)
+            context = frames([window.context_cams for window in windows], range(n_context))
+            shown = range(first_target(stage, n_context), n_context + stage.horizon)
+            targets = frames([window.target_cams for window in windows], shown)
+        return batch_of(stage, windows[0], thinned(context, data), targets)
 
-    def _frames(self, windows: Sequence[Window], depths: tuple[float, float], cams: Sequence, n_steps: int) -> Frames:
-        """The first ``n_steps`` steps of the windows, seen by the cameras of each step."""
+    def _frames(self, windows: Sequence[Window], depths: tuple[float, float], cams: Sequence, steps: range) -> Frames:
+        """Some steps of the windows, seen by the cameras of each step."""
         n_views, (n_frames, n_cams, height, width) = len(cams[0][0]), self._shape
         places = [
             ((window.scene.slot * n_frames + window.steps[step]) * n_cams + cam, cam)
             for window, by_step in zip(windows, cams, strict=True)
-            for step in range(n_steps)
+            for step in steps
             for cam in by_step[step]
         ]
         image, cam = torch.tensor(places, device=self.device).T
-        n_clouds = len(windows) * n_steps
+        n_clouds = len(windows) * len(steps)
         cloud = torch.arange(n_clouds, device=self.device)
         pixels = self._films.view(-1, height, width, 4)[image]
         labels, depth = pixels[..., 3], torch.ones(len(places), device=self.device)
@@ -114,8 +115,8 @@ class FilmStore:
                 width,
                 height,
             ),
-            cloud_scene=cloud // n_steps,
-            cloud_step=cloud % n_steps,
+            cloud_scene=cloud // len(steps),
+            cloud_step=cloud % len(steps),
             origin=self._origin.expand(len(windows), 3).clone(),
             masks=labels != BACKGROUND,
             dynamic=labels == MOVING,
@@ -125,16 +126,20 @@ class FilmStore:
 class Filming:
     """Processes that simulate and film one trajectory after another, from number ``first`` on, into a store.
 
-    Trajectory n is the n-th of the world's list (one of each object in turn), whatever its ``n_trajectories`` says;
-    each number is filmed once. Use as a context; leaving it ends the processes.
+    Trajectory n is the n-th of the worlds' list (one of each object in turn), whatever ``n_trajectories`` says; each
+    number is filmed once. Use as a context; leaving it ends the processes.
 
+    Args:
+        worlds: take turns, from one round of the objects to the next; all have the cameras and objects of the first.
     Attributes:
         next: the smallest number that no process was given.
     """
 
-    def __init__(self, world: World, store: FilmStore, first: int, processes: int, cache: str | Path | None = None):
-        self._world, self._store, self.next = world, store, first
-        self._processes, self._names = processes, world.object_names()
+    def __init__(
+        self, worlds: Sequence[World], store: FilmStore, first: int, processes: int, cache: str | Path | None = None
+    ):
+        self._worlds, self._store, self.next = worlds, store, first
+        self._processes, self._names = processes, worlds[0].object_names()
         self._wanted, self._begun = processes * QUEUED, 0
         self._cache = Path(tempfile.mkdtemp(prefix="films_", dir=cache))
         self._running = True
@@ -186,7 +191,8 @@ class Filming:
             number, names = self.next, self._names
             self.next, self._begun = number + 1, self._begun + 1
             scene = names[number % len(names)], number // len(names)
-            job = self._pool.submit(film, self._world, scene, str(self._cache / f"{number}.npy"))
+            world = self._worlds[scene[1] % len(self._worlds)]
+            job = self._pool.submit(film, world, scene, str(self._cache / f"{number}.npy"))
             job.add_done_callback(self._take)
 
     def _take(self, job: Future) -> None:

@@ -34,20 +34,13 @@ from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import Log, memory_gib, plain, progress_note
 from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
 from gsim3d.train.optimizer import Optimizer
+from gsim3d.train.parts import in_parts
 from gsim3d.train.precision import FIRST_SCALE, LossScale
 from gsim3d.train.processes import Processes
 from gsim3d.train.profile import check_profile, profiler
 from gsim3d.train.recompute import recomputed
 from gsim3d.train.restore import build_simulator, check_device, describe, model_config
-from gsim3d.train.samples import (
-    Batch,
-    check_scenes,
-    context_cameras,
-    draw_batch,
-    history_at,
-    spread_views,
-    thinned,
-)
+from gsim3d.train.samples import Batch, check_scenes, context_cameras, draw_batch, history_at, spread_views, thinned
 from gsim3d.train.schedule import one_cycle
 from gsim3d.train.settings import from_dict, to_dict
 from gsim3d.train.thawing import check_thawing, thaw
@@ -87,7 +80,7 @@ class Trainer:
     ):
         check_device(device)
         self.device, self.processes = device, processes or Processes()
-        check_scenes(scenes, config.data, config.stages)
+        check_scenes(scenes, config.data, config.all_stages)
         self.config, self.scenes, self.out = config, list(scenes), Path(out)
         self.plan_spec = EffectsSpec.from_dict(config.effects)
         self.simulator = build_simulator(model_config(config), config.seed).to(device)
@@ -194,8 +187,8 @@ class Trainer:
         rate = self.learning_rate(stage, place)
         statistics = [(buffer, buffer.clone()) for buffer in self.buffers.values()]
         entry = {"step": self.step, "loss": math.nan, "learning_rate": rate, "grad_norm": math.nan}
-        n_context = history_at(self.config.data, stage, self.config.seed, self.step)
-        errors = torch.full((n_context + stage.horizon,), math.nan)
+        n_past = 0 if stage.dynamics_alone else history_at(self.config.data, stage, self.config.seed, self.step)
+        errors = torch.full((n_past + stage.horizon,), math.nan)
         try:
             loss, errors, gradients, norm, seen = self._whole_batch(stage.batch)
             problem = self._look_at(entry, loss, gradients, norm, seen)
@@ -215,9 +208,10 @@ class Trainer:
         if self.config.precision.scales_loss and math.isfinite(entry["loss"]):
             entry["loss_scale"] = self.scale.value
             self.scale.update(math.isfinite(entry["grad_norm"]))
-        entry["past_psnr"] = _psnr(errors[:n_context])
+        if n_past:
+            entry["past_psnr"] = _psnr(errors[:n_past])
         if stage.horizon:
-            entry["future_psnr"] = _psnr(errors[n_context:])
+            entry["future_psnr"] = _psnr(errors[n_past:])
         self.step += 1
         return {name: plain(value) for name, value in entry.items()}
 
@@ -251,6 +245,9 @@ class Trainer:
             results = self._map(self._gradients, groups)
             loss, errors, gradients = _mean([result[:3] for result in results])
             loss, seen = loss.item(), [watch.seen(norms_scale) for *_, watch in results]
+        if self.config.stage_of(self.step)[0].dynamics_alone:
+            pairs = zip(self.parameters, gradients, strict=True)
+            gradients = [gradient if name.startswith("dynamics.") else None for name, gradient in pairs]
         if scale != 1:
             gradients = [None if gradient is None else gradient / scale for gradient in gradients]
         if norm is None:
@@ -365,6 +362,9 @@ class Trainer:
         """Weight of each step of a batch, on its device."""
         settings = self.config.loss
         weights = time_weights(batch.n_context, batch.n_future, balance=settings.balance, discount=settings.discount)
+        if batch.dynamics_alone:
+            weights = weights[batch.n_context :]
+            weights = weights / weights.sum()
         return weights.to(self.device)
 
     def loss_of_images(self, images: Tensor, targets: Frames, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -396,7 +396,7 @@ class Trainer:
         def again(part: str, generator: torch.Generator | None = None) -> Callable[[Callable], Callable]:
             return recomputed(simulator, generator) if part in recompute else (lambda f: f)
 
-        with precision.of("encoder", self.device):
+        with precision.of("encoder", self.device), torch.set_grad_enabled(not batch.dynamics_alone):
             particles = again("encoder")(lambda context: simulator.encode(context, **options))(batch.context)
         watch.count(particles.n_rows, particles.n_clouds)
         if batch.n_future:
@@ -409,12 +409,12 @@ class Trainer:
                     with torch.no_grad():
                         ahead = simulator.rollout(particles, batch.n_lead, self.plan, generator=noise, **options)
                         begin = concatenate([particles, *ahead])
-                steps = simulator.rollout(
-                    begin, batch.n_future, self.plan, generator=noise, wrap=again("steps", noise), **options
-                )
+                options_of_steps = {"generator": noise, "wrap": again("steps", noise), **options}
+                rollout = partial(simulator.rollout, plan=self.plan, **options_of_steps)
+                steps = in_parts(rollout, begin, batch.n_future, batch.cut)
             if self._is_logged:
                 watch.follow(steps)
-            particles = concatenate([particles, *steps])
+            particles = concatenate(steps if batch.dynamics_alone else [particles, *steps])
         with precision.of("renderer", self.device):
             render = again("images")(
                 lambda p: simulator.render(p, batch.targets.cameras, plan=self.plan, **options).color
@@ -540,7 +540,8 @@ class _Loss(nn.Module):
 def _fixed_settings(settings: dict) -> dict:
     """Of a run's settings those that must stay, as far as parts of them may change."""
     fixed = {**settings, "workers": bool(settings.get("workers"))}
-    for name, free in (("optimizer", FREE_OF_OPTIMIZER), ("stages", FREE_OF_STAGES)):
+    parts_of = {"optimizer": FREE_OF_OPTIMIZER, "stages": FREE_OF_STAGES, "in_turn": FREE_OF_STAGES}
+    for name, free in parts_of.items():
         parts = settings.get(name) or []
         kept = [
             {k: v for k, v in part.items() if k not in free} for part in ([parts] if name == "optimizer" else parts)

@@ -20,7 +20,9 @@ class Batch:
     """Windows of B scenes, all of n_context + n_lead + n_future steps.
 
     context: input images of the first n_context steps of each.
-    targets: images of these and of the last n_future; image i shows cloud b * (n_context + n_future) + t.
+    targets: images of these and of the last n_future; image i shows cloud b * (n_context + n_future) + t. Where only
+        the dynamics learns, of the last n_future alone.
+    dynamics_alone, cut: as of :class:`gsim3d.train.config.StageConfig`.
     """
 
     context: Frames
@@ -28,13 +30,20 @@ class Batch:
     n_context: int
     n_future: int
     n_lead: int = 0
+    dynamics_alone: bool = False
+    cut: int = 0
+
+    @property
+    def n_past(self) -> int:
+        """Encoded steps among the targets."""
+        return 0 if self.dynamics_alone else self.n_context
 
     def to(self, device: str | torch.device) -> Batch:
         return dataclasses.replace(self, context=self.context.to(device), targets=self.targets.to(device))
 
     def target_step(self) -> Tensor:
         """int64 [I], the step in its window that each target image shows."""
-        return self.targets.cameras.image_cloud % (self.n_context + self.n_future)
+        return self.targets.cameras.image_cloud % (self.n_past + self.n_future)
 
 
 def check_scenes(scenes: Sequence[Scene], data: DataConfig, stages: Sequence[StageConfig]) -> None:
@@ -81,11 +90,24 @@ def draw_batch(
     n_context = windows[0].n_context
     chosen = [window.scene for window in windows]
     steps = [window.steps for window in windows]
+    shown = slice(first_target(stage, n_context), None)
     masked = all(scene.has_segmentation() for scene in chosen)
     context_cams = [window.context_cams for window in windows]
     context = make_frames(chosen, context_cams, [s[:n_context] for s in steps], masked=masked)
-    targets = make_frames(chosen, [window.target_cams for window in windows], steps, masked=masked)
-    return Batch(thinned(context, data), targets, n_context, stage.horizon, windows[0].lead)
+    target_cams = [window.target_cams[shown] for window in windows]
+    targets = make_frames(chosen, target_cams, [s[shown] for s in steps], masked=masked)
+    return batch_of(stage, windows[0], thinned(context, data), targets)
+
+
+def batch_of(stage: StageConfig, window: Window, context: Frames, targets: Frames) -> Batch:
+    """A batch of windows like ``window``."""
+    how = {"dynamics_alone": stage.dynamics_alone, "cut": stage.cut}
+    return Batch(context, targets, window.n_context, stage.horizon, window.lead, **how)
+
+
+def first_target(stage: StageConfig, n_context: int) -> int:
+    """The first of a window's steps that the loss looks at."""
+    return n_context if stage.dynamics_alone else 0
 
 
 def draw_windows(

@@ -9,7 +9,10 @@ from gsim3d import presets
 from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec
 from gsim3d.infer_effects import propose, smaller
 from gsim3d.interop import read_ply
-from gsim3d.train.restore import build_simulator
+from gsim3d.pareto import autotune
+from gsim3d.pareto.part_times import PartTimes
+from gsim3d.show_plan import workload
+from gsim3d.train.restore import build_simulator, restore
 from tests.effects.test_round_trip import saved
 from tests.test_commands import call, work  # noqa: F401
 from tests.tiny_scenes import write_scene
@@ -35,6 +38,11 @@ def test_plan_reads_the_spec_that_the_data_ship(capsys, tmp_path):
     assert "a history of one step has nothing to merge" in out and "background is masked_out" in out
     share = float(re.search(r"^dynamics .* (\d\.\d\d)$", out, re.MULTILINE)[1])
     assert share < 0.5
+    file = tmp_path / "mine.yaml"
+    file.write_text("appearance: {held: [moving, {which: frozen, box: [[0, 0, 0], [1, 1, 1]]}]}")
+    code, out, _ = call(capsys, "plan", scene, "--effects", file)
+    assert code == 0 and f"effects: {file}, {EffectsSpec.load(file).hash}" in out
+    assert re.search(r"^held bodies +yes +appearance.held names 2, whose features stay", out, re.MULTILINE)
     (scene / "effects.yaml").write_text("dynamics: {history: 9}")
     code, out, err = call(capsys, "plan", scene)
     assert code == 2 and "unsupported effect dynamics.history: this model goes up to 2; got 9" in err
@@ -50,6 +58,21 @@ def test_plan_tells_what_a_background_costs_once(capsys, tmp_path):
         r"^background made once +yes +in this model frozen particles see only each other", out, re.MULTILINE
     )
     assert float(re.search(r"^and of the background, once a rollout: (\d+\.\d)$", out, re.MULTILINE)[1]) > 0
+
+
+def test_plan_predicts_milliseconds_of_a_checkpoint_that_was_timed(capsys, work):  # noqa: F811
+    scene, run = work / "data" / "ball" / "0000", work / "run"
+    code, before, _ = call(capsys, "plan", scene, run)
+    assert code == 0 and "milliseconds" not in before
+    restored = restore(run)
+    times = PartTimes("a clock", workload(restored.open_scene(scene), restored.data), 8.0, 4.0, 2.0)
+    autotune.save_speeds(run, restored, {}, times)
+    code, out, _ = call(capsys, "plan", scene, run)
+    (run / autotune.SPEEDS).unlink()
+    assert code == 0 and out.startswith(before)
+    assert "predicted milliseconds on cpu, from those that gsim3d pareto measured (a clock)\n" in out
+    table = re.findall(r"^(\w+) +(\d+\.\d) +\d+\.\d +\d\.\d\d$", out[len(before) :], re.MULTILINE)
+    assert table == [("dynamics", "8.0"), ("gaussians", "4.0"), ("images", "2.0"), ("all", "14.0")]
 
 
 def test_infer_measures_every_effect_and_writes_the_smallest_spec(capsys, work, tmp_path):  # noqa: F811
@@ -153,7 +176,7 @@ def test_simulate_tells_how_much_rested(capsys, work, tmp_path):  # noqa: F811
     [
         ("- {step: 9, op: remove, of: frozen}", "edit at step 9, remove: the rollout has steps 0 to 1"),
         ("- {step: 0, op: fly}", "edit 0 at step 0: op must be one of remove, move"),
-        ("- {step: 0, op: insert, scene: nowhere}", "nowhere"),
+        ("- {step: 0, op: insert, scene: nowhere}", "edit 0 at step 0, insert: "),
     ],
 )
 def test_edits_that_cannot_be_made_end_with_one_line(capsys, work, tmp_path, text, message):  # noqa: F811

@@ -187,8 +187,11 @@ def test_the_command_from_end_to_end(subject, run, tmp_path, capsys, monkeypatch
     assert content["training"]["steps"] == [0, 20] and content["not_turned"] == {} and "unfinished" not in content
     assert content["subject"]["scenes"] == 2 and "training step: not measured" in capsys.readouterr().out
     speeds = json.loads((run / SPEEDS).read_text())
-    assert list(speeds[checkpoint.load(run).digest]["cpu"]) == ["exact", "balanced", "fast"]
-    assert all("checkpoint" not in setting for setting in speeds[checkpoint.load(run).digest]["cpu"].values())
+    kept = speeds[checkpoint.load(run).digest]["cpu"]
+    assert list(kept) == ["exact", "balanced", "fast", "measured"]
+    assert all("checkpoint" not in setting for setting in kept.values())
+    parts = sum(kept["measured"][part] for part in ("dynamics", "gaussians", "images"))
+    assert parts == pytest.approx(sum(content["points"][0]["step_ms"]["stages"].values()))
 
 
 def test_what_was_measured_before_an_end_is_kept(subject, run, tmp_path, monkeypatch):

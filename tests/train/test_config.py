@@ -51,6 +51,9 @@ def test_what_is_left_out_comes_from_the_base():
         ({"stages": 3}, r"^stages: must be a list"),
         ({"stages": []}, r"stages: at least one"),
         ({"stages": [{"steps": 1, "lead": 2}]}, r"stages\[0\]: lead: needs a horizon"),
+        ({"stages": [{"steps": 1, "dynamics_alone": True}]}, r"stages\[0\]: dynamics_alone: needs a horizon"),
+        ({"in_turn": [{"steps": 1, "lead": 1}]}, r"in_turn\[0\]: lead: needs a horizon"),
+        ({"rounds": 0}, r"rounds must be at least 1"),
         ({"stages": [{"steps": 0}]}, r"stages\[0\]: steps must be at least 1"),
         ({"data": {"context_cameras": [1], "target_only_cameras": [1]}}, r"share a camera"),
     ],
@@ -100,6 +103,17 @@ def test_stages_follow_one_another():
     assert [(config.stage_of(i)[0].horizon, config.stage_of(i)[1]) for i in range(5)] == [
         (0, 0), (0, 1), (0, 2), (4, 0), (4, 1),
     ]  # fmt: skip
+
+
+def test_the_last_stages_take_turns():
+    stages = (StageConfig(steps=2), StageConfig(steps=1, horizon=4), StageConfig(steps=2, horizon=6))
+    config = TrainConfig(stages=stages[:1], in_turn=stages[1:], rounds=3)
+    assert config.n_steps == 2 + 3 * 3
+    found = [config.stage_of(step) for step in range(config.n_steps)]
+    assert [stage.horizon for stage, _ in found] == [0, 0] + 3 * [4, 6, 6]
+    assert [place for _, place in found] == [0, 1] + 3 * [0, 0, 1]
+    with pytest.raises(IndexError):
+        config.stage_of(config.n_steps)
 
 
 def test_the_documented_training_is_the_published_one():

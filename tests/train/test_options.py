@@ -205,3 +205,52 @@ def test_windows_begin_within_the_steps_asked_for(within, lead, starts):
     assert drawn[lead > 0] == set(range(starts))
     always = dataclasses.replace(stage, from_start=1.0)
     assert draw_windows([Long()], DataConfig(context_views=2), always, 0, 3, [0])[0].steps[0] == 0
+
+
+@pytest.mark.parametrize("where", ["calls", "graphs"])
+def test_the_dynamics_learns_alone(folder, tmp_path, where, device):
+    stage = dataclasses.replace(CONFIG.stages[1], steps=9, batch=2, dynamics_alone=True)
+    trainer = trainer_at(folder, tmp_path, 0, device.type, stages=(stage,))
+    if where == "graphs":
+        trainer.captured = trainer._capture()
+    before = {name: value.clone() for name, value in trainer.parameters.items()}
+    entries = [trainer.train_step() for _ in range(2)]
+    assert all("past_psnr" not in entry and entry["future_psnr"] > 0 for entry in entries)
+    assert set(entries[0]["grad_norm_by_module"]) == {"dynamics"} and entries[1]["grad_norm"] > 0
+    for name, value in trainer.parameters.items():
+        if not name.startswith("dynamics."):
+            assert torch.equal(value, before[name]), name
+    assert any(not torch.equal(value, before[name]) for name, value in trainer.parameters.items())
+
+
+def test_the_loss_of_the_dynamics_alone_is_that_of_the_simulated_steps(folder, tmp_path):
+    trainer = trainer_at(folder, tmp_path)
+    stage = dataclasses.replace(CONFIG.stages[1], batch=2)
+    whole, alone = (
+        trainer.loss(draw_batch(trainer.scenes, CONFIG.data, s, 0, LATER, [0, 1]))
+        for s in (stage, dataclasses.replace(stage, dynamics_alone=True))
+    )
+    torch.testing.assert_close(alone[1], whole[1][-stage.horizon :])
+    weights = torch.tensor([1.0, CONFIG.loss.discount])
+    assert alone[0].item() == pytest.approx((weights * alone[1]).sum().item() / weights.sum().item(), rel=1e-5)
+
+
+def test_gradients_flow_back_through_as_many_steps_as_asked_for(folder, tmp_path):
+    """The last of four steps is compared: gradients reach the particles of those steps that are not cut off."""
+    trainer = trainer_at(folder, tmp_path)
+    with torch.no_grad():
+        for parameter in trainer.simulator.dynamics.net.head.parameters():
+            parameter.normal_(0, 0.02, generator=torch.Generator().manual_seed(0))
+    reached = {}
+    for cut in (0, 1, 2, 3, 4):
+        stage = dataclasses.replace(CONFIG.stages[1], horizon=4, cut=cut, from_start=1.0)
+        batch, watch = draw_batch(trainer.scenes, CONFIG.data, stage, 0, LATER, [0]), StepWatch()
+        trainer.step = 0  # one that is logged
+        images = trainer._images(batch, 0, watch)
+        errors = (images - batch.targets.images.permute(0, 2, 3, 1)).square()
+        errors[batch.target_step() == batch.n_context + 3].mean().backward()
+        reached[cut] = [norm > 0 for norm in watch.norms()]
+    assert reached[0] == reached[4] == [True] * 4
+    assert reached[1] == [False, False, False, True]
+    assert reached[2] == [False, False, True, True]
+    assert reached[3] == [False, False, False, True]  # three steps, then one

@@ -58,10 +58,12 @@ def store(world, films):
 def test_a_store_gives_what_scene_folders_give(store, tmp_path):
     folders = generate(tmp_path, preset="mini", processes=1, progress=False, **OPTIONS).folders
     scenes = [Scene.open(folder) for folder in folders]
-    for step, stage in enumerate((CONFIG.stages[0], dataclasses.replace(CONFIG.stages[1], batch=3, lead=2))):
+    led = dataclasses.replace(CONFIG.stages[1], batch=3, lead=2)
+    for step, stage in enumerate((CONFIG.stages[0], led, dataclasses.replace(led, dynamics_alone=True))):
         given = store.draw(CONFIG.data, stage, 5, step, range(3))
         wanted = draw_batch(scenes, CONFIG.data, stage, 5, step, range(3))
-        assert (given.n_context, given.n_future) == (wanted.n_context, wanted.n_future)
+        assert (given.n_context, given.n_past, given.n_future) == (wanted.n_context, wanted.n_past, wanted.n_future)
+        assert len(given.targets.images) == len(given.target_step()) == 3 * 2 * (given.n_past + given.n_future)
         for part in ("context", "targets"):
             a, b = getattr(given, part), getattr(wanted, part)
             for name in ("images", "cloud_scene", "cloud_step", "origin", "masks", "dynamic"):
@@ -79,7 +81,7 @@ def test_the_newest_replace_the_oldest(store, films):
 
 def test_trajectories_are_filmed_once_each_while_others_work(world, films, tmp_path):
     store = FilmStore(world, 4, "cpu")
-    with Filming(world, store, 1, 1, tmp_path) as filming:
+    with Filming([world], store, 1, 1, tmp_path) as filming:
         assert filming.wait_for(2, seconds=60)
         filming.slow_down(1)
         assert filming.wait_for(4, seconds=60) and 4 <= filming.next <= 8
@@ -88,9 +90,19 @@ def test_trajectories_are_filmed_once_each_while_others_work(world, films, tmp_p
     assert not list(tmp_path.iterdir()) and threading.active_count() < 50
 
 
+def test_worlds_take_turns(world, films, tmp_path):
+    store = FilmStore(world, 2, "cpu")
+    raised = dataclasses.replace(world, ground_height=(0.2, 0.2))
+    with Filming([world, raised], store, 0, 1, tmp_path) as filming:
+        assert filming.wait_for(2, seconds=60)
+    assert torch.equal(store._films[0], torch.from_numpy(films[0]))
+    lower, higher = ((film[0, 0, ..., 3] == FIXED).nonzero()[:, 0].float().mean() for film in store._films)
+    assert higher < lower - 1  # rows are counted from the top of an image
+
+
 def test_what_a_process_raises_is_told(world, tmp_path):
     store = FilmStore(dataclasses.replace(world, n_frames=5), 4, "cpu")  # its films are shorter than those that come
-    with Filming(world, store, 0, 1, tmp_path) as filming:
+    with Filming([world], store, 0, 1, tmp_path) as filming:
         with pytest.raises(RuntimeError, match="size"):
             filming.wait_for(1, seconds=60)
 
@@ -228,8 +240,13 @@ def test_a_sitting_ends_on_time_with_a_falling_rate_and_a_saved_state(store, tmp
 
 def test_recipes_are_sound():
     for world, recipe in RECIPES.items():
-        settings = build_world(recipe.world, "paper", {"seed": shipped.SEED, **recipe.options})
-        data, stages = recipe.train.data, recipe.train.stages
-        assert recipe.world == world and recipe.first_films == 64 <= recipe.capacity
-        assert settings.n_frames >= data.history + max(stage.horizon for stage in stages)
-        assert stages[-1].horizon == 12 and shipped.SEED != shipped.HELD_OUT_SEED
+        data, stages, first, *others = recipe.train.data, recipe.train.stages, *recipe.worlds()
+        assert recipe.world == world == first.name and recipe.first_films <= recipe.capacity
+        assert first == build_world(world, "paper", {"seed": shipped.SEED, **recipe.options})
+        assert all(replace_ground(other, first) == first for other in others)
+        assert first.n_frames >= data.history + max(stage.lead + stage.horizon for stage in stages)
+        assert recipe.train.n_steps >= 1_000_000 and shipped.SEED != shipped.HELD_OUT_SEED
+
+
+def replace_ground(world, other):
+    return dataclasses.replace(world, ground_height=other.ground_height)
