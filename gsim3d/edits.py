@@ -268,7 +268,10 @@ def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Partic
     if kind is Insert:
         if "particles" in values or not isinstance(values.get("scene"), str):
             raise InputError(f"{where}: scene must name a scene folder; got {values.get('scene')!r}")
-        given["particles"] = encode(folder / values.pop("scene"))
+        try:
+            given["particles"] = encode(folder / values.pop("scene"))
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
     return Edit(step, dataclasses.replace(typed(kind, values, where), **given))
 
 

@@ -41,17 +41,24 @@ class Selection:
             InputError: the newest steps have none.
         """
         activity = {"moving": DYNAMIC, "frozen": FROZEN}.get(self.which)
-        rows = torch.ones_like(particles.activity, dtype=torch.bool)
+        rows = kind = torch.ones_like(particles.activity, dtype=torch.bool)
         if activity is not None:
-            rows = particles.activity == activity
+            rows = kind = particles.activity == activity
         if self.box is not None:
             for place, low, high in zip(particles.means.unbind(1), *self.box, strict=True):
                 rows = rows & (place >= low) & (place <= high)
         captured = rows.is_cuda and torch.cuda.is_current_stream_capturing()
         if not captured and not bool(rows[newest_rows(particles)].any()):
-            place = "" if self.box is None else f" in the box {[list(corner) for corner in self.box]}"
-            raise InputError(f"no particle is meant: there are none that are {self.which}{place}")
+            raise InputError(self._nobody(particles.means[kind & newest_rows(particles)]))
         return rows
+
+    def _nobody(self, places: Tensor) -> str:
+        """Why nobody is meant, where particles of the kind are at ``places``."""
+        message = f"no particle is meant: there are none that are {self.which}"
+        if self.box is None or not len(places):
+            return message
+        corners = [[round(x, 2) for x in corner.tolist()] for corner in (places.amin(0), places.amax(0))]
+        return f"{message} in the box {[list(corner) for corner in self.box]}; theirs is {corners}"
 
 
 def rows_of_any(selections: Iterable[Selection], particles: Particles, where: str) -> Tensor:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import argparse
 
+from gsim3d.pretrained import CHECKPOINT_HELP
+
 EPILOG = """\
-The spec is effects.yaml of the scene or of the data set around it, else that of the checkpoint; without a checkpoint
-the model is the preset tiny. Multiply-adds are predicted from the sizes of layers and the scene's masks, for matrix
-products, attention and splats: what they tell is how two plans compare (docs/effects.md).
+Without --effects the spec is effects.yaml of the scene or of the data set around it, else that of the checkpoint,
+which is what gsim3d simulate computes without --effects. Without a checkpoint the model is the preset tiny.
+Multiply-adds are predicted from the sizes of layers and the scene's masks, for matrix products, attention and splats:
+what they tell is how two plans compare (docs/effects.md).
 
 examples:
   gsim3d plan runs/data/ball/0000
   gsim3d plan runs/data/ball/0000 runs/model
+  gsim3d plan runs/data/ball/0000 elastic-small --effects effects.yaml
 """
 
 
@@ -19,7 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Shows which effects are computed, which are not and why, and what that costs."
     parser.epilog = EPILOG
     parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/data.md)")
-    parser.add_argument("checkpoint", metavar="CHECKPOINT", nargs="?", help="run folder, checkpoint or exported file")
+    parser.add_argument("checkpoint", metavar="CHECKPOINT", nargs="?", help=CHECKPOINT_HELP)
+    parser.add_argument("--effects", metavar="FILE", help="YAML file of what to compute (default: see below)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,7 +40,9 @@ def run(args: argparse.Namespace) -> int:
     simulator = build_simulator(presets.tiny(), seed=0) if restored is None else restored.simulator
     data = DataConfig() if restored is None else restored.data
     spec, source = EffectsSpec.of_scene(args.scene), "the scene's own"
-    if spec is None:
+    if args.effects is not None:
+        spec, source = EffectsSpec.load(args.effects), args.effects
+    elif spec is None:
         spec, source = EffectsSpec(), "none, so the model's own"
         if restored is not None:
             spec, source = restored.plan.spec, "the checkpoint's"

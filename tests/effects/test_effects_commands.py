@@ -35,6 +35,11 @@ def test_plan_reads_the_spec_that_the_data_ship(capsys, tmp_path):
     assert "a history of one step has nothing to merge" in out and "background is masked_out" in out
     share = float(re.search(r"^dynamics .* (\d\.\d\d)$", out, re.MULTILINE)[1])
     assert share < 0.5
+    file = tmp_path / "mine.yaml"
+    file.write_text("appearance: {held: [moving, {which: frozen, box: [[0, 0, 0], [1, 1, 1]]}]}")
+    code, out, _ = call(capsys, "plan", scene, "--effects", file)
+    assert code == 0 and f"effects: {file}, {EffectsSpec.load(file).hash}" in out
+    assert re.search(r"^held bodies +yes +appearance.held names 2, whose features stay", out, re.MULTILINE)
     (scene / "effects.yaml").write_text("dynamics: {history: 9}")
     code, out, err = call(capsys, "plan", scene)
     assert code == 2 and "unsupported effect dynamics.history: this model goes up to 2; got 9" in err
@@ -153,7 +158,7 @@ def test_simulate_tells_how_much_rested(capsys, work, tmp_path):  # noqa: F811
     [
         ("- {step: 9, op: remove, of: frozen}", "edit at step 9, remove: the rollout has steps 0 to 1"),
         ("- {step: 0, op: fly}", "edit 0 at step 0: op must be one of remove, move"),
-        ("- {step: 0, op: insert, scene: nowhere}", "nowhere"),
+        ("- {step: 0, op: insert, scene: nowhere}", "edit 0 at step 0, insert: "),
     ],
 )
 def test_edits_that_cannot_be_made_end_with_one_line(capsys, work, tmp_path, text, message):  # noqa: F811

@@ -1,6 +1,7 @@
 """Bodies that a spec names keep their features wherever they go; all others have those of a rollout without names."""
 
 import dataclasses
+import json
 
 import pytest
 import torch
@@ -175,5 +176,9 @@ def test_a_body_that_is_not_there():
     case = Case()
     nowhere = Selection("moving", ((8.0, 8.0, 8.0), (9.0, 9.0, 9.0)))
     message = r"effects: appearance.held\[1\]: no particle is meant: there are none that are moving in the box \[\[8.0"
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=message) as error:
         rolled(case, holding(half(case.state), nowhere))
+    start = last_steps(case.state, 1)
+    places = start.means[start.activity == 0]
+    corners = str(error.value).split("; theirs is ")[1]
+    assert_close_relative_to_max(torch.tensor(json.loads(corners)), torch.stack([places.amin(0), places.amax(0)]), 0.01)
