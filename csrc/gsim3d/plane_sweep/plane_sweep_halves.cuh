@@ -1,6 +1,7 @@
 // Features of the sweep as halves: a row for each pixel, and fragments of tiles.
 #pragma once
 
+#include "gsim3d/core/overlap.cuh"
 #include "gsim3d/plane_sweep/plane_sweep_tile.cuh"
 
 namespace gsim3d::cuda {
@@ -20,6 +21,7 @@ struct SweepHalves {
 __global__ void __launch_bounds__(512) largest_kernel(const float* __restrict__ values, int64_t n /* of an image */,
                                                       uint32_t* __restrict__ largest) {
   __shared__ uint32_t shared[16];
+  let_next_begin();
   uint32_t own = 0;
   values += int64_t{blockIdx.x / kParts} * n;
   constexpr int64_t step = int64_t{kParts} * 512;
@@ -44,25 +46,30 @@ __global__ void __launch_bounds__(512) largest_kernel(const float* __restrict__ 
 // A block takes 32 channels of a tile of [n_images, channels, n_pixels]. tiles: null where nobody wants them.
 __global__ void __launch_bounds__(kTileThreads)
     to_halves_kernel(const float* __restrict__ features, int64_t channels, TileSizes s,
-                     const uint32_t* __restrict__ largest, float* __restrict__ inverses, __half* __restrict__ rows,
+                     const uint32_t* largest /* still written when this begins */, float* __restrict__ inverses,
+                     __half* __restrict__ rows,
                      __half* __restrict__ tiles) {
   __shared__ float held[32][kTile + 1];
   const int64_t image = blockIdx.x / s.n_tiles;
   const int32_t tile = blockIdx.x % s.n_tiles, first = blockIdx.y * 32;
   const int lane = threadIdx.x % kWarp, eighth = threadIdx.x % 8 * 4, row = threadIdx.x / 8;
   const TilePixel pixel(tile, s);
-  const HalfScale scale(largest_of(largest + image * kParts));
-  if (tile == 0 && first == 0 && threadIdx.x == 0) inverses[image] = scale.inverse;
+  let_next_begin();
   for (int c = threadIdx.x / kWarp; c < 32; c += kTileWarps) {
     const bool here = pixel.here && first + c < channels;
     const int64_t plane = image * channels + first + c;
-    held[c][lane] = here ? features[plane * s.n_pixels + pixel.v * s.width + pixel.u] * scale.scale : 0.0f;
+    held[c][lane] = here ? features[plane * s.n_pixels + pixel.v * s.width + pixel.u] : 0.0f;
   }
+  wait_for_previous();
+  const HalfScale scale(largest_of(largest + image * kParts));
+  if (tile == 0 && first == 0 && threadIdx.x == 0) inverses[image] = scale.inverse;
   __syncthreads();
+  const auto halves = [&](float x, float y) { return Halves(x * scale.scale, y * scale.scale); };
   const int32_t u = tile % s.columns * kTileWidth + row % kTileWidth;
   const int32_t v = tile / s.columns * kTileHeight + row / kTileWidth;
   if (u < s.width && v < s.height) {
-    const Halves a(held[eighth][row], held[eighth + 1][row]), b(held[eighth + 2][row], held[eighth + 3][row]);
+    const Halves a = halves(held[eighth][row], held[eighth + 1][row]);
+    const Halves b = halves(held[eighth + 2][row], held[eighth + 3][row]);
     __half* to = rows + (image * s.n_pixels + v * s.width + u) * 2 * s.channels + first + eighth;
     *reinterpret_cast<uint2*>(to) = make_uint2(a.high, b.high);
     *reinterpret_cast<uint2*>(to + s.channels) = make_uint2(a.low, b.low);
@@ -71,8 +78,8 @@ __global__ void __launch_bounds__(kTileThreads)
   if (tiles && threadIdx.x < 4 * kWarp) {
     const int part = threadIdx.x / kWarp, fragment = part % 2;
     const int c = part / 2 * 16 + lane / 4, p = lane % 4 * 8 + fragment * 4;
-    const Halves a(held[c][p], held[c][p + 1]), b(held[c + 8][p], held[c + 8][p + 1]);
-    const Halves d(held[c][p + 2], held[c][p + 3]), e(held[c + 8][p + 2], held[c + 8][p + 3]);
+    const Halves a = halves(held[c][p], held[c][p + 1]), b = halves(held[c + 8][p], held[c + 8][p + 1]);
+    const Halves d = halves(held[c][p + 2], held[c][p + 3]), e = halves(held[c + 8][p + 2], held[c + 8][p + 3]);
     const int64_t sixteenth = ((image * s.n_tiles + tile) * s.channels + first) / 16 + part / 2;
     uint4* to = reinterpret_cast<uint4*>(tiles) + (sixteenth * 4 + fragment) * kWarp + lane;
     to[0] = make_uint4(a.high, b.high, d.high, e.high);
@@ -89,9 +96,9 @@ SweepHalves make_halves(const char* op, const float* features, const PlaneSweep<
   __half* tiles = with_tiles ? workspace.take<__half>(sweep.n_images * s.n_tiles * kTile * 2 * s.channels) : nullptr;
   launch(op, largest_kernel, blocks_for(op, sweep.n_images * kParts, 1), 512, 0, stream, features,
          sweep.channels * s.n_pixels, largest);
-  launch(op, to_halves_kernel,
-         dim3(blocks_for(op, sweep.n_images * s.n_tiles, 1), static_cast<unsigned>(s.channels / 32)), kTileThreads, 0,
-         stream, features, sweep.channels, s, largest, inverses, rows, tiles);
+  launch_overlapping(op, to_halves_kernel,
+                     dim3(blocks_for(op, sweep.n_images * s.n_tiles, 1), static_cast<unsigned>(s.channels / 32)),
+                     kTileThreads, 0, stream, features, sweep.channels, s, largest, inverses, rows, tiles);
   return {rows, tiles, inverses};
 }
 

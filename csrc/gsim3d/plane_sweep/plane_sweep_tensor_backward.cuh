@@ -298,7 +298,7 @@ __global__ void __launch_bounds__(kTileThreads, 2)
     const int64_t source = sweep.src_images[pair];
     if (!inside(source, sweep.n_images)) continue;
     if (kept.first_rank > 0 && *kept.count_of(s, pair, tile) <= kept.first_rank) continue;
-    const TileLines lines(sweep, pair, pixel);
+    const TileLines lines(sweep.homographies + 9 * pair, sweep.translations + 3 * pair, pixel);
     const int32_t count = mark_lines(lines, memory.depths, 0, s.n_depths, s, flags, memory.sums, memory.words);
     if (blockIdx.y == 0) {
       keep_runs(memory.words, s, kept, pair, tile);

@@ -1,36 +1,46 @@
 #include "gsim3d/plane_sweep/plane_sweep_tensor.h"
 
+#include "gsim3d/core/overlap.cuh"
 #include "gsim3d/plane_sweep/plane_sweep_tensor_backward.cuh"
 
 namespace gsim3d::cuda {
 namespace {
 
-constexpr int kDepths = 8;  // of a thread, so 64 of a tile at once
+constexpr int kDepths = 8;        // of a thread, so 64 of a tile at once
+constexpr int kPairNumbers = 12;  // of a homography and a translation
+
+// Four bytes for shared memory, without waiting for them; 0 where `real` is false.
+__device__ __forceinline__ void copy4(void* to, const void* from, bool real) {
+  const uint32_t at = static_cast<uint32_t>(__cvta_generic_to_shared(to));
+  asm volatile("cp.async.ca.shared.global [%0], [%1], 4, %2;" ::"r"(at), "l"(from), "r"(real ? 4 : 0) : "memory");
+}
+__device__ __forceinline__ void wait_for_copies() { asm volatile("cp.async.wait_all;" ::: "memory"); }
 
 int64_t forward_bytes(const TileSizes& s) {
   return TileMemory::bytes(s, kScored) + kTile * 2 * kChannels * sizeof(__half) +
+         2 * aligned_bytes(kPairNumbers * sizeof(float)) +
          std::max<int64_t>(s.n_words * 32, (kScored + 1) * kScoreStride * sizeof(float));
 }
 
-// Brings channels [first, first + count) of the tile's pixels to shared memory as [count / 16, 2, 2, kFragment]: high
-// and low, 16 pixels x 16 channels each. Channels 8 t + 4 i + .. of 32 stand for columns 2 t, 2 t + 1, 2 t + 8 and
-// 2 t + 9 of the i-th sixteen.
+// Begins to bring channels [first, first + count) of the tile's pixels to shared memory as [count / 16, 2, 2,
+// kFragment]: high and low, 16 pixels x 16 channels each. Channels 8 t + 4 i + .. of 32 stand for columns 2 t, 2 t + 1,
+// 2 t + 8 and 2 t + 9 of the i-th sixteen.
 __device__ void load_tile(const __half* __restrict__ rows /* of the image */, int32_t tile, const TileSizes& s,
                           int32_t first, int32_t count, uint32_t* own) {
-  const int32_t packs = count / 4;  // of a pixel, half of them high
-  for (int32_t i = threadIdx.x; i < kTile * packs; i += kTileThreads) {
-    const int32_t p = i / packs, low = i % packs / (packs / 2), c = i % (packs / 2) * 8;
-    const int32_t u = tile % s.columns * kTileWidth + p % kTileWidth;
-    const int32_t v = tile / s.columns * kTileHeight + p / kTileWidth;
-    uint4 value = make_uint4(0, 0, 0, 0);
-    if (u < s.width && v < s.height)
-      value = load8(rows + ((int64_t{v} * s.width + u) * 2 + low) * s.channels + first + c);
-    uint32_t* to = own + ((c / 32 * 4 + low) * 2 + p / 16) * (kFragment / 2) + (p % 8 * 4 + c / 8 % 4) * 4 + p / 8 % 2;
-    to[0] = value.x;
-    to[2] = value.y;
-    to[2 * kFragment] = value.z;
-    to[2 * kFragment + 2] = value.w;
-  }
+  const int32_t p = threadIdx.x / 2 % kTile;  // two lanes take 32 bytes
+  const int32_t u = tile % s.columns * kTileWidth + p % kTileWidth;
+  const int32_t v = tile / s.columns * kTileHeight + p / kTileWidth;
+  const bool here = u < s.width && v < s.height;
+  const __half* from = rows + (here ? int64_t{v} * s.width + u : 0) * 2 * s.channels + first;
+#pragma unroll
+  for (int low = 0; low < 2; ++low)
+    for (int32_t c = (threadIdx.x / (2 * kTile) * 2 + threadIdx.x % 2) * 8; c < count; c += kTileThreads / kTile * 8) {
+      const int32_t fragment = (c / 32 * 4 + low) * 2 + p / 16;
+      uint32_t* to = own + fragment * (kFragment / 2) + (p % 8 * 4 + c / 8 % 4) * 4 + p / 8 % 2;
+      const __half* four = from + low * s.channels + c;
+#pragma unroll
+      for (int i = 0; i < 4; ++i) copy4(to + i % 2 * 2 + i / 2 * 2 * kFragment, four + 2 * i, here);
+    }
 }
 
 // scores[r, p] (+)= <own pixel p, source pixel list[r]> over `count` channels; 0 in the border. A warp takes 16 source
@@ -91,30 +101,46 @@ __global__ void __launch_bounds__(kTileThreads, 2)
   char* at = shared;
   const TileMemory memory(at, s, kScored);
   uint32_t* own = carve<uint32_t>(at, kTile * kChannels);
+  float* numbers = carve<float>(at, kPairNumbers);  // of this pair or the next, in turns
+  float* next_numbers = carve<float>(at, kPairNumbers);
   uint8_t* flags = reinterpret_cast<uint8_t*>(at);
   float* scores = reinterpret_cast<float*>(at);  // [kScored + 1, kScoreStride], the last 0
-  const int64_t image = blockIdx.x / s.n_tiles;
-  const int32_t tile = blockIdx.x % s.n_tiles;
+  const int32_t image = blockIdx.x / s.n_tiles, tile = blockIdx.x % s.n_tiles;
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
-  const TilePixel pixel(tile, s);
   const int64_t image_size = int64_t{s.n_pixels} * 2 * s.channels;
   const Range pairs = range_of(sweep.cu_src, image, sweep.n_pairs);
+  const auto bring = [&](int64_t pair, float* to) {
+    if (threadIdx.x >= kPairNumbers) return;
+    const int32_t i = threadIdx.x;
+    copy4(to + i, i < 9 ? sweep.homographies + 9 * pair + i : sweep.translations + 3 * pair + i - 9, true);
+  };
+  if (pairs.begin < pairs.end) bring(pairs.begin, next_numbers);
   memory.fill_depths(sweep, image);
-  const float own_inverse = halves.inverses[image];
   int32_t held = -1;  // the first of the channels in `own`
 
   for (int32_t first_depth = 0; first_depth < s.n_depths; first_depth += kDepths * kTileWarps) {
     const int32_t end_depth = min(first_depth + kDepths * kTileWarps, s.n_depths);
     float costs[kDepths] = {};
     for (int64_t pair = pairs.begin; pair < pairs.end; ++pair) {
-      const int64_t source = sweep.src_images[pair];
+      const int64_t source = sweep.src_images[pair];  // on its way while the lines are marked
+      wait_for_copies();
+      __syncthreads();
+      float* const brought = next_numbers;
+      next_numbers = numbers;
+      numbers = brought;
+      bring(pair + 1 < pairs.end ? pair + 1 : pairs.begin, next_numbers);
+      if (held < 0) {
+        wait_for_previous();
+        load_tile(halves.rows + image * image_size, tile, s, 0, min(s.channels, kChannels), own);
+        held = 0;
+      }
+      const int32_t count = mark_lines(TileLines(numbers, numbers + 9, TilePixel(tile, s)), memory.depths, first_depth,
+                                       end_depth, s, flags, memory.sums, memory.words);
       if (!inside(source, sweep.n_images)) continue;
-      const TileLines lines(sweep, pair, pixel);
-      const float source_inverse = halves.inverses[source];  // on its way while the lines are marked
-      const int32_t count =
-          mark_lines(lines, memory.depths, first_depth, end_depth, s, flags, memory.sums, memory.words);
+      const Unit unit(halves.inverses[image], halves.inverses[source]);
       for (int32_t first = 0; first < count; first += kScored) {
         const int32_t rows = min(count - first, kScored);
+        if (first > 0) __syncthreads();
         list_pixels(memory.words, s, first, rows, memory.list);
         if (threadIdx.x < kTile) scores[kScored * kScoreStride + threadIdx.x] = 0;
         for (int32_t c = 0; c < s.channels; c += kChannels) {
@@ -124,12 +150,13 @@ __global__ void __launch_bounds__(kTileThreads, 2)
             load_tile(halves.rows + image * image_size, tile, s, c, channels, own);
             held = c;
           }
+          wait_for_copies();
           __syncthreads();
           add_scores(own, halves.rows + source * image_size + c, s.channels, channels, memory.list, rows, c > 0,
                      scores);
         }
         __syncthreads();
-        const Unit unit(own_inverse, source_inverse);
+        const TileLines lines(numbers, numbers + 9, TilePixel(tile, s));  // again, registers are few
 #pragma unroll
         for (int j = 0; j < kDepths; ++j) {
           const int32_t k = first_depth + warp + j * kTileWarps;
@@ -145,17 +172,18 @@ __global__ void __launch_bounds__(kTileThreads, 2)
           costs[j] +=
               unit(interpolate(score(above), score(above + 1), score(below), score(below + 1), place.fx, place.fy));
         }
-        __syncthreads();
       }
     }
     const float mean = pairs.begin < pairs.end ? cost_scale<float>(pairs, sweep.channels) : 0.0f;
+    const TilePixel pixel(tile, s);
 #pragma unroll
     for (int j = 0; j < kDepths; ++j) {
       const int32_t k = first_depth + warp + j * kTileWarps;
       if (k < end_depth && pixel.here)
-        cost[(image * s.n_depths + k) * s.n_pixels + pixel.v * s.width + pixel.u] = costs[j] * mean;
+        cost[(int64_t{image} * s.n_depths + k) * s.n_pixels + pixel.v * s.width + pixel.u] = costs[j] * mean;
     }
   }
+  wait_for_previous();  // also where there are no pairs
 }
 
 }  // namespace
@@ -166,8 +194,8 @@ void tensor_sweep(const char* op, const float* features, const PlaneSweep<float>
   const int64_t bytes = forward_bytes(s);
   check_shared_bytes(op, bytes, sweep, stream);
   const SweepHalves halves = make_halves(op, features, sweep, s, false, workspace, stream);
-  launch(op, tile_costs_kernel, blocks_for(op, sweep.n_images * s.n_tiles, 1), kTileThreads, bytes, stream, halves,
-         sweep, s, cost);
+  launch_overlapping(op, tile_costs_kernel, blocks_for(op, sweep.n_images * s.n_tiles, 1), kTileThreads, bytes, stream,
+                     halves, sweep, s, cost);
 }
 
 void tensor_sweep_vjp(const char* op, const float* grad, const float* features, const PlaneSweep<float>& sweep,

@@ -69,9 +69,9 @@ struct TileLines {
   float b[3];
   bool here;
 
-  __device__ __forceinline__ TileLines(const PlaneSweep<float>& sweep, int64_t pair, const TilePixel& pixel)
-      : ray(source_ray(sweep.homographies + 9 * pair, static_cast<float>(pixel.u), static_cast<float>(pixel.v))),
-        b{sweep.translations[3 * pair], sweep.translations[3 * pair + 1], sweep.translations[3 * pair + 2]},
+  __device__ __forceinline__ TileLines(const float* homography, const float* translation, const TilePixel& pixel)
+      : ray(source_ray(homography, static_cast<float>(pixel.u), static_cast<float>(pixel.v))),
+        b{translation[0], translation[1], translation[2]},
         here(pixel.here) {}
 
   __device__ __forceinline__ Place<float> at(float depth, const TileSizes& s) const {
@@ -90,7 +90,7 @@ __device__ __forceinline__ int32_t rank_of(const Word* words, int32_t at) {
   return word.before + __popc(word.bits & ((1u << (at & 31)) - 1));
 }
 
-// Sum over the threads before and over all; the barriers also order the use of `sums`.
+// Sum over the threads before and over all. `sums` is of use until the block has synchronised once more.
 __device__ __forceinline__ uint32_t sum_before(uint32_t value, uint32_t* sums /* [kTileWarps], shared */,
                                                uint32_t& total) {
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
@@ -109,14 +109,14 @@ __device__ __forceinline__ uint32_t sum_before(uint32_t value, uint32_t* sums /*
     if (w == warp) before = total;
     total += sums[w];
   }
-  __syncthreads();
   return before + sum - value;
 }
 
 // Fills `words` with the places that the lines touch at depths [first, end); returns how many. The flags are of use
 // inside only, the block synchronises before it comes here and before it uses their memory again.
 __device__ __forceinline__ int32_t mark_lines(const TileLines& lines, const float* depths, int32_t first, int32_t end,
-                                              const TileSizes& s, uint8_t* flags, uint32_t* sums, Word* words) {
+                                              const TileSizes& s, uint8_t* flags,
+                                              uint32_t* sums /* [2, kTileWarps] */, Word* words) {
   uint4* clear = reinterpret_cast<uint4*>(flags);
   for (int32_t i = threadIdx.x; i < 2 * s.n_words; i += kTileThreads) clear[i] = make_uint4(0, 0, 0, 0);
   __syncthreads();
@@ -139,8 +139,8 @@ __device__ __forceinline__ int32_t mark_lines(const TileLines& lines, const floa
       bits = pack(low.x) | pack(low.y) << 4 | pack(low.z) << 8 | pack(low.w) << 12 | pack(high.x) << 16 |
              pack(high.y) << 20 | pack(high.z) << 24 | pack(high.w) << 28;
     }
-    uint32_t total;
-    const uint32_t before = count + sum_before(__popc(bits), sums, total);
+    uint32_t total;  // sums in turns, so that nobody waits for who reads the last ones
+    const uint32_t before = count + sum_before(__popc(bits), sums + begin / kTileThreads % 2 * kTileWarps, total);
     if (w < s.n_words) words[w] = {bits, before};
     count += total;
   }
@@ -149,17 +149,23 @@ __device__ __forceinline__ int32_t mark_lines(const TileLines& lines, const floa
 }
 
 // list[r - first] = the pixel q with rank r of [first, first + rows); in the border -1 - q for the pixel beside it.
+// A warp takes every kTileWarps-th word, a lane a bit: words that are touched lie side by side.
 __device__ __forceinline__ void list_pixels(const Word* words, const TileSizes& s, int32_t first, int32_t rows,
                                             int32_t* list) {
-  for (int32_t w = threadIdx.x; w < s.n_words; w += kTileThreads) {
-    const Word word = words[w];
-    int32_t rank = static_cast<int32_t>(word.before) - first;
-    if (word.bits == 0 || rank >= rows || rank + 32 <= 0) continue;
-    int32_t y = w * 32 / s.stride, x = w * 32 - y * s.stride, at = 0;
-    for (uint32_t rest = word.bits; rest; rest &= rest - 1, ++rank) {
-      const int32_t bit = __ffs(rest) - 1;
-      for (x += bit - at, at = bit; x >= s.stride; x -= s.stride) ++y;
-      if (static_cast<uint32_t>(rank) >= static_cast<uint32_t>(rows)) continue;
+  const int32_t lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
+  const float inverse_stride = 1.0f / static_cast<float>(s.stride);
+  for (int32_t begin = warp; begin < s.n_words; begin += kTileWarps * kWarp) {
+    const int32_t own = begin + lane * kTileWarps;
+    const Word word = own < s.n_words ? words[own] : Word{0, 0};
+    for (unsigned touched = __ballot_sync(kFullWarp, word.bits != 0); touched; touched &= touched - 1) {
+      const int from = __ffs(touched) - 1;
+      const uint32_t bits = __shfl_sync(kFullWarp, word.bits, from);
+      const int32_t before = static_cast<int32_t>(__shfl_sync(kFullWarp, word.before, from)) - first;
+      const int32_t rank = before + __popc(bits & ((1u << lane) - 1));
+      if (!(bits >> lane & 1) || static_cast<uint32_t>(rank) >= static_cast<uint32_t>(rows)) continue;
+      // Half a place from the next whole number: exact below 2^21 places, and shared memory holds fewer.
+      const int32_t at = (begin + from * kTileWarps) * 32 + lane;
+      const int32_t y = static_cast<int32_t>((static_cast<float>(at) + 0.5f) * inverse_stride), x = at - y * s.stride;
       const int32_t near_y = min(max(y - 1, 0), s.height - 1), near_x = min(max(x - 1, 0), s.width - 1);
       const int32_t pixel = near_y * s.width + near_x;
       list[rank] = x - 1 == near_x && y - 1 == near_y ? pixel : -1 - pixel;
@@ -240,17 +246,17 @@ __device__ __forceinline__ uint4 load8(const __half* from) { return *reinterpret
 struct TileMemory {
   Word* words;     // [n_words]
   int32_t* list;   // [listed]
-  uint32_t* sums;  // [kTileWarps]
+  uint32_t* sums;  // [2, kTileWarps]
   float* depths;   // [n_depths]
 
   __device__ __forceinline__ TileMemory(char*& at, const TileSizes& s, int listed)
       : words(carve<Word>(at, s.n_words)),
         list(carve<int32_t>(at, listed)),
-        sums(carve<uint32_t>(at, kTileWarps)),
+        sums(carve<uint32_t>(at, 2 * kTileWarps)),
         depths(carve<float>(at, s.n_depths)) {}
   static int64_t bytes(const TileSizes& s, int listed) {
     return aligned_bytes(s.n_words * sizeof(Word)) + aligned_bytes(listed * sizeof(int32_t)) +
-           aligned_bytes(kTileWarps * sizeof(uint32_t)) + aligned_bytes(s.n_depths * sizeof(float));
+           aligned_bytes(2 * kTileWarps * sizeof(uint32_t)) + aligned_bytes(s.n_depths * sizeof(float));
   }
   __device__ __forceinline__ void fill_depths(const PlaneSweep<float>& sweep, int64_t image) const {
     for (int64_t k = threadIdx.x; k < sweep.n_depths; k += kTileThreads)
