@@ -47,8 +47,7 @@ __global__ void __launch_bounds__(512) largest_kernel(const float* __restrict__ 
 __global__ void __launch_bounds__(kTileThreads)
     to_halves_kernel(const float* __restrict__ features, int64_t channels, TileSizes s,
                      const uint32_t* largest /* still written when this begins */, float* __restrict__ inverses,
-                     __half* __restrict__ rows,
-                     __half* __restrict__ tiles) {
+                     __half* __restrict__ rows, __half* __restrict__ tiles) {
   __shared__ float held[32][kTile + 1];
   const int64_t image = blockIdx.x / s.n_tiles;
   const int32_t tile = blockIdx.x % s.n_tiles, first = blockIdx.y * 32;

@@ -90,7 +90,7 @@ __device__ __forceinline__ int32_t rank_of(const Word* words, int32_t at) {
   return word.before + __popc(word.bits & ((1u << (at & 31)) - 1));
 }
 
-// Sum over the threads before and over all. `sums` is of use until the block has synchronised once more.
+// Sum over the threads before and over all; the barriers also order the use of `sums`.
 __device__ __forceinline__ uint32_t sum_before(uint32_t value, uint32_t* sums /* [kTileWarps], shared */,
                                                uint32_t& total) {
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
@@ -109,14 +109,45 @@ __device__ __forceinline__ uint32_t sum_before(uint32_t value, uint32_t* sums /*
     if (w == warp) before = total;
     total += sums[w];
   }
+  __syncthreads();
   return before + sum - value;
+}
+
+// Up to so many words of a table each warp packs and lists some of them, a lane a bit; of more a thread takes a word.
+constexpr int kFewWords = 8 * kTileWarps;
+
+struct Words {
+  int32_t begin, end;
+};
+__device__ __forceinline__ Words words_of_warp(const TileSizes& s) {
+  const int32_t each = (s.n_words + kTileWarps - 1) / kTileWarps, first = threadIdx.x / kWarp * each;
+  return {min(first, s.n_words), min(first + each, s.n_words)};
+}
+
+// mark_lines of few words, from their flags.
+__device__ __forceinline__ int32_t pack_few_words(const TileSizes& s, const uint8_t* flags, uint32_t* sums,
+                                                  Word* words) {
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
+  const Words own = words_of_warp(s);
+  uint32_t count = 0;
+  for (int32_t w = own.begin; w < own.end; ++w) {
+    const uint32_t bits = __ballot_sync(kFullWarp, flags[w * 32 + lane] != 0);
+    if (lane == 0) words[w] = {bits, count};
+    count += __popc(bits);
+  }
+  if (lane == 0) sums[warp] = count;
+  __syncthreads();
+  const uint32_t of_warp = lane < kTileWarps ? sums[lane] : 0;
+  const uint32_t before = __reduce_add_sync(kFullWarp, lane < warp ? of_warp : 0);
+  for (int32_t w = own.begin + lane; w < own.end; w += kWarp) words[w].before += before;
+  __syncthreads();
+  return static_cast<int32_t>(__reduce_add_sync(kFullWarp, of_warp));
 }
 
 // Fills `words` with the places that the lines touch at depths [first, end); returns how many. The flags are of use
 // inside only, the block synchronises before it comes here and before it uses their memory again.
 __device__ __forceinline__ int32_t mark_lines(const TileLines& lines, const float* depths, int32_t first, int32_t end,
-                                              const TileSizes& s, uint8_t* flags,
-                                              uint32_t* sums /* [2, kTileWarps] */, Word* words) {
+                                              const TileSizes& s, uint8_t* flags, uint32_t* sums, Word* words) {
   uint4* clear = reinterpret_cast<uint4*>(flags);
   for (int32_t i = threadIdx.x; i < 2 * s.n_words; i += kTileThreads) clear[i] = make_uint4(0, 0, 0, 0);
   __syncthreads();
@@ -127,6 +158,7 @@ __device__ __forceinline__ int32_t mark_lines(const TileLines& lines, const floa
     touched[0] = touched[1] = touched[s.stride] = touched[s.stride + 1] = 1;
   }
   __syncthreads();
+  if (s.n_words <= kFewWords) return pack_few_words(s, flags, sums, words);
   uint32_t count = 0;
   for (int32_t begin = 0; begin < s.n_words; begin += kTileThreads) {
     const int32_t w = begin + threadIdx.x;
@@ -139,8 +171,8 @@ __device__ __forceinline__ int32_t mark_lines(const TileLines& lines, const floa
       bits = pack(low.x) | pack(low.y) << 4 | pack(low.z) << 8 | pack(low.w) << 12 | pack(high.x) << 16 |
              pack(high.y) << 20 | pack(high.z) << 24 | pack(high.w) << 28;
     }
-    uint32_t total;  // sums in turns, so that nobody waits for who reads the last ones
-    const uint32_t before = count + sum_before(__popc(bits), sums + begin / kTileThreads % 2 * kTileWarps, total);
+    uint32_t total;
+    const uint32_t before = count + sum_before(__popc(bits), sums, total);
     if (w < s.n_words) words[w] = {bits, before};
     count += total;
   }
@@ -148,24 +180,38 @@ __device__ __forceinline__ int32_t mark_lines(const TileLines& lines, const floa
   return static_cast<int32_t>(count);
 }
 
+// list_pixels of few words.
+__device__ __forceinline__ void list_few_words(const Word* words, const TileSizes& s, int32_t first, int32_t rows,
+                                               int32_t* list) {
+  const uint32_t lane = threadIdx.x % kWarp;
+  const float inverse_stride = 1.0f / static_cast<float>(s.stride);
+  const Words own = words_of_warp(s);
+  for (int32_t w = own.begin; w < own.end; ++w) {
+    const Word word = words[w];
+    const int32_t rank = static_cast<int32_t>(word.before + __popc(word.bits & ((1u << lane) - 1))) - first;
+    if (!(word.bits >> lane & 1) || static_cast<uint32_t>(rank) >= static_cast<uint32_t>(rows)) continue;
+    // Half a place from the next whole number, so the quotient is exact.
+    const int32_t at = w * 32 + lane, y = static_cast<int32_t>((static_cast<float>(at) + 0.5f) * inverse_stride);
+    const int32_t x = at - y * s.stride;
+    const int32_t near_y = min(max(y - 1, 0), s.height - 1), near_x = min(max(x - 1, 0), s.width - 1);
+    const int32_t pixel = near_y * s.width + near_x;
+    list[rank] = x - 1 == near_x && y - 1 == near_y ? pixel : -1 - pixel;
+  }
+}
+
 // list[r - first] = the pixel q with rank r of [first, first + rows); in the border -1 - q for the pixel beside it.
-// A warp takes every kTileWarps-th word, a lane a bit: words that are touched lie side by side.
 __device__ __forceinline__ void list_pixels(const Word* words, const TileSizes& s, int32_t first, int32_t rows,
                                             int32_t* list) {
-  const int32_t lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
-  const float inverse_stride = 1.0f / static_cast<float>(s.stride);
-  for (int32_t begin = warp; begin < s.n_words; begin += kTileWarps * kWarp) {
-    const int32_t own = begin + lane * kTileWarps;
-    const Word word = own < s.n_words ? words[own] : Word{0, 0};
-    for (unsigned touched = __ballot_sync(kFullWarp, word.bits != 0); touched; touched &= touched - 1) {
-      const int from = __ffs(touched) - 1;
-      const uint32_t bits = __shfl_sync(kFullWarp, word.bits, from);
-      const int32_t before = static_cast<int32_t>(__shfl_sync(kFullWarp, word.before, from)) - first;
-      const int32_t rank = before + __popc(bits & ((1u << lane) - 1));
-      if (!(bits >> lane & 1) || static_cast<uint32_t>(rank) >= static_cast<uint32_t>(rows)) continue;
-      // Half a place from the next whole number: exact below 2^21 places, and shared memory holds fewer.
-      const int32_t at = (begin + from * kTileWarps) * 32 + lane;
-      const int32_t y = static_cast<int32_t>((static_cast<float>(at) + 0.5f) * inverse_stride), x = at - y * s.stride;
+  if (s.n_words <= kFewWords) return list_few_words(words, s, first, rows, list);
+  for (int32_t w = threadIdx.x; w < s.n_words; w += kTileThreads) {
+    const Word word = words[w];
+    int32_t rank = static_cast<int32_t>(word.before) - first;
+    if (word.bits == 0 || rank >= rows || rank + 32 <= 0) continue;
+    int32_t y = w * 32 / s.stride, x = w * 32 - y * s.stride, at = 0;
+    for (uint32_t rest = word.bits; rest; rest &= rest - 1, ++rank) {
+      const int32_t bit = __ffs(rest) - 1;
+      for (x += bit - at, at = bit; x >= s.stride; x -= s.stride) ++y;
+      if (static_cast<uint32_t>(rank) >= static_cast<uint32_t>(rows)) continue;
       const int32_t near_y = min(max(y - 1, 0), s.height - 1), near_x = min(max(x - 1, 0), s.width - 1);
       const int32_t pixel = near_y * s.width + near_x;
       list[rank] = x - 1 == near_x && y - 1 == near_y ? pixel : -1 - pixel;
@@ -246,17 +292,17 @@ __device__ __forceinline__ uint4 load8(const __half* from) { return *reinterpret
 struct TileMemory {
   Word* words;     // [n_words]
   int32_t* list;   // [listed]
-  uint32_t* sums;  // [2, kTileWarps]
+  uint32_t* sums;  // [kTileWarps]
   float* depths;   // [n_depths]
 
   __device__ __forceinline__ TileMemory(char*& at, const TileSizes& s, int listed)
       : words(carve<Word>(at, s.n_words)),
         list(carve<int32_t>(at, listed)),
-        sums(carve<uint32_t>(at, 2 * kTileWarps)),
+        sums(carve<uint32_t>(at, kTileWarps)),
         depths(carve<float>(at, s.n_depths)) {}
   static int64_t bytes(const TileSizes& s, int listed) {
     return aligned_bytes(s.n_words * sizeof(Word)) + aligned_bytes(listed * sizeof(int32_t)) +
-           aligned_bytes(2 * kTileWarps * sizeof(uint32_t)) + aligned_bytes(s.n_depths * sizeof(float));
+           aligned_bytes(kTileWarps * sizeof(uint32_t)) + aligned_bytes(s.n_depths * sizeof(float));
   }
   __device__ __forceinline__ void fill_depths(const PlaneSweep<float>& sweep, int64_t image) const {
     for (int64_t k = threadIdx.x; k < sweep.n_depths; k += kTileThreads)

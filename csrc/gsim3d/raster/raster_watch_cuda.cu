@@ -1,7 +1,7 @@
 // Which rows the forward pass leaves out, image by image: integer sums and minima, so their order does not matter.
 #include <algorithm>
 
-#include "gsim3d/core/overlap.cuh"
+#include "gsim3d/core/cuda_utils.cuh"
 #include "gsim3d/raster/raster.h"
 #include "gsim3d/raster/raster_lists.cuh"
 
@@ -50,7 +50,6 @@ __device__ bool overflows(const RasterScene<T>& s, int64_t row, int64_t image) {
 
 template <typename T>
 __global__ void __launch_bounds__(kThreads) watch_cameras_kernel(RasterScene<T> s, int64_t* unusable) {
-  let_next_begin();
   for (int64_t i = int64_t{blockIdx.x} * kThreads + threadIdx.x; i < s.n_images; i += int64_t{gridDim.x} * kThreads) {
     const bool good = inside(s.image_cloud[i], s.n_clouds) && camera_is_good(s.viewmats + 16 * i, s.Ks + 9 * i);
     unusable[2 * i] = good ? 0 : 1, unusable[2 * i + 1] = good ? -1 : int64_t{kFaultCamera};
@@ -63,7 +62,6 @@ __global__ void __launch_bounds__(kThreads) watch_kernel(RasterScene<T> s, int64
   for (int64_t row = int64_t{blockIdx.x} * kThreads + threadIdx.x; row < s.n_rows;
        row += int64_t{gridDim.x} * kThreads) {
     const int64_t of_row = faults_of_row(s, row);
-    wait_for_previous();
     for (int64_t image = 0; image < s.n_images; ++image) {
       const int64_t cloud = s.image_cloud[image];
       if (unusable[2 * image + 1] == kFaultCamera || row < s.cu_rows[cloud] || row >= s.cu_rows[cloud + 1]) continue;
@@ -74,7 +72,6 @@ __global__ void __launch_bounds__(kThreads) watch_kernel(RasterScene<T> s, int64
       atomicMin(counts + 1, static_cast<unsigned long long>(row << kFaultBits | faults));
     }
   }
-  wait_for_previous();  // also where a thread has no row
 }
 
 }  // namespace
@@ -86,7 +83,7 @@ void raster_watch(const RasterScene<T>& scene, int64_t* unusable, Stream stream)
     return static_cast<unsigned>(std::min<int64_t>((n + kThreads - 1) / kThreads, 1 << 20));
   };
   launch(kWatch, watch_cameras_kernel<T>, blocks(scene.n_images), kThreads, 0, stream, scene, unusable);
-  launch_overlapping(kWatch, watch_kernel<T>, blocks(scene.n_rows), kThreads, 0, stream, scene, unusable);
+  launch(kWatch, watch_kernel<T>, blocks(scene.n_rows), kThreads, 0, stream, scene, unusable);
 }
 
 #define GSIM3D_INSTANTIATE(T) template void raster_watch<T>(const RasterScene<T>&, int64_t*, Stream);

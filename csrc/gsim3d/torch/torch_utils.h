@@ -2,14 +2,16 @@
 // memory. Written against torch's stable ABI (TORCH_TARGET_VERSION 2.11), so one binary serves torch 2.11 and later.
 #pragma once
 
-#include <torch/csrc/inductor/aoti_torch/c/shim.h>
 #include <torch/csrc/stable/accelerator.h>
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
 #include <torch/headeronly/core/ScalarType.h>
 
-#include <algorithm>
+#ifdef USE_CUDA
+#include <torch/csrc/inductor/aoti_torch/c/shim.h>
+#endif
+
 #include <cstdint>
 #include <initializer_list>
 #include <stdexcept>
@@ -149,26 +151,13 @@ T* mutable_data(Tensor& tensor) {
   return static_cast<T*>(tensor.data_ptr());
 }
 
-// Made by a C call: stable::new_empty looks its operator up by name, which takes several times as long.
-inline Tensor empty_of(const Tensor& like, const int64_t* sizes, size_t n, ScalarType type) {
-  int32_t device = 0;
-  STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_device_type(like.get(), &device));
-  std::vector<int64_t> strides(n, 1);
-  for (size_t i = n; i-- > 1;) strides[i - 1] = strides[i] * std::max<int64_t>(sizes[i], 1);
-  AtenTensorHandle made = nullptr;
-  STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_empty_strided(
-      static_cast<int64_t>(n), sizes, strides.data(),
-      torch::stable::detail::to<int32_t>(torch::stable::detail::from(type)), device, like.get_device_index(), &made));
-  return Tensor(made);
+inline Tensor empty(const Tensor& like, std::initializer_list<int64_t> sizes) {
+  const std::vector<int64_t> shape(sizes);
+  return torch::stable::new_empty(like, shape);
 }
 inline Tensor empty(const Tensor& like, std::initializer_list<int64_t> sizes, ScalarType type) {
-  return empty_of(like, sizes.begin(), sizes.size(), type);
-}
-inline Tensor empty(const Tensor& like, std::initializer_list<int64_t> sizes) {
-  return empty(like, sizes, like.scalar_type());
-}
-inline Tensor empty_as(const Tensor& like) {
-  return empty_of(like, like.sizes().data(), like.sizes().size(), like.scalar_type());
+  const std::vector<int64_t> shape(sizes);
+  return torch::stable::new_empty(like, shape, type);
 }
 
 // Scratch in tensors on the device of `like`; freed with the object.
