@@ -102,9 +102,11 @@ def _(grad, weight, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_ta
 
 
 @torch.library.register_fake("gsim3d::sparse_conv_grad_weight")
-def _(grad, x, kernel_size, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first):
-    c_out, k, wide = grad.shape[1], kernel_size, torch.promote_types(grad.dtype, torch.float32)
-    return grad.new_empty(c_out, k, k, k, x.shape[1], dtype=wide), grad.new_empty(c_out, dtype=wide)
+def _(grad, x, kernel_size, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first, rounded=False):
+    c_out, k, dtype = grad.shape[1], kernel_size, grad.dtype
+    if not rounded:
+        dtype = torch.promote_types(dtype, torch.float32)
+    return grad.new_empty(c_out, k, k, k, x.shape[1], dtype=dtype), grad.new_empty(c_out, dtype=dtype)
 
 
 def _setup(ctx, inputs, output):
@@ -121,8 +123,9 @@ def _backward(ctx, grad):
     if needs_x:
         grad_x = torch.ops.gsim3d.sparse_conv_grad_input(grad, weight, *geometry, ctx.first, plan)
     if needs_weight or needs_bias:
+        # Autograd wants the dtype of the parameters: rounded where they are written, without a pass over them.
         grad_weight, grad_bias = torch.ops.gsim3d.sparse_conv_grad_weight(
-            grad, x, weight.shape[1], *geometry, ctx.first
+            grad, x, weight.shape[1], *geometry, ctx.first, True
         )
     return grad_x, grad_weight, grad_bias if ctx.has_bias else None, *[None] * 8
 

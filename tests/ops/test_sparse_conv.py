@@ -1,6 +1,7 @@
 """Sparse convolution, in the eight sections that every op has."""
 
 import itertools
+import math
 import os
 import subprocess
 import sys
@@ -184,13 +185,17 @@ def test_low_precision_errs_no_more_than_torch(n, side, kernel_size, c_in, c_out
 
 
 @pytest.mark.parametrize("dtype", LOW_PRECISION)
-@pytest.mark.parametrize("n, side, channels", [(1500, 30, 64), (200, 6, 136), (900, 9, 33)])
+@pytest.mark.parametrize("n, side, channels", [(1500, 30, 64), (200, 6, 136), (900, 9, 33), (5000, 24, 320)])
 def test_weight_gradients_of_low_precision_are_float32(n, side, channels, dtype, devices):
-    """No sum is rounded to 16 bits: where no voxel has two rows, only the order of float32 sums differs."""
+    """No sum is rounded to 16 bits: where no voxel has two rows, only the order of float32 sums differs. Rounded
+    gradients are these, rounded once."""
     cells = random_cells(n, side).unique(dim=0)
     tables = geometry(cells, 3, devices[1])
     *inputs, cotangent = (t.to(devices[1]) for t in parameters(len(cells), channels, channels, 3, dtype))
-    actual = torch.ops.gsim3d.sparse_conv_grad_weight(cotangent, inputs[0], 3, *raw_arguments(*tables), False)
+    arguments = cotangent, inputs[0], 3, *raw_arguments(*tables), False
+    actual = torch.ops.gsim3d.sparse_conv_grad_weight(*arguments)
+    for a, rounded in zip(actual, torch.ops.gsim3d.sparse_conv_grad_weight(*arguments, True), strict=True):
+        assert_same_bits(rounded, a.to(dtype))
     exact = gradients(gathered_convolution(*tables, "mean"), [t.double() for t in inputs], cotangent)[2:]
     for a, e in zip(actual, exact, strict=True):
         assert a.dtype == torch.float32
@@ -273,6 +278,23 @@ def test_cuda_skips_indices_out_of_range(dtype, devices):
         gradients(convolution(voxels, replaced(kernel_map, plan=plan)), [x, weight, bias], cotangent)
     torch.cuda.synchronize()
     assert_same_bits(convolution(voxels, fewer)(x, weight, bias), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+def test_rows_that_no_voxel_lists_are_zero_on_cuda(dtype, devices):
+    cells = random_cells(400, 6, clouds=1)
+    voxels, kernel_map = geometry(cells, 3, devices[1])
+    lost = torch.arange(0, 400, 7, device=devices[1])
+    rows = torch.where(torch.isin(voxels.rows, lost), 400, voxels.rows)
+    tables = Voxels(voxels.row_voxel, rows, voxels.cu_rows), kernel_map
+    x, weight, bias, cotangent = (t.to(devices[1]) for t in parameters(400, 48, 64, 3, dtype))
+    for chosen in (tables, with_plan(*tables)):
+        old = [torch.full_like(t, math.nan) for t in (cotangent, x) for _ in range(4)]
+        del old  # results may lie where these lay
+        out, grad_x, *_ = gradients(convolution(*chosen), [x, weight, bias], cotangent)
+        for result in (out, grad_x):
+            assert not result[lost].any()
+            assert result.any(1).sum() == 400 - len(lost)
 
 
 @pytest.mark.parametrize("dtype", LOW_PRECISION)

@@ -145,6 +145,8 @@ __device__ inline const T* features_of(const Job<T>& job, int64_t image, uint32_
 template <typename T, bool kWithFeatures>
 struct BlendShared {
   Batch<T> batch;
+  Record<T> records[kWarp];  // of the next batch; a lane reads its own
+  uint32_t pairs[kWarp];     // of the batch after it, likewise
   T features[kWithFeatures ? kFeatures : 1][kWarp];
 };
 
@@ -179,18 +181,22 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
   // The records of a batch are fetched while the batch before is blended, their numbers another batch earlier. The
   // first entry goes to the last lane: the highest bit is the one that is found fastest.
   const int place = kWarp - 1 - lane;
-  uint32_t pair = 0, next_pair = place < quarter.n ? pairs[place] : 0;
-  Record<T> record{};
-  const auto fetch = [&](int32_t base) {
-    pair = next_pair;
-    if (base + place < quarter.n) load_record(job.records + pair, record);
-    if (base + kWarp + place < quarter.n) next_pair = pairs[base + kWarp + place];
+  const auto number = [&](int32_t base) { return pairs + min(base + place, quarter.n - 1); };
+  const auto fetch = [&](uint32_t pair, int32_t base) {
+    start_copy(job.records + pair, shared.records + lane);
+    start_copy(number(base + kWarp), shared.pairs + lane);
   };
-  fetch(0);
+  uint32_t next_pair = 0;
+  if (quarter.n > 0) next_pair = *number(0), fetch(next_pair, 0);
   const T x = in_register(T(column)), y[kPixels] = {in_register(T(row)), in_register(T(row + 1))};
   for (int32_t base = 0; base < quarter.n; base += kWarp) {
     const bool closed = light[0].floor > 1 && light[1].floor > 1;
     if (__all_sync(kFullWarp, closed)) break;
+    wait_copies();
+    const uint32_t pair = next_pair;
+    Record<T> record;
+    load_record(shared.records + lane, record);
+    next_pair = shared.pairs[lane];
     uint32_t bits = 0;
     __syncwarp();
     if (base + place < quarter.n) {
@@ -205,7 +211,7 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
       }
     }
     __syncwarp();
-    fetch(base + kWarp);
+    if (base + kWarp < quarter.n) fetch(next_pair, base + kWarp);
     uint32_t mine = transpose_bits(bits, lane);
     if (closed) mine = 0;
     while (mine) {
@@ -263,6 +269,7 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
       images.last[pixel] = at.last;
     }
   }
+  wait_copies();  // those of a list that was left before its end: the memory is used again
 }
 
 template <typename T, bool kFade, bool kWithFeatures>

@@ -25,6 +25,24 @@ __device__ __forceinline__ double fast_exp2(double x) { return exp2(x); }
 __device__ __forceinline__ double fast_sqrt(double x) { return sqrt(x); }
 __device__ __forceinline__ double fast_reciprocal(double x) { return 1 / x; }
 
+// Copies from global to shared memory. What is loaded ahead into registers under a condition is waited for at once, to
+// be merged with what was there; these are waited for in wait_copies, after which the calling thread sees its own.
+template <typename V>
+__device__ __forceinline__ void start_copy(const V* from, V* to) {
+  const auto shared = static_cast<uint32_t>(__cvta_generic_to_shared(to));
+  if constexpr (sizeof(V) % 16 == 0) {
+#pragma unroll
+    for (uint32_t i = 0; i < sizeof(V); i += 16)
+      asm volatile("cp.async.ca.shared.global [%0], [%1], 16;" ::"r"(shared + i),
+                   "l"(reinterpret_cast<const char*>(from) + i)
+                   : "memory");
+  } else {
+    static_assert(sizeof(V) == 4);
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(shared), "l"(from) : "memory");
+  }
+}
+__device__ __forceinline__ void wait_copies() { asm volatile("cp.async.wait_all;" ::: "memory"); }
+
 // Saturating: 0 for what is negative.
 __device__ __forceinline__ uint32_t ceil_to_whole(float x) { return __float2uint_ru(x); }
 __device__ __forceinline__ uint32_t ceil_to_whole(double x) { return __double2uint_ru(x); }

@@ -92,9 +92,10 @@ template <typename T>
 void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& map, int64_t c_in, int64_t c_out,
                            T* grad_x, const Workspace& workspace, Stream stream);
 
-template <typename T>
+// R: Sum<T>, or T for results that are rounded once, from the whole sums.
+template <typename T, typename R>
 void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map, int64_t c_in, int64_t c_out,
-                            Sum<T>* grad_weight, Sum<T>* grad_bias, const Workspace& workspace, Stream stream);
+                            R* grad_weight, R* grad_bias, const Workspace& workspace, Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

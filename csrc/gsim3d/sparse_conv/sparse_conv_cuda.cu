@@ -32,19 +32,11 @@ struct alignas(sizeof(E) * kVector) Vector {
   E values[kVector];
 };
 
-// Memory to clear, in units of 16 bytes.
-struct Clear {
-  uint4* to = nullptr;
-  int64_t count = 0;
-};
-
 // One value for each voxel of several rows; a thread has kVector columns of a voxel and takes its rows in order.
-// Clears what a later kernel fills.
 template <typename E, int kVector>
 __global__ void __launch_bounds__(kThreads)
-    combine_rows(const E* x, Sources sources, int32_t channels, VoxelValue kind, E* shared, Clear clear) {
+    combine_rows(const E* x, Sources sources, int32_t channels, VoxelValue kind, E* shared) {
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x, across = channels / kVector;
-  for (int64_t j = i; j < clear.count; j += static_cast<int64_t>(gridDim.x) * kThreads) clear.to[j] = {};
   const int64_t voxel = i / across, c = i % across * kVector;
   if (voxel >= sources.n_voxels) return;
   const int32_t source = sources.of(voxel);
@@ -67,6 +59,32 @@ __global__ void __launch_bounds__(kThreads)
   *reinterpret_cast<Vector<E, kVector>*>(shared + wide_product(source - sources.n_rows, channels) + c) = result;
 }
 
+// Clears the rows that no voxel lists. Every lane looks for one row among those of its voxel, which ascend; the warp
+// clears what it does not find.
+template <typename E>
+__global__ void __launch_bounds__(kThreads)
+    clear_unlisted(Sources sources, const int64_t* row_voxel, int32_t channels, E* y) {
+  const int64_t row = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
+  const int lane = threadIdx.x % kWarp;
+  bool listed = row >= sources.n_rows;
+  const int64_t voxel = listed ? -1 : row_voxel[row];
+  if (inside(voxel, sources.n_voxels)) {
+    Range rows = range_of(sources.cu_voxel_rows, voxel, sources.n_rows);
+    while (rows.begin < rows.end && !listed) {
+      const int64_t middle = (rows.begin + rows.end) / 2, found = sources.voxel_rows[middle];
+      listed = found == row;
+      if (found < row)
+        rows.begin = middle + 1;
+      else
+        rows.end = middle;
+    }
+  }
+  for (unsigned missing = __ballot_sync(kFullWarp, !listed); missing != 0; missing &= missing - 1) {
+    E* to = y + (row - lane + __ffs(missing) - 1) * channels;
+    for (int32_t c = lane; c < channels; c += kWarp) to[c] = E(0);
+  }
+}
+
 // Rows of `channels` columns, with zeros up to `padded`.
 template <typename E>
 __global__ void __launch_bounds__(kThreads)
@@ -77,20 +95,49 @@ __global__ void __launch_bounds__(kThreads)
   to[i] = c < channels ? from[row * channels + c] : E(0);
 }
 
-// to[ci, tap, co] = from[co, tap, ci], with zeros for co up to `padded`.
-template <typename E>
+// to[ci, tap, co] = from[co, tap, ci], with zeros for co up to `padded`, a multiple of 8. A block turns a square: a
+// thread reads eight columns of two rows, in vectors where rows hold whole ones, and writes eight columns of two rows.
+constexpr int kSquare = 64;
+template <typename E, bool kVectors>
 __global__ void __launch_bounds__(kThreads)
     transpose_weights(const E* from, int32_t taps, int32_t c_in, int32_t c_out, int32_t padded, E* to) {
-  __shared__ E square[kWarp][kWarp + 2];
-  const int32_t ci0 = blockIdx.x * kWarp, co0 = blockIdx.y * kWarp, tap = blockIdx.z, lane = threadIdx.x % kWarp;
-  for (int r = threadIdx.x / kWarp; r < kWarp; r += kWarps) {
-    const int64_t co = co0 + r;
-    square[r][lane] = co < c_out && ci0 + lane < c_in ? from[(co * taps + tap) * c_in + ci0 + lane] : E(0);
+  using Eight = Vector<E, 8>;
+  using Two = Vector<E, 2>;
+  constexpr int kTwos = kSquare / 2, kEights = kSquare / 8;
+  static_assert(kThreads == kTwos * kEights);
+  __shared__ Two square[kSquare][kTwos + 1];
+  const int32_t ci0 = blockIdx.x * kSquare, co0 = blockIdx.y * kSquare, tap = blockIdx.z;
+  const int column = threadIdx.x % kEights, row = threadIdx.x / kEights;
+  Eight read[2] = {};
+#pragma unroll
+  for (int h = 0; h < 2; ++h) {
+    const int64_t co = co0 + 2 * row + h;
+    const int32_t ci = ci0 + column * 8;
+    const E* values = from + (co * taps + tap) * c_in + ci;
+    if (co >= c_out) continue;
+    if constexpr (kVectors) {
+      if (ci < c_in) read[h] = *reinterpret_cast<const Eight*>(values);
+    } else {
+#pragma unroll
+      for (int k = 0; k < 8; ++k)
+        if (ci + k < c_in) read[h].values[k] = values[k];
+    }
   }
+#pragma unroll
+  for (int k = 0; k < 8; ++k) square[column * 8 + k][row] = Two{read[0].values[k], read[1].values[k]};
   __syncthreads();
-  for (int r = threadIdx.x / kWarp; r < kWarp; r += kWarps) {
+#pragma unroll
+  for (int r = row; r < kSquare; r += kTwos) {
     const int64_t ci = ci0 + r;
-    if (ci < c_in && co0 + lane < padded) to[(ci * taps + tap) * padded + co0 + lane] = square[lane][r];
+    const int32_t co = co0 + column * 8;
+    Eight turned;
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+      const Two two = square[r][column * 4 + k];
+      turned.values[2 * k] = two.values[0];
+      turned.values[2 * k + 1] = two.values[1];
+    }
+    if (ci < c_in && co < padded) *reinterpret_cast<Eight*>(to + (ci * taps + tap) * padded + co) = turned;
   }
 }
 
@@ -152,6 +199,7 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t begin = static_cast<int64_t>(blockIdx.x) * kBiasRows, end = min(n_rows, begin + kBiasRows);
   Sum<E> sum[kVector] = {};
   if (c < channels)
+#pragma unroll 8
     for (int64_t row = begin + lane; row < end; row += kRowsAtOnce) {
       const auto values = *reinterpret_cast<const Vector<E, kVector>*>(grad + row * channels + c);
 #pragma unroll
@@ -171,54 +219,101 @@ __global__ void __launch_bounds__(kThreads)
       ((sums[0][i] + sums[1][i]) + (sums[2][i] + sums[3][i])) + ((sums[4][i] + sums[5][i]) + (sums[6][i] + sums[7][i]));
 }
 
-// Adding blocks up: kAdders threads take every kAdders-th block, then their sums are added in a tree. A thread has
-// kEach elements, kElements apart, whose loads are in flight together.
-constexpr int kAdders = 4, kElements = kThreads / kAdders, kEach = 4;
-
-// One tap (first_tap + blockIdx.y), behind the taps the bias.
-template <typename E, typename T>
-__global__ void __launch_bounds__(kThreads)
-    add_partials(OuterProducts<E> products, int32_t first_tap, int64_t n_chunks, int32_t c_out, int32_t c_in,
-                 const T* bias_partials, int64_t bias_blocks, T* grad_weight, T* grad_bias) {
-  __shared__ T sums[kAdders][kEach][kElements];
-  const int adder = threadIdx.x / kElements, element = threadIdx.x % kElements;
-  const int32_t tap = first_tap + static_cast<int32_t>(blockIdx.y);
-  const bool bias = tap == products.taps;
-  const int32_t centre = products.taps / 2, parts_of_chunk = tap == centre ? products.centre_parts : 1;
-  const int32_t unit = tap == centre ? 0 : products.centre_parts + (tap < centre ? tap : tap - 1);
-  const int64_t size = bias ? c_out : static_cast<int64_t>(products.c_out) * products.c_in;
-  const int64_t blocks = bias ? bias_blocks : n_chunks * parts_of_chunk;
-  const int64_t count = bias ? c_out : static_cast<int64_t>(c_out) * c_in;
-  const int64_t first = static_cast<int64_t>(blockIdx.x) * kElements * kEach + element;
-  if (first - element >= count) return;
-
-  int64_t offset[kEach];
-#pragma unroll
-  for (int k = 0; k < kEach; ++k) {
-    const int64_t i = min(first + k * kElements, count - 1);
-    offset[k] = bias ? i : i / c_in * products.c_in + i % c_in;
-  }
-  T parts[kEach] = {};
-#pragma unroll 4
-  for (int64_t b = adder; b < blocks; b += kAdders) {
-    const int64_t block = bias ? b : b / parts_of_chunk * products.blocks_per_chunk() + unit + b % parts_of_chunk;
-    const T* from = (bias ? bias_partials : products.partials) + block * size;
-#pragma unroll
-    for (int k = 0; k < kEach; ++k) parts[k] += from[offset[k]];
-  }
-#pragma unroll
-  for (int k = 0; k < kEach; ++k) sums[adder][k][element] = parts[k];
+// The bias of a weight gradient: every warp adds every kWarps-th block up, for one column a lane; then in a tree.
+template <typename T, typename R>
+__device__ void add_bias(const T* partials, int64_t blocks, int32_t channels, R* grad_bias) {
+  __shared__ T sums[kWarps][kWarp];
+  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
+  const int64_t c = static_cast<int64_t>(blockIdx.x) * kWarp + lane;
+  if (c - lane >= channels) return;
+  T sum{};
+  if (c < channels)
+#pragma unroll 8
+    for (int64_t b = warp; b < blocks; b += kWarps) sum += partials[b * channels + c];
+  sums[warp][lane] = sum;
   __syncthreads();
-  // Each adder finishes one of the kEach elements.
-  static_assert(kAdders == kEach);
-  const T sum =
-      (sums[0][adder][element] + sums[1][adder][element]) + (sums[2][adder][element] + sums[3][adder][element]);
-  const int64_t i = first + adder * kElements;
-  if (i >= count) return;
-  if (bias)
-    grad_bias[i] = sum;
-  else
-    grad_weight[(i / c_in * products.taps + tap) * c_in + i % c_in] = sum;
+  if (warp > 0 || c >= channels) return;
+  static_assert(kWarps == 8);
+  grad_bias[c] = static_cast<R>(((sums[0][lane] + sums[1][lane]) + (sums[2][lane] + sums[3][lane])) +
+                                ((sums[4][lane] + sums[5][lane]) + (sums[6][lane] + sums[7][lane])));
+}
+
+// Adding blocks of pairs up. Where there are few, a thread adds all of them, for kFewEach times kFewColumns elements.
+// Else kAdders threads take every kAdders-th block, then their sums are added in a tree; a thread has kEach elements,
+// kElements apart. The loads of a thread are in flight together.
+constexpr int kFewColumns = 4, kFewEach = 2;
+constexpr int kAdders = 4, kElements = kThreads / kAdders, kEach = 4;
+constexpr int64_t kFewChunks = 4;
+
+// First the bias, then one tap after another.
+template <typename E, typename R, bool kFew>
+__global__ void __launch_bounds__(kThreads)
+    add_partials(OuterProducts<E> products, int64_t n_chunks, int32_t c_out, int32_t c_in, const Sum<E>* bias_partials,
+                 int64_t bias_blocks, R* grad_weight, R* grad_bias) {
+  using T = Sum<E>;
+  if (blockIdx.y == 0) return add_bias(bias_partials, bias_blocks, c_out, grad_bias);
+  const int32_t tap = static_cast<int32_t>(blockIdx.y) - 1, centre = products.taps / 2;
+  const int32_t parts_of_chunk = tap == centre ? products.centre_parts : 1;
+  const int32_t unit = tap == centre ? 0 : products.centre_parts + (tap < centre ? tap : tap - 1);
+  const int64_t size = static_cast<int64_t>(products.c_out) * products.c_in, blocks = n_chunks * parts_of_chunk;
+  const int64_t count = static_cast<int64_t>(c_out) * c_in;
+  const auto block_at = [&](int64_t b) {
+    return products.partials + (b / parts_of_chunk * products.blocks_per_chunk() + unit + b % parts_of_chunk) * size;
+  };
+  const auto result_at = [&](int64_t i) { return grad_weight + (i / c_in * products.taps + tap) * c_in + i % c_in; };
+  if constexpr (kFew) {
+    constexpr int64_t kApart = kThreads * kFewColumns;
+    const int64_t first = static_cast<int64_t>(blockIdx.x) * kApart * kFewEach + threadIdx.x * kFewColumns;
+    T sums[kFewEach][kFewColumns] = {};
+#pragma unroll 4
+    for (int64_t b = 0; b < blocks; ++b) {
+      const T* from = block_at(b);
+#pragma unroll
+      for (int k = 0; k < kFewEach; ++k) {
+        const int64_t i = first + k * kApart;
+        if (i >= count) continue;
+        const auto part = *reinterpret_cast<const Vector<T, kFewColumns>*>(from + i);
+#pragma unroll
+        for (int j = 0; j < kFewColumns; ++j) sums[k][j] += part.values[j];
+      }
+    }
+#pragma unroll
+    for (int k = 0; k < kFewEach; ++k) {
+      const int64_t i = first + k * kApart;
+      if (i >= count) continue;
+      Vector<R, kFewColumns> result;
+#pragma unroll
+      for (int j = 0; j < kFewColumns; ++j) result.values[j] = static_cast<R>(sums[k][j]);
+      *reinterpret_cast<Vector<R, kFewColumns>*>(result_at(i)) = result;
+    }
+  } else {
+    __shared__ T sums[kAdders][kEach][kElements];
+    const int adder = threadIdx.x / kElements, element = threadIdx.x % kElements;
+    const int64_t first = static_cast<int64_t>(blockIdx.x) * kElements * kEach + element;
+    if (first - element >= count) return;
+    int64_t offset[kEach];
+#pragma unroll
+    for (int k = 0; k < kEach; ++k) {
+      const int64_t i = min(first + k * kElements, count - 1);
+      offset[k] = i / c_in * products.c_in + i % c_in;
+    }
+    T parts[kEach] = {};
+#pragma unroll 4
+    for (int64_t b = adder; b < blocks; b += kAdders) {
+      const T* from = block_at(b);
+#pragma unroll
+      for (int k = 0; k < kEach; ++k) parts[k] += from[offset[k]];
+    }
+#pragma unroll
+    for (int k = 0; k < kEach; ++k) sums[adder][k][element] = parts[k];
+    __syncthreads();
+    // Each adder finishes one of the kEach elements.
+    static_assert(kAdders == kEach);
+    const int64_t i = first + adder * kElements;
+    if (i < count)
+      *result_at(i) = static_cast<R>((sums[0][adder][element] + sums[1][adder][element]) +
+                                     (sums[2][adder][element] + sums[3][adder][element]));
+  }
 }
 
 template <typename E>
@@ -243,25 +338,19 @@ Padded<E> padded(const char* op, const E* data, int64_t n, int64_t channels, con
   return {copy, wanted};
 }
 
-// Rows of `channels` columns, and for voxels of several rows one value each. Clears `cleared` numbers from `to` on.
+// Rows of `channels` columns, and for voxels of several rows one value each.
 template <typename E>
-Values<E> values_of(const char* op, const E* x, const SparseConvMap& map, int64_t channels, VoxelValue kind, E* to,
-                    int64_t cleared, const Workspace& workspace, Stream stream) {
-  const int64_t n_slots = slots_of(map), bytes = cleared * static_cast<int64_t>(sizeof(E));
-  const bool combines = n_slots > 0 && channels > 0;
-  Clear clear;  // one launch does both
-  if (combines && map.n_voxels > 0 && aligned(to) && bytes % kAlignment == 0)
-    clear = {reinterpret_cast<uint4*>(to), bytes / kAlignment};
-  else
-    fill_zero(op, to, cleared, stream);
+Values<E> values_of(const char* op, const E* x, const SparseConvMap& map, int64_t channels, VoxelValue kind,
+                    const Workspace& workspace, Stream stream) {
+  const int64_t n_slots = slots_of(map);
   E* shared = nullptr;
-  if (combines) {
+  if (n_slots > 0 && channels > 0) {
     shared = workspace.take<E>(n_slots * channels);
     constexpr int kVector = kAlignment / sizeof(E);
     const bool vectors = channels % kVector == 0 && aligned(x);
     launch(op, vectors ? combine_rows<E, kVector> : combine_rows<E, 1>,
            blocks_for(op, map.n_voxels * (vectors ? channels / kVector : channels), kThreads), kThreads, 0, stream, x,
-           sources_of(map), channels, kind, shared, clear);
+           sources_of(map), channels, kind, shared);
   }
   return {x, shared, static_cast<int32_t>(map.n_rows), static_cast<int32_t>(map.n_rows + n_slots),
           static_cast<int32_t>(channels)};
@@ -319,8 +408,8 @@ void convolve(const char* op, const E* x, const E* weight, const E* bias, const 
       kGradient ? Padded<E>{weight, c_in} : padded(op, weight, c_out * taps, c_in, workspace, stream);
   const VoxelValue kind = kGradient ? VoxelValue::kSum : map.first ? VoxelValue::kFirst : VoxelValue::kMean;
   const bool whole = !kGradient || slots_of(map) == 0;
-  const int64_t n_results = map.n_rows * (kGradient ? c_in : c_out);  // 0 for rows that no list has
-  Convolution<E> conv{values_of(op, rows.data, map, rows.channels, kind, y, n_results, workspace, stream),
+  const int64_t c_write = kGradient ? c_in : c_out;
+  Convolution<E> conv{values_of(op, rows.data, map, rows.channels, kind, workspace, stream),
                       weights.data,
                       bias,
                       map.row_voxel,
@@ -329,7 +418,7 @@ void convolve(const char* op, const E* x, const E* weight, const E* bias, const 
                       map.n_voxels,
                       static_cast<int32_t>(taps),
                       static_cast<int32_t>(rows.channels),
-                      static_cast<int32_t>(kGradient ? c_in : c_out),
+                      static_cast<int32_t>(c_write),
                       static_cast<int32_t>(c_out),
                       static_cast<int32_t>(weights.channels),
                       whole ? Share::kWhole : map.first ? Share::kFirstRow : Share::kEqualParts,
@@ -348,15 +437,18 @@ void convolve(const char* op, const E* x, const E* weight, const E* bias, const 
       tensor.plan = row_plan_in(plan, map.n_rows, taps, kGradient && map.plan != nullptr);
       if constexpr (kGradient) {
         E* transposed = workspace.take<E>(c_in * taps * rows.channels);
-        const dim3 squares(blocks_for(op, c_in, kWarp), blocks_for(op, rows.channels, kWarp),
+        const dim3 squares(blocks_for(op, c_in, kSquare), blocks_for(op, rows.channels, kSquare),
                            static_cast<unsigned>(taps));
-        launch(op, transpose_weights<E>, squares, kThreads, 0, stream, weight, taps, c_in, c_out, rows.channels,
-               transposed);
+        launch(op, c_in % 8 == 0 && aligned(weight) ? transpose_weights<E, true> : transpose_weights<E, false>, squares,
+               kThreads, 0, stream, weight, taps, c_in, c_out, rows.channels, transposed);
         tensor.weight = transposed;
         tensor.weight_row = static_cast<int32_t>(rows.channels);
       }
+      launch(op, clear_unlisted<E>, blocks_for(op, map.n_rows, kThreads), kThreads, 0, stream, sources_of(map),
+             map.row_voxel, c_write, y);
       if (convolve_tensor(op, tensor, workspace, stream)) return;
     }
+  fill_zero(op, y, map.n_rows * c_write, stream);
   conv.pairs = pairs_of(op, map, kGradient, workspace, stream);
   convolve_plain(op, conv, tiles_of(map), kGradient, stream);
 }
@@ -378,9 +470,9 @@ void sparse_conv_vjp_input(const T* grad, const T* weight, const SparseConvMap& 
                             native_data(grad_x), workspace, stream);
 }
 
-template <typename T>
+template <typename T, typename R>
 void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map, int64_t c_in, int64_t c_out,
-                            Sum<T>* grad_weight, Sum<T>* grad_bias, const Workspace& workspace, Stream stream) {
+                            R* grad_weight, R* grad_bias, const Workspace& workspace, Stream stream) {
   using E = Native<T>;
   const char* op = "sparse_conv_grad_weight";
   check_sizes(op, map, c_in, c_out);
@@ -400,9 +492,9 @@ void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map,
   const bool direct = kIsHalf<E> && plan.n_chunks * plan.centre_parts == 1 && right.channels == c_in;
   const int64_t n_blocks = plan.n_chunks * (plan.centre_parts + taps - 1);
   const OuterProducts<E> products{
-      values_of<E>(op, left.data, map, left.channels, VoxelValue::kSum, nullptr, 0, workspace, stream),
-      values_of<E>(op, right.data, map, right.channels, map.first ? VoxelValue::kFirst : VoxelValue::kMean, nullptr, 0,
-                   workspace, stream),
+      values_of(op, left.data, map, left.channels, VoxelValue::kSum, workspace, stream),
+      values_of(op, right.data, map, right.channels, map.first ? VoxelValue::kFirst : VoxelValue::kMean, workspace,
+                stream),
       sources_of(map),
       map.tap_in,
       map.tap_out,
@@ -415,27 +507,37 @@ void sparse_conv_vjp_weight(const T* grad, const T* x, const SparseConvMap& map,
       static_cast<int32_t>(right.channels),
       direct ? nullptr : workspace.take<Sum<E>>(n_blocks * left.channels * right.channels),
       grad_weight,
-      static_cast<int32_t>(c_out)};
+      static_cast<int32_t>(c_out),
+      !std::is_same_v<R, Sum<T>>};
   if constexpr (kIsHalf<E>)
     outer_products_tensor(op, products, n_blocks, stream);
   else
     outer_products_plain(op, products, n_blocks, stream);
-  const unsigned columns = blocks_for(op, direct ? c_out : std::max(c_out * c_in, c_out), kElements * kEach);
-  launch(op, add_partials<E, Sum<E>>, dim3(columns, direct ? 1 : static_cast<unsigned>(taps + 1)), kThreads, 0, stream,
-         products, direct ? taps : 0, plan.n_chunks, c_out, c_in, bias_partials, bias_blocks, grad_weight, grad_bias);
+  const bool few = plan.n_chunks <= kFewChunks && right.channels == c_in && c_in % kFewColumns == 0;
+  const unsigned columns =
+      blocks_for(op, direct ? 0 : c_out * c_in, few ? kThreads * kFewColumns * kFewEach : kElements * kEach);
+  const dim3 blocks(std::max(columns, blocks_for(op, c_out, kWarp)), direct ? 1 : static_cast<unsigned>(taps + 1));
+  launch(op, few ? add_partials<E, Native<R>, true> : add_partials<E, Native<R>, false>, blocks, kThreads, 0, stream,
+         products, plan.n_chunks, c_out, c_in, bias_partials, bias_blocks, native_data(grad_weight),
+         native_data(grad_bias));
 }
 
+#define GSIM3D_INSTANTIATE_WEIGHT(T, R)                                                                       \
+  template void sparse_conv_vjp_weight<T, R>(const T*, const T*, const SparseConvMap&, int64_t, int64_t, R*,  \
+                                             R*, const Workspace&, Stream);
 #define GSIM3D_INSTANTIATE(T)                                                                                 \
   template void sparse_conv<T>(const T*, const T*, const T*, const SparseConvMap&, int64_t, int64_t, T*,      \
                                const Workspace&, Stream);                                                     \
   template void sparse_conv_vjp_input<T>(const T*, const T*, const SparseConvMap&, int64_t, int64_t, T*,      \
                                          const Workspace&, Stream);                                           \
-  template void sparse_conv_vjp_weight<T>(const T*, const T*, const SparseConvMap&, int64_t, int64_t,         \
-                                          Sum<T>*, Sum<T>*, const Workspace&, Stream);
+  GSIM3D_INSTANTIATE_WEIGHT(T, Sum<T>)
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 GSIM3D_INSTANTIATE(Float16)
 GSIM3D_INSTANTIATE(BFloat16)
+GSIM3D_INSTANTIATE_WEIGHT(Float16, Float16)
+GSIM3D_INSTANTIATE_WEIGHT(BFloat16, BFloat16)
 #undef GSIM3D_INSTANTIATE
+#undef GSIM3D_INSTANTIATE_WEIGHT
 
 }  // namespace gsim3d::cuda

@@ -149,8 +149,9 @@ struct OuterProducts {
   int64_t n_pairs, chunk_voxels;
   int32_t taps, centre_parts, c_out, c_in;
   Sum<E>* partials;  // [chunks, centre_parts + taps - 1, c_out, c_in]; or null:
-  Sum<E>* result;    // [result_rows, taps, c_in], where one block has all pairs of a tap
+  void* result;      // [result_rows, taps, c_in], Sum<E> or, where rounded, E; one block has all pairs of a tap
   int32_t result_rows;
+  bool rounded;
 
   __host__ __device__ int32_t blocks_per_chunk() const { return centre_parts + taps - 1; }
 };

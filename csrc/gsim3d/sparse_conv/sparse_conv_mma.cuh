@@ -88,17 +88,18 @@ __device__ __forceinline__ void wait_for_phase(uint32_t barrier, uint32_t parity
 #undef GSIM3D_WAIT
 }
 
-// A factor in shared memory: where it starts, in the way that the instructions at hand ask for.
+// A factor in shared memory: where it starts, in the way that the instructions at hand ask for. Of a turned factor the
+// second 64 rows (columns) lie `apart` bytes behind the first.
 #ifdef __CUDA_ARCH_FEAT_SM90_ALL
 using Factor = uint64_t;
-__device__ __forceinline__ Factor factor_at(uint32_t address) {
+__device__ __forceinline__ Factor factor_at(uint32_t address, uint32_t apart = 16) {
   constexpr uint64_t kEightRows = 1024 / 16, kPermuted128 = 1;
-  return address / 16 | uint64_t{1} << 16 | kEightRows << 32 | kPermuted128 << 62;
+  return address / 16 | uint64_t{apart / 16} << 16 | kEightRows << 32 | kPermuted128 << 62;
 }
 __device__ __forceinline__ Factor moved(Factor factor, uint32_t bytes) { return factor + bytes / 16; }
 #else
 using Factor = uint32_t;
-__device__ __forceinline__ Factor factor_at(uint32_t address) { return address; }
+__device__ __forceinline__ Factor factor_at(uint32_t address, uint32_t = 0) { return address; }
 __device__ __forceinline__ Factor moved(Factor factor, uint32_t bytes) { return factor + bytes; }
 #endif
 

@@ -147,7 +147,8 @@ Tensor sparse_conv_grad_input(const Tensor& grad_, const Tensor& weight_, const 
 std::tuple<Tensor, Tensor> sparse_conv_grad_weight(const Tensor& grad_, const Tensor& x_, int64_t kernel_size,
                                                    const Tensor& row_voxel, const Tensor& voxel_rows,
                                                    const Tensor& cu_voxel_rows, const Tensor& tap_in,
-                                                   const Tensor& tap_out, const Tensor& cu_taps, bool first) {
+                                                   const Tensor& tap_out, const Tensor& cu_taps, bool first,
+                                                   bool rounded) {
   const char* op = "sparse_conv_grad_weight";
   cpu::check_sparse_conv_kernel(op, kernel_size);
   check_shape(op, "x", x_, {-1, -1}, "[N, C_in]");
@@ -158,16 +159,19 @@ std::tuple<Tensor, Tensor> sparse_conv_grad_weight(const Tensor& grad_, const Te
   const int64_t c_in = x.size(1), c_out = grad.size(1);
   const Geometry geometry(op, x, kernel_size, first, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out,
                           cu_taps);
-  const ScalarType wide = grad.scalar_type() == ScalarType::Double ? ScalarType::Double : ScalarType::Float;
-  Tensor grad_weight = empty(grad, {c_out, kernel_size, kernel_size, kernel_size, c_in}, wide);
-  Tensor grad_bias = empty(grad, {c_out}, wide);
+  const bool narrow = grad.scalar_type() == ScalarType::Half || grad.scalar_type() == ScalarType::BFloat16;
+  const ScalarType dtype = narrow && !rounded ? ScalarType::Float : grad.scalar_type();
+  Tensor grad_weight = empty(grad, {c_out, kernel_size, kernel_size, kernel_size, c_in}, dtype);
+  Tensor grad_bias = empty(grad, {c_out}, dtype);
   dispatch(op, "grad", grad, [&]<typename T>() {
     TensorWorkspace workspace(grad);
-    if constexpr (kWithCuda)
-      if (grad.is_cuda())
-        return cuda::sparse_conv_vjp_weight(data<T>(grad), data<T>(x), geometry.map, c_in, c_out,
-                                            mutable_data<Sum<T>>(grad_weight), mutable_data<Sum<T>>(grad_bias),
-                                            workspace, current_stream(grad));
+    if constexpr (kWithCuda) {
+      const auto run = [&]<typename R>() {
+        cuda::sparse_conv_vjp_weight(data<T>(grad), data<T>(x), geometry.map, c_in, c_out, mutable_data<R>(grad_weight),
+                                     mutable_data<R>(grad_bias), workspace, current_stream(grad));
+      };
+      if (grad.is_cuda()) return rounded ? run.template operator()<T>() : run.template operator()<Sum<T>>();
+    }
     if constexpr (kOnCpu<T>)
       cpu::sparse_conv_vjp_weight(data<T>(grad), data<T>(x), geometry.map, c_in, c_out, mutable_data<T>(grad_weight),
                                   mutable_data<T>(grad_bias), workspace, torch_parallel());

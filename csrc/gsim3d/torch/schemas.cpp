@@ -26,8 +26,8 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first, Tensor? plan=None) -> Tensor");
   m.def(
       "sparse_conv_grad_weight(Tensor grad, Tensor x, int kernel_size, Tensor row_voxel, Tensor voxel_rows, "
-      "Tensor cu_voxel_rows, Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first) -> (Tensor weight, Tensor "
-      "bias)");
+      "Tensor cu_voxel_rows, Tensor tap_in, Tensor tap_out, Tensor cu_taps, bool first, bool rounded=False) -> (Tensor "
+      "weight, Tensor bias)");
 
   // patch_attn: attention inside patches of a serialized order, separate query and key tables; q, k, v [N, H, D].
   // Joint: to the keys of two tables, in one softmax.
