@@ -8,9 +8,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsim3d.ablate.rows import ROWS
 from gsim3d.data import Scene, find_scenes
-from gsim3d.effects import AppearanceEffects, EffectsSpec
 from gsim3d.errors import InputError
-from gsim3d.selections import Selection
 from gsim3d.stability import StabilityReport
 from gsim3d.train.captured import CapturedLoss
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
@@ -36,9 +34,7 @@ def scenes(tmp_path_factory):
     return [Scene.open(path) for path in find_scenes(write_scenes(tmp_path_factory.mktemp("scenes"), 2))]
 
 
-HELD = AppearanceEffects(held=(Selection("all", ((-9.0, -9.0, -9.0), (0.0, 9.0, 9.0))),))
 KINDS = {"latent": CONFIG, **{name: ROWS[name].change(CONFIG) for name in ("explicit", "background-masked")}}
-KINDS["held"] = dataclasses.replace(CONFIG, effects=EffectsSpec(appearance=HELD).to_dict())
 
 
 @pytest.fixture(params=["latent"])
@@ -74,11 +70,10 @@ def run(captured, batch, trainer, report=None, factor=1.0):
         ({"horizon": 0}, "latent"),
         ({}, "explicit"),
         ({"lead": 2}, "background-masked"),
-        ({"lead": 2}, "held"),
         ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "latent"),
         ({"dynamics_alone": True, "lead": 2}, "background-masked"),
     ],
-    ids=["rollout", "lead", "encoded", "explicit", "masked", "held", "dynamics alone, cut", "dynamics alone, masked"],
+    ids=["rollout", "lead", "encoded", "explicit", "masked", "dynamics alone, cut", "dynamics alone, masked"],
     indirect=["trainer"],
 )
 def test_gradients_are_those_of_the_loss(stage, scenes, trainer, device):
