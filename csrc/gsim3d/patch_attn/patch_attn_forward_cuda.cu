@@ -356,6 +356,10 @@ void run(Forward<T> args, int64_t heads, bool joins, Stream stream) {
   args.division = divide(args.table.n_patches, args.table.n_q_listed, Shape<D>::kGroup, heads,
                          kBlocks * multiprocessors(kOp, stream));
   const int64_t n_stats = args.table.n_q * heads, n_out = n_stats * D * sizeof(T) / sizeof(uint2);
+  // A multiprocessor changes how much shared memory it has only when it is empty: both kernels want the same.
+  check_cuda(cudaFuncSetAttribute(clear_kernel, cudaFuncAttributePreferredSharedMemoryCarveout,
+                                  cudaSharedmemCarveoutMaxShared),
+             kOp);
   launch(kOp, clear_kernel, multiprocessors(kOp, stream), kThreads, 0, stream, reinterpret_cast<uint2*>(args.out),
          n_out, reinterpret_cast<uint2*>(args.stats), n_stats);
   launch_overlapping(kOp, forward_kernel<T, D, false>, blocks_of(args.division), kThreads, kSharedBytes, stream, args);
