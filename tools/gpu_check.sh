@@ -128,7 +128,7 @@ sanitize() {
   # It slows kernels a hundred times, so that it sees our kernels alone, and some cases of every test.
   GSIM3D_FEW=3 GSIM3D_PART="$part" GSIM3D_REQUIRE_CUDA=1 PYTORCH_NO_CUDA_MEMORY_CACHING=1 OMP_NUM_THREADS=1 \
     compute-sanitizer --tool "$tool" --kernel-name kns=gsim3d --kernel-name kns=3cub --error-exitcode 9 \
-    "$PYTHON" -m pytest -q -p no:cacheprovider --durations 10 "$file" -m "$wanted" \
+    "$PYTHON" -m pytest -v -p no:cacheprovider --durations 10 "$file" -m "$wanted" \
     -k "not compile and not graph and not opcheck"
 }
 
@@ -155,6 +155,7 @@ run_bench() {
 
 stop() {
   local group
+  trap '' INT TERM  # told again, it would begin again
   for group in $(jobs -rp); do kill -- "-$group" 2>/dev/null; done
   summary "$PHASE"
   exit 143
