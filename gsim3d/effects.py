@@ -21,7 +21,7 @@ VERSION = 1
 FILE = "effects.yaml"  # of a scene or of a whole data set, in its folder
 BACKGROUNDS = ("frozen", "masked_out", "dynamic", "asymmetric")
 POLICIES = ("exact", "approx")
-CHANGING = ("all", "dynamic", "none")
+CHANGING = ("all", "dynamic", "frozen", "none")
 ACTIONS = ("keypoints3d",)
 
 
@@ -104,7 +104,8 @@ class AppearanceEffects:
     """What changes its look.
 
     view_dependent: degree of the harmonics, 0 to 3; None: the model's.
-    changing: whose dynamic latents change with time: "all" (a shadow may fall on the background), "dynamic" or "none".
+    changing: whose dynamic latents change with time: "all", "dynamic", "frozen" (shadows fall on the background, bodies
+        keep their look) or "none".
     held: bodies whose latents do not, whatever ``changing`` says: who is there when a rollout starts, by kind and box
         as in edits, stays held wherever it goes.
     opacity_changes: opacities change with time; None: where the model predicts it (explicit models do).

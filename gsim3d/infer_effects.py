@@ -125,7 +125,7 @@ def smaller(base, model) -> dict:
         ],
         "changing features": [
             (who, replace(base, appearance=replace(look, changing=who)))
-            for who in ("none", "dynamic")[: ("none", "dynamic", "all").index(look.changing)]
+            for who in {"all": ("none", "dynamic"), "none": ()}.get(look.changing, ("none",))
         ],
         "changing opacities": (
             [("off", replace(base, appearance=replace(look, opacity_changes=False)))]

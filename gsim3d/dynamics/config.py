@@ -32,6 +32,9 @@ class DynamicsConfig:
         position_features: the network also sees positions relative to the scene's origin (in units of
             ``position_length`` metres) and inside the cell. Learning where the ground is takes far less data so;
             without it the network knows particles by their neighbours only, and motion does not depend on the place.
+        motion_length: metres, about the radius of a body. The network sees how the matter around a particle has moved
+            (:func:`gsim3d.dynamics.motion.motion`), and predicts what changes that motion: without a force bodies fly
+            on. None: it has to read velocities off the places in its history.
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.
@@ -65,6 +68,7 @@ class DynamicsConfig:
     max_latent_step: float | None = None
     position_features: bool = False
     position_length: float = 1.0
+    motion_length: float | None = None
     grid_size: float = 0.004
     history_bits: int = 2
     strides: tuple[int, ...] = (4, 2, 2, 2)
@@ -116,6 +120,11 @@ class DynamicsConfig:
             )
         if self.is_asymmetric and (self.norm == "batch" or self.quirks != Quirks()):
             raise ValueError('DynamicsConfig: background="asymmetric" needs norm="layer" and no quirks')
+        if self.motion_length is not None and (self.predicts == "absolute" or not self.motion_length > 0):
+            raise ValueError(
+                'DynamicsConfig: motion_length must be positive, and predicts "from_newest" or "from_previous"; '
+                f"got {self.motion_length} and {self.predicts!r}"
+            )
         if self.steps_per_call < 1:
             raise ValueError(f"DynamicsConfig: steps_per_call must be at least 1; got {self.steps_per_call}")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -11,11 +11,14 @@ from gsim3d import ops
 from gsim3d.dynamics.background import Background
 from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps
 from gsim3d.dynamics.config import DynamicsConfig
+from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.point_transformer import PointTransformer
 from gsim3d.dynamics.state import StateLayout
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.types import ASLEEP, CloudTable, Particles, constant, take_runs
+
+DRIFT = 1  # the motion that goes on by itself, of motion()
 
 
 class Dynamics(nn.Module):
@@ -121,7 +124,11 @@ class Dynamics(nn.Module):
             raise ValueError(
                 'Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"'
             )
-        features, is_awake = self.layout.pack(history), None
+        runs, moved, drift = clouds.row_runs(newest), None, None
+        if self.config.motion_length is not None:
+            now = motion(history, self.config.motion_length)
+            moved, drift = put_runs(now, runs, history.n_rows), now[:, DRIFT]
+        features, is_awake = self.layout.pack(history, moved), None
         n_awake = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
         everyone = n_awake == history.n_rows
         if not everyone:  # rows of the pyramid <-> rows of the history; those that sleep become 0
@@ -134,7 +141,7 @@ class Dynamics(nn.Module):
             features, is_awake = (
                 ops.unpool(x, pyramid.rows, pyramid.cu_rows, history.n_rows, check=False) for x in (features, one)
             )
-        runs, changes = clouds.row_runs(newest), changes or self.layout.changes()
+        changes = changes or self.layout.changes()
         prediction = self.net.head(take_runs(features, runs), self.layout.columns(changes))
         if is_awake is not None:
             is_awake = take_runs(is_awake, runs)[:, 0] > 0
@@ -146,7 +153,7 @@ class Dynamics(nn.Module):
             step.with_clouds(
                 CloudTable.make(counts, table.scenes, (s + 1 + i for s in table.steps), state.cu_rows.device)
             )
-            for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes))
+            for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes, drift))
         ]
         return steps[0] if len(steps) == 1 else concatenate(steps)
 
@@ -200,6 +207,15 @@ def _beside(generator: torch.Generator, device: torch.device) -> torch.Generator
         return generator
     seed = torch.randint(2**62, (), generator=generator, device=generator.device).item()
     return torch.Generator(device).manual_seed(seed)
+
+
+def put_runs(x: Tensor, runs: Sequence[tuple[int, int]], n_rows: int) -> Tensor:
+    """[n_rows, ...], the rows of ``x`` one run after another; 0 elsewhere."""
+    pieces, end = [], 0
+    for part, (begin, until) in zip(x.split([until - begin for begin, until in runs]), runs, strict=True):
+        pieces += [x.new_zeros(begin - end, *x.shape[1:]), part]
+        end = until
+    return torch.cat([*pieces, x.new_zeros(n_rows - end, *x.shape[1:])])
 
 
 def _places(particles: Particles) -> Tensor:

@@ -16,7 +16,7 @@ from gsim3d.rotations import unit_quats
 from gsim3d.types import FROZEN, Particles
 
 SCALE_STEP_SHARE = 1 / 6  # of the range of scales, the most that one step changes a scale
-POSITION_CHANNELS = 6
+POSITION_CHANNELS = MOTION_CHANNELS = 6
 FEATURES = ("dynamic_latents", "sh")  # that rows which are held keep
 SMALL_ANGLE_SQUARED = 1e-8  # radians^2; smaller rotations are their series: a square root has no gradient at 0
 
@@ -51,10 +51,11 @@ class StateLayout:
 
     @property
     def in_channels(self) -> int:
-        return sum(n for _, n in self.inputs) + POSITION_CHANNELS * self.config.position_features
+        known = sum(n for _, n in self.inputs) + POSITION_CHANNELS * self.config.position_features
+        return known + MOTION_CHANNELS * (self.config.motion_length is not None)
 
     def changes(self, features: str = "all", opacities: bool = True) -> dict[str, str]:
-        """Of each output, whose values a step changes: "all", "dynamic" or "none".
+        """Of each output, whose values a step changes: "all", "dynamic", "frozen" or "none".
 
         Args:
             features: whose latents and colours change. Those of frozen particles may: a shadow may fall on them.
@@ -82,8 +83,11 @@ class StateLayout:
     def out_channels(self) -> int:
         return self.config.steps_per_call * sum(n for _, n in self.outputs)
 
-    def pack(self, particles: Particles) -> Tensor:
-        """[N, in_channels] of all rows."""
+    def pack(self, particles: Particles, moved: Tensor | None = None) -> Tensor:
+        """[N, in_channels] of all rows.
+
+        moved: [N, 2, 3] metres a step, of :func:`gsim3d.dynamics.motion.motion`; None: nothing moved.
+        """
         columns = []
         for name, n in self.inputs:
             value = getattr(particles, name)
@@ -93,6 +97,9 @@ class StateLayout:
             columns.append(_flat(name, value))
         if self.config.position_features:
             columns.append(position_features(particles, self.config.grid_size, self.config.position_length))
+        if self.config.motion_length is not None:
+            like = particles.means.new_zeros(particles.n_rows, MOTION_CHANNELS)
+            columns.append(like if moved is None else moved.flatten(1) / self.config.grid_size)
         return torch.cat(columns, 1)
 
     def advance(
@@ -101,6 +108,7 @@ class StateLayout:
         prediction: Tensor,
         awake: Tensor | None = None,
         changes: Mapping[str, str] | None = None,
+        drift: Tensor | None = None,
     ) -> list[Particles]:
         """The particles after 1, 2, ... ``steps_per_call`` steps.
 
@@ -109,27 +117,31 @@ class StateLayout:
             prediction: [N, channels], the outputs that change.
             awake: bool [N], rows that change at all; None: all.
             changes: of :meth:`changes`; None: all that is predicted.
+            drift: [N, 3] metres a step, the motion that goes on by itself; None: none.
         """
         changes = changes or self.changes()
         outputs = [(name, n) for name, n in self.outputs if changes[name] != "none"]
         widths = [n for _, n in outputs]
         parts = widened(prediction).unflatten(1, (self.config.steps_per_call, -1)).transpose(0, 1).split(widths, 2)
         moves = (particles.activity != FROZEN)[:, None].to(parts[0])
-        everywhere = torch.ones_like(moves)
+        shares = {"all": torch.ones_like(moves), "dynamic": moves, "frozen": 1 - moves}
         if awake is not None:
-            moves, everywhere = moves * awake[:, None], everywhere * awake[:, None]
+            shares = {who: share * awake[:, None] for who, share in shares.items()}
         later = {}
         for (name, _), part in zip(outputs, parts, strict=True):
-            share = everywhere if changes[name] == "all" else moves
+            share = shares[changes[name]]
             if particles.held is not None and name in FEATURES:
                 share = share.masked_fill(particles.held[:, None], 0)
-            later[name] = self.later_values(name, getattr(particles, name), part, share)
+            onward = drift if name == "means" else None
+            later[name] = self.later_values(name, getattr(particles, name), part, share, onward)
         return [
             dataclasses.replace(particles, **{name: values[step] for name, values in later.items()})
             for step in range(self.config.steps_per_call)
         ]
 
-    def later_values(self, name: str, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
+    def later_values(
+        self, name: str, newest: Tensor, predicted: Tensor, share: Tensor, drift: Tensor | None = None
+    ) -> Tensor:
         """One field of the particles after each step of a call.
 
         Args:
@@ -137,6 +149,7 @@ class StateLayout:
             newest: [N, ...], its newest values.
             predicted: [S, N, channels], of S steps.
             share: [N, 1] or [S, N, 1], how much of a predicted change happens: 0 holds the value, bit by bit.
+            drift: [N, ...], what is added in every step by itself; None: nothing.
         Returns:
             [S, N, ...].
         """
@@ -147,6 +160,8 @@ class StateLayout:
         changes = self._target(name, predicted) - newest if self._absolute else self._change(name, predicted)
         if self.config.predicts == "from_previous":
             changes = changes.cumsum(0)
+        if drift is not None:
+            changes = changes + drift * torch.arange(1, 1 + changes.shape[0], device=drift.device)[:, None, None]
         return hold(share, newest, self._in_range(name, newest + share * changes))
 
     @property

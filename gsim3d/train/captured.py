@@ -84,7 +84,8 @@ class CapturedLoss:
     Args:
         simulator: that is trained; without drop path and shuffled curves, whose draws a graph would repeat.
         plan: what a step computes.
-        loss: (images [I, H, W, 3], targets, weights of the steps) -> loss and errors by step.
+        loss: (images [I, H, W, 3], where the simulation begins, its steps, targets, weights of the steps) -> loss and
+            errors by step.
         precision: makes the context in which a part ("encoder", "dynamics", "renderer") computes.
 
     Attributes:
@@ -99,7 +100,7 @@ class CapturedLoss:
         self,
         simulator: Simulator,
         plan: Plan,
-        loss: Callable[[Tensor, Frames, Tensor], tuple[Tensor, Tensor]],
+        loss: Callable[[Tensor, Particles, list[Particles], Frames, Tensor], tuple[Tensor, Tensor]],
         precision: Callable[[str], torch.autocast],
     ):
         check_capturable(simulator.config.dynamics)
@@ -197,19 +198,21 @@ class _Step:
         geometry: Callable[[Particles], Pyramid],
         report: StabilityReport,
         wrap: Callable[[Callable], Callable] | None = None,
-    ) -> list[Particles]:
-        """The simulated steps that are looked at; ``wrap`` as of Simulator.rollout."""
+    ) -> tuple[Particles, list[Particles]]:
+        """Where the simulation begins, and its steps that are looked at; ``wrap`` as of Simulator.rollout."""
         owner, plan = self._owner, self._owner.plan
         if not self._n_future:
-            return []
+            return state, []
         if plan.spec.dynamics.background == "masked_out":
             state, plan = _without_background(state), with_background_as_it_is(plan)
+        else:
+            state = owner.simulator.prepare(state, plan)
         rollout = partial(owner.simulator.rollout, plan=plan, geometry=geometry, report=report, on_bad="drop")
         with owner.precision("dynamics"):
             if self._n_lead:
                 with torch.no_grad():
                     state = concatenate([state, *rollout(state, self._n_lead)])
-            return in_parts(partial(rollout, wrap=wrap), state, self._n_future, self._cut)
+            return state, in_parts(partial(rollout, wrap=wrap), state, self._n_future, self._cut)
 
     def _compute(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> tuple:
         owner, dynamics, of_calls = self._owner, self._owner.simulator.dynamics, []
@@ -223,13 +226,13 @@ class _Step:
             return call
 
         state = self._encode(report)
-        steps = self._rollout(state, geometry, report, with_own_weights)
+        begin, steps = self._rollout(state, geometry, report, with_own_weights)
         particles = concatenate(steps if self._dynamics_alone else [state, *steps])
         with owner.precision("renderer"):
             images = owner.simulator.draw(
                 particles, self._targets.cameras, plan=owner.plan, report=report, on_bad="drop"
             ).color
-        loss, errors = owner.loss(images, self._targets, self._weights)
+        loss, errors = owner.loss(images, begin, steps, self._targets, self._weights)
         parts = () if self._dynamics_alone else (owner.simulator.encoder, owner.simulator.renderer)
         once = [parameter for part in parts for parameter in part.parameters()]
         gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)

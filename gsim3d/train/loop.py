@@ -32,7 +32,7 @@ from gsim3d.train.captured import CapturedLoss, Gradients, Prepared
 from gsim3d.train.checks import check_history, check_sharing
 from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import Log, memory_gib, plain, progress_note
-from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
+from gsim3d.train.losses import image_errors, image_loss, mean_by_step, shape_errors, time_weights
 from gsim3d.train.optimizer import Optimizer
 from gsim3d.train.parts import in_parts
 from gsim3d.train.precision import FIRST_SCALE, LossScale
@@ -45,7 +45,7 @@ from gsim3d.train.schedule import one_cycle
 from gsim3d.train.settings import from_dict, to_dict
 from gsim3d.train.thawing import check_thawing, thaw
 from gsim3d.train.watch import Seen, StepWatch, first_not_finite, mean_of_norms, norms_by_module
-from gsim3d.types import Frames
+from gsim3d.types import Frames, Particles
 
 READERS = 2  # threads that read batches; so many steps are read ahead
 EMA_WARM_UP = 10  # the average forgets its first values: decay is at most (1 + step) / (10 + step)
@@ -127,7 +127,7 @@ class Trainer:
 
     def _capture(self) -> CapturedLoss:
         precision = partial(self.config.precision.of, device=self.device)
-        return CapturedLoss(self.simulator, self.plan, self.loss_of_images, precision)
+        return CapturedLoss(self.simulator, self.plan, self.loss_of_steps, precision)
 
     def run(
         self,
@@ -356,7 +356,7 @@ class Trainer:
     def loss(self, batch: Batch, sample: int = 0, watch: StepWatch | None = None) -> tuple[Tensor, Tensor]:
         """The loss of a batch, and each step's unweighted mean squared error; ``sample`` numbers the randomness."""
         watch = watch or StepWatch()
-        return self.loss_of_images(self._images(batch, sample, watch), batch.targets, self.step_weights(batch))
+        return self.loss_of_steps(*self._steps(batch, sample, watch), batch.targets, self.step_weights(batch))
 
     def step_weights(self, batch: Batch) -> Tensor:
         """Weight of each step of a batch, on its device."""
@@ -367,8 +367,11 @@ class Trainer:
             weights = weights / weights.sum()
         return weights.to(self.device)
 
-    def loss_of_images(self, images: Tensor, targets: Frames, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """As :meth:`loss`, of the images [I, H, W, 3] that ``targets`` should have been."""
+    def loss_of_steps(
+        self, images: Tensor, begin: Particles, steps: Sequence[Particles], targets: Frames, weights: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """As :meth:`loss`, of the images [I, H, W, 3] that ``targets`` should have been, and of the simulated steps
+        behind ``begin``."""
         loss_config, n_steps = self.config.loss, weights.shape[0]
         truth = targets.images.permute(0, 2, 3, 1)
         weighted = loss_config.body_weight and targets.dynamic is not None
@@ -382,12 +385,16 @@ class Trainer:
             distances = self.perceptual(seen.permute(0, 3, 1, 2), targets.images)
             wrong = wrong + loss_config.perceptual * distances
         loss = image_loss(wrong, step, weights)
+        if loss_config.shape and steps:
+            bent = shape_errors(begin, steps, loss_config.shape_length)
+            loss = loss + loss_config.shape * (weights[n_steps - len(steps) :] * bent).sum()
         with torch.no_grad():
             errors = mean_by_step(image_errors(images, truth, targets.valid), step, n_steps)
         return loss, errors
 
-    def _images(self, batch: Batch, sample: int, watch: StepWatch) -> Tensor:
-        """What the target cameras of a batch should have seen; each part of the model in its precision."""
+    def _steps(self, batch: Batch, sample: int, watch: StepWatch) -> tuple[Tensor, Particles, list[Particles]]:
+        """What the target cameras of a batch should have seen, where the simulation begins, and its steps; each part of
+        the model in its precision."""
         simulator, precision, recompute = self.simulator, self.config.precision, self.config.recompute
         options = {"report": watch.report, "on_bad": "drop" if watch.strict else None}
         rng = generator(self.config.seed, self.step, sample, "dynamics")
@@ -399,6 +406,7 @@ class Trainer:
         with precision.of("encoder", self.device), torch.set_grad_enabled(not batch.dynamics_alone):
             particles = again("encoder")(lambda context: simulator.encode(context, **options))(batch.context)
         watch.count(particles.n_rows, particles.n_clouds)
+        begin, steps = particles, []
         if batch.n_future:
             if self.config.data.thawed:
                 rng = generator(self.config.seed, self.step, sample, "thawed")
@@ -409,6 +417,7 @@ class Trainer:
                     with torch.no_grad():
                         ahead = simulator.rollout(particles, batch.n_lead, self.plan, generator=noise, **options)
                         begin = concatenate([particles, *ahead])
+                begin = simulator.prepare(begin, self.plan)
                 options_of_steps = {"generator": noise, "wrap": again("steps", noise), **options}
                 rollout = partial(simulator.rollout, plan=self.plan, **options_of_steps)
                 steps = in_parts(rollout, begin, batch.n_future, batch.cut)
@@ -422,7 +431,7 @@ class Trainer:
             images = render(particles)
         if recompute:
             watch.close()
-        return images
+        return images, begin, steps
 
     @torch.no_grad()
     def sample_video(self) -> Tensor:

@@ -1,13 +1,20 @@
-"""The training loss: errors of images, weighted over time."""
+"""The training loss: errors of images and shapes, weighted over time."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from gsim3d.dynamics import last_steps
+from gsim3d.types import DYNAMIC, Particles, constant
+
 BALANCE = 0.5  # lambda of the paper: weight of the first simulated step; the encoded ones share the rest
 DISCOUNT = 0.87  # gamma of the paper: weight of a simulated step relative to the one before it
+PARTNERS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987, 1597)  # rows further on, of shape_errors
 LEAST_WEIGHT = 1e-12  # of an image's pixels together: one without any has an error of 0
+LEAST_SQUARE = 1e-12  # added to squared distances: a root has no gradient at 0
 
 
 def time_weights(n_past: int, n_future: int, *, balance: float = BALANCE, discount: float = DISCOUNT) -> Tensor:
@@ -51,3 +58,34 @@ def image_loss(errors: Tensor, step: Tensor, weights: Tensor) -> Tensor:
     """
     by_step = mean_by_step(errors, step, weights.shape[0])
     return (weights.to(by_step) * by_step).sum()
+
+
+def shape_errors(begin: Particles, steps: Sequence[Particles], length: float) -> Tensor:
+    """How much bodies change their shape in each simulated step [S]: 0 where every distance stays.
+
+    Of pairs of movable particles of a scene that are about ``length`` metres apart in ``begin``, or less, the mean of
+    sqrt(1 + (change of the distance / length)^2) - 1, as the isometry of Dynamic 3D Gaussians (Luiten et al., 2024).
+    It also holds what no camera sees. Partners are rows at fixed distances, which are neighbours in an image, neighbours
+    on the next lines, and what other views saw.
+
+    Args:
+        begin: of which ``steps`` are the future; its newest clouds have their rows.
+    """
+    begin = last_steps(begin, 1)
+    n, offsets = begin.n_rows, constant(PARTNERS, begin.means.device)[:, None]
+    rows = torch.arange(n, device=begin.means.device)
+    partner = (rows + offsets) % max(1, n)
+    cloud, moves, places = begin.row_cloud(), begin.activity == DYNAMIC, begin.means.detach()
+    moves = moves & places.isfinite().all(1)
+    pairs = moves & moves[partner] & (cloud == cloud[partner])
+    far = _distances(places, partner, pairs)
+    weight = torch.where(pairs, torch.exp(-0.5 * (far / length).square()), 0)
+    changes = torch.stack([_distances(step.means, partner, pairs) - far for step in steps])
+    errors = torch.sqrt(1 + (changes / length).square()) - 1
+    return (errors * weight).sum((1, 2)) / weight.sum().clamp(min=1)
+
+
+def _distances(places: Tensor, partner: Tensor, pairs: Tensor) -> Tensor:
+    """[P, N] from each place to its partners [P, N]; of what is no pair any number, without a gradient."""
+    between = torch.where(pairs[:, :, None], places - places[partner], 1)
+    return (between.square().sum(2) + LEAST_SQUARE).sqrt()

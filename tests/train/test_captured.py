@@ -48,7 +48,7 @@ def trainer(scenes, tmp_path, device, request):
 
 def captured_loss(trainer):
     return CapturedLoss(
-        trainer.simulator, trainer.plan, trainer.loss_of_images, lambda part: torch.autocast("cpu", enabled=False)
+        trainer.simulator, trainer.plan, trainer.loss_of_steps, lambda part: torch.autocast("cpu", enabled=False)
     )
 
 
