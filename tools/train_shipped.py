@@ -49,7 +49,7 @@ def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: st
 
     from gsim3d.train.films import Filming, FilmStore
     from gsim3d.train.shipped import SittingTrainer, train
-    from gsim3d.train.sittings import load_into, load_progress, weights_file
+    from gsim3d.train.sittings import begin_with, load_into, load_progress, weights_file
 
     worlds = recipe.worlds()
     progress = load_progress(state, name)
@@ -58,6 +58,7 @@ def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: st
         with Filming(worlds, store, progress.next_trajectory, processes, scratch) as filming:
             trainer = SittingTrainer(recipe.train, store, Path(scratch) / "run", device)
             load_into(trainer, state, name, progress)
+            begun = begin_with(trainer, recipe.begin_with) if not progress.step and recipe.begin_with else None
             if not filming.wait_for(recipe.first_films, end - time.monotonic()):
                 raise InputError(f"--minutes: {minutes:g} pass before {recipe.first_films} trajectories are filmed")
             waited = round(time.monotonic() - begin, 1)
@@ -67,6 +68,7 @@ def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: st
                 "processes": processes,
                 "seconds_before": waited,
                 "in_turn": list(recipe.in_turn),
+                **({"began_with": begun} if begun else {}),
             }
             filming.slow_down(max(1, processes // LATER_SHARE))
             held_out = film_held_out(recipe, Path(scratch) / "held_out")

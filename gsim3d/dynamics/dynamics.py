@@ -126,7 +126,7 @@ class Dynamics(nn.Module):
             )
         runs, moved, drift = clouds.row_runs(newest), None, None
         if self.config.motion_length is not None:
-            now = motion(history, self.config.motion_length)
+            now = motion(history, self.config.motion_length, self.config.grid_size)
             moved, drift = put_runs(now, runs, history.n_rows), now[:, DRIFT]
         features, is_awake = self.layout.pack(history, moved), None
         n_awake = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]

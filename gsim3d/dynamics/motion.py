@@ -10,11 +10,13 @@ from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.types import DYNAMIC, Particles, constant
 
 NODES = 6  # of the lattice that spans the movable rows of a scene, along each axis
-PASSES = 2  # in which the window follows the matter
+CHUNK = 256  # rows that are added at once
+GRID_CELLS = 2**16  # from the origin of a scene: who is outside is seen by nobody
+PASSES = 3  # in which the window follows the matter
 
 
 @torch.no_grad()
-def motion(history: Particles, length: float) -> Tensor:
+def motion(history: Particles, length: float, grid_size: float) -> Tensor:
     """[N, 2, 3] metres a step: the mean motion of movable matter around each row of the newest clouds, since the step
     before it and since the oldest one; 0 of rows that do not move, and where there is one step only.
 
@@ -26,65 +28,79 @@ def motion(history: Particles, length: float) -> Tensor:
     Args:
         history: clouds sorted by (scene, step).
         length: metres, standard deviation of the window; about the radius of a body.
+        grid_size: metres, edge of the dynamics' cells.
     Returns:
         Rows of the newest clouds, packed. No gradients.
     """
     clouds, newest = history.clouds, newest_clouds(history.clouds)
+    if not any(clouds.count(q) for q in newest):
+        return history.means.new_zeros(0, 2, 3)
     first = [0, *(q + 1 for q in newest[:-1])]
-    with torch.autocast(history.means.device.type, enabled=False):
-        now = _Cloud(history, newest)
-        centre = now.mean[:, None]
-        low, high = (now.extent(side, centre) for side in (-1, 1))
-        steps = torch.linspace(0, 1, NODES, device=low.device, dtype=low.dtype)
-        grid = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), 3).reshape(1, -1, 3)
-        nodes = low + grid * (high - low)
-        around = now.window(nodes, centre, length)
-        velocities = []
-        for earlier in ([max(f, q - 1) for f, q in zip(first, newest, strict=True)], first):
-            gaps = [max(1, clouds.steps[q] - clouds.steps[e]) for q, e in zip(newest, earlier, strict=True)]
-            then = _Cloud(history, earlier)
-            moved = (now.mean - then.mean)[:, None].expand_as(nodes)
-            for _ in range(PASSES):
-                moved = around - then.window(nodes - moved, centre, length)
-            is_known = (now.n > 0) & (then.n > 0)
-            moved = torch.where(is_known[:, None, None], moved, 0)
-            velocities.append(moved / constant(tuple(gaps), moved.device)[:, None, None])
-        field = torch.cat(velocities, 2).mT.unflatten(2, (NODES, NODES, NODES))
-        place = 2 * (now.places - centre - low) / (high - low).clamp(min=1e-6) - 1
-        place = torch.where(now.moves[:, :, None], place, 0).flip(2)[:, None, None]
-        rows = F.grid_sample(field, place, padding_mode="border", align_corners=True)[:, :, 0, 0].mT
-        rows = torch.where(now.moves[:, :, None], rows, 0)
+    now = _Cloud(history, newest, grid_size)
+    centre = now.mean
+    low, high = (now.extent(side, centre)[:, :, None] for side in (-1, 1))
+    ticks = torch.linspace(0, 1, NODES, device=low.device, dtype=low.dtype)
+    nodes = low + torch.stack(torch.meshgrid(ticks, ticks, ticks, indexing="ij")).flatten(1) * (high - low)
+    around = now.window(nodes, centre, length)
+    velocities = []
+    for earlier in ([max(f, q - 1) for f, q in zip(first, newest, strict=True)], first):
+        gaps = [max(1, clouds.steps[q] - clouds.steps[e]) for q, e in zip(newest, earlier, strict=True)]
+        then = _Cloud(history, earlier, grid_size)
+        moved = (now.mean - then.mean)[:, :, None].expand_as(nodes)
+        for _ in range(PASSES):
+            moved = around - then.window(nodes - moved, centre, length)
+        is_known = (now.n > 0) & (then.n > 0)
+        moved = torch.where(is_known[:, None, None], moved, 0)
+        velocities.append(moved / constant(tuple(gaps), moved.device)[:, None, None])
+    field = torch.cat(velocities, 1).unflatten(2, (NODES, NODES, NODES))
+    place = 2 * (now.places - centre[:, :, None] - low) / (high - low).clamp(min=1e-6) - 1
+    place = torch.where(now.moves[:, None], place, 0).mT.flip(2)[:, None, None]
+    rows = F.grid_sample(field, place, padding_mode="border", align_corners=True)[:, :, 0, 0].mT
+    rows = torch.where(now.moves[:, :, None], rows, 0)
     return torch.cat([rows[b, : clouds.count(q)] for b, q in enumerate(newest)]).unflatten(1, (2, 3))
 
 
 class _Cloud:
     """One cloud of every scene, padded.
 
-    places: [B, M, 3].   moves: bool [B, M], rows that can move.   n: [B] of them.   mean: [B, 3] of their places.
+    places: [B, 3, M] from the origins of the scenes.   moves: bool [B, M], rows that can move.
+    n: [B] of them.   mean: [B, 3] of their places.
     """
 
-    def __init__(self, history: Particles, chosen: list[int]):
+    def __init__(self, history: Particles, chosen: list[int], grid_size: float):
         table, device = history.clouds, history.means.device
-        size = max(1, max(table.count(q) for q in chosen))
-        starts = constant(tuple(min(table.starts[q], max(0, history.n_rows - 1)) for q in chosen), device)
+        size = -(-max(1, max(table.count(q) for q in chosen)) // CHUNK) * CHUNK
+        starts = constant(tuple(table.starts[q] for q in chosen), device)
         counts = constant(tuple(table.count(q) for q in chosen), device)
+        scenes = constant(tuple(table.scenes[q] for q in chosen), device)
         place = torch.arange(size, device=device)
         rows = (starts[:, None] + place).clamp(max=history.n_rows - 1)
-        places = history.means.detach()[rows]
-        moves = (place < counts[:, None]) & (history.activity[rows] == DYNAMIC) & places.isfinite().all(2)
-        self.places, self.moves = torch.where(moves[:, :, None], places, 0), moves
-        self.n = moves.sum(1)
-        self.mean = self.places.sum(1) / self.n.clamp(min=1)[:, None]
+        places = history.means.detach()[rows].double() - history.origin[scenes][:, None]
+        is_seen = ((places >= 0) & (places / grid_size < GRID_CELLS)).all(2)  # not where a place is NaN
+        self.moves = (place < counts[:, None]) & (history.activity[rows] == DYNAMIC) & is_seen
+        self.places = torch.where(self.moves[:, :, None], places, 0).to(history.means.dtype).mT
+        self.n = self.moves.sum(1)
+        self.mean = _sum(self.places) / self.n.clamp(min=1)[:, None]
 
     def extent(self, side: int, centre: Tensor) -> Tensor:
-        """[B, 1, 3], the corner of the box around all that moves, from ``centre``: -1 the lower, 1 the upper."""
+        """[B, 3], the corner of the box around all that moves, from ``centre``: -1 the lower, 1 the upper."""
         none = self.places.new_full((), -torch.inf)
-        reach = torch.where(self.moves[:, :, None], side * (self.places - centre), none).amax(1, keepdim=True)
+        reach = torch.where(self.moves[:, None], side * (self.places - centre[:, :, None]), none).amax(2)
         return side * torch.where(reach.isfinite(), reach, 0)
 
     def window(self, nodes: Tensor, centre: Tensor, length: float) -> Tensor:
-        """[B, G, 3], means of places in windows around ``nodes``, both from ``centre``."""
-        places = self.places - centre
-        products = torch.baddbmm(places.square().sum(2)[:, None], nodes, places.mT, alpha=-2)
-        closeness = products * (-0.5 / length**2)  # but for what is the same for all rows
-        return torch.where(self.moves[:, None], closeness, -torch.inf).softmax(2).nan_to_num(0) @ places
+        """[B, 3, G], means of places in windows around ``nodes`` [B, 3, G], both from ``centre``."""
+        places = (self.places - centre[:, :, None])[:, :, None]
+        squares = [(nodes[:, axis, :, None] - places[:, axis]).square() for axis in range(3)]
+        closeness = torch.where(self.moves[:, None], sum(squares) * (-0.5 / length**2), -torch.inf)
+        weights = torch.exp(closeness - closeness.amax(2, keepdim=True)).nan_to_num(0)
+        sums = torch.stack([_sum(weights * places[:, axis]) for axis in range(3)], 1)
+        return sums / _sum(weights).clamp(min=1)[:, None]
+
+
+def _sum(x: Tensor) -> Tensor:
+    """Over the last axis, in an order that zeros behind it do not change."""
+    first, *others = x.unflatten(-1, (-1, CHUNK)).sum(-1).unbind(-1)
+    for part in others:
+        first = first + part
+    return first

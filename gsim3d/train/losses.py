@@ -65,19 +65,19 @@ def shape_errors(begin: Particles, steps: Sequence[Particles], length: float) ->
 
     Of pairs of movable particles of a scene that are about ``length`` metres apart in ``begin``, or less, the mean of
     sqrt(1 + (change of the distance / length)^2) - 1, as the isometry of Dynamic 3D Gaussians (Luiten et al., 2024).
-    It also holds what no camera sees. Partners are rows at fixed distances, which are neighbours in an image, neighbours
-    on the next lines, and what other views saw.
+    It also holds what no camera sees. Partners are rows at fixed distances: neighbours in an image, neighbours on the
+    next lines, and what other views saw.
 
     Args:
         begin: of which ``steps`` are the future; its newest clouds have their rows.
     """
     begin = last_steps(begin, 1)
     n, offsets = begin.n_rows, constant(PARTNERS, begin.means.device)[:, None]
-    rows = torch.arange(n, device=begin.means.device)
-    partner = (rows + offsets) % max(1, n)
+    rows = torch.arange(n, device=offsets.device)
+    partner = (rows + offsets).clamp(max=max(0, n - 1))
     cloud, moves, places = begin.row_cloud(), begin.activity == DYNAMIC, begin.means.detach()
     moves = moves & places.isfinite().all(1)
-    pairs = moves & moves[partner] & (cloud == cloud[partner])
+    pairs = moves & moves[partner] & (cloud == cloud[partner]) & (rows + offsets < n)
     far = _distances(places, partner, pairs)
     weight = torch.where(pairs, torch.exp(-0.5 * (far / length).square()), 0)
     changes = torch.stack([_distances(step.means, partner, pairs) - far for step in steps])

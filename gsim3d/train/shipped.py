@@ -41,6 +41,7 @@ class Recipe:
     in_turn: further options; trajectories are made with one set of them after another.
     capacity: trajectories that are kept at a time.   held_out: that are predicted and scored at the end of a sitting.
     first_films: before training begins.
+    begin_with: simulator whose weights a run begins with; None: random ones.
     """
 
     world: str
@@ -50,6 +51,7 @@ class Recipe:
     capacity: int = 600
     held_out: int = 14
     first_films: int = FIRST_FILMS
+    begin_with: str | None = None
 
     def worlds(self) -> list[World]:
         """What makes its trajectories, in turn."""
@@ -61,12 +63,15 @@ class Recipe:
 # come from other cameras and the depth range is tight: else, within ten steps, all particles hide before their cameras.
 MODEL = {
     "encoder": {"transformer_layers": 3, "refine_unet_dim": 24},
-    "dynamics": {"drop_path": 0.0, "shuffle_orders": False},
+    "dynamics": {"drop_path": 0.0, "shuffle_orders": False, "motion_length": 0.3},
     "renderer": {"scale_min": 0.002, "initial_scale": 0.03},
 }
 
 
-TURN = 40, 20  # steps of images, of the dynamics alone
+# Bodies keep the look that they were given: else what is rendered in the wrong place learns to fade, not where to go.
+# The ground may darken, where a shadow falls.
+EFFECTS = {"appearance": {"changing": "frozen"}}
+TURN = 20, 40  # steps of images, of the dynamics alone
 
 
 def _recipe(
@@ -76,9 +81,9 @@ def _recipe(
     *,
     strides: tuple[int, int] = (3, 2),
     batch: int = 4,
-    rollout: tuple[int, int] = (30, 10),
+    rollout: tuple[int, int] = (40, 10),
+    shape_length: float = 0.2,
     capacity: int = 600,
-    before: tuple[StageConfig, ...] | None = None,
     in_turn: tuple[dict, ...] = ({},),
 ) -> Recipe:
     """A recipe in which encoder and renderer learn from images of many scenes, and in turn with them the dynamics.
@@ -88,8 +93,7 @@ def _recipe(
     begin_within: of images; windows of rollouts begin within twice as many steps.
     strides: of the pixels of ground and bodies.   batch: where long rollouts are simulated.
     rollout: their steps, and through how many of them gradients flow back.
-    before: stages that come first; None: of images alone, which are steps of many scenes and few kernels, and to which
-        nothing comes back from a rollout.
+    shape_length: as of LossConfig; less than bodies are apart.
     Others as in Recipe.
     """
     # All views that are no input: what images cost beside the encoder is little.
@@ -99,6 +103,7 @@ def _recipe(
     train = TrainConfig(
         preset="small",
         model=MODEL,
+        effects=EFFECTS,
         data=DataConfig(
             history=4,
             context_views=4,
@@ -110,47 +115,34 @@ def _recipe(
             targets_apart=True,
         ),
         stages=(
-            *((images(steps=2500),) if before is None else before),
-            # How things move right now, before what becomes of it: what is rendered in the wrong place teaches to blur.
-            dynamics(steps=1200, horizon=4, batch=2 * batch, from_start=0.1, learning_rate=8e-4),
+            images(steps=2000),
+            # How things move right now, before what becomes of it.
+            dynamics(steps=200, horizon=4, batch=2 * batch, from_start=0.1, learning_rate=8e-4),
+            dynamics(steps=400, horizon=12, batch=2 * batch, from_start=0.25, learning_rate=8e-4),
         ),
         in_turn=(
             images(steps=TURN[0]),
-            dynamics(steps=TURN[1], horizon=horizon, cut=cut, batch=batch, from_start=0.25, learning_rate=6e-4),
+            dynamics(steps=TURN[1], horizon=horizon, cut=cut, batch=batch, from_start=0.5, learning_rate=6e-4),
         ),
         rounds=100_000,
-        # A score counts the last step like the first.
-        loss=LossConfig(body_weight=3.0, balance=0.15, discount=0.95),
+        # A score counts the last step like the first. What the ground hides would leave its body unseen.
+        loss=LossConfig(body_weight=3.0, balance=0.15, discount=0.95, shape=0.1, shape_length=shape_length),
         optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.995),
         precision=PrecisionConfig(encoder="bf16", dynamics="bf16"),
         captured=True,
         log_every=20,
     )
-    return Recipe(world, train, in_turn=in_turn, capacity=capacity)
-
-
-def _before_elastic() -> tuple[StageConfig, ...]:
-    """How `elastic-small` was trained up to step 6,380: all parts together, with a discount of 0.87, on a ground that
-    was always as high. Then images of others, too."""
-    stage = partial(StageConfig, target_views=4, begin_within=24)
-    return (
-        stage(steps=2500, history=1, batch=16, learning_rate=1e-3),
-        stage(steps=200, horizon=2, batch=8, learning_rate=1e-3),
-        stage(steps=300, horizon=6, batch=4, from_start=0.2, learning_rate=8e-4),
-        stage(steps=400, horizon=12, batch=4, from_start=0.2, learning_rate=6e-4),
-        stage(steps=2980, horizon=12, lead=24, batch=4, from_start=0.2, learning_rate=5e-4),
-        stage(steps=800, history=1, batch=16, target_views=8, learning_rate=1e-3),
-    )
+    return Recipe(world, train, in_turn=in_turn, capacity=capacity, begin_with="elastic-small")
 
 
 # Lower than the held-out grounds, of 15 to 30 cm.
 OTHER_GROUND = {"ground_height": (-0.1, 0.12)}
 RECIPES = {
     # Bodies fall for half a second and then hardly move.
-    "elastic": _recipe("elastic", (1.9, 4.8), 24, before=_before_elastic(), in_turn=({}, {}, OTHER_GROUND)),
+    "elastic": _recipe("elastic", (1.9, 4.8), 24, in_turn=({}, {}, OTHER_GROUND)),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories.
-    "cloth": _recipe("cloth", (1.6, 4.8), 0, strides=(4, 2), batch=3, capacity=400),
-    "rigid": _recipe("rigid", (1.7, 5.0), 12, rollout=(24, 12), in_turn=({}, {}, OTHER_GROUND)),
+    "cloth": _recipe("cloth", (1.6, 4.8), 0, strides=(4, 2), batch=3, shape_length=0.1, capacity=400),
+    "rigid": _recipe("rigid", (1.7, 5.0), 12, rollout=(24, 12), shape_length=0.15, in_turn=({}, {}, OTHER_GROUND)),
 }
 
 

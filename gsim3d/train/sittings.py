@@ -27,7 +27,9 @@ from typing import Any
 import safetensors.torch
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
+from gsim3d.dynamics.state import MOTION_CHANNELS
 from gsim3d.errors import InputError
 from gsim3d.files import MAX_TEXT, read_file, sha256_of
 from gsim3d.train import checkpoint
@@ -36,6 +38,8 @@ from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import describe
 
 FORMAT = 1
+SEEN = "dynamics.net.stem.conv.weight"  # what the network reads of a particle are its last columns
+PREDICTED = ("dynamics.net.head.fc2.weight", "dynamics.net.head.fc2.bias")
 WEIGHTS, DIFFERENCE, SQUARES = "weights", "difference", "squares"
 
 
@@ -106,6 +110,31 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
         ) from None
     trainer.step, trainer.seconds, trainer.n_skipped = progress.step, progress.seconds, progress.n_skipped
     trainer.log.cut(trainer.step)
+
+
+def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
+    """Weights of a trained simulator into a new trainer, whose dynamics may see motion where the other's did not: the
+    columns that read it begin at zero, and so do the rows that predict positions, which mean something else then.
+
+    Returns:
+        The checkpoint's name, digest and step.
+    Raises:
+        InputError: it is a simulator of other sizes.
+    """
+    saved, own = checkpoint.load(path), trainer.simulator.state_dict()
+    given = {key: value.float() for key, value in saved.model.items()}
+    if SEEN in given and given[SEEN].shape[-1] == own[SEEN].shape[-1] - MOTION_CHANNELS:
+        given[SEEN] = F.pad(given[SEEN], (0, MOTION_CHANNELS))
+        names, widths = zip(*trainer.simulator.dynamics.layout.outputs, strict=True)
+        for key in PREDICTED:
+            given[key].split(widths)[names.index("means")].zero_()
+    try:
+        trainer.simulator.load_state_dict(given)
+    except RuntimeError as error:
+        raise InputError(f"{path}: a simulator of other sizes: {str(error).splitlines()[-1].strip()}") from None
+    weights = trainer.simulator.state_dict()
+    trainer.average = {key: value.detach().clone() for key, value in weights.items()}
+    return {"name": str(path), "digest": saved.digest, "step": saved.state["step"]}
 
 
 def save_state(trainer: Trainer, folder: str | Path, name: str, progress: Progress) -> Progress:

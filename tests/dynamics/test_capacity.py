@@ -10,6 +10,7 @@ from gsim3d.types import ASLEEP
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history
 
+MOVING = dataclasses.replace(TINY, motion_length=0.2)
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SIZES = [[(40, 30)], [(1,)], [(0, 12)], [(12, 0)], [(40, 30), (3,), (5, 6, 7), (60, 0, 1, 2)]]
@@ -29,7 +30,7 @@ def with_room(dynamics, history, factor=1.25, generator=None):
 
 
 @pytest.mark.parametrize("asleep", [False, True])
-@pytest.mark.parametrize("config", [TINY, EXPLICIT])
+@pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING])
 @pytest.mark.parametrize("sizes", SIZES)
 @pytest.mark.parametrize("factor", [1.0, 1.25, 4.0])
 def test_room_changes_no_bit(factor, sizes, config, asleep):

@@ -10,13 +10,15 @@ from gsim3d.types import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
 
+MOVING = dataclasses.replace(TINY, motion_length=0.2)
+
 
 def assert_same_particles(actual, expected, what=""):
     for name, value in float_fields(expected).items():
         assert_same_bits(getattr(actual, name), value, f"{what} {name}")
 
 
-@pytest.mark.parametrize("config", [TINY, EXPLICIT])
+@pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING])
 @pytest.mark.parametrize("n_rows", [(30,), (30, 20), (20, 0, 25), (9, 8, 7, 6), (1,), (1, 1), (0, 12)])
 def test_any_history(n_rows, config):
     history = make_history(n_rows, config=config)
@@ -46,7 +48,7 @@ def test_an_untrained_preset_predicts_that_nothing_changes():
         assert_close_relative_to_max(getattr(step, name), value, 1e-6, name)
 
 
-@pytest.mark.parametrize("config", [TINY, EXPLICIT])
+@pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING])
 def test_scenes_do_not_change_each_other(config):
     dynamics = make_dynamics(config)
     sizes = [(40, 30), (3,), (5, 6, 7), (60, 0, 1, 2)]
@@ -56,7 +58,7 @@ def test_scenes_do_not_change_each_other(config):
         assert_same_particles(together.select_clouds(torch.tensor([i])), dynamics(history), f"scene {i}")
 
 
-@pytest.mark.parametrize("config", [TINY, EXPLICIT])
+@pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING])
 def test_frozen_particles_hold_still(config):
     history = make_history((30, 40), config=config)
     step, newest = make_dynamics(config)(history), last_steps(history, 1)
@@ -292,7 +294,7 @@ def test_config_errors(change, message):
         DynamicsConfig(**{**dataclasses.asdict(TINY), "quirks": TINY.quirks, **change})
 
 
-@pytest.mark.parametrize("config", [TINY, EXPLICIT])
+@pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING])
 def test_a_history_without_any_particle_stays_empty(config):
     step = make_dynamics(config)(make_history((0, 0), config=config))
     assert step.n_rows == 0 and step.cloud_step.tolist() == [2]

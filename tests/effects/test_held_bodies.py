@@ -12,6 +12,7 @@ from gsim3d.effects import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.graphs import CapturedRollout
 from gsim3d.selections import Selection
+from gsim3d.types import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.effects.models import MODELS, Case
 
@@ -182,3 +183,19 @@ def test_a_body_that_is_not_there():
     places = start.means[start.activity == 0]
     corners = str(error.value).split("; theirs is ")[1]
     assert_close_relative_to_max(torch.tensor(json.loads(corners)), torch.stack([places.amin(0), places.amax(0)]), 0.01)
+
+
+@pytest.mark.parametrize("model", ["latent", "explicit"])
+def test_bodies_keep_their_look_while_shadows_fall(model):
+    """``changing: frozen``: features of what may move stay, bit by bit; the background's are those of ``all``."""
+    case = Case(MODELS[model])
+    start, (first, *_), (free, *_) = last_steps(case.state, 1), *(
+        rolled(case, {"appearance": {"changing": who}}) for who in ("frozen", "all")
+    )
+    frozen = start.activity == FROZEN
+    assert 0 < int(frozen.sum()) < start.n_rows
+    for name in ("dynamic_latents",) if model == "latent" else ("dynamic_latents", "sh"):
+        assert_same_bits(getattr(first, name)[~frozen], getattr(start, name)[~frozen], name)
+        assert_same_bits(getattr(first, name)[frozen], getattr(free, name)[frozen], name)
+        assert not torch.equal(getattr(first, name)[frozen], getattr(start, name)[frozen])
+    assert_same_bits(first.means, free.means)

@@ -21,7 +21,8 @@ EXPLICIT_CONFIG = dataclasses.replace(
     dynamics=dataclasses.replace(EXPLICIT, grid_size=0.1),
     renderer=dataclasses.replace(CONFIG.renderer, latents=0),
 )
-CONFIGS = {"latent": CONFIG, "explicit": EXPLICIT_CONFIG}
+MOVING = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, motion_length=0.3))
+CONFIGS = {"latent": CONFIG, "explicit": EXPLICIT_CONFIG, "moving": MOVING}
 
 
 def make_sample(device, dtype=torch.float32, n_steps=3, plan=None):

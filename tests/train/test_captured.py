@@ -11,7 +11,7 @@ from gsim3d.data import Scene, find_scenes
 from gsim3d.errors import InputError
 from gsim3d.stability import StabilityReport
 from gsim3d.train.captured import CapturedLoss
-from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, LossConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.samples import draw_batch
 from tests.asserts import assert_close_relative_to_max
@@ -34,7 +34,18 @@ def scenes(tmp_path_factory):
     return [Scene.open(path) for path in find_scenes(write_scenes(tmp_path_factory.mktemp("scenes"), 2))]
 
 
-KINDS = {"latent": CONFIG, **{name: ROWS[name].change(CONFIG) for name in ("explicit", "background-masked")}}
+MOVING = dataclasses.replace(
+    CONFIG,
+    model={"dynamics": {"motion_length": 0.3}},
+    effects={"appearance": {"changing": "frozen"}},
+    loss=LossConfig(shape=0.5, shape_length=0.1),
+)
+KINDS = {
+    "latent": CONFIG,
+    "moving": MOVING,
+    "moving, masked": ROWS["background-masked"].change(MOVING),
+    **{name: ROWS[name].change(CONFIG) for name in ("explicit", "background-masked")},
+}
 
 
 @pytest.fixture(params=["latent"])
@@ -72,8 +83,13 @@ def run(captured, batch, trainer, report=None, factor=1.0):
         ({"lead": 2}, "background-masked"),
         ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "latent"),
         ({"dynamics_alone": True, "lead": 2}, "background-masked"),
+        ({"horizon": 3, "cut": 2}, "moving"),
+        ({}, "moving, masked"),
     ],
-    ids=["rollout", "lead", "encoded", "explicit", "masked", "dynamics alone, cut", "dynamics alone, masked"],
+    ids=[
+        "rollout", "lead", "encoded", "explicit", "masked", "dynamics alone, cut", "dynamics alone, masked", "moving",
+        "moving, masked",
+    ],
     indirect=["trainer"],
 )
 def test_gradients_are_those_of_the_loss(stage, scenes, trainer, device):

@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from gsim3d.data import Scene, find_scenes
+from gsim3d.dynamics import last_steps
+from gsim3d.dynamics.motion import motion
 from gsim3d.errors import InputError
 from gsim3d.data.recording import BACKGROUND, FIXED, MOVING
 from gsim3d.generate import generate
@@ -23,7 +25,7 @@ from gsim3d.train.loop import deterministic
 from gsim3d.train.restore import restore
 from gsim3d.train.samples import draw_batch
 from gsim3d.train.shipped import RECIPES, SittingTrainer, train
-from gsim3d.train.sittings import Progress, load_into, load_progress, save_state, weights_file
+from gsim3d.train.sittings import Progress, begin_with, load_into, load_progress, save_state, weights_file
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -236,6 +238,35 @@ def test_a_sitting_ends_on_time_with_a_falling_rate_and_a_saved_state(store, tmp
     log = (tmp_path / "state" / f"{NAME}.metrics.jsonl").read_text().splitlines()
     rates = [json.loads(entry)["learning_rate"] for entry in log]
     assert rates[0] == pytest.approx(CONFIG.stages[0].learning_rate) and rates[-1] < rates[0]
+
+
+def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path):
+    """What it predicts is the same, but that bodies fly on instead of what it said of positions."""
+    other = SittingTrainer(CONFIG, store, tmp_path / "other", "cpu")
+    with torch.no_grad():
+        for parameter in other.simulator.dynamics.net.head.parameters():
+            parameter.normal_(0, 0.1)
+    other.average = {key: value.clone() for key, value in other.simulator.state_dict().items()}
+    save_state(other, tmp_path / "state", NAME, Progress())
+    known = weights_file(tmp_path / "state", load_progress(tmp_path / "state", NAME))
+    moving = dataclasses.replace(CONFIG, model={"dynamics": {"motion_length": 0.3}})
+    trainer = SittingTrainer(moving, store, tmp_path / "run", "cpu")
+    begun = begin_with(trainer, known)
+    assert begun["digest"] == restore(known).checkpoint.digest and begun["step"] == 0
+    given, own = restore(known).simulator, trainer.simulator.eval()
+    batch = store.draw(CONFIG.data, CONFIG.stages[1], 0, 2, range(1))
+    with torch.no_grad():
+        state = given.encode(batch.context)
+        expected, step = given.dynamics(state), own.dynamics(own.encode(batch.context))
+        drift = motion(state, 0.3, own.config.dynamics.grid_size)[:, 1]
+    torch.testing.assert_close(step.dynamic_latents, expected.dynamic_latents)
+    newest = last_steps(state, 1)
+    torch.testing.assert_close(step.means, newest.means + drift)
+    assert not torch.allclose(expected.means, newest.means + drift, atol=1e-3)
+    assert all(torch.equal(value, trainer.average[key]) for key, value in own.state_dict().items())
+    larger = SittingTrainer(dataclasses.replace(CONFIG, preset="small"), store, tmp_path / "larger", "cpu")
+    with pytest.raises(InputError, match="other sizes"):
+        begin_with(larger, known)
 
 
 def test_recipes_are_sound():

@@ -1,0 +1,157 @@
+"""How matter has moved, read off clouds whose rows do not correspond, and a dynamics that lets it fly on."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gsim3d.dynamics import DynamicsConfig, last_steps
+from gsim3d.dynamics.motion import motion
+from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
+from tests.asserts import assert_close_relative_to_max, assert_same_bits
+from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+LENGTH = 0.2
+HOW = LENGTH, TINY.grid_size
+MOVING = dataclasses.replace(TINY, motion_length=LENGTH)
+
+
+def flying(velocities, n=300, n_steps=4, apart=1.5, seed=0):
+    """Balls of 20 cm, each with its velocity in metres a step; their rows change places from step to step."""
+    g = torch.Generator().manual_seed(seed)
+    history = make_history((n * len(velocities),) * n_steps, frozen_share=0.0)
+    ball = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1) * 0.2
+    steps = []
+    for step in range(n_steps):
+        order = torch.randperm(n, generator=g)
+        for place, velocity in enumerate(velocities):
+            centre = torch.tensor([1 + apart * place, 1.0, 1.0]) + step * torch.tensor(velocity)
+            steps.append(centre + ball[order])
+    return dataclasses.replace(history, means=torch.cat(steps))
+
+
+def test_a_body_has_its_velocity_everywhere():
+    velocity = torch.tensor([0.03, -0.02, 0.05])
+    found = motion(flying([velocity.tolist()]), *HOW)
+    assert_close_relative_to_max(found, velocity.expand(300, 2, 3), 1e-3)
+
+
+def test_two_bodies_have_their_own():
+    velocities = torch.tensor([[0.03, 0.0, -0.05], [-0.03, 0.01, 0.05]])
+    found = motion(flying(velocities.tolist()), *HOW)
+    for body, velocity in enumerate(velocities):
+        error = found[300 * body : 300 * (body + 1)] - velocity
+        assert error.norm(dim=2).mean() < 0.05 * velocity.norm()
+
+
+def test_the_last_step_and_the_whole_history_are_told_apart():
+    history = flying([[0.0, 0.0, 0.0]])
+    means = history.means.clone()
+    means[-300:, 2] -= 0.06
+    found = motion(dataclasses.replace(history, means=means), *HOW)
+    assert_close_relative_to_max(found[:, 0, 2], torch.full((300,), -0.06), 1e-3)
+    assert_close_relative_to_max(found[:, 1, 2], torch.full((300,), -0.02), 1e-3)
+
+
+def test_gaps_between_steps_count():
+    history = flying([[0.02, 0.0, 0.0]], n_steps=3)
+    spread = dataclasses.replace(history, cloud_step=torch.tensor([0, 2, 4]))
+    assert_close_relative_to_max(motion(spread, *HOW), motion(history, *HOW) / 2, 1e-6)
+
+
+@pytest.mark.parametrize("activity", [FROZEN, ASLEEP])
+def test_what_cannot_move_has_no_velocity_and_changes_nobody_elses(activity):
+    history = flying([[0.03, 0.0, 0.0]])
+    rests = torch.arange(history.n_rows) % 3 == 0
+    still = dataclasses.replace(history, activity=torch.where(rests, activity, DYNAMIC).to(torch.uint8))
+    found, newest = motion(still, *HOW), rests[-300:]
+    assert not found[newest].any()
+    elsewhere = dataclasses.replace(still, means=torch.where(rests[:, None], torch.nan, still.means))
+    assert_same_bits(motion(elsewhere, *HOW), found)
+    assert found[~newest].any()
+
+
+@pytest.mark.parametrize("n_rows", [(50,), (0, 50), (50, 0), (0,), (1, 1), (0, 0)])
+def test_without_matter_before_or_now_nothing_has_moved(n_rows):
+    found = motion(make_history(n_rows, frozen_share=0.0), *HOW)
+    assert found.shape == (n_rows[-1], 2, 3) and found.isfinite().all()
+    assert n_rows == (1, 1) or not found.any()
+
+
+def test_the_order_of_rows_does_not_matter():
+    history = flying([[0.03, 0.0, 0.0], [0.0, 0.02, 0.0]])
+    shuffled, order = permute_rows(history)
+    newest = order[-600:] - (history.n_rows - 600)
+    assert_close_relative_to_max(motion(shuffled, *HOW), motion(history, *HOW)[newest], 1e-4)
+
+
+def test_scenes_do_not_see_each_other():
+    histories = [flying([[0.03, 0.0, 0.0]]), make_history((7, 5)), flying([[0.0, 0.0, 0.05]], n=40)]
+    together = motion(batch(histories), *HOW)
+    begin = 0
+    for history in histories:
+        alone = motion(history, *HOW)
+        assert_close_relative_to_max(together[begin : begin + len(alone)], alone, 1e-5)
+        begin += len(alone)
+
+
+def test_a_gpu_finds_the_same(devices):
+    history = batch([flying([[0.03, 0.0, 0.0], [0.0, 0.02, 0.0]]), make_history((30, 40))])
+    expected, actual = (motion(history.to(device), *HOW).cpu() for device in devices)
+    assert_close_relative_to_max(actual, expected, 1e-4)
+    assert_same_bits(motion(history.to(devices[1]), *HOW).cpu(), actual)
+
+
+def test_compiled_it_is_the_same(device):
+    history = flying([[0.03, 0.0, 0.0]], n=50).to(device)
+    history.clouds
+    compiled = torch.compile(motion, fullgraph=True)
+    assert_close_relative_to_max(compiled(history, *HOW), motion(history, *HOW), 1e-5)
+
+
+@pytest.mark.parametrize("predicts", ["from_newest", "from_previous"])
+@pytest.mark.parametrize("steps_per_call", [1, 3])
+def test_untrained_a_body_flies_on(predicts, steps_per_call):
+    config = dataclasses.replace(MOVING, zero_init=True, predicts=predicts, steps_per_call=steps_per_call)
+    history = flying([[0.03, 0.0, -0.05]])
+    steps, newest = make_dynamics(config)(history), last_steps(history, 1)
+    for i in range(steps_per_call):
+        ahead = (1 + i) * torch.tensor([0.03, 0.0, -0.05])
+        assert_close_relative_to_max(steps.means[300 * i : 300 * (i + 1)] - newest.means, ahead.expand(300, 3), 1e-3)
+
+
+def test_frozen_particles_stay_where_they_are():
+    history = make_history((30, 40), config=MOVING)
+    step, newest = make_dynamics(MOVING)(history), last_steps(history, 1)
+    frozen = newest.activity == FROZEN
+    assert frozen.any() and not torch.equal(step.means[~frozen], newest.means[~frozen])
+    assert_same_bits(step.means[frozen], newest.means[frozen])
+
+
+@pytest.mark.parametrize("config", [MOVING, dataclasses.replace(EXPLICIT, motion_length=LENGTH)])
+def test_the_velocity_is_seen_and_added(config):
+    """Older clouds that are elsewhere change the next step, by the network as well: with the motion taken off."""
+    dynamics, history = make_dynamics(config), make_history((60, 60), config=config, frozen_share=0.0)
+    older = torch.arange(120) < 60
+    other = dataclasses.replace(history, means=history.means - 0.0625 * older[:, None])  # whole cells
+    a, b = dynamics(history), dynamics(other)
+    moved = [motion(h, *HOW)[:, 1] for h in (history, other)]
+    assert_close_relative_to_max(moved[1] - moved[0], torch.full((60, 3), 0.0625), 0.05)
+    assert ((b.means - a.means) - (moved[1] - moved[0])).abs().max() > 1e-5
+
+
+def test_gradients_reach_weights_and_features_but_no_velocity():
+    dynamics, history = make_dynamics(MOVING), make_history((30, 40), frozen_share=0.0)
+    leaves = {name: value.clone().requires_grad_() for name, value in float_fields(history).items()}
+    dynamics(dataclasses.replace(history, **leaves)).means.sum().backward()
+    assert dynamics.net.stem.conv.weight.grad[..., -6:].any()
+    assert leaves["dynamic_latents"].grad.any()
+    assert_close_relative_to_max(leaves["means"].grad[30:].sum(0), torch.full((3,), 40.0), 0.5)
+
+
+@pytest.mark.parametrize("change", [{"motion_length": 0.0}, {"predicts": "absolute"}])
+def test_settings_that_make_no_sense_are_refused(change):
+    with pytest.raises(ValueError, match="motion_length"):
+        DynamicsConfig(**{"motion_length": LENGTH, **change})
