@@ -89,7 +89,7 @@ def test_states_and_images_stay_float32(folder, tmp_path, precision, device):
     trainer = trainer_at(folder, tmp_path, device=device, precision=precision)
     render, seen = trainer.simulator.render, []
     trainer.simulator.render = lambda p, *given, **options: seen.append(p) or render(p, *given, **options)
-    images = trainer._images(trainer._batch([0]), 0, StepWatch())
+    images, *_ = trainer._steps(trainer._batch([0]), 0, StepWatch())
     (particles,) = seen
     floats = [value for value in particles.row_fields().values() if value.is_floating_point()]
     assert len(floats) == 4 and particles.n_clouds == 4
@@ -246,7 +246,7 @@ def test_gradients_flow_back_through_as_many_steps_as_asked_for(folder, tmp_path
         stage = dataclasses.replace(CONFIG.stages[1], horizon=4, cut=cut, from_start=1.0)
         batch, watch = draw_batch(trainer.scenes, CONFIG.data, stage, 0, LATER, [0]), StepWatch()
         trainer.step = 0  # one that is logged
-        images = trainer._images(batch, 0, watch)
+        images, *_ = trainer._steps(batch, 0, watch)
         errors = (images - batch.targets.images.permute(0, 2, 3, 1)).square()
         errors[batch.target_step() == batch.n_context + 3].mean().backward()
         reached[cut] = [norm > 0 for norm in watch.norms()]
