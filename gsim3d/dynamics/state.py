@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -161,7 +162,9 @@ class StateLayout:
         if self.config.predicts == "from_previous":
             changes = changes.cumsum(0)
         if drift is not None:
-            changes = changes + drift * torch.arange(1, 1 + changes.shape[0], device=drift.device)[:, None, None]
+            ahead = torch.arange(1, 1 + changes.shape[0], device=drift.device)[:, None, None]
+            most = math.inf if self.config.max_step is None else self.config.max_step
+            changes = torch.minimum(torch.maximum(changes + ahead * drift, -most * ahead), most * ahead)
         return hold(share, newest, self._in_range(name, newest + share * changes))
 
     @property

@@ -142,6 +142,16 @@ def test_the_velocity_is_seen_and_added(config):
     assert ((b.means - a.means) - (moved[1] - moved[0])).abs().max() > 1e-5
 
 
+@pytest.mark.parametrize("predicts", ["from_newest", "from_previous"])
+def test_no_step_is_longer_than_the_limit(predicts):
+    config = dataclasses.replace(MOVING, zero_init=True, max_step=0.04, steps_per_call=2, predicts=predicts)
+    history = flying([[0.03, 0.0, -0.05]])
+    steps, newest = make_dynamics(config)(history), last_steps(history, 1)
+    for i in range(2):
+        ahead = (1 + i) * torch.tensor([0.03, 0.0, -0.04])
+        assert_close_relative_to_max(steps.means[300 * i : 300 * (i + 1)] - newest.means, ahead.expand(300, 3), 1e-3)
+
+
 def test_gradients_reach_weights_and_features_but_no_velocity():
     dynamics, history = make_dynamics(MOVING), make_history((30, 40), frozen_share=0.0)
     leaves = {name: value.clone().requires_grad_() for name, value in float_fields(history).items()}
