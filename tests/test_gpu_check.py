@@ -23,6 +23,7 @@ COMMANDS = {
             *tools/bench/*) echo {} >tools/bench/results/x.json ;;
         esac
         echo "$GSIM3D_PART $*" >>calls
+        [ -z "$GSIM3D_PART" ] || echo "$CUDA_VISIBLE_DEVICES" >>devices
         [[ -n "$SLEEPS" && "$*" == *$SLEEPS* ]] && sleep 60
         [[ -z "$FAILS" || "$*" != *$FAILS* ]]
     """,
@@ -109,6 +110,12 @@ def test_every_test_of_an_op_is_sanitized_by_both_tools(tree):
     assert sorted(found) == sorted((file, tool) for file in files for tool in ("memcheck", "racecheck"))
     for parts in found.values():
         assert sorted(parts) == [(k, len(parts)) for k in range(len(parts))]
+
+
+def test_the_sanitizer_uses_all_gpus_alike(tree):
+    assert check(tree, "sanitize", CUDA_VISIBLE_DEVICES="3,5")[0] == 0
+    used = (tree / "devices").read_text().split()
+    assert set(used) == {"3", "5"} and abs(used.count("3") - used.count("5")) <= 1
 
 
 def test_a_check_that_is_stopped_goes_on_where_it_was(tree):

@@ -4,7 +4,7 @@
 #   tools/gpu_check.sh all                  everything, in this order
 #   tools/gpu_check.sh build                the extension with its CUDA kernels, in place
 #   tools/gpu_check.sh test                 the tests that use the GPU; tools/test.sh has the others
-#   tools/gpu_check.sh sanitize             compute-sanitizer (memcheck, racecheck) on the tests of the ops
+#   tools/gpu_check.sh sanitize             compute-sanitizer (memcheck, racecheck) on the tests of the ops, on all GPUs
 #   tools/gpu_check.sh bench                every op and the whole model against its peers: tools/bench/results
 #
 # A step that passed on these sources is not repeated: started again, the check goes on where it stopped (remove
@@ -87,7 +87,11 @@ compile() {
   MAX_JOBS="${MAX_JOBS:-$(nproc)}" GSIM3D_CUDA=1 "$PYTHON" setup.py build_ext --inplace
 }
 
-at_once() { echo "$(($(nproc) < 14 ? $(nproc) : 14))"; }  # they share one GPU
+at_once() { local most=$((14 * ${1:-1})); echo "$(($(nproc) < most ? $(nproc) : most))"; }  # so many share a GPU
+devices() {
+  if [ -n "${CUDA_VISIBLE_DEVICES:-}" ]; then tr , '\n' <<<"$CUDA_VISIBLE_DEVICES"
+  else nvidia-smi --query-gpu=index --format=csv,noheader 2>/dev/null || echo 0; fi
+}
 
 # Tests run side by side where pytest-xdist is installed.
 tests() {
@@ -136,11 +140,13 @@ run_build() { step build compile; }
 run_test() { step test tests; }
 run_sanitize() {
   command -v compute-sanitizer >/dev/null || die "compute-sanitizer was not found: it comes with the CUDA toolkit"
-  local name tool file part
+  local name tool file part gpus gpu turn=0
+  mapfile -t gpus < <(devices)
   set -m  # a group of processes for each job: what stops this script can stop them
   while read -r name tool file part; do
-    while [ "$(jobs -rp | wc -l)" -ge "$(at_once)" ]; do wait -n; done
-    step "$name" sanitize "$tool" "$file" "$part" </dev/null &
+    while [ "$(jobs -rp | wc -l)" -ge "$(at_once "${#gpus[@]}")" ]; do wait -n; done
+    gpu="${gpus[turn++ % ${#gpus[@]}]}"
+    CUDA_VISIBLE_DEVICES="$gpu" step "$name" sanitize "$tool" "$file" "$part" </dev/null &
   done < <(sanitized)
   wait
   set +m
