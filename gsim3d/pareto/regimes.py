@@ -128,7 +128,9 @@ def work_of(spans: list[tuple[str, float, float]], whole_ms: float, joules: floa
 def training_step(subject: Subject, clock: Clock, repeats: int = 3, quick: bool = False) -> TrainingStep:
     """Trains on the subject's scenes from new weights, and keeps nothing.
 
-    quick: one scene at a time, only as many steps as get gradients, and none before it is timed.
+    Films that are shorter than its windows are simulated to their end.
+
+    quick: one scene at a time, only as many steps as gradients flow back through, and none before it is timed.
     """
     saved = subject.restored.checkpoint.config.get("train")
     if saved is None:
@@ -137,7 +139,10 @@ def training_step(subject: Subject, clock: Clock, repeats: int = 3, quick: bool 
         config = from_dict(TrainConfig, saved, "train")
         stage = dataclasses.replace(config.all_stages[-1], steps=10**6)
         if quick:
-            stage = dataclasses.replace(stage, batch=1, lead=0)
+            stage = dataclasses.replace(stage, batch=1, lead=0, horizon=stage.cut or stage.horizon)
+        known = min(scene.n_steps for scene in subject.scenes) - (stage.history or config.data.history) - stage.lead
+        if known > 0:
+            stage = dataclasses.replace(stage, horizon=min(stage.horizon, known))
         config = dataclasses.replace(config, stages=(stage,), in_turn=())
         with tempfile.TemporaryDirectory() as folder, deterministic():
             trainer = Trainer(config, subject.scenes, folder, device=subject.restored.device.type)

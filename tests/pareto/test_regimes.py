@@ -85,16 +85,20 @@ def test_a_training_step_of_the_last_stage(subject):
     stages = (StageConfig(steps=5, horizon=1), StageConfig(steps=5, horizon=2, batch=2, target_views=1))
     config = TrainConfig(stages=stages, data=DataConfig(history=2, context_views=2, background_stride=2), seed=3)
 
-    def trained(config):
+    def trained(config, **options):
         saved = Checkpoint({}, {"train": to_dict(config)})
         copy = dataclasses.replace(subject.restored, checkpoint=saved)
         changed = type(subject)(copy, subject.scenes)
-        return training_step(changed, DeviceClock("cpu"), repeats=1)
+        return training_step(changed, DeviceClock("cpu"), repeats=1, **options)
 
     step = trained(config)
     assert (step.batch, step.horizon) == (2, 2) and step.timing.median > 0
-    long = dataclasses.replace(config, stages=(StageConfig(steps=5, horizon=50),))
-    assert "do not fit" in trained(long).problem
+    long = StageConfig(steps=5, horizon=50, cut=2, target_views=1)
+    n_steps = min(scene.n_steps for scene in subject.scenes)
+    assert trained(dataclasses.replace(config, stages=(long,))).horizon == n_steps - 2
+    assert trained(dataclasses.replace(config, stages=(long,)), quick=True).horizon == 2
+    ahead = dataclasses.replace(long, lead=50)
+    assert "do not fit" in trained(dataclasses.replace(config, stages=(ahead,))).problem
     found = report.regimes_as_dict([], step)["training"]
     assert found["step_ms"]["median"] == pytest.approx(1e3 * step.timing.median)
 
