@@ -127,7 +127,7 @@ class Dynamics(nn.Module):
         runs, moved, drift = clouds.row_runs(newest), None, None
         if self.config.motion_length is not None:
             now = motion(history, self.config.motion_length, self.config.grid_size)
-            moved, drift = put_runs(now, runs, history.n_rows), now[:, DRIFT]
+            moved, drift = _put_runs(now, runs, history.n_rows), now[:, DRIFT]
         features, is_awake = self.layout.pack(history, moved), None
         n_awake = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
         everyone = n_awake == history.n_rows
@@ -209,7 +209,7 @@ def _beside(generator: torch.Generator, device: torch.device) -> torch.Generator
     return torch.Generator(device).manual_seed(seed)
 
 
-def put_runs(x: Tensor, runs: Sequence[tuple[int, int]], n_rows: int) -> Tensor:
+def _put_runs(x: Tensor, runs: Sequence[tuple[int, int]], n_rows: int) -> Tensor:
     """[n_rows, ...], the rows of ``x`` one run after another; 0 elsewhere."""
     pieces, end = [], 0
     for part, (begin, until) in zip(x.split([until - begin for begin, until in runs]), runs, strict=True):

@@ -7,11 +7,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.dynamics.clouds import newest_clouds
+from gsim3d.ops.sentinel import CELLS
 from gsim3d.types import DYNAMIC, Particles, constant
 
 NODES = 6  # of the lattice that spans the movable rows of a scene, along each axis
 CHUNK = 256  # rows that are added at once
-GRID_CELLS = 2**16  # from the origin of a scene: who is outside is seen by nobody
 PASSES = 3  # in which the window follows the matter
 
 
@@ -76,7 +76,7 @@ class _Cloud:
         place = torch.arange(size, device=device)
         rows = (starts[:, None] + place).clamp(max=history.n_rows - 1)
         places = history.means.detach()[rows].double() - history.origin[scenes][:, None]
-        is_seen = ((places >= 0) & (places / grid_size < GRID_CELLS)).all(2)  # not where a place is NaN
+        is_seen = ((places >= 0) & (places / grid_size < CELLS)).all(2)  # inside the workspace, not NaN
         self.moves = (place < counts[:, None]) & (history.activity[rows] == DYNAMIC) & is_seen
         self.places = torch.where(self.moves[:, :, None], places, 0).to(history.means.dtype).mT
         self.n = self.moves.sum(1)

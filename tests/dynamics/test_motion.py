@@ -7,6 +7,7 @@ import torch
 
 from gsim3d.dynamics import DynamicsConfig, last_steps
 from gsim3d.dynamics.motion import motion
+from gsim3d.dynamics.parts import Parts
 from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
@@ -150,6 +151,18 @@ def test_no_step_is_longer_than_the_limit(predicts):
     for i in range(2):
         ahead = (1 + i) * torch.tensor([0.03, 0.0, -0.04])
         assert_close_relative_to_max(steps.means[300 * i : 300 * (i + 1)] - newest.means, ahead.expand(300, 3), 1e-3)
+
+
+def test_beside_a_background_that_is_computed_once_it_is_the_same():
+    dynamics = make_dynamics(dataclasses.replace(MOVING, background="asymmetric"))
+    history = batch([make_history((40, 50), config=MOVING), make_history((30, 20, 25), seed=1, config=MOVING)])
+    parts = Parts.of(history, asymmetric=True)
+    moving = dynamics(parts.moving, background=dynamics.remember(parts.background))
+    whole = dynamics(history)
+    assert_same_bits(whole.means[parts.rows], moving.means)
+    rests = last_steps(history, 1).activity == FROZEN
+    assert rests.any() and not rests.all()
+    assert_same_bits(whole.means[rests], last_steps(history, 1).means[rests])
 
 
 def test_gradients_reach_weights_and_features_but_no_velocity():
