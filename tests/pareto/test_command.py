@@ -185,7 +185,8 @@ def test_the_command_from_end_to_end(subject, run, tmp_path, capsys, monkeypatch
     assert set(content["points"][0]["task"]) == {"psnr", "psnr_masked"}
     assert len(content["points"][0]["step_ms"]["stages"]) > 4 and content["points"][0]["step_ms"]["repeats"] >= 20
     assert content["training"]["steps"] == [0, 20] and content["not_turned"] == {} and "unfinished" not in content
-    assert content["subject"]["scenes"] == 2 and "training step: not measured" in capsys.readouterr().out
+    assert content["subject"]["scenes"] == 2 and "training step (1 scenes" in capsys.readouterr().out
+    assert content["regimes"]["training"]["step_ms"]["median"] > 0
     speeds = json.loads((run / SPEEDS).read_text())
     kept = speeds[checkpoint.load(run).digest]["cpu"]
     assert list(kept) == ["exact", "balanced", "fast", "measured"]
