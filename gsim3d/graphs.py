@@ -261,7 +261,7 @@ class CapturedRollout:
 
         def geometry(history: Particles) -> Pyramid:
             pyramid = self._model.dynamics.geometry(history)
-            needed.append(PyramidCapacity.of(pyramid, history.n_rows, self._factor))
+            needed.append(PyramidCapacity.of(pyramid, self._model.dynamics.room(history), self._factor))
             return pyramid
 
         self._rollout(geometry, StabilityReport())

@@ -182,14 +182,16 @@ def predicted_cost(plan: Plan, model: ModelConfig, work: Workload) -> dict[str, 
     moving = work.moving + (work.frozen if background == "dynamic" else 0)
     frozen = work.frozen if background in ("frozen", "asymmetric") else 0
     beside = frozen if _is_asymmetric(plan.spec, model) else 0
-    computed, drawn = moving + frozen - beside, moving + frozen
+    drawn = moving + frozen
+    frozen_steps = 1 if model.dynamics.is_relit else plan.history
+    seen = moving * plan.history + (frozen - beside) * frozen_steps
     renderer, outputs = model.renderer, plan.spec.outputs
     harmonics = 3 * (plan.sh_degree + 1) ** 2 if outputs.rgb else 0
     hidden = 4 * renderer.latents
     channels = 3 * outputs.rgb + outputs.depth + renderer.latents * outputs.features
     splats = min(drawn, SPLATS_A_PIXEL) * work.pixels
     return {
-        "dynamics": _network(model.dynamics, computed * plan.history, plan.history, beside) if moving else 0.0,
+        "dynamics": _network(model.dynamics, seen, plan.history, beside) if moving else 0.0,
         "gaussians": float(drawn * hidden * (renderer.latents + harmonics + 7)),
         "images": float(work.views * (drawn * (PROJECTION + harmonics) + splats * (BLENDING + channels))),
     }

@@ -34,6 +34,7 @@ from gsim3d.dynamics import (
     last_steps,
     rollout,
     rollout_in_parts,
+    with_look,
 )
 from gsim3d.edits import Edit, by_step
 from gsim3d.effects import EffectsSpec, OutputEffects, UnsupportedEffect
@@ -197,7 +198,8 @@ class Simulator(nn.Module):
             state = state.select_rows(state.activity == DYNAMIC)
         if background == "dynamic":
             state = dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
-        return last_steps(state, plan.history)
+        state = last_steps(state, plan.history)
+        return with_look(state, "unlit") if self.config.dynamics.is_relit else state
 
     def parts(
         self, prepared: Particles, *, on_bad: OnBad | None = None, report: StabilityReport | None = None

@@ -217,6 +217,8 @@ class Particles(_Tensors):
         (:mod:`gsim3d.edits`): what is drawn is turned further, and its colours go through the matrix.
     held: bool [N], rows whose changing latents and colours stay; only where a spec of effects names bodies
         (``appearance.held``). Rollouts hand it on; None in a state: the next one asks who is meant.
+    unlit: [N, Fd], the dynamic latents of frozen rows where their simulation began; only of a model that relights its
+        background (:class:`gsim3d.dynamics.DynamicsConfig`).
 
     Rows of two encoded steps are not aligned (each step sees other pixels); rows of two simulated steps are.
     """
@@ -236,6 +238,7 @@ class Particles(_Tensors):
     turns: Tensor | None = None
     paint: Tensor | None = None
     held: Tensor | None = None
+    unlit: Tensor | None = None
     known: CloudTable | None = None  # see clouds
 
     ROW_FIELDS = (
@@ -250,6 +253,7 @@ class Particles(_Tensors):
         "turns",
         "paint",
         "held",
+        "unlit",
     )
 
     @property

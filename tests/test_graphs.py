@@ -63,9 +63,11 @@ def rolled_out(simulator, state, n_steps, plan=None):
         return simulator.rollout(state, n_steps, plan)
 
 
-@pytest.mark.parametrize("n_steps, steps_per_call", [(1, 1), (5, 1), (3, 2)])
-def test_a_graph_repeats_the_rollout_with_other_particles(n_steps, steps_per_call, device):
-    simulator = make_simulator(device, dynamics=dataclasses.replace(CONFIG.dynamics, steps_per_call=steps_per_call))
+@pytest.mark.parametrize(
+    "n_steps, changes", [(1, {}), (5, {}), (3, {"steps_per_call": 2}), (5, {"background": "relit"})]
+)
+def test_a_graph_repeats_the_rollout_with_other_particles(n_steps, changes, device):
+    simulator = make_simulator(device, dynamics=dataclasses.replace(CONFIG.dynamics, **changes))
     captured = CapturedRollout(simulator, make_state(device=device), n_steps, factor=5)
     first = captured(make_state(device=device))
     assert first.renderings == []

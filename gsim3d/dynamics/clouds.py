@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from gsim3d.types import CloudTable, Particles, split_rows
 
-LOOKS = ("turns", "paint", "held")  # fields that only some particles have
+LOOKS = ("turns", "paint", "held", "unlit")  # fields that only some particles have
 
 
 def newest_clouds(clouds: CloudTable) -> list[int]:
@@ -63,6 +63,7 @@ def with_look(particles: Particles, name: str) -> Particles:
         "turns": lambda: F.pad(like, (0, 3)),
         "paint": lambda: torch.diag_embed(like.expand(-1, 3)),
         "held": lambda: torch.zeros_like(particles.activity, dtype=torch.bool),
+        "unlit": lambda: particles.dynamic_latents,
     }
     return dataclasses.replace(particles, **{name: identity[name]()})
 

@@ -9,7 +9,7 @@ from gsim3d.quirks import Quirks
 from gsim3d.stability import LARGEST
 
 PREDICTS = ("from_newest", "from_previous", "absolute")
-BACKGROUNDS = ("symmetric", "asymmetric")
+BACKGROUNDS = ("symmetric", "asymmetric", "relit")
 STEM_KERNEL, BLOCK_KERNEL = 5, 3  # edges of the convolutions, in cells
 MAX_HISTORY_BITS = 32  # that the geometry counts
 
@@ -49,7 +49,10 @@ class DynamicsConfig:
         zero_init: the last layer starts at zero: an untrained model that predicts differences predicts none.
         background: "symmetric": frozen rows are rows like others to the network, and their latents change;
             "asymmetric": frozen rows of the newest step read each other only, never change, and are computed once a
-            rollout; the others read both (:mod:`gsim3d.dynamics.background`). Weights fit both; train as you simulate.
+            rollout; the others read both (:mod:`gsim3d.dynamics.background`); "relit": the network sees frozen rows in
+            the newest step only and as they were when the simulation began; what it predicts is by how much their
+            latents differ from that now, so that the errors of shadows do not add up. Weights fit all; train as you
+            simulate.
     Training:
         drop_path: share of rows that skip a branch of a block, growing from 0 at the first block.
         shuffle_orders: the four curves of a stage change places at random.
@@ -120,6 +123,8 @@ class DynamicsConfig:
             )
         if self.is_asymmetric and (self.norm == "batch" or self.quirks != Quirks()):
             raise ValueError('DynamicsConfig: background="asymmetric" needs norm="layer" and no quirks')
+        if self.is_relit and self.explicit:
+            raise ValueError('DynamicsConfig: background="relit" needs a model that is not explicit')
         if self.motion_length is not None and (self.predicts == "absolute" or not self.motion_length > 0):
             raise ValueError(
                 'DynamicsConfig: motion_length must be positive, and predicts "from_newest" or "from_previous"; '
@@ -135,6 +140,10 @@ class DynamicsConfig:
     @property
     def is_asymmetric(self) -> bool:
         return self.background == "asymmetric"
+
+    @property
+    def is_relit(self) -> bool:
+        return self.background == "relit"
 
     @property
     def origin_of_scene(self) -> bool:

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from gsim3d import ops
 from gsim3d.dynamics.background import Background
-from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps
+from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps, with_look
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.point_transformer import PointTransformer
 from gsim3d.dynamics.state import StateLayout
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
-from gsim3d.types import ASLEEP, CloudTable, Particles, constant, take_runs
+from gsim3d.types import ASLEEP, FROZEN, CloudTable, Particles, constant, take_runs
 
 DRIFT = 1  # the motion that goes on by itself, of motion()
+ROOM = 1.1  # for rows that a call reads, over what was counted
 
 
 class Dynamics(nn.Module):
@@ -56,17 +60,32 @@ class Dynamics(nn.Module):
         """
         clouds = history.clouds
         slots, history_bits = self._slots(clouds, newest_clouds(clouds))
-        return ops.build_pyramid(
-            _places(history),
-            history.cu_rows,
+        curves = self._draw_curves(generator) if curves is None else curves
+        options = {"curves": curves, "capacity": capacity, "rounded": rounded}
+        seen, cu_rows, chosen = self._seen(history), history.cu_rows, None
+        places = torch.where(seen[:, None], history.means.detach(), torch.nan)
+        if capacity is not None:
+            options["capacity"] = capacity = capacity.of_rows(history.n_rows)
+        if capacity is not None and capacity.sizes[0] < history.n_rows:
+            chosen, cu_rows, is_row, n_seen = _packed(seen, cu_rows, capacity.sizes[0])
+            places = torch.where(is_row[:, None], places[chosen], torch.nan)
+        pyramid = ops.build_pyramid(
+            places,
+            cu_rows,
             history.cloud_scene,
-            constant(slots, history.cu_rows.device),
+            constant(slots, cu_rows.device),
             history.origin,
             self.config.pyramid_spec(history_bits),
-            curves=self._draw_curves(generator) if curves is None else curves,
-            capacity=capacity,
-            rounded=rounded,
+            **options,
         )
+        return pyramid if chosen is None else pyramid.of_rows(chosen, n_seen)
+
+    def room(self, history: Particles) -> int:
+        """Rows that the network needs room for in calls like that of ``history``: with a background that is relit only
+        those that it sees, which waits for the device."""
+        if not self.config.is_relit:
+            return history.n_rows
+        return min(history.n_rows, math.ceil(ROOM * int(self._seen(history).sum())))
 
     def remember(self, background: Particles, *, generator: torch.Generator | None = None) -> Background:
         """What moving rows read of a background, for all calls until it changes.
@@ -113,6 +132,8 @@ class Dynamics(nn.Module):
         """
         if background is None and self.config.is_asymmetric:
             return self._forward_in_parts(history, generator, changes)
+        if self.config.is_relit:
+            history = _as_it_began(history)
         clouds = history.clouds
         newest = newest_clouds(clouds)
         if pyramid is None:
@@ -156,6 +177,15 @@ class Dynamics(nn.Module):
             for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes, drift))
         ]
         return steps[0] if len(steps) == 1 else concatenate(steps)
+
+    def _seen(self, history: Particles) -> Tensor:
+        """bool [N], rows that the network sees."""
+        seen = history.activity != ASLEEP
+        if self.config.is_relit:
+            runs = history.clouds.row_runs(newest_clouds(history.clouds))
+            newest = torch.ones_like(seen[: sum(end - begin for begin, end in runs)])
+            seen = seen & ((history.activity != FROZEN) | _put_runs(newest, runs, history.n_rows))
+        return seen
 
     def _rounds(self, history: Particles) -> bool:
         """Whether the network sees rows that are none, so that its matrix products have few sizes: cuBLAS chooses an
@@ -218,6 +248,18 @@ def _put_runs(x: Tensor, runs: Sequence[tuple[int, int]], n_rows: int) -> Tensor
     return torch.cat([*pieces, x.new_zeros(n_rows - end, *x.shape[1:])])
 
 
-def _places(particles: Particles) -> Tensor:
-    """[N, 3] positions of the rows that the network sees; NaN, which it leaves out, of those asleep."""
-    return torch.where((particles.activity == ASLEEP)[:, None], torch.nan, particles.means.detach())
+def _packed(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """``n_rows`` rows, those that are ``seen`` first: int64 [n_rows] which, where clouds begin among them (the last one
+    ends with all), bool [n_rows] whether they are seen, and how many are seen in all. Waits for nothing."""
+    until = F.pad(seen.cumsum(0), (1, 0))
+    rows = torch.sort((~seen).to(torch.uint8), stable=True).indices[:n_rows]
+    starts = until[cu_rows].clamp(max=n_rows)
+    return rows, torch.cat([starts[:-1], starts.new_full((1,), n_rows)]), seen[rows], until[-1]
+
+
+def _as_it_began(history: Particles) -> Particles:
+    """``history`` whose frozen rows look as they did when the simulation began."""
+    history = with_look(history, "unlit")
+    frozen = (history.activity == FROZEN)[:, None]
+    latents = torch.where(frozen, history.unlit, history.dynamic_latents)
+    return dataclasses.replace(history, dynamic_latents=latents)

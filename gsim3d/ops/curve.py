@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -215,6 +216,16 @@ class Pyramid:
     stages: tuple[Stage, ...]
     found: Tensor | None = None
 
+    def of_rows(self, rows: Tensor, n_rows: Tensor) -> Pyramid:
+        """This pyramid, made with capacity of ``rows`` of an input, as one of that input.
+
+        n_rows: int64, how many of the input there should have been; more than ``rows`` do not fit.
+        """
+        most = self.found.new_full((), rows.shape[0])
+        problems = self.found[0] | torch.where(n_rows > most, PyramidCapacity.TOO_LARGE, 0)
+        found = torch.cat([torch.stack([problems, torch.maximum(self.found[1], n_rows)]), self.found[2:]])
+        return dataclasses.replace(self, rows=rows[self.rows], found=found)
+
 
 @dataclass(frozen=True)
 class PyramidCapacity:
@@ -248,9 +259,17 @@ class PyramidCapacity:
             factor: 1 or more.
         """
         wanted = [math.ceil(factor * count) for count in found[1:]]
+        n_rows = self.sizes[0] if found[1] <= self.sizes[0] else wanted[0]
         for rows in range(0, self.n_stages * len(self.COUNTS), len(self.COUNTS)):
-            wanted[rows] = min(wanted[rows], self.sizes[0])  # no stage has more rows than go in
+            wanted[rows] = min(wanted[rows], n_rows)  # no stage has more rows than go in
         return PyramidCapacity(self.n_stages, tuple(max(a, b) for a, b in zip(self.sizes, wanted, strict=True)))
+
+    def of_rows(self, n_rows: int) -> PyramidCapacity:
+        """This capacity where no more than ``n_rows`` rows go in."""
+        n_counts = self.n_stages * len(self.COUNTS)
+        is_rows = [i < n_counts and i % len(self.COUNTS) == 0 for i in range(len(self.sizes))]
+        sizes = (min(size, n_rows) if rows else size for size, rows in zip(self.sizes, is_rows, strict=True))
+        return PyramidCapacity(self.n_stages, tuple(sizes))
 
     def fits(self, found: Sequence[int]) -> bool:
         """Whether the data of a call fitted.

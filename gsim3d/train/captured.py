@@ -30,6 +30,7 @@ from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport
 from gsim3d.train.checkpoint import laid_out_as
+from gsim3d.train.losses import bodies_alone
 from gsim3d.train.parts import in_parts
 from gsim3d.train.samples import Batch
 from gsim3d.types import ASLEEP, DYNAMIC, Frames, Particles
@@ -37,7 +38,7 @@ from gsim3d.types import ASLEEP, DYNAMIC, Frames, Particles
 FACTOR = 1.3  # room for geometry over what was observed: little costs captures, much costs time in every step
 ROWS_FACTOR = 1.15  # likewise, for the particles of a cloud
 ROW_UNIT = 256  # rows of a cloud are a multiple of it
-MOST_KINDS = 2  # of steps whose graphs are kept at a time
+MOST_KINDS = 3  # of steps whose graphs are kept at a time
 
 
 @dataclass(frozen=True)
@@ -84,9 +85,10 @@ class CapturedLoss:
     Args:
         simulator: that is trained; without drop path and shuffled curves, whose draws a graph would repeat.
         plan: what a step computes.
-        loss: (images [I, H, W, 3], where the simulation begins, its steps, targets, weights of the steps) -> loss and
-            errors by step.
+        loss: (images [I, H, W, 3], those of bodies alone or None, where the simulation begins, its steps, targets,
+            weights of the steps) -> loss and errors by step.
         precision: makes the context in which a part ("encoder", "dynamics", "renderer") computes.
+        bodies: whether the loss wants images of bodies alone.
 
     Attributes:
         parameters: those whose gradients it returns, all of the simulator.
@@ -100,11 +102,13 @@ class CapturedLoss:
         self,
         simulator: Simulator,
         plan: Plan,
-        loss: Callable[[Tensor, Particles, list[Particles], Frames, Tensor], tuple[Tensor, Tensor]],
+        loss: Callable[[Tensor, Tensor | None, Particles, list[Particles], Frames, Tensor], tuple[Tensor, Tensor]],
         precision: Callable[[str], torch.autocast],
+        bodies: bool = False,
     ):
         check_capturable(simulator.config.dynamics)
         self.simulator, self.plan, self.loss, self.precision = simulator, plan, loss, precision
+        self.bodies = bodies
         self.parameters = list(simulator.parameters())
         self.alone: AbstractContextManager = nullcontext()
         self.meanwhile: Callable[[], None] = lambda: None
@@ -229,10 +233,11 @@ class _Step:
         begin, steps = self._rollout(state, geometry, report, with_own_weights)
         particles = concatenate(steps if self._dynamics_alone else [state, *steps])
         with owner.precision("renderer"):
-            images = owner.simulator.draw(
-                particles, self._targets.cameras, plan=owner.plan, report=report, on_bad="drop"
-            ).color
-        loss, errors = owner.loss(images, begin, steps, self._targets, self._weights)
+            shown = {"plan": owner.plan, "report": report, "on_bad": "drop"}
+            images, bodies = owner.simulator.draw(particles, self._targets.cameras, **shown).color, None
+            if owner.bodies and steps:
+                bodies = owner.simulator.draw(bodies_alone(particles), self._targets.cameras, **shown).color
+        loss, errors = owner.loss(images, bodies, begin, steps, self._targets, self._weights)
         parts = () if self._dynamics_alone else (owner.simulator.encoder, owner.simulator.renderer)
         once = [parameter for part in parts for parameter in part.parameters()]
         gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
@@ -255,7 +260,7 @@ class _Step:
 
         def geometry(history: Particles) -> Pyramid:
             pyramid = self._owner.simulator.dynamics.geometry(history)
-            needed.append(PyramidCapacity.of(pyramid, history.n_rows, FACTOR))
+            needed.append(PyramidCapacity.of(pyramid, self._owner.simulator.dynamics.room(history), FACTOR))
             return pyramid
 
         if self._n_future:

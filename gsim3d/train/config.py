@@ -130,6 +130,8 @@ class LossConfig:
     body_weight: extra weight of pixels that show a body that may move, relative to 1 of any other pixel.
     perceptual: weight of LPIPS (VGG) beside the squared error, 0.05 in the paper and 0.01 for its rigid bodies; its
         weights come with `gsim3d weights lpips`.
+    bodies: weight of :func:`gsim3d.train.losses.body_errors` beside the squared error, of images of what may move
+        alone: a body that others hide, or that is far from its place, is told where to go. Costs a second set of images.
     shape: weight of :func:`gsim3d.train.losses.shape_errors` of simulated steps beside the squared error.
     shape_length: metres, how far apart pairs are whose distance should stay.
     """
@@ -138,11 +140,12 @@ class LossConfig:
     discount: float = DISCOUNT
     body_weight: float = 0.0
     perceptual: float = 0.0
+    bodies: float = 0.0
     shape: float = 0.0
     shape_length: float = 0.2
 
     def __post_init__(self):
-        _at_least(self, balance=0, discount=0, body_weight=0, perceptual=0, shape=0)
+        _at_least(self, balance=0, discount=0, body_weight=0, perceptual=0, bodies=0, shape=0)
         if not self.shape_length > 0:
             raise InputError(f"loss.shape_length: must be above 0; got {self.shape_length}")
 

@@ -32,7 +32,7 @@ from gsim3d.train.captured import CapturedLoss, Gradients, Prepared
 from gsim3d.train.checks import check_history, check_sharing
 from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import Log, memory_gib, plain, progress_note
-from gsim3d.train.losses import image_errors, image_loss, mean_by_step, shape_errors, time_weights
+from gsim3d.train.losses import bodies_alone, time_weights
 from gsim3d.train.optimizer import Optimizer
 from gsim3d.train.parts import in_parts
 from gsim3d.train.precision import FIRST_SCALE, LossScale
@@ -44,6 +44,7 @@ from gsim3d.train.samples import Batch, check_scenes, context_cameras, draw_batc
 from gsim3d.train.schedule import one_cycle
 from gsim3d.train.settings import from_dict, to_dict
 from gsim3d.train.thawing import check_thawing, thaw
+from gsim3d.train.training_loss import training_loss
 from gsim3d.train.watch import Seen, StepWatch, first_not_finite, mean_of_norms, norms_by_module
 from gsim3d.types import Frames, Particles
 
@@ -90,7 +91,8 @@ class Trainer:
         check_history(config, self.plan)
         check_thawing(config.data, self.simulator.config.dynamics)
         check_sharing(config, self.processes.count, self.simulator.config.dynamics.norm)
-        self.perceptual = load("lpips_vgg", partial(LPIPS, "vgg")).to(device) if config.loss.perceptual else None
+        perceptual = load("lpips_vgg", partial(LPIPS, "vgg")).to(device) if config.loss.perceptual else None
+        self.loss_of_steps = partial(training_loss, config.loss, perceptual)
         self.parameters = dict(self.simulator.named_parameters())
         self.buffers = dict(self.simulator.named_buffers())
         self.optimizer = Optimizer(list(self.parameters.values()), config.optimizer)
@@ -127,7 +129,9 @@ class Trainer:
 
     def _capture(self) -> CapturedLoss:
         precision = partial(self.config.precision.of, device=self.device)
-        return CapturedLoss(self.simulator, self.plan, self.loss_of_steps, precision)
+        return CapturedLoss(
+            self.simulator, self.plan, self.loss_of_steps, precision, bodies=self.config.loss.bodies > 0
+        )
 
     def run(
         self,
@@ -367,34 +371,9 @@ class Trainer:
             weights = weights / weights.sum()
         return weights.to(self.device)
 
-    def loss_of_steps(
-        self, images: Tensor, begin: Particles, steps: Sequence[Particles], targets: Frames, weights: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """As :meth:`loss`, of the images [I, H, W, 3] that ``targets`` should have been, and of the simulated steps
-        behind ``begin``."""
-        loss_config, n_steps = self.config.loss, weights.shape[0]
-        truth = targets.images.permute(0, 2, 3, 1)
-        weighted = loss_config.body_weight and targets.dynamic is not None
-        weight = 1 + loss_config.body_weight * targets.dynamic if weighted else None
-        if targets.valid is not None:
-            weight = targets.valid.float() if weight is None else weight * targets.valid
-        step = targets.cameras.image_cloud % n_steps
-        wrong = image_errors(images, truth, weight)
-        if self.perceptual is not None:
-            seen = images if targets.valid is None else torch.where(targets.valid[..., None], images, truth)
-            distances = self.perceptual(seen.permute(0, 3, 1, 2), targets.images)
-            wrong = wrong + loss_config.perceptual * distances
-        loss = image_loss(wrong, step, weights)
-        if loss_config.shape and steps:
-            bent = shape_errors(begin, steps, loss_config.shape_length)
-            loss = loss + loss_config.shape * (weights[n_steps - len(steps) :] * bent).sum()
-        with torch.no_grad():
-            errors = mean_by_step(image_errors(images, truth, targets.valid), step, n_steps)
-        return loss, errors
-
-    def _steps(self, batch: Batch, sample: int, watch: StepWatch) -> tuple[Tensor, Particles, list[Particles]]:
-        """What the target cameras of a batch should have seen, where the simulation begins, and its steps; each part of
-        the model in its precision."""
+    def _steps(self, batch: Batch, sample: int, watch: StepWatch) -> tuple:
+        """What the target cameras of a batch should have seen, of bodies alone if the loss wants it, where the simulation
+        begins, and its steps; each part of the model in its precision."""
         simulator, precision, recompute = self.simulator, self.config.precision, self.config.recompute
         options = {"report": watch.report, "on_bad": "drop" if watch.strict else None}
         rng = generator(self.config.seed, self.step, sample, "dynamics")
@@ -429,9 +408,10 @@ class Trainer:
                 lambda p: simulator.render(p, batch.targets.cameras, plan=self.plan, **options).color
             )
             images = render(particles)
+            bodies = render(bodies_alone(particles)) if self.config.loss.bodies and steps else None
         if recompute:
             watch.close()
-        return images, begin, steps
+        return images, bodies, begin, steps
 
     @torch.no_grad()
     def sample_video(self) -> Tensor:

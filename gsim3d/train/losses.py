@@ -1,11 +1,13 @@
-"""The training loss: errors of images and shapes, weighted over time."""
+"""Errors of images and shapes, and their weights over time."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from gsim3d.dynamics import last_steps
 from gsim3d.types import DYNAMIC, Particles, constant
@@ -13,6 +15,7 @@ from gsim3d.types import DYNAMIC, Particles, constant
 BALANCE = 0.5  # lambda of the paper: weight of the first simulated step; the encoded ones share the rest
 DISCOUNT = 0.87  # gamma of the paper: weight of a simulated step relative to the one before it
 PARTNERS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987, 1597)  # rows further on, of shape_errors
+BODY_SCALES = (1, 4, 16)  # pixels, edges of the squares whose means body_errors compares
 LEAST_WEIGHT = 1e-12  # of an image's pixels together: one without any has an error of 0
 LEAST_SQUARE = 1e-12  # added to squared distances: a root has no gradient at 0
 
@@ -58,6 +61,20 @@ def image_loss(errors: Tensor, step: Tensor, weights: Tensor) -> Tensor:
     """
     by_step = mean_by_step(errors, step, weights.shape[0])
     return (weights.to(by_step) * by_step).sum()
+
+
+def bodies_alone(particles: Particles) -> Particles:
+    """``particles`` of which only those are drawn that may move: also where others hide them."""
+    moves = particles.activity == DYNAMIC
+    return dataclasses.replace(particles, opacities=torch.where(moves, particles.opacities, 0))
+
+
+def body_errors(pred: Tensor, target: Tensor) -> Tensor:
+    """Mean squared error of each image [I] from [I, H, W, C], of pixels and of squares of them: a body in a wrong place
+    is seen from further away, the larger the squares."""
+    wrong = (pred - target).permute(0, 3, 1, 2)
+    sizes = [size for size in BODY_SCALES if size <= min(wrong.shape[2:])]
+    return torch.stack([F.avg_pool2d(wrong, size).square().mean((1, 2, 3)) for size in sizes]).mean(0)
 
 
 def shape_errors(begin: Particles, steps: Sequence[Particles], length: float) -> Tensor:

@@ -63,7 +63,13 @@ class Recipe:
 # come from other cameras and the depth range is tight: else, within ten steps, all particles hide before their cameras.
 MODEL = {
     "encoder": {"transformer_layers": 3, "refine_unet_dim": 24},
-    "dynamics": {"drop_path": 0.0, "shuffle_orders": False, "motion_length": 0.3},
+    "dynamics": {
+        "drop_path": 0.0,
+        "shuffle_orders": False,
+        "motion_length": 0.3,
+        "background": "relit",  # what shadows change would add up else
+        "max_latent_step": 8.0,  # of latents of size 4: from lit to dark at once
+    },
     "renderer": {"scale_min": 0.002, "initial_scale": 0.03},
 }
 
@@ -71,7 +77,7 @@ MODEL = {
 # Bodies keep the look that they were given: else what is rendered in the wrong place learns to fade, not where to go.
 # The ground may darken, where a shadow falls.
 EFFECTS = {"appearance": {"changing": "frozen"}}
-TURN = 20, 40  # steps of images, of the dynamics alone
+TURN = 10, 30, 30  # steps of images, of the dynamics alone in short rollouts and in long ones
 
 
 def _recipe(
@@ -81,7 +87,7 @@ def _recipe(
     *,
     strides: tuple[int, int] = (3, 2),
     batch: int = 4,
-    rollout: tuple[int, int] = (40, 10),
+    rollout: tuple[int, int] = (64, 16),
     shape_length: float = 0.2,
     capacity: int = 600,
     in_turn: tuple[dict, ...] = ({},),
@@ -99,6 +105,7 @@ def _recipe(
     # All views that are no input: what images cost beside the encoder is little.
     images = partial(StageConfig, history=1, batch=16, target_views=8, begin_within=begin_within, learning_rate=1e-3)
     dynamics = partial(StageConfig, dynamics_alone=True, target_views=3, begin_within=2 * begin_within)
+    short = partial(dynamics, horizon=12, batch=2 * batch, from_start=0.25, learning_rate=8e-4)
     horizon, cut = rollout
     train = TrainConfig(
         preset="small",
@@ -115,18 +122,21 @@ def _recipe(
             targets_apart=True,
         ),
         stages=(
-            images(steps=2000),
+            images(steps=300),
             # How things move right now, before what becomes of it.
-            dynamics(steps=200, horizon=4, batch=2 * batch, from_start=0.1, learning_rate=8e-4),
-            dynamics(steps=400, horizon=12, batch=2 * batch, from_start=0.25, learning_rate=8e-4),
+            dynamics(steps=100, horizon=4, batch=2 * batch, from_start=0.1, learning_rate=8e-4),
+            short(steps=400),
         ),
         in_turn=(
             images(steps=TURN[0]),
-            dynamics(steps=TURN[1], horizon=horizon, cut=cut, batch=batch, from_start=0.5, learning_rate=6e-4),
+            short(steps=TURN[1]),
+            dynamics(steps=TURN[2], horizon=horizon, cut=cut, batch=batch, from_start=0.5, learning_rate=6e-4),
         ),
         rounds=100_000,
         # A score counts the last step like the first. What the ground hides would leave its body unseen.
-        loss=LossConfig(body_weight=3.0, balance=0.15, discount=0.95, shape=0.1, shape_length=shape_length),
+        loss=LossConfig(
+            body_weight=3.0, balance=0.15, discount=0.98, bodies=1.0, shape=0.1, shape_length=shape_length
+        ),
         optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.995),
         precision=PrecisionConfig(encoder="bf16", dynamics="bf16"),
         captured=True,

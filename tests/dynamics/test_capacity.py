@@ -11,6 +11,7 @@ from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history
 
 MOVING = dataclasses.replace(TINY, motion_length=0.2)
+RELIT = dataclasses.replace(MOVING, background="relit")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SIZES = [[(40, 30)], [(1,)], [(0, 12)], [(12, 0)], [(40, 30), (3,), (5, 6, 7), (60, 0, 1, 2)]]
@@ -25,12 +26,12 @@ def some_asleep(history):
 
 def with_room(dynamics, history, factor=1.25, generator=None):
     exact = dynamics.geometry(history)
-    capacity = PyramidCapacity.of(exact, history.n_rows, factor)
+    capacity = PyramidCapacity.of(exact, dynamics.room(history), factor)
     return dynamics.geometry(history, capacity=capacity, generator=generator)
 
 
 @pytest.mark.parametrize("asleep", [False, True])
-@pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING])
+@pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING, RELIT])
 @pytest.mark.parametrize("sizes", SIZES)
 @pytest.mark.parametrize("factor", [1.0, 1.25, 4.0])
 def test_room_changes_no_bit(factor, sizes, config, asleep):
@@ -88,6 +89,30 @@ def test_what_does_not_fit_changes_nothing():
     step = dynamics(history, pyramid=pyramid)
     assert_same_bits(step.means, history.means[40:])
     assert_same_bits(step.dynamic_latents, history.dynamic_latents[40:])
+
+
+def test_rows_that_nobody_sees_need_no_room():
+    dynamics, history = make_dynamics(RELIT), some_asleep(make_history((400, 300, 200), frozen_share=0.8))
+    assert dynamics.room(history) < 0.6 * history.n_rows
+    assert make_dynamics(MOVING).room(history) == history.n_rows
+    pyramid = with_room(dynamics, history, 1.0)
+    assert pyramid.rows.shape[0] == dynamics.room(history)
+    expected, step = dynamics(history), dynamics(history, pyramid=pyramid)
+    for name, value in float_fields(expected).items():
+        assert_same_bits(getattr(step, name), value, name)
+
+
+def test_more_seen_rows_than_there_is_room_for_are_noticed():
+    dynamics, history = make_dynamics(RELIT), make_history((40, 30), frozen_share=0.8)
+    exact = dynamics.geometry(history)
+    n_seen = exact.stages[0].n_rows
+    roomy = PyramidCapacity.of(exact, dynamics.room(history))
+    small = dataclasses.replace(roomy, sizes=(n_seen - 1, *roomy.sizes[1:]))
+    found = dynamics.geometry(history, capacity=small).found.tolist()
+    assert found[:2] == [PyramidCapacity.TOO_LARGE, n_seen] and not small.fits(found)
+    pyramid = dynamics.geometry(history, capacity=small.grown(found))
+    assert pyramid.found[0] == 0
+    assert_same_bits(dynamics(history, pyramid=pyramid).means, dynamics(history).means)
 
 
 def test_batch_norm_refuses_to_count_rows_that_are_none():

@@ -88,7 +88,8 @@ def test_what_does_not_fit_leaves_nothing(device):
         assert found == [PyramidCapacity.TOO_LARGE, *counts_of(exact)] and not small.fits(found)
         assert_holds(given, empty, 151)
         assert small.grown(found, 1.0) == capacity
-    grown = capacity.grown([PyramidCapacity.TOO_LARGE, *(2 * count for count in counts_of(exact))])
+    rows, *others = counts_of(exact)
+    grown = capacity.grown([PyramidCapacity.TOO_LARGE, rows, *(2 * count for count in others)])
     assert grown.sizes[0] == 151 and grown.sizes[1] == math.ceil(2.5 * exact.stages[0].n_clouds)
 
 

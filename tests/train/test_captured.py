@@ -40,9 +40,15 @@ MOVING = dataclasses.replace(
     effects={"appearance": {"changing": "frozen"}},
     loss=LossConfig(shape=0.5, shape_length=0.1),
 )
+RELIT = dataclasses.replace(
+    MOVING,
+    model={"dynamics": {"motion_length": 0.3, "background": "relit"}},
+    loss=LossConfig(bodies=1.0),
+)
 KINDS = {
     "latent": CONFIG,
     "moving": MOVING,
+    "relit": RELIT,
     "moving, masked": ROWS["background-masked"].change(MOVING),
     **{name: ROWS[name].change(CONFIG) for name in ("explicit", "background-masked")},
 }
@@ -59,7 +65,11 @@ def trainer(scenes, tmp_path, device, request):
 
 def captured_loss(trainer):
     return CapturedLoss(
-        trainer.simulator, trainer.plan, trainer.loss_of_steps, lambda part: torch.autocast("cpu", enabled=False)
+        trainer.simulator,
+        trainer.plan,
+        trainer.loss_of_steps,
+        lambda part: torch.autocast("cpu", enabled=False),
+        bodies=trainer.config.loss.bodies > 0,
     )
 
 
@@ -85,10 +95,12 @@ def run(captured, batch, trainer, report=None, factor=1.0):
         ({"dynamics_alone": True, "lead": 2}, "background-masked"),
         ({"horizon": 3, "cut": 2}, "moving"),
         ({}, "moving, masked"),
+        ({"lead": 2}, "relit"),
+        ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "relit"),
     ],
     ids=[
         "rollout", "lead", "encoded", "explicit", "masked", "dynamics alone, cut", "dynamics alone, masked", "moving",
-        "moving, masked",
+        "moving, masked", "relit", "relit, dynamics alone",
     ],
     indirect=["trainer"],
 )
@@ -132,9 +144,11 @@ class Ops(TorchDispatchMode):
         return op(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("row", ["latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2"])
+@pytest.mark.parametrize(
+    "row", ["latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relit"]
+)
 def test_nothing_in_a_graph_has_a_size_that_depends_on_numbers(row, scenes, tmp_path):
-    config = ROWS[row].change(CONFIG)
+    config = KINDS[row] if row in KINDS else ROWS[row].change(CONFIG)
     trainer = Trainer(config, scenes, tmp_path)
     captured = captured_loss(trainer)
     run(captured, batches(scenes, 1)[0], trainer)

@@ -6,9 +6,17 @@ import math
 import pytest
 import torch
 
-from gsim3d.train.losses import image_errors, image_loss, mean_by_step, shape_errors, time_weights
+from gsim3d.train.losses import (
+    bodies_alone,
+    body_errors,
+    image_errors,
+    image_loss,
+    mean_by_step,
+    shape_errors,
+    time_weights,
+)
 from gsim3d.train.schedule import one_cycle
-from gsim3d.types import ASLEEP, FROZEN
+from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
 from tests.dynamics.scenes import batch, make_history
 
 
@@ -122,3 +130,32 @@ def test_gradients_of_shape_errors():
     state = make_history((12,), frozen_share=0.2, dtype=torch.float64)
     leaf = (state.means + 0.05 * torch.rand(12, 3, dtype=torch.float64)).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: shape_errors(state, [moved(state, lambda _: x)] * 2, 0.2), leaf)
+
+
+def square(at, size=4, edge=32):
+    image = torch.zeros(1, edge, edge, 3)
+    image[:, at : at + size, at : at + size] = 1.0
+    return image
+
+
+def test_body_errors_by_hand():
+    pred, target = torch.zeros(2, 16, 16, 3), torch.zeros(2, 16, 16, 3)
+    target[0, :4, :4] = 0.5
+    pixels, squares, whole = 0.25 / 16, 0.25 / 16, (0.5 / 16) ** 2
+    assert body_errors(pred, target).tolist() == pytest.approx([(pixels + squares + whole) / 3, 0])
+
+
+def test_body_errors_tell_how_far_away_a_body_is():
+    """Images of pixels do not, once it has left its place."""
+    target = square(0)
+    near, far = (body_errors(square(at), target).item() for at in (5, 24))
+    assert near < 0.95 * far
+    assert image_errors(square(5), target).item() == image_errors(square(24), target).item()
+
+
+def test_bodies_alone_hides_what_cannot_move():
+    particles = make_history((30,))
+    alone = bodies_alone(particles)
+    moves = particles.activity == DYNAMIC
+    assert torch.equal(alone.opacities[moves], particles.opacities[moves])
+    assert alone.opacities[~moves].eq(0).all() and (~moves).any() and torch.equal(alone.means, particles.means)

@@ -1,0 +1,114 @@
+"""A background that is relit: seen as it was when the simulation began, and never moved away from that by errors."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gsim3d.dynamics import append_step, concatenate, last_steps, rollout, with_look
+from gsim3d.types import DYNAMIC, FROZEN
+from tests.asserts import assert_same_bits
+from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history
+
+RELIT = dataclasses.replace(TINY, background="relit", motion_length=0.2)
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def frozen_rows(particles):
+    return particles.activity == FROZEN
+
+
+def with_latents(particles, rows, latents):
+    return dataclasses.replace(
+        particles, dynamic_latents=torch.where(rows[:, None], latents, particles.dynamic_latents)
+    )
+
+
+def test_the_network_sees_the_background_in_the_newest_step_only():
+    dynamics, history = make_dynamics(RELIT), make_history((40, 40, 30))
+    older = frozen_rows(history) & (history.row_cloud() < 2)
+    assert older.any()
+    other = with_latents(history, older, torch.full_like(history.dynamic_latents, 9.0))
+    assert_same_bits(dynamics(other).means, dynamics(history).means)
+    moved = dataclasses.replace(history, means=torch.where(older[:, None], history.means + 0.05, history.means))
+    assert_same_bits(dynamics(moved).dynamic_latents, dynamics(history).dynamic_latents)
+    newest = frozen_rows(history) & (history.row_cloud() == 2)
+    seen = with_latents(history, newest, torch.full_like(history.dynamic_latents, 9.0))
+    assert not torch.equal(dynamics(seen).means, dynamics(history).means)
+    symmetric = make_dynamics(dataclasses.replace(RELIT, background="symmetric"))
+    assert not torch.equal(symmetric(other).means, symmetric(history).means)
+
+
+def test_what_was_predicted_of_the_background_is_not_seen_again():
+    dynamics, history = make_dynamics(RELIT), make_history((30, 30))
+    history = with_look(history, "unlit")
+    frozen = frozen_rows(history)
+    dark = with_latents(history, frozen, torch.full_like(history.dynamic_latents, -3.0))
+    expected, step = dynamics(history), dynamics(dark)
+    for name, value in float_fields(expected).items():
+        assert_same_bits(getattr(step, name), value, name)
+    newest = last_steps(history, 1)
+    frozen = frozen_rows(newest)
+    assert_same_bits(step.unlit[frozen], newest.dynamic_latents[frozen])
+    assert not torch.equal(step.dynamic_latents[frozen], newest.dynamic_latents[frozen])
+
+
+def test_a_background_in_front_of_which_nothing_changes_does_not_change():
+    """Else the same prediction would be added in every step."""
+    dynamics, history = make_dynamics(RELIT), make_history((30, 30, 30, 30))
+    still = {
+        name: value[:30].repeat(4, *[1] * (value.dim() - 1))
+        for name, value in history.row_fields().items()
+    }
+    history = history.with_clouds(history.clouds, **still)
+    bodies, frozen = (last_steps(history, 1).activity == kind for kind in (DYNAMIC, FROZEN))
+
+    def predict(state):
+        step, before = dynamics(state), last_steps(state, 1)
+        return dataclasses.replace(
+            step,
+            means=before.means,
+            dynamic_latents=torch.where(bodies[:, None], before.dynamic_latents, step.dynamic_latents),
+        )
+
+    first, *others = rollout(predict, history, 4, 4)
+    assert not torch.equal(first.dynamic_latents[frozen], history.dynamic_latents[:30][frozen])
+    for step in others:
+        assert_same_bits(step.dynamic_latents, first.dynamic_latents)
+
+
+def test_a_rollout_goes_on_from_its_own_steps():
+    dynamics = make_dynamics(RELIT)
+    history = batch([make_history((30, 20)), make_history((10, 25), 1)])
+    whole = rollout(dynamics, history, 5, 4)
+    begun = rollout(dynamics, history, 2, 4)
+    state = concatenate([history, *begun], 4)
+    assert_same_bits(rollout(dynamics, state, 3, 4)[-1].dynamic_latents, whole[-1].dynamic_latents)
+    one_by_one = history
+    for _ in range(5):
+        one_by_one = append_step(one_by_one, dynamics(one_by_one), 4)
+    assert_same_bits(last_steps(one_by_one, 1).dynamic_latents, whole[-1].dynamic_latents)
+
+
+def test_scenes_do_not_change_each_other():
+    dynamics = make_dynamics(RELIT)
+    histories = [make_history((30, 20), 1), make_history((15, 25), 2)]
+    together = dynamics(batch(histories))
+    alone = [dynamics(history) for history in histories]
+    assert_same_bits(together.dynamic_latents, torch.cat([step.dynamic_latents for step in alone]))
+    assert_same_bits(together.means, torch.cat([step.means for step in alone]))
+
+
+def test_gradients_flow_to_how_the_background_began():
+    dynamics, history = make_dynamics(RELIT), make_history((30, 30))
+    latents = history.dynamic_latents.requires_grad_()
+    steps = rollout(dynamics, history, 3, 4)
+    (gradient,) = torch.autograd.grad(steps[-1].dynamic_latents.square().sum(), [latents])
+    frozen, newest = frozen_rows(history), history.row_cloud() == 1
+    assert gradient[frozen & newest].abs().amax(1).gt(0).all()
+    assert gradient[frozen & ~newest].eq(0).all()
+
+
+def test_explicit_models_have_no_such_background():
+    with pytest.raises(ValueError, match='background="relit" needs a model that is not explicit'):
+        dataclasses.replace(EXPLICIT, background="relit")
