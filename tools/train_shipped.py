@@ -2,12 +2,14 @@
 """Trains the simulators that come with gsim3d, in sittings of given length, while their trajectories are simulated.
 
     python tools/train_shipped.py elastic --minutes 8 --state runs/elastic --out runs/elastic --device cuda
+    torchrun --nproc-per-node 4 tools/train_shipped.py elastic --minutes 8 ...    # on 4 GPUs
 
 One sitting: processes film trajectories on all spare cores, training begins with the first 32 and goes on with what is
 there, while fewer of them film; near the end the learning rate falls, the state is written, and held-out trajectories
 are predicted, scored and filmed. Called again, the next sitting goes on with weights, optimizer and the next
 trajectories; what is kept and what is rounded stands in gsim3d/train/sittings.py. A sitting that is killed loses what
-came after its last save, two minutes or less.
+came after its last save, two minutes or less. On several GPUs each training process has films, and processes that film,
+of its own, and draws a batch of the recipe's size; the first one writes and scores.
 
 Written to OUT: the state, NAME.scores.json (held-out trajectories over the full horizon) and NAME.mp4 (truth above
 prediction).
@@ -29,13 +31,13 @@ from gsim3d.errors import HardCaseError, InputError  # noqa: E402
 WORLDS = ("elastic", "cloth", "rigid")
 REPORT_SHARE, REPORT_MOST = 0.15, 60.0  # of a sitting, seconds: for held-out predictions at its end
 FILMED = 3  # held-out trajectories in the video
-SPARE_CORES = 2  # that the training process keeps
+SPARE_CORES = 2  # that each training process keeps
 LATER_SHARE = 2  # once training has begun one process in so many films: its host thread needs a free core
 HELD_OUT_PROCESSES = 2
 
 
 def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: str, processes: int) -> None:
-    """One sitting of the run ``name`` of a gsim3d.train.shipped.Recipe.
+    """One sitting of the run ``name`` of a gsim3d.train.shipped.Recipe; ``processes`` film for each that trains.
 
     Raises:
         InputError: the state in ``state`` is broken or of another recipe, or the time is too short.
@@ -48,37 +50,44 @@ def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: st
     import torch
 
     from gsim3d.train.films import Filming, FilmStore
+    from gsim3d.train.processes import joined
     from gsim3d.train.shipped import SittingTrainer, train
     from gsim3d.train.sittings import begin_with, load_into, load_progress, weights_file
 
     worlds = recipe.worlds()
-    progress = load_progress(state, name)
     with tempfile.TemporaryDirectory(prefix="sitting_") as scratch:
-        store = FilmStore(worlds[0], recipe.capacity, device)
-        with Filming(worlds, store, progress.next_trajectory, processes, scratch) as filming:
-            trainer = SittingTrainer(recipe.train, store, Path(scratch) / "run", device)
-            load_into(trainer, state, name, progress)
-            begun = begin_with(trainer, recipe.begin_with) if not progress.step and recipe.begin_with else None
-            if not filming.wait_for(recipe.first_films, end - time.monotonic()):
-                raise InputError(f"--minutes: {minutes:g} pass before {recipe.first_films} trajectories are filmed")
-            waited = round(time.monotonic() - begin, 1)
-            say(f"{name}: {filming.count} trajectories after {waited} s; from step {trainer.step}")
-            sitting = {
-                "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
-                "processes": processes,
-                "seconds_before": waited,
-                "in_turn": list(recipe.in_turn),
-                **({"began_with": begun} if begun else {}),
-            }
-            filming.slow_down(max(1, processes // LATER_SHARE))
-            held_out = film_held_out(recipe, Path(scratch) / "held_out")
-            try:
-                train(trainer, filming, progress, sitting, end=end, out=out, name=name, say=say)
-            finally:
-                held_out.wait()
-        say(f"{name}: step {trainer.step}, {trainer.seconds:.0f} s of training in all")
-        del trainer, store, filming
-        report(weights_file(out, load_progress(out, name)), Path(scratch) / "held_out", out, name, device, deadline)
+        with joined(device) as together:
+            tell = say if together.is_first else lambda _: None
+            progress = load_progress(state, name)
+            store = FilmStore(worlds[0], recipe.capacity, device)
+            with Filming(worlds, store, progress.next_trajectory, processes, scratch, together) as filming:
+                trainer = SittingTrainer(recipe.train, store, Path(scratch) / "run", device, together)
+                load_into(trainer, state, name, progress)
+                begun = begin_with(trainer, recipe.begin_with) if not progress.step and recipe.begin_with else None
+                if not filming.wait_for(recipe.first_films, end - time.monotonic()):
+                    raise InputError(f"--minutes: {minutes:g} pass before {recipe.first_films} trajectories are filmed")
+                waited = round(time.monotonic() - begin, 1)
+                tell(f"{name}: {filming.count} trajectories after {waited} s; from step {trainer.step}")
+                machine = torch.cuda.get_device_name() if device == "cuda" else "cpu"
+                sitting = {
+                    "device": machine if together.count == 1 else f"{together.count} x {machine}",
+                    "processes": together.count * processes,
+                    "seconds_before": waited,
+                    "in_turn": list(recipe.in_turn),
+                    **({"began_with": begun} if begun else {}),
+                }
+                filming.slow_down(max(1, processes // LATER_SHARE))
+                held_out = film_held_out(recipe, Path(scratch) / "held_out") if together.is_first else None
+                try:
+                    train(trainer, filming, progress, sitting, end=end, out=out, name=name, say=tell)
+                finally:
+                    if held_out:
+                        held_out.wait()
+            tell(f"{name}: step {trainer.step}, {trainer.seconds:.0f} s of training in all")
+            del trainer, store, filming
+        if together.is_first:
+            weights = weights_file(out, load_progress(out, name))
+            report(weights, Path(scratch) / "held_out", out, name, device, deadline)
 
 
 def film_held_out(recipe, folder: Path) -> subprocess.Popen:
@@ -136,13 +145,15 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--state", type=Path, required=True, help="folder with the state of the last sitting, if any")
     parser.add_argument("--out", type=Path, required=True, help="folder for the state and the scores; may be the same")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda")
-    parser.add_argument("--processes", type=int, help="that film (default: all cores but two)")
+    parser.add_argument("--processes", type=int, help="that film (default: all cores but two for each GPU)")
     args = parser.parse_args(arguments)
     if not args.minutes > 0:
         raise InputError(f"--minutes must be positive; got {args.minutes}")
     from gsim3d.train.shipped import RECIPES
 
-    processes = args.processes or max(1, len(os.sched_getaffinity(0)) - SPARE_CORES)
+    together = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    processes = args.processes or len(os.sched_getaffinity(0)) - SPARE_CORES * together
+    processes = max(1, processes // together)
     options = {"minutes": args.minutes, "device": args.device, "processes": processes}
     sit(RECIPES[args.world], f"{args.world}-small", args.state, args.out, **options)
 

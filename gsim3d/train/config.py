@@ -188,8 +188,8 @@ class TrainConfig:
         changes no bit: "encoder", "steps" (all of a simulated step), "images". Beside "steps",
         ``model.dynamics.checkpointing`` halves what one simulated step holds and costs another pass.
     captured: on a GPU, steps run from CUDA graphs (gsim3d.train.captured): the same sums in fewer seconds where a step
-        has more small kernels than the host can launch. For one process and models without drop path, shuffled curves
-        and batch normalisation; numbers differ from those without by rounding.
+        has more small kernels than the host can launch. For models without drop path, shuffled curves and batch
+        normalisation; numbers differ from those without by rounding.
     seed: all randomness follows from it and from the step.
     workers: samples of a step that are computed at the same time, each on its share of the CPU threads; the numbers are
         the same for any count above 0. 0: a step's samples form one batch, as a GPU and batch normalisation want it.

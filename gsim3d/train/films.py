@@ -17,12 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsim3d.data import Window
+from gsim3d.data import Window, generator
 from gsim3d.data.recording import BACKGROUND, MOVING
 from gsim3d.generate.cameras import workspace_origin
 from gsim3d.generate.film import film, start_filming
 from gsim3d.generate.world import World
 from gsim3d.train.config import DataConfig, StageConfig
+from gsim3d.train.processes import Processes
 from gsim3d.train.samples import Batch, batch_of, draw_windows, first_target, thinned
 from gsim3d.types import Cameras, Frames
 
@@ -59,9 +60,10 @@ class FilmStore:
 
     def __init__(self, world: World, capacity: int, device: str):
         rig = world.rig()
-        self.capacity, self.device, self.count = capacity, torch.device(device), 0
+        self.capacity, self.count = capacity, 0
         self._shape = (world.n_frames, rig.n_cams, rig.size, rig.size)
         self._films = torch.empty((capacity, *self._shape, 4), dtype=torch.uint8, device=device)
+        self.device = self._films.device  # with its number: each thread has a current one of its own
         self._viewmats, self._Ks = (
             torch.from_numpy(np.ascontiguousarray(values)).float().to(device) for values in (rig.viewmats, rig.Ks)
         )
@@ -123,6 +125,12 @@ class FilmStore:
         )
 
 
+def place_of(process: Processes, first: int) -> int:
+    """Which of as many numbers as there are processes is this one's; drawn anew in every round, else a process would
+    always have the same few objects."""
+    return (process.rank + int(generator(0, first, 0, "place").integers(process.count))) % process.count
+
+
 class Filming:
     """Processes that simulate and film one trajectory after another, from number ``first`` on, into a store.
 
@@ -131,14 +139,22 @@ class Filming:
 
     Args:
         worlds: take turns, from one round of the objects to the next; all have the cameras and objects of the first.
+        together: training processes that film for themselves, each other numbers; any of each object and world.
     Attributes:
-        next: the smallest number that no process was given.
+        next: the smallest number from which on no process was given any.
     """
 
     def __init__(
-        self, worlds: Sequence[World], store: FilmStore, first: int, processes: int, cache: str | Path | None = None
+        self,
+        worlds: Sequence[World],
+        store: FilmStore,
+        first: int,
+        processes: int,
+        cache: str | Path | None = None,
+        together: Processes | None = None,
     ):
         self._worlds, self._store, self.next = worlds, store, first
+        self._together = together or Processes()
         self._processes, self._names = processes, worlds[0].object_names()
         self._wanted, self._begun = processes * QUEUED, 0
         self._cache = Path(tempfile.mkdtemp(prefix="films_", dir=cache))
@@ -188,8 +204,8 @@ class Filming:
     def _begin(self) -> None:
         """Hands out trajectories until as many are being filmed as wanted."""
         while self._begun < self._wanted:
-            number, names = self.next, self._names
-            self.next, self._begun = number + 1, self._begun + 1
+            number, names = self.next + place_of(self._together, self.next), self._names
+            self.next, self._begun = self.next + self._together.count, self._begun + 1
             scene = names[number % len(names)], number // len(names)
             world = self._worlds[scene[1] % len(self._worlds)]
             job = self._pool.submit(film, world, scene, str(self._cache / f"{number}.npy"))

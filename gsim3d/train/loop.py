@@ -109,14 +109,14 @@ class Trainer:
             self._resume()
         self.log = Log(self.out, writes=self.processes.is_first)
         self.log.cut(self.step)
-        self.shared = self._share() if self.processes.count > 1 else None
-        self.captured = self._capture() if config.captured and device == "cuda" else None
-
-    def _share(self) -> DistributedDataParallel:
-        """The loss of this process's samples; going back from it gives every process the gradient of all samples."""
         self.processes.check_agreement(
             **{"CONFIG": self.config, "--out": (self.step, self.parent), "--data": [s.name for s in self.scenes]}
         )
+        self.captured = self._capture() if config.captured and device == "cuda" else None
+        self.shared = self._share() if self.processes.count > 1 and self.captured is None else None
+
+    def _share(self) -> DistributedDataParallel:
+        """The loss of this process's samples; going back from it gives every process the gradient of all samples."""
         # Parts without gradients (the dynamics, in a stage that simulates nothing) are searched for in each step. Then
         # torch also leaves its buckets as they are: it would order them anew after the first step, and a resumed run
         # would add in another order. A group of its own, because batch normalisation talks at the same time.
@@ -154,6 +154,7 @@ class Trainer:
         until = self.config.n_steps if until is None else min(until, self.config.n_steps)
         self.out.mkdir(parents=True, exist_ok=True)
         self.simulator.train()
+        self.processes.check_same(weights=self.parameters.values())
         shows = progress and self.processes.is_first
         bar = tqdm(total=until, initial=self.step, desc="training", unit="step", disable=not shows)
         if profile:
@@ -179,7 +180,7 @@ class Trainer:
                     self.save()
                     if self.log.board is not None:
                         self.log.board.video(self.sample_video(), self.step)
-        self.processes.gather(None)  # nobody goes on before the first one has saved
+        self.processes.check_same(weights=self.parameters.values())  # nobody goes on before the first one has saved
 
     def train_step(self) -> dict:
         """One optimizer step; what to log of it.
@@ -227,22 +228,26 @@ class Trainer:
         """Loss, errors by step, gradients of the whole batch and their norm; what was seen in each of its parts."""
         scale, norm = self.scale.value, None
         norms_scale = scale if self._is_logged else None
-        if self.captured is not None:
-            watch = StepWatch()
-            found = self._captured_gradients(list(range(batch)), watch)
-            gradients, norm, seen = found.parameters, found.norm / scale, [watch.seen(norms_scale)]
-            loss, errors = found.loss.item() / scale, found.errors.cpu()
-        elif self.shared is not None:
-            parts = self._shared_gradients(self.processes.share(batch))
-            loss, errors, gradients, watch, n_samples, error = parts
+        if self.processes.count > 1:
+            samples = self.processes.share(batch)
+            compute = self._shared_gradients if self.captured is None else self._own_gradients
+            loss, errors, gradients, watch, error = compute(samples)
             seen = Seen(error=error) if error else watch.seen(norms_scale)
-            parts = self.processes.gather((loss.item(), errors.cpu(), n_samples / batch, seen))
+            parts = self.processes.gather((loss.item(), errors.cpu(), len(samples) / batch, seen))
             losses, errors, shares, seen = zip(*parts, strict=True)
             for rank, part in enumerate(seen):
                 if part.error:
                     raise HardCaseError(f"process {rank}: {part.error}")
             loss = sum(loss * share for loss, share in zip(losses, shares, strict=True))
             errors = sum(values * share for values, share in zip(errors, shares, strict=True))
+            if self.captured is not None:
+                share = len(samples) / batch
+                gradients = self.processes.add([None if g is None else g * share for g in gradients])
+        elif self.captured is not None:
+            watch = StepWatch()
+            found = self._captured_gradients(list(range(batch)), watch)
+            gradients, norm, seen = found.parameters, found.norm / scale, [watch.seen(norms_scale)]
+            loss, errors = found.loss.item() / scale, found.errors.cpu()
         else:
             samples = list(range(batch))
             groups = [[sample] for sample in samples] if self.config.workers else [samples]
@@ -325,8 +330,8 @@ class Trainer:
         return self.captured.prepare(self._batch(samples))
 
     def _shared_gradients(self, samples: list[int]) -> tuple:
-        """As :meth:`_gradients`, but gradients are those of the samples of all processes; and how many samples are this
-        one's, and what is wrong with them, or None."""
+        """As :meth:`_gradients`, but gradients are those of the samples of all processes; and what is wrong with this
+        one's, or None."""
         stage, _ = self.config.stage_of(self.step)
         # One that raises within a step leaves the others waiting: what cannot be used is dropped, and told afterwards.
         watch, error = StepWatch(strict=self.simulator.config.stability.on_bad == "raise"), None
@@ -339,7 +344,17 @@ class Trainer:
             parameter.grad = None
         (loss * (self.scale.value * len(samples) * self.processes.count / stage.batch)).backward()
         gradients = [parameter.grad for parameter in self.parameters.values()]
-        return loss.detach(), errors, gradients, watch, len(samples), error
+        return loss.detach(), errors, gradients, watch, error
+
+    def _own_gradients(self, samples: list[int]) -> tuple:
+        """As :meth:`_shared_gradients`, from a CUDA graph, but gradients are those of this process's samples."""
+        watch = StepWatch()
+        try:
+            found = self._captured_gradients(samples, watch)
+        except HardCaseError as error:  # the others wait
+            nothing = torch.full((), math.nan)
+            return nothing, nothing, (), watch, str(error)
+        return found.loss / self.scale.value, found.errors, found.parameters, watch, None
 
     def _batch(self, samples: list[int]) -> Batch:
         """The samples of this step; those of the next ones are read meanwhile."""

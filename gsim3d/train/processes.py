@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import torch
 import torch.distributed as dist
+from torch import Tensor
 
 from gsim3d.errors import InputError
 
@@ -38,6 +40,19 @@ class Processes:
         values = [None] * self.count
         dist.all_gather_object(values, value)
         return values
+
+    def add(self, tensors: Sequence[Tensor | None]) -> list[Tensor | None]:
+        """Sums over all processes, in one message; what is None in one process must be None in all."""
+        known = [tensor for tensor in tensors if tensor is not None]
+        flat = torch.cat([tensor.reshape(-1) for tensor in known])
+        dist.all_reduce(flat)
+        sums = iter(flat.split([tensor.numel() for tensor in known]))
+        return [None if tensor is None else next(sums).view(tensor.shape) for tensor in tensors]
+
+    def check_same(self, **tensors: Iterable[Tensor]) -> None:
+        """Raises InputError, in every process, where they do not hold the same bits."""
+        if self.count > 1:
+            self.check_agreement(**{name: _digest(values) for name, values in tensors.items()})
 
     def check_agreement(self, **values: Any) -> None:
         """Raises InputError, in every process, where one of ``values`` is not the same in all of them."""
@@ -69,3 +84,10 @@ def joined(device: str) -> Iterator[Processes]:
     dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
     yield Processes(dist.get_rank(), dist.get_world_size())
     dist.destroy_process_group()  # not after an error: others may wait for this process, and torchrun ends them
+
+
+def _digest(tensors: Iterable[Tensor]) -> str:
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(tensor.detach().cpu().contiguous().numpy())
+    return digest.hexdigest()

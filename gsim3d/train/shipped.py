@@ -22,6 +22,7 @@ from gsim3d.train.films import Filming, FilmStore
 from gsim3d.train.log import memory_gib
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.precision import PrecisionConfig
+from gsim3d.train.processes import Processes
 from gsim3d.train.samples import Batch
 from gsim3d.train.sittings import Progress, save_state
 
@@ -157,12 +158,19 @@ RECIPES = {
 
 
 class SittingTrainer(Trainer):
-    """Trains on what a store holds, at a rate that follows the clock: it rises, stays and falls in every sitting."""
+    """Trains on what a store holds, at a rate that follows the clock: it rises, stays and falls in every sitting.
 
-    def __init__(self, config: TrainConfig, store: FilmStore, out: Path, device: str):
+    Each of several processes draws a batch of the configuration's size from a store of its own; all go by the clock of
+    the first one.
+    """
+
+    def __init__(
+        self, config: TrainConfig, store: FilmStore, out: Path, device: str, processes: Processes | None = None
+    ):
         self.store = store
-        super().__init__(config, store.films[:1], out, device=device)
-        self.first_step, self.begin, self.end = 0, 0.0, math.inf
+        config = _for_all(config, processes.count if processes else 1)
+        super().__init__(config, store.films[:1], out, device=device, processes=processes)
+        self.first_step, self.begin, self.now, self.end = 0, 0.0, 0.0, math.inf
         self._side = torch.cuda.Stream() if device == "cuda" else None
         self._next: tuple[int, Future] | None = None
 
@@ -173,13 +181,20 @@ class SittingTrainer(Trainer):
 
     def begin_sitting(self, end: float) -> None:
         """From now to ``end``, on the clock of time.monotonic."""
-        self.first_step, self.begin, self.end = self.step, time.monotonic(), end
+        self.processes.check_same(weights=self.parameters.values())
+        self.begin, self.end = self.processes.gather((time.monotonic(), end))[0]
+        self.first_step, self.now = self.step, self.begin
         self.out.mkdir(parents=True, exist_ok=True)
         self.simulator.train()
 
+    def goes_on(self) -> bool:
+        """Looks at the clock: whether the sitting is not over."""
+        self.now = self.processes.gather(time.monotonic())[0]
+        return self.now < self.end
+
     def learning_rate(self, stage: StageConfig, place: int) -> float:
         rise = min(1.0, (self.step - self.first_step + 1) / WARM_UP)
-        left = (self.end - time.monotonic()) / max(1e-9, self.end - self.begin)
+        left = (self.end - self.now) / max(1e-9, self.end - self.begin)
         fall = min(1.0, max(0.0, left) / COOL_DOWN)
         return stage.learning_rate * rise * (LAST_RATE + (1 - LAST_RATE) * fall)
 
@@ -207,11 +222,22 @@ class SittingTrainer(Trainer):
     def _draw_beside(self, step: int) -> Prepared:
         """Draws a batch on a stream of its own."""
         stage, _ = self.config.stage_of(step)
+        if self._side is not None:
+            torch.cuda.set_device(self._side.device)  # of this thread
         with self.store.lock, torch.cuda.stream(self._side):
-            prepared = self.captured.prepare(self._draw(step, range(stage.batch)))
+            prepared = self.captured.prepare(self._draw(step, self.processes.share(stage.batch)))
             if self._side is not None:
                 self._side.synchronize()
         return prepared
+
+
+def _for_all(config: TrainConfig, n_processes: int) -> TrainConfig:
+    """``config`` with batches of so many processes together."""
+    larger = {
+        name: tuple(dataclasses.replace(stage, batch=n_processes * stage.batch) for stage in getattr(config, name))
+        for name in ("stages", "in_turn")
+    }
+    return dataclasses.replace(config, **larger)
 
 
 def train(
@@ -235,22 +261,23 @@ def train(
     Raises:
         HardCaseError: too many steps in a row met numbers that cannot be used.
     """
-    steps, seconds, saved = trainer.step, trainer.seconds, time.monotonic()
-    settings = trainer.config
+    steps, seconds, settings, gather = trainer.step, trainer.seconds, trainer.config, trainer.processes.gather
 
     def save() -> None:
         done = {
             **sitting,
             "steps": [steps, trainer.step],
             "training_seconds": round(trainer.seconds - seconds, 1),
-            "trajectories": filming.count,
+            "trajectories": sum(gather(filming.count)),
         }
-        known = {"next_trajectory": filming.next, "sittings": [*progress.sittings, done]}
-        save_state(trainer, out, name, dataclasses.replace(progress, **known))
+        known = {"next_trajectory": max(gather(filming.next)), "sittings": [*progress.sittings, done]}
+        if trainer.processes.is_first:
+            save_state(trainer, out, name, dataclasses.replace(progress, **known))
 
     trainer.begin_sitting(end)
+    saved = trainer.begin
     with deterministic(), trainer.log.opened(tensorboard=False):
-        while time.monotonic() < end:
+        while trainer.goes_on():
             start = time.perf_counter()
             entry = trainer.train_step()
             spent = time.perf_counter() - start
@@ -258,7 +285,7 @@ def train(
             if entry["step"] % settings.log_every == 0 or "skipped" in entry:
                 machine = {"seconds": trainer.seconds, "step_seconds": spent, "memory_gib": memory_gib(trainer.device)}
                 entry |= {
-                    "trajectories": filming.count,
+                    "trajectories": sum(gather(filming.count)),
                     "captures": trainer.captured.captures if trainer.captured else 0,
                 }
                 trainer.log.write(entry, machine)
@@ -266,10 +293,11 @@ def train(
             if trainer.n_skipped_in_a_row >= settings.optimizer.max_skipped:
                 raise HardCaseError(f"{name}: step {entry['step']}: {entry['skipped']}", step=entry["step"])
             filming.check()
-            if time.monotonic() - saved > SAVE_EVERY:
+            if trainer.now - saved > SAVE_EVERY:
                 save()
-                saved = time.monotonic()
+                saved = trainer.now
     save()
+    trainer.processes.check_same(weights=trainer.parameters.values())
 
 
 def line(entry: dict, machine: dict) -> str:

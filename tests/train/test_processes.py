@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ import yaml
 from gsim3d.errors import InputError
 from gsim3d.layers import RowBatchNorm
 from gsim3d.train import checkpoint
-from gsim3d.train.config import StageConfig
+from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.processes import Processes, joined
 from gsim3d.train.restore import build_simulator, model_config
@@ -23,6 +24,7 @@ from tests.asserts import assert_close_relative_to_max
 from tests.train.test_loop import CONFIG, assert_same_checkpoint, curve, scenes
 from tests.train.test_watch import spoil
 from tests.tiny_scenes import write_scenes
+from tests.two_processes import run_in_two_processes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -33,19 +35,27 @@ STAGES = (
 LAYER = dataclasses.replace(CONFIG, stages=STAGES)
 BATCH = dataclasses.replace(LAYER, model={"dynamics": {"norm": "batch", "zero_init": False}}, recompute=("steps",))
 UNEVEN = dataclasses.replace(LAYER, stages=(dataclasses.replace(STAGES[1], batch=3),))
-RUNS = {"layer": LAYER, "batch": BATCH, "uneven": UNEVEN}
+RUNS = {"layer": LAYER, "batch": BATCH, "uneven": UNEVEN, "captured": UNEVEN}
 # float32: a batch is added in another order, and AdamW turns a gradient near zero into a step of full size. Relative;
 # worst on an AMD EPYC: loss 3e-7, norms 8e-6, distance of the weights over the way they went 3e-4.
 TOLERANCE = {"loss": 1e-5, "grad_norm": 1e-4, "grad_norm_by_module": 1e-4, "grad_norm_by_step": 1e-4, "weights": 0.01}
 
 
-def train_together(rank: int, folder, out) -> None:
+def trainer_of(name: str, config: TrainConfig, folder, out: Path, processes: Processes | None = None) -> Trainer:
+    trainer = Trainer(config, scenes(folder), out, processes=processes)
+    if name == "captured":  # which without a GPU computes call by call
+        trainer.captured = trainer._capture()
+    return trainer
+
+
+def train_together(rank: int, folder: str, out: str) -> None:
     """What each of two processes does."""
     torch.set_num_threads(1)
+    out = Path(out)
     with joined("cpu") as processes:
         assert processes.rank == rank
         for name, config in RUNS.items():
-            Trainer(config, scenes(folder), out / name, processes=processes).run(progress=False)
+            trainer_of(name, config, folder, out / name, processes).run(progress=False)
         for until in (3, None):
             trainer = Trainer(LAYER, scenes(folder), out / "parts", processes=processes)
             trainer.run(until=until, progress=False)
@@ -87,33 +97,13 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def together(folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("together")
-    script = (
-        "import sys; from pathlib import Path; from tests.train.test_processes import train_together\n"
-        "train_together(int(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]))"
-    )
-    environment = {
-        **os.environ, "PYTHONPATH": os.getcwd(), "OMP_NUM_THREADS": "1", "WORLD_SIZE": "2",
-        "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()),
-    }  # fmt: skip
-    running = [
-        subprocess.Popen([sys.executable, "-c", script, str(rank), folder, out], env={**environment, "RANK": str(rank)})
-        for rank in range(2)
-    ]
-    assert [process.wait(timeout=300) for process in running] == [0, 0]
+    run_in_two_processes(train_together, folder, out)
     return out
-
-
-def free_port() -> int:
-    import socket
-
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
 
 
 @pytest.mark.parametrize("name", RUNS)
 def test_two_processes_give_the_curve_of_one(folder, together, tmp_path, name):
-    Trainer(RUNS[name], scenes(folder), tmp_path).run(progress=False)
+    trainer_of(name, RUNS[name], folder, tmp_path).run(progress=False)
     alone, two = curve(tmp_path), curve(together / name)
     assert len(alone) == len(two) == RUNS[name].n_steps
     for a, b in zip(alone, two, strict=True):

@@ -1,0 +1,121 @@
+"""Sittings of two processes: one clock, one state, the weights of one process with both batches."""
+
+import dataclasses
+import math
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from gsim3d.errors import HardCaseError, InputError
+from gsim3d.train import shipped
+from gsim3d.train.films import QUEUED, Filming, FilmStore
+from gsim3d.train.loop import deterministic
+from gsim3d.train.processes import Processes, joined
+from gsim3d.train.restore import build_simulator, model_config
+from gsim3d.train.shipped import SittingTrainer, train
+from gsim3d.train.sittings import Progress, load_progress
+from tests.train.test_sittings import CONFIG, NAME, Painted
+from tests.two_processes import run_in_two_processes
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+STEPS = 4  # of both kinds
+
+
+def trainer_in(out, config=CONFIG, processes=None) -> SittingTrainer:
+    """Computes as a graph does, call by call."""
+    store = FilmStore(Painted(), 2, "cpu")
+    for seed in range(2):
+        store.put(Painted().film(seed))
+    trainer = SittingTrainer(config, store, out, "cpu", processes)
+    trainer.captured = trainer._capture()
+    return trainer
+
+
+def steps_of(trainer: SittingTrainer) -> tuple[list[dict], dict[str, torch.Tensor]]:
+    trainer.begin_sitting(time.monotonic() + 1e4)
+    with deterministic():
+        return [trainer.train_step() for _ in range(STEPS)], trainer.simulator.state_dict()
+
+
+def sit_together(rank: int, out: str) -> None:
+    """What each of two processes does; the clock of the second one is wrong."""
+    torch.set_num_threads(1)
+    out, clock, end = Path(out), time.monotonic, time.monotonic() + 4
+    if rank == 1:
+        shipped.time, end = SimpleNamespace(monotonic=lambda: clock() + 1e6, perf_counter=time.perf_counter), 0.0
+    shipped.SAVE_EVERY = 1.0
+    with joined("cpu") as processes:
+        torch.save(steps_of(trainer_in(out / f"run_{rank}", processes=processes)), out / f"steps_{rank}.pt")
+
+        trainer, saved = trainer_in(out / f"sitting_{rank}", processes=processes), []
+        shipped.save_state = lambda *given, save=shipped.save_state: saved.append(save(*given))
+        filming = SimpleNamespace(count=2 + rank, next=7 + 2 * rank, check=lambda: None)
+        train(trainer, filming, Progress(), {}, end=end, out=out / "state", name=NAME, say=lambda _: None)
+        assert (len(saved) > 1) == (rank == 0)
+        assert len({*processes.gather(trainer.step)}) == 1 < trainer.step
+
+        if rank == 1:
+            trainer.captured.prepare = broken
+        trainer._next = None
+        assert trainer.train_step()["skipped"] == "process 1: broken" and trainer.n_skipped == 1
+        if rank == 1:
+            next(trainer.simulator.parameters()).data.mul_(1 + 1e-6)
+        with pytest.raises(InputError, match="weights: not the same in all processes"):
+            trainer.begin_sitting(math.inf)
+
+
+def broken(*_):
+    raise HardCaseError("broken")
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory):
+    out = tmp_path_factory.mktemp("together")
+    run_in_two_processes(sit_together, out)
+    return out
+
+
+def test_two_processes_make_the_steps_of_one_with_both_batches(together, tmp_path):
+    (first, weights), (second, others) = (torch.load(together / f"steps_{rank}.pt") for rank in range(2))
+    assert first == second and all(torch.equal(weights[name], others[name]) for name in weights)
+    doubled = tuple(dataclasses.replace(stage, batch=2 * stage.batch) for stage in CONFIG.stages)
+    alone, expected = steps_of(trainer_in(tmp_path, dataclasses.replace(CONFIG, stages=doubled)))
+    for a, b in zip(alone, first, strict=True):
+        assert a.keys() == b.keys() and a["particles"] == b["particles"]
+        assert b["loss"] == pytest.approx(a["loss"], rel=1e-5)
+        assert b["grad_norm"] == pytest.approx(a["grad_norm"], rel=1e-4)
+    start = build_simulator(model_config(CONFIG), CONFIG.seed).state_dict()
+    moved, apart = (
+        sum((a[name] - b[name]).double().square().sum() for name in a)
+        for a, b in ((expected, start), (expected, weights))
+    )
+    assert (apart / moved).sqrt() < 0.01
+
+
+def test_one_state_counts_what_all_have_filmed(together):
+    progress = load_progress(together / "state", NAME)
+    assert progress.next_trajectory == 9 and progress.sittings[0]["trajectories"] == 5
+    assert len(list((together / "state").glob("*.safetensors"))) == 3
+    log = (together / "state" / f"{NAME}.metrics.jsonl").read_text().splitlines()
+    assert len(log) == progress.step and not (together / "sitting_1" / "metrics.jsonl").exists()
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 5])
+def test_each_trajectory_is_filmed_by_one_process_and_each_process_films_all_kinds(count, tmp_path):
+    names, n_worlds, first, n = "abcd", 3, 5, 400
+    world, job, known = SimpleNamespace(object_names=lambda: [*names]), SimpleNamespace(add_done_callback=id), []
+    for rank in range(count):
+        filming = Filming([world] * n_worlds, None, first, n // QUEUED, tmp_path, Processes(rank, count))
+        files = []
+        filming._pool = SimpleNamespace(submit=lambda *given: files.append(given[-1]) or job)
+        filming._begin()
+        numbers = [int(Path(file).stem) for file in files]
+        n_kinds = len(names) * n_worlds
+        assert len({number % n_kinds for number in numbers}) == n_kinds
+        assert filming.next == first + n * count
+        known += numbers
+    assert sorted(known) == list(range(first, first + n * count))
