@@ -8,7 +8,8 @@ import sys
 
 def run_in_two_processes(function, *arguments) -> None:
     """``function`` of (rank, *arguments as text), found by its name in its module, in two processes."""
-    script = f"import sys; from {function.__module__} import {function.__name__} as f; f(int(sys.argv[1]), *sys.argv[2:])"
+    name = function.__name__
+    script = f"import sys; from {function.__module__} import {name}; {name}(int(sys.argv[1]), *sys.argv[2:])"
     environment = {
         **os.environ, "PYTHONPATH": os.getcwd(), "OMP_NUM_THREADS": "1", "WORLD_SIZE": "2",
         "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port()),

@@ -85,9 +85,10 @@ def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: st
                         held_out.wait()
             tell(f"{name}: step {trainer.step}, {trainer.seconds:.0f} s of training in all")
             del trainer, store, filming
-        if together.is_first:
-            weights = weights_file(out, load_progress(out, name))
-            report(weights, Path(scratch) / "held_out", out, name, device, deadline)
+            if together.is_first:
+                weights = weights_file(out, load_progress(out, name))
+                report(weights, Path(scratch) / "held_out", out, name, device, deadline)
+            together.gather(None)  # torchrun ends all where one ends badly: nobody leaves before the report
 
 
 def film_held_out(recipe, folder: Path) -> subprocess.Popen:
