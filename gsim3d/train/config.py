@@ -131,7 +131,7 @@ class LossConfig:
     perceptual: weight of LPIPS (VGG) beside the squared error, 0.05 in the paper and 0.01 for its rigid bodies; its
         weights come with `gsim3d weights lpips`.
     bodies: weight of :func:`gsim3d.train.losses.body_errors` beside the squared error, of images of what may move
-        alone: a body that others hide, or that is far from its place, is told where to go. Costs a second set of images.
+        alone: a body that others hide, or that is far from its place, is told where to go. Every image is made twice.
     shape: weight of :func:`gsim3d.train.losses.shape_errors` of simulated steps beside the squared error.
     shape_length: metres, how far apart pairs are whose distance should stay.
     """

@@ -372,8 +372,8 @@ class Trainer:
         return weights.to(self.device)
 
     def _steps(self, batch: Batch, sample: int, watch: StepWatch) -> tuple:
-        """What the target cameras of a batch should have seen, of bodies alone if the loss wants it, where the simulation
-        begins, and its steps; each part of the model in its precision."""
+        """What the target cameras of a batch should have seen, and of bodies alone if the loss wants it; where the
+        simulation begins, and its steps. Each part of the model in its precision."""
         simulator, precision, recompute = self.simulator, self.config.precision, self.config.recompute
         options = {"report": watch.report, "on_bad": "drop" if watch.strict else None}
         rng = generator(self.config.seed, self.step, sample, "dynamics")
