@@ -34,7 +34,7 @@ from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import Log, memory_gib, plain, progress_note
 from gsim3d.train.losses import bodies_alone, time_weights
 from gsim3d.train.optimizer import Optimizer
-from gsim3d.train.parts import in_parts
+from gsim3d.train.parts import in_parts, with_first_background
 from gsim3d.train.precision import FIRST_SCALE, LossScale
 from gsim3d.train.processes import Processes
 from gsim3d.train.profile import check_profile, profiler
@@ -385,6 +385,8 @@ class Trainer:
         with precision.of("encoder", self.device), torch.set_grad_enabled(not batch.dynamics_alone):
             particles = again("encoder")(lambda context: simulator.encode(context, **options))(batch.context)
         watch.count(particles.n_rows, particles.n_clouds)
+        if batch.has_own_background:
+            particles = with_first_background(particles)
         begin, steps = particles, []
         if batch.n_future:
             if self.config.data.thawed:
