@@ -153,6 +153,7 @@ class Window:
     """Consecutive steps of one scene: the first ``n_context`` are given, the rest is to be predicted.
 
     lead: steps behind the given ones that are predicted and not looked at.
+    gap: steps behind the first given one that are not looked at.
     context_cams, target_cams: camera numbers for each step (targets at every step, context at the given ones).
     """
 
@@ -162,9 +163,10 @@ class Window:
     context_cams: tuple[tuple[int, ...], ...]
     target_cams: tuple[tuple[int, ...], ...]
     lead: int = 0
+    gap: int = 0
 
     @property
     def steps(self) -> list[int]:
         """Those that are looked at."""
-        places = range(self.start, self.start + len(self.target_cams))
-        return [step if k < self.n_context else step + self.lead for k, step in enumerate(places)]
+        places = range(len(self.target_cams))
+        return [self.start + k + self.gap * (k > 0) + self.lead * (k >= self.n_context) for k in places]

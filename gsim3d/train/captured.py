@@ -31,14 +31,14 @@ from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport
 from gsim3d.train.checkpoint import laid_out_as
 from gsim3d.train.losses import bodies_alone
-from gsim3d.train.parts import in_parts
+from gsim3d.train.parts import in_parts, with_first_background
 from gsim3d.train.samples import Batch
 from gsim3d.types import ASLEEP, DYNAMIC, Frames, Particles
 
-FACTOR = 1.3  # room for geometry over what was observed: little costs captures, much costs time in every step
+FACTOR = 1.5  # room for geometry over what was observed: little costs captures, much costs time in every step
 ROWS_FACTOR = 1.15  # likewise, for the particles of a cloud
 ROW_UNIT = 256  # rows of a cloud are a multiple of it
-MOST_KINDS = 3  # of steps whose graphs are kept at a time
+MOST_KINDS = 4  # of steps whose graphs are kept at a time
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,8 @@ class Prepared:
         """What batches have in common that one graph serves."""
         batch, table = self.batch, self.room.clouds
         images = len(batch.context.cameras), len(batch.targets.cameras)
-        return table.scenes, table.steps, batch.n_lead, batch.n_future, batch.cut, batch.dynamics_alone, images
+        how = batch.cut, batch.dynamics_alone, batch.has_own_background
+        return table.scenes, table.steps, batch.n_lead, batch.n_future, *how, images
 
 
 def check_capturable(config: DynamicsConfig) -> None:
@@ -160,6 +161,7 @@ class _Step:
         self._room = owner.simulator.encoder.room(batch.context, rows)
         self._n_lead, self._n_future, self._weights = batch.n_lead, batch.n_future, weights.clone()
         self._cut, self._dynamics_alone = batch.cut, batch.dynamics_alone
+        self._has_own_background = batch.has_own_background
 
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
         self._load(prepared, weights)
@@ -194,7 +196,8 @@ class _Step:
 
     def _encode(self, report: StabilityReport) -> Particles:
         with self._owner.precision("encoder"), torch.set_grad_enabled(not self._dynamics_alone):
-            return self._owner.simulator.encode(self._context, room=self._room, report=report)
+            state = self._owner.simulator.encode(self._context, room=self._room, report=report)
+        return with_first_background(state) if self._has_own_background else state
 
     def _rollout(
         self,

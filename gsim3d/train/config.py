@@ -27,6 +27,8 @@ class StageConfig:
     horizon: simulated steps after the encoded ones; 0 trains encoder and renderer alone.
     lead: in every other optimizer step, on average, so many steps are simulated before these, without loss and
         gradients: the model learns to go on from its own states, which a long rollout needs.
+    lit_before: the background is first seen in an encoded step of its own, up to so many steps before the others: so a
+        model that relights it learns what shadows do meanwhile, which is not simulated. Needs dynamics_alone.
     cut: gradients flow back through so many simulated steps at most: a longer horizon is simulated in parts, each of
         which begins where the one before ended; 0: through all.
     dynamics_alone: only the dynamics learns. Encoder and renderer compute without gradients, and encoded steps are not
@@ -45,6 +47,7 @@ class StageConfig:
     steps: int
     horizon: int = 0
     lead: int = 0
+    lit_before: int = 0
     cut: int = 0
     dynamics_alone: bool = False
     history: int = 0
@@ -56,11 +59,13 @@ class StageConfig:
     warm_up: float = 0.01
 
     def __post_init__(self):
-        _at_least(self, steps=1, horizon=0, lead=0, cut=0, history=0, batch=1, target_views=1)
+        _at_least(self, steps=1, horizon=0, lead=0, lit_before=0, cut=0, history=0, batch=1, target_views=1)
         _at_least(self, begin_within=0, from_start=0, learning_rate=0, warm_up=0)
         for name in ("lead", "dynamics_alone"):
             if getattr(self, name) and not self.horizon:
                 raise InputError(f"{name}: needs a horizon of 1 or more")
+        if self.lit_before and not self.dynamics_alone:
+            raise InputError("lit_before: needs dynamics_alone: true")
 
 
 @dataclass(frozen=True)
@@ -131,7 +136,7 @@ class LossConfig:
     perceptual: weight of LPIPS (VGG) beside the squared error, 0.05 in the paper and 0.01 for its rigid bodies; its
         weights come with `gsim3d weights lpips`.
     bodies: weight of :func:`gsim3d.train.losses.body_errors` beside the squared error, of images of what may move
-        alone: a body that others hide, or that is far from its place, is told where to go. Costs a second set of images.
+        alone: a body that others hide, or that is far from its place, is told where to go. Every image is made twice.
     shape: weight of :func:`gsim3d.train.losses.shape_errors` of simulated steps beside the squared error.
     shape_length: metres, how far apart pairs are whose distance should stay.
     """

@@ -34,7 +34,7 @@ from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import Log, memory_gib, plain, progress_note
 from gsim3d.train.losses import bodies_alone, time_weights
 from gsim3d.train.optimizer import Optimizer
-from gsim3d.train.parts import in_parts
+from gsim3d.train.parts import in_parts, with_first_background
 from gsim3d.train.precision import FIRST_SCALE, LossScale
 from gsim3d.train.processes import Processes
 from gsim3d.train.profile import check_profile, profiler
@@ -387,8 +387,8 @@ class Trainer:
         return weights.to(self.device)
 
     def _steps(self, batch: Batch, sample: int, watch: StepWatch) -> tuple:
-        """What the target cameras of a batch should have seen, of bodies alone if the loss wants it, where the simulation
-        begins, and its steps; each part of the model in its precision."""
+        """What the target cameras of a batch should have seen, and of bodies alone if the loss wants it; where the
+        simulation begins, and its steps. Each part of the model in its precision."""
         simulator, precision, recompute = self.simulator, self.config.precision, self.config.recompute
         options = {"report": watch.report, "on_bad": "drop" if watch.strict else None}
         rng = generator(self.config.seed, self.step, sample, "dynamics")
@@ -400,6 +400,8 @@ class Trainer:
         with precision.of("encoder", self.device), torch.set_grad_enabled(not batch.dynamics_alone):
             particles = again("encoder")(lambda context: simulator.encode(context, **options))(batch.context)
         watch.count(particles.n_rows, particles.n_clouds)
+        if batch.has_own_background:
+            particles = with_first_background(particles)
         begin, steps = particles, []
         if batch.n_future:
             if self.config.data.thawed:

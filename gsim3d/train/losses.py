@@ -89,20 +89,24 @@ def shape_errors(begin: Particles, steps: Sequence[Particles], length: float) ->
         begin: of which ``steps`` are the future; its newest clouds have their rows.
     """
     begin = last_steps(begin, 1)
-    n, offsets = begin.n_rows, constant(PARTNERS, begin.means.device)[:, None]
-    rows = torch.arange(n, device=offsets.device)
-    partner = (rows + offsets).clamp(max=max(0, n - 1))
-    cloud, moves, places = begin.row_cloud(), begin.activity == DYNAMIC, begin.means.detach()
-    moves = moves & places.isfinite().all(1)
-    pairs = moves & moves[partner] & (cloud == cloud[partner]) & (rows + offsets < n)
-    far = _distances(places, partner, pairs)
+    cloud, places = begin.row_cloud(), begin.means.detach()
+    partner = torch.arange(begin.n_rows, device=places.device) + constant(PARTNERS, places.device)[:, None]
+    moves = (begin.activity == DYNAMIC) & places.isfinite().all(1)
+    pairs = moves & _partners(moves) & (cloud == _partners(cloud)) & (partner < begin.n_rows)
+    far = _distances(places, pairs)
     weight = torch.where(pairs, torch.exp(-0.5 * (far / length).square()), 0)
-    changes = torch.stack([_distances(step.means, partner, pairs) - far for step in steps])
+    changes = torch.stack([_distances(step.means, pairs) - far for step in steps])
     errors = torch.sqrt(1 + (changes / length).square()) - 1
     return (errors * weight).sum((1, 2)) / weight.sum().clamp(min=1)
 
 
-def _distances(places: Tensor, partner: Tensor, pairs: Tensor) -> Tensor:
-    """[P, N] from each place to its partners [P, N]; of what is no pair any number, without a gradient."""
-    between = torch.where(pairs[:, :, None], places - places[partner], 1)
+def _partners(x: Tensor) -> Tensor:
+    """[P, N, ...], the values [N, ...] of each row's partners; behind the last row begins the first. Not indexed: the
+    gradient of what is rolled is rolled back."""
+    return torch.stack([x.roll(-offset, 0) for offset in PARTNERS])
+
+
+def _distances(places: Tensor, pairs: Tensor) -> Tensor:
+    """[P, N] from each place to its partners; of what is no pair any number, without a gradient."""
+    between = torch.where(pairs[:, :, None], places - _partners(places), 1)
     return (between.square().sum(2) + LEAST_SQUARE).sqrt()

@@ -23,6 +23,7 @@ class Batch:
     targets: images of these and of the last n_future; image i shows cloud b * (n_context + n_future) + t. Where only
         the dynamics learns, of the last n_future alone.
     dynamics_alone, cut: as of :class:`gsim3d.train.config.StageConfig`.
+    has_own_background: the first of the n_context steps shows the background and no bodies.
     """
 
     context: Frames
@@ -32,6 +33,7 @@ class Batch:
     n_lead: int = 0
     dynamics_alone: bool = False
     cut: int = 0
+    has_own_background: bool = False
 
     @property
     def n_past(self) -> int:
@@ -58,7 +60,7 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, stages: Sequence[Sta
                 f"{first.width}x{first.height}; data.resize brings all to one size"
             )
         for stage in stages:
-            n_steps = (stage.history or data.history) + stage.lead + stage.horizon
+            n_steps = (stage.history or data.history) + stage.lead + stage.horizon + longest_gap(stage)
             if scene.n_steps < n_steps:
                 raise InputError(f"{scene.path}: {scene.n_steps} steps; windows of {n_steps} steps do not fit")
             if scene.n_cams - data.targets_apart * data.context_views < stage.target_views:
@@ -101,7 +103,7 @@ def draw_batch(
 
 def batch_of(stage: StageConfig, window: Window, context: Frames, targets: Frames) -> Batch:
     """A batch of windows like ``window``."""
-    how = {"dynamics_alone": stage.dynamics_alone, "cut": stage.cut}
+    how = {"dynamics_alone": stage.dynamics_alone, "cut": stage.cut, "has_own_background": stage.lit_before > 0}
     return Batch(context, targets, window.n_context, stage.horizon, window.lead, **how)
 
 
@@ -114,7 +116,7 @@ def draw_windows(
     scenes: Sequence[Scene], data: DataConfig, stage: StageConfig, seed: int, step: int, samples: Sequence[int]
 ) -> list[Window]:
     """What :func:`draw_batch` shows of which scene; of ``scenes`` only the numbers of steps and cameras are read."""
-    n_context = history_at(data, stage, seed, step)
+    n_context = history_at(data, stage, seed, step) + (stage.lit_before > 0)
     data = dataclasses.replace(data, context_views=_drawn(data.fewest_views, data.context_views, seed, step, "views"))
     return [_draw_window(scenes, data, stage, n_context, seed, step, sample) for sample in samples]
 
@@ -156,13 +158,18 @@ def spread_views(cameras: Sequence[int], count: int, turn: int) -> tuple[int, ..
     return tuple(sorted(cameras[(turn + k * n // count) % n] for k in range(count)))
 
 
+def longest_gap(stage: StageConfig) -> int:
+    """Steps that a background of its own takes, with those behind it."""
+    return stage.lit_before + (stage.lit_before > 0)
+
+
 def _draw_window(
     scenes: Sequence[Scene], data: DataConfig, stage: StageConfig, n_context: int, seed: int, step: int, sample: int
 ) -> Window:
     rng = generator(seed, step, sample, "window")
     scene = scenes[int(rng.integers(len(scenes)))]
     n_steps, lead = n_context + stage.horizon, lead_at(stage, seed, step)
-    n_starts = scene.n_steps - n_steps - lead + 1
+    n_starts = scene.n_steps - n_steps - lead - stage.lit_before + 1
     start = int(rng.integers(min(n_starts, stage.begin_within or n_starts)))
     if rng.random() < stage.from_start:
         start = 0
@@ -173,4 +180,5 @@ def _draw_window(
     targets = tuple(
         tuple(seen[place] for place in views.permutation(len(seen))[: stage.target_views]) for _ in range(n_steps)
     )
-    return Window(scene, start, n_context, (context,) * n_context, targets, lead)
+    gap = int(generator(seed, step, sample, "gap").integers(stage.lit_before + 1)) if stage.lit_before else 0
+    return Window(scene, start, n_context, (context,) * n_context, targets, lead, gap)

@@ -78,7 +78,7 @@ MODEL = {
 # Bodies keep the look that they were given: else what is rendered in the wrong place learns to fade, not where to go.
 # The ground may darken, where a shadow falls.
 EFFECTS = {"appearance": {"changing": "frozen"}}
-TURN = 10, 30, 30  # steps of images, of the dynamics alone in short rollouts and in long ones
+TURN = 10, 60, 30, 20  # steps of images; of the dynamics alone with other light, in short rollouts, in long ones
 
 
 def _recipe(
@@ -88,7 +88,8 @@ def _recipe(
     *,
     strides: tuple[int, int] = (3, 2),
     batch: int = 4,
-    rollout: tuple[int, int] = (64, 16),
+    rollout: tuple[int, int] = (48, 16),
+    lit_before: int = 60,
     shape_length: float = 0.2,
     capacity: int = 600,
     in_turn: tuple[dict, ...] = ({},),
@@ -100,6 +101,7 @@ def _recipe(
     begin_within: of images; windows of rollouts begin within twice as many steps.
     strides: of the pixels of ground and bodies.   batch: where long rollouts are simulated.
     rollout: their steps, and through how many of them gradients flow back.
+    lit_before: as of StageConfig, in rollouts of two steps.
     shape_length: as of LossConfig; less than bodies are apart.
     Others as in Recipe.
     """
@@ -107,6 +109,7 @@ def _recipe(
     images = partial(StageConfig, history=1, batch=16, target_views=8, begin_within=begin_within, learning_rate=1e-3)
     dynamics = partial(StageConfig, dynamics_alone=True, target_views=3, begin_within=2 * begin_within)
     short = partial(dynamics, horizon=12, batch=2 * batch, from_start=0.25, learning_rate=8e-4)
+    lit = partial(dynamics, begin_within=0, horizon=2, batch=4 * batch, lit_before=lit_before, learning_rate=8e-4)
     horizon, cut = rollout
     train = TrainConfig(
         preset="small",
@@ -127,11 +130,14 @@ def _recipe(
             # How things move right now, before what becomes of it.
             dynamics(steps=100, horizon=4, batch=2 * batch, from_start=0.1, learning_rate=8e-4),
             short(steps=400),
+            # Where shadows are, before they follow what was simulated.
+            lit(steps=2000),
         ),
         in_turn=(
             images(steps=TURN[0]),
-            short(steps=TURN[1]),
-            dynamics(steps=TURN[2], horizon=horizon, cut=cut, batch=batch, from_start=0.5, learning_rate=6e-4),
+            lit(steps=TURN[1]),
+            short(steps=TURN[2]),
+            dynamics(steps=TURN[3], horizon=horizon, cut=cut, batch=batch, from_start=0.5, learning_rate=6e-4),
         ),
         rounds=100_000,
         # A score counts the last step like the first. What the ground hides would leave its body unseen.
@@ -153,7 +159,15 @@ RECIPES = {
     "elastic": _recipe("elastic", (1.9, 4.8), 24, in_turn=({}, {}, OTHER_GROUND)),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories.
     "cloth": _recipe("cloth", (1.6, 4.8), 0, strides=(4, 2), batch=3, shape_length=0.1, capacity=400),
-    "rigid": _recipe("rigid", (1.7, 5.0), 12, rollout=(24, 12), shape_length=0.15, in_turn=({}, {}, OTHER_GROUND)),
+    "rigid": _recipe(
+        "rigid",
+        (1.7, 5.0),
+        12,
+        rollout=(24, 12),
+        lit_before=20,
+        shape_length=0.15,
+        in_turn=({}, {}, OTHER_GROUND),
+    ),
 }
 
 

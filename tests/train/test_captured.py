@@ -97,10 +97,11 @@ def run(captured, batch, trainer, report=None, factor=1.0):
         ({}, "moving, masked"),
         ({"lead": 2}, "relit"),
         ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "relit"),
+        ({"dynamics_alone": True, "lit_before": 1, "horizon": 1}, "relit"),
     ],
     ids=[
         "rollout", "lead", "encoded", "explicit", "masked", "dynamics alone, cut", "dynamics alone, masked", "moving",
-        "moving, masked", "relit", "relit, dynamics alone",
+        "moving, masked", "relit", "relit, dynamics alone", "relit, background of its own",
     ],
     indirect=["trainer"],
 )

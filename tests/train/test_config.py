@@ -53,6 +53,7 @@ def test_what_is_left_out_comes_from_the_base():
         ({"stages": [{"steps": 1, "lead": 2}]}, r"stages\[0\]: lead: needs a horizon"),
         ({"stages": [{"steps": 1, "dynamics_alone": True}]}, r"stages\[0\]: dynamics_alone: needs a horizon"),
         ({"in_turn": [{"steps": 1, "lead": 1}]}, r"in_turn\[0\]: lead: needs a horizon"),
+        ({"stages": [{"steps": 1, "horizon": 1, "lit_before": 1}]}, r"stages\[0\]: lit_before: needs dynamics_alone"),
         ({"rounds": 0}, r"rounds must be at least 1"),
         ({"stages": [{"steps": 0}]}, r"stages\[0\]: steps must be at least 1"),
         ({"data": {"context_cameras": [1], "target_only_cameras": [1]}}, r"share a camera"),

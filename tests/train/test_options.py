@@ -12,10 +12,13 @@ from gsim3d.errors import InputError
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, StageConfig
 from gsim3d.train.loop import Trainer, deterministic
+from gsim3d.train.parts import with_first_background
 from gsim3d.train.precision import STEPS_TO_DOUBLE, LossScale, PrecisionConfig
 from gsim3d.train.samples import draw_batch, draw_windows
 from gsim3d.train.settings import from_dict
 from gsim3d.train.watch import StepWatch
+from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
+from tests.dynamics.scenes import batch, make_history
 from tests.train.test_loop import CONFIG, curve, scenes
 from tests.tiny_scenes import write_scenes
 
@@ -205,6 +208,40 @@ def test_windows_begin_within_the_steps_asked_for(within, lead, starts):
     assert drawn[lead > 0] == set(range(starts))
     always = dataclasses.replace(stage, from_start=1.0)
     assert draw_windows([Long()], DataConfig(context_views=2), always, 0, 3, [0])[0].steps[0] == 0
+
+
+def test_a_background_of_its_own_comes_from_an_earlier_step():
+    """Windows of 1 + 2 + 1 steps, with up to 5 between the first two, in a scene of 12."""
+
+    class Long:
+        n_steps, n_cams = 12, 6
+
+    stage = StageConfig(
+        steps=1, horizon=1, history=2, lit_before=5, begin_within=2, target_views=1, dynamics_alone=True
+    )
+    drawn = set()
+    for step in range(80):
+        (window,) = draw_windows([Long()], DataConfig(context_views=2), stage, 0, step, [0])
+        first, *others = window.steps
+        assert others == [others[0], others[0] + 1, others[0] + 2] and window.n_context == 3
+        assert len(window.context_cams) == 3 and 0 <= first < 2
+        drawn.add(others[0] - first)
+    assert drawn == set(range(1, 7))
+
+
+def test_the_background_of_the_first_step_lies_behind_the_bodies_of_the_last():
+    history = batch([make_history((30, 20, 10)), make_history((12, 0, 25), seed=1)])
+    state = with_first_background(history)
+    assert (state.clouds.scenes, state.clouds.steps) == ((0, 0, 1, 1), (1, 2, 1, 2))
+    for scene, (first, newest) in enumerate(((0, 2), (3, 5))):
+        given = [history.select_clouds([cloud]) for cloud in (first, newest)]
+        seen = state.select_clouds([2 * scene + 1])
+        for activity, source in ((FROZEN, given[0]), (DYNAMIC, given[1])):
+            rows, wanted = seen.activity == activity, source.activity == activity
+            assert torch.equal(seen.means[rows], source.means[wanted])
+            assert torch.equal(seen.opacities[rows], source.opacities[wanted])
+        assert not seen.opacities[seen.activity == ASLEEP].any()
+    assert torch.equal(state.select_clouds([0]).activity, history.select_clouds([1]).activity)
 
 
 @pytest.mark.parametrize("where", ["calls", "graphs"])

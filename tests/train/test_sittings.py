@@ -25,6 +25,7 @@ from gsim3d.train.loop import deterministic
 from gsim3d.train.restore import restore
 from gsim3d.train.samples import draw_batch
 from gsim3d.train.shipped import RECIPES, SittingTrainer, train
+from gsim3d.train.samples import longest_gap
 from gsim3d.train.sittings import Progress, begin_with, load_into, load_progress, save_state, weights_file
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -275,7 +276,7 @@ def test_recipes_are_sound():
         assert recipe.world == world == first.name and recipe.first_films <= recipe.capacity
         assert first == build_world(world, "paper", {"seed": shipped.SEED, **recipe.options})
         assert all(replace_ground(other, first) == first for other in others)
-        assert first.n_frames >= data.history + max(stage.lead + stage.horizon for stage in stages)
+        assert first.n_frames >= data.history + max(stage.lead + stage.horizon + longest_gap(stage) for stage in stages)
         assert recipe.train.n_steps >= 1_000_000 and shipped.SEED != shipped.HELD_OUT_SEED
 
 
