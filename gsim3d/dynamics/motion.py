@@ -15,6 +15,7 @@ SAMPLES = 1024  # movable rows of a cloud that are looked at, evenly spread over
 PASSES = 3  # in which the window follows the matter, and in which rows are matched
 REACH = 0.2  # of the window's length: how far from where it is expected a row is looked for
 LIKENESS = 0.12  # how far apart the latents of one place may be, relative to how far they spread
+FAINTEST = -60.0  # logarithm of a weight: a CPU takes many times as long for numbers that are almost 0
 LEAST_SPREAD = 1e-12  # of latents, squared: where all look the same the place alone counts
 STIFFNESS = 1e-3  # against turning, relative to the window's size: a point and a line do not turn
 
@@ -179,7 +180,10 @@ def _share(clouds: CloudTable, earlier: list[int], newest: list[int], now: _Samp
 
 def _weights(logits: Tensor, of: _Samples) -> Tensor:
     """[B, G, S], how much each sample counts; nothing where there is none."""
-    return torch.where(of.known[:, None], logits, -torch.inf).softmax(2).nan_to_num(0)
+    known = of.known[:, None]
+    logits = torch.where(known, logits, -torch.inf)
+    logits = (logits - logits.amax(2, keepdim=True)).clamp(min=FAINTEST)
+    return torch.where(known, logits, -torch.inf).softmax(2).nan_to_num(0)
 
 
 def _squares(a: Tensor, b: Tensor) -> Tensor:
