@@ -16,7 +16,7 @@ PYTHON="${PYTHON:-python3}"
 STATE=build/gpu_check
 OPS=(curve sparse_conv patch_attn pool row_norm plane_sweep raster decode background)
 # Tests whose checks take longest come first, longest first, in so many parts: racecheck, then memcheck.
-LONG=(unchecked_lists:4:2 raster_edges:4:2 pyramid:3:2 sparse_conv:3:2 plane_sweep:2:1 joint_attention:2:1
+LONG=(sparse_conv:6:2 unchecked_lists:4:2 raster_edges:4:2 pyramid:3:2 plane_sweep:2:1 joint_attention:2:1
   pyramid_capacity:2:2 raster:2:1 patch_attn:2:1 patch_attn_cuda:2:1)
 
 say() { printf '\033[1m%s\033[0m\n' "$*" >&2; }
