@@ -80,6 +80,10 @@ def joined(device: str) -> Iterator[Processes]:
                 f"--nproc-per-node: process {local} of this node has no GPU; {torch.cuda.device_count()} found"
             )
         torch.cuda.set_device(local)
+    # Functions of this module keep the group that is there when it is imported (with DistributedDataParallel, for one).
+    # The group's threads would outlive it, and one that frees a tensor while Python ends aborts the process.
+    from torch.distributed.nn import functional  # noqa: F401
+
     # Small Python values travel over gloo in both cases.
     dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
     yield Processes(dist.get_rank(), dist.get_world_size())

@@ -6,11 +6,14 @@ import math
 import os
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
 import torch
+import torch.distributed as dist
 import yaml
+from torch.nn.parallel import DistributedDataParallel
 
 from gsim3d.errors import InputError
 from gsim3d.layers import RowBatchNorm
@@ -168,3 +171,14 @@ def test_what_cannot_be_shared_is_named(folder, tmp_path):
         Trainer(LAYER, scenes(folder), tmp_path, processes=Processes(0, 3))
     with pytest.raises(InputError, match="workers: must be 0 in 2 processes"):
         Trainer(dataclasses.replace(LAYER, workers=2), scenes(folder), tmp_path, processes=Processes(0, 2))
+
+
+def leave(rank: int) -> None:
+    with joined("cpu"):
+        group = weakref.ref(dist.group.WORLD)
+        DistributedDataParallel(torch.nn.Linear(1, 1), process_group=dist.new_group())
+    assert group() is None
+
+
+def test_threads_of_the_group_end_before_python_does():
+    run_in_two_processes(leave)
