@@ -47,6 +47,9 @@ def motion(history: Particles, length: float, grid_size: float) -> Tensor:
     before = [max(f, q - 1) for f, q in zip(first, newest, strict=True)]
     with torch.autocast(history.means.device.type, enabled=False):
         now, last, oldest = (_Samples(history, chosen, grid_size) for chosen in (newest, before, first))
+        here = now.mean[:, None]
+        for samples in (now, last, oldest):
+            samples.seen_from(here)
         lattice = _Lattice(now)
         window = _weights(_squares(lattice.nodes, now.places) * (-0.5 / length**2), now)
         moved, expected = (_shift(now, then, lattice.nodes, window, length) for then in (last, oldest))
@@ -54,8 +57,9 @@ def motion(history: Particles, length: float, grid_size: float) -> Tensor:
         a_step, all_steps = _share(clouds, before, newest, now, last), _share(clouds, first, newest, now, oldest)
         rows = _Rows(history, newest, grid_size)
         fields = moved * a_step, velocity * all_steps, spin * all_steps, centre
-        moved, velocity, spin, centre = lattice.at(rows.places, *fields)
-        turning = torch.linalg.cross(spin, rows.places - centre)
+        places = rows.places - here
+        moved, velocity, spin, centre = lattice.at(places, *fields)
+        turning = torch.linalg.cross(spin, places - centre)
         onward = velocity + turning + 0.5 * torch.linalg.cross(spin, turning)
         result = torch.where(rows.move[:, :, None, None], torch.stack([moved, onward], 2), 0)
     return torch.cat([result[b, : clouds.count(q)] for b, q in enumerate(newest)])
@@ -101,6 +105,11 @@ class _Samples:
         latents = history.latents.detach()[cloud.rows.gather(1, at)].to(self.places.dtype)
         self.latents = torch.where(here, latents, 0).nan_to_num(0, 0, 0)
         self.mean = self.mean_of(self.places)
+
+    def seen_from(self, place: Tensor) -> None:
+        """Counts places from ``place`` [B, 1, 3]: squares of places far away would be all rounding."""
+        self.places = torch.where(self.known[:, :, None], self.places - place, 0)
+        self.mean = self.mean - place[:, 0]
 
     def mean_of(self, values: Tensor) -> Tensor:
         """[B, C] of [B, S, C], values of the entries."""

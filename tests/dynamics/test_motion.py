@@ -73,6 +73,12 @@ def test_a_body_turns_on(spin, n):
     assert (longer - 1).abs().max() < 4e-3  # else a body would grow as it turns
 
 
+def test_far_from_the_origin_it_is_the_same():
+    history = flying([(0.03, -0.02, 0.05)], spin=(0.0, 0.0, 0.05))
+    far = dataclasses.replace(history, means=history.means + torch.tensor([2000.0, 1000.0, 0.0]))
+    assert_close_relative_to_max(motion(far, *HOW), motion(history, *HOW), 0.03)
+
+
 def test_what_looks_the_same_everywhere_does_not_turn():
     history = flying([(0.03, -0.02, 0.05)], spin=(0.0, 0.0, 0.05))
     plain = dataclasses.replace(history, dynamic_latents=torch.zeros_like(history.dynamic_latents))
