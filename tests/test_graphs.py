@@ -13,7 +13,7 @@ from gsim3d.ops import PyramidCapacity
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityConfig, StabilityReport
-from gsim3d.types import Cameras, constant, keeping_constants
+from gsim3d.types import FROZEN, Cameras, constant, keeping_constants
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import batch, float_fields, make_history
 from tests.test_simulator import CONFIG, look_at
@@ -79,6 +79,23 @@ def test_a_graph_repeats_the_rollout_with_other_particles(n_steps, changes, devi
     for step, fields in zip(first.steps, kept, strict=True):
         for name, value in fields.items():
             assert_same_bits(getattr(step, name), value, name)
+
+
+def test_a_state_that_is_prepared_knows_how_its_background_began(device):
+    """Guards compare a step with the one before it, field by field."""
+    state = make_state(device=device)
+    symmetric, relit = (
+        make_simulator(device, dynamics=dataclasses.replace(CONFIG.dynamics, background=background))
+        for background in ("symmetric", "relit")
+    )
+    assert symmetric.prepare(state, symmetric.plan()).unlit is None
+    prepared = relit.prepare(state, relit.plan())
+    assert_same_bits(prepared.unlit, prepared.dynamic_latents)
+    step = rolled_out(relit, state, 2)[-1]
+    frozen = step.activity == FROZEN
+    assert frozen.any() and not torch.equal(step.unlit[frozen], step.dynamic_latents[frozen])
+    again = relit.prepare(step, relit.plan())
+    assert_same_bits(again.unlit, step.unlit)
 
 
 def test_a_graph_counts_steps_from_those_given(device):
