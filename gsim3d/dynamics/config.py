@@ -33,8 +33,8 @@ class DynamicsConfig:
             ``position_length`` metres) and inside the cell. Learning where the ground is takes far less data so;
             without it the network knows particles by their neighbours only, and motion does not depend on the place.
         motion_length: metres, about the radius of a body. The network sees how the matter around a particle has moved
-            (:func:`gsim3d.dynamics.motion.motion`), and predicts what changes that motion: without a force bodies fly
-            on. None: it has to read velocities off the places in its history.
+            (:func:`gsim3d.dynamics.motion.motion`), and predicts how much of that is kept along each axis and what is
+            added to it: without a force bodies fly on. None: it has to read velocities off the places in its history.
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.

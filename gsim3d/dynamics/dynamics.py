@@ -21,7 +21,6 @@ from gsim3d.dynamics.state import StateLayout
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.types import ASLEEP, FROZEN, CloudTable, Particles, constant, take_runs
 
-DRIFT = 1  # the motion that goes on by itself, of motion()
 ROOM = 1.1  # for rows that a call reads, over what was counted
 
 
@@ -147,8 +146,8 @@ class Dynamics(nn.Module):
             )
         runs, moved, drift = clouds.row_runs(newest), None, None
         if self.config.motion_length is not None:
-            now = motion(history, self.config.motion_length, self.config.grid_size)
-            moved, drift = _put_runs(now, runs, history.n_rows), now[:, DRIFT]
+            drift = motion(history, self.config.motion_length, self.config.grid_size)
+            moved = _put_runs(drift, runs, history.n_rows)
         features, is_awake = self.layout.pack(history, moved), None
         n_awake = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
         everyone = n_awake == history.n_rows

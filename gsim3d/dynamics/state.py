@@ -18,6 +18,8 @@ from gsim3d.types import FROZEN, Particles
 
 SCALE_STEP_SHARE = 1 / 6  # of the range of scales, the most that one step changes a scale
 POSITION_CHANNELS = MOTION_CHANNELS = 6
+ONWARD = 1  # of the motions that gsim3d.dynamics.motion tells, the one that goes on if nothing is predicted
+MOST_KEPT = 2.0  # how much more or less of a motion may go on
 FEATURES = ("dynamic_latents", "sh")  # that rows which are held keep
 SMALL_ANGLE_SQUARED = 1e-8  # radians^2; smaller rotations are their series: a square root has no gradient at 0
 
@@ -27,8 +29,10 @@ class StateLayout:
     """Order and width of the channels: fields that change, then fields that do not, each by the alphabet.
 
     inputs, outputs: (field of Particles, channels). Positions are no input by themselves (``position_features`` appends
-    six channels); a difference of rotations is predicted as a rotation vector about world axes. Harmonics are flat as
-    (3, K), quaternions as (x, y, z, w). The channels of ``outputs`` repeat for every step of a call.
+    six channels); a difference of rotations is predicted as a rotation vector about world axes. With ``motion_length``
+    six further channels of positions say how much of each motion is kept along each axis: a contact takes a share, and
+    where nothing of it is kept errors do not add up. Harmonics are flat as (3, K), quaternions as (x, y, z, w). The
+    channels of ``outputs`` repeat for every step of a call.
     """
 
     config: DynamicsConfig
@@ -38,15 +42,16 @@ class StateLayout:
     @classmethod
     def of(cls, config: DynamicsConfig) -> StateLayout:
         dynamic, static = config.dynamic_latents, config.static_latents
+        means = 3 + MOTION_CHANNELS * (config.motion_length is not None)
         if not config.explicit:
             inputs = [("dynamic_latents", dynamic), ("opacities", 1), ("static_latents", static)]
-            outputs = [("dynamic_latents", dynamic), ("means", 3)]
+            outputs = [("dynamic_latents", dynamic), ("means", means)]
         else:
             sh = 3 * (config.sh_degree + 1) ** 2
             inputs = [("dynamic_latents", dynamic), ("sh", sh), ("opacities", 1), ("quats", 4), ("scales", 3)]
             inputs += [("static_latents", static)]
             rotation = 4 if config.predicts == "absolute" else 3
-            outputs = [("dynamic_latents", dynamic), ("sh", sh), ("means", 3), ("opacities", 1)]
+            outputs = [("dynamic_latents", dynamic), ("sh", sh), ("means", means), ("opacities", 1)]
             outputs += [("quats", rotation), ("scales", 3)]
         return cls(config, *(tuple((name, n) for name, n in fields if n > 0) for fields in (inputs, outputs)))
 
@@ -118,7 +123,7 @@ class StateLayout:
             prediction: [N, channels], the outputs that change.
             awake: bool [N], rows that change at all; None: all.
             changes: of :meth:`changes`; None: all that is predicted.
-            drift: [N, 3] metres a step, the motion that goes on by itself; None: none.
+            drift: [N, 2, 3] metres a step, motions that go on as far as they are kept; None: none.
         """
         changes = changes or self.changes()
         outputs = [(name, n) for name, n in self.outputs if changes[name] != "none"]
@@ -150,18 +155,22 @@ class StateLayout:
             newest: [N, ...], its newest values.
             predicted: [S, N, channels], of S steps.
             share: [N, 1] or [S, N, 1], how much of a predicted change happens: 0 holds the value, bit by bit.
-            drift: [N, ...], what is added in every step by itself; None: nothing.
+            drift: [N, 2, 3], what is added in every step as far as it is kept; None: nothing.
         Returns:
             [S, N, ...].
         """
         if name == "quats":
             return self._later_quats(newest, predicted, share)
         predicted = _unflat(name, predicted)
+        if name == "means":
+            predicted, kept = predicted[..., :3], predicted[..., 3:]
         share = share.reshape(*share.shape[:-1], *(1,) * (newest.dim() - 1))
         changes = self._target(name, predicted) - newest if self._absolute else self._change(name, predicted)
         if self.config.predicts == "from_previous":
             changes = changes.cumsum(0)
         if drift is not None:
+            kept = bounded(kept / MOST_KEPT, MOST_KEPT).unflatten(2, drift.shape[1:])
+            drift = drift[:, ONWARD] + (kept * drift).sum(2)
             ahead = torch.arange(1, 1 + changes.shape[0], device=drift.device)[:, None, None]
             most = math.inf if self.config.max_step is None else self.config.max_step
             changes = torch.minimum(torch.maximum(changes + ahead * drift, -most * ahead), most * ahead)

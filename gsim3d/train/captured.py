@@ -16,6 +16,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -96,6 +97,7 @@ class CapturedLoss:
         alone: a context in which no other thread uses the GPU, which a capture does not allow.
         meanwhile: is called in every call, while the graph runs: what else the host has to do delays no kernel then.
         captures: how often a graph was made.
+        most_rows: particles that any cloud had so far.
         most: sizes of geometry that any simulated step needed so far, by scenes and times of the encoded clouds.
     """
 
@@ -113,9 +115,27 @@ class CapturedLoss:
         self.parameters = list(simulator.parameters())
         self.alone: AbstractContextManager = nullcontext()
         self.meanwhile: Callable[[], None] = lambda: None
-        self.captures = 0
+        self.captures = self.most_rows = 0
         self.most: dict[tuple, tuple[int, ...]] = {}
         self._steps: dict[tuple, _Step] = {}
+
+    @property
+    def needed(self) -> dict[str, Any]:
+        """``most_rows`` and ``most`` as JSON knows them."""
+        geometry = [[*map(list, clouds), list(sizes)] for clouds, sizes in self.most.items()]
+        return {"rows": self.most_rows, "geometry": geometry}
+
+    def make_room(self, needed: dict[str, Any]) -> None:
+        """Graphs made from now on have room for what others (another run, another process) say was ``needed``."""
+        self.most_rows = max(self.most_rows, needed["rows"])
+        for scenes, times, sizes in needed["geometry"]:
+            self.grow((tuple(scenes), tuple(times)), [tuple(sizes)])
+
+    def grow(self, clouds: tuple, sizes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+        """``most`` of these clouds, which is at least all of ``sizes`` from now on."""
+        known = [self.most[clouds]] if clouds in self.most else []
+        self.most[clouds] = tuple(map(max, zip(*sizes, *known, strict=True)))
+        return self.most[clouds]
 
     @torch.no_grad()
     def prepare(self, batch: Batch) -> Prepared:
@@ -140,12 +160,13 @@ class CapturedLoss:
             report: is told what the simulator's guards find; rows of a rollout that cannot be used sleep.
         """
         kind, largest = prepared.kind, max(prepared.counts)
+        self.most_rows = max(self.most_rows, largest)
         step = self._steps.pop(kind, None)
         if step is None or largest > step.rows:
             step = None  # its memory goes back first
             while len(self._steps) >= MOST_KINDS:
                 del self._steps[next(iter(self._steps))]
-            step = _Step(self, _rounded_up(ROWS_FACTOR * largest), prepared, weights)
+            step = _Step(self, _rounded_up(ROWS_FACTOR * self.most_rows), prepared, weights)
         self._steps[kind] = step  # now the newest
         return step(prepared, weights, report)
 
@@ -187,9 +208,7 @@ class _Step:
         """What was too small for one simulated step, of whatever kind, will soon be too small for others."""
         if not needed:
             return
-        known = self._owner.most.get(self._clouds)
-        sizes = [capacity.sizes for capacity in needed] + ([known] if known else [])
-        self._owner.most[self._clouds] = most = tuple(map(max, zip(*sizes, strict=True)))
+        most = self._owner.grow(self._clouds, [capacity.sizes for capacity in needed])
         self._capacities = [capacity.grown((0, *most), 1) for capacity in needed]
 
     # ---- what runs ----

@@ -78,7 +78,7 @@ MODEL = {
 # Bodies keep the look that they were given: else what is rendered in the wrong place learns to fade, not where to go.
 # The ground may darken, where a shadow falls.
 EFFECTS = {"appearance": {"changing": "frozen"}}
-TURN = 10, 60, 30, 20  # steps of images; of the dynamics alone with other light, in short rollouts, in long ones
+TURN = 10, 40, 20, 50  # steps of images; of the dynamics alone with other light, in short rollouts, in long ones
 
 
 def _recipe(
@@ -285,6 +285,10 @@ def train(
             "trajectories": sum(gather(filming.count)),
         }
         known = {"next_trajectory": max(gather(filming.next)), "sittings": [*progress.sittings, done]}
+        if trainer.captured:
+            for needed in gather(trainer.captured.needed):
+                trainer.captured.make_room(needed)
+            known["needed"] = trainer.captured.needed
         if trainer.processes.is_first:
             save_state(trainer, out, name, dataclasses.replace(progress, **known))
 

@@ -50,6 +50,7 @@ class Progress:
     step: optimizer steps done.   next_trajectory: number of the first one that was not begun to be filmed.
     seconds: of training, of all sittings.   n_skipped: steps that changed nothing.
     sittings: what each of them did, as written by the tool.   files: name -> sha256.
+    needed: room of graphs, of CapturedLoss: making one again takes half a minute where rollouts are long.
     """
 
     step: int = 0
@@ -58,6 +59,7 @@ class Progress:
     n_skipped: int = 0
     sittings: list[dict[str, Any]] = field(default_factory=list)
     files: dict[str, str] = field(default_factory=dict)
+    needed: dict[str, Any] = field(default_factory=dict)
 
 
 def load_progress(folder: str | Path, name: str) -> Progress:
@@ -84,7 +86,8 @@ def load_progress(folder: str | Path, name: str) -> Progress:
 
 
 def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progress) -> None:
-    """Weights, averages and moments of the run's last sitting into a new trainer; its log into the trainer's folder."""
+    """Weights, averages and moments of the run's last sitting into a new trainer, and what its graphs needed; its log
+    into the trainer's folder."""
     folder = Path(folder)
     trainer.out.mkdir(parents=True, exist_ok=True)
     log = folder / f"{name}.{LOG}"
@@ -109,12 +112,14 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
             f"{folder}: the state of {name} is of another model: {str(error).splitlines()[-1].strip()}"
         ) from None
     trainer.step, trainer.seconds, trainer.n_skipped = progress.step, progress.seconds, progress.n_skipped
+    if trainer.captured and progress.needed:
+        trainer.captured.make_room(progress.needed)
     trainer.log.cut(trainer.step)
 
 
 def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     """Weights of a trained simulator into a new trainer, whose dynamics may see motion where the other's did not: the
-    columns that read it begin at zero, and so do the rows that predict positions, which mean something else then.
+    columns that read it begin at zero, and so do the rows that predict positions, which are others then.
 
     Returns:
         The checkpoint's name, digest and step.
@@ -125,9 +130,11 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     given = {key: value.float() for key, value in saved.model.items()}
     if SEEN in given and given[SEEN].shape[-1] == own[SEEN].shape[-1] - MOTION_CHANNELS:
         given[SEEN] = F.pad(given[SEEN], (0, MOTION_CHANNELS))
-        names, widths = zip(*trainer.simulator.dynamics.layout.outputs, strict=True)
+        outputs = trainer.simulator.dynamics.layout.outputs
+        widths = [3 if name == "means" else n for name, n in outputs]
         for key in PREDICTED:
-            given[key].split(widths)[names.index("means")].zero_()
+            parts = zip(outputs, given[key].split(widths), strict=True)
+            given[key] = torch.cat([x.new_zeros(n, *x.shape[1:]) if name == "means" else x for (name, n), x in parts])
     try:
         trainer.simulator.load_state_dict(given)
     except RuntimeError as error:

@@ -28,7 +28,7 @@ def test_any_history(n_rows, config):
     newest = last_steps(history, 1)
     assert all(torch.isfinite(value).all() for value in float_fields(step).values())
     assert_same_bits(step.static_latents, newest.static_latents)
-    assert (step.means - newest.means).abs().max() < TINY.max_step
+    assert (step.means - newest.means).abs().max() <= TINY.max_step + 1e-6
     moves = newest.activity != FROZEN
     assert not torch.equal(step.means[moves], newest.means[moves])
 

@@ -162,6 +162,25 @@ def test_untrained_a_body_flies_on(predicts, steps_per_call):
         assert_close_relative_to_max(steps.means[300 * i : 300 * (i + 1)] - newest.means, ahead.expand(300, 3), 1e-3)
 
 
+@pytest.mark.parametrize("steps_per_call", [1, 2])
+@pytest.mark.parametrize("config", [MOVING, dataclasses.replace(EXPLICIT, motion_length=LENGTH)])
+def test_of_each_motion_a_share_is_kept(config, steps_per_call):
+    """A body that slides to rest, flies on and bounces, and takes some of what it did last."""
+    config = dataclasses.replace(config, zero_init=True, steps_per_call=steps_per_call)
+    dynamics, history = make_dynamics(config), make_history((80, 80), config=config, frozen_share=0.0)
+    flown = torch.tensor([0.03, 0.02, -0.05]) * history.row_cloud()[:, None]
+    history = dataclasses.replace(history, means=history.means + flown)
+    names, widths = zip(*dynamics.layout.outputs, strict=True)
+    bias = dynamics.net.head.fc2.bias.detach().unflatten(0, (steps_per_call, -1))
+    shares = torch.tensor([[0.2, 0.0, 0.5], [-1.0, 0.0, -1.6]])
+    bias.split(widths, 1)[names.index("means")][:, 3:] = 2 * (shares / 2).atanh().flatten()
+    last, onward = motion(history, *HOW).unbind(1)
+    kept = shares[0] * last + (1 + shares[1]) * onward
+    steps, newest = dynamics(history).means.unflatten(0, (steps_per_call, -1)), last_steps(history, 1).means
+    for i, step in enumerate(steps):
+        assert_close_relative_to_max(step - newest, (1 + i) * kept, 1e-4)
+
+
 def test_frozen_particles_stay_where_they_are():
     history = make_history((30, 40), config=MOVING)
     step, newest = make_dynamics(MOVING)(history), last_steps(history, 1)

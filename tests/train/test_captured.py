@@ -1,6 +1,7 @@
 """Steps from a graph: on the CPU the same sums call by call, with the sizes that a graph would have."""
 
 import dataclasses
+import json
 
 import pytest
 import torch
@@ -172,6 +173,22 @@ def test_room_that_one_kind_of_step_needed_is_there_for_others(scenes, trainer, 
     assert all(capacity.sizes[-1] == captured.most[clouds][-1] >= most[-1] + 100 for capacity in step._capacities)
 
 
+def test_room_that_another_run_needed_is_there_from_the_first_step(scenes, trainer, device):
+    captured, other = captured_loss(trainer), captured_loss(trainer)
+    small, large = (batch.to(device) for batch in batches(scenes, 2))
+    run(other, large, trainer)
+    ((clouds, most),) = other.most.items()
+    other.most[clouds] = (most[0], *(2 * size for size in most[1:]))
+    other.most_rows = 2 * max(other.prepare(large).counts)
+    captured.make_room(json.loads(json.dumps(other.needed)))
+    assert captured.needed == other.needed
+    loss = run(captured, small, trainer).loss.clone()
+    (step,) = captured._steps.values()
+    assert captured.captures == 1 and step.rows >= other.most_rows
+    assert all(capacity.sizes[1:] == other.most[clouds][1:] for capacity in step._capacities)
+    torch.testing.assert_close(loss, run(captured_loss(trainer), small, trainer).loss, rtol=1e-4, atol=0)
+
+
 def test_what_needs_more_room_gets_it(scenes, trainer, device):
     captured = captured_loss(trainer)
     batch = batches(scenes, 1)[0].to(device)
@@ -209,8 +226,6 @@ def test_training_from_graphs_is_training(scenes, tmp_path, device):
         pytest.skip("graphs need a GPU")
     for name, config in (("plain", CONFIG), ("captured", dataclasses.replace(CONFIG, captured=True))):
         Trainer(config, scenes, tmp_path / name, device="cuda").run(progress=False)
-    import json
-
     plain, captured = (
         [json.loads(line)["loss"] for line in (tmp_path / name / "metrics.jsonl").read_text().splitlines()]
         for name in ("plain", "captured")

@@ -241,6 +241,21 @@ def test_a_sitting_ends_on_time_with_a_falling_rate_and_a_saved_state(store, tmp
     assert rates[0] == pytest.approx(CONFIG.stages[0].learning_rate) and rates[-1] < rates[0]
 
 
+def test_the_next_sitting_knows_what_graphs_needed(store, tmp_path):
+    first, second = (SittingTrainer(CONFIG, store, tmp_path / name, "cpu") for name in ("first", "second"))
+    for trainer in (first, second):
+        trainer.captured = trainer._capture()
+    known = {"rows": 10_000, "geometry": [[[0], [0, 1], [7, 8]]]}
+    first.captured.make_room(known)
+    end = time.monotonic() + 2
+    train(first, NoFilming(), Progress(), {}, end=end, out=tmp_path / "state", name=NAME, say=lambda _: None)
+    progress = load_progress(tmp_path / "state", NAME)
+    assert progress.step and progress.needed == first.captured.needed
+    assert known["geometry"][0] in progress.needed["geometry"]
+    load_into(second, tmp_path / "state", NAME, progress)
+    assert second.captured.needed == progress.needed and second.captured.most_rows == 10_000
+
+
 def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path):
     """What it predicts is the same, but that bodies fly on instead of what it said of positions."""
     other = SittingTrainer(CONFIG, store, tmp_path / "other", "cpu")
