@@ -9,6 +9,7 @@ import json
 import zlib
 from abc import ABC, abstractmethod
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -264,7 +265,8 @@ class World(ABC):
         spin = rng.uniform(0, self.spin) * axis / np.linalg.norm(axis)
         simulated, facts = self._make_body(collision + place, body.collision_faces, velocity, spin, rng)
         facts = {"object": name, "mass": round(simulated.mass, 6), "size": round(size, 6), **facts}
-        return Actor(simulated, render.Surface(body.faces, body.corners, body.paint), vertices + place, facts)
+        surface = render.Surface(body.faces, body.corners, self._painted(body.paint, facts))
+        return Actor(simulated, surface, vertices + place, facts)
 
     def _drop(self, height: float, body_height: float) -> float:
         """Height of the lowest point above what the body falls on, from the drawn one."""
@@ -279,6 +281,10 @@ class World(ABC):
     @abstractmethod
     def _make_body(self, vertices, faces, velocity, spin, rng) -> tuple[SoftBody | RigidBody, dict]:
         """The body with its collision mesh at time 0, and what metadata.json tells of it."""
+
+    def _painted(self, paint: Callable[[np.ndarray], np.ndarray], facts: dict) -> Callable[[np.ndarray], np.ndarray]:
+        """The paint of a body of which metadata.json tells ``facts``, from the one that was drawn."""
+        return paint
 
     def _draw_cloth(self, rng: np.random.Generator) -> Cloth | None:
         return None

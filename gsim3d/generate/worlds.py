@@ -24,6 +24,9 @@ MATERIALS = {
     "foam": ((5e3, 8e3), 0.04, None),
     "clay": ((8e3, 1.2e4), 0.04, (0.02, 0.05)),
 }
+# Colours to which bodies lean where there are several materials: nothing else tells them apart before a body lands.
+TINTS = {"jelly": (0.15, 0.6, 0.25), "rubber": (0.1, 0.25, 0.8), "foam": (0.95, 0.85, 0.3), "clay": (0.75, 0.25, 0.15)}
+TINT_SHARE = 0.6
 
 
 def draw_material(names: tuple[str, ...], rng: np.random.Generator) -> tuple[str, Material]:
@@ -34,34 +37,53 @@ def draw_material(names: tuple[str, ...], rng: np.random.Generator) -> tuple[str
 
 
 @dataclass(frozen=True)
-class Elastic(World):
-    """Soft bodies fall on a round ground, are squeezed and jump back or stay bent."""
+class SoftWorld(World):
+    """Soft bodies of one or several materials.
+
+    materials: names in MATERIALS.   cells: of the control lattice of a body, along each axis.
+    """
 
     materials: tuple[str, ...] = ("jelly",)
-    cells: int = 3  # of the control lattice along each axis
+    cells: int = 3
 
-    name = "elastic"
+    density = SOFT_DENSITY
 
     def check(self) -> None:
         super().check()
-        _check_materials(self.materials, self.cells)
+        unknown = sorted(set(self.materials) - set(MATERIALS))
+        if unknown or not self.materials:
+            got = ", ".join(self.materials) or "none"
+            raise InputError(f"materials must be some of {', '.join(MATERIALS)}; got {got}")
+        if not (isinstance(self.cells, int) and self.cells >= 1):
+            raise InputError(f"cells must be a whole number, 1 or more; got {self.cells!r}")
+
+    def _make_body(self, vertices, faces, velocity, spin, rng):
+        name, material = draw_material(self.materials, rng)
+        mass = self.density * float(np.prod(np.ptp(vertices, axis=0)))
+        return SoftBody(vertices, faces, velocity, spin, material, mass, self.cells), {"material": name}
+
+    def _painted(self, paint, facts):
+        if len(self.materials) == 1:
+            return paint
+        tint = TINT_SHARE * np.array(TINTS[facts["material"]])
+        return lambda points: (1 - TINT_SHARE) * paint(points) + tint
+
+
+@dataclass(frozen=True)
+class Elastic(SoftWorld):
+    """Soft bodies fall on a round ground, are squeezed and jump back or stay bent."""
+
+    name = "elastic"
 
     def _drop(self, height, body_height):
         # A soft body that falls less than its own height is hardly squeezed; without ground there is no fall.
         return max(height, body_height) if self.ground else height
 
-    def _make_body(self, vertices, faces, velocity, spin, rng):
-        name, material = draw_material(self.materials, rng)
-        mass = SOFT_DENSITY * float(np.prod(np.ptp(vertices, axis=0)))
-        return SoftBody(vertices, faces, velocity, spin, material, mass, self.cells), {"material": name}
-
 
 @dataclass(frozen=True)
-class ClothWorld(World):
+class ClothWorld(SoftWorld):
     """Soft bodies fall on a square cloth that hangs from its four corners over the ground."""
 
-    materials: tuple[str, ...] = ("jelly",)
-    cells: int = 3
     body_size: tuple[float, float] = (0.42, 0.56)
     drop_height: tuple[float, float] = (0.1, 0.35)
     speed: float = 0.2
@@ -78,10 +100,10 @@ class ClothWorld(World):
     far: float = 5.0
 
     name = "cloth"
+    density = LIGHT_DENSITY
 
     def check(self) -> None:
         super().check()
-        _check_materials(self.materials, self.cells)
         if not (isinstance(self.cloth_count, int) and self.cloth_count >= 3):
             raise InputError(f"cloth_count must be a whole number, 3 or more; got {self.cloth_count!r}")
 
@@ -95,11 +117,6 @@ class ClothWorld(World):
             thickness=0.008,
             damping=0.015,
         )
-
-    def _make_body(self, vertices, faces, velocity, spin, rng):
-        name, material = draw_material(self.materials, rng)
-        mass = LIGHT_DENSITY * float(np.prod(np.ptp(vertices, axis=0)))
-        return SoftBody(vertices, faces, velocity, spin, material, mass, self.cells), {"material": name}
 
 
 @dataclass(frozen=True)
@@ -134,14 +151,6 @@ class Rigid(World):
         parts = tuple(meshes.convex_pieces(vertices, faces))
         facts = {"friction": round(friction, 6), "bounce": round(bounce, 6)}
         return RigidBody(parts, velocity, spin, mass, friction, bounce), facts
-
-
-def _check_materials(names: tuple[str, ...], cells: int) -> None:
-    unknown = sorted(set(names) - set(MATERIALS))
-    if unknown or not names:
-        raise InputError(f"materials must be some of {', '.join(MATERIALS)}; got {', '.join(names) or 'none'}")
-    if not (isinstance(cells, int) and cells >= 1):
-        raise InputError(f"cells must be a whole number, 1 or more; got {cells!r}")
 
 
 WORLDS = {"elastic": Elastic, "rigid": Rigid, "cloth": ClothWorld}

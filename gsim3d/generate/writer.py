@@ -22,7 +22,7 @@ from gsim3d.errors import InputError
 from gsim3d.generate.cameras import Rig, workspace_origin
 from gsim3d.generate.render import View
 
-GENERATOR_VERSION = 2  # raise it whenever the same options would give other bytes
+GENERATOR_VERSION = 3  # raise it whenever the same options would give other bytes
 FILE_TEMPLATE = "cam_{cam_ix}/{img_type}_{n_step:04d}"
 PNG_COMPRESSION = 3
 DEPTH_UNIT = 1e-4  # metres a count of the 16-bit depth images

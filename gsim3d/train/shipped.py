@@ -78,7 +78,7 @@ MODEL = {
 # Bodies keep the look that they were given: else what is rendered in the wrong place learns to fade, not where to go.
 # The ground may darken, where a shadow falls.
 EFFECTS = {"appearance": {"changing": "frozen"}}
-TURN = 10, 40, 20, 50  # steps of images; of the dynamics alone with other light, in short rollouts, in long ones
+TURN = 20, 40, 20, 50  # steps of images; of the dynamics alone with other light, in short rollouts, in long ones
 
 
 def _recipe(

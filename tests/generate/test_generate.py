@@ -22,7 +22,8 @@ from gsim3d.errors import InputError
 from gsim3d.generate import generate
 from gsim3d.generate.cameras import project
 from gsim3d.generate.command import add_arguments, run
-from gsim3d.generate.worlds import HELD_OUT, PRESETS, WORLDS, build_world
+from gsim3d.generate.shapes import PALETTE
+from gsim3d.generate.worlds import HELD_OUT, MATERIALS, PRESETS, TINTS, WORLDS, build_world
 from gsim3d.plans import make_plan
 from tests.tolerances import TOLERANCES
 
@@ -222,6 +223,22 @@ def test_first_frames_are_those_of_other_machines(mini_scenes):
     for scene in scenes:
         heights = scene.states["body_0"][:10, 1:3, 1:3, 1:3, 2].mean((1, 2, 3))
         np.testing.assert_allclose(heights, RECORDED_HEIGHTS[scene.object], atol=TOLERANCES["generate_machines"].value)
+
+
+@pytest.mark.parametrize("world", ["elastic", "cloth"])
+def test_colours_tell_materials_apart_where_there_are_several(world):
+    points, found = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)), set()
+    for seed in range(30):
+        alone, several = (
+            build_world(world, "paper", options)._draw("ball", np.random.default_rng(seed))[2][0]
+            for options in ({"materials": ("jelly",)}, {})
+        )
+        drawn, painted = alone.surface.paint(points), several.surface.paint(points)
+        assert {tuple(color) for color in drawn} <= {tuple(color) for color in PALETTE}
+        tint = np.array(TINTS[several.facts["material"]])
+        np.testing.assert_allclose(painted - tint, 0.4 * (drawn - tint), atol=1e-12)
+        found.add(several.facts["material"])
+    assert found == set(TINTS) == set(MATERIALS)
 
 
 def test_impossible_options_say_why(tmp_path):
