@@ -18,7 +18,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
-import torch.distributed as dist
 from torch import Tensor, nn
 
 from gsim3d.dynamics import Background, Parts
@@ -72,9 +71,8 @@ class Captured:
                 function()
         torch.cuda.current_stream().wait_stream(side)
         self._graph = torch.cuda.CUDAGraph()
-        # NCCL has a thread that asks the GPU what is done, at any time.
-        talks = dist.is_available() and dist.is_initialized()
-        with torch.cuda.graph(self._graph, capture_error_mode="thread_local" if talks else "global"):
+        # What other threads do (one of NCCL asks the GPU what is done, at any time) must not end the capture.
+        with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
             self.result = function()
 
     def __call__(self) -> Any:

@@ -64,7 +64,7 @@ def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: st
                 trainer = SittingTrainer(recipe.train, store, Path(scratch) / "run", device, together)
                 load_into(trainer, state, name, progress)
                 begun = begin_with(trainer, recipe.begin_with) if not progress.step and recipe.begin_with else None
-                if not filming.wait_for(recipe.first_films, end - time.monotonic()):
+                if not filming.wait_for(-(-recipe.first_films // together.count), end - time.monotonic()):
                     raise InputError(f"--minutes: {minutes:g} pass before {recipe.first_films} trajectories are filmed")
                 waited = round(time.monotonic() - begin, 1)
                 tell(f"{name}: {filming.count} trajectories after {waited} s; from step {trainer.step}")

@@ -78,7 +78,7 @@ MODEL = {
 # Bodies keep the look that they were given: else what is rendered in the wrong place learns to fade, not where to go.
 # The ground may darken, where a shadow falls.
 EFFECTS = {"appearance": {"changing": "frozen"}}
-TURN = 20, 40, 20, 50  # steps of images; of the dynamics alone with other light, in short rollouts, in long ones
+TURN = 20, 20, 40, 40  # steps of images; of the dynamics alone with other light, in short rollouts, in long ones
 
 
 def _recipe(
@@ -90,6 +90,7 @@ def _recipe(
     batch: int = 4,
     rollout: tuple[int, int] = (48, 16),
     lit_before: int = 60,
+    shape: float = 0.05,
     shape_length: float = 0.2,
     capacity: int = 600,
     in_turn: tuple[dict, ...] = ({},),
@@ -102,7 +103,7 @@ def _recipe(
     strides: of the pixels of ground and bodies.   batch: where long rollouts are simulated.
     rollout: their steps, and through how many of them gradients flow back.
     lit_before: as of StageConfig, in rollouts of two steps.
-    shape_length: as of LossConfig; less than bodies are apart.
+    shape, shape_length: as of LossConfig; the length less than bodies are apart.
     Others as in Recipe.
     """
     # All views that are no input: what images cost beside the encoder is little.
@@ -134,7 +135,7 @@ def _recipe(
             lit(steps=2000),
         ),
         in_turn=(
-            images(steps=TURN[0]),
+            images(steps=TURN[0], learning_rate=3e-4),  # at 1e-3 a good encoder was lost twice, for hundreds of steps
             lit(steps=TURN[1]),
             short(steps=TURN[2]),
             dynamics(steps=TURN[3], horizon=horizon, cut=cut, batch=batch, from_start=0.5, learning_rate=6e-4),
@@ -142,7 +143,7 @@ def _recipe(
         rounds=100_000,
         # A score counts the last step like the first. What the ground hides would leave its body unseen.
         loss=LossConfig(
-            body_weight=3.0, balance=0.15, discount=0.98, bodies=1.0, shape=0.1, shape_length=shape_length
+            body_weight=3.0, balance=0.15, discount=0.98, bodies=1.0, shape=shape, shape_length=shape_length
         ),
         optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.995),
         precision=PrecisionConfig(encoder="bf16", dynamics="bf16"),
@@ -165,6 +166,7 @@ RECIPES = {
         12,
         rollout=(24, 12),
         lit_before=20,
+        shape=0.2,
         shape_length=0.15,
         in_turn=({}, {}, OTHER_GROUND),
     ),
