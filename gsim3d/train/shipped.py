@@ -78,7 +78,7 @@ MODEL = {
 # Bodies keep the look that they were given: else what is rendered in the wrong place learns to fade, not where to go.
 # The ground may darken, where a shadow falls.
 EFFECTS = {"appearance": {"changing": "frozen"}}
-TURN = 20, 20, 40, 40  # steps of images; of the dynamics alone with other light, in short rollouts, in long ones
+TURN = 20, 40, 30, 40  # steps of images; of the dynamics alone with other light, in short rollouts, in long ones
 
 
 def _recipe(
@@ -110,7 +110,7 @@ def _recipe(
     images = partial(StageConfig, history=1, batch=16, target_views=8, begin_within=begin_within, learning_rate=1e-3)
     dynamics = partial(StageConfig, dynamics_alone=True, target_views=3, begin_within=2 * begin_within)
     short = partial(dynamics, horizon=12, batch=2 * batch, from_start=0.25, learning_rate=8e-4)
-    lit = partial(dynamics, begin_within=0, horizon=2, batch=4 * batch, lit_before=lit_before, learning_rate=8e-4)
+    lit = partial(dynamics, horizon=2, batch=4 * batch, lit_before=lit_before, learning_rate=8e-4)
     horizon, cut = rollout
     train = TrainConfig(
         preset="small",
