@@ -110,7 +110,8 @@ def _recipe(
     images = partial(StageConfig, history=1, batch=16, target_views=8, begin_within=begin_within, learning_rate=1e-3)
     dynamics = partial(StageConfig, dynamics_alone=True, target_views=3, begin_within=2 * begin_within)
     short = partial(dynamics, horizon=12, batch=2 * batch, from_start=0.25, learning_rate=8e-4)
-    lit = partial(dynamics, begin_within=begin_within // 2, horizon=2, batch=4 * batch, lit_before=lit_before, learning_rate=8e-4)
+    lit = partial(dynamics, begin_within=begin_within // 2, horizon=2, lit_before=lit_before)
+    lit = partial(lit, batch=4 * batch, learning_rate=8e-4)
     horizon, cut = rollout
     train = TrainConfig(
         preset="small",
