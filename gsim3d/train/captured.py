@@ -94,7 +94,7 @@ class CapturedLoss:
 
     Attributes:
         parameters: those whose gradients it returns, all of the simulator.
-        alone: a context in which no other thread uses the GPU, which a capture does not allow.
+        alone: a context in which no other thread uses the GPU, for captures.
         meanwhile: is called in every call, while the graph runs: what else the host has to do delays no kernel then.
         captures: how often a graph was made.
         most_rows: particles that any cloud had so far.
