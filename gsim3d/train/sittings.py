@@ -113,7 +113,10 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
         ) from None
     trainer.step, trainer.seconds, trainer.n_skipped = progress.step, progress.seconds, progress.n_skipped
     if trainer.captured and progress.needed:
-        trainer.captured.make_room(progress.needed)
+        try:
+            trainer.captured.make_room(progress.needed)
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"{folder / name}.json: needed must be the room that graphs of this model had") from None
     trainer.log.cut(trainer.step)
 
 

@@ -254,6 +254,9 @@ def test_the_next_sitting_knows_what_graphs_needed(store, tmp_path):
     assert known["geometry"][0] in progress.needed["geometry"]
     load_into(second, tmp_path / "state", NAME, progress)
     assert second.captured.needed == progress.needed and second.captured.most_rows == 10_000
+    for damaged in ({"rows": 1}, {**known, "geometry": [[[0], [0, 1], [7]]]}):
+        with pytest.raises(InputError, match="needed"):
+            load_into(second, tmp_path / "state", NAME, dataclasses.replace(progress, needed=damaged))
 
 
 def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path):
