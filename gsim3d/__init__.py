@@ -18,6 +18,7 @@ _HOME = {
     "Particles": "gsim3d.types",
     "Simulator": "gsim3d.simulator",
     "StabilityReport": "gsim3d.stability",
+    "autotune": "gsim3d.pareto.autotune",
 }
 
 __all__ = ["__version__", *_HOME]

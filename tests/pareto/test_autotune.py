@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 
+import gsim3d
 from gsim3d.errors import InputError
 from gsim3d.pareto import autotune
 from gsim3d.pareto.limit import TimeLimit
@@ -129,7 +130,7 @@ def test_nothing_is_tried_when_the_time_is_over(comparison, monkeypatch):
 
 def test_limits_are_kept(subject):
     few = {"knobs": [knob for knob in KNOBS if knob.name in ("history", "grid size")], "effort": SHORT}
-    tuned = autotune.autotune(subject, min_agreement_psnr=30.0, **few)
+    tuned = gsim3d.autotune(subject, min_agreement_psnr=30.0, **few)
     again = Comparison(subject).of(tuned.setting).agreement
     assert again.psnr >= 30.0
     assert autotune.autotune(subject, max_ms=1e6, **few).setting == Setting()
