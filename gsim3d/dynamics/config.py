@@ -26,7 +26,7 @@ class DynamicsConfig:
         predicts: "from_newest": the network predicts how much each later state differs from the newest one of the
             history; "from_previous": from the state one step before it; "absolute": the state itself.
         steps_per_call: steps that one call of the network predicts.
-        max_step: metres; one step moves a particle by less than this along each axis. None: no limit, and none to how
+        max_step: metres; one step moves a particle by this at most along each axis. None: no limit, and none to how
             much a scale changes.
         max_latent_step: the same for each dynamic latent. None: no limit.
         position_features: the network also sees positions relative to the scene's origin (in units of
