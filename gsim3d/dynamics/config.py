@@ -12,6 +12,7 @@ PREDICTS = ("from_newest", "from_previous", "absolute")
 BACKGROUNDS = ("symmetric", "asymmetric", "relit")
 STEM_KERNEL, BLOCK_KERNEL = 5, 3  # edges of the convolutions, in cells
 MAX_HISTORY_BITS = 32  # that the geometry counts
+MOST_WAVES = 16  # further ones are shorter than rounding
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,11 @@ class DynamicsConfig:
         position_features: the network also sees positions relative to the scene's origin (in units of
             ``position_length`` metres) and inside the cell. Learning where the ground is takes far less data so;
             without it the network knows particles by their neighbours only, and motion does not depend on the place.
+        position_waves: of the positions the network also sees sines and cosines of so many wavelengths, from 4
+            ``position_length`` down, each half as long as the one before: attention can then find what is at a given
+            distance, as a body over its shadow.
+        contact_length: metres, more than a step moves. The network sees where frozen matter is that a particle may meet
+            (:func:`gsim3d.dynamics.contact.contact`). None: it has to find that out from the places of both.
         motion_length: metres, about the radius of a body. The network sees how the matter around a particle has moved
             (:func:`gsim3d.dynamics.motion.motion`), and predicts how much of that is kept along each axis and what is
             added to it: without a force bodies fly on. None: it has to read velocities off the places in its history.
@@ -71,7 +77,9 @@ class DynamicsConfig:
     max_latent_step: float | None = None
     position_features: bool = False
     position_length: float = 1.0
+    position_waves: int = 0
     motion_length: float | None = None
+    contact_length: float | None = None
     grid_size: float = 0.004
     history_bits: int = 2
     strides: tuple[int, ...] = (4, 2, 2, 2)
@@ -129,6 +137,16 @@ class DynamicsConfig:
             raise ValueError(
                 'DynamicsConfig: motion_length must be positive, and predicts "from_newest" or "from_previous"; '
                 f"got {self.motion_length} and {self.predicts!r}"
+            )
+        if self.contact_length is not None and (self.is_asymmetric or not self.contact_length > 0):
+            raise ValueError(
+                'DynamicsConfig: contact_length must be positive, and background "symmetric" or "relit"; '
+                f"got {self.contact_length} and {self.background!r}"
+            )
+        if not 0 <= self.position_waves <= MOST_WAVES or self.position_waves and not self.position_features:
+            raise ValueError(
+                f"DynamicsConfig: position_waves must be from 0 to {MOST_WAVES}, and 0 without position_features; "
+                f"got {self.position_waves}"
             )
         if self.steps_per_call < 1:
             raise ValueError(f"DynamicsConfig: steps_per_call must be at least 1; got {self.steps_per_call}")

@@ -14,6 +14,7 @@ from gsim3d import ops
 from gsim3d.dynamics.background import Background
 from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps, with_look
 from gsim3d.dynamics.config import DynamicsConfig
+from gsim3d.dynamics.contact import contact
 from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.point_transformer import PointTransformer
@@ -144,11 +145,13 @@ class Dynamics(nn.Module):
             raise ValueError(
                 'Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"'
             )
-        runs, moved, drift = clouds.row_runs(newest), None, None
-        if self.config.motion_length is not None:
-            drift = motion(history, self.config.motion_length, self.config.grid_size)
+        runs, config, moved, drift, near = clouds.row_runs(newest), self.config, None, None, None
+        if config.motion_length is not None:
+            drift = motion(history, config.motion_length, config.grid_size)
             moved = _put_runs(drift, runs, history.n_rows)
-        features, is_awake = self.layout.pack(history, moved), None
+        if config.contact_length is not None:
+            near = _put_runs(contact(history, config.contact_length, config.grid_size), runs, history.n_rows)
+        features, is_awake = self.layout.pack(history, moved, near), None
         n_awake = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
         everyone = n_awake == history.n_rows
         if not everyone:  # rows of the pyramid <-> rows of the history; those that sleep become 0

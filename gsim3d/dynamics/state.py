@@ -11,13 +11,15 @@ import torch
 from torch import Tensor
 
 from gsim3d.dynamics.config import DynamicsConfig
+from gsim3d.dynamics.contact import CONTACT_CHANNELS
 from gsim3d.harmonics import degree_damping
 from gsim3d.layers import widened
 from gsim3d.rotations import unit_quats
 from gsim3d.types import FROZEN, Particles
 
 SCALE_STEP_SHARE = 1 / 6  # of the range of scales, the most that one step changes a scale
-POSITION_CHANNELS = MOTION_CHANNELS = 6
+POSITION_CHANNELS = MOTION_CHANNELS = WAVE_CHANNELS = 6  # of every wave
+LONGEST_WAVE = 4.0  # in units of position_length; each further wave is half as long
 ONWARD = 1  # of the motions that gsim3d.dynamics.motion tells, the one that goes on if nothing is predicted
 MOST_KEPT = 2.0  # how much more or less of a motion may go on
 FEATURES = ("dynamic_latents", "sh")  # that rows which are held keep
@@ -28,11 +30,12 @@ SMALL_ANGLE_SQUARED = 1e-8  # radians^2; smaller rotations are their series: a s
 class StateLayout:
     """Order and width of the channels: fields that change, then fields that do not, each by the alphabet.
 
-    inputs, outputs: (field of Particles, channels). Positions are no input by themselves (``position_features`` appends
-    six channels); a difference of rotations is predicted as a rotation vector about world axes. With ``motion_length``
-    six further channels of positions say how much of each motion is kept along each axis: a contact takes a share, and
-    where nothing of it is kept errors do not add up. Harmonics are flat as (3, K), quaternions as (x, y, z, w). The
-    channels of ``outputs`` repeat for every step of a call.
+    inputs, outputs: (field of Particles, channels). What the network is told of places and motion comes behind the
+    inputs, as far as the configuration asks for it: ``position_features``, ``motion_length``, ``position_waves``,
+    ``contact_length``. A difference of rotations is predicted as a rotation vector about world axes. With
+    ``motion_length`` six further channels of positions say how much of each motion is kept along each axis: a contact
+    takes a share, and where nothing of it is kept errors do not add up. Harmonics are flat as (3, K), quaternions as
+    (x, y, z, w). The channels of ``outputs`` repeat for every step of a call.
     """
 
     config: DynamicsConfig
@@ -57,8 +60,14 @@ class StateLayout:
 
     @property
     def in_channels(self) -> int:
-        known = sum(n for _, n in self.inputs) + POSITION_CHANNELS * self.config.position_features
-        return known + MOTION_CHANNELS * (self.config.motion_length is not None)
+        config = self.config
+        return (
+            sum(n for _, n in self.inputs)
+            + POSITION_CHANNELS * config.position_features
+            + MOTION_CHANNELS * (config.motion_length is not None)
+            + WAVE_CHANNELS * config.position_waves
+            + CONTACT_CHANNELS * (config.contact_length is not None)
+        )
 
     def changes(self, features: str = "all", opacities: bool = True) -> dict[str, str]:
         """Of each output, whose values a step changes: "all", "dynamic", "frozen" or "none".
@@ -89,11 +98,13 @@ class StateLayout:
     def out_channels(self) -> int:
         return self.config.steps_per_call * sum(n for _, n in self.outputs)
 
-    def pack(self, particles: Particles, moved: Tensor | None = None) -> Tensor:
+    def pack(self, particles: Particles, moved: Tensor | None = None, near: Tensor | None = None) -> Tensor:
         """[N, in_channels] of all rows.
 
         moved: [N, 2, 3] metres a step, of :func:`gsim3d.dynamics.motion.motion`; None: nothing moved.
+        near: [N, 4], of :func:`gsim3d.dynamics.contact.contact`; None: nothing is near.
         """
+        config = self.config
         columns = []
         for name, n in self.inputs:
             value = getattr(particles, name)
@@ -101,11 +112,15 @@ class StateLayout:
                 got = "None" if value is None else list(value.shape)
                 raise ValueError(f"Dynamics: particles.{name} must have {n} channels a row; got {got}")
             columns.append(_flat(name, value))
-        if self.config.position_features:
-            columns.append(position_features(particles, self.config.grid_size, self.config.position_length))
-        if self.config.motion_length is not None:
-            like = particles.means.new_zeros(particles.n_rows, MOTION_CHANNELS)
-            columns.append(like if moved is None else moved.flatten(1) / self.config.grid_size)
+        if config.position_features:
+            columns.append(position_features(particles, config.grid_size, config.position_length))
+        if config.motion_length is not None:
+            still = particles.means.new_zeros(particles.n_rows, MOTION_CHANNELS)
+            columns.append(still if moved is None else moved.flatten(1) / config.grid_size)
+        if config.position_waves:
+            columns.append(position_waves(particles, config.position_waves, config.position_length))
+        if config.contact_length is not None:
+            columns.append(particles.means.new_zeros(particles.n_rows, CONTACT_CHANNELS) if near is None else near)
         return torch.cat(columns, 1)
 
     def advance(
@@ -238,12 +253,24 @@ def _unflat(name: str, value: Tensor) -> Tensor:
 
 def position_features(particles: Particles, grid_size: float, length: float) -> Tensor:
     """[N, 6]: position relative to the scene's origin in units of ``length``; position inside the cell, -1 to 1."""
-    scene = particles.cloud_scene[particles.row_cloud()]
-    relative = particles.means.double() - particles.origin[scene]
+    relative = _from_origin(particles)
     with torch.no_grad():
         corner = torch.floor(relative / grid_size) * grid_size
     inside = (relative - corner) * (2 / grid_size) - 1
     return torch.cat([relative / length, inside], 1).to(particles.means.dtype)
+
+
+def position_waves(particles: Particles, n: int, length: float) -> Tensor:
+    """[N, 6 n]: sines and cosines of the position relative to the scene's origin, of ``n`` waves along each axis from
+    ``LONGEST_WAVE`` times ``length`` down."""
+    angles = _from_origin(particles) * (2 * math.pi / (LONGEST_WAVE * length))
+    waves = [wave for k in range(n) for wave in ((2**k * angles).sin(), (2**k * angles).cos())]
+    return torch.cat(waves, 1).to(particles.means.dtype)
+
+
+def _from_origin(particles: Particles) -> Tensor:
+    """float64 [N, 3]."""
+    return particles.means.double() - particles.origin[particles.cloud_scene[particles.row_cloud()]]
 
 
 def hold(share: Tensor, newest: Tensor, later: Tensor) -> Tensor:

@@ -68,6 +68,7 @@ MODEL = {
         "drop_path": 0.0,
         "shuffle_orders": False,
         "motion_length": 0.3,
+        "position_waves": 4,
         "background": "relit",  # what shadows change would add up else
         "max_latent_step": 8.0,  # of latents of size 4: from lit to dark at once
     },
@@ -90,7 +91,8 @@ def _recipe(
     batch: int = 4,
     rollout: tuple[int, int] = (48, 24),
     lit_before: int = 40,
-    shape: float = 0.05,
+    contact_length: float = 0.15,
+    shape: float = 0.015,
     shape_length: float = 0.2,
     capacity: int = 600,
     in_turn: tuple[dict, ...] = ({},),
@@ -103,6 +105,7 @@ def _recipe(
     strides: of the pixels of ground and bodies.   batch: where long rollouts are simulated.
     rollout: their steps, and through how many of them gradients flow back.
     lit_before: as of StageConfig, in rollouts of two steps.
+    contact_length: as of DynamicsConfig; more than bodies fall in a step.
     shape, shape_length: as of LossConfig; the length less than bodies are apart.
     Others as in Recipe.
     """
@@ -115,7 +118,7 @@ def _recipe(
     horizon, cut = rollout
     train = TrainConfig(
         preset="small",
-        model=MODEL,
+        model={**MODEL, "dynamics": {**MODEL["dynamics"], "contact_length": contact_length}},
         effects=EFFECTS,
         data=DataConfig(
             history=4,
@@ -167,6 +170,7 @@ RECIPES = {
         12,
         rollout=(24, 12),
         lit_before=20,
+        contact_length=0.4,
         shape=0.2,
         shape_length=0.15,
         in_turn=({}, {}, OTHER_GROUND),

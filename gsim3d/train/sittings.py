@@ -29,7 +29,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.dynamics.state import MOTION_CHANNELS
 from gsim3d.errors import InputError
 from gsim3d.files import MAX_TEXT, read_file, sha256_of
 from gsim3d.train import checkpoint
@@ -121,8 +120,9 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
 
 
 def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
-    """Weights of a trained simulator into a new trainer, whose dynamics may see motion where the other's did not: the
-    columns that read it begin at zero, and so do the rows that predict positions, which are others then.
+    """Weights of a trained simulator into a new trainer, whose dynamics may see more (motion, waves, contacts) than the
+    other's: the columns that read it begin at zero, and where motion is new so do the rows that predict positions, which
+    are others then.
 
     Returns:
         The checkpoint's name, digest and step.
@@ -131,11 +131,13 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     """
     saved, own = checkpoint.load(path), trainer.simulator.state_dict()
     given = {key: value.float() for key, value in saved.model.items()}
-    if SEEN in given and given[SEEN].shape[-1] == own[SEEN].shape[-1] - MOTION_CHANNELS:
-        given[SEEN] = F.pad(given[SEEN], (0, MOTION_CHANNELS))
-        outputs = trainer.simulator.dynamics.layout.outputs
-        widths = [3 if name == "means" else n for name, n in outputs]
-        for key in PREDICTED:
+    new = own[SEEN].shape[-1] - given[SEEN].shape[-1] if SEEN in given else 0
+    if new > 0:
+        given[SEEN] = F.pad(given[SEEN], (0, new))
+    outputs = trainer.simulator.dynamics.layout.outputs
+    widths = [3 if name == "means" else n for name, n in outputs]
+    for key in PREDICTED:
+        if key in given and len(given[key]) == sum(widths) < len(own[key]):
             parts = zip(outputs, given[key].split(widths), strict=True)
             given[key] = torch.cat([x.new_zeros(n, *x.shape[1:]) if name == "means" else x for (name, n), x in parts])
     try:

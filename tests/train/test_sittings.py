@@ -259,7 +259,8 @@ def test_the_next_sitting_knows_what_graphs_needed(store, tmp_path):
             load_into(second, tmp_path / "state", NAME, dataclasses.replace(progress, needed=damaged))
 
 
-def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path):
+@pytest.mark.parametrize("more", [{}, {"position_waves": 2, "contact_length": 0.15}])
+def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path, more):
     """What it predicts is the same, but that bodies fly on instead of what it said of positions."""
     other = SittingTrainer(CONFIG, store, tmp_path / "other", "cpu")
     with torch.no_grad():
@@ -268,7 +269,7 @@ def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path):
     other.average = {key: value.clone() for key, value in other.simulator.state_dict().items()}
     save_state(other, tmp_path / "state", NAME, Progress())
     known = weights_file(tmp_path / "state", load_progress(tmp_path / "state", NAME))
-    moving = dataclasses.replace(CONFIG, model={"dynamics": {"motion_length": 0.3}})
+    moving = dataclasses.replace(CONFIG, model={"dynamics": {"motion_length": 0.3, **more}})
     trainer = SittingTrainer(moving, store, tmp_path / "run", "cpu")
     begun = begin_with(trainer, known)
     assert begun["digest"] == restore(known).checkpoint.digest and begun["step"] == 0
@@ -286,6 +287,30 @@ def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path):
     larger = SittingTrainer(dataclasses.replace(CONFIG, preset="small"), store, tmp_path / "larger", "cpu")
     with pytest.raises(InputError, match="other sizes"):
         begin_with(larger, known)
+
+
+def test_a_run_that_sees_more_begins_as_one_that_saw_motion_went_on(store, tmp_path):
+    motion_only = dataclasses.replace(CONFIG, model={"dynamics": {"motion_length": 0.3}})
+    more = dataclasses.replace(
+        CONFIG, model={"dynamics": {"motion_length": 0.3, "position_waves": 2, "contact_length": 0.15}}
+    )
+    other = SittingTrainer(motion_only, store, tmp_path / "other", "cpu")
+    with torch.no_grad():
+        for parameter in other.simulator.dynamics.net.head.parameters():
+            parameter.normal_(0, 0.1)
+    other.average = {key: value.clone() for key, value in other.simulator.state_dict().items()}
+    save_state(other, tmp_path / "state", NAME, Progress())
+    known = weights_file(tmp_path / "state", load_progress(tmp_path / "state", NAME))
+    trainer = SittingTrainer(more, store, tmp_path / "run", "cpu")
+    begin_with(trainer, known)
+    given, own = restore(known).simulator, trainer.simulator.eval()
+    batch = store.draw(CONFIG.data, CONFIG.stages[1], 0, 2, range(1))
+    with torch.no_grad():
+        state = given.encode(batch.context)
+        expected, step = given.dynamics(state), own.dynamics(state)
+    moved = (expected.means - last_steps(state, 1).means).abs().max()
+    assert moved > 0.01 and (step.means - expected.means).abs().max() < 1e-4 * moved
+    torch.testing.assert_close(step.dynamic_latents, expected.dynamic_latents)
 
 
 def test_recipes_are_sound():

@@ -1,0 +1,83 @@
+"""Rows of one cloud of every scene, padded and thinned: of a size that is known without waiting for the device."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsim3d.ops.sentinel import CELLS
+from gsim3d.types import DYNAMIC, Particles, constant
+
+SAMPLES = 1024  # rows of a cloud that are looked at, evenly spread over them
+FAINTEST = -60.0  # logarithm of a weight: a CPU takes many times as long for numbers that are almost 0
+
+
+class Rows:
+    """One cloud of every scene, padded.
+
+    rows: int64 [B, M].   wanted: bool [B, M], those of the ``activity`` that are at least as opaque as ``opacity``.
+    places: [B, M, 3] from the origins of the scenes, 0 of others.
+    """
+
+    def __init__(
+        self, history: Particles, chosen: list[int], grid_size: float, activity: int = DYNAMIC, opacity: float = 0.0
+    ):
+        table, device = history.clouds, history.means.device
+        starts, counts, scenes = (
+            constant(tuple(of[q] for q in chosen), device)
+            for of in (table.starts, [table.count(q) for q in range(len(table))], table.scenes)
+        )
+        place = torch.arange(max(1, max(table.count(q) for q in chosen)), device=device)
+        self.rows = (starts[:, None] + place).clamp(max=history.n_rows - 1)
+        places = history.means.detach()[self.rows].double() - history.origin[scenes][:, None]
+        is_seen = ((places >= 0) & (places / grid_size < CELLS)).all(2)  # inside the workspace, not NaN
+        self.wanted = (place < counts[:, None]) & (history.activity[self.rows] == activity) & is_seen
+        if opacity > 0:
+            self.wanted = self.wanted & (history.opacities.detach()[self.rows] >= opacity)
+        self.places = torch.where(self.wanted[:, :, None], places, 0).to(history.means.dtype)
+
+
+class Samples:
+    """Of :class:`Rows` all that are wanted, or S that are evenly spread over their list.
+
+    n: [B] there are.   known: bool [B, S], entries that are rows; others are 0.   mean: [B, 3] of the places.
+    places: [B, S, 3].   latents: [B, S, C].
+    """
+
+    def __init__(
+        self, history: Particles, chosen: list[int], grid_size: float, activity: int = DYNAMIC, opacity: float = 0.0
+    ):
+        cloud = Rows(history, chosen, grid_size, activity, opacity)
+        until = cloud.wanted.cumsum(1)
+        self.n = until[:, -1]
+        n, k = self.n[:, None], torch.arange(SAMPLES, device=until.device)
+        self.known = k < n
+        wanted = torch.where(n > SAMPLES, k * n // SAMPLES, k)
+        at = torch.searchsorted(until, wanted + 1).clamp(max=until.shape[1] - 1)
+        here = self.known[:, :, None]
+        self.places = torch.where(here, cloud.places.gather(1, at[:, :, None].expand(-1, -1, 3)), 0)
+        latents = history.latents.detach()[cloud.rows.gather(1, at)].to(self.places.dtype)
+        self.latents = torch.where(here, latents, 0).nan_to_num(0, 0, 0)
+        self.mean = self.mean_of(self.places)
+
+    def seen_from(self, place: Tensor) -> None:
+        """Counts places from ``place`` [B, 1, 3]: squares of places far away would be all rounding."""
+        self.places = torch.where(self.known[:, :, None], self.places - place, 0)
+        self.mean = self.mean - place[:, 0]
+
+    def mean_of(self, values: Tensor) -> Tensor:
+        """[B, C] of [B, S, C], values of the entries."""
+        return torch.where(self.known[:, :, None], values, 0).sum(1) / self.n.clamp(1, SAMPLES)[:, None]
+
+
+def weights(logits: Tensor, of: Samples) -> Tensor:
+    """[B, G, S], how much each sample counts; nothing where there is none."""
+    known = of.known[:, None]
+    logits = torch.where(known, logits, -torch.inf)
+    logits = (logits - logits.amax(2, keepdim=True)).clamp(min=FAINTEST)
+    return torch.where(known, logits, -torch.inf).softmax(2).nan_to_num(0)
+
+
+def squares(a: Tensor, b: Tensor) -> Tensor:
+    """[B, G, S], squared distances of [B, G, C] from [B, S, C]."""
+    return (a.square().sum(2)[:, :, None] + b.square().sum(2)[:, None] - 2 * (a @ b.mT)).clamp(min=0)
