@@ -121,8 +121,8 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
 
 def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     """Weights of a trained simulator into a new trainer, whose dynamics may see more (motion, waves, contacts) than the
-    other's: the columns that read it begin at zero, and where motion is new so do the rows that predict positions, which
-    are others then.
+    other's: the columns that read it begin at zero, and where motion is new so do the rows that predict positions,
+    which are others then.
 
     Returns:
         The checkpoint's name, digest and step.
