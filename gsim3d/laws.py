@@ -149,11 +149,12 @@ def take_scenes_of_particles(particles: Particles, scenes: Sequence[int]) -> Par
 
 
 def permute_rows(particles: Particles, seed: int = 0) -> tuple[Particles, Tensor]:
-    """The particles of each cloud in another order, and where each new row came from."""
-    generator = torch.Generator().manual_seed(seed)
+    """The particles of each cloud in another order, and where each new row came from. Clouds of as many rows have the
+    same order: in simulated steps a row is one particle throughout."""
     table = particles.clouds
-    order = [table.starts[q] + torch.randperm(table.count(q), generator=generator) for q in range(len(table))]
-    order = torch.cat(order).to(particles.means.device)
+    counts = [table.count(q) for q in range(len(table))]
+    order = [torch.randperm(n, generator=torch.Generator().manual_seed(seed)) for n in counts]
+    order = torch.cat([start + rows for start, rows in zip(table.starts, order)]).to(particles.means.device)
     return dataclasses.replace(particles, **{n: v[order] for n, v in particles.row_fields().items()}), order
 
 

@@ -41,6 +41,10 @@ class DynamicsConfig:
         motion_length: metres, about the radius of a body. The network sees how the matter around a particle has moved
             (:func:`gsim3d.dynamics.motion.motion`), and predicts how much of that is kept along each axis and what is
             added to it: without a force bodies fly on. None: it has to read velocities off the places in its history.
+        momentum: with ``motion_length`` what goes on is the rigid motion of a window in its last step, where that was
+            predicted, and a row's own last step is a third motion of which a share is kept
+            (:func:`gsim3d.dynamics.momentum.momentum`). Gradients flow through both, so that an impulse is blamed for
+            all that follows from it.
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.
@@ -79,6 +83,7 @@ class DynamicsConfig:
     position_length: float = 1.0
     position_waves: int = 0
     motion_length: float | None = None
+    momentum: bool = False
     contact_length: float | None = None
     grid_size: float = 0.004
     history_bits: int = 2
@@ -138,6 +143,8 @@ class DynamicsConfig:
                 'DynamicsConfig: motion_length must be positive, and predicts "from_newest" or "from_previous"; '
                 f"got {self.motion_length} and {self.predicts!r}"
             )
+        if self.momentum and (self.motion_length is None or self.static_latents < 1):
+            raise ValueError("DynamicsConfig: momentum needs motion_length, and static_latents, which tell rows apart")
         if self.contact_length is not None and (self.is_asymmetric or not self.contact_length > 0):
             raise ValueError(
                 'DynamicsConfig: contact_length must be positive, and background "symmetric" or "relit"; '

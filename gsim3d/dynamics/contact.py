@@ -39,7 +39,7 @@ def contact(history: Particles, length: float, grid_size: float) -> Tensor:
         here = rests.mean[:, None]
         rests.seen_from(here)
         places = rows.places - here
-        window = weights(squares(places, rests.places) * (-0.5 / (WINDOW * length) ** 2), rests)
+        window = weights(squares(places, rests.places) * (-0.5 / (WINDOW * length) ** 2), rests.known)
         way = (window @ rests.places - places) / length
         near = (-0.5 * way.square().sum(2, keepdim=True)).clamp(min=FAINTEST).exp()
         known = (rows.wanted & (rests.n > 0)[:, None])[:, :, None]

@@ -15,10 +15,11 @@ from gsim3d.dynamics.background import Background
 from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps, with_look
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import contact
+from gsim3d.dynamics.momentum import momentum
 from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.point_transformer import PointTransformer
-from gsim3d.dynamics.state import StateLayout
+from gsim3d.dynamics.state import ONWARD, StateLayout
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.types import ASLEEP, FROZEN, CloudTable, Particles, constant, take_runs
 
@@ -39,7 +40,8 @@ class Dynamics(nn.Module):
         self.config = config
         self.layout = StateLayout.of(config)
         self.rounds = None  # whether geometry is rounded in training; None: on a GPU
-        self.net = PointTransformer(self.layout.in_channels, self.layout.out_channels, config)
+        layout = self.layout
+        self.net = PointTransformer(layout.in_channels, layout.told_channels, layout.out_channels, config)
 
     def geometry(
         self,
@@ -148,6 +150,9 @@ class Dynamics(nn.Module):
         runs, config, moved, drift, near = clouds.row_runs(newest), self.config, None, None, None
         if config.motion_length is not None:
             drift = motion(history, config.motion_length, config.grid_size)
+            if config.momentum:
+                onward = momentum(history, drift[:, ONWARD], config.motion_length, config.grid_size)
+                drift = torch.cat([drift[:, :ONWARD], onward], 1)
             moved = _put_runs(drift, runs, history.n_rows)
         if config.contact_length is not None:
             near = _put_runs(contact(history, config.contact_length, config.grid_size), runs, history.n_rows)

@@ -33,6 +33,7 @@ from gsim3d.ops.curve import PatchTable, Pyramid, Stage
 
 Beside = Recorder | Reader
 TIME_EMBEDDING_STD = 0.02
+TOLD_MULTIPLE = 8  # of the columns of a matrix product; with others the bits of a row depend on its place in the list
 HALF_MAX = torch.finfo(torch.float16).max  # beyond it half precision has infinity, and attention NaN
 
 
@@ -212,16 +213,23 @@ def run_blocks(
 
 
 class Stem(nn.Module):
-    """Features of the particles -> channels of stage 0."""
+    """Features of the particles -> channels of stage 0. What rows are told alone, the last ones, is not convolved."""
 
-    def __init__(self, in_channels: int, config: DynamicsConfig):
+    def __init__(self, in_channels: int, told_channels: int, config: DynamicsConfig):
         super().__init__()
         channels = config.encoder_channels[0]
+        self.widths = in_channels, told_channels
         self.conv = SparseConv(in_channels, channels, STEM_KERNEL, bias=False, duplicates=duplicates_rule(config))
+        rounded = -(-told_channels // TOLD_MULTIPLE) * TOLD_MULTIPLE
+        self.told = RowLinear(rounded, channels, bias=False) if told_channels else None
         self.norm = make_norm(config.norm, channels)
 
     def forward(self, x: Tensor, stage: Stage, beside: Beside | None = None) -> Tensor:
-        return self.norm.activated(self.conv(x, stage, beside), stage.n_data)
+        x, told = x.split(self.widths, 1)
+        x = self.conv(x.contiguous(), stage, beside)
+        if self.told is not None:
+            x = x + self.told(F.pad(told, (0, self.told.in_features - told.shape[1])))
+        return self.norm.activated(x, stage.n_data)
 
 
 class Pool(nn.Module):
@@ -345,7 +353,8 @@ class Head(nn.Module):
 
 
 class PointTransformer(nn.Module):
-    """Features [N, in_channels] of all clouds -> features [N, decoder_channels[0]] of the same rows, and a head.
+    """Features [N, in_channels + told_channels] of all clouds -> features [N, decoder_channels[0]] of the same rows,
+    and a head.
 
     Args of forward:
         x: features of the rows of stage 0.
@@ -354,9 +363,9 @@ class PointTransformer(nn.Module):
         besides: of each stage what else its rows read, or who listens; none: nothing and nobody.
     """
 
-    def __init__(self, in_channels: int, out_channels: int, config: DynamicsConfig):
+    def __init__(self, in_channels: int, told_channels: int, out_channels: int, config: DynamicsConfig):
         super().__init__()
-        self.stem = Stem(in_channels, config)
+        self.stem = Stem(in_channels, told_channels, config)
         rates = linear_rates(config.drop_path, config.encoder_depths)
         self.encoder = nn.ModuleList(EncoderStage(s, rates[s], config) for s in range(config.n_stages))
         rates = linear_rates(config.drop_path, config.decoder_depths)

@@ -40,8 +40,8 @@ class Rows:
 class Samples:
     """Of :class:`Rows` all that are wanted, or S that are evenly spread over their list.
 
-    n: [B] there are.   known: bool [B, S], entries that are rows; others are 0.   mean: [B, 3] of the places.
-    places: [B, S, 3].   latents: [B, S, C].
+    n: [B] there are.   known: bool [B, S], entries that are rows; others are 0.   at: int64 [B, S], which of the cloud.
+    mean: [B, 3] of the places.   places: [B, S, 3].   latents: [B, S, C].
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Samples:
         n, k = self.n[:, None], torch.arange(SAMPLES, device=until.device)
         self.known = k < n
         wanted = torch.where(n > SAMPLES, k * n // SAMPLES, k)
-        at = torch.searchsorted(until, wanted + 1).clamp(max=until.shape[1] - 1)
+        self.at = at = torch.searchsorted(until, wanted + 1).clamp(max=until.shape[1] - 1)
         here = self.known[:, :, None]
         self.places = torch.where(here, cloud.places.gather(1, at[:, :, None].expand(-1, -1, 3)), 0)
         latents = history.latents.detach()[cloud.rows.gather(1, at)].to(self.places.dtype)
@@ -70,9 +70,9 @@ class Samples:
         return torch.where(self.known[:, :, None], values, 0).sum(1) / self.n.clamp(1, SAMPLES)[:, None]
 
 
-def weights(logits: Tensor, of: Samples) -> Tensor:
-    """[B, G, S], how much each sample counts; nothing where there is none."""
-    known = of.known[:, None]
+def weights(logits: Tensor, known: Tensor) -> Tensor:
+    """[B, G, S], how much each of the ``known`` [B, S] counts; nothing where there is none."""
+    known = known[:, None]
     logits = torch.where(known, logits, -torch.inf)
     logits = (logits - logits.amax(2, keepdim=True)).clamp(min=FAINTEST)
     return torch.where(known, logits, -torch.inf).softmax(2).nan_to_num(0)

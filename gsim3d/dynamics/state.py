@@ -18,7 +18,9 @@ from gsim3d.rotations import unit_quats
 from gsim3d.types import FROZEN, Particles
 
 SCALE_STEP_SHARE = 1 / 6  # of the range of scales, the most that one step changes a scale
-POSITION_CHANNELS = MOTION_CHANNELS = WAVE_CHANNELS = 6  # of every wave
+POSITION_CHANNELS = MOTION_CHANNELS = 6
+WAVE_CHANNELS = 6  # of each wave
+OWN_CHANNELS = 3
 LONGEST_WAVE = 4.0  # in units of position_length; each further wave is half as long
 ONWARD = 1  # of the motions that gsim3d.dynamics.motion tells, the one that goes on if nothing is predicted
 MOST_KEPT = 2.0  # how much more or less of a motion may go on
@@ -30,11 +32,11 @@ SMALL_ANGLE_SQUARED = 1e-8  # radians^2; smaller rotations are their series: a s
 class StateLayout:
     """Order and width of the channels: fields that change, then fields that do not, each by the alphabet.
 
-    inputs, outputs: (field of Particles, channels). What the network is told of places and motion comes behind the
-    inputs, as far as the configuration asks for it: ``position_features``, ``motion_length``, ``position_waves``,
-    ``contact_length``. A difference of rotations is predicted as a rotation vector about world axes. With
-    ``motion_length`` six further channels of positions say how much of each motion is kept along each axis: a contact
-    takes a share, and where nothing of it is kept errors do not add up. Harmonics are flat as (3, K), quaternions as
+    inputs, outputs: (field of Particles, channels). Behind the inputs comes what the configuration adds to them:
+    ``position_features`` and ``motion_length``; then what rows are told alone: ``position_waves``, ``contact_length``
+    and ``momentum``. A difference of rotations is predicted as a rotation vector about world axes. With
+    ``motion_length`` further channels of positions say how much of each motion is kept along each axis: a contact takes
+    a share, and where nothing of it is kept errors do not add up. Harmonics are flat as (3, K), quaternions as
     (x, y, z, w). The channels of ``outputs`` repeat for every step of a call.
     """
 
@@ -45,7 +47,7 @@ class StateLayout:
     @classmethod
     def of(cls, config: DynamicsConfig) -> StateLayout:
         dynamic, static = config.dynamic_latents, config.static_latents
-        means = 3 + MOTION_CHANNELS * (config.motion_length is not None)
+        means = 3 + MOTION_CHANNELS * (config.motion_length is not None) + OWN_CHANNELS * config.momentum
         if not config.explicit:
             inputs = [("dynamic_latents", dynamic), ("opacities", 1), ("static_latents", static)]
             outputs = [("dynamic_latents", dynamic), ("means", means)]
@@ -60,14 +62,15 @@ class StateLayout:
 
     @property
     def in_channels(self) -> int:
-        config = self.config
-        return (
-            sum(n for _, n in self.inputs)
-            + POSITION_CHANNELS * config.position_features
-            + MOTION_CHANNELS * (config.motion_length is not None)
-            + WAVE_CHANNELS * config.position_waves
-            + CONTACT_CHANNELS * (config.contact_length is not None)
-        )
+        """That are convolved."""
+        known = sum(n for _, n in self.inputs) + POSITION_CHANNELS * self.config.position_features
+        return known + MOTION_CHANNELS * (self.config.motion_length is not None)
+
+    @property
+    def told_channels(self) -> int:
+        """That follow them and are not."""
+        known = WAVE_CHANNELS * self.config.position_waves + CONTACT_CHANNELS * (self.config.contact_length is not None)
+        return known + OWN_CHANNELS * self.config.momentum
 
     def changes(self, features: str = "all", opacities: bool = True) -> dict[str, str]:
         """Of each output, whose values a step changes: "all", "dynamic", "frozen" or "none".
@@ -99,9 +102,9 @@ class StateLayout:
         return self.config.steps_per_call * sum(n for _, n in self.outputs)
 
     def pack(self, particles: Particles, moved: Tensor | None = None, near: Tensor | None = None) -> Tensor:
-        """[N, in_channels] of all rows.
+        """[N, in_channels + told_channels] of all rows.
 
-        moved: [N, 2, 3] metres a step, of :func:`gsim3d.dynamics.motion.motion`; None: nothing moved.
+        moved: [N, 2 or 3, 3] metres a step, of :mod:`gsim3d.dynamics.motion`; None: nothing moved.
         near: [N, 4], of :func:`gsim3d.dynamics.contact.contact`; None: nothing is near.
         """
         config = self.config
@@ -115,12 +118,15 @@ class StateLayout:
         if config.position_features:
             columns.append(position_features(particles, config.grid_size, config.position_length))
         if config.motion_length is not None:
-            still = particles.means.new_zeros(particles.n_rows, MOTION_CHANNELS)
-            columns.append(still if moved is None else moved.flatten(1) / config.grid_size)
+            still = particles.means.new_zeros(particles.n_rows, MOTION_CHANNELS + OWN_CHANNELS * config.momentum)
+            moved = still if moved is None else moved.flatten(1) / config.grid_size
+            columns.append(moved[:, :MOTION_CHANNELS])
         if config.position_waves:
             columns.append(position_waves(particles, config.position_waves, config.position_length))
         if config.contact_length is not None:
             columns.append(particles.means.new_zeros(particles.n_rows, CONTACT_CHANNELS) if near is None else near)
+        if config.momentum:
+            columns.append(moved[:, MOTION_CHANNELS:])
         return torch.cat(columns, 1)
 
     def advance(
@@ -138,7 +144,7 @@ class StateLayout:
             prediction: [N, channels], the outputs that change.
             awake: bool [N], rows that change at all; None: all.
             changes: of :meth:`changes`; None: all that is predicted.
-            drift: [N, 2, 3] metres a step, motions that go on as far as they are kept; None: none.
+            drift: [N, 2 or 3, 3] metres a step, motions that go on as far as they are kept; None: none.
         """
         changes = changes or self.changes()
         outputs = [(name, n) for name, n in self.outputs if changes[name] != "none"]
@@ -170,7 +176,7 @@ class StateLayout:
             newest: [N, ...], its newest values.
             predicted: [S, N, channels], of S steps.
             share: [N, 1] or [S, N, 1], how much of a predicted change happens: 0 holds the value, bit by bit.
-            drift: [N, 2, 3], what is added in every step as far as it is kept; None: nothing.
+            drift: [N, 2 or 3, 3], what is added in every step as far as it is kept; None: nothing.
         Returns:
             [S, N, ...].
         """
@@ -185,7 +191,8 @@ class StateLayout:
             changes = changes.cumsum(0)
         if drift is not None:
             kept = bounded(kept / MOST_KEPT, MOST_KEPT).unflatten(2, drift.shape[1:])
-            drift = drift[:, ONWARD] + (kept * drift).sum(2)
+            shares = zip(kept.unbind(2), drift.unbind(1), strict=True)
+            drift = drift[:, ONWARD] + sum(share * motion for share, motion in shares)  # in one order for all rows
             ahead = torch.arange(1, 1 + changes.shape[0], device=drift.device)[:, None, None]
             most = math.inf if self.config.max_step is None else self.config.max_step
             changes = torch.minimum(torch.maximum(changes + ahead * drift, -most * ahead), most * ahead)

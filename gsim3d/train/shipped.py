@@ -68,6 +68,7 @@ MODEL = {
         "drop_path": 0.0,
         "shuffle_orders": False,
         "motion_length": 0.3,
+        "momentum": True,
         "position_waves": 4,
         "background": "relit",  # what shadows change would add up else
         "max_latent_step": 8.0,  # of latents of size 4: from lit to dark at once

@@ -29,6 +29,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from gsim3d.dynamics.state import MOTION_CHANNELS
 from gsim3d.errors import InputError
 from gsim3d.files import MAX_TEXT, read_file, sha256_of
 from gsim3d.train import checkpoint
@@ -37,8 +38,10 @@ from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import describe
 
 FORMAT = 1
-SEEN = "dynamics.net.stem.conv.weight"  # what the network reads of a particle are its last columns
+SEEN = "dynamics.net.stem.conv.weight"  # what the network reads of motion are its last columns
+TOLD = "dynamics.net.stem.told.weight"
 PREDICTED = ("dynamics.net.head.fc2.weight", "dynamics.net.head.fc2.bias")
+PLACES = 3  # rows that predict places where no motion is seen
 WEIGHTS, DIFFERENCE, SQUARES = "weights", "difference", "squares"
 
 
@@ -120,9 +123,9 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
 
 
 def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
-    """Weights of a trained simulator into a new trainer, whose dynamics may see more (motion, waves, contacts) than the
-    other's: the columns that read it begin at zero, and where motion is new so do the rows that predict positions,
-    which are others then.
+    """Weights of a trained simulator into a new trainer, whose dynamics may see more (motion, waves, contacts, momentum)
+    than the other's: what reads it begins at zero, and so does what predicts shares of motions; where motion is new all
+    that predicts positions, which are others then.
 
     Returns:
         The checkpoint's name, digest and step.
@@ -131,15 +134,19 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     """
     saved, own = checkpoint.load(path), trainer.simulator.state_dict()
     given = {key: value.float() for key, value in saved.model.items()}
-    new = own[SEEN].shape[-1] - given[SEEN].shape[-1] if SEEN in given else 0
-    if new > 0:
-        given[SEEN] = F.pad(given[SEEN], (0, new))
+    if SEEN in given and given[SEEN].shape[-1] == own[SEEN].shape[-1] - MOTION_CHANNELS:
+        given[SEEN] = F.pad(given[SEEN], (0, MOTION_CHANNELS))
+    if TOLD in own and TOLD not in given:
+        given[TOLD] = torch.zeros_like(own[TOLD])
     outputs = trainer.simulator.dynamics.layout.outputs
-    widths = [3 if name == "means" else n for name, n in outputs]
     for key in PREDICTED:
-        if key in given and len(given[key]) == sum(widths) < len(own[key]):
-            parts = zip(outputs, given[key].split(widths), strict=True)
-            given[key] = torch.cat([x.new_zeros(n, *x.shape[1:]) if name == "means" else x for (name, n), x in parts])
+        new = len(own.get(key, ())) - len(given.get(key, ()))
+        before = dict(outputs)["means"] - new
+        if new > 0 and before >= PLACES:  # else a model of other sizes
+            parts = given[key].split([before if name == "means" else n for name, n in outputs])
+            given[key] = torch.cat(
+                [_means_of(x, x.shape[0] + new) if name == "means" else x for (name, _), x in zip(outputs, parts)]
+            )
     try:
         trainer.simulator.load_state_dict(given)
     except RuntimeError as error:
@@ -147,6 +154,12 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     weights = trainer.simulator.state_dict()
     trainer.average = {key: value.detach().clone() for key, value in weights.items()}
     return {"name": str(path), "digest": saved.digest, "step": saved.state["step"]}
+
+
+def _means_of(rows: Tensor, n: int) -> Tensor:
+    """The ``n`` rows that predict places, from those of a dynamics that sees less motion or none."""
+    known = rows[: 0 if len(rows) == PLACES else None]
+    return torch.cat([known, rows.new_zeros(n - len(known), *rows.shape[1:])])
 
 
 def save_state(trainer: Trainer, folder: str | Path, name: str, progress: Progress) -> Progress:

@@ -10,7 +10,7 @@ from gsim3d.types import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
 
-MOVING = dataclasses.replace(TINY, motion_length=0.2, position_waves=2, contact_length=0.1)
+MOVING = dataclasses.replace(TINY, motion_length=0.2, momentum=True, position_waves=2, contact_length=0.1)
 
 
 def assert_same_particles(actual, expected, what=""):

@@ -10,7 +10,8 @@ from gsim3d.types import DYNAMIC, FROZEN
 from tests.asserts import assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history
 
-RELIT = dataclasses.replace(TINY, background="relit", motion_length=0.2, position_waves=2, contact_length=0.1)
+SEEING = {"motion_length": 0.2, "momentum": True, "position_waves": 2, "contact_length": 0.1}
+RELIT = dataclasses.replace(TINY, background="relit", **SEEING)
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 

@@ -43,7 +43,11 @@ MOVING = dataclasses.replace(
 )
 RELIT = dataclasses.replace(
     MOVING,
-    model={"dynamics": {"motion_length": 0.3, "background": "relit", "position_waves": 2, "contact_length": 0.15}},
+    model={
+        "dynamics": {
+            "motion_length": 0.3, "momentum": True, "background": "relit", "position_waves": 2, "contact_length": 0.15
+        }
+    },
     loss=LossConfig(bodies=1.0),
 )
 KINDS = {

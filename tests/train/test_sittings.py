@@ -259,7 +259,7 @@ def test_the_next_sitting_knows_what_graphs_needed(store, tmp_path):
             load_into(second, tmp_path / "state", NAME, dataclasses.replace(progress, needed=damaged))
 
 
-@pytest.mark.parametrize("more", [{}, {"position_waves": 2, "contact_length": 0.15}])
+@pytest.mark.parametrize("more", [{}, {"position_waves": 2, "contact_length": 0.15, "momentum": True}])
 def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path, more):
     """What it predicts is the same, but that bodies fly on instead of what it said of positions."""
     other = SittingTrainer(CONFIG, store, tmp_path / "other", "cpu")
@@ -291,9 +291,8 @@ def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path, more)
 
 def test_a_run_that_sees_more_begins_as_one_that_saw_motion_went_on(store, tmp_path):
     motion_only = dataclasses.replace(CONFIG, model={"dynamics": {"motion_length": 0.3}})
-    more = dataclasses.replace(
-        CONFIG, model={"dynamics": {"motion_length": 0.3, "position_waves": 2, "contact_length": 0.15}}
-    )
+    told = {"motion_length": 0.3, "momentum": True, "position_waves": 2, "contact_length": 0.15}
+    more = dataclasses.replace(CONFIG, model={"dynamics": told})
     other = SittingTrainer(motion_only, store, tmp_path / "other", "cpu")
     with torch.no_grad():
         for parameter in other.simulator.dynamics.net.head.parameters():

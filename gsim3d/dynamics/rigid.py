@@ -1,0 +1,73 @@
+"""Rigid motions that fit the paths of matter within windows: at the nodes of a lattice, and between them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from gsim3d.dynamics.samples import SAMPLES
+
+NODES = 6  # of the lattice that spans the movable rows of a scene, along each axis
+STIFFNESS = 1e-3  # against turning, relative to the window's size: a point and a line do not turn
+
+
+class Lattice:
+    """nodes: [B, G, 3] that span ``places`` [B, S, 3], those that are ``known`` [B, S]."""
+
+    def __init__(self, places: Tensor, known: Tensor):
+        here = known[:, :, None]
+        low, high = (side * torch.where(here, side * places, torch.inf).amin(1, keepdim=True) for side in (1, -1))
+        self._low, high = (torch.where(x.isfinite(), x, 0) for x in (low, high))
+        self._size = high - self._low
+        self._ticks = torch.linspace(0, 1, NODES, device=low.device, dtype=low.dtype)
+        unit = torch.stack(torch.meshgrid(self._ticks, self._ticks, self._ticks, indexing="ij"), -1).flatten(0, 2)
+        self.nodes = self._low + unit * self._size
+
+    def at(self, places: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
+        """[B, N, 3] at ``places`` [B, N, 3], of each of ``values`` [B, G, 3].
+
+        A product with the share of every node: on a GPU its gradient has a fixed order, that of grid_sample has not.
+        Rows are multiplied in groups of one size, so that the bits of a scene do not depend on the others.
+        """
+        n, field = places.shape[1], torch.cat(values, 2)
+        place = ((places - self._low) / self._size.clamp(min=1e-6)).clamp(0, 1)
+        place = F.pad(place, (0, 0, 0, -n % SAMPLES)).unflatten(1, (-1, SAMPLES))
+        x, y, z = (1 - (NODES - 1) * (place[..., None] - self._ticks).abs()).clamp(min=0).unbind(3)
+        shares = (x[..., :, None, None] * y[..., None, :, None] * z[..., None, None, :]).flatten(3)
+        found = torch.cat([shares[:, group] @ field for group in range(shares.shape[1])], 1)
+        return found[:, :n].split(3, 2)
+
+
+class RigidFit:
+    """Of rows at ``places`` [B, S, 3], as far as each window [B, G, S] counts them.
+
+    centre: [B, G, 3] of the rows in the window.
+    """
+
+    def __init__(self, window: Tensor, places: Tensor, length: float):
+        self.window, self.places, self.centre = window, places, window @ places
+        products = (places[:, :, :, None] * places[:, :, None]).flatten(2)
+        scatter = (window @ products).unflatten(2, (3, 3)) - self.centre[:, :, :, None] * self.centre[:, :, None]
+        size = scatter.diagonal(dim1=2, dim2=3).sum(2)[:, :, None, None] + STIFFNESS * length**2
+        self._inertia = size * torch.eye(3, device=size.device, dtype=size.dtype) - scatter
+
+    def fit(self, paths: Tensor) -> tuple[Tensor, Tensor]:
+        """How far the centre moved and the spin (rad), both [B, G, 3], of ``paths`` [B, S, 3]."""
+        moved = self.window @ paths
+        impulse = self.window @ torch.linalg.cross(self.places, paths) - torch.linalg.cross(self.centre, moved)
+        return moved, _solved(self._inertia, impulse)
+
+
+def onward_at(places: Tensor, velocity: Tensor, spin: Tensor, centre: Tensor) -> Tensor:
+    """[B, N, 3], what comes next at ``places`` of rigid motions there, [B, N, 3] all of them."""
+    turning = torch.linalg.cross(spin, places - centre)
+    return velocity + turning + 0.5 * torch.linalg.cross(spin, turning)
+
+
+def _solved(matrices: Tensor, values: Tensor) -> Tensor:
+    """The solutions [..., 3] of symmetric systems [..., 3, 3], by Cramer's rule: a graph can capture it."""
+    a, b, c = matrices.unbind(-2)
+    rows = torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)
+    determinant = (a * rows[0]).sum(-1, keepdim=True)
+    return torch.stack([(row * values).sum(-1) for row in rows], -1) / determinant
