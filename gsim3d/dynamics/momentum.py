@@ -72,8 +72,9 @@ def own_motion(history: Particles, otherwise: Tensor) -> tuple[Tensor, Tensor]:
         (take_runs(values, runs), take_runs(values, then))
         for values in (history.means, history.static_latents, history.activity)
     )
-    same = (static[0] == static[1]).all(1) & (activity[0] == DYNAMIC) & (activity[1] == DYNAMIC)
     moved = means[0] - means[1]
+    same = (static[0] == static[1]).all(1) & (activity[0] == DYNAMIC) & (activity[1] == DYNAMIC)
+    same = same & moved.isfinite().all(1)
     if any(gap != 1 for gap in gaps):
         counts = constant(tuple(clouds.count(q) for q in newest), moved.device)
         gap = constant(tuple(gaps), moved.device).repeat_interleave(counts, output_size=len(moved))

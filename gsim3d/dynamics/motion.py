@@ -69,7 +69,7 @@ def _shift(now: Samples, then: Samples, nodes: Tensor, window: Tensor, length: f
 
 
 def _rigid_motion(
-    now: Samples, then: Samples, lattice: _Lattice, window: Tensor, moved: Tensor, length: float
+    now: Samples, then: Samples, lattice: Lattice, window: Tensor, moved: Tensor, length: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Velocity, spin (rad) and centre [B, G, 3] of the rigid motion that takes matter in each window from ``then`` to
     ``now``, if it moved about as far as ``moved``."""

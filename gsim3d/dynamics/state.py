@@ -191,8 +191,7 @@ class StateLayout:
             changes = changes.cumsum(0)
         if drift is not None:
             kept = bounded(kept / MOST_KEPT, MOST_KEPT).unflatten(2, drift.shape[1:])
-            shares = zip(kept.unbind(2), drift.unbind(1), strict=True)
-            drift = drift[:, ONWARD] + sum(share * motion for share, motion in shares)  # in one order for all rows
+            drift = drift[:, ONWARD] + (kept * drift).sum(2)
             ahead = torch.arange(1, 1 + changes.shape[0], device=drift.device)[:, None, None]
             most = math.inf if self.config.max_step is None else self.config.max_step
             changes = torch.minimum(torch.maximum(changes + ahead * drift, -most * ahead), most * ahead)

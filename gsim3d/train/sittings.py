@@ -144,9 +144,8 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
         before = dict(outputs)["means"] - new
         if new > 0 and before >= PLACES:  # else a model of other sizes
             parts = given[key].split([before if name == "means" else n for name, n in outputs])
-            given[key] = torch.cat(
-                [_means_of(x, x.shape[0] + new) if name == "means" else x for (name, _), x in zip(outputs, parts)]
-            )
+            parts = zip(outputs, parts, strict=True)
+            given[key] = torch.cat([_means_of(x, n) if name == "means" else x for (name, n), x in parts])
     try:
         trainer.simulator.load_state_dict(given)
     except RuntimeError as error:

@@ -92,6 +92,24 @@ def test_steps_that_are_missing_count():
     assert_close_relative_to_max(parts_of(apart)[2], torch.tensor(VELOCITY).expand(200, 3) / 2, 1e-4)
 
 
+def test_a_place_that_is_none_spoils_nothing():
+    """Neither what others are told nor a gradient."""
+    history = turning(2)
+    means = history.means.clone()
+    means[250], means[30] = torch.nan, torch.inf
+    means.requires_grad_()
+    dynamics, broken = make_dynamics(KEEPING), dataclasses.replace(history, means=means)
+    _, rigid, own = parts_of(broken)
+    assert rigid.isfinite().all() and own.isfinite().all()
+    others = torch.ones(200, dtype=torch.bool)
+    others[[30, 50]] = False
+    assert_close_relative_to_max(rigid[others], parts_of(history)[1][others], 0.02)
+    step = dynamics(broken).means
+    step[others].sum().backward()
+    gradients = [means.grad, *(p.grad for p in dynamics.parameters() if p.grad is not None)]
+    assert all(gradient.isfinite().all() for gradient in gradients)
+
+
 def test_scenes_do_not_see_each_other_and_frozen_rows_do_not_move():
     one, other = turning(2), turning(3, n=90, velocity=(0.0, 0.05, 0.0), seed=1)
     frozen = torch.arange(len(other.means)) % 90 < 20
