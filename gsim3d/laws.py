@@ -154,7 +154,8 @@ def permute_rows(particles: Particles, seed: int = 0) -> tuple[Particles, Tensor
     table = particles.clouds
     counts = [table.count(q) for q in range(len(table))]
     order = [torch.randperm(n, generator=torch.Generator().manual_seed(seed)) for n in counts]
-    order = torch.cat([start + rows for start, rows in zip(table.starts[:-1], order, strict=True)]).to(particles.means.device)
+    order = torch.cat([start + rows for start, rows in zip(table.starts[:-1], order, strict=True)])
+    order = order.to(particles.means.device)
     return dataclasses.replace(particles, **{n: v[order] for n, v in particles.row_fields().items()}), order
 
 
