@@ -43,8 +43,7 @@ def momentum(history: Particles, onward: Tensor, length: float, grid_size: float
             body = RigidFit(window, now.places, length)
         most = rows.wanted.shape[1]
         paths = torch.stack([F.pad(part, (0, 0, 0, most - len(part))) for part in own.split(counts)])
-        paths = torch.where(now.known[:, :, None], paths.gather(1, now.at[:, :, None].expand(-1, -1, 3)), 0)
-        rigid = onward_at(places, *lattice.at(places, *body.fit(paths), body.centre))
+        rigid = onward_at(places, *lattice.at(places, *body.fit(now.take(paths)), body.centre))
     rigid = torch.cat([rigid[b, :n] for b, n in enumerate(counts)])
     return torch.stack([torch.where(known, rigid, onward), own], 1)
 

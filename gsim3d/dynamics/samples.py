@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from gsim3d.ops.sentinel import CELLS
 from gsim3d.types import DYNAMIC, Particles, constant
@@ -40,25 +41,37 @@ class Rows:
 class Samples:
     """Of :class:`Rows` all that are wanted, or S that are evenly spread over their list.
 
-    n: [B] there are.   known: bool [B, S], entries that are rows; others are 0.   at: int64 [B, S], which of the cloud.
-    mean: [B, 3] of the places.   places: [B, S, 3].   latents: [B, S, C].
+    n: [B] there are.   known: bool [B, S], entries that are rows; others are 0.   mean: [B, 3] of the places.
+    places: [B, S, 3].   latents: [B, S, C].
     """
 
     def __init__(
         self, history: Particles, chosen: list[int], grid_size: float, activity: int = DYNAMIC, opacity: float = 0.0
     ):
         cloud = Rows(history, chosen, grid_size, activity, opacity)
-        until = cloud.wanted.cumsum(1)
-        self.n = until[:, -1]
-        n, k = self.n[:, None], torch.arange(SAMPLES, device=until.device)
-        self.known = k < n
-        wanted = torch.where(n > SAMPLES, k * n // SAMPLES, k)
-        self.at = at = torch.searchsorted(until, wanted + 1).clamp(max=until.shape[1] - 1)
+        self._wanted, self._until = cloud.wanted, cloud.wanted.cumsum(1)
+        self.n = self._until[:, -1]
+        k = torch.arange(SAMPLES, device=self.n.device)
+        self.known = k < self.n[:, None]
+        at = torch.searchsorted(self._until, self._place(k) + 1).clamp(max=self._until.shape[1] - 1)
+        self._at = at
         here = self.known[:, :, None]
         self.places = torch.where(here, cloud.places.gather(1, at[:, :, None].expand(-1, -1, 3)), 0)
         latents = history.latents.detach()[cloud.rows.gather(1, at)].to(self.places.dtype)
         self.latents = torch.where(here, latents, 0).nan_to_num(0, 0, 0)
         self.mean = self.mean_of(self.places)
+
+    def _place(self, k: Tensor) -> Tensor:
+        """Of sample ``k`` in the list of those that are wanted."""
+        n = self.n[:, None]
+        return torch.where(n > SAMPLES, k * n // SAMPLES, k)
+
+    def take(self, values: Tensor) -> Tensor:
+        """[B, S, C] of ``values`` [B, M, C] of the clouds' rows; 0 where there is no sample."""
+        place, n = self._until - 1, self.n[:, None]
+        k = torch.where(n > SAMPLES, (place * SAMPLES + n - 1) // n.clamp(min=1), place).clamp(0, SAMPLES - 1)
+        is_sample = self._wanted & (self._place(k) == place)
+        return _Taken.apply(values, self._at, self.known, k, is_sample)
 
     def seen_from(self, place: Tensor) -> None:
         """Counts places from ``place`` [B, 1, 3]: squares of places far away would be all rounding."""
@@ -68,6 +81,23 @@ class Samples:
     def mean_of(self, values: Tensor) -> Tensor:
         """[B, C] of [B, S, C], values of the entries."""
         return torch.where(self.known[:, :, None], values, 0).sum(1) / self.n.clamp(1, SAMPLES)[:, None]
+
+
+class _Taken(torch.autograd.Function):
+    """Rows ``at``, of which each is taken once: row i as sample k[i], where ``is_sample``. So its gradient is taken,
+    too; that of gather waits for the device where it has to be deterministic."""
+
+    @staticmethod
+    def forward(ctx, values: Tensor, at: Tensor, known: Tensor, k: Tensor, is_sample: Tensor) -> Tensor:
+        ctx.save_for_backward(k, is_sample)
+        return torch.where(known[:, :, None], values.gather(1, at[:, :, None].expand(-1, -1, values.shape[2])), 0)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
+        k, is_sample = ctx.saved_tensors
+        taken = grad.gather(1, k[:, :, None].expand(-1, -1, grad.shape[2]))
+        return torch.where(is_sample[:, :, None], taken, 0), None, None, None, None
 
 
 def weights(logits: Tensor, known: Tensor) -> Tensor:

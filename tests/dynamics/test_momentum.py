@@ -121,17 +121,19 @@ def test_scenes_do_not_see_each_other_and_frozen_rows_do_not_move():
     assert not together[200:220].any() and together[220:].any()
 
 
-def test_gradients_of_the_step_before():
-    """Of its places only: those of the newest step also say where the windows are, which is a constant."""
-    history = turning(2, n=40)
+@pytest.mark.parametrize("n", [40, 1500])
+def test_gradients_of_the_step_before(n):
+    """Of its places only: those of the newest step also say where the windows are, which is a constant. Of 1,500 rows
+    1,024 are looked at."""
+    history = turning(2, n=n)
     history = dataclasses.replace(history, means=history.means.double())
-    onward = torch.zeros(40, 3, dtype=torch.float64)
+    onward = torch.zeros(n, 3, dtype=torch.float64)
 
     def of_older(older):
-        return momentum(dataclasses.replace(history, means=torch.cat([older, history.means[40:]])), onward, *HOW)
+        return momentum(dataclasses.replace(history, means=torch.cat([older, history.means[n:]])), onward, *HOW)
 
-    older = history.means[:40].clone().requires_grad_()
-    assert torch.autograd.gradcheck(of_older, (older,), atol=1e-6)
+    older = history.means[:n].clone().requires_grad_()
+    assert torch.autograd.gradcheck(of_older, (older,), atol=1e-6, fast_mode=n > 100)
 
 
 def test_an_impulse_is_blamed_for_all_that_follows():
