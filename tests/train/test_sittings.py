@@ -259,16 +259,21 @@ def test_the_next_sitting_knows_what_graphs_needed(store, tmp_path):
             load_into(second, tmp_path / "state", NAME, dataclasses.replace(progress, needed=damaged))
 
 
+def saved_with_a_head(config, store, folder):
+    """The checkpoint of a simulator whose dynamics predicts something."""
+    trainer = SittingTrainer(config, store, folder / "other", "cpu")
+    with torch.no_grad():
+        for parameter in trainer.simulator.dynamics.net.head.parameters():
+            parameter.normal_(0, 0.1)
+    trainer.average = {key: value.clone() for key, value in trainer.simulator.state_dict().items()}
+    save_state(trainer, folder / "state", NAME, Progress())
+    return weights_file(folder / "state", load_progress(folder / "state", NAME))
+
+
 @pytest.mark.parametrize("more", [{}, {"position_waves": 2, "contact_length": 0.15, "momentum": True}])
 def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path, more):
     """What it predicts is the same, but that bodies fly on instead of what it said of positions."""
-    other = SittingTrainer(CONFIG, store, tmp_path / "other", "cpu")
-    with torch.no_grad():
-        for parameter in other.simulator.dynamics.net.head.parameters():
-            parameter.normal_(0, 0.1)
-    other.average = {key: value.clone() for key, value in other.simulator.state_dict().items()}
-    save_state(other, tmp_path / "state", NAME, Progress())
-    known = weights_file(tmp_path / "state", load_progress(tmp_path / "state", NAME))
+    known = saved_with_a_head(CONFIG, store, tmp_path)
     moving = dataclasses.replace(CONFIG, model={"dynamics": {"motion_length": 0.3, **more}})
     trainer = SittingTrainer(moving, store, tmp_path / "run", "cpu")
     begun = begin_with(trainer, known)
@@ -293,13 +298,7 @@ def test_a_run_that_sees_more_begins_as_one_that_saw_motion_went_on(store, tmp_p
     motion_only = dataclasses.replace(CONFIG, model={"dynamics": {"motion_length": 0.3}})
     told = {"motion_length": 0.3, "momentum": True, "position_waves": 2, "contact_length": 0.15}
     more = dataclasses.replace(CONFIG, model={"dynamics": told})
-    other = SittingTrainer(motion_only, store, tmp_path / "other", "cpu")
-    with torch.no_grad():
-        for parameter in other.simulator.dynamics.net.head.parameters():
-            parameter.normal_(0, 0.1)
-    other.average = {key: value.clone() for key, value in other.simulator.state_dict().items()}
-    save_state(other, tmp_path / "state", NAME, Progress())
-    known = weights_file(tmp_path / "state", load_progress(tmp_path / "state", NAME))
+    known = saved_with_a_head(motion_only, store, tmp_path)
     trainer = SittingTrainer(more, store, tmp_path / "run", "cpu")
     begin_with(trainer, known)
     given, own = restore(known).simulator, trainer.simulator.eval()
