@@ -39,7 +39,7 @@ def load(file, quirks=FULL_PRECISION):
     config = dataclasses.replace(dynamics_config(name, quirks), grid_size=float(g["grid_size"]))
     weights = renamed(g / "w")
     in_channels, out_channels = weights["stem.conv.weight"].shape[-1], weights["head.fc2.bias"].shape[0]
-    net = PointTransformer(in_channels, out_channels, config).eval()
+    net = PointTransformer(in_channels, 0, out_channels, config).eval()
     net.load_state_dict(weights)
     return g, net, config
 
