@@ -41,6 +41,9 @@ class DynamicsConfig:
         motion_length: metres, about the radius of a body. The network sees how the matter around a particle has moved
             (:func:`gsim3d.dynamics.motion.motion`), and predicts how much of that is kept along each axis and what is
             added to it: without a force bodies fly on. None: it has to read velocities off the places in its history.
+        looks: with ``motion_length`` the turning of bodies is found in so many channels that a learned linear map makes
+            of their latents: what does not change when they turn in the light. 0: in all latents, as they are; that
+            finds a third of a spin.
         momentum: with ``motion_length`` what goes on is the rigid motion of a window in its last step, where that was
             predicted, and a row's own last step is a third motion of which a share is kept
             (:func:`gsim3d.dynamics.momentum.momentum`). Gradients flow through both, so that an impulse is blamed for
@@ -83,6 +86,7 @@ class DynamicsConfig:
     position_length: float = 1.0
     position_waves: int = 0
     motion_length: float | None = None
+    looks: int = 0
     momentum: bool = False
     contact_length: float | None = None
     grid_size: float = 0.004
@@ -142,6 +146,11 @@ class DynamicsConfig:
             raise ValueError(
                 'DynamicsConfig: motion_length must be positive, and predicts "from_newest" or "from_previous"; '
                 f"got {self.motion_length} and {self.predicts!r}"
+            )
+        latents = self.dynamic_latents + self.static_latents
+        if self.looks < 0 or self.looks and (self.motion_length is None or latents < 1):
+            raise ValueError(
+                f"DynamicsConfig: looks must be 0 or more, and need motion_length and latents; got {self.looks}"
             )
         if self.momentum and (self.motion_length is None or self.static_latents < 1):
             raise ValueError("DynamicsConfig: momentum needs motion_length, and static_latents, which tell rows apart")

@@ -42,6 +42,8 @@ class Dynamics(nn.Module):
         self.rounds = None  # whether geometry is rounded in training; None: on a GPU
         layout = self.layout
         self.net = PointTransformer(layout.in_channels, layout.told_channels, layout.out_channels, config)
+        latents = config.dynamic_latents + config.static_latents
+        self.looks = nn.Linear(latents, config.looks, bias=False) if config.looks else None
 
     def geometry(
         self,
@@ -149,7 +151,8 @@ class Dynamics(nn.Module):
             )
         runs, config, moved, drift, near = clouds.row_runs(newest), self.config, None, None, None
         if config.motion_length is not None:
-            drift = motion(history, config.motion_length, config.grid_size)
+            looks = None if self.looks is None else self.looks.weight
+            drift = motion(history, config.motion_length, config.grid_size, looks)
             if config.momentum:
                 onward = momentum(history, drift[:, ONWARD], config.motion_length, config.grid_size)
                 drift = torch.cat([drift[:, :ONWARD], onward], 1)

@@ -56,7 +56,7 @@ class RigidFit:
         """How far the centre moved and the spin (rad), both [B, G, 3], of ``paths`` [B, S, 3]."""
         moved = self.window @ paths
         impulse = self.window @ torch.linalg.cross(self.places, paths) - torch.linalg.cross(self.centre, moved)
-        return moved, _solved(self._inertia, impulse)
+        return moved, solved(self._inertia, impulse)
 
 
 def onward_at(places: Tensor, velocity: Tensor, spin: Tensor, centre: Tensor) -> Tensor:
@@ -65,7 +65,7 @@ def onward_at(places: Tensor, velocity: Tensor, spin: Tensor, centre: Tensor) ->
     return velocity + turning + 0.5 * torch.linalg.cross(spin, turning)
 
 
-def _solved(matrices: Tensor, values: Tensor) -> Tensor:
+def solved(matrices: Tensor, values: Tensor) -> Tensor:
     """The solutions [..., 3] of symmetric systems [..., 3, 3], by Cramer's rule: a graph can capture it."""
     a, b, c = matrices.unbind(-2)
     rows = torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)

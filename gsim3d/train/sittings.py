@@ -35,11 +35,12 @@ from gsim3d.files import MAX_TEXT, read_file, sha256_of
 from gsim3d.train import checkpoint
 from gsim3d.train.log import LOG
 from gsim3d.train.loop import Trainer
-from gsim3d.train.restore import describe
+from gsim3d.train.restore import describe, restore
 
 FORMAT = 1
 SEEN = "dynamics.net.stem.conv.weight"  # what the network reads of motion are its last columns
 TOLD = "dynamics.net.stem.told.weight"
+LOOKS = "dynamics.looks.weight"
 PREDICTED = ("dynamics.net.head.fc2.weight", "dynamics.net.head.fc2.bias")
 PLACES = 3  # rows that predict places where no motion is seen
 WEIGHTS, DIFFERENCE, SQUARES = "weights", "difference", "squares"
@@ -125,27 +126,31 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
 def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     """Weights of a trained simulator into a new trainer, whose dynamics may see more (motion, waves, contacts,
     momentum) than the other's: what reads it begins at zero, and so does what predicts shares of motions; where motion
-    is new all that predicts positions, which are others then.
+    is new all that predicts positions, which are others then. New looks begin as in any new trainer; where latents may
+    change more, small changes stay as they are.
 
     Returns:
         The checkpoint's name, digest and step.
     Raises:
         InputError: it is a simulator of other sizes.
     """
-    saved, own = checkpoint.load(path), trainer.simulator.state_dict()
+    other, own = restore(path), trainer.simulator.state_dict()
+    saved, before = other.checkpoint, dict(other.simulator.dynamics.layout.outputs)
     given = {key: value.float() for key, value in saved.model.items()}
     if SEEN in given and given[SEEN].shape[-1] == own[SEEN].shape[-1] - MOTION_CHANNELS:
         given[SEEN] = F.pad(given[SEEN], (0, MOTION_CHANNELS))
     if TOLD in own and TOLD not in given:
         given[TOLD] = torch.zeros_like(own[TOLD])
-    outputs = trainer.simulator.dynamics.layout.outputs
+    if LOOKS in own:
+        given.setdefault(LOOKS, own[LOOKS])
+    after = dict(trainer.simulator.dynamics.layout.outputs)
+    limits = [simulator.config.dynamics.max_latent_step for simulator in (other.simulator, trainer.simulator)]
     for key in PREDICTED:
-        new = len(own.get(key, ())) - len(given.get(key, ()))
-        before = dict(outputs)["means"] - new
-        if new > 0 and before >= PLACES:  # else a model of other sizes
-            parts = given[key].split([before if name == "means" else n for name, n in outputs])
-            parts = zip(outputs, parts, strict=True)
-            given[key] = torch.cat([_means_of(x, n) if name == "means" else x for (name, n), x in parts])
+        if before.keys() == after.keys():  # else of other sizes
+            parts = dict(zip(before, given[key].split(list(before.values())), strict=True))
+            if "dynamic_latents" in parts and None not in limits:
+                parts["dynamic_latents"] = parts["dynamic_latents"] * (limits[0] / limits[1])
+            given[key] = torch.cat([_widened(name, x, after[name]) for name, x in parts.items()])
     try:
         trainer.simulator.load_state_dict(given)
     except RuntimeError as error:
@@ -155,10 +160,11 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     return {"name": str(path), "digest": saved.digest, "step": saved.state["step"]}
 
 
-def _means_of(rows: Tensor, n: int) -> Tensor:
-    """The ``n`` rows that predict places, from those of a dynamics that sees less motion or none."""
-    known = rows[: 0 if len(rows) == PLACES else None]
-    return torch.cat([known, rows.new_zeros(n - len(known), *rows.shape[1:])])
+def _widened(name: str, rows: Tensor, n: int) -> Tensor:
+    """The ``n`` rows that predict a field, from those of a dynamics that sees less."""
+    if name == "means" and len(rows) == PLACES < n:  # without motion, which goes on now
+        rows = rows[:0]
+    return torch.cat([rows, rows.new_zeros(max(0, n - len(rows)), *rows.shape[1:])])
 
 
 def save_state(trainer: Trainer, folder: str | Path, name: str, progress: Progress) -> Progress:

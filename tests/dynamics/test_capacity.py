@@ -8,9 +8,9 @@ import torch
 from gsim3d.ops import PyramidCapacity
 from gsim3d.types import ASLEEP
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
-from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history
+from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
 
-MOVING = dataclasses.replace(TINY, motion_length=0.2, momentum=True, position_waves=2, contact_length=0.1)
+MOVING = dataclasses.replace(TINY, **SEEING)
 RELIT = dataclasses.replace(MOVING, background="relit")
 pytestmark = pytest.mark.usefixtures("one_thread")
 

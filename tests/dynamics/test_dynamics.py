@@ -8,9 +8,9 @@ import torch
 from gsim3d.dynamics import Dynamics, DynamicsConfig, append_step, concatenate, last_steps, rollout
 from gsim3d.types import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
-from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
+from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
 
-MOVING = dataclasses.replace(TINY, motion_length=0.2, momentum=True, position_waves=2, contact_length=0.1)
+MOVING = dataclasses.replace(TINY, **SEEING)
 
 
 def assert_same_particles(actual, expected, what=""):

@@ -73,6 +73,51 @@ def test_a_body_turns_on(spin, n):
     assert (longer - 1).abs().max() < 4e-3  # else a body would grow as it turns
 
 
+def in_light(history, spin, strength=1.0):
+    """Bodies of ``flying`` whose latents also say how a place faces the light, which stays where it is."""
+    steps = history.means.unflatten(0, (4, -1))
+    shading = (steps - steps.mean(1, keepdim=True)).flatten(0, 1) @ torch.tensor([[1.0], [2.0], [2.0]]) * 20
+    latents = torch.cat([history.dynamic_latents[:, :3], strength * shading], 1)
+    return dataclasses.replace(history, dynamic_latents=latents)
+
+
+PAINT = torch.eye(3, 7)  # looks that do not read the light
+
+
+@pytest.mark.parametrize("n", [300, 3000])
+@pytest.mark.parametrize("spin", [(0.0, 0.0, 0.05), (0.04, -0.03, 0.02)])
+def test_paint_tells_how_a_body_turns_in_the_light(spin, n):
+    velocity, history = torch.tensor((0.03, -0.02, 0.05)), in_light(flying([(0.03, -0.02, 0.05)], n, spin=spin), spin)
+    newest = last_steps(history, 1).means
+    radius = newest - newest.mean(0)
+    turned = radius @ torch.linalg.matrix_exp(cross_matrix(spin)).T - radius
+    by_paint, by_all = (motion(history, *HOW, looks)[:, 1] - velocity - turned for looks in (PAINT, None))
+    assert by_paint.norm() < 0.25 * turned.norm() < by_all.norm()
+
+
+def test_looks_get_a_gradient_that_finds_the_paint():
+    """A few steps along it, beginning with a look that reads light and paint alike."""
+    spin = (0.04, -0.03, 0.02)
+    history = in_light(flying([(0.0, 0.0, 0.0)], spin=spin), spin, 0.5)
+    radius = last_steps(history, 1).means
+    radius = radius - radius.mean(0)
+    turned = radius @ torch.linalg.matrix_exp(cross_matrix(spin)).T - radius
+    looks = torch.eye(4, 7).requires_grad_()
+    optimizer, missed = torch.optim.Adam([looks], lr=0.05), []
+    for _ in range(20):
+        missed.append(((motion(history, *HOW, looks)[:, 1] - turned).norm() / turned.norm()))
+        optimizer.zero_grad()
+        missed[-1].backward()
+        optimizer.step()
+    assert missed[0] > 0.3 and missed[-1] < 0.6 * missed[0]
+
+
+def test_without_paint_nothing_is_found_to_turn():
+    history = flying([(0.03, -0.02, 0.05)], spin=(0.0, 0.0, 0.05))
+    found = motion(history, *HOW, torch.zeros(2, 7))
+    assert_close_relative_to_max(found, torch.tensor((0.03, -0.02, 0.05)).expand(300, 2, 3), 0.1)
+
+
 def test_far_from_the_origin_it_is_the_same():
     history = flying([(0.03, -0.02, 0.05)], spin=(0.0, 0.0, 0.05))
     far = dataclasses.replace(history, means=history.means + torch.tensor([2000.0, 1000.0, 0.0]))
@@ -137,18 +182,37 @@ def test_scenes_do_not_see_each_other():
         begin += len(alone)
 
 
-def test_a_gpu_finds_the_same(devices):
+@pytest.mark.parametrize("looks", [None, PAINT], ids=["latents", "looks"])
+def test_a_gpu_finds_the_same(looks, devices):
     history = batch([flying([[0.03, 0.0, 0.0], [0.0, 0.02, 0.0]]), make_history((30, 40))])
-    expected, actual = (motion(history.to(device), *HOW).cpu() for device in devices)
+
+    def found(device):
+        return motion(history.to(device), *HOW, None if looks is None else looks.to(device)).cpu()
+
+    expected, actual = (found(device) for device in devices)
     assert_close_relative_to_max(actual, expected, 1e-4)
-    assert_same_bits(motion(history.to(devices[1]), *HOW).cpu(), actual)
+    assert_same_bits(found(devices[1]), actual)
 
 
-def test_compiled_it_is_the_same(device):
-    history = flying([[0.03, 0.0, 0.0]], n=50).to(device)
+@pytest.mark.parametrize("looks", [None, PAINT], ids=["latents", "looks"])
+def test_compiled_it_is_the_same(looks, device):
+    history, looks = flying([[0.03, 0.0, 0.0]], n=50).to(device), None if looks is None else looks.to(device)
     history.clouds
     compiled = torch.compile(motion, fullgraph=True)
-    assert_close_relative_to_max(compiled(history, *HOW), motion(history, *HOW), 1e-4)
+    assert_close_relative_to_max(compiled(history, *HOW, looks), motion(history, *HOW, looks), 1e-4)
+
+
+def test_the_gradient_of_looks_is_that_of_its_last_pass():
+    """In float64, beside finite differences where one pass is all there is."""
+    history = flying([(0.03, -0.02, 0.05)], n=60, spin=(0.0, 0.0, 0.05))
+    history = dataclasses.replace(
+        history,
+        **{name: value.double() for name, value in float_fields(history).items()},
+    )
+    looks = torch.rand(2, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gsim3d.dynamics.motion.PASSES", 1)
+        assert torch.autograd.gradcheck(lambda x: motion(history, *HOW, x)[:, 1], [looks])
 
 
 @pytest.mark.parametrize("predicts", ["from_newest", "from_previous"])
@@ -230,7 +294,16 @@ def test_gradients_reach_weights_and_features_but_no_velocity():
     assert_close_relative_to_max(leaves["means"].grad[30:].sum(0), torch.full((3,), 40.0), 0.5)
 
 
-@pytest.mark.parametrize("change", [{"motion_length": 0.0}, {"predicts": "absolute"}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"motion_length": 0.0},
+        {"predicts": "absolute"},
+        {"motion_length": None, "looks": 2},
+        {"looks": -1},
+        {"looks": 2, "dynamic_latents": 0, "static_latents": 0},
+    ],
+)
 def test_settings_that_make_no_sense_are_refused(change):
     with pytest.raises(ValueError, match="motion_length"):
         DynamicsConfig(**{"motion_length": LENGTH, **change})

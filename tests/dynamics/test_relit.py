@@ -8,9 +8,8 @@ import torch
 from gsim3d.dynamics import append_step, concatenate, last_steps, rollout, with_look
 from gsim3d.types import DYNAMIC, FROZEN
 from tests.asserts import assert_same_bits
-from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history
+from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
 
-SEEING = {"motion_length": 0.2, "momentum": True, "position_waves": 2, "contact_length": 0.1}
 RELIT = dataclasses.replace(TINY, background="relit", **SEEING)
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -21,7 +21,8 @@ EXPLICIT_CONFIG = dataclasses.replace(
     dynamics=dataclasses.replace(EXPLICIT, grid_size=0.1),
     renderer=dataclasses.replace(CONFIG.renderer, latents=0),
 )
-MOVING = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, motion_length=0.3, momentum=True))
+MORE = {"motion_length": 0.3, "momentum": True, "looks": 4}
+MOVING = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **MORE))
 CONFIGS = {"latent": CONFIG, "explicit": EXPLICIT_CONFIG, "moving": MOVING}
 
 

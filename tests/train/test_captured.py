@@ -45,7 +45,8 @@ RELIT = dataclasses.replace(
     MOVING,
     model={
         "dynamics": {
-            "motion_length": 0.3, "momentum": True, "background": "relit", "position_waves": 2, "contact_length": 0.15
+            "motion_length": 0.3, "momentum": True, "background": "relit", "position_waves": 2, "contact_length": 0.15,
+            "looks": 4,
         }
     },
     loss=LossConfig(bodies=1.0),

@@ -26,7 +26,7 @@ from gsim3d.train.restore import restore
 from gsim3d.train.samples import draw_batch
 from gsim3d.train.shipped import RECIPES, SittingTrainer, train
 from gsim3d.train.samples import longest_gap
-from gsim3d.train.sittings import Progress, begin_with, load_into, load_progress, save_state, weights_file
+from gsim3d.train.sittings import LOOKS, Progress, begin_with, load_into, load_progress, save_state, weights_file
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -309,6 +309,32 @@ def test_a_run_that_sees_more_begins_as_one_that_saw_motion_went_on(store, tmp_p
     moved = (expected.means - last_steps(state, 1).means).abs().max()
     assert moved > 0.01 and (step.means - expected.means).abs().max() < 1e-4 * moved
     torch.testing.assert_close(step.dynamic_latents, expected.dynamic_latents)
+
+
+def test_looks_of_a_run_begin_as_they_are_made_or_go_on(store, tmp_path):
+    config = dataclasses.replace(CONFIG, model={"dynamics": {"motion_length": 0.3, "looks": 4}})
+    for known in (saved_with_a_head(CONFIG, store, tmp_path / "a"), saved_with_a_head(config, store, tmp_path / "b")):
+        trainer = SittingTrainer(config, store, tmp_path / "run", "cpu")
+        made = trainer.simulator.state_dict()[LOOKS].clone()
+        begin_with(trainer, known)
+        expected = restore(known).simulator.state_dict().get(LOOKS, made)
+        assert made.any() and torch.equal(trainer.simulator.state_dict()[LOOKS], expected)
+
+
+def test_where_latents_may_change_more_they_change_as_much_at_first(store, tmp_path):
+    known = saved_with_a_head(CONFIG, store, tmp_path)
+    limit = restore(known).simulator.config.dynamics.max_latent_step
+    freer = dataclasses.replace(CONFIG, model={"dynamics": {"max_latent_step": 8 * limit}})
+    trainer = SittingTrainer(freer, store, tmp_path / "run", "cpu")
+    begin_with(trainer, known)
+    given, own = restore(known).simulator, trainer.simulator.eval()
+    with torch.no_grad():
+        state = given.encode(store.draw(CONFIG.data, CONFIG.stages[1], 0, 2, range(1)).context)
+        newest = last_steps(state, 1).dynamic_latents
+        expected, actual = (simulator.dynamics(state).dynamic_latents - newest for simulator in (given, own))
+    small = expected.abs() < 0.2 * limit
+    assert small.float().mean() > 0.2
+    torch.testing.assert_close(actual[small], expected[small], rtol=0.03, atol=1e-5)
 
 
 def test_recipes_are_sound():
