@@ -112,6 +112,22 @@ def test_looks_get_a_gradient_that_finds_the_paint():
     assert missed[0] > 0.3 and missed[-1] < 0.6 * missed[0]
 
 
+def test_how_strong_looks_are_does_not_matter():
+    history = flying([(0.03, -0.02, 0.05)], spin=(0.0, 0.0, 0.05))
+    assert_close_relative_to_max(motion(history, *HOW, 10 * PAINT), motion(history, *HOW, PAINT), 1e-4)
+
+
+def test_the_dynamics_finds_turns_by_its_looks_and_learns_them():
+    dynamics = make_dynamics(dataclasses.replace(MOVING, zero_init=True, looks=3))
+    dynamics.looks.weight.data.copy_(PAINT)
+    spin = (0.04, -0.03, 0.02)
+    history = in_light(flying([(0.0, 0.0, 0.0)], spin=spin), spin)
+    step, newest = dynamics(history), last_steps(history, 1)
+    assert_close_relative_to_max(step.means - newest.means, motion(history, *HOW, PAINT)[:, 1], 1e-5)
+    step.means.square().sum().backward()
+    assert dynamics.looks.weight.grad.any()
+
+
 def test_without_paint_nothing_is_found_to_turn():
     history = flying([(0.03, -0.02, 0.05)], spin=(0.0, 0.0, 0.05))
     found = motion(history, *HOW, torch.zeros(2, 7))
