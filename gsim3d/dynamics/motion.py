@@ -134,8 +134,7 @@ def _field(at: Tensor, samples: Samples, values: Tensor, length: float) -> tuple
     """``values`` [B, S, C] of the samples in a Gaussian window around each of ``at`` [B, Q, 3], and their slopes
     [B, Q, C, 3] there."""
     with torch.no_grad():
-        off = squares(at, samples.places)
-        near = weights(off * (-0.5 / length**2), samples.known)
+        near = weights(squares(at, samples.places) * (-0.5 / length**2), samples.known)
         around = near @ samples.places
     products = values[:, :, :, None] * samples.places[:, :, None]
     mean = near @ values

@@ -72,7 +72,7 @@ MODEL = {
         "momentum": True,
         "position_waves": 4,
         "background": "relit",  # what shadows change would add up else
-        "max_latent_step": 24.0,  # from lit to dark at once: encoded latents differ by up to 20 then
+        "max_latent_step": 8.0,  # of latents of size 4: from lit to dark at once
     },
     "renderer": {"scale_min": 0.002, "initial_scale": 0.03},
 }

@@ -126,8 +126,7 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
 def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     """Weights of a trained simulator into a new trainer, whose dynamics may see more (motion, waves, contacts,
     momentum) than the other's: what reads it begins at zero, and so does what predicts shares of motions; where motion
-    is new all that predicts positions, which are others then. New looks begin as in any new trainer; where latents may
-    change more, small changes stay as they are.
+    is new all that predicts positions, which are others then. New looks begin as in any new trainer.
 
     Returns:
         The checkpoint's name, digest and step.
@@ -144,13 +143,10 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     if LOOKS in own:
         given.setdefault(LOOKS, own[LOOKS])
     after = dict(trainer.simulator.dynamics.layout.outputs)
-    limits = [simulator.config.dynamics.max_latent_step for simulator in (other.simulator, trainer.simulator)]
     for key in PREDICTED:
-        if before.keys() == after.keys():  # else of other sizes
-            parts = dict(zip(before, given[key].split(list(before.values())), strict=True))
-            if "dynamic_latents" in parts and None not in limits:
-                parts["dynamic_latents"] = parts["dynamic_latents"] * (limits[0] / limits[1])
-            given[key] = torch.cat([_widened(name, x, after[name]) for name, x in parts.items()])
+        if before.keys() == after.keys() and len(given[key]) == sum(before.values()):  # else of other sizes
+            parts = zip(after.items(), given[key].split(list(before.values())), strict=True)
+            given[key] = torch.cat([_widened(name, x, n) for (name, n), x in parts])
     try:
         trainer.simulator.load_state_dict(given)
     except RuntimeError as error:

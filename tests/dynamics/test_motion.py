@@ -73,7 +73,7 @@ def test_a_body_turns_on(spin, n):
     assert (longer - 1).abs().max() < 4e-3  # else a body would grow as it turns
 
 
-def in_light(history, spin, strength=1.0):
+def in_light(history, strength=1.0):
     """Bodies of ``flying`` whose latents also say how a place faces the light, which stays where it is."""
     steps = history.means.unflatten(0, (4, -1))
     shading = (steps - steps.mean(1, keepdim=True)).flatten(0, 1) @ torch.tensor([[1.0], [2.0], [2.0]]) * 20
@@ -87,7 +87,7 @@ PAINT = torch.eye(3, 7)  # looks that do not read the light
 @pytest.mark.parametrize("n", [300, 3000])
 @pytest.mark.parametrize("spin", [(0.0, 0.0, 0.05), (0.04, -0.03, 0.02)])
 def test_paint_tells_how_a_body_turns_in_the_light(spin, n):
-    velocity, history = torch.tensor((0.03, -0.02, 0.05)), in_light(flying([(0.03, -0.02, 0.05)], n, spin=spin), spin)
+    velocity, history = torch.tensor((0.03, -0.02, 0.05)), in_light(flying([(0.03, -0.02, 0.05)], n, spin=spin))
     newest = last_steps(history, 1).means
     radius = newest - newest.mean(0)
     turned = radius @ torch.linalg.matrix_exp(cross_matrix(spin)).T - radius
@@ -98,7 +98,7 @@ def test_paint_tells_how_a_body_turns_in_the_light(spin, n):
 def test_looks_get_a_gradient_that_finds_the_paint():
     """A few steps along it, beginning with a look that reads light and paint alike."""
     spin = (0.04, -0.03, 0.02)
-    history = in_light(flying([(0.0, 0.0, 0.0)], spin=spin), spin, 0.5)
+    history = in_light(flying([(0.0, 0.0, 0.0)], spin=spin), 0.5)
     radius = last_steps(history, 1).means
     radius = radius - radius.mean(0)
     turned = radius @ torch.linalg.matrix_exp(cross_matrix(spin)).T - radius
@@ -121,7 +121,7 @@ def test_the_dynamics_finds_turns_by_its_looks_and_learns_them():
     dynamics = make_dynamics(dataclasses.replace(MOVING, zero_init=True, looks=3))
     dynamics.looks.weight.data.copy_(PAINT)
     spin = (0.04, -0.03, 0.02)
-    history = in_light(flying([(0.0, 0.0, 0.0)], spin=spin), spin)
+    history = in_light(flying([(0.0, 0.0, 0.0)], spin=spin))
     step, newest = dynamics(history), last_steps(history, 1)
     assert_close_relative_to_max(step.means - newest.means, motion(history, *HOW, PAINT)[:, 1], 1e-5)
     step.means.square().sum().backward()
@@ -221,10 +221,7 @@ def test_compiled_it_is_the_same(looks, device):
 def test_the_gradient_of_looks_is_that_of_its_last_pass():
     """In float64, beside finite differences where one pass is all there is."""
     history = flying([(0.03, -0.02, 0.05)], n=60, spin=(0.0, 0.0, 0.05))
-    history = dataclasses.replace(
-        history,
-        **{name: value.double() for name, value in float_fields(history).items()},
-    )
+    history = dataclasses.replace(history, **{name: x.double() for name, x in float_fields(history).items()})
     looks = torch.rand(2, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gsim3d.dynamics.motion.PASSES", 1)
