@@ -14,7 +14,7 @@ from gsim3d.types import CloudTable, Particles, constant
 
 PASSES = 3  # in which the window follows the matter, and in which rows are matched
 REACH = 0.2  # of the window's length: how far from where it is expected a row is looked for
-FINE = 0.1  # of the window's length: Gaussian windows in which looks are compared
+FINE = 0.1  # of the window's length: Gaussian windows in which looks are compared; a cell at least
 PLAIN = 0.03  # squares of looks by radian, added to those of a body: one without any paint does not turn
 LIKENESS = 0.12  # how far apart the latents of one place may be, relative to how far they spread
 LEAST_SPREAD = 1e-12  # of latents, squared: where all look the same the place alone counts
@@ -62,7 +62,8 @@ def motion(history: Particles, length: float, grid_size: float, looks: Tensor | 
             velocity, spin, centre = _matched(now, oldest, lattice, window, velocity, length)
         else:
             centre = window @ now.places
-            spin = _turned(now, oldest, lattice, window, velocity, centre, length, looks)
+            fine = max(FINE * length, grid_size)  # between rows that are farther apart nothing is known of slopes
+            spin = _turned(now, oldest, lattice, window, velocity, centre, fine, looks)
         moved, *rigid = lattice.at(places, moved * a_step, velocity * all_steps, spin * all_steps, centre)
         onward = onward_at(places, *rigid)
         result = torch.where(rows.wanted[:, :, None, None], torch.stack([moved, onward], 2), 0)
@@ -104,25 +105,25 @@ def _turned(
     window: Tensor,
     velocity: Tensor,
     centre: Tensor,
-    length: float,
+    fine: float,
     looks: Tensor,
 ) -> Tensor:
     """Spin (rad) [B, G, 3] of matter in each window that moved by ``velocity`` from ``then`` to ``now``, about its
-    ``centre``: that with which it looked then, at the places where it was, as it looks now (Lucas and Kanade, of
-    clouds). The last pass has a gradient.
+    ``centre``: that with which it looked then, at the places where it was, as it looks now, in Gaussian windows of
+    ``fine`` metres (Lucas and Kanade, of clouds). The last pass has a gradient.
     """
     seen, before = (samples.latents @ looks.T for samples in (now, then))
     mean = now.mean_of(seen)[:, None]
     spread = now.mean_of((seen - mean).square().sum(2, keepdim=True)).clamp(min=LEAST_SPREAD)[:, None].sqrt()
     seen, before = (seen - mean) / spread, (before - mean) / spread
     places, plain = now.places, PLAIN * torch.eye(3, device=centre.device, dtype=centre.dtype)
-    seen, _ = _field(places, now, seen, FINE * length)
+    seen, _ = _field(places, now, seen, fine)
     spin = torch.zeros_like(centre)
     for n in range(PASSES):
         with torch.no_grad() if n + 1 < PASSES else nullcontext():
             gone, turned, middle = lattice.at(places, velocity, spin, centre)
             back = places + onward_at(places, -gone, -turned, middle)
-            found, slopes = _field(back, then, before, FINE * length)
+            found, slopes = _field(back, then, before, fine)
             by_spin = torch.linalg.cross(slopes, (back + gone - middle)[:, :, None].expand_as(slopes))
             squared = (by_spin.mT @ by_spin).flatten(2)
             missed = (by_spin * (seen - found)[..., None]).sum(2)

@@ -91,7 +91,8 @@ def test_paint_tells_how_a_body_turns_in_the_light(spin, n):
     newest = last_steps(history, 1).means
     radius = newest - newest.mean(0)
     turned = radius @ torch.linalg.matrix_exp(cross_matrix(spin)).T - radius
-    by_paint, by_all = (motion(history, *HOW, looks)[:, 1] - velocity - turned for looks in (PAINT, None))
+    cell = 0.02  # no wider than the windows in which looks are compared
+    by_paint, by_all = (motion(history, LENGTH, cell, looks)[:, 1] - velocity - turned for looks in (PAINT, None))
     assert by_paint.norm() < 0.25 * turned.norm() < by_all.norm()
 
 
@@ -110,6 +111,16 @@ def test_looks_get_a_gradient_that_finds_the_paint():
         missed[-1].backward()
         optimizer.step()
     assert missed[0] > 0.3 and missed[-1] < 0.6 * missed[0]
+
+
+def test_rows_far_apart_are_compared_in_windows_of_a_cell():
+    """In narrower ones looks have steps between rows, and rounding decides how they turn."""
+    history = flying([(0.03, -0.02, 0.05)], n=20, seed=2, spin=(0.0, 0.0, 0.05))
+    latents = torch.randn(history.dynamic_latents.shape, generator=torch.Generator().manual_seed(2))
+    history = dataclasses.replace(history, dynamic_latents=latents)
+    fields = {name: getattr(history, name).double() for name in ("means", "dynamic_latents", "static_latents")}
+    exact = motion(dataclasses.replace(history, **fields), *HOW, PAINT.double())
+    assert_close_relative_to_max(motion(history, *HOW, PAINT), exact, 2e-5)
 
 
 def test_how_strong_looks_are_does_not_matter():
