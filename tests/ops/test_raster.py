@@ -156,7 +156,7 @@ def test_same_bits_every_time_on_cuda(devices):
 @pytest.mark.parametrize("limits", [(1, 1, 4), (2, 4, 8), (3, 10, 12)], ids=str)
 def test_any_limits_give_the_same_result_on_cuda(devices, limits):
     """What exceeds the limits is done in further groups of images, down to parts of one image."""
-    scene = random_scene(n=2000, clouds=2, images=6, width=40, height=33, sh_terms=4, dtype=torch.float32, seed=8)
+    scene = random_scene(n=800, clouds=2, images=6, width=40, height=33, sh_terms=4, dtype=torch.float32, seed=8)
     scene = scene.replace(opacities=0.01 + 0.02 * scene.opacities, scales=8 * scene.scales).to(devices[1])
     leaves = [x.clone().requires_grad_() for x in scene.inputs]
     args, cotangents = operator_args(scene)[8:-3], scene.cotangents()
