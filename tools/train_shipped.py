@@ -17,6 +17,7 @@ prediction).
 
 # The processes that film import this file, too: what needs torch is imported where it is used.
 import argparse
+import gc
 import os
 import subprocess
 import sys
@@ -85,6 +86,9 @@ def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: st
                         held_out.wait()
             tell(f"{name}: step {trainer.step}, {trainer.seconds:.0f} s of training in all")
             del trainer, store, filming
+            gc.collect()  # the trainer and its graphs refer to each other: all that they hold, else predictions lack it
+            if device == "cuda":
+                torch.cuda.empty_cache()
             if together.is_first:
                 weights = weights_file(out, load_progress(out, name))
                 report(weights, Path(scratch) / "held_out", out, name, device, deadline)
