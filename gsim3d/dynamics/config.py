@@ -38,6 +38,10 @@ class DynamicsConfig:
             distance, as a body over its shadow.
         contact_length: metres, more than a step moves. The network sees where frozen matter is that a particle may meet
             (:func:`gsim3d.dynamics.contact.contact`). None: it has to find that out from the places of both.
+        lights: directions towards lamps far away, where they begin; training turns them. The network sees how much
+            movable matter is between a particle and each (:func:`gsim3d.dynamics.shade.shade`), and predicts how its
+            look changes there and by how much more in the shade. None: where shadows fall has to be found out from
+            the places of all.
         motion_length: metres, about the radius of a body. The network sees how the matter around a particle has moved
             (:func:`gsim3d.dynamics.motion.motion`), and predicts how much of that is kept along each axis and what is
             added to it: without a force bodies fly on. None: it has to read velocities off the places in its history.
@@ -64,8 +68,8 @@ class DynamicsConfig:
             "asymmetric": frozen rows of the newest step read each other only, never change, and are computed once a
             rollout; the others read both (:mod:`gsim3d.dynamics.background`); "relit": the network sees frozen rows in
             the newest step only and as they were when the simulation began; what it predicts is by how much their
-            latents differ from that now, so that the errors of shadows do not add up. Weights fit all; train as you
-            simulate.
+            latents differ from that now, so that the errors of shadows do not add up; likewise the looks of bodies,
+            where a plan lets them change. Weights fit all; train as you simulate.
     Training:
         drop_path: share of rows that skip a branch of a block, growing from 0 at the first block.
         shuffle_orders: the four curves of a stage change places at random.
@@ -89,6 +93,7 @@ class DynamicsConfig:
     looks: int = 0
     momentum: bool = False
     contact_length: float | None = None
+    lights: tuple[tuple[float, float, float], ...] = ()
     grid_size: float = 0.004
     history_bits: int = 2
     strides: tuple[int, ...] = (4, 2, 2, 2)
@@ -158,6 +163,11 @@ class DynamicsConfig:
             raise ValueError(
                 'DynamicsConfig: contact_length must be positive, and background "symmetric" or "relit"; '
                 f"got {self.contact_length} and {self.background!r}"
+            )
+        if any(len(light) != 3 or not any(light) for light in self.lights) or self.lights and self.is_asymmetric:
+            raise ValueError(
+                'DynamicsConfig: lights must be directions (x, y, z), and background "symmetric" or "relit"; '
+                f"got {self.lights} and {self.background!r}"
             )
         if not 0 <= self.position_waves <= MOST_WAVES or self.position_waves and not self.position_features:
             raise ValueError(

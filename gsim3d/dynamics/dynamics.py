@@ -19,11 +19,13 @@ from gsim3d.dynamics.momentum import momentum
 from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.point_transformer import PointTransformer
+from gsim3d.dynamics.shade import shade
 from gsim3d.dynamics.state import ONWARD, StateLayout
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.types import ASLEEP, FROZEN, CloudTable, Particles, constant, take_runs
 
 ROOM = 1.1  # for rows that a call reads, over what was counted
+LIGHT_SIZE = 0.1  # of the parameter that is a direction: smaller ones are turned faster in training
 
 
 class Dynamics(nn.Module):
@@ -44,6 +46,7 @@ class Dynamics(nn.Module):
         self.net = PointTransformer(layout.in_channels, layout.told_channels, layout.out_channels, config)
         latents = config.dynamic_latents + config.static_latents
         self.looks = nn.Linear(latents, config.looks, bias=False) if config.looks else None
+        self.lights = nn.Parameter(LIGHT_SIZE * torch.tensor(config.lights)) if config.lights else None
 
     def geometry(
         self,
@@ -134,10 +137,11 @@ class Dynamics(nn.Module):
             ValueError: clouds are not sorted, a history is longer than the model's, or a model with ``norm="batch"`` is
                 trained on a pyramid of given capacity: its statistics would count rows that are none.
         """
+        changes = changes or self.layout.changes()
         if background is None and self.config.is_asymmetric:
             return self._forward_in_parts(history, generator, changes)
         if self.config.is_relit:
-            history = _as_it_began(history)
+            history = _as_it_began(history, changes["dynamic_latents"] in ("all", "dynamic"))
         clouds = history.clouds
         newest = newest_clouds(clouds)
         if pyramid is None:
@@ -149,7 +153,8 @@ class Dynamics(nn.Module):
             raise ValueError(
                 'Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"'
             )
-        runs, config, moved, drift, near = clouds.row_runs(newest), self.config, None, None, None
+        runs, config = clouds.row_runs(newest), self.config
+        moved = drift = near = shaded = dark = None
         if config.motion_length is not None:
             looks = None if self.looks is None else self.looks.weight
             drift = motion(history, config.motion_length, config.grid_size, looks)
@@ -159,7 +164,10 @@ class Dynamics(nn.Module):
             moved = _put_runs(drift, runs, history.n_rows)
         if config.contact_length is not None:
             near = _put_runs(contact(history, config.contact_length, config.grid_size), runs, history.n_rows)
-        features, is_awake = self.layout.pack(history, moved, near), None
+        if self.lights is not None:
+            shaded = shade(history, self.lights, config.grid_size)
+            dark = _put_runs(shaded, runs, history.n_rows)
+        features, is_awake = self.layout.pack(history, moved, near, dark), None
         n_awake = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
         everyone = n_awake == history.n_rows
         if not everyone:  # rows of the pyramid <-> rows of the history; those that sleep become 0
@@ -172,7 +180,6 @@ class Dynamics(nn.Module):
             features, is_awake = (
                 ops.unpool(x, pyramid.rows, pyramid.cu_rows, history.n_rows, check=False) for x in (features, one)
             )
-        changes = changes or self.layout.changes()
         prediction = self.net.head(take_runs(features, runs), self.layout.columns(changes))
         if is_awake is not None:
             is_awake = take_runs(is_awake, runs)[:, 0] > 0
@@ -184,7 +191,7 @@ class Dynamics(nn.Module):
             step.with_clouds(
                 CloudTable.make(counts, table.scenes, (s + 1 + i for s in table.steps), state.cu_rows.device)
             )
-            for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes, drift))
+            for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes, drift, shaded))
         ]
         return steps[0] if len(steps) == 1 else concatenate(steps)
 
@@ -267,9 +274,9 @@ def _packed(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor,
     return rows, torch.cat([starts[:-1], starts.new_full((1,), n_rows)]), seen[rows], until[-1]
 
 
-def _as_it_began(history: Particles) -> Particles:
-    """``history`` whose frozen rows look as they did when the simulation began."""
+def _as_it_began(history: Particles, bodies: bool) -> Particles:
+    """``history`` whose frozen rows look as they did when the simulation began; with ``bodies`` all rows."""
     history = with_look(history, "unlit")
-    frozen = (history.activity == FROZEN)[:, None]
-    latents = torch.where(frozen, history.unlit, history.dynamic_latents)
+    relit = ((history.activity == FROZEN) | bodies)[:, None]
+    latents = torch.where(relit, history.unlit, history.dynamic_latents)
     return dataclasses.replace(history, dynamic_latents=latents)

@@ -222,6 +222,8 @@ class Stem(nn.Module):
         self.conv = SparseConv(in_channels, channels, STEM_KERNEL, bias=False, duplicates=duplicates_rule(config))
         rounded = -(-told_channels // TOLD_MULTIPLE) * TOLD_MULTIPLE
         self.told = RowLinear(rounded, channels, bias=False) if told_channels else None
+        if told_channels:  # what begins with these weights may be told more
+            nn.init.zeros_(self.told.weight[:, told_channels:])
         self.norm = make_norm(config.norm, channels)
 
     def forward(self, x: Tensor, stage: Stage, beside: Beside | None = None) -> Tensor:

@@ -33,10 +33,11 @@ class StateLayout:
     """Order and width of the channels: fields that change, then fields that do not, each by the alphabet.
 
     inputs, outputs: (field of Particles, channels). Behind the inputs comes what the configuration adds to them:
-    ``position_features`` and ``motion_length``; then what rows are told alone: ``position_waves``, ``contact_length``
-    and ``momentum``. A difference of rotations is predicted as a rotation vector about world axes. With
+    ``position_features`` and ``motion_length``; then what rows are told alone: ``position_waves``, ``contact_length``,
+    ``momentum`` and ``lights``. A difference of rotations is predicted as a rotation vector about world axes. With
     ``motion_length`` further channels of positions say how much of each motion is kept along each axis: a contact takes
-    a share, and where nothing of it is kept errors do not add up. Harmonics are flat as (3, K), quaternions as
+    a share, and where nothing of it is kept errors do not add up. With ``lights`` further channels of dynamic latents
+    say how a look changes more where a light does not reach. Harmonics are flat as (3, K), quaternions as
     (x, y, z, w). The channels of ``outputs`` repeat for every step of a call.
     """
 
@@ -48,15 +49,16 @@ class StateLayout:
     def of(cls, config: DynamicsConfig) -> StateLayout:
         dynamic, static = config.dynamic_latents, config.static_latents
         means = 3 + MOTION_CHANNELS * (config.motion_length is not None) + OWN_CHANNELS * config.momentum
+        looks = dynamic * (1 + len(config.lights))
         if not config.explicit:
             inputs = [("dynamic_latents", dynamic), ("opacities", 1), ("static_latents", static)]
-            outputs = [("dynamic_latents", dynamic), ("means", means)]
+            outputs = [("dynamic_latents", looks), ("means", means)]
         else:
             sh = 3 * (config.sh_degree + 1) ** 2
             inputs = [("dynamic_latents", dynamic), ("sh", sh), ("opacities", 1), ("quats", 4), ("scales", 3)]
             inputs += [("static_latents", static)]
             rotation = 4 if config.predicts == "absolute" else 3
-            outputs = [("dynamic_latents", dynamic), ("sh", sh), ("means", means), ("opacities", 1)]
+            outputs = [("dynamic_latents", looks), ("sh", sh), ("means", means), ("opacities", 1)]
             outputs += [("quats", rotation), ("scales", 3)]
         return cls(config, *(tuple((name, n) for name, n in fields if n > 0) for fields in (inputs, outputs)))
 
@@ -70,7 +72,7 @@ class StateLayout:
     def told_channels(self) -> int:
         """That follow them and are not."""
         known = WAVE_CHANNELS * self.config.position_waves + CONTACT_CHANNELS * (self.config.contact_length is not None)
-        return known + OWN_CHANNELS * self.config.momentum
+        return known + OWN_CHANNELS * self.config.momentum + len(self.config.lights)
 
     def changes(self, features: str = "all", opacities: bool = True) -> dict[str, str]:
         """Of each output, whose values a step changes: "all", "dynamic", "frozen" or "none".
@@ -101,11 +103,18 @@ class StateLayout:
     def out_channels(self) -> int:
         return self.config.steps_per_call * sum(n for _, n in self.outputs)
 
-    def pack(self, particles: Particles, moved: Tensor | None = None, near: Tensor | None = None) -> Tensor:
+    def pack(
+        self,
+        particles: Particles,
+        moved: Tensor | None = None,
+        near: Tensor | None = None,
+        shaded: Tensor | None = None,
+    ) -> Tensor:
         """[N, in_channels + told_channels] of all rows.
 
         moved: [N, 2 or 3, 3] metres a step, of :mod:`gsim3d.dynamics.motion`; None: nothing moved.
         near: [N, 4], of :func:`gsim3d.dynamics.contact.contact`; None: nothing is near.
+        shaded: [N, lights], of :func:`gsim3d.dynamics.shade.shade`; None: nothing is in the light.
         """
         config = self.config
         columns = []
@@ -127,6 +136,9 @@ class StateLayout:
             columns.append(particles.means.new_zeros(particles.n_rows, CONTACT_CHANNELS) if near is None else near)
         if config.momentum:
             columns.append(moved[:, MOTION_CHANNELS:])
+        if config.lights:
+            dark = particles.means.new_zeros(particles.n_rows, len(config.lights)) if shaded is None else shaded
+            columns.append(dark)
         return torch.cat(columns, 1)
 
     def advance(
@@ -136,6 +148,7 @@ class StateLayout:
         awake: Tensor | None = None,
         changes: Mapping[str, str] | None = None,
         drift: Tensor | None = None,
+        shaded: Tensor | None = None,
     ) -> list[Particles]:
         """The particles after 1, 2, ... ``steps_per_call`` steps.
 
@@ -145,6 +158,7 @@ class StateLayout:
             awake: bool [N], rows that change at all; None: all.
             changes: of :meth:`changes`; None: all that is predicted.
             drift: [N, 2 or 3, 3] metres a step, motions that go on as far as they are kept; None: none.
+            shaded: [N, lights], of :func:`gsim3d.dynamics.shade.shade`; None: nothing is in the light.
         """
         changes = changes or self.changes()
         outputs = [(name, n) for name, n in self.outputs if changes[name] != "none"]
@@ -159,6 +173,9 @@ class StateLayout:
             share = shares[changes[name]]
             if particles.held is not None and name in FEATURES:
                 share = share.masked_fill(particles.held[:, None], 0)
+            if name == "dynamic_latents" and self.config.lights:
+                none = particles.means.new_zeros(particles.n_rows, len(self.config.lights))
+                part = in_light(part, none if shaded is None else shaded)
             onward = drift if name == "means" else None
             later[name] = self.later_values(name, getattr(particles, name), part, share, onward)
         return [
@@ -239,6 +256,14 @@ class StateLayout:
             later.append(rotate_left(before, vectors))
             before = later[-1] if self.config.predicts == "from_previous" else newest
         return hold(share, newest, torch.stack(later))
+
+
+def in_light(predicted: Tensor, shaded: Tensor) -> Tensor:
+    """[S, N, F] of what is ``predicted``, [S, N, (1 + L) F]: how a look changes, and by how much more if the light from
+    each lamp does not reach the row."""
+    change, *more = predicted.chunk(1 + shaded.shape[1], 2)
+    dark = 1 - (-shaded).exp()  # 1 - 1 / (1 + n)
+    return change + sum(x * dark[:, light, None] for light, x in enumerate(more))
 
 
 def _flat(name: str, value: Tensor) -> Tensor:

@@ -69,6 +69,7 @@ MODEL = {
         "shuffle_orders": False,
         "motion_length": 0.3,
         "looks": 4,
+        "lights": ((0.36, 0.24, 0.9),),  # the lamp of the worlds; training may turn it
         "momentum": True,
         "position_waves": 4,
         "background": "relit",  # what shadows change would add up else
@@ -78,9 +79,9 @@ MODEL = {
 }
 
 
-# Bodies keep the look that they were given: else what is rendered in the wrong place learns to fade, not where to go.
-# The ground may darken, where a shadow falls.
-EFFECTS = {"appearance": {"changing": "frozen"}}
+# How a look differs from the one that it had at first: bodies turn in the light, and shadows fall. From step to step
+# what is rendered in the wrong place would learn to fade, not where to go.
+EFFECTS = {"appearance": {"changing": "all"}}
 TURN = 20, 40, 30, 40  # steps of images; of the dynamics alone with other light, in short rollouts, in long ones
 
 

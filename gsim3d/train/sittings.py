@@ -40,7 +40,7 @@ from gsim3d.train.restore import describe, restore
 FORMAT = 1
 SEEN = "dynamics.net.stem.conv.weight"  # what the network reads of motion are its last columns
 TOLD = "dynamics.net.stem.told.weight"
-LOOKS = "dynamics.looks.weight"
+LOOKS, LIGHTS = "dynamics.looks.weight", "dynamics.lights"
 PREDICTED = ("dynamics.net.head.fc2.weight", "dynamics.net.head.fc2.bias")
 PLACES = 3  # rows that predict places where no motion is seen
 WEIGHTS, DIFFERENCE, SQUARES = "weights", "difference", "squares"
@@ -140,8 +140,9 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
         given[SEEN] = F.pad(given[SEEN], (0, MOTION_CHANNELS))
     if TOLD in own and TOLD not in given:
         given[TOLD] = torch.zeros_like(own[TOLD])
-    if LOOKS in own:
-        given.setdefault(LOOKS, own[LOOKS])
+    for key in (LOOKS, LIGHTS):
+        if key in own:
+            given.setdefault(key, own[key])
     after = dict(trainer.simulator.dynamics.layout.outputs)
     for key in PREDICTED:
         if before.keys() == after.keys() and len(given[key]) == sum(before.values()):  # else of other sizes

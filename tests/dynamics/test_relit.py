@@ -53,6 +53,17 @@ def test_what_was_predicted_of_the_background_is_not_seen_again():
     assert not torch.equal(step.dynamic_latents[frozen], newest.dynamic_latents[frozen])
 
 
+@pytest.mark.parametrize("features, is_seen", [("all", False), ("dynamic", False), ("frozen", True), ("none", True)])
+def test_what_was_predicted_of_bodies_is_not_seen_again_where_their_look_changes(features, is_seen):
+    """Else it is what they were given, or were made to be."""
+    dynamics, history = make_dynamics(RELIT), with_look(make_history((30, 30)), "unlit")
+    bodies = history.activity == DYNAMIC
+    dark = with_latents(history, bodies, torch.full_like(history.dynamic_latents, -3.0))
+    changes = dynamics.layout.changes(features)
+    before, step = dynamics(history, changes=changes), dynamics(dark, changes=changes)
+    assert torch.equal(step.means, before.means) != is_seen
+
+
 def test_a_background_in_front_of_which_nothing_changes_does_not_change():
     """Else the same prediction would be added in every step."""
     dynamics, history = make_dynamics(RELIT), make_history((30, 30, 30, 30))

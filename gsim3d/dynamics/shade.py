@@ -1,0 +1,63 @@
+"""What stands in the light of a particle: how much movable matter there is on its way to a lamp far away."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsim3d.dynamics.clouds import newest_clouds
+from gsim3d.dynamics.samples import FAINTEST, Rows, Samples, squares
+from gsim3d.types import DYNAMIC, FROZEN, Particles
+
+BEAM = 2.0  # cells: standard deviation of the beam of light in which matter is counted
+NEAREST = 3.0  # cells towards the light, from which on matter counts half; less is the surface that a row is part of
+EDGE = 0.5  # cells, over which it begins to count
+
+
+def shade(history: Particles, lights: Tensor, grid_size: float) -> Tensor:
+    """[N, L]: log(1 + n) of each row of the newest clouds and each light, where n is the matter between them: rows of
+    its scene that move, counted in a Gaussian beam from the row towards the light. 0 of rows that are asleep.
+
+    A shadow falls where n is large: on the background, on another body, and on the side of a body that is turned away.
+    Up to ``samples.SAMPLES`` movable rows of a scene are looked at, evenly spread. Scenes do not see each other.
+
+    Args:
+        history: clouds sorted by (scene, step).
+        lights: [L, 3], directions towards lamps far away, of any length.
+        grid_size: metres, edge of the dynamics' cells.
+    Returns:
+        Rows of the newest clouds, packed. Gradients: of ``lights``.
+    """
+    clouds, newest = history.clouds, newest_clouds(history.clouds)
+    if not any(clouds.count(q) for q in newest):
+        return history.means.new_zeros(0, len(lights))
+    with torch.autocast(history.means.device.type, enabled=False):
+        with torch.no_grad():
+            matter = Samples(history, newest, grid_size)
+            here = matter.mean[:, None]
+            matter.seen_from(here)
+            rows = [Rows(history, newest, grid_size, activity) for activity in (DYNAMIC, FROZEN)]
+            is_lit = rows[0].wanted | rows[1].wanted
+            places = torch.where(rows[0].wanted[:, :, None], rows[0].places, rows[1].places) - here
+        found = torch.stack([_between(places, matter, light, grid_size) for light in lights.unbind(0)], 2)
+        result = torch.where(is_lit[:, :, None], found.log1p(), 0)
+    return torch.cat([result[b, : clouds.count(q)] for b, q in enumerate(newest)])
+
+
+def _between(places: Tensor, matter: Samples, light: Tensor, grid_size: float) -> Tensor:
+    """[B, M], how many rows are between each of ``places`` [B, M, 3] and the light. What is near a beam enters it when
+    the light turns: that is its gradient."""
+    direction = light / light.norm()
+    with torch.no_grad():
+        beam, nearest, edge = (cells * grid_size for cells in (BEAM, NEAREST, EDGE))
+        ahead = (matter.places @ direction)[:, None] - (places @ direction)[:, :, None]
+        off = (squares(places, matter.places) - ahead.square()).clamp(min=0)
+        begun = ((ahead - nearest) / edge).sigmoid()
+        each = (matter.n / matter.known.sum(1).clamp(min=1)).to(off.dtype)[:, None, None]
+        counted = (off * (-0.5 / beam**2)).clamp(min=FAINTEST).exp() * begun * each
+        counted = torch.where(matter.known[:, None], counted, 0)
+        # By the direction, the squared way off changes by -2 ahead * way, and the way ahead by the way.
+        by_way = counted * (ahead / beam**2 + (1 - begun) / edge)
+        slope = by_way @ matter.places - by_way.sum(2, keepdim=True) * places
+        found = counted.sum(2)
+    return found + slope @ (direction - direction.detach())

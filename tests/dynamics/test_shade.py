@@ -1,0 +1,168 @@
+"""What stands in the light of a particle, and a network that is told of it."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gsim3d.dynamics import DynamicsConfig, last_steps
+from gsim3d.dynamics.samples import SAMPLES
+from gsim3d.dynamics.shade import shade
+from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
+from tests.asserts import assert_close_relative_to_max, assert_same_bits
+from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history, permute_rows
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+CELL = 0.02
+ZENITH = torch.tensor([[0.0, 0.0, 1.0]])
+LIT = dataclasses.replace(TINY, lights=((0.0, 0.0, 1.0), (0.0, 0.6, 0.8)))
+HEIGHT, RADIUS, SPACING = 0.6, 0.2, 0.05
+
+
+def under_a_ball(n=600, seed=0, n_steps=2, height=HEIGHT):
+    """A ground of frozen rows 5 cm apart, and a ball of 20 cm, the last ``n`` rows, over the middle of it; metres."""
+    g = torch.Generator().manual_seed(seed)
+    ticks = (torch.arange(41) - 20) * SPACING
+    x, y = (v.flatten() for v in torch.meshgrid(ticks, ticks, indexing="ij"))
+    ball = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1) * RADIUS
+    places = torch.cat([torch.stack([x, y, 0 * x], 1), ball + torch.tensor([0.0, 0.0, height])]) + 1.0
+    history = make_history((len(places),) * n_steps, seed=seed)
+    activity = torch.tensor([FROZEN] * len(x) + [DYNAMIC] * n).repeat(n_steps)
+    return dataclasses.replace(
+        history, means=places.repeat(n_steps, 1), activity=activity.to(history.activity.dtype)
+    )
+
+
+def ground_of(history, lights=ZENITH):
+    """The shade of the ground's rows, and where they are around the middle."""
+    frozen = last_steps(history, 1).activity == FROZEN
+    places = last_steps(history, 1).means[frozen] - 1.0
+    return shade(history, lights, CELL)[frozen], places
+
+
+@pytest.mark.parametrize("light", [(0.0, 0.0, 1.0), (0.0, 0.0, 0.02), (0.6, 0.0, 0.8), (-0.3, 0.5, 0.8)])
+def test_a_shadow_falls_where_the_light_does_not(light):
+    light = torch.tensor([light])
+    shaded, places = ground_of(under_a_ball(), light)
+    way = torch.tensor([0.0, 0.0, HEIGHT]) - places
+    off = torch.linalg.cross(way, (light / light.norm()).expand_as(way)).norm(dim=1)
+    inside, outside = off < RADIUS - 0.05, off > RADIUS + 0.15
+    assert inside.any() and outside.any()
+    assert shaded[inside].min() > 1 and shaded[outside].max() < 0.1
+
+
+def test_the_far_side_of_a_body_is_in_its_own_shade():
+    history = under_a_ball(2000)
+    newest = last_steps(history, 1)
+    shaded = shade(history, ZENITH, CELL)[newest.activity == DYNAMIC][:, 0]
+    height = newest.means[newest.activity == DYNAMIC, 2] - 1.0 - HEIGHT
+    assert shaded[height > 0.8 * RADIUS].mean() < 0.3 and shaded[height < -0.7 * RADIUS].min() > 2
+
+
+def test_bodies_behind_the_light_and_what_rests_cast_none():
+    below = under_a_ball(height=-HEIGHT)
+    assert ground_of(below)[0].max() < 1e-6
+    over = under_a_ball()
+    for activity in (FROZEN, ASLEEP):
+        rests = torch.where(over.activity == DYNAMIC, activity, over.activity).to(torch.uint8)
+        assert not shade(dataclasses.replace(over, activity=rests), ZENITH, CELL).any()
+
+
+def test_of_many_rows_some_stand_for_all():
+    few, many = (ground_of(under_a_ball(n))[0].exp() - 1 for n in (SAMPLES, 4 * SAMPLES))
+    assert abs(float(many.sum() / few.sum()) - 4) < 0.2
+
+
+def test_turning_the_light_changes_it_as_its_gradient_says():
+    """Along every axis, in float64, beside finite differences."""
+    history = under_a_ball(300)
+    history = dataclasses.replace(history, means=history.means.double())
+    light = torch.tensor([[0.2, 0.1, 0.5]], dtype=torch.float64, requires_grad=True)
+    weights = torch.rand(last_steps(history, 1).n_rows, 1, dtype=torch.float64)
+
+    def total(x):
+        return (shade(history, x, CELL) * weights).sum()
+
+    (gradient,) = torch.autograd.grad(total(light), [light])
+    for axis in range(3):
+        step = torch.zeros(1, 3, dtype=torch.float64)
+        step[0, axis] = 1e-5
+        difference = (total(light.detach() + step) - total(light.detach() - step)) / 2e-5
+        assert abs(float(difference - gradient[0, axis])) < 1e-4 * float(gradient.abs().max())
+
+
+def test_scenes_do_not_see_each_other_and_rows_have_no_order():
+    one, other = under_a_ball(200), make_history((7, 50), seed=1)
+    both = shade(batch([one, other]), ZENITH, CELL)
+    assert_close_relative_to_max(both, torch.cat([shade(q, ZENITH, CELL) for q in (one, other)]), 1e-5)
+    shuffled, order = permute_rows(one)
+    newest = order[one.cu_rows[-2] :] - one.cu_rows[-2]
+    assert_close_relative_to_max(shade(shuffled, ZENITH, CELL), shade(one, ZENITH, CELL)[newest], 1e-5)
+
+
+def test_far_from_the_origin_it_is_as_exact():
+    near = under_a_ball()
+    far = dataclasses.replace(near, means=near.means + 500, origin=near.origin + 500)
+    assert_close_relative_to_max(shade(far, ZENITH, CELL), shade(near, ZENITH, CELL), 0.01)
+
+
+@pytest.mark.parametrize("n_rows", [(0,), (0, 50), (1, 1), (0, 0)])
+def test_where_nothing_moves_there_is_no_shade(n_rows):
+    found = shade(make_history(n_rows, frozen_share=1.0), ZENITH, CELL)
+    assert found.shape == (n_rows[-1], 1) and not found.any()
+
+
+def test_no_number_it_cannot_use_gets_out():
+    history = under_a_ball()
+    means = history.means.clone()
+    means[-1], means[-5], means[-2000] = torch.nan, torch.inf, torch.nan
+    found = shade(dataclasses.replace(history, means=means), ZENITH, CELL)
+    assert found.isfinite().all() and found.any()
+
+
+def test_a_gpu_finds_the_same(devices):
+    history, lights = batch([under_a_ball(), make_history((30, 40))]), torch.tensor([[0.2, 0.1, 0.5]])
+    expected, actual = (shade(history.to(device), lights.to(device), CELL).cpu() for device in devices)
+    assert_close_relative_to_max(actual, expected, 1e-4)
+    assert_same_bits(shade(history.to(devices[1]), lights.to(devices[1]), CELL).cpu(), actual)
+
+
+def test_compiled_it_is_the_same(device):
+    history, lights = under_a_ball(50).to(device), ZENITH.to(device)
+    history.clouds
+    compiled = torch.compile(shade, fullgraph=True)
+    assert_close_relative_to_max(compiled(history, lights, CELL), shade(history, lights, CELL), 1e-4)
+
+
+def test_the_network_reads_it_and_turns_its_lights():
+    """Without the columns that read it the next step is another one."""
+    dynamics, history = make_dynamics(LIT), under_a_ball(100)
+    step = dynamics(history)
+    step.dynamic_latents.square().sum().backward()
+    assert dynamics.lights.grad.abs().amax(1).gt(0).all()
+    with torch.no_grad():
+        dynamics.net.stem.told.weight[:, :2] = 0
+    assert (dynamics(history).dynamic_latents - step.dynamic_latents).abs().max() > 1e-5
+
+
+@pytest.mark.parametrize("steps_per_call", [1, 2])
+@pytest.mark.parametrize("background", ["symmetric", "relit"])
+def test_a_look_changes_more_where_light_is_missing(background, steps_per_call):
+    """By what is predicted for each light, in the shade of that one alone, and the rest everywhere."""
+    config = dataclasses.replace(LIT, zero_init=True, background=background, steps_per_call=steps_per_call)
+    dynamics, history = make_dynamics(config), under_a_ball()
+    change = torch.tensor([[0.1, 0.0, 0.0, 0.2], [-0.3, 0.1, 0.0, 0.0], [0.0, 0.0, 0.4, 0.0]])
+    dynamics.net.head.fc2.bias.detach().unflatten(0, (steps_per_call, -1))[:, :12] = change.flatten()
+    newest, first = last_steps(history, 1), dynamics(history).dynamic_latents.unflatten(0, (steps_per_call, -1))[0]
+    dark = 1 - (-shade(history, torch.tensor(LIT.lights), LIT.grid_size)).exp()
+    assert dark.amin(0).max() < 0.1 and dark.amax(0).min() > 0.9
+    assert_close_relative_to_max(first, newest.dynamic_latents + (change[0] + dark @ change[1:]).tanh(), 1e-5)
+
+
+@pytest.mark.parametrize(
+    "change", [{"lights": ((0.0, 0.0, 0.0),)}, {"lights": ((0.0, 1.0),)}, {"background": "asymmetric"}]
+)
+def test_settings_that_make_no_sense_are_refused(change):
+    with pytest.raises(ValueError, match="lights"):
+        DynamicsConfig(**{"lights": ((0.0, 0.0, 1.0),), "norm": "layer", **change})
