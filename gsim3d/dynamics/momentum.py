@@ -11,6 +11,8 @@ from gsim3d.dynamics.rigid import Lattice, RigidFit, onward_at
 from gsim3d.dynamics.samples import Rows, Samples, squares, weights
 from gsim3d.types import DYNAMIC, Particles, constant, take_runs
 
+STIFFNESS = 1e-5  # of fits to known paths: what it takes of a spin it takes in every step
+
 
 def momentum(history: Particles, onward: Tensor, length: float, grid_size: float) -> Tensor:
     """[N, 2, 3] metres a step: what comes next at each row of the newest clouds if the matter in a Gaussian window
@@ -40,7 +42,7 @@ def momentum(history: Particles, onward: Tensor, length: float, grid_size: float
             now.seen_from(here)
             places, lattice = rows.places - here, Lattice(now.places, now.known)
             window = weights(squares(lattice.nodes, now.places) * (-0.5 / length**2), now.known)
-            body = RigidFit(window, now.places, length)
+            body = RigidFit(window, now.places, length, STIFFNESS)
         most = rows.wanted.shape[1]
         paths = torch.stack([F.pad(part, (0, 0, 0, most - len(part))) for part in own.split(counts)])
         rigid = onward_at(places, *lattice.at(places, *body.fit(now.take(paths)), body.centre))

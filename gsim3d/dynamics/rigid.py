@@ -45,11 +45,11 @@ class RigidFit:
     centre: [B, G, 3] of the rows in the window.
     """
 
-    def __init__(self, window: Tensor, places: Tensor, length: float):
+    def __init__(self, window: Tensor, places: Tensor, length: float, stiffness: float = STIFFNESS):
         self.window, self.places, self.centre = window, places, window @ places
         products = (places[:, :, :, None] * places[:, :, None]).flatten(2)
         scatter = (window @ products).unflatten(2, (3, 3)) - self.centre[:, :, :, None] * self.centre[:, :, None]
-        size = scatter.diagonal(dim1=2, dim2=3).sum(2)[:, :, None, None] + STIFFNESS * length**2
+        size = scatter.diagonal(dim1=2, dim2=3).sum(2)[:, :, None, None] + stiffness * length**2
         self._inertia = size * torch.eye(3, device=size.device, dtype=size.dtype) - scatter
 
     def fit(self, paths: Tensor) -> tuple[Tensor, Tensor]:

@@ -152,6 +152,14 @@ def test_untrained_a_body_flies_and_turns_on():
     assert_close_relative_to_max(end.means - 1, turning(8).means[1400:] - 1, 0.03)
 
 
+def test_a_body_that_nothing_stops_does_not_stop_turning():
+    dynamics = make_dynamics(dataclasses.replace(KEEPING, zero_init=True))
+    steps = rollout(dynamics, turning(2, velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.03, 0.0)), 20, max_steps=2)
+    before, after = (step.means - step.means.mean(0) for step in steps[-2:])
+    turned = torch.linalg.cross(before, after).mean(0)[1] / before[:, [0, 2]].square().sum(1).mean()
+    assert 0.97 < turned / 0.03 < 1.03
+
+
 @pytest.mark.parametrize("columns", [slice(-3, None), slice(-9, -3)])
 def test_shares_of_all_three_motions_are_kept(columns):
     dynamics = make_dynamics(dataclasses.replace(KEEPING, zero_init=True))
