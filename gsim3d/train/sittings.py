@@ -126,7 +126,7 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
 def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     """Weights of a trained simulator into a new trainer, whose dynamics may see more (motion, waves, contacts,
     momentum) than the other's: what reads it begins at zero, and so does what predicts shares of motions; where motion
-    is new all that predicts positions, which are others then. New looks begin as in any new trainer.
+    is new all that predicts positions, which are others then. New looks and lights begin as in any new trainer.
 
     Returns:
         The checkpoint's name, digest and step.
