@@ -40,7 +40,7 @@ class DynamicsConfig:
             (:func:`gsim3d.dynamics.contact.contact`). None: it has to find that out from the places of both.
         lights: directions towards lamps far away, where they begin; training turns them. The network sees how much
             movable matter is between a particle and each (:func:`gsim3d.dynamics.shade.shade`), and predicts how its
-            look changes there and by how much more in the shade. None: where shadows fall has to be found out from
+            look changes there and by how much more in the shade. Empty: where shadows fall has to be found out from
             the places of all.
         motion_length: metres, about the radius of a body. The network sees how the matter around a particle has moved
             (:func:`gsim3d.dynamics.motion.motion`), and predicts how much of that is kept along each axis and what is

@@ -26,7 +26,16 @@ from gsim3d.train.restore import restore
 from gsim3d.train.samples import draw_batch
 from gsim3d.train.shipped import RECIPES, SittingTrainer, train
 from gsim3d.train.samples import longest_gap
-from gsim3d.train.sittings import LOOKS, Progress, begin_with, load_into, load_progress, save_state, weights_file
+from gsim3d.train.sittings import (
+    LIGHTS,
+    LOOKS,
+    Progress,
+    begin_with,
+    load_into,
+    load_progress,
+    save_state,
+    weights_file,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -319,14 +328,17 @@ def test_a_run_does_not_begin_with_what_predicts_more(store, tmp_path, other):
         begin_with(trainer, saved_with_a_head(config, store, tmp_path))
 
 
-def test_looks_of_a_run_begin_as_they_are_made_or_go_on(store, tmp_path):
-    config = dataclasses.replace(CONFIG, model={"dynamics": {"motion_length": 0.3, "looks": 4}})
+@pytest.mark.parametrize(
+    "key, options", [(LOOKS, {"motion_length": 0.3, "looks": 4}), (LIGHTS, {"lights": ((0.0, 0.3, 1.0),)})]
+)
+def test_looks_and_lights_of_a_run_begin_as_they_are_made_or_go_on(store, tmp_path, key, options):
+    config = dataclasses.replace(CONFIG, model={"dynamics": options})
     for known in (saved_with_a_head(CONFIG, store, tmp_path / "a"), saved_with_a_head(config, store, tmp_path / "b")):
         trainer = SittingTrainer(config, store, tmp_path / "run", "cpu")
-        made = trainer.simulator.state_dict()[LOOKS].clone()
+        made = trainer.simulator.state_dict()[key].clone()
         begin_with(trainer, known)
-        expected = restore(known).simulator.state_dict().get(LOOKS, made)
-        assert made.any() and torch.equal(trainer.simulator.state_dict()[LOOKS], expected)
+        expected = restore(known).simulator.state_dict().get(key, made)
+        assert made.any() and torch.equal(trainer.simulator.state_dict()[key], expected)
 
 
 def test_recipes_are_sound():
