@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.dynamics.clouds import LOOKS, alike, newest_clouds, with_look
+from gsim3d.dynamics.clouds import SOME, alike, newest_clouds, with_look
 from gsim3d.dynamics.state import rotate_left
 from gsim3d.errors import InputError
 from gsim3d.files import read_yaml, typed
@@ -105,6 +105,8 @@ class Rotate(Operation):
         else:
             state = with_look(state, "turns")
             fields["turns"] = quat_product(quat.to(means).expand_as(state.turns), state.turns)
+        if state.velocity is not None:
+            fields["velocity"] = state.velocity @ matrix.T
         return _changed(state, rows, fields)
 
 
@@ -124,7 +126,10 @@ class Throw(Operation):
             raise InputError("a history of one step holds no velocity; give the model two steps or more")
         ages = torch.tensor([newest[scene] - step for scene, step in zip(table.scenes, table.steps)])
         back = ages.to(state.means)[state.row_cloud()][:, None] * state.means.new_tensor(self.velocity)
-        return _changed(state, rows, {"means": state.means - back})
+        fields = {"means": state.means - back}
+        if state.velocity is not None:
+            fields["velocity"] = state.velocity + state.velocity.new_tensor(self.velocity)
+        return _changed(state, rows, fields)
 
 
 @dataclass(frozen=True)
@@ -183,7 +188,7 @@ class Insert(Operation):
             raise InputError("particles must be of one scene")
         for field, value in given.row_fields().items():
             mine = getattr(state, field)
-            if field not in LOOKS and (mine is None or mine.shape[1:] != value.shape[1:]):
+            if field not in SOME and (mine is None or mine.shape[1:] != value.shape[1:]):
                 raise InputError(f"particles.{field} must be as those of the state; were they made by another model?")
         given = _moved(given, rows, self.by).select_rows(rows).to(state.means.device)
         table, newest = state.clouds, {

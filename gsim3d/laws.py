@@ -273,9 +273,9 @@ def translate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
         state = on_grain(state)
         step, there = simulator.step(state, sample.plan), simulator.step(_moved(state, shift), sample.plan)
         step, there = last_steps(step, 1), last_steps(there, 1)
-        unmoved = [name for name in step.row_fields() if name != "means"]
+        unmoved = [name for name in step.row_fields() if name not in ("means", "velocity")]
         yield from compare_particles("step", there, step, 0, unmoved)
-        yield from compare_particles("step", _moved(there, -shift), step, BOUND, ["means"])
+        yield from compare_particles("step", _moved(there, -shift), step, BOUND, ["means", "velocity"])
         targets = move_cameras(sample.targets, still, 0 * shift)
         image = _color(simulator, step, targets)
         picture = _color(simulator, _moved(step, shift), move_cameras(targets, still, shift))
@@ -431,6 +431,8 @@ def _with_far_particle(state: Particles, far: float) -> Particles:
     is_copy[[new.starts[q + 1] - 1 for q in range(len(new)) if new.count(q)]] = True
     fields["means"] = fields["means"] + far * is_copy[:, None]
     fields["activity"] = fields["activity"].masked_fill(is_copy, DYNAMIC)
+    if state.velocity is not None:
+        fields["velocity"] = fields["velocity"] * ~is_copy[:, None]
     return state.with_clouds(new, **fields)
 
 

@@ -36,6 +36,7 @@ from gsim3d.dynamics import (
     rollout_in_parts,
     with_look,
 )
+from gsim3d.dynamics.follow import follow
 from gsim3d.edits import Edit, by_step
 from gsim3d.effects import EffectsSpec, OutputEffects, UnsupportedEffect
 from gsim3d.encoder import Encoder, Room, pixel_rows
@@ -84,6 +85,10 @@ class Simulator(nn.Module):
         frames, spoiled = guard_frames(frames, guard.keywords["config"], guard.keywords["report"], "encode")
         particles = self.encoder(frames, room)
         particles = guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled, room)))
+        if (dynamics := self.config.dynamics).velocity:
+            n_views = None if room is None else len(frames.cameras) // particles.n_clouds
+            velocity = follow(particles, frames, dynamics.motion_length, dynamics.grid_size, n_views)
+            particles = dataclasses.replace(particles, velocity=velocity)
         guard.keywords["report"].send()
         return particles
 

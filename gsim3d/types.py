@@ -219,6 +219,8 @@ class Particles(_Tensors):
         (``appearance.held``). Rollouts hand it on; None in a state: the next one asks who is meant.
     unlit: [N, Fd], the dynamic latents of frozen rows where their simulation began; only of a model that relights its
         background (:class:`gsim3d.dynamics.DynamicsConfig`).
+    velocity: [N, 3] metres a step, how rows came to where they are: simulated ones in their last step, encoded ones of
+        the newest step on average since the oldest, 0 of others; only of a model with ``velocity``.
 
     Rows of two encoded steps are not aligned (each step sees other pixels); rows of two simulated steps are.
     """
@@ -239,6 +241,7 @@ class Particles(_Tensors):
     paint: Tensor | None = None
     held: Tensor | None = None
     unlit: Tensor | None = None
+    velocity: Tensor | None = None
     known: CloudTable | None = None  # see clouds
 
     ROW_FIELDS = (
@@ -254,6 +257,7 @@ class Particles(_Tensors):
         "paint",
         "held",
         "unlit",
+        "velocity",
     )
 
     @property

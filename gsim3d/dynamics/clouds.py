@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from gsim3d.types import CloudTable, Particles, split_rows
 
-LOOKS = ("turns", "paint", "held", "unlit")  # fields that only some particles have
+SOME = ("turns", "paint", "held", "unlit", "velocity")  # fields that only some particles have
 
 
 def newest_clouds(clouds: CloudTable) -> list[int]:
@@ -55,7 +55,8 @@ def last_steps(particles: Particles, n_steps: int) -> Particles:
 
 
 def with_look(particles: Particles, name: str) -> Particles:
-    """``particles`` with the field ``name``, one of ``LOOKS``, which changes nothing where there was none."""
+    """``particles`` with the field ``name``, one of ``SOME``, which changes nothing where there was none; what has no
+    velocity rests."""
     if getattr(particles, name) is not None:
         return particles
     like = particles.means.new_ones(particles.n_rows, 1)
@@ -64,13 +65,14 @@ def with_look(particles: Particles, name: str) -> Particles:
         "paint": lambda: torch.diag_embed(like.expand(-1, 3)),
         "held": lambda: torch.zeros_like(particles.activity, dtype=torch.bool),
         "unlit": lambda: particles.dynamic_latents,
+        "velocity": lambda: torch.zeros_like(particles.means),
     }
     return dataclasses.replace(particles, **{name: identity[name]()})
 
 
 def alike(parts: Sequence[Particles]) -> list[Particles]:
-    """``parts`` with the same fields: what some have of ``LOOKS``, all have."""
-    for name in LOOKS:
+    """``parts`` with the same fields: what some have of ``SOME``, all have."""
+    for name in SOME:
         if any(getattr(part, name) is not None for part in parts):
             parts = [with_look(part, name) for part in parts]
     return list(parts)

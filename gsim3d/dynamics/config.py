@@ -45,13 +45,10 @@ class DynamicsConfig:
         motion_length: metres, about the radius of a body. The network sees how the matter around a particle has moved
             (:func:`gsim3d.dynamics.motion.motion`), and predicts how much of that is kept along each axis and what is
             added to it: without a force bodies fly on. None: it has to read velocities off the places in its history.
-        looks: with ``motion_length`` the turning of bodies is found in so many channels that a learned linear map makes
-            of their latents: what does not change when they turn in the light. 0: in all latents, as they are; that
-            finds a third of a spin.
-        momentum: with ``motion_length`` what goes on is the rigid motion of a window in its last step, where that was
-            predicted, and a row's own last step is a third motion of which a share is kept
-            (:func:`gsim3d.dynamics.momentum.momentum`). Gradients flow through both, so that an impulse is blamed for
-            all that follows from it.
+        velocity: with ``motion_length`` particles carry their velocity: encoded ones as images tell it
+            (:func:`gsim3d.dynamics.follow.follow`), simulated ones their last step. What goes on is the rigid motion of
+            a window of these, and a row's own is a third motion (:func:`gsim3d.dynamics.momentum.momentum`). Gradients
+            flow through both, so that an impulse is blamed for all that follows from it.
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.
@@ -90,8 +87,7 @@ class DynamicsConfig:
     position_length: float = 1.0
     position_waves: int = 0
     motion_length: float | None = None
-    looks: int = 0
-    momentum: bool = False
+    velocity: bool = False
     contact_length: float | None = None
     lights: tuple[tuple[float, float, float], ...] = ()
     grid_size: float = 0.004
@@ -153,12 +149,8 @@ class DynamicsConfig:
                 f"got {self.motion_length} and {self.predicts!r}"
             )
         latents = self.dynamic_latents + self.static_latents
-        if self.looks < 0 or self.looks and (self.motion_length is None or latents < 1):
-            raise ValueError(
-                f"DynamicsConfig: looks must be 0 or more, and need motion_length and latents; got {self.looks}"
-            )
-        if self.momentum and (self.motion_length is None or self.static_latents < 1):
-            raise ValueError("DynamicsConfig: momentum needs motion_length, and static_latents, which tell rows apart")
+        if self.velocity and self.motion_length is None:
+            raise ValueError("DynamicsConfig: velocity needs motion_length")
         if self.contact_length is not None and (self.is_asymmetric or not self.contact_length > 0):
             raise ValueError(
                 'DynamicsConfig: contact_length must be positive, and background "symmetric" or "relit"; '

@@ -20,7 +20,7 @@ from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.point_transformer import PointTransformer
 from gsim3d.dynamics.shade import shade
-from gsim3d.dynamics.state import ONWARD, StateLayout
+from gsim3d.dynamics.state import StateLayout
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.types import ASLEEP, FROZEN, CloudTable, Particles, constant, take_runs
 
@@ -44,8 +44,6 @@ class Dynamics(nn.Module):
         self.rounds = None  # whether geometry is rounded in training; None: on a GPU
         layout = self.layout
         self.net = PointTransformer(layout.in_channels, layout.told_channels, layout.out_channels, config)
-        latents = config.dynamic_latents + config.static_latents
-        self.looks = nn.Linear(latents, config.looks, bias=False) if config.looks else None
         self.lights = nn.Parameter(LIGHT_SIZE * torch.tensor(config.lights)) if config.lights else None
 
     def geometry(
@@ -155,12 +153,11 @@ class Dynamics(nn.Module):
             )
         runs, config = clouds.row_runs(newest), self.config
         moved = drift = near = shaded = dark = None
-        if config.motion_length is not None:
-            looks = None if self.looks is None else self.looks.weight
-            drift = motion(history, config.motion_length, config.grid_size, looks)
-            if config.momentum:
-                onward = momentum(history, drift[:, ONWARD], config.motion_length, config.grid_size)
-                drift = torch.cat([drift[:, :ONWARD], onward], 1)
+        if config.velocity:
+            drift = momentum(history, config.motion_length, config.grid_size)
+        elif config.motion_length is not None:
+            drift = motion(history, config.motion_length, config.grid_size)
+        if drift is not None:
             moved = _put_runs(drift, runs, history.n_rows)
         if config.contact_length is not None:
             near = _put_runs(contact(history, config.contact_length, config.grid_size), runs, history.n_rows)
@@ -193,6 +190,11 @@ class Dynamics(nn.Module):
             )
             for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes, drift, shaded))
         ]
+        if config.velocity:
+            steps = [
+                dataclasses.replace(step, velocity=step.means - before.means)
+                for before, step in zip([state, *steps], steps)
+            ]
         return steps[0] if len(steps) == 1 else concatenate(steps)
 
     def _seen(self, history: Particles) -> Tensor:

@@ -34,7 +34,7 @@ class StateLayout:
 
     inputs, outputs: (field of Particles, channels). Behind the inputs comes what the configuration adds to them:
     ``position_features`` and ``motion_length``; then what rows are told alone: ``position_waves``, ``contact_length``,
-    ``momentum`` and ``lights``. A difference of rotations is predicted as a rotation vector about world axes. With
+    ``velocity`` and ``lights``. A difference of rotations is predicted as a rotation vector about world axes. With
     ``motion_length`` further channels of positions say how much of each motion is kept along each axis: a contact takes
     a share, and where nothing of it is kept errors do not add up. With ``lights`` further channels of dynamic latents
     say how a look changes more where a light does not reach. Harmonics are flat as (3, K), quaternions as
@@ -48,7 +48,7 @@ class StateLayout:
     @classmethod
     def of(cls, config: DynamicsConfig) -> StateLayout:
         dynamic, static = config.dynamic_latents, config.static_latents
-        means = 3 + MOTION_CHANNELS * (config.motion_length is not None) + OWN_CHANNELS * config.momentum
+        means = 3 + MOTION_CHANNELS * (config.motion_length is not None) + OWN_CHANNELS * config.velocity
         looks = dynamic * (1 + len(config.lights))
         if not config.explicit:
             inputs = [("dynamic_latents", dynamic), ("opacities", 1), ("static_latents", static)]
@@ -72,7 +72,7 @@ class StateLayout:
     def told_channels(self) -> int:
         """That follow them and are not."""
         known = WAVE_CHANNELS * self.config.position_waves + CONTACT_CHANNELS * (self.config.contact_length is not None)
-        return known + OWN_CHANNELS * self.config.momentum + len(self.config.lights)
+        return known + OWN_CHANNELS * self.config.velocity + len(self.config.lights)
 
     def changes(self, features: str = "all", opacities: bool = True) -> dict[str, str]:
         """Of each output, whose values a step changes: "all", "dynamic", "frozen" or "none".
@@ -127,14 +127,14 @@ class StateLayout:
         if config.position_features:
             columns.append(position_features(particles, config.grid_size, config.position_length))
         if config.motion_length is not None:
-            still = particles.means.new_zeros(particles.n_rows, MOTION_CHANNELS + OWN_CHANNELS * config.momentum)
+            still = particles.means.new_zeros(particles.n_rows, MOTION_CHANNELS + OWN_CHANNELS * config.velocity)
             moved = still if moved is None else moved.flatten(1) / config.grid_size
             columns.append(moved[:, :MOTION_CHANNELS])
         if config.position_waves:
             columns.append(position_waves(particles, config.position_waves, config.position_length))
         if config.contact_length is not None:
             columns.append(particles.means.new_zeros(particles.n_rows, CONTACT_CHANNELS) if near is None else near)
-        if config.momentum:
+        if config.velocity:
             columns.append(moved[:, MOTION_CHANNELS:])
         if config.lights:
             dark = particles.means.new_zeros(particles.n_rows, len(config.lights)) if shaded is None else shaded

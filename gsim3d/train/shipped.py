@@ -68,9 +68,8 @@ MODEL = {
         "drop_path": 0.0,
         "shuffle_orders": False,
         "motion_length": 0.3,
-        "looks": 4,
         "lights": ((0.36, 0.24, 0.9),),  # the lamp of the worlds; training may turn it
-        "momentum": True,
+        "velocity": True,
         "position_waves": 4,
         "background": "relit",  # what shadows change would add up else
         "max_latent_step": 8.0,  # of latents of size 4: from lit to dark at once

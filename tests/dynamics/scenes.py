@@ -29,7 +29,7 @@ TINY = DynamicsConfig(
     drop_path=0.0,
     shuffle_orders=False,
 )
-SEEING = {"motion_length": 0.2, "looks": 3, "momentum": True, "position_waves": 2, "contact_length": 0.1}
+SEEING = {"motion_length": 0.2, "velocity": True, "position_waves": 2, "contact_length": 0.1}
 SEEING["lights"] = ((0.1, 0.2, 1.0),)
 EXPLICIT = dataclasses.replace(TINY, explicit=True, sh_degree=1, scale_min=0.001, scale_max=0.1)
 

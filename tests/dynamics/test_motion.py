@@ -73,78 +73,6 @@ def test_a_body_turns_on(spin, n):
     assert (longer - 1).abs().max() < 4e-3  # else a body would grow as it turns
 
 
-def in_light(history, strength=1.0):
-    """Bodies of ``flying`` whose latents also say how a place faces the light, which stays where it is."""
-    steps = history.means.unflatten(0, (4, -1))
-    shading = (steps - steps.mean(1, keepdim=True)).flatten(0, 1) @ torch.tensor([[1.0], [2.0], [2.0]]) * 20
-    latents = torch.cat([history.dynamic_latents[:, :3], strength * shading], 1)
-    return dataclasses.replace(history, dynamic_latents=latents)
-
-
-PAINT = torch.eye(3, 7)  # looks that do not read the light
-
-
-@pytest.mark.parametrize("n", [300, 3000])
-@pytest.mark.parametrize("spin", [(0.0, 0.0, 0.05), (0.04, -0.03, 0.02)])
-def test_paint_tells_how_a_body_turns_in_the_light(spin, n):
-    velocity, history = torch.tensor((0.03, -0.02, 0.05)), in_light(flying([(0.03, -0.02, 0.05)], n, spin=spin))
-    newest = last_steps(history, 1).means
-    radius = newest - newest.mean(0)
-    turned = radius @ torch.linalg.matrix_exp(cross_matrix(spin)).T - radius
-    cell = 0.02  # no wider than the windows in which looks are compared
-    by_paint, by_all = (motion(history, LENGTH, cell, looks)[:, 1] - velocity - turned for looks in (PAINT, None))
-    assert by_paint.norm() < 0.25 * turned.norm() < by_all.norm()
-
-
-def test_looks_get_a_gradient_that_finds_the_paint():
-    """A few steps along it, beginning with a look that reads light and paint alike."""
-    spin = (0.04, -0.03, 0.02)
-    history = in_light(flying([(0.0, 0.0, 0.0)], spin=spin), 0.5)
-    radius = last_steps(history, 1).means
-    radius = radius - radius.mean(0)
-    turned = radius @ torch.linalg.matrix_exp(cross_matrix(spin)).T - radius
-    looks = torch.eye(4, 7).requires_grad_()
-    optimizer, missed = torch.optim.Adam([looks], lr=0.05), []
-    for _ in range(20):
-        missed.append(((motion(history, *HOW, looks)[:, 1] - turned).norm() / turned.norm()))
-        optimizer.zero_grad()
-        missed[-1].backward()
-        optimizer.step()
-    assert missed[0] > 0.3 and missed[-1] < 0.6 * missed[0]
-
-
-def test_rows_far_apart_are_compared_in_windows_of_a_cell():
-    """In narrower ones looks have steps between rows, and rounding decides how they turn."""
-    history = flying([(0.03, -0.02, 0.05)], n=20, seed=2, spin=(0.0, 0.0, 0.05))
-    latents = torch.randn(history.dynamic_latents.shape, generator=torch.Generator().manual_seed(2))
-    history = dataclasses.replace(history, dynamic_latents=latents)
-    fields = {name: getattr(history, name).double() for name in ("means", "dynamic_latents", "static_latents")}
-    exact = motion(dataclasses.replace(history, **fields), *HOW, PAINT.double())
-    assert_close_relative_to_max(motion(history, *HOW, PAINT), exact, 2e-5)
-
-
-def test_how_strong_looks_are_does_not_matter():
-    history = flying([(0.03, -0.02, 0.05)], spin=(0.0, 0.0, 0.05))
-    assert_close_relative_to_max(motion(history, *HOW, 10 * PAINT), motion(history, *HOW, PAINT), 1e-4)
-
-
-def test_the_dynamics_finds_turns_by_its_looks_and_learns_them():
-    dynamics = make_dynamics(dataclasses.replace(MOVING, zero_init=True, looks=3))
-    dynamics.looks.weight.data.copy_(PAINT)
-    spin = (0.04, -0.03, 0.02)
-    history = in_light(flying([(0.0, 0.0, 0.0)], spin=spin))
-    step, newest = dynamics(history), last_steps(history, 1)
-    assert_close_relative_to_max(step.means - newest.means, motion(history, *HOW, PAINT)[:, 1], 1e-5)
-    step.means.square().sum().backward()
-    assert dynamics.looks.weight.grad.any()
-
-
-def test_without_paint_nothing_is_found_to_turn():
-    history = flying([(0.03, -0.02, 0.05)], spin=(0.0, 0.0, 0.05))
-    found = motion(history, *HOW, torch.zeros(2, 7))
-    assert_close_relative_to_max(found, torch.tensor((0.03, -0.02, 0.05)).expand(300, 2, 3), 0.1)
-
-
 def test_far_from_the_origin_it_is_the_same():
     history = flying([(0.03, -0.02, 0.05)], spin=(0.0, 0.0, 0.05))
     far = dataclasses.replace(history, means=history.means + torch.tensor([2000.0, 1000.0, 0.0]))
@@ -209,34 +137,18 @@ def test_scenes_do_not_see_each_other():
         begin += len(alone)
 
 
-@pytest.mark.parametrize("looks", [None, PAINT], ids=["latents", "looks"])
-def test_a_gpu_finds_the_same(looks, devices):
+def test_a_gpu_finds_the_same(devices):
     history = batch([flying([[0.03, 0.0, 0.0], [0.0, 0.02, 0.0]]), make_history((30, 40))])
-
-    def found(device):
-        return motion(history.to(device), *HOW, None if looks is None else looks.to(device)).cpu()
-
-    expected, actual = (found(device) for device in devices)
+    expected, actual = (motion(history.to(device), *HOW).cpu() for device in devices)
     assert_close_relative_to_max(actual, expected, 1e-4)
-    assert_same_bits(found(devices[1]), actual)
+    assert_same_bits(motion(history.to(devices[1]), *HOW).cpu(), actual)
 
 
-@pytest.mark.parametrize("looks", [None, PAINT], ids=["latents", "looks"])
-def test_compiled_it_is_the_same(looks, device):
-    history, looks = flying([[0.03, 0.0, 0.0]], n=50).to(device), None if looks is None else looks.to(device)
+def test_compiled_it_is_the_same(device):
+    history = flying([[0.03, 0.0, 0.0]], n=50).to(device)
     history.clouds
     compiled = torch.compile(motion, fullgraph=True)
-    assert_close_relative_to_max(compiled(history, *HOW, looks), motion(history, *HOW, looks), 1e-4)
-
-
-def test_the_gradient_of_looks_is_that_of_its_last_pass():
-    """In float64, beside finite differences where one pass is all there is."""
-    history = flying([(0.03, -0.02, 0.05)], n=60, spin=(0.0, 0.0, 0.05))
-    history = dataclasses.replace(history, **{name: x.double() for name, x in float_fields(history).items()})
-    looks = torch.rand(2, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gsim3d.dynamics.motion.PASSES", 1)
-        assert torch.autograd.gradcheck(lambda x: motion(history, *HOW, x)[:, 1], [looks])
+    assert_close_relative_to_max(compiled(history, *HOW), motion(history, *HOW), 1e-4)
 
 
 @pytest.mark.parametrize("predicts", ["from_newest", "from_previous"])
@@ -318,16 +230,7 @@ def test_gradients_reach_weights_and_features_but_no_velocity():
     assert_close_relative_to_max(leaves["means"].grad[30:].sum(0), torch.full((3,), 40.0), 0.5)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"motion_length": 0.0},
-        {"predicts": "absolute"},
-        {"motion_length": None, "looks": 2},
-        {"looks": -1},
-        {"looks": 2, "dynamic_latents": 0, "static_latents": 0},
-    ],
-)
+@pytest.mark.parametrize("change", [{"motion_length": 0.0}, {"predicts": "absolute"}])
 def test_settings_that_make_no_sense_are_refused(change):
     with pytest.raises(ValueError, match="motion_length"):
         DynamicsConfig(**{"motion_length": LENGTH, **change})

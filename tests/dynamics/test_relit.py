@@ -79,6 +79,7 @@ def test_a_background_in_front_of_which_nothing_changes_does_not_change():
         return dataclasses.replace(
             step,
             means=before.means,
+            velocity=torch.zeros_like(before.means),
             dynamic_latents=torch.where(bodies[:, None], before.dynamic_latents, step.dynamic_latents),
         )
 

@@ -21,7 +21,7 @@ EXPLICIT_CONFIG = dataclasses.replace(
     dynamics=dataclasses.replace(EXPLICIT, grid_size=0.1),
     renderer=dataclasses.replace(CONFIG.renderer, latents=0),
 )
-MORE = {"motion_length": 0.3, "momentum": True, "looks": 4}
+MORE = {"motion_length": 0.3, "velocity": True}
 MOVING = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **MORE))
 CONFIGS = {"latent": CONFIG, "explicit": EXPLICIT_CONFIG, "moving": MOVING}
 

@@ -45,8 +45,8 @@ RELIT = dataclasses.replace(
     MOVING,
     model={
         "dynamics": {
-            "motion_length": 0.3, "momentum": True, "background": "relit", "position_waves": 2, "contact_length": 0.15,
-            "looks": 4, "lights": ((0.1, 0.2, 1.0),),
+            "motion_length": 0.3, "velocity": True, "background": "relit", "position_waves": 2, "contact_length": 0.15,
+            "lights": ((0.1, 0.2, 1.0),),
         }
     },
     loss=LossConfig(bodies=1.0),

@@ -11,6 +11,7 @@ import torch
 
 from gsim3d.data import Scene, find_scenes
 from gsim3d.dynamics import last_steps
+from gsim3d.dynamics.momentum import momentum
 from gsim3d.dynamics.motion import motion
 from gsim3d.errors import InputError
 from gsim3d.data.recording import BACKGROUND, FIXED, MOVING
@@ -26,16 +27,7 @@ from gsim3d.train.restore import restore
 from gsim3d.train.samples import draw_batch
 from gsim3d.train.shipped import RECIPES, SittingTrainer, train
 from gsim3d.train.samples import longest_gap
-from gsim3d.train.sittings import (
-    LIGHTS,
-    LOOKS,
-    Progress,
-    begin_with,
-    load_into,
-    load_progress,
-    save_state,
-    weights_file,
-)
+from gsim3d.train.sittings import LIGHTS, Progress, begin_with, load_into, load_progress, save_state, weights_file
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -279,7 +271,7 @@ def saved_with_a_head(config, store, folder):
     return weights_file(folder / "state", load_progress(folder / "state", NAME))
 
 
-@pytest.mark.parametrize("more", [{}, {"position_waves": 2, "contact_length": 0.15, "momentum": True}])
+@pytest.mark.parametrize("more", [{}, {"position_waves": 2, "contact_length": 0.15, "velocity": True}])
 def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path, more):
     """What it predicts is the same, but that bodies fly on instead of what it said of positions."""
     known = saved_with_a_head(CONFIG, store, tmp_path)
@@ -291,8 +283,10 @@ def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path, more)
     batch = store.draw(CONFIG.data, CONFIG.stages[1], 0, 2, range(1))
     with torch.no_grad():
         state = given.encode(batch.context)
-        expected, step = given.dynamics(state), own.dynamics(own.encode(batch.context))
-        drift = motion(state, 0.3, own.config.dynamics.grid_size)[:, 1]
+        seen = own.encode(batch.context)
+        expected, step = given.dynamics(state), own.dynamics(seen)
+        goes_on = momentum if seen.velocity is not None else motion
+        drift = goes_on(seen, 0.3, own.config.dynamics.grid_size)[:, 1]
     torch.testing.assert_close(step.dynamic_latents, expected.dynamic_latents)
     newest = last_steps(state, 1)
     torch.testing.assert_close(step.means, newest.means + drift)
@@ -303,17 +297,19 @@ def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path, more)
         begin_with(larger, known)
 
 
-def test_a_run_that_sees_more_begins_as_one_that_saw_motion_went_on(store, tmp_path):
+def test_a_run_that_sees_more_begins_as_one_that_saw_motion_went_on(store, tmp_path, monkeypatch):
+    """Given the same motions, which one reads off clouds and the other off velocities."""
     motion_only = dataclasses.replace(CONFIG, model={"dynamics": {"motion_length": 0.3}})
-    told = {"motion_length": 0.3, "momentum": True, "position_waves": 2, "contact_length": 0.15}
+    told = {"motion_length": 0.3, "velocity": True, "position_waves": 2, "contact_length": 0.15}
     more = dataclasses.replace(CONFIG, model={"dynamics": told})
     known = saved_with_a_head(motion_only, store, tmp_path)
     trainer = SittingTrainer(more, store, tmp_path / "run", "cpu")
     begin_with(trainer, known)
     given, own = restore(known).simulator, trainer.simulator.eval()
     batch = store.draw(CONFIG.data, CONFIG.stages[1], 0, 2, range(1))
+    monkeypatch.setattr("gsim3d.dynamics.dynamics.motion", lambda *history: momentum(*history)[:, :2])
     with torch.no_grad():
-        state = given.encode(batch.context)
+        state = own.encode(batch.context)
         expected, step = given.dynamics(state), own.dynamics(state)
     moved = (expected.means - last_steps(state, 1).means).abs().max()
     assert moved > 0.01 and (step.means - expected.means).abs().max() < 1e-4 * moved
@@ -328,17 +324,14 @@ def test_a_run_does_not_begin_with_what_predicts_more(store, tmp_path, other):
         begin_with(trainer, saved_with_a_head(config, store, tmp_path))
 
 
-@pytest.mark.parametrize(
-    "key, options", [(LOOKS, {"motion_length": 0.3, "looks": 4}), (LIGHTS, {"lights": ((0.0, 0.3, 1.0),)})]
-)
-def test_looks_and_lights_of_a_run_begin_as_they_are_made_or_go_on(store, tmp_path, key, options):
-    config = dataclasses.replace(CONFIG, model={"dynamics": options})
+def test_lights_of_a_run_begin_as_they_are_made_or_go_on(store, tmp_path):
+    config = dataclasses.replace(CONFIG, model={"dynamics": {"lights": ((0.0, 0.3, 1.0),)}})
     for known in (saved_with_a_head(CONFIG, store, tmp_path / "a"), saved_with_a_head(config, store, tmp_path / "b")):
         trainer = SittingTrainer(config, store, tmp_path / "run", "cpu")
-        made = trainer.simulator.state_dict()[key].clone()
+        made = trainer.simulator.state_dict()[LIGHTS].clone()
         begin_with(trainer, known)
-        expected = restore(known).simulator.state_dict().get(key, made)
-        assert made.any() and torch.equal(trainer.simulator.state_dict()[key], expected)
+        expected = restore(known).simulator.state_dict().get(LIGHTS, made)
+        assert made.any() and torch.equal(trainer.simulator.state_dict()[LIGHTS], expected)
 
 
 def test_recipes_are_sound():
