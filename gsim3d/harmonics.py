@@ -44,6 +44,13 @@ def painted(sh: Tensor, paint: Tensor) -> Tensor:
     return torch.cat([sh[:, :1] + offset[:, None], sh[:, 1:]], 1)
 
 
+def lit(sh: Tensor, light: Tensor) -> Tensor:
+    """Coefficients [N, K, 3] of colours that are multiplied by ``light`` [N, 3]."""
+    offset = 0.5 * (light - 1) / SH_0
+    sh = sh * light[:, None]
+    return torch.cat([sh[:, :1] + offset[:, None], sh[:, 1:]], 1)
+
+
 def degree_damping(degree: int, like: Tensor) -> Tensor:
     """[(degree + 1)^2]: 1 for the constant, then 0.1 / 4^l, so that colour starts almost independent of the view."""
     return _damping(degree, like.dtype, like.device)

@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from gsim3d import ops
 from gsim3d.harmonics import (
     degree_damping,
+    lit,
     painted,
     published_axes,
     readings,
@@ -81,6 +82,8 @@ class GaussianHead(nn.Module):
         """The Gaussians of all rows; ``sh_degree``: without colours of higher degrees; not ``rgb``: without any."""
         n_harmonics = (self.config.n_harmonics if sh_degree is None else (sh_degree + 1) ** 2) if rgb else 0
         sh, quats, scales = self._shape_and_color(particles, n_harmonics)
+        if sh is not None and particles.light is not None:
+            sh = lit(sh, particles.light)
         return Gaussians(particles.means, quats, scales, particles.opacities, sh, particles.cu_rows)
 
     def _shape_and_color(self, particles: Particles, n_harmonics: int) -> tuple[Tensor | None, Tensor, Tensor]:

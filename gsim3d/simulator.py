@@ -34,7 +34,6 @@ from gsim3d.dynamics import (
     last_steps,
     rollout,
     rollout_in_parts,
-    with_look,
 )
 from gsim3d.dynamics.follow import follow
 from gsim3d.edits import Edit, by_step
@@ -87,8 +86,11 @@ class Simulator(nn.Module):
         particles = guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled, room)))
         if (dynamics := self.config.dynamics).velocity:
             n_views = None if room is None else len(frames.cameras) // particles.n_clouds
-            velocity = follow(particles, frames, dynamics.motion_length, dynamics.grid_size, n_views)
+            velocity = follow(
+                particles, frames, dynamics.motion_length, dynamics.grid_size, 2**dynamics.history_bits, n_views
+            )
             particles = dataclasses.replace(particles, velocity=velocity)
+        particles = self.dynamics.in_light(particles)
         guard.keywords["report"].send()
         return particles
 
@@ -204,7 +206,7 @@ class Simulator(nn.Module):
         if background == "dynamic":
             state = dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
         state = last_steps(state, plan.history)
-        return with_look(state, "unlit") if self.config.dynamics.is_relit else state
+        return self.dynamics.begin(state)
 
     def parts(
         self, prepared: Particles, *, on_bad: OnBad | None = None, report: StabilityReport | None = None

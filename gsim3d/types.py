@@ -221,6 +221,10 @@ class Particles(_Tensors):
         background (:class:`gsim3d.dynamics.DynamicsConfig`).
     velocity: [N, 3] metres a step, how rows came to where they are: simulated ones in their last step, encoded ones of
         the newest step on average since the oldest, 0 of others; only of a model with ``velocity``.
+    light: [N, 3], factors of the colours of simulated rows: the light that reaches them over that where they were
+        encoded; only of a model with ``lights``.
+    shaded: [N, L], what stood in the light of each lamp where rows were encoded (:func:`gsim3d.dynamics.shade.shade`);
+        negative where that is not known: they are lit there as where their simulation begins.
 
     Rows of two encoded steps are not aligned (each step sees other pixels); rows of two simulated steps are.
     """
@@ -242,6 +246,8 @@ class Particles(_Tensors):
     held: Tensor | None = None
     unlit: Tensor | None = None
     velocity: Tensor | None = None
+    light: Tensor | None = None
+    shaded: Tensor | None = None
     known: CloudTable | None = None  # see clouds
 
     ROW_FIELDS = (
@@ -258,6 +264,8 @@ class Particles(_Tensors):
         "held",
         "unlit",
         "velocity",
+        "light",
+        "shaded",
     )
 
     @property

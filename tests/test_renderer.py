@@ -10,7 +10,7 @@ from gsim3d.harmonics import sh_basis
 from gsim3d.renderer import GaussianHead, RendererConfig, render, rotation_matrices, unit_quats
 from gsim3d.types import Cameras
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
-from tests.dynamics.scenes import EXPLICIT, make_history
+from tests.dynamics.scenes import EXPLICIT, TINY, make_history
 
 CONFIG = RendererConfig(latents=7, sh_degree=2, scale_min=0.001, scale_max=0.1, initial_scale=0.03)
 
@@ -61,6 +61,24 @@ def test_colours_turn_with_the_particle():
     turned = (rotation_matrices(gaussians.quats) @ d[:, :, None])[..., 0]
     seen = torch.einsum("nk,nkc->nc", sh_basis(turned, 2), gaussians.sh)
     assert_close_relative_to_max(seen, torch.einsum("nk,nkc->nc", sh_basis(d, 2), own), 1e-12)
+
+
+@pytest.mark.parametrize("config", [CONFIG, RendererConfig(latents=0, sh_degree=1)])
+def test_light_multiplies_the_colours_that_are_seen_from_anywhere(config):
+    """Also those of paint, and nothing else."""
+    particles, head = make_history((10,), config=TINY if config.latents else EXPLICIT), make_head(config)
+    light, paint = torch.rand(10, 3) + 0.5, torch.rand(10, 3, 3)
+    d = torch.nn.functional.normalize(torch.randn(10, 3), dim=1)
+
+    def colours(**look):
+        gaussians = head(dataclasses.replace(particles, **look))
+        return 0.5 + torch.einsum("nk,nkc->nc", sh_basis(d, config.sh_degree), gaussians.sh), gaussians
+
+    for look in ({}, {"paint": paint}):
+        (plain, before), (seen, gaussians) = colours(**look), colours(**look, light=light)
+        assert_close_relative_to_max(seen, light * plain, 1e-5)
+        assert_same_bits(gaussians.scales, before.scales)
+        assert_same_bits(gaussians.opacities, before.opacities)
 
 
 def test_explicit_particles_are_gaussians_already():

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from gsim3d.types import CloudTable, Particles, split_rows
 
-SOME = ("turns", "paint", "held", "unlit", "velocity")  # fields that only some particles have
+SOME = ("turns", "paint", "held", "unlit", "velocity", "light", "shaded")  # fields that only some particles have
 
 
 def newest_clouds(clouds: CloudTable) -> list[int]:
@@ -54,9 +54,9 @@ def last_steps(particles: Particles, n_steps: int) -> Particles:
     return particles if len(kept) == particles.n_clouds else particles.select_clouds(kept)
 
 
-def with_look(particles: Particles, name: str) -> Particles:
+def with_look(particles: Particles, name: str, width: int = 3) -> Particles:
     """``particles`` with the field ``name``, one of ``SOME``, which changes nothing where there was none; what has no
-    velocity rests."""
+    velocity rests. ``width``: channels, where the field itself does not say how many."""
     if getattr(particles, name) is not None:
         return particles
     like = particles.means.new_ones(particles.n_rows, 1)
@@ -66,6 +66,8 @@ def with_look(particles: Particles, name: str) -> Particles:
         "held": lambda: torch.zeros_like(particles.activity, dtype=torch.bool),
         "unlit": lambda: particles.dynamic_latents,
         "velocity": lambda: torch.zeros_like(particles.means),
+        "light": lambda: torch.ones_like(particles.means),
+        "shaded": lambda: -like.expand(-1, width),
     }
     return dataclasses.replace(particles, **{name: identity[name]()})
 
@@ -73,8 +75,9 @@ def with_look(particles: Particles, name: str) -> Particles:
 def alike(parts: Sequence[Particles]) -> list[Particles]:
     """``parts`` with the same fields: what some have of ``SOME``, all have."""
     for name in SOME:
-        if any(getattr(part, name) is not None for part in parts):
-            parts = [with_look(part, name) for part in parts]
+        known = [getattr(part, name) for part in parts if getattr(part, name) is not None]
+        if known:
+            parts = [with_look(part, name, known[0].shape[-1]) for part in parts]
     return list(parts)
 
 

@@ -39,9 +39,9 @@ class DynamicsConfig:
         contact_length: metres, more than a step moves. The network sees where frozen matter is that a particle may meet
             (:func:`gsim3d.dynamics.contact.contact`). None: it has to find that out from the places of both.
         lights: directions towards lamps far away, where they begin; training turns them. The network sees how much
-            movable matter is between a particle and each (:func:`gsim3d.dynamics.shade.shade`), and predicts how its
-            look changes there and by how much more in the shade. Empty: where shadows fall has to be found out from
-            the places of all.
+            movable matter is between a particle and each, now and where it was encoded
+            (:func:`gsim3d.dynamics.shade.shade`), and predicts by how much more light reaches it now: colours are
+            multiplied by that. Empty: where shadows fall has to be found out from the places of all.
         motion_length: metres, about the radius of a body. The network sees how the matter around a particle has moved
             (:func:`gsim3d.dynamics.motion.motion`), and predicts how much of that is kept along each axis and what is
             added to it: without a force bodies fly on. None: it has to read velocities off the places in its history.
@@ -148,7 +148,6 @@ class DynamicsConfig:
                 'DynamicsConfig: motion_length must be positive, and predicts "from_newest" or "from_previous"; '
                 f"got {self.motion_length} and {self.predicts!r}"
             )
-        latents = self.dynamic_latents + self.static_latents
         if self.velocity and self.motion_length is None:
             raise ValueError("DynamicsConfig: velocity needs motion_length")
         if self.contact_length is not None and (self.is_asymmetric or not self.contact_length > 0):

@@ -20,12 +20,13 @@ from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.point_transformer import PointTransformer
 from gsim3d.dynamics.shade import shade
-from gsim3d.dynamics.state import StateLayout
+from gsim3d.dynamics.state import LIGHT_CHANNELS, StateLayout
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.types import ASLEEP, FROZEN, CloudTable, Particles, constant, take_runs
 
 ROOM = 1.1  # for rows that a call reads, over what was counted
 LIGHT_SIZE = 0.1  # of the parameter that is a direction: smaller ones are turned faster in training
+DIMMING = 0.2  # logarithm of how much darker a row is where log(1 + n) of the matter before its lamp grows by one
 
 
 class Dynamics(nn.Module):
@@ -44,7 +45,10 @@ class Dynamics(nn.Module):
         self.rounds = None  # whether geometry is rounded in training; None: on a GPU
         layout = self.layout
         self.net = PointTransformer(layout.in_channels, layout.told_channels, layout.out_channels, config)
-        self.lights = nn.Parameter(LIGHT_SIZE * torch.tensor(config.lights)) if config.lights else None
+        self.lights = self.dimming = None
+        if config.lights:
+            self.lights = nn.Parameter(LIGHT_SIZE * torch.tensor(config.lights))
+            self.dimming = nn.Parameter(torch.full((len(config.lights), LIGHT_CHANNELS), DIMMING))
 
     def geometry(
         self,
@@ -109,6 +113,23 @@ class Dynamics(nn.Module):
             self.net(x, pyramid, generator=draws and _beside(draws, x.device), besides=recorders)
         return remembered
 
+    @torch.no_grad()
+    def in_light(self, particles: Particles) -> Particles:
+        """``particles`` of which the newest clouds know what stands in their light, as rows that were encoded there."""
+        if self.lights is None:
+            return particles
+        runs = particles.clouds.row_runs(newest_clouds(particles.clouds))
+        shaded = shade(particles, self.lights, self.config.grid_size)
+        return dataclasses.replace(particles, shaded=_put_runs(shaded, runs, particles.n_rows, -1.0))
+
+    def begin(self, state: Particles) -> Particles:
+        """``state`` with the fields in which simulated rows know how they began."""
+        if self.config.is_relit:
+            state = with_look(state, "unlit")
+        if self.lights is not None:
+            state = with_look(with_look(state, "light"), "shaded", len(self.lights))
+        return state
+
     def forward(
         self,
         history: Particles,
@@ -138,6 +159,7 @@ class Dynamics(nn.Module):
         changes = changes or self.layout.changes()
         if background is None and self.config.is_asymmetric:
             return self._forward_in_parts(history, generator, changes)
+        history = self.begin(history)
         if self.config.is_relit:
             history = _as_it_began(history, changes["dynamic_latents"] in ("all", "dynamic"))
         clouds = history.clouds
@@ -152,7 +174,7 @@ class Dynamics(nn.Module):
                 'Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"'
             )
         runs, config = clouds.row_runs(newest), self.config
-        moved = drift = near = shaded = dark = None
+        moved = drift = near = dark = brighter = None
         if config.velocity:
             drift = momentum(history, config.motion_length, config.grid_size)
         elif config.motion_length is not None:
@@ -162,8 +184,10 @@ class Dynamics(nn.Module):
         if config.contact_length is not None:
             near = _put_runs(contact(history, config.contact_length, config.grid_size), runs, history.n_rows)
         if self.lights is not None:
-            shaded = shade(history, self.lights, config.grid_size)
-            dark = _put_runs(shaded, runs, history.n_rows)
+            shaded, began = shade(history, self.lights, config.grid_size), take_runs(history.shaded, runs)
+            began = torch.where(began < 0, shaded, began)
+            brighter = ((began - shaded)[:, :, None] * self.dimming).sum(1)  # a product of matrices would be rounded
+            dark = _put_runs(torch.cat([shaded, began], 1), runs, history.n_rows)
         features, is_awake = self.layout.pack(history, moved, near, dark), None
         n_awake = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
         everyone = n_awake == history.n_rows
@@ -182,13 +206,15 @@ class Dynamics(nn.Module):
             is_awake = take_runs(is_awake, runs)[:, 0] > 0
 
         state = history.select_clouds(newest)
+        if self.lights is not None:
+            state = dataclasses.replace(state, shaded=began)
         table = state.clouds
         counts = [table.count(q) for q in range(len(table))]
         steps = [
             step.with_clouds(
                 CloudTable.make(counts, table.scenes, (s + 1 + i for s in table.steps), state.cu_rows.device)
             )
-            for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes, drift, shaded))
+            for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes, drift, brighter))
         ]
         if config.velocity:
             steps = [
@@ -258,13 +284,13 @@ def _beside(generator: torch.Generator, device: torch.device) -> torch.Generator
     return torch.Generator(device).manual_seed(seed)
 
 
-def _put_runs(x: Tensor, runs: Sequence[tuple[int, int]], n_rows: int) -> Tensor:
-    """[n_rows, ...], the rows of ``x`` one run after another; 0 elsewhere."""
+def _put_runs(x: Tensor, runs: Sequence[tuple[int, int]], n_rows: int, other: float = 0.0) -> Tensor:
+    """[n_rows, ...], the rows of ``x`` one run after another; ``other`` elsewhere."""
     pieces, end = [], 0
     for part, (begin, until) in zip(x.split([until - begin for begin, until in runs]), runs, strict=True):
-        pieces += [x.new_zeros(begin - end, *x.shape[1:]), part]
+        pieces += [x.new_full((begin - end, *x.shape[1:]), other), part]
         end = until
-    return torch.cat([*pieces, x.new_zeros(n_rows - end, *x.shape[1:])])
+    return torch.cat([*pieces, x.new_full((n_rows - end, *x.shape[1:]), other)])
 
 
 def _packed(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -278,7 +304,6 @@ def _packed(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor,
 
 def _as_it_began(history: Particles, bodies: bool) -> Particles:
     """``history`` whose frozen rows look as they did when the simulation began; with ``bodies`` all rows."""
-    history = with_look(history, "unlit")
     relit = ((history.activity == FROZEN) | bodies)[:, None]
     latents = torch.where(relit, history.unlit, history.dynamic_latents)
     return dataclasses.replace(history, dynamic_latents=latents)

@@ -10,7 +10,7 @@ from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.dynamics.motion import share_of_a_step, shift
 from gsim3d.dynamics.rigid import Lattice, onward_at, solved
 from gsim3d.dynamics.samples import Rows, Samples, squares, weights
-from gsim3d.types import Frames, Particles, constant
+from gsim3d.types import CloudTable, Frames, Particles, constant
 
 PASSES = 5
 BLUR = 1.5  # pixels: standard deviation of the window in which images are smoothed
@@ -25,10 +25,10 @@ NEAR = 0.01  # metres, from a camera
 
 @torch.no_grad()
 def follow(
-    particles: Particles, frames: Frames, length: float, grid_size: float, n_views: int | None = None
+    particles: Particles, frames: Frames, length: float, grid_size: float, n_steps: int, n_views: int | None = None
 ) -> Tensor:
-    """[N, 3] metres a step, how movable rows of each scene's newest cloud moved on average since its oldest; 0 of
-    others.
+    """[N, 3] metres a step, how movable rows of each scene's newest cloud moved on average since the oldest of its
+    history; 0 of others, and where there is one step only.
 
     The rigid motion of each Gaussian window of matter is the one with which its rows have in the oldest images, at the
     places where they were, the colours that they have in the newest (Lucas and Kanade, in all cameras at once): colours
@@ -40,13 +40,14 @@ def follow(
             compared in the order of their images: best those of the same camera.
         length: metres, standard deviation of the window; about the radius of a body.
         grid_size: metres, edge of the dynamics' cells.
+        n_steps: of a history; older clouds are not looked at.
         n_views: of every cloud, whose images follow each other, cloud by cloud; nothing then waits for the device.
     """
     clouds, newest = particles.clouds, newest_clouds(particles.clouds)
     result = torch.zeros_like(particles.means)
-    if not any(clouds.count(q) for q in newest):
+    first = [_oldest(clouds, begin, q, n_steps) for begin, q in zip([0, *(q + 1 for q in newest)], newest)]
+    if first == newest or not any(clouds.count(q) for q in newest):
         return result
-    first = [0, *(q + 1 for q in newest[:-1])]
     with torch.autocast(particles.means.device.type, enabled=False):
         now, then = (Samples(particles, chosen, grid_size) for chosen in (newest, first))
         here = now.mean[:, None]
@@ -67,6 +68,11 @@ def follow(
     for b, q in enumerate(newest):
         result[clouds.starts[q] : clouds.starts[q + 1]] = found[b, : clouds.count(q)]
     return result
+
+
+def _oldest(clouds: CloudTable, begin: int, newest: int, n_steps: int) -> int:
+    """Of the clouds from ``begin`` to ``newest`` the first that is less than ``n_steps`` steps older than the last."""
+    return next(q for q in range(begin, newest + 1) if clouds.steps[newest] - clouds.steps[q] < n_steps)
 
 
 def _aligned(

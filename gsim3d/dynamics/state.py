@@ -24,7 +24,9 @@ OWN_CHANNELS = 3
 LONGEST_WAVE = 4.0  # in units of position_length; each further wave is half as long
 ONWARD = 1  # of the motions that gsim3d.dynamics.motion tells, the one that goes on if nothing is predicted
 MOST_KEPT = 2.0  # how much more or less of a motion may go on
-FEATURES = ("dynamic_latents", "sh")  # that rows which are held keep
+LIGHT_CHANNELS = 3  # of colours
+MOST_LIGHT = 2.0  # logarithm of how much more or less light there may be
+FEATURES = ("dynamic_latents", "sh", "light")  # that rows which are held keep
 SMALL_ANGLE_SQUARED = 1e-8  # radians^2; smaller rotations are their series: a square root has no gradient at 0
 
 
@@ -36,9 +38,9 @@ class StateLayout:
     ``position_features`` and ``motion_length``; then what rows are told alone: ``position_waves``, ``contact_length``,
     ``velocity`` and ``lights``. A difference of rotations is predicted as a rotation vector about world axes. With
     ``motion_length`` further channels of positions say how much of each motion is kept along each axis: a contact takes
-    a share, and where nothing of it is kept errors do not add up. With ``lights`` further channels of dynamic latents
-    say how a look changes more where a light does not reach. Harmonics are flat as (3, K), quaternions as
-    (x, y, z, w). The channels of ``outputs`` repeat for every step of a call.
+    a share, and where nothing of it is kept errors do not add up. With ``lights`` the last channels are the
+    logarithm of how much more light reaches a row than what stands in it lets expect. Harmonics are flat as (3, K),
+    quaternions as (x, y, z, w). The channels of ``outputs`` repeat for every step of a call.
     """
 
     config: DynamicsConfig
@@ -49,17 +51,18 @@ class StateLayout:
     def of(cls, config: DynamicsConfig) -> StateLayout:
         dynamic, static = config.dynamic_latents, config.static_latents
         means = 3 + MOTION_CHANNELS * (config.motion_length is not None) + OWN_CHANNELS * config.velocity
-        looks = dynamic * (1 + len(config.lights))
         if not config.explicit:
             inputs = [("dynamic_latents", dynamic), ("opacities", 1), ("static_latents", static)]
-            outputs = [("dynamic_latents", looks), ("means", means)]
+            outputs = [("dynamic_latents", dynamic), ("means", means)]
         else:
             sh = 3 * (config.sh_degree + 1) ** 2
             inputs = [("dynamic_latents", dynamic), ("sh", sh), ("opacities", 1), ("quats", 4), ("scales", 3)]
             inputs += [("static_latents", static)]
             rotation = 4 if config.predicts == "absolute" else 3
-            outputs = [("dynamic_latents", looks), ("sh", sh), ("means", means), ("opacities", 1)]
+            outputs = [("dynamic_latents", dynamic), ("sh", sh), ("means", means), ("opacities", 1)]
             outputs += [("quats", rotation), ("scales", 3)]
+        if config.lights:
+            outputs.append(("light", LIGHT_CHANNELS))
         return cls(config, *(tuple((name, n) for name, n in fields if n > 0) for fields in (inputs, outputs)))
 
     @property
@@ -72,7 +75,7 @@ class StateLayout:
     def told_channels(self) -> int:
         """That follow them and are not."""
         known = WAVE_CHANNELS * self.config.position_waves + CONTACT_CHANNELS * (self.config.contact_length is not None)
-        return known + OWN_CHANNELS * self.config.velocity + len(self.config.lights)
+        return known + OWN_CHANNELS * self.config.velocity + 2 * len(self.config.lights)
 
     def changes(self, features: str = "all", opacities: bool = True) -> dict[str, str]:
         """Of each output, whose values a step changes: "all", "dynamic", "frozen" or "none".
@@ -114,7 +117,8 @@ class StateLayout:
 
         moved: [N, 2 or 3, 3] metres a step, of :mod:`gsim3d.dynamics.motion`; None: nothing moved.
         near: [N, 4], of :func:`gsim3d.dynamics.contact.contact`; None: nothing is near.
-        shaded: [N, lights], of :func:`gsim3d.dynamics.shade.shade`; None: nothing is in the light.
+        shaded: [N, 2 lights], of :func:`gsim3d.dynamics.shade.shade` and, behind that, ``particles.shaded``; None:
+            nothing is in the light.
         """
         config = self.config
         columns = []
@@ -137,7 +141,7 @@ class StateLayout:
         if config.velocity:
             columns.append(moved[:, MOTION_CHANNELS:])
         if config.lights:
-            dark = particles.means.new_zeros(particles.n_rows, len(config.lights)) if shaded is None else shaded
+            dark = particles.means.new_zeros(particles.n_rows, 2 * len(config.lights)) if shaded is None else shaded
             columns.append(dark)
         return torch.cat(columns, 1)
 
@@ -148,7 +152,7 @@ class StateLayout:
         awake: Tensor | None = None,
         changes: Mapping[str, str] | None = None,
         drift: Tensor | None = None,
-        shaded: Tensor | None = None,
+        brighter: Tensor | None = None,
     ) -> list[Particles]:
         """The particles after 1, 2, ... ``steps_per_call`` steps.
 
@@ -158,7 +162,7 @@ class StateLayout:
             awake: bool [N], rows that change at all; None: all.
             changes: of :meth:`changes`; None: all that is predicted.
             drift: [N, 2 or 3, 3] metres a step, motions that go on as far as they are kept; None: none.
-            shaded: [N, lights], of :func:`gsim3d.dynamics.shade.shade`; None: nothing is in the light.
+            brighter: [N, 3], logarithm of light if nothing is predicted; None: there are no lights.
         """
         changes = changes or self.changes()
         outputs = [(name, n) for name, n in self.outputs if changes[name] != "none"]
@@ -173,10 +177,7 @@ class StateLayout:
             share = shares[changes[name]]
             if particles.held is not None and name in FEATURES:
                 share = share.masked_fill(particles.held[:, None], 0)
-            if name == "dynamic_latents" and self.config.lights:
-                none = particles.means.new_zeros(particles.n_rows, len(self.config.lights))
-                part = in_light(part, none if shaded is None else shaded)
-            onward = drift if name == "means" else None
+            onward = {"means": drift, "light": brighter}.get(name)
             later[name] = self.later_values(name, getattr(particles, name), part, share, onward)
         return [
             dataclasses.replace(particles, **{name: values[step] for name, values in later.items()})
@@ -193,12 +194,16 @@ class StateLayout:
             newest: [N, ...], its newest values.
             predicted: [S, N, channels], of S steps.
             share: [N, 1] or [S, N, 1], how much of a predicted change happens: 0 holds the value, bit by bit.
-            drift: [N, 2 or 3, 3], what is added in every step as far as it is kept; None: nothing.
+            drift: of means [N, 2 or 3, 3], what is added in every step as far as it is kept; of light [N, 3], what is
+                added to the logarithm that is predicted; None: nothing.
         Returns:
             [S, N, ...].
         """
         if name == "quats":
             return self._later_quats(newest, predicted, share)
+        if name == "light":  # not of the step before: its errors would add up
+            brighter = predicted if drift is None else predicted + drift
+            return hold(share, newest, bounded(brighter / MOST_LIGHT, MOST_LIGHT).exp())
         predicted = _unflat(name, predicted)
         if name == "means":
             predicted, kept = predicted[..., :3], predicted[..., 3:]
@@ -256,14 +261,6 @@ class StateLayout:
             later.append(rotate_left(before, vectors))
             before = later[-1] if self.config.predicts == "from_previous" else newest
         return hold(share, newest, torch.stack(later))
-
-
-def in_light(predicted: Tensor, shaded: Tensor) -> Tensor:
-    """[S, N, F] of what is ``predicted``, [S, N, (1 + L) F]: how a look changes, and by how much more if the light from
-    each lamp does not reach the row."""
-    change, *more = predicted.chunk(1 + shaded.shape[1], 2)
-    dark = 1 - (-shaded).exp()  # 1 - 1 / (1 + n)
-    return change + sum(x * dark[:, light, None] for light, x in enumerate(more))
 
 
 def _flat(name: str, value: Tensor) -> Tensor:

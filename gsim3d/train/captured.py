@@ -216,7 +216,7 @@ class _Step:
     def _encode(self, report: StabilityReport) -> Particles:
         with self._owner.precision("encoder"), torch.set_grad_enabled(not self._dynamics_alone):
             state = self._owner.simulator.encode(self._context, room=self._room, report=report)
-        return with_first_background(state) if self._has_own_background else state
+        return with_first_background(state, self._owner.simulator.dynamics) if self._has_own_background else state
 
     def _rollout(
         self,

@@ -401,7 +401,7 @@ class Trainer:
             particles = again("encoder")(lambda context: simulator.encode(context, **options))(batch.context)
         watch.count(particles.n_rows, particles.n_clouds)
         if batch.has_own_background:
-            particles = with_first_background(particles)
+            particles = with_first_background(particles, simulator.dynamics)
         begin, steps = particles, []
         if batch.n_future:
             if self.config.data.thawed:

@@ -24,8 +24,9 @@ def in_parts(
     return steps
 
 
-def with_first_background(particles: Particles) -> Particles:
-    """All but the first cloud of each scene, the newest ones in front of the background of the first.
+def with_first_background(particles: Particles, dynamics: Dynamics) -> Particles:
+    """All but the first cloud of each scene, the newest ones in front of the background of the first, which knows what
+    stood in its light then.
 
     Rows that are replaced sleep and are not drawn: nothing waits for the device.
     """
@@ -33,7 +34,7 @@ def with_first_background(particles: Particles) -> Particles:
     first = [q for q, scene in enumerate(table.scenes) if q == 0 or scene != table.scenes[q - 1]]
     newest = newest_clouds(table)
     older = particles.select_clouds(sorted(set(range(len(table))) - set(first) - set(newest)))
-    background = _without(particles.select_clouds(first), DYNAMIC)
+    background = _without(dynamics.in_light(particles.select_clouds(first)), DYNAMIC)
     bodies = _without(particles.select_clouds(newest), FROZEN)
     counts = [background.clouds.count(b) + bodies.clouds.count(b) for b in range(len(newest))]
     whole = CloudTable.make(counts, bodies.clouds.scenes, bodies.clouds.steps, particles.means.device)

@@ -14,6 +14,8 @@ from gsim3d.errors import InputError
 from gsim3d.train.config import DataConfig, StageConfig
 from gsim3d.types import Frames
 
+LONG_AGO = 1000  # steps: more than any history has
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -23,7 +25,7 @@ class Batch:
     targets: images of these and of the last n_future; image i shows cloud b * (n_context + n_future) + t. Where only
         the dynamics learns, of the last n_future alone.
     dynamics_alone, cut: as of :class:`gsim3d.train.config.StageConfig`.
-    has_own_background: the first of the n_context steps shows the background and no bodies.
+    has_own_background: the first of the n_context steps tells the background alone, as if seen long ago.
     """
 
     context: Frames
@@ -104,6 +106,8 @@ def draw_batch(
 def batch_of(stage: StageConfig, window: Window, context: Frames, targets: Frames) -> Batch:
     """A batch of windows like ``window``."""
     how = {"dynamics_alone": stage.dynamics_alone, "cut": stage.cut, "has_own_background": stage.lit_before > 0}
+    if stage.lit_before:
+        context = dataclasses.replace(context, cloud_step=context.cloud_step + LONG_AGO * (context.cloud_step > 0))
     return Batch(context, targets, window.n_context, stage.horizon, window.lead, **how)
 
 

@@ -40,7 +40,7 @@ from gsim3d.train.restore import describe, restore
 FORMAT = 1
 SEEN = "dynamics.net.stem.conv.weight"  # what the network reads of motion are its last columns
 TOLD = "dynamics.net.stem.told.weight"
-LIGHTS = "dynamics.lights"
+LIGHTS, DIMMING = "dynamics.lights", "dynamics.dimming"
 PREDICTED = ("dynamics.net.head.fc2.weight", "dynamics.net.head.fc2.bias")
 PLACES = 3  # rows that predict places where no motion is seen
 WEIGHTS, DIFFERENCE, SQUARES = "weights", "difference", "squares"
@@ -125,8 +125,9 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
 
 def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     """Weights of a trained simulator into a new trainer, whose dynamics may see more (motion, waves, contacts,
-    momentum) than the other's: what reads it begins at zero, and so does what predicts shares of motions; where motion
-    is new all that predicts positions, which are others then. New lights begin as in any new trainer.
+    velocities, lights) than the other's: what reads it begins at zero, and so does what predicts shares of motions and
+    light; where motion is new all that predicts positions, which are others then. New lights begin as in any new
+    trainer.
 
     Returns:
         The checkpoint's name, digest and step.
@@ -140,13 +141,14 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
         given[SEEN] = F.pad(given[SEEN], (0, MOTION_CHANNELS))
     if TOLD in own and TOLD not in given:
         given[TOLD] = torch.zeros_like(own[TOLD])
-    if LIGHTS in own:
-        given.setdefault(LIGHTS, own[LIGHTS])
+    for key in (LIGHTS, DIMMING):
+        if key in own:
+            given.setdefault(key, own[key])
     after = dict(trainer.simulator.dynamics.layout.outputs)
     for key in PREDICTED:
-        if before.keys() == after.keys() and len(given[key]) == sum(before.values()):  # else of other sizes
-            parts = zip(after.items(), given[key].split(list(before.values())), strict=True)
-            given[key] = torch.cat([_widened(name, x, n) for (name, n), x in parts])
+        if before.keys() <= after.keys() and len(given[key]) == sum(before.values()):  # else of other sizes
+            parts = dict(zip(before, given[key].split(list(before.values())), strict=True))
+            given[key] = torch.cat([_widened(name, parts.get(name, given[key][:0]), n) for name, n in after.items()])
     try:
         trainer.simulator.load_state_dict(given)
     except RuntimeError as error:

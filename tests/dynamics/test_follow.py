@@ -13,7 +13,7 @@ from tests.dynamics.scenes import batch, make_history
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-LENGTH, CELL, SIZE, RADIUS = 0.3, 0.02, 64, 0.25
+LENGTH, CELL, STEPS, SIZE, RADIUS = 0.3, 0.02, 4, 64, 0.25
 VELOCITY, SPIN = (0.01, -0.005, -0.02), (0.02, -0.03, 0.015)
 LAMP = torch.tensor([0.36, 0.24, 0.9])
 
@@ -87,7 +87,7 @@ def motion_of(particles, found):
 @pytest.mark.parametrize("lit", [False, True])
 def test_it_finds_how_a_body_flies_and_turns_whatever_the_light_does(spin, lit):
     particles, frames = filmed(spin=spin, lit=lit)
-    velocity, turn = motion_of(particles, follow(particles, frames, LENGTH, CELL))
+    velocity, turn = motion_of(particles, follow(particles, frames, LENGTH, CELL, STEPS))
     assert (velocity - torch.tensor(VELOCITY)).norm() < 1e-3
     assert (turn - torch.tensor(spin)).norm() < 5e-3
 
@@ -97,7 +97,7 @@ def test_places_that_are_wrong_do_not_matter_much():
     particles, frames = filmed()
     noise = 0.01 * torch.randn(particles.means.shape, generator=torch.Generator().manual_seed(1))
     noisy = dataclasses.replace(particles, means=particles.means + noise)
-    velocity, turn = motion_of(noisy, follow(noisy, frames, LENGTH, CELL))
+    velocity, turn = motion_of(noisy, follow(noisy, frames, LENGTH, CELL, STEPS))
     assert (velocity - torch.tensor(VELOCITY)).norm() < 2e-3
     assert (turn - torch.tensor(SPIN)).norm() < 8e-3
 
@@ -106,7 +106,7 @@ def test_only_movable_rows_of_the_newest_cloud_have_one():
     particles, frames = filmed()
     activity = particles.activity.clone()
     activity[-500:] = FROZEN
-    found = follow(dataclasses.replace(particles, activity=activity), frames, LENGTH, CELL)
+    found = follow(dataclasses.replace(particles, activity=activity), frames, LENGTH, CELL, STEPS)
     n = particles.clouds.count(3)
     assert not found[:-n].any() and not found[-500:].any() and found[-n:-500].any(1).all()
     assert (activity[-n:-500] == DYNAMIC).all()
@@ -114,7 +114,22 @@ def test_only_movable_rows_of_the_newest_cloud_have_one():
 
 def test_one_step_tells_nothing():
     particles, frames = filmed(n_steps=1)
-    assert not follow(particles, frames, LENGTH, CELL).any()
+    assert not follow(particles, frames, LENGTH, CELL, STEPS).any()
+
+
+def test_clouds_older_than_a_history_are_not_looked_at():
+    particles, frames = filmed()
+    velocity = 0.01 * torch.rand(3)
+    moved = torch.where((particles.row_cloud() == 0)[:, None], particles.means + 20 * velocity, particles.means)
+    long_ago = dataclasses.replace(
+        particles, means=moved, cloud_step=torch.tensor([0, 7, 8, 9]), known=None
+    )
+    found = follow(long_ago, frames, LENGTH, CELL, STEPS)
+    newer = dataclasses.replace(frames, images=frames.images.clone())
+    newer.images[:4] = 0.5
+    assert_same_bits(follow(long_ago, newer, LENGTH, CELL, STEPS), found)
+    velocity, turn = motion_of(particles, found)
+    assert (velocity - torch.tensor(VELOCITY)).norm() < 1e-3 and (turn - torch.tensor(SPIN)).norm() < 8e-3
 
 
 def test_far_from_the_origin_it_is_the_same():
@@ -124,19 +139,19 @@ def test_far_from_the_origin_it_is_the_same():
     viewmats[:, :3, 3] -= viewmats[:, :3, :3] @ far
     moved = dataclasses.replace(particles, means=particles.means + far, origin=particles.origin + far)
     cameras = dataclasses.replace(frames.cameras, viewmats=viewmats)
-    found = follow(moved, dataclasses.replace(frames, cameras=cameras, origin=moved.origin), LENGTH, CELL)
-    assert_close_relative_to_max(found, follow(particles, frames, LENGTH, CELL), 0.03)
+    found = follow(moved, dataclasses.replace(frames, cameras=cameras, origin=moved.origin), LENGTH, CELL, STEPS)
+    assert_close_relative_to_max(found, follow(particles, frames, LENGTH, CELL, STEPS), 0.03)
 
 
 def test_images_may_come_in_any_order_of_clouds_and_be_counted_beforehand():
     particles, frames = filmed()
-    expected = follow(particles, frames, LENGTH, CELL)
-    assert_same_bits(follow(particles, frames, LENGTH, CELL, n_views=4), expected)
+    expected = follow(particles, frames, LENGTH, CELL, STEPS)
+    assert_same_bits(follow(particles, frames, LENGTH, CELL, STEPS, n_views=4), expected)
     order = torch.arange(16).reshape(4, 4).T.flatten()
     mixed = dataclasses.replace(
         frames, images=frames.images[order], cameras=frames.cameras.select(order), dynamic=frames.dynamic[order]
     )
-    assert_same_bits(follow(particles, mixed, LENGTH, CELL), expected)
+    assert_same_bits(follow(particles, mixed, LENGTH, CELL, STEPS), expected)
 
 
 def test_clouds_with_fewer_views_are_compared_in_those():
@@ -145,7 +160,7 @@ def test_clouds_with_fewer_views_are_compared_in_those():
     fewer = dataclasses.replace(
         frames, images=frames.images[kept], cameras=frames.cameras.select(kept), dynamic=frames.dynamic[kept]
     )
-    velocity, turn = motion_of(particles, follow(particles, fewer, LENGTH, CELL))
+    velocity, turn = motion_of(particles, follow(particles, fewer, LENGTH, CELL, STEPS))
     assert (velocity - torch.tensor(VELOCITY)).norm() < 3e-3 and turn.isfinite().all()
 
 
@@ -158,19 +173,19 @@ def test_scenes_do_not_see_each_other():
         torch.cat([one[1].images, other[1].images]), cameras, particles.cloud_scene, particles.cloud_step,
         particles.origin, dynamic=torch.cat([one[1].dynamic, other[1].dynamic]),
     )  # fmt: skip
-    together = follow(particles, frames, LENGTH, CELL)
-    alone = torch.cat([follow(*scene, LENGTH, CELL) for scene in (one, other)])
+    together = follow(particles, frames, LENGTH, CELL, STEPS)
+    alone = torch.cat([follow(*scene, LENGTH, CELL, STEPS) for scene in (one, other)])
     assert_close_relative_to_max(together, alone, 1e-4)
 
 
 def test_images_that_show_nothing_leave_the_way_of_the_means():
     particles, frames = filmed(spin=(0.0, 0.0, 0.0))
     dark = dataclasses.replace(frames, images=torch.zeros_like(frames.images))
-    velocity, turn = motion_of(particles, follow(particles, dark, LENGTH, CELL))
+    velocity, turn = motion_of(particles, follow(particles, dark, LENGTH, CELL, STEPS))
     assert (velocity - torch.tensor(VELOCITY)).norm() < 1e-4 and turn.norm() < 1e-4
 
 
 def test_a_gpu_finds_the_same(devices):
     particles, frames = filmed()
-    expected, actual = (follow(particles.to(d), frames.to(d), LENGTH, CELL).cpu() for d in devices)
+    expected, actual = (follow(particles.to(d), frames.to(d), LENGTH, CELL, STEPS).cpu() for d in devices)
     assert_close_relative_to_max(actual, expected, 1e-3)

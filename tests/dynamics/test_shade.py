@@ -1,11 +1,13 @@
 """What stands in the light of a particle, and a network that is told of it."""
 
+import copy
 import dataclasses
+from functools import partial
 
 import pytest
 import torch
 
-from gsim3d.dynamics import DynamicsConfig, last_steps
+from gsim3d.dynamics import DynamicsConfig, last_steps, rollout
 from gsim3d.dynamics.samples import SAMPLES
 from gsim3d.dynamics.shade import shade
 from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
@@ -141,23 +143,62 @@ def test_the_network_reads_it_and_turns_its_lights():
     step = dynamics(history)
     step.dynamic_latents.square().sum().backward()
     assert dynamics.lights.grad.abs().amax(1).gt(0).all()
-    with torch.no_grad():
-        dynamics.net.stem.told.weight[:, :2] = 0
-    assert (dynamics(history).dynamic_latents - step.dynamic_latents).abs().max() > 1e-5
+    for columns in (slice(0, 2), slice(2, 4)):  # now, and where rows were encoded
+        other = copy.deepcopy(dynamics)
+        with torch.no_grad():
+            other.net.stem.told.weight[:, columns] = 0
+        assert (other(history).dynamic_latents - step.dynamic_latents).abs().max() > 1e-5
+
+
+def unlit(n_rows, n_lights=2):
+    return torch.zeros(n_rows, n_lights)
 
 
 @pytest.mark.parametrize("steps_per_call", [1, 2])
 @pytest.mark.parametrize("background", ["symmetric", "relit"])
-def test_a_look_changes_more_where_light_is_missing(background, steps_per_call):
-    """By what is predicted for each light, in the shade of that one alone, and the rest everywhere."""
+def test_light_is_that_of_where_rows_are_over_that_of_where_they_were_encoded(background, steps_per_call):
     config = dataclasses.replace(LIT, zero_init=True, background=background, steps_per_call=steps_per_call)
     dynamics, history = make_dynamics(config), under_a_ball()
-    change = torch.tensor([[0.1, 0.0, 0.0, 0.2], [-0.3, 0.1, 0.0, 0.0], [0.0, 0.0, 0.4, 0.0]])
-    dynamics.net.head.fc2.bias.detach().unflatten(0, (steps_per_call, -1))[:, :12] = change.flatten()
-    newest, first = last_steps(history, 1), dynamics(history).dynamic_latents.unflatten(0, (steps_per_call, -1))[0]
-    dark = 1 - (-shade(history, torch.tensor(LIT.lights), LIT.grid_size)).exp()
-    assert dark.amin(0).max() < 0.1 and dark.amax(0).min() > 0.9
-    assert_close_relative_to_max(first, newest.dynamic_latents + (change[0] + dark @ change[1:]).tanh(), 1e-5)
+    dynamics.dimming.data = torch.tensor([[0.3, 0.2, 0.1], [0.0, 0.1, 0.2]])
+    shaded = shade(history, torch.tensor(LIT.lights), LIT.grid_size)
+    assert shaded.amin(0).max() < 0.1 and shaded.amax(0).min() > 2
+    began = 0.5 + unlit(history.n_rows)
+    step = dynamics(dataclasses.replace(history, shaded=began))
+    expected = (2 * (((0.5 - shaded) @ dynamics.dimming) / 2).tanh()).exp()
+    for light, known in ((x.unflatten(0, (steps_per_call, -1)) for x in (step.light, step.shaded)),):
+        for k in range(steps_per_call):
+            assert_close_relative_to_max(light[k], expected, 1e-5)
+            assert_same_bits(known[k], began[: len(shaded)])
+    change = torch.tensor([0.1, 0.0, -0.4])
+    dynamics.net.head.fc2.bias.detach().unflatten(0, (steps_per_call, -1))[:, -3:] = change
+    brighter = dynamics(history).light.unflatten(0, (steps_per_call, -1))[0]  # as far as is known they began here
+    assert_close_relative_to_max(brighter, (2 * (change / 2).tanh()).exp().expand_as(brighter), 1e-5)
+
+
+def test_light_does_not_add_up_and_is_not_of_rows_that_keep_their_look():
+    """It is asked anew in every step, of the places at which bodies are then."""
+    dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True)), under_a_ball()
+    held = torch.zeros(history.n_rows, dtype=torch.bool)
+    held[::3] = True
+    history = dataclasses.replace(history, shaded=0.5 + unlit(history.n_rows), held=held)
+    for who in ("all", "dynamic", "frozen", "none"):
+        first, *_, last = rollout(partial(dynamics, changes=dynamics.layout.changes(who)), history, 3, 2)
+        rows, moves = last_steps(history, 1).held, last_steps(history, 1).activity == DYNAMIC
+        kept = rows | {"all": rows, "dynamic": ~moves, "frozen": moves, "none": ~rows}[who]
+        assert (last.light[kept] == 1).all() and (last.light[~kept] != 1).any() == (who != "none")
+        assert_same_bits(last.light, first.light)  # nothing moved
+
+
+def test_encoded_rows_know_what_stood_in_their_light():
+    dynamics, history = make_dynamics(LIT), under_a_ball(n_steps=2)
+    known = dynamics.in_light(history)
+    newest = known.row_cloud() == 1
+    assert_close_relative_to_max(known.shaded[newest], shade(history, dynamics.lights, LIT.grid_size), 1e-6)
+    assert (known.shaded[~newest] == -1).all()
+    gone = known.select_rows(known.activity == FROZEN)  # the ball is taken away: its shadow goes with it
+    step = make_dynamics(dataclasses.replace(LIT, zero_init=True))(gone)
+    before = last_steps(gone, 1).shaded.sum(1)
+    assert (step.light[before > 2] > 1.2).all() and (step.light[before == 0] == 1).all()
 
 
 @pytest.mark.parametrize(

@@ -9,16 +9,17 @@ import pytest
 import torch
 
 from gsim3d.errors import InputError
+from gsim3d.presets import paper_latent, small
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, StageConfig
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.parts import with_first_background
 from gsim3d.train.precision import STEPS_TO_DOUBLE, LossScale, PrecisionConfig
-from gsim3d.train.samples import draw_batch, draw_windows
+from gsim3d.train.samples import LONG_AGO, draw_batch, draw_windows
 from gsim3d.train.settings import from_dict
 from gsim3d.train.watch import StepWatch
 from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
-from tests.dynamics.scenes import batch, make_history
+from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
 from tests.train.test_loop import CONFIG, curve, scenes
 from tests.tiny_scenes import write_scenes
 
@@ -229,9 +230,18 @@ def test_a_background_of_its_own_comes_from_an_earlier_step():
     assert drawn == set(range(1, 7))
 
 
+def test_a_background_of_its_own_is_in_no_history(folder):
+    """What moves in its step tells nothing of how fast anything moves later."""
+    stage = dataclasses.replace(CONFIG.stages[1], history=2, horizon=1, dynamics_alone=True, lit_before=1)
+    steps = draw_batch(scenes(folder), CONFIG.data, stage, 0, 0, [0, 1]).context.cloud_step.tolist()
+    assert steps == [0, 1 + LONG_AGO, 2 + LONG_AGO] * 2
+    assert LONG_AGO >= 2 ** max(paper_latent(8).dynamics.history_bits, small().dynamics.history_bits)
+
+
 def test_the_background_of_the_first_step_lies_behind_the_bodies_of_the_last():
     history = batch([make_history((30, 20, 10)), make_history((12, 0, 25), seed=1)])
-    state = with_first_background(history)
+    dynamics = make_dynamics(dataclasses.replace(TINY, lights=((0.0, 0.0, 1.0),)))
+    state = with_first_background(history, dynamics)
     assert (state.clouds.scenes, state.clouds.steps) == ((0, 0, 1, 1), (1, 2, 1, 2))
     for scene, (first, newest) in enumerate(((0, 2), (3, 5))):
         given = [history.select_clouds([cloud]) for cloud in (first, newest)]
@@ -241,6 +251,8 @@ def test_the_background_of_the_first_step_lies_behind_the_bodies_of_the_last():
             assert torch.equal(seen.means[rows], source.means[wanted])
             assert torch.equal(seen.opacities[rows], source.opacities[wanted])
         assert not seen.opacities[seen.activity == ASLEEP].any()
+        lit = dynamics.in_light(given[0]).shaded[given[0].activity == FROZEN]
+        assert torch.equal(seen.shaded[seen.activity == FROZEN], lit) and lit.any()
     assert torch.equal(state.select_clouds([0]).activity, history.select_clouds([1]).activity)
 
 

@@ -27,7 +27,16 @@ from gsim3d.train.restore import restore
 from gsim3d.train.samples import draw_batch
 from gsim3d.train.shipped import RECIPES, SittingTrainer, train
 from gsim3d.train.samples import longest_gap
-from gsim3d.train.sittings import LIGHTS, Progress, begin_with, load_into, load_progress, save_state, weights_file
+from gsim3d.train.sittings import (
+    DIMMING,
+    LIGHTS,
+    Progress,
+    begin_with,
+    load_into,
+    load_progress,
+    save_state,
+    weights_file,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -301,6 +310,7 @@ def test_a_run_that_sees_more_begins_as_one_that_saw_motion_went_on(store, tmp_p
     """Given the same motions, which one reads off clouds and the other off velocities."""
     motion_only = dataclasses.replace(CONFIG, model={"dynamics": {"motion_length": 0.3}})
     told = {"motion_length": 0.3, "velocity": True, "position_waves": 2, "contact_length": 0.15}
+    told["lights"] = ((0.0, 0.3, 1.0),)
     more = dataclasses.replace(CONFIG, model={"dynamics": told})
     known = saved_with_a_head(motion_only, store, tmp_path)
     trainer = SittingTrainer(more, store, tmp_path / "run", "cpu")
@@ -314,6 +324,7 @@ def test_a_run_that_sees_more_begins_as_one_that_saw_motion_went_on(store, tmp_p
     moved = (expected.means - last_steps(state, 1).means).abs().max()
     assert moved > 0.01 and (step.means - expected.means).abs().max() < 1e-4 * moved
     torch.testing.assert_close(step.dynamic_latents, expected.dynamic_latents)
+    assert state.shaded.max() > 0 and (step.light == 1).all()  # nobody knows yet of what has moved
 
 
 @pytest.mark.parametrize("other", [{"steps_per_call": 2}, {"motion_length": 0.3}])
@@ -324,14 +335,15 @@ def test_a_run_does_not_begin_with_what_predicts_more(store, tmp_path, other):
         begin_with(trainer, saved_with_a_head(config, store, tmp_path))
 
 
-def test_lights_of_a_run_begin_as_they_are_made_or_go_on(store, tmp_path):
+@pytest.mark.parametrize("key", [LIGHTS, DIMMING])
+def test_lights_of_a_run_begin_as_they_are_made_or_go_on(store, tmp_path, key):
     config = dataclasses.replace(CONFIG, model={"dynamics": {"lights": ((0.0, 0.3, 1.0),)}})
     for known in (saved_with_a_head(CONFIG, store, tmp_path / "a"), saved_with_a_head(config, store, tmp_path / "b")):
         trainer = SittingTrainer(config, store, tmp_path / "run", "cpu")
-        made = trainer.simulator.state_dict()[LIGHTS].clone()
+        made = trainer.simulator.state_dict()[key].clone()
         begin_with(trainer, known)
-        expected = restore(known).simulator.state_dict().get(LIGHTS, made)
-        assert made.any() and torch.equal(trainer.simulator.state_dict()[LIGHTS], expected)
+        expected = restore(known).simulator.state_dict().get(key, made)
+        assert made.any() and torch.equal(trainer.simulator.state_dict()[key], expected)
 
 
 def test_recipes_are_sound():
