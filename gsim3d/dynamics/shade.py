@@ -56,6 +56,8 @@ def _between(places: Tensor, matter: Samples, light: Tensor, grid_size: float) -
         each = (matter.n / matter.known.sum(1).clamp(min=1)).to(off.dtype)[:, None, None]
         counted = (off * (-0.5 / beam**2)).clamp(min=FAINTEST).exp() * begun * each
         counted = torch.where(matter.known[:, None], counted, 0)
+        if not direction.requires_grad:
+            return counted.sum(2)
         # By the direction, the squared way off changes by -2 ahead * way, and the way ahead by the way.
         by_way = counted * (ahead / beam**2 + (1 - begun) / edge)
         slope = by_way @ matter.places - by_way.sum(2, keepdim=True) * places
