@@ -92,6 +92,24 @@ def test_encode_step_rollout_render():
     assert image.color.shape == (3, SIZE, SIZE, 3) and torch.isfinite(image.color).all() and image.alpha.max() > 0.05
 
 
+def test_encoded_particles_know_how_fast_they_are_and_what_stands_in_their_light():
+    """Velocities come from no step that is older than the longest history, here of four."""
+    seeing = dataclasses.replace(CONFIG.dynamics, motion_length=0.5, velocity=True, lights=((0.0, 0.0, 1.0),))
+    simulator, frames = make_simulator(dataclasses.replace(CONFIG, dynamics=seeing)), make_frames((3,))
+    in_history, too_old = (
+        simulator.encode(dataclasses.replace(frames, cloud_step=torch.tensor([0, last - 1, last]))) for last in (3, 4)
+    )
+    newest = in_history.row_cloud() == 2
+    for state in (in_history, too_old):
+        assert state.velocity[newest].any() and not state.velocity[~newest].any()
+        assert (state.shaded[newest] >= 0).all() and state.shaded.max() > 0 and (state.shaded[~newest] < 0).all()
+    first = dataclasses.replace(frames, images=frames.images.clone(), cloud_step=torch.tensor([0, 3, 4]))
+    first.images[:2] = 0.5
+    again = simulator.encode(first)
+    assert_same_bits(again.velocity, too_old.velocity)
+    assert not torch.equal(in_history.velocity, too_old.velocity)
+
+
 def test_rollout_is_repeated_steps():
     simulator, frames = make_simulator(), make_frames((2, 3))
     state = simulator.encode(frames)

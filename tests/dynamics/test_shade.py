@@ -171,7 +171,9 @@ def test_light_is_that_of_where_rows_are_over_that_of_where_they_were_encoded(ba
             assert_same_bits(known[k], began[: len(shaded)])
     change = torch.tensor([0.1, 0.0, -0.4])
     dynamics.net.head.fc2.bias.detach().unflatten(0, (steps_per_call, -1))[:, -3:] = change
-    brighter = dynamics(history).light.unflatten(0, (steps_per_call, -1))[0]  # as far as is known they began here
+    step = dynamics(history)  # as far as is known they began here
+    assert_close_relative_to_max(step.shaded, torch.cat([shaded] * steps_per_call), 1e-5)
+    brighter = step.light.unflatten(0, (steps_per_call, -1))[0]
     assert_close_relative_to_max(brighter, (2 * (change / 2).tanh()).exp().expand_as(brighter), 1e-5)
 
 
