@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.dynamics.clouds import SOME, alike, newest_clouds, with_look
+from gsim3d.dynamics.clouds import OPTIONAL_FIELDS, alike, newest_clouds, with_field
 from gsim3d.dynamics.state import rotate_left
 from gsim3d.errors import InputError
 from gsim3d.files import read_yaml, typed
@@ -103,7 +103,7 @@ class Rotate(Operation):
             fields["quats"] = rotate_left(state.quats, vector.to(means).expand(state.n_rows, 3))
             fields["sh"] = rotate_harmonics(state.sh, matrix.expand(state.n_rows, 3, 3))
         else:
-            state = with_look(state, "turns")
+            state = with_field(state, "turns")
             fields["turns"] = quat_product(quat.to(means).expand_as(state.turns), state.turns)
         if state.velocity is not None:
             fields["velocity"] = state.velocity @ matrix.T
@@ -152,7 +152,7 @@ class Recolor(Operation):
         paint = torch.outer(state.means.new_tensor(self.color) / mean, grey).expand(state.n_rows, 3, 3)
         if state.sh is not None:
             return _changed(state, rows, {"sh": painted(state.sh, paint)})
-        state = with_look(state, "paint")
+        state = with_field(state, "paint")
         return _changed(state, rows, {"paint": paint @ state.paint})
 
 
@@ -188,7 +188,7 @@ class Insert(Operation):
             raise InputError("particles must be of one scene")
         for field, value in given.row_fields().items():
             mine = getattr(state, field)
-            if field not in SOME and (mine is None or mine.shape[1:] != value.shape[1:]):
+            if field not in OPTIONAL_FIELDS and (mine is None or mine.shape[1:] != value.shape[1:]):
                 raise InputError(f"particles.{field} must be as those of the state; were they made by another model?")
         given = _moved(given, rows, self.by).select_rows(rows).to(state.means.device)
         table, newest = state.clouds, {

@@ -1,7 +1,7 @@
 """Particles of the last steps -> particles of the next steps."""
 
 from gsim3d.dynamics.background import Background
-from gsim3d.dynamics.clouds import append_step, concatenate, last_steps, with_look
+from gsim3d.dynamics.clouds import append_step, concatenate, last_steps, with_field
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.dynamics import Dynamics
 from gsim3d.dynamics.parts import Parts
@@ -20,5 +20,5 @@ __all__ = [
     "last_steps",
     "rollout",
     "rollout_in_parts",
-    "with_look",
+    "with_field",
 ]

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from gsim3d.types import CloudTable, Particles, split_rows
 
-SOME = ("turns", "paint", "held", "unlit", "velocity", "light", "shaded")  # fields that only some particles have
+OPTIONAL_FIELDS = ("turns", "paint", "held", "unlit", "velocity", "light", "shaded")  # that only some particles have
 
 
 def newest_clouds(clouds: CloudTable) -> list[int]:
@@ -54,9 +54,9 @@ def last_steps(particles: Particles, n_steps: int) -> Particles:
     return particles if len(kept) == particles.n_clouds else particles.select_clouds(kept)
 
 
-def with_look(particles: Particles, name: str, width: int = 3) -> Particles:
-    """``particles`` with the field ``name``, one of ``SOME``, which changes nothing where there was none; what has no
-    velocity rests. ``width``: channels, where the field itself does not say how many."""
+def with_field(particles: Particles, name: str, width: int = 3) -> Particles:
+    """``particles`` with the field ``name``, one of ``OPTIONAL_FIELDS``, which changes nothing where there was none;
+    what has no velocity rests. ``width``: channels, where the field itself does not say how many."""
     if getattr(particles, name) is not None:
         return particles
     like = particles.means.new_ones(particles.n_rows, 1)
@@ -73,11 +73,11 @@ def with_look(particles: Particles, name: str, width: int = 3) -> Particles:
 
 
 def alike(parts: Sequence[Particles]) -> list[Particles]:
-    """``parts`` with the same fields: what some have of ``SOME``, all have."""
-    for name in SOME:
+    """``parts`` with the same fields: what some have of ``OPTIONAL_FIELDS``, all have."""
+    for name in OPTIONAL_FIELDS:
         known = [getattr(part, name) for part in parts if getattr(part, name) is not None]
         if known:
-            parts = [with_look(part, name, known[0].shape[-1]) for part in parts]
+            parts = [with_field(part, name, known[0].shape[-1]) for part in parts]
     return list(parts)
 
 

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from gsim3d import ops
 from gsim3d.dynamics.background import Background
-from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps, with_look
+from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps, with_field
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import contact
 from gsim3d.dynamics.momentum import momentum
@@ -125,9 +125,9 @@ class Dynamics(nn.Module):
     def begin(self, state: Particles) -> Particles:
         """``state`` with the fields in which simulated rows know how they began."""
         if self.config.is_relit:
-            state = with_look(state, "unlit")
+            state = with_field(state, "unlit")
         if self.lights is not None:
-            state = with_look(with_look(state, "light"), "shaded", len(self.lights))
+            state = with_field(with_field(state, "light"), "shaded", len(self.lights))
         return state
 
     def forward(

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.dynamics.clouds import newest_clouds, with_look
+from gsim3d.dynamics.clouds import newest_clouds, with_field
 from gsim3d.dynamics.rigid import Lattice, RigidFit, onward_at
 from gsim3d.dynamics.samples import Rows, Samples, squares, weights
 from gsim3d.types import Particles, take_runs
@@ -28,7 +28,7 @@ def momentum(history: Particles, length: float, grid_size: float) -> Tensor:
         Rows of the newest clouds, packed. Gradients: of velocities.
     """
     clouds = history.clouds
-    own = take_runs(with_look(history, "velocity").velocity, clouds.row_runs(newest_clouds(clouds)))
+    own = take_runs(with_field(history, "velocity").velocity, clouds.row_runs(newest_clouds(clouds)))
     return torch.stack([*_rigid(history, own, length, grid_size), own], 1)
 
 
