@@ -18,6 +18,8 @@ from gsim3d.types import ASLEEP, CloudTable, Frames, Particles
 
 BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
 ALWAYS = ("means", "opacities")  # are looked at, changed or not
+# Choices, and what others were when the simulation began: those are looked at.
+NOT_LOOKED_AT = ("activity", "held", "unlit", "shaded", "reference")
 
 
 class _Looks(NamedTuple):
@@ -80,7 +82,7 @@ def guard_particles(
     fields = {
         name: value
         for name, value in particles.row_fields().items()
-        if name not in ("activity", "held") and (changed is None or name in changed or name in ALWAYS)
+        if name not in NOT_LOOKED_AT and (changed is None or name in changed or name in ALWAYS)
     }
     looks = (_looks_at if torch.compiler.is_compiling() else _recent_looks)(tuple(fields), config, max_opacity)
     before = None if previous is None else [getattr(previous, name) for name in fields]

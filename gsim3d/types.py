@@ -225,6 +225,8 @@ class Particles(_Tensors):
         encoded; only of a model with ``lights``.
     shaded: [N, L], what stood in the light of each lamp where rows were encoded (:func:`gsim3d.dynamics.shade.shade`);
         negative where that is not known: they are lit there as where their simulation begins.
+    reference: [N, 3] metres, where rows were when their simulation began: the shape that elastic bodies go back to;
+        only of a model with ``deformation``.
 
     Rows of two encoded steps are not aligned (each step sees other pixels); rows of two simulated steps are.
     """
@@ -248,6 +250,7 @@ class Particles(_Tensors):
     velocity: Tensor | None = None
     light: Tensor | None = None
     shaded: Tensor | None = None
+    reference: Tensor | None = None
     known: CloudTable | None = None  # see clouds
 
     ROW_FIELDS = (
@@ -266,6 +269,7 @@ class Particles(_Tensors):
         "velocity",
         "light",
         "shaded",
+        "reference",
     )
 
     @property

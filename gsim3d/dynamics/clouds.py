@@ -13,7 +13,8 @@ from torch.nn import functional as F
 
 from gsim3d.types import CloudTable, Particles, split_rows
 
-OPTIONAL_FIELDS = ("turns", "paint", "held", "unlit", "velocity", "light", "shaded")  # that only some particles have
+# That only some particles have.
+OPTIONAL_FIELDS = ("turns", "paint", "held", "unlit", "velocity", "light", "shaded", "reference")
 
 
 def newest_clouds(clouds: CloudTable) -> list[int]:
@@ -68,6 +69,7 @@ def with_field(particles: Particles, name: str, width: int = 3) -> Particles:
         "velocity": lambda: torch.zeros_like(particles.means),
         "light": lambda: torch.ones_like(particles.means),
         "shaded": lambda: -like.expand(-1, width),
+        "reference": lambda: particles.means.detach(),
     }
     return dataclasses.replace(particles, **{name: identity[name]()})
 

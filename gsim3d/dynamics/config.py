@@ -49,6 +49,10 @@ class DynamicsConfig:
             (:func:`gsim3d.dynamics.follow.follow`), simulated ones their last step. What goes on is the rigid motion of
             a window of these, and a row's own is a third motion (:func:`gsim3d.dynamics.momentum.momentum`). Gradients
             flow through both, so that an impulse is blamed for all that follows from it.
+        deformation: with ``motion_length`` particles remember where they were when the simulation began. The network
+            sees how they would have to move for the shape that bodies had then
+            (:func:`gsim3d.dynamics.deformation.deformation`), and predicts which share of that they do, as of a motion:
+            what an elastic body does next cannot be told without it.
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.
@@ -88,6 +92,7 @@ class DynamicsConfig:
     position_waves: int = 0
     motion_length: float | None = None
     velocity: bool = False
+    deformation: bool = False
     contact_length: float | None = None
     lights: tuple[tuple[float, float, float], ...] = ()
     grid_size: float = 0.004
@@ -148,8 +153,9 @@ class DynamicsConfig:
                 'DynamicsConfig: motion_length must be positive, and predicts "from_newest" or "from_previous"; '
                 f"got {self.motion_length} and {self.predicts!r}"
             )
-        if self.velocity and self.motion_length is None:
-            raise ValueError("DynamicsConfig: velocity needs motion_length")
+        for name in ("velocity", "deformation"):
+            if getattr(self, name) and self.motion_length is None:
+                raise ValueError(f"DynamicsConfig: {name} needs motion_length")
         if self.contact_length is not None and (self.is_asymmetric or not self.contact_length > 0):
             raise ValueError(
                 'DynamicsConfig: contact_length must be positive, and background "symmetric" or "relit"; '

@@ -15,6 +15,7 @@ from gsim3d.dynamics.background import Background
 from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps, with_field
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import contact
+from gsim3d.dynamics.deformation import deformation
 from gsim3d.dynamics.momentum import momentum
 from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
@@ -126,6 +127,8 @@ class Dynamics(nn.Module):
         """``state`` with the fields in which simulated rows know how they began."""
         if self.config.is_relit:
             state = with_field(state, "unlit")
+        if self.config.deformation:
+            state = with_field(state, "reference")
         if self.lights is not None:
             state = with_field(with_field(state, "light"), "shaded", len(self.lights))
         return state
@@ -179,6 +182,9 @@ class Dynamics(nn.Module):
             drift = momentum(history, config.motion_length, config.grid_size)
         elif config.motion_length is not None:
             drift = motion(history, config.motion_length, config.grid_size)
+        if config.deformation:
+            bent = deformation(history, config.motion_length, config.grid_size)
+            drift = torch.cat([drift, bent[:, None].to(drift.dtype)], 1)
         if drift is not None:
             moved = _put_runs(drift, runs, history.n_rows)
         if config.contact_length is not None:
@@ -304,6 +310,6 @@ def _packed(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor,
 
 def _as_it_began(history: Particles, bodies: bool) -> Particles:
     """``history`` whose frozen rows look as they did when the simulation began; with ``bodies`` all rows."""
-    relit = ((history.activity == FROZEN) | bodies)[:, None]
+    relit = ((history.activity == FROZEN) | bodies & (history.activity != ASLEEP))[:, None]
     latents = torch.where(relit, history.unlit, history.dynamic_latents)
     return dataclasses.replace(history, dynamic_latents=latents)

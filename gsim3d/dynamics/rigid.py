@@ -7,8 +7,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.dynamics.samples import SAMPLES
+from gsim3d.types import constant
 
+SQUARINGS = 10  # of a matrix: what is left is its largest eigenvalue's, to the power 2^10
 NODES = 6  # of the lattice that spans the movable rows of a scene, along each axis
+SMALLEST = 1e-30  # of what is divided by
 STIFFNESS = 1e-3  # against turning, relative to the window's size: a point and a line do not turn
 
 
@@ -71,3 +74,40 @@ def solved(matrices: Tensor, values: Tensor) -> Tensor:
     rows = torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)
     determinant = (a * rows[0]).sum(-1, keepdim=True)
     return torch.stack([(row * values).sum(-1) for row in rows], -1) / determinant
+
+
+def turned_most(products: Tensor) -> Tensor:
+    """Rotations [..., 3, 3] that take vectors nearest to others, of sums [..., 3, 3] of their products, those of the
+    others first (Horn, 1987).
+
+    The rotation is that of the eigenvector q of a symmetric 4 x 4 matrix with the largest eigenvalue: powers of the
+    matrix become q q^T, whose entries a rotation is made of. Where several are as good, as for points on a line, it is
+    the mean of them and no rotation; of no products it is 0.
+    """
+    of_quats = constant(OF_QUATS, products.device).to(products.dtype).unflatten(0, (9, 16))
+    matrix = (products.flatten(-2) @ of_quats).unflatten(-1, (4, 4))
+    one = torch.eye(4, dtype=products.dtype, device=products.device)
+    matrix = matrix + matrix.square().sum((-2, -1), keepdim=True).sqrt() * one  # no eigenvalue is below 0
+    for _ in range(SQUARINGS):
+        matrix = _of_trace_one(matrix)
+        matrix = matrix @ matrix
+    return (_of_trace_one(matrix).flatten(-2) @ of_quats.T).unflatten(-1, (3, 3))
+
+
+def _of_trace_one(matrices: Tensor) -> Tensor:
+    return matrices / matrices.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=SMALLEST)
+
+
+def _of_quats() -> tuple[int, ...]:
+    """9 x 16: each entry of the matrix of a unit quaternion q = (w, x, y, z) as a sum of the entries of q q^T."""
+    ww, xx, yy, zz = 0, 5, 10, 15
+    wx, wy, wz, xy, xz, yz = ((1, 4), (2, 8), (3, 12), (6, 9), (7, 13), (11, 14))
+    sums = [
+        ((ww, xx), (yy, zz)), (xy, wz), ((*xz, *wy), ()),
+        ((*xy, *wz), ()), ((ww, yy), (xx, zz)), (yz, wx),
+        (xz, wy), ((*yz, *wx), ()), ((ww, zz), (xx, yy)),
+    ]  # fmt: skip
+    return tuple((k in added) - (k in taken) for added, taken in sums for k in range(16))
+
+
+OF_QUATS = _of_quats()

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import CONTACT_CHANNELS
+from gsim3d.dynamics.deformation import DEFORMATION_CHANNELS
 from gsim3d.harmonics import degree_damping
 from gsim3d.layers import widened
 from gsim3d.rotations import unit_quats
@@ -35,12 +36,12 @@ class StateLayout:
     """Order and width of the channels: fields that change, then fields that do not, each by the alphabet.
 
     inputs, outputs: (field of Particles, channels). Behind the inputs comes what the configuration adds to them:
-    ``position_features`` and ``motion_length``; then what rows are told alone: ``position_waves``, ``contact_length``,
-    ``velocity`` and ``lights``. A difference of rotations is predicted as a rotation vector about world axes. With
-    ``motion_length`` further channels of positions say how much of each motion is kept along each axis: a contact takes
-    a share, and where nothing of it is kept errors do not add up. With ``lights`` the last channels are the
-    logarithm of how much more light reaches a row than what stands in it lets expect. Harmonics are flat as (3, K),
-    quaternions as (x, y, z, w). The channels of ``outputs`` repeat for every step of a call.
+    ``position_features`` and ``motion_length``; then what rows are ``told`` alone. A difference of rotations is
+    predicted as a rotation vector about world axes. With ``motion_length`` further channels of positions say how much
+    of each motion is kept along each axis: a contact takes a share, and where nothing of it is kept errors do not add
+    up; with ``deformation`` also which share of the way back to its shape a row goes. With ``lights`` the last
+    channels are the logarithm of how much more light reaches a row than what stands in it lets expect. Harmonics are
+    flat as (3, K), quaternions as (x, y, z, w). The channels of ``outputs`` repeat for every step of a call.
     """
 
     config: DynamicsConfig
@@ -51,6 +52,7 @@ class StateLayout:
     def of(cls, config: DynamicsConfig) -> StateLayout:
         dynamic, static = config.dynamic_latents, config.static_latents
         means = 3 + MOTION_CHANNELS * (config.motion_length is not None) + OWN_CHANNELS * config.velocity
+        means += DEFORMATION_CHANNELS * config.deformation
         if not config.explicit:
             inputs = [("dynamic_latents", dynamic), ("opacities", 1), ("static_latents", static)]
             outputs = [("dynamic_latents", dynamic), ("means", means)]
@@ -72,10 +74,21 @@ class StateLayout:
         return known + MOTION_CHANNELS * (self.config.motion_length is not None)
 
     @property
+    def told(self) -> tuple[tuple[str, int], ...]:
+        """(setting, channels) of what follows them and is not."""
+        config = self.config
+        known = {
+            "position_waves": WAVE_CHANNELS * config.position_waves,
+            "contact_length": CONTACT_CHANNELS * (config.contact_length is not None),
+            "velocity": OWN_CHANNELS * config.velocity,
+            "deformation": DEFORMATION_CHANNELS * config.deformation,
+            "lights": 2 * len(config.lights),
+        }
+        return tuple((name, n) for name, n in known.items() if n > 0)
+
+    @property
     def told_channels(self) -> int:
-        """That follow them and are not."""
-        known = WAVE_CHANNELS * self.config.position_waves + CONTACT_CHANNELS * (self.config.contact_length is not None)
-        return known + OWN_CHANNELS * self.config.velocity + 2 * len(self.config.lights)
+        return sum(n for _, n in self.told)
 
     def changes(self, features: str = "all", opacities: bool = True) -> dict[str, str]:
         """Of each output, whose values a step changes: "all", "dynamic", "frozen" or "none".
@@ -115,7 +128,8 @@ class StateLayout:
     ) -> Tensor:
         """[N, in_channels + told_channels] of all rows.
 
-        moved: [N, 2 or 3, 3] metres a step, of :mod:`gsim3d.dynamics.motion`; None: nothing moved.
+        moved: [N, 2 to 4, 3] metres a step, of :mod:`gsim3d.dynamics.motion` or :mod:`gsim3d.dynamics.momentum` and,
+                behind that, :mod:`gsim3d.dynamics.deformation`; None: nothing moved, and nothing is bent.
         near: [N, 4], of :func:`gsim3d.dynamics.contact.contact`; None: nothing is near.
         shaded: [N, 2 lights], of :func:`gsim3d.dynamics.shade.shade` and, behind that, ``particles.shaded``; None:
             nothing is in the light.
@@ -131,14 +145,16 @@ class StateLayout:
         if config.position_features:
             columns.append(position_features(particles, config.grid_size, config.position_length))
         if config.motion_length is not None:
-            still = particles.means.new_zeros(particles.n_rows, MOTION_CHANNELS + OWN_CHANNELS * config.velocity)
+            told = dict(self.told)
+            n_told = told.get("velocity", 0) + told.get("deformation", 0)
+            still = particles.means.new_zeros(particles.n_rows, MOTION_CHANNELS + n_told)
             moved = still if moved is None else moved.flatten(1) / config.grid_size
             columns.append(moved[:, :MOTION_CHANNELS])
         if config.position_waves:
             columns.append(position_waves(particles, config.position_waves, config.position_length))
         if config.contact_length is not None:
             columns.append(particles.means.new_zeros(particles.n_rows, CONTACT_CHANNELS) if near is None else near)
-        if config.velocity:
+        if config.velocity or config.deformation:
             columns.append(moved[:, MOTION_CHANNELS:])
         if config.lights:
             dark = particles.means.new_zeros(particles.n_rows, 2 * len(config.lights)) if shaded is None else shaded
@@ -161,7 +177,7 @@ class StateLayout:
             prediction: [N, channels], the outputs that change.
             awake: bool [N], rows that change at all; None: all.
             changes: of :meth:`changes`; None: all that is predicted.
-            drift: [N, 2 or 3, 3] metres a step, motions that go on as far as they are kept; None: none.
+            drift: as ``moved`` of :meth:`pack`, motions that go on as far as they are kept; None: none.
             brighter: [N, 3], logarithm of light if nothing is predicted; None: there are no lights.
         """
         changes = changes or self.changes()
@@ -194,7 +210,7 @@ class StateLayout:
             newest: [N, ...], its newest values.
             predicted: [S, N, channels], of S steps.
             share: [N, 1] or [S, N, 1], how much of a predicted change happens: 0 holds the value, bit by bit.
-            drift: of means [N, 2 or 3, 3], what is added in every step as far as it is kept; of light [N, 3], what is
+            drift: of means [N, 2 to 4, 3], what is added in every step as far as it is kept; of light [N, 3], what is
                 added to the logarithm that is predicted; None: nothing.
         Returns:
             [S, N, ...].

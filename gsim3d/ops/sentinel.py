@@ -15,7 +15,7 @@ from gsim3d.stability import LARGEST
 # As in csrc/gsim3d/sentinel/sentinel.h
 CELLS = 2**16  # of a workspace along each axis
 OUTSIDE, FAST = 1 << 29, 1 << 30  # bits of a status
-MAX_FIELDS = 8
+MAX_FIELDS = 9
 PIECES = {"cpu": 1024, "cuda": 128}  # rows of a part
 SUMS = ("awake", "kinetic_energy", "opacity_mass", "low_x", "low_y", "low_z", "high_x", "high_y", "high_z")
 
@@ -73,7 +73,7 @@ def watch_rows(
     zeros. The opacity of rows out of bounds is 0. Rows that sleep already stay as they are.
 
     Args:
-        fields: 2 to 8 tensors with N rows, float32 or float64: positions [N, 3], opacities [N], others of any shape.
+        fields: 2 to 9 tensors with N rows, float32 or float64: positions [N, 3], opacities [N], others of any shape.
         bounds: lowest and highest value of each.
         cu_rows: int64 [Q + 1], rows of cloud q are cu_rows[q] .. cu_rows[q + 1].
         cloud_scene: int64 [Q] in [0, B).

@@ -70,6 +70,7 @@ MODEL = {
         "motion_length": 0.3,
         "lights": ((0.36, 0.24, 0.9),),  # the lamp of the worlds; training may turn it
         "velocity": True,
+        "deformation": True,
         "position_waves": 4,
         "background": "relit",  # what shadows change would add up else
         "max_latent_step": 8.0,  # of latents of size 4: from lit to dark at once
@@ -164,8 +165,8 @@ OTHER_GROUND = {"ground_height": (-0.1, 0.12)}
 RECIPES = {
     # Bodies fall for half a second and then hardly move.
     "elastic": _recipe("elastic", (1.9, 4.8), 24, in_turn=({}, {}, OTHER_GROUND)),
-    # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories.
-    "cloth": _recipe("cloth", (1.6, 4.8), 0, strides=(4, 2), batch=3, shape_length=0.1, capacity=400),
+    # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories and graphs.
+    "cloth": _recipe("cloth", (1.6, 4.8), 0, strides=(4, 2), batch=3, rollout=(24, 12), shape_length=0.1, capacity=400),
     "rigid": _recipe(
         "rigid",
         (1.7, 5.0),

@@ -125,9 +125,9 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
 
 def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     """Weights of a trained simulator into a new trainer, whose dynamics may see more (motion, waves, contacts,
-    velocities, lights) than the other's: what reads it begins at zero, and so does what predicts shares of motions and
-    light; where motion is new all that predicts positions, which are others then. New lights begin as in any new
-    trainer.
+    velocities, deformations, lights) than the other's: what reads it begins at zero, and so does what predicts shares
+    of motions and light; where motion is new all that predicts positions, which are others then. New lights begin as in
+    any new trainer.
 
     Returns:
         The checkpoint's name, digest and step.
@@ -139,8 +139,9 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     given = {key: value.float() for key, value in saved.model.items()}
     if SEEN in given and given[SEEN].shape[-1] == own[SEEN].shape[-1] - MOTION_CHANNELS:
         given[SEEN] = F.pad(given[SEEN], (0, MOTION_CHANNELS))
-    if TOLD in own and TOLD not in given:
-        given[TOLD] = torch.zeros_like(own[TOLD])
+    was_told, told = (dict(simulator.dynamics.layout.told) for simulator in (other.simulator, trainer.simulator))
+    if told and was_told.items() <= told.items():
+        given[TOLD] = _told(given.get(TOLD), was_told, told, own[TOLD])
     for key in (LIGHTS, DIMMING):
         if key in own:
             given.setdefault(key, own[key])
@@ -156,6 +157,16 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     weights = trainer.simulator.state_dict()
     trainer.average = {key: value.detach().clone() for key, value in weights.items()}
     return {"name": str(path), "digest": saved.digest, "step": saved.state["step"]}
+
+
+def _told(given: Tensor | None, before: dict[str, int], after: dict[str, int], like: Tensor) -> Tensor:
+    """Weights of what rows are told ``after``, [C, channels] each, padded as ``like``: those of what they were told
+    ``before``, and 0."""
+    parts = {}
+    if given is not None:
+        parts = dict(zip(before, given.split([*before.values(), given.shape[1] - sum(before.values())], 1)))
+    columns = torch.cat([parts.get(name, like.new_zeros(len(like), n)) for name, n in after.items()], 1)
+    return F.pad(columns, (0, like.shape[1] - columns.shape[1]))
 
 
 def _widened(name: str, rows: Tensor, n: int) -> Tensor:

@@ -283,3 +283,17 @@ def test_files_that_are_no_edits(tmp_path, text, message):
     (tmp_path / "edits.yaml").write_text(text)
     with pytest.raises(InputError, match=message):
         load_edits(tmp_path / "edits.yaml", lambda folder: None)
+
+
+@pytest.mark.parametrize("model", CONFIGS)
+def test_a_model_that_is_told_everything_goes_on_from_edits(model):
+    """Its particles have every field that there is."""
+    more = {"motion_length": 0.5, "velocity": True, "deformation": True, "lights": ((0.0, 0.0, 1.0),)}
+    more |= {"background": "relit"} if model == "latent" else {}
+    config = CONFIGS[model]
+    config = dataclasses.replace(config, dynamics=dataclasses.replace(config.dynamics, **more))
+    simulator, state, _ = encoded(config)
+    edits = [Edit(step, Rotate("moving", degrees=30.0)) for step in (0, 1)] + [Edit(1, Recolor("moving", (1.0, 0, 0)))]
+    step = future(simulator, state, 2, edits)[-1]
+    own = {"sh", "quats"} if model == "explicit" else {"turns", "paint", "unlit"}
+    assert own | {"light", "velocity", "reference"} <= step.row_fields().keys() and step.means.isfinite().all()

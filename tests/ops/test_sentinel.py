@@ -249,7 +249,7 @@ def test_gradients_pass_by():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda f, o: (f[:1], o), "fields must be 2 to 8 tensors, positions and opacities first; got 1"),
+        (lambda f, o: (f[:1], o), "fields must be 2 to 9 tensors, positions and opacities first; got 1"),
         (lambda f, o: ([f[0][:, :2], *f[1:]], o), r"fields\[0\] must be \[N, 3\]"),
         (lambda f, o: ([f[0], f[1][:3], *f[2:]], o), r"fields\[1\] must be \[N\]"),
         (lambda f, o: ([*f[:2], f[2].double(), *f[3:]], o), "fields must be float32; got float64"),

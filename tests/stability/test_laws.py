@@ -21,7 +21,7 @@ EXPLICIT_CONFIG = dataclasses.replace(
     dynamics=dataclasses.replace(EXPLICIT, grid_size=0.1),
     renderer=dataclasses.replace(CONFIG.renderer, latents=0),
 )
-MORE = {"motion_length": 0.3, "velocity": True}
+MORE = {"motion_length": 0.3, "velocity": True, "deformation": True, "lights": ((0.1, 0.2, 1.0),)}
 MOVING = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **MORE))
 CONFIGS = {"latent": CONFIG, "explicit": EXPLICIT_CONFIG, "moving": MOVING}
 

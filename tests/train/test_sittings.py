@@ -280,7 +280,10 @@ def saved_with_a_head(config, store, folder):
     return weights_file(folder / "state", load_progress(folder / "state", NAME))
 
 
-@pytest.mark.parametrize("more", [{}, {"position_waves": 2, "contact_length": 0.15, "velocity": True}])
+ALL_BUT_LIGHTS = {"position_waves": 2, "contact_length": 0.15, "velocity": True, "deformation": True}
+
+
+@pytest.mark.parametrize("more", [{}, ALL_BUT_LIGHTS])
 def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path, more):
     """What it predicts is the same, but that bodies fly on instead of what it said of positions."""
     known = saved_with_a_head(CONFIG, store, tmp_path)
@@ -309,8 +312,7 @@ def test_a_run_begins_with_a_simulator_that_saw_no_motion(store, tmp_path, more)
 def test_a_run_that_sees_more_begins_as_one_that_saw_motion_went_on(store, tmp_path, monkeypatch):
     """Given the same motions, which one reads off clouds and the other off velocities."""
     motion_only = dataclasses.replace(CONFIG, model={"dynamics": {"motion_length": 0.3}})
-    told = {"motion_length": 0.3, "velocity": True, "position_waves": 2, "contact_length": 0.15}
-    told["lights"] = ((0.0, 0.3, 1.0),)
+    told = {"motion_length": 0.3, **ALL_BUT_LIGHTS, "lights": ((0.0, 0.3, 1.0),)}
     more = dataclasses.replace(CONFIG, model={"dynamics": told})
     known = saved_with_a_head(motion_only, store, tmp_path)
     trainer = SittingTrainer(more, store, tmp_path / "run", "cpu")
@@ -325,6 +327,26 @@ def test_a_run_that_sees_more_begins_as_one_that_saw_motion_went_on(store, tmp_p
     assert moved > 0.01 and (step.means - expected.means).abs().max() < 1e-4 * moved
     torch.testing.assert_close(step.dynamic_latents, expected.dynamic_latents)
     assert state.shaded.max() > 0 and (step.light == 1).all()  # nobody knows yet of what has moved
+
+
+def test_a_run_that_is_told_more_goes_on_with_what_it_was_told_before(store, tmp_path):
+    """Whatever stands between."""
+    lights = {"lights": ((0.0, 0.3, 1.0),)}
+    before = {"motion_length": 0.3, "velocity": True, **lights}
+    known = saved_with_a_head(dataclasses.replace(CONFIG, model={"dynamics": before}), store, tmp_path)
+    after = {"motion_length": 0.3, **ALL_BUT_LIGHTS, **lights}
+    trainer = SittingTrainer(dataclasses.replace(CONFIG, model={"dynamics": after}), store, tmp_path / "run", "cpu")
+    begin_with(trainer, known)
+    given, own = restore(known).simulator, trainer.simulator.eval()
+    batch = store.draw(CONFIG.data, CONFIG.stages[1], 0, 2, range(1))
+    with torch.no_grad():
+        state = own.encode(batch.context)
+        expected, step = given.dynamics(state), own.dynamics(state)
+    for name in ("means", "dynamic_latents", "light"):
+        torch.testing.assert_close(getattr(step, name), getattr(expected, name))
+    less = SittingTrainer(dataclasses.replace(CONFIG, model={"dynamics": lights}), store, tmp_path / "less", "cpu")
+    with pytest.raises(InputError, match="other sizes"):
+        begin_with(less, known)
 
 
 @pytest.mark.parametrize("other", [{"steps_per_call": 2}, {"motion_length": 0.3}])

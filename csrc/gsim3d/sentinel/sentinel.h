@@ -13,7 +13,7 @@
 
 namespace gsim3d {
 
-constexpr int kMaxWatchedFields = 8;
+constexpr int kMaxWatchedFields = 9;
 constexpr int32_t kOutside = 1 << 29, kFast = 1 << 30;
 constexpr uint8_t kAsleep = 2;         // Particles.activity of gsim3d/types.py
 constexpr double kWatchedCells = 65536;  // of a workspace along each axis: codes have 16 bits
