@@ -51,8 +51,8 @@ class DynamicsConfig:
             flow through both, so that an impulse is blamed for all that follows from it.
         deformation: with ``motion_length`` particles remember where they were when the simulation began. The network
             sees how they would have to move for the shape that bodies had then
-            (:func:`gsim3d.dynamics.deformation.deformation`), and predicts which share of that they do, as of a motion:
-            what an elastic body does next cannot be told without it.
+            (:func:`gsim3d.dynamics.deformation.deformation`), and predicts how much more or less of that they do than
+            a share that keeps shapes: what an elastic body does next cannot be told without it.
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.

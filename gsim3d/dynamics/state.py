@@ -25,6 +25,7 @@ OWN_CHANNELS = 3
 LONGEST_WAVE = 4.0  # in units of position_length; each further wave is half as long
 ONWARD = 1  # of the motions that gsim3d.dynamics.motion tells, the one that goes on if nothing is predicted
 MOST_KEPT = 2.0  # how much more or less of a motion may go on
+BACK = 0.3  # share of the way back to its shape that a row goes in a step if nothing is predicted: else shapes dissolve
 LIGHT_CHANNELS = 3  # of colours
 MOST_LIGHT = 2.0  # logarithm of how much more or less light there may be
 FEATURES = ("dynamic_latents", "sh", "light")  # that rows which are held keep
@@ -229,10 +230,12 @@ class StateLayout:
             changes = changes.cumsum(0)
         if drift is not None:
             kept = bounded(kept / MOST_KEPT, MOST_KEPT).unflatten(2, drift.shape[1:])
-            drift = drift[:, ONWARD] + (kept * drift).sum(2)
             ahead = torch.arange(1, 1 + changes.shape[0], device=drift.device)[:, None, None]
+            onward = ahead * (drift[:, ONWARD] + (kept * drift).sum(2))
+            if self.config.deformation:
+                onward = onward + (1 - (1 - BACK) ** ahead) * drift[:, -1]
             most = math.inf if self.config.max_step is None else self.config.max_step
-            changes = torch.minimum(torch.maximum(changes + ahead * drift, -most * ahead), most * ahead)
+            changes = torch.minimum(torch.maximum(changes + onward, -most * ahead), most * ahead)
         return hold(share, newest, self._in_range(name, newest + share * changes))
 
     @property
