@@ -14,7 +14,7 @@ from gsim3d.quirks import Quirks
 from gsim3d.renderer import RendererConfig, render, render_as_published
 from gsim3d.simulator import Simulator
 from gsim3d.train.loop import deterministic
-from gsim3d.types import FROZEN, Cameras, Frames
+from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import TINY
 from tests.encoder.scenes import CONFIG as TINY_ENCODER
@@ -108,6 +108,24 @@ def test_encoded_particles_know_how_fast_they_are_and_what_stands_in_their_light
     again = simulator.encode(first)
     assert_same_bits(again.velocity, too_old.velocity)
     assert not torch.equal(in_history.velocity, too_old.velocity)
+
+
+@pytest.mark.parametrize("name", ["means", "dynamic_latents"])
+@pytest.mark.parametrize("activity", [DYNAMIC, FROZEN])
+def test_what_a_broken_row_remembers_is_not_used(name, activity):
+    more = {"motion_length": 0.5, "deformation": True, "lights": ((0.0, 0.0, 1.0),), "background": "relit"}
+    config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **more))
+    simulator, frames = awake(make_simulator(config)), make_frames()
+    plan = simulator.plan(EffectsSpec(appearance=AppearanceEffects(changing="all")))
+    state = simulator.encode(frames)
+    row = int(torch.nonzero((state.activity == activity) & (state.row_cloud() == 1))[0])
+    values = getattr(state, name).clone()
+    values[row] = torch.nan
+    state = dataclasses.replace(state, **{name: values})
+    step = simulator.rollout(state, 3, plan, on_bad="drop")[-1]
+    for seen in ("means", "opacities", "dynamic_latents", "light"):
+        assert getattr(step, seen).isfinite().all(), seen
+    assert simulator.render(step, target_cameras(frames, 1), torch.ones(3)).color.isfinite().all()
 
 
 def test_rollout_is_repeated_steps():

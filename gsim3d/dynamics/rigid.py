@@ -88,9 +88,10 @@ def turned_most(products: Tensor) -> Tensor:
     matrix = (products.flatten(-2) @ of_quats).unflatten(-1, (4, 4))
     one = torch.eye(4, dtype=products.dtype, device=products.device)
     matrix = matrix + matrix.square().sum((-2, -1), keepdim=True).sqrt() * one  # no eigenvalue is below 0
-    for _ in range(SQUARINGS):
+    for _ in range(2):  # numbers stay far from the smallest
         matrix = _of_trace_one(matrix)
-        matrix = matrix @ matrix
+        for _ in range(SQUARINGS // 2):
+            matrix = matrix @ matrix
     return (_of_trace_one(matrix).flatten(-2) @ of_quats.T).unflatten(-1, (3, 3))
 
 
