@@ -140,7 +140,9 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     if SEEN in given and given[SEEN].shape[-1] == own[SEEN].shape[-1] - MOTION_CHANNELS:
         given[SEEN] = F.pad(given[SEEN], (0, MOTION_CHANNELS))
     was_told, told = (dict(simulator.dynamics.layout.told) for simulator in (other.simulator, trainer.simulator))
-    if told and was_told.items() <= told.items():
+    if not was_told.items() <= told.items():
+        raise InputError(f"{path}: a simulator of other sizes: its dynamics is told {was_told}, this one {told}")
+    if told:
         given[TOLD] = _told(given.get(TOLD), was_told, told, own[TOLD])
     for key in (LIGHTS, DIMMING):
         if key in own:

@@ -120,6 +120,14 @@ def test_simulated_rows_remember_where_they_were():
         assert_same_bits(step.reference, last_steps(history, 1).means)
 
 
+@pytest.mark.parametrize("background", ["asymmetric", "relit"])
+def test_where_the_background_is_not_computed_anew_bodies_remember_too(background):
+    config = dataclasses.replace(REMEMBERING, norm="layer", background=background, zero_init=True, velocity=True)
+    history = with_field(bent(SQUEEZED, frozen_share=0.3), "velocity")
+    moved = make_dynamics(config)(history).means - history.means
+    assert_close_relative_to_max(moved, BACK * deformation(history, *HOW), 1e-3)
+
+
 def test_a_share_of_the_way_back_is_gone():
     history = with_field(bent(SQUEEZED), "velocity")
     dynamics = make_dynamics(dataclasses.replace(REMEMBERING, velocity=True, zero_init=True))

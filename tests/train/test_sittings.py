@@ -349,7 +349,7 @@ def test_a_run_that_is_told_more_goes_on_with_what_it_was_told_before(store, tmp
         begin_with(less, known)
 
 
-@pytest.mark.parametrize("other", [{"steps_per_call": 2}, {"motion_length": 0.3}])
+@pytest.mark.parametrize("other", [{"steps_per_call": 2}, {"motion_length": 0.3}, {"contact_length": 0.2}])
 def test_a_run_does_not_begin_with_what_predicts_more(store, tmp_path, other):
     config = dataclasses.replace(CONFIG, model={"dynamics": other})
     trainer = SittingTrainer(CONFIG, store, tmp_path / "run", "cpu")
