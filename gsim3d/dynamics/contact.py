@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsim3d.dynamics.clouds import newest_clouds
-from gsim3d.dynamics.samples import FAINTEST, Rows, Samples, squares, weights
+from gsim3d.dynamics.matter import Matter
+from gsim3d.dynamics.samples import FAINTEST, Samples, squares, weights
 from gsim3d.types import FROZEN, Particles
 
 CONTACT_CHANNELS = 4
@@ -15,7 +15,7 @@ SOLID = 0.1  # opacity; below it are rows at silhouettes, whose depth was not kn
 
 
 @torch.no_grad()
-def contact(history: Particles, length: float, grid_size: float) -> Tensor:
+def contact(history: Particles, length: float, grid_size: float, matter: Matter | None = None) -> Tensor:
     """[N, 4]: how near what is frozen is to each row of the newest clouds that moves, exp(-d^2 / 2 length^2), and that
     times the way there in units of ``length``, which comes first. 0 of other rows, and where nothing is frozen.
 
@@ -27,21 +27,20 @@ def contact(history: Particles, length: float, grid_size: float) -> Tensor:
         history: clouds sorted by (scene, step).
         length: metres; larger than what a step moves a row, so that a contact is seen before it happens.
         grid_size: metres, edge of the dynamics' cells.
+        matter: of ``history``; None: found here.
     Returns:
         Rows of the newest clouds, packed. No gradients.
     """
-    clouds, newest = history.clouds, newest_clouds(history.clouds)
-    if not any(clouds.count(q) for q in newest):
+    matter = matter or Matter.of(history, grid_size)
+    if matter is None:
         return history.means.new_zeros(0, CONTACT_CHANNELS)
     with torch.autocast(history.means.device.type, enabled=False):
-        rows = Rows(history, newest, grid_size)
-        rests = Samples(history, newest, grid_size, FROZEN, SOLID)
+        rests = Samples(matter.rows.that_are(history, FROZEN, SOLID))
         here = rests.mean[:, None]
         rests.seen_from(here)
-        places = rows.places - here
+        places = matter.rows.places - here
         window = weights(squares(places, rests.places) * (-0.5 / (WINDOW * length) ** 2), rests.known)
         way = (window @ rests.places - places) / length
         near = (-0.5 * way.square().sum(2, keepdim=True)).clamp(min=FAINTEST).exp()
-        known = (rows.wanted & (rests.n > 0)[:, None])[:, :, None]
-        result = torch.where(known, torch.cat([near * way, near], 2), 0)
-    return torch.cat([result[b, : clouds.count(q)] for b, q in enumerate(newest)])
+        known = (matter.rows.wanted & (rests.n > 0)[:, None])[:, :, None]
+        return matter.packed(torch.where(known, torch.cat([near * way, near], 2), 0))

@@ -16,6 +16,7 @@ from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps, wit
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import contact
 from gsim3d.dynamics.deformation import deformation
+from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.momentum import momentum
 from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
@@ -178,19 +179,22 @@ class Dynamics(nn.Module):
             )
         runs, config = clouds.row_runs(newest), self.config
         moved = drift = near = dark = brighter = None
+        matter = self._matter(history)
         if config.velocity:
-            drift = momentum(history, config.motion_length, config.grid_size)
+            drift = momentum(history, config.motion_length, config.grid_size, matter)
         elif config.motion_length is not None:
             drift = motion(history, config.motion_length, config.grid_size)
         if config.deformation:
-            bent = deformation(history, config.motion_length, config.grid_size)
+            bent = deformation(history, config.motion_length, config.grid_size, matter)
             drift = torch.cat([drift, bent[:, None].to(drift.dtype)], 1)
         if drift is not None:
             moved = _put_runs(drift, runs, history.n_rows)
         if config.contact_length is not None:
-            near = _put_runs(contact(history, config.contact_length, config.grid_size), runs, history.n_rows)
+            near = contact(history, config.contact_length, config.grid_size, matter)
+            near = _put_runs(near, runs, history.n_rows)
         if self.lights is not None:
-            shaded, began = shade(history, self.lights, config.grid_size), take_runs(history.shaded, runs)
+            shaded = shade(history, self.lights, config.grid_size, matter)
+            began = take_runs(history.shaded, runs)
             began = torch.where(began < 0, shaded, began)
             brighter = ((began - shaded)[:, :, None] * self.dimming).sum(1)  # a product of matrices would be rounded
             dark = _put_runs(torch.cat([shaded, began], 1), runs, history.n_rows)
@@ -228,6 +232,15 @@ class Dynamics(nn.Module):
                 for before, step in zip([state, *steps], steps)
             ]
         return steps[0] if len(steps) == 1 else concatenate(steps)
+
+    def _matter(self, history: Particles) -> Matter | None:
+        """What all that rows are told begins with; None where nothing is told of it."""
+        config = self.config
+        if config.velocity or config.deformation:
+            return Matter.of(history, config.grid_size, config.motion_length)
+        if config.contact_length is not None or self.lights is not None:
+            return Matter.of(history, config.grid_size)
+        return None
 
     def _seen(self, history: Particles) -> Tensor:
         """bool [N], rows that the network sees."""

@@ -49,7 +49,8 @@ def follow(
     if first == newest or not any(clouds.count(q) for q in newest):
         return result
     with torch.autocast(particles.means.device.type, enabled=False):
-        now, then = (Samples(particles, chosen, grid_size) for chosen in (newest, first))
+        rows = Rows(particles, newest, grid_size)
+        now, then = Samples(rows), Samples(Rows(particles, first, grid_size))
         here = now.mean[:, None]
         for samples in (now, then):
             samples.seen_from(here)
@@ -61,7 +62,6 @@ def follow(
         seen, before = (_Views(frames, particles, images, is_image, chosen, here) for chosen in (newest, first))
         moved = _aligned(now, lattice, window, centre, velocity, seen, before)
         a_step = share_of_a_step(clouds, first, newest, now, then)
-        rows = Rows(particles, newest, grid_size)
         places = rows.places - here
         velocity, spin, middle = lattice.at(places, *(x * a_step for x in moved), centre)
         found = torch.where(rows.wanted[:, :, None], velocity + torch.linalg.cross(spin, places - middle), 0)

@@ -42,17 +42,18 @@ def motion(history: Particles, length: float, grid_size: float) -> Tensor:
     first = [0, *(q + 1 for q in newest[:-1])]
     before = [max(f, q - 1) for f, q in zip(first, newest, strict=True)]
     with torch.autocast(history.means.device.type, enabled=False):
-        now, last, oldest = (Samples(history, chosen, grid_size) for chosen in (newest, before, first))
+        rows = Rows(history, newest, grid_size)
+        now, last, oldest = map(Samples, (rows, *(Rows(history, chosen, grid_size) for chosen in (before, first))))
         here = now.mean[:, None]
         for samples in (now, last, oldest):
             samples.seen_from(here)
         lattice = Lattice(now.places, now.known)
         window = weights(squares(lattice.nodes, now.places) * (-0.5 / length**2), now.known)
         moved, expected = (shift(now, then, lattice.nodes, window, length) for then in (last, oldest))
-        velocity, spin, centre = _rigid_motion(now, oldest, lattice, window, expected, length)
+        looks = tuple(samples.of(history.latents) for samples in (now, oldest))
+        velocity, spin, centre = _rigid_motion(now, oldest, looks, lattice, window, expected, length)
         a_step = share_of_a_step(clouds, before, newest, now, last)
         all_steps = share_of_a_step(clouds, first, newest, now, oldest)
-        rows = Rows(history, newest, grid_size)
         places = rows.places - here
         moved, *rigid = lattice.at(places, moved * a_step, velocity * all_steps, spin * all_steps, centre)
         onward = onward_at(places, *rigid)
@@ -70,14 +71,20 @@ def shift(now: Samples, then: Samples, nodes: Tensor, window: Tensor, length: fl
 
 
 def _rigid_motion(
-    now: Samples, then: Samples, lattice: Lattice, window: Tensor, moved: Tensor, length: float
+    now: Samples,
+    then: Samples,
+    looks: tuple[Tensor, Tensor],
+    lattice: Lattice,
+    window: Tensor,
+    moved: Tensor,
+    length: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Velocity, spin (rad) and centre [B, G, 3] of the rigid motion that takes matter in each window from ``then`` to
-    ``now``, if it moved about as far as ``moved``."""
-    mean = now.mean_of(now.latents)[:, None]
-    looks, looked = now.latents - mean, then.latents - mean
-    spread = now.mean_of(looks.square().sum(2, keepdim=True)).clamp(min=LEAST_SPREAD)[:, None]
-    unlike = squares(looks, looked) * (-0.5 / (LIKENESS**2 * spread))
+    ``now``, if it moved about as far as ``moved``. looks: their latents."""
+    mean = now.mean_of(looks[0])[:, None]
+    look, looked = (x - mean for x in looks)
+    spread = now.mean_of(look.square().sum(2, keepdim=True)).clamp(min=LEAST_SPREAD)[:, None]
+    unlike = squares(look, looked) * (-0.5 / (LIKENESS**2 * spread))
     body, spin = RigidFit(window, now.places, length), torch.zeros_like(moved)
     for _ in range(PASSES):
         velocity, turns, middle = lattice.at(now.places, moved, spin, body.centre)

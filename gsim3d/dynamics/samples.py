@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -30,36 +32,46 @@ class Rows:
         )
         place = torch.arange(max(1, max(table.count(q) for q in chosen)), device=device)
         self.rows = (starts[:, None] + place).clamp(max=history.n_rows - 1)
-        places = history.means.detach()[self.rows].double() - history.origin[scenes][:, None]
-        is_seen = ((places >= 0) & (places / grid_size < CELLS)).all(2)  # inside the workspace, not NaN
-        self.wanted = (place < counts[:, None]) & (history.activity[self.rows] == activity) & is_seen
+        self._all = history.means.detach()[self.rows].double() - history.origin[scenes][:, None]
+        inside = ((self._all >= 0) & (self._all / grid_size < CELLS)).all(2)  # the workspace, and not NaN
+        self._is_seen = (place < counts[:, None]) & inside
+        self._choose(history, activity, opacity)
+
+    def that_are(self, history: Particles, activity: int, opacity: float = 0.0) -> Rows:
+        """Others of the same cloud."""
+        others = copy.copy(self)
+        others._choose(history, activity, opacity)
+        return others
+
+    def _choose(self, history: Particles, activity: int, opacity: float) -> None:
+        self.wanted = self._is_seen & (history.activity[self.rows] == activity)
         if opacity > 0:
             self.wanted = self.wanted & (history.opacities.detach()[self.rows] >= opacity)
-        self.places = torch.where(self.wanted[:, :, None], places, 0).to(history.means.dtype)
+        self.places = torch.where(self.wanted[:, :, None], self._all, 0).to(history.means.dtype)
 
 
 class Samples:
     """Of :class:`Rows` all that are wanted, or S that are evenly spread over their list.
 
     n: [B] there are.   known: bool [B, S], entries that are rows; others are 0.   mean: [B, 3] of the places.
-    places: [B, S, 3].   latents: [B, S, C].
+    places: [B, S, 3].
     """
 
-    def __init__(
-        self, history: Particles, chosen: list[int], grid_size: float, activity: int = DYNAMIC, opacity: float = 0.0
-    ):
-        cloud = Rows(history, chosen, grid_size, activity, opacity)
-        self._wanted, self._until = cloud.wanted, cloud.wanted.cumsum(1)
+    def __init__(self, cloud: Rows):
+        self._rows, self._wanted, self._until = cloud.rows, cloud.wanted, cloud.wanted.cumsum(1)
         self.n = self._until[:, -1]
         k = torch.arange(SAMPLES, device=self.n.device)
         self.known = k < self.n[:, None]
-        at = torch.searchsorted(self._until, self._place(k) + 1).clamp(max=self._until.shape[1] - 1)
-        self._at = at
-        here = self.known[:, :, None]
-        self.places = torch.where(here, cloud.places.gather(1, at[:, :, None].expand(-1, -1, 3)), 0)
-        latents = history.latents.detach()[cloud.rows.gather(1, at)].to(self.places.dtype)
-        self.latents = torch.where(here, latents, 0).nan_to_num(0, 0, 0)
+        self._at = torch.searchsorted(self._until, self._place(k) + 1).clamp(max=self._until.shape[1] - 1)
+        self.places = torch.where(
+            self.known[:, :, None], cloud.places.gather(1, self._at[:, :, None].expand(-1, -1, 3)), 0
+        )
         self.mean = self.mean_of(self.places)
+
+    def of(self, values: Tensor) -> Tensor:
+        """[B, S, C] of ``values`` [N, C] of all rows of the history, as places; 0 for what is no number."""
+        found = values.detach()[self._rows.gather(1, self._at)].to(self.places.dtype)
+        return torch.where(self.known[:, :, None], found, 0).nan_to_num(0, 0, 0)
 
     def _place(self, k: Tensor) -> Tensor:
         """Of sample ``k`` in the list of those that are wanted."""

@@ -5,16 +5,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsim3d.dynamics.clouds import newest_clouds
-from gsim3d.dynamics.samples import FAINTEST, Rows, Samples, squares
-from gsim3d.types import DYNAMIC, FROZEN, Particles
+from gsim3d.dynamics.matter import Matter
+from gsim3d.dynamics.samples import FAINTEST, Samples, squares
+from gsim3d.types import FROZEN, Particles
 
 BEAM = 2.0  # cells: standard deviation of the beam of light in which matter is counted
 NEAREST = 3.0  # cells towards the light, from which on matter counts half; less is the surface that a row is part of
 EDGE = 0.5  # cells, over which it begins to count
 
 
-def shade(history: Particles, lights: Tensor, grid_size: float) -> Tensor:
+def shade(history: Particles, lights: Tensor, grid_size: float, matter: Matter | None = None) -> Tensor:
     """[N, L]: log(1 + n) of each row of the newest clouds and each light, where n is the matter between them: rows of
     its scene that move, counted in a Gaussian beam from the row towards the light. 0 of rows that are asleep.
 
@@ -25,23 +25,20 @@ def shade(history: Particles, lights: Tensor, grid_size: float) -> Tensor:
         history: clouds sorted by (scene, step).
         lights: [L, 3], directions towards lamps far away, of any length.
         grid_size: metres, edge of the dynamics' cells.
+        matter: of ``history``; None: found here.
     Returns:
         Rows of the newest clouds, packed. Gradients: of ``lights``.
     """
-    clouds, newest = history.clouds, newest_clouds(history.clouds)
-    if not any(clouds.count(q) for q in newest):
+    matter = matter or Matter.of(history, grid_size)
+    if matter is None:
         return history.means.new_zeros(0, len(lights))
     with torch.autocast(history.means.device.type, enabled=False):
         with torch.no_grad():
-            matter = Samples(history, newest, grid_size)
-            here = matter.mean[:, None]
-            matter.seen_from(here)
-            rows = [Rows(history, newest, grid_size, activity) for activity in (DYNAMIC, FROZEN)]
-            is_lit = rows[0].wanted | rows[1].wanted
-            places = torch.where(rows[0].wanted[:, :, None], rows[0].places, rows[1].places) - here
-        found = torch.stack([_between(places, matter, light, grid_size) for light in lights.unbind(0)], 2)
-        result = torch.where(is_lit[:, :, None], found.log1p(), 0)
-    return torch.cat([result[b, : clouds.count(q)] for b, q in enumerate(newest)])
+            moves, rests = matter.rows, matter.rows.that_are(history, FROZEN)
+            places = torch.where(moves.wanted[:, :, None], moves.places, rests.places) - matter.here
+            is_lit = moves.wanted | rests.wanted
+        found = [_between(places, matter.samples, light, grid_size) for light in lights.unbind(0)]
+        return matter.packed(torch.where(is_lit[:, :, None], torch.stack(found, 2).log1p(), 0))
 
 
 def _between(places: Tensor, matter: Samples, light: Tensor, grid_size: float) -> Tensor:

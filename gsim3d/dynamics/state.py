@@ -311,8 +311,8 @@ def position_waves(particles: Particles, n: int, length: float) -> Tensor:
     """[N, 6 n]: sines and cosines of the position relative to the scene's origin, of ``n`` waves along each axis from
     ``LONGEST_WAVE`` times ``length`` down."""
     angles = _from_origin(particles) * (2 * math.pi / (LONGEST_WAVE * length))
-    waves = [wave for k in range(n) for wave in ((2**k * angles).sin(), (2**k * angles).cos())]
-    return torch.cat(waves, 1).to(particles.means.dtype)
+    angles = torch.stack([2**k * angles for k in range(n)], 1)
+    return torch.stack([angles.sin(), angles.cos()], 2).flatten(1).to(particles.means.dtype)
 
 
 def _from_origin(particles: Particles) -> Tensor:

@@ -95,7 +95,7 @@ def _recipe(
     rollout: tuple[int, int] = (48, 24),
     lit_before: int = 40,
     contact_length: float = 0.15,
-    shape: float = 0.015,
+    shape: float = 0.005,
     shape_length: float = 0.2,
     capacity: int = 600,
     in_turn: tuple[dict, ...] = ({},),

@@ -1,0 +1,51 @@
+"""What may move of the newest step of every scene: momentum, deformation, contact and shade look at the same."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from gsim3d.dynamics.clouds import newest_clouds
+from gsim3d.dynamics.rigid import Lattice
+from gsim3d.dynamics.samples import Rows, Samples, squares, weights
+from gsim3d.types import Particles
+
+
+class Matter:
+    """The rows that may move, and samples of them. No gradients.
+
+    rows, samples: of the newest clouds; places of samples count from ``here`` [B, 1, 3], the mean of theirs.
+    places: [B, M, 3] of the rows, from there as well.
+    lattice, window: [B, G, S] how much each sample counts around a node, in a Gaussian of ``length`` metres; where one
+        is given.
+    """
+
+    def __init__(self, history: Particles, grid_size: float, length: float | None = None):
+        self.newest = newest_clouds(history.clouds)
+        self._counts = [history.clouds.count(q) for q in self.newest]
+        with torch.no_grad(), torch.autocast(history.means.device.type, enabled=False):
+            self.rows = Rows(history, self.newest, grid_size)
+            self.samples = Samples(self.rows)
+            self.here = self.samples.mean[:, None]
+            self.samples.seen_from(self.here)
+            self.places = self.rows.places - self.here
+            if length is not None:
+                self.lattice = Lattice(self.samples.places, self.samples.known)
+                far = squares(self.lattice.nodes, self.samples.places)
+                self.window = weights(far * (-0.5 / length**2), self.samples.known)
+
+    @classmethod
+    def of(cls, history: Particles, grid_size: float, length: float | None = None) -> Matter | None:
+        """None where the newest clouds have no rows."""
+        clouds = history.clouds
+        return cls(history, grid_size, length) if any(clouds.count(q) for q in newest_clouds(clouds)) else None
+
+    def padded(self, values: Tensor) -> Tensor:
+        """[B, M, C] of ``values`` [N, C] of the rows of the newest clouds, packed."""
+        most = self.places.shape[1]
+        return torch.stack([F.pad(part, (0, 0, 0, most - len(part))) for part in values.split(self._counts)])
+
+    def packed(self, values: Tensor) -> Tensor:
+        """[N, ...] of ``values`` [B, M, ...]."""
+        return torch.cat([values[b, :n] for b, n in enumerate(self._counts)])
