@@ -7,9 +7,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.dynamics.clouds import newest_clouds
+from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.motion import share_of_a_step, shift
-from gsim3d.dynamics.rigid import Lattice, onward_at, solved
-from gsim3d.dynamics.samples import Rows, Samples, squares, weights
+from gsim3d.dynamics.rigid import onward_at, solved
+from gsim3d.dynamics.samples import Rows, Samples
 from gsim3d.types import CloudTable, Frames, Particles, constant
 
 PASSES = 5
@@ -49,22 +50,20 @@ def follow(
     if first == newest or not any(clouds.count(q) for q in newest):
         return result
     with torch.autocast(particles.means.device.type, enabled=False):
-        rows = Rows(particles, newest, grid_size)
-        now, then = Samples(rows), Samples(Rows(particles, first, grid_size))
-        here = now.mean[:, None]
-        for samples in (now, then):
-            samples.seen_from(here)
-        lattice = Lattice(now.places, now.known)
-        window = weights(squares(lattice.nodes, now.places) * (-0.5 / length**2), now.known)
-        centre = window @ now.places
-        velocity = shift(now, then, lattice.nodes, window, length)
+        matter, then = Matter(particles, grid_size, length), Samples(Rows(particles, first, grid_size))
+        then.seen_from(matter.here)
+        now, lattice = matter.samples, matter.lattice
+        centre = matter.window @ now.places
+        velocity = shift(now, then, lattice.nodes, matter.window, length)
         images, is_image = _images(frames, len(clouds), n_views)
-        seen, before = (_Views(frames, particles, images, is_image, chosen, here) for chosen in (newest, first))
-        moved = _aligned(now, lattice, window, centre, velocity, seen, before)
+        seen, before = (
+            _Views(frames, particles, images, is_image, chosen, matter.here) for chosen in (newest, first)
+        )
+        moved = _aligned(matter, centre, velocity, seen, before)
         a_step = share_of_a_step(clouds, first, newest, now, then)
-        places = rows.places - here
-        velocity, spin, middle = lattice.at(places, *(x * a_step for x in moved), centre)
-        found = torch.where(rows.wanted[:, :, None], velocity + torch.linalg.cross(spin, places - middle), 0)
+        velocity, spin, middle = lattice.at(matter.places, *(x * a_step for x in moved), centre)
+        found = velocity + torch.linalg.cross(spin, matter.places - middle)
+        found = torch.where(matter.rows.wanted[:, :, None], found, 0)
     for b, q in enumerate(newest):
         result[clouds.starts[q] : clouds.starts[q + 1]] = found[b, : clouds.count(q)]
     return result
@@ -76,9 +75,10 @@ def _oldest(clouds: CloudTable, begin: int, newest: int, n_steps: int) -> int:
 
 
 def _aligned(
-    now: Samples, lattice: Lattice, window: Tensor, centre: Tensor, velocity: Tensor, seen: _Views, before: _Views
+    matter: Matter, centre: Tensor, velocity: Tensor, seen: _Views, before: _Views
 ) -> tuple[Tensor, Tensor]:
     """Velocity and spin (rad) [B, G, 3] of each window, from the oldest step to the newest."""
+    now, lattice, window = matter.samples, matter.lattice, matter.window
     spin, places = torch.zeros_like(velocity), now.places
     outwards = F.normalize(places - lattice.at(places, centre)[0], dim=2)
     wanted = []

@@ -1,4 +1,4 @@
-"""What may move of the newest step of every scene: momentum, deformation, contact and shade look at the same."""
+"""What may move of the newest step of every scene: all that rows are told looks at the same."""
 
 from __future__ import annotations
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsim3d.dynamics.clouds import newest_clouds
-from gsim3d.dynamics.rigid import Lattice, RigidFit, onward_at
+from gsim3d.dynamics.matter import Matter
+from gsim3d.dynamics.rigid import RigidFit, onward_at
 from gsim3d.dynamics.samples import Rows, Samples, squares, weights
 from gsim3d.types import CloudTable, Particles, constant
 
@@ -36,29 +36,24 @@ def motion(history: Particles, length: float, grid_size: float) -> Tensor:
     Returns:
         Rows of the newest clouds, packed. No gradients.
     """
-    clouds, newest = history.clouds, newest_clouds(history.clouds)
-    if not any(clouds.count(q) for q in newest):
+    matter = Matter.of(history, grid_size, length)
+    if matter is None:
         return history.means.new_zeros(0, 2, 3)
+    clouds, newest, now, lattice = history.clouds, matter.newest, matter.samples, matter.lattice
     first = [0, *(q + 1 for q in newest[:-1])]
     before = [max(f, q - 1) for f, q in zip(first, newest, strict=True)]
     with torch.autocast(history.means.device.type, enabled=False):
-        rows = Rows(history, newest, grid_size)
-        now, last, oldest = map(Samples, (rows, *(Rows(history, chosen, grid_size) for chosen in (before, first))))
-        here = now.mean[:, None]
-        for samples in (now, last, oldest):
-            samples.seen_from(here)
-        lattice = Lattice(now.places, now.known)
-        window = weights(squares(lattice.nodes, now.places) * (-0.5 / length**2), now.known)
-        moved, expected = (shift(now, then, lattice.nodes, window, length) for then in (last, oldest))
+        last, oldest = (Samples(Rows(history, chosen, grid_size)) for chosen in (before, first))
+        for samples in (last, oldest):
+            samples.seen_from(matter.here)
+        moved, expected = (shift(now, then, lattice.nodes, matter.window, length) for then in (last, oldest))
         looks = tuple(samples.of(history.latents) for samples in (now, oldest))
-        velocity, spin, centre = _rigid_motion(now, oldest, looks, lattice, window, expected, length)
+        velocity, spin, centre = _rigid_motion(matter, oldest, looks, expected, length)
         a_step = share_of_a_step(clouds, before, newest, now, last)
         all_steps = share_of_a_step(clouds, first, newest, now, oldest)
-        places = rows.places - here
-        moved, *rigid = lattice.at(places, moved * a_step, velocity * all_steps, spin * all_steps, centre)
-        onward = onward_at(places, *rigid)
-        result = torch.where(rows.wanted[:, :, None, None], torch.stack([moved, onward], 2), 0)
-    return torch.cat([result[b, : clouds.count(q)] for b, q in enumerate(newest)])
+        moved, *rigid = lattice.at(matter.places, moved * a_step, velocity * all_steps, spin * all_steps, centre)
+        onward = onward_at(matter.places, *rigid)
+        return matter.packed(torch.where(matter.rows.wanted[:, :, None, None], torch.stack([moved, onward], 2), 0))
 
 
 def shift(now: Samples, then: Samples, nodes: Tensor, window: Tensor, length: float) -> Tensor:
@@ -71,23 +66,18 @@ def shift(now: Samples, then: Samples, nodes: Tensor, window: Tensor, length: fl
 
 
 def _rigid_motion(
-    now: Samples,
-    then: Samples,
-    looks: tuple[Tensor, Tensor],
-    lattice: Lattice,
-    window: Tensor,
-    moved: Tensor,
-    length: float,
+    matter: Matter, then: Samples, looks: tuple[Tensor, Tensor], moved: Tensor, length: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Velocity, spin (rad) and centre [B, G, 3] of the rigid motion that takes matter in each window from ``then`` to
-    ``now``, if it moved about as far as ``moved``. looks: their latents."""
+    now, if it moved about as far as ``moved``. looks: latents of the samples now and then."""
+    now = matter.samples
     mean = now.mean_of(looks[0])[:, None]
     look, looked = (x - mean for x in looks)
     spread = now.mean_of(look.square().sum(2, keepdim=True)).clamp(min=LEAST_SPREAD)[:, None]
     unlike = squares(look, looked) * (-0.5 / (LIKENESS**2 * spread))
-    body, spin = RigidFit(window, now.places, length), torch.zeros_like(moved)
+    body, spin = RigidFit(matter.window, now.places, length), torch.zeros_like(moved)
     for _ in range(PASSES):
-        velocity, turns, middle = lattice.at(now.places, moved, spin, body.centre)
+        velocity, turns, middle = matter.lattice.at(now.places, moved, spin, body.centre)
         expected = now.places - velocity - torch.linalg.cross(turns, now.places - middle)
         match = weights(unlike - squares(expected, then.places) * (0.5 / (REACH * length) ** 2), then.known)
         moved, spin = body.fit(now.places - match @ then.places)

@@ -230,7 +230,7 @@ class StateLayout:
             changes = changes.cumsum(0)
         if drift is not None:
             kept = bounded(kept / MOST_KEPT, MOST_KEPT).unflatten(2, drift.shape[1:])
-            ahead = torch.arange(1, 1 + changes.shape[0], device=drift.device)[:, None, None]
+            ahead = torch.arange(1, 1 + changes.shape[0], device=drift.device, dtype=drift.dtype)[:, None, None]
             onward = ahead * (drift[:, ONWARD] + (kept * drift).sum(2))
             if self.config.deformation:
                 onward = onward + (1 - (1 - BACK) ** ahead) * drift[:, -1]
