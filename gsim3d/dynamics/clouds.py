@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.types import CloudTable, Particles, split_rows
@@ -65,13 +66,18 @@ def with_field(particles: Particles, name: str, width: int = 3) -> Particles:
         "turns": lambda: F.pad(like, (0, 3)),
         "paint": lambda: torch.diag_embed(like.expand(-1, 3)),
         "held": lambda: torch.zeros_like(particles.activity, dtype=torch.bool),
-        "unlit": lambda: particles.dynamic_latents,
+        "unlit": lambda: _known(particles.dynamic_latents),
         "velocity": lambda: torch.zeros_like(particles.means),
         "light": lambda: torch.ones_like(particles.means),
         "shaded": lambda: -like.expand(-1, width),
-        "reference": lambda: particles.means.detach(),
+        "reference": lambda: _known(particles.means.detach()),
     }
     return dataclasses.replace(particles, **{name: identity[name]()})
+
+
+def _known(values: Tensor) -> Tensor:
+    """0 for what is no number: a guard puts its row to sleep, and does not look at what that remembers."""
+    return values.nan_to_num(0, 0, 0)
 
 
 def alike(parts: Sequence[Particles]) -> list[Particles]:
