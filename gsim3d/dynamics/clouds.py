@@ -66,16 +66,16 @@ def with_field(particles: Particles, name: str, width: int = 3) -> Particles:
         "turns": lambda: F.pad(like, (0, 3)),
         "paint": lambda: torch.diag_embed(like.expand(-1, 3)),
         "held": lambda: torch.zeros_like(particles.activity, dtype=torch.bool),
-        "unlit": lambda: _known(particles.dynamic_latents),
+        "unlit": lambda: _finite(particles.dynamic_latents),
         "velocity": lambda: torch.zeros_like(particles.means),
         "light": lambda: torch.ones_like(particles.means),
         "shaded": lambda: -like.expand(-1, width),
-        "reference": lambda: _known(particles.means.detach()),
+        "reference": lambda: _finite(particles.means.detach()),
     }
     return dataclasses.replace(particles, **{name: identity[name]()})
 
 
-def _known(values: Tensor) -> Tensor:
+def _finite(values: Tensor) -> Tensor:
     """0 for what is no number: a guard puts its row to sleep, and does not look at what that remembers."""
     return values.nan_to_num(0, 0, 0)
 
