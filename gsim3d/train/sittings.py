@@ -96,6 +96,11 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
     log = folder / f"{name}.{LOG}"
     if log.is_file() and log.resolve() != (trainer.out / LOG).resolve():
         shutil.copyfile(log, trainer.out / LOG)
+    if trainer.captured and progress.needed:
+        try:
+            trainer.captured.make_room(progress.needed)
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"{folder / name}.json: needed must be the room that graphs of this model had") from None
     if not progress.step:
         return
     averaged, difference, squares = (
@@ -115,11 +120,6 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
             f"{folder}: the state of {name} is of another model: {str(error).splitlines()[-1].strip()}"
         ) from None
     trainer.step, trainer.seconds, trainer.n_skipped = progress.step, progress.seconds, progress.n_skipped
-    if trainer.captured and progress.needed:
-        try:
-            trainer.captured.make_room(progress.needed)
-        except (KeyError, TypeError, ValueError):
-            raise InputError(f"{folder / name}.json: needed must be the room that graphs of this model had") from None
     trainer.log.cut(trainer.step)
 
 

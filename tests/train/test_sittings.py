@@ -264,6 +264,10 @@ def test_the_next_sitting_knows_what_graphs_needed(store, tmp_path):
     assert known["geometry"][0] in progress.needed["geometry"]
     load_into(second, tmp_path / "state", NAME, progress)
     assert second.captured.needed == progress.needed and second.captured.most_rows == 10_000
+    new = SittingTrainer(CONFIG, store, tmp_path / "new", "cpu")
+    new.captured = new._capture()
+    load_into(new, tmp_path / "nothing", NAME, Progress(needed=known))  # a run that begins with what another one knew
+    assert new.captured.needed == known and new.step == 0
     for damaged in ({"rows": 1}, {**known, "geometry": [[[0], [0, 1], [7]]]}):
         with pytest.raises(InputError, match="needed"):
             load_into(second, tmp_path / "state", NAME, dataclasses.replace(progress, needed=damaged))
