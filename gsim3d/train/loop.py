@@ -241,8 +241,7 @@ class Trainer:
             loss = sum(loss * share for loss, share in zip(losses, shares, strict=True))
             errors = sum(values * share for values, share in zip(errors, shares, strict=True))
             if self.captured is not None:
-                share = len(samples) / batch
-                gradients = self.processes.add([None if g is None else g * share for g in gradients])
+                gradients = self.processes.add(gradients, len(samples) / batch)
         elif self.captured is not None:
             watch = StepWatch()
             found = self._captured_gradients(list(range(batch)), watch)

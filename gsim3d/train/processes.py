@@ -41,10 +41,11 @@ class Processes:
         dist.all_gather_object(values, value)
         return values
 
-    def add(self, tensors: Sequence[Tensor | None]) -> list[Tensor | None]:
-        """Sums over all processes, in one message; what is None in one process must be None in all."""
+    def add(self, tensors: Sequence[Tensor | None], factor: float = 1.0) -> list[Tensor | None]:
+        """Sums over all processes, each with its ``factor``, in one message; what is None in one process must be None
+        in all."""
         known = [tensor for tensor in tensors if tensor is not None]
-        flat = torch.cat([tensor.reshape(-1) for tensor in known])
+        flat = torch.cat([tensor.reshape(-1) for tensor in known]).mul_(factor)
         dist.all_reduce(flat)
         sums = iter(flat.split([tensor.numel() for tensor in known]))
         return [None if tensor is None else next(sums).view(tensor.shape) for tensor in tensors]
