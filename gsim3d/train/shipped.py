@@ -82,7 +82,7 @@ MODEL = {
 # How a look differs from the one that it had at first: bodies turn in the light, and shadows fall. From step to step
 # what is rendered in the wrong place would learn to fade, not where to go.
 EFFECTS = {"appearance": {"changing": "all"}}
-TURN = 20, 30, 20, 50  # steps of images; of the dynamics alone with other light, in short rollouts, in long ones
+TURN = 30, 20, 50  # steps of the dynamics alone with other light, in short rollouts, in long ones
 
 
 def _recipe(
@@ -93,6 +93,7 @@ def _recipe(
     strides: tuple[int, int] = (3, 2),
     batch: int = 4,
     rollout: tuple[int, int] = (48, 24),
+    images_in_turn: int = 20,
     lit_before: int = 40,
     contact_length: float = 0.15,
     shape: float = 0.005,
@@ -107,6 +108,7 @@ def _recipe(
     begin_within: of images; windows of rollouts begin within twice as many steps.
     strides: of the pixels of ground and bodies.   batch: where long rollouts are simulated.
     rollout: their steps, and through how many of them gradients flow back.
+    images_in_turn: steps of images in each round; more where the encoder does not know the world yet.
     lit_before: as of StageConfig, in rollouts of two steps.
     contact_length: as of DynamicsConfig; more than bodies fall in a step.
     shape, shape_length: as of LossConfig; the length less than bodies are apart.
@@ -143,10 +145,10 @@ def _recipe(
             lit(steps=300),
         ),
         in_turn=(
-            images(steps=TURN[0]),
-            lit(steps=TURN[1]),
-            short(steps=TURN[2]),
-            dynamics(steps=TURN[3], horizon=horizon, cut=cut, batch=batch, from_start=0.5, learning_rate=6e-4),
+            images(steps=images_in_turn),
+            lit(steps=TURN[0]),
+            short(steps=TURN[1]),
+            dynamics(steps=TURN[2], horizon=horizon, cut=cut, batch=batch, from_start=0.5, learning_rate=6e-4),
         ),
         rounds=100_000,
         # A score counts the last step like the first. What the ground hides would leave its body unseen.
@@ -158,7 +160,7 @@ def _recipe(
         captured=True,
         log_every=20,
     )
-    return Recipe(world, train, in_turn=in_turn, capacity=capacity, begin_with="elastic-small")
+    return Recipe(world, train, in_turn=in_turn, capacity=capacity, begin_with=f"{world}-small")
 
 
 # Lower than the held-out grounds, of 15 to 30 cm.
@@ -167,12 +169,23 @@ RECIPES = {
     # Bodies fall for half a second and then hardly move.
     "elastic": _recipe("elastic", (1.9, 4.8), 24, in_turn=({}, {}, OTHER_GROUND)),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories and graphs.
-    "cloth": _recipe("cloth", (1.6, 4.8), 0, strides=(4, 2), batch=3, rollout=(24, 12), shape_length=0.1, capacity=400),
+    "cloth": _recipe(
+        "cloth",
+        (1.6, 4.8),
+        0,
+        strides=(4, 2),
+        batch=3,
+        rollout=(24, 12),
+        images_in_turn=120,
+        shape_length=0.1,
+        capacity=400,
+    ),
     "rigid": _recipe(
         "rigid",
         (1.7, 5.0),
         12,
         rollout=(24, 12),
+        images_in_turn=120,
         lit_before=20,
         contact_length=0.4,
         shape=0.2,
