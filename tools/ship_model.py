@@ -99,6 +99,7 @@ def card(name: str, recipe: dict, scores: dict, config: dict, wrong: str) -> str
     ]
     changed = f" (some with {', '.join(dict.fromkeys(changes))})" if changes else ""
     world, begun = recipe["world"], recipe["sittings"][0].get("began_with")
+    n_sittings = len(recipe["sittings"])
     before = f"; begun with the weights of `{begun['name']}` at step {begun['step']:,}" if begun else ""
     return f"""# {name}
 
@@ -110,7 +111,7 @@ A gsim3d simulator of the world `{world["world"]}`: `gsim3d simulate {name} SCEN
   `gsim3d generate {world["world"]} --preset paper --seed {world["seed"]}`{changed}, never the same twice;
   from images alone.
 - **Budget** {recipe["steps"]:,} optimizer steps in {recipe["training_seconds"]:,.0f} s of training,
-  {len(recipe["sittings"])} sittings, on {" and ".join(devices)}; {recipe["skipped_steps"]} steps were
+  {n_sittings} sitting{"s" if n_sittings > 1 else ""}, on {" and ".join(devices)}; {recipe["skipped_steps"]} steps were
   skipped{before}.
 - **Weights** averaged, bfloat16. `config.yaml` has all settings, `training.jsonl` a part of the log, `recipe.json` the
   data.

@@ -41,7 +41,7 @@ class Processes:
         dist.all_gather_object(values, value)
         return values
 
-    def add(self, tensors: Sequence[Tensor | None], factor: float = 1.0) -> list[Tensor | None]:
+    def add(self, tensors: Sequence[Tensor | None], factor: float) -> list[Tensor | None]:
         """Sums over all processes, each with its ``factor``, in one message; what is None in one process must be None
         in all."""
         known = [tensor for tensor in tensors if tensor is not None]
