@@ -42,6 +42,8 @@ class DynamicsConfig:
             movable matter is between a particle and each, now and where it was encoded
             (:func:`gsim3d.dynamics.shade.shade`), and predicts by how much more light reaches it now: colours are
             multiplied by that. Empty: where shadows fall has to be found out from the places of all.
+        surfaces: with ``lights``: particles are lit as the surfaces that they make, by the direction of those and by
+            shadows, beside a light that comes from everywhere (:func:`gsim3d.dynamics.daylight.daylight`).
         motion_length: metres, about the radius of a body. The network sees how the matter around a particle has moved
             (:func:`gsim3d.dynamics.motion.motion`), and predicts how much of that is kept along each axis and what is
             added to it: without a force bodies fly on. None: it has to read velocities off the places in its history.
@@ -53,6 +55,9 @@ class DynamicsConfig:
             sees how they would have to move for the shape that bodies had then
             (:func:`gsim3d.dynamics.deformation.deformation`), and predicts how much more or less of that they do than
             a share that keeps shapes: what an elastic body does next cannot be told without it.
+        gravity: metres a step, of every step, where it begins; training adjusts it. With ``velocity``, ``deformation`` and
+            ``contact_length``: if nothing is predicted bodies fall, hit what is frozen, slide on it, turn and go back
+            to their shape (:func:`gsim3d.dynamics.mechanics.mechanics`). None: then they fly on.
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.
@@ -93,8 +98,10 @@ class DynamicsConfig:
     motion_length: float | None = None
     velocity: bool = False
     deformation: bool = False
+    gravity: tuple[float, float, float] | None = None
     contact_length: float | None = None
     lights: tuple[tuple[float, float, float], ...] = ()
+    surfaces: bool = False
     grid_size: float = 0.004
     history_bits: int = 2
     strides: tuple[int, ...] = (4, 2, 2, 2)
@@ -166,6 +173,14 @@ class DynamicsConfig:
                 'DynamicsConfig: lights must be directions (x, y, z), and background "symmetric" or "relit"; '
                 f"got {self.lights} and {self.background!r}"
             )
+        needed = (self.velocity, self.deformation, self.contact_length is not None, self.steps_per_call == 1)
+        if self.gravity is not None and not (len(self.gravity) == 3 and all(needed)):
+            raise ValueError(
+                "DynamicsConfig: gravity must be an acceleration (x, y, z), of a model with velocity, deformation and "
+                f"contact_length and one step a call; got {self.gravity}"
+            )
+        if self.surfaces and not self.lights:
+            raise ValueError("DynamicsConfig: surfaces needs lights")
         if not 0 <= self.position_waves <= MOST_WAVES or self.position_waves and not self.position_features:
             raise ValueError(
                 f"DynamicsConfig: position_waves must be from 0 to {MOST_WAVES}, and 0 without position_features; "

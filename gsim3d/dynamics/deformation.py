@@ -32,18 +32,33 @@ def deformation(history: Particles, length: float, grid_size: float, matter: Mat
     matter = matter or Matter.of(history, grid_size, length)
     if matter is None:
         return history.means.new_zeros(0, 3)
-    clouds, now = history.clouds, matter.samples
+    clouds = history.clouds
     reference = take_runs(with_field(history, "reference").reference, clouds.row_runs(matter.newest))
     with torch.autocast(reference.device.type, enabled=False):
         scenes = constant(tuple(clouds.scenes[q] for q in matter.newest), reference.device)
         before = (matter.padded(reference).double() - history.origin[scenes][:, None]).to(reference.dtype)
-        then = now.take(before)
+        way = Shape(matter, before).way_back(matter.places, matter.samples.places)
+        return matter.packed(torch.where(matter.rows.wanted[:, :, None], way, 0))
+
+
+class Shape:
+    """The shape that ``matter`` had where its rows were at ``before`` [B, M, 3], from the origins of their scenes."""
+
+    def __init__(self, matter: Matter, before: Tensor):
+        now = matter.samples
+        self._matter, then = matter, now.take(before)
         there = now.mean_of(then)[:, None]
-        then = torch.where(now.known[:, :, None], then - there, 0)
-        centre, began = matter.window @ now.places, matter.window @ then
-        products = matter.window @ (now.places[:, :, :, None] * then[:, :, None]).flatten(2)
+        self._then = torch.where(now.known[:, :, None], then - there, 0)
+        self._before = before - there
+
+    def way_back(self, places: Tensor, sampled: Tensor) -> Tensor:
+        """[B, M, 3], from each of the rows' ``places`` [B, M, 3] to where it would be in that shape, moved and turned as
+        the matter around it, whose samples are at ``sampled`` [B, S, 3]. Windows are those of ``matter``; no gradients
+        are needed."""
+        window, then = self._matter.window, self._then
+        centre, began = window @ sampled, window @ then
+        products = window @ (sampled[:, :, :, None] * then[:, :, None]).flatten(2)
         turns = turned_most(products.unflatten(2, (3, 3)) - centre[:, :, :, None] * began[:, :, None])
         shifts = centre - (turns @ began[:, :, :, None])[..., 0]
-        *columns, shift = matter.lattice.at(matter.places, *turns.unbind(3), shifts)
-        kept = (torch.stack(columns, 3) @ (before - there)[:, :, :, None])[..., 0] + shift
-        return matter.packed(torch.where(matter.rows.wanted[:, :, None], kept - matter.places, 0))
+        *columns, shift = self._matter.lattice.at(self._matter.places, *turns.unbind(3), shifts)
+        return (torch.stack(columns, 3) @ self._before[:, :, :, None])[..., 0] + shift - places

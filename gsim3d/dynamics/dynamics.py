@@ -15,8 +15,10 @@ from gsim3d.dynamics.background import Background
 from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps, with_field
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import contact
+from gsim3d.dynamics.daylight import daylight
 from gsim3d.dynamics.deformation import deformation
 from gsim3d.dynamics.matter import Matter
+from gsim3d.dynamics.mechanics import Law, mechanics
 from gsim3d.dynamics.momentum import momentum
 from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
@@ -29,6 +31,9 @@ from gsim3d.types import ASLEEP, FROZEN, CloudTable, Particles, constant, take_r
 ROOM = 1.1  # for rows that a call reads, over what was counted
 LIGHT_SIZE = 0.1  # of the parameter that is a direction: smaller ones are turned faster in training
 DIMMING = 0.2  # logarithm of how much darker a row is where log(1 + n) of the matter before its lamp grows by one
+GRAVITY_SIZE = 0.01  # metres a step, of every step: of the parameter's unit, so that training changes it little
+CONTACTS = 0.8, 1.0, 0.5  # stiffness, friction and damping of gsim3d.dynamics.mechanics
+STRENGTH = 2.0  # of the light that a surface facing the lamp gets, over that which comes from everywhere
 
 
 class Dynamics(nn.Module):
@@ -47,10 +52,19 @@ class Dynamics(nn.Module):
         self.rounds = None  # whether geometry is rounded in training; None: on a GPU
         layout = self.layout
         self.net = PointTransformer(layout.in_channels, layout.told_channels, layout.out_channels, config)
-        self.lights = self.dimming = None
+        self.lights = self.dimming = self.strength = None
         if config.lights:
-            self.lights = nn.Parameter(LIGHT_SIZE * torch.tensor(config.lights))
-            self.dimming = nn.Parameter(torch.full((len(config.lights), LIGHT_CHANNELS), DIMMING))
+            size, each = STRENGTH if config.surfaces else LIGHT_SIZE, (len(config.lights), LIGHT_CHANNELS)
+            directions = F.normalize(torch.tensor(config.lights), dim=1) if config.surfaces else torch.tensor(config.lights)
+            self.lights = nn.Parameter(size * directions)
+            if config.surfaces:
+                self.strength = nn.Parameter(torch.full(each, STRENGTH))
+            else:
+                self.dimming = nn.Parameter(torch.full(each, DIMMING))
+        self.gravity = self.contacts = None
+        if config.gravity is not None:
+            self.gravity = nn.Parameter(torch.tensor(config.gravity) / GRAVITY_SIZE)
+            self.contacts = nn.Parameter(torch.tensor(CONTACTS))
 
     def geometry(
         self,
@@ -121,8 +135,16 @@ class Dynamics(nn.Module):
         if self.lights is None:
             return particles
         runs = particles.clouds.row_runs(newest_clouds(particles.clouds))
-        shaded = shade(particles, self.lights, self.config.grid_size)
+        if self.config.surfaces:
+            shaded = torch.cat(daylight(particles, self.lights, self.config.grid_size), 1)
+        else:
+            shaded = shade(particles, self.lights, self.config.grid_size)
         return dataclasses.replace(particles, shaded=_put_runs(shaded, runs, particles.n_rows, -1.0))
+
+    def law(self) -> Law:
+        """Of a model with ``gravity``: what bodies do if nothing is predicted."""
+        stiffness, friction, damping = self.contacts.clamp(min=0)
+        return Law(GRAVITY_SIZE * self.gravity, stiffness.clamp(max=1), friction, damping.clamp(max=1))
 
     def begin(self, state: Particles) -> Particles:
         """``state`` with the fields in which simulated rows know how they began."""
@@ -131,7 +153,8 @@ class Dynamics(nn.Module):
         if self.config.deformation:
             state = with_field(state, "reference")
         if self.lights is not None:
-            state = with_field(with_field(state, "light"), "shaded", len(self.lights))
+            n_lights = len(self.lights)
+            state = with_field(with_field(state, "light"), "shaded", n_lights * (1 + self.config.surfaces))
         return state
 
     def forward(
@@ -184,6 +207,10 @@ class Dynamics(nn.Module):
             drift = momentum(history, config.motion_length, config.grid_size, matter)
         elif config.motion_length is not None:
             drift = motion(history, config.motion_length, config.grid_size)
+        if config.gravity is not None:
+            lengths = config.motion_length, config.contact_length
+            onward = mechanics(history, *lengths, config.grid_size, self.law(), matter)
+            drift = torch.stack([drift[:, 0], onward, drift[:, 2]], 1)
         if config.deformation:
             bent = deformation(history, config.motion_length, config.grid_size, matter)
             drift = torch.cat([drift, bent[:, None].to(drift.dtype)], 1)
@@ -193,11 +220,8 @@ class Dynamics(nn.Module):
             near = contact(history, config.contact_length, config.grid_size, matter)
             near = _put_runs(near, runs, history.n_rows)
         if self.lights is not None:
-            shaded = shade(history, self.lights, config.grid_size, matter)
-            began = take_runs(history.shaded, runs)
-            began = torch.where(began < 0, shaded, began)
-            brighter = ((began - shaded)[:, :, None] * self.dimming).sum(1)  # a product of matrices would be rounded
-            dark = _put_runs(torch.cat([shaded, began], 1), runs, history.n_rows)
+            began, told, brighter = self._light(history, take_runs(history.shaded, runs), matter)
+            dark = _put_runs(told, runs, history.n_rows)
         features, is_awake = self.layout.pack(history, moved, near, dark), None
         n_awake = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
         everyone = n_awake == history.n_rows
@@ -232,6 +256,24 @@ class Dynamics(nn.Module):
                 for before, step in zip([state, *steps], steps)
             ]
         return steps[0] if len(steps) == 1 else concatenate(steps)
+
+    def _light(self, history: Particles, began: Tensor, matter: Matter | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the newest rows: what is known of the light where they were encoded (``began``, as far as it is), what the
+        network is told of it, [N, 2 L], and the logarithm [N, 3] of how much more light reaches them now."""
+        if not self.config.surfaces:
+            shaded = shade(history, self.lights, self.config.grid_size, matter)
+            began = torch.where(began < 0, shaded, began)
+            brighter = ((began - shaded)[:, :, None] * self.dimming).sum(1)  # a product of matrices would be rounded
+            return began, torch.cat([shaded, began], 1), brighter
+        n_lights = len(self.lights)
+        facing = began[:, n_lights:]
+        lit, faces = daylight(
+            history, self.lights, self.config.grid_size, matter, torch.where(facing < 0, 1.0, facing)
+        )
+        began = torch.where(began < 0, torch.cat([lit, faces], 1), began)
+        before = began[:, :n_lights]
+        now, then = ((x[:, :, None] * self.strength.clamp(min=0)).sum(1).log1p() for x in (lit, before))
+        return began, torch.cat([lit, before], 1), now - then
 
     def _matter(self, history: Particles) -> Matter | None:
         """What all that rows are told begins with; None where nothing is told of it."""

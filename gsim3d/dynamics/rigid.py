@@ -88,11 +88,17 @@ def turned_most(products: Tensor) -> Tensor:
     matrix = (products.flatten(-2) @ of_quats).unflatten(-1, (4, 4))
     one = torch.eye(4, dtype=products.dtype, device=products.device)
     matrix = matrix + matrix.square().sum((-2, -1), keepdim=True).sqrt() * one  # no eigenvalue is below 0
+    return (of_largest(matrix).flatten(-2) @ of_quats.T).unflatten(-1, (3, 3))
+
+
+def of_largest(matrices: Tensor) -> Tensor:
+    """v v^T [..., n, n] of the eigenvector v of length 1 with the largest eigenvalue of symmetric matrices [..., n, n]
+    without negative ones: a high power of the matrix. Of several as large it is the mean; of zeros it is 0."""
     for _ in range(2):  # numbers stay far from the smallest
-        matrix = _of_trace_one(matrix)
+        matrices = _of_trace_one(matrices)
         for _ in range(SQUARINGS // 2):
-            matrix = matrix @ matrix
-    return (_of_trace_one(matrix).flatten(-2) @ of_quats.T).unflatten(-1, (3, 3))
+            matrices = matrices @ matrices
+    return _of_trace_one(matrices)
 
 
 def _of_trace_one(matrices: Tensor) -> Tensor:

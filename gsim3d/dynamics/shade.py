@@ -37,21 +37,22 @@ def shade(history: Particles, lights: Tensor, grid_size: float, matter: Matter |
             moves, rests = matter.rows, matter.rows.that_are(history, FROZEN)
             places = torch.where(moves.wanted[:, :, None], moves.places, rests.places) - matter.here
             is_lit = moves.wanted | rests.wanted
-        found = [_between(places, matter.samples, light, grid_size) for light in lights.unbind(0)]
+        cells = (BEAM * grid_size, NEAREST * grid_size, EDGE * grid_size)
+        each = (matter.samples.n / matter.samples.known.sum(1).clamp(min=1)).to(places.dtype)[:, None]
+        found = [each * between(places, matter.samples, light, *cells) for light in lights.unbind(0)]
         return matter.packed(torch.where(is_lit[:, :, None], torch.stack(found, 2).log1p(), 0))
 
 
-def _between(places: Tensor, matter: Samples, light: Tensor, grid_size: float) -> Tensor:
-    """[B, M], how many rows are between each of ``places`` [B, M, 3] and the light. What is near a beam enters it when
-    the light turns: that is its gradient."""
+def between(places: Tensor, matter: Samples, light: Tensor, beam: float, nearest: float, edge: float) -> Tensor:
+    """[B, M], how many samples are between each of ``places`` [B, M, 3] and the light, in a Gaussian beam, from
+    ``nearest`` on, where they begin to count over ``edge``; metres. What is near a beam enters it when the light turns:
+    that is its gradient."""
     direction = light / light.norm()
     with torch.no_grad():
-        beam, nearest, edge = (cells * grid_size for cells in (BEAM, NEAREST, EDGE))
         ahead = (matter.places @ direction)[:, None] - (places @ direction)[:, :, None]
         off = (squares(places, matter.places) - ahead.square()).clamp(min=0)
         begun = ((ahead - nearest) / edge).sigmoid()
-        each = (matter.n / matter.known.sum(1).clamp(min=1)).to(off.dtype)[:, None, None]
-        counted = (off * (-0.5 / beam**2)).clamp(min=FAINTEST).exp() * begun * each
+        counted = (off * (-0.5 / beam**2)).clamp(min=FAINTEST).exp() * begun
         counted = torch.where(matter.known[:, None], counted, 0)
         if not direction.requires_grad:
             return counted.sum(2)

@@ -195,11 +195,24 @@ class StateLayout:
             if particles.held is not None and name in FEATURES:
                 share = share.masked_fill(particles.held[:, None], 0)
             onward = {"means": drift, "light": brighter}.get(name)
+            if name == "light" and self.config.surfaces:
+                part = share * bounded(part / MOST_LIGHT, MOST_LIGHT)
+                share = self._lit(particles, shares["all"])
             later[name] = self.later_values(name, getattr(particles, name), part, share, onward)
+        if self.config.surfaces and brighter is not None and "light" not in later:
+            nothing, share = torch.zeros_like(brighter).expand(self.config.steps_per_call, -1, -1), shares["all"]
+            later["light"] = self.later_values(
+                "light", particles.light, nothing, self._lit(particles, share), brighter
+            )
         return [
             dataclasses.replace(particles, **{name: values[step] for name, values in later.items()})
             for step in range(self.config.steps_per_call)
         ]
+
+    @staticmethod
+    def _lit(particles: Particles, share: Tensor) -> Tensor:
+        """``share`` of the rows that surfaces light: whose look changes otherwise does not matter, but for ``held``."""
+        return share if particles.held is None else share.masked_fill(particles.held[:, None], 0)
 
     def later_values(
         self, name: str, newest: Tensor, predicted: Tensor, share: Tensor, drift: Tensor | None = None
@@ -207,7 +220,7 @@ class StateLayout:
         """One field of the particles after each step of a call.
 
         Args:
-            name: of the field.
+            name: of the field; with ``surfaces`` what is predicted of light has its share already.
             newest: [N, ...], its newest values.
             predicted: [S, N, channels], of S steps.
             share: [N, 1] or [S, N, 1], how much of a predicted change happens: 0 holds the value, bit by bit.
@@ -220,7 +233,9 @@ class StateLayout:
             return self._later_quats(newest, predicted, share)
         if name == "light":  # not of the step before: its errors would add up
             brighter = predicted if drift is None else predicted + drift
-            return hold(share, newest, bounded(brighter / MOST_LIGHT, MOST_LIGHT).exp())
+            if not self.config.surfaces:  # their light has bounds of its own
+                brighter = bounded(brighter / MOST_LIGHT, MOST_LIGHT)
+            return hold(share, newest, brighter.exp())
         predicted = _unflat(name, predicted)
         if name == "means":
             predicted, kept = predicted[..., :3], predicted[..., 3:]
@@ -232,7 +247,7 @@ class StateLayout:
             kept = bounded(kept / MOST_KEPT, MOST_KEPT).unflatten(2, drift.shape[1:])
             ahead = torch.arange(1, 1 + changes.shape[0], device=drift.device, dtype=drift.dtype)[:, None, None]
             onward = ahead * (drift[:, ONWARD] + (kept * drift).sum(2))
-            if self.config.deformation:
+            if self.config.deformation and self.config.gravity is None:
                 onward = onward + (1 - (1 - BACK) ** ahead) * drift[:, -1]
             most = math.inf if self.config.max_step is None else self.config.max_step
             changes = torch.minimum(torch.maximum(changes + onward, -most * ahead), most * ahead)

@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 
 from gsim3d.errors import HardCaseError
+from gsim3d.generate.stage import GRAVITY
 from gsim3d.generate.world import World
 from gsim3d.generate.worlds import build_world
 from gsim3d.train.captured import CapturedLoss, Prepared
@@ -27,7 +28,7 @@ from gsim3d.train.samples import Batch
 from gsim3d.train.sittings import Progress, save_state
 
 FIRST_FILMS = 32  # before training begins
-SEED, HELD_OUT_SEED = 20261123, 77  # of the trajectories; `gsim3d generate` without --seed makes others
+SEED, HELD_OUT_SEED = 20261124, 77  # of the trajectories; `gsim3d generate` without --seed makes others
 WARM_UP = 40  # steps at the beginning of a sitting
 COOL_DOWN = 0.25  # of a sitting's training, in which the learning rate falls to LAST_RATE of its peak
 LAST_RATE = 0.03
@@ -69,6 +70,7 @@ MODEL = {
         "shuffle_orders": False,
         "motion_length": 0.3,
         "lights": ((0.36, 0.24, 0.9),),  # the lamp of the worlds; training may turn it
+        "surfaces": True,
         "velocity": True,
         "deformation": True,
         "position_waves": 4,
@@ -81,8 +83,9 @@ MODEL = {
 
 # How a look differs from the one that it had at first: bodies turn in the light, and shadows fall. From step to step
 # what is rendered in the wrong place would learn to fade, not where to go.
-EFFECTS = {"appearance": {"changing": "all"}}
-TURN = 30, 20, 50  # steps of the dynamics alone with other light, in short rollouts, in long ones
+# What rests changes in the light alone.
+EFFECTS = {"appearance": {"changing": "dynamic"}}
+TURN = 10, 20, 50  # steps of the dynamics alone with other light, in short rollouts, in long ones
 
 
 def _recipe(
@@ -96,6 +99,7 @@ def _recipe(
     images_in_turn: int = 20,
     lit_before: int = 40,
     contact_length: float = 0.15,
+    gravity: tuple[float, float, float] | None = None,
     shape: float = 0.005,
     shape_length: float = 0.2,
     capacity: int = 600,
@@ -110,7 +114,7 @@ def _recipe(
     rollout: their steps, and through how many of them gradients flow back.
     images_in_turn: steps of images in each round; more where the encoder does not know the world yet.
     lit_before: as of StageConfig, in rollouts of two steps.
-    contact_length: as of DynamicsConfig; more than bodies fall in a step.
+    contact_length, gravity: as of DynamicsConfig; the length more than bodies fall in a step.
     shape, shape_length: as of LossConfig; the length less than bodies are apart.
     Others as in Recipe.
     """
@@ -124,7 +128,7 @@ def _recipe(
     horizon, cut = rollout
     train = TrainConfig(
         preset="small",
-        model={**MODEL, "dynamics": {**MODEL["dynamics"], "contact_length": contact_length}},
+        model={**MODEL, "dynamics": {**MODEL["dynamics"], "contact_length": contact_length, "gravity": gravity}},
         effects=EFFECTS,
         data=DataConfig(
             history=4,
@@ -142,7 +146,7 @@ def _recipe(
             dynamics(steps=100, horizon=4, batch=2 * batch, from_start=0.1, learning_rate=8e-4),
             short(steps=300),
             # Where shadows are, before they follow what was simulated.
-            lit(steps=300),
+            lit(steps=100),
         ),
         in_turn=(
             images(steps=images_in_turn),
@@ -167,7 +171,9 @@ def _recipe(
 OTHER_GROUND = {"ground_height": (-0.1, 0.12)}
 RECIPES = {
     # Bodies fall for half a second and then hardly move.
-    "elastic": _recipe("elastic", (1.9, 4.8), 24, in_turn=({}, {}, OTHER_GROUND)),
+    "elastic": _recipe(
+        "elastic", (1.9, 4.8), 24, gravity=(0.0, 0.0, -GRAVITY / 42**2), in_turn=({}, {}, OTHER_GROUND)
+    ),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories and graphs.
     "cloth": _recipe(
         "cloth",

@@ -20,6 +20,7 @@ import dataclasses
 import json
 import os
 import shutil
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,8 @@ from gsim3d.train.restore import describe, restore
 FORMAT = 1
 SEEN = "dynamics.net.stem.conv.weight"  # what the network reads of motion are its last columns
 TOLD = "dynamics.net.stem.told.weight"
-LIGHTS, DIMMING = "dynamics.lights", "dynamics.dimming"
+LIGHTS, DIMMING, STRENGTH = "dynamics.lights", "dynamics.dimming", "dynamics.strength"
+LAW = ("dynamics.gravity", "dynamics.contacts")
 PREDICTED = ("dynamics.net.head.fc2.weight", "dynamics.net.head.fc2.bias")
 PLACES = 3  # rows that predict places where no motion is seen
 WEIGHTS, DIFFERENCE, SQUARES = "weights", "difference", "squares"
@@ -126,8 +128,8 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
 def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     """Weights of a trained simulator into a new trainer, whose dynamics may see more (motion, waves, contacts,
     velocities, deformations, lights) than the other's: what reads it begins at zero, and so does what predicts shares
-    of motions and light; where motion is new all that predicts positions, which are others then. New lights begin as in
-    any new trainer.
+    of motions and light; where motion or gravity is new all that predicts positions, which are others then. New lights
+    and those that begin to light surfaces begin as in any new trainer, and so does what is read and predicted of them.
 
     Returns:
         The checkpoint's name, digest and step.
@@ -142,15 +144,22 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     was_told, told = (dict(simulator.dynamics.layout.told) for simulator in (other.simulator, trainer.simulator))
     if not was_told.items() <= told.items():
         raise InputError(f"{path}: a simulator of other sizes: its dynamics is told {was_told}, this one {told}")
+    anew = set()  # fields whose meaning is another one: what is read and predicted of them
+    if STRENGTH in own and STRENGTH not in given:
+        anew |= {"lights", "light"}
+        given = {key: value for key, value in given.items() if key not in (LIGHTS, DIMMING)}
+    if LAW[0] in own and LAW[0] not in given:
+        anew.add("means")
     if told:
-        given[TOLD] = _told(given.get(TOLD), was_told, told, own[TOLD])
-    for key in (LIGHTS, DIMMING):
+        given[TOLD] = _told(given.get(TOLD), was_told, told, own[TOLD], anew)
+    for key in (LIGHTS, DIMMING, STRENGTH, *LAW):
         if key in own:
             given.setdefault(key, own[key])
     after = dict(trainer.simulator.dynamics.layout.outputs)
     for key in PREDICTED:
         if before.keys() <= after.keys() and len(given[key]) == sum(before.values()):  # else of other sizes
             parts = dict(zip(before, given[key].split(list(before.values())), strict=True))
+            parts = {name: rows for name, rows in parts.items() if name not in anew}
             given[key] = torch.cat([_widened(name, parts.get(name, given[key][:0]), n) for name, n in after.items()])
     try:
         trainer.simulator.load_state_dict(given)
@@ -161,12 +170,15 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     return {"name": str(path), "digest": saved.digest, "step": saved.state["step"]}
 
 
-def _told(given: Tensor | None, before: dict[str, int], after: dict[str, int], like: Tensor) -> Tensor:
+def _told(
+    given: Tensor | None, before: dict[str, int], after: dict[str, int], like: Tensor, anew: Collection[str]
+) -> Tensor:
     """Weights of what rows are told ``after``, [C, channels] each, padded as ``like``: those of what they were told
-    ``before``, and 0."""
+    ``before``, and 0 of what is new or ``anew``."""
     parts = {}
     if given is not None:
         parts = dict(zip(before, given.split([*before.values(), given.shape[1] - sum(before.values())], 1)))
+    parts = {name: columns for name, columns in parts.items() if name not in anew}
     columns = torch.cat([parts.get(name, like.new_zeros(len(like), n)) for name, n in after.items()], 1)
     return F.pad(columns, (0, like.shape[1] - columns.shape[1]))
 

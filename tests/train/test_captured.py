@@ -51,10 +51,20 @@ RELIT = dataclasses.replace(
     },
     loss=LossConfig(bodies=1.0),
 )
+OBEYING = dataclasses.replace(
+    RELIT,
+    model={
+        "dynamics": {
+            **RELIT.model["dynamics"], "deformation": True, "surfaces": True, "gravity": (0.0, 0.0, -0.005),
+        }
+    },
+    effects={"appearance": {"changing": "dynamic"}},
+)  # fmt: skip
 KINDS = {
     "latent": CONFIG,
     "moving": MOVING,
     "relit": RELIT,
+    "obeying": OBEYING,
     "moving, masked": ROWS["background-masked"].change(MOVING),
     **{name: ROWS[name].change(CONFIG) for name in ("explicit", "background-masked")},
 }
@@ -104,10 +114,13 @@ def run(captured, batch, trainer, report=None, factor=1.0):
         ({"lead": 2}, "relit"),
         ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "relit"),
         ({"dynamics_alone": True, "lit_before": 1, "horizon": 1}, "relit"),
+        ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "obeying"),
+        ({"dynamics_alone": True, "lit_before": 1, "horizon": 1}, "obeying"),
     ],
     ids=[
         "rollout", "lead", "encoded", "explicit", "masked", "dynamics alone, cut", "dynamics alone, masked", "moving",
         "moving, masked", "relit", "relit, dynamics alone", "relit, background of its own",
+        "obeying, dynamics alone", "obeying, background of its own",
     ],
     indirect=["trainer"],
 )
@@ -152,7 +165,7 @@ class Ops(TorchDispatchMode):
 
 
 @pytest.mark.parametrize(
-    "row", ["latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relit"]
+    "row", ["latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relit", "obeying"]
 )
 def test_nothing_in_a_graph_has_a_size_that_depends_on_numbers(row, scenes, tmp_path):
     config = KINDS[row] if row in KINDS else ROWS[row].change(CONFIG)

@@ -372,6 +372,32 @@ def test_lights_of_a_run_begin_as_they_are_made_or_go_on(store, tmp_path, key):
         assert made.any() and torch.equal(trainer.simulator.state_dict()[key], expected)
 
 
+def test_a_run_whose_bodies_obey_and_are_lit_begins_with_what_neither_knew(store, tmp_path, monkeypatch):
+    """Nothing is predicted of places and light at first; latents are what they were."""
+    told = {"motion_length": 0.3, **ALL_BUT_LIGHTS, "lights": ((0.0, 0.3, 1.0),)}
+    known = saved_with_a_head(dataclasses.replace(CONFIG, model={"dynamics": told}), store, tmp_path)
+    new = {**told, "surfaces": True, "gravity": (0.0, 0.0, -0.01)}
+    trainer = SittingTrainer(dataclasses.replace(CONFIG, model={"dynamics": new}), store, tmp_path / "run", "cpu")
+    begin_with(trainer, known)
+    given, own = restore(known).simulator, trainer.simulator.eval()
+    with torch.no_grad():
+        state = own.encode(store.draw(CONFIG.data, CONFIG.stages[1], 0, 2, range(1)).context)
+    goes_on = momentum(last_steps(own.dynamics.begin(state), 1), 0.3, own.config.dynamics.grid_size)[:, 1]
+    monkeypatch.setattr("gsim3d.dynamics.dynamics.mechanics", lambda *_: goes_on)  # the network is told of it, too
+    with torch.no_grad():
+        n_told = sum(n for _, n in given.dynamics.layout.told)
+        given.dynamics.net.stem.told.weight[:, n_told - 2 : n_told] = 0  # what it was told of its lights
+        expected, step = given.dynamics(dataclasses.replace(state, shaded=None)), own.dynamics(state)
+        newest = last_steps(state, 1)
+    torch.testing.assert_close(step.dynamic_latents, expected.dynamic_latents)
+    torch.testing.assert_close(step.means, newest.means + goes_on)
+    assert (expected.means - step.means).abs().max() > 1e-3 and (step.light - 1).abs().max() < 1e-5
+    again = saved_with_a_head(dataclasses.replace(CONFIG, model={"dynamics": new}), store, tmp_path / "again")
+    begin_with(trainer, again)
+    for key, value in restore(again).simulator.state_dict().items():
+        assert torch.equal(trainer.simulator.state_dict()[key], value), key
+
+
 def test_recipes_are_sound():
     for world, recipe in RECIPES.items():
         data, stages, first, *others = recipe.train.data, recipe.train.all_stages, *recipe.worlds()
