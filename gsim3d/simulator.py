@@ -87,9 +87,8 @@ class Simulator(nn.Module):
         if (dynamics := self.config.dynamics).velocity:
             n_views = None if room is None else len(frames.cameras) // particles.n_clouds
             gravity = None if dynamics.gravity is None else self.dynamics.law().gravity
-            velocity = follow(
-                particles, frames, dynamics.motion_length, dynamics.grid_size, 2**dynamics.history_bits, n_views, gravity
-            )
+            sizes = dynamics.motion_length, dynamics.grid_size, 2**dynamics.history_bits
+            velocity = follow(particles, frames, *sizes, n_views, gravity)
             particles = dataclasses.replace(particles, velocity=velocity)
         particles = self.dynamics.in_light(particles)
         guard.keywords["report"].send()

@@ -55,9 +55,9 @@ class DynamicsConfig:
             sees how they would have to move for the shape that bodies had then
             (:func:`gsim3d.dynamics.deformation.deformation`), and predicts how much more or less of that they do than
             a share that keeps shapes: what an elastic body does next cannot be told without it.
-        gravity: metres a step, of every step, where it begins; training adjusts it. With ``velocity``, ``deformation`` and
-            ``contact_length``: if nothing is predicted bodies fall, hit what is frozen, slide on it, turn and go back
-            to their shape (:func:`gsim3d.dynamics.mechanics.mechanics`). None: then they fly on.
+        gravity: metres a step, of every step, where it begins; training adjusts it. With ``velocity``, ``deformation``
+            and ``contact_length``: if nothing is predicted bodies fall, hit what is frozen, slide on it, turn and go
+            back to their shape (:func:`gsim3d.dynamics.mechanics.mechanics`). None: then they fly on.
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.

@@ -92,7 +92,7 @@ class _Surface:
         self._out = ((places - wide @ samples.places) * self._normal).sum(2)
 
     def normals(self, direction: Tensor, grid_size: float) -> Tensor:
-        """[B, M, 3], towards the outside, or the light ``direction`` where that is not clear; 0 where nothing is near."""
+        """[B, M, 3], towards the outside, or the light ``direction`` where that is not clear."""
         out = self._out + TOWARDS * grid_size * (self._normal @ direction)
         return torch.where((out < 0)[:, :, None], -self._normal, self._normal)
 

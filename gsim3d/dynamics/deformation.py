@@ -52,9 +52,8 @@ class Shape:
         self._before = before - there
 
     def way_back(self, places: Tensor, sampled: Tensor) -> Tensor:
-        """[B, M, 3], from each of the rows' ``places`` [B, M, 3] to where it would be in that shape, moved and turned as
-        the matter around it, whose samples are at ``sampled`` [B, S, 3]. Windows are those of ``matter``; no gradients
-        are needed."""
+        """[B, M, 3], from each of the rows' ``places`` [B, M, 3] to where it would be in that shape, moved and turned
+        as the matter around it, whose samples are at ``sampled`` [B, S, 3]. Windows are those of ``matter``."""
         window, then = self._matter.window, self._then
         centre, began = window @ sampled, window @ then
         products = window @ (sampled[:, :, :, None] * then[:, :, None]).flatten(2)

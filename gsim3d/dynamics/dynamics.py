@@ -54,12 +54,12 @@ class Dynamics(nn.Module):
         self.net = PointTransformer(layout.in_channels, layout.told_channels, layout.out_channels, config)
         self.lights = self.dimming = self.strength = None
         if config.lights:
-            size, each = STRENGTH if config.surfaces else LIGHT_SIZE, (len(config.lights), LIGHT_CHANNELS)
-            directions = F.normalize(torch.tensor(config.lights), dim=1) if config.surfaces else torch.tensor(config.lights)
-            self.lights = nn.Parameter(size * directions)
+            directions, each = torch.tensor(config.lights), (len(config.lights), LIGHT_CHANNELS)
             if config.surfaces:
+                self.lights = nn.Parameter(STRENGTH * F.normalize(directions, dim=1))
                 self.strength = nn.Parameter(torch.full(each, STRENGTH))
             else:
+                self.lights = nn.Parameter(LIGHT_SIZE * directions)
                 self.dimming = nn.Parameter(torch.full(each, DIMMING))
         self.gravity = self.contacts = None
         if config.gravity is not None:

@@ -10,7 +10,7 @@ from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.motion import share_of_a_step, shift
 from gsim3d.dynamics.rigid import onward_at, solved
-from gsim3d.dynamics.samples import Rows, Samples
+from gsim3d.dynamics.samples import Padded, Rows, Samples
 from gsim3d.types import CloudTable, Frames, Particles, constant
 
 PASSES = 5
@@ -57,7 +57,8 @@ def follow(
     if first == newest or not any(clouds.count(q) for q in newest):
         return result
     with torch.autocast(particles.means.device.type, enabled=False):
-        matter, then = Matter(particles, grid_size, length), Samples(Rows(particles, first, grid_size))
+        matter = Matter(particles, grid_size, length)
+        then = Samples(Rows(Padded(particles, first, grid_size), particles))
         then.seen_from(matter.here)
         now, lattice = matter.samples, matter.lattice
         centre = matter.window @ now.places

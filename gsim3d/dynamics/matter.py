@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.dynamics.rigid import Lattice
-from gsim3d.dynamics.samples import Rows, Samples, squares, weights
+from gsim3d.dynamics.samples import Padded, Rows, Samples, squares, weights
 from gsim3d.types import Particles
 
 
@@ -25,7 +25,7 @@ class Matter:
         self.newest = newest_clouds(history.clouds)
         self._counts = [history.clouds.count(q) for q in self.newest]
         with torch.no_grad(), torch.autocast(history.means.device.type, enabled=False):
-            self.rows = Rows(history, self.newest, grid_size)
+            self.rows = Rows(Padded(history, self.newest, grid_size), history)
             self.samples = Samples(self.rows)
             self.here = self.samples.mean[:, None]
             self.samples.seen_from(self.here)

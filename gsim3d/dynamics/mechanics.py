@@ -27,7 +27,8 @@ SMALLEST = 1e-9  # metres
 class Law:
     """What a body does, parameters that training may change.
 
-    gravity: [3] metres a step, of every step.   stiffness: share of the way back to its shape that a row goes in a step.
+    gravity: [3] metres a step, of every step.
+    stiffness: share of the way back to its shape that a row goes in a step.
     friction: of sliding on what is frozen.   damping: share of the way along it that matter which touches it loses.
     """
 
@@ -43,9 +44,9 @@ def mechanics(
     """[N, 3] metres, how each movable row of the newest clouds moves in the next step; 0 of others.
 
     A window of matter goes on as it moved, as one rigid body, and falls; rows go part of the way back to the shape that
-    matter had; and what would get behind frozen rows is put on the plane that they make, and slides there less (position
-    based dynamics: Müller et al., 2005 and 2007). So a body that is stopped below turns, rolls and is squeezed; how
-    high it jumps is for the network to say. All this happens ``SUBSTEPS`` times.
+    matter had; and what would get behind frozen rows is put on the plane that they make, and slides there less
+    (position based dynamics: Müller et al., 2005 and 2007). So a body that is stopped below turns, rolls and is
+    squeezed; how high it jumps is for the network to say. All this happens ``SUBSTEPS`` times.
 
     Args:
         history: clouds sorted by (scene, step); what carries no velocity rests.

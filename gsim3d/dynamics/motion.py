@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.rigid import RigidFit, onward_at
-from gsim3d.dynamics.samples import Rows, Samples, squares, weights
+from gsim3d.dynamics.samples import Padded, Rows, Samples, squares, weights
 from gsim3d.types import CloudTable, Particles, constant
 
 PASSES = 3  # in which the window follows the matter, and in which rows are matched
@@ -43,7 +43,7 @@ def motion(history: Particles, length: float, grid_size: float) -> Tensor:
     first = [0, *(q + 1 for q in newest[:-1])]
     before = [max(f, q - 1) for f, q in zip(first, newest, strict=True)]
     with torch.autocast(history.means.device.type, enabled=False):
-        last, oldest = (Samples(Rows(history, chosen, grid_size)) for chosen in (before, first))
+        last, oldest = (Samples(Rows(Padded(history, chosen, grid_size), history)) for chosen in (before, first))
         for samples in (last, oldest):
             samples.seen_from(matter.here)
         moved, expected = (shift(now, then, lattice.nodes, matter.window, length) for then in (last, oldest))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -15,16 +13,14 @@ SAMPLES = 1024  # rows of a cloud that are looked at, evenly spread over them
 FAINTEST = -60.0  # logarithm of a weight: a CPU takes many times as long for numbers that are almost 0
 
 
-class Rows:
+class Padded:
     """One cloud of every scene, padded.
 
-    rows: int64 [B, M].   wanted: bool [B, M], those of the ``activity`` that are at least as opaque as ``opacity``.
-    places: [B, M, 3] from the origins of the scenes, 0 of others.
+    rows: int64 [B, M].   places: float64 [B, M, 3] from the origins of the scenes.   is_row: bool [B, M], those within
+    the workspace.
     """
 
-    def __init__(
-        self, history: Particles, chosen: list[int], grid_size: float, activity: int = DYNAMIC, opacity: float = 0.0
-    ):
+    def __init__(self, history: Particles, chosen: list[int], grid_size: float):
         table, device = history.clouds, history.means.device
         starts, counts, scenes = (
             constant(tuple(of[q] for q in chosen), device)
@@ -32,22 +28,28 @@ class Rows:
         )
         place = torch.arange(max(1, max(table.count(q) for q in chosen)), device=device)
         self.rows = (starts[:, None] + place).clamp(max=history.n_rows - 1)
-        self._all = history.means.detach()[self.rows].double() - history.origin[scenes][:, None]
-        inside = ((self._all >= 0) & (self._all / grid_size < CELLS)).all(2)  # the workspace, and not NaN
-        self._is_seen = (place < counts[:, None]) & inside
-        self._choose(history, activity, opacity)
+        self.places = history.means.detach()[self.rows].double() - history.origin[scenes][:, None]
+        inside = ((self.places >= 0) & (self.places / grid_size < CELLS)).all(2)  # the workspace, and not NaN
+        self.is_row = (place < counts[:, None]) & inside
 
-    def that_are(self, history: Particles, activity: int, opacity: float = 0.0) -> Rows:
-        """Others of the same cloud."""
-        others = copy.copy(self)
-        others._choose(history, activity, opacity)
-        return others
 
-    def _choose(self, history: Particles, activity: int, opacity: float) -> None:
-        self.wanted = self._is_seen & (history.activity[self.rows] == activity)
+class Rows:
+    """Some rows of padded clouds.
+
+    rows: int64 [B, M].   wanted: bool [B, M], those of the ``activity`` that are at least as opaque as ``opacity``.
+    places: [B, M, 3] from the origins of the scenes, 0 of others.
+    """
+
+    def __init__(self, clouds: Padded, history: Particles, activity: int = DYNAMIC, opacity: float = 0.0):
+        self._clouds, self.rows = clouds, clouds.rows
+        self.wanted = clouds.is_row & (history.activity[self.rows] == activity)
         if opacity > 0:
             self.wanted = self.wanted & (history.opacities.detach()[self.rows] >= opacity)
-        self.places = torch.where(self.wanted[:, :, None], self._all, 0).to(history.means.dtype)
+        self.places = torch.where(self.wanted[:, :, None], clouds.places, 0).to(history.means.dtype)
+
+    def that_are(self, history: Particles, activity: int, opacity: float = 0.0) -> Rows:
+        """Others of the same clouds."""
+        return Rows(self._clouds, history, activity, opacity)
 
 
 class Samples:

@@ -136,7 +136,8 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: it is a simulator of other sizes.
     """
-    other, own = restore(path), trainer.simulator.state_dict()
+    other = restore(path)
+    own = {key: value.cpu() for key, value in trainer.simulator.state_dict().items()}
     saved, before = other.checkpoint, dict(other.simulator.dynamics.layout.outputs)
     given = {key: value.float() for key, value in saved.model.items()}
     if SEEN in given and given[SEEN].shape[-1] == own[SEEN].shape[-1] - MOTION_CHANNELS:

@@ -130,7 +130,8 @@ def test_a_bent_body_goes_back_to_its_shape():
     history = ball(2.0)
     moves = history.activity == DYNAMIC
     centre = history.means[moves].mean(0)
-    squeezed = torch.where(moves[:, None], centre + (history.means - centre) * torch.tensor([1.1, 1.1, 0.7]), history.means)
+    squeezed = centre + (history.means - centre) * torch.tensor([1.1, 1.1, 0.7])
+    squeezed = torch.where(moves[:, None], squeezed, history.means)
     places = film(dataclasses.replace(history, means=squeezed), 8, law(gravity=(0.0, 0.0, 0.0)))
     before = history.means[moves] - 1.0
     assert (places[-1] - before).norm(dim=1).mean() < 0.2 * (places[0] - before).norm(dim=1).mean()
@@ -153,8 +154,9 @@ def test_scenes_do_not_see_each_other_and_rows_have_no_order():
 
 def test_far_from_the_origin_it_is_the_same():
     near = ball(0.02, (0.01, 0.0, -0.05))
-    far = {"means": near.means + 400, "origin": near.origin + 400, "reference": near.reference + 400}
-    assert_close_relative_to_max(mechanics(dataclasses.replace(near, **far), *HOW, law()), mechanics(near, *HOW, law()), 0.02)
+    moved = {"means": near.means + 400, "origin": near.origin + 400, "reference": near.reference + 400}
+    far = mechanics(dataclasses.replace(near, **moved), *HOW, law())
+    assert_close_relative_to_max(far, mechanics(near, *HOW, law()), 0.02)
 
 
 def test_nothing_and_no_numbers_spoil_nothing():
@@ -173,7 +175,8 @@ def test_gradients_are_those_of_differences(wanted):
     """In float64, of a ball that slides as it lands."""
     history = ball(0.01, (0.02, 0.0, -0.03), n=60)
     history = dataclasses.replace(history, reference=history.reference * torch.tensor([0.9, 1.0, 1.1]))  # it is bent
-    history = dataclasses.replace(history, **{k: getattr(history, k).double() for k in ("means", "velocity", "reference")})
+    exact = {name: getattr(history, name).double() for name in ("means", "velocity", "reference")}
+    history = dataclasses.replace(history, **exact)
     laws = law(friction=0.3, dtype=torch.float64)
     g = torch.Generator().manual_seed(1)
     weights = torch.rand(history.means.shape, generator=g, dtype=torch.float64)
@@ -202,14 +205,16 @@ def test_a_gpu_finds_the_same(devices):
 
 
 def test_compiled_it_is_the_same(device):
-    history, of = ball(0.02, (0.01, 0.0, -0.05), n=50).to(device), Law(*(x.to(device) for x in dataclasses.astuple(law())))
+    history = ball(0.02, (0.01, 0.0, -0.05), n=50).to(device)
+    of = Law(*(x.to(device) for x in dataclasses.astuple(law())))
     history.clouds
     compiled = torch.compile(mechanics, fullgraph=True)
     assert_close_relative_to_max(compiled(history, *HOW, of), mechanics(history, *HOW, of), 1e-3)
 
 
 def test_untrained_dynamics_obeys_and_training_reaches_its_law():
-    dynamics, history = make_dynamics(dataclasses.replace(OBEYING, zero_init=True)), ball(0.02, (0.0, 0.0, -0.05), n=100)
+    dynamics = make_dynamics(dataclasses.replace(OBEYING, zero_init=True))
+    history = ball(0.02, (0.0, 0.0, -0.05), n=100)
     history = dataclasses.replace(history, velocity=history.velocity.requires_grad_())
     steps = rollout(dynamics, history, 3, max_steps=2)
     expected = mechanics(history, *HOW, dynamics.law())
@@ -221,7 +226,9 @@ def test_untrained_dynamics_obeys_and_training_reaches_its_law():
     assert history.velocity.grad[moves].abs().amax(1).gt(0).all()
 
 
-@pytest.mark.parametrize("change", [{"velocity": False}, {"contact_length": None}, {"steps_per_call": 2}, {"gravity": (1.0,)}])
+@pytest.mark.parametrize(
+    "change", [{"velocity": False}, {"contact_length": None}, {"steps_per_call": 2}, {"gravity": (1.0,)}]
+)
 def test_settings_that_make_no_sense_are_refused(change):
     with pytest.raises(ValueError, match="gravity"):
         DynamicsConfig(**{**dataclasses.asdict(OBEYING), "quirks": OBEYING.quirks, **change})
