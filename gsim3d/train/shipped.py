@@ -350,12 +350,13 @@ def train(
 
 def line(entry: dict, machine: dict) -> str:
     """What is said of a step."""
+    if "skipped" in entry:  # its numbers may be none
+        return f"step {entry['step']:6d}  skipped: {entry['skipped']}"
     known = {name: entry.get(f"{name}_psnr") for name in ("past", "future")}
     decibels = " ".join(f"{name} {value:.2f}" for name, value in known.items() if isinstance(value, float))
-    numbers = (
+    return (
         f"step {entry['step']:6d}  loss {entry['loss']:.5f}  {decibels} dB  "
         f"norm {entry['grad_norm']:.3f}  rate {entry['learning_rate']:.1e}  {machine['step_seconds']:.3f} s  "
         f"{machine['memory_gib']:.1f} GiB  {entry['particles']:.0f} particles  {entry['trajectories']} trajectories  "
         f"{entry['captures']} captures"
     )
-    return numbers if "skipped" not in entry else f"step {entry['step']:6d}  skipped: {entry['skipped']}"

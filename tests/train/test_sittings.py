@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import threading
 import time
 
@@ -25,6 +26,7 @@ from gsim3d.train.films import Filming, FilmStore
 from gsim3d.train.loop import deterministic
 from gsim3d.train.restore import restore
 from gsim3d.train.samples import draw_batch
+from gsim3d.train.log import plain
 from gsim3d.train.shipped import RECIPES, SittingTrainer, train
 from gsim3d.train.samples import longest_gap
 from gsim3d.train.sittings import (
@@ -410,3 +412,10 @@ def test_recipes_are_sound():
 
 def replace_ground(world, other):
     return dataclasses.replace(world, ground_height=other.ground_height)
+
+
+def test_a_step_that_was_skipped_is_said_to_be_whatever_its_numbers():
+    entry = {"step": 7, "loss": math.nan, "grad_norm": math.inf, "learning_rate": 1e-3, "future_psnr": math.nan}
+    why = "the gradient is not finite, first that of dynamics.gravity"
+    said = shipped.line(plain({**entry, "skipped": why}), {"step_seconds": 0.1, "memory_gib": 1.0})
+    assert said == f"step      7  skipped: {why}"
