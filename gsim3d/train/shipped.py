@@ -14,7 +14,6 @@ from pathlib import Path
 import torch
 
 from gsim3d.errors import HardCaseError
-from gsim3d.generate.stage import GRAVITY
 from gsim3d.generate.world import World
 from gsim3d.generate.worlds import build_world
 from gsim3d.train.captured import CapturedLoss, Prepared
@@ -99,7 +98,6 @@ def _recipe(
     images_in_turn: int = 20,
     lit_before: int = 40,
     contact_length: float = 0.15,
-    gravity: tuple[float, float, float] | None = None,
     shape: float = 0.005,
     shape_length: float = 0.2,
     capacity: int = 600,
@@ -114,7 +112,7 @@ def _recipe(
     rollout: their steps, and through how many of them gradients flow back.
     images_in_turn: steps of images in each round; more where the encoder does not know the world yet.
     lit_before: as of StageConfig, in rollouts of two steps.
-    contact_length, gravity: as of DynamicsConfig; the length more than bodies fall in a step.
+    contact_length: as of DynamicsConfig; more than bodies fall in a step.
     shape, shape_length: as of LossConfig; the length less than bodies are apart.
     Others as in Recipe.
     """
@@ -128,7 +126,7 @@ def _recipe(
     horizon, cut = rollout
     train = TrainConfig(
         preset="small",
-        model={**MODEL, "dynamics": {**MODEL["dynamics"], "contact_length": contact_length, "gravity": gravity}},
+        model={**MODEL, "dynamics": {**MODEL["dynamics"], "contact_length": contact_length}},
         effects=EFFECTS,
         data=DataConfig(
             history=4,
@@ -171,9 +169,7 @@ def _recipe(
 OTHER_GROUND = {"ground_height": (-0.1, 0.12)}
 RECIPES = {
     # Bodies fall for half a second and then hardly move.
-    "elastic": _recipe(
-        "elastic", (1.9, 4.8), 24, gravity=(0.0, 0.0, -GRAVITY / 42**2), in_turn=({}, {}, OTHER_GROUND)
-    ),
+    "elastic": _recipe("elastic", (1.9, 4.8), 24, in_turn=({}, {}, OTHER_GROUND)),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories and graphs.
     "cloth": _recipe(
         "cloth",
