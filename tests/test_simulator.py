@@ -110,6 +110,20 @@ def test_encoded_particles_know_how_fast_they_are_and_what_stands_in_their_light
     assert not torch.equal(in_history.velocity, too_old.velocity)
 
 
+def test_with_gravity_encoded_particles_are_as_fast_as_in_their_last_step():
+    """Not as on average over the three steps that were given."""
+    fall = (0.0, 0.002, -0.01)
+    more = {"motion_length": 0.5, "velocity": True, "deformation": True, "contact_length": 0.2}
+    states = []
+    for gravity in (None, fall):
+        config = dataclasses.replace(CONFIG.dynamics, **more, gravity=gravity)
+        states.append(make_simulator(dataclasses.replace(CONFIG, dynamics=config)).encode(make_frames((3,))))
+    moves = (states[0].activity == DYNAMIC) & (states[0].row_cloud() == 2)
+    assert moves.any()
+    faster = (states[1].velocity - states[0].velocity)[moves]
+    torch.testing.assert_close(faster, 0.5 * torch.tensor(fall).expand_as(faster), atol=1e-5, rtol=1e-3)
+
+
 @pytest.mark.parametrize("name", ["means", "dynamic_latents"])
 @pytest.mark.parametrize("activity", [DYNAMIC, FROZEN])
 def test_what_a_broken_row_remembers_is_not_used(name, activity):
