@@ -32,7 +32,9 @@ ROOM = 1.1  # for rows that a call reads, over what was counted
 LIGHT_SIZE = 0.1  # of the parameter that is a direction: smaller ones are turned faster in training
 DIMMING = 0.2  # logarithm of how much darker a row is where log(1 + n) of the matter before its lamp grows by one
 GRAVITY_SIZE = 0.01  # metres a step, of every step: of the parameter's unit, so that training changes it little
+STIFFEST = 0.99  # of bodies: the root of what is left has no gradient at 0
 CONTACTS = 0.8, 1.0, 0.5  # stiffness, friction and damping of gsim3d.dynamics.mechanics
+STEADY = 2.0  # as LIGHT_SIZE, of lamps that light surfaces
 STRENGTH = 2.0  # of the light that a surface facing the lamp gets, over that which comes from everywhere
 
 
@@ -56,7 +58,7 @@ class Dynamics(nn.Module):
         if config.lights:
             directions, each = torch.tensor(config.lights), (len(config.lights), LIGHT_CHANNELS)
             if config.surfaces:
-                self.lights = nn.Parameter(STRENGTH * F.normalize(directions, dim=1))
+                self.lights = nn.Parameter(STEADY * F.normalize(directions, dim=1))
                 self.strength = nn.Parameter(torch.full(each, STRENGTH))
             else:
                 self.lights = nn.Parameter(LIGHT_SIZE * directions)
@@ -144,7 +146,7 @@ class Dynamics(nn.Module):
     def law(self) -> Law:
         """Of a model with ``gravity``: what bodies do if nothing is predicted."""
         stiffness, friction, damping = self.contacts.clamp(min=0)
-        return Law(GRAVITY_SIZE * self.gravity, stiffness.clamp(max=1), friction, damping.clamp(max=1))
+        return Law(GRAVITY_SIZE * self.gravity, stiffness.clamp(max=STIFFEST), friction, damping.clamp(max=1))
 
     def begin(self, state: Particles) -> Particles:
         """``state`` with the fields in which simulated rows know how they began."""

@@ -228,6 +228,16 @@ def test_untrained_dynamics_obeys_and_training_reaches_its_law():
     assert history.velocity.grad[moves].abs().amax(1).gt(0).all()
 
 
+@pytest.mark.parametrize("value", [-1.0, 0.0, 1.0, 5.0])
+def test_a_law_that_training_took_to_its_limits_still_has_gradients(value):
+    dynamics, history = make_dynamics(OBEYING), ball(0.02, (0.0, 0.0, -0.05), n=100)
+    dynamics.contacts.data.fill_(value)
+    step = mechanics(history, *HOW, dynamics.law())
+    step.square().sum().backward()
+    assert step.isfinite().all()
+    assert dynamics.contacts.grad.isfinite().all() and dynamics.gravity.grad.isfinite().all()
+
+
 @pytest.mark.parametrize(
     "change", [{"velocity": False}, {"contact_length": None}, {"steps_per_call": 2}, {"gravity": (1.0,)}]
 )
