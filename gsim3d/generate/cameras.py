@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras of one data set, the same in every scene.
+    """The cameras of a scene.
 
     viewmats [V, 4, 4]: world-to-camera, OpenCV axes (x right, y down, z forward).
     Ks [V, 3, 3]: pixels, pixel centres at +0.5.    size: image width and height in pixels.
@@ -40,17 +40,18 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def two_rings(n_cams, size, near, far, *, distance, target_height, elevations, fov) -> Rig:
+def two_rings(n_cams, size, near, far, *, distance, target_height, elevations, fov, turned=0.0) -> Rig:
     """``n_cams`` cameras on two rings, low and high in turn, all ``distance`` metres from the point they look at.
 
     Args:
         elevations: (low, high) degrees above the horizon.   fov: vertical field of view, degrees.
+        turned: radians, of both rings about the vertical.
     """
     target = np.array([0.0, 0.0, target_height])
     focal = size / 2 / np.tan(np.radians(fov) / 2)
     viewmats = []
     for cam in range(n_cams):
-        azimuth, elevation = 2 * np.pi * cam / n_cams, np.radians(elevations[cam % 2])
+        azimuth, elevation = turned + 2 * np.pi * cam / n_cams, np.radians(elevations[cam % 2])
         toward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
         viewmats.append(look_at(target + distance * np.array(toward), target))
     K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])

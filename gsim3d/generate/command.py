@@ -51,6 +51,7 @@ _OPTIONS = {
     "drop": "drop_height",
     "body_size": "body_size",
     "background": "background",
+    "camera_spread": "camera_spread",
     "depth": "depth",
     "engine": "engine",
 }
@@ -87,6 +88,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--body-size", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of body diameters, metres"
     )
     parser.add_argument("--background", choices=("black", "white"), help="colour behind the ground (default black)")
+    parser.add_argument(
+        "--camera-spread",
+        type=float,
+        metavar="S",
+        help="cameras differ from scene to scene: up to S of their distance nearer or farther, other heights and "
+        "angles (default 0: the same in all)",
+    )
     parser.add_argument("--depth", action="store_true", default=None, help="also write depth images")
     parser.add_argument(
         "--engine", help="mujoco (default), or genesis: the paper's MPM and PBD (pip install 'gsim3d[genesis]')"

@@ -19,7 +19,9 @@ def start_filming() -> None:
 
 
 def film(world: World, scene: tuple[str, int], file: str) -> str:
-    """Writes trajectory ``scene`` into ``file``, .npy: uint8 [T, V, H, W, 4], colours and the label of seg images."""
-    views = world.make(*scene).views
-    np.save(file, np.stack([np.concatenate([view.rgb, view.segmentation[..., None]], -1) for view in views]))
+    """Writes trajectory ``scene`` into ``file``, .npz: images uint8 [T, V, H, W, 4], colours and the label of seg
+    images; viewmats [V, 4, 4] and Ks [V, 3, 3] of its cameras."""
+    made = world.make(*scene)
+    images = np.stack([np.concatenate([view.rgb, view.segmentation[..., None]], -1) for view in made.views])
+    np.savez(file, images=images, viewmats=made.rig.viewmats, Ks=made.rig.Ks)
     return file

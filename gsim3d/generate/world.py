@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import importlib
+import itertools
 import json
 import zlib
 from abc import ABC, abstractmethod
@@ -38,6 +39,8 @@ ENGINES = {"mujoco": "gsim3d.generate.mujoco_engine", "genesis": "gsim3d.generat
 CLOTH_REFINEMENT = 3  # drawn cloth is so many times finer than the simulated one
 GAP = 0.03  # metres between the spheres around two bodies at the start
 TRAIN = "train"
+MAX_SPREAD = 0.25  # of cameras: bodies leave the views of closer ones
+HIGHER, STEEPER = 0.5, 45.0  # times the spread: the target in distances, the rings in degrees
 
 
 class Rejected(Exception):
@@ -84,6 +87,7 @@ class World(ABC):
     elevations: tuple[float, float] = (18.0, 42.0)  # degrees, of the low and the high ring
     target_height: float = 0.52
     fov: float = 42.0  # degrees
+    camera_spread: float = 0.0  # how much cameras differ from scene to scene, see rig(); 0: not at all
     ground: bool = True
     ground_height: tuple[float, float] = (0.0, 0.0)
     ground_radius: float = 0.85
@@ -109,6 +113,8 @@ class World(ABC):
             raise InputError(f"far must lie beyond near; got near {self.near} and far {self.far}")
         if self.depth and self.far > writer.MAX_DEPTH:
             raise InputError(f"depth images reach to {writer.MAX_DEPTH} m; got far {self.far}")
+        if not 0 <= self.camera_spread <= MAX_SPREAD:
+            raise InputError(f"camera_spread must be from 0 to {MAX_SPREAD:g}; got {self.camera_spread!r}")
         if not self.seed >= 0:
             raise InputError(f"seed must be 0 or more; got {self.seed}")
         for field, allowed in (("background", BACKGROUNDS), ("mesh_up", MESH_UPS), ("engine", self.engines)):
@@ -128,9 +134,10 @@ class World(ABC):
     def _check_ground(self) -> None:
         if not self.ground:
             return
-        rig = self.rig()
         angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-        for height in self.ground_height:
+        extremes = itertools.product((-1.0, 1.0), repeat=3) if self.camera_spread else [(0.0, 0.0, 0.0)]
+        for height, extreme in itertools.product(self.ground_height, extremes):
+            rig = self._rig(*extreme)
             rim = np.stack([np.cos(angle), np.sin(angle), np.full(64, height)], 1)
             rim[:, :2] *= self.ground_radius
             pixels, depth = cameras.project(rim, rig.viewmats, rig.Ks)
@@ -154,7 +161,8 @@ class World(ABC):
         """Hash of all that the scenes of object ``name`` depend on, apart from their sample number."""
         fields = dataclasses.asdict(self)
         others = self.n_bodies[1] > 1  # then any object may appear in a scene of this one
-        for field in ("n_trajectories", "meshes", *(() if others else ("objects",))):
+        one_rig = not self.camera_spread
+        for field in ("n_trajectories", "meshes", *(() if others else ("objects",)), *(("camera_spread",) * one_rig)):
             del fields[field]
         text = json.dumps([writer.GENERATOR_VERSION, self.name, fields, name], sort_keys=True)
         digest = hashlib.sha256(text.encode())
@@ -163,17 +171,31 @@ class World(ABC):
                 digest.update(Path(path).read_bytes())
         return digest.hexdigest()
 
-    def rig(self) -> cameras.Rig:
-        """The cameras, the same in every scene."""
+    def rig(self, scene: tuple[str, int] | None = None) -> cameras.Rig:
+        """The cameras of a scene; None: those that all scenes differ from.
+
+        With a ``camera_spread`` of s they stand up to s times their distance nearer or farther, look at a place up to
+        s / 2 distances higher or lower, from up to 45 s degrees less or more above the horizon, and both rings are
+        turned by any angle.
+        """
+        if scene is None or not self.camera_spread:
+            return self._rig()
+        rng = np.random.default_rng([self.seed, zlib.crc32(scene[0].encode()), scene[1], zlib.crc32(b"cameras")])
+        return self._rig(*rng.uniform(-1, 1, 3), turned=rng.uniform(0, 2 * np.pi))
+
+    def _rig(self, farther: float = 0.0, higher: float = 0.0, steeper: float = 0.0, turned: float = 0.0) -> cameras.Rig:
+        """The cameras, each difference as a share of the largest."""
+        spread = self.camera_spread
         return cameras.two_rings(
             self.n_cams,
             self.image_size,
             self.near,
             self.far,
-            distance=self.distance,
-            target_height=self.target_height,
-            elevations=self.elevations,
+            distance=self.distance * (1 + spread * farther),
+            target_height=self.target_height + HIGHER * spread * self.distance * higher,
+            elevations=tuple(degrees + STEEPER * spread * steeper for degrees in self.elevations),
             fov=self.fov,
+            turned=turned,
         )
 
     def effects(self) -> EffectsSpec:
@@ -187,7 +209,7 @@ class World(ABC):
     def make(self, name: str, sample: int) -> writer.Scene:
         """Simulates and films trajectory ``sample`` of object ``name``; draws again until one can be used."""
         rejected = []
-        rig = self.rig()
+        rig = self.rig((name, sample))
         subset = [zlib.crc32(text.encode()) for text in (self.name, self.subset) if text not in ("elastic", TRAIN)]
         for attempt in range(MAX_ATTEMPTS):
             rng = np.random.default_rng([self.seed, zlib.crc32(name.encode()), sample, attempt, *subset])

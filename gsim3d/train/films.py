@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gsim3d.data import Window, generator
 from gsim3d.data.recording import BACKGROUND, MOVING
-from gsim3d.generate.cameras import workspace_origin
+from gsim3d.generate.cameras import Rig, workspace_origin
 from gsim3d.generate.film import film, start_filming
 from gsim3d.generate.world import World
 from gsim3d.train.config import DataConfig, StageConfig
@@ -53,7 +53,7 @@ class FilmStore:
     """Images and labels of many trajectories of one world in the memory of a device; the newest replace the oldest.
 
     Args:
-        world: whose cameras film; the same in every trajectory.
+        world: of the trajectories: how many cameras film how many frames.
         capacity: trajectories that there is room for.
         device: where they are kept.
     """
@@ -64,20 +64,23 @@ class FilmStore:
         self._shape = (world.n_frames, rig.n_cams, rig.size, rig.size)
         self._films = torch.empty((capacity, *self._shape, 4), dtype=torch.uint8, device=device)
         self.device = self._films.device  # with its number: each thread has a current one of its own
-        self._viewmats, self._Ks = (
-            torch.from_numpy(np.ascontiguousarray(values)).float().to(device) for values in (rig.viewmats, rig.Ks)
-        )
+        self._viewmats = torch.zeros(capacity, rig.n_cams, 4, 4, device=device)
+        self._Ks = torch.zeros(capacity, rig.n_cams, 3, 3, device=device)
+        self._origins = torch.zeros(capacity, 3, dtype=torch.float64, device=device)
         self._near, self._far = rig.near, rig.far
-        self._origin = torch.from_numpy(workspace_origin(rig)).to(device)
         self.lock = threading.RLock()  # held while films come or are read
         self.films = [
             Film(slot, Path(f"film_{slot}"), *self._shape[:2], rig.size, rig.size) for slot in range(capacity)
         ]
 
-    def put(self, film: np.ndarray) -> None:
-        """Keeps a trajectory: uint8 [T, V, H, W, 4], colours and label."""
+    def put(self, images: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> None:
+        """Keeps a trajectory, as :func:`gsim3d.generate.film.film` writes it."""
+        rig = Rig(viewmats, Ks, images.shape[2], self._near, self._far)
         with self.lock:
-            self._films[self.count % self.capacity].copy_(torch.from_numpy(film))
+            slot = self.count % self.capacity
+            kept = (self._films, images), (self._viewmats, viewmats), (self._Ks, Ks)
+            for place, values in (*kept, (self._origins, workspace_origin(rig))):
+                place[slot].copy_(torch.from_numpy(values))
             self.count += 1
 
     def draw(self, data: DataConfig, stage: StageConfig, seed: int, step: int, samples: Sequence[int]) -> Batch:
@@ -95,8 +98,9 @@ class FilmStore:
     def _frames(self, windows: Sequence[Window], depths: tuple[float, float], cams: Sequence, steps: range) -> Frames:
         """Some steps of the windows, seen by the cameras of each step."""
         n_views, (n_frames, n_cams, height, width) = len(cams[0][0]), self._shape
+        slots = torch.tensor([window.scene.slot for window in windows], device=self.device)
         places = [
-            ((window.scene.slot * n_frames + window.steps[step]) * n_cams + cam, cam)
+            ((window.scene.slot * n_frames + window.steps[step]) * n_cams + cam, window.scene.slot * n_cams + cam)
             for window, by_step in zip(windows, cams, strict=True)
             for step in steps
             for cam in by_step[step]
@@ -109,8 +113,8 @@ class FilmStore:
         return Frames(
             images=pixels[..., :3].permute(0, 3, 1, 2).float().contiguous().div_(255),
             cameras=Cameras(
-                self._viewmats[cam],
-                self._Ks[cam],
+                self._viewmats.flatten(0, 1)[cam],
+                self._Ks.flatten(0, 1)[cam],
                 depth * depths[0],
                 depth * depths[1],
                 cloud.repeat_interleave(n_views),
@@ -119,7 +123,7 @@ class FilmStore:
             ),
             cloud_scene=cloud // len(steps),
             cloud_step=cloud % len(steps),
-            origin=self._origin.expand(len(windows), 3).clone(),
+            origin=self._origins[slots],
             masks=labels != BACKGROUND,
             dynamic=labels == MOVING,
         )
@@ -138,7 +142,7 @@ class Filming:
     number is filmed once. Use as a context; leaving it ends the processes.
 
     Args:
-        worlds: take turns, from one round of the objects to the next; all have the cameras and objects of the first.
+        worlds: take turns, from one round of the objects to the next; all have the objects and as many cameras as the first.
         together: training processes that film for themselves, each other numbers; any of each object and world.
     Attributes:
         next: the smallest number from which on no process was given any.
@@ -208,7 +212,7 @@ class Filming:
             self.next, self._begun = self.next + self._together.count, self._begun + 1
             scene = names[number % len(names)], number // len(names)
             world = self._worlds[scene[1] % len(self._worlds)]
-            job = self._pool.submit(film, world, scene, str(self._cache / f"{number}.npy"))
+            job = self._pool.submit(film, world, scene, str(self._cache / f"{number}.npz"))
             job.add_done_callback(self._take)
 
     def _take(self, job: Future) -> None:
@@ -217,7 +221,8 @@ class Filming:
             return
         try:
             file = Path(job.result())
-            self._store.put(np.load(file))
+            with np.load(file) as film:
+                self._store.put(**film)
             file.unlink()
             self._begun -= 1
             self._begin()

@@ -226,6 +226,15 @@ def test_the_network_reads_it_and_training_reaches_strength_and_direction():
     assert dynamics.net.stem.told.weight.grad[:, : 2 * len(LIT.lights)].abs().amax(0).gt(0).all()
 
 
+def test_a_step_of_training_turns_a_lamp_by_little():
+    dynamics = make_dynamics(LIT)
+    before, rate = F.normalize(dynamics.lights.detach(), dim=1), 1e-3
+    dynamics.lights.grad = torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    torch.optim.AdamW([dynamics.lights], lr=rate).step()
+    turned = (F.normalize(dynamics.lights.detach(), dim=1) - before).norm(dim=1)
+    assert turned.gt(0).all() and turned.max() < 0.1 * rate
+
+
 def test_rows_that_were_not_encoded_are_lit_as_where_they_begin():
     dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True)), scene(300)
     step = dynamics(history)

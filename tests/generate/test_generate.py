@@ -296,6 +296,43 @@ def test_presets_build():
         assert (paper.n_frames, paper.fps) == length and paper.image_size == 128 and paper.n_cams == 12
 
 
+def test_cameras_differ_from_scene_to_scene_as_far_as_they_may(tmp_path):
+    plain, spread = (build_world("elastic", "mini", {**SMALL, **more}) for more in ({}, {"camera_spread": 0.06}))
+    assert plain.fingerprint("ball") != spread.fingerprint("ball") and plain.rig(("ball", 1)).n_cams == 3
+    np.testing.assert_array_equal(plain.rig(("ball", 1)).viewmats, plain.rig().viewmats)
+    np.testing.assert_array_equal(spread.rig().viewmats, plain.rig().viewmats)
+    distances, heights, turns = [], [], []
+    for sample in range(40):
+        rig = spread.rig(("ball", sample))
+        np.testing.assert_array_equal(rig.viewmats, spread.rig(("ball", sample)).viewmats)
+        rotations = rig.viewmats[:, :3, :3]
+        places = -np.einsum("vji,vj->vi", rotations, rig.viewmats[:, :3, 3])
+        aside = np.hypot(*places[:, :2].T)
+        target = places[0, 2] + aside[0] * rotations[0, 2, 2] / np.hypot(*rotations[0, 2, :2])
+        distances.append(np.hypot(aside[0], places[0, 2] - target) / plain.distance), heights.append(target)
+        turns.append(np.arctan2(places[0, 1], places[0, 0]))
+    assert 0.94 <= min(distances) < 0.95 and 1.05 < max(distances) <= 1.06
+    height = 0.03 * plain.distance
+    assert plain.target_height - height <= min(heights) < plain.target_height - 0.8 * height
+    assert plain.target_height + 0.8 * height < max(heights) <= plain.target_height + height
+    assert np.ptp(turns) > 5
+    made = generate(tmp_path, preset="mini", processes=1, progress=False, camera_spread=0.06, **SMALL)
+    scenes = [Scene.open(folder) for folder in made.folders]
+    for scene in scenes:
+        found = scene.cameras_at(range(3), [0]).viewmats
+        np.testing.assert_allclose(found, spread.rig((scene.path.parent.name, int(scene.path.name))).viewmats, atol=1e-6)
+    assert len({scene.cameras_at([0], [0]).viewmats.numpy().tobytes() for scene in scenes}) == len(scenes) > 1
+
+
+def test_cameras_that_see_beyond_near_and_far_are_refused():
+    build_world("elastic", "mini", {"camera_spread": 0.05})
+    with pytest.raises(InputError, match="the ground is seen from"):
+        build_world("elastic", "mini", {"camera_spread": 0.1})
+    for spread in (-0.1, 0.3, float("nan")):
+        with pytest.raises(InputError, match="camera_spread must be from 0 to 0.25"):
+            build_world("elastic", "mini", {"camera_spread": spread})
+
+
 HELD_OUT_SETS = [(world, subset) for subset, worlds in HELD_OUT.items() for world in worlds]
 
 

@@ -46,7 +46,7 @@ def scored(tmp_path_factory, one_thread):
     out = tmp_path_factory.mktemp("shipping")
     world = build_world("elastic", "paper", OPTIONS)
     store = FilmStore(world, 1, "cpu")
-    store.put(np.load(film(world, ("ball", 0), str(out / "film.npy"))))
+    store.put(**np.load(film(world, ("ball", 0), str(out / "film.npz"))))
     trainer = SittingTrainer(CONFIG, store, out / "run", "cpu")
     trainer.begin_sitting(time.monotonic() + 60)
     with trainer.log.opened(tensorboard=False):

@@ -59,19 +59,24 @@ def world():
 @pytest.fixture(scope="module")
 def films(world, tmp_path_factory):
     out = tmp_path_factory.mktemp("films")
-    return [np.load(film(world, scene, str(out / f"{scene[1]}.npy"))) for scene in world.scenes()]
+    return [dict(np.load(film(world, scene, str(out / f"{scene[1]}.npz")))) for scene in world.scenes()]
 
 
 @pytest.fixture
 def store(world, films):
     store = FilmStore(world, 2, "cpu")
-    for images in films:
-        store.put(images)
+    for given in films:
+        store.put(**given)
     return store
 
 
-def test_a_store_gives_what_scene_folders_give(store, tmp_path):
-    folders = generate(tmp_path, preset="mini", processes=1, progress=False, **OPTIONS).folders
+@pytest.mark.parametrize("spread", [0.0, 0.06])
+def test_a_store_gives_what_scene_folders_give(world, spread, tmp_path):
+    world, store = dataclasses.replace(world, camera_spread=spread), FilmStore(world, 2, "cpu")
+    for scene in world.scenes():
+        store.put(**np.load(film(world, scene, str(tmp_path / "film.npz"))))
+    options = {**OPTIONS, "camera_spread": spread}
+    folders = generate(tmp_path / "data", preset="mini", processes=1, progress=False, **options).folders
     scenes = [Scene.open(folder) for folder in folders]
     led = dataclasses.replace(CONFIG.stages[1], batch=3, lead=2)
     for step, stage in enumerate((CONFIG.stages[0], led, dataclasses.replace(led, dynamics_alone=True))):
@@ -88,10 +93,11 @@ def test_a_store_gives_what_scene_folders_give(store, tmp_path):
 
 
 def test_the_newest_replace_the_oldest(store, films):
-    store.put(films[0] // 2)
+    darker = films[0]["images"] // 2
+    store.put(**{**films[0], "images": darker})
     assert store.count == 3
-    assert torch.equal(store._films[0], torch.from_numpy(films[0] // 2))
-    assert torch.equal(store._films[1], torch.from_numpy(films[1]))
+    assert torch.equal(store._films[0], torch.from_numpy(darker))
+    assert torch.equal(store._films[1], torch.from_numpy(films[1]["images"]))
 
 
 def test_trajectories_are_filmed_once_each_while_others_work(world, films, tmp_path):
@@ -100,7 +106,7 @@ def test_trajectories_are_filmed_once_each_while_others_work(world, films, tmp_p
         assert filming.wait_for(2, seconds=60)
         filming.slow_down(1)
         assert filming.wait_for(4, seconds=60) and 4 <= filming.next <= 8
-    assert torch.equal(store._films[0], torch.from_numpy(films[1]))  # it began with number 1
+    assert torch.equal(store._films[0], torch.from_numpy(films[1]["images"]))  # it began with number 1
     assert not torch.equal(store._films[0], store._films[1])
     assert not list(tmp_path.iterdir()) and threading.active_count() < 50
 
@@ -110,7 +116,7 @@ def test_worlds_take_turns(world, films, tmp_path):
     raised = dataclasses.replace(world, ground_height=(0.2, 0.2))
     with Filming([world, raised], store, 0, 1, tmp_path) as filming:
         assert filming.wait_for(2, seconds=60)
-    assert torch.equal(store._films[0], torch.from_numpy(films[0]))
+    assert torch.equal(store._films[0], torch.from_numpy(films[0]["images"]))
     lower, higher = ((film[0, 0, ..., 3] == FIXED).nonzero()[:, 0].float().mean() for film in store._films)
     assert higher < lower - 1  # rows are counted from the top of an image
 
@@ -137,13 +143,13 @@ class Painted:
         film[..., self.size // 2 :, :, 3] = FIXED
         for step in range(self.n_frames):
             film[step, :, 4 + step : 14 + step, 10:20, 3] = MOVING
-        return film
+        return {"images": film, "viewmats": self.rig().viewmats, "Ks": self.rig().Ks}
 
 
 def test_batches_drawn_ahead_are_those_of_their_steps(tmp_path, device):
     store = FilmStore(Painted(), 2, device.type)
     for seed in range(2):
-        store.put(Painted().film(seed))
+        store.put(**Painted().film(seed))
     ahead, plain = (SittingTrainer(CONFIG, store, tmp_path / name, device.type) for name in "ab")
     ahead.captured = ahead._capture()
     ahead.begin_sitting(time.monotonic() + 1e4), plain.begin_sitting(time.monotonic() + 1e4)

@@ -30,7 +30,7 @@ def trainer_in(out, config=CONFIG, processes=None) -> SittingTrainer:
     """Computes as a graph does, call by call."""
     store = FilmStore(Painted(), 2, "cpu")
     for seed in range(2):
-        store.put(Painted().film(seed))
+        store.put(**Painted().film(seed))
     trainer = SittingTrainer(config, store, out, "cpu", processes)
     trainer.captured = trainer._capture()
     return trainer
