@@ -142,7 +142,8 @@ class Filming:
     number is filmed once. Use as a context; leaving it ends the processes.
 
     Args:
-        worlds: take turns, from one round of the objects to the next; all have the objects and as many cameras as the first.
+        worlds: take turns, from one round of the objects to the next; all have the objects and as many cameras as the
+            first.
         together: training processes that film for themselves, each other numbers; any of each object and world.
     Attributes:
         next: the smallest number from which on no process was given any.

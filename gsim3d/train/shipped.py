@@ -70,7 +70,6 @@ MODEL = {
         "shuffle_orders": False,
         "motion_length": 0.3,
         "lights": ((0.36, 0.24, 0.9),),  # the lamp of the worlds; training may turn it
-        "surfaces": True,
         "velocity": True,
         "deformation": True,
         "position_waves": 4,
@@ -81,10 +80,6 @@ MODEL = {
 }
 
 
-# How a look differs from the one that it had at first: bodies turn in the light, and shadows fall. From step to step
-# what is rendered in the wrong place would learn to fade, not where to go.
-# What rests changes in the light alone.
-EFFECTS = {"appearance": {"changing": "dynamic"}}
 TURN = 20, 20, 50  # steps of the dynamics alone with other light, in short rollouts, in long ones
 
 
@@ -101,6 +96,7 @@ def _recipe(
     contact_length: float = 0.15,
     shape: float = 0.005,
     shape_length: float = 0.2,
+    surfaces: bool = False,
     capacity: int = 600,
     options: Mapping = MappingProxyType({}),
     in_turn: tuple[dict, ...] = ({},),
@@ -116,6 +112,7 @@ def _recipe(
     lit_before: as of StageConfig, in rollouts of two steps.
     contact_length: as of DynamicsConfig; more than bodies fall in a step.
     shape, shape_length: as of LossConfig; the length less than bodies are apart.
+    surfaces: as of DynamicsConfig; what rests then changes in the light alone.
     Others as in Recipe.
     """
     # All views that are no input: what images cost beside the encoder is little.
@@ -128,8 +125,13 @@ def _recipe(
     horizon, cut = rollout
     train = TrainConfig(
         preset="small",
-        model={**MODEL, "dynamics": {**MODEL["dynamics"], "contact_length": contact_length}},
-        effects=EFFECTS,
+        model={
+            **MODEL,
+            "dynamics": {**MODEL["dynamics"], "contact_length": contact_length, "surfaces": surfaces},
+        },
+        # How a look differs from the one that it had at first: bodies turn in the light, and shadows fall. From step to
+        # step what is rendered in the wrong place would learn to fade, not where to go.
+        effects={"appearance": {"changing": "dynamic" if surfaces else "all"}},
         data=DataConfig(
             history=4,
             context_views=4,
@@ -173,7 +175,9 @@ OTHER_CAMERAS = {"camera_spread": 0.06}
 OTHER_GROUND = {"ground_height": (-0.25, 0.14)}
 RECIPES = {
     # Bodies fall for half a second and then hardly move.
-    "elastic": _recipe("elastic", (1.75, 5.0), 24, options=OTHER_CAMERAS, in_turn=({}, {}, OTHER_GROUND)),
+    "elastic": _recipe(
+        "elastic", (1.75, 5.0), 24, surfaces=True, options=OTHER_CAMERAS, in_turn=({}, {}, OTHER_GROUND)
+    ),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories and graphs.
     "cloth": _recipe(
         "cloth",

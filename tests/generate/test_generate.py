@@ -320,7 +320,8 @@ def test_cameras_differ_from_scene_to_scene_as_far_as_they_may(tmp_path):
     scenes = [Scene.open(folder) for folder in made.folders]
     for scene in scenes:
         found = scene.cameras_at(range(3), [0]).viewmats
-        np.testing.assert_allclose(found, spread.rig((scene.path.parent.name, int(scene.path.name))).viewmats, atol=1e-6)
+        rig = spread.rig((scene.path.parent.name, int(scene.path.name)))
+        np.testing.assert_allclose(found, rig.viewmats, atol=1e-6)
     assert len({scene.cameras_at([0], [0]).viewmats.numpy().tobytes() for scene in scenes}) == len(scenes) > 1
 
 
