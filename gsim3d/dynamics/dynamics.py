@@ -34,7 +34,7 @@ DIMMING = 0.2  # logarithm of how much darker a row is where log(1 + n) of the m
 GRAVITY_SIZE = 0.01  # metres a step, of every step: of the parameter's unit, so that training changes it little
 STIFFEST = 0.99  # of bodies: the root of what is left has no gradient at 0
 CONTACTS = 0.8, 1.0, 0.5  # stiffness, friction and damping of gsim3d.dynamics.mechanics
-STEADY = 20.0  # as LIGHT_SIZE, of lamps that light surfaces: training would turn them to make up for other errors
+STEADY = 20.0  # as LIGHT_SIZE, of lamps that light surfaces: training turned them away from the true ones
 STRENGTH = 2.0  # of the light that a surface facing the lamp gets, over that which comes from everywhere
 
 
