@@ -143,11 +143,13 @@ run_build() { step build compile; }
 run_test() { step test tests; }
 run_sanitize() {
   command -v compute-sanitizer >/dev/null || die "compute-sanitizer was not found: it comes with the CUDA toolkit"
-  local name tool file part gpus gpu turn=0
+  local name tool file part gpus gpu most n_running=0 turn=0
   mapfile -t gpus < <(devices)
+  most="$(at_once "${#gpus[@]}")"
   set -m  # a group of processes for each job: what stops this script can stop them
   while read -r name tool file part; do
-    while [ "$(jobs -rp | wc -l)" -ge "$(at_once "${#gpus[@]}")" ]; do wait -n; done
+    # No $( ) here: bash 5.2 cannot run a trap while it parses one.
+    if ((n_running == most)); then wait -n; else n_running=$((n_running + 1)); fi
     gpu="${gpus[turn++ % ${#gpus[@]}]}"
     CUDA_VISIBLE_DEVICES="$gpu" step "$name" sanitize "$tool" "$file" "$part" </dev/null &
   done < <(sanitized)
