@@ -7,4 +7,6 @@ if [ "${1:-}" = "--full" ]; then
   select=()
   shift
 fi
-exec python -m pytest "${select[@]}" "$@"
+# Side by side, a thread each: on tensors as small as those of most tests threads wait for each other.
+export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
+exec python -m pytest -n auto --maxprocesses 8 --dist worksteal "${select[@]}" "$@"
