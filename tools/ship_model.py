@@ -101,6 +101,7 @@ def card(name: str, recipe: dict, scores: dict, config: dict, wrong: str) -> str
     world, begun = recipe["world"], recipe["sittings"][0].get("began_with")
     n_sittings = len(recipe["sittings"])
     before = f"; begun with the weights of `{begun['name']}` at step {begun['step']:,}" if begun else ""
+    put = "".join(f"; then without training: {sitting['then']}" for sitting in recipe["sittings"] if "then" in sitting)
     return f"""# {name}
 
 A gsim3d simulator of the world `{world["world"]}`: `gsim3d simulate {name} SCENE --out DIR`. Apache-2.0.
@@ -112,7 +113,7 @@ A gsim3d simulator of the world `{world["world"]}`: `gsim3d simulate {name} SCEN
   from images alone.
 - **Budget** {recipe["steps"]:,} optimizer steps in {recipe["training_seconds"]:,.0f} s of training,
   {n_sittings} sitting{"s" if n_sittings > 1 else ""}, on {" and ".join(devices)}; {recipe["skipped_steps"]} steps were
-  skipped{before}.
+  skipped{before}{put}.
 - **Weights** averaged, bfloat16. `config.yaml` has all settings, `training.jsonl` a part of the log, `recipe.json` the
   data.
 

@@ -91,7 +91,7 @@ def _recipe(
     strides: tuple[int, int] = (3, 2),
     batch: int = 4,
     rollout: tuple[int, int] = (48, 24),
-    images_in_turn: int = 20,
+    images: tuple[int, int] = (400, 20),
     lit_before: int = 40,
     contact_length: float = 0.15,
     shape: float = 0.005,
@@ -108,7 +108,7 @@ def _recipe(
     begin_within: of images; windows of rollouts begin within twice as many steps.
     strides: of the pixels of ground and bodies.   batch: where long rollouts are simulated.
     rollout: their steps, and through how many of them gradients flow back.
-    images_in_turn: steps of images in each round; more where the encoder does not know the world yet.
+    images: steps of images before all others, and in each round; more where the encoder does not know the world yet.
     lit_before: as of StageConfig, in rollouts of two steps.
     contact_length: as of DynamicsConfig; more than bodies fall in a step.
     shape, shape_length: as of LossConfig; the length less than bodies are apart.
@@ -117,7 +117,7 @@ def _recipe(
     """
     # All views that are no input: what images cost beside the encoder is little.
     # At a rate of 1e-3 a good encoder was lost twice, for hundreds of steps.
-    images = partial(StageConfig, history=1, batch=16, target_views=8, begin_within=begin_within, learning_rate=3e-4)
+    seen = partial(StageConfig, history=1, batch=16, target_views=8, begin_within=begin_within, learning_rate=3e-4)
     dynamics = partial(StageConfig, dynamics_alone=True, target_views=3, begin_within=2 * begin_within)
     short = partial(dynamics, horizon=12, batch=2 * batch, from_start=0.25, learning_rate=8e-4)
     lit = partial(dynamics, begin_within=begin_within // 2, horizon=2, lit_before=lit_before)
@@ -143,7 +143,7 @@ def _recipe(
             targets_apart=True,
         ),
         stages=(
-            images(steps=400),
+            seen(steps=images[0]),
             # How things move right now, before what becomes of it.
             dynamics(steps=100, horizon=4, batch=2 * batch, from_start=0.1, learning_rate=8e-4),
             short(steps=200),
@@ -151,7 +151,7 @@ def _recipe(
             lit(steps=400),
         ),
         in_turn=(
-            images(steps=images_in_turn),
+            seen(steps=images[1]),
             lit(steps=TURN[0]),
             short(steps=TURN[1]),
             dynamics(steps=TURN[2], horizon=horizon, cut=cut, batch=batch, from_start=0.5, learning_rate=6e-4),
@@ -186,7 +186,7 @@ RECIPES = {
         strides=(4, 2),
         batch=3,
         rollout=(24, 12),
-        images_in_turn=120,
+        images=(1600, 240),
         shape_length=0.1,
         capacity=400,
     ),
@@ -195,7 +195,7 @@ RECIPES = {
         (1.7, 5.2),
         12,
         rollout=(24, 12),
-        images_in_turn=120,
+        images=(400, 120),
         lit_before=20,
         contact_length=0.4,
         shape=0.2,
