@@ -16,7 +16,9 @@ def planes(window: Tensor, points: Tensor, length: float) -> tuple[Tensor, Tenso
     middle = window @ points
     products = (points[:, :, :, None] * points[:, :, None]).flatten(2)
     scatter = (window @ products).unflatten(2, (3, 3)) - middle[:, :, :, None] * middle[:, :, None]
-    size = scatter.diagonal(dim1=2, dim2=3).sum(2)[:, :, None, None] + ROUND * length**2
+    # Rounded products (TF32) of places far away may have a trace below 0; the other norm bounds all eigenvalues then.
+    size = torch.maximum(scatter.diagonal(dim1=2, dim2=3).sum(2), scatter.square().sum((2, 3)).sqrt())
+    size = size[:, :, None, None] + ROUND * length**2
     across = of_largest(size * torch.eye(3, dtype=size.dtype, device=size.device) - scatter)
     longest = across.diagonal(dim1=2, dim2=3).argmax(2)[:, :, None, None].expand(-1, -1, 1, 3)
     normal = across.gather(2, longest)[:, :, 0]
