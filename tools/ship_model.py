@@ -25,6 +25,7 @@ from gsim3d import pretrained  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402
 from gsim3d.evaluate.pictures import write_curves  # noqa: E402
 from gsim3d.evaluate.report import markdown  # noqa: E402
+from gsim3d.pareto.autotune import SPEEDS  # noqa: E402
 from gsim3d.train import checkpoint  # noqa: E402
 from gsim3d.train.shipped import HELD_OUT_SEED, RECIPES  # noqa: E402
 from gsim3d.train.sittings import load_progress, weights_file  # noqa: E402
@@ -67,6 +68,9 @@ def ship(name: str, state: Path, scores: Path, wrong: str) -> Path:
     folder = pretrained.FOLDER / name
     folder.mkdir(exist_ok=True)
     shutil.copyfile(weights, folder / pretrained.WEIGHTS)
+    speeds = folder / SPEEDS
+    if speeds.is_file() and saved.digest not in json.loads(speeds.read_text()):
+        speeds.unlink()  # of the weights before
     (folder / "config.yaml").write_text(yaml.safe_dump(saved.config, sort_keys=False))
     log = (state / f"{name}.metrics.jsonl").read_text().splitlines()
     kept = log[:: -(-len(log) // LOGGED)]
