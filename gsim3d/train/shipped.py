@@ -176,7 +176,13 @@ OTHER_GROUND = {"ground_height": (-0.25, 0.14)}
 RECIPES = {
     # Bodies fall for half a second and then hardly move.
     "elastic": _recipe(
-        "elastic", (1.75, 5.0), 24, surfaces=True, options=OTHER_CAMERAS, in_turn=({}, {}, OTHER_GROUND)
+        "elastic",
+        (1.75, 5.0),
+        24,
+        images=(1600, 60),
+        surfaces=True,
+        options=OTHER_CAMERAS,
+        in_turn=({}, {}, OTHER_GROUND),
     ),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories and graphs.
     "cloth": _recipe(
@@ -195,7 +201,7 @@ RECIPES = {
         (1.7, 5.2),
         12,
         rollout=(24, 12),
-        images=(400, 120),
+        images=(1600, 240),
         lit_before=20,
         contact_length=0.4,
         shape=0.2,
