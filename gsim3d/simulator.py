@@ -167,6 +167,8 @@ class Simulator(nn.Module):
         for begin, end in pairwise(sorted({0, *changes, n_steps})):
             for edit in changes.get(begin, ()):
                 state = edit.apply(state, self._colors)
+            if begin in changes:
+                state = self.dynamics.in_light(state)
             state = guard(state)
             steps += self._roll(predict, state, end - begin, plan, generator, log)
             if end < n_steps:
@@ -206,7 +208,7 @@ class Simulator(nn.Module):
         if background == "dynamic":
             state = dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
         state = last_steps(state, plan.history)
-        return self.dynamics.begin(state)
+        return self.dynamics.begin(self.dynamics.in_light(state))
 
     def parts(
         self, prepared: Particles, *, on_bad: OnBad | None = None, report: StabilityReport | None = None

@@ -223,8 +223,9 @@ class Particles(_Tensors):
         the newest step on average since the oldest, 0 of others; only of a model with ``velocity``.
     light: [N, 3], factors of the colours of simulated rows: the light that reaches them over that where they were
         encoded; only of a model with ``lights``.
-    shaded: [N, L], what stood in the light of each lamp where rows were encoded (:func:`gsim3d.dynamics.shade.shade`);
-        negative where that is not known: they are lit there as where their simulation begins.
+    shaded: [N, 2 L], what stood in the light of each lamp where rows were encoded and what stands there now
+        (:func:`gsim3d.dynamics.shade.shade`), or [N, 3 L]: how much light reached them there, how much they faced the
+        lamp, and how much reaches them now (:func:`gsim3d.dynamics.daylight.daylight`); negative where not known.
     reference: [N, 3] metres, where rows were when their simulation began: the shape that elastic bodies go back to;
         only of a model with ``deformation``.
 

@@ -133,14 +133,13 @@ class Dynamics(nn.Module):
 
     @torch.no_grad()
     def in_light(self, particles: Particles) -> Particles:
-        """``particles`` of which the newest clouds know what stands in their light, as rows that were encoded there."""
+        """``particles`` of which the newest clouds know what stands in their light; where they do not know what stood
+        there as they were encoded, that is what stands there now."""
         if self.lights is None:
             return particles
         runs = particles.clouds.row_runs(newest_clouds(particles.clouds))
-        if self.config.surfaces:
-            shaded = torch.cat(daylight(particles, self.lights, self.config.grid_size), 1)
-        else:
-            shaded = shade(particles, self.lights, self.config.grid_size)
+        known = None if particles.shaded is None else take_runs(particles.shaded, runs)
+        shaded = self._shaded(particles, known)
         return dataclasses.replace(particles, shaded=_put_runs(shaded, runs, particles.n_rows, -1.0))
 
     def law(self) -> Law:
@@ -154,10 +153,7 @@ class Dynamics(nn.Module):
             state = with_field(state, "unlit")
         if self.config.deformation:
             state = with_field(state, "reference")
-        if self.lights is not None:
-            n_lights = len(self.lights)
-            state = with_field(with_field(state, "light"), "shaded", n_lights * (1 + self.config.surfaces))
-        return state
+        return state if self.lights is None else with_field(state, "light")
 
     def forward(
         self,
@@ -171,7 +167,8 @@ class Dynamics(nn.Module):
         """The next step of every scene, or the next ``config.steps_per_call`` steps.
 
         Args:
-            history: clouds sorted by (scene, step); steps may have different numbers of rows, and gaps are fine.
+            history: clouds sorted by (scene, step); steps may have different numbers of rows, and gaps are fine. What
+                stands in the light of the newest ones is known (:meth:`in_light`), or of none.
             generator: of drop path and of the curves' shuffling, both in training only; None: neither happens.
             pyramid: ``geometry(history)``; None: made here. With one of a given capacity nothing waits for the device,
                 and the result has the same values as long as ``pyramid.found`` fits the capacity.
@@ -188,7 +185,7 @@ class Dynamics(nn.Module):
         changes = changes or self.layout.changes()
         if background is None and self.config.is_asymmetric:
             return self._forward_in_parts(history, generator, changes)
-        history = self.begin(history)
+        history = self.begin(history if history.shaded is not None else self.in_light(history))
         if self.config.is_relit:
             history = _as_it_began(history, changes["dynamic_latents"] in ("all", "dynamic"))
         clouds = history.clouds
@@ -203,7 +200,7 @@ class Dynamics(nn.Module):
                 'Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"'
             )
         runs, config = clouds.row_runs(newest), self.config
-        moved = drift = near = dark = brighter = None
+        moved = drift = near = dark = shaded = None
         matter = self._matter(history)
         if config.velocity:
             drift = momentum(history, config.motion_length, config.grid_size, matter)
@@ -222,8 +219,9 @@ class Dynamics(nn.Module):
             near = contact(history, config.contact_length, config.grid_size, matter)
             near = _put_runs(near, runs, history.n_rows)
         if self.lights is not None:
-            began, told, brighter = self._light(history, take_runs(history.shaded, runs), matter)
-            dark = _put_runs(told, runs, history.n_rows)
+            shaded, n_lights = take_runs(history.shaded, runs), len(self.lights)
+            dark = torch.cat([shaded[:, -n_lights:], shaded[:, :n_lights]], 1)  # now and then
+            dark = _put_runs(dark, runs, history.n_rows)
         features, is_awake = self.layout.pack(history, moved, near, dark), None
         n_awake = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
         everyone = n_awake == history.n_rows
@@ -242,47 +240,60 @@ class Dynamics(nn.Module):
             is_awake = take_runs(is_awake, runs)[:, 0] > 0
 
         state = history.select_clouds(newest)
-        if self.lights is not None:
-            state = dataclasses.replace(state, shaded=began)
         table = state.clouds
         counts = [table.count(q) for q in range(len(table))]
         steps = [
             step.with_clouds(
                 CloudTable.make(counts, table.scenes, (s + 1 + i for s in table.steps), state.cu_rows.device)
             )
-            for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes, drift, brighter))
+            for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes, drift))
         ]
         if config.velocity:
             steps = [
                 dataclasses.replace(step, velocity=step.means - before.means)
                 for before, step in zip([state, *steps], steps)
             ]
+        if self.lights is not None:
+            # Where rows have come to: with the light of where they were shadows would lag behind their bodies.
+            found = [self._shaded(step, shaded) for step in steps]
+            brighter = torch.stack([self._brighter(values) for values in found])
+            light = self.layout.later_light(state, prediction, brighter, is_awake, changes)
+            steps = [
+                dataclasses.replace(step, shaded=values, light=lit)
+                for step, values, lit in zip(steps, found, light.unbind(0), strict=True)
+            ]
         return steps[0] if len(steps) == 1 else concatenate(steps)
 
-    def _light(self, history: Particles, began: Tensor, matter: Matter | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Of the newest rows: what is known of the light where they were encoded (``began``, as far as it is), what the
-        network is told of it, [N, 2 L], and the logarithm [N, 3] of how much more light reaches them now."""
+    def _shaded(self, particles: Particles, known: Tensor | None) -> Tensor:
+        """Of the newest rows: what stood in the light of each lamp where they were encoded, with ``surfaces`` how much
+        they faced it there, and what stands there now. The former are ``known``, as far as they are not negative."""
+        n_lights, grid_size = len(self.lights), self.config.grid_size
+        if self.config.surfaces:
+            facing = None if known is None else known[:, n_lights : 2 * n_lights]
+            facing = None if facing is None else torch.where(facing < 0, 1.0, facing)
+            now, faces = daylight(particles, self.lights, grid_size, facing=facing)
+            began = torch.cat([now, faces], 1)
+        else:
+            now = began = shade(particles, self.lights, grid_size)
+        if known is not None:
+            known = known[:, : began.shape[1]]
+            began = torch.where(known < 0, began, known)
+        return torch.cat([began, now], 1)
+
+    def _brighter(self, shaded: Tensor) -> Tensor:
+        """[N, 3], logarithm of how much more light reaches rows now than where they were encoded."""
+        before, now = shaded[:, : len(self.lights)], shaded[:, -len(self.lights) :]
         if not self.config.surfaces:
-            shaded = shade(history, self.lights, self.config.grid_size, matter)
-            began = torch.where(began < 0, shaded, began)
-            brighter = ((began - shaded)[:, :, None] * self.dimming).sum(1)  # a product of matrices would be rounded
-            return began, torch.cat([shaded, began], 1), brighter
-        n_lights = len(self.lights)
-        facing = began[:, n_lights:]
-        lit, faces = daylight(
-            history, self.lights, self.config.grid_size, matter, torch.where(facing < 0, 1.0, facing)
-        )
-        began = torch.where(began < 0, torch.cat([lit, faces], 1), began)
-        before = began[:, :n_lights]
-        now, then = ((x[:, :, None] * self.strength.clamp(min=0)).sum(1).log1p() for x in (lit, before))
-        return began, torch.cat([lit, before], 1), now - then
+            return ((before - now)[:, :, None] * self.dimming).sum(1)  # a product of matrices would be rounded
+        now, then = ((lit[:, :, None] * self.strength.clamp(min=0)).sum(1).log1p() for lit in (now, before))
+        return now - then
 
     def _matter(self, history: Particles) -> Matter | None:
         """What all that rows are told begins with; None where nothing is told of it."""
         config = self.config
         if config.velocity or config.deformation:
             return Matter.of(history, config.grid_size, config.motion_length)
-        if config.contact_length is not None or self.lights is not None:
+        if config.contact_length is not None:
             return Matter.of(history, config.grid_size)
         return None
 

@@ -132,8 +132,8 @@ class StateLayout:
         moved: [N, 2 to 4, 3] metres a step, of :mod:`gsim3d.dynamics.motion` or :mod:`gsim3d.dynamics.momentum` and,
                 behind that, :mod:`gsim3d.dynamics.deformation`; None: nothing moved, and nothing is bent.
         near: [N, 4], of :func:`gsim3d.dynamics.contact.contact`; None: nothing is near.
-        shaded: [N, 2 lights], of :func:`gsim3d.dynamics.shade.shade` and, behind that, ``particles.shaded``; None:
-            nothing is in the light.
+        shaded: [N, 2 lights], what stands in the light of each lamp, and what stood there where rows were encoded;
+            None: nothing.
         """
         config = self.config
         columns = []
@@ -169,9 +169,8 @@ class StateLayout:
         awake: Tensor | None = None,
         changes: Mapping[str, str] | None = None,
         drift: Tensor | None = None,
-        brighter: Tensor | None = None,
     ) -> list[Particles]:
-        """The particles after 1, 2, ... ``steps_per_call`` steps.
+        """The particles after 1, 2, ... ``steps_per_call`` steps, in the light of before (:meth:`later_light`).
 
         Args:
             particles: N rows, the newest state; those that are ``held`` keep their latents and colours.
@@ -179,40 +178,61 @@ class StateLayout:
             awake: bool [N], rows that change at all; None: all.
             changes: of :meth:`changes`; None: all that is predicted.
             drift: as ``moved`` of :meth:`pack`, motions that go on as far as they are kept; None: none.
-            brighter: [N, 3], logarithm of light if nothing is predicted; None: there are no lights.
         """
         changes = changes or self.changes()
-        outputs = [(name, n) for name, n in self.outputs if changes[name] != "none"]
-        widths = [n for _, n in outputs]
-        parts = widened(prediction).unflatten(1, (self.config.steps_per_call, -1)).transpose(0, 1).split(widths, 2)
-        moves = (particles.activity != FROZEN)[:, None].to(parts[0])
-        shares = {"all": torch.ones_like(moves), "dynamic": moves, "frozen": 1 - moves}
-        if awake is not None:
-            shares = {who: share * awake[:, None] for who, share in shares.items()}
         later = {}
-        for (name, _), part in zip(outputs, parts, strict=True):
-            share = shares[changes[name]]
-            if particles.held is not None and name in FEATURES:
-                share = share.masked_fill(particles.held[:, None], 0)
-            onward = {"means": drift, "light": brighter}.get(name)
-            if name == "light" and self.config.surfaces:
-                part = share * bounded(part / MOST_LIGHT, MOST_LIGHT)
-                share = self._lit(particles, shares["all"])
+        for name, part in self._parts(prediction, changes).items():
+            if name == "light":
+                continue
+            share = self._share(particles, changes[name], awake, name in FEATURES)
+            onward = drift if name == "means" else None
             later[name] = self.later_values(name, getattr(particles, name), part, share, onward)
-        if self.config.surfaces and brighter is not None and "light" not in later:
-            nothing, share = torch.zeros_like(brighter).expand(self.config.steps_per_call, -1, -1), shares["all"]
-            later["light"] = self.later_values(
-                "light", particles.light, nothing, self._lit(particles, share), brighter
-            )
         return [
             dataclasses.replace(particles, **{name: values[step] for name, values in later.items()})
             for step in range(self.config.steps_per_call)
         ]
 
+    def later_light(
+        self,
+        particles: Particles,
+        prediction: Tensor,
+        brighter: Tensor,
+        awake: Tensor | None = None,
+        changes: Mapping[str, str] | None = None,
+    ) -> Tensor:
+        """[S, N, 3], the light after 1, 2, ... steps: not of the step before, or its errors would add up.
+
+        Args:
+            brighter: [S, N, 3], its logarithm if nothing is predicted.
+            others: as of :meth:`advance`.
+        """
+        changes = changes or self.changes()
+        who, predicted = changes["light"], self._parts(prediction, changes).get("light")
+        share = self._share(particles, who, awake, True)
+        if self.config.surfaces:  # their light has bounds of its own, and reaches all, whose look changes otherwise
+            if predicted is not None:
+                brighter = brighter + share * bounded(predicted / MOST_LIGHT, MOST_LIGHT)
+            share = self._share(particles, "all", awake, True)
+        elif predicted is not None:
+            brighter = bounded((predicted + brighter) / MOST_LIGHT, MOST_LIGHT)
+        return hold(share, particles.light, brighter.exp())
+
+    def _parts(self, prediction: Tensor, changes: Mapping[str, str]) -> dict[str, Tensor]:
+        """[S, N, channels] of each output that changes."""
+        outputs = [(name, n) for name, n in self.outputs if changes[name] != "none"]
+        parts = widened(prediction).unflatten(1, (self.config.steps_per_call, -1)).transpose(0, 1)
+        return {name: part for (name, _), part in zip(outputs, parts.split([n for _, n in outputs], 2), strict=True)}
+
     @staticmethod
-    def _lit(particles: Particles, share: Tensor) -> Tensor:
-        """``share`` of the rows that surfaces light: whose look changes otherwise does not matter, but for ``held``."""
-        return share if particles.held is None else share.masked_fill(particles.held[:, None], 0)
+    def _share(particles: Particles, who: str, awake: Tensor | None, is_look: bool) -> Tensor:
+        """[N, 1], 1 of rows that change where ``who`` does; of a look 0 of those that are ``held``."""
+        frozen = particles.activity == FROZEN
+        rows = {"all": torch.ones_like(frozen), "dynamic": ~frozen, "frozen": frozen}.get(who, torch.zeros_like(frozen))
+        if awake is not None:
+            rows = rows & awake
+        if is_look and particles.held is not None:
+            rows = rows.masked_fill(particles.held, False)
+        return rows[:, None].to(particles.means)
 
     def later_values(
         self, name: str, newest: Tensor, predicted: Tensor, share: Tensor, drift: Tensor | None = None
@@ -220,22 +240,16 @@ class StateLayout:
         """One field of the particles after each step of a call.
 
         Args:
-            name: of the field; with ``surfaces`` what is predicted of light has its share already.
+            name: of the field.
             newest: [N, ...], its newest values.
             predicted: [S, N, channels], of S steps.
             share: [N, 1] or [S, N, 1], how much of a predicted change happens: 0 holds the value, bit by bit.
-            drift: of means [N, 2 to 4, 3], what is added in every step as far as it is kept; of light [N, 3], what is
-                added to the logarithm that is predicted; None: nothing.
+            drift: of means [N, 2 to 4, 3], what is added in every step as far as it is kept; None: nothing.
         Returns:
             [S, N, ...].
         """
         if name == "quats":
             return self._later_quats(newest, predicted, share)
-        if name == "light":  # not of the step before: its errors would add up
-            brighter = predicted if drift is None else predicted + drift
-            if not self.config.surfaces:  # their light has bounds of its own
-                brighter = bounded(brighter / MOST_LIGHT, MOST_LIGHT)
-            return hold(share, newest, brighter.exp())
         predicted = _unflat(name, predicted)
         if name == "means":
             predicted, kept = predicted[..., :3], predicted[..., 3:]

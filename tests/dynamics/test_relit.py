@@ -76,12 +76,13 @@ def test_a_background_in_front_of_which_nothing_changes_does_not_change():
 
     def predict(state):
         step, before = dynamics(state), last_steps(state, 1)
-        return dataclasses.replace(
+        step = dataclasses.replace(
             step,
             means=before.means,
             velocity=torch.zeros_like(before.means),
             dynamic_latents=torch.where(bodies[:, None], before.dynamic_latents, step.dynamic_latents),
         )
+        return dynamics.in_light(step)
 
     first, *others = rollout(predict, history, 4, 4)
     assert not torch.equal(first.dynamic_latents[frozen], history.dynamic_latents[:30][frozen])

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from gsim3d.dynamics import DynamicsConfig, last_steps, rollout
+from gsim3d.dynamics.clouds import single_steps
 from gsim3d.dynamics.samples import SAMPLES
 from gsim3d.dynamics.shade import shade
 from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
@@ -138,10 +139,11 @@ def test_compiled_it_is_the_same(device):
 
 
 def test_the_network_reads_it_and_turns_its_lights():
-    """Without the columns that read it the next step is another one."""
+    """Without the columns that read it the next step is another one. Training is told by how a step is lit."""
     dynamics, history = make_dynamics(LIT), under_a_ball(100)
     step = dynamics(history)
-    step.dynamic_latents.square().sum().backward()
+    assert not (step.light == 1).all()
+    step.light.square().sum().backward()
     assert dynamics.lights.grad.abs().amax(1).gt(0).all()
     for columns in (slice(0, 2), slice(2, 4)):  # now, and where rows were encoded
         other = copy.deepcopy(dynamics)
@@ -163,16 +165,17 @@ def test_light_is_that_of_where_rows_are_over_that_of_where_they_were_encoded(ba
     shaded = shade(history, torch.tensor(LIT.lights), LIT.grid_size)
     assert shaded.amin(0).max() < 0.1 and shaded.amax(0).min() > 2
     began = 0.5 + unlit(history.n_rows)
-    step = dynamics(dataclasses.replace(history, shaded=began))
+    step = dynamics(dynamics.in_light(dataclasses.replace(history, shaded=began)))
     expected = (2 * (((0.5 - shaded) @ dynamics.dimming) / 2).tanh()).exp()
     for light, known in ((x.unflatten(0, (steps_per_call, -1)) for x in (step.light, step.shaded)),):
         for k in range(steps_per_call):
             assert_close_relative_to_max(light[k], expected, 1e-5)
-            assert_same_bits(known[k], began[: len(shaded)])
+            assert_same_bits(known[k][:, :2], began[: len(shaded)])
+            assert_close_relative_to_max(known[k][:, 2:], shaded, 1e-5)
     change = torch.tensor([0.1, 0.0, -0.4])
     dynamics.net.head.fc2.bias.detach().unflatten(0, (steps_per_call, -1))[:, -3:] = change
     step = dynamics(history)  # as far as is known they began here
-    assert_close_relative_to_max(step.shaded, torch.cat([shaded] * steps_per_call), 1e-5)
+    assert_close_relative_to_max(step.shaded, torch.cat([shaded.repeat(1, 2)] * steps_per_call), 1e-5)
     brighter = step.light.unflatten(0, (steps_per_call, -1))[0]
     assert_close_relative_to_max(brighter, (2 * (change / 2).tanh()).exp().expand_as(brighter), 1e-5)
 
@@ -182,7 +185,7 @@ def test_light_does_not_add_up_and_is_not_of_rows_that_keep_their_look():
     dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True)), under_a_ball()
     held = torch.zeros(history.n_rows, dtype=torch.bool)
     held[::3] = True
-    history = dataclasses.replace(history, shaded=0.5 + unlit(history.n_rows), held=held)
+    history = dynamics.in_light(dataclasses.replace(history, shaded=0.5 + unlit(history.n_rows), held=held))
     for who in ("all", "dynamic", "frozen", "none"):
         first, *_, last = rollout(partial(dynamics, changes=dynamics.layout.changes(who)), history, 3, 2)
         rows, moves = last_steps(history, 1).held, last_steps(history, 1).activity == DYNAMIC
@@ -195,11 +198,12 @@ def test_encoded_rows_know_what_stood_in_their_light():
     dynamics, history = make_dynamics(LIT), under_a_ball(n_steps=2)
     known = dynamics.in_light(history)
     newest = known.row_cloud() == 1
-    assert_close_relative_to_max(known.shaded[newest], shade(history, dynamics.lights, LIT.grid_size), 1e-6)
+    shaded = shade(history, dynamics.lights, LIT.grid_size)
+    assert_close_relative_to_max(known.shaded[newest], shaded.repeat(1, 2), 1e-6)
     assert (known.shaded[~newest] == -1).all()
     gone = known.select_rows(known.activity == FROZEN)  # the ball is taken away: its shadow goes with it
     step = make_dynamics(dataclasses.replace(LIT, zero_init=True))(gone)
-    before = last_steps(gone, 1).shaded.sum(1)
+    before = last_steps(gone, 1).shaded[:, :2].sum(1)
     assert (step.light[before > 2] > 1.2).all() and (step.light[before == 0] == 1).all()
 
 
@@ -209,3 +213,22 @@ def test_encoded_rows_know_what_stood_in_their_light():
 def test_settings_that_make_no_sense_are_refused(change):
     with pytest.raises(ValueError, match="lights"):
         DynamicsConfig(**{"lights": ((0.0, 0.0, 1.0),), "norm": "layer", **change})
+
+
+@pytest.mark.parametrize("surfaces", [False, True])
+@pytest.mark.parametrize("steps_per_call", [1, 2])
+def test_a_shadow_does_not_lag_behind_its_body(surfaces, steps_per_call):
+    """A step is lit as its rows are where it ends, and the next one is told that."""
+    config = dataclasses.replace(LIT, surfaces=surfaces, grid_size=CELL, zero_init=True, steps_per_call=steps_per_call)
+    dynamics, history = make_dynamics(config), under_a_ball()
+    names = [name for name, n in dynamics.layout.outputs for _ in range(n)]
+    dynamics.net.head.fc2.bias.detach().unflatten(0, (steps_per_call, -1))[:, names.index("means")] = 2.0
+    known = dynamics.in_light(history)
+    for step in single_steps(dynamics(known)):
+        moved = (step.means - last_steps(known, 1).means)[:, 0].abs().max()
+        here = dynamics.in_light(step)
+        assert moved > 0.2
+        assert_close_relative_to_max(step.shaded, here.shaded, 1e-6)
+        n_lights = len(LIT.lights)
+        assert (step.shaded[:, :n_lights] - step.shaded[:, -n_lights:]).abs().max() > 0.3
+        assert (step.light[step.activity == FROZEN] - 1).abs().max() > 0.1
