@@ -33,6 +33,7 @@ FOLLOWED_BOUND = 1e-3  # of velocities, fitted to pixels: images of noise have n
 IMAGE_BOUND = 1e-3  # root mean square of a pixel's error: one splat whose alpha crosses 1/255 moves one pixel by 0.004
 GRAIN = 2.0**-18  # metres; positions are rounded to it before a scene is moved, so that sums of float32 are exact
 PLACES = ("means", "reference")  # fields of particles
+OF_PLACES = (*PLACES, "velocity", "light", "shaded")  # which a step leaves where it ends, rounded as that is
 FAR = 2.0**17  # cells: outside of the 2^16 that a grid has
 
 
@@ -283,7 +284,7 @@ def translate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
         state = on_grain(state)
         step, there = simulator.step(state, sample.plan), simulator.step(_moved(state, shift), sample.plan)
         step, there = last_steps(step, 1), last_steps(there, 1)
-        moved = [name for name in step.row_fields() if name in (*PLACES, "velocity")]
+        moved = [name for name in step.row_fields() if name in OF_PLACES]
         unmoved = [name for name in step.row_fields() if name not in moved]
         yield from compare_particles("step", there, step, 0, unmoved)
         yield from compare_particles("step", _moved(there, -shift), step, BOUND, moved)

@@ -266,16 +266,20 @@ class Dynamics(nn.Module):
 
     def _shaded(self, particles: Particles, known: Tensor | None) -> Tensor:
         """Of the newest rows: what stood in the light of each lamp where they were encoded, with ``surfaces`` how much
-        they faced it there, and what stands there now. The former are ``known``, as far as they are not negative."""
+        they faced it there, and what stands there now. The former are ``known``, as far as they are not negative; rows
+        that sleep keep what they knew."""
         n_lights, grid_size = len(self.lights), self.config.grid_size
+        matter = Matter.of(particles, grid_size)
         if self.config.surfaces:
             facing = None if known is None else known[:, n_lights : 2 * n_lights]
             facing = None if facing is None else torch.where(facing < 0, 1.0, facing)
-            now, faces = daylight(particles, self.lights, grid_size, facing=facing)
+            now, faces = daylight(particles, self.lights, grid_size, matter, facing)
             began = torch.cat([now, faces], 1)
         else:
-            now = began = shade(particles, self.lights, grid_size)
-        if known is not None:
+            now = began = shade(particles, self.lights, grid_size, matter)
+        if known is not None and matter is not None:
+            before = known[:, -n_lights:]
+            now = torch.where(matter.awake(particles)[:, None] | (before < 0), now, before)
             known = known[:, : began.shape[1]]
             began = torch.where(known < 0, began, known)
         return torch.cat([began, now], 1)

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.dynamics.rigid import Lattice
 from gsim3d.dynamics.samples import Padded, Rows, Samples, squares, weights
-from gsim3d.types import Particles
+from gsim3d.types import FROZEN, Particles
 
 
 class Matter:
@@ -40,6 +40,10 @@ class Matter:
         """None where the newest clouds have no rows."""
         clouds = history.clouds
         return cls(history, grid_size, length) if any(clouds.count(q) for q in newest_clouds(clouds)) else None
+
+    def awake(self, history: Particles) -> Tensor:
+        """bool [N], packed, rows of the newest clouds that neither sleep nor are outside of the workspace."""
+        return self.packed(self.rows.wanted | self.rows.that_are(history, FROZEN).wanted)
 
     def padded(self, values: Tensor) -> Tensor:
         """[B, M, C] of ``values`` [N, C] of the rows of the newest clouds, packed."""

@@ -232,3 +232,17 @@ def test_a_shadow_does_not_lag_behind_its_body(surfaces, steps_per_call):
         n_lights = len(LIT.lights)
         assert (step.shaded[:, :n_lights] - step.shaded[:, -n_lights:]).abs().max() > 0.3
         assert (step.light[step.activity == FROZEN] - 1).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("surfaces", [False, True])
+def test_rows_that_sleep_keep_what_they_knew(surfaces):
+    config = dataclasses.replace(LIT, surfaces=surfaces, grid_size=CELL)
+    dynamics, history = make_dynamics(config), under_a_ball()
+    known = dynamics.in_light(history)
+    asleep = torch.arange(known.n_rows) % 2 == 0
+    known = dataclasses.replace(known, activity=torch.where(asleep, ASLEEP, known.activity))
+    rows = last_steps(known, 1).activity == ASLEEP
+    step = dynamics(known)
+    assert_same_bits(step.shaded[rows], last_steps(known, 1).shaded[rows])
+    assert_same_bits(dynamics.in_light(step).shaded[rows], step.shaded[rows])
+    assert (step.shaded[rows] > 0).any() and not torch.equal(step.shaded[~rows], last_steps(known, 1).shaded[~rows])
