@@ -154,6 +154,7 @@ class Window:
 
     lead: steps behind the given ones that are predicted and not looked at.
     gap: steps behind the first given one that are not looked at.
+    masked_out: images show what may move alone, as if there was no ground.
     context_cams, target_cams: camera numbers for each step (targets at every step, context at the given ones).
     """
 
@@ -164,6 +165,7 @@ class Window:
     target_cams: tuple[tuple[int, ...], ...]
     lead: int = 0
     gap: int = 0
+    masked_out: bool = False
 
     @property
     def steps(self) -> list[int]:

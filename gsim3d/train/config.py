@@ -34,6 +34,9 @@ class StageConfig:
     dynamics_alone: only the dynamics learns. Encoder and renderer compute without gradients, and encoded steps are not
         compared: a step costs less, so that there is time for more of them between those that train all parts. The
         weights of the simulated steps add up to 1.
+    masked_out: share of the windows whose images show what may move alone, black elsewhere: an encoder that always saw
+        a ground below bodies tells their depth from where they are above it. For stages without simulated steps, since
+        bodies would land on what nobody sees; scenes need a segmentation.
     history: encoded steps; 0: as many as the data section says.
     batch: scenes a step, of all processes together.
     target_views: images of each step that the loss compares.
@@ -50,6 +53,7 @@ class StageConfig:
     lit_before: int = 0
     cut: int = 0
     dynamics_alone: bool = False
+    masked_out: float = 0.0
     history: int = 0
     batch: int = 1
     target_views: int = 5
@@ -66,6 +70,10 @@ class StageConfig:
                 raise InputError(f"{name}: needs a horizon of 1 or more")
         if self.lit_before and not self.dynamics_alone:
             raise InputError("lit_before: needs dynamics_alone: true")
+        if not 0 <= self.masked_out <= 1:
+            raise InputError(f"masked_out: must be from 0 to 1; got {self.masked_out}")
+        if self.masked_out and self.horizon:
+            raise InputError(f"masked_out: needs horizon: 0; got {self.horizon}")
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ class FilmStore:
             context = frames([window.context_cams for window in windows], range(n_context))
             shown = range(first_target(stage, n_context), n_context + stage.horizon)
             targets = frames([window.target_cams for window in windows], shown)
-        return batch_of(stage, windows[0], thinned(context, data), targets)
+        return batch_of(stage, windows, thinned(context, data), targets)
 
     def _frames(self, windows: Sequence[Window], depths: tuple[float, float], cams: Sequence, steps: range) -> Frames:
         """Some steps of the windows, seen by the cameras of each step."""

@@ -100,15 +100,33 @@ def draw_batch(
     context = make_frames(chosen, context_cams, [s[:n_context] for s in steps], masked=masked)
     target_cams = [window.target_cams[shown] for window in windows]
     targets = make_frames(chosen, target_cams, [s[shown] for s in steps], masked=masked)
-    return batch_of(stage, windows[0], thinned(context, data), targets)
+    return batch_of(stage, windows, thinned(context, data), targets)
 
 
-def batch_of(stage: StageConfig, window: Window, context: Frames, targets: Frames) -> Batch:
-    """A batch of windows like ``window``."""
+def batch_of(stage: StageConfig, windows: Sequence[Window], context: Frames, targets: Frames) -> Batch:
+    """The batch of ``windows``, given their images."""
+    window, masked_out = windows[0], [window.masked_out for window in windows]
+    if any(masked_out):
+        context, targets = (_without_background(frames, masked_out) for frames in (context, targets))
     how = {"dynamics_alone": stage.dynamics_alone, "cut": stage.cut, "has_own_background": stage.lit_before > 0}
     if stage.lit_before:
         context = dataclasses.replace(context, cloud_step=context.cloud_step + LONG_AGO * (context.cloud_step > 0))
     return Batch(context, targets, window.n_context, stage.horizon, window.lead, **how)
+
+
+def _without_background(frames: Frames, masked_out: Sequence[bool]) -> Frames:
+    """``frames`` in which some scenes show what may move alone.
+
+    Raises:
+        InputError: nobody knows what may move.
+    """
+    if frames.dynamic is None or frames.masks is None:
+        raise InputError("masked_out: needs scenes with a segmentation; a scene of this step has none")
+    scenes = torch.tensor(masked_out, device=frames.images.device)
+    chosen = scenes[frames.cloud_scene[frames.cameras.image_cloud]]
+    shown = frames.dynamic | ~chosen[:, None, None]
+    images = torch.where(shown[:, None], frames.images, 0)
+    return dataclasses.replace(frames, images=images, masks=frames.masks & shown)
 
 
 def first_target(stage: StageConfig, n_context: int) -> int:
@@ -185,4 +203,5 @@ def _draw_window(
         tuple(seen[place] for place in views.permutation(len(seen))[: stage.target_views]) for _ in range(n_steps)
     )
     gap = int(generator(seed, step, sample, "gap").integers(stage.lit_before + 1)) if stage.lit_before else 0
-    return Window(scene, start, n_context, (context,) * n_context, targets, lead, gap)
+    masked_out = bool(stage.masked_out) and generator(seed, step, sample, "background").random() < stage.masked_out
+    return Window(scene, start, n_context, (context,) * n_context, targets, lead, gap, bool(masked_out))

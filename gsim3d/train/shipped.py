@@ -80,7 +80,9 @@ MODEL = {
 }
 
 
-TURN = 20, 20, 50  # steps of the dynamics alone with other light, in short rollouts, in long ones
+MASKED_OUT = 0.3  # of windows of images: bodies are seen where there is no ground, too
+BEGINNING = 100, 200, 400  # steps of the dynamics alone: how things move right now, in short rollouts, with other light
+TURN = 20, 20, 50  # likewise, in each round: with other light, in short rollouts, in long ones
 
 
 def _recipe(
@@ -92,6 +94,7 @@ def _recipe(
     batch: int = 4,
     rollout: tuple[int, int] = (48, 24),
     images: tuple[int, int] = (400, 20),
+    beginning: tuple[int, int, int] = BEGINNING,
     lit_before: int = 40,
     contact_length: float = 0.15,
     shape: float = 0.005,
@@ -109,6 +112,8 @@ def _recipe(
     strides: of the pixels of ground and bodies.   batch: where long rollouts are simulated.
     rollout: their steps, and through how many of them gradients flow back.
     images: steps of images before all others, and in each round; more where the encoder does not know the world yet.
+    beginning: steps behind the images, before the rounds; 0 where the weights that a run begins with know how things
+        move.
     lit_before: as of StageConfig, in rollouts of two steps.
     contact_length: as of DynamicsConfig; more than bodies fall in a step.
     shape, shape_length: as of LossConfig; the length less than bodies are apart.
@@ -118,11 +123,17 @@ def _recipe(
     # All views that are no input: what images cost beside the encoder is little.
     # At a rate of 1e-3 a good encoder was lost twice, for hundreds of steps.
     seen = partial(StageConfig, history=1, batch=16, target_views=8, begin_within=begin_within, learning_rate=3e-4)
+    seen = partial(seen, masked_out=MASKED_OUT)
     dynamics = partial(StageConfig, dynamics_alone=True, target_views=3, begin_within=2 * begin_within)
     short = partial(dynamics, horizon=12, batch=2 * batch, from_start=0.25, learning_rate=8e-4)
     lit = partial(dynamics, begin_within=begin_within // 2, horizon=2, lit_before=lit_before)
     lit = partial(lit, batch=4 * batch, learning_rate=8e-4)
     horizon, cut = rollout
+    first = (
+        partial(dynamics, horizon=4, batch=2 * batch, from_start=0.1, learning_rate=8e-4),
+        short,
+        lit,  # where shadows are, before they follow what was simulated
+    )
     train = TrainConfig(
         preset="small",
         model={
@@ -144,11 +155,7 @@ def _recipe(
         ),
         stages=(
             seen(steps=images[0]),
-            # How things move right now, before what becomes of it.
-            dynamics(steps=100, horizon=4, batch=2 * batch, from_start=0.1, learning_rate=8e-4),
-            short(steps=200),
-            # Where shadows are, before they follow what was simulated.
-            lit(steps=400),
+            *(stage(steps=steps) for stage, steps in zip(first, beginning, strict=True) if steps),
         ),
         in_turn=(
             seen(steps=images[1]),
@@ -179,9 +186,9 @@ RECIPES = {
         "elastic",
         (1.75, 5.0),
         24,
-        images=(1600, 60),
+        images=(1500, 60),
+        beginning=(0, 0, 0),
         surfaces=True,
-        options=OTHER_CAMERAS,
         in_turn=({}, {}, OTHER_GROUND),
     ),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories and graphs.
@@ -201,11 +208,13 @@ RECIPES = {
         (1.7, 5.2),
         12,
         rollout=(24, 12),
-        images=(1600, 240),
+        images=(1500, 60),
+        beginning=(0, 0, 400),
         lit_before=20,
         contact_length=0.4,
         shape=0.2,
         shape_length=0.15,
+        surfaces=True,
         options=OTHER_CAMERAS,
         in_turn=({}, {}, OTHER_GROUND),
     ),

@@ -256,6 +256,39 @@ def test_the_background_of_the_first_step_lies_behind_the_bodies_of_the_last():
     assert torch.equal(state.select_clouds([0]).activity, history.select_clouds([1]).activity)
 
 
+def test_some_windows_show_what_may_move_alone(folder):
+    stage = StageConfig(steps=1, history=1, batch=4, target_views=2)
+    chosen, shown = range(12), dataclasses.replace(stage, masked_out=0.4)
+    windows = draw_windows(scenes(folder), CONFIG.data, shown, 0, 0, chosen)
+    masked = torch.tensor([window.masked_out for window in windows])
+    assert 2 <= masked.sum() <= 9
+    whole, some = (draw_batch(scenes(folder), CONFIG.data, s, 0, 0, chosen) for s in (stage, shown))
+    for frames, given in ((some.context, whole.context), (some.targets, whole.targets)):
+        alone = masked[given.cloud_scene[given.cameras.image_cloud]]
+        bodies = given.dynamic & alone[:, None, None]
+        assert torch.equal(frames.images[~alone], given.images[~alone])
+        assert torch.equal(frames.masks[~alone], given.masks[~alone])
+        assert torch.equal(frames.masks[alone], (given.masks & given.dynamic)[alone]) and frames.masks[alone].any()
+        assert torch.equal(frames.images[alone], (given.images * bodies[:, None])[alone])
+        assert not torch.equal(frames.images[alone], given.images[alone])
+
+
+def test_a_background_that_nobody_knows_is_not_masked_out(tmp_path):
+    write_scenes(tmp_path, 1)
+    stage = StageConfig(steps=1, history=1, target_views=2, masked_out=1.0)
+    assert draw_batch(scenes(tmp_path), CONFIG.data, stage, 0, 0, [0]).context.masks.any()
+    for image in tmp_path.rglob("seg_*.png"):
+        image.unlink()
+    with pytest.raises(InputError, match="masked_out: needs scenes with a segmentation"):
+        draw_batch(scenes(tmp_path), CONFIG.data, stage, 0, 0, [0])
+
+
+@pytest.mark.parametrize("wrong", [{"masked_out": 1.5}, {"masked_out": 0.1, "horizon": 4}])
+def test_what_cannot_be_masked_out_is_refused(wrong):
+    with pytest.raises(InputError, match="masked_out"):
+        StageConfig(steps=1, **wrong)
+
+
 @pytest.mark.parametrize("where", ["calls", "graphs"])
 def test_the_dynamics_learns_alone(folder, tmp_path, where, device):
     stage = dataclasses.replace(CONFIG.stages[1], steps=9, batch=2, dynamics_alone=True)
