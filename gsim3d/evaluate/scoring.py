@@ -38,7 +38,6 @@ METRICS = {
     "lpips_vgg": Metric("LPIPS vgg", 4, rises=False, weights="lpips_vgg"),
     "fvd": Metric("FVD", 1, rises=False, weights="fvd_i3d", by_step=False),
 }
-PIXELS = 2**20  # of the images that are compared at once: with those of one step alone a GPU would wait for the host
 PLAIN_METRICS = tuple(name for name, metric in METRICS.items() if metric.weights is None)
 
 
@@ -134,16 +133,11 @@ class SceneTruth:
 
     def _by_step(self, images: Tensor) -> dict[str, Tensor]:
         """Metric -> float64 [S], means over the views that have a value; NaN for steps without images."""
-        first, n_views = len(self.images) - len(images), images.shape[1]
-        together = max(1, PIXELS // images[0, ..., 0].numel())  # steps
-        none = images.new_full((first,), torch.nan, dtype=torch.float64)
-        scores = {metric: [none] for metric in self.metrics if METRICS[metric].by_step}
-        for begin in range(0, len(images), together):
-            steps = slice(first + begin, first + begin + together)
-            pred, true = images[begin : begin + together].flatten(0, 1), self.images[steps].flatten(0, 1)
-            labels, filmed = (
-                None if mask is None else mask[steps].flatten(0, 1) for mask in (self.labels, self.filmed)
-            )
+        n_steps = len(self.images)
+        scores = {m: torch.full((n_steps,), torch.nan, dtype=torch.float64) for m in self.metrics if METRICS[m].by_step}
+        for step, pred in enumerate(images, n_steps - len(images)):
+            true = self.images[step]
+            labels, filmed = (None if mask is None else mask[step] for mask in (self.labels, self.filmed))
             measure = {
                 "psnr": lambda: psnr(pred, true, filmed),
                 "psnr_masked": lambda: psnr(pred, true, labels != BACKGROUND),
@@ -153,8 +147,8 @@ class SceneTruth:
                 "lpips_vgg": lambda: lpips.lpips(pred, true, "vgg"),
             }
             for metric, values in scores.items():
-                values.append(measure[metric]().unflatten(0, (-1, n_views)).nanmean(1))
-        return {metric: torch.cat(values).cpu() for metric, values in scores.items()}
+                values[step] = measure[metric]().nanmean()
+        return scores
 
     def _clip_features(self, images: Tensor) -> Tensor:
         """[V, 400], of the predicted steps."""

@@ -189,6 +189,7 @@ RECIPES = {
         images=(1500, 60),
         beginning=(0, 0, 0),
         surfaces=True,
+        capacity=300,  # with more the graphs of long rollouts do not fit a GPU of 80 GB
         in_turn=({}, {}, OTHER_GROUND),
     ),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories and graphs.
