@@ -28,7 +28,7 @@ from gsim3d.train.samples import Batch
 from gsim3d.train.sittings import Progress, save_state
 
 FIRST_FILMS = 32  # before training begins
-SEED, HELD_OUT_SEED = 20261127, 77  # of the trajectories; `gsim3d generate` without --seed makes others
+SEED, HELD_OUT_SEED = 20261128, 77  # of the trajectories; `gsim3d generate` without --seed makes others
 WARM_UP = 40  # steps at the beginning of a sitting
 COOL_DOWN = 0.25  # of a sitting's training, in which the learning rate falls to LAST_RATE of its peak
 LAST_RATE = 0.03

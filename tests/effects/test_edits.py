@@ -297,3 +297,15 @@ def test_a_model_that_is_told_everything_goes_on_from_edits(model):
     step = future(simulator, state, 2, edits)[-1]
     own = {"sh", "quats"} if model == "explicit" else {"turns", "paint", "unlit"}
     assert own | {"light", "velocity", "reference"} <= step.row_fields().keys() and step.means.isfinite().all()
+
+
+@pytest.mark.parametrize("step", [0, 1])
+def test_who_is_removed_stands_in_no_light(step):
+    """What the network is told, from the step of the edit on."""
+    more = {"lights": ((0.1, 0.2, 1.0),)}
+    config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **more))
+    simulator, state, _ = encoded(config)
+    told = []
+    simulator.dynamics.register_forward_pre_hook(lambda _, args: told.append(last_steps(args[0], 1).shaded[:, 1]))
+    future(simulator, state, 2, [Edit(step, Remove("moving"))])
+    assert len(told) == 2 and [bool(now.any()) for now in told] == [step > 0, False]
