@@ -6,13 +6,16 @@
     python tools/ship_report.py elastic-small cpu=runs/cpu h200=runs/h200
 
 Every DIR holds report.json and the pictures, and speeds.json where `gsim3d pareto` could not write beside the
-checkpoint. Written: docs/cost-NAME.md and its pictures; NAME's speeds.json for `gsim3d simulate --speed`.
+checkpoint. Written: docs/cost-NAME.md and its pictures, in which reports of other machines stay, marked where they are of
+other weights; NAME's speeds.json for `gsim3d simulate --speed`.
 """
 
 import argparse
 import json
+import re
 import shutil
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -26,6 +29,7 @@ from gsim3d.pareto.report import regimes_in_words  # noqa: E402
 
 DOCS = ROOT / "docs"
 PICTURES = ("cost.png", "stages.png", "horizon.png")
+OTHER_WEIGHTS = "Of weights that this simulator had before those in the package."
 INTRO = """# What the accuracy of {name} costs
 
 Written by `python tools/ship_report.py`; do not edit. How to read it: [accuracy-time.md](accuracy-time.md); what the
@@ -35,15 +39,30 @@ simulator is: [trained.md](trained.md). Every number can be made again by the co
 
 def write_page(name: str, reports: dict[str, Path], docs: Path = DOCS) -> Path:
     """docs/cost-NAME.md of reports by the names of their machines."""
-    parts = [INTRO.format(name=name)]
+    page = docs / f"cost-{name}.md"
+    parts, checkpoints = [INTRO.format(name=name)], []
     for machine, folder in reports.items():
         content = json.loads((folder / "report.json").read_text())
         for picture in PICTURES:
             shutil.copyfile(folder / picture, docs / f"cost-{name}-{machine}-{picture}")
         parts.append(section(name, machine, content))
-    page = docs / f"cost-{name}.md"
+        checkpoints.append(content["subject"]["checkpoint"])
+    parts += other_sections(name, page, reports, checkpoints)
     page.write_text("\n".join(parts))
     return page
+
+
+def other_sections(name: str, page: Path, reports: Iterable[str], checkpoints: Sequence[str]) -> list[str]:
+    """What ``page`` says of machines that have no new report."""
+    kept = []
+    for part in page.read_text().split("\n## ")[1:] if page.is_file() else ():
+        if re.search(rf"\(cost-{name}-(\w+)-cost\.png\)", part)[1] in reports:
+            continue
+        heading, rest = part.split("\n", 1)
+        if OTHER_WEIGHTS not in rest and not any(f"checkpoint {digest}" in rest for digest in checkpoints):
+            rest = f"\n{OTHER_WEIGHTS}\n{rest}"
+        kept.append(f"## {heading}\n{rest}")
+    return kept
 
 
 def section(name: str, machine: str, content: dict) -> str:

@@ -5,6 +5,7 @@ import dataclasses
 import importlib.util
 import json
 import re
+import shutil
 from html import escape
 from pathlib import Path
 
@@ -251,6 +252,16 @@ def test_a_report_goes_into_the_documentation(written, tmp_path, monkeypatch):
     assert page.count(".png)") == len(tool.PICTURES)
     assert "gsim3d pareto <x>" in page and "failed: out of memory at step 3" in page and "holds: a" in page
     assert "| 1 | history 1 | model |" in page
+    both = tool.write_page("ball-small", {"h200": written[0]}, tmp_path).read_text()
+    assert both.count("\n## ") == 2 and tool.OTHER_WEIGHTS not in both and page.split("\n## ")[1] in both
+    other = tmp_path / "other"
+    shutil.copytree(written[0], other)
+    content = json.loads((other / "report.json").read_text())
+    content["subject"]["checkpoint"] = "another"
+    (other / "report.json").write_text(json.dumps(content))
+    for _ in range(2):  # marked once
+        first, *parts = tool.write_page("ball-small", {"cpu": other}, tmp_path).read_text().split("\n## ")
+        assert [tool.OTHER_WEIGHTS in part for part in parts] == [False, True] and "another" in parts[0]
     reports = {name: tmp_path / name for name in ("cpu", "h200")}
     for (name, folder), device in zip(reports.items(), ("cpu", "cuda"), strict=True):
         folder.mkdir()
