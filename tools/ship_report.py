@@ -6,7 +6,7 @@
     python tools/ship_report.py elastic-small cpu=runs/cpu h200=runs/h200
 
 Every DIR holds report.json and the pictures, and speeds.json where `gsim3d pareto` could not write beside the
-checkpoint. Written: docs/cost-NAME.md and its pictures, in which reports of other machines stay, marked where they are of
+checkpoint. Written: docs/cost-NAME.md and its pictures, where reports of other machines stay, marked if they are of
 other weights; NAME's speeds.json for `gsim3d simulate --speed`.
 """
 
