@@ -77,7 +77,8 @@ def ship(name: str, state: Path, scores: Path, wrong: str) -> Path:
     (folder / "training.jsonl").write_text("".join(line + "\n" for line in kept))
     (folder / "scores.json").write_text(json.dumps(measured) + "\n")
     recipe = RECIPES[name.split("-")[0]]
-    world = recipe.worlds()[0]
+    # The recipe has the seed of the next sitting, perhaps.
+    world = dataclasses.replace(recipe.worlds()[0], seed=progress.sittings[-1]["seed"])
     described = {
         "steps": progress.step,
         "training_seconds": progress.seconds,

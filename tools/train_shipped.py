@@ -74,6 +74,7 @@ def sit(recipe, name: str, state: Path, out: Path, *, minutes: float, device: st
                     "device": machine if together.count == 1 else f"{together.count} x {machine}",
                     "processes": together.count * processes,
                     "seconds_before": waited,
+                    "seed": worlds[0].seed,
                     "in_turn": list(recipe.in_turn),
                     **({"began_with": begun} if begun else {}),
                 }

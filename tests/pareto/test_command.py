@@ -261,7 +261,7 @@ def test_a_report_goes_into_the_documentation(written, tmp_path, monkeypatch):
     (other / "report.json").write_text(json.dumps(content))
     for _ in range(2):  # marked once
         first, *parts = tool.write_page("ball-small", {"cpu": other}, tmp_path).read_text().split("\n## ")
-        assert [tool.OTHER_WEIGHTS in part for part in parts] == [False, True] and "another" in parts[0]
+        assert [part.count(tool.OTHER_WEIGHTS) for part in parts] == [0, 1] and "another" in parts[0]
     reports = {name: tmp_path / name for name in ("cpu", "h200")}
     for (name, folder), device in zip(reports.items(), ("cpu", "cuda"), strict=True):
         folder.mkdir()

@@ -52,7 +52,7 @@ def scored(tmp_path_factory, one_thread):
     with trainer.log.opened(tensorboard=False):
         for _ in range(2):
             trainer.log.write(trainer.train_step(), {})
-    sitting = {"device": "cpu", "trajectories": 1, "steps": [0, 2]}
+    sitting = {"device": "cpu", "trajectories": 1, "steps": [0, 2], "seed": 4321}
     progress = save_state(trainer, out / "state", NAME, Progress(next_trajectory=1, sittings=[sitting]))
     score = tool("score_shipped").score
     given = {"device": "cpu", "counts": (2, 1), "changes": {**OPTIONS, "objects": ("ball",)}}
@@ -104,7 +104,7 @@ def test_a_state_becomes_a_simulator_with_card_and_page(scored, package, tmp_pat
     assert restore(NAME).checkpoint.state["step"] == 2
     text, page = (folder / "README.md").read_text(), (tmp_path / "trained.md").read_text()
     scores = json.loads((folder / "scores.json").read_text())
-    assert text.endswith("## What is wrong with it\n\nIt floats.\n") and "--seed" in text
+    assert text.endswith("## What is wrong with it\n\nIt floats.\n") and "--seed 4321" in text
     assert f"{scores['unseen']['future.psnr_masked']:.2f}" in text and "It floats." in page
     assert (tmp_path / f"trained-{NAME}.png").is_file() and "Truth above prediction" in page
     package.main([NAME, *paths])  # keeps what was said to be wrong
