@@ -12,9 +12,11 @@ captured anew with room for them, and repeated.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import torch
@@ -72,13 +74,25 @@ class Captured:
         torch.cuda.current_stream().wait_stream(side)
         self._graph = torch.cuda.CUDAGraph()
         # What other threads do (one of NCCL asks the GPU what is done, at any time) must not end the capture.
-        with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+        with collecting_nothing(), torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
             self.result = function()
 
     def __call__(self) -> Any:
         with torch.cuda.device(self._device):
             self._graph.replay()
         return self.result
+
+
+@contextlib.contextmanager
+def collecting_nothing() -> Iterator[None]:
+    """No garbage is collected inside: another graph that happens to be freed then would end a capture."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 class CaptureError(RuntimeError):

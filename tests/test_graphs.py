@@ -2,13 +2,14 @@
 
 import dataclasses
 import functools
+import gc
 
 import pytest
 import torch
 
 from gsim3d.effects import DynamicsEffects, EffectsSpec
 from gsim3d.errors import HardCaseError, InputError
-from gsim3d.graphs import Captured, CapturedRollout, CaptureError
+from gsim3d.graphs import Captured, CapturedRollout, CaptureError, collecting_nothing
 from gsim3d.ops import PyramidCapacity
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
@@ -280,6 +281,39 @@ def test_what_waits_for_the_device_is_no_graph(devices):
         Captured(lambda: x.sum().item(), devices[1])
     torch.cuda.synchronize()
     assert Captured(lambda: 2 * x, devices[1])().tolist() == [2, 2, 2]
+
+
+def test_graphs_that_nobody_needs_do_not_end_a_capture(devices):
+    x, calls, before = torch.ones(3, device=devices[1]), [], gc.get_threshold()
+    graphs = [Captured(lambda: 2 * x, devices[1])]
+
+    def function():
+        calls.append(len(calls))
+        if len(calls) == 3:  # the one that is captured
+            cycle = [graphs.pop()]
+            cycle.append(cycle)
+            del cycle  # only the collector finds it, and so many lists call for it
+            gc.set_threshold(100)
+        return x * len([[k] for k in range(5000)])
+
+    try:
+        assert Captured(function, devices[1])().tolist() == [5000, 5000, 5000]
+    finally:
+        gc.set_threshold(*before)
+    assert len(calls) == 3 and not graphs
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_the_collector_goes_on_as_before(enabled):
+    assert gc.isenabled()
+    try:
+        (gc.enable if enabled else gc.disable)()
+        with pytest.raises(KeyError), collecting_nothing():
+            assert not gc.isenabled()
+            raise KeyError
+        assert gc.isenabled() == enabled
+    finally:
+        gc.enable()
 
 
 def test_only_a_gpu_has_graphs():

@@ -180,17 +180,21 @@ def _recipe(
 OTHER_CAMERAS = {"camera_spread": 0.06}
 # Lower than the held-out grounds, of 15 to 30 cm.
 OTHER_GROUND = {"ground_height": (-0.25, 0.14)}
+# From low above the ground, at metres a second: bodies that rise are rare else.
+THROWN_UP = {"drop_height": (0.05, 0.5), "lift": (0.5, 2.5)}
 RECIPES = {
-    # Bodies fall for half a second and then hardly move.
+    # Bodies fall for half a second, jump, and then hardly move. A part of a rollout that begins with the fall ends high
+    # in the jump: only then is how they land blamed for how high they jump.
     "elastic": _recipe(
         "elastic",
         (1.75, 5.0),
         24,
-        images=(1500, 60),
+        rollout=(64, 32),
+        images=(20, 20),
         beginning=(0, 0, 0),
         surfaces=True,
-        capacity=300,  # with more the graphs of long rollouts do not fit a GPU of 80 GB
-        in_turn=({}, {}, OTHER_GROUND),
+        capacity=300,
+        in_turn=({}, {}, {}, THROWN_UP),
     ),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories and graphs.
     "cloth": _recipe(
