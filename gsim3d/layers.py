@@ -1,7 +1,7 @@
-"""Layers over packed rows: a row's result has the same bits whatever rows are packed with it.
+"""Layers over packed rows: on one thread a row's result has the same bits whatever rows are packed with it.
 
 (Batch normalisation in training is the exception.) Gradients repeat bit by bit on the same number of threads; how BLAS
-splits the rows of a matrix product over threads is its own affair.
+splits the rows of a matrix product over threads is its own affair, and on some processors changes the last bits.
 """
 
 from __future__ import annotations

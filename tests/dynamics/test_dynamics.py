@@ -48,6 +48,7 @@ def test_an_untrained_preset_predicts_that_nothing_changes():
         assert_close_relative_to_max(getattr(step, name), value, 1e-6, name)
 
 
+@pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING])
 def test_scenes_do_not_change_each_other(config):
     dynamics = make_dynamics(config)
