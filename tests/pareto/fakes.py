@@ -64,6 +64,20 @@ class FakeClock:
             self.device = max(self.device, self.host) + item
 
 
+class TickingClock(FakeClock):
+    """Every look at it is a millisecond after the one before: what else the machine does changes nothing."""
+
+    def now(self):
+        self.host += 1e-3
+        self.wait()
+        return self.host
+
+    def mark(self):
+        mark = super().mark()
+        mark.at = self.now()
+        return mark
+
+
 class FakeGraph:
     """What a function asks of a clock's device, as one launch."""
 
