@@ -6,7 +6,7 @@ import argparse
 import importlib
 import sys
 
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import CaptureError, HardCaseError, InputError
 
 # command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called
 COMMANDS = {
@@ -76,7 +76,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser = _Parser(prog=f"gsim3d {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
         module.add_arguments(parser)
         return module.run(parser.parse_intermixed_args(arguments[1:])) or 0
-    except (InputError, HardCaseError) as error:
+    except (InputError, HardCaseError, CaptureError) as error:
         return _fail(str(error))
     except OSError as error:
         return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))

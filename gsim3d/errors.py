@@ -24,3 +24,14 @@ class HardCaseError(ValueError):
     ):
         super().__init__(message)
         self.tensor, self.scene, self.step, self.row, self.camera = tensor, scene, step, row, camera
+
+
+class CaptureError(RuntimeError):
+    """Something cannot be made a CUDA graph; the message says why.
+
+    no_room: whether the GPU's memory was full.
+    """
+
+    def __init__(self, message: str, *, no_room: bool = False):
+        super().__init__(message)
+        self.no_room = no_room

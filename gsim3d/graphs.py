@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from gsim3d.dynamics import Background, Parts
 from gsim3d.dynamics.point_transformer import SparseConv
-from gsim3d.errors import InputError
+from gsim3d.errors import CaptureError, InputError
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.ops.raster import Rendering
 from gsim3d.plans import Plan
@@ -34,6 +34,7 @@ from gsim3d.stability import StabilityReport, pack
 from gsim3d.types import Cameras, CloudTable, Particles, keeping_constants
 
 FACTOR = 1.25  # room over what was observed
+NO_ROOM = "out of memory"  # what all of torch's errors for it say
 
 
 class Captured:
@@ -46,11 +47,18 @@ class Captured:
     Args:
         function: is called twice before it is captured.
         device: of all that it does.
+        pool: of torch.cuda.graph_pool_handle(), memory that graphs share which run one after another, and whose results
+            nobody reads once another of them has run; None: its own.
     Raises:
         CaptureError: it cannot be captured; the message repeats CUDA's.
     """
 
-    def __init__(self, function: Callable[[], Any], device: torch.device | str = "cuda"):
+    def __init__(
+        self,
+        function: Callable[[], Any],
+        device: torch.device | str = "cuda",
+        pool: tuple[int, int] | None = None,
+    ):
         self._device, self._constants = torch.device(device), {}
         if self._device.type != "cuda":
             raise CaptureError(f"Captured: device must be a GPU; got {device}")
@@ -59,13 +67,14 @@ class Captured:
         torch.clear_autocast_cache()  # what it holds was made on another stream, for which a backward pass would wait
         try:
             with torch.cuda.device(self._device), keeping_constants(self._constants):
-                self._capture(function)
+                self._capture(function, pool)
         except RuntimeError as error:
-            raise CaptureError(f"Captured: {str(error).splitlines()[0]}") from error
+            no_room = any(NO_ROOM in str(cause) for cause in _causes(error))
+            raise CaptureError(f"Captured: {str(error).splitlines()[0]}", no_room=no_room) from error
         finally:
             torch.set_autocast_cache_enabled(cached)
 
-    def _capture(self, function: Callable[[], Any]) -> None:
+    def _capture(self, function: Callable[[], Any], pool: tuple[int, int] | None) -> None:
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(side):
@@ -74,13 +83,20 @@ class Captured:
         torch.cuda.current_stream().wait_stream(side)
         self._graph = torch.cuda.CUDAGraph()
         # What other threads do (one of NCCL asks the GPU what is done, at any time) must not end the capture.
-        with collecting_nothing(), torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+        with collecting_nothing(), torch.cuda.graph(self._graph, pool=pool, capture_error_mode="thread_local"):
             self.result = function()
 
     def __call__(self) -> Any:
         with torch.cuda.device(self._device):
             self._graph.replay()
         return self.result
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """``error`` and what it was raised because of: a capture that is broken off complains of that, too."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 @contextlib.contextmanager
@@ -93,10 +109,6 @@ def collecting_nothing() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
-
-
-class CaptureError(RuntimeError):
-    """Something cannot be made a CUDA graph."""
 
 
 class Predicted(NamedTuple):

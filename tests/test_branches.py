@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from gsim3d.branches import Branches
-from gsim3d.graphs import Captured, CaptureError
+from gsim3d.errors import CaptureError
+from gsim3d.graphs import Captured
 from tests.asserts import assert_same_bits
 
 

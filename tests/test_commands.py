@@ -12,6 +12,7 @@ import yaml
 
 from gsim3d.__main__ import COMMANDS, main
 from gsim3d.effects import EffectsSpec
+from gsim3d.errors import CaptureError
 from gsim3d.interop import read_ply
 from tests.conftest import cuda_problem
 from tests.tiny_scenes import write_scene, write_scenes
@@ -229,6 +230,16 @@ def test_a_wrong_setting_is_named(capsys, work, tmp_path):
     code, _, err = call(capsys, "train", tmp_path / "bad.yaml", "--data", work / "data", "--out", tmp_path / "run")
     assert code == 2 and err.startswith("gsim3d: error: optimizer.learning_rte: unknown setting")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_gpu_without_room_is_told_in_one_line(capsys, work, tmp_path, monkeypatch):
+    def full(*args, **options):
+        raise CaptureError("captured: no room;\nlower batch", no_room=True)
+
+    monkeypatch.setattr("gsim3d.train.loop.Trainer.run", full)
+    (tmp_path / "config.yaml").write_text(TRAINING)
+    code, _, err = call(capsys, "train", tmp_path / "config.yaml", "--data", work / "data", "--out", tmp_path / "run")
+    assert (code, err) == (2, "gsim3d: error: captured: no room; lower batch\n")
 
 
 def test_weights_of_another_model_are_refused(capsys, work, tmp_path):

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from gsim3d.effects import DynamicsEffects, EffectsSpec
-from gsim3d.errors import HardCaseError, InputError
-from gsim3d.graphs import Captured, CapturedRollout, CaptureError, collecting_nothing
+from gsim3d.errors import CaptureError, HardCaseError, InputError
+from gsim3d.graphs import Captured, CapturedRollout, collecting_nothing
 from gsim3d.ops import PyramidCapacity
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
@@ -281,6 +281,15 @@ def test_what_waits_for_the_device_is_no_graph(devices):
         Captured(lambda: x.sum().item(), devices[1])
     torch.cuda.synchronize()
     assert Captured(lambda: 2 * x, devices[1])().tolist() == [2, 2, 2]
+
+
+def test_what_a_gpu_has_no_room_for(devices):
+    x = torch.ones(3, device=devices[1])
+    with pytest.raises(CaptureError, match="Captured: .*captur") as waits:
+        Captured(lambda: x.sum().item(), devices[1])
+    with pytest.raises(CaptureError, match="out of memory") as full:
+        Captured(lambda: torch.empty(1 << 50, dtype=torch.uint8, device=devices[1]), devices[1])
+    assert full.value.no_room and not waits.value.no_room
 
 
 def test_graphs_that_nobody_needs_do_not_end_a_capture(devices):

@@ -27,7 +27,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
-from gsim3d.errors import HardCaseError, InputError  # noqa: E402
+from gsim3d.errors import CaptureError, HardCaseError, InputError  # noqa: E402
 
 WORLDS = ("elastic", "cloth", "rigid")
 REPORT_SHARE, REPORT_MOST = 0.15, 60.0  # of a sitting, seconds: for held-out predictions at its end
@@ -167,5 +167,5 @@ def main(arguments: list[str] | None = None) -> None:
 if __name__ == "__main__":
     try:
         main()
-    except (InputError, HardCaseError) as error:
+    except (InputError, HardCaseError, CaptureError) as error:
         sys.exit(f"train_shipped: error: {error}")

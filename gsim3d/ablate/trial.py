@@ -12,11 +12,10 @@ import torch
 
 from gsim3d.ablate.table import METHODS, PSNRS
 from gsim3d.data import Scene
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import CaptureError, HardCaseError, InputError
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.evaluate.report import summarize, write_json
 from gsim3d.files import MAX_TEXT, read_file
-from gsim3d.graphs import CaptureError
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.log import LOG
 from gsim3d.train.loop import Trainer

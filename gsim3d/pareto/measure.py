@@ -12,10 +12,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gsim3d.errors import InputError
+from gsim3d.errors import CaptureError, InputError
 from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr
 from gsim3d.evaluate.scoring import METRICS, PLAIN_METRICS, SceneScores, SceneTruth
-from gsim3d.graphs import CaptureError
 from gsim3d.pareto.limit import COMPARE, LEFT_OUT, ROUNDS, TimeLimit
 from gsim3d.pareto.predict import Predicted, Unusable, predict_together, timing_of, told
 from gsim3d.pareto.settings import KNOBS, Knob, Setting, turned

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch.nn import functional as F
 
-from gsim3d.graphs import Captured, CaptureError
+from gsim3d.errors import CaptureError
+from gsim3d.graphs import Captured
 from gsim3d.layers import RowLinear
 from gsim3d.simulator import Simulator
 from gsim3d.types import Particles

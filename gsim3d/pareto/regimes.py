@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from gsim3d.errors import InputError
-from gsim3d.graphs import CaptureError
+from gsim3d.errors import CaptureError, InputError
 from gsim3d.pareto.machine import energy
 from gsim3d.pareto.settings import Setting
 from gsim3d.pareto.stepping import Stepping

@@ -16,8 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gsim3d.errors import InputError
-from gsim3d.graphs import CaptureError
+from gsim3d.errors import CaptureError, InputError
 from gsim3d.pareto.settings import Setting
 from gsim3d.pareto.stepping import Stepping
 from gsim3d.pareto.subject import Subject

@@ -4,12 +4,13 @@ A training step launches tens of thousands of small kernels; a GPU would wait fo
 (encoder, rollout, images, loss and their gradients) is captured once for each kind of batch and replayed with other
 images. A graph has fixed sizes: each cloud gets as many rows as the largest, those without a particle sleep, and
 geometry has room for more than was observed. Where a batch needs more, the graph is made anew, so results never depend
-on the room.
+on the room. Graphs have memory of their own as long as the GPU has room for all of them, then they share it.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import gc
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -23,7 +24,7 @@ from torch import Tensor, nn
 
 from gsim3d.dynamics import DynamicsConfig, concatenate
 from gsim3d.encoder import Room
-from gsim3d.errors import InputError
+from gsim3d.errors import CaptureError, InputError
 from gsim3d.graphs import Captured, with_background_as_it_is
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
@@ -118,6 +119,7 @@ class CapturedLoss:
         self.captures = self.most_rows = 0
         self.most: dict[tuple, tuple[int, ...]] = {}
         self._steps: dict[tuple, _Step] = {}
+        self._pool: tuple[int, int] | None = None
 
     @property
     def needed(self) -> dict[str, Any]:
@@ -136,6 +138,32 @@ class CapturedLoss:
         known = [self.most[clouds]] if clouds in self.most else []
         self.most[clouds] = tuple(map(max, zip(*sizes, *known, strict=True)))
         return self.most[clouds]
+
+    def graph(self, step: _Step, function: Callable[[], Any]) -> Captured:
+        """The graph of ``step``. Where the GPU has no room for it those of other steps go, to be made anew when needed,
+        and from then on all share the memory of the largest.
+
+        Raises:
+            CaptureError: there is no room for this one alone, or it cannot be captured.
+        """
+        device = self.parameters[0].device
+        for is_last in (False, True):
+            try:
+                return Captured(function, device, self._pool)
+            except CaptureError as error:
+                if not error.no_room:
+                    raise
+                if is_last:
+                    raise CaptureError(
+                        f"captured: {error}; lower batch, target_views or horizon of the stage, or set captured: false "
+                        "and recompute: [encoder, steps]",
+                        no_room=True,
+                    ) from error
+            # Not while the error is handled: it holds all that did not fit.
+            self._steps = {kind: other for kind, other in self._steps.items() if other is step}
+            self._pool = torch.cuda.graph_pool_handle()
+            gc.collect()
+            torch.cuda.empty_cache()
 
     @torch.no_grad()
     def prepare(self, batch: Batch) -> Prepared:
@@ -305,14 +333,15 @@ class _Step:
         self._is_ready = False
         if self._weights.device.type == "cuda":
             torch.cuda.empty_cache()
-            self._records = StabilityReport()
 
             def function() -> tuple:
-                capturing = torch.cuda.is_current_stream_capturing()
-                return self._given(self._records if capturing else StabilityReport())
+                report = StabilityReport()
+                if torch.cuda.is_current_stream_capturing():
+                    self._records = report
+                return self._given(report)
 
             with self._owner.alone:
-                self._graph = Captured(function, self._weights.device)
+                self._graph = self._owner.graph(self, function)
         self._is_ready = True
 
     def _replay(self) -> tuple:

@@ -10,8 +10,7 @@ from gsim3d.ablate.rows import ROWS, base_run, rows_named, with_steps
 from gsim3d.ablate.study import Study
 from gsim3d.ablate.table import as_dict, markdown
 from gsim3d.data import find_scenes
-from gsim3d.errors import HardCaseError, InputError
-from gsim3d.graphs import CaptureError
+from gsim3d.errors import CaptureError, HardCaseError, InputError
 from gsim3d.train.captured import check_capturable
 from gsim3d.train.config import DataConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from gsim3d.graphs import CapturedRollout, CaptureError
+from gsim3d.errors import CaptureError
+from gsim3d.graphs import CapturedRollout
 from gsim3d.pareto import report
 from gsim3d.pareto.regimes import _steady_steps, throughput, training_step
 from gsim3d.pareto.settings import Setting

@@ -9,7 +9,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsim3d.ablate.rows import ROWS
 from gsim3d.data import Scene, find_scenes
-from gsim3d.errors import InputError
+from gsim3d.errors import CaptureError, InputError
+from gsim3d.graphs import Captured
 from gsim3d.stability import StabilityReport
 from gsim3d.train.captured import CapturedLoss
 from gsim3d.train.config import DataConfig, LossConfig, StageConfig, TrainConfig
@@ -128,6 +129,11 @@ def test_gradients_are_those_of_the_loss(stage, scenes, trainer, device):
     captured, report = captured_loss(trainer), StabilityReport()
     drawn = batches(scenes, 4, **stage)
     assert {batch.n_lead for batch in drawn} == {0, stage.get("lead", 0)}
+    assert_gradients_of_the_loss(captured, drawn, trainer, device, report)
+    assert captured.captures >= 1 and not report.total
+
+
+def assert_gradients_of_the_loss(captured, drawn, trainer, device, report):
     for batch in drawn:
         batch = batch.to(device)
         loss, errors = trainer.loss(batch)
@@ -146,7 +152,69 @@ def test_gradients_are_those_of_the_loss(stage, scenes, trainer, device):
                 assert gradient.stride() == trainer.parameters[name].stride(), name
         squares = sum(gradient.double().square().sum() for gradient in actual.parameters if gradient is not None)
         assert actual.norm.item() == pytest.approx(squares.sqrt().item(), rel=1e-5)
-    assert captured.captures >= 1 and not report.total
+
+
+class FullGPU:
+    """In the place of Captured: has room for the graphs of one kind of step, or for any that share memory."""
+
+    def __init__(self, captured, make):
+        self.captured, self.make, self.pools = captured, make, []
+
+    def __call__(self, function, device, pool):
+        self.pools.append(pool)
+        if pool is None and len(self.captured._steps) > 1:
+            raise CaptureError("Captured: CUDA out of memory.", no_room=True)
+        return self.make(function, device, pool)
+
+
+@pytest.fixture
+def full_gpu(monkeypatch):
+    def fill(captured, make):
+        gpu = FullGPU(captured, make)
+        monkeypatch.setattr("gsim3d.train.captured.Captured", gpu)
+        return gpu
+
+    return fill
+
+
+@pytest.mark.parametrize("trainer", ["latent", "relit"], indirect=True)
+def test_graphs_that_share_memory_do_not_change_each_other(scenes, trainer, full_gpu, device):
+    if device.type != "cuda":
+        pytest.skip("graphs need a GPU")
+    captured, report = captured_loss(trainer), StabilityReport()
+    gpu = full_gpu(captured, Captured)
+    drawn = batches(scenes, 8, lead=2)
+    assert {batch.n_lead for batch in drawn} == {0, 2}
+    assert_gradients_of_the_loss(captured, drawn, trainer, device, report)
+    assert not report.total and len(captured._steps) == 2
+    assert None not in gpu.pools[-2:]
+
+
+def test_where_a_gpu_is_full_other_graphs_go_and_memory_is_shared(scenes, trainer, full_gpu, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 7))
+    captured = captured_loss(trainer)
+    for batch in batches(scenes, 9, lead=2):
+        run(captured, batch.to(trainer.device), trainer)
+    (_, first), (kind, last) = captured._steps.items()
+    gpu = full_gpu(captured, lambda function, device, pool: (function, pool))
+    assert captured.graph(last, len) == (len, (0, 7))
+    assert gpu.pools == [None, (0, 7)] and captured._steps == {kind: last}
+    captured._steps["first"] = first  # made anew
+    assert captured.graph(first, max) == (max, (0, 7))
+    assert gpu.pools[2:] == [(0, 7)] and list(captured._steps.values()) == [last, first]
+
+
+@pytest.mark.parametrize("no_room, tries, match", [(True, 2, "lower batch, target_views or"), (False, 1, "^no$")])
+def test_what_no_room_can_be_made_for(no_room, tries, match, scenes, trainer, full_gpu, monkeypatch):
+    def make(function, device, pool):
+        raise CaptureError("no", no_room=no_room)
+
+    monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 7))
+    captured = captured_loss(trainer)
+    gpu = full_gpu(captured, make)
+    with pytest.raises(CaptureError, match=match) as caught:
+        captured.graph(None, len)
+    assert caught.value.no_room == no_room and len(gpu.pools) == tries
 
 
 class Ops(TorchDispatchMode):
