@@ -185,8 +185,8 @@ OTHER_GROUND = {"ground_height": (-0.25, 0.14)}
 # From low above the ground, at metres a second: bodies that rise are rare else.
 THROWN_UP = {"drop_height": (0.05, 0.5), "lift": (0.5, 2.5)}
 RECIPES = {
-    # Bodies fall for half a second, jump, and then hardly move. With a fourth scene in long rollouts, or many more
-    # trajectories, a GPU of 80 GB has no room for the graphs.
+    # Bodies fall for half a second, jump, and then hardly move. With a fourth scene in long rollouts a GPU of 80 GB had
+    # no room for all graphs.
     "elastic": _recipe(
         "elastic",
         (1.75, 5.0),
