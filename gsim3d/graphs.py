@@ -68,8 +68,8 @@ class Captured:
         try:
             with torch.cuda.device(self._device), keeping_constants(self._constants):
                 self._capture(function, pool)
-        except RuntimeError as error:
-            no_room = any(NO_ROOM in str(cause) for cause in _causes(error))
+        except (RuntimeError, MemoryError) as error:
+            no_room = any(isinstance(cause, MemoryError) or NO_ROOM in str(cause) for cause in _causes(error))
             raise CaptureError(f"Captured: {str(error).splitlines()[0]}", no_room=no_room) from error
         finally:
             torch.set_autocast_cache_enabled(cached)

@@ -86,9 +86,9 @@ class Simulator(nn.Module):
         particles = guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled, room)))
         if (dynamics := self.config.dynamics).velocity:
             n_views = None if room is None else len(frames.cameras) // particles.n_clouds
-            gravity = None if dynamics.gravity is None else self.dynamics.law().gravity
+            flight = self.dynamics.flight(particles)
             sizes = dynamics.motion_length, dynamics.grid_size, 2**dynamics.history_bits
-            velocity = follow(particles, frames, *sizes, n_views, gravity)
+            velocity = follow(particles, frames, *sizes, n_views, flight and flight.falls)
             particles = dataclasses.replace(particles, velocity=velocity)
         particles = self.dynamics.in_light(particles)
         guard.keywords["report"].send()

@@ -289,6 +289,13 @@ def test_what_a_gpu_has_no_room_for(devices):
         Captured(lambda: torch.empty(1 << 50, dtype=torch.uint8, device=devices[1]), devices[1])
     assert caught.value.no_room
 
+    def render():  # the ops have an error of their own for it
+        raise MemoryError("rasterize_gaussians: there is no memory for the result")
+
+    with pytest.raises(CaptureError, match="no memory for the result") as caught:
+        Captured(render, devices[1])
+    assert caught.value.no_room
+
 
 def test_graphs_that_nobody_needs_do_not_end_a_capture(devices):
     x, calls, before = torch.ones(3, device=devices[1]), [], gc.get_threshold()

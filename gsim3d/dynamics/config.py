@@ -56,8 +56,9 @@ class DynamicsConfig:
             (:func:`gsim3d.dynamics.deformation.deformation`), and predicts how much more or less of that they do than
             a share that keeps shapes: what an elastic body does next cannot be told without it.
         gravity: metres a step, of every step, where it begins; training adjusts it. With ``velocity``, ``deformation``
-            and ``contact_length``: if nothing is predicted bodies fall, hit what is frozen, slide on it, turn and go
-            back to their shape (:func:`gsim3d.dynamics.mechanics.mechanics`). None: then they fly on.
+            and ``contact_length``: what touches nothing frozen flies on, turns and falls, whatever is predicted, and
+            encoded rows in flight have the velocity of their last step (:mod:`gsim3d.dynamics.flight`). None: what is
+            predicted counts everywhere.
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.

@@ -17,8 +17,8 @@ from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import contact
 from gsim3d.dynamics.daylight import daylight
 from gsim3d.dynamics.deformation import deformation
+from gsim3d.dynamics.flight import Flight, touching
 from gsim3d.dynamics.matter import Matter
-from gsim3d.dynamics.mechanics import Law, mechanics
 from gsim3d.dynamics.momentum import momentum
 from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
@@ -32,8 +32,6 @@ ROOM = 1.1  # for rows that a call reads, over what was counted
 LIGHT_SIZE = 0.1  # of the parameter that is a direction: smaller ones are turned faster in training
 DIMMING = 0.2  # logarithm of how much darker a row is where log(1 + n) of the matter before its lamp grows by one
 GRAVITY_SIZE = 0.01  # metres a step, of every step: of the parameter's unit, so that training changes it little
-STIFFEST = 0.99  # of bodies: the root of what is left has no gradient at 0
-CONTACTS = 0.8, 1.0, 0.5  # stiffness, friction and damping of gsim3d.dynamics.mechanics
 STEADY = 20.0  # as LIGHT_SIZE, of lamps that light surfaces: training turned them away from the true ones
 STRENGTH = 2.0  # of the light that a surface facing the lamp gets, over that which comes from everywhere
 
@@ -63,10 +61,9 @@ class Dynamics(nn.Module):
             else:
                 self.lights = nn.Parameter(LIGHT_SIZE * directions)
                 self.dimming = nn.Parameter(torch.full(each, DIMMING))
-        self.gravity = self.contacts = None
+        self.gravity = None
         if config.gravity is not None:
             self.gravity = nn.Parameter(torch.tensor(config.gravity) / GRAVITY_SIZE)
-            self.contacts = nn.Parameter(torch.tensor(CONTACTS))
 
     def geometry(
         self,
@@ -142,10 +139,16 @@ class Dynamics(nn.Module):
         shaded = self._shaded(particles, known)
         return dataclasses.replace(particles, shaded=_put_runs(shaded, runs, particles.n_rows, -1.0))
 
-    def law(self) -> Law:
-        """Of a model with ``gravity``: what bodies do if nothing is predicted."""
-        stiffness, friction, damping = self.contacts.clamp(min=0)
-        return Law(GRAVITY_SIZE * self.gravity, stiffness.clamp(max=STIFFEST), friction, damping.clamp(max=1))
+    def flight(self, history: Particles, near: Tensor | None = None, matter: Matter | None = None) -> Flight | None:
+        """How far the rows of the newest clouds are from flying; None of a model without ``gravity``.
+
+        near, matter: of ``history``; None: found here.
+        """
+        if self.gravity is None:
+            return None
+        matter = matter or self._matter(history)
+        near = contact(history, self.config.contact_length, self.config.grid_size, matter) if near is None else near
+        return Flight(near[:, -1:], touching(near[:, -1:], matter), GRAVITY_SIZE * self.gravity)
 
     def begin(self, state: Particles) -> Particles:
         """``state`` with the fields in which simulated rows know how they began."""
@@ -200,16 +203,12 @@ class Dynamics(nn.Module):
                 'Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"'
             )
         runs, config = clouds.row_runs(newest), self.config
-        moved = drift = near = dark = shaded = None
+        moved = drift = near = flight = dark = shaded = None
         matter = self._matter(history)
         if config.velocity:
             drift = momentum(history, config.motion_length, config.grid_size, matter)
         elif config.motion_length is not None:
             drift = motion(history, config.motion_length, config.grid_size)
-        if config.gravity is not None:
-            lengths = config.motion_length, config.contact_length
-            onward = mechanics(history, *lengths, config.grid_size, self.law(), matter)
-            drift = torch.stack([drift[:, 0], onward, drift[:, 2]], 1)
         if config.deformation:
             bent = deformation(history, config.motion_length, config.grid_size, matter)
             drift = torch.cat([drift, bent[:, None].to(drift.dtype)], 1)
@@ -217,6 +216,7 @@ class Dynamics(nn.Module):
             moved = _put_runs(drift, runs, history.n_rows)
         if config.contact_length is not None:
             near = contact(history, config.contact_length, config.grid_size, matter)
+            flight = self.flight(history, near, matter)
             near = _put_runs(near, runs, history.n_rows)
         if self.lights is not None:
             shaded, n_lights = take_runs(history.shaded, runs), len(self.lights)
@@ -246,7 +246,7 @@ class Dynamics(nn.Module):
             step.with_clouds(
                 CloudTable.make(counts, table.scenes, (s + 1 + i for s in table.steps), state.cu_rows.device)
             )
-            for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes, drift))
+            for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes, drift, flight))
         ]
         if config.velocity:
             steps = [

@@ -32,10 +32,10 @@ def follow(
     grid_size: float,
     n_steps: int,
     n_views: int | None = None,
-    gravity: Tensor | None = None,
+    falls: Tensor | None = None,
 ) -> Tensor:
     """[N, 3] metres a step, how movable rows of each scene's newest cloud moved on average since the oldest of its
-    history, or with ``gravity`` in their last step; 0 of others, and where there is one step only.
+    history, or with ``falls`` in their last step; 0 of others, and where there is one step only.
 
     The rigid motion of each Gaussian window of matter is the one with which its rows have in the oldest images, at the
     places where they were, the colours that they have in the newest (Lucas and Kanade, in all cameras at once): colours
@@ -49,7 +49,8 @@ def follow(
         grid_size: metres, edge of the dynamics' cells.
         n_steps: of a history; older clouds are not looked at.
         n_views: of every cloud, whose images follow each other, cloud by cloud; nothing then waits for the device.
-        gravity: [3] metres a step, of every step: what falls is faster at last than on average. None: none.
+        falls: [N, 3] metres a step, of every step, of the rows of the newest clouds, packed: what falls is faster at last
+            than on average. None: nothing does.
     """
     clouds, newest = particles.clouds, newest_clouds(particles.clouds)
     result = torch.zeros_like(particles.means)
@@ -71,10 +72,10 @@ def follow(
         a_step = share_of_a_step(clouds, first, newest, now, then)
         velocity, spin, middle = lattice.at(matter.places, *(x * a_step for x in moved), centre)
         found = velocity + torch.linalg.cross(spin, matter.places - middle)
-        if gravity is not None:
+        if falls is not None:
             spans = [clouds.steps[q] - clouds.steps[f] for f, q in zip(first, newest)]
             later = constant(tuple(max(0, span - 1) for span in spans), found.device)
-            found = found + 0.5 * later[:, None, None] * gravity
+            found = found + 0.5 * later[:, None, None] * matter.padded(falls)
         found = torch.where(matter.rows.wanted[:, :, None], found, 0)
     for b, q in enumerate(newest):
         result[clouds.starts[q] : clouds.starts[q + 1]] = found[b, : clouds.count(q)]

@@ -13,6 +13,7 @@ from torch import Tensor
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import CONTACT_CHANNELS
 from gsim3d.dynamics.deformation import DEFORMATION_CHANNELS
+from gsim3d.dynamics.flight import Flight
 from gsim3d.harmonics import degree_damping
 from gsim3d.layers import widened
 from gsim3d.rotations import unit_quats
@@ -169,6 +170,7 @@ class StateLayout:
         awake: Tensor | None = None,
         changes: Mapping[str, str] | None = None,
         drift: Tensor | None = None,
+        flight: Flight | None = None,
     ) -> list[Particles]:
         """The particles after 1, 2, ... ``steps_per_call`` steps, in the light of before (:meth:`later_light`).
 
@@ -178,6 +180,7 @@ class StateLayout:
             awake: bool [N], rows that change at all; None: all.
             changes: of :meth:`changes`; None: all that is predicted.
             drift: as ``moved`` of :meth:`pack`, motions that go on as far as they are kept; None: none.
+            flight: as of :meth:`later_values`.
         """
         changes = changes or self.changes()
         later = {}
@@ -185,8 +188,8 @@ class StateLayout:
             if name == "light":
                 continue
             share = self._share(particles, changes[name], awake, name in FEATURES)
-            onward = drift if name == "means" else None
-            later[name] = self.later_values(name, getattr(particles, name), part, share, onward)
+            onward = (drift, flight) if name == "means" else ()
+            later[name] = self.later_values(name, getattr(particles, name), part, share, *onward)
         return [
             dataclasses.replace(particles, **{name: values[step] for name, values in later.items()})
             for step in range(self.config.steps_per_call)
@@ -235,7 +238,13 @@ class StateLayout:
         return rows[:, None].to(particles.means)
 
     def later_values(
-        self, name: str, newest: Tensor, predicted: Tensor, share: Tensor, drift: Tensor | None = None
+        self,
+        name: str,
+        newest: Tensor,
+        predicted: Tensor,
+        share: Tensor,
+        drift: Tensor | None = None,
+        flight: Flight | None = None,
     ) -> Tensor:
         """One field of the particles after each step of a call.
 
@@ -245,6 +254,8 @@ class StateLayout:
             predicted: [S, N, channels], of S steps.
             share: [N, 1] or [S, N, 1], how much of a predicted change happens: 0 holds the value, bit by bit.
             drift: of means [N, 2 to 4, 3], what is added in every step as far as it is kept; None: nothing.
+            flight: of means with ``drift``: motions are all kept by what is near nothing frozen, and what touches
+                nothing of it falls and goes nowhere else; None: no row flies.
         Returns:
             [S, N, ...].
         """
@@ -259,9 +270,13 @@ class StateLayout:
             changes = changes.cumsum(0)
         if drift is not None:
             kept = bounded(kept / MOST_KEPT, MOST_KEPT).unflatten(2, drift.shape[1:])
+            if flight is not None:
+                changes = flight.touch * changes + flight.falls
+                of_motions = flight.near[:, :, None].expand(-1, drift.shape[1] - 1, -1)
+                kept = kept * torch.cat([of_motions, torch.ones_like(of_motions[:, :1])], 1)
             ahead = torch.arange(1, 1 + changes.shape[0], device=drift.device, dtype=drift.dtype)[:, None, None]
             onward = ahead * (drift[:, ONWARD] + (kept * drift).sum(2))
-            if self.config.deformation and self.config.gravity is None:
+            if self.config.deformation:
                 onward = onward + (1 - (1 - BACK) ** ahead) * drift[:, -1]
             most = math.inf if self.config.max_step is None else self.config.max_step
             changes = torch.minimum(torch.maximum(changes + onward, -most * ahead), most * ahead)

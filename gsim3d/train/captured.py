@@ -147,6 +147,8 @@ class CapturedLoss:
             CaptureError: there is no room for this one alone, or it cannot be captured.
         """
         device = self.parameters[0].device
+        if self._pool is not None and all(other is step for other in self._steps.values()):
+            self._pool = torch.cuda.graph_pool_handle()  # memory whose graphs are all gone cannot be used again
         for is_last in (False, True):
             try:
                 return Captured(function, device, self._pool)

@@ -101,6 +101,7 @@ def _recipe(
     shape: float = 0.005,
     shape_length: float = 0.2,
     surfaces: bool = False,
+    gravity: tuple[float, float, float] | None = None,
     capacity: int = 600,
     options: Mapping = MappingProxyType({}),
     in_turn: tuple[dict, ...] = ({},),
@@ -120,6 +121,7 @@ def _recipe(
     contact_length: as of DynamicsConfig; more than bodies fall in a step.
     shape, shape_length: as of LossConfig; the length less than bodies are apart.
     surfaces: as of DynamicsConfig; what rests then changes in the light alone.
+    gravity: as of DynamicsConfig.
     Others as in Recipe.
     """
     # All views that are no input: what images cost beside the encoder is little.
@@ -140,7 +142,7 @@ def _recipe(
         preset="small",
         model={
             **MODEL,
-            "dynamics": {**MODEL["dynamics"], "contact_length": contact_length, "surfaces": surfaces},
+            "dynamics": {**MODEL["dynamics"], "contact_length": contact_length, "surfaces": surfaces, "gravity": gravity},
         },
         # How a look differs from the one that it had at first: bodies turn in the light, and shadows fall. From step to
         # step what is rendered in the wrong place would learn to fade, not where to go.
@@ -192,11 +194,13 @@ RECIPES = {
         (1.75, 5.0),
         24,
         batch=3,
+        rollout=(48, 32),
         images=(20, 20),
         beginning=(0, 0, 0),
-        rate=4e-4,
+        rate=6e-4,
         shape=0.015,
         surfaces=True,
+        gravity=(0.0, 0.0, -9.81 / 42**2),
         capacity=80,
         in_turn=({}, {}, {}, THROWN_UP),
     ),
@@ -206,12 +210,14 @@ RECIPES = {
         (1.6, 4.8),
         0,
         strides=(4, 2),
-        batch=3,
-        rollout=(24, 12),
+        batch=2,
+        rollout=(36, 12),
         images=(200, 120),
         beginning=(0, 0, 0),
+        rate=6e-4,
+        shape=0.015,
         shape_length=0.1,
-        capacity=300,
+        capacity=120,
     ),
     "rigid": _recipe(
         "rigid",

@@ -42,7 +42,7 @@ FORMAT = 1
 SEEN = "dynamics.net.stem.conv.weight"  # what the network reads of motion are its last columns
 TOLD = "dynamics.net.stem.told.weight"
 LIGHTS, DIMMING, STRENGTH = "dynamics.lights", "dynamics.dimming", "dynamics.strength"
-LAW = ("dynamics.gravity", "dynamics.contacts")
+GRAVITY = "dynamics.gravity"
 PREDICTED = ("dynamics.net.head.fc2.weight", "dynamics.net.head.fc2.bias")
 PLACES = 3  # rows that predict places where no motion is seen
 WEIGHTS, DIFFERENCE, SQUARES = "weights", "difference", "squares"
@@ -128,7 +128,7 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, progress: Progres
 def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     """Weights of a trained simulator into a new trainer, whose dynamics may see more (motion, waves, contacts,
     velocities, deformations, lights) than the other's: what reads it begins at zero, and so does what predicts shares
-    of motions and light; where motion or gravity is new all that predicts positions, which are others then. New lights
+    of motions and light; where motion is new all that predicts positions, which are others then. New lights
     and those that begin to light surfaces begin as in any new trainer, and so does what is read and predicted of them.
 
     Returns:
@@ -149,11 +149,9 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     if STRENGTH in own and STRENGTH not in given:
         anew |= {"lights", "light"}
         given = {key: value for key, value in given.items() if key not in (LIGHTS, DIMMING)}
-    if LAW[0] in own and LAW[0] not in given:
-        anew.add("means")
     if told:
         given[TOLD] = _told(given.get(TOLD), was_told, told, own[TOLD], anew)
-    for key in (LIGHTS, DIMMING, STRENGTH, *LAW):
+    for key in (LIGHTS, DIMMING, STRENGTH, GRAVITY):
         if key in own:
             given.setdefault(key, own[key])
     after = dict(trainer.simulator.dynamics.layout.outputs)

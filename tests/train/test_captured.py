@@ -1,6 +1,7 @@
 """Steps from a graph: on the CPU the same sums call by call, with the sizes that a graph would have."""
 
 import dataclasses
+import itertools
 import json
 
 import pytest
@@ -52,7 +53,7 @@ RELIT = dataclasses.replace(
     },
     loss=LossConfig(bodies=1.0),
 )
-OBEYING = dataclasses.replace(
+FLYING = dataclasses.replace(
     RELIT,
     model={
         "dynamics": {
@@ -65,7 +66,7 @@ KINDS = {
     "latent": CONFIG,
     "moving": MOVING,
     "relit": RELIT,
-    "obeying": OBEYING,
+    "flying": FLYING,
     "moving, masked": ROWS["background-masked"].change(MOVING),
     **{name: ROWS[name].change(CONFIG) for name in ("explicit", "background-masked")},
 }
@@ -115,13 +116,13 @@ def run(captured, batch, trainer, report=None, factor=1.0):
         ({"lead": 2}, "relit"),
         ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "relit"),
         ({"dynamics_alone": True, "lit_before": 1, "horizon": 1}, "relit"),
-        ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "obeying"),
-        ({"dynamics_alone": True, "lit_before": 1, "horizon": 1}, "obeying"),
+        ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "flying"),
+        ({"dynamics_alone": True, "lit_before": 1, "horizon": 1}, "flying"),
     ],
     ids=[
         "rollout", "lead", "encoded", "explicit", "masked", "dynamics alone, cut", "dynamics alone, masked", "moving",
         "moving, masked", "relit", "relit, dynamics alone", "relit, background of its own",
-        "obeying, dynamics alone", "obeying, background of its own",
+        "flying, dynamics alone", "flying, background of its own",
     ],
     indirect=["trainer"],
 )
@@ -188,6 +189,8 @@ def test_graphs_that_share_memory_do_not_change_each_other(scenes, trainer, full
     assert_gradients_of_the_loss(captured, drawn, trainer, device, report)
     assert not report.total and len(captured._steps) == 2
     assert None not in gpu.pools[-2:]
+    captured._steps.clear()
+    assert_gradients_of_the_loss(captured, drawn, trainer, device, report)  # in memory of its own again
 
 
 def test_where_a_gpu_is_full_other_graphs_go_and_memory_is_shared(scenes, trainer, full_gpu, monkeypatch):
@@ -202,6 +205,21 @@ def test_where_a_gpu_is_full_other_graphs_go_and_memory_is_shared(scenes, traine
     captured._steps["first"] = first  # made anew
     assert captured.graph(first, max) == (max, (0, 7))
     assert gpu.pools[2:] == [(0, 7)] and list(captured._steps.values()) == [last, first]
+
+
+def test_memory_whose_graphs_are_all_gone_is_not_used_again(scenes, trainer, full_gpu, monkeypatch):
+    """torch has forgotten it."""
+    handles = ((0, number) for number in itertools.count(7))
+    monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: next(handles))
+    captured = captured_loss(trainer)
+    for batch in batches(scenes, 9, lead=2):
+        run(captured, batch.to(trainer.device), trainer)
+    (_, first), (kind, last) = captured._steps.items()
+    gpu = full_gpu(captured, lambda function, device, pool: pool)
+    assert captured.graph(last, len) == (0, 7) and gpu.pools == [None, (0, 7)]
+    assert captured.graph(last, len) == (0, 8)  # it was the only one
+    captured._steps["first"] = first
+    assert captured.graph(first, len) == (0, 8)
 
 
 @pytest.mark.parametrize("no_room, tries, match", [(True, 2, "lower batch, target_views or"), (False, 1, "^no$")])
@@ -233,7 +251,7 @@ class Ops(TorchDispatchMode):
 
 
 @pytest.mark.parametrize(
-    "row", ["latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relit", "obeying"]
+    "row", ["latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relit", "flying"]
 )
 def test_nothing_in_a_graph_has_a_size_that_depends_on_numbers(row, scenes, tmp_path):
     config = KINDS[row] if row in KINDS else ROWS[row].change(CONFIG)

@@ -14,7 +14,7 @@ import torch
 
 from gsim3d.data import Scene, find_scenes
 from gsim3d.dynamics import last_steps
-from gsim3d.dynamics.momentum import momentum
+from gsim3d.dynamics.flight import Flight
 from gsim3d.dynamics.motion import motion
 from gsim3d.errors import InputError
 from gsim3d.data.recording import BACKGROUND, FIXED, MOVING
@@ -386,8 +386,8 @@ def test_lights_of_a_run_begin_as_they_are_made_or_go_on(store, tmp_path, key):
         assert made.any() and torch.equal(trainer.simulator.state_dict()[key], expected)
 
 
-def test_a_run_whose_bodies_obey_and_are_lit_begins_with_what_neither_knew(store, tmp_path, monkeypatch):
-    """Nothing is predicted of places and light at first; latents are what they were."""
+def test_a_run_whose_bodies_fly_and_are_lit_begins_with_what_neither_knew(store, tmp_path, monkeypatch):
+    """Nothing is predicted of light at first; latents, and what is predicted of places, are what they were."""
     told = {"motion_length": 0.3, **ALL_BUT_LIGHTS, "lights": ((0.0, 0.3, 1.0),)}
     known = saved_with_a_head(dataclasses.replace(CONFIG, model={"dynamics": told}), store, tmp_path)
     new = {**told, "surfaces": True, "gravity": (0.0, 0.0, -0.01)}
@@ -396,16 +396,16 @@ def test_a_run_whose_bodies_obey_and_are_lit_begins_with_what_neither_knew(store
     given, own = restore(known).simulator, trainer.simulator.eval()
     with torch.no_grad():
         state = own.encode(store.draw(CONFIG.data, CONFIG.stages[1], 0, 2, range(1)).context)
-    goes_on = momentum(last_steps(own.dynamics.begin(state), 1), 0.3, own.config.dynamics.grid_size)[:, 1]
-    monkeypatch.setattr("gsim3d.dynamics.dynamics.mechanics", lambda *_: goes_on)  # the network is told of it, too
-    with torch.no_grad():
         n_told = sum(n for _, n in given.dynamics.layout.told)
         given.dynamics.net.stem.told.weight[:, n_told - 2 : n_told] = 0  # what it was told of its lights
-        expected, step = given.dynamics(dataclasses.replace(state, shaded=None)), own.dynamics(state)
-        newest = last_steps(state, 1)
+        expected, flight = given.dynamics(dataclasses.replace(state, shaded=None)), own.dynamics.flight(state)
+        ones = torch.ones_like(flight.near)
+        monkeypatch.setattr(own.dynamics, "flight", lambda *_: Flight(ones, ones, flight.gravity))
+        step = own.dynamics(state)
     torch.testing.assert_close(step.dynamic_latents, expected.dynamic_latents)
-    torch.testing.assert_close(step.means, newest.means + goes_on)
-    assert (expected.means - step.means).abs().max() > 1e-3
+    torch.testing.assert_close(step.means, expected.means)
+    assert (step.means - last_steps(state, 1).means).abs().max() > 1e-3
+    assert flight.gravity.tolist() == pytest.approx(new["gravity"])
     before, _, now = (1 + lit * own.dynamics.strength for lit in step.shaded.split(1, 1))
     torch.testing.assert_close(step.light, now / before)
     again = saved_with_a_head(dataclasses.replace(CONFIG, model={"dynamics": new}), store, tmp_path / "again")
