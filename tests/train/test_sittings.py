@@ -15,6 +15,7 @@ import torch
 from gsim3d.data import Scene, find_scenes
 from gsim3d.dynamics import last_steps
 from gsim3d.dynamics.flight import Flight
+from gsim3d.dynamics.momentum import momentum
 from gsim3d.dynamics.motion import motion
 from gsim3d.errors import InputError
 from gsim3d.data.recording import BACKGROUND, FIXED, MOVING
