@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from gsim3d.dynamics.matter import Matter
@@ -31,8 +32,8 @@ class Flight:
 
 
 def touching(near: Tensor, matter: Matter | None) -> Tensor:
-    """[N, 1], from 0 of rows around which all matter flies to 1 of those around which some of it touches what is frozen:
-    a contact anywhere changes how the whole body moves.
+    """[N, 1], from 0 of rows around which all matter flies to 1 of those around which some touches what is frozen: a
+    contact anywhere changes how the whole body moves.
 
     Args:
         near: [N, 1] of the rows of the newest clouds, packed.
@@ -40,6 +41,7 @@ def touching(near: Tensor, matter: Matter | None) -> Tensor:
     """
     if matter is None:
         return near
-    sampled = matter.samples.take(matter.padded(near.expand(-1, 3)))
-    (mean,) = matter.lattice.at(matter.places, matter.window @ sampled)
-    return (matter.packed(mean)[:, :1] / TOUCHING).clamp(max=1)
+    with torch.autocast(near.device.type, enabled=False):
+        sampled = matter.samples.take(matter.padded(near.expand(-1, 3)))
+        (mean,) = matter.lattice.at(matter.places, matter.window @ sampled)
+        return (matter.packed(mean)[:, :1] / TOUCHING).clamp(max=1)

@@ -49,8 +49,8 @@ def follow(
         grid_size: metres, edge of the dynamics' cells.
         n_steps: of a history; older clouds are not looked at.
         n_views: of every cloud, whose images follow each other, cloud by cloud; nothing then waits for the device.
-        falls: [N, 3] metres a step, of every step, of the rows of the newest clouds, packed: what falls is faster at last
-            than on average. None: nothing does.
+        falls: [N, 3] metres a step, of every step, of the rows of the newest clouds, packed: they are faster at last
+            than on average. None: nothing falls.
     """
     clouds, newest = particles.clouds, newest_clouds(particles.clouds)
     result = torch.zeros_like(particles.means)

@@ -86,6 +86,13 @@ def test_how_far_a_body_touches_falls_with_its_height():
     assert not flight_of(ball(0.0, ground=False)).touch.any()
 
 
+def test_where_products_are_rounded_it_is_the_same():
+    history = ball(0.35)
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = flight_of(history)
+    assert_same_bits(rounded.touch, flight_of(history).touch)
+
+
 def test_scenes_do_not_see_each_other():
     one, other = ball(0.2), ball(0.0, seed=2, n=200, ground=False)
     both = flight_of(batch([one, other]))
