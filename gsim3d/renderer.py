@@ -95,7 +95,8 @@ class GaussianHead(nn.Module):
         else:
             wanted = [(c * K, c * K + n_harmonics) for c in range(3)] if n_harmonics else []
             raw = self.fc2.some(hidden, [*wanted, (3 * K, 3 * K + 7)])
-        if particles.turns is None and self.config.quirks == Quirks():
+        turns = particles.turns
+        if self.config.quirks == Quirks():
             wide = torch.float64 if raw.dtype == torch.float64 else torch.float32
             quats, scales, sh = ops.decode_gaussians(
                 raw,
@@ -105,19 +106,23 @@ class GaussianHead(nn.Module):
                 scale_max=self.config.scale_max,
                 check=False,
             )
+            if turns is not None:
+                quats = quat_product(turns, quats)
             if n_harmonics == 0:
                 return None, quats, scales
+            if turns is not None and n_harmonics > 1:  # the constant looks the same from everywhere
+                sh = rotate_harmonics(sh, rotation_matrices(turns))
             return sh if particles.paint is None else painted(sh, particles.paint), quats, scales
         sh, quats, scales = widened(raw).split([raw.shape[1] - 7, 4, 3], 1)
         quats = unit_quats(quats.roll(1, 1))
-        if particles.turns is not None:
-            quats = quat_product(particles.turns, quats)
+        if turns is not None:
+            quats = quat_product(turns, quats)
         smallest, largest = self.config.scale_min, self.config.scale_max
         scales = smallest + (largest - smallest) * scales.sigmoid()
         if n_harmonics == 0:
             return None, quats, scales
         sh = sh.unflatten(1, (3, -1)).mT * degree_damping(self.config.sh_degree, sh)[:n_harmonics, None]
-        if n_harmonics > 1:  # the constant looks the same from everywhere
+        if n_harmonics > 1:
             sh = turn_predicted_harmonics(sh, rotation_matrices(quats), self.config.quirks)
         return sh if particles.paint is None else painted(sh, particles.paint), quats, scales
 

@@ -213,8 +213,9 @@ class Particles(_Tensors):
         see gsim3d.stability). A masked-out particle is absent.
     origin: float64 [B, 3] metres, lower corner of each scene's workspace.
     quats [N, 4] (w, x, y, z), scales [N, 3] metres, sh [N, K, 3]: only in explicit models.
-    turns [N, 4] (w, x, y, z), paint [N, 3, 3]: only where an edit turned or painted particles whose look is latent
-        (:mod:`gsim3d.edits`): what is drawn is turned further, and its colours go through the matrix.
+    turns: [N, 4] (w, x, y, z), by which what is drawn of a latent look is turned further: where an edit turned it
+        (:mod:`gsim3d.edits`), and of a model with ``turning`` with the matter since rows were encoded.
+    paint: [N, 3, 3], only where an edit painted particles whose look is latent: their colours go through the matrix.
     held: bool [N], rows whose changing latents and colours stay; only where a spec of effects names bodies
         (``appearance.held``). Rollouts hand it on; None in a state: the next one asks who is meant.
     unlit: [N, Fd], the dynamic latents of frozen rows where their simulation began; only of a model that relights its

@@ -63,6 +63,21 @@ def test_colours_turn_with_the_particle():
     assert_close_relative_to_max(seen, torch.einsum("nk,nkc->nc", sh_basis(d, 2), own), 1e-12)
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_what_is_turned_further_is_seen_from_as_far_round(degree):
+    """Gaussians and colours of a particle that is turned further are its own, seen from as far round."""
+    head, particles = make_head(dtype=torch.float64), make_history((10,), dtype=torch.float64)
+    turns = torch.nn.functional.normalize(torch.randn(10, 4, dtype=torch.float64), dim=1)
+    before = head(particles, sh_degree=degree)
+    after = head(dataclasses.replace(particles, turns=turns), sh_degree=degree)
+    turn = rotation_matrices(turns)
+    assert_close_relative_to_max(rotation_matrices(after.quats), turn @ rotation_matrices(before.quats), 1e-12)
+    assert_same_bits(after.scales, before.scales)
+    d = torch.nn.functional.normalize(torch.randn(10, 3, dtype=torch.float64), dim=1)
+    seen = torch.einsum("nk,nkc->nc", sh_basis((turn @ d[:, :, None])[..., 0], degree), after.sh)
+    assert_close_relative_to_max(seen, torch.einsum("nk,nkc->nc", sh_basis(d, degree), before.sh), 1e-12)
+
+
 @pytest.mark.parametrize("config", [CONFIG, RendererConfig(latents=0, sh_degree=1)])
 def test_light_multiplies_the_colours_that_are_seen_from_anywhere(config):
     """Also those of paint, and nothing else."""

@@ -55,6 +55,8 @@ class DynamicsConfig:
             sees how they would have to move for the shape that bodies had then
             (:func:`gsim3d.dynamics.deformation.deformation`), and predicts how much more or less of that they do than
             a share that keeps shapes: what an elastic body does next cannot be told without it.
+        turning: with ``velocity``: what is drawn turns with the matter around its particle, as its shape and harmonics
+            would not by themselves (:func:`gsim3d.dynamics.momentum.turned`).
         gravity: metres a step, of every step, where it begins; training adjusts it. With ``velocity``, ``deformation``
             and ``contact_length``: what touches nothing frozen flies on, turns and falls, whatever is predicted, and
             encoded rows in flight have the velocity of their last step (:mod:`gsim3d.dynamics.flight`). None: what is
@@ -99,6 +101,7 @@ class DynamicsConfig:
     motion_length: float | None = None
     velocity: bool = False
     deformation: bool = False
+    turning: bool = False
     gravity: tuple[float, float, float] | None = None
     contact_length: float | None = None
     lights: tuple[tuple[float, float, float], ...] = ()
@@ -180,6 +183,8 @@ class DynamicsConfig:
                 "DynamicsConfig: gravity must be an acceleration (x, y, z), of a model with velocity, deformation and "
                 f"contact_length and one step a call; got {self.gravity}"
             )
+        if self.turning and not (self.velocity and self.steps_per_call == 1):
+            raise ValueError("DynamicsConfig: turning needs velocity and one step a call")
         if self.surfaces and not self.lights:
             raise ValueError("DynamicsConfig: surfaces needs lights")
         if not 0 <= self.position_waves <= MOST_WAVES or self.position_waves and not self.position_features:

@@ -17,9 +17,9 @@ from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import contact
 from gsim3d.dynamics.daylight import daylight
 from gsim3d.dynamics.deformation import deformation
-from gsim3d.dynamics.flight import Flight, touching
+from gsim3d.dynamics.flight import Flight
 from gsim3d.dynamics.matter import Matter
-from gsim3d.dynamics.momentum import momentum
+from gsim3d.dynamics.momentum import momentum, turned
 from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.point_transformer import PointTransformer
@@ -148,7 +148,7 @@ class Dynamics(nn.Module):
             return None
         matter = matter or self._matter(history)
         near = contact(history, self.config.contact_length, self.config.grid_size, matter) if near is None else near
-        return Flight(near[:, -1:], touching(near[:, -1:], matter), GRAVITY_SIZE * self.gravity)
+        return Flight.of(near[:, -1:], matter, GRAVITY_SIZE * self.gravity)
 
     def begin(self, state: Particles) -> Particles:
         """``state`` with the fields in which simulated rows know how they began."""
@@ -156,6 +156,8 @@ class Dynamics(nn.Module):
             state = with_field(state, "unlit")
         if self.config.deformation:
             state = with_field(state, "reference")
+        if self.config.turning:
+            state = with_field(state, "turns")
         return state if self.lights is None else with_field(state, "light")
 
     def forward(
@@ -253,6 +255,9 @@ class Dynamics(nn.Module):
                 dataclasses.replace(step, velocity=step.means - before.means)
                 for before, step in zip([state, *steps], steps)
             ]
+        if config.turning:
+            turns = turned(state.turns, steps[0].velocity, config.motion_length, matter)
+            steps = [dataclasses.replace(steps[0], turns=turns)]
         if self.lights is not None:
             # Where rows have come to: with the light of where they were shadows would lag behind their bodies.
             found = [self._shaded(step, shaded) for step in steps]

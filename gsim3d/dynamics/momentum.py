@@ -1,4 +1,4 @@
-"""How particles that carry their velocity go on: the momentum of the matter around each, and its own."""
+"""How particles that carry their velocity go on and turn: the momentum of the matter around each, and its own."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from torch import Tensor
 from gsim3d.dynamics.clouds import newest_clouds, with_field
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.rigid import RigidFit, onward_at
+from gsim3d.dynamics.state import rotate_left
 from gsim3d.types import Particles, take_runs
 
 STIFFNESS = 1e-5  # of fits to known paths: what it takes of a spin it takes in every step
@@ -45,3 +46,22 @@ def _rigid(matter: Matter, own: Tensor, length: float) -> tuple[Tensor, Tensor]:
         of_rows = (found[0], onward_at(matter.places, *found))
         moved, rigid = (matter.packed(torch.where(matter.rows.wanted[:, :, None], x, 0)) for x in of_rows)
     return moved, rigid
+
+
+@torch.no_grad()
+def turned(turns: Tensor, moved: Tensor, length: float, matter: Matter | None) -> Tensor:
+    """[N, 4], ``turns`` of the rows of the newest clouds after a step: turned on with the matter around each.
+
+    Args:
+        turns: [N, 4] (w, x, y, z), before the step.
+        moved: [N, 3] metres, by the step.
+        length: metres, standard deviation of the window; about the radius of a body.
+        matter: before the step, with windows of that length; None: there are no rows.
+    """
+    if matter is None:
+        return turns
+    with torch.autocast(moved.device.type, enabled=False):
+        body = RigidFit(matter.window, matter.samples.places, length, STIFFNESS)
+        _, spin = body.fit(matter.samples.take(matter.padded(moved)))
+        (spin,) = matter.lattice.at(matter.places, spin)
+        return rotate_left(turns, matter.packed(torch.where(matter.rows.wanted[:, :, None], spin, 0)))

@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from gsim3d.dynamics import DynamicsConfig, last_steps, rollout, with_field
-from gsim3d.dynamics.momentum import momentum
+from gsim3d.dynamics.matter import Matter
+from gsim3d.dynamics.momentum import momentum, turned
 from gsim3d.edits import Rotate, Throw
+from gsim3d.rotations import rotation_matrices
 from gsim3d.types import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
@@ -191,3 +193,73 @@ def test_compiled_it_is_the_same(device):
     history.clouds
     compiled = torch.compile(momentum, fullgraph=True)
     assert_close_relative_to_max(compiled(history, *HOW), momentum(history, *HOW), 1e-4)
+
+
+TURNING = dataclasses.replace(CARRYING, zero_init=True, turning=True)
+
+
+def test_what_is_drawn_turns_with_the_body_and_what_is_frozen_does_not():
+    """Also on from where an edit turned it to."""
+    history = flying()
+    frozen = torch.arange(400) % 200 < 5
+    history = dataclasses.replace(history, activity=torch.where(frozen, FROZEN, history.activity).to(torch.uint8))
+    steps = rollout(make_dynamics(TURNING), history, 6, max_steps=2)
+    expected = torch.linalg.matrix_exp(6 * cross_matrix(SPIN))
+    found = rotation_matrices(steps[-1].turns)
+    assert_close_relative_to_max(found[5:], expected.expand(195, 3, 3), 0.02)
+    assert_same_bits(steps[-1].turns[:5], torch.tensor([1.0, 0, 0, 0]).expand(5, 4))
+    edited = Rotate(axis=(1.0, 0.0, 0.0), degrees=90.0).apply(history, None)
+    again = rollout(make_dynamics(TURNING), edited, 1, max_steps=2)[0].turns
+    about_x = torch.linalg.matrix_exp(cross_matrix((torch.pi / 2, 0.0, 0.0)))
+    one = about_x @ torch.linalg.matrix_exp(cross_matrix(SPIN)) @ about_x.T @ about_x
+    assert_close_relative_to_max(rotation_matrices(again)[5:], one.expand(195, 3, 3), 0.02)
+
+
+def test_without_turning_nothing_turns():
+    assert make_dynamics(CARRYING)(flying()).turns is None
+
+
+def test_where_there_is_nothing_nothing_turns():
+    """Nor where a place is none."""
+    history = flying()
+    nobody = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
+    assert make_dynamics(TURNING)(nobody).turns.shape == (0, 4)
+    means = history.means.clone()
+    means[250] = torch.nan
+    found = make_dynamics(TURNING)(dataclasses.replace(history, means=means)).turns
+    assert_same_bits(found[50], torch.tensor([1.0, 0, 0, 0]))
+    others = torch.arange(200) != 50
+    assert_close_relative_to_max(found[others], make_dynamics(TURNING)(history).turns[others], 0.02)
+
+
+def test_scenes_turn_each_for_itself():
+    one, other = flying(), flying(n=150, seed=3, spin=(0.1, 0.0, 0.0))
+    both = make_dynamics(TURNING)(batch([one, other])).turns
+    alone = torch.cat([make_dynamics(TURNING)(q).turns for q in (one, other)])
+    assert_close_relative_to_max(both, alone, 1e-5)
+
+
+def test_a_gpu_turns_the_same(devices):
+    history = flying()
+    expected, actual, again = (make_dynamics(TURNING).to(d)(history.to(d)).turns.cpu() for d in (*devices, devices[1]))
+    assert_close_relative_to_max(actual, expected, 1e-4)
+    assert_same_bits(again, actual)
+
+
+def test_compiled_it_turns_the_same(device):
+    history = flying().to(device)
+    last = last_steps(history, 1)
+    last.clouds
+    turns, moved = torch.tensor([1.0, 0, 0, 0], device=device).expand(200, 4), history.velocity[200:]
+
+    def found(turns, moved, last):
+        return turned(turns, moved, LENGTH, Matter.of(last, TINY.grid_size, LENGTH))
+
+    expected = found(turns, moved, last)
+    assert_close_relative_to_max(torch.compile(found, fullgraph=True)(turns, moved, last), expected, 1e-5)
+
+
+@pytest.mark.parametrize("change", [{"velocity": False}, {"steps_per_call": 2}])
+def test_turning_needs_velocity_and_one_step_a_call(change):
+    with pytest.raises(ValueError, match="turning needs velocity"):
+        dataclasses.replace(TURNING, **change)
