@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -21,7 +19,6 @@ BODY = 12.5  # whose mean is inside a body: that is how a surface knows its outs
 BEAM = 1.5  # in which a ray meets matter
 START = 3.0  # cells above a surface that moves, where its rays begin: its own rows would be in their way
 TOWARDS = 1.5  # cells: a surface with as much matter on both sides shows the light its front
-EDGE_LAYERS = 0.7  # surfaces, as a ray meets in its window at the edge of a body
 SOFT = 0.15  # cosine by which a face that is turned away is lit still: normals are not exact
 
 
@@ -36,10 +33,9 @@ def daylight(
     0 to 1: the first is the second times the share of the light that no movable matter takes.
 
     A row is part of the plane through its opaque neighbours, of those that move like it or of those that rest; the
-    outside is where there is less of them. A ray towards the light loses half of it where it meets the rows of
-    ``EDGE_LAYERS`` surfaces that move, and almost all where it meets those of two. Up to ``samples.SAMPLES`` rows of a
-    scene that move and as many that rest are looked at, evenly spread. Scenes do not see each other. 0 of rows that are
-    asleep.
+    outside is where there is less of them. A ray towards the light loses the share 1 - exp(-n) where it meets the rows
+    of n surfaces that move. Up to ``samples.SAMPLES`` rows of a scene that move and as many that rest are looked at,
+    evenly spread. Scenes do not see each other. 0 of rows that are asleep.
 
     Args:
         history: clouds sorted by (scene, step).
@@ -77,7 +73,7 @@ def daylight(
                 above = places + START * grid_size * torch.where(moving, surface.normals(direction, grid_size), 0)
             layers = between(above, solid, light, BEAM * grid_size, 0.0, EDGE * grid_size) / one_layer
             towards.append(faces)
-            lit.append(faces * (-math.log(2) * (layers / EDGE_LAYERS).square()).exp())
+            lit.append(faces * (-layers).exp())
         found = (torch.where(is_lit, torch.stack(values, 2), 0) for values in (lit, towards))
         return tuple(matter.packed(values) for values in found)
 

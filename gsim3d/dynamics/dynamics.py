@@ -17,7 +17,7 @@ from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import contact
 from gsim3d.dynamics.daylight import daylight
 from gsim3d.dynamics.deformation import deformation
-from gsim3d.dynamics.flight import Flight
+from gsim3d.dynamics.flight import Flight, touching
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.momentum import momentum, turned
 from gsim3d.dynamics.motion import motion
@@ -148,7 +148,7 @@ class Dynamics(nn.Module):
             return None
         matter = matter or self._matter(history)
         near = contact(history, self.config.contact_length, self.config.grid_size, matter) if near is None else near
-        return Flight.of(near[:, -1:], matter, GRAVITY_SIZE * self.gravity)
+        return Flight(near[:, -1:], touching(near[:, -1:], matter), GRAVITY_SIZE * self.gravity)
 
     def begin(self, state: Particles) -> Particles:
         """``state`` with the fields in which simulated rows know how they began."""

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from gsim3d.dynamics.matter import Matter
 
-HOLDING, REACHING = 2, 4  # powers of the nearness: what shares of motions count, and what a touch is told from
 TOUCHING = 0.02  # mean nearness of the matter around a row to what is frozen, from which on it touches that in full
 
 
@@ -17,7 +16,7 @@ TOUCHING = 0.02  # mean nearness of the matter around a row to what is frozen, f
 class Flight:
     """How far each row of the newest clouds is from flying.
 
-    near: [N, 1], how far shares of motions count, from 0 to 1: as far as what is frozen is near.
+    near: [N, 1], how near what is frozen is to it, from 0 to 1, of :func:`gsim3d.dynamics.contact.contact`.
     touch: [N, 1], of :func:`touching`.
     gravity: [3] metres a step, of every step.
     """
@@ -25,11 +24,6 @@ class Flight:
     near: Tensor
     touch: Tensor
     gravity: Tensor
-
-    @classmethod
-    def of(cls, near: Tensor, matter: Matter | None, gravity: Tensor) -> Flight:
-        """near: [N, 1] from 0 to 1, how near what is frozen is, of :func:`gsim3d.dynamics.contact.contact`."""
-        return cls(near**HOLDING, touching(near**REACHING, matter), gravity)
 
     @property
     def falls(self) -> Tensor:
@@ -42,7 +36,7 @@ def touching(near: Tensor, matter: Matter | None) -> Tensor:
     contact anywhere changes how the whole body moves.
 
     Args:
-        near: [N, 1] of the rows of the newest clouds, packed, from 0 to 1.
+        near: [N, 1] of the rows of the newest clouds, packed.
         matter: of them, with windows about the size of a body; None: there are no rows.
     """
     if matter is None:
