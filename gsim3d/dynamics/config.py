@@ -183,8 +183,8 @@ class DynamicsConfig:
                 "DynamicsConfig: gravity must be an acceleration (x, y, z), of a model with velocity, deformation and "
                 f"contact_length and one step a call; got {self.gravity}"
             )
-        if self.turning and not (self.velocity and self.steps_per_call == 1):
-            raise ValueError("DynamicsConfig: turning needs velocity and one step a call")
+        if self.turning and (self.explicit or not self.velocity or self.steps_per_call > 1):
+            raise ValueError("DynamicsConfig: turning needs velocity, a latent look (not explicit) and one step a call")
         if self.surfaces and not self.lights:
             raise ValueError("DynamicsConfig: surfaces needs lights")
         if not 0 <= self.position_waves <= MOST_WAVES or self.position_waves and not self.position_features:

@@ -259,7 +259,7 @@ def test_compiled_it_turns_the_same(device):
     assert_close_relative_to_max(torch.compile(found, fullgraph=True)(turns, moved, last), expected, 1e-5)
 
 
-@pytest.mark.parametrize("change", [{"velocity": False}, {"steps_per_call": 2}])
-def test_turning_needs_velocity_and_one_step_a_call(change):
+@pytest.mark.parametrize("change", [{"velocity": False}, {"explicit": True}, {"steps_per_call": 2}])
+def test_turning_needs_velocity_a_latent_look_and_one_step_a_call(change):
     with pytest.raises(ValueError, match="turning needs velocity"):
         dataclasses.replace(TURNING, **change)
