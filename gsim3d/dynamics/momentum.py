@@ -39,13 +39,17 @@ def _rigid(matter: Matter, own: Tensor, length: float) -> tuple[Tensor, Tensor]:
     """[N, 3] twice, of rows that moved by ``own`` [N, 3]: the motion of the window around each, and what comes next of
     the rigid motion of that window."""
     with torch.autocast(own.device.type, enabled=False):
-        with torch.no_grad():
-            body = RigidFit(matter.window, matter.samples.places, length, STIFFNESS)
-        motion = body.fit(matter.samples.take(matter.padded(own)))
-        found = matter.lattice.at(matter.places, *motion, body.centre)
+        found = matter.lattice.at(matter.places, *_of_windows(matter, own, length))
         of_rows = (found[0], onward_at(matter.places, *found))
         moved, rigid = (matter.packed(torch.where(matter.rows.wanted[:, :, None], x, 0)) for x in of_rows)
     return moved, rigid
+
+
+def _of_windows(matter: Matter, moved: Tensor, length: float) -> tuple[Tensor, Tensor, Tensor]:
+    """How far each window moved, its spin (rad) and its centre, [B, G, 3] each, of rows that moved by ``moved``."""
+    with torch.no_grad():
+        body = RigidFit(matter.window, matter.samples.places, length, STIFFNESS)
+    return *body.fit(matter.samples.take(matter.padded(moved))), body.centre
 
 
 @torch.no_grad()
@@ -61,7 +65,6 @@ def turned(turns: Tensor, moved: Tensor, length: float, matter: Matter | None) -
     if matter is None:
         return turns
     with torch.autocast(moved.device.type, enabled=False):
-        body = RigidFit(matter.window, matter.samples.places, length, STIFFNESS)
-        _, spin = body.fit(matter.samples.take(matter.padded(moved)))
+        _, spin, _ = _of_windows(matter, moved, length)
         (spin,) = matter.lattice.at(matter.places, spin)
         return rotate_left(turns, matter.packed(torch.where(matter.rows.wanted[:, :, None], spin, 0)))

@@ -199,7 +199,8 @@ THROWN_UP = {"drop_height": (0.05, 0.5), "lift": (0.5, 2.5)}
 RECIPES = {
     # Bodies fall for half a second, jump, and then hardly move. Rollouts begin before they land: one that is squeezed
     # where a rollout begins looks like one that was made so. The ground is seen with more particles than elsewhere, as
-    # half of what images miss is at its edges. Long rollouts of four scenes had no room on a GPU of 80 GB.
+    # more than half of what encoded images miss is at the edges of its squares. Long rollouts of four scenes had no
+    # room on a GPU of 80 GB.
     "elastic": _recipe(
         "elastic",
         (1.75, 5.0),
