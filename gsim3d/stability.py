@@ -198,8 +198,13 @@ class StabilityReport:
         self._pending: deque[_Pending] = deque()
         self._quiet: list[_Packed] = []  # have no findings, and sentinels that nobody has asked for
         self._captured: list[_Record] = []
+        self._is_closed = False
 
     # ---- writing ----
+
+    def close(self) -> None:
+        """Takes no further records: guards go on, and what they find is not counted."""
+        self._is_closed = True
 
     def add(self, finding: Finding) -> None:
         """Counts a finding; those of the same kind and place become one."""
@@ -235,6 +240,8 @@ class StabilityReport:
             join: makes one tensor of several such ``numbers``, parts on a GPU with the shape, dtype and device of what
                 they make, when they are copied. None: they are whole.
         """
+        if self._is_closed:
+            return
         if numbers.device.type != "cuda":
             self._take(read(numbers))
             self.poll()

@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -34,6 +34,7 @@ from gsim3d.stability import StabilityReport
 from gsim3d.train.checkpoint import laid_out_as
 from gsim3d.train.losses import bodies_alone
 from gsim3d.train.parts import in_parts, with_first_background
+from gsim3d.train.recompute import recomputing
 from gsim3d.train.samples import Batch
 from gsim3d.types import ASLEEP, DYNAMIC, Frames, Particles
 
@@ -92,6 +93,7 @@ class CapturedLoss:
             weights of the steps) -> loss and errors by step.
         precision: makes the context in which a part ("encoder", "dynamics", "renderer") computes.
         bodies: whether the loss wants images of bodies alone.
+        recompute: as of TrainConfig.
 
     Attributes:
         parameters: those whose gradients it returns, all of the simulator.
@@ -109,10 +111,11 @@ class CapturedLoss:
         loss: Callable[[Tensor, Tensor | None, Particles, list[Particles], Frames, Tensor], tuple[Tensor, Tensor]],
         precision: Callable[[str], torch.autocast],
         bodies: bool = False,
+        recompute: Collection[str] = (),
     ):
         check_capturable(simulator.config.dynamics)
         self.simulator, self.plan, self.loss, self.precision = simulator, plan, loss, precision
-        self.bodies = bodies
+        self.bodies, self.again = bodies, recomputing(recompute, simulator)
         self.parameters = list(simulator.parameters())
         self.alone: AbstractContextManager = nullcontext()
         self.meanwhile: Callable[[], None] = lambda: None
@@ -244,9 +247,11 @@ class _Step:
     # ---- what runs ----
 
     def _encode(self, report: StabilityReport) -> Particles:
-        with self._owner.precision("encoder"), torch.set_grad_enabled(not self._dynamics_alone):
-            state = self._owner.simulator.encode(self._context, room=self._room, report=report)
-        return with_first_background(state, self._owner.simulator.dynamics) if self._has_own_background else state
+        owner = self._owner
+        with owner.precision("encoder"), torch.set_grad_enabled(not self._dynamics_alone):
+            encode = partial(owner.simulator.encode, room=self._room, report=report)
+            state = owner.again("encoder")(encode)(self._context)
+        return with_first_background(state, owner.simulator.dynamics) if self._has_own_background else state
 
     def _rollout(
         self,
@@ -272,12 +277,13 @@ class _Step:
 
     def _compute(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> tuple:
         owner, dynamics, of_calls = self._owner, self._owner.simulator.dynamics, []
+        geometry = _OfCalls(geometry)
 
         def with_own_weights(predict: Callable[[Particles], Particles]) -> Callable[[Particles], Particles]:
             def call(state: Particles) -> Particles:
                 with _aliased(dynamics) as aliases:
                     of_calls.append(aliases)
-                    return predict(state)
+                    return owner.again("steps")(geometry.in_call(len(of_calls), predict))(state)
 
             return call
 
@@ -286,9 +292,10 @@ class _Step:
         particles = concatenate(steps if self._dynamics_alone else [state, *steps])
         with owner.precision("renderer"):
             shown = {"plan": owner.plan, "report": report, "on_bad": "drop"}
-            images, bodies = owner.simulator.draw(particles, self._targets.cameras, **shown).color, None
-            if owner.bodies and steps:
-                bodies = owner.simulator.draw(bodies_alone(particles), self._targets.cameras, **shown).color
+            draw = owner.again("images")(lambda p: owner.simulator.draw(p, self._targets.cameras, **shown).color)
+            images = draw(particles)
+            bodies = draw(bodies_alone(particles)) if owner.bodies and steps else None
+        report.close()  # what the backward pass computes again would be counted twice
         loss, errors = owner.loss(images, bodies, begin, steps, self._targets, self._weights)
         parts = () if self._dynamics_alone else (owner.simulator.encoder, owner.simulator.renderer)
         once = [parameter for part in parts for parameter in part.parameters()]
@@ -363,6 +370,33 @@ class _Step:
                 for name, tensor in vars(value).items():
                     if isinstance(tensor, Tensor):
                         getattr(mine, name).copy_(tensor)
+
+
+class _OfCalls:
+    """``make`` of the geometry of calls: one that is computed again has that of before, which gradients do not reach."""
+
+    def __init__(self, make: Callable[[Particles], Pyramid]):
+        self._make, self._made, self._call = make, {}, 0
+
+    def __call__(self, history: Particles) -> Pyramid:
+        if self._call not in self._made:
+            made = self._make(history)
+            if not self._call:
+                return made
+            self._made[self._call] = made
+        return self._made[self._call]
+
+    def in_call(self, number: int, predict: Callable[[Particles], Particles]) -> Callable[[Particles], Particles]:
+        """``predict`` as call ``number``, from 1 on; what is outside of calls is made anew each time."""
+
+        def run(state: Particles) -> Particles:
+            self._call = number
+            try:
+                return predict(state)
+            finally:
+                self._call = 0
+
+        return run
 
 
 @contextmanager

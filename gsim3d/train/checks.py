@@ -10,8 +10,8 @@ from gsim3d.train.config import TrainConfig
 def check_sharing(config: TrainConfig, n_processes: int, norm: str) -> None:
     if config.workers and norm == "batch":
         raise InputError("workers: must be 0 for a model with batch normalisation, which needs all samples at once")
-    if config.captured and (config.workers or config.recompute):
-        raise InputError("captured: needs workers 0 and nothing to recompute")
+    if config.captured and config.workers:
+        raise InputError("captured: needs workers 0")
     if config.workers and n_processes > 1:
         raise InputError(f"workers: must be 0 in {n_processes} processes, which share the samples of a step themselves")
     for name in ("stages", "in_turn"):

@@ -38,7 +38,7 @@ from gsim3d.train.parts import in_parts, with_first_background
 from gsim3d.train.precision import FIRST_SCALE, LossScale
 from gsim3d.train.processes import Processes
 from gsim3d.train.profile import check_profile, profiler
-from gsim3d.train.recompute import recomputed
+from gsim3d.train.recompute import recomputing
 from gsim3d.train.restore import build_simulator, check_device, describe, model_config
 from gsim3d.train.samples import Batch, check_scenes, context_cameras, draw_batch, history_at, spread_views, thinned
 from gsim3d.train.schedule import one_cycle
@@ -130,7 +130,12 @@ class Trainer:
     def _capture(self) -> CapturedLoss:
         precision = partial(self.config.precision.of, device=self.device)
         return CapturedLoss(
-            self.simulator, self.plan, self.loss_of_steps, precision, bodies=self.config.loss.bodies > 0
+            self.simulator,
+            self.plan,
+            self.loss_of_steps,
+            precision,
+            bodies=self.config.loss.bodies > 0,
+            recompute=self.config.recompute,
         )
 
     def run(
@@ -388,13 +393,11 @@ class Trainer:
     def _steps(self, batch: Batch, sample: int, watch: StepWatch) -> tuple:
         """What the target cameras of a batch should have seen, and of bodies alone if the loss wants it; where the
         simulation begins, and its steps. Each part of the model in its precision."""
-        simulator, precision, recompute = self.simulator, self.config.precision, self.config.recompute
+        simulator, precision = self.simulator, self.config.precision
+        again = recomputing(self.config.recompute, simulator)
         options = {"report": watch.report, "on_bad": "drop" if watch.strict else None}
         rng = generator(self.config.seed, self.step, sample, "dynamics")
         noise = torch.Generator().manual_seed(int(rng.integers(2**63)))
-
-        def again(part: str, generator: torch.Generator | None = None) -> Callable[[Callable], Callable]:
-            return recomputed(simulator, generator) if part in recompute else (lambda f: f)
 
         with precision.of("encoder", self.device), torch.set_grad_enabled(not batch.dynamics_alone):
             particles = again("encoder")(lambda context: simulator.encode(context, **options))(batch.context)
@@ -425,8 +428,7 @@ class Trainer:
             )
             images = render(particles)
             bodies = render(bodies_alone(particles)) if self.config.loss.bodies and steps else None
-        if recompute:
-            watch.close()
+        watch.report.close()  # what the backward pass computes again would be counted twice
         return images, bodies, begin, steps
 
     @torch.no_grad()

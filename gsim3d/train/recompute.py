@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
@@ -40,6 +40,15 @@ def recomputed(module: nn.Module, generator: torch.Generator | None = None) -> C
         return call
 
     return wrap
+
+
+def recomputing(parts: Collection[str], module: nn.Module) -> Callable[..., Callable[[Callable], Callable]]:
+    """(part, generator) -> :func:`recomputed` where the part is one of ``parts``, else what changes no function."""
+
+    def choose(part: str, generator: torch.Generator | None = None) -> Callable[[Callable], Callable]:
+        return recomputed(module, generator) if part in parts else (lambda f: f)
+
+    return choose
 
 
 @contextmanager

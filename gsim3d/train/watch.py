@@ -40,24 +40,18 @@ class StepWatch:
         self.strict = strict
         self.report = StabilityReport()
         self._n_rows = self._n_clouds = 0
-        self._n_unusable: int | None = None
         self._squares: list[list[Tensor]] = []
 
     def count(self, n_rows: int, n_clouds: int) -> None:
         """Notes how many particles the encoder made, and in how many clouds."""
         self._n_rows, self._n_clouds = n_rows, n_clouds
 
-    def close(self) -> None:
-        """Counts no further findings: what the backward pass computes again would be counted twice."""
-        self._n_unusable = self.report.total
-
     def seen(self, scale: float | None) -> Seen:
         """After the backward pass of a loss that was multiplied with ``scale``; None: without the gradients' norms."""
         wrong = ("error", "dropped") if self.strict else ("error",)
         error = next((str(finding.error()) for finding in self.report.findings if finding.action in wrong), None)
-        n_unusable = self.report.total if self._n_unusable is None else self._n_unusable
         norms = () if scale is None else tuple(norm / scale for norm in self.norms())
-        return Seen(self._n_rows, self._n_clouds, n_unusable, norms, error)
+        return Seen(self._n_rows, self._n_clouds, self.report.total, norms, error)
 
     def follow(self, steps: Sequence[Particles]) -> None:
         """Notes the gradients that will reach the particles of each step of a rollout."""

@@ -81,13 +81,14 @@ def trainer(scenes, tmp_path, device, request):
     return trainer
 
 
-def captured_loss(trainer):
+def captured_loss(trainer, recompute=()):
     return CapturedLoss(
         trainer.simulator,
         trainer.plan,
         trainer.loss_of_steps,
         lambda part: torch.autocast("cpu", enabled=False),
         bodies=trainer.config.loss.bodies > 0,
+        recompute=recompute,
     )
 
 
@@ -132,6 +133,30 @@ def test_gradients_are_those_of_the_loss(stage, scenes, trainer, device):
     assert {batch.n_lead for batch in drawn} == {0, stage.get("lead", 0)}
     assert_gradients_of_the_loss(captured, drawn, trainer, device, report)
     assert captured.captures >= 1 and not report.total
+
+
+@pytest.mark.parametrize(
+    "stage, trainer",
+    [({"lead": 2}, "latent"), ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "flying")],
+    ids=["lead", "flying, dynamics alone"],
+    indirect=["trainer"],
+)
+def test_what_is_computed_again_changes_no_bit(stage, scenes, trainer, device):
+    batch, counts = batches(scenes, 2, **stage)[1].to(device), {"calls": 0, "geometry": 0}
+    reports, found, counted = (StabilityReport(), StabilityReport()), [], []
+    dynamics, geometry = trainer.simulator.dynamics, trainer.simulator.dynamics.geometry
+    dynamics.register_forward_pre_hook(lambda *_: counts.update(calls=counts["calls"] + 1))
+    dynamics.geometry = lambda *a, **k: (counts.update(geometry=counts["geometry"] + 1), geometry(*a, **k))[1]
+    for recompute, report in zip(((), ("encoder", "steps", "images")), reports, strict=True):
+        counts.update(calls=0, geometry=0)
+        found.append(run(captured_loss(trainer, recompute), batch, trainer, report))
+        counted.append(dict(counts))
+    expected, actual = found
+    assert torch.equal(expected.loss, actual.loss) and torch.equal(expected.errors, actual.errors)
+    for one, other in zip(expected.parameters, actual.parameters, strict=True):
+        assert (one is None) == (other is None) and (one is None or torch.equal(one, other))
+    assert reports[0].total == reports[1].total
+    assert counted[1]["calls"] > counted[0]["calls"] and counted[1]["geometry"] == counted[0]["geometry"]
 
 
 def assert_gradients_of_the_loss(captured, drawn, trainer, device, report):
@@ -345,7 +370,6 @@ def test_models_that_draw_are_refused(scenes, trainer):
             captured_loss(trainer)
 
 
-@pytest.mark.parametrize("changes", [{"workers": 2}, {"recompute": ("steps",)}])
-def test_settings_that_do_not_fit_are_refused(scenes, tmp_path, changes):
-    with pytest.raises(InputError, match="captured"):
-        Trainer(dataclasses.replace(CONFIG, captured=True, **changes), scenes, tmp_path)
+def test_settings_that_do_not_fit_are_refused(scenes, tmp_path):
+    with pytest.raises(InputError, match="captured: needs workers 0"):
+        Trainer(dataclasses.replace(CONFIG, captured=True, workers=2), scenes, tmp_path)
