@@ -16,13 +16,16 @@ import contextlib
 import copy
 import dataclasses
 import gc
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from gsim3d.dynamics import Background, Parts
+from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.dynamics.point_transformer import SparseConv
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
@@ -31,10 +34,10 @@ from gsim3d.plans import Plan
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
 from gsim3d.stability import StabilityReport, pack
-from gsim3d.types import Cameras, CloudTable, Particles, keeping_constants
+from gsim3d.types import DYNAMIC, Cameras, CloudTable, Particles, keeping_constants
 
 FACTOR = 1.25  # room over what was observed
-NO_ROOM = "out of memory"  # what all of torch's errors for it say
+NO_ROOM = "out of memory", "aten::new_empty"  # what errors for it say: torch's, and those of ops, which say no more
 
 
 class Captured:
@@ -69,8 +72,7 @@ class Captured:
             with torch.cuda.device(self._device), keeping_constants(self._constants):
                 self._capture(function, pool)
         except (RuntimeError, MemoryError) as error:
-            no_room = any(isinstance(cause, MemoryError) or NO_ROOM in str(cause) for cause in _causes(error))
-            raise CaptureError(f"Captured: {str(error).splitlines()[0]}", no_room=no_room) from error
+            raise CaptureError(f"Captured: {str(error).splitlines()[0]}", no_room=has_no_room(error)) from error
         finally:
             torch.set_autocast_cache_enabled(cached)
 
@@ -90,6 +92,13 @@ class Captured:
         with torch.cuda.device(self._device):
             self._graph.replay()
         return self.result
+
+
+def has_no_room(error: BaseException) -> bool:
+    """Whether it was raised because memory was lacking."""
+    return any(
+        isinstance(cause, MemoryError) or any(text in str(cause) for text in NO_ROOM) for cause in _causes(error)
+    )
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
@@ -201,6 +210,7 @@ class CapturedRollout:
             self._state = _own(parts.moving)
             own = Parts(_own(parts.newest), self._state, _own(parts.background), parts.rows.clone())
             self._rest = _Rest(own, self._remember(parts.background))
+        self._moving = self._room_for(int(self._count_moving()))
         self._make_room(self._observed())
 
     def __call__(self, state: Particles, cameras: Cameras | None = None) -> Predicted:
@@ -240,12 +250,13 @@ class CapturedRollout:
         if not self._launched:
             raise InputError("CapturedRollout: finish() must follow launch()")
         self._launched = False
-        found, counted = self._arrive()
-        while not all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)]):
+        found, moving, counted = self._arrive()
+        while moving > self._moving or not self._fits(found):
+            self._moving = max(self._moving, self._room_for(moving))
             needed = zip(self._grown(found), self._observed(), strict=True)
             self._make_room([a.grown((0, *b.sizes)) for a, b in needed])
             self._replay()
-            found, counted = self._arrive()
+            found, moving, counted = self._arrive()
         self._records.replayed(self._report, counted)
         return self._results()
 
@@ -264,7 +275,8 @@ class CapturedRollout:
         """The rollout of the graph's own state."""
         plan, rest = with_background_as_it_is(self._plan), self._rest
         options, renderings = {"geometry": geometry, "report": report}, []
-        with torch.no_grad(), self._autocast():
+        at_most = self._model.dynamics.moving_at_most(self._moving)
+        with torch.no_grad(), self._autocast(), at_most:
             if rest is None:
                 steps = self._model.rollout(self._state, self._n_steps, plan, **options)
             else:
@@ -294,6 +306,18 @@ class CapturedRollout:
         self._rollout(geometry, StabilityReport())
         return needed
 
+    def _count_moving(self) -> Tensor:
+        """int64 [1], rows of a scene of the graph's own state that may move, at most."""
+        table, until = self._state.clouds, F.pad((self._state.activity == DYNAMIC).cumsum(0), (1, 0))
+        counts = [until[table.starts[q + 1]] - until[table.starts[q]] for q in newest_clouds(table)]
+        return torch.stack(counts).amax(0, keepdim=True)
+
+    def _room_for(self, moving: int) -> int:
+        return min(self._state.n_rows, math.ceil(self._factor * moving))
+
+    def _fits(self, found: list[list[int]]) -> bool:
+        return all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)])
+
     def _given(self, report: StabilityReport) -> tuple[Predicted, Tensor]:
         """The rollout with the sizes of this object, and what the geometry of every call found."""
         sizes, found = iter(self._capacities), []
@@ -321,7 +345,7 @@ class CapturedRollout:
     def _capture(self) -> tuple[Predicted, Tensor, Tensor]:
         report = self._records if torch.cuda.is_current_stream_capturing() else StabilityReport()
         predicted, found = self._given(report)
-        return predicted, found, pack([found, *report.captured()])
+        return predicted, found, pack([found, self._count_moving(), *report.captured()])
 
     def _replay(self) -> None:
         if self._device.type != "cuda":
@@ -333,13 +357,14 @@ class CapturedRollout:
             self._on_host.copy_(self._packed, non_blocking=True)
             self._arrived.record()
 
-    def _arrive(self) -> tuple[list[list[int]], Tensor | None]:
-        """Waits for the replay: what the geometry of every call found, and what the guards of a graph counted."""
+    def _arrive(self) -> tuple[list[list[int]], int, Tensor | None]:
+        """Waits for the replay: what the geometry of every call found, rows that may move, and what the guards of a
+        graph counted."""
         if self._device.type != "cuda":
-            return self._found.tolist(), None
+            return self._found.tolist(), int(self._count_moving()), None
         self._arrived.synchronize()
-        numbers, n_found = self._on_host.clone(), self._found.numel()
-        return numbers[:n_found].view(self._found.shape).tolist(), numbers[n_found:]
+        found, moving, counted = self._on_host.clone().tensor_split([n := self._found.numel(), n + 1])
+        return found.view(self._found.shape).tolist(), int(moving), counted
 
     def _grown(self, found: list[list[int]]) -> list[PyramidCapacity]:
         calls = zip(self._capacities, found, strict=True)

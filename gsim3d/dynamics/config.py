@@ -61,6 +61,9 @@ class DynamicsConfig:
             and ``contact_length``: what touches nothing frozen flies on, turns and falls, whatever is predicted, and
             encoded rows in flight have the velocity of their last step (:mod:`gsim3d.dynamics.flight`). None: what is
             predicted counts everywhere.
+        pushes: with ``gravity``: what is predicted of rows changes the momentum and the spin of their body only as a
+            push of the background does, which changes it as those of its rows change that are near
+            (:func:`gsim3d.dynamics.push.pushed`).
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.
@@ -102,6 +105,7 @@ class DynamicsConfig:
     velocity: bool = False
     deformation: bool = False
     turning: bool = False
+    pushes: bool = False
     gravity: tuple[float, float, float] | None = None
     contact_length: float | None = None
     lights: tuple[tuple[float, float, float], ...] = ()
@@ -183,6 +187,8 @@ class DynamicsConfig:
                 "DynamicsConfig: gravity must be an acceleration (x, y, z), of a model with velocity, deformation and "
                 f"contact_length and one step a call; got {self.gravity}"
             )
+        if self.pushes and self.gravity is None:
+            raise ValueError("DynamicsConfig: pushes needs gravity")
         if self.turning and (self.explicit or not self.velocity or self.steps_per_call > 1):
             raise ValueError("DynamicsConfig: turning needs velocity, a latent look (not explicit) and one step a call")
         if self.surfaces and not self.lights:

@@ -42,5 +42,5 @@ def contact(history: Particles, length: float, grid_size: float, matter: Matter 
         window = weights(squares(places, rests.places) * (-0.5 / (WINDOW * length) ** 2), rests.known)
         way = (window @ rests.places - places) / length
         near = (-0.5 * way.square().sum(2, keepdim=True)).clamp(min=FAINTEST).exp()
-        known = (matter.rows.wanted & (rests.n > 0)[:, None])[:, :, None]
-        return matter.packed(torch.where(known, torch.cat([near * way, near], 2), 0))
+        any_rests = (rests.n > 0)[:, None, None]
+        return matter.packed(torch.where(any_rests, torch.cat([near * way, near], 2), 0))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.planes import planes
 from gsim3d.dynamics.rigid import SMALLEST
-from gsim3d.dynamics.samples import FAINTEST, Samples, squares
+from gsim3d.dynamics.samples import FAINTEST, Few, Samples, squares
 from gsim3d.dynamics.shade import EDGE, between
 from gsim3d.types import DYNAMIC, FROZEN, Particles
 
@@ -19,6 +21,7 @@ BODY = 12.5  # whose mean is inside a body: that is how a surface knows its outs
 BEAM = 1.5  # in which a ray meets matter
 START = 3.0  # cells above a surface that moves, where its rays begin: its own rows would be in their way
 TOWARDS = 1.5  # cells: a surface with as much matter on both sides shows the light its front
+EDGE_LAYERS = 0.7  # surfaces, as a ray meets in its window at the edge of a body
 SOFT = 0.15  # cosine by which a face that is turned away is lit still: normals are not exact
 
 
@@ -33,9 +36,10 @@ def daylight(
     0 to 1: the first is the second times the share of the light that no movable matter takes.
 
     A row is part of the plane through its opaque neighbours, of those that move like it or of those that rest; the
-    outside is where there is less of them. A ray towards the light loses the share 1 - exp(-n) where it meets the rows
-    of n surfaces that move. Up to ``samples.SAMPLES`` rows of a scene that move and as many that rest are looked at,
-    evenly spread. Scenes do not see each other. 0 of rows that are asleep.
+    outside is where there is less of them. A ray towards the light loses half of it where it meets the rows of
+    ``EDGE_LAYERS`` surfaces that move, and almost all where it meets those of two. Up to ``samples.SAMPLES`` rows of a
+    scene that move and as many that rest are looked at, evenly spread. Scenes do not see each other. 0 of rows that are
+    asleep.
 
     Args:
         history: clouds sorted by (scene, step).
@@ -52,44 +56,46 @@ def daylight(
         return nothing, nothing
     with torch.autocast(history.means.device.type, enabled=False):
         with torch.no_grad():
-            moves, rests = matter.rows, matter.rows.that_are(history, FROZEN)
+            moves, rests = matter.everything, matter.everything.that_are(history, FROZEN)
             moving, is_lit = moves.wanted[:, :, None], (moves.wanted | rests.wanted)[:, :, None]
             places = torch.where(moving, moves.places, rests.places) - matter.here
             solid = Samples(moves.that_are(history, DYNAMIC, OPAQUE))
             solid.seen_from(matter.here)
-            surface, one_layer = _Surface(places, solid, grid_size), _one_layer(solid, BEAM * grid_size)
+            surface = _Surface(places, matter.few, solid, grid_size)
+            one_layer = _one_layer(solid, BEAM * grid_size)
             behind = None
             if facing is None:
                 ground = Samples(moves.that_are(history, FROZEN, OPAQUE))
                 ground.seen_from(matter.here)
-                behind = _Surface(places, ground, grid_size)
+                behind = _Surface(places, Few(rests.wanted), ground, grid_size)
         towards, lit = [], []
         for n, light in enumerate(lights.unbind(0)):
             direction = light / light.norm()
             faces = surface.faces(direction, grid_size)
-            other = matter.padded(facing)[:, :, n] if behind is None else behind.faces(direction, grid_size)
+            other = matter.apart(facing)[:, :, n] if behind is None else behind.faces(direction, grid_size)
             faces = torch.where(moving[:, :, 0], faces, other)
             with torch.no_grad():
                 above = places + START * grid_size * torch.where(moving, surface.normals(direction, grid_size), 0)
             layers = between(above, solid, light, BEAM * grid_size, 0.0, EDGE * grid_size) / one_layer
             towards.append(faces)
-            lit.append(faces * (-layers).exp())
+            lit.append(faces * (-math.log(2) * (layers / EDGE_LAYERS).square()).exp())
         found = (torch.where(is_lit, torch.stack(values, 2), 0) for values in (lit, towards))
-        return tuple(matter.packed(values) for values in found)
+        return tuple(matter.together(values) for values in found)
 
 
 class _Surface:
-    """The plane through the samples near each of ``places`` [B, M, 3]."""
+    """The plane through the samples near each of ``few`` of the ``places`` [B, M, 3]."""
 
-    def __init__(self, places: Tensor, samples: Samples, grid_size: float):
-        flat, body = FLAT * grid_size, BODY * grid_size
+    def __init__(self, places: Tensor, few: Few, samples: Samples, grid_size: float):
+        flat, body, places = FLAT * grid_size, BODY * grid_size, few.take(places)
         far, known = squares(places, samples.places), samples.known[:, None]
-        near = torch.where(known, (far * (-0.5 / flat**2)).clamp(min=FAINTEST).exp(), 0)
-        window = near / near.sum(2, keepdim=True).clamp(min=SMALLEST)
-        _, self._normal = planes(window, samples.places, flat)
-        wide = torch.where(known, (far * (-0.5 / body**2)).clamp(min=FAINTEST).exp(), 0)
-        wide = wide / wide.sum(2, keepdim=True).clamp(min=SMALLEST)
-        self._out = ((places - wide @ samples.places) * self._normal).sum(2)
+        near = torch.where(known, (far * (-0.5 / flat**2)).clamp_(min=FAINTEST).exp_(), 0)
+        window = near.div_(near.sum(2, keepdim=True).clamp(min=SMALLEST))
+        _, normal = planes(window, samples.places, flat)
+        wide = torch.where(known, far.mul_(-0.5 / body**2).clamp_(min=FAINTEST).exp_(), 0)
+        wide = wide.div_(wide.sum(2, keepdim=True).clamp(min=SMALLEST))
+        out = ((places - wide @ samples.places) * normal).sum(2, keepdim=True)
+        self._normal, self._out = few.put(normal), few.put(out)[:, :, 0]
 
     def normals(self, direction: Tensor, grid_size: float) -> Tensor:
         """[B, M, 3], towards the outside, or the light ``direction`` where that is not clear."""

@@ -38,7 +38,7 @@ def deformation(history: Particles, length: float, grid_size: float, matter: Mat
         scenes = constant(tuple(clouds.scenes[q] for q in matter.newest), reference.device)
         before = (matter.padded(reference).double() - history.origin[scenes][:, None]).to(reference.dtype)
         way = Shape(matter, before).way_back(matter.places, matter.samples.places)
-        return matter.packed(torch.where(matter.rows.wanted[:, :, None], way, 0))
+        return matter.packed(way)
 
 
 class Shape:

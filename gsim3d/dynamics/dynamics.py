@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -17,12 +19,13 @@ from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import contact
 from gsim3d.dynamics.daylight import daylight
 from gsim3d.dynamics.deformation import deformation
-from gsim3d.dynamics.flight import Flight, touching
+from gsim3d.dynamics.flight import Flight
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.momentum import momentum, turned
 from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.point_transformer import PointTransformer
+from gsim3d.dynamics.push import pushed
 from gsim3d.dynamics.shade import shade
 from gsim3d.dynamics.state import LIGHT_CHANNELS, StateLayout
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
@@ -32,6 +35,7 @@ ROOM = 1.1  # for rows that a call reads, over what was counted
 LIGHT_SIZE = 0.1  # of the parameter that is a direction: smaller ones are turned faster in training
 DIMMING = 0.2  # logarithm of how much darker a row is where log(1 + n) of the matter before its lamp grows by one
 GRAVITY_SIZE = 0.01  # metres a step, of every step: of the parameter's unit, so that training changes it little
+LEAST_INERTIA = 0.1  # of bodies, over that of their rows
 STEADY = 20.0  # as LIGHT_SIZE, of lamps that light surfaces: training turned them away from the true ones
 STRENGTH = 2.0  # of the light that a surface facing the lamp gets, over that which comes from everywhere
 
@@ -50,6 +54,7 @@ class Dynamics(nn.Module):
         self.config = config
         self.layout = StateLayout.of(config)
         self.rounds = None  # whether geometry is rounded in training; None: on a GPU
+        self._most_moving: int | None = None
         layout = self.layout
         self.net = PointTransformer(layout.in_channels, layout.told_channels, layout.out_channels, config)
         self.lights = self.dimming = self.strength = None
@@ -64,6 +69,7 @@ class Dynamics(nn.Module):
         self.gravity = None
         if config.gravity is not None:
             self.gravity = nn.Parameter(torch.tensor(config.gravity) / GRAVITY_SIZE)
+        self.inertia = nn.Parameter(torch.ones(())) if config.pushes else None
 
     def geometry(
         self,
@@ -103,6 +109,16 @@ class Dynamics(nn.Module):
             **options,
         )
         return pyramid if chosen is None else pyramid.of_rows(chosen, n_seen)
+
+    @contextlib.contextmanager
+    def moving_at_most(self, n_rows: int) -> Iterator[None]:
+        """Within it no scene has more rows that may move than ``n_rows``: a GPU computes what is told of these alone,
+        as a CPU does that counts them."""
+        before, self._most_moving = self._most_moving, n_rows
+        try:
+            yield
+        finally:
+            self._most_moving = before
 
     def room(self, history: Particles) -> int:
         """Rows that the network needs room for in calls like that of ``history``: with a background that is relit only
@@ -148,7 +164,10 @@ class Dynamics(nn.Module):
             return None
         matter = matter or self._matter(history)
         near = contact(history, self.config.contact_length, self.config.grid_size, matter) if near is None else near
-        return Flight(near[:, -1:], touching(near[:, -1:], matter), GRAVITY_SIZE * self.gravity)
+        push = None
+        if self.inertia is not None:
+            push = partial(pushed, length=self.config.motion_length, inertia=self.inertia.clamp(min=LEAST_INERTIA))
+        return Flight.of(near[:, -1:], matter, GRAVITY_SIZE * self.gravity, push)
 
     def begin(self, state: Particles) -> Particles:
         """``state`` with the fields in which simulated rows know how they began."""
@@ -274,7 +293,7 @@ class Dynamics(nn.Module):
         they faced it there, and what stands there now. The former are ``known``, as far as they are not negative; rows
         that sleep keep what they knew."""
         n_lights, grid_size = len(self.lights), self.config.grid_size
-        matter = Matter.of(particles, grid_size)
+        matter = Matter.of(particles, grid_size, most=self._most_moving)
         if self.config.surfaces:
             facing = None if known is None else known[:, n_lights : 2 * n_lights]
             facing = None if facing is None else torch.where(facing < 0, 1.0, facing)
@@ -301,9 +320,9 @@ class Dynamics(nn.Module):
         """What all that rows are told begins with; None where nothing is told of it."""
         config = self.config
         if config.velocity or config.deformation:
-            return Matter.of(history, config.grid_size, config.motion_length)
+            return Matter.of(history, config.grid_size, config.motion_length, self._most_moving)
         if config.contact_length is not None:
-            return Matter.of(history, config.grid_size)
+            return Matter.of(history, config.grid_size, most=self._most_moving)
         return None
 
     def _seen(self, history: Particles) -> Tensor:

@@ -76,9 +76,9 @@ def follow(
             spans = [clouds.steps[q] - clouds.steps[f] for f, q in zip(first, newest)]
             later = constant(tuple(max(0, span - 1) for span in spans), found.device)
             found = found + 0.5 * later[:, None, None] * matter.padded(falls)
-        found = torch.where(matter.rows.wanted[:, :, None], found, 0)
-    for b, q in enumerate(newest):
-        result[clouds.starts[q] : clouds.starts[q + 1]] = found[b, : clouds.count(q)]
+        found = matter.packed(found)
+    for q, part in zip(newest, found.split([clouds.count(q) for q in newest]), strict=True):
+        result[clouds.starts[q] : clouds.starts[q + 1]] = part
     return result
 
 

@@ -8,24 +8,30 @@ from torch.nn import functional as F
 
 from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.dynamics.rigid import Lattice
-from gsim3d.dynamics.samples import Padded, Rows, Samples, squares, weights
+from gsim3d.dynamics.samples import Few, Padded, Rows, Samples, squares, weights
 from gsim3d.types import FROZEN, Particles
 
 
 class Matter:
     """The rows that may move, and samples of them. No gradients.
 
-    rows, samples: of the newest clouds; places of samples count from ``here`` [B, 1, 3], the mean of theirs.
-    places: [B, M, 3] of the rows, from there as well.
+    everything: rows [B, M] of the newest clouds, those that may move are wanted.
+    few: how the m rows of which more is computed stand among them.
+    rows, samples: those; places of samples count from ``here`` [B, 1, 3], the mean of theirs.
+    places: [B, m, 3] of the rows, from there as well.
     lattice, window: [B, G, S] how much each sample counts around a node, in a Gaussian of ``length`` metres; where one
         is given.
     """
 
-    def __init__(self, history: Particles, grid_size: float, length: float | None = None):
+    def __init__(
+        self, history: Particles, grid_size: float, length: float | None = None, most: int | None = None
+    ):
         self.newest = newest_clouds(history.clouds)
         self._counts = [history.clouds.count(q) for q in self.newest]
         with torch.no_grad(), torch.autocast(history.means.device.type, enabled=False):
-            self.rows = Rows(Padded(history, self.newest, grid_size), history)
+            self.everything = Rows(Padded(history, self.newest, grid_size), history)
+            self.few = Few(self.everything.wanted, most)
+            self.rows = self.everything.only(self.few)
             self.samples = Samples(self.rows)
             self.here = self.samples.mean[:, None]
             self.samples.seen_from(self.here)
@@ -36,20 +42,33 @@ class Matter:
                 self.window = weights(far * (-0.5 / length**2), self.samples.known)
 
     @classmethod
-    def of(cls, history: Particles, grid_size: float, length: float | None = None) -> Matter | None:
-        """None where the newest clouds have no rows."""
+    def of(
+        cls, history: Particles, grid_size: float, length: float | None = None, most: int | None = None
+    ) -> Matter | None:
+        """None where the newest clouds have no rows.
+
+        most: rows of a scene that may move, if that is known.
+        """
         clouds = history.clouds
-        return cls(history, grid_size, length) if any(clouds.count(q) for q in newest_clouds(clouds)) else None
+        return cls(history, grid_size, length, most) if any(clouds.count(q) for q in newest_clouds(clouds)) else None
 
     def awake(self, history: Particles) -> Tensor:
         """bool [N], packed, rows of the newest clouds that neither sleep nor are outside of the workspace."""
-        return self.packed(self.rows.wanted | self.rows.that_are(history, FROZEN).wanted)
+        return self.together(self.everything.wanted | self.everything.that_are(history, FROZEN).wanted)
 
     def padded(self, values: Tensor) -> Tensor:
-        """[B, M, C] of ``values`` [N, C] of the rows of the newest clouds, packed."""
-        most = self.places.shape[1]
-        return torch.stack([F.pad(part, (0, 0, 0, most - len(part))) for part in values.split(self._counts)])
+        """[B, m, C] of ``values`` [N, C] of the rows of the newest clouds, packed."""
+        return self.few.take(self.apart(values))
 
     def packed(self, values: Tensor) -> Tensor:
+        """[N, ...] of ``values`` [B, m, ...]; 0 of rows that cannot move."""
+        return self.together(self.few.put(values))
+
+    def apart(self, values: Tensor) -> Tensor:
+        """[B, M, C] of ``values`` [N, C] of the rows of the newest clouds, packed."""
+        most = self.everything.rows.shape[1]
+        return torch.stack([F.pad(part, (0, 0, 0, most - len(part))) for part in values.split(self._counts)])
+
+    def together(self, values: Tensor) -> Tensor:
         """[N, ...] of ``values`` [B, M, ...]."""
         return torch.cat([values[b, :n] for b, n in enumerate(self._counts)])

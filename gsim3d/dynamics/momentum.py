@@ -40,9 +40,7 @@ def _rigid(matter: Matter, own: Tensor, length: float) -> tuple[Tensor, Tensor]:
     the rigid motion of that window."""
     with torch.autocast(own.device.type, enabled=False):
         found = matter.lattice.at(matter.places, *_of_windows(matter, own, length))
-        of_rows = (found[0], onward_at(matter.places, *found))
-        moved, rigid = (matter.packed(torch.where(matter.rows.wanted[:, :, None], x, 0)) for x in of_rows)
-    return moved, rigid
+        return matter.packed(found[0]), matter.packed(onward_at(matter.places, *found))
 
 
 def _of_windows(matter: Matter, moved: Tensor, length: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -67,4 +65,4 @@ def turned(turns: Tensor, moved: Tensor, length: float, matter: Matter | None) -
     with torch.autocast(moved.device.type, enabled=False):
         _, spin, _ = _of_windows(matter, moved, length)
         (spin,) = matter.lattice.at(matter.places, spin)
-        return rotate_left(turns, matter.packed(torch.where(matter.rows.wanted[:, :, None], spin, 0)))
+        return rotate_left(turns, matter.packed(spin))

@@ -53,7 +53,7 @@ def motion(history: Particles, length: float, grid_size: float) -> Tensor:
         all_steps = share_of_a_step(clouds, first, newest, now, oldest)
         moved, *rigid = lattice.at(matter.places, moved * a_step, velocity * all_steps, spin * all_steps, centre)
         onward = onward_at(matter.places, *rigid)
-        return matter.packed(torch.where(matter.rows.wanted[:, :, None, None], torch.stack([moved, onward], 2), 0))
+        return matter.packed(torch.stack([moved, onward], 2))
 
 
 def shift(now: Samples, then: Samples, nodes: Tensor, window: Tensor, length: float) -> Tensor:

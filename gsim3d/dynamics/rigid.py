@@ -45,7 +45,7 @@ class Lattice:
 class RigidFit:
     """Of rows at ``places`` [B, S, 3], as far as each window [B, G, S] counts them.
 
-    centre: [B, G, 3] of the rows in the window.
+    centre: [B, G, 3] of the rows in the window.   inertia: [B, G, 3, 3] about it, over their mass.
     """
 
     def __init__(self, window: Tensor, places: Tensor, length: float, stiffness: float = STIFFNESS):
@@ -53,13 +53,13 @@ class RigidFit:
         products = (places[:, :, :, None] * places[:, :, None]).flatten(2)
         scatter = (window @ products).unflatten(2, (3, 3)) - self.centre[:, :, :, None] * self.centre[:, :, None]
         size = scatter.diagonal(dim1=2, dim2=3).sum(2)[:, :, None, None] + stiffness * length**2
-        self._inertia = size * torch.eye(3, device=size.device, dtype=size.dtype) - scatter
+        self.inertia = size * torch.eye(3, device=size.device, dtype=size.dtype) - scatter
 
     def fit(self, paths: Tensor) -> tuple[Tensor, Tensor]:
         """How far the centre moved and the spin (rad), both [B, G, 3], of ``paths`` [B, S, 3]."""
         moved = self.window @ paths
         impulse = self.window @ torch.linalg.cross(self.places, paths) - torch.linalg.cross(self.centre, moved)
-        return moved, solved(self._inertia, impulse)
+        return moved, solved(self.inertia, impulse)
 
 
 def onward_at(places: Tensor, velocity: Tensor, spin: Tensor, centre: Tensor) -> Tensor:

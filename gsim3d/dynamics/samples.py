@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -47,9 +49,53 @@ class Rows:
             self.wanted = self.wanted & (history.opacities.detach()[self.rows] >= opacity)
         self.places = torch.where(self.wanted[:, :, None], clouds.places, 0).to(history.means.dtype)
 
+    def only(self, few: Few) -> Rows:
+        """Those of ``few``; 0 of others."""
+        if few.known is self.wanted:
+            return self
+        some = copy.copy(self)
+        some.rows, some.places, some.wanted = few.take(self.rows), few.take(self.places), few.known
+        return some
+
     def that_are(self, history: Particles, activity: int, opacity: float = 0.0) -> Rows:
-        """Others of the same clouds."""
+        """Others of the same clouds, all of them."""
         return Rows(self._clouds, history, activity, opacity)
+
+
+class Few:
+    """Rows that are ``wanted`` [B, M], of every scene the first m of its list, in their order.
+
+    m is how many a scene has at most: ``most``, where the caller knows it; else a CPU counts them, and a GPU, which
+    would have to wait for the number, has all M in their places.
+    """
+
+    def __init__(self, wanted: Tensor, most: int | None = None):
+        if most is None and wanted.device.type == "cpu" and not torch.compiler.is_compiling():
+            most = int(wanted.sum(1).max())
+        self.known, self._wanted = wanted, wanted
+        self._at = None
+        if most is not None:
+            until, k = wanted.cumsum(1), torch.arange(max(1, most), device=wanted.device)
+            self.known = k < until[:, -1:]
+            self._at = torch.searchsorted(until, (k + 1).repeat(len(until), 1)).clamp(max=until.shape[1] - 1)
+            self._rank = (until - 1).clamp(0, max(1, most) - 1)
+
+    def take(self, values: Tensor) -> Tensor:
+        """[B, m, ...] of ``values`` [B, M, ...]; 0 where there is none."""
+        if self._at is None:
+            return values
+        return _moved(values, self._at, self.known, self._rank, self._wanted)
+
+    def put(self, values: Tensor) -> Tensor:
+        """[B, M, ...] of ``values`` [B, m, ...]; 0 of rows that are not wanted."""
+        if self._at is None:
+            return torch.where(self._wanted.reshape(*self._wanted.shape, *(1,) * (values.dim() - 2)), values, 0)
+        return _moved(values, self._rank, self._wanted, self._at, self.known)
+
+
+def _moved(values: Tensor, *places: Tensor) -> Tensor:
+    """_Taken, of ``values`` [B, M, ...]."""
+    return _Taken.apply(values.reshape(*values.shape[:2], -1), *places).reshape(len(values), -1, *values.shape[2:])
 
 
 class Samples:
@@ -124,4 +170,5 @@ def weights(logits: Tensor, known: Tensor) -> Tensor:
 
 def squares(a: Tensor, b: Tensor) -> Tensor:
     """[B, G, S], squared distances of [B, G, C] from [B, S, C]."""
-    return (a.square().sum(2)[:, :, None] + b.square().sum(2)[:, None] - 2 * (a @ b.mT)).clamp(min=0)
+    found = torch.baddbmm(b.square().sum(2)[:, None], a, b.mT, alpha=-2)
+    return found.add_(a.square().sum(2)[:, :, None]).clamp_(min=0)

@@ -34,13 +34,13 @@ def shade(history: Particles, lights: Tensor, grid_size: float, matter: Matter |
         return history.means.new_zeros(0, len(lights))
     with torch.autocast(history.means.device.type, enabled=False):
         with torch.no_grad():
-            moves, rests = matter.rows, matter.rows.that_are(history, FROZEN)
+            moves, rests = matter.everything, matter.everything.that_are(history, FROZEN)
             places = torch.where(moves.wanted[:, :, None], moves.places, rests.places) - matter.here
             is_lit = moves.wanted | rests.wanted
         cells = (BEAM * grid_size, NEAREST * grid_size, EDGE * grid_size)
         each = (matter.samples.n / matter.samples.known.sum(1).clamp(min=1)).to(places.dtype)[:, None]
         found = [each * between(places, matter.samples, light, *cells) for light in lights.unbind(0)]
-        return matter.packed(torch.where(is_lit[:, :, None], torch.stack(found, 2).log1p(), 0))
+        return matter.together(torch.where(is_lit[:, :, None], torch.stack(found, 2).log1p(), 0))
 
 
 def between(places: Tensor, matter: Samples, light: Tensor, beam: float, nearest: float, edge: float) -> Tensor:
@@ -50,10 +50,10 @@ def between(places: Tensor, matter: Samples, light: Tensor, beam: float, nearest
     direction = light / light.norm()
     with torch.no_grad():
         ahead = (matter.places @ direction)[:, None] - (places @ direction)[:, :, None]
-        off = (squares(places, matter.places) - ahead.square()).clamp(min=0)
-        begun = ((ahead - nearest) / edge).sigmoid()
-        counted = (off * (-0.5 / beam**2)).clamp(min=FAINTEST).exp() * begun
-        counted = torch.where(matter.known[:, None], counted, 0)
+        off = squares(places, matter.places).sub_(ahead.square()).clamp_(min=0)
+        begun = (ahead - nearest).div_(edge).sigmoid_()
+        counted = off.mul_(-0.5 / beam**2).clamp_(min=FAINTEST).exp_().mul_(begun)
+        counted.masked_fill_(~matter.known[:, None], 0)
         if not direction.requires_grad:
             return counted.sum(2)
         # By the direction, the squared way off changes by -2 ahead * way, and the way ahead by the way.

@@ -271,7 +271,7 @@ class StateLayout:
         if drift is not None:
             kept = bounded(kept / MOST_KEPT, MOST_KEPT).unflatten(2, drift.shape[1:])
             if flight is not None:
-                changes = flight.touch * changes + flight.falls
+                changes = flight.changed(changes)
                 of_motions = flight.near[:, :, None].expand(-1, drift.shape[1] - 1, -1)
                 kept = kept * torch.cat([of_motions, torch.ones_like(of_motions[:, :1])], 1)
             ahead = torch.arange(1, 1 + changes.shape[0], device=drift.device, dtype=drift.dtype)[:, None, None]

@@ -59,10 +59,14 @@ class Gradients:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A batch and what the host must know of it before its graph can run. counts: particles of each cloud."""
+    """A batch and what the host must know of it before its graph can run.
+
+    counts: particles of each cloud.   moving: of one cloud at most, that may move.
+    """
 
     batch: Batch
     counts: tuple[int, ...]
+    moving: int
     room: Room
 
     @property
@@ -100,7 +104,7 @@ class CapturedLoss:
         alone: a context in which no other thread uses the GPU, for captures.
         meanwhile: is called in every call, while the graph runs: what else the host has to do delays no kernel then.
         captures: how often a graph was made.
-        most_rows: particles that any cloud had so far.
+        most_rows, most_moving: particles that any cloud had so far, and those of them that may move.
         most: sizes of geometry that any simulated step needed so far, by scenes and times of the encoded clouds.
     """
 
@@ -119,20 +123,21 @@ class CapturedLoss:
         self.parameters = list(simulator.parameters())
         self.alone: AbstractContextManager = nullcontext()
         self.meanwhile: Callable[[], None] = lambda: None
-        self.captures = self.most_rows = 0
+        self.captures = self.most_rows = self.most_moving = 0
         self.most: dict[tuple, tuple[int, ...]] = {}
         self._steps: dict[tuple, _Step] = {}
         self._pool: tuple[int, int] | None = None
 
     @property
     def needed(self) -> dict[str, Any]:
-        """``most_rows`` and ``most`` as JSON knows them."""
+        """``most_rows``, ``most_moving`` and ``most`` as JSON knows them."""
         geometry = [[*map(list, clouds), list(sizes)] for clouds, sizes in self.most.items()]
-        return {"rows": self.most_rows, "geometry": geometry}
+        return {"rows": self.most_rows, "moving": self.most_moving, "geometry": geometry}
 
     def make_room(self, needed: dict[str, Any]) -> None:
         """Graphs made from now on have room for what others (another run, another process) say was ``needed``."""
         self.most_rows = max(self.most_rows, needed["rows"])
+        self.most_moving = max(self.most_moving, needed.get("moving", 0))
         for scenes, times, sizes in needed["geometry"]:
             self.grow((tuple(scenes), tuple(times)), [tuple(sizes)])
 
@@ -179,11 +184,11 @@ class CapturedLoss:
         """
         context = batch.context
         n_clouds, (n_images, _, *size) = context.cloud_scene.shape[0], context.images.shape
-        if context.masks is None:
-            counts = [n_images // n_clouds * math.prod(size)] * n_clouds
-        else:
-            counts = context.masks.reshape(n_clouds, -1).sum(1).tolist()
-        return Prepared(batch, tuple(counts), self.simulator.encoder.room(context, max(counts)))
+        every = torch.ones(n_images, *size, dtype=torch.bool, device=context.images.device)
+        masks = every if context.masks is None else context.masks
+        moving = masks if context.dynamic is None else masks & context.dynamic
+        counts, moving = torch.stack([x.reshape(n_clouds, -1).sum(1) for x in (masks, moving)]).tolist()
+        return Prepared(batch, tuple(counts), max(moving), self.simulator.encoder.room(context, max(counts)))
 
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
         """Gradients are overwritten by the next call.
@@ -194,21 +199,24 @@ class CapturedLoss:
         """
         kind, largest = prepared.kind, max(prepared.counts)
         self.most_rows = max(self.most_rows, largest)
+        self.most_moving = max(self.most_moving, prepared.moving)
         step = self._steps.pop(kind, None)
-        if step is None or largest > step.rows:
+        if step is None or largest > step.rows or prepared.moving > step.moving:
             step = None  # its memory goes back first
             while len(self._steps) >= MOST_KINDS:
                 del self._steps[next(iter(self._steps))]
-            step = _Step(self, _rounded_up(ROWS_FACTOR * self.most_rows), prepared, weights)
+            room = (_rounded_up(ROWS_FACTOR * most) for most in (self.most_rows, self.most_moving))
+            step = _Step(self, *room, prepared, weights)
         self._steps[kind] = step  # now the newest
         return step(prepared, weights, report)
 
 
 class _Step:
-    """A step of one kind, with ``rows`` rows a cloud."""
+    """A step of one kind, with ``rows`` rows a cloud, of which ``moving`` may move."""
 
-    def __init__(self, owner: CapturedLoss, rows: int, prepared: Prepared, weights: Tensor):
-        self._owner, self.rows, self._capacities, self._is_ready = owner, rows, [], False
+    def __init__(self, owner: CapturedLoss, rows: int, moving: int, prepared: Prepared, weights: Tensor):
+        self._owner, self._capacities, self._is_ready = owner, [], False
+        self.rows, self.moving = rows, moving
         self._graph = self._records = None
         batch, self._clouds = prepared.batch, prepared.kind[:2]
         self._context, self._targets = _own(batch.context), _own(batch.targets)
@@ -323,7 +331,8 @@ class _Step:
             return pyramid
 
         if self._n_future:
-            self._rollout(self._encode(StabilityReport()), geometry, StabilityReport())
+            with self._owner.simulator.dynamics.moving_at_most(self.moving):
+                self._rollout(self._encode(StabilityReport()), geometry, StabilityReport())
         return needed
 
     def _given(self, report: StabilityReport) -> tuple:
@@ -334,7 +343,8 @@ class _Step:
             found.append(self._owner.simulator.dynamics.geometry(history, capacity=next(sizes)))
             return found[-1]
 
-        computed = self._compute(geometry, report)
+        with self._owner.simulator.dynamics.moving_at_most(self.moving):
+            computed = self._compute(geometry, report)
         return *computed, torch.stack([p.found for p in found]) if found else self._weights.new_empty(0)
 
     def _capture(self) -> None:
@@ -373,7 +383,7 @@ class _Step:
 
 
 class _OfCalls:
-    """``make`` of the geometry of calls: one that is computed again has that of before, which gradients do not reach."""
+    """``make`` of the geometry of calls: one that is computed again has that of before."""
 
     def __init__(self, make: Callable[[Particles], Pyramid]):
         self._make, self._made, self._call = make, {}, 0

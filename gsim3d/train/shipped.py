@@ -29,7 +29,7 @@ from gsim3d.train.samples import Batch
 from gsim3d.train.sittings import Progress, save_state
 
 FIRST_FILMS = 32  # before training begins
-SEED, HELD_OUT_SEED = 20261201, 77  # of the trajectories; `gsim3d generate` without --seed makes others
+SEED, HELD_OUT_SEED = 20261202, 77  # of the trajectories; `gsim3d generate` without --seed makes others
 WARM_UP = 40  # steps at the beginning of a sitting
 COOL_DOWN = 0.25  # of a sitting's training, in which the learning rate falls to LAST_RATE of its peak
 LAST_RATE = 0.03
@@ -95,6 +95,7 @@ def _recipe(
     rollouts_within: int | None = None,
     strides: tuple[int, int] = (3, 2),
     batch: int = 4,
+    long_batch: int | None = None,
     rollout: tuple[int, int] = (48, 24),
     images: tuple[int, int] = (400, 20),
     beginning: tuple[int, int, int] = BEGINNING,
@@ -105,6 +106,7 @@ def _recipe(
     shape_length: float = 0.2,
     surfaces: bool = False,
     flies: bool = False,
+    recompute: tuple[str, ...] = (),
     capacity: int = 600,
     options: Mapping = MappingProxyType({}),
     in_turn: tuple[dict, ...] = ({},),
@@ -114,7 +116,9 @@ def _recipe(
     A joint step of 12 simulated steps spends almost half of its time in the encoder, mostly on the way back.
 
     begin_within: of images.   rollouts_within: windows of rollouts begin within so many steps; None: twice as many.
-    strides: of the pixels of ground and bodies.   batch: where long rollouts are simulated.
+    strides: of the pixels of ground and bodies.
+    batch: scenes in steps with other light are four times as many, in short rollouts twice.
+    long_batch: scenes in long rollouts; None: ``batch``.
     rollout: their steps, and through how many of them gradients flow back.
     images: steps of images before all others, and in each round; more where the encoder does not know the world yet.
     beginning: steps behind the images, before the rounds; 0 where the weights that a run begins with know how things
@@ -124,6 +128,7 @@ def _recipe(
     contact_length: as of DynamicsConfig; more than bodies fall in a step.
     shape, shape_length: as of LossConfig; the length less than bodies are apart.
     surfaces: as of DynamicsConfig; what rests then changes in the light alone.
+    recompute: as of TrainConfig.
     flies: with the world's gravity as of DynamicsConfig: not where bodies touch no more than what moves.
     Others as in Recipe.
     """
@@ -152,6 +157,7 @@ def _recipe(
                 "contact_length": contact_length,
                 "surfaces": surfaces,
                 "gravity": (0.0, 0.0, -GRAVITY / fps**2) if flies else None,
+                "pushes": flies,
             },
         },
         # How a look differs from the one that it had at first: bodies turn in the light, and shadows fall. From step to
@@ -175,7 +181,14 @@ def _recipe(
             seen(steps=images[1]),
             lit(steps=TURN[0]),
             short(steps=TURN[1]),
-            dynamics(steps=TURN[2], horizon=horizon, cut=cut, batch=batch, from_start=0.5, learning_rate=0.75 * rate),
+            dynamics(
+                steps=TURN[2],
+                horizon=horizon,
+                cut=cut,
+                batch=long_batch or batch,
+                from_start=0.5,
+                learning_rate=0.75 * rate,
+            ),
         ),
         rounds=100_000,
         # A score counts the last step like the first. What the ground hides would leave its body unseen.
@@ -184,6 +197,7 @@ def _recipe(
         ),
         optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.995),
         precision=PrecisionConfig(encoder="bf16", dynamics="bf16"),
+        recompute=recompute,
         captured=True,
         log_every=20,
     )
@@ -199,23 +213,24 @@ THROWN_UP = {"drop_height": (0.05, 0.5), "lift": (0.5, 2.5)}
 RECIPES = {
     # Bodies fall for half a second, jump, and then hardly move. Rollouts begin before they land: one that is squeezed
     # where a rollout begins looks like one that was made so. The ground is seen with more particles than elsewhere, as
-    # more than half of what encoded images miss is at the edges of its squares. Long rollouts of four scenes had no
-    # room on a GPU of 80 GB.
+    # more than half of what encoded images miss is at the edges of its squares. Beside the other graphs long rollouts
+    # of four scenes had no room on a GPU of 80 GB, though steps are computed again.
     "elastic": _recipe(
         "elastic",
         (1.75, 5.0),
         24,
         rollouts_within=12,
         strides=(2, 2),
-        batch=2,
+        long_batch=2,
         rollout=(48, 24),
-        images=(300, 20),
+        recompute=("steps",),
+        images=(150, 20),
         beginning=(0, 0, 0),
         rate=6e-4,
         shape=0.015,
         surfaces=True,
         flies=True,
-        capacity=80,
+        capacity=200,
         in_turn=({}, {}, {}, THROWN_UP),
     ),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories and graphs.

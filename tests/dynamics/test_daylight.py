@@ -61,7 +61,7 @@ def test_a_shadow_falls_on_the_ground_where_the_light_does_not(light):
     off = torch.linalg.cross(torch.tensor([0.0, 0.0, HEIGHT]) - places, towards.expand_as(places)).norm(dim=1)
     share = of_ground[:, 0] / of_ground[:, 1]
     assert_close_relative_to_max(of_ground[:, 1], lambert(towards[2]).expand(len(places)), 0.01)
-    assert share[off < RADIUS - 0.05].max() < 0.35 and share[off > RADIUS + 0.15].min() > 0.95
+    assert share[off < RADIUS].max() < 0.1 and share[off > RADIUS + 0.1].min() > 0.95
 
 
 def test_a_sheet_shows_the_light_its_front():

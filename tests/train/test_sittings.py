@@ -268,7 +268,7 @@ def test_the_next_sitting_knows_what_graphs_needed(store, tmp_path):
     first, second = (SittingTrainer(CONFIG, store, tmp_path / name, "cpu") for name in ("first", "second"))
     for trainer in (first, second):
         trainer.captured = trainer._capture()
-    known = {"rows": 10_000, "geometry": [[[0], [0, 1], [7, 8]]]}
+    known = {"rows": 10_000, "moving": 500, "geometry": [[[0], [0, 1], [7, 8]]]}
     first.captured.make_room(known)
     end = time.monotonic() + 2
     train(first, NoFilming(), Progress(), {}, end=end, out=tmp_path / "state", name=NAME, say=lambda _: None)
@@ -391,7 +391,7 @@ def test_a_run_whose_bodies_fly_and_are_lit_begins_with_what_neither_knew(store,
     """Nothing is predicted of light at first; latents, and what is predicted of places, are what they were."""
     told = {"motion_length": 0.3, **ALL_BUT_LIGHTS, "lights": ((0.0, 0.3, 1.0),)}
     known = saved_with_a_head(dataclasses.replace(CONFIG, model={"dynamics": told}), store, tmp_path)
-    new = {**told, "surfaces": True, "gravity": (0.0, 0.0, -0.01)}
+    new = {**told, "surfaces": True, "gravity": (0.0, 0.0, -0.01), "pushes": True}
     trainer = SittingTrainer(dataclasses.replace(CONFIG, model={"dynamics": new}), store, tmp_path / "run", "cpu")
     begin_with(trainer, known)
     given, own = restore(known).simulator, trainer.simulator.eval()
