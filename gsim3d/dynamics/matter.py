@@ -23,9 +23,7 @@ class Matter:
         is given.
     """
 
-    def __init__(
-        self, history: Particles, grid_size: float, length: float | None = None, most: int | None = None
-    ):
+    def __init__(self, history: Particles, grid_size: float, length: float | None = None, most: int | None = None):
         self.newest = newest_clouds(history.clouds)
         self._counts = [history.clouds.count(q) for q in self.newest]
         with torch.no_grad(), torch.autocast(history.means.device.type, enabled=False):

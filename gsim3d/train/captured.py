@@ -186,7 +186,8 @@ class CapturedLoss:
         n_clouds, (n_images, _, *size) = context.cloud_scene.shape[0], context.images.shape
         every = torch.ones(n_images, *size, dtype=torch.bool, device=context.images.device)
         masks = every if context.masks is None else context.masks
-        moving = masks if context.dynamic is None else masks & context.dynamic
+        all_move = context.dynamic is None or self.plan.spec.dynamics.background == "dynamic"
+        moving = masks if all_move else masks & context.dynamic
         counts, moving = torch.stack([x.reshape(n_clouds, -1).sum(1) for x in (masks, moving)]).tolist()
         return Prepared(batch, tuple(counts), max(moving), self.simulator.encoder.room(context, max(counts)))
 

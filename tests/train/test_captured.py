@@ -63,8 +63,14 @@ FLYING = dataclasses.replace(
     },
     effects={"appearance": {"changing": "dynamic"}},
 )  # fmt: skip
+ALL_MOVING = dataclasses.replace(
+    MOVING,
+    model={"dynamics": {"motion_length": 0.3, "velocity": True, "deformation": True}},
+    effects={"dynamics": {"background": "dynamic"}},
+)
 KINDS = {
     "latent": CONFIG,
+    "all moving": ALL_MOVING,
     "moving": MOVING,
     "relit": RELIT,
     "flying": FLYING,
@@ -115,6 +121,7 @@ def run(captured, batch, trainer, report=None, factor=1.0):
         ({"dynamics_alone": True, "lead": 2}, "background-masked"),
         ({"horizon": 3, "cut": 2}, "moving"),
         ({}, "moving, masked"),
+        ({"dynamics_alone": True}, "all moving"),
         ({"lead": 2}, "relit"),
         ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "relit"),
         ({"dynamics_alone": True, "lit_before": 1, "horizon": 1}, "relit"),
@@ -123,7 +130,7 @@ def run(captured, batch, trainer, report=None, factor=1.0):
     ],
     ids=[
         "rollout", "lead", "encoded", "explicit", "masked", "dynamics alone, cut", "dynamics alone, masked", "moving",
-        "moving, masked", "relit", "relit, dynamics alone", "relit, background of its own",
+        "moving, masked", "all moving", "relit", "relit, dynamics alone", "relit, background of its own",
         "flying, dynamics alone", "flying, background of its own",
     ],
     indirect=["trainer"],
