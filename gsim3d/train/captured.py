@@ -184,8 +184,9 @@ class CapturedLoss:
         """
         context = batch.context
         n_clouds, (n_images, _, *size) = context.cloud_scene.shape[0], context.images.shape
-        every = torch.ones(n_images, *size, dtype=torch.bool, device=context.images.device)
-        masks = every if context.masks is None else context.masks
+        masks = context.masks
+        if masks is None:
+            masks = torch.ones(n_images, *size, dtype=torch.bool, device=context.images.device)
         all_move = context.dynamic is None or self.plan.spec.dynamics.background == "dynamic"
         moving = masks if all_move else masks & context.dynamic
         counts, moving = torch.stack([x.reshape(n_clouds, -1).sum(1) for x in (masks, moving)]).tolist()
