@@ -88,8 +88,10 @@ def test_a_graph_makes_room_where_more_rows_may_move(device):
     simulator = make_simulator(device, dynamics=dataclasses.replace(CONFIG.dynamics, **told))
     state = make_state(device=device)
     moves = state.activity == DYNAMIC
-    first = dataclasses.replace(state, activity=torch.where(moves & (moves.cumsum(0) % 3 > 0), FROZEN, state.activity))
-    captured = CapturedRollout(simulator, first, 3, factor=1)
+    newest = torch.arange(state.n_rows, device=device) >= state.clouds.starts[-2]
+    one = moves & newest & ((moves & newest).cumsum(0) == 1)  # with room for five
+    first = dataclasses.replace(state, activity=torch.where(moves & ~one, FROZEN, state.activity))
+    captured = CapturedRollout(simulator, first, 3, factor=5)
     assert_same_steps(captured(first).steps, rolled_out(simulator, first, 3), rounded=1e-5)
     made = captured.captures
     assert_same_steps(captured(state).steps, rolled_out(simulator, state, 3), rounded=1e-5)

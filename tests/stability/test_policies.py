@@ -150,6 +150,20 @@ def test_rows_are_mended_alike_with_and_without_gradients(simulator, state, know
     assert asleep == [row for row in range(len(cases)) if knows_previous or row != len(cases) - 2]
 
 
+def test_a_closed_report_keeps_what_it_knows_and_takes_nothing_more(simulator, state):
+    row, report = int(state.cu_rows[-2]) + 4, StabilityReport()
+    bad = with_value(state, "means", row, NAN)
+    with torch.no_grad():
+        simulator.rollout(bad, 1, on_bad="drop", report=report)
+        known = report.total
+        report.close()
+        steps = simulator.rollout(bad, 1, on_bad="drop", report=report)
+        assert known == report.total == 1 and int((steps[0].activity == ASLEEP).sum()) == 1
+        report.clear()
+        simulator.rollout(bad, 1, on_bad="drop", report=report)
+    assert report.total == 1
+
+
 def kick_row(simulator, row, call, kick):
     """At that call of the dynamics, ``kick`` is added to the position of one row of the result."""
     calls = []
