@@ -61,9 +61,9 @@ class DynamicsConfig:
             and ``contact_length``: what touches nothing frozen flies on, turns and falls, whatever is predicted, and
             encoded rows in flight have the velocity of their last step (:mod:`gsim3d.dynamics.flight`). None: what is
             predicted counts everywhere.
-        pushes: with ``gravity``: what is predicted of rows changes the momentum and the spin of their body only as a
-            push of the background does, which changes it as those of its rows change that are near
-            (:func:`gsim3d.dynamics.push.pushed`).
+        pushes: with ``gravity``: the background stops rows that would get behind it, with friction, and else changes
+            what those do that are near it; what rows of a body do to each other changes neither its momentum nor its
+            spin (:mod:`gsim3d.dynamics.push`).
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.

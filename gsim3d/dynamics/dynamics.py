@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +15,7 @@ from gsim3d import ops
 from gsim3d.dynamics.background import Background
 from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps, with_field
 from gsim3d.dynamics.config import DynamicsConfig
-from gsim3d.dynamics.contact import contact
+from gsim3d.dynamics.contact import FIRM, SOLID, Beside
 from gsim3d.dynamics.daylight import daylight
 from gsim3d.dynamics.deformation import deformation
 from gsim3d.dynamics.flight import Flight
@@ -25,7 +24,7 @@ from gsim3d.dynamics.momentum import momentum, turned
 from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.point_transformer import PointTransformer
-from gsim3d.dynamics.push import pushed
+from gsim3d.dynamics.push import Pushes
 from gsim3d.dynamics.shade import shade
 from gsim3d.dynamics.state import LIGHT_CHANNELS, StateLayout
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
@@ -35,7 +34,7 @@ ROOM = 1.1  # for rows that a call reads, over what was counted
 LIGHT_SIZE = 0.1  # of the parameter that is a direction: smaller ones are turned faster in training
 DIMMING = 0.2  # logarithm of how much darker a row is where log(1 + n) of the matter before its lamp grows by one
 GRAVITY_SIZE = 0.01  # metres a step, of every step: of the parameter's unit, so that training changes it little
-LEAST_INERTIA = 0.1  # of bodies, over that of their rows
+SKIN, SKIN_SIZE = 0.02, 0.1  # metres, where it begins; and its unit, likewise
 STEADY = 20.0  # as LIGHT_SIZE, of lamps that light surfaces: training turned them away from the true ones
 STRENGTH = 2.0  # of the light that a surface facing the lamp gets, over that which comes from everywhere
 
@@ -69,7 +68,10 @@ class Dynamics(nn.Module):
         self.gravity = None
         if config.gravity is not None:
             self.gravity = nn.Parameter(torch.tensor(config.gravity) / GRAVITY_SIZE)
-        self.inertia = nn.Parameter(torch.ones(())) if config.pushes else None
+        self.friction = self.skin = None
+        if config.pushes:
+            self.friction = nn.Parameter(torch.ones(()))
+            self.skin = nn.Parameter(torch.tensor(SKIN / SKIN_SIZE))
 
     def geometry(
         self,
@@ -155,19 +157,20 @@ class Dynamics(nn.Module):
         shaded = self._shaded(particles, known)
         return dataclasses.replace(particles, shaded=_put_runs(shaded, runs, particles.n_rows, -1.0))
 
-    def flight(self, history: Particles, near: Tensor | None = None, matter: Matter | None = None) -> Flight | None:
+    def flight(self, history: Particles, matter: Matter | None = None, beside: Beside | None = None) -> Flight | None:
         """How far the rows of the newest clouds are from flying; None of a model without ``gravity``.
 
-        near, matter: of ``history``; None: found here.
+        matter, beside: of ``history``; None: found here.
         """
         if self.gravity is None:
             return None
         matter = matter or self._matter(history)
-        near = contact(history, self.config.contact_length, self.config.grid_size, matter) if near is None else near
-        push = None
-        if self.inertia is not None:
-            push = partial(pushed, length=self.config.motion_length, inertia=self.inertia.clamp(min=LEAST_INERTIA))
-        return Flight.of(near[:, -1:], matter, GRAVITY_SIZE * self.gravity, push)
+        beside = beside or self._beside(history, matter)
+        pushes = None
+        if self.friction is not None and matter is not None:
+            numbers = self.friction, SKIN_SIZE * self.skin
+            pushes = Pushes(history, matter, beside, self.config.motion_length, *numbers)
+        return Flight.of(beside.contact[:, -1:], matter, GRAVITY_SIZE * self.gravity, pushes)
 
     def begin(self, state: Particles) -> Particles:
         """``state`` with the fields in which simulated rows know how they began."""
@@ -236,9 +239,9 @@ class Dynamics(nn.Module):
         if drift is not None:
             moved = _put_runs(drift, runs, history.n_rows)
         if config.contact_length is not None:
-            near = contact(history, config.contact_length, config.grid_size, matter)
-            flight = self.flight(history, near, matter)
-            near = _put_runs(near, runs, history.n_rows)
+            beside = self._beside(history, matter)
+            flight = self.flight(history, matter, beside)
+            near = _put_runs(beside.contact, runs, history.n_rows)
         if self.lights is not None:
             shaded, n_lights = take_runs(history.shaded, runs), len(self.lights)
             dark = torch.cat([shaded[:, -n_lights:], shaded[:, :n_lights]], 1)  # now and then
@@ -320,10 +323,13 @@ class Dynamics(nn.Module):
         """What all that rows are told begins with; None where nothing is told of it."""
         config = self.config
         if config.velocity or config.deformation:
-            return Matter.of(history, config.grid_size, config.motion_length, self._most_moving)
+            return Matter.of(history, config.grid_size, config.motion_length, self._most_moving, evenly=config.pushes)
         if config.contact_length is not None:
             return Matter.of(history, config.grid_size, most=self._most_moving)
         return None
+
+    def _beside(self, history: Particles, matter: Matter | None) -> Beside:
+        return Beside(history, self.config.contact_length, matter, FIRM if self.config.pushes else SOLID)
 
     def _seen(self, history: Particles) -> Tensor:
         """bool [N], rows that the network sees."""

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
 
 from gsim3d.dynamics.matter import Matter
+from gsim3d.dynamics.push import REACHING, Pushes
 
-HOLDING, REACHING = 2, 4  # powers of the nearness: what shares of motions count, and what a touch is told from
+HOLDING = 2  # power of the nearness to the background, which is as much as shares of motions count
 TOUCHING = 0.02  # mean nearness of the matter around a row to what is frozen, from which on it touches that in full
+BACK, STIFF_BACK = 0.3, 1.2  # share of the way back to its shape that a row goes in a step if nothing is predicted
 
 
 @dataclass(frozen=True)
@@ -22,31 +22,30 @@ class Flight:
     near: [N, 1], how far shares of motions count, from 0 to 1: as far as what is frozen is near.
     touch: [N, 1], of :func:`touching`.
     gravity: [3] metres a step, of every step.
-    push: what bodies make of changes [N, 3] of their rows, of :func:`gsim3d.dynamics.push.pushed`; None: all of them.
+    pushes: what the background does; None: that is predicted.
     """
 
     near: Tensor
     touch: Tensor
     gravity: Tensor
-    push: Callable[[Tensor], Tensor] | None = None
+    pushes: Pushes | None = None
 
     @classmethod
-    def of(
-        cls,
-        near: Tensor,
-        matter: Matter | None,
-        gravity: Tensor,
-        push: Callable[[Tensor, Tensor, Matter | None], Tensor] | None = None,
-    ) -> Flight:
+    def of(cls, near: Tensor, matter: Matter | None, gravity: Tensor, pushes: Pushes | None = None) -> Flight:
         """near: [N, 1] from 0 to 1, how near what is frozen is, of :func:`gsim3d.dynamics.contact.contact`."""
-        reach = near**REACHING
-        push = None if push is None else partial(push, near=reach, matter=matter)
-        return cls(near**HOLDING, touching(reach, matter), gravity, push)
+        return cls(near**HOLDING, touching(near**REACHING, matter), gravity, pushes)
 
-    def changed(self, changes: Tensor) -> Tensor:
-        """[1, N, 3], what happens of ``changes`` that are predicted, and what does by itself."""
-        changes = self.touch * changes
-        return self.falls + (changes if self.push is None else self.push(changes[0])[None])
+    def moves(self, onward: Tensor, changes: Tensor, motions: Tensor, back: Tensor) -> Tensor:
+        """[N, 3] metres, how rows move in a step.
+
+        Args:
+            onward: [N, 3], how they do by themselves, but for gravity.
+            changes, motions: [N, 3], what is predicted, and what of motions is kept beside ``onward``.
+            back: [N, 3], towards the shape that bodies had.
+        """
+        if self.pushes is None:
+            return onward + self.falls + self.touch * changes + self.near * motions + back
+        return self.pushes.moves(onward + self.gravity, self.touch * (changes + motions), back)
 
     @property
     def falls(self) -> Tensor:

@@ -11,6 +11,7 @@ from gsim3d.dynamics.rigid import Lattice
 from gsim3d.dynamics.samples import Few, Padded, Rows, Samples, squares, weights
 from gsim3d.types import FROZEN, Particles
 
+EVEN = 0.15  # of the windows' length: standard deviation of those in which rows are counted
 
 class Matter:
     """The rows that may move, and samples of them. No gradients.
@@ -20,10 +21,17 @@ class Matter:
     rows, samples: those; places of samples count from ``here`` [B, 1, 3], the mean of theirs.
     places: [B, m, 3] of the rows, from there as well.
     lattice, window: [B, G, S] how much each sample counts around a node, in a Gaussian of ``length`` metres; where one
-        is given.
+        is given. ``evenly``: as much as the surface that it stands for, as more rows are seen of the top of a body.
     """
 
-    def __init__(self, history: Particles, grid_size: float, length: float | None = None, most: int | None = None):
+    def __init__(
+        self,
+        history: Particles,
+        grid_size: float,
+        length: float | None = None,
+        most: int | None = None,
+        evenly: bool = False,
+    ):
         self.newest = newest_clouds(history.clouds)
         self._counts = [history.clouds.count(q) for q in self.newest]
         with torch.no_grad(), torch.autocast(history.means.device.type, enabled=False):
@@ -36,19 +44,27 @@ class Matter:
             self.places = self.rows.places - self.here
             if length is not None:
                 self.lattice = Lattice(self.samples.places, self.samples.known)
-                far = squares(self.lattice.nodes, self.samples.places)
-                self.window = weights(far * (-0.5 / length**2), self.samples.known)
+                counts = squares(self.lattice.nodes, self.samples.places) * (-0.5 / length**2)
+                if evenly:
+                    counts = counts - self.samples.crowd(EVEN * length).log()[:, None]
+                self.window = weights(counts, self.samples.known)
 
     @classmethod
     def of(
-        cls, history: Particles, grid_size: float, length: float | None = None, most: int | None = None
+        cls,
+        history: Particles,
+        grid_size: float,
+        length: float | None = None,
+        most: int | None = None,
+        evenly: bool = False,
     ) -> Matter | None:
         """None where the newest clouds have no rows.
 
         most: rows of a scene that may move, if that is known.
         """
         clouds = history.clouds
-        return cls(history, grid_size, length, most) if any(clouds.count(q) for q in newest_clouds(clouds)) else None
+        any_rows = any(clouds.count(q) for q in newest_clouds(clouds))
+        return cls(history, grid_size, length, most, evenly) if any_rows else None
 
     def awake(self, history: Particles) -> Tensor:
         """bool [N], packed, rows of the newest clouds that neither sleep nor are outside of the workspace."""

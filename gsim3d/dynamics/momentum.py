@@ -7,11 +7,9 @@ from torch import Tensor
 
 from gsim3d.dynamics.clouds import newest_clouds, with_field
 from gsim3d.dynamics.matter import Matter
-from gsim3d.dynamics.rigid import RigidFit, onward_at
+from gsim3d.dynamics.rigid import LITTLE, RigidFit, onward_at
 from gsim3d.dynamics.state import rotate_left
 from gsim3d.types import Particles, take_runs
-
-STIFFNESS = 1e-5  # of fits to known paths: what it takes of a spin it takes in every step
 
 
 def momentum(history: Particles, length: float, grid_size: float, matter: Matter | None = None) -> Tensor:
@@ -46,7 +44,7 @@ def _rigid(matter: Matter, own: Tensor, length: float) -> tuple[Tensor, Tensor]:
 def _of_windows(matter: Matter, moved: Tensor, length: float) -> tuple[Tensor, Tensor, Tensor]:
     """How far each window moved, its spin (rad) and its centre, [B, G, 3] each, of rows that moved by ``moved``."""
     with torch.no_grad():
-        body = RigidFit(matter.window, matter.samples.places, length, STIFFNESS)
+        body = RigidFit(matter.window, matter.samples.places, length, LITTLE)
     return *body.fit(matter.samples.take(matter.padded(moved))), body.centre
 
 

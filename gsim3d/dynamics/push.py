@@ -1,44 +1,69 @@
-"""What the background does to a body: it pushes the rows near it, and their body takes the push as one."""
+"""What the background does to bodies: it stops rows that would get behind it, and nothing else moves a body as one."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from gsim3d.dynamics.contact import Beside
 from gsim3d.dynamics.matter import Matter
-from gsim3d.dynamics.rigid import RigidFit, solved
+from gsim3d.dynamics.rigid import LITTLE, RigidFit
+from gsim3d.types import Particles, take_runs
 
-STIFFNESS = 1e-5  # of windows against turning: what it takes of a spin it takes in every step
-LEAST = 1e-4  # share of the matter around a row: a smaller one near the background is pushed less
+REACHING = 4  # power of the nearness to the background, which is as much as a row is pushed by it
+LEAST = 1e-6  # metres a step along a surface: slower rows are held
 
 
-def pushed(changes: Tensor, near: Tensor, matter: Matter | None, length: float, inertia: Tensor) -> Tensor:
-    """[N, 3], ``changes`` of how rows move with the laws of motion kept: what rows of a body do to each other changes
-    neither its momentum nor its spin, and a push does both, by where it is.
+class Pushes:
+    """The background near the rows of ``matter``, the newest ones of ``history``.
 
-    Of the changes of rows in a window their own rigid part goes. In its place comes what a push gives that changes the
-    window's velocity by the mean change of its rows near the background: that velocity, and the spin of it about the
-    centre.
-
-    Args:
-        changes: [N, 3] metres a step, of the rows of the newest clouds, packed.
-        near: [N, 1] from 0 to 1, how much each counts as near the background.
-        matter: of them, with windows of ``length`` metres, about the radius of a body; None: there are no rows.
-        inertia: of bodies, over that of the rows that are seen of them (a number).
-    Returns:
-        Gradients: of ``changes`` and ``inertia``.
+    length: metres, of the windows of ``matter``, about the radius of a body.
+    friction: most of what a stopped row loses along a surface, over what it loses towards it (a number).
+    skin: metres over the background at which rows stop: they are seen inside of their bodies (a number).
     """
-    if matter is None:
-        return changes
-    with torch.autocast(changes.device.type, enabled=False):
-        places, window = matter.samples.places, matter.window
-        body = RigidFit(window, places, length, STIFFNESS)
-        sampled = matter.samples.take(matter.padded(changes))
-        moved, spin = body.fit(sampled)
-        touching = window * matter.samples.take(matter.padded(near)).mT
-        touching = touching / touching.sum(2, keepdim=True).clamp(min=LEAST)
-        push = touching @ sampled
-        torque = touching @ torch.linalg.cross(places, sampled) - torch.linalg.cross(body.centre, push)
-        turn = solved(body.inertia, torque) / inertia
-        moved, spin, centre = matter.lattice.at(matter.places, push - moved, turn - spin, body.centre)
-        return changes + matter.packed(moved + torch.linalg.cross(spin, matter.places - centre))
+
+    def __init__(
+        self, history: Particles, matter: Matter, beside: Beside, length: float, friction: Tensor, skin: Tensor
+    ):
+        self._matter, self._friction, self._near = matter, friction, beside.contact[:, -1:] ** REACHING
+        with torch.no_grad(), torch.autocast(history.means.device.type, enabled=False):
+            self._body = RigidFit(matter.window, matter.samples.places, length, LITTLE)
+            (self._centre,) = matter.lattice.at(matter.places, self._body.centre)
+        height, self._normal = beside.surface(self._centre)
+        newest = take_runs(history.means, history.clouds.row_runs(matter.newest))
+        # A row that is stopped comes to the same height wherever it was.
+        self._height = height + ((newest - newest.detach()) * self._normal).sum(1, keepdim=True) - skin
+
+    def moves(self, onward: Tensor, changes: Tensor, back: Tensor) -> Tensor:
+        """[N, 3] metres, how rows of the newest clouds move in a step.
+
+        What rows of a body do to each other changes neither its momentum nor its spin: of that their rigid part in a
+        window goes. ``back`` is of this kind, and ``changes`` as far as a row is not near the background. Then rows
+        that would get behind it stop at its surface, and slide along it as far as friction lets them.
+
+        Args:
+            onward: [N, 3], what happens by itself.
+            changes: [N, 3], what is predicted beside it.
+            back: [N, 3], towards the shape that bodies had.
+        Gradients: of all of them, of friction and skin, and of places as far as they tell where rows stop.
+        """
+        with torch.autocast(onward.device.type, enabled=False):
+            inner = (1 - self._near) * changes + back
+            moves = onward + self._near * changes + inner - self._as_one(inner)
+            return moves + self._stopped(moves)
+
+    def _as_one(self, moves: Tensor) -> Tensor:
+        """The rigid part of ``moves`` of the rows in the window around each row."""
+        matter = self._matter
+        found = self._body.fit(matter.samples.take(matter.padded(moves)))
+        moved, spin = matter.lattice.at(matter.places, *found)
+        return matter.packed(moved + torch.linalg.cross(spin, matter.places - self._centre))
+
+    def _stopped(self, moves: Tensor) -> Tensor:
+        """What is to be added to ``moves``. A row that is behind the surface may stay there."""
+        into = (moves * self._normal).sum(1, keepdim=True)
+        stop = torch.minimum((-into).clamp(min=0), (-self._height - into).clamp(min=0))
+        along = moves - into * self._normal
+        speed = along.square().sum(1, keepdim=True).clamp(min=LEAST**2).sqrt()
+        held = (self._friction.clamp(min=0) * stop / speed).clamp(max=1)
+        return stop * self._normal - held * along

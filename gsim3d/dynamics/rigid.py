@@ -13,6 +13,7 @@ SQUARINGS = 10  # of a matrix: what is left is its largest eigenvalue's, to the 
 NODES = 6  # of the lattice that spans the movable rows of a scene, along each axis
 SMALLEST = 1e-30  # of what is divided by
 STIFFNESS = 1e-3  # against turning, relative to the window's size: a point and a line do not turn
+LITTLE = 1e-5  # likewise, of paths that are known: what it takes of a spin it takes in every step
 
 
 class Lattice:

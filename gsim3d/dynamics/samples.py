@@ -142,6 +142,11 @@ class Samples:
         """[B, C] of [B, S, C], values of the entries."""
         return torch.where(self.known[:, :, None], values, 0).sum(1) / self.n.clamp(1, SAMPLES)[:, None]
 
+    def crowd(self, length: float) -> Tensor:
+        """[B, S], how many samples are around each in a Gaussian window of ``length`` metres, itself one of them."""
+        near = (squares(self.places, self.places) * (-0.5 / length**2)).clamp(min=FAINTEST).exp()
+        return (near * self.known[:, None]).sum(2).clamp(min=1)
+
 
 class _Taken(torch.autograd.Function):
     """Rows ``at``, of which each is taken once: row i as sample k[i], where ``is_sample``. So its gradient is taken,

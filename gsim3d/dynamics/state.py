@@ -13,7 +13,7 @@ from torch import Tensor
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import CONTACT_CHANNELS
 from gsim3d.dynamics.deformation import DEFORMATION_CHANNELS
-from gsim3d.dynamics.flight import Flight
+from gsim3d.dynamics.flight import BACK, STIFF_BACK, Flight
 from gsim3d.harmonics import degree_damping
 from gsim3d.layers import widened
 from gsim3d.rotations import unit_quats
@@ -26,7 +26,6 @@ OWN_CHANNELS = 3
 LONGEST_WAVE = 4.0  # in units of position_length; each further wave is half as long
 ONWARD = 1  # of the motions that gsim3d.dynamics.motion tells, the one that goes on if nothing is predicted
 MOST_KEPT = 2.0  # how much more or less of a motion may go on
-BACK = 0.3  # share of the way back to its shape that a row goes in a step if nothing is predicted: else shapes dissolve
 LIGHT_CHANNELS = 3  # of colours
 MOST_LIGHT = 2.0  # logarithm of how much more or less light there may be
 FEATURES = ("dynamic_latents", "sh", "light")  # that rows which are held keep
@@ -270,16 +269,19 @@ class StateLayout:
             changes = changes.cumsum(0)
         if drift is not None:
             kept = bounded(kept / MOST_KEPT, MOST_KEPT).unflatten(2, drift.shape[1:])
-            if flight is not None:
-                changes = flight.changed(changes)
-                of_motions = flight.near[:, :, None].expand(-1, drift.shape[1] - 1, -1)
-                kept = kept * torch.cat([of_motions, torch.ones_like(of_motions[:, :1])], 1)
             ahead = torch.arange(1, 1 + changes.shape[0], device=drift.device, dtype=drift.dtype)[:, None, None]
-            onward = ahead * (drift[:, ONWARD] + (kept * drift).sum(2))
-            if self.config.deformation:
-                onward = onward + (1 - (1 - BACK) ** ahead) * drift[:, -1]
+            if flight is not None:
+                by_itself = STIFF_BACK if self.config.pushes else BACK
+                shares = (kept * drift)[0]
+                back = by_itself * drift[:, -1] + shares[:, -1]
+                changes = flight.moves(drift[:, ONWARD], changes[0], shares[:, :-1].sum(1), back)[None]
+            else:
+                onward = ahead * (drift[:, ONWARD] + (kept * drift).sum(2))
+                if self.config.deformation:
+                    onward = onward + (1 - (1 - BACK) ** ahead) * drift[:, -1]
+                changes = changes + onward
             most = math.inf if self.config.max_step is None else self.config.max_step
-            changes = torch.minimum(torch.maximum(changes + onward, -most * ahead), most * ahead)
+            changes = torch.minimum(torch.maximum(changes, -most * ahead), most * ahead)
         return hold(share, newest, self._in_range(name, newest + share * changes))
 
     @property

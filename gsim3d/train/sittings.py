@@ -42,7 +42,7 @@ FORMAT = 1
 SEEN = "dynamics.net.stem.conv.weight"  # what the network reads of motion are its last columns
 TOLD = "dynamics.net.stem.told.weight"
 LIGHTS, DIMMING, STRENGTH = "dynamics.lights", "dynamics.dimming", "dynamics.strength"
-GRAVITY, INERTIA = "dynamics.gravity", "dynamics.inertia"
+GRAVITY, FRICTION, SKIN = "dynamics.gravity", "dynamics.friction", "dynamics.skin"
 PREDICTED = ("dynamics.net.head.fc2.weight", "dynamics.net.head.fc2.bias")
 PLACES = 3  # rows that predict places where no motion is seen
 WEIGHTS, DIFFERENCE, SQUARES = "weights", "difference", "squares"
@@ -149,9 +149,11 @@ def begin_with(trainer: Trainer, path: str | Path) -> dict[str, Any]:
     if STRENGTH in own and STRENGTH not in given:
         anew |= {"lights", "light"}
         given = {key: value for key, value in given.items() if key not in (LIGHTS, DIMMING)}
+    if FRICTION in own and FRICTION not in given:
+        anew.add("means")
     if told:
         given[TOLD] = _told(given.get(TOLD), was_told, told, own[TOLD], anew)
-    for key in (LIGHTS, DIMMING, STRENGTH, GRAVITY, INERTIA):
+    for key in (LIGHTS, DIMMING, STRENGTH, GRAVITY, FRICTION, SKIN):
         if key in own:
             given.setdefault(key, own[key])
     after = dict(trainer.simulator.dynamics.layout.outputs)

@@ -1,4 +1,4 @@
-"""What the background does to rows near it their body takes as one; what its rows do to each other does not move it."""
+"""The background stops what would get behind it; what the rows of a body do to each other does not move it as one."""
 
 import dataclasses
 
@@ -6,121 +6,217 @@ import pytest
 import torch
 
 from gsim3d.dynamics import DynamicsConfig, rollout
+from gsim3d.dynamics.contact import FIRM, Beside
 from gsim3d.dynamics.matter import Matter
-from gsim3d.dynamics.push import pushed
+from gsim3d.dynamics.push import Pushes
 from gsim3d.types import DYNAMIC
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import batch, make_dynamics
-from tests.dynamics.test_flight import CELL, FLYING, RADIUS, ball
+from tests.dynamics.test_flight import CELL, CONTACT, FALL, FLYING, RADIUS, ball
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 WIDE = 5.0  # metres: a window of all rows alike
 PUSHED = dataclasses.replace(FLYING, pushes=True)
-ONE = torch.ones(())
+FRICTION, SKIN = torch.tensor(1.0), torch.tensor(0.0)
 
 
-def touched(history):
-    """[N, 1], the lowest tenth of the ball's radius."""
-    return ((history.activity == DYNAMIC) & (history.means[:, 2] < 1.0 + 0.1 * RADIUS)).to(history.means)[:, None]
+def pushes(history, length=WIDE, friction=FRICTION, skin=SKIN):
+    matter = Matter.of(history, CELL, length, evenly=True)
+    beside = Beside(history, CONTACT, matter, FIRM)
+    return Pushes(history, matter, beside, length, *(x.to(history.means) for x in (friction, skin)))
 
 
-def shares(history, changes, inertia=ONE, length=WIDE):
-    """How ``changes`` of the ball are shared, and where its rows are from its centre."""
-    found = pushed(changes, touched(history), Matter.of(history, CELL, length), length, inertia)
-    moves = history.activity == DYNAMIC
-    places = history.means[moves] - history.means[moves].mean(0)
-    return found[moves], places
+def moves(history, onward=0.0, changes=0.0, back=0.0, **options):
+    """[N, 3], of what is given for rows that move; for all of them alike where it is a vector."""
+    moving = (history.activity == DYNAMIC)[:, None]
+    rows = [torch.where(moving, torch.as_tensor(x).to(history.means), 0) for x in (onward, changes, back)]
+    return pushes(history, **options).moves(*(x.expand(history.n_rows, 3) for x in rows))
 
 
 def noise(history, seed=0):
     return 0.01 * torch.randn(history.n_rows, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def test_what_rows_do_to_each_other_neither_moves_nor_turns_their_body():
-    history = ball(0.0)
-    found, places = shares(history, torch.where(touched(history) > 0, 0, noise(history) + 0.02))
+def moving_places(history):
+    moving = history.activity == DYNAMIC
+    return moving, history.means[moving] - history.means[moving].mean(0)
+
+
+def weights(history, moving):
+    """How much surface each row that moves stands for, as windows count it."""
+    return Matter.of(history, CELL, WIDE, evenly=True).window[0, 0, : int(moving.sum()), None]
+
+
+@pytest.mark.parametrize("what", ["changes", "back"])
+def test_what_rows_do_to_each_other_neither_moves_nor_turns_their_body(what):
+    history = ball(1.0)
+    moving, places = moving_places(history)
+    found, share = moves(history, **{what: noise(history) + 0.02})[moving], weights(history, moving)
     assert found.abs().max() > 0.01
-    assert found.mean(0).abs().max() < 1e-4 and torch.linalg.cross(places, found).mean(0).abs().max() < 1e-5
+    assert (share * found).sum(0).abs().max() < 1e-4
+    assert (share * torch.linalg.cross(places - (share * places).sum(0), found)).sum(0).abs().max() < 1e-5
 
 
-@pytest.mark.parametrize("push", [(0.0, 0.0, 0.03), (0.02, 0.0, 0.0), (0.01, -0.01, 0.02)])
-@pytest.mark.parametrize("inertia", [1.0, 0.6])
-def test_a_push_moves_and_turns_the_body_by_where_it_is(push, inertia):
-    history, push = ball(0.0), torch.tensor(push)
-    found, places = shares(history, touched(history) * push, torch.tensor(inertia))
-    assert_close_relative_to_max(found.mean(0), push, 0.05)
-    momentum = torch.linalg.cross(places, found).mean(0)
-    lever = places[(touched(history)[history.activity == DYNAMIC] > 0)[:, 0]].mean(0)
-    assert_close_relative_to_max(momentum, torch.linalg.cross(lever, push) / inertia, 0.05)
-    # but for what the pushed rows do beside the others, all rows go on as one
-    others = (touched(history)[history.activity == DYNAMIC] == 0)[:, 0]
-    turn = torch.linalg.lstsq(torch.stack([torch.linalg.cross(e.expand_as(places), places) for e in torch.eye(3)], 2)
-                              .flatten(0, 1), (found - found.mean(0)).flatten()[:, None]).solution[:, 0]  # fmt: skip
-    as_one = push + torch.linalg.cross(turn.expand_as(places), places)
-    assert (found - as_one)[others].norm(dim=1).mean() < 0.15 * push.norm()
+def test_what_is_predicted_near_the_ground_moves_and_turns_the_body_by_where_it_is():
+    history, push = ball(0.0), torch.tensor([0.02, 0.0, 0.01])
+    moving, places = moving_places(history)
+    found = torch.stack([moves(history, changes=x)[moving] for x in (0.0, push)]).diff(dim=0)[0]
+    near = pushes(history)._near[moving]
+    share = weights(history, moving)
+    # of all rows alike what is near the ground is kept, and the rest is none
+    expected = near * push
+    assert_close_relative_to_max((share * found).sum(0), (share * expected).sum(0), 0.05)
+    spin = (share * torch.linalg.cross(places, found)).sum(0)
+    assert_close_relative_to_max(spin, (share * torch.linalg.cross(places, expected)).sum(0), 0.05)
+
+
+@pytest.mark.parametrize("skin", [0.0, 0.02])
+def test_rows_stop_at_the_ground_and_stick_to_it(skin):
+    """A ball that falls by 8 cm and comes from 2 cm above."""
+    history = ball(0.02)
+    moving, _ = moving_places(history)
+    found = moves(history, onward=[0.03, 0.0, -0.08], skin=torch.tensor(skin))[moving]
+    height = (history.means[moving] - 1.0)[:, 2]
+    stopped = height < 0.08 + skin
+    assert 2 < stopped.sum() < 0.6 * len(height)
+    assert_close_relative_to_max(height[stopped] + found[stopped, 2], torch.full_like(height[stopped], skin), 2e-3)
+    strong = 0.08 + skin - height > 0.03  # friction is as large as what stops them
+    assert strong.any() and found[strong, 0].abs().max() < 1e-3
+    assert_close_relative_to_max(found[~stopped], torch.tensor([0.03, 0.0, -0.08]).expand_as(found[~stopped]), 1e-4)
+
+
+def test_friction_takes_as_much_of_what_slides_as_it_may():
+    history = ball(0.0)
+    moving, _ = moving_places(history)
+    lowest = history.means[moving, 2].argmin()
+    height = history.means[moving, 2][lowest].item() - 1.0
+    for friction in (0.0, 0.5, 4.0):
+        found = moves(history, onward=[0.04, 0.0, -0.06], friction=torch.tensor(friction))[moving][lowest]
+        left = max(0.0, 0.04 - friction * (0.06 - height))
+        assert found[0].item() == pytest.approx(left, abs=2e-3) and found[2].item() == pytest.approx(-height, abs=2e-3)
+
+
+def test_what_got_behind_the_ground_may_stay_and_come_back():
+    history = ball(-0.03)
+    moving, _ = moving_places(history)
+    lowest = history.means[moving, 2].argmin()
+    down, up = (moves(history, onward=[0.0, 0.0, z])[moving][lowest, 2] for z in (-0.02, 0.02))
+    assert down.abs() < 1e-3 and up.item() == pytest.approx(0.02, abs=1e-4)
+
+
+def test_untrained_a_ball_falls_is_squeezed_and_jumps():
+    dynamics = make_dynamics(PUSHED)
+    torch.nn.init.zeros_(dynamics.net.head.fc2.weight), torch.nn.init.zeros_(dynamics.net.head.fc2.bias)
+    history = ball(0.1, (0.01, 0.0, -0.04))
+    moving, _ = moving_places(history)
+    steps = [history, *rollout(dynamics, history, 16, max_steps=2)]
+    heights = torch.stack([step.means[moving, 2] - 1.0 for step in steps])
+    sizes = heights.amax(1) - heights.amin(1)
+    centre = heights.mean(1)
+    assert heights.min() > -0.01
+    assert sizes.min() < 0.85 * 2 * RADIUS and sizes[-1] > 0.9 * 2 * RADIUS
+    lowest = centre.argmin()
+    assert 2 < lowest < 12 and centre[-1] > centre[lowest] + 0.05
+    assert centre[-1] < centre[0]  # what it had at first it does not get back
+    assert_close_relative_to_max(centre[1] - centre[0], torch.tensor(-0.04 + FALL[2]), 0.02)
 
 
 def test_rows_that_cannot_move_keep_what_they_were_given_and_scenes_do_not_meet():
     one, other = ball(0.0), ball(0.0, n=200, seed=3)
     both = batch([one, other])
     changes = [noise(history, seed) for seed, history in enumerate((one, other))]
-    found = pushed(torch.cat(changes), touched(both), Matter.of(both, CELL, 0.2), 0.2, ONE)
-    alone = [pushed(c, touched(h), Matter.of(h, CELL, 0.2), 0.2, ONE) for c, h in zip(changes, (one, other))]
-    assert_close_relative_to_max(found, torch.cat(alone), 1e-5)
+    found = pushes(both, 0.2).moves(0 * torch.cat(changes), torch.cat(changes), 0 * torch.cat(changes))
+    alone = [pushes(h, 0.2).moves(0 * c, c, 0 * c) for c, h in zip(changes, (one, other))]
+    assert_close_relative_to_max(found, torch.cat(alone), 1e-4)
     rests = both.activity != DYNAMIC
     assert_same_bits(found[rests], torch.cat(changes)[rests])
-    assert_same_bits(pushed(changes[0], touched(one), None, 0.2, ONE), changes[0])
 
 
 def test_gradients():
-    history = dataclasses.replace(ball(0.0, n=20, ground=False), velocity=None, reference=None)
+    history = dataclasses.replace(ball(0.01, n=20), velocity=None, reference=None)
     history = dataclasses.replace(history, means=history.means.double())
-    matter, near = Matter.of(history, CELL, 0.3), 0.5 * touched(history) + 0.1
-    changes, inertia = noise(history).double().requires_grad_(), torch.tensor(0.7, dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda c, i: pushed(c, near, matter, 0.3, i), (changes, inertia))
+    moving = history.activity == DYNAMIC
+    rows = [torch.where(moving[:, None], noise(history, seed).double(), 0)[moving] for seed in range(3)]
+    rows[0] = rows[0] + torch.tensor([0.02, 0.01, -0.03])
+    numbers = [torch.tensor(x, dtype=torch.float64) for x in (0.7, 0.01)]
+    inputs = [x.requires_grad_() for x in (*rows, *numbers)]
+
+    def found(onward, changes, back, friction, skin):
+        at = moving.nonzero()[:, 0]
+        full = [torch.zeros_like(history.means).index_put((at,), x) for x in (onward, changes, back)]
+        return pushes(history, 0.3, friction, skin).moves(*full)[moving]
+
+    assert torch.autograd.gradcheck(found, inputs)
+
+
+def test_where_rows_stop_does_not_follow_where_they_were():
+    history = ball(0.02)
+    means = history.means.clone().requires_grad_()
+    history = dataclasses.replace(history, means=means)
+    moving = history.activity == DYNAMIC
+    found = (means + moves(history, onward=[0.0, 0.0, -0.05]))[moving]
+    lowest = found[:, 2].argmin()
+    (grad,) = torch.autograd.grad(found[lowest, 2], means)
+    assert grad[moving][lowest].abs().max() < 1e-2
 
 
 def test_in_flight_nothing_pushes():
     history = ball(2.0, (0.03, 0.01, 0.02), (0.0, 0.05, 0.0))
-    one, other = (rollout(make_dynamics(config), history, 5, max_steps=2)[-1] for config in (PUSHED, FLYING))
-    moves = history.activity == DYNAMIC
-    assert_close_relative_to_max((one.means - history.means)[moves], (other.means - history.means)[moves], 2e-3)
+    one, other = (make_dynamics(config) for config in (PUSHED, FLYING))
+    for dynamics in (one, other):
+        torch.nn.init.zeros_(dynamics.net.head.fc2.weight), torch.nn.init.zeros_(dynamics.net.head.fc2.bias)
+    ways = [(rollout(dynamics, history, 5, max_steps=2)[-1].means - history.means) for dynamics in (one, other)]
+    moving = history.activity == DYNAMIC
+    assert_close_relative_to_max(ways[0][moving], ways[1][moving], 0.02)
 
 
-def test_on_the_ground_a_body_is_pushed_and_weights_learn_from_it():
-    history = ball(0.0, (0.03, 0.0, 0.0))
-    one, other = make_dynamics(PUSHED), make_dynamics(FLYING)
-    other.load_state_dict({k: v for k, v in one.state_dict().items() if k != "inertia"})
-    means = [rollout(dynamics, history, 1, max_steps=2)[0].means for dynamics in (one, other)]
-    moves = history.activity == DYNAMIC
-    assert (means[0] - means[1])[moves].abs().max() > 1e-4
-    assert_same_bits(means[0][~moves], means[1][~moves])
-    means[0].square().sum().backward()
-    assert one.inertia.grad.abs() > 0 and one.net.head.fc2.weight.grad.any()
+def test_weights_learn_from_what_the_ground_does():
+    history = ball(0.0, (0.03, 0.0, -0.02))
+    dynamics = make_dynamics(PUSHED)
+    (step,) = rollout(dynamics, history, 1, max_steps=2)
+    step.means.square().sum().backward()
+    for parameter in (dynamics.friction, dynamics.skin, dynamics.gravity, dynamics.net.head.fc2.weight):
+        assert parameter.grad.isfinite().all() and parameter.grad.abs().sum() > 0
+
+
+def test_where_nothing_is_nothing_happens():
+    history = ball(0.02)
+    nobody = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
+    assert make_dynamics(PUSHED).flight(nobody).pushes is None
+    found = moves(ball(0.0, ground=False), onward=[0.0, 0.0, -0.05])
+    assert_close_relative_to_max(found, torch.tensor([0.0, 0.0, -0.05]).expand_as(found), 1e-6)
+
+
+def test_what_is_hardly_seen_stops_nobody():
+    history = ball(0.02)
+    moving, _ = moving_places(history)
+    for opacity, stops in ((FIRM - 0.01, False), (FIRM + 0.01, True)):
+        opacities = torch.where(moving.reshape(history.opacities.shape), history.opacities, opacity)
+        found = moves(dataclasses.replace(history, opacities=opacities), onward=[0.0, 0.0, -0.08])[moving]
+        assert (found[:, 2] > -0.07).any() == stops
 
 
 def test_a_gpu_pushes_the_same(devices):
-    history = ball(0.0)
-    changes, near = noise(history), touched(history)
+    history = ball(0.01)
     expected, actual, again = (
-        pushed(changes.to(d), near.to(d), Matter.of(history.to(d), CELL, 0.2), 0.2, ONE.to(d)).cpu()
+        moves(history.to(d), onward=[0.01, 0.0, -0.03], changes=noise(history).to(d), length=0.2).cpu()
         for d in (*devices, devices[1])
     )
-    assert_close_relative_to_max(actual, expected, 1e-4)
+    assert_close_relative_to_max(actual, expected, 1e-3)
     assert_same_bits(again, actual)
 
 
 def test_compiled_it_is_the_same(device):
     history = ball(0.0, n=60).to(device)
-    changes, near = noise(history.to("cpu")).to(device), touched(history)
+    changes = noise(history.to("cpu")).to(device)
     history.clouds
 
-    def found(changes, near, history):
-        return pushed(changes, near, Matter.of(history, CELL, 0.2), 0.2, ONE.to(changes))
+    def found(changes, history):
+        return pushes(history, 0.2).moves(changes, changes, changes)
 
-    expected = found(changes, near, history)
-    assert_close_relative_to_max(torch.compile(found, fullgraph=True)(changes, near, history), expected, 1e-4)
+    expected = found(changes, history)
+    assert_close_relative_to_max(torch.compile(found, fullgraph=True)(changes, history), expected, 1e-3)
 
 
 def test_pushes_need_gravity():

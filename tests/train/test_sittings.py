@@ -391,7 +391,7 @@ def test_a_run_whose_bodies_fly_and_are_lit_begins_with_what_neither_knew(store,
     """Nothing is predicted of light at first; latents, and what is predicted of places, are what they were."""
     told = {"motion_length": 0.3, **ALL_BUT_LIGHTS, "lights": ((0.0, 0.3, 1.0),)}
     known = saved_with_a_head(dataclasses.replace(CONFIG, model={"dynamics": told}), store, tmp_path)
-    new = {**told, "surfaces": True, "gravity": (0.0, 0.0, -0.01), "pushes": True}
+    new = {**told, "surfaces": True, "gravity": (0.0, 0.0, -0.01)}
     trainer = SittingTrainer(dataclasses.replace(CONFIG, model={"dynamics": new}), store, tmp_path / "run", "cpu")
     begin_with(trainer, known)
     given, own = restore(known).simulator, trainer.simulator.eval()
@@ -413,6 +413,23 @@ def test_a_run_whose_bodies_fly_and_are_lit_begins_with_what_neither_knew(store,
     begin_with(trainer, again)
     for key, value in restore(again).simulator.state_dict().items():
         assert torch.equal(trainer.simulator.state_dict()[key], value), key
+
+
+def test_a_run_whose_bodies_are_pushed_begins_with_nothing_predicted_of_places(store, tmp_path):
+    told = {"motion_length": 0.3, **ALL_BUT_LIGHTS, "gravity": (0.0, 0.0, -0.01)}
+    known = saved_with_a_head(dataclasses.replace(CONFIG, model={"dynamics": told}), store, tmp_path)
+    config = dataclasses.replace(CONFIG, model={"dynamics": {**told, "pushes": True}})
+    trainer = SittingTrainer(config, store, tmp_path / "run", "cpu")
+    begin_with(trainer, known)
+    own, given = (simulator.state_dict() for simulator in (trainer.simulator, restore(known).simulator))
+    (_, n_looks), (name, n_places) = trainer.simulator.dynamics.layout.outputs
+    assert name == "means"
+    for key in ("dynamics.net.head.fc2.weight", "dynamics.net.head.fc2.bias"):
+        looks, places = own.pop(key).split([n_looks, n_places])
+        assert not places.any() and given[key][n_looks:].any()
+        assert torch.equal(looks, given.pop(key)[:n_looks])
+    assert own.pop("dynamics.friction") == 1 and own.pop("dynamics.skin") > 0
+    assert own.keys() == given.keys() and all(torch.equal(own[key], given[key]) for key in own)
 
 
 def test_recipes_are_sound():
