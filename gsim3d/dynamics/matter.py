@@ -13,6 +13,7 @@ from gsim3d.types import FROZEN, Particles
 
 EVEN = 0.15  # of the windows' length: standard deviation of those in which rows are counted
 
+
 class Matter:
     """The rows that may move, and samples of them. No gradients.
 

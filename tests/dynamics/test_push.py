@@ -222,3 +222,15 @@ def test_compiled_it_is_the_same(device):
 def test_pushes_need_gravity():
     with pytest.raises(ValueError, match="pushes needs gravity"):
         DynamicsConfig(**{**dataclasses.asdict(PUSHED), "quirks": PUSHED.quirks, "gravity": None})
+
+
+def test_rows_count_as_much_as_the_surface_around_them():
+    """Of the lower half of a ball one row in five is seen."""
+    history = ball(1.0, n=800)
+    moving, _ = moving_places(history)
+    height = history.means[:, 2] - 2.0 - RADIUS
+    seen = ~moving | (height > 0) | (torch.arange(history.n_rows) % 5 == 0)
+    history, height = history.select_rows(seen), height[seen & moving]
+    windows = [Matter.of(history, CELL, 0.4, evenly=even).window[0, :, : len(height)] for even in (False, True)]
+    alike, evenly = ((window @ height).mean() for window in windows)
+    assert alike > 0.2 * RADIUS and evenly.abs() < 0.5 * alike
