@@ -211,7 +211,7 @@ THROWN_UP = {"drop_height": (0.05, 0.5), "lift": (0.5, 2.5)}
 RECIPES = {
     # Bodies fall for half a second, jump, and then hardly move. Rollouts begin before they land: one that is squeezed
     # where a rollout begins looks like one that was made so. The ground is seen with more particles than elsewhere, as
-    # more than half of what encoded images miss is at the edges of its squares. All graphs together take 83 GiB; where
+    # more than half of what encoded images miss is at the edges of its squares. All graphs together take 81 GiB; where
     # a GPU has less they share what there is.
     "elastic": _recipe(
         "elastic",

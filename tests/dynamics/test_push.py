@@ -71,6 +71,15 @@ def test_what_is_predicted_near_the_ground_moves_and_turns_the_body_by_where_it_
     assert_close_relative_to_max(spin, (share * torch.linalg.cross(places, expected)).sum(0), 0.05)
 
 
+def test_what_is_predicted_of_a_row_is_counted_once():
+    history = ball(0.0)
+    moving, _ = moving_places(history)
+    lowest, push = history.means[moving, 2].argmin(), torch.tensor([0.0, 0.0, 0.02])
+    row = torch.zeros(history.n_rows, 1).index_put((moving.nonzero()[lowest, 0],), torch.tensor(1.0))
+    found = moves(history, changes=row * push)[moving][lowest]
+    assert_close_relative_to_max(found, push, 0.05)
+
+
 @pytest.mark.parametrize("skin", [0.0, 0.02])
 def test_rows_stop_at_the_ground_and_stick_to_it(skin):
     """A ball that falls by 8 cm and comes from 2 cm above."""
