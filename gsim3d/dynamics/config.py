@@ -61,9 +61,10 @@ class DynamicsConfig:
             and ``contact_length``: what touches nothing frozen flies on, turns and falls, whatever is predicted, and
             encoded rows in flight have the velocity of their last step (:mod:`gsim3d.dynamics.flight`). None: what is
             predicted counts everywhere.
-        pushes: with ``gravity``: the background stops rows that would get behind it, with friction, and else changes
-            what those do that are near it; what rows of a body do to each other changes neither its momentum nor its
-            spin (:mod:`gsim3d.dynamics.push`).
+        pushes: with ``gravity``: the background stops rows that would get behind it, with friction; what rows of a body
+            do to each other changes neither its momentum nor its spin (:mod:`gsim3d.dynamics.push`). Of places nothing
+            is predicted but shares of the motions that rows are told and of the way back to their shape: how damped and
+            how stiff bodies are, and not where they go.
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.
@@ -204,6 +205,11 @@ class DynamicsConfig:
     @property
     def n_stages(self) -> int:
         return len(self.encoder_channels)
+
+    @property
+    def place_channels(self) -> int:
+        """Channels of what is predicted of places beside shares of motions."""
+        return 0 if self.pushes else 3
 
     @property
     def is_asymmetric(self) -> bool:

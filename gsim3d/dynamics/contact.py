@@ -28,7 +28,7 @@ class Beside:
     """
 
     def __init__(self, history: Particles, length: float, matter: Matter | None, opacity: float = SOLID):
-        self._matter, self._length = matter, length
+        self._matter, self.length = matter, length
         if matter is None:
             self.contact = history.means.new_zeros(0, CONTACT_CHANNELS)
             return
@@ -49,7 +49,7 @@ class Beside:
         normal [N, 3]. Bodies are in front of it: ``centre`` [B, m, 3], of the body of each row of ``matter``, from
         ``matter.here``. 0 of rows that do not move, and where nothing is frozen."""
         with torch.no_grad(), torch.autocast(self._places.device.type, enabled=False):
-            middle, normal = planes(self._window, self._rests.places, WINDOW * self._length)
+            middle, normal = planes(self._window, self._rests.places, WINDOW * self.length)
             ahead = ((centre + self._matter.here - self._here - middle) * normal).sum(2, keepdim=True)
             normal = torch.where(ahead < 0, -normal, normal)
             height = ((self._places - middle) * normal).sum(2, keepdim=True)

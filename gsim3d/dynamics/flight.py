@@ -22,7 +22,7 @@ class Flight:
     near: [N, 1], how far shares of motions count, from 0 to 1: as far as what is frozen is near.
     touch: [N, 1], of :func:`touching`.
     gravity: [3] metres a step, of every step.
-    pushes: what the background does; None: that is predicted.
+    pushes: what the background does, where nothing but shares is predicted; None: that is predicted.
     """
 
     near: Tensor
@@ -45,7 +45,7 @@ class Flight:
         """
         if self.pushes is None:
             return onward + self.falls + self.touch * changes + self.near * motions + back
-        return self.pushes.moves(onward + self.gravity, self.touch * (changes + motions), back)
+        return self.pushes.moves(onward + self.gravity, self.touch * motions, back)
 
     @property
     def falls(self) -> Tensor:

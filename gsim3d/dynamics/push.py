@@ -25,31 +25,34 @@ class Pushes:
     def __init__(
         self, history: Particles, matter: Matter, beside: Beside, length: float, friction: Tensor, skin: Tensor
     ):
-        self._matter, self._friction, self._near = matter, friction, beside.contact[:, -1:] ** REACHING
+        self._matter, self._friction = matter, friction
         with torch.no_grad(), torch.autocast(history.means.device.type, enabled=False):
             self._body = RigidFit(matter.window, matter.samples.places, length, LITTLE)
             (self._centre,) = matter.lattice.at(matter.places, self._body.centre)
         height, self._normal = beside.surface(self._centre)
         newest = take_runs(history.means, history.clouds.row_runs(matter.newest))
-        # A row that is stopped comes to the same height wherever it was.
-        self._height = height + ((newest - newest.detach()) * self._normal).sum(1, keepdim=True) - skin
+        # For gradients: a row that is stopped comes to the same height wherever it was, and a higher one is less near.
+        raised = ((newest - newest.detach()) * self._normal).sum(1, keepdim=True)
+        self._height = height + raised - skin
+        self._near = beside.contact[:, -1:] ** REACHING * (1 - REACHING / beside.length**2 * height * raised)
 
-    def moves(self, onward: Tensor, changes: Tensor, back: Tensor) -> Tensor:
+    def moves(self, onward: Tensor, motions: Tensor, back: Tensor) -> Tensor:
         """[N, 3] metres, how rows of the newest clouds move in a step.
 
         What rows of a body do to each other changes neither its momentum nor its spin: of that their rigid part in a
-        window goes. ``back`` is of this kind, and ``changes`` as far as a row is not near the background. Then rows
+        window goes. ``back`` is of this kind, and ``motions`` as far as a row is not near the background. Then rows
         that would get behind it stop at its surface, and slide along it as far as friction lets them.
 
         Args:
             onward: [N, 3], what happens by itself.
-            changes: [N, 3], what is predicted beside it.
+            motions: [N, 3], what of motions is kept beside it.
             back: [N, 3], towards the shape that bodies had.
-        Gradients: of all of them, of friction and skin, and of places as far as they tell where rows stop.
+        Gradients: of all of them, of friction and skin, and of places as far as they tell where rows stop and how near
+            they are.
         """
         with torch.autocast(onward.device.type, enabled=False):
-            inner = (1 - self._near) * changes + back
-            moves = onward + self._near * changes + inner - self._as_one(inner)
+            inner = (1 - self._near) * motions + back
+            moves = onward + self._near * motions + inner - self._as_one(inner)
             return moves + self._stopped(moves)
 
     def _as_one(self, moves: Tensor) -> Tensor:

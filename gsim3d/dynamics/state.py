@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import CONTACT_CHANNELS
@@ -52,8 +53,8 @@ class StateLayout:
     @classmethod
     def of(cls, config: DynamicsConfig) -> StateLayout:
         dynamic, static = config.dynamic_latents, config.static_latents
-        means = 3 + MOTION_CHANNELS * (config.motion_length is not None) + OWN_CHANNELS * config.velocity
-        means += DEFORMATION_CHANNELS * config.deformation
+        means = config.place_channels + MOTION_CHANNELS * (config.motion_length is not None)
+        means += OWN_CHANNELS * config.velocity + DEFORMATION_CHANNELS * config.deformation
         if not config.explicit:
             inputs = [("dynamic_latents", dynamic), ("opacities", 1), ("static_latents", static)]
             outputs = [("dynamic_latents", dynamic), ("means", means)]
@@ -262,7 +263,8 @@ class StateLayout:
             return self._later_quats(newest, predicted, share)
         predicted = _unflat(name, predicted)
         if name == "means":
-            predicted, kept = predicted[..., :3], predicted[..., 3:]
+            n = self.config.place_channels
+            predicted, kept = F.pad(predicted[..., :n], (0, 3 - n)), predicted[..., n:]
         share = share.reshape(*share.shape[:-1], *(1,) * (newest.dim() - 1))
         changes = self._target(name, predicted) - newest if self._absolute else self._change(name, predicted)
         if self.config.predicts == "from_previous":
@@ -271,10 +273,12 @@ class StateLayout:
             kept = bounded(kept / MOST_KEPT, MOST_KEPT).unflatten(2, drift.shape[1:])
             ahead = torch.arange(1, 1 + changes.shape[0], device=drift.device, dtype=drift.dtype)[:, None, None]
             if flight is not None:
-                by_itself = STIFF_BACK if self.config.pushes else BACK
-                shares = (kept * drift)[0]
-                back = by_itself * drift[:, -1] + shares[:, -1]
-                changes = flight.moves(drift[:, ONWARD], changes[0], shares[:, :-1].sum(1), back)[None]
+                by_itself, way = STIFF_BACK if self.config.pushes else BACK, drift[:, -1]
+                if flight.pushes is not None:  # gradients: without them stiffness would be learned wrongly
+                    way = way - (newest - newest.detach())
+                shares = (kept[0, :, :-1] * drift[:, :-1]).sum(1)
+                back = (by_itself + kept[0, :, -1]) * way
+                changes = flight.moves(drift[:, ONWARD], changes[0], shares, back)[None]
             else:
                 onward = ahead * (drift[:, ONWARD] + (kept * drift).sum(2))
                 if self.config.deformation:

@@ -29,7 +29,7 @@ from gsim3d.train.samples import Batch
 from gsim3d.train.sittings import Progress, save_state
 
 FIRST_FILMS = 32  # before training begins
-SEED, HELD_OUT_SEED = 20261204, 77  # of the trajectories; `gsim3d generate` without --seed makes others
+SEED, HELD_OUT_SEED = 20261206, 77  # of the trajectories; `gsim3d generate` without --seed makes others
 WARM_UP = 40  # steps at the beginning of a sitting
 COOL_DOWN = 0.25  # of a sitting's training, in which the learning rate falls to LAST_RATE of its peak
 LAST_RATE = 0.03
@@ -221,14 +221,14 @@ RECIPES = {
         strides=(2, 2),
         rollout=(48, 24),
         recompute=("steps",),
-        images=(20, 20),
+        images=(60, 30),
         beginning=(0, 0, 0),
         rate=6e-4,
         shape=0.015,
         surfaces=True,
         flies=True,
         capacity=200,
-        in_turn=({}, {}, {}, THROWN_UP),
+        in_turn=({}, {}, {}, THROWN_UP, OTHER_GROUND),
     ),
     # A cloth swings to the end and fills half of an image: more particles, and less memory for trajectories and graphs.
     "cloth": _recipe(
@@ -243,6 +243,7 @@ RECIPES = {
         rate=6e-4,
         shape=0.015,
         shape_length=0.1,
+        recompute=("steps",),
         capacity=120,
     ),
     "rigid": _recipe(
@@ -250,8 +251,8 @@ RECIPES = {
         (1.7, 5.2),
         12,
         rollout=(24, 12),
-        images=(1500, 60),
-        beginning=(0, 0, 400),
+        images=(60, 60),
+        beginning=(0, 0, 100),
         lit_before=20,
         contact_length=0.4,
         shape=0.2,

@@ -27,10 +27,10 @@ def pushes(history, length=WIDE, friction=FRICTION, skin=SKIN):
     return Pushes(history, matter, beside, length, *(x.to(history.means) for x in (friction, skin)))
 
 
-def moves(history, onward=0.0, changes=0.0, back=0.0, **options):
+def moves(history, onward=0.0, motions=0.0, back=0.0, **options):
     """[N, 3], of what is given for rows that move; for all of them alike where it is a vector."""
     moving = (history.activity == DYNAMIC)[:, None]
-    rows = [torch.where(moving, torch.as_tensor(x).to(history.means), 0) for x in (onward, changes, back)]
+    rows = [torch.where(moving, torch.as_tensor(x).to(history.means), 0) for x in (onward, motions, back)]
     return pushes(history, **options).moves(*(x.expand(history.n_rows, 3) for x in rows))
 
 
@@ -48,7 +48,7 @@ def weights(history, moving):
     return Matter.of(history, CELL, WIDE, evenly=True).window[0, 0, : int(moving.sum()), None]
 
 
-@pytest.mark.parametrize("what", ["changes", "back"])
+@pytest.mark.parametrize("what", ["motions", "back"])
 def test_what_rows_do_to_each_other_neither_moves_nor_turns_their_body(what):
     history = ball(1.0)
     moving, places = moving_places(history)
@@ -58,10 +58,10 @@ def test_what_rows_do_to_each_other_neither_moves_nor_turns_their_body(what):
     assert (share * torch.linalg.cross(places - (share * places).sum(0), found)).sum(0).abs().max() < 1e-5
 
 
-def test_what_is_predicted_near_the_ground_moves_and_turns_the_body_by_where_it_is():
+def test_what_is_kept_near_the_ground_moves_and_turns_the_body_by_where_it_is():
     history, push = ball(0.0), torch.tensor([0.02, 0.0, 0.01])
     moving, places = moving_places(history)
-    found = torch.stack([moves(history, changes=x)[moving] for x in (0.0, push)]).diff(dim=0)[0]
+    found = torch.stack([moves(history, motions=x)[moving] for x in (0.0, push)]).diff(dim=0)[0]
     near = pushes(history)._near[moving]
     share = weights(history, moving)
     # of all rows alike what is near the ground is kept, and the rest is none
@@ -71,12 +71,12 @@ def test_what_is_predicted_near_the_ground_moves_and_turns_the_body_by_where_it_
     assert_close_relative_to_max(spin, (share * torch.linalg.cross(places, expected)).sum(0), 0.05)
 
 
-def test_what_is_predicted_of_a_row_is_counted_once():
+def test_what_is_kept_of_a_row_is_counted_once():
     history = ball(0.0)
     moving, _ = moving_places(history)
     lowest, push = history.means[moving, 2].argmin(), torch.tensor([0.0, 0.0, 0.02])
     row = torch.zeros(history.n_rows, 1).index_put((moving.nonzero()[lowest, 0],), torch.tensor(1.0))
-    found = moves(history, changes=row * push)[moving][lowest]
+    found = moves(history, motions=row * push)[moving][lowest]
     assert_close_relative_to_max(found, push, 0.05)
 
 
@@ -134,12 +134,12 @@ def test_untrained_a_ball_falls_is_squeezed_and_jumps():
 def test_rows_that_cannot_move_keep_what_they_were_given_and_scenes_do_not_meet():
     one, other = ball(0.0), ball(0.0, n=200, seed=3)
     both = batch([one, other])
-    changes = [noise(history, seed) for seed, history in enumerate((one, other))]
-    found = pushes(both, 0.2).moves(0 * torch.cat(changes), torch.cat(changes), 0 * torch.cat(changes))
-    alone = [pushes(h, 0.2).moves(0 * c, c, 0 * c) for c, h in zip(changes, (one, other))]
+    motions = [noise(history, seed) for seed, history in enumerate((one, other))]
+    found = pushes(both, 0.2).moves(0 * torch.cat(motions), torch.cat(motions), 0 * torch.cat(motions))
+    alone = [pushes(h, 0.2).moves(0 * c, c, 0 * c) for c, h in zip(motions, (one, other))]
     assert_close_relative_to_max(found, torch.cat(alone), 1e-4)
     rests = both.activity != DYNAMIC
-    assert_same_bits(found[rests], torch.cat(changes)[rests])
+    assert_same_bits(found[rests], torch.cat(motions)[rests])
 
 
 def test_gradients():
@@ -151,9 +151,9 @@ def test_gradients():
     numbers = [torch.tensor(x, dtype=torch.float64) for x in (0.7, 0.01)]
     inputs = [x.requires_grad_() for x in (*rows, *numbers)]
 
-    def found(onward, changes, back, friction, skin):
+    def found(onward, motions, back, friction, skin):
         at = moving.nonzero()[:, 0]
-        full = [torch.zeros_like(history.means).index_put((at,), x) for x in (onward, changes, back)]
+        full = [torch.zeros_like(history.means).index_put((at,), x) for x in (onward, motions, back)]
         return pushes(history, 0.3, friction, skin).moves(*full)[moving]
 
     assert torch.autograd.gradcheck(found, inputs)
@@ -168,6 +168,29 @@ def test_where_rows_stop_does_not_follow_where_they_were():
     lowest = found[:, 2].argmin()
     (grad,) = torch.autograd.grad(found[lowest, 2], means)
     assert grad[moving][lowest].abs().max() < 1e-2
+
+
+@pytest.mark.parametrize("share", ["own motion", "way back"])
+def test_what_shares_do_to_a_jump_is_what_their_gradient_says(share):
+    """Of how high a ball is that was squeezed and jumps: a row that went back is nearer to its place from then on."""
+    history = ball(0.1, (0.02, 0.0, -0.06), (0.03, 0.06, 0.0))
+    dynamics = make_dynamics(PUSHED)
+    last = dynamics.net.head.fc2
+    torch.nn.init.zeros_(last.weight)
+    n_looks, n_shares = (n for _, n in dynamics.layout.outputs)
+    begin = n_looks + {"own motion": 6, "way back": 9}[share]
+    chosen = torch.zeros(n_looks + n_shares).index_fill(0, torch.arange(begin, begin + 3), 1.0)
+    del last.bias
+
+    def height(kept):
+        last.bias = kept * chosen
+        return rollout(dynamics, history, 12, max_steps=2)[-1].means[history.activity == DYNAMIC, 2].mean()
+
+    kept = torch.tensor(0.0, requires_grad=True)
+    (grad,) = torch.autograd.grad(height(kept), kept)
+    with torch.no_grad():
+        slope = (height(torch.tensor(0.04)) - height(torch.tensor(-0.04))) / 0.08
+    assert grad.item() == pytest.approx(slope.item(), rel=0.25) and slope > 0.02
 
 
 def test_in_flight_nothing_pushes():
@@ -209,7 +232,7 @@ def test_what_is_hardly_seen_stops_nobody():
 def test_a_gpu_pushes_the_same(devices):
     history = ball(0.01)
     expected, actual, again = (
-        moves(history.to(d), onward=[0.01, 0.0, -0.03], changes=noise(history).to(d), length=0.2).cpu()
+        moves(history.to(d), onward=[0.01, 0.0, -0.03], motions=noise(history).to(d), length=0.2).cpu()
         for d in (*devices, devices[1])
     )
     assert_close_relative_to_max(actual, expected, 1e-3)
@@ -218,14 +241,14 @@ def test_a_gpu_pushes_the_same(devices):
 
 def test_compiled_it_is_the_same(device):
     history = ball(0.0, n=60).to(device)
-    changes = noise(history.to("cpu")).to(device)
+    motions = noise(history.to("cpu")).to(device)
     history.clouds
 
-    def found(changes, history):
-        return pushes(history, 0.2).moves(changes, changes, changes)
+    def found(motions, history):
+        return pushes(history, 0.2).moves(motions, motions, motions)
 
-    expected = found(changes, history)
-    assert_close_relative_to_max(torch.compile(found, fullgraph=True)(changes, history), expected, 1e-3)
+    expected = found(motions, history)
+    assert_close_relative_to_max(torch.compile(found, fullgraph=True)(motions, history), expected, 1e-3)
 
 
 def test_pushes_need_gravity():
