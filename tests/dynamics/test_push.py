@@ -193,6 +193,22 @@ def test_what_shares_do_to_a_jump_is_what_their_gradient_says(share):
     assert grad.item() == pytest.approx(slope.item(), rel=0.25) and slope > 0.02
 
 
+def test_what_is_kept_of_motions_moves_a_higher_body_less_and_has_that_gradient():
+    history, push = ball(0.02), torch.tensor([0.02, 0.0, 0.0])
+    moving, _ = moving_places(history)
+    share = weights(history, moving)
+
+    def moved(raised):
+        means = history.means + raised * moving[:, None] * torch.tensor([0.0, 0.0, 1.0])
+        return (share * moves(dataclasses.replace(history, means=means), motions=push)[moving]).sum(0)[0]
+
+    raised = torch.tensor(0.0, requires_grad=True)
+    (grad,) = torch.autograd.grad(moved(raised), raised)
+    with torch.no_grad():
+        slope = (moved(torch.tensor(0.004)) - moved(torch.tensor(-0.004))) / 0.008
+    assert grad.item() == pytest.approx(slope.item(), rel=0.1) and slope < -0.005
+
+
 def test_in_flight_nothing_pushes():
     history = ball(2.0, (0.03, 0.01, 0.02), (0.0, 0.05, 0.0))
     one, other = (make_dynamics(config) for config in (PUSHED, FLYING))
