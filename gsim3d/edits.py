@@ -290,7 +290,8 @@ def _changed(state: Particles, rows: Tensor, fields: dict[str, Tensor]) -> Parti
 
 
 def _moved(state: Particles, rows: Tensor, by: Vector) -> Particles:
-    return _changed(state, rows, {"means": state.means + state.means.new_tensor(by)})
+    moved = (name for name in ("means", "body") if getattr(state, name) is not None)
+    return _changed(state, rows, {name: getattr(state, name) + state.means.new_tensor(by) for name in moved})
 
 
 def _middles(state: Particles, rows: Tensor) -> Tensor:

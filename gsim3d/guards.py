@@ -19,7 +19,7 @@ from gsim3d.types import ASLEEP, CloudTable, Frames, Particles
 BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
 ALWAYS = ("means", "opacities")  # are looked at, changed or not
 # Choices, and what others were when the simulation began: those are looked at.
-NOT_LOOKED_AT = ("activity", "held", "unlit", "shaded", "reference")
+NOT_LOOKED_AT = ("activity", "held", "unlit", "shaded", "reference", "body")
 
 
 class _Looks(NamedTuple):

@@ -84,6 +84,7 @@ class Simulator(nn.Module):
         frames, spoiled = guard_frames(frames, guard.keywords["config"], guard.keywords["report"], "encode")
         particles = self.encoder(frames, room)
         particles = guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled, room)))
+        particles = self.dynamics.with_bodies(particles)
         if (dynamics := self.config.dynamics).velocity:
             n_views = None if room is None else len(frames.cameras) // particles.n_clouds
             flight = self.dynamics.flight(particles)

@@ -229,6 +229,9 @@ class Particles(_Tensors):
         lamp, and how much reaches them now (:func:`gsim3d.dynamics.daylight.daylight`); negative where not known.
     reference: [N, 3] metres, where rows were when their simulation began: the shape that elastic bodies go back to;
         only of a model with ``deformation``.
+    body: [N, 3] metres, a place of the body that a row is a part of, the same for all its rows: where the middle of
+        what is seen of it was when it was encoded (:func:`gsim3d.dynamics.bodies.bodies`); only of a model with
+        ``pushes``.
 
     Rows of two encoded steps are not aligned (each step sees other pixels); rows of two simulated steps are.
     """
@@ -253,6 +256,7 @@ class Particles(_Tensors):
     light: Tensor | None = None
     shaded: Tensor | None = None
     reference: Tensor | None = None
+    body: Tensor | None = None
     known: CloudTable | None = None  # see clouds
 
     ROW_FIELDS = (
@@ -272,6 +276,7 @@ class Particles(_Tensors):
         "light",
         "shaded",
         "reference",
+        "body",
     )
 
     @property

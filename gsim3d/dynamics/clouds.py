@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from gsim3d.types import CloudTable, Particles, split_rows
 
 # That only some particles have.
-OPTIONAL_FIELDS = ("turns", "paint", "held", "unlit", "velocity", "light", "shaded", "reference")
+OPTIONAL_FIELDS = ("turns", "paint", "held", "unlit", "velocity", "light", "shaded", "reference", "body")
 
 
 def newest_clouds(clouds: CloudTable) -> list[int]:
@@ -71,6 +71,7 @@ def with_field(particles: Particles, name: str, width: int = 3) -> Particles:
         "light": lambda: torch.ones_like(particles.means),
         "shaded": lambda: -like.expand(-1, width),
         "reference": lambda: _finite(particles.means.detach()),
+        "body": lambda: _finite(particles.means.detach()),
     }
     return dataclasses.replace(particles, **{name: identity[name]()})
 

@@ -64,7 +64,10 @@ class DynamicsConfig:
         pushes: with ``gravity``: the background stops rows that would get behind it, with friction; what rows of a body
             do to each other changes neither its momentum nor its spin (:mod:`gsim3d.dynamics.push`). Of places nothing
             is predicted but shares of the motions that rows are told and of the way back to their shape: how damped and
-            how stiff bodies are, and not where they go.
+            how stiff bodies are, and not where they go. Bodies are told apart when they are encoded
+            (:mod:`gsim3d.dynamics.bodies`).
+        solid: with ``pushes``: what stops some rows of a body stops it as a whole in the same step, as bodies that are
+            not soft need it where they fall far in a step.
     Geometry:
         grid_size: metres, edge of a cell at stage 0.
         history_bits: a history has 1 to 2^history_bits steps.
@@ -107,6 +110,7 @@ class DynamicsConfig:
     deformation: bool = False
     turning: bool = False
     pushes: bool = False
+    solid: bool = False
     gravity: tuple[float, float, float] | None = None
     contact_length: float | None = None
     lights: tuple[tuple[float, float, float], ...] = ()
@@ -190,6 +194,8 @@ class DynamicsConfig:
             )
         if self.pushes and self.gravity is None:
             raise ValueError("DynamicsConfig: pushes needs gravity")
+        if self.solid and not self.pushes:
+            raise ValueError("DynamicsConfig: solid needs pushes")
         if self.turning and (self.explicit or not self.velocity or self.steps_per_call > 1):
             raise ValueError("DynamicsConfig: turning needs velocity, a latent look (not explicit) and one step a call")
         if self.surfaces and not self.lights:

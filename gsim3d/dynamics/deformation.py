@@ -59,5 +59,5 @@ class Shape:
         products = window @ (sampled[:, :, :, None] * then[:, :, None]).flatten(2)
         turns = turned_most(products.unflatten(2, (3, 3)) - centre[:, :, :, None] * began[:, :, None])
         shifts = centre - (turns @ began[:, :, :, None])[..., 0]
-        *columns, shift = self._matter.lattice.at(self._matter.places, *turns.unbind(3), shifts)
+        *columns, shift = self._matter.of_rows(*turns.unbind(3), shifts)
         return (torch.stack(columns, 3) @ self._before[:, :, :, None])[..., 0] + shift - places

@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from gsim3d import ops
 from gsim3d.dynamics.background import Background
+from gsim3d.dynamics.bodies import bodies
 from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps, with_field
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import FIRM, SOLID, Beside
@@ -157,6 +158,17 @@ class Dynamics(nn.Module):
         shaded = self._shaded(particles, known)
         return dataclasses.replace(particles, shaded=_put_runs(shaded, runs, particles.n_rows, -1.0))
 
+    def with_bodies(self, particles: Particles) -> Particles:
+        """``particles`` of which the newest clouds know their bodies, if that is asked for; others know no more than
+        where they are."""
+        if not self.config.pushes or particles.body is not None:
+            return particles
+        runs = particles.clouds.row_runs(newest_clouds(particles.clouds))
+        here = with_field(particles, "body").body
+        found = bodies(particles, self.config.grid_size)
+        newest = _put_runs(torch.ones_like(found[:, :1], dtype=torch.bool), runs, particles.n_rows)
+        return dataclasses.replace(particles, body=torch.where(newest, _put_runs(found, runs, particles.n_rows), here))
+
     def flight(self, history: Particles, matter: Matter | None = None, beside: Beside | None = None) -> Flight | None:
         """How far the rows of the newest clouds are from flying; None of a model without ``gravity``.
 
@@ -169,7 +181,7 @@ class Dynamics(nn.Module):
         pushes = None
         if self.friction is not None and matter is not None:
             numbers = self.friction, SKIN_SIZE * self.skin
-            pushes = Pushes(history, matter, beside, self.config.motion_length, *numbers)
+            pushes = Pushes(history, matter, beside, self.config.motion_length, *numbers, self.config.solid)
         return Flight.of(beside.contact[:, -1:], matter, GRAVITY_SIZE * self.gravity, pushes)
 
     def begin(self, state: Particles) -> Particles:
@@ -180,6 +192,7 @@ class Dynamics(nn.Module):
             state = with_field(state, "reference")
         if self.config.turning:
             state = with_field(state, "turns")
+        state = self.with_bodies(state)
         return state if self.lights is None else with_field(state, "light")
 
     def forward(

@@ -65,5 +65,5 @@ def touching(near: Tensor, matter: Matter | None) -> Tensor:
         return near
     with torch.autocast(near.device.type, enabled=False):
         sampled = matter.samples.take(matter.padded(near.expand(-1, 3)))
-        (mean,) = matter.lattice.at(matter.places, matter.window @ sampled)
+        (mean,) = matter.of_rows(matter.window @ sampled)
         return (matter.packed(mean)[:, :1] / TOUCHING).clamp(max=1)

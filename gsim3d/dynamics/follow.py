@@ -14,13 +14,14 @@ from gsim3d.dynamics.samples import Padded, Rows, Samples
 from gsim3d.types import CloudTable, Frames, Particles, constant
 
 PASSES = 5
-BLUR = 1.5  # pixels: standard deviation of the window in which images are smoothed
-FACING = 0.5  # least cosine between where matter faces and a camera that it is looked for in
-SHOWN = 0.6  # share of a window of pixels that must show what moves
-ROBUST = 0.05  # differences of colours, from which on they count as if they were as small
-STIFF, STILL = 1e-3, 0.3  # against turning, and against leaving the way of the means, relative to what is seen
-GREY = 0.05  # added to the sum that a colour is divided by
-LEAST = 1e-12  # of what is seen: where nothing is, nothing is solved
+BLUR = 1.0  # pixels: standard deviation of the window in which images are smoothed
+FACING = 0.6  # least cosine between where matter faces and a camera that it is looked for in
+SHOWN = 0.9  # share of a window of pixels that must show what moves
+ROBUST = 0.02  # differences of colours, from which on they count as if they were as small
+STIFF, STILL = 1e-4, 0.3  # against turning, and against leaving the way of the means, relative to what is seen
+GREY = 0.02  # added to the sum that a colour is divided by
+INSIDE = 0.02  # metres: rows are encoded so far below the surface that images show, which turns on a larger circle
+LEAST = 1e-8  # of what is seen: where nothing is, nothing is solved
 NEAR = 0.01  # metres, from a camera
 
 
@@ -61,16 +62,16 @@ def follow(
         matter = Matter(particles, grid_size, length)
         then = Samples(Rows(Padded(particles, first, grid_size), particles))
         then.seen_from(matter.here)
-        now, lattice = matter.samples, matter.lattice
+        now = matter.samples
         centre = matter.window @ now.places
-        velocity = shift(now, then, lattice.nodes, matter.window, length)
+        velocity = shift(now, then, matter.nodes, length)
         images, is_image = _images(frames, len(clouds), n_views)
         seen, before = (
             _Views(frames, particles, images, is_image, chosen, matter.here) for chosen in (newest, first)
         )
         moved = _aligned(matter, centre, velocity, seen, before)
         a_step = share_of_a_step(clouds, first, newest, now, then)
-        velocity, spin, middle = lattice.at(matter.places, *(x * a_step for x in moved), centre)
+        velocity, spin, middle = matter.of_rows(*(x * a_step for x in moved), centre)
         found = velocity + torch.linalg.cross(spin, matter.places - middle)
         if falls is not None:
             spans = [clouds.steps[q] - clouds.steps[f] for f, q in zip(first, newest)]
@@ -91,15 +92,16 @@ def _aligned(
     matter: Matter, centre: Tensor, velocity: Tensor, seen: _Views, before: _Views
 ) -> tuple[Tensor, Tensor]:
     """Velocity and spin (rad) [B, G, 3] of each window, from the oldest step to the newest."""
-    now, lattice, window = matter.samples, matter.lattice, matter.window
+    now, window = matter.samples, matter.window
     spin, places = torch.zeros_like(velocity), now.places
-    outwards = F.normalize(places - lattice.at(places, centre)[0], dim=2)
+    outwards = F.normalize(places - matter.of_samples(centre)[0], dim=2)
+    places = places + INSIDE * outwards
     wanted = []
     for view in range(seen.n_views):
         colours, is_shown = seen.colours(view, places)
         wanted.append((colours, now.known & is_shown & seen.faces(view, places, outwards)))
     for _ in range(PASSES):
-        gone, turned, middle = lattice.at(places, velocity, spin, centre)
+        gone, turned, middle = matter.of_samples(velocity, spin, centre)
         back = places + onward_at(places, -gone, -turned, middle)
         squared, missed = back.new_zeros(*back.shape[:2], 6, 6), back.new_zeros(*back.shape[:2], 6)
         for view, (colours, is_shown) in enumerate(wanted):

@@ -9,9 +9,10 @@ from torch.nn import functional as F
 from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.dynamics.rigid import Lattice
 from gsim3d.dynamics.samples import Few, Padded, Rows, Samples, squares, weights
-from gsim3d.types import FROZEN, Particles
+from gsim3d.types import FROZEN, Particles, constant
 
 EVEN = 0.15  # of the windows' length: standard deviation of those in which rows are counted
+APART = 0.2  # of the windows' length: less than half as far as the middles of two bodies are apart
 
 
 class Matter:
@@ -21,8 +22,10 @@ class Matter:
     few: how the m rows of which more is computed stand among them.
     rows, samples: those; places of samples count from ``here`` [B, 1, 3], the mean of theirs.
     places: [B, m, 3] of the rows, from there as well.
-    lattice, window: [B, G, S] how much each sample counts around a node, in a Gaussian of ``length`` metres; where one
-        is given. ``evenly``: as much as the surface that it stands for, as more rows are seen of the top of a body.
+    nodes, window: [B, G, 3] of a lattice, and [B, G, S] how much each sample counts around a node; where a ``length``
+        is given. Of rows that know their ``body`` all of that count, and nothing else: nodes are places of bodies. Of
+        others it is a Gaussian of ``length`` metres. ``evenly``: as much as the surface that it stands for, as more
+        rows are seen of the top of a body.
     """
 
     def __init__(
@@ -44,11 +47,31 @@ class Matter:
             self.samples.seen_from(self.here)
             self.places = self.rows.places - self.here
             if length is not None:
-                self.lattice = Lattice(self.samples.places, self.samples.known)
-                counts = squares(self.lattice.nodes, self.samples.places) * (-0.5 / length**2)
+                self._at, self._sampled, size = self.places, self.samples.places, length
+                if history.body is not None:
+                    self._at, size = self._from_here(history, history.body), APART * length
+                    self._sampled = self.samples.take(self._at)
+                self._lattice = Lattice(self._sampled, self.samples.known)
+                self.nodes = self._lattice.nodes
+                counts = squares(self.nodes, self._sampled) * (-0.5 / size**2)
                 if evenly:
                     counts = counts - self.samples.crowd(EVEN * length).log()[:, None]
                 self.window = weights(counts, self.samples.known)
+
+    def _from_here(self, history: Particles, places: Tensor) -> Tensor:
+        """[B, m, 3] of ``places`` [N, 3] of all rows."""
+        table, rows = history.clouds, self.rows
+        scenes = constant(tuple(table.scenes[q] for q in self.newest), places.device)
+        found = places.detach()[rows.rows].double() - history.origin[scenes][:, None]
+        return torch.where(rows.wanted[:, :, None], found, 0).to(self.here.dtype) - self.here
+
+    def of_rows(self, *values: Tensor) -> tuple[Tensor, ...]:
+        """[B, m, 3] of the rows, of each of ``values`` [B, G, 3] of the nodes."""
+        return self._lattice.at(self._at, *values)
+
+    def of_samples(self, *values: Tensor) -> tuple[Tensor, ...]:
+        """[B, S, 3], as :meth:`of_rows`."""
+        return self._lattice.at(self._sampled, *values)
 
     @classmethod
     def of(

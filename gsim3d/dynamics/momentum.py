@@ -37,7 +37,7 @@ def _rigid(matter: Matter, own: Tensor, length: float) -> tuple[Tensor, Tensor]:
     """[N, 3] twice, of rows that moved by ``own`` [N, 3]: the motion of the window around each, and what comes next of
     the rigid motion of that window."""
     with torch.autocast(own.device.type, enabled=False):
-        found = matter.lattice.at(matter.places, *_of_windows(matter, own, length))
+        found = matter.of_rows(*_of_windows(matter, own, length))
         return matter.packed(found[0]), matter.packed(onward_at(matter.places, *found))
 
 
@@ -62,5 +62,5 @@ def turned(turns: Tensor, moved: Tensor, length: float, matter: Matter | None) -
         return turns
     with torch.autocast(moved.device.type, enabled=False):
         _, spin, _ = _of_windows(matter, moved, length)
-        (spin,) = matter.lattice.at(matter.places, spin)
+        (spin,) = matter.of_rows(spin)
         return rotate_left(turns, matter.packed(spin))

@@ -39,30 +39,34 @@ def motion(history: Particles, length: float, grid_size: float) -> Tensor:
     matter = Matter.of(history, grid_size, length)
     if matter is None:
         return history.means.new_zeros(0, 2, 3)
-    clouds, newest, now, lattice = history.clouds, matter.newest, matter.samples, matter.lattice
+    clouds, newest, now = history.clouds, matter.newest, matter.samples
     first = [0, *(q + 1 for q in newest[:-1])]
     before = [max(f, q - 1) for f, q in zip(first, newest, strict=True)]
     with torch.autocast(history.means.device.type, enabled=False):
         last, oldest = (Samples(Rows(Padded(history, chosen, grid_size), history)) for chosen in (before, first))
         for samples in (last, oldest):
             samples.seen_from(matter.here)
-        moved, expected = (shift(now, then, lattice.nodes, matter.window, length) for then in (last, oldest))
+        moved, expected = (shift(now, then, matter.nodes, length) for then in (last, oldest))
         looks = tuple(samples.of(history.latents) for samples in (now, oldest))
         velocity, spin, centre = _rigid_motion(matter, oldest, looks, expected, length)
         a_step = share_of_a_step(clouds, before, newest, now, last)
         all_steps = share_of_a_step(clouds, first, newest, now, oldest)
-        moved, *rigid = lattice.at(matter.places, moved * a_step, velocity * all_steps, spin * all_steps, centre)
+        moved, *rigid = matter.of_rows(moved * a_step, velocity * all_steps, spin * all_steps, centre)
         onward = onward_at(matter.places, *rigid)
         return matter.packed(torch.stack([moved, onward], 2))
 
 
-def shift(now: Samples, then: Samples, nodes: Tensor, window: Tensor, length: float) -> Tensor:
+def shift(now: Samples, then: Samples, nodes: Tensor, length: float) -> Tensor:
     """[B, G, 3], how far the matter in the window around each node has moved."""
-    around = window @ now.places
+    around = _mean_around(nodes, now, length)
     moved = (now.mean - then.mean)[:, None].expand_as(nodes)
     for _ in range(PASSES):
-        moved = around - weights(squares(nodes - moved, then.places) * (-0.5 / length**2), then.known) @ then.places
+        moved = around - _mean_around(nodes - moved, then, length)
     return moved
+
+
+def _mean_around(nodes: Tensor, samples: Samples, length: float) -> Tensor:
+    return weights(squares(nodes, samples.places) * (-0.5 / length**2), samples.known) @ samples.places
 
 
 def _rigid_motion(
@@ -77,7 +81,7 @@ def _rigid_motion(
     unlike = squares(look, looked) * (-0.5 / (LIKENESS**2 * spread))
     body, spin = RigidFit(matter.window, now.places, length), torch.zeros_like(moved)
     for _ in range(PASSES):
-        velocity, turns, middle = matter.lattice.at(now.places, moved, spin, body.centre)
+        velocity, turns, middle = matter.of_samples(moved, spin, body.centre)
         expected = now.places - velocity - torch.linalg.cross(turns, now.places - middle)
         match = weights(unlike - squares(expected, then.places) * (0.5 / (REACH * length) ** 2), then.known)
         moved, spin = body.fit(now.places - match @ then.places)

@@ -7,11 +7,12 @@ from torch import Tensor
 
 from gsim3d.dynamics.contact import Beside
 from gsim3d.dynamics.matter import Matter
-from gsim3d.dynamics.rigid import LITTLE, RigidFit
+from gsim3d.dynamics.rigid import LITTLE, SMALLEST, RigidFit
 from gsim3d.types import Particles, take_runs
 
 REACHING = 4  # power of the nearness to the background, which is as much as a row is pushed by it
 LEAST = 1e-6  # metres a step along a surface: slower rows are held
+PASSES, MOST_TIMES = 3, 50.0  # in which a solid body gets out of the background, and the longest way of one
 
 
 class Pushes:
@@ -20,15 +21,23 @@ class Pushes:
     length: metres, of the windows of ``matter``, about the radius of a body.
     friction: most of what a stopped row loses along a surface, over what it loses towards it (a number).
     skin: metres over the background at which rows stop: they are seen inside of their bodies (a number).
+    solid: what stops some rows moves their body in the same step.
     """
 
     def __init__(
-        self, history: Particles, matter: Matter, beside: Beside, length: float, friction: Tensor, skin: Tensor
+        self,
+        history: Particles,
+        matter: Matter,
+        beside: Beside,
+        length: float,
+        friction: Tensor,
+        skin: Tensor,
+        solid: bool = False,
     ):
-        self._matter, self._friction = matter, friction
+        self._matter, self._friction, self._solid = matter, friction, solid
         with torch.no_grad(), torch.autocast(history.means.device.type, enabled=False):
             self._body = RigidFit(matter.window, matter.samples.places, length, LITTLE)
-            (self._centre,) = matter.lattice.at(matter.places, self._body.centre)
+            (self._centre,) = matter.of_rows(self._body.centre)
         height, self._normal = beside.surface(self._centre)
         newest = take_runs(history.means, history.clouds.row_runs(matter.newest))
         # For gradients: a row that is stopped comes to the same height wherever it was, and a higher one is less near.
@@ -53,13 +62,29 @@ class Pushes:
         with torch.autocast(onward.device.type, enabled=False):
             inner = (1 - self._near) * motions + back
             moves = onward + self._near * motions + inner - self._as_one(inner)
+            for _ in range(PASSES if self._solid else 0):
+                moves = moves + self._pushed(self._stopped(moves))
             return moves + self._stopped(moves)
+
+    def _pushed(self, stopped: Tensor) -> Tensor:
+        """How bodies move as one, each so far that the squares of what its rows, ``stopped``, still miss are least."""
+        moves = self._as_one(stopped)
+        with torch.no_grad():
+            missed, done = (self._mean((stopped * x).sum(1, keepdim=True)) for x in (stopped, moves))
+            times = (missed / done.clamp(min=SMALLEST)).clamp(1, MOST_TIMES)
+        return times * moves
+
+    def _mean(self, values: Tensor) -> Tensor:
+        """[N, 1], of the rows in the window around each row."""
+        matter = self._matter
+        (found,) = matter.of_rows(matter.window @ matter.samples.take(matter.padded(values.expand(-1, 3))))
+        return matter.packed(found)[:, :1]
 
     def _as_one(self, moves: Tensor) -> Tensor:
         """The rigid part of ``moves`` of the rows in the window around each row."""
         matter = self._matter
         found = self._body.fit(matter.samples.take(matter.padded(moves)))
-        moved, spin = matter.lattice.at(matter.places, *found)
+        moved, spin = matter.of_rows(*found)
         return matter.packed(moved + torch.linalg.cross(spin, matter.places - self._centre))
 
     def _stopped(self, moves: Tensor) -> Tensor:

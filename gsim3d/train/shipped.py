@@ -29,7 +29,7 @@ from gsim3d.train.samples import Batch
 from gsim3d.train.sittings import Progress, save_state
 
 FIRST_FILMS = 32  # before training begins
-SEED, HELD_OUT_SEED = 20261206, 77  # of the trajectories; `gsim3d generate` without --seed makes others
+SEED, HELD_OUT_SEED = 20261207, 77  # of the trajectories; `gsim3d generate` without --seed makes others
 WARM_UP = 40  # steps at the beginning of a sitting
 COOL_DOWN = 0.25  # of a sitting's training, in which the learning rate falls to LAST_RATE of its peak
 LAST_RATE = 0.03
@@ -105,6 +105,7 @@ def _recipe(
     shape_length: float = 0.2,
     surfaces: bool = False,
     flies: bool = False,
+    solid: bool = False,
     recompute: tuple[str, ...] = (),
     capacity: int = 600,
     options: Mapping = MappingProxyType({}),
@@ -128,6 +129,7 @@ def _recipe(
     surfaces: as of DynamicsConfig; what rests then changes in the light alone.
     recompute: as of TrainConfig.
     flies: with the world's gravity, and pushes, as of DynamicsConfig: not where bodies touch no more than what moves.
+    solid: as of DynamicsConfig.
     Others as in Recipe.
     """
     # All views that are no input: what images cost beside the encoder is little.
@@ -156,6 +158,7 @@ def _recipe(
                 "surfaces": surfaces,
                 "gravity": (0.0, 0.0, -GRAVITY / fps**2) if flies else None,
                 "pushes": flies,
+                "solid": solid,
             },
         },
         # How a look differs from the one that it had at first: bodies turn in the light, and shadows fall. From step to
@@ -259,6 +262,7 @@ RECIPES = {
         shape_length=0.15,
         surfaces=True,
         flies=True,
+        solid=True,
         options=OTHER_CAMERAS,
         in_turn=({}, {}, OTHER_GROUND),
     ),

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsim3d.dynamics import last_steps
-from gsim3d.dynamics.follow import follow
+from gsim3d.dynamics.follow import INSIDE, follow
 from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import batch, make_history
@@ -55,9 +55,9 @@ def image_of(camera, viewmat, middle, turn, painted, lit):
 
 
 def filmed(velocity=VELOCITY, spin=SPIN, n_steps=4, n=3000, n_views=4, lit=True, seed=0):
-    """A painted ball that flies and turns in the light of a lamp, and particles of its surface."""
+    """A painted ball that flies and turns in the light of a lamp, and particles as they are encoded of its surface."""
     g = torch.Generator().manual_seed(seed)
-    ball = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1) * RADIUS
+    ball = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1) * (RADIUS - INSIDE)
     waves = 12 * torch.randn(3, 3, generator=g)
     history = make_history((n,) * n_steps, seed=seed, frozen_share=0.0)
     cameras = ring(n_views, [t for t in range(n_steps) for _ in range(n_views)])

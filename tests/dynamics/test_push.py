@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from gsim3d.dynamics import DynamicsConfig, rollout
+from gsim3d.dynamics.bodies import bodies
 from gsim3d.dynamics.contact import FIRM, Beside
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.push import Pushes
@@ -21,10 +22,10 @@ PUSHED = dataclasses.replace(FLYING, pushes=True)
 FRICTION, SKIN = torch.tensor(1.0), torch.tensor(0.0)
 
 
-def pushes(history, length=WIDE, friction=FRICTION, skin=SKIN):
+def pushes(history, length=WIDE, friction=FRICTION, skin=SKIN, solid=False):
     matter = Matter.of(history, CELL, length, evenly=True)
     beside = Beside(history, CONTACT, matter, FIRM)
-    return Pushes(history, matter, beside, length, *(x.to(history.means) for x in (friction, skin)))
+    return Pushes(history, matter, beside, length, *(x.to(history.means) for x in (friction, skin)), solid)
 
 
 def moves(history, onward=0.0, motions=0.0, back=0.0, **options):
@@ -78,6 +79,69 @@ def test_what_is_kept_of_a_row_is_counted_once():
     row = torch.zeros(history.n_rows, 1).index_put((moving.nonzero()[lowest, 0],), torch.tensor(1.0))
     found = moves(history, motions=row * push)[moving][lowest]
     assert_close_relative_to_max(found, push, 0.05)
+
+
+def two_balls():
+    """One on the ground and one 16 cm away from it, which know their bodies; bool [N], rows of the first."""
+    one, other = ball(0.0), ball(0.25, n=300, seed=1)
+    moves = other.activity == DYNAMIC
+    other = dataclasses.replace(other, means=other.means + torch.tensor([0.5, 0.0, 0.0])).select_rows(moves)
+    fields = {name: torch.cat([value, other.row_fields()[name]]) for name, value in one.row_fields().items()}
+    both = dataclasses.replace(one, **fields, cu_rows=one.cu_rows + torch.tensor([0, other.n_rows]), known=None)
+    first = torch.arange(both.n_rows) < one.n_rows
+    return dataclasses.replace(both, body=bodies(both, CELL)), first & (both.activity == DYNAMIC)
+
+
+def test_bodies_push_themselves_alone_however_near_others_are():
+    """What a window about as large as a body would not do: what stops one slows the other, too."""
+    history, first = two_balls()
+    second = (history.activity == DYNAMIC) & ~first
+    pushed = torch.where(first[:, None], torch.tensor([0.02, 0.0, 0.03]), 0)
+    found = moves(history, motions=pushed + noise(history) * first[:, None], length=0.3)
+    assert found[first].abs().max() > 0.01 and found[second].abs().max() < 1e-4
+    unknown = moves(dataclasses.replace(history, body=None), motions=pushed, length=0.3)
+    assert unknown[second].abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_in_windows_of_bodies_no_momentum_is_lost_nor_made(which):
+    history, first = two_balls()
+    chosen = first if which == 0 else (history.activity == DYNAMIC) & ~first
+    matter = Matter.of(history, CELL, 0.3, evenly=True)
+    share = matter.together(matter.few.put(matter.window.amax(1)[:, : matter.places.shape[1], None]))[chosen]
+    found = moves(history, back=noise(history) + 0.02, length=0.3)[chosen]
+    places = history.means[chosen] - history.means[chosen].mean(0)
+    assert share.sum().item() == pytest.approx(1, abs=1e-3) and found.abs().max() > 0.01
+    assert (share * found).sum(0).abs().max() < 1e-5
+    assert (share * torch.linalg.cross(places - (share * places).sum(0), found)).sum(0).abs().max() < 1e-5
+
+
+def test_a_solid_body_stops_as_a_whole():
+    """Of a ball that falls by 8 cm and comes from 2 cm above most rows fall on, if it is not solid."""
+    history = ball(0.02)
+    history = dataclasses.replace(history, body=bodies(history, CELL))
+    moving, places = moving_places(history)
+    for solid in (False, True):
+        found = moves(history, onward=[0.0, 0.0, -0.08], solid=solid)[moving]
+        squeezed = found - found.mean(0)
+        height = (history.means[moving] - 1.0 + found)[:, 2]
+        assert height.min() > -1e-3
+        assert (found[:, 2].mean() > -0.04) == solid and (squeezed.norm(dim=1).max() < 0.02) == solid
+
+
+def test_a_solid_body_that_is_stopped_at_one_end_turns():
+    history = ball(0.02)
+    moving = history.activity == DYNAMIC
+    slope = torch.tensor([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
+    middle = torch.tensor([1.0, 1.0, 1.22])
+    stick = (history.means - middle) * torch.tensor([1.0, 0.2, 0.2]) @ slope.T
+    stick = stick + middle - torch.tensor([0.0, 0.0, 0.05])
+    history = dataclasses.replace(history, means=torch.where(moving[:, None], stick, history.means))
+    history = dataclasses.replace(history, body=bodies(history, CELL))
+    found = moves(history, onward=[0.0, 0.0, -0.08], friction=torch.tensor(0.0), solid=True)[moving]
+    down = history.means[moving, 2] < 1.1
+    up = history.means[moving, 2] > 1.25
+    assert down.any() and up.any() and found[up, 2].mean() < found[down, 2].mean() - 0.02
 
 
 @pytest.mark.parametrize("skin", [0.0, 0.02])
@@ -142,7 +206,8 @@ def test_rows_that_cannot_move_keep_what_they_were_given_and_scenes_do_not_meet(
     assert_same_bits(found[rests], torch.cat(motions)[rests])
 
 
-def test_gradients():
+@pytest.mark.parametrize("solid", [False, True])
+def test_gradients(solid):
     history = dataclasses.replace(ball(0.01, n=20), velocity=None, reference=None)
     history = dataclasses.replace(history, means=history.means.double())
     moving = history.activity == DYNAMIC
@@ -154,7 +219,7 @@ def test_gradients():
     def found(onward, motions, back, friction, skin):
         at = moving.nonzero()[:, 0]
         full = [torch.zeros_like(history.means).index_put((at,), x) for x in (onward, motions, back)]
-        return pushes(history, 0.3, friction, skin).moves(*full)[moving]
+        return pushes(history, 0.3, friction, skin, solid).moves(*full)[moving]
 
     assert torch.autograd.gradcheck(found, inputs)
 
@@ -190,7 +255,7 @@ def test_what_shares_do_to_a_jump_is_what_their_gradient_says(share):
     (grad,) = torch.autograd.grad(height(kept), kept)
     with torch.no_grad():
         slope = (height(torch.tensor(0.04)) - height(torch.tensor(-0.04))) / 0.08
-    assert grad.item() == pytest.approx(slope.item(), rel=0.25) and slope > 0.02
+    assert grad.item() == pytest.approx(slope.item(), rel=0.35) and slope > 0.02
 
 
 def test_what_is_kept_of_motions_moves_a_higher_body_less_and_has_that_gradient():
