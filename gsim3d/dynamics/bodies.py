@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsim3d.dynamics.clouds import newest_clouds
+from gsim3d.dynamics.clouds import with_field
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.samples import SAMPLES, squares
-from gsim3d.types import Particles, constant
+from gsim3d.types import Particles, constant, take_runs
 
 NEIGHBOURS = 8  # within reach of every second row, itself one of them
 LEAST = 0.1  # of the rows of the largest part: smaller ones belong to what is nearest
@@ -18,7 +18,8 @@ HOPS = 16  # in which what is connected finds out; the way that is known doubles
 
 @torch.no_grad()
 def bodies(history: Particles, grid_size: float) -> Tensor:
-    """[N, 3] metres, the middle of the body that each movable row of the newest clouds belongs to; 0 of other rows.
+    """[N, 3] metres, the middle of the body that each movable row of the newest clouds belongs to; of other rows where
+    they are.
 
     Rows are connected where they are within reach of each other and both have as many neighbours there as every second
     row (DBSCAN, Ester et al., 1996, with a density that is read off the rows); all others, and small parts, belong to
@@ -43,7 +44,9 @@ def bodies(history: Particles, grid_size: float) -> Tensor:
         scenes = constant(tuple(clouds.scenes[q] for q in matter.newest), middle.device)
         found = middle.gather(1, nearest[:, :, None].expand(-1, -1, 3)).double()
         found = found + matter.here + history.origin[scenes][:, None]
-        return matter.packed(found.to(history.means.dtype))
+        found, may_move = (matter.packed(x.to(history.means.dtype)) for x in (found, torch.ones_like(found[:, :, :1])))
+        here = take_runs(with_field(history, "body").body, clouds.row_runs(matter.newest))
+        return torch.where(may_move > 0, found, here)
 
 
 def _parts(places: Tensor, known: Tensor) -> Tensor:

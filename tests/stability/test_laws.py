@@ -23,6 +23,7 @@ EXPLICIT_CONFIG = dataclasses.replace(
 )
 MORE = {"motion_length": 0.3, "velocity": True, "deformation": True, "lights": ((0.1, 0.2, 1.0),)}
 MOVING = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **MORE))
+PUSHED = {**MORE, "gravity": (0.0, 0.0, -0.005), "contact_length": 0.15, "pushes": True}
 CONFIGS = {"latent": CONFIG, "explicit": EXPLICIT_CONFIG, "moving": MOVING}
 
 
@@ -58,6 +59,13 @@ def test_laws_hold_for_every_background(law, background, device, simulators):
     simulator = simulators["latent", torch.float32].to(device)
     plan = simulator.plan(EffectsSpec(dynamics=DynamicsEffects(background=background)))
     assert all(deviation.holds for deviation in LAWS[law](simulator, make_sample(device, plan=plan)))
+
+
+@pytest.mark.parametrize("law", ["repeat", "translate", "append a far particle"])
+def test_laws_hold_for_bodies_that_the_ground_pushes(law, device):
+    config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **PUSHED))
+    broken = [str(x) for x in LAWS[law](awake(make_simulator(config)).to(device), make_sample(device)) if not x.holds]
+    assert not broken, "\n".join(broken)
 
 
 class Broken(Simulator):
