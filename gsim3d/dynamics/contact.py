@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.planes import planes
-from gsim3d.dynamics.samples import FAINTEST, Samples, squares, weights
+from gsim3d.dynamics.samples import FAINTEST, Samples, grouped, squares, ungrouped, weights
 from gsim3d.types import FROZEN, Particles
 
 CONTACT_CHANNELS = 4
@@ -37,9 +37,9 @@ class Beside:
             self._here = self._rests.mean[:, None]
             self._rests.seen_from(self._here)
             self._places = matter.rows.places - self._here
-            far = squares(self._places, self._rests.places)
-            self._window = weights(far * (-0.5 / (WINDOW * length) ** 2), self._rests.known)
-            way = (self._window @ self._rests.places - self._places) / length
+            places, self._around, known = grouped(self._places, self._rests.places, self._rests.known)
+            self._window = weights(squares(places, self._around) * (-0.5 / (WINDOW * length) ** 2), known)
+            way = (ungrouped(self._window @ self._around, self._places) - self._places) / length
             near = (-0.5 * way.square().sum(2, keepdim=True)).clamp(min=FAINTEST).exp()
             any_rests = (self._rests.n > 0)[:, None, None]
             self.contact = matter.packed(torch.where(any_rests, torch.cat([near * way, near], 2), 0))
@@ -49,7 +49,8 @@ class Beside:
         normal [N, 3]. Bodies are in front of it: ``centre`` [B, m, 3], of the body of each row of ``matter``, from
         ``matter.here``. 0 of rows that do not move, and where nothing is frozen."""
         with torch.no_grad(), torch.autocast(self._places.device.type, enabled=False):
-            middle, normal = planes(self._window, self._rests.places, WINDOW * self.length)
+            found = planes(self._window, self._around, WINDOW * self.length)
+            middle, normal = (ungrouped(x, self._places) for x in found)
             ahead = ((centre + self._matter.here - self._here - middle) * normal).sum(2, keepdim=True)
             normal = torch.where(ahead < 0, -normal, normal)
             height = ((self._places - middle) * normal).sum(2, keepdim=True)

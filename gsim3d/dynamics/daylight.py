@@ -10,7 +10,7 @@ from torch import Tensor
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.planes import planes
 from gsim3d.dynamics.rigid import SMALLEST
-from gsim3d.dynamics.samples import FAINTEST, Few, Samples, squares
+from gsim3d.dynamics.samples import FAINTEST, Few, Samples, grouped, squares, ungrouped
 from gsim3d.dynamics.shade import EDGE, between
 from gsim3d.types import DYNAMIC, FROZEN, Particles
 
@@ -87,14 +87,16 @@ class _Surface:
     """The plane through the samples near each of ``few`` of the ``places`` [B, M, 3]."""
 
     def __init__(self, places: Tensor, few: Few, samples: Samples, grid_size: float):
-        flat, body, places = FLAT * grid_size, BODY * grid_size, few.take(places)
-        far, known = squares(places, samples.places), samples.known[:, None]
+        flat, body, rows = FLAT * grid_size, BODY * grid_size, few.take(places)
+        places, around, known = grouped(rows, samples.places, samples.known[:, None])
+        far = squares(places, around)
         near = torch.where(known, (far * (-0.5 / flat**2)).clamp_(min=FAINTEST).exp_(), 0)
         window = near.div_(near.sum(2, keepdim=True).clamp(min=SMALLEST))
-        _, normal = planes(window, samples.places, flat)
+        _, normal = planes(window, around, flat)
         wide = torch.where(known, far.mul_(-0.5 / body**2).clamp_(min=FAINTEST).exp_(), 0)
         wide = wide.div_(wide.sum(2, keepdim=True).clamp(min=SMALLEST))
-        out = ((places - wide @ samples.places) * normal).sum(2, keepdim=True)
+        out = ((places - wide @ around) * normal).sum(2, keepdim=True)
+        normal, out = (ungrouped(x, rows) for x in (normal, out))
         self._normal, self._out = few.put(normal), few.put(out)[:, :, 0]
 
     def normals(self, direction: Tensor, grid_size: float) -> Tensor:

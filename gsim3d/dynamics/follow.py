@@ -1,4 +1,4 @@
-"""How encoded matter moves: its newest particles are found again in the oldest images."""
+"""How encoded matter moves: its newest particles are found again in older images."""
 
 from __future__ import annotations
 
@@ -40,8 +40,9 @@ def follow(
 
     The rigid motion of each Gaussian window of matter is the one with which its rows have in the oldest images, at the
     places where they were, the colours that they have in the newest (Lucas and Kanade, in all cameras at once): colours
-    divided by their sum, which do not change as a body turns in white light. It is found at the nodes of a lattice and
-    begins with how far the means moved. Scenes do not see each other.
+    divided by their sum, which do not change as a body turns in white light. It is found at the nodes of a lattice,
+    beginning with how far the means moved, and with the spin that is found likewise in the images of the last step:
+    since the oldest a body may have turned too far to be found again. Scenes do not see each other.
 
     Args:
         particles: ``frames`` encoded, clouds sorted by (scene, step). Views of the newest and the oldest step are
@@ -60,19 +61,20 @@ def follow(
         return result
     with torch.autocast(particles.means.device.type, enabled=False):
         matter = Matter(particles, grid_size, length)
-        then = Samples(Rows(Padded(particles, first, grid_size), particles))
-        then.seen_from(matter.here)
-        now = matter.samples
+        now, images = matter.samples, _images(frames, len(clouds), n_views)
+        seen = _Views(frames, particles, *images, newest, matter.here)
         centre = matter.window @ now.places
-        velocity = shift(now, then, matter.nodes, length)
-        images, is_image = _images(frames, len(clouds), n_views)
-        seen, before = (
-            _Views(frames, particles, images, is_image, chosen, matter.here) for chosen in (newest, first)
-        )
-        moved = _aligned(matter, centre, velocity, seen, before)
-        a_step = share_of_a_step(clouds, first, newest, now, then)
-        velocity, spin, middle = matter.of_rows(*(x * a_step for x in moved), centre)
-        found = velocity + torch.linalg.cross(spin, matter.places - middle)
+        spin = torch.zeros_like(centre)  # a step
+        for earlier in ([max(f, q - 1) for f, q in zip(first, newest)], first):
+            then = Samples(Rows(Padded(particles, earlier, grid_size), particles))
+            then.seen_from(matter.here)
+            before = _Views(frames, particles, *images, earlier, matter.here)
+            spans = constant(tuple(clouds.steps[q] - clouds.steps[e] for e, q in zip(earlier, newest)), spin.device)
+            begin = shift(now, then, matter.nodes, length), spans[:, None, None] * spin
+            a_step = share_of_a_step(clouds, earlier, newest, now, then)
+            velocity, spin = (x * a_step for x in _aligned(matter, centre, *begin, seen, before))
+        velocity, spin, middle = matter.of_rows(velocity, spin, centre)
+        found = -onward_at(matter.places, -velocity, -spin, middle)
         if falls is not None:
             spans = [clouds.steps[q] - clouds.steps[f] for f, q in zip(first, newest)]
             later = constant(tuple(max(0, span - 1) for span in spans), found.device)
@@ -89,11 +91,11 @@ def _oldest(clouds: CloudTable, begin: int, newest: int, n_steps: int) -> int:
 
 
 def _aligned(
-    matter: Matter, centre: Tensor, velocity: Tensor, seen: _Views, before: _Views
+    matter: Matter, centre: Tensor, velocity: Tensor, spin: Tensor, seen: _Views, before: _Views
 ) -> tuple[Tensor, Tensor]:
-    """Velocity and spin (rad) [B, G, 3] of each window, from the oldest step to the newest."""
+    """Velocity and spin (rad) [B, G, 3] of each window, from an earlier step to the newest; about those that are given."""
     now, window = matter.samples, matter.window
-    spin, places = torch.zeros_like(velocity), now.places
+    places = now.places
     outwards = F.normalize(places - matter.of_samples(centre)[0], dim=2)
     places = places + INSIDE * outwards
     wanted = []

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsim3d.dynamics.clouds import newest_clouds, with_field
 from gsim3d.dynamics.matter import Matter
-from gsim3d.dynamics.rigid import LITTLE, RigidFit, onward_at
+from gsim3d.dynamics.rigid import LITTLE, RigidFit, onward_at, spin_of
 from gsim3d.dynamics.state import rotate_left
 from gsim3d.types import Particles, take_runs
 
@@ -37,15 +37,17 @@ def _rigid(matter: Matter, own: Tensor, length: float) -> tuple[Tensor, Tensor]:
     """[N, 3] twice, of rows that moved by ``own`` [N, 3]: the motion of the window around each, and what comes next of
     the rigid motion of that window."""
     with torch.autocast(own.device.type, enabled=False):
-        found = matter.of_rows(*_of_windows(matter, own, length))
+        found = matter.of_rows(*_of_windows(matter, own, length, since=True))
         return matter.packed(found[0]), matter.packed(onward_at(matter.places, *found))
 
 
-def _of_windows(matter: Matter, moved: Tensor, length: float) -> tuple[Tensor, Tensor, Tensor]:
-    """How far each window moved, its spin (rad) and its centre, [B, G, 3] each, of rows that moved by ``moved``."""
-    with torch.no_grad():
-        body = RigidFit(matter.window, matter.samples.places, length, LITTLE)
-    return *body.fit(matter.samples.take(matter.padded(moved))), body.centre
+def _of_windows(matter: Matter, moved: Tensor, length: float, since: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """How far each window moved, its spin (rad) and its centre, [B, G, 3] each, of rows that moved by ``moved``, from
+    where they are or, ``since`` then, to there."""
+    paths, half = matter.samples.take(matter.padded(moved)), -0.5 if since else 0.5
+    body = RigidFit(matter.window, matter.samples.places + half * paths, length, LITTLE)
+    velocity, fitted = body.fit(paths)
+    return velocity, spin_of(fitted), body.centre - half * velocity
 
 
 @torch.no_grad()
@@ -61,6 +63,6 @@ def turned(turns: Tensor, moved: Tensor, length: float, matter: Matter | None) -
     if matter is None:
         return turns
     with torch.autocast(moved.device.type, enabled=False):
-        _, spin, _ = _of_windows(matter, moved, length)
+        _, spin, _ = _of_windows(matter, moved, length, since=False)
         (spin,) = matter.of_rows(spin)
         return rotate_left(turns, matter.packed(spin))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
-from gsim3d.dynamics.samples import SAMPLES
+from gsim3d.dynamics.samples import grouped, ungrouped
 from gsim3d.types import constant
 
 SQUARINGS = 10  # of a matrix: what is left is its largest eigenvalue's, to the power 2^10
@@ -14,6 +15,7 @@ NODES = 6  # of the lattice that spans the movable rows of a scene, along each a
 SMALLEST = 1e-30  # of what is divided by
 STIFFNESS = 1e-3  # against turning, relative to the window's size: a point and a line do not turn
 LITTLE = 1e-5  # likewise, of paths that are known: what it takes of a spin it takes in every step
+STRAIGHT = 1e-4  # radian: a smaller turn has an arc as long as its chord
 
 
 class Lattice:
@@ -32,15 +34,12 @@ class Lattice:
         """[B, N, 3] at ``places`` [B, N, 3], of each of ``values`` [B, G, 3].
 
         A product with the share of every node: on a GPU its gradient has a fixed order, that of grid_sample has not.
-        Rows are multiplied in groups of one size, so that the bits of a scene do not depend on the others.
         """
-        n, field = places.shape[1], torch.cat(values, 2)
         place = ((places - self._low) / self._size.clamp(min=1e-6)).clamp(0, 1)
-        place = F.pad(place, (0, 0, 0, -n % SAMPLES)).unflatten(1, (-1, SAMPLES))
-        x, y, z = (1 - (NODES - 1) * (place[..., None] - self._ticks).abs()).clamp(min=0).unbind(3)
-        shares = (x[..., :, None, None] * y[..., None, :, None] * z[..., None, None, :]).flatten(3)
-        found = torch.cat([shares[:, group] @ field for group in range(shares.shape[1])], 1)
-        return found[:, :n].split(3, 2)
+        place, field = grouped(place, torch.cat(values, 2))
+        x, y, z = (1 - (NODES - 1) * (place[..., None] - self._ticks).abs()).clamp(min=0).unbind(2)
+        shares = (x[..., :, None, None] * y[..., None, :, None] * z[..., None, None, :]).flatten(2)
+        return ungrouped(shares @ field, places).split(3, 2)
 
 
 class RigidFit:
@@ -64,9 +63,22 @@ class RigidFit:
 
 
 def onward_at(places: Tensor, velocity: Tensor, spin: Tensor, centre: Tensor) -> Tensor:
-    """[B, N, 3], what comes next at ``places`` of rigid motions there, [B, N, 3] all of them."""
-    turning = torch.linalg.cross(spin, places - centre)
-    return velocity + turning + 0.5 * torch.linalg.cross(spin, turning)
+    """[B, N, 3], what comes next at ``places`` of rigid motions there, [B, N, 3] all of them, however far they turn."""
+    turning, angle = torch.linalg.cross(spin, places - centre), _size(spin)
+    towards_axis = 0.5 * torch.sinc(angle / (2 * math.pi)).square() * torch.linalg.cross(spin, turning)
+    return velocity + torch.sinc(angle / math.pi) * turning + towards_axis
+
+
+def spin_of(fitted: Tensor) -> Tensor:
+    """[B, G, 3] rad, of the spins that :class:`RigidFit` finds in paths of the places halfway: the chords of a turn are
+    those of twice the tangent of its half."""
+    tangent = 0.5 * _size(fitted)
+    return torch.atan(tangent) / tangent * fitted
+
+
+def _size(spin: Tensor) -> Tensor:
+    """[..., 1] rad; not less than ``STRAIGHT``."""
+    return spin.square().sum(-1, keepdim=True).clamp(min=STRAIGHT**2).sqrt()
 
 
 def solved(matrices: Tensor, values: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ import copy
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
 
 from gsim3d.ops.sentinel import CELLS
 from gsim3d.types import DYNAMIC, Particles, constant
@@ -171,6 +172,19 @@ def weights(logits: Tensor, known: Tensor) -> Tensor:
     logits = torch.where(known, logits, -torch.inf)
     logits = (logits - logits.amax(2, keepdim=True)).clamp(min=FAINTEST)
     return torch.where(known, logits, -torch.inf).softmax(2).nan_to_num(0)
+
+
+def grouped(rows: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
+    """``rows`` [B, N, C] in groups of one size, [B K, SAMPLES, C], and what belongs to each group of ``others``
+    [B, ...]: bits of products of matrices do not depend on how many rows other scenes have. Back: :func:`ungrouped`."""
+    k = -(-rows.shape[1] // SAMPLES)
+    rows = F.pad(rows, (0, 0, 0, k * SAMPLES - rows.shape[1])).unflatten(1, (k, SAMPLES))
+    return tuple(x.flatten(0, 1) for x in (rows, *(x[:, None].expand(-1, k, *x.shape[1:]) for x in others)))
+
+
+def ungrouped(values: Tensor, like: Tensor) -> Tensor:
+    """[B, N, ...] of ``values`` [B K, SAMPLES, ...], of the rows ``like`` [B, N, C]."""
+    return values.unflatten(0, (len(like), -1)).flatten(1, 2)[:, : like.shape[1]]
 
 
 def squares(a: Tensor, b: Tensor) -> Tensor:

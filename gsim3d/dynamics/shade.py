@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.dynamics.matter import Matter
-from gsim3d.dynamics.samples import FAINTEST, Samples, squares
+from gsim3d.dynamics.samples import FAINTEST, Samples, grouped, squares, ungrouped
 from gsim3d.types import FROZEN, Particles
 
 BEAM = 2.0  # cells: standard deviation of the beam of light in which matter is counted
@@ -47,17 +47,18 @@ def between(places: Tensor, matter: Samples, light: Tensor, beam: float, nearest
     """[B, M], how many samples are between each of ``places`` [B, M, 3] and the light, in a Gaussian beam, from
     ``nearest`` on, where they begin to count over ``edge``; metres. What is near a beam enters it when the light turns:
     that is its gradient."""
-    direction = light / light.norm()
+    direction, rows = light / light.norm(), places
+    places, there, known = grouped(rows, matter.places, matter.known)
     with torch.no_grad():
-        ahead = (matter.places @ direction)[:, None] - (places @ direction)[:, :, None]
-        off = squares(places, matter.places).sub_(ahead.square()).clamp_(min=0)
+        ahead = (there @ direction)[:, None] - (places @ direction)[:, :, None]
+        off = squares(places, there).sub_(ahead.square()).clamp_(min=0)
         begun = (ahead - nearest).div_(edge).sigmoid_()
         counted = off.mul_(-0.5 / beam**2).clamp_(min=FAINTEST).exp_().mul_(begun)
-        counted.masked_fill_(~matter.known[:, None], 0)
+        counted.masked_fill_(~known[:, None], 0)
         if not direction.requires_grad:
-            return counted.sum(2)
+            return ungrouped(counted.sum(2), rows)
         # By the direction, the squared way off changes by -2 ahead * way, and the way ahead by the way.
         by_way = counted * (ahead / beam**2 + (1 - begun) / edge)
-        slope = by_way @ matter.places - by_way.sum(2, keepdim=True) * places
+        slope = by_way @ there - by_way.sum(2, keepdim=True) * places
         found = counted.sum(2)
-    return found + slope @ (direction - direction.detach())
+    return ungrouped(found + slope @ (direction - direction.detach()), rows)

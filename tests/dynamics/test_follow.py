@@ -92,6 +92,18 @@ def test_it_finds_how_a_body_flies_and_turns_whatever_the_light_does(spin, lit):
     assert (turn - torch.tensor(spin)).norm() < 5e-3
 
 
+@pytest.mark.parametrize("spin", [(0.0, 0.0, 0.3), (0.25, -0.1, 0.1)])
+def test_it_finds_how_a_body_tumbles(spin):
+    """Since the oldest step by 0.9 rad: more than is found again without the spin of the last step."""
+    particles, frames = filmed(spin=spin)
+    particles = dataclasses.replace(particles, body=torch.ones_like(particles.means))
+    found = follow(particles, frames, LENGTH, CELL, STEPS)
+    newest = last_steps(particles, 1).means
+    back = (newest - 1) @ torch.linalg.matrix_exp(-cross_matrix(spin)).T + 1 - torch.tensor(VELOCITY)
+    off = (found[-len(newest) :] - (newest - back)).norm(dim=1)
+    assert off.max() < 0.05 * RADIUS * torch.tensor(spin).norm()
+
+
 def test_places_that_are_wrong_do_not_matter_much():
     """Those of encoded rows are, by about a centimetre."""
     particles, frames = filmed()

@@ -55,6 +55,20 @@ def test_what_comes_next_follows_from_what_is_momentum():
     assert_close_relative_to_max(moved.mean(0), torch.tensor(VELOCITY), 0.1)
 
 
+@pytest.mark.parametrize("squashed", [1.0, 0.2])
+def test_a_whole_body_may_tumble(squashed):
+    """Whatever its shape: ways of half a radian are chords, which an inertia of one end of them would misread."""
+    spin, size = (0.3, 0.0, -0.4), torch.tensor([1.0, 1.0, squashed])
+    turn = torch.linalg.matrix_exp(cross_matrix(spin))
+    now = (turning(1).means - 1 - 0.2) * size
+    places, way = 1 + now, torch.tensor(VELOCITY) + now - now @ turn
+    history = dataclasses.replace(turning(1), means=places, velocity=way, body=torch.ones_like(places))
+    moved, rigid, _ = momentum(history, *HOW).unbind(1)
+    arms = now - now.mean(0)
+    assert_close_relative_to_max(moved, way.mean(0).expand_as(moved), 1e-4)
+    assert_close_relative_to_max(rigid, way.mean(0) + arms @ turn.T - arms, 2e-3)
+
+
 def test_untrained_a_body_flies_and_turns_on_and_knows_how():
     dynamics = make_dynamics(dataclasses.replace(CARRYING, zero_init=True))
     steps = rollout(dynamics, flying(), 6, max_steps=2)

@@ -61,7 +61,8 @@ def test_laws_hold_for_every_background(law, background, device, simulators):
     assert all(deviation.holds for deviation in LAWS[law](simulator, make_sample(device, plan=plan)))
 
 
-@pytest.mark.parametrize("law", ["repeat", "translate", "append a far particle"])
+# Bodies of noise that are stopped amplify the rounding of sums in another order: of rows in another one.
+@pytest.mark.parametrize("law", [law for law in LAWS if law != "permute particles"])
 def test_laws_hold_for_bodies_that_the_ground_pushes(law, device):
     config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **PUSHED))
     broken = [str(x) for x in LAWS[law](awake(make_simulator(config)).to(device), make_sample(device)) if not x.holds]
