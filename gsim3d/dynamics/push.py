@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsim3d.dynamics.contact import Beside
+from gsim3d.dynamics.contact import FIRM, Beside
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.rigid import LITTLE, SMALLEST, RigidFit
 from gsim3d.types import Particles, take_runs
@@ -21,7 +21,8 @@ class Pushes:
     length: metres, of the windows of ``matter``, about the radius of a body.
     friction: most of what a stopped row loses along a surface, over what it loses towards it (a number).
     skin: metres over the background at which rows stop: they are seen inside of their bodies (a number).
-    solid: what stops some rows moves their body in the same step.
+    solid: what stops some rows moves their body in the same step. Rows that are less opaque than ``contact.FIRM`` stop
+        none: they lie outside of the bodies that they are seen of, and a ball would stand on them.
     """
 
     def __init__(
@@ -39,7 +40,9 @@ class Pushes:
             self._body = RigidFit(matter.window, matter.samples.places, length, LITTLE)
             (self._centre,) = matter.of_rows(self._body.centre)
         height, self._normal = beside.surface(self._centre)
-        newest = take_runs(history.means, history.clouds.row_runs(matter.newest))
+        runs = history.clouds.row_runs(matter.newest)
+        newest = take_runs(history.means, runs)
+        self._stops = take_runs(history.opacities.detach(), runs)[:, None] >= FIRM if solid else None
         # For gradients: a row that is stopped comes to the same height wherever it was, and a higher one is less near.
         raised = ((newest - newest.detach()) * self._normal).sum(1, keepdim=True)
         self._height = height + raised - skin
@@ -92,6 +95,8 @@ class Pushes:
         into = (moves * self._normal).sum(1, keepdim=True)
         stop = torch.minimum((-into).clamp(min=0), (-self._height - into).clamp(min=0))
         along = moves - into * self._normal
+        if self._stops is not None:
+            stop = stop * self._stops
         speed = along.square().sum(1, keepdim=True).clamp(min=LEAST**2).sqrt()
         held = (self._friction.clamp(min=0) * stop / speed).clamp(max=1)
         return stop * self._normal - held * along

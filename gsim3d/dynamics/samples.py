@@ -179,7 +179,8 @@ def grouped(rows: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
     [B, ...]: bits of products of matrices do not depend on how many rows other scenes have. Back: :func:`ungrouped`."""
     k = -(-rows.shape[1] // SAMPLES)
     rows = F.pad(rows, (0, 0, 0, k * SAMPLES - rows.shape[1])).unflatten(1, (k, SAMPLES))
-    return tuple(x.flatten(0, 1) for x in (rows, *(x[:, None].expand(-1, k, *x.shape[1:]) for x in others)))
+    others = (x[:, None].expand(-1, k, *x.shape[1:]) for x in others)
+    return tuple(x.flatten(0, 1).contiguous() for x in (rows, *others))
 
 
 def ungrouped(values: Tensor, like: Tensor) -> Tensor:

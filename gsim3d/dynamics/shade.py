@@ -50,7 +50,7 @@ def between(places: Tensor, matter: Samples, light: Tensor, beam: float, nearest
     direction, rows = light / light.norm(), places
     places, there, known = grouped(rows, matter.places, matter.known)
     with torch.no_grad():
-        ahead = (there @ direction)[:, None] - (places @ direction)[:, :, None]
+        ahead = (there * direction).sum(2)[:, None] - (places * direction).sum(2)[:, :, None]
         off = squares(places, there).sub_(ahead.square()).clamp_(min=0)
         begun = (ahead - nearest).div_(edge).sigmoid_()
         counted = off.mul_(-0.5 / beam**2).clamp_(min=FAINTEST).exp_().mul_(begun)

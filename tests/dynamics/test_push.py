@@ -129,6 +129,25 @@ def test_a_solid_body_stops_as_a_whole():
         assert (found[:, 2].mean() > -0.04) == solid and (squeezed.norm(dim=1).max() < 0.02) == solid
 
 
+@pytest.mark.parametrize("solid", [False, True])
+def test_faint_rows_stop_no_solid_body(solid):
+    """Of a ball high above the ground one row is below it."""
+    history = ball(0.2)
+    moving = history.activity == DYNAMIC
+    lowest = moving.nonzero()[history.means[moving, 2].argmin()]
+    means, opacities = history.means.clone(), torch.full_like(history.opacities, FIRM)
+    means[lowest, 2] = 1.0
+    found = []
+    for opacity in (FIRM, 0.9 * FIRM):
+        opacities[lowest] = opacity
+        changed = dataclasses.replace(history, means=means, opacities=opacities.clone())
+        changed = dataclasses.replace(changed, body=bodies(changed, CELL))
+        found.append(moves(changed, onward=[0.0, 0.0, -0.05], solid=solid))
+    stopped = [x[moving, 2] + 0.05 for x in found]
+    assert stopped[0].max() > 0.049 and (stopped[0].median() > 0.01) == solid
+    assert (stopped[1].abs().max() < 1e-6) if solid else torch.equal(*found)
+
+
 def test_a_solid_body_that_is_stopped_at_one_end_turns():
     history = ball(0.02)
     moving = history.activity == DYNAMIC
