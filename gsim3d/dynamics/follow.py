@@ -93,7 +93,7 @@ def _oldest(clouds: CloudTable, begin: int, newest: int, n_steps: int) -> int:
 def _aligned(
     matter: Matter, centre: Tensor, velocity: Tensor, spin: Tensor, seen: _Views, before: _Views
 ) -> tuple[Tensor, Tensor]:
-    """Velocity and spin (rad) [B, G, 3] of each window, from an earlier step to the newest; about those that are given."""
+    """Velocity and spin (rad) [B, G, 3] of each window since an earlier step, beginning with those that are given."""
     now, window = matter.samples, matter.window
     places = now.places
     outwards = F.normalize(places - matter.of_samples(centre)[0], dim=2)
