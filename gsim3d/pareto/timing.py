@@ -57,7 +57,7 @@ class Clock(Protocol):
         """The point in the device's work that has been asked for so far; in a capture, in the work of every replay."""
 
     def capturing(self) -> bool:
-        """Whether what is asked for now becomes part of a graph."""
+        """Whether a graph is being captured."""
 
     def mark_cost(self) -> float:
         """Seconds that a mark in a graph adds to it."""

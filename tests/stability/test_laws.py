@@ -65,7 +65,8 @@ def test_laws_hold_for_every_background(law, background, device, simulators):
 @pytest.mark.parametrize("law", [law for law in LAWS if law != "permute particles"])
 def test_laws_hold_for_bodies_that_the_ground_pushes(law, device):
     config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **PUSHED))
-    sample = make_sample(device, n_steps=3 if device == "cpu" else 1)  # products of a GPU are rounded by the batch
+    # Products of a GPU are rounded by the batch: one step does not amplify that.
+    sample = make_sample(device, n_steps=1 if device != "cpu" and law == "split the batch" else 3)
     broken = [str(x) for x in LAWS[law](awake(make_simulator(config)).to(device), sample) if not x.holds]
     assert not broken, "\n".join(broken)
 
