@@ -1,5 +1,6 @@
 """The torch-free core: its C++ tests, and a stranger's CMake project built against the installed package."""
 
+import platform
 import shutil
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +26,18 @@ def build(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def prefix(build, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("prefix")
+    run("cmake", "--install", build, "--prefix", folder)
+    return folder
+
+
+def check_syntax(include, text, place, *options):
+    place.write_text(text)
+    run("c++", "-std=c++20", "-Wall", "-Wextra", "-Werror", *options, "-I", include, "-fsyntax-only", place)
+
+
 def test_core_tests_pass(build):
     output = run("ctest", "--test-dir", build, "--output-on-failure")
     assert "100% tests passed" in output
@@ -32,14 +45,28 @@ def test_core_tests_pass(build):
     assert f"out of {sources}" in output
 
 
-def test_foreign_project_builds_against_the_install_tree(build, tmp_path):
-    run("cmake", "--install", build, "--prefix", tmp_path / "prefix")
-    headers = {path.name for path in (tmp_path / "prefix" / "include" / "gsim3d").rglob("*.h")}
-    assert "pool.h" in headers and "torch_utils.h" not in headers
+def test_foreign_project_builds_against_the_install_tree(prefix, tmp_path):
     consumer = ROOT / "tests" / "cpp" / "consumer"
-    run("cmake", "-G", "Ninja", "-S", consumer, "-B", tmp_path / "app", f"-DCMAKE_PREFIX_PATH={tmp_path / 'prefix'}")
+    run("cmake", "-G", "Ninja", "-S", consumer, "-B", tmp_path / "app", f"-DCMAKE_PREFIX_PATH={prefix}")
     run("cmake", "--build", tmp_path / "app")
     assert run(tmp_path / "app" / "app").split() == ["3", "3"]
+
+
+def test_installed_headers_compile_alone_and_together(prefix, tmp_path):
+    include = prefix / "include"
+    headers = sorted(str(path.relative_to(include)) for path in include.rglob("*.h"))
+    ops = {path.name for path in (ROOT / "csrc" / "gsim3d").iterdir()} - {"torch", "numpy"}
+    assert {header.split("/")[1] for header in headers} == ops  # those of bindings are not installed
+    alone = [f'#include "{header}"\n' for header in headers]
+    for number, text in enumerate(alone):
+        check_syntax(include, text, tmp_path / f"{number}.cpp")
+    check_syntax(include, "".join(alone), tmp_path / "together.cpp")
+
+
+@pytest.mark.parametrize("header", ["core/simd.h", "raster/raster_simd.h", "raster/raster_tiles.h"])
+def test_other_headers_compile_alone(header, tmp_path):
+    baseline = ["-march=x86-64-v3"] if platform.machine() in ("x86_64", "AMD64") else []
+    check_syntax(ROOT / "csrc", f'#include "gsim3d/{header}"\n', tmp_path / "alone.cpp", *baseline)
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ struct Overlap {
 // Part p of a curve: queries q_rows[cu_q[p]] .. and keys kv_rows[cu_k[p]] .. A patch of many queries becomes several
 // parts, which all list its keys; one of none becomes no part. Parts are ordered by patch, queries of a patch by cloud
 // and code. Behind the last part offsets repeat, q_rows lists the rows without a patch, and kv_rows is 0.
-struct Parts {
+struct QueryParts {
   int64_t* q_rows;   // [n_curves, n_rows]
   int64_t* kv_rows;  // [n_curves, n_listed]
   int64_t* cu_q;     // [n_curves, n_parts + 1]
@@ -80,7 +80,7 @@ void add_cells(const T* x,      // [n, channels]
 
 // A row belongs to the last patch of its scene that begins no later than its code. Throws ArgumentError unless the
 // lists are well formed.
-void overlapping_patches(const Overlap& overlap, const Parts& parts, const Workspace& workspace,
+void overlapping_patches(const Overlap& overlap, const QueryParts& parts, const Workspace& workspace,
                          const Parallel& parallel);
 
 }  // namespace cpu
@@ -95,7 +95,7 @@ void find_cells(const int64_t* cells, int64_t n_cells, const int64_t* scene, con
 template <typename T>
 void add_cells(const T* x, const T* field, const int64_t* places, int64_t n, int64_t n_cells, int64_t channels, T* out,
                Stream stream);
-void overlapping_patches(const Overlap& overlap, const Parts& parts, const Workspace& workspace, Stream stream);
+void overlapping_patches(const Overlap& overlap, const QueryParts& parts, const Workspace& workspace, Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

@@ -40,7 +40,7 @@ void check_overlap(const Overlap& overlap) {
 }
 
 // Of one curve. `patch` [n_rows] and `begin` [n_patches + 2] are scratch.
-void cut(const Overlap& overlap, const Parts& parts, int64_t curve, int64_t* patch, int64_t* begin) {
+void cut(const Overlap& overlap, const QueryParts& parts, int64_t curve, int64_t* patch, int64_t* begin) {
   const int64_t n_patches = overlap.n_patches, n_parts = overlap.n_parts(), n_listed = overlap.n_listed();
   const int64_t n_real = overlap.cu_clouds[overlap.n_clouds];
   const int64_t* codes = overlap.codes + curve * overlap.n_rows;
@@ -109,7 +109,7 @@ template void add_cells<float>(const float*, const float*, const int64_t*, int64
 template void add_cells<double>(const double*, const double*, const int64_t*, int64_t, int64_t, int64_t, double*,
                                 const Parallel&);
 
-void overlapping_patches(const Overlap& overlap, const Parts& parts, const Workspace& workspace,
+void overlapping_patches(const Overlap& overlap, const QueryParts& parts, const Workspace& workspace,
                          const Parallel& parallel) {
   check_overlap(overlap);
   const int64_t n = overlap.n_rows, n_begins = overlap.n_patches + 2;

@@ -51,7 +51,7 @@ __global__ void __launch_bounds__(kThreads)
 // Queries of one curve on their way to parts. A bucket is a patch, or behind the last one the rows without a patch.
 struct Cut {
   Overlap overlap;
-  Parts parts;
+  QueryParts parts;
   int64_t n_parts, n_buckets;
   int64_t* bucket;  // [n_curves, n_rows], of the row at each place of the order
   int64_t* starts;  // [n_curves, n_clouds, n_buckets + 1]: the place at which a cloud's rows of each bucket begin
@@ -239,7 +239,7 @@ GSIM3D_INSTANTIATE(Float16)
 GSIM3D_INSTANTIATE(BFloat16)
 #undef GSIM3D_INSTANTIATE
 
-void overlapping_patches(const Overlap& overlap, const Parts& parts, const Workspace& workspace, Stream stream) {
+void overlapping_patches(const Overlap& overlap, const QueryParts& parts, const Workspace& workspace, Stream stream) {
   Cut cut{overlap, parts, overlap.n_parts(), overlap.n_patches + 1};
   cut.bucket = workspace.take<int64_t>(overlap.n_curves * overlap.n_rows);
   cut.starts = workspace.take<int64_t>(overlap.n_curves * overlap.n_clouds * (cut.n_buckets + 1));

@@ -123,7 +123,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> overlapping_patches(const Tensor& fir
   const int64_t n_parts = overlap.n_parts();
   Tensor q_rows = empty(first, {n_curves, overlap.n_rows}), keys = empty(first, {n_curves, overlap.n_listed()});
   Tensor cu_q = empty(first, {n_curves, n_parts + 1}), cu_keys = empty(first, {n_curves, n_parts + 1});
-  const Parts parts{mutable_data<int64_t>(q_rows), mutable_data<int64_t>(keys), mutable_data<int64_t>(cu_q),
+  const QueryParts parts{mutable_data<int64_t>(q_rows), mutable_data<int64_t>(keys), mutable_data<int64_t>(cu_q),
                     mutable_data<int64_t>(cu_keys)};
   TensorWorkspace workspace(first);
   if constexpr (kWithCuda)

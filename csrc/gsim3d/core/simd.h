@@ -53,7 +53,7 @@ namespace baseline {
 #else
 #define GSIM3D_SIMD_BYTES 16
 #endif
-#include "gsim3d/core/simd_lanes.h"
+#include "gsim3d/core/simd_lanes.inc"
 #undef GSIM3D_SIMD_BYTES
 }  // namespace baseline
 
@@ -61,7 +61,7 @@ namespace baseline {
 GSIM3D_SIMD_AVX512_BEGIN
 namespace avx512 {
 #define GSIM3D_SIMD_BYTES 64
-#include "gsim3d/core/simd_lanes.h"
+#include "gsim3d/core/simd_lanes.inc"
 #undef GSIM3D_SIMD_BYTES
 }  // namespace avx512
 GSIM3D_SIMD_AVX512_END

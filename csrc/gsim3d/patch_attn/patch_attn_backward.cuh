@@ -8,7 +8,7 @@
 
 #include "gsim3d/patch_attn/patch_attn_mma_tile.cuh"
 #include "gsim3d/patch_attn/patch_attn_softmax.cuh"
-#include "gsim3d/patch_attn/patch_attn_tensor.h"
+#include "gsim3d/patch_attn/patch_attn_tensor.cuh"
 
 namespace gsim3d::cuda {
 

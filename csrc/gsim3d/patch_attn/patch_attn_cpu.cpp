@@ -22,14 +22,14 @@ constexpr int64_t kTasks = 64;          // long patches are cut until there are 
 
 namespace baseline {
 using namespace simd::baseline;
-#include "gsim3d/patch_attn/patch_attn_tile.h"
+#include "gsim3d/patch_attn/patch_attn_tile.inc"
 }  // namespace baseline
 
 #ifdef GSIM3D_SIMD_X86
 GSIM3D_SIMD_AVX512_BEGIN
 namespace avx512 {
 using namespace simd::avx512;
-#include "gsim3d/patch_attn/patch_attn_tile.h"
+#include "gsim3d/patch_attn/patch_attn_tile.inc"
 }  // namespace avx512
 GSIM3D_SIMD_AVX512_END
 #else

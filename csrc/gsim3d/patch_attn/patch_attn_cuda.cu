@@ -1,8 +1,8 @@
 // Patch attention on a GPU: which kernels run, and gradients of rows that several slots list.
 #include <algorithm>
 
-#include "gsim3d/patch_attn/patch_attn_simple.h"
-#include "gsim3d/patch_attn/patch_attn_tensor.h"
+#include "gsim3d/patch_attn/patch_attn_simple.cuh"
+#include "gsim3d/patch_attn/patch_attn_tensor.cuh"
 
 namespace gsim3d::cuda {
 namespace {

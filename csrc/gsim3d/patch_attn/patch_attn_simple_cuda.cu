@@ -6,7 +6,7 @@
 #include <cuda_bf16.h>
 #include <cuda_fp16.h>
 
-#include "gsim3d/patch_attn/patch_attn_simple.h"
+#include "gsim3d/patch_attn/patch_attn_simple.cuh"
 
 namespace gsim3d::cuda {
 namespace {

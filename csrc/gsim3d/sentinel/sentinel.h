@@ -57,7 +57,7 @@ constexpr int64_t watched_parts(int64_t n_rows, int64_t n_clouds, int64_t piece)
 }
 
 // The parts of one look, and where its record goes.
-struct Parts {
+struct StatePartials {
   const double* parts;     // [watched_parts(n_rows, n_clouds, kWatchedPiece), watched_columns(n_fields)]
   const int64_t* cu_rows;  // [n_clouds + 1]
   double* record;          // [n_clouds, watched_columns(n_fields)]
@@ -72,11 +72,11 @@ constexpr int64_t kWatchedPiece = 1024;  // rows
 template <typename T>
 void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended,
                 int32_t* status,  // [n_rows]
-                double* parts,    // as in Parts
+                double* parts,    // as in StatePartials
                 const Parallel& parallel);
 
 // Throws ArgumentError unless offsets ascend from 0 to n_rows.
-void join_parts(const Parts& look);
+void join_parts(const StatePartials& look);
 
 }  // namespace cpu
 
@@ -90,7 +90,7 @@ template <typename T>
 void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* parts,
                 Stream stream);
 
-void join_parts(const Parts* looks, int64_t n_looks, Stream stream);
+void join_parts(const StatePartials* looks, int64_t n_looks, Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

@@ -101,7 +101,7 @@ void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t
   });
 }
 
-void join_parts(const Parts& look) {
+void join_parts(const StatePartials& look) {
   check_offsets("join_parts", look.cu_rows, look.n_clouds, look.n_rows);
   const int columns = watched_columns(look.n_fields);
   for (int64_t q = 0; q < look.n_clouds; ++q) {

@@ -159,13 +159,13 @@ __global__ void __launch_bounds__(kPiece)
 
 constexpr int kLooks = 32;  // of a launch
 struct Looks {
-  Parts of[kLooks];
+  StatePartials of[kLooks];
 };
 
 // A block takes a cloud of a look, a lane a column, a warp a run of the cloud's partial records.
 __global__ void __launch_bounds__(kTeams* kWarp) join_kernel(const __grid_constant__ Looks looks) {
   __shared__ double of_team[kTeams][kWarp];
-  const Parts& look = looks.of[blockIdx.y];
+  const StatePartials& look = looks.of[blockIdx.y];
   const int columns = watched_columns(look.n_fields), column = threadIdx.x % kWarp, team = threadIdx.x / kWarp;
   bool ascends = true;  // else some pairs of a piece and a cloud have no partial record
   for (int64_t q = threadIdx.x; q < look.n_clouds; q += kTeams * kWarp)
@@ -203,7 +203,7 @@ void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t
          parts);
 }
 
-void join_parts(const Parts* all, int64_t n_looks, Stream stream) {
+void join_parts(const StatePartials* all, int64_t n_looks, Stream stream) {
   for (int64_t first = 0; first < n_looks; first += kLooks) {
     Looks looks{};
     const int64_t n = std::min<int64_t>(n_looks - first, kLooks);

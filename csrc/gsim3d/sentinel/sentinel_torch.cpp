@@ -17,7 +17,7 @@ Tensor join_parts(std::vector<Tensor> parts, std::vector<Tensor> cu_rows, std::v
   check(!parts.empty() && parts.size() == cu_rows.size() && parts.size() == n_rows.size(), op,
         ": parts must be of one look at least, cu_rows and n_rows of as many; got ", parts.size(), ", ",
         cu_rows.size(), " and ", n_rows.size());
-  std::vector<Parts> looks;
+  std::vector<StatePartials> looks;
   int64_t total = 0;
   for (size_t i = 0; i < parts.size(); ++i) {
     parts[i] = rows_of(parts[i]), cu_rows[i] = rows_of(cu_rows[i]);
@@ -42,7 +42,7 @@ Tensor join_parts(std::vector<Tensor> parts, std::vector<Tensor> cu_rows, std::v
   }
   Tensor records = empty(parts[0], {total}, ScalarType::Double);
   double* record = mutable_data<double>(records);
-  for (Parts& look : looks) {
+  for (StatePartials& look : looks) {
     look.record = record;
     record += look.n_clouds * watched_columns(look.n_fields);
   }
@@ -51,7 +51,7 @@ Tensor join_parts(std::vector<Tensor> parts, std::vector<Tensor> cu_rows, std::v
       cuda::join_parts(looks.data(), static_cast<int64_t>(looks.size()), current_stream(parts[0]));
       return records;
     }
-  for (const Parts& look : looks) cpu::join_parts(look);
+  for (const StatePartials& look : looks) cpu::join_parts(look);
   return records;
 }
 
@@ -137,8 +137,8 @@ std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
   });
   if (!joined) return {status, parts, made};
   Tensor record = empty(fields[0], {n_clouds, columns}, ScalarType::Double);
-  const Parts look{data<double>(parts),         data<int64_t>(cu_rows), mutable_data<double>(record), n, n_clouds,
-                   static_cast<int>(n_fields)};
+  const StatePartials look{data<double>(parts), data<int64_t>(cu_rows), mutable_data<double>(record), n, n_clouds,
+                           static_cast<int>(n_fields)};
   if constexpr (kWithCuda)
     if (record.is_cuda()) {
       cuda::join_parts(&look, 1, current_stream(record));

@@ -20,14 +20,14 @@ struct Products {
 
 namespace baseline {
 using namespace simd::baseline;
-#include "gsim3d/sparse_conv/sparse_conv_tile.h"
+#include "gsim3d/sparse_conv/sparse_conv_tile.inc"
 }  // namespace baseline
 
 #ifdef GSIM3D_SIMD_X86
 GSIM3D_SIMD_AVX512_BEGIN
 namespace avx512 {
 using namespace simd::avx512;
-#include "gsim3d/sparse_conv/sparse_conv_tile.h"
+#include "gsim3d/sparse_conv/sparse_conv_tile.inc"
 }  // namespace avx512
 GSIM3D_SIMD_AVX512_END
 #else
