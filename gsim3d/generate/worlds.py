@@ -12,6 +12,8 @@ from gsim3d.generate import meshes, shapes
 from gsim3d.generate.stage import Cloth, Material, RigidBody, SoftBody
 from gsim3d.generate.world import TRAIN, World
 
+# Seeds of held-out trajectories: models are chosen on the first; the second is scored once a release.
+VALIDATION_SEED, TEST_SEED = 77, 78
 SOFT_DENSITY = 45.0  # kg per cubic metre of the body's bounding box, about half of which it fills
 LIGHT_DENSITY = 20.0  # likewise, of bodies that a cloth must carry
 RIGID_DENSITY = 200.0

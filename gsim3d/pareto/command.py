@@ -251,7 +251,7 @@ def _scenes(args: argparse.Namespace, restored, out, count: int | None) -> list:
 
     if args.data is None:
         from gsim3d.generate import generate
-        from gsim3d.train.shipped import HELD_OUT_SEED
+        from gsim3d.generate.worlds import VALIDATION_SEED
 
         world, preset, options = _world(args.checkpoint, quick)
         folders = generate(
@@ -260,7 +260,7 @@ def _scenes(args: argparse.Namespace, restored, out, count: int | None) -> list:
             preset=preset,
             image_size=restored.image_size[0],
             n_trajectories=count,
-            seed=HELD_OUT_SEED,
+            seed=VALIDATION_SEED,
             progress=not args.quiet,
             **options,
         ).folders
