@@ -167,7 +167,8 @@ class LossConfig:
 class OptimizerConfig:
     """AdamW, clipped at a global gradient norm.
 
-    ema_decay: of the averaged weights; 0: no averaging.
+    encoder_rate: learning rate of the encoder, relative to that of the other parts.
+    ema_decay: of the averaged weights; 0: no averaging. A step counts for the weights that it moves.
     max_skipped: steps in a row whose loss or gradient is not finite, then the run stops. Fewer stop at a rare bad
         sample; more only take longer to tell that weights or data are beyond help.
     """
@@ -177,11 +178,13 @@ class OptimizerConfig:
     eps: float = 1e-8
     weight_decay: float = 1e-3
     clip_norm: float = 0.5
+    encoder_rate: float = 1.0
     ema_decay: float = 0.999
     max_skipped: int = 20
 
     def __post_init__(self):
-        _at_least(self, beta1=0, beta2=0, eps=0, weight_decay=0, clip_norm=0, ema_decay=0, max_skipped=1)
+        _at_least(self, beta1=0, beta2=0, eps=0, weight_decay=0, clip_norm=0, encoder_rate=0)
+        _at_least(self, ema_decay=0, max_skipped=1)
         for name in ("beta1", "beta2", "ema_decay"):
             if getattr(self, name) >= 1:
                 raise InputError(f"optimizer.{name} must be below 1; got {getattr(self, name)}")

@@ -95,7 +95,7 @@ class Trainer:
         self.loss_of_steps = partial(training_loss, config.loss, perceptual)
         self.parameters = dict(self.simulator.named_parameters())
         self.buffers = dict(self.simulator.named_buffers())
-        self.optimizer = Optimizer(list(self.parameters.values()), config.optimizer)
+        self.optimizer = Optimizer(self.parameters, config.optimizer)
         averaged = self.simulator.state_dict() if config.optimizer.ema_decay else {}
         self.average = {name: value.clone() for name, value in averaged.items()}
         self.scale = LossScale(FIRST_SCALE if config.precision.scales_loss else 1.0)
@@ -206,7 +206,7 @@ class Trainer:
             problem = str(error)
         if problem is None:
             self.optimizer.update(gradients, norm, rate)
-            self._update_average()
+            self._update_average(gradients)
             self.n_skipped_in_a_row = 0
         else:
             with torch.no_grad():
@@ -519,13 +519,17 @@ class Trainer:
         self.seconds, self.parent = saved.state["seconds"], saved.digest
         self.scale = LossScale(*saved.state.get("loss_scale", (self.scale.value, 0)))
 
-    def _update_average(self) -> None:
+    def _update_average(self, gradients: Sequence[Tensor | None]) -> None:
+        """Counts the step for those weights that it moved."""
         decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (EMA_WARM_UP + self.step))
         if not self.average:
             return
         with torch.no_grad():
-            weights = self.parameters | {name: x for name, x in self.buffers.items() if x.is_floating_point()}
-            torch._foreach_lerp_([self.average[name] for name in weights], list(weights.values()), 1 - decay)
+            pairs = zip(self.parameters.items(), gradients, strict=True)
+            weights = {name: parameter for (name, parameter), gradient in pairs if gradient is not None}
+            weights |= {name: x for name, x in self.buffers.items() if x.is_floating_point()}
+            if weights:
+                torch._foreach_lerp_([self.average[name] for name in weights], list(weights.values()), 1 - decay)
             for name in self.buffers.keys() - weights.keys():
                 self.average[name].copy_(self.buffers[name])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -17,11 +18,23 @@ class Optimizer(torch.optim.AdamW):
 
     On a GPU a step is some thirty launches of kernels that read many tensors each. torch's own step looks at tensor by
     tensor in Python, and counts the steps of each on the host.
+
+    Args:
+        parameters: by name; those of ``encoder.`` learn at ``settings.encoder_rate`` times the rate of a step.
     """
 
-    def __init__(self, parameters: Sequence[nn.Parameter], settings: OptimizerConfig):
-        betas = settings.beta1, settings.beta2
-        super().__init__(parameters, lr=0.0, betas=betas, eps=settings.eps, weight_decay=settings.weight_decay)
+    def __init__(self, parameters: Mapping[str, nn.Parameter], settings: OptimizerConfig):
+        groups = defaultdict(list)
+        for name, parameter in parameters.items():
+            groups[settings.encoder_rate if name.startswith("encoder.") else 1.0].append(parameter)
+        super().__init__(
+            [{"params": members, "factor": factor} for factor, members in groups.items()],
+            lr=0.0,
+            betas=(settings.beta1, settings.beta2),
+            eps=settings.eps,
+            weight_decay=settings.weight_decay,
+        )
+        self._parameters = list(parameters.values())
         self._limit = settings.clip_norm or math.inf
 
     @torch.no_grad()
@@ -33,14 +46,14 @@ class Optimizer(torch.optim.AdamW):
             norm: [], of all gradients together.
             rate: the learning rate.
         """
-        (group,) = self.param_groups
-        group["lr"] = rate
+        for group in self.param_groups:
+            group["lr"] = rate * group["factor"]
         if norm.is_cuda:
-            self._update_at_once(group, gradients, norm)
+            self._update_at_once(gradients, norm)
             return
-        for parameter, gradient in zip(group["params"], gradients, strict=True):
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
-        torch.nn.utils.clip_grads_with_norm_(group["params"], self._limit, norm)
+        torch.nn.utils.clip_grads_with_norm_(self._parameters, self._limit, norm)
         self.step()
 
     def restore(self, parameter: nn.Parameter, moments: Mapping[str, Tensor]) -> None:
@@ -50,21 +63,25 @@ class Optimizer(torch.optim.AdamW):
             for kind, value in moments.items()
         }
 
-    def _update_at_once(self, group: dict, gradients: Sequence[Tensor | None], norm: Tensor) -> None:
-        pairs = zip(group["params"], gradients, strict=True)
-        known = [(p, laid_out_as(p, gradient)) for p, gradient in pairs if gradient is not None]
+    def _update_at_once(self, gradients: Sequence[Tensor | None], norm: Tensor) -> None:
+        pairs = zip(self._parameters, gradients, strict=True)
+        known = {p: laid_out_as(p, gradient) for p, gradient in pairs if gradient is not None}
         if not known:
             return
-        parameters, gradients = map(list, zip(*known, strict=True))
-        torch._foreach_mul_(gradients, (self._limit / (norm + 1e-6)).clamp(max=1.0))  # as torch clips
-        states = [self.state[parameter] or self._begin(parameter) for parameter in parameters]
-        steps, means, squares = ([state[kind] for state in states] for kind in ("step", "exp_avg", "exp_avg_sq"))
-        torch._foreach_add_(steps, 1)
-        beta1, beta2 = group["betas"]
-        settings = {"lr": group["lr"], "beta1": beta1, "beta2": beta2, "eps": group["eps"]}
-        settings |= {"weight_decay": group["weight_decay"], "amsgrad": False, "maximize": False}
-        torch._fused_adamw_(parameters, gradients, means, squares, [], steps, **settings)
-        torch.autograd.graph.increment_version(parameters)  # which that call does not: rounded copies would stay
+        torch._foreach_mul_(list(known.values()), (self._limit / (norm + 1e-6)).clamp(max=1.0))  # as torch clips
+        for group in self.param_groups:
+            parameters = [parameter for parameter in group["params"] if parameter in known]
+            if not parameters:
+                continue
+            states = [self.state[parameter] or self._begin(parameter) for parameter in parameters]
+            steps, means, squares = ([state[kind] for state in states] for kind in ("step", "exp_avg", "exp_avg_sq"))
+            torch._foreach_add_(steps, 1)
+            beta1, beta2 = group["betas"]
+            settings = {"lr": group["lr"], "beta1": beta1, "beta2": beta2, "eps": group["eps"]}
+            settings |= {"weight_decay": group["weight_decay"], "amsgrad": False, "maximize": False}
+            own = [known[parameter] for parameter in parameters]
+            torch._fused_adamw_(parameters, own, means, squares, [], steps, **settings)
+        torch.autograd.graph.increment_version(list(known))  # which that call does not: rounded copies would stay
 
     def _begin(self, parameter: nn.Parameter) -> dict[str, Tensor]:
         state = self.state[parameter]

@@ -10,7 +10,7 @@ from torch import nn
 from gsim3d.train.config import OptimizerConfig
 from gsim3d.train.optimizer import Optimizer
 
-CONFIG = OptimizerConfig(beta1=0.8, beta2=0.95, weight_decay=0.1, clip_norm=0.5)
+CONFIG = OptimizerConfig(beta1=0.8, beta2=0.95, weight_decay=0.1, clip_norm=0.5, encoder_rate=0.3)
 RATES = (1e-2, 3e-2, 1e-3, 2e-2)
 
 
@@ -19,10 +19,10 @@ def step_of(request):
     """How an optimizer makes a step; without a GPU, that of a GPU too."""
 
     def at_once(optimizer, gradients, norm, rate):
-        (group,) = optimizer.param_groups
-        group["lr"] = rate
+        for group in optimizer.param_groups:
+            group["lr"] = rate * group["factor"]
         with torch.no_grad():
-            optimizer._update_at_once(group, gradients, norm)
+            optimizer._update_at_once(gradients, norm)
 
     return Optimizer.update if request.param != "at once" else at_once
 
@@ -31,6 +31,11 @@ def model(device):
     torch.manual_seed(0)
     parts = nn.Conv2d(3, 4, 3), nn.Conv2d(4, 2, 1), nn.Linear(5, 6), nn.Linear(6, 1)
     return nn.Sequential(*parts).to(device, memory_format=torch.channels_last)
+
+
+def named(parameters):
+    """The first five belong to the encoder."""
+    return {f"{'encoder' if k < 5 else 'dynamics'}.{k}": parameter for k, parameter in enumerate(parameters)}
 
 
 def draw(parameters, k):
@@ -54,8 +59,9 @@ def moments(optimizer, parameters):
 def test_a_step_is_that_of_torch(clip_norm, step_of, device):
     config = dataclasses.replace(CONFIG, clip_norm=clip_norm)
     ours, theirs = (list(model(device).parameters()) for _ in range(2))
-    optimizer = Optimizer(ours, config)
-    plain = torch.optim.AdamW(theirs, lr=0.0, betas=(0.8, 0.95), eps=config.eps, weight_decay=0.1)
+    optimizer = Optimizer(named(ours), config)
+    groups = [{"params": theirs[:5]}, {"params": theirs[5:]}]
+    plain = torch.optim.AdamW(groups, lr=0.0, betas=(0.8, 0.95), eps=config.eps, weight_decay=0.1)
     for k, rate in enumerate(RATES):
         before = [(p.detach().clone(), p._version) for p in ours]
         gradients = draw(ours, k)
@@ -63,7 +69,7 @@ def test_a_step_is_that_of_torch(clip_norm, step_of, device):
             p.grad = None if gradient is None else gradient.clone()
         if clip_norm:
             torch.nn.utils.clip_grad_norm_(theirs, clip_norm)
-        plain.param_groups[0]["lr"] = rate
+        plain.param_groups[0]["lr"], plain.param_groups[1]["lr"] = 0.3 * rate, rate
         plain.step()
         take(optimizer, gradients, rate, step_of)
         for p, expected, gradient, (value, version) in zip(ours, theirs, gradients, before, strict=True):
@@ -78,11 +84,11 @@ def test_a_step_is_that_of_torch(clip_norm, step_of, device):
 
 def test_what_was_saved_goes_on_with_the_same_bits(step_of, device):
     first = list(model(device).parameters())
-    optimizer = Optimizer(first, CONFIG)
+    optimizer = Optimizer(named(first), CONFIG)
     for k in range(2):
         take(optimizer, draw(first, k), RATES[k], step_of)
     again = [nn.Parameter(copy.deepcopy(p.detach())) for p in first]
-    resumed = Optimizer(again, CONFIG)
+    resumed = Optimizer(named(again), CONFIG)
     for p, q in zip(first, again, strict=True):
         if optimizer.state[p]:
             saved = {kind: value.cpu().contiguous().clone() for kind, value in optimizer.state[p].items()}
@@ -98,5 +104,5 @@ def test_what_was_saved_goes_on_with_the_same_bits(step_of, device):
 def test_without_gradients_nothing_changes(step_of, device):
     parameters = list(model(device).parameters())
     before = [p.detach().clone() for p in parameters]
-    step_of(Optimizer(parameters, CONFIG), [None] * len(parameters), torch.zeros((), device=device), 0.1)
+    step_of(Optimizer(named(parameters), CONFIG), [None] * len(parameters), torch.zeros((), device=device), 0.1)
     assert all(torch.equal(p, value) for p, value in zip(parameters, before, strict=True))
