@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+import warnings
+from functools import partial
 
-from gsim3d.errors import CaptureError, HardCaseError, InputError
+from gsim3d.errors import CaptureError, FitWarning, HardCaseError, InputError
 
 # command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called
 COMMANDS = {
@@ -72,10 +74,13 @@ def main(arguments: list[str] | None = None) -> int:
         given = known.command or arguments[0]
         parser.error(f"unknown command {given!r}; commands: {', '.join(COMMANDS)}")
     try:
-        module = importlib.import_module(COMMANDS[name][0])
-        parser = _Parser(prog=f"gsim3d {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
-        module.add_arguments(parser)
-        return module.run(parser.parse_intermixed_args(arguments[1:])) or 0
+        with warnings.catch_warnings():
+            warnings.simplefilter("default", FitWarning)
+            warnings.showwarning = partial(_show_warning, warnings.showwarning)
+            module = importlib.import_module(COMMANDS[name][0])
+            parser = _Parser(prog=f"gsim3d {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
+            module.add_arguments(parser)
+            return module.run(parser.parse_intermixed_args(arguments[1:])) or 0
     except (InputError, HardCaseError, CaptureError) as error:
         return _fail(str(error))
     except OSError as error:
@@ -83,6 +88,13 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("gsim3d: interrupted", file=sys.stderr)
         return 130
+
+
+def _show_warning(otherwise, message, category, *place, **more) -> None:
+    if issubclass(category, FitWarning):
+        print(f"gsim3d: {message}", file=sys.stderr)
+    else:
+        otherwise(message, category, *place, **more)
 
 
 def _fail(message: str) -> int:

@@ -122,8 +122,9 @@ def sample_of_scenes(subject: Subject, folders: Sequence[Path]) -> tuple[Sample 
 
 def _views(subject: Subject, scene: Scene) -> list[int]:
     if subject.restored is not None:
-        cameras = context_cameras(scene, subject.restored.data)
-        return list(spread_views(cameras, min(len(cameras), subject.restored.data.context_views), 0))
+        data = subject.restored.data_of(scene)
+        cameras = context_cameras(scene, data)
+        return list(spread_views(cameras, min(len(cameras), data.context_views), 0))
     return list(spread_views(range(scene.n_cams), min(3, scene.n_cams), 0))
 
 

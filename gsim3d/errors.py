@@ -35,3 +35,7 @@ class CaptureError(RuntimeError):
     def __init__(self, message: str, *, no_room: bool = False):
         super().__init__(message)
         self.no_room = no_room
+
+
+class FitWarning(UserWarning):
+    """A scene is changed to fit a model; the message says what is changed and how to keep it."""

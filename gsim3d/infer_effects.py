@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gsim3d.pretrained import CHECKPOINT_HELP
+from gsim3d.pretrained import CHECKPOINT_HELP, add_keep
 
 EPILOG = """\
 Each effect that the checkpoint's spec has on is switched off alone, or lowered, and predictions of four steps at the
@@ -32,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     parser.add_argument("--tolerance", default="0.1dB", metavar="X", help="PSNR that may be lost (default: 0.1dB)")
     parser.add_argument("--out", metavar="FILE", help="file to write; must not exist yet (default: SCENE/effects.yaml)")
+    add_keep(parser)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
 
 
@@ -47,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     tolerance = _decibels(args.tolerance)
     out = new_place(args.out or Path(args.scene) / FILE, "file")
     restored = restore(args.checkpoint, args.device)
-    scene = restored.open_scene(args.scene)
+    scene = restored.open_scene(args.scene, args.keep)
     trial = _Trial(restored, scene)
     base = restored.plan.spec
     psnr, seconds = trial(base)

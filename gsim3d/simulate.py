@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gsim3d.pretrained import CHECKPOINT_HELP
+from gsim3d.pretrained import CHECKPOINT_HELP, add_keep
 
 EPILOG = """\
 The scene's first steps are the input; the following ones are predicted, also beyond the end of the film. Written to
@@ -35,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--cameras", type=int, nargs="+", metavar="CAM", help="cameras to show (default: up to 4 targets)"
     )
     parser.add_argument("--context", type=int, nargs="+", metavar="CAM", help="input cameras (default: spread evenly)")
+    add_keep(parser)
     parser.add_argument("--edit", metavar="FILE", help="YAML file of changes of the scene on the way")
     parser.add_argument("--effects", metavar="FILE", help="YAML file of what to compute (default: as in training)")
     parser.add_argument(
@@ -68,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
 
     out = new_place(args.out)
     restored = restore(args.checkpoint, args.device)
-    scene = restored.open_scene(args.scene)
+    scene = restored.open_scene(args.scene, args.keep)
     context, target = default_views(restored, scene, args.context)
     cams = args.cameras or list(target[:4])
     n_future = args.steps if args.steps is not None else max(1, scene.n_steps - args.start - restored.data.history)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from gsim3d.data.cameras import depth_range, spread_steps
 from gsim3d.data.recording import BACKGROUND, FIXED, MOVING, ReadImages, Recording
 from gsim3d.errors import InputError
 
@@ -23,11 +25,17 @@ class Fitting:
     size: (width, height) pixels: images are scaled until they cover it, smoothly, and cropped around their centre.
     near_far: metres, the depth range of all scenes (in the new unit).
     unit_cameras: lengths are divided by the largest coordinate of a scene's cameras at its first step.
+    slack: a scene whose own near or far is not that of ``near_far`` up to this factor keeps its own range.
+    enlarge: images smaller than ``size`` are scaled up; else they are refused.
+    whole: images are scaled until ``size`` holds them, and not cropped; padding fills the rest.
     """
 
     size: tuple[int, int] | None = None
     near_far: tuple[float, float] | None = None
     unit_cameras: bool = False
+    slack: float = math.inf
+    enlarge: bool = False
+    whole: bool = False
 
 
 def fit(recording: Recording, fitting: Fitting) -> Recording:
@@ -35,11 +43,24 @@ def fit(recording: Recording, fitting: Fitting) -> Recording:
     if fitting.unit_cameras:
         recording = _in_units_of_cameras(recording)
     if fitting.size is not None and any(size != fitting.size for size in recording.sizes):
-        recording = _of_size(recording, fitting.size)
+        recording = _of_size(recording, fitting.size, fitting)
     if fitting.near_far is not None:
         near, far = fitting.near_far
-        recording = dataclasses.replace(recording, near=near, far=far)
+        own = own_depths(recording)
+        if own is None or max(near / own[0], own[0] / near, far / own[1], own[1] / far) <= fitting.slack:
+            recording = dataclasses.replace(recording, near=near, far=far)
     return recording
+
+
+def own_depths(recording: Recording) -> tuple[float, float] | None:
+    """near and far: given, or around the point that the cameras look at; None: there is no such point."""
+    near, far = recording.near, recording.far
+    if near is None or far is None:
+        guessed = depth_range(spread_steps(recording.viewmats).reshape(-1, 4, 4))
+        if guessed is None:
+            return None
+        near, far = near or guessed[0], far or guessed[1]
+    return near, far
 
 
 def _in_units_of_cameras(recording: Recording) -> Recording:
@@ -58,23 +79,25 @@ def _in_units_of_cameras(recording: Recording) -> Recording:
     return dataclasses.replace(recording, viewmats=viewmats, **lengths)
 
 
-def _of_size(recording: Recording, size: tuple[int, int]) -> Recording:
+def _of_size(recording: Recording, size: tuple[int, int], how: Fitting) -> Recording:
     width, height = size
-    scaled, corners, Ks = [], [], recording.Ks.copy()
+    scaled, corners, sizes, Ks = [], [], [], recording.Ks.copy()
     for cam, (w, h) in enumerate(recording.sizes):
-        if w < width or h < height:
+        if (w < width or h < height) and not how.enlarge:
             raise InputError(
                 f"{recording.source}: camera {recording.camera_names[cam]} has images of {w}x{h} pixels; the model "
                 f"needs at least {width}x{height}"
             )
-        share = max(width / w, height / h)
-        large = round(w * share), round(h * share)
-        corner = (large[0] - width) // 2, (large[1] - height) // 2
+        share = (min if how.whole else max)(width / w, height / h)
+        large = max(1, round(w * share)), max(1, round(h * share))
+        kept = min(width, large[0]), min(height, large[1])
+        corner = (large[0] - kept[0]) // 2, (large[1] - kept[1]) // 2
         for axis in (0, 1):
             Ks[:, cam, axis] *= large[axis] / (w, h)[axis]
             Ks[:, cam, axis, 2] -= corner[axis]
         scaled.append(large)
         corners.append(corner)
+        sizes.append(kept)
 
     def changed(read: ReadImages, scale: Callable[[np.ndarray, tuple[int, int]], np.ndarray]) -> ReadImages:
         def read_images(cam, steps, problems):
@@ -89,7 +112,7 @@ def _of_size(recording: Recording, size: tuple[int, int]) -> Recording:
     return dataclasses.replace(
         recording,
         Ks=Ks,
-        sizes=(size,) * len(recording.sizes),
+        sizes=tuple(sizes),
         read_images=changed(recording.read_images, _scale_colors),
         read_labels=None if recording.read_labels is None else changed(recording.read_labels, _scale_labels),
     )

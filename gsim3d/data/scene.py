@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from gsim3d.data import layouts
-from gsim3d.data.cameras import check_directions, depth_range, frusta_origin, shared_view, spread_steps
-from gsim3d.data.fitting import Fitting, fit
+from gsim3d.data.cameras import check_directions, frusta_origin, shared_view, spread_steps
+from gsim3d.data.fitting import Fitting, fit, own_depths
 from gsim3d.data.images import ImageCache
 from gsim3d.data.masks import Undistorter, foreground, median_image
 from gsim3d.data.recording import BACKGROUND, MOVING, Problems, ReadImages, Recording
@@ -38,15 +38,15 @@ class Scene:
     ):
         self.path = path
         self.filmed_sizes = recording.sizes
-        self._filmed, self._fitting = recording, fitting
+        self._filmed, self.fitting = recording, fitting
         recording = fit(recording, fitting)
         self.name = "/".join(path.absolute().parts[-2:])
         self.recording = recording
         self.layout, self.camera_names = recording.layout, recording.camera_names
         self.n_steps, self.fps, self.n_cams = recording.n_steps, recording.fps, len(recording.camera_names)
         self.near, self.far = _depths(recording)
-        sizes = np.array(recording.sizes)
-        self.width, self.height = (int(-(-side // SIZE_MULTIPLE) * SIZE_MULTIPLE) for side in sizes.max(0))
+        largest = fitting.size or np.array(recording.sizes).max(0)
+        self.width, self.height = (int(-(-side // SIZE_MULTIPLE) * SIZE_MULTIPLE) for side in largest)
         if recording.origin is not None:
             self.origin = recording.origin
         else:
@@ -58,6 +58,7 @@ class Scene:
         self._medians: dict[int, np.ndarray] = {}
         shape = (self.n_steps, self.n_cams, self.height, self.width)
         stamp = (str(path.resolve()), recording.source.stat().st_mtime_ns, *(fitting.size or ()))
+        stamp += ("whole",) * fitting.whole
         self._images = ImageCache((*shape, 3), self._read_images, cache_dir, (*stamp, "rgb"))
         self._labels = ImageCache(shape, self._read_labels, cache_dir, (*stamp, "seg"))
 
@@ -82,6 +83,11 @@ class Scene:
     def bounds(self) -> np.ndarray:
         """float64 [2, 3] metres, corners of the box that is shown as the scene's: given, or what most cameras see."""
         return shared_view(*self._view()) if self.recording.bounds is None else self.recording.bounds
+
+    @property
+    def own_depths(self) -> tuple[float, float] | None:
+        """near and far without ``fitting.near_far``; None where nothing tells them."""
+        return own_depths(fit(self._filmed, Fitting(unit_cameras=self.fitting.unit_cameras)))
 
     def _view(self) -> tuple:
         recording = self.recording
@@ -176,7 +182,7 @@ class Scene:
 
     def filmed_as(self, read_images: ReadImages) -> Scene:
         """The same scene with other images of sizes ``filmed_sizes``, which are fitted and undistorted like its own."""
-        return Scene(self.path, dataclasses.replace(self._filmed, read_images=read_images), None, self._fitting)
+        return Scene(self.path, dataclasses.replace(self._filmed, read_images=read_images), None, self.fitting)
 
     def _read_images(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
         undistorter = self._undistorters[cam]
@@ -217,15 +223,13 @@ class Scene:
 
 def _depths(recording: Recording) -> tuple[float, float]:
     """near and far: given, or around the point that the cameras look at."""
-    near, far = recording.near, recording.far
-    if near is None or far is None:
-        guessed = depth_range(spread_steps(recording.viewmats).reshape(-1, 4, 4))
-        if guessed is None:
-            raise InputError(
-                f"{recording.source}: near and far (metres) are needed: the cameras look at no common point that "
-                "would tell how far the scene is"
-            )
-        near, far = near or guessed[0], far or guessed[1]
+    depths = own_depths(recording)
+    if depths is None:
+        raise InputError(
+            f"{recording.source}: near and far (metres) are needed: the cameras look at no common point that "
+            "would tell how far the scene is"
+        )
+    near, far = depths
     if not 0 < np.float32(near) < np.float32(far):  # as cameras hold them
         raise InputError(f"{recording.source}: far must lie beyond near; got near {near:g} and far {far:g}")
     return near, far

@@ -13,6 +13,7 @@ Predictions of other models (predictions.py) are scored on the same steps, views
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -23,7 +24,7 @@ from gsim3d.data import Scene, make_frames
 from gsim3d.data.recording import BACKGROUND
 from gsim3d.dynamics import RestLog, concatenate
 from gsim3d.edits import Edit
-from gsim3d.errors import InputError
+from gsim3d.errors import FitWarning, InputError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.scoring import PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.layers import exact_convolutions
@@ -60,17 +61,26 @@ def default_views(
 
     inputs spread evenly, none of them a named target; targets those kept from training's inputs, else all the rest.
     """
+    data = restored.data_of(scene)
     if not context:
-        cameras = [cam for cam in context_cameras(scene, restored.data) if cam not in (target or ())]
-        if len(cameras) < restored.data.context_views:
+        cameras = [cam for cam in context_cameras(scene, data) if cam not in (target or ())]
+        count = min(data.context_views, len(cameras))
+        if count < min(2, restored.data.context_views):
             raise InputError(
                 f"{scene.path}: {len(cameras)} cameras left as inputs; training had {restored.data.context_views} "
                 "views (--context names inputs)"
             )
-        context = spread_views(cameras, restored.data.context_views, 0)
+        context = spread_views(cameras, count, 0)
+        if count < restored.data.context_views:
+            warnings.warn(
+                f"fitted to the model: {count} input views, cameras {' '.join(map(str, context))}; training had "
+                f"{restored.data.context_views} (--context names inputs)",
+                FitWarning,
+                stacklevel=2,
+            )
     if not target:
         rest = tuple(cam for cam in range(scene.n_cams) if cam not in context)
-        target = restored.data.target_only_cameras or rest or context
+        target = data.target_only_cameras or rest or context
     return tuple(context), tuple(target)
 
 

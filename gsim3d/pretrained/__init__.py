@@ -6,6 +6,7 @@ recipe.json (what it was trained on, and for how long), scores.json and README.m
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 from gsim3d.errors import InputError
@@ -13,6 +14,18 @@ from gsim3d.errors import InputError
 FOLDER = Path(__file__).parent
 WEIGHTS = "model.safetensors"
 CHECKPOINT_HELP = "run folder, checkpoint folder, .safetensors file, or name of a simulator that comes with gsim3d"
+KEEP = ("image", "depth")  # parts of a scene that need not be fitted to a model
+
+
+def add_keep(parser: argparse.ArgumentParser) -> None:
+    """Adds the option of commands that open one scene for a model."""
+    parser.add_argument(
+        "--keep",
+        nargs="+",
+        choices=KEEP,
+        default=(),
+        help="what of the scene is not fitted to the model: image: scaled, not cropped; depth: near and far",
+    )
 
 
 def names() -> list[str]:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,16 +20,18 @@ from torch.overrides import TorchFunctionMode
 from gsim3d import presets
 from gsim3d.data import Scene
 from gsim3d.effects import EffectsSpec
-from gsim3d.errors import InputError
+from gsim3d.errors import FitWarning, InputError
 from gsim3d.ops import cuda_compiled
 from gsim3d.plans import Plan
 from gsim3d.presets import ModelConfig
+from gsim3d.pretrained import KEEP
 from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, TrainConfig
 from gsim3d.train.settings import from_dict, to_dict
 
+SIMILAR = 1.25  # near and far are replaced by those of the training where they differ by at most this factor
 PRESETS = ("tiny", "small", "paper_latent", "paper_explicit")
 
 
@@ -50,11 +55,51 @@ class Restored:
         """Where the simulator's weights are, and where it predicts."""
         return next(self.simulator.parameters()).device
 
-    def open_scene(self, folder: str | Path) -> Scene:
-        """The scene in ``folder`` as the model expects it. Raises InputError as :meth:`check_scene` and the reader."""
-        scene = Scene.open(folder, fitting=self.data.fitting)
+    def open_scene(self, folder: str | Path, keep: Sequence[str] = ()) -> Scene:
+        """The scene in ``folder`` as the model expects it; a :class:`gsim3d.errors.FitWarning` says what is changed.
+
+        Args:
+            keep: parts of KEEP that stay as they are: "image", scaled into the model's size instead of cropped to it,
+                and "depth", near and far. Without it, near and far are those of the training where the scene's own
+                differ from them by at most a factor of SIMILAR: elsewhere the model sees less with them.
+        Raises:
+            InputError: as :meth:`check_scene` and the reader, or ``keep`` names another part.
+        """
+        if unknown := [part for part in keep if part not in KEEP]:
+            raise InputError(f"keep must name parts of {', '.join(KEEP)}; got {unknown[0]!r}")
+        exact = self.simulator.config.encoder.quirks != Quirks()
+        fitting = dataclasses.replace(
+            self.data.fitting, slack=math.inf if exact else SIMILAR, enlarge=True, whole="image" in keep
+        )
+        if "depth" in keep:
+            fitting = dataclasses.replace(fitting, near_far=None)
+        scene = Scene.open(folder, fitting=fitting)
         self.check_scene(scene)
+        if changes := self._changes(scene):
+            warnings.warn(f"fitted to the model: {'; '.join(changes)}", FitWarning, stacklevel=2)
         return scene
+
+    def _changes(self, scene: Scene) -> list[str]:
+        """What fitting changed of a scene, in words."""
+        changes, (width, height) = [], self.image_size
+        sizes = sorted(set(scene.filmed_sizes) - {self.image_size})
+        if sizes and self.data.resize:
+            filmed = ", ".join(f"{w}x{h}" for w, h in sizes)
+            areas = [w * h * max(width / w, height / h) ** 2 for w, h in sizes]
+            lost = 0.0 if scene.fitting.whole else max(0.0, 1 - width * height / max(areas))
+            cut = f", of which {lost:.0%} is cut off (--keep image keeps it)" if lost >= 0.005 else ""
+            changes.append(f"images of {filmed} pixels scaled to {width}x{height}{cut}")
+        own = scene.own_depths
+        if own is not None and (scene.near > own[0] or scene.far < own[1]):
+            changes.append(
+                f"depths {own[0]:.3g} to {own[1]:.3g} replaced by {scene.near:.3g} to {scene.far:.3g}, those of the "
+                "training (--keep depth keeps them)"
+            )
+        if scene.recording.subtract_background:
+            changes.append(
+                'background subtracted and painted black ("masks": "none" in cameras.json keeps it, masks/ replaces it)'
+            )
+        return changes
 
     def check_scene(self, scene: Scene) -> None:
         """Raises InputError where the scene's images or depths are others than those of the training."""
@@ -63,11 +108,21 @@ class Restored:
                 f"{scene.path}: images of {scene.width}x{scene.height} pixels; the model was trained on "
                 f"{self.image_size[0]}x{self.image_size[1]} (trained with data: {{resize: [W, H]}}, it would fit them)"
             )
-        if self.data.near_far and (scene.near, scene.far) != tuple(self.data.near_far):
+        fitted = scene.fitting.enlarge  # by open_scene, which chose the depths
+        if self.data.near_far and not fitted and (scene.near, scene.far) != tuple(self.data.near_far):
             raise InputError(
                 f"{scene.path}: depths from {scene.near:g} to {scene.far:g}; the model was trained on "
                 f"{self.data.near_far[0]:g} to {self.data.near_far[1]:g}: open the scene with open_scene, which fits it"
             )
+
+    def data_of(self, scene: Scene) -> DataConfig:
+        """``data`` for a scene's cameras: numbers of cameras hold where the scene has them all, and there are at most
+        as many inputs as cameras."""
+        data = self.data
+        if max((*data.context_cameras, *data.target_only_cameras), default=-1) >= scene.n_cams:
+            data = dataclasses.replace(data, context_cameras=(), target_only_cameras=())
+        views = min(data.context_views, scene.n_cams)
+        return dataclasses.replace(data, context_views=views, fewest_views=min(data.fewest_views, views))
 
 
 def model_config(config: TrainConfig) -> ModelConfig:
