@@ -7,13 +7,26 @@ import functools
 import math
 from collections.abc import Collection, Iterable
 from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from gsim3d.errors import HardCaseError, InputError
 from gsim3d.ops.sentinel import CELLS, FAST, OUTSIDE, joined, watch_rows
-from gsim3d.stability import ACTIONS, LARGEST, Finding, Reading, Sentinels, StabilityConfig, StabilityReport
+from gsim3d.stability import (
+    ACTIONS,
+    FARTHEST,
+    LARGEST,
+    Finding,
+    Reading,
+    Sentinels,
+    StabilityConfig,
+    StabilityReport,
+    at_most,
+    usable_pixels,
+)
 from gsim3d.types import ASLEEP, CloudTable, Frames, Particles
 
 BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
@@ -119,18 +132,85 @@ def guard_particles(
 def guard_frames(
     frames: Frames, config: StabilityConfig, report: StabilityReport, where: str
 ) -> tuple[Frames, Tensor | None]:
-    """``frames`` with finite pixels, and bool [I, H, W]: those that must not become particles (None: all may).
+    """``frames`` with pixels in [0, 1], and bool [I, H, W]: those that must not become particles (None: all may).
 
-    Pixels that are not finite are black, where the policy is "clamp" also 1 for infinity, and then particles like any
-    other. "raise" leaves them to the encoder, as every policy does with cameras that cannot see: these raise always.
+    Numbers that are no colour are 0, where the policy is "clamp" the nearest one, and then particles like any other.
+    "raise" leaves them to the encoder, as every policy does with all other fields of ``frames``: these raise always.
     """
     images = frames.images
-    if config.on_bad == "raise" or images.dim() != 4 or not images.is_floating_point():
+    if config.on_bad == "raise":
         return frames, None
-    bad = (~images.isfinite()).any(1)
+    usable = usable_pixels(images)
+    bad = (~usable).any(1)
     report.record(bad.sum((1, 2)), partial(_read_images, frames, where, ACTIONS[config.on_bad]))
-    images = images.nan_to_num(0.0, 1.0 if config.on_bad == "clamp" else 0.0, 0.0)
+    nearest = images.nan_to_num(0.0, 1.0, 0.0).clamp(0, 1) if config.on_bad == "clamp" else torch.zeros_like(images)
+    images = torch.where(usable, images, nearest)
     return dataclasses.replace(frames, images=images), bad if config.on_bad == "drop" else None
+
+
+# Shapes of the fields of particles behind their N rows; None: any.
+_SHAPES = {"means": (3,), "opacities": (), "activity": (), "quats": (4,), "scales": (3,), "sh": (None, 3)}
+_SHAPES |= {"turns": (4,), "paint": (3, 3), "held": (), "velocity": (3,), "light": (3,), "reference": (3,), "body": (3,)}
+_DTYPES = {"activity": torch.uint8, "held": torch.bool}
+
+
+def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths: dict[str, int]) -> None:
+    """Looks at what :func:`guard_particles` does not: types, shapes, offsets, indices, origins and choices.
+
+    Args:
+        where: what the message calls this place.
+        dtype: of the network, and so of the rows.
+        widths: channels of fields that the network reads.
+    Raises:
+        InputError: the message names the field and what it must be.
+        HardCaseError: an origin, or what is remembered of a row, is not finite or too far; on a GPU these are not
+            looked at: rows far from their origin sleep.
+    """
+    if torch.compiler.is_compiling():
+        return
+    if not isinstance(particles, Particles):
+        raise InputError(f"{where}: particles must be gsim3d.Particles; got {type(particles).__name__}")
+    rows, device = particles.row_fields(), particles.means.device
+    shapes = {name: (len(particles.means), *_SHAPES.get(name, (widths.get(name),))) for name in rows}
+    shapes |= {"cu_rows": (len(particles.cloud_scene) + 1,), "cloud_scene": (None,), "cloud_step": (None,)}
+    shapes["origin"] = (None, 3)
+    for name, shape in shapes.items():
+        value, whole = getattr(particles, name), name.startswith(("cu_", "cloud_"))
+        wanted = torch.int64 if whole else _DTYPES.get(name, dtype)
+        is_one = isinstance(value, Tensor) and (value.dtype == wanted or name == "origin" and value.is_floating_point())
+        if not is_one or value.dim() != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape)):
+            got = f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            sizes = ", ".join("any" if n is None else str(n) for n in shape)
+            raise InputError(f"{where}: particles.{name} must be {wanted} [{sizes}]; got {got}")
+        if value.device != device:
+            raise InputError(f"{where}: particles.{name} is on {value.device}, particles.means on {device}")
+    clouds, n_scenes = particles.clouds, len(particles.origin)
+    starts = clouds.starts
+    if starts[0] != 0 or starts[-1] != particles.n_rows or any(b < a for a, b in pairwise(starts)):
+        raise InputError(f"{where}: particles.cu_rows must ascend from 0 to {particles.n_rows}, the number of rows")
+    if len(clouds.steps) != len(clouds) or any(not 0 <= scene < n_scenes for scene in clouds.scenes):
+        raise InputError(f"{where}: particles.cloud_scene must be in [0, {n_scenes}), rows of origin, as cloud_step")
+    if device.type == "cpu":
+        _check_choices(particles, where)
+
+
+def _check_choices(particles: Particles, where: str) -> None:
+    if bool((particles.activity > ASLEEP).any()):
+        raise InputError(f"{where}: particles.activity must be 0 (dynamic), 1 (frozen) or 2 (asleep)")
+    remembered = {name: getattr(particles, name) for name in NOT_LOOKED_AT[2:]} | {"origin": particles.origin}
+    for name, value in remembered.items():
+        if value is None or value.dtype == torch.bool:
+            continue
+        good = at_most(value, FARTHEST if name == "origin" else LARGEST)
+        if bool(good.all()):
+            continue
+        row, one = int(good.logical_not().nonzero()[0]), "scene" if name == "origin" else "row"
+        largest = f" and at most {FARTHEST:g} m in size" if name == "origin" else ""
+        raise HardCaseError(
+            f"{where}: particles.{name} must be finite{largest}; {one} {row} is not",
+            tensor=f"particles.{name}",
+            **{one: row},
+        )
 
 
 def drop_rows(particles: Particles, rows: Tensor) -> Particles:
@@ -148,7 +228,7 @@ def _read_images(frames: Frames, where: str, action: str, counts: Tensor) -> Rea
         if count:
             cloud = int(frames.cameras.image_cloud[image])
             scene, step = int(frames.cloud_scene[cloud]), int(frames.cloud_step[cloud])
-            findings.append(Finding("not finite", where, "frames.images", action, count, None, scene, step, image))
+            findings.append(Finding("not finite or outside [0, 1]", where, "frames.images", action, count, None, scene, step, image))
     return Reading(findings, {})
 
 

@@ -39,7 +39,7 @@ from gsim3d.dynamics.follow import follow
 from gsim3d.edits import Edit, by_step
 from gsim3d.effects import EffectsSpec, OutputEffects, UnsupportedEffect
 from gsim3d.encoder import Encoder, Room, pixel_rows
-from gsim3d.guards import drop_rows, guard_frames, guard_particles
+from gsim3d.guards import check_particles, drop_rows, guard_frames, guard_particles
 from gsim3d.harmonics import SH_0
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
@@ -81,8 +81,11 @@ class Simulator(nn.Module):
         room: as of ``encoder``.
         """
         guard = self._guard("encode", on_bad, report)
-        frames, spoiled = guard_frames(frames, guard.keywords["config"], guard.keywords["report"], "encode")
-        particles = self.encoder(frames, room)
+        config = guard.keywords["config"]
+        if room is None:
+            self.encoder.check(frames, pixels=config.on_bad == "raise")
+        frames, spoiled = guard_frames(frames, config, guard.keywords["report"], "encode")
+        particles = self.encoder(frames, room, check=False)
         particles = guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled, room)))
         particles = self.dynamics.with_bodies(particles)
         if (dynamics := self.config.dynamics).velocity:
@@ -127,6 +130,7 @@ class Simulator(nn.Module):
             generator: randomness of training (drop path, curve shuffling); None: none.
         """
         plan, guard = plan or self.plan(), self._guard("step", on_bad, report)
+        self._check(state, "step")
         state = guard(self.prepare(state, plan))
         step = self._predict(state, plan=plan, generator=generator, guard=guard)
         guard.keywords["report"].send()
@@ -162,6 +166,7 @@ class Simulator(nn.Module):
         plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
         predict = predict if wrap is None else wrap(predict)
+        self._check(state, "rollout")
         state, steps = self.prepare(state, plan), []
         structure = plan.spec.structure
         changes = by_step(edits, n_steps, insert=structure.insert, remove=structure.remove)
@@ -253,6 +258,7 @@ class Simulator(nn.Module):
             cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
         """
         guard = self._guard("render", on_bad, report, in_workspace=False)
+        self._check(particles, "render")
         image = self.draw(guard(particles), cameras, background, plan, cutoff=cutoff, on_bad=on_bad, report=report)
         guard.keywords["report"].send()
         return image
@@ -291,6 +297,12 @@ class Simulator(nn.Module):
     def _colors(self, particles: Particles) -> Tensor:
         """[N, 3], of the Gaussians, seen from nowhere in particular."""
         return 0.5 + SH_0 * self.renderer(particles, sh_degree=0).sh[:, 0]
+
+    def _check(self, particles: Particles, where: str) -> None:
+        """Raises where fields of ``particles`` are not what they must be."""
+        config = self.config.dynamics
+        widths = {"dynamic_latents": config.dynamic_latents, "static_latents": config.static_latents}
+        check_particles(particles, where, next(self.parameters()).dtype, widths)
 
     def _guard(
         self, where: str, on_bad: OnBad | None, report: StabilityReport | None, in_workspace: bool = True

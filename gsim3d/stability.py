@@ -30,6 +30,8 @@ OnBad = Literal["raise", "drop", "clamp"]
 LARGEST = torch.finfo(torch.float32).max
 ACTIONS = {"raise": "error", "drop": "dropped", "clamp": "clamped"}
 ADVICE = 'on_bad="drop" goes on without such rows, on_bad="clamp" bounds them'
+NEAREST, FARTHEST = 1e-6, 1e9  # metres: depths lie between them, cameras and origins no further from 0
+PIXEL_SLACK = 1e-3  # colours may leave [0, 1] by as much: resampling rounds
 MAX_FINDINGS = 1000  # of a report, then only its total goes on counting
 MAX_QUIET = 1000  # records kept as they came
 
@@ -38,6 +40,16 @@ def check_on_bad(on_bad: str) -> None:
     """Raises InputError where it is no policy."""
     if on_bad not in get_args(OnBad):
         raise InputError(f"on_bad must be one of {', '.join(get_args(OnBad))}; got {on_bad!r}")
+
+
+def at_most(values: Tensor, largest: float) -> Tensor:
+    """bool, of each row of ``values``: whether its numbers are finite and no larger in size."""
+    return (values.detach().abs() <= largest).flatten(1).all(1)
+
+
+def usable_pixels(images: Tensor) -> Tensor:
+    """bool, of each number of ``images``: whether it is a colour in [0, 1]."""
+    return (images >= -PIXEL_SLACK) & (images <= 1 + PIXEL_SLACK)
 
 
 @dataclass(frozen=True)

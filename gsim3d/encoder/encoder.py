@@ -52,7 +52,11 @@ class Encoder(nn.Module):
         self.heads = ParticleHeads(config)
         self.to(memory_format=torch.channels_last)  # convolutions with few channels are faster on it, on CPU and GPU
 
-    def forward(self, frames: Frames, room: Room | None = None) -> Particles:
+    def check(self, frames: Frames, *, pixels: bool = True) -> None:
+        """Raises as :meth:`forward` does for ``frames``; ``pixels``: the values of images are looked at, too."""
+        check_frames(frames, self.config, next(self.parameters()).dtype, pixels=pixels)
+
+    def forward(self, frames: Frames, room: Room | None = None, *, check: bool = True) -> Particles:
         """Particles of every cloud: its images in ascending order, pixels row by row, those outside ``masks`` left out.
 
         On a GPU it computes in float32 unless autocast, or torch's switch for TF32 in matrix products, says otherwise.
@@ -60,15 +64,18 @@ class Encoder(nn.Module):
         Args:
             room: of :meth:`room`, for frames like these in all but their numbers. Nothing then waits for the device,
                 and nothing is checked; particles that have no row are left out.
+            check: look for what cannot be used; a caller that has done so leaves it out.
         Gradients: ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
         Raises:
             InputError: sizes do not fit the network's strides or each other; the message names the argument.
-            HardCaseError: an image or camera is not finite; the message names scene, step and tensor.
+            HardCaseError: an image, camera or origin is not finite or out of range; the message names scene, step and
+                tensor.
         """
         if room is not None:
             with tf32_only_if_asked():
                 return self._encode_into(frames, room)
-        check_frames(frames, self.config)
+        if check:
+            self.check(frames)
         with tf32_only_if_asked():
             return self._encode(frames)
 
@@ -79,7 +86,7 @@ class Encoder(nn.Module):
         Raises:
             InputError, HardCaseError: as :meth:`forward`; or clouds have different numbers of views.
         """
-        check_frames(frames, self.config)
+        self.check(frames)
         n_clouds, cameras = frames.cloud_scene.shape[0], frames.cameras
         n_views = len(cameras) // n_clouds
         ordered = torch.arange(n_clouds, device=cameras.image_cloud.device).repeat_interleave(n_views)
