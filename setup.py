@@ -1,7 +1,7 @@
 """Builds gsim3d._ops (torch ops, stable ABI) and gsim3d._core (the torch-free core for numpy, pybind11).
 
-GSIM3D_CUDA=0 leaves CUDA out, GSIM3D_CUDA=1 insists on it; default: CUDA when this torch has CUDA and nvcc is found.
-TORCH_CUDA_ARCH_LIST chooses the GPUs to build for; default: the visible ones, or sm_80, sm_90a and sm_100 without any.
+GSIM3D_CUDA=0 leaves CUDA out, GSIM3D_CUDA=1 insists on it; default: CUDA when a GPU is visible, torch has CUDA and nvcc
+is found. TORCH_CUDA_ARCH_LIST chooses the GPUs to build for; default: the visible ones, or sm_80, sm_90a and sm_100.
 """
 
 import os
@@ -33,12 +33,14 @@ def sources(*suffixes: str) -> list[str]:
 
 def wants_cuda() -> bool:
     choice = os.environ.get("GSIM3D_CUDA", "")
+    if choice not in ("", "0", "1"):
+        raise SystemExit(f"GSIM3D_CUDA must be 0 or 1; got {choice!r}")
     import torch
 
     possible = torch.version.cuda is not None and cpp_extension.CUDA_HOME is not None
     if choice == "1" and not possible:
         raise SystemExit("GSIM3D_CUDA=1, but this torch has no CUDA or nvcc was not found (set CUDA_HOME)")
-    return possible and choice != "0" and bool(sources("_cuda.cu"))
+    return possible and (choice == "1" or (choice == "" and torch.cuda.device_count() > 0))
 
 
 def check_compiler() -> None:
@@ -106,7 +108,7 @@ class BuildExtension(cpp_extension.BuildExtension):
 
 
 setup(
-    ext_modules=[ops_extension()] + ([core_extension()] if (ROOT / "csrc/gsim3d/numpy/core.cpp").exists() else []),
+    ext_modules=[ops_extension(), core_extension()],
     cmdclass={"build_ext": BuildExtension},
     options={"bdist_wheel": {"py_limited_api": False}},
 )

@@ -6,7 +6,11 @@ use, so ``gsim3d._core`` (the kernels on numpy arrays) works without torch.
 
 import importlib
 
+from gsim3d.processor import check_processor
+
 __version__ = "0.1.0"
+
+check_processor()
 
 _HOME = {
     "Cameras": "gsim3d.types",
@@ -16,6 +20,7 @@ _HOME = {
     "HardCaseError": "gsim3d.errors",
     "InputError": "gsim3d.errors",
     "Particles": "gsim3d.types",
+    "ProcessorError": "gsim3d.errors",
     "Simulator": "gsim3d.simulator",
     "StabilityReport": "gsim3d.stability",
     "autotune": "gsim3d.pareto.autotune",

@@ -150,7 +150,7 @@ def _compiled() -> bool:
     if torch.cuda.is_available():
         _row("ok" if cuda else "-", "GPU", torch.cuda.get_device_name())
     if not cuda:
-        _row("-", "CUDA kernels", "not compiled (needs a CUDA build of torch and nvcc; GSIM3D_CUDA=1 insists)")
+        _row("-", "CUDA kernels", "not compiled (needs torch with CUDA, nvcc, and a visible GPU or GSIM3D_CUDA=1)")
     devices = ["cpu"] + (["cuda"] if cuda and torch.cuda.is_available() else [])
     for device in devices:
         print(f"Self-test on {device} (forward and backward against plain torch)")

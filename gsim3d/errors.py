@@ -26,6 +26,10 @@ class HardCaseError(ValueError):
         self.tensor, self.scene, self.step, self.row, self.camera = tensor, scene, step, row, camera
 
 
+class ProcessorError(ImportError):
+    """The processor lacks instructions that the compiled kernels use; the message names them."""
+
+
 class CaptureError(RuntimeError):
     """Something cannot be made a CUDA graph; the message says why.
 
