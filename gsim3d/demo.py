@@ -50,7 +50,7 @@ class DemoConfig:
     """
 
     preset: str = "mini"
-    data: dict[str, Any] = field(default_factory=lambda: {"n_frames": 18, "fps": 16.0})
+    data: dict[str, Any] = field(default_factory=lambda: {"n_frames": 18, "fps": 16.0, "image_size": 64})
     train: TrainConfig = TrainConfig(
         preset="tiny",
         data=DataConfig(history=2, context_views=3, target_only_cameras=(2, 7), background_stride=2),
@@ -70,7 +70,7 @@ class DemoConfig:
 
 
 SHIPPED = DemoConfig(
-    preset="paper", data={"n_trajectories": 2, "objects": ("star", "torus")}, simulator="elastic-small"
+    preset="diverse", data={"n_trajectories": 2, "objects": ("star", "torus")}, simulator="elastic-small"
 )
 
 

@@ -65,13 +65,13 @@ def score(
         sets = json.loads(file.read_text())
         if sets["checkpoint"] != head["checkpoint"]:
             raise InputError(f"{file}: of other weights; measure all sets")
-    for subset in subsets or (KIND, *(subset for subset in SETS if world in HELD_OUT[subset])):
+    for subset in subsets or (KIND, *(subset for subset in SETS if world in HELD_OUT["diverse"][subset])):
         metrics, missing = measurable(None if subset == KIND else PLAIN_METRICS)
         begin = time.monotonic()
         count = counts[0] if subset == KIND else counts[1]
         options = {**changes, **({} if subset == KIND else {"subset": subset})}
         made = generate(
-            data / world / subset, world, preset="paper", n_trajectories=count, seed=HELD_OUT_SEED, **options
+            data / world / subset, world, preset="diverse", n_trajectories=count, seed=HELD_OUT_SEED, **options
         )
         filmed, scores = time.monotonic(), []
         scenes = [restored.open_scene(folder) for folder in made.folders]

@@ -46,7 +46,7 @@ INTRO = """# Trained simulators
 Written by `python tools/ship_model.py`; do not edit. Their names stand wherever a CHECKPOINT is expected:
 
 ```bash
-gsim3d generate elastic --preset paper --trajectories 7 --out runs/films
+gsim3d generate elastic --preset diverse --trajectories 7 --out runs/films
 gsim3d simulate elastic-small runs/films/ball/0000 --out runs/ball
 gsim3d evaluate elastic-small runs/films --scenes all
 ```
@@ -85,7 +85,7 @@ def ship(name: str, state: Path, scores: Path, wrong: str) -> Path:
         "skipped_steps": progress.n_skipped,
         "sittings": progress.sittings,
         "trajectories_begun": progress.next_trajectory,
-        "world": {"world": recipe.world, "preset": "paper", **dataclasses.asdict(world)},
+        "world": {"world": recipe.world, "preset": "diverse", **dataclasses.asdict(world)},
         "held_out_seed": HELD_OUT_SEED,
     }
     (folder / "recipe.json").write_text(json.dumps(described, indent=1) + "\n")
@@ -114,7 +114,7 @@ A gsim3d simulator of the world `{world["world"]}`: `gsim3d simulate {name} SCEN
 - **Sees** {data["history"]} steps from {data["context_views"]} calibrated cameras at {world["image_size"]} pixels with
   masks, {world["fps"]:g} steps a second; predicts particles, drawn as 3D Gaussians from any view.
 - **Trained on** {used:,} trajectories of {world["n_frames"]} steps and {world["n_cams"]} cameras, made by
-  `gsim3d generate {world["world"]} --preset paper --seed {world["seed"]}`{changed}, never the same twice;
+  `gsim3d generate {world["world"]} --preset diverse --seed {world["seed"]}`{changed}, never the same twice;
   from images alone.
 - **Budget** {recipe["steps"]:,} optimizer steps in {recipe["training_seconds"]:,.0f} s of training,
   {n_sittings} sitting{"s" if n_sittings > 1 else ""}, on {" and ".join(devices)}; {recipe["skipped_steps"]} steps were

@@ -100,7 +100,7 @@ def film_held_out(recipe, folder: Path) -> subprocess.Popen:
     """`gsim3d generate` in the background."""
     from gsim3d.train.shipped import HELD_OUT_SEED
 
-    options = [recipe.world, "--preset", "paper", "--seed", HELD_OUT_SEED, "--trajectories", recipe.held_out]
+    options = [recipe.world, "--preset", "diverse", "--seed", HELD_OUT_SEED, "--trajectories", recipe.held_out]
     for option, flag in (("image_size", "--size"), ("n_frames", "--frames")):
         options += [flag, recipe.options[option]] if option in recipe.options else []
     options += ["--out", folder, "--processes", HELD_OUT_PROCESSES, "--quiet"]

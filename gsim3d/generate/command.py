@@ -6,20 +6,25 @@ import argparse
 
 EPILOG = """\
 worlds:
-  elastic   soft bodies, from rubber to clay, fall on a round ground
-  rigid     one to three rigid bodies are thrown on it
+  elastic   soft bodies fall on a round ground
+  rigid     rigid bodies are thrown on it
   cloth     soft bodies fall on a cloth that hangs from its four corners
 
 examples:
-  gsim3d generate elastic --out data/mini                      34 short scenes at 64 pixels, a minute on 2 cores
-  gsim3d generate cloth --preset paper --out data/cloth        1200 trajectories of 84 frames at 128 pixels
-  gsim3d generate rigid --preset paper --set higher --trajectories 100 --out data/rigid-higher
+  gsim3d generate elastic --out data/mini                      34 short scenes at 128 pixels
+  gsim3d generate cloth --preset published --out data/cloth    1200 trajectories of 84 frames at 128 pixels
+  gsim3d generate rigid --preset diverse --set higher --trajectories 100 --out data/rigid-higher
   gsim3d generate elastic --out data/cow --mesh cow.obj --objects none --seed 7
+
+presets (--preset):
+  published six bodies, each of one look, size and material; a plain ground; 1200 trajectories, as long as the paper's
+  mini      the same with 24 frames and 34 trajectories (default)
+  diverse   pattern, colours, size, material and spin are drawn for every trajectory; a ground of three colours
 
 sets (--set), with the preset's cameras:
   train     what models learn from
   unseen    shapes that no training set has: cross, dumbbell, knot, pyramid
-  several   two or three bodies (rigid: four or five; cloth: two)
+  several   two or three bodies (diverse rigid: four or five; cloth: two)
   no-ground bodies are thrown up and fall freely, filmed for 0.7 s (elastic, rigid)
   raised    the ground lies 15 to 30 cm higher (elastic, rigid)
   higher    from greater heights
@@ -66,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="DIR", required=True, help="folder of the data set; made if absent, continued if unfinished"
     )
-    parser.add_argument("--preset", default="mini", help="options to start from: mini (default) or paper")
+    parser.add_argument("--preset", default="mini", help="options to start from: mini (default), published or diverse")
     parser.add_argument("--set", metavar="NAME", help="train (default), or a held-out set, see below")
     parser.add_argument("--size", type=int, metavar="PX", help="width and height of the images")
     parser.add_argument("--frames", type=int, metavar="N", help="steps of a trajectory")
@@ -77,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--objects",
         type=_names,
         metavar="A,B",
-        help="ball,blob,box,capsule,ellipsoid,star,torus (all; rigid also cone,cylinder), or none",
+        help="ball,blob,box,capsule,cone,cylinder,ellipsoid,spot,star,torus (default: those of the preset), or none",
     )
     parser.add_argument(
         "--mesh", action="append", metavar="FILE", help="a closed mesh as one more object, with its texture; repeatable"

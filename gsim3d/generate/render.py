@@ -56,10 +56,14 @@ class Surface:
 
 @dataclass(frozen=True)
 class Ground:
-    """A disc around the world's z axis: radius and height, metres."""
+    """A disc around the world's z axis: radius and height, metres.
+
+    albedo: grey of the whole disc, in [0, 1]; None: rings cut into sectors of three colours.
+    """
 
     radius: float
     height: float
+    albedo: float | None = None
 
 
 def ground_color(points: np.ndarray, radius: float) -> np.ndarray:
@@ -116,7 +120,10 @@ class Renderer:
         self.ground_rays = np.flatnonzero(hit)
         self.ground_points = points[hit]
         self.ground_across = self.ground_points @ ACROSS_LIGHT.T
-        albedo = ground_color(self.ground_points, ground.radius)
+        if ground.albedo is None:
+            albedo = ground_color(self.ground_points, ground.radius)
+        else:
+            albedo = np.full(self.ground_points.shape, ground.albedo)
         self.ground_shadowed = (albedo * AMBIENT).astype(np.float32)
         lit = np.broadcast_to(background, (*hit.shape, 3)).astype(np.float32)
         lit[hit] = albedo * (AMBIENT + DIFFUSE * LIGHT_DIRECTION[2])

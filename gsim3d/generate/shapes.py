@@ -223,7 +223,7 @@ def normalise(vertices: np.ndarray) -> tuple[np.ndarray, float]:
 def procedural_body(name: str, rng: np.random.Generator) -> Body:
     """One of SHAPES, painted with a random solid pattern of three colours."""
     if name not in SHAPES:
-        raise InputError(f"object {name!r} is not known; choose from {', '.join(SHAPES)} or give a mesh file")
+        raise InputError(f"object {name!r} is not known; choose from {', '.join(SHAPES)}")
     vertices, faces = SHAPES[name](FINE_LEVEL)
     light_vertices, light_faces = SHAPES[name](COARSE_LEVEL)
     centre, diameter = normalise(vertices)

@@ -18,7 +18,7 @@ import numpy as np
 
 from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects
 from gsim3d.errors import InputError
-from gsim3d.generate import cameras, meshes, render, shapes, writer
+from gsim3d.generate import bodies, cameras, meshes, render, shapes, writer
 from gsim3d.generate.carriers import grid_faces
 from gsim3d.generate.stage import (
     GRAVITY,
@@ -39,6 +39,8 @@ ENGINES = {"mujoco": "gsim3d.generate.mujoco_engine", "genesis": "gsim3d.generat
 CLOTH_REFINEMENT = 3  # drawn cloth is so many times finer than the simulated one
 GAP = 0.03  # metres between the spheres around two bodies at the start
 TRAIN = "train"
+CLOTH_COLOR = (0.78, 0.14, 0.12)  # where looks are functions of the name
+LATER_OPTIONS = ("by_name", "ground_albedo")  # at their defaults, sets that are older than them go on
 MAX_SPREAD = 0.25  # of cameras: bodies leave the views of closer ones
 HIGHER, STEEPER = 0.5, 45.0  # times the spread: the target in distances, the rings in degrees
 
@@ -72,6 +74,7 @@ class World(ABC):
     objects: tuple[str, ...] = shapes.SOFT_SHAPES
     meshes: tuple[str, ...] = ()  # files; they take part like objects, and alone where objects is empty
     mesh_up: str = "y"
+    by_name: bool = False  # paint, friction and bounce are functions of the body's name, not drawn; the cloth is red
     background: str = "black"
     depth: bool = False
     samples: int = 2  # rays along each side of a pixel
@@ -91,6 +94,7 @@ class World(ABC):
     ground: bool = True
     ground_height: tuple[float, float] = (0.0, 0.0)
     ground_radius: float = 0.85
+    ground_albedo: float | None = None  # grey of the whole ground; None: rings cut into sectors of three colours
     near: float = 1.5
     far: float = 3.8
 
@@ -115,14 +119,16 @@ class World(ABC):
             raise InputError(f"depth images reach to {writer.MAX_DEPTH} m; got far {self.far}")
         if not 0 <= self.camera_spread <= MAX_SPREAD:
             raise InputError(f"camera_spread must be from 0 to {MAX_SPREAD:g}; got {self.camera_spread!r}")
+        if self.ground_albedo is not None and not 0 <= self.ground_albedo <= 1:
+            raise InputError(f"ground_albedo must be from 0 to 1, or None; got {self.ground_albedo!r}")
         if not self.seed >= 0:
             raise InputError(f"seed must be 0 or more; got {self.seed}")
         for field, allowed in (("background", BACKGROUNDS), ("mesh_up", MESH_UPS), ("engine", self.engines)):
             if getattr(self, field) not in allowed:
                 raise InputError(f"{field} must be one of {', '.join(allowed)}; got {getattr(self, field)!r}")
         for name in self.objects:
-            if name not in shapes.SHAPES:
-                raise InputError(f"object {name!r} is not known; choose from {', '.join(shapes.SHAPES)}")
+            if name not in bodies.OBJECTS:
+                raise InputError(f"object {name!r} is not known; choose from {', '.join(bodies.OBJECTS)}")
         names = self.object_names()
         repeated = [name for name, count in Counter(names).items() if count > 1]
         if repeated or not names:
@@ -164,6 +170,9 @@ class World(ABC):
         one_rig = not self.camera_spread
         for field in ("n_trajectories", "meshes", *(() if others else ("objects",)), *(("camera_spread",) * one_rig)):
             del fields[field]
+        for field in LATER_OPTIONS:
+            if fields[field] == getattr(World, field):
+                del fields[field]
         text = json.dumps([writer.GENERATOR_VERSION, self.name, fields, name], sort_keys=True)
         digest = hashlib.sha256(text.encode())
         for path in self.meshes:
@@ -226,7 +235,7 @@ class World(ABC):
             renderer = render.Renderer(
                 rig,
                 surfaces,
-                ground=None if ground is None else render.Ground(self.ground_radius, ground),
+                ground=None if ground is None else render.Ground(self.ground_radius, ground, self.ground_albedo),
                 background=BACKGROUNDS[self.background],
                 samples=self.samples,
                 depth=self.depth,
@@ -267,8 +276,11 @@ class World(ABC):
 
     def _draw_actor(self, name: str, floor: float, before: list[Actor], rng: np.random.Generator) -> Actor:
         path = next((path for path in self.meshes if Path(path).stem == name), None)
-        body = shapes.procedural_body(name, rng) if path is None else meshes.load_body(path, self.mesh_up)
-        # Mesh files keep their feet down and turn about the vertical; procedural bodies have no top.
+        if path is None:
+            body = bodies.named_body(name, bodies.name_rng(name) if self.by_name else rng)
+        else:
+            body = meshes.load_body(path, self.mesh_up)
+        # Mesh files keep their feet down and turn about the vertical; bodies of the package have no top.
         rotation = _random_rotation(rng) if path is None else _turn(rng.uniform(0, 2 * np.pi))
         size = rng.uniform(*self.body_size)
         vertices = size * (body.vertices[:, None, :] * rotation).sum(-1)
@@ -285,7 +297,7 @@ class World(ABC):
         place = _clear_of(place, size / 2, before)
         axis = rng.normal(size=3)
         spin = rng.uniform(0, self.spin) * axis / np.linalg.norm(axis)
-        simulated, facts = self._make_body(collision + place, body.collision_faces, velocity, spin, rng)
+        simulated, facts = self._make_body(name, collision + place, body.collision_faces, velocity, spin, rng)
         facts = {"object": name, "mass": round(simulated.mass, 6), "size": round(size, 6), **facts}
         surface = render.Surface(body.faces, body.corners, self._painted(body.paint, facts))
         return Actor(simulated, surface, vertices + place, facts)
@@ -301,7 +313,7 @@ class World(ABC):
         return (lift + np.sqrt(lift**2 + 2 * GRAVITY * drop)) / GRAVITY
 
     @abstractmethod
-    def _make_body(self, vertices, faces, velocity, spin, rng) -> tuple[SoftBody | RigidBody, dict]:
+    def _make_body(self, name, vertices, faces, velocity, spin, rng) -> tuple[SoftBody | RigidBody, dict]:
         """The body with its collision mesh at time 0, and what metadata.json tells of it."""
 
     def _painted(self, paint: Callable[[np.ndarray], np.ndarray], facts: dict) -> Callable[[np.ndarray], np.ndarray]:
@@ -316,7 +328,8 @@ class World(ABC):
         part = np.arange(n) / (n - 1) - 0.5
         places = np.stack(np.meshgrid(part, part, [0.0], indexing="ij"), -1).reshape(-1, 3)
         faces = grid_faces(n)
-        return render.Surface(faces, places[faces], shapes.random_paint(rng), two_sided=True)
+        paint = _plain_cloth if self.by_name else shapes.random_paint(rng)
+        return render.Surface(faces, places[faces], paint, two_sided=True)
 
     def _move(self, rig, ground, cloth, actors) -> tuple[dict, list[np.ndarray]]:
         """States by name, and the vertices [T, V, 3] of every surface, checked."""
@@ -366,6 +379,10 @@ def _clear_of(place: np.ndarray, radius: float, before: list[Actor]) -> np.ndarr
         if aside < reach**2 and abs(place[2] - centre[2]) ** 2 + aside < reach**2:
             place[2] = centre[2] + np.sqrt(reach**2 - aside)
     return place
+
+
+def _plain_cloth(points: np.ndarray) -> np.ndarray:
+    return np.broadcast_to(CLOTH_COLOR, points.shape)
 
 
 def _turn(angle: float) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsim3d.errors import InputError
-from gsim3d.generate import meshes, shapes
+from gsim3d.generate import bodies, meshes, shapes
 from gsim3d.generate.stage import Cloth, Material, RigidBody, SoftBody
 from gsim3d.generate.world import TRAIN, World
 
@@ -25,9 +25,16 @@ MATERIALS = {
     "rubber": ((1.5e4, 2.5e4), 0.002, None),
     "foam": ((5e3, 8e3), 0.04, None),
     "clay": ((8e3, 1.2e4), 0.04, (0.02, 0.05)),
+    "putty": ((1e4, 1e4), 0.04, (0.03, 0.03)),
 }
 # Colours to which bodies lean where there are several materials: nothing else tells them apart before a body lands.
-TINTS = {"jelly": (0.15, 0.6, 0.25), "rubber": (0.1, 0.25, 0.8), "foam": (0.95, 0.85, 0.3), "clay": (0.75, 0.25, 0.15)}
+TINTS = {
+    "jelly": (0.15, 0.6, 0.25),
+    "rubber": (0.1, 0.25, 0.8),
+    "foam": (0.95, 0.85, 0.3),
+    "clay": (0.75, 0.25, 0.15),
+    "putty": (0.6, 0.58, 0.55),
+}
 TINT_SHARE = 0.6
 
 
@@ -59,10 +66,10 @@ class SoftWorld(World):
         if not (isinstance(self.cells, int) and self.cells >= 1):
             raise InputError(f"cells must be a whole number, 1 or more; got {self.cells!r}")
 
-    def _make_body(self, vertices, faces, velocity, spin, rng):
-        name, material = draw_material(self.materials, rng)
+    def _make_body(self, name, vertices, faces, velocity, spin, rng):
+        material_name, material = draw_material(self.materials, rng)
         mass = self.density * float(np.prod(np.ptp(vertices, axis=0)))
-        return SoftBody(vertices, faces, velocity, spin, material, mass, self.cells), {"material": name}
+        return SoftBody(vertices, faces, velocity, spin, material, mass, self.cells), {"material": material_name}
 
     def _painted(self, paint, facts):
         if len(self.materials) == 1:
@@ -147,8 +154,11 @@ class Rigid(World):
     name = "rigid"
     engines = ("mujoco",)
 
-    def _make_body(self, vertices, faces, velocity, spin, rng):
-        friction, bounce = rng.uniform(*self.friction), rng.uniform(*self.bounce)
+    def _make_body(self, name, vertices, faces, velocity, spin, rng):
+        if self.by_name:
+            friction, bounce = bodies.named_contact(name, self.friction, self.bounce)
+        else:
+            friction, bounce = rng.uniform(*self.friction), rng.uniform(*self.bounce)
         mass = RIGID_DENSITY * float(np.prod(np.ptp(vertices, axis=0)))
         parts = tuple(meshes.convex_pieces(vertices, faces))
         facts = {"friction": round(friction, 6), "bounce": round(bounce, 6)}
@@ -157,33 +167,78 @@ class Rigid(World):
 
 WORLDS = {"elastic": Elastic, "rigid": Rigid, "cloth": ClothWorld}
 
-# Full-size sets see more of the scene than the small ones, and throw bodies about in it.
-_PAPER = {"n_trajectories": 1200, "image_size": 128}
+_FULL_SIZE = {"n_trajectories": 1200, "image_size": 128, "n_cams": 12}
+# Few bodies, each of one look, size and material; a plain ground; one rig. Nothing that decides a motion is invisible.
+_KNOWN = {**_FULL_SIZE, "by_name": True, "ground_albedo": 0.55, "n_bodies": (1, 1), "lift": (0.0, 0.0)}
+_SOFT = {**_KNOWN, "objects": ("spot", "blob", "box", "capsule", "ellipsoid", "cylinder"), "materials": ("putty",)}
+_VARIED = ("jelly", "rubber", "foam", "clay")
+_ELASTIC_VIEW = {"distance": 3.2, "target_height": 0.7, "ground_radius": 1.2, "near": 1.5, "far": 5.0}
+_PUBLISHED = {
+    "elastic": {
+        **_SOFT,
+        **_ELASTIC_VIEW,
+        "n_frames": 84,
+        "fps": 42.0,
+        "body_size": (0.68, 0.68),
+        "drop_height": (0.4, 1.0),
+        "speed": 0.3,
+        "spin": 0.0,
+        "spread": 0.08,
+    },
+    "rigid": {
+        **_KNOWN,
+        "objects": ("box", "capsule", "ellipsoid", "cylinder", "cone", "spot"),
+        "n_frames": 32,
+        "fps": 12.0,
+        "body_size": (0.62, 0.62),
+        "drop_height": (0.3, 0.7),
+        "speed": 0.4,
+        "spin": 1.0,
+        "distance": 2.8,
+        "target_height": 0.45,
+        "ground_radius": 1.1,
+        "near": 0.9,
+        "far": 4.6,
+    },
+    "cloth": {
+        **_SOFT,
+        "n_frames": 84,
+        "fps": 42.0,
+        "body_size": (0.5, 0.5),
+        "drop_height": (0.1, 0.35),
+        "speed": 0.2,
+        "spin": 0.0,
+        "cloth_mass": (0.9, 0.9),
+        "cloth_young": (7e4, 7e4),
+    },
+}
 PRESETS = {
-    "mini": {"elastic": {}, "rigid": {}, "cloth": {}},
-    "paper": {
+    "mini": {world: {**options, "n_trajectories": 34, "n_frames": 24} for world, options in _PUBLISHED.items()},
+    "published": _PUBLISHED,
+    # Bodies, looks, sizes and materials are drawn anew for every trajectory.
+    "diverse": {
         "elastic": {
-            **_PAPER,
+            **_FULL_SIZE,
+            **_ELASTIC_VIEW,
             "n_frames": 84,
             "fps": 42.0,
-            "materials": tuple(MATERIALS),
+            "materials": _VARIED,
             "drop_height": (0.4, 1.0),
             "speed": 0.7,
             "spin": 3.0,
-            "distance": 3.2,
-            "target_height": 0.7,
-            "ground_radius": 1.2,
-            "far": 5.0,
         },
-        "rigid": {**_PAPER, "n_frames": 32, "fps": 12.0},
-        "cloth": {**_PAPER, "n_frames": 84, "fps": 42.0, "materials": tuple(MATERIALS)},
+        "rigid": {**_FULL_SIZE, "n_frames": 32, "fps": 12.0},
+        "cloth": {**_FULL_SIZE, "n_frames": 84, "fps": 42.0, "materials": _VARIED},
     },
 }
+_RENAMED = {"paper": "diverse"}
 
 # What a held-out set changes, by world. Without ground, bodies are thrown up and filmed until they have fallen out of
 # reach; the number of frames is given in seconds.
 _UNSEEN = {"objects": shapes.UNSEEN_SHAPES}
-HELD_OUT = {
+_RAISED = {"ground_height": (0.15, 0.3)}
+_THROWN = {"ground": False, "drop_height": (0.02, 0.1)}
+_DIVERSE_HELD_OUT = {
     "unseen": {"elastic": _UNSEEN, "rigid": _UNSEEN, "cloth": _UNSEEN},
     "several": {
         "elastic": {"n_bodies": (2, 3), "body_size": (0.38, 0.5), "spread": 0.25},
@@ -191,19 +246,32 @@ HELD_OUT = {
         "cloth": {"n_bodies": (2, 2), "body_size": (0.3, 0.4), "spread": 0.25},
     },
     "no-ground": {
-        "elastic": {"ground": False, "drop_height": (0.02, 0.1), "lift": (3.3, 3.8)},
-        "rigid": {"ground": False, "drop_height": (0.02, 0.1), "lift": (3.6, 4.2), "n_bodies": (1, 1)},
+        "elastic": {**_THROWN, "lift": (3.3, 3.8)},
+        "rigid": {**_THROWN, "lift": (3.6, 4.2), "n_bodies": (1, 1)},
     },
-    "raised": {
-        "elastic": {"ground_height": (0.15, 0.3)},
-        "rigid": {"ground_height": (0.15, 0.3)},
-    },
+    "raised": {"elastic": _RAISED, "rigid": _RAISED},
     "higher": {
         "elastic": {"drop_height": (1.05, 1.2)},
         "rigid": {"drop_height": (0.8, 1.0), "lift": (0.8, 1.2)},
         "cloth": {"drop_height": (0.45, 0.6)},
     },
 }
+_PUBLISHED_HELD_OUT = {
+    **_DIVERSE_HELD_OUT,
+    "several": {
+        "elastic": {"n_bodies": (2, 3), "body_size": (0.46, 0.46), "spread": 0.25},
+        "rigid": {"n_bodies": (2, 3), "body_size": (0.42, 0.42), "spread": 0.35},
+        "cloth": {"n_bodies": (2, 2), "body_size": (0.36, 0.36), "spread": 0.25},
+    },
+    "no-ground": {"elastic": {**_THROWN, "lift": (3.3, 3.8)}, "rigid": {**_THROWN, "lift": (2.8, 3.2)}},
+    "higher": {
+        "elastic": {"drop_height": (1.05, 1.2)},
+        "rigid": {"drop_height": (0.75, 0.85)},
+        "cloth": {"drop_height": (0.45, 0.6)},
+    },
+}
+HELD_OUT = {"mini": _PUBLISHED_HELD_OUT, "published": _PUBLISHED_HELD_OUT, "diverse": _DIVERSE_HELD_OUT}
+_HELD_OUT_COUNT = {"mini": 24, "published": 24}  # trajectories; others have those of their preset
 _SECONDS_WITHOUT_GROUND = 0.72
 
 
@@ -215,12 +283,13 @@ def build_world(world: str, preset: str, changes: dict) -> World:
     if world not in WORLDS:
         raise InputError(f"world {world!r} is not known; choose from {', '.join(WORLDS)}")
     if preset not in PRESETS:
-        raise InputError(f"preset {preset!r} is not known; choose from {', '.join(PRESETS)}")
+        hint = f"; {preset} is called {_RENAMED[preset]} now" if preset in _RENAMED else ""
+        raise InputError(f"preset {preset!r} is not known; choose from {', '.join(PRESETS)}{hint}")
     known = {field.name for field in dataclasses.fields(WORLDS[world])}
     unknown = sorted(set(changes) - known)
     if unknown:
         raise InputError(f"world {world!r} has no option {unknown[0]!r}; it has {', '.join(sorted(known))}")
-    chosen = {**PRESETS[preset][world], **_held_out(world, changes.get("subset", TRAIN)), **changes}
+    chosen = {**PRESETS[preset][world], **_held_out(world, preset, changes.get("subset", TRAIN)), **changes}
     settings = WORLDS[world](**chosen)
     if not settings.ground and "n_frames" not in changes:
         settings = dataclasses.replace(settings, n_frames=int(_SECONDS_WITHOUT_GROUND * settings.fps))
@@ -228,10 +297,11 @@ def build_world(world: str, preset: str, changes: dict) -> World:
     return settings
 
 
-def _held_out(world: str, subset: str) -> dict:
+def _held_out(world: str, preset: str, subset: str) -> dict:
     if subset == TRAIN:
         return {}
-    sets = [name for name, worlds in HELD_OUT.items() if world in worlds]
+    sets = [name for name, worlds in HELD_OUT[preset].items() if world in worlds]
     if subset not in sets:
         raise InputError(f"world {world!r} has no set {subset!r}; choose from {', '.join([TRAIN, *sets])}")
-    return HELD_OUT[subset][world]
+    count = {"n_trajectories": _HELD_OUT_COUNT[preset]} if preset in _HELD_OUT_COUNT else {}
+    return {**HELD_OUT[preset][subset][world], **count}

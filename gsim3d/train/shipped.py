@@ -40,7 +40,7 @@ SAVE_EVERY = 120.0  # seconds
 class Recipe:
     """How one simulator is trained.
 
-    world, options: `gsim3d generate WORLD --preset paper`, and options to change.
+    world, options: `gsim3d generate WORLD --preset diverse`, and options to change.
     in_turn: further options; trajectories are made with one set of them after another.
     capacity: trajectories that are kept at a time.   held_out: that are predicted and scored at the end of a sitting.
     first_films: before training begins.
@@ -58,7 +58,8 @@ class Recipe:
 
     def worlds(self) -> list[World]:
         """What makes its trajectories, in turn."""
-        return [build_world(self.world, "paper", {"seed": SEED, **self.options, **options}) for options in self.in_turn]
+        changes = [{"seed": SEED, **self.options, **options} for options in self.in_turn]
+        return [build_world(self.world, "diverse", options) for options in changes]
 
 
 # `small` with a lighter encoder, so that three sets of weights in 16 bits stay below 25 MB; without drop path and
@@ -144,7 +145,7 @@ def _recipe(
     lit = partial(dynamics, begin_within=begin_within // 2, horizon=2, lit_before=lit_before)
     lit = partial(lit, batch=4 * batch, learning_rate=rate)
     horizon, cut = rollout
-    fps = build_world(world, "paper", {}).fps
+    fps = build_world(world, "diverse", {}).fps
     first = (
         partial(dynamics, horizon=4, batch=2 * batch, from_start=0.1, learning_rate=rate),
         short,

@@ -137,11 +137,11 @@ def test_held_out_scenes_are_of_the_world_of_the_training(tmp_path, monkeypatch)
     monkeypatch.setattr("gsim3d.pretrained.FOLDER", tmp_path)
     (tmp_path / "cloth-small").mkdir()
     (tmp_path / "cloth-small" / "model.safetensors").write_bytes(b"")
-    recipe = {"world": {"world": "cloth", "preset": "paper", "n_frames": 84}}
+    recipe = {"world": {"world": "cloth", "preset": "diverse", "n_frames": 84}}
     (tmp_path / "cloth-small" / "recipe.json").write_text(json.dumps(recipe))
-    assert command._world("cloth-small", True) == ("cloth", "paper", {"n_frames": command.QUICK_FRAMES})
-    assert command._world("cloth-small", False) == ("cloth", "paper", {})
-    assert command._world(str(tmp_path / "cloth-small" / "model.safetensors"), False) == ("cloth", "paper", {})
+    assert command._world("cloth-small", True) == ("cloth", "diverse", {"n_frames": command.QUICK_FRAMES})
+    assert command._world("cloth-small", False) == ("cloth", "diverse", {})
+    assert command._world(str(tmp_path / "cloth-small" / "model.safetensors"), False) == ("cloth", "diverse", {})
     (tmp_path / "run").mkdir()
     assert command._world(str(tmp_path / "run"), True) == ("elastic", "mini", {})
 

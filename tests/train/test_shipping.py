@@ -44,7 +44,7 @@ def scored(tmp_path_factory, one_thread):
     import numpy as np
 
     out = tmp_path_factory.mktemp("shipping")
-    world = build_world("elastic", "paper", OPTIONS)
+    world = build_world("elastic", "diverse", OPTIONS)
     store = FilmStore(world, 1, "cpu")
     store.put(**np.load(film(world, ("ball", 0), str(out / "film.npz"))))
     trainer = SittingTrainer(CONFIG, store, out / "run", "cpu")

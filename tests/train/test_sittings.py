@@ -436,7 +436,7 @@ def test_recipes_are_sound():
     for world, recipe in RECIPES.items():
         data, stages, first, *others = recipe.train.data, recipe.train.all_stages, *recipe.worlds()
         assert recipe.world == world == first.name and recipe.first_films <= recipe.capacity
-        assert first == build_world(world, "paper", {"seed": shipped.SEED, **recipe.options})
+        assert first == build_world(world, "diverse", {"seed": shipped.SEED, **recipe.options})
         assert all(begun_alike(other, first) == first for other in others)
         assert first.n_frames >= data.history + max(stage.lead + stage.horizon + longest_gap(stage) for stage in stages)
         assert recipe.train.n_steps >= 1_000_000 and shipped.SEED != shipped.HELD_OUT_SEED
