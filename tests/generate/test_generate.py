@@ -221,8 +221,188 @@ def test_first_frames_are_those_of_other_machines(mini_scenes):
     """Heights of the middle of the body at the first ten frames, as computed on another day elsewhere."""
     _, scenes = mini_scenes
     for scene in scenes:
-        # Of the corners of its control lattice, of which those that hold nothing may stay behind.
+        heights = scene.states["body_0"][:10, 1:3, 1:3, 1:3, 2].mean((1, 2, 3))
+        np.testing.assert_allclose(heights, RECORDED_HEIGHTS[scene.object], atol=TOLERANCES["generate_machines"].value)
+
+
+@pytest.mark.parametrize("world", ["elastic", "cloth"])
+def test_colours_tell_materials_apart_where_there_are_several(world):
+    points, found = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)), set()
+    for seed in range(30):
+        alone, several = (
+            build_world(world, "diverse", options)._draw("ball", np.random.default_rng(seed))[2][0]
+            for options in ({"materials": ("jelly",)}, {})
+        )
+        drawn, painted = alone.surface.paint(points), several.surface.paint(points)
+        assert {tuple(color) for color in drawn} <= {tuple(color) for color in PALETTE}
+        tint = np.array(TINTS[several.facts["material"]])
+        np.testing.assert_allclose(painted - tint, 0.4 * (drawn - tint), atol=1e-12)
+        found.add(several.facts["material"])
+    assert found == set(build_world(world, "diverse", {}).materials) and set(TINTS) == set(MATERIALS)
+
+
+def test_impossible_options_say_why(tmp_path):
+    cases = [
+        ({"n_frames": 0}, "n_frames"),
+        ({"fps": -1.0}, "fps"),
+        ({"drop_height": (2.0, 1.0)}, "drop_height"),
+        ({"background": "green"}, "background"),
+        ({"objects": ("cube",)}, "cube.*choose from"),
+        ({"objects": ()}, "objects"),
+        ({"meshes": ("absent.obj",)}, "absent.obj"),
+        ({"near": 3.0}, "the ground is seen from"),
+        ({"far": 1.0}, "far must lie beyond near"),
+        ({"colour": 1}, "has no option 'colour'"),
+        ({"drop_height": (3.0, 4.0)}, "none of .* draws"),
+        ({"processes": 0}, "processes"),
+        ({"world": "lava"}, "world 'lava'"),
+        ({"world": "rigid", "subset": "moon"}, "no set 'moon'.*higher"),
+        ({"world": "cloth", "subset": "raised"}, "no set 'raised'"),
+        ({"materials": ("steel",)}, "materials must be some of"),
+        ({"engine": "havok"}, "engine must be one of mujoco, genesis"),
+        ({"world": "rigid", "engine": "genesis"}, "engine must be one of mujoco; got"),
+        ({"depth": True, "far": 8.0}, "depth images reach"),
+        ({"preset": "huge"}, "preset 'huge'"),
+        ({"preset": "paper"}, "paper is called diverse now"),
+        ({"ground_albedo": 2.0}, "ground_albedo must be"),
+    ]
+    for changes, message in cases:
+        options = {"processes": 1, **SMALL, **changes}
+        with pytest.raises(InputError, match=message):
+            generate(tmp_path / "out", progress=False, **options)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="not a folder"):
+        generate(tmp_path / "file", progress=False, **SMALL)
+
+
+def test_two_writers_do_not_share_a_folder(tmp_path):
+    import fcntl
+
+    handle = os.open(tmp_path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        with pytest.raises(InputError, match="another process"):
+            generate(tmp_path, processes=1, progress=False, **SMALL)
+    finally:
+        os.close(handle)
+
+
+def test_presets_build():
+    for preset in PRESETS:
+        for world in WORLDS:
+            assert build_world(world, preset, {}).scenes()
+    for world, length in {"elastic": (84, 42.0), "cloth": (84, 42.0), "rigid": (32, 12.0)}.items():
+        for preset in ("published", "diverse"):
+            full = build_world(world, preset, {})
+            assert (full.n_frames, full.fps) == length and full.image_size == 128 and full.n_cams == 12
+        mini, published = build_world(world, "mini", {}), build_world(world, "published", {})
+        assert mini == dataclasses.replace(published, n_frames=24, n_trajectories=34)
+
+
+def test_sets_that_are_older_than_some_options_go_on():
+    """The fingerprint of today's defaults is that of before there were `by_name` and `ground_albedo`."""
+    assert Elastic(n_frames=9).fingerprint("ball") == "9f3e7e705993520d240f078b4f98e4553795565c0b370a0101cae9c530d382f8"
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_published_bodies_are_functions_of_their_names(world):
+    settings = build_world(world, "published", {})
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
+    looks = set()
+    for name in settings.object_names():
+        drawn = [settings._draw(name, np.random.default_rng(seed)) for seed in range(2)]
+        (first,), (second,) = (actors for _, _, actors in drawn)
+        assert first.facts == {**second.facts, "mass": first.facts["mass"]} and len(drawn[0][2]) == 1
+        assert not np.array_equal(first.vertices, second.vertices)
+        sampled = points[:, : first.surface.corners.shape[2]]
+        looks.add(first.surface.paint(sampled).tobytes())
+        np.testing.assert_array_equal(first.surface.paint(sampled), second.surface.paint(sampled))
+        if world != "rigid":
+            assert first.body.material == second.body.material and not first.body.spin.any()
+    assert len(settings.object_names()) == len(looks) == 6
+    if world == "cloth":
+        cloths = [settings._draw_cloth(np.random.default_rng(seed)) for seed in range(2)]
+        assert cloths[0] == cloths[1] and (cloths[0].mass, cloths[0].young) == (0.9, 7e4)
+    upright = [settings._draw("spot", np.random.default_rng(seed))[2][0].vertices for seed in range(8)]
+    assert np.ptp([np.ptp(vertices[:, 2]) for vertices in upright]) > 0.1  # any rotation, not about the vertical alone
+
+
+def test_published_ground_is_plain():
+    settings = build_world("elastic", "published", {**TINY, "n_frames": 1})
+    scene = settings.make("box", 0)
+    (view,) = scene.views
+    colors, counts = np.unique(view.rgb[view.segmentation == 1], axis=0, return_counts=True)
+    assert (colors.max(1) == colors.min(1)).mean() > 0.5 and counts.max() > 0.4 * counts.sum()
+    assert (view.rgb[view.segmentation == 0].max(1) == 0).mean() > 0.9
+
+
+def test_cameras_differ_from_scene_to_scene_as_far_as_they_may(tmp_path):
+    plain, spread = (build_world("elastic", "mini", {**SMALL, **more}) for more in ({}, {"camera_spread": 0.06}))
+    assert plain.fingerprint("ball") != spread.fingerprint("ball") and plain.rig(("ball", 1)).n_cams == 3
+    np.testing.assert_array_equal(plain.rig(("ball", 1)).viewmats, plain.rig().viewmats)
+    np.testing.assert_array_equal(spread.rig().viewmats, plain.rig().viewmats)
+    distances, heights, turns = [], [], []
+    for sample in range(40):
+        rig = spread.rig(("ball", sample))
+        np.testing.assert_array_equal(rig.viewmats, spread.rig(("ball", sample)).viewmats)
+        rotations = rig.viewmats[:, :3, :3]
+        places = -np.einsum("vji,vj->vi", rotations, rig.viewmats[:, :3, 3])
+        aside = np.hypot(*places[:, :2].T)
+        target = places[0, 2] + aside[0] * rotations[0, 2, 2] / np.hypot(*rotations[0, 2, :2])
+        distances.append(np.hypot(aside[0], places[0, 2] - target) / plain.distance), heights.append(target)
+        turns.append(np.arctan2(places[0, 1], places[0, 0]))
+    assert 0.94 <= min(distances) < 0.95 and 1.05 < max(distances) <= 1.06
+    height = 0.03 * plain.distance
+    assert plain.target_height - height <= min(heights) < plain.target_height - 0.8 * height
+    assert plain.target_height + 0.8 * height < max(heights) <= plain.target_height + height
+    assert np.ptp(turns) > 5
+    made = generate(tmp_path, preset="mini", processes=1, progress=False, camera_spread=0.06, **SMALL)
+    scenes = [Scene.open(folder) for folder in made.folders]
+    for scene in scenes:
+        found = scene.cameras_at(range(3), [0]).viewmats
+        rig = spread.rig((scene.path.parent.name, int(scene.path.name)))
+        np.testing.assert_allclose(found, rig.viewmats, atol=1e-6)
+    assert len({scene.cameras_at([0], [0]).viewmats.numpy().tobytes() for scene in scenes}) == len(scenes) > 1
+
+
+def test_cameras_that_see_beyond_near_and_far_are_refused():
+    build_world("elastic", "mini", {"camera_spread": 0.05})
+    with pytest.raises(InputError, match="the ground is seen from"):
+        build_world("elastic", "mini", {"camera_spread": 0.2})
+    for spread in (-0.1, 0.3, float("nan")):
+        with pytest.raises(InputError, match="camera_spread must be from 0 to 0.25"):
+            build_world("elastic", "mini", {"camera_spread": spread})
+
+
+HELD_OUT_SETS = [
+    (preset, world, subset)
+    for preset in ("published", "diverse")
+    for subset, worlds in HELD_OUT[preset].items()
+    for world in worlds
+]
+
+
+@pytest.mark.parametrize("preset, world, subset", HELD_OUT_SETS)
+def test_held_out_sets_differ_from_the_training_set_as_they_say(preset, world, subset):
+    length = {} if subset == "no-ground" else {"n_frames": 2}
+    train, other = (build_world(world, preset, {"subset": s, **TINY, **length}) for s in ("train", subset))
+    np.testing.assert_array_equal(train.rig().viewmats, other.rig().viewmats)
+    name = other.object_names()[0]
+    scene = other.make(name, 0)
+    bodies, ground = scene.extras["bodies"], scene.extras["ground_height"]
+    if subset == "unseen":
+        assert not set(other.object_names()) & set(train.object_names())
+    else:
+        assert other.object_names() == train.object_names()
+        seen = dataclasses.replace(train, n_frames=2).make(name, 0).extras["bodies"][0]["size"]
+        assert seen != bodies[0]["size"] or train.by_name  # other random numbers
+    if subset == "several":
+        assert len(bodies) >= 2 and other.n_bodies[1] > train.n_bodies[1]
+    if subset == "no-ground":
+        assert ground is None and not (np.stack([view.segmentation for view in scene.views]) == 1).any()
+        # Corners of a control lattice that hold nothing may stay behind; of a rigid body the first node is its origin.
         heights = scene.states["body_0"][..., 2].reshape(len(scene.views), -1)
+        heights = heights[:, :1] if world == "rigid" else heights
         bend = np.median(np.diff(heights, 2, axis=0).mean(0)) * other.fps**2
         np.testing.assert_allclose(bend, -9.81, atol=0.6)
         assert np.median(np.abs(np.diff(heights, axis=0)).sum(0)) > 0.7
