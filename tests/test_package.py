@@ -157,7 +157,7 @@ def test_sdist_becomes_a_wheel_that_predicts_without_a_compiler(sdist, tmp_path)
     site = next((tmp_path / "env").glob("lib/python*/site-packages"))
     (site / "dependencies.pth").write_text("\n".join({sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}))
     command = [fresh, "-I", "-m", "gsim3d"]
-    films = "generate elastic --preset paper --objects ball --trajectories 1 --frames 8 --processes 1 --out films"
+    films = "generate elastic --preset diverse --objects ball --trajectories 1 --frames 8 --processes 1 --out films"
     python(*command, *films.split(), cwd=tmp_path, PATH="")
     python(*command, *"simulate elastic-small films/ball/0000 --steps 1 --out predicted".split(), cwd=tmp_path, PATH="")
     assert (tmp_path / "predicted" / "rollout.mp4").stat().st_size > 1000
