@@ -17,6 +17,7 @@ _HOME = {
     "EffectsSpec": "gsim3d.effects",
     "Frames": "gsim3d.types",
     "Gaussians": "gsim3d.types",
+    "GradientError": "gsim3d.errors",
     "HardCaseError": "gsim3d.errors",
     "InputError": "gsim3d.errors",
     "Particles": "gsim3d.types",

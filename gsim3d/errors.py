@@ -43,3 +43,14 @@ class CaptureError(RuntimeError):
 
 class FitWarning(UserWarning):
     """A scene is changed to fit a model; the message says what is changed and how to keep it."""
+
+
+class GradientError(NotImplementedError):
+    """A derivative that an op does not have; the message names the op, the argument and the order.
+
+    argument: name of the argument that asked for it; None: any. order: 1, or 2 for the derivative of a gradient.
+    """
+
+    def __init__(self, message: str, *, op: str, argument: str | None, order: int):
+        super().__init__(message)
+        self.op, self.argument, self.order = op, argument, order

@@ -10,6 +10,7 @@ from torch import Tensor
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole
 from gsim3d.ops._autocast import follow_autocast
+from gsim3d.ops._gradients import register_gradients
 from gsim3d.ops.curve import PatchTable, Segments
 
 RUN = 64  # rows that are summed one after another
@@ -163,7 +164,7 @@ def _sum_by_cell(x: Tensor, places: Tensor, n_cells: int) -> Tensor:
     return torch.ops.gsim3d.unpool_backward(runs, each, torch.searchsorted(cuts, cu_cells)).to(x.dtype)
 
 
-torch.library.register_autograd("gsim3d::add_cells", _backward, setup_context=_setup)
+register_gradients("add_cells", _backward, _setup, gradient_ops=[])
 torch.library.register_autocast("gsim3d::add_cells", "cpu", torch.float32)
 follow_autocast("add_cells")
 

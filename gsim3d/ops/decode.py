@@ -5,6 +5,7 @@ from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_real, check_tensors, check_whole
+from gsim3d.ops._gradients import register_gradients
 
 
 def decode_gaussians(
@@ -64,7 +65,8 @@ def _backward(ctx, *grads):
     return grad_raw, None, None, None, None
 
 
-torch.library.register_autograd("gsim3d::decode_gaussians", _backward, setup_context=_setup)
+_gradient_ops = ["decode_gaussians_backward"]
+register_gradients("decode_gaussians", _backward, _setup, gradient_ops=_gradient_ops, without=["readings"])
 _library = torch.library.Library("gsim3d", "FRAGMENT")
 
 

@@ -6,6 +6,7 @@ from torch import Tensor
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_real, check_tensors
 from gsim3d.ops._autocast import follow_autocast
+from gsim3d.ops._gradients import register_gradients
 from gsim3d.ops.curve import PatchTable
 
 
@@ -157,8 +158,9 @@ def _joint_backward(ctx, grad, _grad_stats):
     return own[0] + other[0], *own[1:], *other[1:], *(None,) * 9
 
 
-_rules = {"patch_attention": (_backward, _setup), "joint_attention": (_joint_backward, _joint_setup)}
-for _name, (_gradients, _context) in _rules.items():
-    torch.library.register_autograd(f"gsim3d::{_name}", _gradients, setup_context=_context)
+_own_ops = ["patch_attention_backward", "patch_attention_backward_packed"]
+_rules = {"patch_attention": (_backward, _setup, _own_ops), "joint_attention": (_joint_backward, _joint_setup, [])}
+for _name, (_gradients, _context, _gradient_ops) in _rules.items():
+    register_gradients(_name, _gradients, _context, gradient_ops=_gradient_ops)
     torch.library.register_autocast(f"gsim3d::{_name}", "cpu", torch.float32)
     follow_autocast(_name)

@@ -6,6 +6,7 @@ from torch import Tensor
 from gsim3d.errors import HardCaseError
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_tensors
+from gsim3d.ops._gradients import register_gradients
 
 
 def sweep_geometry(
@@ -151,6 +152,7 @@ def _backward(ctx, grad):
     return torch.ops.gsim3d.plane_sweep_backward(grad, *ctx.saved_tensors), None, None, None, None, None
 
 
-torch.library.register_autograd("gsim3d::plane_sweep", _backward, setup_context=_setup)
+_without = ["homographies", "translations", "inverse_depths"]
+register_gradients("plane_sweep", _backward, _setup, gradient_ops=["plane_sweep_backward"], without=_without)
 for _device in ("cpu", "cuda"):
     torch.library.register_autocast("gsim3d::plane_sweep", _device, torch.float32)

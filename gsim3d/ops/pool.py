@@ -5,6 +5,7 @@ from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole, within_memory
+from gsim3d.ops._gradients import register_gradients
 
 
 def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -> Tensor:
@@ -138,9 +139,9 @@ def _unpool_backward(ctx, grad):
     return torch.ops.gsim3d.unpool_backward(grad, *ctx.saved_tensors), None, None, None
 
 
-torch.library.register_autograd("gsim3d::pool_max", _pool_max_backward, setup_context=_pool_max_setup)
-torch.library.register_autograd("gsim3d::pool_mean", _pool_mean_backward, setup_context=_pool_mean_setup)
-torch.library.register_autograd("gsim3d::unpool", _unpool_backward, setup_context=_unpool_setup)
+register_gradients("pool_max", _pool_max_backward, _pool_max_setup, gradient_ops=["pool_max_backward"])
+register_gradients("pool_mean", _pool_mean_backward, _pool_mean_setup, gradient_ops=["pool_mean_backward"])
+register_gradients("unpool", _unpool_backward, _unpool_setup, gradient_ops=["unpool_backward"])
 for _op in ("pool_max", "pool_mean", "unpool"):
     for _device in ("cpu", "cuda"):
         torch.library.register_autocast(f"gsim3d::{_op}", _device, torch.float32)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_real, check_tensors, check_whole, within_memory
+from gsim3d.ops._gradients import register_gradients
 from gsim3d.stability import Finding, OnBad, Reading, StabilityReport, check_on_bad
 from gsim3d.types import Cameras
 
@@ -310,6 +311,7 @@ def _backward(ctx, *grads):
     return (*grads, viewmats if viewmats_grad else None, *[None] * 11)
 
 
-torch.library.register_autograd("gsim3d::rasterize_gaussians", _backward, setup_context=_setup)
+_gradient_ops = ["rasterize_gaussians_backward"]
+register_gradients("rasterize_gaussians", _backward, _setup, gradient_ops=_gradient_ops, without=["Ks"])
 for _device in ("cpu", "cuda"):
     torch.library.register_autocast("gsim3d::rasterize_gaussians", _device, torch.float32)

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_real, check_tensors
+from gsim3d.ops._gradients import register_gradients
 
 
 def row_norm(
@@ -123,7 +124,7 @@ def _backward(ctx, grad, _grad_stats):
     return grad_x, grad_weight, grad_bias, grad if ctx.has_residual else None, None, None
 
 
-torch.library.register_autograd("gsim3d::row_norm", _backward, setup_context=_setup)
+register_gradients("row_norm", _backward, _setup, gradient_ops=["row_norm_backward"])
 
 
 @torch.library.register_fake("gsim3d::residual_norm")
@@ -161,7 +162,8 @@ def _residual_backward(ctx, grad_sum, grad_out, *_):
     return x, branch, None, *(g if has else None for g, has in zip(of_norms, given, strict=True)), None
 
 
-torch.library.register_autograd("gsim3d::residual_norm", _residual_backward, setup_context=_residual_setup)
+_residual_ops = ["residual_norm_backward", "linear_grad_bias"]  # of the linear layer of a branch
+register_gradients("residual_norm", _residual_backward, _residual_setup, gradient_ops=_residual_ops, without=["keep"])
 _library = torch.library.Library("gsim3d", "FRAGMENT")
 
 
@@ -227,7 +229,7 @@ def _gelu_backward(ctx, grad):
     return x, -saved[2] * bias, scale, bias, None
 
 
-torch.library.register_autograd("gsim3d::norm_gelu", _gelu_backward, setup_context=_gelu_setup)
+register_gradients("norm_gelu", _gelu_backward, _gelu_setup, gradient_ops=["norm_gelu_backward"])
 
 
 def _gelu_autocast(device: str):

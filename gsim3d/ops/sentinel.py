@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_real, check_tensors
+from gsim3d.ops._gradients import refuse
 from gsim3d.stability import LARGEST
 
 # As in csrc/gsim3d/sentinel/sentinel.h
@@ -87,7 +88,8 @@ def watch_rows(
         check: look at the types of the arguments; a model that makes them itself leaves it out.
     Returns:
         Watched, on the device of the rows.
-    Gradients: none, of mended rows neither. Determinism: equal bits for any number of threads; on a GPU in every run.
+    Gradients: none; fields that ask for one are refused where rows are mended.
+    Determinism: equal bits for any number of threads; on a GPU in every run.
     Raises:
         ValueError, TypeError: an argument is malformed; the message names it. On a GPU offsets are not looked at.
 
@@ -103,6 +105,8 @@ def watch_rows(
         clouds = {"cu_rows": cu_rows, "cloud_scene": cloud_scene, "origin": origin, "activity": activity}
         _check_arguments(fields, bounds, previous, neutral, clouds)
         check_real("watch_rows", grid_size=grid_size, max_step=max_step)
+    if neutral is not None:
+        refuse("watch_rows", {f"fields[{f}]": field for f, field in enumerate(fields)})
     status, record, mended = torch.ops.gsim3d.watch_rows(
         _detached(fields),
         [low for low, _ in bounds],

@@ -6,6 +6,7 @@ from torch import Tensor
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole
 from gsim3d.ops._autocast import follow_autocast
+from gsim3d.ops._gradients import register_gradients
 from gsim3d.ops.curve import KernelMap, Voxels
 
 
@@ -130,6 +131,7 @@ def _backward(ctx, grad):
     return grad_x, grad_weight, grad_bias if ctx.has_bias else None, *[None] * 8
 
 
-torch.library.register_autograd("gsim3d::sparse_conv", _backward, setup_context=_setup)
+_gradient_ops = ["sparse_conv_grad_input", "sparse_conv_grad_weight"]
+register_gradients("sparse_conv", _backward, _setup, gradient_ops=_gradient_ops)
 torch.library.register_autocast("gsim3d::sparse_conv", "cpu", torch.float32)
 follow_autocast("sparse_conv")

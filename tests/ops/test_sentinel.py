@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from gsim3d.errors import GradientError
 from gsim3d.ops import watch_rows
 from gsim3d.ops.sentinel import FAST, OUTSIDE, SUMS, joined
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
@@ -239,8 +240,12 @@ def test_a_strided_field(device):
 
 def test_gradients_pass_by():
     fields, bounds, cu_rows, options = state()
-    watched = watch_rows([field.requires_grad_() for field in fields], bounds, cu_rows, neutral=NEUTRAL, **options)
-    assert not any(out.requires_grad for out in (watched.record, *watched.fields))
+    leaves = [field.requires_grad_() for field in fields]
+    assert not watch_rows(leaves, bounds, cu_rows, **options).record.requires_grad
+    with pytest.raises(GradientError, match=r"watch_rows: fields\[0\] has no gradient"):
+        watch_rows(leaves, bounds, cu_rows, neutral=NEUTRAL, **options)
+    with torch.no_grad():
+        assert not watch_rows(leaves, bounds, cu_rows, neutral=NEUTRAL, **options).fields[0].requires_grad
 
 
 # 8 error messages
