@@ -36,6 +36,7 @@ def score(
     device: str,
     counts: tuple[int, int],
     subsets: Sequence[str] = (),
+    preset: str = "published",
     changes: Mapping = MappingProxyType({}),
 ) -> dict:
     """Writes and returns the scores of ``name``.
@@ -43,7 +44,8 @@ def score(
     Args:
         counts: trajectories of its own kind, and of each other set.
         subsets: to be measured; none: all that the world has.
-        changes: of the options of the preset.
+        preset: of `gsim3d generate`.
+        changes: of its options.
     """
     import cv2
     import numpy as np
@@ -52,9 +54,8 @@ def score(
     from gsim3d.evaluate.report import summarize, write_json
     from gsim3d.evaluate.scoring import PLAIN_METRICS, measurable
     from gsim3d.generate import generate
-    from gsim3d.generate.worlds import HELD_OUT
+    from gsim3d.generate.worlds import HELD_OUT, VALIDATION_SEED
     from gsim3d.train.restore import restore
-    from gsim3d.train.shipped import HELD_OUT_SEED
 
     restored = restore(checkpoint, device)
     world = name.split("-")[0]
@@ -71,7 +72,7 @@ def score(
         count = counts[0] if subset == KIND else counts[1]
         options = {**changes, **({} if subset == KIND else {"subset": subset})}
         made = generate(
-            data / world / subset, world, preset="diverse", n_trajectories=count, seed=HELD_OUT_SEED, **options
+            data / world / subset, world, preset=preset, n_trajectories=count, seed=VALIDATION_SEED, **options
         )
         filmed, scores = time.monotonic(), []
         scenes = [restored.open_scene(folder) for folder in made.folders]
@@ -114,11 +115,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the trajectories; made if absent")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--trajectories", type=int, nargs=2, default=(14, 7), metavar=("OWN", "OTHERS"))
+    parser.add_argument("--preset", default="published", help="of its trajectories (default: published)")
     parser.add_argument("--sets", nargs="+", choices=(KIND, *SETS), default=(), help="default: all")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     args = parser.parse_args(arguments)
     counts = tuple(args.trajectories)
-    given = {"device": args.device, "counts": counts, "subsets": args.sets}
+    given = {"device": args.device, "counts": counts, "subsets": args.sets, "preset": args.preset}
     score(args.checkpoint or args.name, args.name, args.data, args.out, **given)
 
 

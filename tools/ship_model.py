@@ -1,8 +1,8 @@
 #!/usr/bin/env python
 """Puts a trained simulator into the package, with its model card, and writes the page of all of them.
 
-    python tools/train_shipped.py elastic --minutes 8 --state runs/elastic --out runs/elastic
-    python tools/score_shipped.py elastic-small --checkpoint runs/elastic/elastic-small.*.weights.safetensors \
+    python tools/release/train.py elastic --minutes 22 --state runs/elastic --out runs/elastic
+    python tools/score_shipped.py elastic-small --checkpoint runs/elastic/elastic-pure.weights.safetensors \
         --data runs/held_out --out runs/scores
     python tools/ship_model.py elastic-small --state runs/elastic --scores runs/scores --wrong runs/wrong.md
     python tools/ship_model.py                        # writes docs/trained.md and its pictures anew
@@ -13,6 +13,7 @@ WRONG says what is wrong with the model's films, in one's own words, for the car
 import argparse
 import dataclasses
 import json
+import math
 import shutil
 import sys
 from pathlib import Path
@@ -25,10 +26,11 @@ from gsim3d import pretrained  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402
 from gsim3d.evaluate.pictures import write_curves  # noqa: E402
 from gsim3d.evaluate.report import markdown  # noqa: E402
+from gsim3d.generate.worlds import VALIDATION_SEED  # noqa: E402
 from gsim3d.pareto.autotune import SPEEDS  # noqa: E402
 from gsim3d.train import checkpoint  # noqa: E402
-from gsim3d.train.shipped import HELD_OUT_SEED, RECIPES  # noqa: E402
-from gsim3d.train.sittings import load_progress, weights_file  # noqa: E402
+from tools.release.recipes import Recipe, recipe  # noqa: E402
+from tools.release.state import CURVE, load_progress, weights_file  # noqa: E402
 
 PAGE = ROOT / "docs" / "trained.md"
 LOGGED = 400  # lines that are kept of a log
@@ -57,11 +59,11 @@ Scores are of trajectories that no training saw, from four cameras, {history} st
 """
 
 
-def ship(name: str, state: Path, scores: Path, wrong: str) -> Path:
-    """Makes the folder of the simulator in the package."""
-    progress = load_progress(state, name)
+def ship(name: str, made: Recipe, state: Path, scores: Path, wrong: str) -> Path:
+    """Makes the folder of the simulator in the package, from the state of a run of the recipe ``made``."""
+    progress = load_progress(state, made.name)
     measured = json.loads((scores / f"{name}.scores.json").read_text())
-    weights = weights_file(state, progress)
+    weights = weights_file(state, made.name)
     saved = checkpoint.load(weights)
     if measured["checkpoint"] != saved.digest:
         raise InputError(f"{scores / name}.scores.json: of other weights than those in {state}")
@@ -72,21 +74,19 @@ def ship(name: str, state: Path, scores: Path, wrong: str) -> Path:
     if speeds.is_file() and saved.digest not in json.loads(speeds.read_text()):
         speeds.unlink()  # of the weights before
     (folder / "config.yaml").write_text(yaml.safe_dump(saved.config, sort_keys=False))
-    log = (state / f"{name}.metrics.jsonl").read_text().splitlines()
-    kept = log[:: -(-len(log) // LOGGED)]
-    (folder / "training.jsonl").write_text("".join(line + "\n" for line in kept))
+    kept = progress.curve[:: max(1, -(-len(progress.curve) // LOGGED))]
+    (folder / "training.jsonl").write_text("".join(json.dumps(logged(row)) + "\n" for row in kept))
     (folder / "scores.json").write_text(json.dumps(measured) + "\n")
-    recipe = RECIPES[name.split("-")[0]]
-    # The recipe has the seed of the next sitting, perhaps.
-    world = dataclasses.replace(recipe.worlds()[0], seed=progress.sittings[-1]["seed"])
+    world = dataclasses.replace(made.stream(), seed=progress.runs[-1]["seed"])
     described = {
         "steps": progress.step,
         "training_seconds": progress.seconds,
         "skipped_steps": progress.n_skipped,
-        "sittings": progress.sittings,
+        "windows": progress.windows,
+        "runs": progress.runs,
         "trajectories_begun": progress.next_trajectory,
-        "world": {"world": recipe.world, "preset": "diverse", **dataclasses.asdict(world)},
-        "held_out_seed": HELD_OUT_SEED,
+        "world": {"world": made.world, "preset": made.preset, **dataclasses.asdict(world)},
+        "held_out_seed": VALIDATION_SEED,
     }
     (folder / "recipe.json").write_text(json.dumps(described, indent=1) + "\n")
     (folder / "README.md").write_text(card(name, described, measured, saved.config, wrong))
@@ -95,18 +95,24 @@ def ship(name: str, state: Path, scores: Path, wrong: str) -> Path:
     return folder
 
 
+def logged(row: list[float]) -> dict:
+    """A line of training.jsonl: one logged step, as ``gsim3d train`` logs it."""
+    known = {column: value for column, value in zip(CURVE, row, strict=True) if math.isfinite(value)}
+    return {**known, "step": int(known["step"]), "machine": {"seconds": known.pop("seconds")}}
+
+
 def card(name: str, recipe: dict, scores: dict, config: dict, wrong: str) -> str:
     """The model card."""
-    data, devices = config["data"], sorted({sitting["device"] for sitting in recipe["sittings"]})
-    used = sum(sitting["trajectories"] for sitting in recipe["sittings"])
+    data, devices = config["data"], sorted({run["device"] for run in recipe["runs"]})
+    used = sum(run["trajectories"] for run in recipe["runs"])
     changes = [
-        json.dumps(options) for sitting in recipe["sittings"] for options in sitting.get("in_turn", ()) if options
+        json.dumps(options) for run in recipe["runs"] for options in run.get("in_turn", ()) if options
     ]
     changed = f" (some with {', '.join(dict.fromkeys(changes))})" if changes else ""
-    world, begun = recipe["world"], recipe["sittings"][0].get("began_with")
-    n_sittings = len(recipe["sittings"])
+    world, begun = recipe["world"], recipe["runs"][0].get("began_with")
+    n_runs = len(recipe["runs"])
     before = f"; begun with the weights of `{begun['name']}` at step {begun['step']:,}" if begun else ""
-    put = "".join(f"; then without training: {sitting['then']}" for sitting in recipe["sittings"] if "then" in sitting)
+    put = "".join(f"; then without training: {run['then']}" for run in recipe["runs"] if "then" in run)
     return f"""# {name}
 
 A gsim3d simulator of the world `{world["world"]}`: `gsim3d simulate {name} SCENE --out DIR`. Apache-2.0.
@@ -114,10 +120,10 @@ A gsim3d simulator of the world `{world["world"]}`: `gsim3d simulate {name} SCEN
 - **Sees** {data["history"]} steps from {data["context_views"]} calibrated cameras at {world["image_size"]} pixels with
   masks, {world["fps"]:g} steps a second; predicts particles, drawn as 3D Gaussians from any view.
 - **Trained on** {used:,} trajectories of {world["n_frames"]} steps and {world["n_cams"]} cameras, made by
-  `gsim3d generate {world["world"]} --preset diverse --seed {world["seed"]}`{changed}, never the same twice;
+  `gsim3d generate {world["world"]} --preset {world["preset"]} --seed {world["seed"]}`{changed}, never the same twice;
   from images alone.
 - **Budget** {recipe["steps"]:,} optimizer steps in {recipe["training_seconds"]:,.0f} s of training,
-  {n_sittings} sitting{"s" if n_sittings > 1 else ""}, on {" and ".join(devices)}; {recipe["skipped_steps"]} steps were
+  {n_runs} run{"s" if n_runs > 1 else ""}, on {" and ".join(devices)}; {recipe["skipped_steps"]} steps were
   skipped{before}{put}.
 - **Weights** averaged, bfloat16. `config.yaml` has all settings, `training.jsonl` a part of the log, `recipe.json` the
   data.
@@ -171,7 +177,8 @@ def write_page() -> None:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("name", nargs="?", help="such as elastic-small (left out: only the page is written)")
-    parser.add_argument("--state", type=Path, help="what train_shipped wrote")
+    parser.add_argument("--arm", default="pure", help="of the recipe (default: pure)")
+    parser.add_argument("--state", type=Path, help="what tools/release/train.py wrote")
     parser.add_argument("--scores", type=Path, help="what score_shipped wrote")
     parser.add_argument("--wrong", type=Path, help="text of what is wrong (default: that of the card that is there)")
     args = parser.parse_args(arguments)
@@ -180,7 +187,7 @@ def main(arguments: list[str] | None = None) -> None:
         if args.wrong is None and not known.is_file():
             raise InputError("--wrong is needed: look at the films, and say what is wrong")
         wrong = args.wrong.read_text() if args.wrong else known.read_text().split(WRONG_HEAD)[1]
-        print(f"written: {ship(args.name, args.state, args.scores, wrong)}")
+        print(f"written: {ship(args.name, recipe(args.name.split('-')[0], args.arm), args.state, args.scores, wrong)}")
     write_page()
     print(f"written: {PAGE}")
 

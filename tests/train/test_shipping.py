@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import math
 import sys
 import time
 from pathlib import Path
@@ -12,22 +13,23 @@ from gsim3d import pretrained
 from gsim3d.errors import InputError
 from gsim3d.generate.film import film
 from gsim3d.generate.worlds import build_world
-from gsim3d.train import shipped
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
-from gsim3d.train.films import FilmStore
 from gsim3d.train.restore import restore
-from gsim3d.train.shipped import Recipe, SittingTrainer
-from gsim3d.train.sittings import Progress, save_state, weights_file
+from tools.release.films import FilmStore
+from tools.release.recipes import Recipe
+from tools.release.runs import RunTrainer
+from tools.release.state import Progress, save_state, weights_file
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).parent.parent.parent
-NAME = "elastic-small"
+NAME, RUN = "elastic-small", "elastic-pure"
 OPTIONS = {"image_size": 32, "n_frames": 6, "objects": ("ball",)}
 CONFIG = TrainConfig(
     stages=(StageConfig(steps=9, horizon=1, target_views=2),),
     data=DataConfig(history=2, context_views=2, target_only_cameras=(2, 7), background_stride=2),
     log_every=1,
 )
+MADE = Recipe(RUN, "elastic", CONFIG, options=OPTIONS)
 
 
 def tool(name):
@@ -47,16 +49,16 @@ def scored(tmp_path_factory, one_thread):
     world = build_world("elastic", "diverse", OPTIONS)
     store = FilmStore(world, 1, "cpu")
     store.put(**np.load(film(world, ("ball", 0), str(out / "film.npz"))))
-    trainer = SittingTrainer(CONFIG, store, out / "run", "cpu")
-    trainer.begin_sitting(time.monotonic() + 60)
-    with trainer.log.opened(tensorboard=False):
-        for _ in range(2):
-            trainer.log.write(trainer.train_step(), {})
-    sitting = {"device": "cpu", "trajectories": 1, "steps": [0, 2], "seed": 4321}
-    progress = save_state(trainer, out / "state", NAME, Progress(next_trajectory=1, sittings=[sitting]))
+    trainer = RunTrainer(CONFIG, store, out / "run", "cpu")
+    trainer.begin_run(time.monotonic() + 60)
+    for _ in range(2):
+        trainer.train_step()
+    this = {"device": "cpu", "trajectories": 1, "steps": [0, 2], "seed": 4321}
+    curve = [[step, 1, 0.5, 0.1, 20.0, math.nan, 1e-4] for step in range(2)]
+    save_state(trainer, out / "state", RUN, Progress(next_trajectory=1, runs=[this], curve=curve))
     score = tool("score_shipped").score
     given = {"device": "cpu", "counts": (2, 1), "changes": {**OPTIONS, "objects": ("ball",)}}
-    score(weights_file(out / "state", progress), NAME, out / "films", out / "scores", **given)
+    score(weights_file(out / "state", RUN), NAME, out / "films", out / "scores", **given)
     return out
 
 
@@ -66,7 +68,7 @@ def package(tmp_path, monkeypatch):
     pretrained.FOLDER.mkdir()
     module = tool("ship_model")
     monkeypatch.setattr(module, "PAGE", tmp_path / "trained.md")
-    monkeypatch.setattr(module, "RECIPES", {"elastic": Recipe("elastic", CONFIG, OPTIONS)})
+    monkeypatch.setattr(module, "recipe", lambda *_: MADE)
     return module
 
 
@@ -102,6 +104,10 @@ def test_a_state_becomes_a_simulator_with_card_and_page(scored, package, tmp_pat
     names = {path.name for path in folder.iterdir()}
     assert names == {"model.safetensors", "config.yaml", "training.jsonl", "recipe.json", "scores.json", "README.md"}
     assert restore(NAME).checkpoint.state["step"] == 2
+    steps = [json.loads(line) for line in (folder / "training.jsonl").read_text().splitlines()]
+    assert [(step["step"], step["past_psnr"], step["machine"]) for step in steps] == [
+        (0, 20.0, {"seconds": 0.5}), (1, 20.0, {"seconds": 0.5})
+    ]  # fmt: skip
     text, page = (folder / "README.md").read_text(), (tmp_path / "trained.md").read_text()
     scores = json.loads((folder / "scores.json").read_text())
     assert text.endswith("## What is wrong with it\n\nIt floats.\n") and "--seed 4321" in text
@@ -115,5 +121,5 @@ def test_scores_of_other_weights_are_refused(scored, package, tmp_path):
     content = json.loads((scored / "scores" / f"{NAME}.scores.json").read_text())
     (tmp_path / f"{NAME}.scores.json").write_text(json.dumps({**content, "checkpoint": "0"}))
     with pytest.raises(InputError, match="of other weights"):
-        package.ship(NAME, scored / "state", tmp_path, "")
-    assert shipped.HELD_OUT_SEED != shipped.SEED and pretrained.names() == []
+        package.ship(NAME, MADE, scored / "state", tmp_path, "")
+    assert pretrained.names() == []

@@ -1,4 +1,4 @@
-"""Sittings of two processes: one clock, one state, the weights of one process with both batches."""
+"""Runs of two processes: one clock, one state, the weights of one process with both batches."""
 
 import dataclasses
 import math
@@ -11,38 +11,38 @@ import pytest
 import torch
 
 from gsim3d.errors import HardCaseError, InputError
-from gsim3d.train import shipped
-from gsim3d.train.films import QUEUED, Filming, FilmStore
 from gsim3d.train.loop import deterministic
 from gsim3d.train.processes import Processes, joined
 from gsim3d.train.restore import build_simulator, model_config
-from gsim3d.train.shipped import SittingTrainer, train
-from gsim3d.train.sittings import Progress, load_progress
-from tests.train.test_sittings import CONFIG, NAME, Painted
+from tests.train.test_release_state import CONFIG, NAME, Painted
 from tests.two_processes import run_in_two_processes
+from tools.release import runs
+from tools.release.films import QUEUED, Filming, FilmStore
+from tools.release.runs import RunTrainer, train
+from tools.release.state import Progress, load_progress
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 STEPS = 4  # of both kinds
 
 
-def trainer_in(out, config=CONFIG, processes=None) -> SittingTrainer:
+def trainer_in(out, config=CONFIG, processes=None) -> RunTrainer:
     """Computes as a graph does, call by call."""
     store = FilmStore(Painted(), 2, "cpu")
     for seed in range(2):
         store.put(**Painted().film(seed))
-    trainer = SittingTrainer(config, store, out, "cpu", processes)
+    trainer = RunTrainer(config, store, out, "cpu", processes)
     trainer.captured = trainer._capture()
     return trainer
 
 
-def steps_of(trainer: SittingTrainer) -> tuple[list[dict], dict[str, torch.Tensor]]:
-    trainer.begin_sitting(time.monotonic() + 1e4)
+def steps_of(trainer: RunTrainer) -> tuple[list[dict], dict[str, torch.Tensor]]:
+    trainer.begin_run(time.monotonic() + 1e4)
     with deterministic():
         return [trainer.train_step() for _ in range(STEPS)], trainer.simulator.state_dict()
 
 
-def sit_together(rank: int, out: str) -> None:
+def run_together(rank: int, out: str) -> None:
     """What each of two processes does. A second passes whenever the clock is read; that of the second one is wrong."""
     torch.set_num_threads(1)
     out = Path(out)
@@ -50,10 +50,10 @@ def sit_together(rank: int, out: str) -> None:
         torch.save(steps_of(trainer_in(out / f"run_{rank}", processes=processes)), out / f"steps_{rank}.pt")
 
         clock, end = (count(), 6.0) if rank == 0 else (count(1000), 0.0)
-        shipped.time = SimpleNamespace(monotonic=clock.__next__, perf_counter=time.perf_counter)
-        shipped.SAVE_EVERY, saved, save = 2.0, [], shipped.save_state
-        shipped.save_state = lambda *given: saved.append(save(*given).step)
-        trainer = trainer_in(out / f"sitting_{rank}", processes=processes)
+        runs.time = SimpleNamespace(monotonic=clock.__next__, perf_counter=time.perf_counter)
+        runs.SAVE_EVERY, saved, save = 2.0, [], runs.save_state
+        runs.save_state = lambda *given: saved.append(save(*given).step)
+        trainer = trainer_in(out / f"run_of_{rank}", processes=processes)
         filming = SimpleNamespace(count=2 + rank, next=7 + 2 * rank, check=lambda: None)
         train(trainer, filming, Progress(), {}, end=end, out=out / "state", name=NAME, say=lambda _: None)
         assert trainer.step == 5 and saved == ([3, 5] if rank == 0 else [])
@@ -65,7 +65,7 @@ def sit_together(rank: int, out: str) -> None:
         if rank == 1:
             next(trainer.simulator.parameters()).data.mul_(1 + 1e-6)
         with pytest.raises(InputError, match="weights: not the same in all processes"):
-            trainer.begin_sitting(math.inf)
+            trainer.begin_run(math.inf)
 
 
 def broken(*_):
@@ -75,7 +75,7 @@ def broken(*_):
 @pytest.fixture(scope="module")
 def together(tmp_path_factory):
     out = tmp_path_factory.mktemp("together")
-    run_in_two_processes(sit_together, out)
+    run_in_two_processes(run_together, out)
     return out
 
 
@@ -98,10 +98,9 @@ def test_two_processes_make_the_steps_of_one_with_both_batches(together, tmp_pat
 
 def test_one_state_counts_what_all_have_filmed(together):
     progress = load_progress(together / "state", NAME)
-    assert progress.next_trajectory == 9 and progress.sittings[0]["trajectories"] == 5
-    assert len(list((together / "state").glob("*.safetensors"))) == 3
-    log = (together / "state" / f"{NAME}.metrics.jsonl").read_text().splitlines()
-    assert len(log) == progress.step and not (together / "sitting_1" / "metrics.jsonl").exists()
+    assert progress.next_trajectory == 9 and progress.runs[0]["trajectories"] == 5
+    assert len(list((together / "state").glob("*.safetensors"))) == 2 and len(progress.curve) == progress.step
+    assert not (together / "run_of_1" / "metrics.jsonl").exists()
 
 
 @pytest.mark.parametrize("n_processes", [1, 2, 4, 5])

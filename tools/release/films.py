@@ -40,6 +40,7 @@ class Film:
     n_cams: int
     width: int
     height: int
+    fps: float
 
     @property
     def name(self) -> str:
@@ -70,7 +71,8 @@ class FilmStore:
         self._near, self._far = rig.near, rig.far
         self.lock = threading.RLock()  # held while films come or are read
         self.films = [
-            Film(slot, Path(f"film_{slot}"), *self._shape[:2], rig.size, rig.size) for slot in range(capacity)
+            Film(slot, Path(f"film_{slot}"), *self._shape[:2], rig.size, rig.size, world.fps)
+            for slot in range(capacity)
         ]
 
     def put(self, images: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> None:
@@ -196,10 +198,6 @@ class Filming:
             done = self._arrived.wait_for(lambda: self._failure or self._store.count >= count, seconds)
         self.check()
         return bool(done)
-
-    def slow_down(self, processes: int) -> None:
-        """From now on no more than ``processes`` film, so that the others' cores are free."""
-        self._wanted = processes
 
     def check(self) -> None:
         """Raises what a process raised."""

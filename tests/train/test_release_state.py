@@ -1,0 +1,332 @@
+"""Runs for release: films arrive while a run goes on, its state travels, and the next run goes on from it."""
+
+import dataclasses
+import itertools
+import math
+import threading
+import time
+import types
+
+import numpy as np
+import pytest
+import torch
+
+from gsim3d.data import Scene, find_scenes
+from gsim3d.errors import InputError
+from gsim3d.data.recording import BACKGROUND, FIXED, MOVING
+from gsim3d.generate import generate
+from gsim3d.generate.cameras import two_rings
+from gsim3d.generate.film import film
+from gsim3d.generate.worlds import VALIDATION_SEED, build_world
+from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.loop import deterministic
+from gsim3d.train.restore import build_simulator, model_config, restore
+from gsim3d.train.samples import draw_batch
+from gsim3d.train.log import plain
+from gsim3d.train.samples import longest_gap
+from tools.release import recipes, runs
+from tools.release.films import Filming, FilmStore
+from tools.release.recipes import ARMS, WORLDS, recipe
+from tools.release.runs import RunTrainer, train
+from tools.release.state import Progress, load_into, load_progress, save_state, state_file, weights_file
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+NAME = "ball-tiny"
+OPTIONS = {"image_size": 32, "n_frames": 6, "objects": ("ball",), "n_trajectories": 2}
+CONFIG = TrainConfig(
+    stages=(StageConfig(steps=2, history=1, batch=2, target_views=2), StageConfig(steps=98, horizon=2, target_views=2)),
+    data=DataConfig(history=2, context_views=2, target_only_cameras=(2, 7), background_stride=2),
+    log_every=1,
+)
+
+
+@pytest.fixture(scope="module")
+def world():
+    return build_world("elastic", "mini", OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def films(world, tmp_path_factory):
+    out = tmp_path_factory.mktemp("films")
+    return [dict(np.load(film(world, scene, str(out / f"{scene[1]}.npz")))) for scene in world.scenes()]
+
+
+@pytest.fixture
+def store(world, films):
+    store = FilmStore(world, 2, "cpu")
+    for given in films:
+        store.put(**given)
+    return store
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.06])
+def test_a_store_gives_what_scene_folders_give(world, spread, tmp_path):
+    world, store = dataclasses.replace(world, camera_spread=spread), FilmStore(world, 2, "cpu")
+    for scene in world.scenes():
+        store.put(**np.load(film(world, scene, str(tmp_path / "film.npz"))))
+    options = {**OPTIONS, "camera_spread": spread}
+    folders = generate(tmp_path / "data", preset="mini", processes=1, progress=False, **options).folders
+    scenes = [Scene.open(folder) for folder in folders]
+    led = dataclasses.replace(CONFIG.stages[1], batch=3, lead=2)
+    for step, stage in enumerate((CONFIG.stages[0], led, dataclasses.replace(led, dynamics_alone=True))):
+        given = store.draw(CONFIG.data, stage, 5, step, range(3))
+        wanted = draw_batch(scenes, CONFIG.data, stage, 5, step, range(3))
+        assert (given.n_context, given.n_past, given.n_future) == (wanted.n_context, wanted.n_past, wanted.n_future)
+        assert len(given.targets.images) == len(given.target_step()) == 3 * 2 * (given.n_past + given.n_future)
+        for part in ("context", "targets"):
+            a, b = getattr(given, part), getattr(wanted, part)
+            for name in ("images", "cloud_scene", "cloud_step", "origin", "masks", "dynamic"):
+                assert torch.equal(getattr(a, name), getattr(b, name)), (part, name)
+            for name in ("viewmats", "Ks", "near", "far", "image_cloud"):
+                assert torch.equal(getattr(a.cameras, name), getattr(b.cameras, name)), (part, name)
+
+
+def test_the_newest_replace_the_oldest(store, films):
+    darker = films[0]["images"] // 2
+    store.put(**{**films[0], "images": darker})
+    assert store.count == 3
+    assert torch.equal(store._films[0], torch.from_numpy(darker))
+    assert torch.equal(store._films[1], torch.from_numpy(films[1]["images"]))
+
+
+def test_trajectories_are_filmed_once_each_while_others_work(world, films, tmp_path):
+    store = FilmStore(world, 4, "cpu")
+    with Filming([world], store, 1, 1, tmp_path) as filming:
+        assert filming.wait_for(2, seconds=60)
+        assert filming.wait_for(4, seconds=60) and 4 <= filming.next <= 8
+    assert torch.equal(store._films[0], torch.from_numpy(films[1]["images"]))  # it began with number 1
+    assert not torch.equal(store._films[0], store._films[1])
+    assert not list(tmp_path.iterdir()) and threading.active_count() < 50
+
+
+def test_worlds_take_turns(world, films, tmp_path):
+    store = FilmStore(world, 2, "cpu")
+    raised = dataclasses.replace(world, ground_height=(0.2, 0.2))
+    with Filming([world, raised], store, 0, 1, tmp_path) as filming:
+        assert filming.wait_for(2, seconds=60)
+    assert torch.equal(store._films[0], torch.from_numpy(films[0]["images"]))
+    lower, higher = ((film[0, 0, ..., 3] == FIXED).nonzero()[:, 0].float().mean() for film in store._films)
+    assert higher < lower - 1  # rows are counted from the top of an image
+
+
+def test_what_a_process_raises_is_told(world, tmp_path):
+    store = FilmStore(dataclasses.replace(world, n_frames=5), 4, "cpu")  # its films are shorter than those that come
+    with Filming([world], store, 0, 1, tmp_path) as filming:
+        with pytest.raises(RuntimeError, match="size"):
+            filming.wait_for(1, seconds=60)
+
+
+class Painted:
+    """Cameras of a world whose films are painted, not simulated."""
+
+    n_frames, size, fps = 6, 32, 24.0
+
+    def rig(self):
+        return two_rings(12, self.size, 1.5, 5.0, distance=3.2, target_height=0.7, elevations=(18.0, 42.0), fov=42.0)
+
+    def film(self, seed):
+        rng = np.random.default_rng(seed)
+        film = rng.integers(0, 255, (self.n_frames, 12, self.size, self.size, 4), dtype=np.uint8)
+        film[..., 3] = BACKGROUND
+        film[..., self.size // 2 :, :, 3] = FIXED
+        for step in range(self.n_frames):
+            film[step, :, 4 + step : 14 + step, 10:20, 3] = MOVING
+        return {"images": film, "viewmats": self.rig().viewmats, "Ks": self.rig().Ks}
+
+
+def test_batches_drawn_ahead_are_those_of_their_steps(tmp_path, device):
+    store = FilmStore(Painted(), 2, device.type)
+    for seed in range(2):
+        store.put(**Painted().film(seed))
+    ahead, plain = (RunTrainer(CONFIG, store, tmp_path / name, device.type) for name in "ab")
+    ahead.captured = ahead._capture()
+    ahead.begin_run(time.monotonic() + 1e4), plain.begin_run(time.monotonic() + 1e4)
+    with deterministic():
+        for step in range(4):
+            samples = list(range(CONFIG.stage_of(step)[0].batch))
+            assert torch.equal(ahead._prepared(samples).batch.targets.images, plain._batch(samples).targets.images)
+            a, b = ahead.train_step(), plain.train_step()
+            assert ahead._next[0] == step + 1 and a["particles"] == b["particles"]
+            assert a["loss"] == pytest.approx(b["loss"], rel=1e-3)
+    assert ahead.captured.captures == 2  # one for each kind of step
+
+
+class NoFilming:
+    count, next = 2, 7
+
+    def check(self):
+        pass
+
+
+@pytest.fixture
+def first_run(store, tmp_path):
+    """A first run of three steps."""
+    trainer = RunTrainer(CONFIG, store, tmp_path / "run", "cpu")
+    trainer.begin_run(time.monotonic() + 60)
+    for _ in range(3):
+        trainer.train_step()
+    rows = [[0, 0, 0.5, 0.1, math.nan, 12.0, 1e-4]]
+    progress = Progress(next_trajectory=7, windows=1, runs=[{"device": "cpu"}], curve=rows)
+    return trainer, tmp_path / "state", save_state(trainer, tmp_path / "state", NAME, progress)
+
+
+def test_the_next_run_goes_on(first_run, store, tmp_path):
+    trainer, state, done = first_run
+    progress = load_progress(state, NAME)
+    assert (progress.step, progress.next_trajectory, progress.windows) == (3, 7, 1)
+    assert np.array_equal(progress.curve, done.curve, equal_nan=True)
+    assert dataclasses.replace(progress, curve=[]) == dataclasses.replace(done, curve=[])
+    other = RunTrainer(CONFIG, store, tmp_path / "again", "cpu")
+    assert load_into(other, state, NAME).step == other.step == 3
+    for name, value in trainer.simulator.state_dict().items():
+        again = other.simulator.state_dict()[name]
+        assert (again - value).abs().max() <= value.abs().max() / 127, name
+        assert value.ndim > 1 or torch.equal(again, value)
+        assert torch.equal(other.average[name], again)
+    for name, parameter in trainer.parameters.items():
+        before, now = trainer.optimizer.state[parameter], other.optimizer.state[other.parameters[name]]
+        assert before.keys() == now.keys()
+        if before:
+            assert not now["exp_avg"].any() and now["exp_avg_sq"].mean() == pytest.approx(before["exp_avg_sq"].mean())
+            if parameter.ndim < 2:
+                assert torch.equal(now["exp_avg_sq"], before["exp_avg_sq"])
+    other.begin_run(time.monotonic() + 60)
+    assert np.isfinite(other.train_step()["loss"])
+
+
+def test_moments_of_rank_one_come_back_and_a_state_takes_about_a_byte_a_weight(store, tmp_path):
+    trainer = RunTrainer(dataclasses.replace(CONFIG, preset="small"), store, tmp_path / "run", "cpu")
+    name, parameter = max(trainer.parameters.items(), key=lambda item: item[1].numel())
+    rows, columns = torch.rand(len(parameter)), torch.rand(parameter[0].numel())
+    squares = (rows[:, None] * columns).view(parameter.shape)
+    moments = {"step": torch.tensor(1.0), "exp_avg": squares, "exp_avg_sq": squares}
+    trainer.optimizer.restore(parameter, moments)
+    save_state(trainer, tmp_path / "state", NAME, Progress())
+    other = RunTrainer(dataclasses.replace(CONFIG, preset="small"), store, tmp_path / "again", "cpu")
+    load_into(other, tmp_path / "state", NAME)
+    torch.testing.assert_close(other.optimizer.state[other.parameters[name]]["exp_avg_sq"], squares)
+    assert state_file(tmp_path / "state", NAME).stat().st_size < 1.12 * sum(x.numel() for x in trainer.parameters.values())
+
+
+def test_the_weights_are_a_checkpoint(first_run):
+    trainer, state, _ = first_run
+    restored = restore(weights_file(state, NAME))
+    assert restored.image_size == (32, 32) and restored.data == CONFIG.data
+    weights = restored.simulator.state_dict()
+    assert all(torch.equal(weights[k], v.bfloat16().float()) for k, v in trainer.average.items())
+
+
+def test_a_state_replaces_the_one_before(first_run):
+    trainer, state, done = first_run
+    trainer.train_step()
+    save_state(trainer, state, NAME, done)
+    assert load_progress(state, NAME).step == 4 and len(list(state.iterdir())) == 2
+
+
+def test_a_run_without_state_begins(store, tmp_path):
+    trainer = RunTrainer(CONFIG, store, tmp_path / "run", "cpu")
+    before = {name: value.clone() for name, value in trainer.simulator.state_dict().items()}
+    assert load_progress(tmp_path, NAME) == load_into(trainer, tmp_path, NAME) == Progress()
+    assert all(torch.equal(before[name], value) for name, value in trainer.simulator.state_dict().items())
+
+
+@pytest.mark.parametrize("damage", ["cut", "other format", "no state", "not json"])
+def test_a_damaged_state_is_named(first_run, damage):
+    _, state, _ = first_run
+    file = state_file(state, NAME)
+    content = file.read_bytes()
+    if damage == "cut":
+        file.write_bytes(content[:-1])
+    elif damage == "no state":
+        file.write_bytes(weights_file(state, NAME).read_bytes())
+    else:
+        old, new = (b'"format":"2"', b'"format":"0"') if damage == "other format" else (b'\\"step\\"', b'\\"step\\x')
+        assert old in content
+        file.write_bytes(content.replace(old, new))
+    with pytest.raises(InputError, match=file.name):
+        load_progress(state, NAME)
+
+
+def test_a_state_of_another_model_is_refused(first_run, store, tmp_path):
+    _, state, _ = first_run
+    config = dataclasses.replace(CONFIG, model={"dynamics": {"mlp_ratio": 4}})
+    with pytest.raises(InputError, match="another model"):
+        load_into(RunTrainer(config, store, tmp_path / "other", "cpu"), state, NAME)
+
+
+@pytest.mark.parametrize("is_last", [False, True])
+def test_a_run_ends_on_time_with_a_saved_state_and_its_rate_falls_if_it_is_the_last(
+    store, tmp_path, monkeypatch, is_last
+):
+    monkeypatch.setattr(runs, "WARM_UP", 1)
+    monkeypatch.setattr(runs, "SCORED_EVERY", 2)
+    clock = itertools.count(100)  # a second for every look at it: a busy machine takes no fewer steps
+    stand_in = types.SimpleNamespace(monotonic=clock.__next__, perf_counter=time.perf_counter)
+    monkeypatch.setattr(runs, "time", stand_in)
+    trainer, said = RunTrainer(CONFIG, store, tmp_path / "run", "cpu"), []
+    given = {"end": 106, "out": tmp_path / "state", "name": NAME, "say": said.append, "is_last": is_last}
+    train(trainer, NoFilming(), Progress(windows=10, runs=[{"steps": [0, 0]}]), {"device": "cpu"}, **given)
+    progress = load_progress(tmp_path / "state", NAME)
+    assert progress.step == trainer.step == len(said) == 5
+    assert progress.next_trajectory == 7 and progress.runs[1]["steps"] == [0, trainer.step]
+    assert progress.windows == 13 and progress.runs[1]["windows"] == [10, 13]  # two steps simulate nothing
+    rates = [row[-1] for row in progress.curve]
+    assert len(rates) == 5 and rates[0] == pytest.approx(CONFIG.stages[0].learning_rate)
+    assert (rates[-1] < 0.5 * rates[0]) == is_last
+    scored = list((tmp_path / "state" / "scored").iterdir())
+    assert [file.name for file in scored] == [f"{NAME}.0000012.weights.safetensors"]
+
+
+def test_the_next_run_has_the_capacity_that_graphs_needed(store, tmp_path):
+    first, second = (RunTrainer(CONFIG, store, tmp_path / name, "cpu") for name in ("first", "second"))
+    for trainer in (first, second):
+        trainer.captured = trainer._capture()
+    known = {"rows": 10_000, "moving": 500, "geometry": [[[0], [0, 1], [7, 8]]]}
+    first.captured.make_room(known)
+    end = time.monotonic() + 2
+    train(first, NoFilming(), Progress(), {}, end=end, out=tmp_path / "state", name=NAME, say=lambda _: None)
+    progress = load_progress(tmp_path / "state", NAME)
+    assert progress.step and progress.needed == first.captured.needed
+    assert known["geometry"][0] in progress.needed["geometry"]
+    load_into(second, tmp_path / "state", NAME)
+    assert second.captured.needed == progress.needed and second.captured.most_rows == 10_000
+    for damaged in ({"rows": 1}, {**known, "geometry": [[[0], [0, 1], [7]]]}):
+        save_state(first, tmp_path / "state", NAME, dataclasses.replace(progress, needed=damaged))
+        with pytest.raises(InputError, match=NAME):
+            load_into(second, tmp_path / "state", NAME)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+@pytest.mark.parametrize("world", WORLDS)
+def test_recipes_are_sound(world, arm):
+    made = recipe(world, arm)
+    stream, data, stages = made.stream(), made.train.data, made.train.all_stages
+    assert made.name == f"{world}-{arm}" and stream.name == world and made.first_films <= made.capacity
+    assert stream.n_frames >= data.history + max(stage.lead + stage.horizon + longest_gap(stage) for stage in stages)
+    assert made.train.n_steps >= 1_000_000
+    model = build_simulator(model_config(made.train), 0).config.dynamics  # raises where switches do not agree
+    hand_made = model.position_features, model.motion_length is not None, model.pushes
+    expected = {"pure": (0, 0, 0), "positions": (1, 0, 0), "motion": (0, 1, 0), "priors": (1, 1, world != "cloth")}
+    assert hand_made == expected[arm]
+
+
+@pytest.mark.parametrize("world, arm", [("water", "pure"), ("elastic", "magic")])
+def test_an_unknown_recipe_is_refused(world, arm):
+    with pytest.raises(InputError, match="choose from"):
+        recipe(world, arm)
+
+
+def test_validation_is_of_the_recipes_own_world_with_another_seed():
+    made = dataclasses.replace(recipe("elastic"), options={"n_frames": 30, "camera_spread": 0.05, "drop_height": (0.4, 0.5)})
+    given = made.validation()
+    assert given["seed"] == VALIDATION_SEED != recipes.SEED and given["n_trajectories"] == made.n_validation
+    world = build_world(given.pop("world"), given.pop("preset"), given)
+    assert dataclasses.replace(world, seed=recipes.SEED, n_trajectories=made.stream().n_trajectories) == made.stream()
+
+
+def test_a_step_that_was_skipped_is_said_to_be_whatever_its_numbers():
+    entry = {"step": 7, "loss": math.nan, "grad_norm": math.inf, "learning_rate": 1e-3, "future_psnr": math.nan}
+    why = "the gradient is not finite, first that of dynamics.gravity"
+    said = runs.line(plain({**entry, "skipped": why}), {"step_seconds": 0.1, "memory_gib": 1.0})
+    assert said == f"step      7  skipped: {why}"

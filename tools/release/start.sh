@@ -1,0 +1,29 @@
+#!/usr/bin/env bash
+# Unpacks what pack.sh packed, builds it and trains; to be started where the run may outlive the shell:
+#
+#   setsid bash DIR/start.sh DIR WORK [options of tools/release/train.py] >WORK.log 2>&1 &
+#
+# WORK/out holds the state and its film at any time. --state, --out, --device and --commit are set here. A build that
+# another run left in DIR/build (made by this script in WORK/build) is used if it is of the same sources.
+set -euo pipefail
+[ $# -ge 3 ] || { echo "usage: bash start.sh DIR WORK WORLD --minutes M [options]" >&2; exit 2; }
+packed="$(realpath "$1")" && mkdir -p "$2" && work="$(realpath "$2")" && shift 2
+mkdir -p "$work/code" "$work/out" "$work/build"
+tar -xzf "$packed/source.tar.gz" -C "$work/code"
+cp "$packed"/state/*.safetensors "$work/out/" 2>/dev/null || true
+if compgen -G "$packed/wheels/*.whl" >/dev/null; then
+  python3 -m pip install -q --no-index --no-deps --no-compile --target "$work/site" "$packed"/wheels/*.whl
+  export PYTHONPATH="$work/site"
+fi
+cd "$work/code"
+sources="$(find csrc setup.py -type f -print0 | sort -z | xargs -0 cat | sha256sum | cut -d ' ' -f 1)"
+if [ "$(cat "$packed/build/sources" 2>/dev/null)" = "$sources" ]; then
+  cp "$packed"/build/*.so gsim3d/
+else
+  GSIM3D_CUDA=1 python3 setup.py -q build_ext --inplace
+  cp gsim3d/*.so "$work/build/" && echo "$sources" >"$work/build/sources"
+fi
+gpus="$(nvidia-smi -L | wc -l)"
+command=(python3 -u)
+[ "$gpus" -le 1 ] || command=(torchrun --nproc-per-node "$gpus")
+exec "${command[@]}" tools/release/train.py "$@" --state "$work/out" --out "$work/out" --device cuda --commit "$(cat "$packed/commit")"
