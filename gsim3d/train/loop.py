@@ -520,7 +520,6 @@ class Trainer:
         self.scale = LossScale(*saved.state.get("loss_scale", (self.scale.value, 0)))
 
     def _update_average(self, gradients: Sequence[Tensor | None]) -> None:
-        """Counts the step for those weights that it moved."""
         decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (EMA_WARM_UP + self.step))
         if not self.average:
             return

@@ -206,7 +206,8 @@ def test_moments_of_rank_one_come_back_and_a_state_takes_about_a_byte_a_weight(s
     other = RunTrainer(dataclasses.replace(CONFIG, preset="small"), store, tmp_path / "again", "cpu")
     load_into(other, tmp_path / "state", NAME)
     torch.testing.assert_close(other.optimizer.state[other.parameters[name]]["exp_avg_sq"], squares)
-    assert state_file(tmp_path / "state", NAME).stat().st_size < 1.12 * sum(x.numel() for x in trainer.parameters.values())
+    n_weights = sum(x.numel() for x in trainer.parameters.values())
+    assert state_file(tmp_path / "state", NAME).stat().st_size < 1.12 * n_weights
 
 
 def test_the_weights_are_a_checkpoint(first_run):
@@ -318,7 +319,8 @@ def test_an_unknown_recipe_is_refused(world, arm):
 
 
 def test_validation_is_of_the_recipes_own_world_with_another_seed():
-    made = dataclasses.replace(recipe("elastic"), options={"n_frames": 30, "camera_spread": 0.05, "drop_height": (0.4, 0.5)})
+    options = {"n_frames": 30, "camera_spread": 0.05, "drop_height": (0.4, 0.5)}
+    made = dataclasses.replace(recipe("elastic"), options=options)
     given = made.validation()
     assert given["seed"] == VALIDATION_SEED != recipes.SEED and given["n_trajectories"] == made.n_validation
     world = build_world(given.pop("world"), given.pop("preset"), given)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from gsim3d.effects import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.generate.stage import GRAVITY
 from gsim3d.generate.world import World
@@ -139,7 +138,7 @@ def recipe(world: str, arm: str = "pure") -> Recipe:
         preset="small",
         model={**MODEL, "dynamics": {**MODEL["dynamics"], **built_in}},
         # Bodies that are lit by a prior change in its light alone.
-        effects=EffectsSpec.from_dict({"appearance": {"changing": "dynamic"}} if built_in.get("surfaces") else {}).to_dict(),
+        effects={"appearance": {"changing": "dynamic"}} if built_in.get("surfaces") else {},
         data=DataConfig(
             history=4,
             context_views=4,

@@ -26,4 +26,5 @@ fi
 gpus="$(nvidia-smi -L | wc -l)"
 command=(python3 -u)
 [ "$gpus" -le 1 ] || command=(torchrun --nproc-per-node "$gpus")
-exec "${command[@]}" tools/release/train.py "$@" --state "$work/out" --out "$work/out" --device cuda --commit "$(cat "$packed/commit")"
+exec "${command[@]}" tools/release/train.py "$@" \
+  --state "$work/out" --out "$work/out" --device cuda --commit "$(cat "$packed/commit")"
