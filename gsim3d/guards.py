@@ -35,6 +35,9 @@ ALWAYS = ("means", "opacities")  # are looked at, changed or not
 NOT_LOOKED_AT = ("activity", "held", "unlit", "shaded", "reference", "body")
 
 
+_WATCHED = "gsim3d.watched"  # a node of a graph whose gradients are looked at
+
+
 class _Looks(NamedTuple):
     """How a guard looks at the fields of particles.
 
@@ -88,7 +91,8 @@ def guard_particles(
             rows that cannot be used return to it.
         changed: fields that differ from ``previous``; others are not looked at again. None: all.
         max_opacity: larger ones count as out of range.
-    Gradients: through all rows that stay as they are.
+    Gradients: through all rows that stay as they are. On the CPU a backward pass raises where a gradient behind rows that
+        did not stay is not finite, unless ``report`` is closed.
     Raises:
         HardCaseError: ``config.on_bad`` is "raise", on the CPU.
     """
@@ -121,8 +125,11 @@ def guard_particles(
         read = partial(_read, particles.clouds, where, looks, previous is not None)
         counts = _places_of_counts(*watched.record.shape, len(looks.kinds))
         report.record(watched.record, read, counts=counts, at_once=False, join=joined if is_told else None)
-        if watched.status.device.type == "cpu" and not bool(watched.status.any()):
-            return particles
+        if watched.status.device.type == "cpu":
+            if not bool(watched.status.any()):
+                return particles
+            if torch.is_grad_enabled():
+                _watch_gradients(fields.values(), read(watched.record).findings[0], report)
     if watched.fields is not None:
         return _with_rows(particles, dict(zip(fields, watched.fields)) | {"activity": watched.activity})
     mend = _clamp if clamps else _put_to_sleep
@@ -269,6 +276,32 @@ def _with_rows(particles: Particles, fields: dict[str, Tensor]) -> Particles:
 
 def _have_gradients(*groups: Iterable[Tensor]) -> bool:
     return any(value.requires_grad for group in groups for value in group)
+
+
+def _watch_gradients(values: Iterable[Tensor], finding: Finding, report: StabilityReport) -> None:
+    """Makes a backward pass through ``values`` raise where what it computes is not finite.
+
+    Rows that were mended have a gradient of 0, which becomes NaN where it meets what overflowed before them.
+    """
+
+    def look(gradients, _):
+        if not report.is_closed and not all(bool(g.isfinite().all()) for g in gradients if g is not None):
+            raise HardCaseError(
+                f"{finding}, {finding.action}, and gradients behind it are not finite; mend the inputs of its scene or "
+                "leave it out, or go on under torch.no_grad()",
+                tensor=finding.tensor,
+                scene=finding.scene,
+                step=finding.step,
+                row=finding.row,
+            )
+
+    nodes = [value.grad_fn for value in values if value.grad_fn is not None]
+    while nodes:
+        node = nodes.pop()
+        if node.next_functions and _WATCHED not in node.metadata:  # leaves outlive their graph
+            node.metadata[_WATCHED] = True
+            node.register_hook(look)
+            nodes += [behind for behind, _ in node.next_functions if behind is not None]
 
 
 def _neutral(name: str, particles: Particles) -> Tensor:

@@ -30,7 +30,8 @@ OnBad = Literal["raise", "drop", "clamp"]
 LARGEST = torch.finfo(torch.float32).max
 ACTIONS = {"raise": "error", "drop": "dropped", "clamp": "clamped"}
 ADVICE = 'on_bad="drop" goes on without such rows, on_bad="clamp" bounds them'
-NEAREST, FARTHEST = 1e-6, 1e9  # metres: depths lie between them, cameras and origins no further from 0
+NEAREST = 1e-6  # metres: no depth range begins nearer
+FARTHEST = 1e9  # metres: no depth range ends further away, and no camera or origin is further from 0
 PIXEL_SLACK = 1e-3  # colours may leave [0, 1] by as much: resampling rounds
 MAX_FINDINGS = 1000  # of a report, then only its total goes on counting
 MAX_QUIET = 1000  # records kept as they came
@@ -185,6 +186,8 @@ class StabilityReport:
     CUDA graph records are overwritten by every replay: :meth:`replayed` fetches them. A region of ``torch.compile``
     records nothing; its rows sleep all the same.
 
+    is_closed: whether :meth:`close` was called.
+
     Example:
         >>> report = StabilityReport()
         >>> report.total, bool(report.findings)
@@ -210,13 +213,13 @@ class StabilityReport:
         self._pending: deque[_Pending] = deque()
         self._quiet: list[_Packed] = []  # have no findings, and sentinels that nobody has asked for
         self._captured: list[_Record] = []
-        self._is_closed = False
+        self.is_closed = False
 
     # ---- writing ----
 
     def close(self) -> None:
-        """Takes no further records: guards go on, and what they find is not counted."""
-        self._is_closed = True
+        """Takes no further records: guards go on, and what they find is neither counted nor, in gradients, an error."""
+        self.is_closed = True
 
     def add(self, finding: Finding) -> None:
         """Counts a finding; those of the same kind and place become one."""
@@ -252,7 +255,7 @@ class StabilityReport:
             join: makes one tensor of several such ``numbers``, parts on a GPU with the shape, dtype and device of what
                 they make, when they are copied. None: they are whole.
         """
-        if self._is_closed:
+        if self.is_closed:
             return
         if numbers.device.type != "cuda":
             self._take(read(numbers))

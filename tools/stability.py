@@ -43,6 +43,11 @@ as long as the sizes of the call are the same. (In float64 and on a GPU, BLAS an
 images: rows in calls of different sizes are equal to rounding. That of TF32 is large, and torch lets convolutions use
 it unless told otherwise; the encoder and training do only where matrix products may, too.)
 
+Every policy is run over hostile frames, cameras, origins and particles, forward and backward
+(`tests/stability/test_every_policy.py`). Where rows were dropped or clamped, a backward pass on the CPU raises
+`HardCaseError` where a gradient behind them is not finite. On a GPU gradients are not looked at, as that would wait for
+it: the encoder refuses the frames that make such gradients there, too, and training skips steps that are not finite.
+
 Index lists that the CPU refuses are not looked at on a GPU, which would have to be waited for: entries out of range
 take no part, nothing else is read or written, and rows that no entry names are 0.
 

@@ -165,6 +165,9 @@ CONSTANTS = (
         _STABILITY,
         "an infinite place, rotation or scale cannot be used; clamped ones become it",
     ),
+    Constant("NEAREST", "1e-6", "metres", _STABILITY, "a camera whose near bound is smaller is refused"),
+    Constant("FARTHEST", "1e9", "metres", _STABILITY, "cameras, origins and far bounds further away are refused"),
+    Constant("PIXEL_SLACK", "1e-3", "1", _STABILITY, "a colour further outside of [0, 1] cannot be used"),
     Constant(
         "OPACITY_MARGIN",
         "1e-6",
