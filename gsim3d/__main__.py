@@ -8,7 +8,7 @@ import sys
 import warnings
 from functools import partial
 
-from gsim3d.errors import CaptureError, FitWarning, HardCaseError, InputError
+from gsim3d.errors import CaptureError, FitWarning, HardCaseError, InputError, RunStopped
 
 # command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called
 COMMANDS = {
@@ -83,6 +83,9 @@ def main(arguments: list[str] | None = None) -> int:
             return module.run(parser.parse_intermixed_args(arguments[1:])) or 0
     except (InputError, HardCaseError, CaptureError) as error:
         return _fail(str(error))
+    except RunStopped as error:
+        _fail(str(error))
+        return error.code
     except OSError as error:
         return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except KeyboardInterrupt:

@@ -54,3 +54,15 @@ class GradientError(NotImplementedError):
     def __init__(self, message: str, *, op: str, argument: str | None, order: int):
         super().__init__(message)
         self.op, self.argument, self.order = op, argument, order
+
+
+class RunStopped(RuntimeError):
+    """A run ended before its work was done: by a signal, or because its launcher or another process of it is gone; the
+    message says how to go on.
+
+    code: exit code of the command; 128 and the signal's number where a signal ended it.
+    """
+
+    def __init__(self, message: str, code: int = 2):
+        super().__init__(message)
+        self.code = code

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import time
 import warnings
 from collections import defaultdict
@@ -21,7 +22,7 @@ from tqdm import tqdm
 from gsim3d.data import Scene, generator, make_frames
 from gsim3d.dynamics import concatenate
 from gsim3d.effects import EffectsSpec
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import HardCaseError, InputError, RunStopped
 from gsim3d.layers import tf32_only_if_asked
 from gsim3d.perceptual.lpips import LPIPS
 from gsim3d.perceptual.weights import load
@@ -29,7 +30,7 @@ from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.captured import CapturedLoss, Gradients, Prepared
-from gsim3d.train.checks import check_history, check_sharing
+from gsim3d.train.checks import check_history, check_same_run, check_sharing
 from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import Log, memory_gib, plain, progress_note
 from gsim3d.train.losses import bodies_alone, time_weights
@@ -42,7 +43,7 @@ from gsim3d.train.recompute import recomputing
 from gsim3d.train.restore import build_simulator, check_device, describe, model_config
 from gsim3d.train.samples import Batch, check_scenes, context_cameras, draw_batch, history_at, spread_views, thinned
 from gsim3d.train.schedule import one_cycle
-from gsim3d.train.settings import from_dict, to_dict
+from gsim3d.train.signals import noted_signals
 from gsim3d.train.thawing import check_thawing, thaw
 from gsim3d.train.training_loss import training_loss
 from gsim3d.train.watch import Seen, StepWatch, first_not_finite, mean_of_norms, norms_by_module
@@ -50,10 +51,6 @@ from gsim3d.types import Frames, Particles
 
 READERS = 2  # threads that read batches; so many steps are read ahead
 EMA_WARM_UP = 10  # the average forgets its first values: decay is at most (1 + step) / (10 + step)
-# May change between two sittings of one run without changing the curve; so may the number of workers, if there are any.
-FREE_SETTINGS = ("captured", "checkpoint_every", "keep_checkpoints", "log_every", "recompute")
-# May change as well, so that a run which diverged can go on; the curve is another one from there on.
-FREE_OF_OPTIMIZER, FREE_OF_STAGES = ("clip_norm", "max_skipped"), ("learning_rate", "warm_up")
 
 
 class Trainer:
@@ -103,6 +100,8 @@ class Trainer:
         self.seconds = 0.0
         self.parent = None
         self.same_scenes = True
+        self._signals: list[int] = []
+        self._stop: tuple[str, int] | None = None  # why, and the exit code
         self._ahead: dict[tuple, Future] = {}
         self._reader = ThreadPoolExecutor(READERS)
         if checkpoint.exists(self.out):
@@ -155,6 +154,7 @@ class Trainer:
             profile: write a trace of two steps.
         Raises:
             HardCaseError: ``optimizer.max_skipped`` steps in a row were skipped; the message says what to do.
+            RunStopped: after SIGINT, SIGTERM or SIGUSR1, or without its launcher, it saved and ended before ``until``.
         """
         until = self.config.n_steps if until is None else min(until, self.config.n_steps)
         self.out.mkdir(parents=True, exist_ok=True)
@@ -165,13 +165,16 @@ class Trainer:
         if profile:
             check_profile(until - self.step)
         tracer = profiler(self.out, self.processes.rank) if profile else nullcontext()
-        with bar, deterministic(), self.log.opened(tensorboard=tensorboard), tracer:
+        signals = noted_signals()
+        with bar, deterministic(), self.log.opened(tensorboard=tensorboard), tracer, signals as self._signals:
             stops = self.step >= until
             while not stops:
                 start = time.perf_counter()
                 entry = self.train_step()
                 spent = time.perf_counter() - start
                 self.seconds += spent
+                if self.processes.count == 1:  # else all have agreed on it within the step
+                    self._stop = self._reason_to_stop()
                 machine = {"seconds": self.seconds, "step_seconds": spent, "memory_gib": memory_gib(self.device)}
                 if entry["step"] % self.config.log_every == 0 or "skipped" in entry or self.step == self.config.n_steps:
                     self.log.write(entry, machine)
@@ -180,12 +183,16 @@ class Trainer:
                 bar.update()
                 if profile:
                     tracer.step()
-                stops = self.step == until or time.monotonic() >= end
+                stops = self.step == until or time.monotonic() >= end or self._stop is not None
                 if self.step % self.config.checkpoint_every == 0 or stops:
                     self.save()
                     if self.log.board is not None:
                         self.log.board.video(self.sample_video(), self.step)
         self.processes.check_same(weights=self.parameters.values())  # nobody goes on before the first one has saved
+        if self._stop is not None and self.step < until:
+            why, code = self._stop
+            saved = f"step {self.step} of {self.config.n_steps} is saved in {self.out}"
+            raise RunStopped(f"{why}: {saved}; the same command goes on from there", code)
 
     def train_step(self) -> dict:
         """One optimizer step; what to log of it.
@@ -238,8 +245,10 @@ class Trainer:
             compute = self._shared_gradients if self.captured is None else self._own_gradients
             loss, errors, gradients, watch, error = compute(samples)
             seen = Seen(error=error) if error else watch.seen(norms_scale)
-            parts = self.processes.gather((loss.item(), errors.cpu(), len(samples) / batch, seen))
-            losses, errors, shares, seen = zip(*parts, strict=True)
+            mine = (loss.item(), errors.cpu(), len(samples) / batch, seen, self._reason_to_stop())
+            parts = self.processes.gather(mine)
+            losses, errors, shares, seen, reasons = zip(*parts, strict=True)
+            self._stop = next(filter(None, reasons), None)
             for rank, part in enumerate(seen):
                 if part.error:
                     raise HardCaseError(f"process {rank}: {part.error}")
@@ -266,6 +275,12 @@ class Trainer:
         if norm is None:
             norm = torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
         return loss, errors, gradients, norm, list(seen)
+
+    def _reason_to_stop(self) -> tuple[str, int] | None:
+        """Why this process should save and end, and its exit code then."""
+        if self._signals:
+            return signal.Signals(self._signals[0]).name, 128 + self._signals[0]
+        return (self.processes.lost, 2) if self.processes.lost else None
 
     def _look_at(self, entry: dict, loss: float, gradients: Sequence, norm: Tensor, seen: list[Seen]) -> str | None:
         """Fills in ``entry``; why the gradients cannot be used, or None."""
@@ -490,11 +505,7 @@ class Trainer:
 
     def _resume(self) -> None:
         saved = checkpoint.load(self.out)
-        before = to_dict(from_dict(TrainConfig, dict(saved.config.get("train", {})), base=self.config))
-        before, now = _fixed_settings(before), _fixed_settings(to_dict(self.config))
-        for name in now:
-            if name not in FREE_SETTINGS and before.get(name) != now[name]:
-                raise InputError(f"{self.out}: was started with another {name!r}; use the same or another folder")
+        check_same_run(self.config, saved.config.get("train", {}), self.out)
         names = [scene.name for scene in self.scenes]
         known = saved.state.get("scenes", names)
         if missing := sorted(set(known) - set(names)):
@@ -545,19 +556,6 @@ class _Loss(nn.Module):
             return self._trainer.loss(*arguments)
         zero = sum(parameter.sum() * 0 for parameter in self.simulator.parameters())
         return zero, zero.detach()
-
-
-def _fixed_settings(settings: dict) -> dict:
-    """Of a run's settings those that must stay, as far as parts of them may change."""
-    fixed = {**settings, "workers": bool(settings.get("workers"))}
-    parts_of = {"optimizer": FREE_OF_OPTIMIZER, "stages": FREE_OF_STAGES, "in_turn": FREE_OF_STAGES}
-    for name, free in parts_of.items():
-        parts = settings.get(name) or []
-        kept = [
-            {k: v for k, v in part.items() if k not in free} for part in ([parts] if name == "optimizer" else parts)
-        ]
-        fixed[name] = kept
-    return fixed
 
 
 @contextmanager

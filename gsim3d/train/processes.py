@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -12,17 +14,24 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, RunStopped
+from gsim3d.train.liveness import Liveness
 
 
 class Processes:
     """The processes of one training run; each has a replica of the model and computes its share of every batch.
 
-    rank: number of this one, from 0.    count: how many there are.
+    rank: number of this one, from 0.    count: how many there are.    liveness: watches the others; None: nothing does.
     """
 
-    def __init__(self, rank: int = 0, count: int = 1):
-        self.rank, self.count = rank, count
+    def __init__(self, rank: int = 0, count: int = 1, liveness: Liveness | None = None):
+        self.rank, self.count, self.liveness = rank, count, liveness
+
+    @property
+    def lost(self) -> str | None:
+        """The launcher or process that is gone, as a sentence: save and end within half a minute; None while all are
+        there."""
+        return None if self.liveness is None else self.liveness.lost
 
     @property
     def is_first(self) -> bool:
@@ -69,6 +78,9 @@ def joined(device: str) -> Iterator[Processes]:
 
     Args:
         device: "cpu" (gloo) or "cuda" (NCCL; each process takes the GPU of its local rank).
+    Raises:
+        RunStopped: another process is gone. Where that leaves this one waiting, it ends with the same line and exit
+            code 2 within a minute.
     """
     count = int(os.environ.get("WORLD_SIZE", "1"))
     if count == 1:
@@ -85,10 +97,34 @@ def joined(device: str) -> Iterator[Processes]:
     # The group's threads would outlive it, and one that frees a tensor while Python ends aborts the process.
     from torch.distributed.nn import functional  # noqa: F401
 
-    # Small Python values travel over gloo in both cases.
-    dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
-    yield Processes(dist.get_rank(), dist.get_world_size())
-    dist.destroy_process_group()  # not after an error: others may wait for this process, and torchrun ends them
+    rank = int(os.environ.get("RANK", "0"))
+    liveness, failed = Liveness(rank), True
+    try:
+        # Small Python values travel over gloo in both cases.
+        dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
+        processes = Processes(rank, count, liveness)
+        liveness.connect(count, processes.gather)
+        yield processes
+        failed = False
+        dist.destroy_process_group()  # not after an error: others may wait for this process, and torchrun ends them
+    except RunStopped:  # all have agreed to end
+        failed = False
+        dist.destroy_process_group()
+        raise
+    except RuntimeError as error:
+        if not (isinstance(error, dist.DistError) or "gloo" in str(error)):
+            raise
+        atexit.register(_exit_at_once)
+        raise liveness.error() from None
+    finally:
+        liveness.end(failed=failed)
+
+
+def _exit_at_once() -> None:
+    """Else NCCL waits for the process that is gone, and threads of gloo abort this one while Python ends."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(2)
 
 
 def _digest(tensors: Iterable[Tensor]) -> str:
