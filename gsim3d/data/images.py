@@ -12,105 +12,182 @@ from pathlib import Path
 
 import numpy as np
 
+from gsim3d.data.headers import Header, read_header
 from gsim3d.data.recording import BACKGROUND, MOVING, Problems
 from gsim3d.errors import InputError
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-PNG_START, JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
+IMAGE_SUFFIXES = (".png", ".tif", ".tiff", *LOSSY_SUFFIXES)
 MAX_FILE = 1 << 30  # bytes of one image file
+HEADER = 1 << 16  # bytes that most headers lie in
+MAX_ID = 16  # masks whose values are all below it hold ids of bodies
+MAX_LABELS = 256  # masks of more values hold none
 
 
 def read_image(file: Path, size: tuple[int, int], place: str, problems: Problems) -> np.ndarray | None:
-    """The pixels of a PNG or JPEG file as it stores them, uint8 or uint16, [h, w] or [h, w, 3 or 4] (blue first).
+    """The pixels of a PNG, JPEG, WebP or TIFF file as it stores them, [h, w] or [h, w, 3 or 4] (blue first).
 
     Args:
         size: (width, height) that it must have; the file's header is asked before pixels are decoded.
         place: camera and frame, for messages.
-    Returns: None where there is a problem.
+    Returns: uint8 or uint16; None where there is a problem.
     """
     import cv2
 
     what = f"image {file} ({place})"
-    try:
-        if not file.is_file():
-            problems.add(f"{what} is missing")
-            return None
-        if file.stat().st_size > MAX_FILE:
-            problems.add(f"{what} is larger than {MAX_FILE >> 20} MiB")
-            return None
-        data = file.read_bytes()
-    except OSError as error:
-        problems.add(f"{what} cannot be read: {error.strerror}")
+    data = _bytes_of(file, what, problems)
+    if data is None:
         return None
-    found, whole = _header(data)
-    if found is None:
-        problems.add(f"{what} cannot be decoded: neither PNG nor JPEG, or cut off")
-    elif found != size:
-        problems.add(f"{what} has {found[0]}x{found[1]} pixels, its camera {size[0]}x{size[1]}")
-    elif not whole:
+    header = read_header(data)
+    if header is None:
+        problems.add(f"{what} cannot be decoded: no PNG, JPEG, WebP or TIFF, or cut off")
+    elif header.size != size:
+        problems.add(f"{what} has {header.size[0]}x{header.size[1]} pixels, its camera {size[0]}x{size[1]}")
+    elif not header.whole:
         problems.add(f"{what} cannot be decoded: its end is missing")
+    elif header.refused:
+        problems.add(f"{what} {header.refused}; save it as one plain image")
     else:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-        if image is not None and image.shape[1::-1] == size:
+        if image is None or image.shape[1::-1] != size:
+            problems.add(f"{what} cannot be decoded")
+        elif image.dtype not in (np.uint8, np.uint16):
+            problems.add(f"{what} must have 8 or 16 bits a channel; got {image.dtype}")
+        elif header.alpha and not _has_alpha(image):
+            problems.add(f"{what} has a transparency that cannot be read; save it as RGBA")
+        else:
             return image
-        problems.add(f"{what} cannot be decoded")
     return None
 
 
-def _header(data: bytes) -> tuple[tuple[int, int] | None, bool]:
-    """((width, height), whether the file has its end) of PNG or JPEG bytes; (None, False) for anything else."""
-    if data.startswith(PNG_START) and len(data) >= 33 and data[12:16] == b"IHDR":
-        size = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-        return size, data.rfind(b"IEND") > 24
-    if not data.startswith(JPEG_START):
-        return None, False
-    place, size = 2, None
-    while place + 9 < len(data) and data[place] == 0xFF:
-        marker = data[place + 1]
-        if marker == 0xFF:  # fill byte
-            place += 1
-            continue
-        if marker == 0xDA:  # start of scan; inside a scan 0xFF 0xD9 can only be the end of the image
-            return size, data.rfind(b"\xff\xd9") > place
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            size = int.from_bytes(data[place + 7 : place + 9], "big"), int.from_bytes(
-                data[place + 5 : place + 7], "big"
-            )
-        place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
-    return size, False
+def _bytes_of(file: Path, what: str, problems: Problems, most: int = -1) -> bytes | None:
+    try:
+        if not file.is_file():
+            problems.add(f"{what} is missing")
+        elif file.stat().st_size > MAX_FILE:
+            problems.add(f"{what} is larger than {MAX_FILE >> 20} MiB")
+        else:
+            with open(file, "rb") as opened:
+                return opened.read(most)
+    except OSError as error:
+        problems.add(f"{what} cannot be read: {error.strerror}")
+    return None
 
 
-def as_color(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray | None:
-    """uint8 [h, w, 3], RGB; alpha is dropped, grey repeated."""
-    import cv2
+def header_of(file: Path, place: str, problems: Problems) -> Header | None:
+    """Size and kind of an image file, without its pixels; None where there is a problem."""
+    what = f"image {file} ({place})"
+    data = _bytes_of(file, what, problems, HEADER)
+    header = None if data is None else read_header(data)
+    if header is None and data is not None and len(data) == HEADER:  # it lies farther behind
+        data = _bytes_of(file, what, problems)
+        header = None if data is None else read_header(data)
+    if data is not None and header is None:
+        problems.add(f"{what} cannot be decoded: no PNG, JPEG, WebP or TIFF, or cut off")
+    return header
 
-    if image.dtype != np.uint8:
-        problems.add(f"image {file} ({place}) must have 8 bits a channel; got {image.dtype}")
-        return None
-    if image.ndim == 2:
-        return np.repeat(image[..., None], 3, 2)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGB)
+
+def as_color(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray:
+    """uint8 [h, w, 3], RGB: grey is repeated, 16 bits are rounded to 8, transparency is composed on black."""
+    image = _over_black(image)
+    if image.dtype == np.uint16:
+        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    return np.repeat(image[..., None], 3, 2) if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
 
 
 def as_labels(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray | None:
     """uint8 [h, w], the one channel of a label image."""
-    if image.dtype != np.uint8:
-        problems.add(f"image {file} ({place}) must have 8 bits a channel; got {image.dtype}")
-        return None
     if image.ndim == 3 and (image[..., :1] != image[..., :3]).any():
         problems.add(f"image {file} ({place}) must hold labels in one channel; got a colour image")
         return None
-    return image if image.ndim == 2 else image[..., 0]
+    labels = image if image.ndim == 2 else image[..., 0]
+    if file.suffix.lower() in LOSSY_SUFFIXES or labels.max() > 255:
+        problems.add(f"image {file} ({place}) must hold labels from 0 to 255, in a lossless format (PNG or TIFF)")
+        return None
+    return labels.astype(np.uint8)
 
 
-def as_mask(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray:
-    """uint8 [h, w]: MOVING where any channel but alpha is not zero, else BACKGROUND."""
-    return np.where(is_marked(image), MOVING, BACKGROUND).astype(np.uint8)
+def as_mask(image: np.ndarray, file: Path | None, place: str, problems: Problems) -> np.ndarray | None:
+    """uint8 [h, w]: MOVING where a mask is set, else BACKGROUND.
+
+    A mask of two values, up to compression noise and soft borders, is set above half of its range; one of labels is set
+    where it is not 0. Colours count by their largest channel.
+    """
+    grey = _over_black(image)
+    grey = np.ascontiguousarray(grey if grey.ndim == 2 else grey.max(-1))
+    lossy = file is not None and file.suffix.lower() in LOSSY_SUFFIXES
+    marked = _marked(grey, lossy)
+    if marked is None:
+        problems.add(
+            f"image {file} ({place}) is no mask: its values are neither two, up to noise and soft borders, nor labels; "
+            "save it as 0 and 255"
+        )
+        return None
+    return np.where(marked, MOVING, BACKGROUND).astype(np.uint8)
+
+
+def as_opaque(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray:
+    """uint8 [h, w]: MOVING where an image is more opaque than transparent, else BACKGROUND."""
+    return np.where(is_opaque(image), MOVING, BACKGROUND).astype(np.uint8)
+
+
+def is_opaque(image: np.ndarray) -> np.ndarray:
+    """bool [h, w]: where alpha is above half of its range, everywhere in images without."""
+    if not _has_alpha(image):
+        return np.ones(image.shape[:2], bool)
+    return image[..., 3] > np.iinfo(image.dtype).max // 2
 
 
 def is_marked(image: np.ndarray) -> np.ndarray:
     """bool [h, w]: where any channel but alpha is not zero."""
     return image > 0 if image.ndim == 2 else (image[..., :3] > 0).any(-1)
+
+
+def _has_alpha(image: np.ndarray) -> bool:
+    return image.ndim == 3 and image.shape[2] == 4
+
+
+def _over_black(image: np.ndarray) -> np.ndarray:
+    """Without alpha: colours composed on black, the background of every scene."""
+    if not _has_alpha(image):
+        return image
+    alpha, full = image[..., 3:].astype(np.uint32), np.iinfo(image.dtype).max
+    return ((image[..., :3] * alpha + full // 2) // full).astype(image.dtype)
+
+
+def _marked(grey: np.ndarray, lossy: bool) -> np.ndarray | None:
+    """bool [h, w]: where a mask is set; None where it is neither of two values nor of labels."""
+    levels = np.flatnonzero(np.bincount(grey.ravel()))
+    low, high = int(levels[0]), int(levels[-1])
+    full = np.iinfo(grey.dtype).max
+    if high == 0 or (high < MAX_ID and not lossy) or _are_labels(grey, levels):
+        return grey > 0
+    if len(levels) == 1 or lossy:  # compression leaves the ends of the range where they are
+        low, high = 0, full
+    soft = (grey > low + (high - low) // 4) & (grey < high - (high - low) // 4)
+    if _blocks(soft).any() or (lossy and not (grey > high - (high - low) // 4).any()):
+        return None
+    return grey > (low + high) // 2
+
+
+def _are_labels(grey: np.ndarray, levels: np.ndarray) -> bool:
+    """Whether most values between the first and the last one cover areas: noise and soft borders do not."""
+    import cv2
+
+    inner = levels[1:-1]
+    if not 0 < len(inner) <= MAX_LABELS:
+        return False
+    block = np.ones((3, 3), np.uint8)
+    flat = grey[(cv2.erode(grey, block) == cv2.dilate(grey, block))]
+    return 2 * np.isin(inner, flat).sum() >= len(inner)
+
+
+def _blocks(where: np.ndarray) -> np.ndarray:
+    """bool [h, w]: pixels whose neighbours all belong to ``where``, as they do."""
+    import cv2
+
+    block = np.ones((3, 3), np.uint8)
+    return cv2.erode(where.astype(np.uint8), block, borderType=cv2.BORDER_REPLICATE) > 0
 
 
 class ImageCache:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.data.cameras import OPENGL, by_step, check_intrinsics, inverse
-from gsim3d.data.images import as_color, is_marked, read_image, read_files
+from gsim3d.data.images import as_color, is_marked, is_opaque, read_files, read_image
 from gsim3d.data.recording import (
     BACKGROUND,
     FIXED,
@@ -131,7 +131,7 @@ class _Camera:
         image = read_image(self.images[number], self.size, self.place(number), problems)
         if image is None:
             return None
-        solid = image[..., 3] > 0 if image.ndim == 3 and image.shape[2] == 4 else np.ones(image.shape[:2], bool)
+        solid = is_opaque(image)
         if not has_segmentation:
             return np.where(solid, MOVING, BACKGROUND).astype(np.uint8)
         if number not in self.segmentation:

@@ -1,4 +1,4 @@
-"""From films of real cameras to what the model reads: lenses undistorted, moving bodies cut out."""
+"""From films of real cameras to labels: moving bodies cut out of a background that stands still."""
 
 from __future__ import annotations
 
@@ -14,42 +14,6 @@ BLUR = 1.2  # pixels; noise of single pixels and blocks of JPEG are smoothed bef
 CLOSE_SHARE = 0.012  # of the image's height: gaps so wide are closed
 MIN_AREA = 0.001  # of the image; smaller spots are noise ...
 MAX_HOLE = 0.005  # ... and smaller holes are body that looks like what is behind it
-
-
-class Undistorter:
-    """Images of one camera as a pinhole of the same intrinsics would see them.
-
-    Args:
-        coefficients: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]].    size: (width, height).
-    """
-
-    def __init__(self, coefficients: np.ndarray, size: tuple[int, int]):
-        self._coefficients, self._size = coefficients, size
-        self._key, self._maps = None, None
-
-    def __call__(self, image: np.ndarray, K: np.ndarray, *, nearest: bool = False) -> np.ndarray:
-        import cv2
-
-        x, y = self._sources(K)
-        return cv2.remap(image, x, y, cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR, borderValue=0)
-
-    def valid(self, K: np.ndarray) -> np.ndarray:
-        """bool [h, w]: pixels that come from inside the distorted image."""
-        x, y = self._sources(K)
-        return (x >= 0) & (x <= self._size[0] - 1) & (y >= 0) & (y <= self._size[1] - 1)
-
-    def _sources(self, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where each pixel lies in the distorted image, x and y, float32 [h, w]; kept for the next image."""
-        import cv2
-
-        if self._key is None or not np.array_equal(self._key, K):
-            centred = K.copy()
-            centred[:2, 2] -= 0.5  # OpenCV's pixel centres are whole numbers
-            self._maps = cv2.initUndistortRectifyMap(
-                centred, self._coefficients, None, centred, self._size, cv2.CV_32FC1
-            )
-            self._key = K.copy()
-        return self._maps
 
 
 def median_image(film: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> np.ndarray:

@@ -17,6 +17,7 @@ from gsim3d.files import MAX_TEXT, read_file
 MAX_STEPS, MAX_CAMS, MAX_SIZE = 1_000_000, 10_000, 16_384  # beyond them a description is taken to be broken
 MAX_NUMBER = 1e9  # metres, pixels, seconds: likewise
 MAX_NAME = 200  # letters of a file name
+HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")  # what may be one in JSON
 SPACING_TOLERANCE = 0.01  # of the time between two steps
 BACKGROUND, FIXED, MOVING = 0, 1, 3  # labels of pixels: nothing, what never moves, bodies that may move
 
@@ -37,6 +38,18 @@ class Problems:
         self.found.append(message)
 
 
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """coefficients: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 of its fisheye model.   fisheye: which."""
+
+    coefficients: np.ndarray
+    fisheye: bool = False
+
+    def __eq__(self, other) -> bool:
+        same = isinstance(other, Lens) and self.fisheye == other.fisheye
+        return same and np.array_equal(self.coefficients, other.coefficients)
+
+
 @dataclass(frozen=True)
 class Recording:
     """One scene as its reader found it, in gsim3d's conventions (OpenCV axes, pixel centres at +0.5, metres).
@@ -47,10 +60,11 @@ class Recording:
     viewmats [S, V, 4, 4], Ks [S, V, 3, 3]: float64; S is 1 for cameras that stand still, else n_steps.
     sizes: (width, height) of each camera's images.
     read_images: uint8 [h, w, 3], RGB.   read_labels: uint8 [h, w] of BACKGROUND, FIXED, MOVING; None: no labels.
-    distortions: per camera None or OpenCV's coefficients k1 k2 p1 p2 [k3 ...]; images are not undistorted yet.
+    distortions: per camera its lens, None for a pinhole; images are not undistorted yet.
     near, far, origin, bounds: None where nobody gave them.
     is_film: shows a real background: it is painted black where labels say so.
     subtract_background: labels come from what differs from the median image of the camera.
+    notes: what was left out or changed on reading; check-data prints them.
     """
 
     layout: str
@@ -63,24 +77,32 @@ class Recording:
     sizes: tuple[tuple[int, int], ...]
     read_images: ReadImages
     read_labels: ReadImages | None = None
-    distortions: tuple[np.ndarray | None, ...] = ()
+    distortions: tuple[Lens | None, ...] = ()
     near: float | None = None
     far: float | None = None
     origin: np.ndarray | None = None
     bounds: np.ndarray | None = None
     is_film: bool = False
     subtract_background: bool = False
+    notes: tuple[str, ...] = ()
 
 
 def read_json(file: Path) -> dict:
     """The JSON object in ``file``. Raises InputError when it cannot be read or is none."""
-    text = read_file(file, MAX_TEXT)
+    content = read_file(file, MAX_TEXT)
     try:
+        text = content.decode(json.detect_encoding(content))
         content = json.loads(text)
     except (ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"{file} cannot be read: {error}") from error
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold a JSON object; got {type(content).__name__}")
+    if HALF_PAIR.search(text):  # no file and no terminal takes half of a pair
+        try:
+            json.dumps(content, ensure_ascii=False).encode()
+        except UnicodeEncodeError as error:
+            half = error.object[error.start]
+            raise InputError(f"{file} cannot be read: it holds half of a surrogate pair, {half!a}") from None
     return content
 
 
@@ -104,8 +126,12 @@ def positive(value, what: str, problems: Problems) -> float | None:
 
 def array(value, shapes: Sequence[tuple[int, ...]], what: str, problems: Problems) -> np.ndarray | None:
     """``value`` as finite float64 numbers of one of ``shapes``; None where it is not."""
+    if value is None:
+        problems.add(f"{what} is missing")
+        return None
     try:
-        numbers = np.asarray(value, dtype=np.float64)
+        given = np.asarray(value)
+        numbers = np.asarray(value, dtype=np.float64) if given.dtype.kind in "iufO" else None
     except (TypeError, ValueError, OverflowError):
         numbers = None
     if numbers is None or numbers.shape not in shapes:
@@ -116,7 +142,8 @@ def array(value, shapes: Sequence[tuple[int, ...]], what: str, problems: Problem
     if not np.isfinite(numbers).all():
         place = np.argwhere(~np.isfinite(numbers))[0]
         frame = f" (frame {place[0]})" if len(shapes) > 1 and numbers.ndim == max(map(len, shapes)) else ""
-        problems.add(f"{what}{frame} holds values that are not finite")
+        null = given.dtype.kind == "O" and given[tuple(place)] is None
+        problems.add(f"{what}{frame} holds {'null' if null else 'values that are not finite'}")
         return None
     if (np.abs(numbers) > MAX_NUMBER).any():
         problems.add(f"{what} holds {np.abs(numbers).max():g}; numbers beyond {MAX_NUMBER:g} are taken to be broken")

@@ -15,7 +15,8 @@ from gsim3d.data import layouts
 from gsim3d.data.cameras import check_directions, frusta_origin, shared_view, spread_steps
 from gsim3d.data.fitting import Fitting, fit, own_depths
 from gsim3d.data.images import ImageCache
-from gsim3d.data.masks import Undistorter, foreground, median_image
+from gsim3d.data.lenses import Undistorter
+from gsim3d.data.masks import foreground, median_image
 from gsim3d.data.recording import BACKGROUND, MOVING, Problems, ReadImages, Recording
 from gsim3d.errors import InputError
 from gsim3d.types import Cameras
@@ -52,8 +53,8 @@ class Scene:
         else:
             self.origin = frusta_origin(*self._view()) if recording.bounds is None else recording.bounds[0]
         self._undistorters = [
-            None if coefficients is None else Undistorter(coefficients, size)
-            for coefficients, size in zip(recording.distortions or (None,) * self.n_cams, recording.sizes, strict=True)
+            None if lens is None else Undistorter(lens, size)
+            for lens, size in zip(recording.distortions or (None,) * self.n_cams, recording.sizes, strict=True)
         ]
         self._medians: dict[int, np.ndarray] = {}
         shape = (self.n_steps, self.n_cams, self.height, self.width)

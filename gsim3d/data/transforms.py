@@ -1,23 +1,29 @@
-"""Nerfstudio's transforms.json, with a time for every frame and any number of cameras.
+"""Nerfstudio's transforms.json, with a time for every frame and any number of cameras; and NeRF-synthetic's splits.
 
-Keys of the file, or of single frames, which win: fl_x, fl_y, cx, cy, w, h; k1, k2, p1, p2, k3 (OpenCV's lens model).
+Keys of the file, or of single frames, which win: fl_x, fl_y, cx, cy, or camera_angle_x, camera_angle_y (radians), w, h
+(default: of the images), and the lens: camera_model, is_fisheye, k1 to k6, p1, p2 (see :mod:`gsim3d.data.lenses`).
 Each of ``frames``: file_path; transform_matrix, camera-to-world with OpenGL's axes (x right, y up, z backwards); time
 in seconds (any unit where fps is given); camera, its name; mask_path, an image that is not 0 on bodies that may move;
-or label_path, one with 0 background, 1 fixed parts, 3 bodies that may move. Without ``camera`` the path decides:
-frames whose paths differ in their last number only come from one camera. Without any ``time`` all show one instant
-and each has its own camera. Beside them: fps, near, far, origin, bounds.
+or label_path, one with 0 background, 1 fixed parts, 3 bodies that may move; without either, alpha above half may move.
+Without ``camera`` the path decides: frames whose paths differ in their last number only come from one camera. Without
+any ``time`` all show one instant and each has its own camera. Beside them: fps, near, far, origin, bounds.
+
+Without transforms.json, transforms_train.json, transforms_val.json and transforms_test.json are one scene.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from gsim3d.data import lenses
 from gsim3d.data.cameras import OPENGL, by_step, check_intrinsics, check_pose, inverse
-from gsim3d.data.images import as_color, as_labels, as_mask, read_files
+from gsim3d.data.images import IMAGE_SUFFIXES, as_color, as_labels, as_mask, as_opaque, header_of, read_files
 from gsim3d.data.recording import (
     MAX_CAMS,
     MAX_STEPS,
@@ -36,42 +42,41 @@ from gsim3d.errors import InputError
 
 NAME = "transforms"
 FILE = "transforms.json"
-PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-LENS = ("k1", "k2", "p1", "p2", "k3")
+SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
+ANGLES = ("camera_angle_x", "camera_angle_y")
+SHARED = ("fl_x", "fl_y", "cx", "cy", "w", "h", *ANGLES, *lenses.KEYS)  # of the file; frames may have their own
 SAME_TIME = 1e-6  # of the whole duration: times closer than that are one step
 
 
 def recognises(folder: Path) -> bool:
-    return (folder / FILE).is_file()
+    return any((folder / name).is_file() for name in (FILE, *SPLITS))
 
 
 def read(folder: Path, problems: Problems) -> Recording:
     """The scene in ``folder``. Raises InputError where its description cannot be read at all."""
-    source = folder / FILE
-    description = read_json(source)
-    frames = description.get("frames")
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise InputError(f"{source}: frames must be a list of one or more JSON objects")
+    sources = [folder / name for name in (FILE, *SPLITS) if (folder / name).is_file()]
+    source, *splits = sources[:1] if sources[0].name == FILE else sources
+    description, notes = read_json(source), []
+    frames = _frames(folder, source, description)
+    for other in splits:
+        more = _frames(folder, other, read_json(other))
+        if _times(more) == _times(frames):
+            frames += more
+            notes.append(f"the views of {other.name} are cameras, too")
+        else:
+            notes.append(f"{other.name} has other times than {source.name} and is left out")
+    return dataclasses.replace(recording_of(folder, source, description, frames, problems), notes=tuple(notes))
+
+
+def recording_of(folder: Path, source: Path, description: dict, frames: list[dict], problems: Problems) -> Recording:
+    """The scene of ``frames`` that have all their keys; fps, near, far, origin and bounds are those of ``description``."""
     if len(frames) > MAX_STEPS:
         raise InputError(f"{source}: {len(frames)} frames; more than {MAX_STEPS} are taken to be a mistake")
-    model = description.get("camera_model", "OPENCV")
-    if model not in PINHOLES:
-        raise InputError(
-            f"{source}: camera_model {model!r} is not read; undistort the images to a pinhole "
-            f"(known: {', '.join(PINHOLES)})"
-        )
-    for number, frame in enumerate(frames):
-        for key in ("file_path", "mask_path", "label_path"):
-            if key != "file_path" and key not in frame:
-                continue
-            if not isinstance(frame.get(key), str):
-                raise InputError(f"{source}: frames[{number}].{key} must be text; got {str(frame.get(key))[:80]!r}")
-            inside(folder, frame[key], f"{source}: frames[{number}].{key}")
     table, times = _table(frames, source, problems)
     names = sorted(table, key=natural_order)
     if len(names) > MAX_CAMS:
         raise InputError(f"{source}: {len(names)} cameras; more than {MAX_CAMS} are taken to be a mistake")
-    cameras = [_Camera(name, table[name], description, source, problems) for name in names]
+    cameras = [_Camera(name, table[name], folder, source, problems) for name in names]
     n_steps = len(times)
     fps = positive(description.get("fps"), f"{source}: fps", problems)
     if n_steps > 1:
@@ -84,18 +89,19 @@ def read(folder: Path, problems: Problems) -> Recording:
         fps = fps or rate
 
     def read_images(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
-        return read_files(cameras[cam].files(folder, "file_path", steps), cameras[cam].size, as_color, problems)
+        return read_files(cameras[cam].files("file_path", steps), cameras[cam].size, as_color, problems)
 
     def read_labels(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
         camera = cameras[cam]
         for step in steps:
             frame = camera.frames[step]
             key, convert = ("label_path", as_labels) if "label_path" in frame else ("mask_path", as_mask)
-            if key not in frame:
+            if key not in frame and has_labels:
                 problems.add(f"{source}: {camera.place(step)} has no mask_path, though other frames have one")
                 yield None
                 continue
-            yield from read_files(camera.files(folder, key, [step]), camera.size, convert, problems)
+            key, convert = (key, convert) if has_labels else ("file_path", as_opaque)
+            yield from read_files(camera.files(key, [step]), camera.size, convert, problems)
 
     has_labels = any("mask_path" in frame or "label_path" in frame for frame in frames)
     return Recording(
@@ -108,18 +114,41 @@ def read(folder: Path, problems: Problems) -> Recording:
         Ks=by_step([camera.Ks for camera in cameras], n_steps),
         sizes=tuple(camera.size for camera in cameras),
         read_images=read_images,
-        read_labels=read_labels if has_labels else None,
-        distortions=tuple(camera.distortion for camera in cameras),
+        read_labels=read_labels if has_labels or any(camera.has_alpha() for camera in cameras) else None,
+        distortions=tuple(camera.lens for camera in cameras),
         is_film=True,
         **workspace(description, source, problems),
     )
+
+
+def _frames(folder: Path, source: Path, description: dict) -> list[dict]:
+    """The frames of a file, with its keys in each; their paths lie in the folder."""
+    frames = description.get("frames")
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError(f"{source}: frames must be a list of one or more JSON objects")
+    for number, frame in enumerate(frames):
+        for key in ("file_path", "mask_path", "label_path"):
+            if key != "file_path" and key not in frame:
+                continue
+            if not isinstance(frame.get(key), str):
+                raise InputError(f"{source}: frames[{number}].{key} must be text; got {str(frame.get(key))[:80]!r}")
+            inside(folder, frame[key], f"{source}: frames[{number}].{key}")
+    shared = {key: description[key] for key in SHARED if key in description}
+    return [{**shared, **frame} for frame in frames]
+
+
+def _times(frames: list[dict]) -> set[str]:
+    return {f"{time:.6g}" if isinstance(time := frame.get("time"), (int, float)) else repr(time) for frame in frames}
 
 
 def _table(frames: list[dict], source: Path, problems: Problems) -> tuple[dict, np.ndarray]:
     """(camera -> its frames step by step, times of the steps)."""
     timeless = [number for number, frame in enumerate(frames) if "time" not in frame]
     if len(timeless) == len(frames):
-        return {str(frame.get("camera", frame["file_path"])): [frame] for frame in frames}, np.zeros(1)
+        table = {str(frame.get("camera", frame["file_path"])): [frame] for frame in frames}
+        if len(table) < len(frames):
+            raise InputError(f"{source}: {len(frames)} frames without time are {len(table)} cameras'; give every frame its time")
+        return table, np.zeros(1)
     if timeless:
         raise InputError(
             f"{source}: frames[{timeless[0]}] ({frames[timeless[0]]['file_path']}) has no time, others have"
@@ -163,34 +192,40 @@ def _camera_name(frame: dict) -> str:
 class _Camera:
     """All frames of one camera, step by step."""
 
-    def __init__(self, name: str, frames: list[dict], description: dict, source: Path, problems: Problems):
-        self.name, self.frames, self._source = name, frames, source
-        self._description = description
-        self.size = image_size(self._values(frames[0], ("w", "h")), f"{source}: w, h of camera {name}", problems)
-        lenses = np.array([self._lens(frame, step, problems) for step, frame in enumerate(frames)])
-        if (lenses != lenses[0]).any():
-            problems.add(f"{source}: camera {name}: the lens (k1, k2, p1, p2, k3) must be the same in all frames")
-        self.distortion = lenses[0] if lenses[0].any() else None
+    def __init__(self, name: str, frames: list[dict], folder: Path, source: Path, problems: Problems):
+        self.name, self.frames, self._folder, self._source = name, frames, folder, source
+        self.size = self._size(problems)
+        found = [self._lens(frame, step, problems) for step, frame in enumerate(frames)]
+        if any(lens != found[0] for lens in found):
+            problems.add(f"{source}: camera {name}: the lens (camera_model, k1 ...) must be the same in all frames")
+        self.lens = found[0]
         self.viewmats = np.stack([self._viewmat(frame, step, problems) for step, frame in enumerate(frames)])
         self.Ks = np.stack([self._K(frame, step, problems) for step, frame in enumerate(frames)])
 
     def place(self, step: int) -> str:
         return f"camera {self.name}, frame {step}"
 
-    def files(self, folder: Path, key: str, steps: Sequence[int]) -> Iterator[tuple[Path, str]]:
+    def files(self, key: str, steps: Sequence[int]) -> Iterator[tuple[Path, str]]:
         for step in steps:
-            file = inside(folder, self.frames[step][key], f"{self._source}: {key} of {self.place(step)}")
-            if not file.suffix:
-                file = file.with_suffix(".png")  # as in the synthetic sets
+            file = inside(self._folder, self.frames[step][key], f"{self._source}: {key} of {self.place(step)}")
+            if file.suffix.lower() not in IMAGE_SUFFIXES:  # as in the synthetic sets
+                found = [file.with_name(file.name + suffix) for suffix in IMAGE_SUFFIXES]
+                file = next((path for path in found if path.is_file()), found[0])
             yield file, self.place(step)
 
-    def _values(self, frame: dict, keys: Sequence[str], default=None) -> list:
-        return [frame.get(key, self._description.get(key, default)) for key in keys]
+    def has_alpha(self) -> bool:
+        header = header_of(*next(self.files("file_path", [0])), Problems(collect=True))
+        return header is not None and header.alpha
 
-    def _lens(self, frame: dict, step: int, problems: Problems) -> np.ndarray:
-        what = f"{self._source}: {', '.join(LENS)} of {self.place(step)}"
-        values = array(self._values(frame, LENS, 0.0), [(len(LENS),)], what, problems)
-        return np.zeros(len(LENS)) if values is None else values
+    def _size(self, problems: Problems) -> tuple[int, int]:
+        given = [self.frames[0].get(key) for key in ("w", "h")]
+        if given != [None, None]:
+            return image_size(given, f"{self._source}: w, h of camera {self.name}", problems)
+        header = header_of(*next(self.files("file_path", [0])), problems)
+        return (1, 1) if header is None else image_size(header.size, f"images of camera {self.name}", problems)
+
+    def _lens(self, frame: dict, step: int, problems: Problems) -> lenses.Lens | None:
+        return lenses.lens_of(frame, f"{self._source}: {self.place(step)}", problems)
 
     def _viewmat(self, frame: dict, step: int, problems: Problems) -> np.ndarray:
         what = f"{self._source}: transform_matrix of {self.place(step)}"
@@ -203,12 +238,33 @@ class _Camera:
 
     def _K(self, frame: dict, step: int, problems: Problems) -> np.ndarray:
         what = f"{self._source}: intrinsics of {self.place(step)}"
-        size = self._values(frame, ("w", "h"))
+        size = [frame.get(key) for key in ("w", "h")]
         if size != list(self.size) and size != [None, None]:
             problems.add(f"{what}: w, h are {size}, but {list(self.size)} in its first frame")
-        fl_x, fl_y, cx, cy = self._values(frame, ("fl_x", "fl_y", "cx", "cy"))
-        values = array([fl_x, fl_x if fl_y is None else fl_y, cx, cy], [(4,)], f"{what}: fl_x, fl_y, cx, cy", problems)
+        keys = ("fl_x", "fl_y", "cx", "cy")
+        given = {key: frame[key] for key in keys if frame.get(key) is not None}
+        angles = [self._focal(frame, axis, what, problems) for axis in (0, 1)]
+        known = {"fl_x": angles[0] or angles[1], "fl_y": angles[1] or given.get("fl_x") or angles[0]}
+        if any(angles):  # they are symmetric
+            known |= {"cx": self.size[0] / 2, "cy": self.size[1] / 2}
+        given = {key: value for key, value in known.items() if value is not None} | given
+        missing = [key for key in keys if key not in given]
+        if missing:
+            angle = ", or camera_angle_x instead" if missing[0] == "fl_x" else ""
+            problems.add(f"{what}: {', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing{angle}")
+            return np.eye(3)
+        values = array([given[key] for key in keys], [(4,)], f"{what}: fl_x, fl_y, cx, cy", problems)
         if values is None:
             return np.eye(3)
         K = np.array([[values[0], 0, values[2]], [0, values[1], values[3]], [0, 0, 1.0]])
         return K if check_intrinsics(K, self.size, what, problems) else np.eye(3)
+
+    def _focal(self, frame: dict, axis: int, what: str, problems: Problems) -> float | None:
+        """The focal length in pixels of the angle that an axis of the image spans; None where there is none."""
+        angle = positive(frame.get(ANGLES[axis]), f"{what}: {ANGLES[axis]}", problems)
+        if angle is None:
+            return None
+        if angle >= math.pi:
+            problems.add(f"{what}: {ANGLES[axis]} must be below pi (radians); got {angle:g}")
+            return None
+        return 0.5 * self.size[axis] / math.tan(0.5 * angle)

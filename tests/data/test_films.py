@@ -12,7 +12,7 @@ import torch
 from gsim3d.__main__ import main
 from gsim3d.data import Scene, make_frames
 from gsim3d.data.check import check_scene
-from gsim3d.data.masks import Undistorter
+from gsim3d.data.lenses import Lens, Undistorter
 from gsim3d.errors import InputError
 from gsim3d.interop import write_video
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
@@ -120,7 +120,7 @@ def test_undistorted_pixels_come_from_where_the_lens_puts_their_rays():
     """An image that holds its own coordinates shows where each pixel of the result was taken."""
     K = np.array([[200.0, 0, 101.5], [0, 210.0, 76.0], [0, 0, 1]])
     y, x = np.mgrid[:160, :200].astype(np.float32)
-    taken = Undistorter(np.array(LENS), (200, 160))(np.stack([x, y], -1), K)
+    taken = Undistorter(Lens(np.array(LENS)), (200, 160))(np.stack([x, y], -1), K)
     for column, row in ((20, 15), (101, 76), (180, 30), (60, 140)):
         ray = np.linalg.inv(K) @ [column + 0.5, row + 0.5, 1]  # through the centre of the pixel
         in_lens = cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), K, np.array(LENS))[0].ravel()

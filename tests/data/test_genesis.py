@@ -251,8 +251,9 @@ def test_broken_images_are_named(tmp_path):
     cv2.imwrite(str(tmp_path / "seg/cam_0/0000.png"), np.eye(32)[:16, :, None] * [255, 0, 0])
     with pytest.raises(InputError, match="one channel"):
         scene.segmentation([0], [0])
-    cv2.imwrite(str(files[0]), np.zeros((16, 32), dtype=np.uint16))
-    with pytest.raises(InputError, match="8 bits"):
+    cv2.imwrite(str(tmp_path / "deep.tif"), np.zeros((16, 32), dtype=np.float32))
+    (tmp_path / "deep.tif").replace(files[0])
+    with pytest.raises(InputError, match="8 or 16 bits"):
         scene.images([0], [0])
 
 

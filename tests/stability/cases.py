@@ -198,7 +198,7 @@ CASES = {
     "E38": Case("constant and saturated images", "finite"),
     "E39": Case(
         "no pixel of 0; 16 bits; alpha; grey",
-        "values keep their meaning; 16 bits are refused, the file named",
+        "values keep their meaning; 16 bits are rounded to 8",
         "release: shifts colours and labels where an image holds no 0",
     ),
     "E40": Case(

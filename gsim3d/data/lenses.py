@@ -1,0 +1,141 @@
+"""Lens models by their published names, and images undistorted to a pinhole."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from gsim3d.data.recording import Lens, Problems, array
+
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+FISHEYE_ORDER = ("k1", "k2", "k3", "k4")
+PARAMS_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")  # of the key distortion_params
+PERSPECTIVE = {
+    "PINHOLE": (),
+    "SIMPLE_PINHOLE": (),
+    "PERSPECTIVE": COEFFICIENTS,
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": COEFFICIENTS,
+    "FULL_OPENCV": COEFFICIENTS,
+}
+FISHEYE = {
+    "OPENCV_FISHEYE": FISHEYE_ORDER,
+    "FISHEYE": FISHEYE_ORDER,
+    "RADIAL_FISHEYE": ("k1", "k2"),
+    "SIMPLE_RADIAL_FISHEYE": ("k1",),
+}
+# Keys of lenses that no image is undistorted from, wherever they say more than 0 or false.
+OTHER_KEYS = (
+    *(f"ftheta_p{i}" for i in range(5)), "latlong", "equirectangular", "rolling_shutter",
+    "s1", "s2", "s3", "s4", "sx1", "sy1", "tau_x", "tau_y", "b1", "b2", "p3", "p4", "omega", "xi", "skew",
+)  # fmt: skip
+KEYS = ("camera_model", "is_fisheye", "distortion_params", *COEFFICIENTS, *OTHER_KEYS)
+SAMPLES = 2000  # of the radius, where it is asked whether it grows
+WIDEST = 1.55  # radians from the axis: a pinhole sees less than 90 degrees of it
+
+
+def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
+    """The lens that the keys of a description tell of; None: a pinhole. ``what``: for messages."""
+    for key in OTHER_KEYS:
+        if key in values and values[key] not in (0, None) and not _zeros(values[key]):
+            problems.add(f"{what}: the lens key {key} is not read; undistort the images to a pinhole")
+            return None
+    model, flag = values.get("camera_model"), values.get("is_fisheye", False)
+    if not isinstance(flag, bool):
+        problems.add(f"{what}: is_fisheye must be true or false; got {flag!r:.80}")
+        return None
+    model = ("OPENCV_FISHEYE" if flag else "OPENCV") if model is None else model
+    known = PERSPECTIVE | FISHEYE
+    if not isinstance(model, str) or model not in known:
+        problems.add(
+            f"{what}: camera_model {model!r:.80} is not read; undistort the images to a pinhole (known: "
+            f"{', '.join(known)})"
+        )
+        return None
+    if flag and model not in FISHEYE:
+        problems.add(f"{what}: camera_model is {model}, but is_fisheye is true; remove the wrong one")
+        return None
+    numbers = _coefficients(values, what, problems)
+    extra = next((key for key in COEFFICIENTS if numbers[key] and key not in known[model]), None)
+    if extra:
+        problems.add(f"{what}: camera_model {model} has no {extra}, but it is {numbers[extra]:g}")
+        return None
+    order = FISHEYE_ORDER if model in FISHEYE else OPENCV_ORDER
+    coefficients = np.array([numbers[key] for key in order])
+    if model in FISHEYE:
+        return Lens(coefficients, True)
+    short = coefficients if coefficients[5:].any() else coefficients[:5]
+    return Lens(short) if coefficients.any() else None
+
+
+def _zeros(value) -> bool:
+    return isinstance(value, list) and all(number in (0, None) for number in value)
+
+
+def _coefficients(values: Mapping, what: str, problems: Problems) -> dict[str, float]:
+    numbers = dict.fromkeys(COEFFICIENTS, 0.0)
+    if "distortion_params" in values:
+        found = array(values["distortion_params"], [(len(PARAMS_ORDER),)], f"{what}: distortion_params", problems)
+        numbers |= {} if found is None else dict(zip(PARAMS_ORDER, found.tolist(), strict=True))
+    given = [key for key in COEFFICIENTS if key in values]
+    found = array([values[key] for key in given], [(len(given),)], f"{what}: {', '.join(given)}", problems)
+    return numbers if found is None else numbers | dict(zip(given, found.tolist(), strict=True))
+
+
+class Undistorter:
+    """Images of one camera as a pinhole of the same intrinsics would see them. ``size``: (width, height)."""
+
+    def __init__(self, lens: Lens, size: tuple[int, int]):
+        self._lens, self._size = lens, size
+        self._key, self._maps = None, None
+
+    def __call__(self, image: np.ndarray, K: np.ndarray, *, nearest: bool = False) -> np.ndarray:
+        import cv2
+
+        x, y = self._sources(K)
+        return cv2.remap(image, x, y, cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR, borderValue=0)
+
+    def valid(self, K: np.ndarray) -> np.ndarray:
+        """bool [h, w]: pixels that come from inside the distorted image."""
+        x, y = self._sources(K)
+        return (x >= 0) & (x <= self._size[0] - 1) & (y >= 0) & (y <= self._size[1] - 1)
+
+    def _sources(self, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where each pixel lies in the distorted image, x and y, float32 [h, w]; kept for the next image."""
+        import cv2
+
+        if self._key is None or not np.array_equal(self._key, K):
+            centred = K.copy()
+            centred[:2, 2] -= 0.5  # OpenCV's pixel centres are whole numbers
+            make = cv2.fisheye.initUndistortRectifyMap if self._lens.fisheye else cv2.initUndistortRectifyMap
+            maps = make(centred, self._lens.coefficients, np.eye(3), centred, self._size, cv2.CV_32FC1)
+            folded = self._radius(K) > _reach(self._lens)
+            self._maps = tuple(np.where(folded, np.float32(-2), places) for places in maps)
+            self._key = K.copy()
+        return self._maps
+
+    def _radius(self, K: np.ndarray) -> np.ndarray:
+        """[h, w]: the tangent of the angle between the ray of each pixel and the optical axis."""
+        y = (np.arange(self._size[1]) + 0.5 - K[1, 2]) / K[1, 1]
+        x = (np.arange(self._size[0]) + 0.5 - K[0, 2]) / K[0, 0]
+        return np.hypot(x[None] - K[0, 1] / K[0, 0] * y[:, None], y[:, None])
+
+
+def _reach(lens: Lens) -> float:
+    """The tangent of the angle up to which the lens puts rays farther and farther out. Beyond it the polynomial turns
+    back, and pixels would show what lies elsewhere."""
+    angles = np.linspace(0, WIDEST, SAMPLES)
+    if lens.fisheye:
+        k1, k2, k3, k4 = lens.coefficients
+        square = angles**2
+        placed = angles * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
+    else:
+        k1, k2, _, _, k3, k4, k5, k6 = np.pad(lens.coefficients, (0, 8 - len(lens.coefficients)))
+        square = np.tan(angles) ** 2
+        below = 1 + square * (k4 + square * (k5 + square * k6))
+        placed = np.sqrt(square) * (1 + square * (k1 + square * (k2 + square * k3))) / np.where(below > 0, below, np.nan)
+    grows = np.diff(placed) > 0
+    return float(np.tan(angles[-1 if grows.all() else int(np.argmin(grows))]))
