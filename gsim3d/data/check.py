@@ -147,6 +147,7 @@ def describe(scene: Scene) -> str:
         f"{scene.name}: {scene.layout}, {scene.n_steps} steps at {scene.fps:g} a second, "
         f"{scene.n_cams} cameras{moves}, "
         f"{pixels} pixels, depth {scene.near:.2f} to {scene.far:.2f} m, bounds {size} m, masks: {labels}"
+        + "".join(f"; {note}" for note in scene.recording.notes)
     )
 
 

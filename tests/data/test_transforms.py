@@ -1,0 +1,202 @@
+"""NeRF-synthetic and D-NeRF, and what transforms.json lacks: named as missing."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from gsim3d.data import Scene, find_scenes
+from gsim3d.data.check import check_scene, describe
+from gsim3d.data.recording import MOVING
+from gsim3d.errors import InputError
+from tests.data.made_scenes import edit_json, make_scene, save, write_transforms
+
+FLIP = np.diag([1.0, -1, -1, 1])
+ANGLE = 0.9
+
+
+def write_synthetic(folder, made, splits, times=None, suffix=".png", **top):
+    """NeRF-synthetic's folders: square pixels, RGBA, no size. ``splits``: name -> rows (step, camera)."""
+    width = made.labels.shape[3]
+    focal = 0.5 * width / np.tan(0.5 * ANGLE)
+    for name, rows in splits.items():
+        frames = []
+        for number, (step, cam) in enumerate(rows):
+            alpha = (made.labels[step, cam] > 0) * np.uint8(255)
+            save(folder / name / f"r_{number}{suffix}", np.concatenate([made.rgb[step, cam], alpha[..., None]], -1))
+            frames.append({
+                "file_path": f"./{name}/r_{number}", "rotation": 0.01,
+                "transform_matrix": (np.linalg.inv(made.viewmats[step, cam]) @ FLIP).tolist(),
+                **({} if times is None else {"time": times[step]}),
+            })  # fmt: skip
+        content = {"camera_angle_x": ANGLE, "frames": frames, "near": 1.0, "far": 6.0, **top}
+        (folder / f"transforms_{name}.json").write_text(json.dumps(content))
+    return focal
+
+
+def test_the_views_of_nerf_synthetic_are_cameras_of_one_step(tmp_path):
+    made = make_scene(n_steps=1, n_cams=5)
+    focal = write_synthetic(tmp_path, made, {"train": [(0, 0), (0, 1), (0, 2)], "test": [(0, 3)], "val": [(0, 4)]})
+    scene = Scene.open(tmp_path)
+    assert (scene.n_steps, scene.n_cams) == (1, 5) and scene.camera_names[0] == "./test/r_0"
+    order = [int(scene.camera_names.index(name)) for name in ("./train/r_0", "./train/r_1", "./train/r_2")]
+    cameras = scene.cameras_at(order, [0])
+    np.testing.assert_allclose(cameras.viewmats, made.viewmats[0, :3], atol=1e-6)
+    np.testing.assert_allclose(cameras.Ks, np.broadcast_to([[focal, 0, 24], [0, focal, 16], [0, 0, 1]], (3, 3, 3)), rtol=1e-6)
+    labels = scene.segmentation(order, [0])[0].numpy()
+    np.testing.assert_array_equal(labels == MOVING, made.labels[0, :3] > 0)
+    assert "transforms_val.json are cameras" in describe(scene) and find_scenes(tmp_path) == [tmp_path]
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_d_nerf_is_one_camera_that_moves(tmp_path, count):
+    made = make_scene(moving=True, n_steps=6)
+    rows = [(step, step % 3) for step in range(6)]
+    write_synthetic(tmp_path, made, {"train": rows, "test": rows[:count]}, times=np.linspace(0, 1, 6).tolist())
+    scene = Scene.open(tmp_path)
+    assert (scene.n_steps, scene.n_cams, scene.cameras_move) == (6, 1, True) and scene.fps == pytest.approx(5)
+    wanted = np.stack([made.viewmats[row] for row in rows])
+    np.testing.assert_allclose(scene.cameras_at([0], range(6)).viewmats, wanted, atol=1e-6)
+    assert "transforms_test.json has other times" in describe(scene)
+    assert check_scene(tmp_path).problems == ()
+
+
+def test_held_out_cameras_of_the_same_times_are_cameras(tmp_path):
+    made = make_scene(n_steps=4)
+    splits = {"train": [(step, 0) for step in range(4)], "test": [(step, 1) for step in range(4)]}
+    write_synthetic(tmp_path, made, splits, times=[0, 0.25, 0.5, 0.75])
+    scene = Scene.open(tmp_path)
+    assert scene.camera_names == ("test/r", "train/r") and (scene.n_steps, scene.fps) == (4, 4.0)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".webp"])
+def test_paths_without_suffix(tmp_path, suffix):
+    made = make_scene(n_steps=1)
+    write_synthetic(tmp_path, made, {"train": [(0, 0), (0, 1)]}, suffix=suffix)
+    for number in range(2):
+        (tmp_path / "train" / f"r_{number}{suffix}").rename(tmp_path / "train" / f"r_{number}.5{suffix}")
+    edit_json(tmp_path / "transforms_train.json", lambda c: [f.update(file_path=f["file_path"] + ".5") for f in c["frames"]])
+    assert Scene.open(tmp_path).film([0, 1], [0]).float().mean() > 5
+
+
+def test_the_angles_of_both_axes_and_of_single_frames(tmp_path):
+    made = make_scene(n_steps=1)
+    write_synthetic(tmp_path, made, {"train": [(0, 0), (0, 1)]}, camera_angle_y=0.5)
+    edit_json(tmp_path / "transforms_train.json", lambda c: c["frames"][1].update(camera_angle_x=0.7, cx=20.0, w=48, h=32))
+    Ks = Scene.open(tmp_path).cameras_at([0, 1], [0]).Ks
+    fy = 16 / np.tan(0.25)
+    wanted = [[[24 / np.tan(ANGLE / 2), 0, 24], [0, fy, 16], [0, 0, 1]], [[24 / np.tan(0.35), 0, 20], [0, fy, 16], [0, 0, 1]]]
+    np.testing.assert_allclose(Ks, wanted, rtol=1e-6)
+    for value in (0, 3.2, -0.1, "wide", [0.9]):
+        edit_json(tmp_path / "transforms_train.json", lambda c: c.update(camera_angle_x=value))
+        with pytest.raises(InputError, match="transforms_train.json: .*camera_angle_x must be"):
+            Scene.open(tmp_path)
+
+
+def test_transforms_json_wins_over_the_splits(tmp_path):
+    made = make_scene(n_steps=1)
+    write_synthetic(tmp_path, made, {"train": [(0, 0), (0, 1), (0, 2)]})
+    write_transforms(tmp_path, make_scene(n_steps=2))
+    assert Scene.open(tmp_path).n_steps == 2
+
+
+MISSING = {
+    "fl_x": r"intrinsics of camera .*frame 1: fl_x, fl_y are missing, or camera_angle_x instead",
+    "cx": r"intrinsics of camera .*frame 1: cx is missing",
+    "cy": r"intrinsics of camera .*frame 1: cy is missing",
+    "transform_matrix": r"transform_matrix of camera .*frame 1 is missing",
+    "time": r"has no time, others have",
+    "file_path": r"file_path must be text; got 'None'",
+}
+
+
+@pytest.mark.parametrize("key", MISSING)
+@pytest.mark.parametrize("how", ["removed", "null"])
+def test_missing_keys_are_named_as_missing(tmp_path, key, how):
+    write_transforms(tmp_path, make_scene())
+
+    def edit(content):
+        for frame in content["frames"]:
+            if frame["file_path"].endswith("00002.png"):
+                frame.pop(key) if how == "removed" else frame.update({key: None})
+                key == "fl_x" and frame.pop("fl_y")
+
+    edit_json(tmp_path / "transforms.json", edit)
+    message = "time of frames holds null" if (key, how) == ("time", "null") else MISSING[key]
+    with pytest.raises(InputError, match="transforms.json: .*" + message) as error:
+        Scene.open(tmp_path)
+    assert "not finite" not in str(error.value)
+
+
+@pytest.mark.parametrize("value", [True, "1.0", [[1, 0, 0, "x"]] * 4, [[True] * 4] * 4, [[None] * 4] * 4, {"a": 1}])
+def test_values_of_a_wrong_type_are_named(tmp_path, value):
+    write_transforms(tmp_path, make_scene())
+    edit_json(tmp_path / "transforms.json", lambda content: content["frames"][0].update(transform_matrix=value))
+    with pytest.raises(InputError, match="transform_matrix of camera .* (must be numbers|holds null)"):
+        Scene.open(tmp_path)
+
+
+def test_two_frames_of_one_camera_need_times(tmp_path):
+    write_transforms(tmp_path, make_scene())
+
+    def edit(content):
+        for frame in content["frames"]:
+            frame.pop("time")
+            frame["camera"] = frame["file_path"].split("/")[1]
+
+    edit_json(tmp_path / "transforms.json", edit)
+    with pytest.raises(InputError, match="12 frames without time .* 3 cameras"):
+        Scene.open(tmp_path)
+
+
+@pytest.mark.parametrize("text", [
+    rb'{"frames": [{"file_path": "\xff.png"}]}', rb'{"frames": [{"file_path": "a\ud800.png"}]}',
+    rb'{"frames": [], "na\udc80me": 1}', b'{"frames": [{"file_path": "\xed\xa0\x80.png"}]}',
+])  # fmt: skip
+def test_text_that_no_file_can_be_named_by_is_refused(tmp_path, text):
+    """Bytes that are no UTF-8, and halves of surrogate pairs, which can neither be printed nor opened."""
+    for name in ("transforms.json", "cameras.json", "metadata.json"):
+        folder = tmp_path / name[:5]
+        folder.mkdir()
+        (folder / name).write_bytes(text)
+        with pytest.raises(InputError, match=f"{name} cannot be read: ") as error:
+            Scene.open(folder)
+        str(error.value).encode()
+
+
+def test_names_beyond_latin_are_names(tmp_path):
+    write_transforms(tmp_path, make_scene(n_steps=1))
+    edit_json(tmp_path / "transforms.json", lambda content: [f.update(camera=f["file_path"] + "\U0001f3a5é") for f in content["frames"]])
+    assert Scene.open(tmp_path).camera_names[0].endswith("\U0001f3a5é")
+
+
+def test_utm_coordinates_keep_their_digits(tmp_path):
+    made = make_scene()
+    write_transforms(tmp_path, made)
+    where = np.array([500000.0, 4649776.0, 100.0])
+
+    def move(content):
+        content.pop("bounds"), content.pop("origin")
+        for frame in content["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, 3] += where
+            frame["transform_matrix"] = matrix.tolist()
+
+    edit_json(tmp_path / "transforms.json", move)
+    viewmats = Scene.open(tmp_path).recording.viewmats
+    assert viewmats.dtype == np.float64
+    point = np.array([0.3, 0.2, 0.1])
+    for found, wanted in zip(viewmats[0], made.viewmats[0], strict=True):
+        seen = found[:3, :3] @ (point + where) + found[:3, 3]
+        np.testing.assert_allclose(seen, wanted[:3, :3] @ point + wanted[:3, 3], atol=1e-8)
+
+
+def test_mixed_masks_of_one_scene(tmp_path):
+    """A frame without a mask is named, whether its image has alpha or not."""
+    write_transforms(tmp_path, make_scene())
+    edit_json(tmp_path / "transforms.json", lambda content: content["frames"][-1].pop("label_path"))
+    file = tmp_path / "images/cam_0/frame_00001.png"
+    cv2.imwrite(str(file), cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2BGRA))
+    with pytest.raises(InputError, match="frame 0 has no mask_path"):
+        Scene.open(tmp_path).segmentation([0], [0])
