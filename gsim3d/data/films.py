@@ -241,7 +241,8 @@ def _steps(
     notes = []
     for video in videos.values():
         if video.rate is None and resample is None:
-            problems.add(f'{video.what} is uneven: {video.unevenness}; give "resample", steps a second, in {source.name}')
+            hint = f'give "resample", steps a second, in {source.name}'
+            problems.add(f"{video.what} is uneven: {video.unevenness}; {hint}")
     rates = {name: video.rate for name, video in videos.items() if video.rate}
     slow, fast = min(rates, key=rates.get, default=None), max(rates, key=rates.get, default=None)
     told = rates.get(slow)
@@ -268,7 +269,8 @@ def _steps(
         longest = max(map(len, ticks.values()))
         ticks = {name: [tick for tick in own if low <= tick <= high] for name, own in ticks.items()}
         if high - low + 1 < longest:
-            notes.append(f"the videos start at different times: {max(0, high - low + 1)} of {longest} frames are common")
+            common = max(0, high - low + 1)
+            notes.append(f"the videos start at different times: {common} of {longest} frames are common")
     common = common_numbers(ticks, source, problems) if ticks else []
     if not common:
         raise InputError(f"{source}: the cameras have no frame number in common")
@@ -286,8 +288,10 @@ def _resampled(
         times[name] = own * frames.rate / fps if fps and isinstance(frames, Video) and frames.rate else own
     low, high = max(own[0] for own in times.values()), min(own[-1] for own in times.values())
     count = math.floor((high - low) * rate + 1e-6) + 1 if high >= low else 0
-    if not 1 <= count <= MAX_STEPS:
-        raise InputError(f"{source}: the cameras have no time in common" if count < 1 else f"{source}: resample is too large")
+    if count < 1:
+        raise InputError(f"{source}: the cameras have no time in common")
+    if count > MAX_STEPS:
+        raise InputError(f"{source}: resample gives {count} steps; more than {MAX_STEPS} are taken to be a mistake")
     grid = low + np.arange(count) / rate
     numbers, off, again = {}, 0.0, 0
     for name, own in times.items():

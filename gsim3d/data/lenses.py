@@ -136,6 +136,7 @@ def _reach(lens: Lens) -> float:
         k1, k2, _, _, k3, k4, k5, k6 = np.pad(lens.coefficients, (0, 8 - len(lens.coefficients)))
         square = np.tan(angles) ** 2
         below = 1 + square * (k4 + square * (k5 + square * k6))
-        placed = np.sqrt(square) * (1 + square * (k1 + square * (k2 + square * k3))) / np.where(below > 0, below, np.nan)
+        above = 1 + square * (k1 + square * (k2 + square * k3))
+        placed = np.sqrt(square) * above / np.where(below > 0, below, np.nan)
     grows = np.diff(placed) > 0
     return float(np.tan(angles[-1 if grows.all() else int(np.argmin(grows))]))

@@ -69,7 +69,7 @@ def read(folder: Path, problems: Problems) -> Recording:
 
 
 def recording_of(folder: Path, source: Path, description: dict, frames: list[dict], problems: Problems) -> Recording:
-    """The scene of ``frames`` that have all their keys; fps, near, far, origin and bounds are those of ``description``."""
+    """The scene of ``frames`` that have all their keys; fps, near, far, origin and bounds lie in ``description``."""
     if len(frames) > MAX_STEPS:
         raise InputError(f"{source}: {len(frames)} frames; more than {MAX_STEPS} are taken to be a mistake")
     table, times = _table(frames, source, problems)
@@ -147,7 +147,9 @@ def _table(frames: list[dict], source: Path, problems: Problems) -> tuple[dict, 
     if len(timeless) == len(frames):
         table = {str(frame.get("camera", frame["file_path"])): [frame] for frame in frames}
         if len(table) < len(frames):
-            raise InputError(f"{source}: {len(frames)} frames without time are {len(table)} cameras'; give every frame its time")
+            raise InputError(
+                f"{source}: {len(frames)} frames without time are of {len(table)} cameras; give every frame its time"
+            )
         return table, np.zeros(1)
     if timeless:
         raise InputError(

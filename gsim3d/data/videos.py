@@ -41,10 +41,10 @@ class Video:
         self.numbers, self.times = list(range(len(found.times))), found.times
         self.rate = _even_rate(found.times, found.rate)
         if self.rate is None:
-            gaps = 1000 * np.diff(found.times)
+            gaps = (1000 * np.diff(found.times)).round(1)
             self.unevenness = (
-                f"its {len(found.times)} frames are {gaps.min():.4g} to {gaps.max():.4g} ms apart, though its header "
-                f"tells of {found.rate:.4g} a second"
+                f"its {len(found.times)} frames are {gaps.min():g} to {gaps.max():g} ms apart, though its header tells of "
+                f"{found.rate:.4g} a second"
             )
 
     def read(self, numbers: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:

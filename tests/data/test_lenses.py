@@ -24,8 +24,10 @@ def in_lens(ray: np.ndarray, lens: Lens) -> np.ndarray:
     return cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), K, lens.coefficients)[0].ravel()
 
 
-@pytest.mark.parametrize("model, keys", [("OPENCV_FISHEYE", FISHEYE), ("OPENCV", RATIONAL), ("FULL_OPENCV", RATIONAL),
-                                         ("SIMPLE_RADIAL_FISHEYE", {"k1": -0.05}), ("RADIAL", {"k1": 0.1, "k2": 0.02})])  # fmt: skip
+@pytest.mark.parametrize("model, keys", [
+    ("OPENCV_FISHEYE", FISHEYE), ("OPENCV", RATIONAL), ("FULL_OPENCV", RATIONAL),
+    ("SIMPLE_RADIAL_FISHEYE", {"k1": -0.05}), ("RADIAL", {"k1": 0.1, "k2": 0.02}),
+])  # fmt: skip
 def test_undistorted_pixels_come_from_where_the_lens_puts_their_rays(model, keys):
     lens = lens_of({"camera_model": model, **keys}, "", Problems())
     y, x = np.mgrid[:160, :200].astype(np.float32)

@@ -43,7 +43,7 @@ def test_the_views_of_nerf_synthetic_are_cameras_of_one_step(tmp_path):
     order = [int(scene.camera_names.index(name)) for name in ("./train/r_0", "./train/r_1", "./train/r_2")]
     cameras = scene.cameras_at(order, [0])
     np.testing.assert_allclose(cameras.viewmats, made.viewmats[0, :3], atol=1e-6)
-    np.testing.assert_allclose(cameras.Ks, np.broadcast_to([[focal, 0, 24], [0, focal, 16], [0, 0, 1]], (3, 3, 3)), rtol=1e-6)
+    np.testing.assert_allclose(cameras.Ks, [[[focal, 0, 24], [0, focal, 16], [0, 0, 1]]] * 3, rtol=1e-6)
     labels = scene.segmentation(order, [0])[0].numpy()
     np.testing.assert_array_equal(labels == MOVING, made.labels[0, :3] > 0)
     assert "transforms_val.json are cameras" in describe(scene) and find_scenes(tmp_path) == [tmp_path]
@@ -76,18 +76,22 @@ def test_paths_without_suffix(tmp_path, suffix):
     write_synthetic(tmp_path, made, {"train": [(0, 0), (0, 1)]}, suffix=suffix)
     for number in range(2):
         (tmp_path / "train" / f"r_{number}{suffix}").rename(tmp_path / "train" / f"r_{number}.5{suffix}")
-    edit_json(tmp_path / "transforms_train.json", lambda c: [f.update(file_path=f["file_path"] + ".5") for f in c["frames"]])
+    edit_json(
+        tmp_path / "transforms_train.json",
+        lambda content: [frame.update(file_path=frame["file_path"] + ".5") for frame in content["frames"]],
+    )
     assert Scene.open(tmp_path).film([0, 1], [0]).float().mean() > 5
 
 
 def test_the_angles_of_both_axes_and_of_single_frames(tmp_path):
     made = make_scene(n_steps=1)
     write_synthetic(tmp_path, made, {"train": [(0, 0), (0, 1)]}, camera_angle_y=0.5)
-    edit_json(tmp_path / "transforms_train.json", lambda c: c["frames"][1].update(camera_angle_x=0.7, cx=20.0, w=48, h=32))
+    own = {"camera_angle_x": 0.7, "cx": 20.0, "w": 48, "h": 32}
+    edit_json(tmp_path / "transforms_train.json", lambda content: content["frames"][1].update(own))
     Ks = Scene.open(tmp_path).cameras_at([0, 1], [0]).Ks
     fy = 16 / np.tan(0.25)
-    wanted = [[[24 / np.tan(ANGLE / 2), 0, 24], [0, fy, 16], [0, 0, 1]], [[24 / np.tan(0.35), 0, 20], [0, fy, 16], [0, 0, 1]]]
-    np.testing.assert_allclose(Ks, wanted, rtol=1e-6)
+    for K, fx, cx in zip(Ks, (24 / np.tan(ANGLE / 2), 24 / np.tan(0.35)), (24, 20), strict=True):
+        np.testing.assert_allclose(K, [[fx, 0, cx], [0, fy, 16], [0, 0, 1]], rtol=1e-6)
     for value in (0, 3.2, -0.1, "wide", [0.9]):
         edit_json(tmp_path / "transforms_train.json", lambda c: c.update(camera_angle_x=value))
         with pytest.raises(InputError, match="transforms_train.json: .*camera_angle_x must be"):
@@ -167,7 +171,10 @@ def test_text_that_no_file_can_be_named_by_is_refused(tmp_path, text):
 
 def test_names_beyond_latin_are_names(tmp_path):
     write_transforms(tmp_path, make_scene(n_steps=1))
-    edit_json(tmp_path / "transforms.json", lambda content: [f.update(camera=f["file_path"] + "\U0001f3a5é") for f in content["frames"]])
+    edit_json(
+        tmp_path / "transforms.json",
+        lambda content: [frame.update(camera=frame["file_path"] + "\U0001f3a5é") for frame in content["frames"]],
+    )
     assert Scene.open(tmp_path).camera_names[0].endswith("\U0001f3a5é")
 
 
