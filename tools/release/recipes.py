@@ -41,7 +41,7 @@ class Recipe:
     preset: str = "published"
     options: dict[str, Any] = field(default_factory=dict)
     capacity: int = 240
-    first_films: int = 48
+    first_films: int = 24
     n_validation: int = 24
 
     def stream(self) -> World:

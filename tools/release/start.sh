@@ -16,12 +16,15 @@ if compgen -G "$packed/wheels/*.whl" >/dev/null; then
   export PYTHONPATH="$work/site"
 fi
 cd "$work/code"
+[ ! -x /usr/bin/g++ ] || export CXX="${CXX:-/usr/bin/g++}" CC="${CC:-/usr/bin/gcc}"  # it has a shared libstdc++
 sources="$(find csrc setup.py -type f -print0 | sort -z | xargs -0 cat | sha256sum | cut -d ' ' -f 1)"
 if [ "$(cat "$packed/build/sources" 2>/dev/null)" = "$sources" ]; then
-  cp "$packed"/build/*.so gsim3d/
+  for file in "$packed"/build/*.so.xz; do xz -dc "$file" >"gsim3d/$(basename "${file%.xz}")"; done
 else
   GSIM3D_CUDA=1 python3 setup.py -q build_ext --inplace
-  cp gsim3d/*.so "$work/build/" && echo "$sources" >"$work/build/sources"
+  strip --strip-debug gsim3d/*.so
+  for file in gsim3d/*.so; do xz -T0 -c "$file" >"$work/build/$(basename "$file").xz"; done
+  echo "$sources" >"$work/build/sources"
 fi
 gpus="$(nvidia-smi -L | wc -l)"
 command=(python3 -u)
