@@ -17,7 +17,7 @@ if compgen -G "$packed/wheels/*.whl" >/dev/null; then
 fi
 cd "$work/code"
 [ ! -x /usr/bin/g++ ] || export CXX="${CXX:-/usr/bin/g++}" CC="${CC:-/usr/bin/gcc}"  # it has a shared libstdc++
-sources="$(find csrc setup.py -type f -print0 | sort -z | xargs -0 cat | sha256sum | cut -d ' ' -f 1)"
+sources="$(find csrc setup.py -type f -print0 | LC_ALL=C sort -z | xargs -0 cat | sha256sum | cut -d ' ' -f 1)"
 if [ "$(cat "$packed/build/sources" 2>/dev/null)" = "$sources" ]; then
   for file in "$packed"/build/*.so.xz; do xz -dc "$file" >"gsim3d/$(basename "${file%.xz}")"; done
 else
