@@ -1,10 +1,16 @@
-"""Image metrics, one value an image; float32 images are compared in float64."""
+"""Image metrics, one value an image; computed in float64.
+
+Images are floating with colours in [0, 1], or uint8, which is divided by 255; other dtypes and ranges are refused.
+"""
 
 from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from gsim3d.errors import InputError
+from gsim3d.perceptual.colors import as_colors
 
 PSNR_CAP = 100.0  # dB, given to images whose mean squared error is below 1e-10, perfect ones included
 
@@ -15,7 +21,7 @@ _SSIM_K1, _SSIM_K2 = 0.01, 0.03
 
 
 def psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Peak signal-to-noise ratio of each image, both clipped to [0, 1], over all pixels or over a mask.
+    """Peak signal-to-noise ratio of each image, over all pixels or over a mask.
 
     ``-10 log10 max(1e-10, mean of squared errors over counted pixels and channels)``; so never above 100 dB, never
     infinite. An image with an empty mask has no such value: it is NaN, and :func:`mean_of_counted` leaves it out.
@@ -26,10 +32,10 @@ def psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     Returns:
         float64 [I], dB.
     Raises:
-        ValueError: shapes differ.
+        InputError: shapes differ, or images are not in [0, 1].
     """
-    _check(pred, target, mask)
-    error = (pred.double().clamp(0, 1) - target.double().clamp(0, 1)).square().mean(-1)
+    pred, target = _checked(pred, target, mask)
+    error = (pred - target).square().mean(-1)
     weight = torch.ones_like(error) if mask is None else mask.double()
     mean = (error * weight).sum((1, 2)) / weight.sum((1, 2))
     return -10 * torch.log10(mean.clamp(min=10 ** (-PSNR_CAP / 10)))
@@ -38,18 +44,20 @@ def psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
 def ssim(pred: Tensor, target: Tensor) -> Tensor:
     """Structural similarity of each image: Gaussian window of 11 pixels (sigma 1.5), sample covariance, range 1.
 
-    The mean over channels and over the pixels whose whole window lies inside the image. Inputs are not clipped.
+    The mean over channels and over the pixels whose whole window lies inside the image.
 
     Args:
         pred, target: [I, H, W, C], H and W at least 11.
     Returns:
         float64 [I] in [-1, 1].
+    Raises:
+        InputError: shapes differ, or images are not in [0, 1] or too small.
     Source: Wang et al. 2004, "Image quality assessment: from error visibility to structural similarity".
     """
-    _check(pred, target, None)
+    x, y = _checked(pred, target)
     size, radius = SSIM_WINDOW, SSIM_WINDOW // 2
     if min(pred.shape[1:3]) < size:
-        raise ValueError(f"ssim: images must be at least {size} x {size}; got {tuple(pred.shape[1:3])}")
+        raise InputError(f"ssim: images must be at least {size} x {size}; got {tuple(pred.shape[1:3])}")
     offsets = torch.arange(-radius, radius + 1, dtype=torch.float64, device=pred.device)
     window = torch.exp(-0.5 * (offsets / _SSIM_SIGMA) ** 2)
     window = window / window.sum()
@@ -59,7 +67,6 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
         image = F.conv2d(F.conv2d(image, window[None, None, :, None]), window[None, None, None])
         return image.reshape(pred.shape[0], pred.shape[3], *image.shape[2:])
 
-    x, y = pred.double(), target.double()
     mean_x, mean_y = blur(x), blur(y)
     unbiased = size**2 / (size**2 - 1)
     var_x = unbiased * (blur(x * x) - mean_x**2)
@@ -76,8 +83,11 @@ def mean_of_counted(values: Tensor) -> float | None:
     return float(counted.mean()) if len(counted) else None
 
 
-def _check(pred: Tensor, target: Tensor, mask: Tensor | None) -> None:
-    if pred.ndim != 4 or pred.shape != target.shape:
-        raise ValueError(f"images must both be [I, H, W, C]; got {tuple(pred.shape)} and {tuple(target.shape)}")
+def _checked(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Both in float64."""
+    pred, target = as_colors(pred, "pred"), as_colors(target, "target")
+    if pred.ndim != 4 or pred.shape != target.shape or 0 in pred.shape[1:]:
+        raise InputError(f"images must both be [I, H, W, C]; got {tuple(pred.shape)} and {tuple(target.shape)}")
     if mask is not None and (mask.shape != pred.shape[:3] or mask.dtype != torch.bool):
-        raise ValueError(f"mask must be bool {tuple(pred.shape[:3])}; got {mask.dtype} {tuple(mask.shape)}")
+        raise InputError(f"mask must be bool {tuple(pred.shape[:3])}; got {mask.dtype} {tuple(mask.shape)}")
+    return pred.double(), target.double()

@@ -12,7 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsim3d.errors import InputError
 from gsim3d.layers import exact_convolutions
+from gsim3d.perceptual.colors import as_colors, check_colors
 from gsim3d.perceptual.i3d import I3D, INPUT_SIZE
 from gsim3d.perceptual.weights import load
 
@@ -26,19 +28,21 @@ def clip_features(clips: Tensor) -> Tensor:
     """I3D's logits of each clip, resized to 224 x 224 (bilinear, the whole image, aspect not kept).
 
     Args:
-        clips: [K, T, H, W, 3], T at least 10, colours in [0, 1].
+        clips: [K, T, H, W, 3], T at least 10, floating with colours in [0, 1], or uint8, which is divided by 255.
     Returns:
         float64 [K, 400].
     Raises:
-        ValueError: shapes that do not fit.
-        InputError: the weights are not installed (`gsim3d weights fvd`).
+        InputError: shapes that do not fit, clips that are not in [0, 1], or the weights are not installed
+            (`gsim3d weights fvd`).
     """
-    if clips.ndim != 5 or clips.shape[-1] != 3 or clips.shape[1] < MIN_FRAMES:
-        raise ValueError(f"fvd: clips must be [K, T, H, W, 3] with T >= {MIN_FRAMES}; got {tuple(clips.shape)}")
+    check_colors(clips, "fvd: clips")
+    if clips.ndim != 5 or clips.shape[-1] != 3 or clips.shape[1] < MIN_FRAMES or 0 in clips.shape[2:]:
+        raise InputError(f"fvd: clips must be [K, T, H, W, 3] with T >= {MIN_FRAMES}; got {tuple(clips.shape)}")
     module = load("fvd_i3d", I3D).to(clips.device)
     features = []
     for clip in clips:  # one at a time: a clip alone takes some hundred megabytes
-        frames = F.interpolate(clip.permute(0, 3, 1, 2).float(), (INPUT_SIZE, INPUT_SIZE), mode="bilinear")
+        frames = as_colors(clip, "fvd: clips").permute(0, 3, 1, 2).float()
+        frames = F.interpolate(frames, (INPUT_SIZE, INPUT_SIZE), mode="bilinear")
         with exact_convolutions():
             features.append(module((2 * frames - 1).transpose(0, 1)[None])[0].double())
     return torch.stack(features) if features else torch.zeros(0, 400, dtype=torch.float64)
@@ -61,10 +65,13 @@ def frechet_distance(a: Tensor, b: Tensor) -> float:
     Args:
         a, b: [N, D] and [M, D], N and M at least 2.
     Raises:
-        ValueError: shapes that do not fit.
+        InputError: shapes that do not fit, or vectors that are not finite.
     """
     if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1] or min(len(a), len(b)) < MIN_CLIPS:
-        raise ValueError(f"frechet_distance: [N, D] and [M, D], N, M >= 2, are needed; got {a.shape} and {b.shape}")
+        got = f"{tuple(a.shape)} and {tuple(b.shape)}"
+        raise InputError(f"frechet_distance: [N, D] and [M, D], N, M >= 2, are needed; got {got}")
+    if not (a.isfinite().all() and b.isfinite().all()):
+        raise InputError("frechet_distance: vectors must be finite")
     means, roots = [], []
     for rows in (a.double(), b.double()):
         mean = rows.mean(0)

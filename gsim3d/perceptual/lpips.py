@@ -15,7 +15,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from gsim3d.errors import InputError
 from gsim3d.layers import exact_convolutions
+from gsim3d.perceptual.colors import as_colors
 from gsim3d.perceptual.weights import load
 
 # Mean and deviation of the classifier's training images, for inputs in [-1, 1].
@@ -111,19 +113,20 @@ def lpips(pred: Tensor, target: Tensor, network: str = "vgg") -> Tensor:
     """LPIPS of each pair of images; 0 for equal ones.
 
     Args:
-        pred, target: [I, H, W, 3], colours in [0, 1]; not clipped.
+        pred, target: [I, H, W, 3], floating with colours in [0, 1], or uint8, which is divided by 255.
         network: ``"alex"`` (sides of at least 31 pixels) or ``"vgg"`` (16).
     Returns:
         float64 [I].
     Raises:
-        ValueError: shapes that do not fit.
-        InputError: the weights are not installed (`gsim3d weights lpips`).
+        InputError: shapes that do not fit, images that are not in [0, 1], or the weights are not installed
+            (`gsim3d weights lpips`).
     """
+    pred, target = as_colors(pred, "lpips: pred"), as_colors(target, "lpips: target")
     if pred.ndim != 4 or pred.shape[-1] != 3 or pred.shape != target.shape:
-        raise ValueError(f"lpips: images must both be [I, H, W, 3]; got {tuple(pred.shape)} and {tuple(target.shape)}")
+        raise InputError(f"lpips: images must both be [I, H, W, 3]; got {tuple(pred.shape)} and {tuple(target.shape)}")
     if min(pred.shape[1:3]) < MIN_SIZE[network]:
         least = MIN_SIZE[network]
-        raise ValueError(f"lpips: {network} needs images of at least {least} x {least}; got {tuple(pred.shape[1:3])}")
+        raise InputError(f"lpips: {network} needs images of at least {least} x {least}; got {tuple(pred.shape[1:3])}")
     module = load(f"lpips_{network}", lambda: LPIPS(network)).to(pred.device)
     pred, target = (images.permute(0, 3, 1, 2).float() for images in (pred, target))
     pairs = zip(pred.split(_CHUNK), target.split(_CHUNK), strict=True)

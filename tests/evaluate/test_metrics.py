@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr, ssim
 from tests.oracle.metrics import psnr_reference, ssim_reference
 
@@ -15,7 +16,7 @@ def images(seed, *shape):
 
 
 def test_psnr_equals_its_definition():
-    pred, target = images(0, 3, 9, 7, 3) * 1.4 - 0.2, images(1, 3, 9, 7, 3)
+    pred, target = images(0, 3, 9, 7, 3), images(1, 3, 9, 7, 3)
     mask = images(2, 3, 9, 7) > 0.6
     for chosen in (None, mask):
         for i in range(3):
@@ -37,12 +38,12 @@ def test_psnr_is_capped_and_an_empty_mask_is_not_counted():
 def test_psnr_of_a_known_error():
     target = torch.full((1, 5, 5, 3), 0.5)
     assert psnr(target + 0.1, target).item() == pytest.approx(20.0, abs=1e-5)
-    assert psnr(target + 9.0, target).item() == pytest.approx(-20 * math.log10(0.5), abs=1e-9)  # clipped to 1
+    assert psnr(target + 0.5, target).item() == pytest.approx(-20 * math.log10(0.5), abs=1e-9)
 
 
 def test_ssim_equals_its_definition():
     pred, target = images(3, 2, 17, 13, 3), images(4, 2, 17, 13, 3)
-    pred[1] = target[1] + 0.05 * pred[1]
+    pred[1] = 0.95 * target[1] + 0.05 * pred[1]
     for i in range(2):
         expected = ssim_reference(pred[i].numpy().astype(np.float64), target[i].numpy().astype(np.float64))
         assert ssim(pred, target)[i].item() == pytest.approx(expected, abs=1e-10)
@@ -65,12 +66,57 @@ def test_shapes_are_checked():
         psnr(image, image, torch.ones(1, 12, 12))
 
 
+METRICS = (psnr, ssim)
+BAD = {
+    "as_bytes": lambda x: x * 255,
+    "slightly_above": lambda x: x + 1e-3 * (x == x.max()) + (1 - x.max()),
+    "below": lambda x: x - 0.5,
+    "nan": lambda x: torch.where(x == x.max(), torch.nan, x),
+    "inf": lambda x: torch.where(x == x.max(), torch.inf, x),
+    "int64": lambda x: (x * 255).long(),
+    "int8": lambda x: (x * 100).to(torch.int8),
+    "uint16": lambda x: (x * 65535).to(torch.int32).to(torch.uint16),
+    "bool": lambda x: x > 0.5,
+    "complex": lambda x: x.to(torch.complex64),
+    "numpy": lambda x: x.numpy(),
+}
+
+
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("what", BAD)
+def test_images_of_another_range_or_dtype_are_refused(metric, what):
+    good = images(0, 2, 12, 13, 3)
+    bad = BAD[what](good)
+    for arguments, name in (((bad, good), "pred"), ((good, bad), "target")):
+        with pytest.raises(InputError, match=f"^{name}: (colours must be in|must be)"):
+            metric(*arguments)
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_bytes_are_scaled_and_every_float_is_read(metric):
+    a, b = ((255 * images(seed, 2, 12, 13, 3)).to(torch.uint8) for seed in (0, 1))
+    expected = metric(a / 255, b / 255)
+    assert torch.equal(metric(a, b), expected) and torch.equal(metric(a, b / 255), expected)
+    assert expected.max() < 20
+    for dtype, tolerance in ((torch.float16, 1e-2), (torch.bfloat16, 0.1), (torch.float64, 1e-6)):
+        assert torch.allclose(metric((a.double() / 255).to(dtype), b), expected, rtol=tolerance, atol=tolerance)
+    rounded = (a / 255) * (1 + 1e-7)
+    assert torch.allclose(metric(rounded, b), expected, rtol=1e-5)
+
+
+def test_images_without_pixels_are_refused():
+    for shape in ((1, 0, 12, 3), (1, 12, 12, 0)):
+        with pytest.raises(InputError, match="images must both be"):
+            psnr(torch.zeros(shape), torch.zeros(shape))
+    assert psnr(torch.zeros(0, 4, 4, 3), torch.zeros(0, 4, 4, 3)).shape == (0,)
+
+
 # structural_similarity of scikit-image 0.26 (gaussian_weights, sigma 1.5, win_size 11, data_range 1, channel_axis 2).
-SCIKIT_IMAGE = [-0.021749193141947943, 0.9881103296553451]
+SCIKIT_IMAGE = [-0.021749193141947943, 0.9751051739546357]
 
 
 def test_ssim_equals_scikit_image():
     i, y, x, c = np.meshgrid(np.arange(2), np.arange(48), np.arange(64), np.arange(3), indexing="ij")
     a, b = (0.5 + 0.5 * np.sin(0.37 * (s + 1) * y + 0.21 * (c + 1) * x + 0.9 * i + s) for s in (0, 1))
-    b[1] = a[1] + 0.1 * (b[1] - 0.5)
+    b[1] = 0.9 * a[1] + 0.1 * b[1]
     assert ssim(torch.from_numpy(b), torch.from_numpy(a)).tolist() == pytest.approx(SCIKIT_IMAGE, abs=1e-12)

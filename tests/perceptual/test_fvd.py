@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from gsim3d.errors import InputError
 from gsim3d.perceptual import fvd, i3d
 from gsim3d.perceptual.fvd import clip_features, frechet_distance
 from gsim3d.perceptual.weights import WeightsMissing
@@ -93,6 +94,17 @@ def test_clips_are_checked_before_weights_are_wanted(monkeypatch, tmp_path):
         clip_features(torch.zeros(2, 9, 32, 32, 3))
     with pytest.raises(WeightsMissing, match="run gsim3d weights fvd"):
         clip_features(torch.zeros(2, 10, 32, 32, 3))
+
+
+def test_clips_of_another_range_are_refused_and_bytes_are_scaled(monkeypatch):
+    monkeypatch.setattr(fvd, "load", lambda name, build: torch.nn.Flatten())
+    clips = (255 * pattern(0, 10, 8, 8)).to(torch.uint8)[None]
+    assert torch.equal(clip_features(clips), clip_features(clips / 255))
+    for bad in (clips.float(), clips.int(), clips / 255 - 0.5, torch.full((1, 10, 8, 8, 3), torch.inf), clips > 9):
+        with pytest.raises(InputError, match="fvd: clips: "):
+            clip_features(bad)
+    with pytest.raises(InputError, match="vectors must be finite"):
+        frechet_distance(torch.full((3, 4), torch.nan), vectors(0, 3, 4))
 
 
 @needs("fvd_i3d")

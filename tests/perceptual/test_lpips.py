@@ -4,6 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from gsim3d.errors import InputError
 from gsim3d.perceptual import lpips
 from gsim3d.perceptual.weights import WeightsMissing, load
 from tests.oracle.perceptual import ALEX, VGG, lpips_reference
@@ -91,6 +92,14 @@ def test_shapes_are_checked(network):
     for other in (image[:, :20], image[..., :1], image[0]):
         with pytest.raises(ValueError, match="images must both be"):
             lpips.lpips(image, other, network)
+
+
+def test_bytes_are_scaled_and_other_ranges_are_refused(network, random_weights):
+    a, b = ((255 * pattern(seed, 1, 40, 40)).to(torch.uint8) for seed in (0, 1))
+    assert torch.equal(lpips.lpips(a, b, network), lpips.lpips(a / 255, b / 255, network))
+    for bad in (255 * pattern(0, 1, 40, 40), a.long(), a / 255 - 0.1, torch.full((1, 40, 40, 3), torch.nan)):
+        with pytest.raises(InputError, match="lpips: target: "):
+            lpips.lpips(a, bad, network)
 
 
 def test_missing_weights_are_named(network, monkeypatch, tmp_path):

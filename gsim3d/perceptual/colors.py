@@ -1,0 +1,40 @@
+"""Images as metrics want them: colours in [0, 1]."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsim3d.errors import InputError
+
+ROUNDING = 1e-6  # what colours may be outside of [0, 1]
+
+
+def as_colors(images: Tensor, name: str) -> Tensor:
+    """``images`` as float32 or float64 in [0, 1].
+
+    Args:
+        images: floating, or uint8, which is divided by 255.
+        name: of the argument, for messages.
+    Raises:
+        InputError: another dtype, or numbers that are not finite or outside of [0, 1].
+    """
+    check_colors(images, name)
+    if images.dtype == torch.uint8:
+        return images.float() / 255
+    return (images if images.dtype == torch.float64 else images.float()).clamp(0, 1)
+
+
+def check_colors(images: Tensor, name: str) -> None:
+    """Raises InputError where :func:`as_colors` does."""
+    if not isinstance(images, Tensor):
+        raise InputError(f"{name}: must be a tensor; got {type(images).__name__}")
+    if images.dtype == torch.uint8 or not images.numel():
+        return
+    if not images.is_floating_point():
+        raise InputError(f"{name}: must be uint8, or floating with colours in [0, 1]; got {images.dtype}")
+    least, most = (bound.item() for bound in images.detach().aminmax())
+    if not (-ROUNDING <= least and most <= 1 + ROUNDING):  # NaN is not, either
+        raise InputError(
+            f"{name}: colours must be in [0, 1]; got {least:g} to {most:g} (divide what goes to 255, or clamp)"
+        )
