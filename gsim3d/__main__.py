@@ -13,6 +13,7 @@ from gsim3d.errors import CaptureError, FitWarning, HardCaseError, InputError, R
 # command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called
 COMMANDS = {
     "generate": ("gsim3d.generate.command", "simulate and film bodies that fall: a data set of multi-view video"),
+    "bound": ("gsim3d.generate.bound_command", "the scores that a perfect simulator has on a generated data set"),
     "check-data": ("gsim3d.check_data", "what is wrong with recorded scenes, and a picture of their cameras"),
     "train": ("gsim3d.train.command", "learn a simulator from a data set"),
     "simulate": ("gsim3d.simulate", "predict the future of one scene: video and .ply"),

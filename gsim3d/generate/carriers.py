@@ -138,6 +138,9 @@ class Cloud:
         return Binding(corners, near * np.einsum("nki,ni->nk", design, multiplier))
 
 
+Carrier = Lattice | Frame | Sheet | Cloud
+
+
 def _nearest(nodes: np.ndarray, point: np.ndarray, count: int) -> np.ndarray:
     distance = ((nodes - point) ** 2).sum(1)
     chosen = np.argpartition(distance, count - 1)[:count]

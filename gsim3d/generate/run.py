@@ -7,7 +7,7 @@ import fcntl
 import multiprocessing
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -59,11 +59,10 @@ def generate(
 
     Raises: InputError for impossible options, missing packages, and folders that hold something else.
     """
-    _require_packages(NEEDED)
+    require_packages(NEEDED)
     settings = build_world(world, preset, changes)
-    _require_engine(settings.engine)
-    if processes is not None and processes < 1:
-        raise InputError(f"processes must be 1 or more; got {processes}")
+    require_engine(settings.engine)
+    check_processes(processes)
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is not a folder")
@@ -75,7 +74,9 @@ def generate(
         missing = [
             scene for scene, folder in zip(scenes, folders) if not writer.is_finished(folder, fingerprints[scene[0]])
         ]
-        _make_all(settings, out, missing, processes or len(os.sched_getaffinity(0)), progress)
+        jobs = [(settings, out, scene) for scene in missing]
+        for _ in each(_make_one, jobs, processes, "scenes" if progress else None):
+            pass
         settings.effects().save(out / EFFECTS_FILE)
         manifest = writer.write_manifest(out, folders, {"world": world, **dataclasses.asdict(settings)})
     from gsim3d.data import find_scenes  # not above: the worker processes do without torch
@@ -85,7 +86,7 @@ def generate(
     return Report(ordered, len(missing), manifest["rejected"])
 
 
-def _require_packages(needed: dict[str, str]) -> None:
+def require_packages(needed: dict[str, str]) -> None:
     for module, package in needed.items():
         try:
             __import__(module)
@@ -93,9 +94,9 @@ def _require_packages(needed: dict[str, str]) -> None:
             raise InputError(f"generate needs {package}: pip install 'gsim3d[generate]' ({error})") from error
 
 
-def _require_engine(engine: str) -> None:
+def require_engine(engine: str) -> None:
     if engine == "mujoco":
-        _require_packages({"mujoco": "mujoco-core==4.0.0"})
+        require_packages({"mujoco": "mujoco-core==4.0.0"})
     elif find_spec(engine) is None:
         raise InputError(
             f"engine {engine} needs the package genesis-world, 4 GB with what it needs: "
@@ -117,22 +118,33 @@ def _only_one_writer(out: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def _make_all(settings, out: Path, scenes: list, processes: int, progress: bool) -> None:
+def check_processes(processes: int | None) -> None:
+    """Raises InputError unless ``processes`` is None or a number of processes."""
+    if processes is not None and processes < 1:
+        raise InputError(f"processes must be 1 or more; got {processes}")
+
+
+def each(function: Callable, jobs: Sequence[tuple], processes: int | None, shown: str | None) -> Iterator:
+    """What ``function`` returns for the arguments of each job, in the order in which they end.
+
+    Args:
+        processes: None: as many as there are cores.    shown: what the progress bar counts; None: no bar.
+    """
     from tqdm import tqdm
 
-    bar = tqdm(total=len(scenes), desc="scenes", unit="scene", disable=not progress or not scenes)
-    with bar:
-        if processes == 1 or len(scenes) <= 1:
-            for scene in scenes:
-                _make_one(settings, out, scene)
+    processes = min(processes or len(os.sched_getaffinity(0)), len(jobs))
+    with tqdm(total=len(jobs), desc=shown, unit="scene", disable=shown is None or not jobs) as bar:
+        if processes <= 1:
+            for job in jobs:
+                yield function(*job)
                 bar.update()
             return
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(processes, len(scenes)), context, start_worker) as pool:
-            jobs = [pool.submit(_make_one, settings, out, scene) for scene in scenes]
+        with ProcessPoolExecutor(processes, context, start_worker) as pool:
+            futures = [pool.submit(function, *job) for job in jobs]
             try:
-                for job in as_completed(jobs):
-                    job.result()
+                for future in as_completed(futures):
+                    yield future.result()
                     bar.update()
             except BaseException:
                 pool.shutdown(wait=True, cancel_futures=True)

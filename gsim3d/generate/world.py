@@ -18,8 +18,9 @@ import numpy as np
 
 from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects
 from gsim3d.errors import InputError
-from gsim3d.generate import bodies, cameras, meshes, render, shapes, writer
-from gsim3d.generate.carriers import grid_faces
+from gsim3d.generate import cameras, meshes, render, shapes, writer
+from gsim3d.generate.bodies import OBJECTS, name_rng, named_body
+from gsim3d.generate.carriers import Carrier, grid_faces
 from gsim3d.generate.stage import (
     GRAVITY,
     Cloth,
@@ -57,6 +58,19 @@ class Actor:
     surface: render.Surface
     vertices: np.ndarray
     facts: dict
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One draw of a trajectory.
+
+    ground: height, metres, or None.   cloth: or None.   surfaces: of the actors, and of the cloth last.
+    """
+
+    ground: float | None
+    cloth: Cloth | None
+    actors: list[Actor]
+    surfaces: list[render.Surface]
 
 
 @dataclass(frozen=True)
@@ -127,8 +141,8 @@ class World(ABC):
             if getattr(self, field) not in allowed:
                 raise InputError(f"{field} must be one of {', '.join(allowed)}; got {getattr(self, field)!r}")
         for name in self.objects:
-            if name not in bodies.OBJECTS:
-                raise InputError(f"object {name!r} is not known; choose from {', '.join(bodies.OBJECTS)}")
+            if name not in OBJECTS:
+                raise InputError(f"object {name!r} is not known; choose from {', '.join(OBJECTS)}")
         names = self.object_names()
         repeated = [name for name, count in Counter(names).items() if count > 1]
         if repeated or not names:
@@ -219,27 +233,16 @@ class World(ABC):
         """Simulates and films trajectory ``sample`` of object ``name``; draws again until one can be used."""
         rejected = []
         rig = self.rig((name, sample))
-        subset = [zlib.crc32(text.encode()) for text in (self.name, self.subset) if text not in ("elastic", TRAIN)]
         for attempt in range(MAX_ATTEMPTS):
-            rng = np.random.default_rng([self.seed, zlib.crc32(name.encode()), sample, attempt, *subset])
-            ground, cloth, actors = self._draw(name, rng)
+            drawn = self.draw(name, sample, attempt)
             try:
-                self._check_view(rig, ground, [actor.vertices[None] for actor in actors])  # before the costly part
-                states, frames = self._move(rig, ground, cloth, actors)
+                # Before the costly part.
+                self._check_view(rig, drawn.ground, [actor.vertices[None] for actor in drawn.actors])
+                states, frames = self._move(rig, drawn)
             except (Unstable, Rejected) as reason:
                 rejected.append(str(reason))
                 continue
-            surfaces = [actor.surface for actor in actors]
-            if cloth is not None:
-                surfaces.append(self._cloth_surface(cloth, rng))
-            renderer = render.Renderer(
-                rig,
-                surfaces,
-                ground=None if ground is None else render.Ground(self.ground_radius, ground, self.ground_albedo),
-                background=BACKGROUNDS[self.background],
-                samples=self.samples,
-                depth=self.depth,
-            )
+            renderer = self.renderer(rig, drawn)
             return writer.Scene(
                 name,
                 sample,
@@ -249,14 +252,36 @@ class World(ABC):
                 states=states,
                 extras={
                     **{"world": self.name, "subset": self.subset, "engine": self.engine, "seed": self.seed},
-                    **{"attempt": attempt, "rejected": rejected, "ground_height": ground},
-                    "bodies": [actor.facts for actor in actors],
+                    **{"attempt": attempt, "rejected": rejected, "ground_height": drawn.ground},
+                    "bodies": [actor.facts for actor in drawn.actors],
                 },
                 fingerprint=self.fingerprint(name),
             )
         raise InputError(
             f"{name}: none of {MAX_ATTEMPTS} draws could be used ({Counter(rejected).most_common(1)[0][0]}); "
             "lower the drop height or the body size, or widen the view"
+        )
+
+    def draw(self, name: str, sample: int, attempt: int) -> Drawn:
+        """What is simulated and seen in trajectory ``sample`` of object ``name``, at its ``attempt``-th draw."""
+        subset = [zlib.crc32(text.encode()) for text in (self.name, self.subset) if text not in ("elastic", TRAIN)]
+        rng = np.random.default_rng([self.seed, zlib.crc32(name.encode()), sample, attempt, *subset])
+        ground, cloth, actors = self._draw(name, rng)
+        surfaces = [actor.surface for actor in actors]
+        if cloth is not None:
+            surfaces.append(self._cloth_surface(cloth, rng))
+        return Drawn(ground, cloth, actors, surfaces)
+
+    def renderer(self, rig: cameras.Rig, drawn: Drawn) -> render.Renderer:
+        """What films ``drawn`` with the cameras of ``rig``."""
+        ground = None if drawn.ground is None else render.Ground(self.ground_radius, drawn.ground, self.ground_albedo)
+        return render.Renderer(
+            rig,
+            drawn.surfaces,
+            ground=ground,
+            background=BACKGROUNDS[self.background],
+            samples=self.samples,
+            depth=self.depth,
         )
 
     def _draw(self, name: str, rng: np.random.Generator) -> tuple[float | None, Cloth | None, list[Actor]]:
@@ -277,7 +302,7 @@ class World(ABC):
     def _draw_actor(self, name: str, floor: float, before: list[Actor], rng: np.random.Generator) -> Actor:
         path = next((path for path in self.meshes if Path(path).stem == name), None)
         if path is None:
-            body = bodies.named_body(name, bodies.name_rng(name) if self.by_name else rng)
+            body = named_body(name, name_rng(name) if self.by_name else rng)
         else:
             body = meshes.load_body(path, self.mesh_up)
         # Mesh files keep their feet down and turn about the vertical; bodies of the package have no top.
@@ -331,30 +356,36 @@ class World(ABC):
         paint = _plain_cloth if self.by_name else shapes.random_paint(rng)
         return render.Surface(faces, places[faces], paint, two_sided=True)
 
-    def _move(self, rig, ground, cloth, actors) -> tuple[dict, list[np.ndarray]]:
-        """States by name, and the vertices [T, V, 3] of every surface, checked."""
+    def simulate(self, drawn: Drawn) -> tuple[list[Carrier], list[np.ndarray]]:
+        """What carries each body, and the cloth last; and the vertices [T, V, 3] of every surface.
+
+        Raises: Unstable when the solver gives up; nothing else is checked.
+        """
         engine = importlib.import_module(ENGINES[self.engine])
-        stage = Stage(tuple(actor.body for actor in actors), ground, cloth)
+        stage = Stage(tuple(actor.body for actor in drawn.actors), drawn.ground, drawn.cloth)
         carriers = engine.simulate(stage, self.n_frames, self.fps, self.max_timestep)
-        moved = []
-        for actor, carrier in zip(actors, carriers):
-            binding = carrier.bind(actor.vertices)
-            moved.append(np.stack([binding.move(nodes) for nodes in carrier.nodes]))
-            check_motion(moved[-1], ground)
-        self._check_view(rig, ground, moved)
-        centres = np.stack([vertices.mean(1) for vertices in moved])
+        bindings = [carrier.bind(actor.vertices) for actor, carrier in zip(drawn.actors, carriers)]
+        if drawn.cloth is not None:
+            bindings.append(carriers[-1].refine(CLOTH_REFINEMENT))
+        moved = [np.stack([b.move(nodes) for nodes in c.nodes]) for b, c in zip(bindings, carriers, strict=True)]
+        return carriers, moved
+
+    def _move(self, rig: cameras.Rig, drawn: Drawn) -> tuple[dict, list[np.ndarray]]:
+        """States by name, and the vertices [T, V, 3] of every surface, checked."""
+        carriers, moved = self.simulate(drawn)
+        actors, cloth, bodies = drawn.actors, drawn.cloth, moved[: len(drawn.actors)]
+        for vertices in bodies:
+            check_motion(vertices, drawn.ground)
+        self._check_view(rig, drawn.ground, bodies)
+        centres = np.stack([vertices.mean(1) for vertices in bodies])
         masses = np.array([actor.body.mass for actor in actors])
         spins = [((actor.body.spin**2).sum() * (actor.facts["size"] / 2) ** 2) / 2 for actor in actors]
         check_energy(centres, masses, max(spins), self.fps)
         states = {f"body_{index}": carrier.nodes.astype(np.float32) for index, carrier in enumerate(carriers)}
         if cloth is not None:
-            sheet = carriers[-1]
             states["cloth"] = states.pop(f"body_{len(actors)}")
-            binding = sheet.refine(CLOTH_REFINEMENT)
-            fine = np.stack([binding.move(nodes) for nodes in sheet.nodes])
             n = (cloth.count - 1) * CLOTH_REFINEMENT + 1
-            check_cloth(moved, fine.reshape(len(fine), n, n, 3), ground)
-            moved.append(fine)
+            check_cloth(bodies, moved[-1].reshape(self.n_frames, n, n, 3), drawn.ground)
         return states, moved
 
     def _check_view(self, rig: cameras.Rig, ground: float | None, bodies: list[np.ndarray]) -> None:

@@ -89,7 +89,7 @@ def write_scene(out: Path, scene: Scene) -> Path:
         states_hash.update(name.encode() + nodes.tobytes())
     np.savez(unfinished / "states.npz", **scene.states)
     hashes = {"states_sha256": states_hash.hexdigest(), "images_sha256": images_hash.hexdigest()}
-    _write_json(unfinished / "metadata.json", {**_metadata(scene), **hashes})
+    write_json(unfinished / "metadata.json", {**_metadata(scene), **hashes})
     os.replace(unfinished, folder)
     return folder
 
@@ -139,7 +139,7 @@ def _metadata(scene: Scene) -> dict:
     }
 
 
-def _write_json(path: Path, content: dict) -> None:
+def write_json(path: Path, content: dict) -> None:
     text = json.dumps(content, indent=1) + "\n"
     unfinished = path.with_name(f".{path.name}.unfinished")
     unfinished.write_text(text)
@@ -164,7 +164,7 @@ def write_manifest(out: Path, folders: list[Path], settings: dict) -> dict:
         "rejected": rejected,
         "scenes": scenes,
     }
-    _write_json(out / "manifest.json", manifest)
+    write_json(out / "manifest.json", manifest)
     return manifest
 
 

@@ -374,6 +374,23 @@ def test_cameras_that_see_beyond_near_and_far_are_refused():
             build_world("elastic", "mini", {"camera_spread": spread})
 
 
+def test_published_bodies_are_as_large_as_they_should_be():
+    """Masked scores mean nothing without the bodies' share of the mask. Two seconds, as in the sets, of fewer frames."""
+    few = {"n_frames": 12, "n_trajectories": 6, "samples": 1}
+    elastic = build_world("elastic", "published", {**few, "fps": 6.0, "n_cams": 4, "image_size": 64})
+    shares = []
+    for scene in elastic.scenes():
+        labels = np.stack([view.segmentation for view in elastic.make(*scene).views])
+        shares.append((labels == 3).sum() / (labels > 0).sum())
+    assert abs(np.mean(shares) - 0.09) < 0.01
+    rigid, widths = build_world("rigid", "published", {**few, "fps": 4.5, "n_cams": 4}), []
+    for scene in rigid.scenes():
+        for view in rigid.make(*scene).views:
+            for columns in (view.segmentation == 3).any(1):
+                widths.append(np.ptp(np.flatnonzero(columns)) + 1)
+    assert np.mean(widths) >= 26
+
+
 HELD_OUT_SETS = [
     (preset, world, subset)
     for preset in ("published", "diverse")
