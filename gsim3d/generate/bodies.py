@@ -1,9 +1,10 @@
-"""Bodies by name: procedural shapes, and meshes that come with the package."""
+"""Bodies by name: procedural shapes, meshes that come with the package, and those of an installed genesis-world."""
 
 from __future__ import annotations
 
 import zlib
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from gsim3d.generate import meshes, shapes
 ASSETS = Path(__file__).parent / "assets"
 MESH_BODIES = {"spot": ASSETS / "spot.obj"}
 OBJECTS = (*shapes.SHAPES, *MESH_BODIES)
+GENESIS = "genesis:"  # begins names of meshes of the package genesis-world
+MESH_SUFFIXES = (".glb", ".obj", ".ply", ".stl")
 
 # Friction and bounce of rigid bodies whose properties are functions of their names.
 CONTACTS = {
@@ -43,6 +46,39 @@ def named_body(name: str, rng: np.random.Generator) -> shapes.Body:
 @cache
 def _mesh_body(name: str) -> shapes.Body:
     return meshes.load_body(MESH_BODIES[name])
+
+
+def mesh_file(text: str, up: str = "y") -> str:
+    """The path of a mesh: ``text`` itself, or the file that ``genesis:NAME`` means.
+
+    That is the first closed mesh in the folder NAME of the meshes of an installed genesis-world, else NAME beside these
+    folders. The package is not imported.
+
+    Raises: InputError when there is none.
+    """
+    if not text.startswith(GENESIS):
+        return text
+    spec = find_spec("genesis")
+    folders = [Path(place) / "assets" / "meshes" for place in (spec and spec.submodule_search_locations) or ()]
+    folder = next((folder for folder in folders if folder.is_dir()), None)
+    if folder is None:
+        raise InputError(
+            f"mesh {text} is a file of the package genesis-world, which is not installed: "
+            "pip install --no-deps genesis-world==1.4.5 (84 MB; nothing of it is executed)"
+        )
+    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in MESH_SUFFIXES)
+    names = {file: file.relative_to(folder).parts[0].removesuffix(file.suffix) for file in files}
+    chosen = [file for file in files if names[file] == text.removeprefix(GENESIS)]
+    if not chosen:
+        raise InputError(f"mesh {text} does not exist; choose from {', '.join(sorted(set(names.values())))}")
+    problems = []
+    for file in sorted(chosen, key=lambda file: -len(file.parts)):
+        try:
+            meshes.load_body(file, up)
+            return str(file)
+        except InputError as problem:
+            problems.append(str(problem))
+    raise InputError(f"mesh {text}: {'; '.join(problems)}")
 
 
 def named_contact(name: str, friction: tuple[float, float], bounce: tuple[float, float]) -> tuple[float, float]:

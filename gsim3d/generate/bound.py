@@ -257,7 +257,7 @@ def _summary(scenes: dict[tuple[str, int], np.ndarray], given: dict[str, float])
 
 def _mean_psnr(errors: np.ndarray) -> float:
     """Mean PSNR over samples, steps and cameras of squared errors; NaN are left out."""
-    return float(np.nanmean(-10 * np.log10(np.maximum(errors, 10 ** (-PSNR_CAP / 10)))))
+    return float(np.nanmean(-10 * np.log10(np.maximum(errors.astype(np.float64), 10 ** (-PSNR_CAP / 10)))))
 
 
 def _mean_and_error(values: np.ndarray) -> list[float | None]:

@@ -15,6 +15,7 @@ examples:
   gsim3d generate cloth --preset published --out data/cloth    1200 trajectories of 84 frames at 128 pixels
   gsim3d generate rigid --preset diverse --set higher --trajectories 100 --out data/rigid-higher
   gsim3d generate elastic --out data/cow --mesh cow.obj --objects none --seed 7
+  gsim3d generate elastic --preset published --mesh genesis:dragon --out data/seven    a mesh of genesis-world, if installed
 
 presets (--preset):
   published six bodies, each of one look, size and material; a plain ground; 1200 trajectories, as long as the paper's
@@ -85,7 +86,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="ball,blob,box,capsule,cone,cylinder,ellipsoid,spot,star,torus (default: those of the preset), or none",
     )
     parser.add_argument(
-        "--mesh", action="append", metavar="FILE", help="a closed mesh as one more object, with its texture; repeatable"
+        "--mesh",
+        action="append",
+        metavar="FILE",
+        help="a closed mesh as one more object, with its texture, or genesis:NAME (duck, dragon, worm, bunny ...) of an "
+        "installed genesis-world; repeatable",
     )
     parser.add_argument("--mesh-up", choices=("y", "z"), help="which axis of mesh files points up (default y)")
     parser.add_argument("--drop", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of drop heights, metres")

@@ -1,5 +1,6 @@
 """Bodies: closed, outward facing, of unit size, coloured; mesh files and their errors."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 import trimesh
 
 from gsim3d.errors import InputError
-from gsim3d.generate import meshes, shapes
+from gsim3d.generate import bodies, meshes, shapes
+from gsim3d.generate.worlds import build_world
 
 CUBE = """v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 2\nv 1 0 2\nv 1 1 2\nv 0 1 2
 f 1 3 2\nf 1 4 3\nf 5 6 7\nf 5 7 8\nf 1 2 6\nf 1 6 5\nf 2 3 7\nf 2 7 6\nf 3 4 8\nf 3 8 7\nf 4 1 5\nf 4 5 8\n"""
@@ -99,3 +101,30 @@ def test_mesh_that_cannot_be_used(tmp_path, text):
         path.write_text(text)
     with pytest.raises(InputError, match="bad.obj"):
         meshes.load_body(path)
+
+
+def test_meshes_of_an_installed_genesis_are_found_without_importing_it(tmp_path, monkeypatch):
+    folder = tmp_path / "genesis" / "assets" / "meshes"
+    (folder / "duck").mkdir(parents=True)
+    (tmp_path / "genesis" / "__init__.py").write_text("raise RuntimeError('imported')")
+    (folder / "duck" / "duck.obj").write_text(CUBE.replace("f 4 5 8\n", "").replace("f 4 1 5\n", ""))  # open
+    (folder / "duck.obj").write_text(CUBE)
+    (folder / "worm").mkdir()
+    (folder / "worm" / "worm.obj").write_text(CUBE)
+    (folder / "broken.stl").write_text("")
+    monkeypatch.setattr(bodies, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match="genesis:duck.*pip install --no-deps genesis-world"):
+        bodies.mesh_file("genesis:duck")
+    monkeypatch.undo()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "genesis", raising=False)
+    assert bodies.mesh_file("genesis:worm") == str(folder / "worm" / "worm.obj")
+    assert bodies.mesh_file("genesis:duck") == str(folder / "duck.obj")  # the other one is open
+    assert bodies.mesh_file("cow.obj") == "cow.obj"
+    with pytest.raises(InputError, match="genesis:pig does not exist; choose from broken, duck, worm"):
+        bodies.mesh_file("genesis:pig")
+    with pytest.raises(InputError, match="genesis:broken.*broken.stl"):
+        bodies.mesh_file("genesis:broken")
+    settings = build_world("elastic", "published", {"meshes": ("genesis:worm",)})
+    assert settings.meshes == (str(folder / "worm" / "worm.obj"),) and settings.object_names()[-1] == "worm"
+    assert "genesis" not in sys.modules
