@@ -15,7 +15,7 @@ examples:
   gsim3d generate cloth --preset published --out data/cloth    1200 trajectories of 84 frames at 128 pixels
   gsim3d generate rigid --preset diverse --set higher --trajectories 100 --out data/rigid-higher
   gsim3d generate elastic --out data/cow --mesh cow.obj --objects none --seed 7
-  gsim3d generate elastic --preset published --mesh genesis:dragon --out data/seven    a mesh of genesis-world, if installed
+  gsim3d generate elastic --out data/seven --mesh genesis:dragon
 
 presets (--preset):
   published six bodies, each of one look, size and material; a plain ground; 1200 trajectories, as long as the paper's
