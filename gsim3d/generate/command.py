@@ -89,7 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mesh",
         action="append",
         metavar="FILE",
-        help="a closed mesh as one more object, with its texture, or genesis:NAME (duck, dragon, worm, bunny ...) of an "
+        help="a mesh as one more object, with its texture, or genesis:NAME (duck, dragon, worm, bunny ...) of an "
         "installed genesis-world; repeatable",
     )
     parser.add_argument("--mesh-up", choices=("y", "z"), help="which axis of mesh files points up (default y)")

@@ -375,7 +375,7 @@ def test_cameras_that_see_beyond_near_and_far_are_refused():
 
 
 def test_published_bodies_are_as_large_as_they_should_be():
-    """Masked scores mean nothing without the bodies' share of the mask. Two seconds, as in the sets, of fewer frames."""
+    """Masked scores mean nothing without the share of bodies in the mask. As long as in the sets, of fewer frames."""
     few = {"n_frames": 12, "n_trajectories": 6, "samples": 1}
     elastic = build_world("elastic", "published", {**few, "fps": 6.0, "n_cams": 4, "image_size": 64})
     shares = []
