@@ -41,7 +41,8 @@ layout:
   DIR/effects.yaml                                     what these scenes call for (gsim3d plan)
 
 The same options give the same bytes for any number of processes. It may be killed at any time: run it again and
-it goes on where it stopped. A larger --trajectories adds scenes to a finished set.
+it goes on where it stopped. A larger --trajectories adds scenes to a finished set. On many machines, each with
+--part I/N and then one without: tools/slurm/generate.sbatch.
 """
 
 _OPTIONS = {
@@ -110,11 +111,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--engine", help="mujoco (default), or genesis: the paper's MPM and PBD (pip install 'gsim3d[genesis]')"
     )
     parser.add_argument("--processes", type=int, metavar="N", help="default: one a core")
+    parser.add_argument(
+        "--part",
+        type=_part,
+        metavar="I/N",
+        help="make only the I-th of N parts of the scenes, beside other parts; the same call without it ends the set",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def _names(text: str) -> tuple[str, ...]:
     return () if text == "none" else tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _part(text: str) -> tuple[int, int]:
+    try:
+        part, count = map(int, text.split("/"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be I/N, such as 3/16; got {text!r}") from None
+    return part, count
 
 
 def run(args: argparse.Namespace) -> int:
@@ -124,7 +139,13 @@ def run(args: argparse.Namespace) -> int:
     given = {field: getattr(args, option) for option, field in _OPTIONS.items()}
     changes = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items() if v is not None}
     report = generate(
-        args.out, args.world, preset=args.preset, processes=args.processes, progress=not args.quiet, **changes
+        args.out,
+        args.world,
+        preset=args.preset,
+        processes=args.processes,
+        part=args.part,
+        progress=not args.quiet,
+        **changes,
     )
     kept = len(report.folders) - report.n_made
     print(f"{len(report.folders)} scenes in {args.out}: {report.n_made} made, {kept} already there")

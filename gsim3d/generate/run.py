@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import fcntl
 import multiprocessing
 import os
@@ -19,6 +20,7 @@ from gsim3d.errors import InputError
 from gsim3d.generate import writer
 from gsim3d.generate.worlds import build_world
 
+LOCK_FILE = ".lock"
 NEEDED = {"embreex": "embreex", "trimesh": "trimesh", "PIL": "pillow"}
 
 
@@ -41,6 +43,7 @@ def generate(
     *,
     preset: str = "mini",
     processes: int | None = None,
+    part: tuple[int, int] | None = None,
     progress: bool = True,
     **changes,
 ) -> Report:
@@ -55,6 +58,8 @@ def generate(
         world: one of worlds.WORLDS.
         preset: one of worlds.PRESETS; ``changes`` replace single options of it (fields of the world's class).
         processes: default: as many as there are cores.
+        part: (i, n) makes the i-th of n parts of the scenes, from 1, and no manifest: other parts may be made at the
+            same time, on other machines too. A call without it then makes what is missing, and the manifest.
         progress: show a progress bar.
 
     Raises: InputError for impossible options, missing packages, and folders that hold something else.
@@ -63,12 +68,16 @@ def generate(
     settings = build_world(world, preset, changes)
     require_engine(settings.engine)
     check_processes(processes)
+    if part is not None and not 1 <= part[0] <= part[1]:
+        raise InputError(f"part must be I/N with I from 1 to N; got {part[0]}/{part[1]}")
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is not a folder")
     out.mkdir(parents=True, exist_ok=True)
-    with _only_one_writer(out):
-        scenes = settings.scenes()
+    scenes = settings.scenes()
+    mine = None if part is None else range(part[0] - 1, len(scenes), part[1])
+    with _only_one_writer(out, mine):
+        scenes = scenes if mine is None else [scenes[i] for i in mine]
         fingerprints = {name: settings.fingerprint(name) for name in settings.object_names()}
         folders = [writer.scene_folder(out, *scene) for scene in scenes]
         missing = [
@@ -77,13 +86,15 @@ def generate(
         jobs = [(settings, out, scene) for scene in missing]
         for _ in each(_make_one, jobs, processes, "scenes" if progress else None):
             pass
-        settings.effects().save(out / EFFECTS_FILE)
-        manifest = writer.write_manifest(out, folders, {"world": world, **dataclasses.asdict(settings)})
+        if part is None:
+            settings.effects().save(out / EFFECTS_FILE)
+            writer.write_manifest(out, folders, {"world": world, **dataclasses.asdict(settings)})
+        rejected = writer.rejected_draws(folders)
     from gsim3d.data import find_scenes  # not above: the worker processes do without torch
 
     wanted = set(folders)
     ordered = [folder for folder in find_scenes(out) if folder in wanted]
-    return Report(ordered, len(missing), manifest["rejected"])
+    return Report(ordered, len(missing), rejected)
 
 
 def require_packages(needed: dict[str, str]) -> None:
@@ -105,17 +116,40 @@ def require_engine(engine: str) -> None:
 
 
 @contextmanager
-def _only_one_writer(out: Path) -> Iterator[None]:
-    """Holds a lock on the folder itself, so that nothing is left behind."""
-    handle = os.open(out, os.O_RDONLY)
-    try:
+def _only_one_writer(out: Path, scenes: range | None) -> Iterator[None]:
+    """Locks the scenes with these numbers, or all, for this process; also where ``out`` is on a network file system.
+
+    Each scene is one byte of a file, which calls that lock all of it remove when they end.
+    """
+    file = out / LOCK_FILE
+    while True:
+        handle = os.open(file, os.O_RDWR | os.O_CREAT)
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(handle, scenes)
+            if file.exists() and os.path.samestat(os.fstat(handle), os.stat(file)):
+                break  # else another call has removed it meanwhile
         except BlockingIOError:
+            os.close(handle)
             raise InputError(f"another process is writing to {out}; wait for it or choose another folder") from None
+        os.close(handle)
+    try:
         yield
     finally:
+        if scenes is None:
+            file.unlink()
         os.close(handle)
+
+
+def _lock(handle: int, scenes: range | None) -> None:
+    ranges = [(0, 0)] if scenes is None else [(1, number) for number in scenes]  # length 0: to the end, however far
+    try:
+        for length, start in ranges:
+            fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB, length, start)
+    except PermissionError as error:  # what some systems say instead
+        raise BlockingIOError from error
+    except OSError as error:
+        if error.errno not in (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP):  # file systems that know no locks
+            raise
 
 
 def check_processes(processes: int | None) -> None:

@@ -12,6 +12,7 @@ import json
 import os
 import platform
 import shutil
+from collections import Counter
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -148,24 +149,27 @@ def write_json(path: Path, content: dict) -> None:
 
 def write_manifest(out: Path, folders: list[Path], settings: dict) -> dict:
     """Writes OUT/manifest.json: options, hashes of every scene, rejected draws, machine and versions."""
-    scenes, rejected = {}, {}
+    scenes = {}
     for folder in folders:
         metadata = read_metadata(folder)
         scenes[folder.relative_to(out).as_posix()] = {
             key: metadata[key] for key in ("states_sha256", "images_sha256", "fingerprint", "attempt")
         }
-        for reason in metadata["rejected"]:
-            rejected[reason] = rejected.get(reason, 0) + 1
     manifest = {
         "generator_version": GENERATOR_VERSION,
         "settings": settings,
         "machine": {"processor": _processor(), "system": platform.platform(), "python": platform.python_version()},
         "versions": {package: _version(package) for package in PACKAGES},
-        "rejected": rejected,
+        "rejected": rejected_draws(folders),
         "scenes": scenes,
     }
     write_json(out / "manifest.json", manifest)
     return manifest
+
+
+def rejected_draws(folders: list[Path]) -> dict[str, int]:
+    """Number of draws that were not filmed, by reason."""
+    return dict(Counter(reason for folder in folders for reason in read_metadata(folder)["rejected"]))
 
 
 def _version(package: str) -> str:

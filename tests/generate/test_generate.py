@@ -21,7 +21,7 @@ from gsim3d.effects import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.generate import generate
 from gsim3d.generate.cameras import project
-from gsim3d.generate.command import add_arguments, run
+from gsim3d.generate.command import _part, add_arguments, run
 from gsim3d.generate.shapes import PALETTE
 from gsim3d.generate.worlds import HELD_OUT, MATERIALS, PRESETS, TINTS, WORLDS, Elastic, build_world
 from gsim3d.plans import make_plan
@@ -276,15 +276,45 @@ def test_impossible_options_say_why(tmp_path):
 
 
 def test_two_writers_do_not_share_a_folder(tmp_path):
-    import fcntl
+    """One that makes the second of two parts, in another process, leaves the first part to others, and no more."""
+    hold = "import sys; from pathlib import Path; from gsim3d.generate.run import _only_one_writer\n"
+    hold += "with _only_one_writer(Path(sys.argv[1]), range(1, 3, 2)): print(flush=True), sys.stdin.read()"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", hold, str(tmp_path)], **pipes, cwd=Path.cwd()) as other:
+        other.stdout.readline()
+        assert generate(tmp_path, processes=1, part=(1, 2), progress=False, **SMALL).n_made == 2
+        for part in (None, (2, 2), (2, 3)):
+            with pytest.raises(InputError, match="another process"):
+                generate(tmp_path, processes=1, part=part, progress=False, **SMALL)
+        other.stdin.close()
+    assert generate(tmp_path, processes=1, progress=False, **SMALL).n_made == 1
 
-    handle = os.open(tmp_path, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        with pytest.raises(InputError, match="another process"):
-            generate(tmp_path, processes=1, progress=False, **SMALL)
-    finally:
-        os.close(handle)
+
+def test_parts_make_the_set_of_one_call(made, tmp_path):
+    reports = [generate(tmp_path, processes=1, part=(part, 2), progress=False, **SMALL) for part in (2, 1)]
+    assert [report.n_made for report in reports] == [1, 2]
+    assert [folder.parent.name for folder in reports[0].folders] == ["torus"]
+    assert not (tmp_path / "manifest.json").exists()
+    assert generate(tmp_path, processes=1, progress=False, **SMALL).n_made == 0
+    assert tree_hash(tmp_path) == tree_hash(made[0])
+    for part in ((0, 2), (3, 2), (1, 0)):
+        with pytest.raises(InputError, match="part must be I/N"):
+            generate(tmp_path, processes=1, part=part, progress=False, **SMALL)
+
+
+def test_the_slurm_script_makes_a_part(tmp_path):
+    (tmp_path / "python").write_text('#!/bin/bash\necho "$*"\n')
+    (tmp_path / "python").chmod(0o755)
+    slurm = {"ARRAY_TASK_ID": "12", "ARRAY_TASK_MIN": "10", "ARRAY_TASK_COUNT": "4", "CPUS_PER_TASK": "8"}
+    environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}", **{f"SLURM_{k}": v for k, v in slurm.items()}}
+    command = ["bash", str(Path(__file__).parents[2] / "tools/slurm/generate.sbatch"), "elastic", "--out", "a b"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert _part("3/4") == (3, 4)
+    for text in ("3", "a/b", "3/4/5"):
+        with pytest.raises(argparse.ArgumentTypeError, match="I/N"):
+            _part(text)
+    assert done.stdout == "-m gsim3d generate elastic --out a b --part 3/4 --processes 8 --quiet\n"
+    assert subprocess.run(command[:2], env=environment, capture_output=True).returncode == 2
 
 
 def test_presets_build():
