@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import sys
 import warnings
 from functools import partial
 
-from gsim3d.errors import CaptureError, FitWarning, HardCaseError, InputError, RunStopped
+from gsim3d.errors import CaptureError, FitWarning, HardCaseError, InputError, RunStopped, did_you_mean
+from gsim3d.terminal import Parser, Terminal
 
 # command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called
 COMMANDS = {
@@ -38,11 +40,6 @@ COMMANDS = {
 }
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message):
-        self.exit(2, f"gsim3d: error: {message} (see {self.prog} --help)\n")
-
-
 def _overview() -> str:
     lines = [f"  {name:<10} {text}" for name, (_, text) in COMMANDS.items()]
     hints = ["", "A first try: gsim3d demo --out runs/demo", "Help on one command: gsim3d train --help"]
@@ -52,46 +49,65 @@ def _overview() -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command; the exit code is 0, or 2 with one line on stderr where the input is wrong."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    with contextlib.redirect_stdout(Terminal(sys.stdout)), contextlib.redirect_stderr(Terminal(sys.stderr)):
+        try:
+            return _command(arguments)
+        finally:
+            sys.stdout.flush()
+
+
+def _command(arguments: list[str]) -> int:
     name = arguments[0] if arguments else None
     if name not in COMMANDS:
-        parser = _Parser(
-            prog="gsim3d",
-            description="Learns 3D simulators from multi-view video.",
-            epilog=_overview(),
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-            usage="gsim3d [--help] [--version] COMMAND ...",
-        )
-        parser.add_argument("--version", action="store_true", help="print the version and exit")
-        parser.add_argument("command", nargs="?", metavar="COMMAND", help="one of the commands below")
-        known, _ = parser.parse_known_args(arguments)
-        if known.version:
-            from gsim3d import __version__
-
-            print(f"gsim3d {__version__}")
-            return 0
-        if known.command is None and not arguments:
-            parser.print_help()
-            return 0
-        given = known.command or arguments[0]
-        parser.error(f"unknown command {given!r}; commands: {', '.join(COMMANDS)}")
+        return _no_command(arguments)
+    args = argparse.Namespace()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("default", FitWarning)
             warnings.showwarning = partial(_show_warning, warnings.showwarning)
             module = importlib.import_module(COMMANDS[name][0])
-            parser = _Parser(prog=f"gsim3d {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
+            parser = Parser(prog=f"gsim3d {name}")
             module.add_arguments(parser)
-            return module.run(parser.parse_intermixed_args(arguments[1:])) or 0
+            args = parser.parsed(arguments[1:])
+            return module.run(args) or 0
     except (InputError, HardCaseError, CaptureError) as error:
         return _fail(str(error))
     except RunStopped as error:
         _fail(str(error))
         return error.code
-    except OSError as error:
-        return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except UnicodeEncodeError as error:
+        return _fail(f"{error.object[:200]!r}: names must be valid Unicode")
+    except OSError as error:  # a full disk names no file
+        place = error.filename or getattr(args, "out", None)
+        return _fail(f"{place}: {error.strerror}" if place and error.strerror else str(error))
     except KeyboardInterrupt:
         print("gsim3d: interrupted", file=sys.stderr)
         return 130
+
+
+def _no_command(arguments: list[str]) -> int:
+    """Help, the version, or what is wrong with the first word."""
+    parser = Parser(
+        prog="gsim3d",
+        description="Learns 3D simulators from multi-view video.",
+        epilog=_overview(),
+        usage="gsim3d [--help] [--version] COMMAND ...",
+    )
+    parser.add_argument("--version", action="store_true", help="print the version and exit")
+    parser.add_argument("command", nargs="?", metavar="COMMAND", help="one of the commands below")
+    known, _ = parser.parse_known_args(arguments)
+    if known.version:
+        from gsim3d import __version__
+
+        print(f"gsim3d {__version__}")
+        return 0
+    if known.command is None and not arguments:
+        parser.print_help()
+        return 0
+    given = known.command or arguments[0]
+    if given in COMMANDS:
+        parser.error(f"the command comes first: gsim3d {given} ...; got {arguments[0]!r} before it")
+    parser.error(f"unknown command {given!r}; commands: {', '.join(COMMANDS)}{did_you_mean(given, COMMANDS)}")
 
 
 def _show_warning(otherwise, message, category, *place, **more) -> None:

@@ -1,4 +1,9 @@
-"""Typed errors. The command line turns them into one line and exit code 2."""
+"""Typed errors, which the command line turns into one line and exit code 2, and hints for their messages."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
 
 
 class InputError(ValueError):
@@ -66,3 +71,10 @@ class RunStopped(RuntimeError):
     def __init__(self, message: str, code: int = 2):
         super().__init__(message)
         self.code = code
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """The end of a message about an unknown ``name``: "; did you mean X?", or nothing where no known one is near."""
+    lower = {str(word).lower(): str(word) for word in known}
+    near = difflib.get_close_matches(str(name)[:100].lower(), lower, 1)
+    return f"; did you mean {lower[near[0]]}?" if near else ""

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import reprlib
 import sys
 import types
 import typing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, did_you_mean
 
+_BOUNDED = reprlib.Repr()
+_BOUNDED.maxstring = _BOUNDED.maxother = 80
 MAX_TEXT = 256 * 2**20  # bytes of a description or of settings
 
 
@@ -24,17 +28,45 @@ def sha256_of(path: Path) -> str:
 
 
 def new_place(out: str | Path, kind: str = "folder") -> Path:
-    """Where a command will write a file or folder.
+    """Where a command will write a file or folder that is not there yet.
 
     Raises:
-        InputError: something is there, or the folder around it is not; the message starts with ``--out``.
+        InputError: something is there, or what should be a folder around it is a file; the message starts with
+            ``--out``.
+    """
+    out = place_of(out)
+    if out.exists() or out.is_symlink():
+        raise InputError(f"--out: {out} exists already; name another {kind} or remove it")
+    return out
+
+
+def place_of(out: str | Path, suffix: str = "", option: str = "--out") -> Path:
+    """Where a command will write a file that ends in ``suffix``, or a folder; :func:`made_around` makes those around it.
+
+    Raises:
+        InputError: another ending, a folder where the file should be, or a file where a folder around it should be.
     """
     out = Path(out)
-    if out.exists():
-        raise InputError(f"--out: {out} exists already; name another {kind} or remove it")
-    if not out.absolute().parent.is_dir():
-        raise InputError(f"--out: the folder {out.absolute().parent} does not exist")
+    if suffix and (out.suffix != suffix or out.is_dir()):
+        raise InputError(f"{option}: must name a file that ends in {suffix}; got {out}")
+    around = next(folder for folder in out.absolute().parents if folder.exists() or folder == folder.parent)
+    if not around.is_dir():
+        raise InputError(f"{option}: {out} lies in {around}, which is not a folder")
     return out
+
+
+def made_around(path: Path) -> Path:
+    """``path``, the folders around which exist from here on."""
+    path.absolute().parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def write_picture(path: Path, image: np.ndarray) -> None:
+    """Writes uint8 [H, W, 3], RGB, as PNG. Raises OSError that names the file where it cannot be written."""
+    import cv2
+
+    with open(path, "wb") as file:
+        file.write(cv2.imencode(".png", image[..., ::-1])[1])
 
 
 def read_file(path: str | Path, most: int) -> bytes:
@@ -72,6 +104,14 @@ def read_yaml(path: str | Path, subject: str) -> Any:
         raise InputError(f"{subject}: {path} cannot be read: {' '.join(str(error).split())[:300]}") from None
 
 
+def shown(value: Any) -> str:
+    """The repr of a value that somebody else wrote, cut short before it is made: lists may hold each other many times."""
+    try:
+        return _BOUNDED.repr(value)
+    except ValueError:  # an integer of thousands of digits
+        return "a number of thousands of digits"
+
+
 def typed(cls: type, values: Any, subject: str, where: str = "") -> Any:
     """An object of the dataclass ``cls`` from plain values, whose types are those of its fields. Where a dataclass has
     an attribute ``alone``, a text by itself is the field of this name.
@@ -80,11 +120,12 @@ def typed(cls: type, values: Any, subject: str, where: str = "") -> Any:
         InputError: a key is unknown or a value of another type; the message starts with ``subject`` and names the key.
     """
     if not isinstance(values, dict):
-        raise InputError(f"{subject}: {where.rstrip('.')} must be a mapping; got {values!r}")
+        raise InputError(f"{subject}: {where.rstrip('.')} must be a mapping; got {shown(values)}")
     hints = typing.get_type_hints(cls)
     hints = {field.name: hints[field.name] for field in dataclasses.fields(cls)}
     if unknown := [name for name in values if name not in hints]:
-        raise InputError(f"{subject}: unknown key {where}{unknown[0]}; known: {', '.join(hints)}")
+        hint = did_you_mean(unknown[0], hints)
+        raise InputError(f"{subject}: unknown key {where}{str(unknown[0])[:80]}; known: {', '.join(hints)}{hint}")
     fields = {name: _value(hints[name], value, subject, where + name) for name, value in values.items()}
     try:
         return cls(**fields)
@@ -108,11 +149,11 @@ def _value(hint: Any, value: Any, subject: str, where: str) -> Any:
         items = typing.get_args(hint)
         n = None if items[-1] is ... else len(items)
         if not isinstance(value, (list, tuple)) or n not in (None, len(value)):
-            raise InputError(f"{subject}: {where} must be a list{'' if n is None else f' of {n}'}; got {value!r}")
+            raise InputError(f"{subject}: {where} must be a list{'' if n is None else f' of {n}'}; got {shown(value)}")
         return tuple(_value(item, v, subject, where) for item, v in zip(items if n else items[:1] * len(value), value))
     number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
     fits = {bool: isinstance(value, bool), str: isinstance(value, str), float: number}
     if not fits.get(hint, True):
         wanted = {bool: "true or false", str: "a text", float: "a number"}[hint]
-        raise InputError(f"{subject}: {where} must be {wanted}; got {value!r}")
+        raise InputError(f"{subject}: {where} must be {wanted}; got {shown(value)}")
     return value

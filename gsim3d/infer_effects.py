@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 
 from gsim3d.pretrained import CHECKPOINT_HELP, add_keep
+from gsim3d.terminal import progress
 
 EPILOG = """\
 Each effect that the checkpoint's spec has on is switched off alone, or lowered, and predictions of four steps at the
 film's begin, middle and end are compared with it: what it is worth is how many dB of PSNR that loses, what it costs is
 the time of a step and its images that it takes. The smallest settings within the tolerance are taken together; while
-together they lose more, the one that is worth most comes back.
+together they lose more, the one that is worth most comes back. What is measured as slower is not proposed.
 
 It is the model that is measured: where its predictions are hardly better than particles held still (the first line
 tells both), it has not learned what the effects are for, and the proposal says little about the scene. Times of a few
@@ -33,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tolerance", default="0.1dB", metavar="X", help="PSNR that may be lost (default: 0.1dB)")
     parser.add_argument("--out", metavar="FILE", help="file to write; must not exist yet (default: SCENE/effects.yaml)")
     add_keep(parser)
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
 
 
@@ -41,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from gsim3d.effects import FILE
-    from gsim3d.files import new_place
+    from gsim3d.files import made_around, new_place
     from gsim3d.plans import in_columns
     from gsim3d.train.restore import restore
 
@@ -49,48 +51,56 @@ def run(args: argparse.Namespace) -> int:
     out = new_place(args.out or Path(args.scene) / FILE, "file")
     restored = restore(args.checkpoint, args.device)
     scene = restored.open_scene(args.scene, args.keep)
-    trial = _Trial(restored, scene)
     base = restored.plan.spec
-    psnr, seconds = trial(base)
+    settings = smaller(base, restored.simulator.config)
+    with progress(None, "settings", 2 + sum(map(len, settings.values())), unit="setting", quiet=args.quiet) as bar:
+        trial = _Trial(restored, scene, bar)
+        psnr, seconds = trial(base)
+        rows, spec, (now, time) = propose(base, settings, trial, (psnr, seconds), tolerance)
     print(
         f"{scene.name}: {psnr:.2f} dB with what the checkpoint has on, {trial.held_still():.2f} dB with particles held "
         f"still; {1e3 * seconds:.1f} ms a step with images of {len(trial.cams)} cameras\n"
     )
-    rows, spec, (now, time) = propose(base, smaller(base, restored.simulator.config), trial, (psnr, seconds), tolerance)
     print(in_columns([("effect", "setting", "worth dB", "costs ms", ""), *rows]))
-    spec.save(out)
+    spec.save(made_around(out))
     print(f"\nproposed: {now:.2f} dB ({now - psnr:+.3f}), {seconds / time:.2f} times as fast; written to {out}:")
     print(textwrap.indent(out.read_text(), "  ").rstrip())
     return 0
 
 
 def propose(base, settings: dict, trial, measured: tuple[float, float], tolerance: float):
-    """Rows of a table, the smallest spec that loses at most ``tolerance`` dB of ``measured``, and its own measurement.
+    """Rows of a table, the smallest spec that loses at most ``tolerance`` dB of ``measured`` and takes no longer, and
+    its own measurement: ``base`` where none is as good and as fast.
 
     Args:
         settings: of :func:`smaller`.
         trial: spec -> PSNR, seconds.   measured: those of ``base``.
     """
     psnr, seconds = measured
-    table, chosen, lost = [], {}, {}
+    table, chosen, lost, saved, put_back = [], {}, {}, {}, {}
     for effect, specs in settings.items():
         for name, spec in specs:
             now, time = trial(spec)
-            if effect not in chosen and psnr - now <= tolerance:
-                chosen[effect], lost[effect] = spec, psnr - now
-            table.append((effect, name, psnr - now, seconds - time, chosen.get(effect) is spec))
-    alone = dict(chosen)
+            fits = psnr - now <= tolerance
+            if effect not in chosen and fits and time <= seconds:
+                chosen[effect], lost[effect], saved[effect] = spec, psnr - now, seconds - time
+            table.append((effect, name, psnr - now, seconds - time, chosen.get(effect) is spec, fits))
     while True:
         spec = together(base, chosen.values())
         now, time = trial(spec) if chosen else measured
-        if psnr - now <= tolerance:
+        if psnr - now > tolerance:
+            back, why = max(chosen, key=lost.get), "too much with the others"
+        elif time > seconds:
+            back, why = min(chosen, key=saved.get), "slower with the others"
+        else:
             break
-        del chosen[max(chosen, key=lost.get)]
+        del chosen[back]
+        put_back[back] = why
     rows = []
-    for effect, name, worth, cost, fits in table:
-        note = (
-            "proposed" if fits and effect in chosen else "too much with the others" if fits and effect in alone else ""
-        )
+    for effect, name, worth, cost, picked, fits in table:
+        note = "slower" if fits and cost < 0 else ""
+        if picked:
+            note = put_back.get(effect, "proposed")
         rows.append((effect, name, f"{worth:+.3f}", f"{1e3 * cost:+.1f}", note))
     return rows, spec, (now, time)
 
@@ -159,12 +169,12 @@ def together(base, specs):
 class _Trial:
     """spec -> PSNR of short predictions of the scene against its film, seconds of a step and its images."""
 
-    def __init__(self, restored, scene):
+    def __init__(self, restored, scene, bar):
         import numpy as np
 
         from gsim3d.evaluate.protocol import default_views, encode_steps, horizon
 
-        self.restored, self.scene, n_encoded = restored, scene, restored.data.history
+        self.restored, self.scene, self.bar, n_encoded = restored, scene, bar, restored.data.history
         self.n_steps = min(STEPS, horizon(scene, n_encoded, None))
         context, self.cams = default_views(restored, scene)
         last = scene.n_steps - n_encoded - self.n_steps
@@ -183,6 +193,8 @@ class _Trial:
             start = time.perf_counter()
             psnr = self._psnr(restored, lambda state: restored.simulator.rollout(state, self.n_steps, restored.plan))
             times.append(time.perf_counter() - start)
+        self.bar.total = max(self.bar.total, self.bar.n + 1)  # sets of settings may be tried several times
+        self.bar.update()
         return psnr, min(times) / self.n_steps / len(self.films)
 
     def held_still(self) -> float:

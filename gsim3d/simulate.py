@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from gsim3d.pretrained import CHECKPOINT_HELP, add_keep
+from gsim3d.terminal import progress, whole
 
 EPILOG = """\
 The scene's first steps are the input; the following ones are predicted, also beyond the end of the film. Written to
@@ -29,12 +30,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/data.md)")
     parser.add_argument("--out", metavar="DIR", required=True, help="folder to write; must not exist yet")
-    parser.add_argument("--steps", type=int, help="steps to predict (default: to the end of the film)")
-    parser.add_argument("--start", type=int, default=0, help="first input step (default: 0)")
+    parser.add_argument("--steps", type=whole(1), help="steps to predict (default: to the end of the film)")
+    parser.add_argument("--start", type=whole(0), default=0, help="first input step (default: 0)")
     parser.add_argument(
-        "--cameras", type=int, nargs="+", metavar="CAM", help="cameras to show (default: up to 4 targets)"
+        "--cameras", type=whole(0), nargs="+", metavar="CAM", help="cameras to show (default: up to 4 targets)"
     )
-    parser.add_argument("--context", type=int, nargs="+", metavar="CAM", help="input cameras (default: spread evenly)")
+    parser.add_argument(
+        "--context", type=whole(0), nargs="+", metavar="CAM", help="input cameras (default: spread evenly)"
+    )
     add_keep(parser)
     parser.add_argument("--edit", metavar="FILE", help="YAML file of changes of the scene on the way")
     parser.add_argument("--effects", metavar="FILE", help="YAML file of what to compute (default: as in training)")
@@ -45,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="exact (default), or balanced or fast: tuned by gsim3d pareto to keep 99.9 %% or 99 %% of the gain",
     )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -53,14 +57,14 @@ def run(args: argparse.Namespace) -> int:
     from dataclasses import replace
     from functools import partial
 
-    import cv2
+    import numpy as np
 
     from gsim3d.edits import load_edits
     from gsim3d.effects import EffectsSpec, OutputEffects, StructureEffects
     from gsim3d.errors import InputError
     from gsim3d.evaluate.pictures import as_bytes, comparison_frames, true_images, write_gaussians
     from gsim3d.evaluate.protocol import default_views, render_steps
-    from gsim3d.files import new_place
+    from gsim3d.files import new_place, write_picture
     from gsim3d.interop import write_video
     from gsim3d.pareto.autotune import load_speed
     from gsim3d.pareto.runner import Runner
@@ -85,16 +89,20 @@ def run(args: argparse.Namespace) -> int:
     checkpoint = located(args.checkpoint)
     setting = load_speed(checkpoint if checkpoint.is_dir() else checkpoint.parent, restored, args.speed)
     runner = Runner(restored, setting)
-    prediction = runner.predict(scene, context, n_future, args.start, edits)
+    with progress(None, "simulating", n_future, unit="step", quiet=args.quiet) as bar:
+        prediction = runner.predict(scene, context, n_future, args.start, edits, bar.update)
     restored, first = replace(restored, simulator=runner.simulator, plan=runner.plan), args.start + runner.skipped
-    images = as_bytes(render_steps(restored, prediction.particles, scene, cams, first))
+    steps = [prediction.particles.select_clouds([step]) for step in range(prediction.n_steps)]
+    steps = progress(steps, "drawing", unit="step", quiet=args.quiet)
+    images = [as_bytes(render_steps(restored, step, scene, cams, first + i))[0] for i, step in enumerate(steps)]
+    images = np.stack(images)
     part = out.with_name(f".{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     try:
         (part / "frames").mkdir(parents=True)
         for step, views in enumerate(images):
             for cam, image in zip(cams, views, strict=True):
-                cv2.imwrite(str(part / "frames" / f"cam_{cam}_{step:04d}.png"), image[..., ::-1])
+                write_picture(part / "frames" / f"cam_{cam}_{step:04d}.png", image)
         truth = true_images(scene, cams, range(first, first + len(images)))
         write_video(part / "rollout.mp4", comparison_frames(truth, images), scene.fps)
         write_gaussians(part / "gaussians", restored, prediction)

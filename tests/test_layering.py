@@ -10,7 +10,7 @@ ROOT = Path(__file__).parent.parent
 # Each room may import the rooms before it (and its own), never one after it.
 ROOMS = [
     {"errors", "quirks"},
-    {"types", "stability", "files", "pretrained", "branches", "processor"},
+    {"types", "stability", "terminal", "files", "pretrained", "branches", "processor"},
     {"selections"},
     {"ops", "effects", "harmonics", "rotations"},
     {"layers", "guards"},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import torch
@@ -133,9 +133,16 @@ class Runner:
 
     @torch.no_grad()
     def predict(
-        self, scene: Scene, context: Sequence[int], n_future: int, start: int = 0, edits: Sequence[Edit] = ()
+        self,
+        scene: Scene,
+        context: Sequence[int],
+        n_future: int,
+        start: int = 0,
+        edits: Sequence[Edit] = (),
+        on_steps: Callable[[int], object] | None = None,
     ) -> Prediction:
-        """As :func:`gsim3d.evaluate.protocol.predict`, of the steps from ``start + skipped`` on. Errors likewise."""
+        """As :func:`gsim3d.evaluate.protocol.predict`, of the steps from ``start + skipped`` on. Errors likewise.
+        ``on_steps`` is called with the number of steps that have just been simulated."""
         self.restored.check_scene(scene)
         if not 0 <= start <= scene.n_steps - self.restored.data.history:
             raise InputError(f"{scene.path}: the input steps from step {start} on do not fit its {scene.n_steps} steps")
@@ -147,7 +154,7 @@ class Runner:
             if self.setting.captured and not edits:
                 steps = CapturedRollout(self.simulator, encoded, n_future, self.plan)(encoded).steps
             else:
-                steps = self._rollout(encoded, n_future, edits, log)
+                steps = self._rollout(encoded, n_future, edits, log, on_steps)
         return Prediction(concatenate([encoded, *steps]), self.n_encoded, tuple(context), log.resting_share)
 
     def newest(self, state: Particles) -> Particles:
@@ -193,9 +200,20 @@ class Runner:
         finally:
             torch.backends.cuda.matmul.allow_tf32 = before
 
-    def _rollout(self, state: Particles, n_steps: int, edits: Sequence[Edit], log: RestLog) -> list[Particles]:
+    def _rollout(
+        self, state: Particles, n_steps: int, edits: Sequence[Edit], log: RestLog, on_steps: Callable | None
+    ) -> list[Particles]:
+        def counted(predict: Callable) -> Callable:
+            def wrapped(*state, **options):
+                steps = predict(*state, **options)
+                on_steps(steps.n_clouds)
+                return steps
+
+            return wrapped
+
         if self.setting.orders == 1:
-            return self.simulator.rollout(state, n_steps, self.plan, edits=edits, log=log)
+            wrap = None if on_steps is None else counted
+            return self.simulator.rollout(state, n_steps, self.plan, edits=edits, log=log, wrap=wrap)
         if edits:
             raise InputError("setting: orders cannot be averaged while a scene is edited; use another --speed")
         return list(self.steps(state, n_steps))

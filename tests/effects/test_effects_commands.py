@@ -125,6 +125,35 @@ def test_infer_puts_back_what_is_worth_most_when_together_too_much_is_lost():
     assert notes["changing features", "none"] == ("+0.030", "proposed")
 
 
+def timed(cost):
+    """Proposes from presets.paper_latent where a spec takes ``cost`` (spec) seconds and all are as good."""
+    model, base = presets.paper_latent(2), EffectsSpec()
+    rows, spec, measured = propose(base, smaller(base, model), lambda spec: (30.0, cost(spec)), (30.0, 1.0), 0.1)
+    return {(effect, setting): note for effect, setting, _, _, note in rows}, spec, measured
+
+
+def test_infer_proposes_nothing_that_it_measured_as_slower():
+    base = EffectsSpec()
+    notes, spec, measured = timed(lambda spec: 1.16)
+    assert spec == base and measured == (30.0, 1.0) and set(notes.values()) == {"slower"}
+    notes, spec, (_, time) = timed(lambda spec: 0.9 if spec.dynamics.history == 1 else 1.01)
+    assert spec == EffectsSpec(DynamicsEffects(history=1)) and time == 0.9
+    assert notes["time merging", "1 step"] == "proposed" and notes["frozen background", "masked out"] == "slower"
+
+
+def test_infer_takes_settings_apart_that_are_slower_together():
+    """Each alone saves time; with a history of one step all others cost more."""
+
+    def cost(spec):
+        short = spec.dynamics.history == 1
+        others = spec.appearance != AppearanceEffects() or spec.dynamics.background != "frozen"
+        return 1.2 if short and others else 0.99 if short else 0.9 if others else 1.0
+
+    notes, spec, (_, time) = timed(cost)
+    assert time == 0.9 and spec.dynamics.history is None and spec.dynamics.background == "masked_out"
+    assert notes["time merging", "1 step"] == "slower with the others"
+
+
 @pytest.mark.parametrize("text", ["loud", "-1", "nandB", "inf"])
 def test_infer_wants_a_tolerance(capsys, work, text):  # noqa: F811
     arguments = ["infer", work / "data" / "ball" / "0000", work / "run", f"--tolerance={text}"]
