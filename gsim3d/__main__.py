@@ -58,10 +58,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _command(arguments: list[str]) -> int:
     name = arguments[0] if arguments else None
-    if name not in COMMANDS:
-        return _no_command(arguments)
     args = argparse.Namespace()
     try:
+        if name not in COMMANDS:
+            return _no_command(arguments)
         with warnings.catch_warnings():
             warnings.simplefilter("default", FitWarning)
             warnings.showwarning = partial(_show_warning, warnings.showwarning)

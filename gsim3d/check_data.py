@@ -40,22 +40,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     import os
     from concurrent.futures import ThreadPoolExecutor
-    from pathlib import Path
-
-    import cv2
-    from tqdm import tqdm
 
     from gsim3d.data import find_scenes
     from gsim3d.data.check import check_scene, contact_sheet, describe
-    from gsim3d.errors import InputError
+    from gsim3d.files import made_around, place_of, write_picture
+    from gsim3d.terminal import progress
 
-    out = None if args.out is None else Path(args.out)
-    if out is not None and (out.suffix != ".png" or not out.absolute().parent.is_dir()):
-        raise InputError(f"--out must name a .png file in a folder that exists; got {out}")
+    out = None if args.out is None else place_of(args.out, ".png")
     folders = find_scenes(args.data)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         hidden = args.quiet or len(folders) == 1
-        checks = list(tqdm(pool.map(check_scene, folders), "scenes", len(folders), unit="scene", disable=hidden))
+        checks = pool.map(check_scene, folders)
+        checks = list(progress(checks, "scenes", len(folders), unit="scene", quiet=hidden))
     for check in checks:
         if check.problems or not args.quiet:
             print(describe(check.scene) if check.scene else f"{check.path}: cannot be opened")
@@ -63,8 +59,8 @@ def run(args: argparse.Namespace) -> int:
             print(f"  problem: {problem}")
     scenes = [check.scene for check in checks if check.scene]
     if scenes and out is not None:
-        part = out.with_name(f".{out.stem}.part.png")
-        cv2.imwrite(str(part), contact_sheet(scenes))
+        part = made_around(out).with_name(f".{out.stem}.part.png")
+        write_picture(part, contact_sheet(scenes)[..., ::-1])
         os.replace(part, out)
     n_problems = sum(len(check.problems) for check in checks)
     n_bad = sum(bool(check.problems) for check in checks)

@@ -19,11 +19,12 @@ from gsim3d import presets
 from gsim3d.data import Scene, find_scenes, make_frames
 from gsim3d.data.check import check_scene
 from gsim3d.endurance import CASES
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, did_you_mean
 from gsim3d.laws import LAWS, Deviation, Sample
 from gsim3d.quirks import Quirks
 from gsim3d.pretrained import located, names
 from gsim3d.simulator import Simulator
+from gsim3d.terminal import progress
 from gsim3d.train.restore import Restored, build_simulator, restore
 from gsim3d.train.samples import context_cameras, spread_views
 from gsim3d.types import Cameras, Frames
@@ -316,10 +317,11 @@ def run(job: Job) -> Report:
     Raises:
         InputError: a path is neither a checkpoint nor a scene nor a folder of scenes, or a check is unknown.
     """
-    from tqdm import tqdm
-
     if unknown := [name for name in job.only if name not in CHECKS]:
-        raise InputError(f"--only: unknown check {unknown[0]!r}; checks: {', '.join(CHECKS)}")
+        raise InputError(
+            f"--only: unknown check {unknown[0]!r}; checks: {', '.join(CHECKS)}"
+            f"{did_you_mean(unknown[0], CHECKS)}"
+        )
     if job.n_steps < 1:
         raise InputError(f"--steps must be at least 1; got {job.n_steps}")
     paths = [located(path) if str(path) in names() else Path(path) for path in job.paths]
@@ -337,7 +339,7 @@ def run(job: Job) -> Report:
     findings: list[Finding] = []
     if sample is not None:
         (job.out / "failures").mkdir(parents=True, exist_ok=True)
-        with tqdm(total=len(job.only or CHECKS), unit="check", disable=not job.progress) as bar:
+        with progress(None, "checks", len(job.only or CHECKS), unit="check", quiet=not job.progress) as bar:
             for finding, tried in check(subject, sample, job.n_steps, job.only, bar.set_description):
                 if finding.outcome == "fails":
                     file = job.out / "failures" / f"{finding.check.replace(' ', '_')}.safetensors"

@@ -7,6 +7,8 @@ import platform
 import sys
 import time
 
+from gsim3d.terminal import whole
+
 EPILOG = """\
 Without options: what is installed and compiled, and every op against plain torch.
 
@@ -50,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--out", metavar="DIR", default="runs/stability", help="folder of the report (default: %(default)s)"
     )
-    group.add_argument("--steps", type=int, default=100, help="length of the long rollout (default: %(default)s)")
+    group.add_argument("--steps", type=whole(1), default=100, help="length of the long rollout (default: %(default)s)")
     group.add_argument("--only", nargs="+", metavar="CHECK", default=(), help="checks to make (default: all)")
     group.add_argument("--replay", metavar="FILE", help="make the check again that FILE, from a report, reproduces")
     group.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: cpu)")

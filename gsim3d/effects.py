@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, did_you_mean
 from gsim3d.files import read_yaml, typed
 from gsim3d.selections import Selection
 
@@ -208,7 +208,10 @@ class EffectsSpec:
 
 def _one_of(name: str, value: Any, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
-        raise InputError(f"effects: {name} must be one of {', '.join(allowed)}; got {value!r}")
+        raise InputError(
+            f"effects: {name} must be one of {', '.join(allowed)}; got {value!r}"
+            f"{did_you_mean(value, allowed)}"
+        )
 
 
 def _at_least(name: str, value: Any, least: int) -> None:

@@ -18,6 +18,7 @@ from gsim3d.errors import InputError, did_you_mean
 
 _BOUNDED = reprlib.Repr()
 _BOUNDED.maxstring = _BOUNDED.maxother = 80
+_BOUNDED.maxlevel = 2
 MAX_TEXT = 256 * 2**20  # bytes of a description or of settings
 
 
@@ -41,17 +42,17 @@ def new_place(out: str | Path, kind: str = "folder") -> Path:
 
 
 def place_of(out: str | Path, suffix: str = "", option: str = "--out") -> Path:
-    """Where a command will write a file that ends in ``suffix``, or a folder; :func:`made_around` makes those around it.
+    """Where a command will write a file that ends in ``suffix``, or a folder; folders around it need not exist.
 
     Raises:
         InputError: another ending, a folder where the file should be, or a file where a folder around it should be.
     """
     out = Path(out)
     if suffix and (out.suffix != suffix or out.is_dir()):
-        raise InputError(f"{option}: must name a file that ends in {suffix}; got {out}")
+        raise InputError(f"{option}: the name must end in {suffix}; got {out}")
     around = next(folder for folder in out.absolute().parents if folder.exists() or folder == folder.parent)
     if not around.is_dir():
-        raise InputError(f"{option}: {out} lies in {around}, which is not a folder")
+        raise InputError(f"{option}: {out} lies in {around}, which is no folder")
     return out
 
 
@@ -105,7 +106,7 @@ def read_yaml(path: str | Path, subject: str) -> Any:
 
 
 def shown(value: Any) -> str:
-    """The repr of a value that somebody else wrote, cut short before it is made: lists may hold each other many times."""
+    """The start of the repr of a value of a file, never made as a whole: lists may hold each other many times."""
     try:
         return _BOUNDED.repr(value)
     except ValueError:  # an integer of thousands of digits

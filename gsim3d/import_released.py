@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from gsim3d.errors import InputError
-    from gsim3d.files import new_place
+    from gsim3d.files import made_around, new_place
     from gsim3d.interop.released_import import import_released
     from gsim3d.train import checkpoint
     from gsim3d.train.settings import load_yaml, to_dict
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(message if message.startswith(str(source)) else f"{args.config}: {message}") from None
     config, effects = imported.config, imported.config.effects
     checkpoint.write(
-        out,
+        made_around(out),
         checkpoint.Checkpoint(
             model=imported.weights,
             config={

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, did_you_mean
 from gsim3d.types import DYNAMIC, FROZEN, Particles
 
 Vector = tuple[float, float, float]
@@ -29,7 +29,10 @@ class Selection:
 
     def __post_init__(self):
         if self.which not in WHICH:
-            raise InputError(f"which must be one of {', '.join(WHICH)}; got {self.which!r}")
+            raise InputError(
+                f"which must be one of {', '.join(WHICH)}; got {self.which!r}"
+                f"{did_you_mean(self.which, WHICH)}"
+            )
         if self.box is not None and any(low > high for low, high in zip(*self.box, strict=True)):
             corners = [list(corner) for corner in self.box]
             raise InputError(f"box must be the lowest and the highest corner; got {corners}")

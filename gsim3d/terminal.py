@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from gsim3d.errors import did_you_mean
+from gsim3d.errors import InputError, did_you_mean
 
 # C0 and C1 control characters, lone surrogates, and those that turn the direction of writing
 HIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -55,7 +55,7 @@ class Terminal:
 
 
 class Parser(argparse.ArgumentParser):
-    """Takes no abbreviations, and its errors are one line that suggests the nearest known word."""
+    """Takes no abbreviations; its errors are InputErrors that suggest the nearest known word."""
 
     def __init__(self, *args: Any, **options: Any):
         options = {"formatter_class": argparse.RawDescriptionHelpFormatter, **options, "allow_abbrev": False}
@@ -70,7 +70,7 @@ class Parser(argparse.ArgumentParser):
         return self.parse_intermixed_args(arguments)
 
     def error(self, message: str) -> None:
-        self.exit(2, f"gsim3d: error: {message} (see {self.prog} --help)\n")
+        raise InputError(f"{message} (see {self.prog} --help)")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -50,7 +51,9 @@ def test_random_weights_on_random_images_keep_every_law_and_case(tmp_path):
     assert not list((tmp_path / "failures").iterdir())
 
 
-def test_a_checkpoint_and_a_folder_of_scenes(tmp_path, trained, scenes, capsys):
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_checkpoint_and_a_folder_of_scenes(tmp_path, trained, scenes, capsys, monkeypatch, terminal):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     arguments = [
         "--stability",
         trained,
@@ -66,7 +69,7 @@ def test_a_checkpoint_and_a_folder_of_scenes(tmp_path, trained, scenes, capsys):
     assert main(["doctor", *map(str, arguments)]) == 0
     printed = capsys.readouterr()
     assert f"checkpoint: {trained}" in printed.out and "ok   a long rollout" in printed.out
-    assert "3/3" in printed.err, "no progress"
+    assert ("3/3" in printed.err) == terminal
     written = json.loads((tmp_path / "r" / "report.json").read_text())
     assert written["subject"] == {"checkpoint": str(trained), "scenes": str(scenes)}
 
@@ -156,7 +159,7 @@ def test_a_sample_comes_back_as_it_was_saved(tmp_path):
         (["--stability", "{tmp}/nowhere"], "no such file or folder"),
         (["--stability", "{tmp}"], "holds no scene"),
         (["--stability", "--only", "gravity"], "unknown check 'gravity'"),
-        (["--stability", "--steps", "0"], "--steps must be at least 1"),
+        (["--stability", "--steps", "0"], "--steps: must be at least 1"),
         (["--replay", "{tmp}/note.txt"], "not a file that gsim3d doctor --stability wrote"),
         (["--stability", "{scene}", "{scene}"], "one scene or folder of scenes"),
     ],

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 
+from gsim3d.terminal import number, whole
+
 EPILOG = """\
 Every row is the base run with one thing changed, trained on the same scenes for as many steps and scored on the scenes
 that `gsim3d train` holds out, all rows over the same steps. The base run is CONFIG (as of gsim3d train) or, without it,
@@ -36,16 +38,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("tiny", "small", "paper_latent"),
         help="size of the base model (default: CONFIG's, or tiny)",
     )
-    parser.add_argument("--steps", type=int, metavar="N", help="optimizer steps of each run (default: the base run's)")
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of each row (default: 1)")
+    parser.add_argument(
+        "--steps", type=whole(1), metavar="N", help="optimizer steps of each run (default: the base run's)"
+    )
+    parser.add_argument("--seeds", type=whole(1), default=1, metavar="N", help="runs of each row (default: 1)")
     parser.add_argument(
         "--together",
-        type=int,
+        type=whole(1),
         default=1,
         metavar="N",
         help="runs at a time, a process each: a small model leaves most of a GPU idle (default: 1)",
     )
-    parser.add_argument("--minutes", type=float, metavar="M", help="train no longer; the next call goes on")
+    parser.add_argument(
+        "--minutes", type=number(0, above=True), metavar="M", help="train no longer; the next call goes on"
+    )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default: cpu)")
     parser.add_argument("--list", action="store_true", help="print the rows and exit")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
@@ -68,10 +74,6 @@ def run(args: argparse.Namespace) -> int:
     for name in ("data", "out"):
         if getattr(args, name) is None:
             raise InputError(f"{'DATA' if name == 'data' else '--out'} is needed (see gsim3d ablate --help)")
-    if args.together < 1:
-        raise InputError(f"--together must be at least 1; got {args.together}")
-    if args.minutes is not None and not 0 < args.minutes < math.inf:
-        raise InputError(f"--minutes must be positive and finite; got {args.minutes}")
     rows = rows_named(",".join(DEFAULT_ROWS) if args.rows is None else args.rows)
 
     from gsim3d.ablate.study import Study

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, did_you_mean
 from gsim3d.train.config import LossConfig, OptimizerConfig, TrainConfig
 from gsim3d.train.restore import model_config
 
@@ -175,7 +175,10 @@ def rows_named(names: str) -> list[Row]:
     """Rows from their names with commas between. Raises InputError for an unknown or repeated name, or none."""
     found = [name.strip() for name in names.split(",")]
     if unknown := [name for name in found if name not in ROWS]:
-        raise InputError(f"--rows: {unknown[0]!r} does not exist; rows: {', '.join(ROWS)}")
+        raise InputError(
+            f"--rows: {unknown[0]!r} does not exist; rows: {', '.join(ROWS)}"
+            f"{did_you_mean(unknown[0], ROWS)}"
+        )
     if len(set(found)) < len(found):
         raise InputError(f"--rows: a row is named twice in {names!r}")
     return [ROWS[name] for name in found]

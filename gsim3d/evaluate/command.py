@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from gsim3d.pretrained import CHECKPOINT_HELP, FOLDER, located
+from gsim3d.terminal import progress, whole
 
 EPILOG = """\
 Every scene's first steps are given, all others predicted and compared with the film, seen from cameras that were no
@@ -54,7 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="predictions of another model to score; may be given several times",
     )
-    parser.add_argument("--given", type=int, metavar="N", help="steps that the other models were given (no CHECKPOINT)")
+    parser.add_argument(
+        "--given", type=whole(1), metavar="N", help="steps that the other models were given (no CHECKPOINT)"
+    )
     parser.add_argument(
         "--scenes",
         choices=("test", "train", "all"),
@@ -68,15 +71,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="rule that holds scenes out (default: gsim3d; published: that of the released model, which leaks in small "
         "sets)",
     )
-    parser.add_argument("--steps", type=int, help="steps to predict (default: to the end of the shortest film)")
+    parser.add_argument("--steps", type=whole(1), help="steps to predict (default: to the end of the shortest film)")
     parser.add_argument(
         "--cameras",
-        type=int,
+        type=whole(0),
         nargs="+",
         metavar="CAM",
         help="cameras to compare (default: those kept from the training's inputs; without CHECKPOINT all predicted)",
     )
-    parser.add_argument("--context", type=int, nargs="+", metavar="CAM", help="input cameras (default: spread evenly)")
+    parser.add_argument(
+        "--context", type=whole(0), nargs="+", metavar="CAM", help="input cameras (default: spread evenly)"
+    )
     parser.add_argument(
         "--metrics", nargs="+", metavar="METRIC", help="what to measure (default: all whose weights are installed)"
     )
@@ -91,8 +96,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from dataclasses import replace
-
-    from tqdm import tqdm
 
     from gsim3d.errors import InputError
     from gsim3d.evaluate.predictions import Predictions
@@ -129,8 +132,8 @@ def run(args: argparse.Namespace) -> int:
         for other in others:
             other.check(scene, targets, n_encoded, n_future)
     scores = []
-    with tqdm(scenes, desc="scenes", unit="scene") as progress:
-        for scene, (context, targets) in zip(progress, views):
+    with progress(scenes, "scenes", unit="scene") as bar:
+        for scene, (context, targets) in zip(bar, views):
             given = {"context_cams": context, "target_cams": targets, "n_encoded": n_encoded, "n_future": n_future}
             score = score_scene(restored, scene, **given, metrics=metrics, others=others)
             scores.append(replace(score, scene=_name(scene, args.data)))
@@ -143,18 +146,14 @@ def run(args: argparse.Namespace) -> int:
 def _out_file(args: argparse.Namespace, others: list):
     from pathlib import Path
 
-    from gsim3d.errors import InputError
+    from gsim3d.files import place_of
 
     if args.out:
-        out = Path(args.out)
-        if out.suffix != ".json":
-            raise InputError(f"--out: the name must end in .json; got {out}")
+        out = place_of(args.out, ".json")
     else:
         place = located(args.checkpoint) if args.checkpoint else Path(others[0].folder)
         shipped = place.is_relative_to(FOLDER)  # nothing is written into the package
         out = Path() / "metrics.json" if shipped else (place if place.is_dir() else place.parent) / "metrics.json"
-    if not out.parent.is_dir() and args.out:
-        raise InputError(f"--out: the folder {out.parent} does not exist")
     return out
 
 
@@ -197,7 +196,9 @@ def _write(out, args: argparse.Namespace, scenes: list, scores: list, summary: d
     from gsim3d.errors import InputError
     from gsim3d.evaluate.pictures import write_curves
     from gsim3d.evaluate.report import write_csv, write_json, write_markdown
+    from gsim3d.files import made_around
 
+    made_around(out)
     files = [out, out.with_suffix(".csv"), out.with_suffix(".md"), out.with_suffix(".png")]
     write_json(files[0], summary)
     write_csv(files[1], scores)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.data.recording import BACKGROUND, MOVING
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, did_you_mean
 from gsim3d.evaluate.metrics import SSIM_WINDOW, psnr, ssim
 from gsim3d.perceptual import fvd, lpips, weights
 
@@ -71,7 +71,10 @@ def measurable(names: Sequence[str] | None = None) -> tuple[tuple[str, ...], dic
         return chosen, {name: weights.how_to_install(needed) for name, needed in missing.items()}
     for name in names:
         if name not in METRICS:
-            raise InputError(f"metric {name!r} does not exist; metrics: {', '.join(METRICS)}")
+            raise InputError(
+                f"metric {name!r} does not exist; metrics: {', '.join(METRICS)}"
+                f"{did_you_mean(name, METRICS)}"
+            )
         if name in missing:
             raise weights.WeightsMissing(f"metric {name} needs weights: {weights.how_to_install(missing[name])}")
     return tuple(name for name in METRICS if name in names), {}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from gsim3d.terminal import number, whole
+
 EPILOG = """\
 worlds:
   elastic   soft bodies fall on a round ground
@@ -45,6 +47,7 @@ it goes on where it stopped. A larger --trajectories adds scenes to a finished s
 --part I/N and then one without: tools/slurm/generate.sbatch.
 """
 
+LENGTH = number(0, above=True)  # metres
 _OPTIONS = {
     "set": "subset",
     "size": "image_size",
@@ -75,11 +78,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--preset", default="mini", help="options to start from: mini (default), published or diverse")
     parser.add_argument("--set", metavar="NAME", help="train (default), or a held-out set, see below")
-    parser.add_argument("--size", type=int, metavar="PX", help="width and height of the images")
-    parser.add_argument("--frames", type=int, metavar="N", help="steps of a trajectory")
-    parser.add_argument("--fps", type=float, help="steps a second")
-    parser.add_argument("--trajectories", type=int, metavar="N", help="number of scenes, dealt to the objects in turn")
-    parser.add_argument("--seed", type=int, help="another seed gives other trajectories (default 0)")
+    parser.add_argument("--size", type=whole(16, 4096), metavar="PX", help="width and height of the images")
+    parser.add_argument("--frames", type=whole(1), metavar="N", help="steps of a trajectory")
+    parser.add_argument("--fps", type=number(0, above=True), help="steps a second")
+    parser.add_argument(
+        "--trajectories", type=whole(1), metavar="N", help="number of scenes, dealt to the objects in turn"
+    )
+    parser.add_argument("--seed", type=whole(0), help="another seed gives other trajectories (default 0)")
     parser.add_argument(
         "--objects",
         type=_names,
@@ -94,14 +99,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "installed genesis-world; repeatable",
     )
     parser.add_argument("--mesh-up", choices=("y", "z"), help="which axis of mesh files points up (default y)")
-    parser.add_argument("--drop", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of drop heights, metres")
+    parser.add_argument("--drop", type=LENGTH, nargs=2, metavar=("LOW", "HIGH"), help="range of drop heights, metres")
     parser.add_argument(
-        "--body-size", type=float, nargs=2, metavar=("LOW", "HIGH"), help="range of body diameters, metres"
+        "--body-size", type=LENGTH, nargs=2, metavar=("LOW", "HIGH"), help="range of body diameters, metres"
     )
     parser.add_argument("--background", choices=("black", "white"), help="colour behind the ground (default black)")
     parser.add_argument(
         "--camera-spread",
-        type=float,
+        type=number(0, 0.25),
         metavar="S",
         help="cameras differ from scene to scene: up to S of their distance nearer or farther, other heights and "
         "angles (default 0: the same in all)",
@@ -110,7 +115,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--engine", help="mujoco (default), or genesis: the paper's MPM and PBD (pip install 'gsim3d[genesis]')"
     )
-    parser.add_argument("--processes", type=int, metavar="N", help="default: one a core")
+    parser.add_argument("--processes", type=whole(1), metavar="N", help="default: one a core")
     parser.add_argument(
         "--part",
         type=_part,

@@ -164,10 +164,10 @@ def each(function: Callable, jobs: Sequence[tuple], processes: int | None, shown
     Args:
         processes: None: as many as there are cores.    shown: what the progress bar counts; None: no bar.
     """
-    from tqdm import tqdm
+    from gsim3d.terminal import progress
 
     processes = min(processes or len(os.sched_getaffinity(0)), len(jobs))
-    with tqdm(total=len(jobs), desc=shown, unit="scene", disable=shown is None or not jobs) as bar:
+    with progress(None, shown or "", len(jobs), unit="scene", quiet=shown is None or not jobs) as bar:
         if processes <= 1:
             for job in jobs:
                 yield function(*job)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, did_you_mean
 from gsim3d.generate import cameras, meshes, render, shapes, writer
 from gsim3d.generate.bodies import OBJECTS, name_rng, named_body
 from gsim3d.generate.carriers import Carrier, grid_faces
@@ -142,7 +142,8 @@ class World(ABC):
                 raise InputError(f"{field} must be one of {', '.join(allowed)}; got {getattr(self, field)!r}")
         for name in self.objects:
             if name not in OBJECTS:
-                raise InputError(f"object {name!r} is not known; choose from {', '.join(OBJECTS)}")
+                known, hint = ", ".join(OBJECTS), did_you_mean(name, OBJECTS)
+                raise InputError(f"object {name!r} is not known; choose from {known}{hint}")
         names = self.object_names()
         repeated = [name for name, count in Counter(names).items() if count > 1]
         if repeated or not names:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, did_you_mean
 from gsim3d.generate import bodies, meshes, shapes
 from gsim3d.generate.stage import Cloth, Material, RigidBody, SoftBody
 from gsim3d.generate.world import TRAIN, World
@@ -281,14 +281,15 @@ def build_world(world: str, preset: str, changes: dict) -> World:
     Other ``changes`` replace single settings.
     """
     if world not in WORLDS:
-        raise InputError(f"world {world!r} is not known; choose from {', '.join(WORLDS)}")
+        raise InputError(f"world {world!r} is not known; choose from {', '.join(WORLDS)}{did_you_mean(world, WORLDS)}")
     if preset not in PRESETS:
-        hint = f"; {preset} is called {_RENAMED[preset]} now" if preset in _RENAMED else ""
+        hint = f"; {preset} is called {_RENAMED[preset]} now" if preset in _RENAMED else did_you_mean(preset, PRESETS)
         raise InputError(f"preset {preset!r} is not known; choose from {', '.join(PRESETS)}{hint}")
     known = {field.name for field in dataclasses.fields(WORLDS[world])}
     unknown = sorted(set(changes) - known)
     if unknown:
-        raise InputError(f"world {world!r} has no option {unknown[0]!r}; it has {', '.join(sorted(known))}")
+        hint = did_you_mean(unknown[0], known)
+        raise InputError(f"world {world!r} has no option {unknown[0]!r}; it has {', '.join(sorted(known))}{hint}")
     chosen = {**PRESETS[preset][world], **_held_out(world, preset, changes.get("subset", TRAIN)), **changes}
     settings = WORLDS[world](**chosen)
     files = tuple(bodies.mesh_file(path, settings.mesh_up) for path in settings.meshes)
@@ -304,6 +305,8 @@ def _held_out(world: str, preset: str, subset: str) -> dict:
         return {}
     sets = [name for name, worlds in HELD_OUT[preset].items() if world in worlds]
     if subset not in sets:
-        raise InputError(f"world {world!r} has no set {subset!r}; choose from {', '.join([TRAIN, *sets])}")
+        known = [TRAIN, *sets]
+        hint = did_you_mean(subset, known)
+        raise InputError(f"world {world!r} has no set {subset!r}; choose from {', '.join(known)}{hint}")
     count = {"n_trajectories": _HELD_OUT_COUNT[preset]} if preset in _HELD_OUT_COUNT else {}
     return {**HELD_OUT[preset][subset][world], **count}

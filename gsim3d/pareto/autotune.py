@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, did_you_mean
 from gsim3d.evaluate.report import write_json
 from gsim3d.files import MAX_TEXT, read_file
 from gsim3d.pareto.limit import PRESETS, TimeLimit
@@ -184,7 +184,10 @@ def load_speed(folder: Path, restored: Restored, preset: str) -> Setting:
         InputError: it was not tuned; the message says how to.
     """
     if preset not in PROMISES:
-        raise InputError(f"--speed: must be one of {', '.join(PROMISES)}; got {preset!r}")
+        raise InputError(
+            f"--speed: must be one of {', '.join(PROMISES)}; got {preset!r}"
+            f"{did_you_mean(preset, PROMISES)}"
+        )
     if preset == "exact":
         return Setting()
     path, device = folder / SPEEDS, restored.device.type

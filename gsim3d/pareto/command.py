@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from gsim3d.pretrained import CHECKPOINT_HELP
+from gsim3d.terminal import number, progress
 
 SLOW_METRICS = ("lpips_vgg", "fvd")  # seconds a setting
 HURRIED_REPEATS = 5  # of a batch, in a quick report on a CPU
@@ -65,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--minutes",
-        type=float,
+        type=number(0, 1e6, above=True),
         metavar="M",
         help="end in about so many; the report says what there was no time for (default: no limit)",
     )
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
 
     from tqdm import tqdm
 
-    from gsim3d.errors import InputError
+    from gsim3d.errors import InputError, did_you_mean
     from gsim3d.evaluate.pictures import pyplot
     from gsim3d.evaluate.scoring import measurable
     from gsim3d.pareto import autotune, budget, machine, report
@@ -95,13 +96,14 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.pretrained import located
     from gsim3d.train.restore import restore
 
-    if args.minutes is not None and not 0 < args.minutes < 1e6:
-        raise InputError(f"--minutes: must be above 0; got {args.minutes}")
     limit = TimeLimit(None if args.minutes is None else 60 * args.minutes)
     pyplot()
     known = {knob.name: knob for knob in KNOBS}
     if unknown := sorted(set(args.knobs or ()) - set(known)):
-        raise InputError(f"--knobs: {unknown[0]!r} does not exist; knobs: {', '.join(map(repr, known))}")
+        raise InputError(
+            f"--knobs: {unknown[0]!r} does not exist; knobs: {', '.join(map(repr, known))}"
+            f"{did_you_mean(unknown[0], known)}"
+        )
     metrics, not_measured = measurable(args.metrics)
     quick = args.preset == "quick"
     if quick and args.metrics is None:
@@ -123,14 +125,14 @@ def run(args: argparse.Namespace) -> int:
     clock = DeviceClock(restored.device)
     knobs = [known[name] for name in args.knobs] if args.knobs else KNOBS
     out.mkdir(parents=True, exist_ok=True)
-    with tqdm(total=REST, unit="run", disable=args.quiet) as bar:
+    with progress(total=REST, unit="run", quiet=args.quiet) as bar:
 
-        def progress(doing: str, runs: int = 1) -> None:
+        def advance(doing: str, runs: int = 1) -> None:
             bar.set_description(doing[:60], refresh=False)
             bar.update(runs)
             bar.refresh()
 
-        progress("first input, and which knobs there are", 0)
+        advance("first input, and which knobs there are", 0)
         points, not_turned = points_of(subject, knobs, effort)
         if training is not None:
             not_turned.pop("training steps", None)  # the figure of the training shows it
@@ -139,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
         if args.self_check:
             blind = DeviceClock(restored.device, waits=False) if args.device == "cuda" else None
             most = limit.part(SELF_CHECK)
-            checks = self_check(subject, clock, blind, lambda doing: progress(doing, 0), min(MOST_SECONDS, most), most)
+            checks = self_check(subject, clock, blind, lambda doing: advance(doing, 0), min(MOST_SECONDS, most), most)
             tqdm.write("\n".join(map(str, checks)))
         comparison = Comparison(subject, metrics, None if effort.apart else clock)
         conditions = {
@@ -157,16 +159,16 @@ def run(args: argparse.Namespace) -> int:
             unfinished = {**conditions, "unfinished": f"ended after {n_rounds} of {effort.n_rounds} rounds"}
             report.write_numbers(out, report.as_dict(_in_time(points), comparison, unfinished, {"exact": points[0]}))
 
-        measure(comparison, points, clock, effort, progress, limit, keep)
+        measure(comparison, points, clock, effort, advance, limit, keep)
         if points[0].failure:
             raise InputError(f"{args.checkpoint}: the reference run has no result: {points[0].failure}")
         points = _in_time(points, not_turned)
         doing = "combinations for the presets"
-        presets = autotune.tune(comparison, points, clock, effort, lambda what: progress(f"{doing}: {what}", 0), limit)
+        presets = autotune.tune(comparison, points, clock, effort, lambda what: advance(f"{doing}: {what}", 0), limit)
         points = list(dict.fromkeys([*points, *presets.values()]))
-        progress("many scenes, training", REST // 2)
+        advance("many scenes, training", REST // 2)
         conditions["regimes"] = _regimes(subject, presets, clock, quick, lambda: limit.is_over(REGIMES))
-        progress("pictures", REST - REST // 2)
+        advance("pictures", REST - REST // 2)
         content, files = report.write(out, points, comparison, conditions, presets, training)
     files.append(_keep_speeds(located(args.checkpoint), out, restored, presets, PartTimes.of(subject, points[0])))
     print(report.table(content))

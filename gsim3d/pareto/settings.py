@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, did_you_mean
 from gsim3d.ops.raster import CUTOFFS
 from gsim3d.pareto.products import compiler_problem, why_not
 
@@ -138,7 +138,10 @@ class Setting:
         """Raises InputError for an unknown key."""
         known = [f.name for f in dataclasses.fields(cls)]
         if unknown := sorted(set(values) - set(known)):
-            raise InputError(f"setting: unknown key {unknown[0]}; known: {', '.join(known)}")
+            raise InputError(
+                f"setting: unknown key {unknown[0]}; known: {', '.join(known)}"
+                f"{did_you_mean(unknown[0], known)}"
+            )
         return cls(**values)
 
 

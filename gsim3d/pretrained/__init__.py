@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, did_you_mean
 
 FOLDER = Path(__file__).parent
 WEIGHTS = "model.safetensors"
@@ -45,4 +45,4 @@ def located(checkpoint: str | Path) -> Path:
     if str(checkpoint) in names():
         return FOLDER / str(checkpoint) / WEIGHTS
     known = f"simulators that come with gsim3d: {', '.join(names())}" if names() else "none comes with gsim3d"
-    raise InputError(f"{checkpoint}: no such checkpoint ({known})")
+    raise InputError(f"{checkpoint}: no such checkpoint ({known}{did_you_mean(checkpoint, names())})")

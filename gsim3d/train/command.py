@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from gsim3d.terminal import whole
+
 EPILOG = """\
 CONFIG is a YAML file; what it leaves out has a default, what it does not know is an error. For example
 
@@ -35,7 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", metavar="DIR", help="run folder; made if absent")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default: cpu)")
-    parser.add_argument("--until", type=int, metavar="STEP", help="stop after this optimizer step (default: the last)")
+    parser.add_argument(
+        "--until", type=whole(1), metavar="STEP", help="stop after this optimizer step (default: the last)"
+    )
     parser.add_argument("--export", metavar="FILE", help="also write the result as one .safetensors file")
     parser.add_argument("--tensorboard", action="store_true", help="also log to OUT/tensorboard, with sample videos")
     parser.add_argument("--profile", action="store_true", help="write a trace of two steps to OUT/profile, then go on")
@@ -49,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
 
     from gsim3d.data import Scene, find_scenes, split_scenes
     from gsim3d.errors import InputError
+    from gsim3d.files import made_around, place_of
     from gsim3d.train import checkpoint
     from gsim3d.train.config import TrainConfig
     from gsim3d.train.settings import from_dict, load_yaml, to_dict
@@ -60,10 +65,8 @@ def run(args: argparse.Namespace) -> int:
     for name in ("config", "data", "out"):
         if getattr(args, name) is None:
             raise InputError(f"{'CONFIG' if name == 'config' else f'--{name}'} is needed (see gsim3d train --help)")
-    if args.until is not None and args.until < 1:
-        raise InputError(f"--until must be at least 1; got {args.until}")
-    if args.export and (not args.export.endswith(".safetensors") or not Path(args.export).absolute().parent.is_dir()):
-        raise InputError(f"--export must name a .safetensors file in a folder that exists; got {args.export}")
+    if args.export:
+        place_of(args.export, ".safetensors", "--export")
     folders, _ = split_scenes(find_scenes(args.data))
     if args.cache:
         Path(args.cache).mkdir(parents=True, exist_ok=True)  # a folder that cannot be is told before work begins
@@ -81,6 +84,6 @@ def run(args: argparse.Namespace) -> int:
         trainer.run(until=args.until, tensorboard=args.tensorboard, profile=args.profile)
         say(f"trained to step {trainer.step} of {config.n_steps}: {args.out}")
         if args.export and processes.is_first:
-            checkpoint.export(checkpoint.load(args.out), args.export)
+            checkpoint.export(checkpoint.load(args.out), made_around(Path(args.export)))
             say(f"written: {args.export}")
     return 0

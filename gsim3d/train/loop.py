@@ -161,7 +161,7 @@ class Trainer:
         self.simulator.train()
         self.processes.check_same(weights=self.parameters.values())
         shows = progress and self.processes.is_first
-        bar = tqdm(total=until, initial=self.step, desc="training", unit="step", disable=not shows)
+        bar = tqdm(total=until, initial=self.step, desc="training", unit="step", disable=None if shows else True)
         if profile:
             check_profile(until - self.step)
         tracer = profiler(self.out, self.processes.rank) if profile else nullcontext()

@@ -20,7 +20,7 @@ from torch.overrides import TorchFunctionMode
 from gsim3d import presets
 from gsim3d.data import Scene
 from gsim3d.effects import EffectsSpec
-from gsim3d.errors import FitWarning, InputError
+from gsim3d.errors import FitWarning, InputError, did_you_mean
 from gsim3d.ops import cuda_compiled
 from gsim3d.plans import Plan
 from gsim3d.presets import ModelConfig
@@ -128,7 +128,10 @@ class Restored:
 def model_config(config: TrainConfig) -> ModelConfig:
     """The preset with the configuration's changes."""
     if config.preset not in PRESETS:
-        raise InputError(f"preset: must be one of {', '.join(PRESETS)}; got {config.preset!r}")
+        raise InputError(
+            f"preset: must be one of {', '.join(PRESETS)}; got {config.preset!r}"
+            f"{did_you_mean(config.preset, PRESETS)}"
+        )
     base = getattr(presets, config.preset)()
     return from_dict(ModelConfig, config.model, "model", base)
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, did_you_mean
 from gsim3d.files import MAX_TEXT, read_file
 
 T = TypeVar("T")
@@ -51,7 +51,8 @@ def from_dict(cls: type[T], content: dict, where: str = "", base: T | None = Non
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     unknown = [str(key) for key in content if key not in fields]
     if unknown:
-        raise InputError(f"{_join(where, unknown[0])}: unknown setting; known here: {', '.join(fields)}")
+        hint = did_you_mean(unknown[0], fields)
+        raise InputError(f"{_join(where, unknown[0])}: unknown setting; known here: {', '.join(fields)}{hint}")
     values = {}
     for name, field in fields.items():
         if name in content:
@@ -96,7 +97,10 @@ def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:
         return tuple(_convert(kind, item, f"{where}[{i}]", None) for i, (kind, item) in enumerate(zip(kinds, value)))
     if origin is typing.Literal:
         if value not in arguments:
-            raise InputError(f"{where}: must be one of {', '.join(map(repr, arguments))}; got {value!r}")
+            raise InputError(
+                f"{where}: must be one of {', '.join(map(repr, arguments))}; got {value!r}"
+                f"{did_you_mean(value, map(str, arguments))}"
+            )
         return value
     if hint is float and isinstance(value, str):  # YAML 1.1 reads 2e-4 as text
         try:

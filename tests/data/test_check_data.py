@@ -71,11 +71,12 @@ def test_nothing_to_draw(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["{data}/absent"], ["{empty}"], ["{data}", "--out", "a.jpg"], ["{data}", "--out", "{data}/no/a.png"]]
+    "arguments", [["{data}/absent"], ["{empty}"], ["{data}", "--out", "a.jpg"], ["{data}", "--out", "{file}/no/a.png"]]
 )
 def test_the_check_cannot_run(data, tmp_path, capsys, arguments):
     (tmp_path / "empty").mkdir()
-    words = [word.format(data=data, empty=tmp_path / "empty") for word in arguments]
+    places = {"data": data, "empty": tmp_path / "empty", "file": data / "genesis" / "metadata.json"}
+    words = [word.format(**places) for word in arguments]
     assert main(["check-data", *words]) == 2
     assert capsys.readouterr().err.startswith("gsim3d: error: ")
 
