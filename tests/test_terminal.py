@@ -100,7 +100,7 @@ def test_progress_is_for_terminals(capsys, monkeypatch):
         (["simulate", "a", "b", "--out", "c", "--device", "cud"], "invalid choice: 'cud' .*; did you mean cuda?"),
         (["weights", "lpip"], "; did you mean lpips?"),
         (["generate", "elastik", "--out", "{new}"], "world 'elastik' .*; did you mean elastic?"),
-        (["generate", "elastic", "--preset", "papr", "--out", "{new}"], "; did you mean paper?"),
+        (["generate", "elastic", "--preset", "publishd", "--out", "{new}"], "; did you mean published?"),
         (["generate", "elastic", "--set", "uneen", "--out", "{new}"], "; did you mean unseen?"),
         (["generate", "elastic", "--objects", "bal", "--out", "{new}"], "; did you mean ball?"),
         (["plan", "{scene}", "elastic-smal"], "; did you mean elastic-small?"),
