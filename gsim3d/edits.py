@@ -80,7 +80,8 @@ class Move(Operation):
 
 @dataclass(frozen=True)
 class Rotate(Operation):
-    """They turn by ``degrees`` about an axis through ``about`` (default: each scene's middle); so does their speed."""
+    """They turn by ``degrees`` about an axis through ``about``, a place in the world (default: each scene's middle); so
+    does their speed."""
 
     axis: Vector = (0.0, 0.0, 1.0)
     degrees: float = 0.0
@@ -97,7 +98,7 @@ class Rotate(Operation):
         vector = F.normalize(torch.tensor(self.axis, dtype=torch.float64), dim=0) * math.radians(self.degrees)
         quat = rotate_left(torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64), vector[None])
         matrix = rotation_matrices(quat)[0].to(means)
-        pivots = _middles(state, rows) if self.about is None else means.new_tensor(self.about).expand_as(means)
+        pivots = _middles(state, rows) if self.about is None else _from_world(state, self.about)
         fields = {"means": (means - pivots) @ matrix.T + pivots}
         if state.quats is not None:
             fields["quats"] = rotate_left(state.quats, vector.to(means).expand(state.n_rows, 3))
@@ -190,7 +191,7 @@ class Insert(Operation):
             mine = getattr(state, field)
             if field not in OPTIONAL_FIELDS and (mine is None or mine.shape[1:] != value.shape[1:]):
                 raise InputError(f"particles.{field} must be as those of the state; were they made by another model?")
-        given = _moved(given, rows, self.by).select_rows(rows).to(state.means.device)
+        given = given.select_rows(rows).to(state.means.device)
         table, newest = state.clouds, {
             state.clouds.scenes[q]: state.clouds.steps[q] for q in newest_clouds(state.clouds)
         }
@@ -202,7 +203,11 @@ class Insert(Operation):
             runs.append((0, 0) if q is None else given.clouds.row_runs([q])[0])
         counts = CloudTable.make((b - a for a, b in runs), table.scenes, table.steps, state.cu_rows.device)
         fields = {name: torch.cat([x[a:b] for a, b in runs]) for name, x in given.row_fields().items()}
-        return _joined(state, dataclasses.replace(given, origin=state.origin).with_clouds(counts, **fields))
+        own = {"origin": state.origin, "world_offset": state.world_offset}
+        here = dataclasses.replace(given, **own).with_clouds(counts, **fields)
+        there = None if given.world_offset is None else given.world_offset[given.clouds.scenes[-1]]
+        by = _between(there, here.row_offset(), self.by)
+        return _joined(state, _moved(here, torch.ones_like(here.activity, dtype=torch.bool), by))
 
 
 OPERATIONS = {kind.name: kind for kind in (Remove, Move, Rotate, Throw, Recolor, Duplicate, Insert)}
@@ -289,9 +294,26 @@ def _changed(state: Particles, rows: Tensor, fields: dict[str, Tensor]) -> Parti
     return dataclasses.replace(state, **mixed)
 
 
-def _moved(state: Particles, rows: Tensor, by: Vector) -> Particles:
+def _moved(state: Particles, rows: Tensor, by: Vector | Tensor) -> Particles:
     moved = (name for name in ("means", "body") if getattr(state, name) is not None)
-    return _changed(state, rows, {name: getattr(state, name) + state.means.new_tensor(by) for name in moved})
+    by = by.to(state.means) if isinstance(by, Tensor) else state.means.new_tensor(by)
+    return _changed(state, rows, {name: getattr(state, name) + by for name in moved})
+
+
+def _from_world(state: Particles, place: Vector) -> Tensor:
+    """[N, 3], ``place`` in the world as rows of ``state`` count positions."""
+    offset = state.row_offset()
+    place = torch.tensor(place, dtype=torch.float64, device=state.means.device).expand(state.n_rows, 3)
+    return (place if offset is None else place - offset).to(state.means)
+
+
+def _between(there: Tensor | None, here: Tensor | None, by: Vector) -> Vector | Tensor:
+    """What positions that count from ``there`` [3] change by where they are moved and count from ``here`` [N, 3]."""
+    if there is None and here is None:
+        return by
+    known = there if here is None else here
+    there, here = (known.new_zeros(3) if offset is None else offset for offset in (there, here))
+    return known.new_tensor(by) + there - here
 
 
 def _middles(state: Particles, rows: Tensor) -> Tensor:

@@ -234,7 +234,7 @@ class CapturedRollout:
         """
         state = self._simulator.prepare(state, self._plan)
         self._check(state, self._table)
-        tables = state.clouds
+        tables, self._world_offset = state.clouds, state.world_offset
         if self._rest is not None:
             state = self._load_parts(self._simulator.parts(state, report=self._report))
         _copy(self._state, state)
@@ -430,7 +430,7 @@ class CapturedRollout:
             counts = [table.count(q) for q in range(len(table))]
             numbers = [number + later[scene] for scene, number in zip(table.scenes, table.steps)]
             fields = step.row_fields() | {"origin": step.origin}
-            fields = _clones(fields) if self._copies else fields
+            fields = (_clones(fields) if self._copies else fields) | {"world_offset": self._world_offset}
             steps.append(step.with_clouds(CloudTable.make(counts, table.scenes, numbers, device), **fields))
         renderings = self._predicted.renderings
         if self._copies:

@@ -91,8 +91,8 @@ def guard_particles(
             rows that cannot be used return to it.
         changed: fields that differ from ``previous``; others are not looked at again. None: all.
         max_opacity: larger ones count as out of range.
-    Gradients: through all rows that stay as they are. On the CPU a backward pass raises where a gradient behind rows that
-        did not stay is not finite, unless ``report`` is closed.
+    Gradients: through all rows that stay as they are. On the CPU a backward pass raises where a gradient behind rows
+        that did not stay is not finite, unless ``report`` is closed.
     Raises:
         HardCaseError: ``config.on_bad`` is "raise", on the CPU.
     """
@@ -157,7 +157,9 @@ def guard_frames(
 
 # Shapes of the fields of particles behind their N rows; None: any.
 _SHAPES = {"means": (3,), "opacities": (), "activity": (), "quats": (4,), "scales": (3,), "sh": (None, 3)}
-_SHAPES |= {"turns": (4,), "paint": (3, 3), "held": (), "velocity": (3,), "light": (3,), "reference": (3,), "body": (3,)}
+_SHAPES |= {"turns": (4,), "paint": (3, 3), "held": (), "velocity": (3,), "light": (3,)}
+_SHAPES |= {"reference": (3,), "body": (3,)}
+_OF_SCENES = ("origin", "world_offset")  # float64, one row a scene
 _DTYPES = {"activity": torch.uint8, "held": torch.bool}
 
 
@@ -181,10 +183,14 @@ def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths
     shapes = {name: (len(particles.means), *_SHAPES.get(name, (widths.get(name),))) for name in rows}
     shapes |= {"cu_rows": (len(particles.cloud_scene) + 1,), "cloud_scene": (None,), "cloud_step": (None,)}
     shapes["origin"] = (None, 3)
+    if particles.world_offset is not None:
+        shapes["world_offset"] = (len(particles.origin), 3)
     for name, shape in shapes.items():
-        value, whole = getattr(particles, name), name.startswith(("cu_", "cloud_"))
-        wanted = torch.int64 if whole else _DTYPES.get(name, dtype)
-        is_one = isinstance(value, Tensor) and (value.dtype == wanted or name == "origin" and value.is_floating_point())
+        value = getattr(particles, name)
+        wanted = torch.int64 if name.startswith(("cu_", "cloud_")) else _DTYPES.get(name, dtype)
+        if name in _OF_SCENES:
+            wanted = torch.float32 if getattr(value, "dtype", None) == torch.float32 else torch.float64
+        is_one = isinstance(value, Tensor) and value.dtype == wanted
         if not is_one or value.dim() != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape)):
             got = f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
             sizes = ", ".join("any" if n is None else str(n) for n in shape)
@@ -204,15 +210,15 @@ def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths
 def _check_choices(particles: Particles, where: str) -> None:
     if bool((particles.activity > ASLEEP).any()):
         raise InputError(f"{where}: particles.activity must be 0 (dynamic), 1 (frozen) or 2 (asleep)")
-    remembered = {name: getattr(particles, name) for name in NOT_LOOKED_AT[2:]} | {"origin": particles.origin}
-    for name, value in remembered.items():
+    for name in (*NOT_LOOKED_AT[2:], *_OF_SCENES):
+        value = getattr(particles, name)
         if value is None or value.dtype == torch.bool:
             continue
-        good = at_most(value, FARTHEST if name == "origin" else LARGEST)
+        good = at_most(value, FARTHEST if name in _OF_SCENES else LARGEST)
         if bool(good.all()):
             continue
-        row, one = int(good.logical_not().nonzero()[0]), "scene" if name == "origin" else "row"
-        largest = f" and at most {FARTHEST:g} m in size" if name == "origin" else ""
+        row, one = int(good.logical_not().nonzero()[0]), "scene" if name in _OF_SCENES else "row"
+        largest = f" and at most {FARTHEST:g} m in size" if name in _OF_SCENES else ""
         raise HardCaseError(
             f"{where}: particles.{name} must be finite{largest}; {one} {row} is not",
             tensor=f"particles.{name}",
@@ -230,12 +236,12 @@ def drop_rows(particles: Particles, rows: Tensor) -> Particles:
 
 
 def _read_images(frames: Frames, where: str, action: str, counts: Tensor) -> Reading:
-    findings = []
+    findings, what = [], "not finite or outside [0, 1]"
     for image, count in enumerate(counts.tolist()):
         if count:
             cloud = int(frames.cameras.image_cloud[image])
             scene, step = int(frames.cloud_scene[cloud]), int(frames.cloud_step[cloud])
-            findings.append(Finding("not finite or outside [0, 1]", where, "frames.images", action, count, None, scene, step, image))
+            findings.append(Finding(what, where, "frames.images", action, count, None, scene, step, image))
     return Reading(findings, {})
 
 

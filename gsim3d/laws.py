@@ -134,6 +134,7 @@ def take_scenes(frames: Frames, scenes: Sequence[int]) -> Frames:
         cloud_scene=new_scene,
         cloud_step=frames.cloud_step[chosen],
         origin=frames.origin[list(scenes)],
+        world_offset=None if frames.world_offset is None else frames.world_offset[list(scenes)],
     )
 
 
@@ -149,7 +150,9 @@ def take_scenes_of_particles(particles: Particles, scenes: Sequence[int]) -> Par
         particles.cu_rows.device,
     )
     fields = {name: take_runs(value, runs) for name, value in particles.row_fields().items()}
-    return dataclasses.replace(particles.with_clouds(new, **fields), origin=particles.origin[list(scenes)])
+    offset = None if particles.world_offset is None else particles.world_offset[list(scenes)]
+    fields |= {"origin": particles.origin[list(scenes)], "world_offset": offset}
+    return particles.with_clouds(new, **fields)
 
 
 def permute_rows(particles: Particles, seed: int = 0) -> tuple[Particles, Tensor]:

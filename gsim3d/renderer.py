@@ -84,7 +84,8 @@ class GaussianHead(nn.Module):
         sh, quats, scales = self._shape_and_color(particles, n_harmonics)
         if sh is not None and particles.light is not None:
             sh = lit(sh, particles.light)
-        return Gaussians(particles.means, quats, scales, particles.opacities, sh, particles.cu_rows)
+        offset = None if particles.world_offset is None else particles.world_offset[particles.cloud_scene]
+        return Gaussians(particles.means, quats, scales, particles.opacities, sh, particles.cu_rows, offset)
 
     def _shape_and_color(self, particles: Particles, n_harmonics: int) -> tuple[Tensor | None, Tensor, Tensor]:
         if self.config.latents == 0:

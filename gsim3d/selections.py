@@ -20,7 +20,10 @@ WHICH = ("all", "moving", "frozen")
 
 @dataclass(frozen=True)
 class Selection:
-    """Which particles. which: "moving", "frozen" (the ground) or "all".   box: lowest and highest corner [metres]."""
+    """Which particles. which: "moving", "frozen" (the ground) or "all".
+
+    box: lowest and highest corner in the world [metres].
+    """
 
     which: str = "moving"
     box: Box | None = None
@@ -47,12 +50,15 @@ class Selection:
         rows = kind = torch.ones_like(particles.activity, dtype=torch.bool)
         if activity is not None:
             rows = kind = particles.activity == activity
+        places, offset = particles.means, None if self.box is None else particles.row_offset()
+        if offset is not None:
+            places = places + offset
         if self.box is not None:
-            for place, low, high in zip(particles.means.unbind(1), *self.box, strict=True):
+            for place, low, high in zip(places.unbind(1), *self.box, strict=True):
                 rows = rows & (place >= low) & (place <= high)
         captured = rows.is_cuda and torch.cuda.is_current_stream_capturing()
         if not captured and not bool(rows[newest_rows(particles)].any()):
-            raise InputError(self._nobody(particles.means[kind & newest_rows(particles)]))
+            raise InputError(self._nobody(places[kind & newest_rows(particles)]))
         return rows
 
     def _nobody(self, places: Tensor) -> str:

@@ -80,6 +80,7 @@ class Frames(_Tensors):
     masks: bool [I, H, W], pixels that become particles; None: all.
     dynamic: bool [I, H, W], pixels of bodies that may move; None: all.
     valid: bool [I, H, W], pixels that were filmed: no padding; losses look at no others; None: all.
+    world_offset: float64 [B, 3] metres, as of Particles.
     """
 
     images: Tensor
@@ -90,6 +91,7 @@ class Frames(_Tensors):
     masks: Tensor | None = None
     dynamic: Tensor | None = None
     valid: Tensor | None = None
+    world_offset: Tensor | None = None
 
     def to(self, device):
         return dataclasses.replace(super().to(device), cameras=self.cameras.to(device))
@@ -212,6 +214,8 @@ class Particles(_Tensors):
     activity: uint8 [N], 0 dynamic, 1 frozen (never moves), 2 asleep (never changes, and the dynamics does not see it;
         see gsim3d.stability). A masked-out particle is absent.
     origin: float64 [B, 3] metres, lower corner of each scene's workspace.
+    world_offset: float64 [B, 3] metres, the point of each scene's world that cameras, origin and positions count from,
+        so that float32 holds them; None: 0. Coordinates in edits and files are those of the world.
     quats [N, 4] (w, x, y, z), scales [N, 3] metres, sh [N, K, 3]: only in explicit models.
     turns: [N, 4] (w, x, y, z), by which what is drawn of a latent look is turned further: where an edit turned it
         (:mod:`gsim3d.edits`), and of a model with ``turning`` with the matter since rows were encoded.
@@ -257,6 +261,7 @@ class Particles(_Tensors):
     shaded: Tensor | None = None
     reference: Tensor | None = None
     body: Tensor | None = None
+    world_offset: Tensor | None = None
     known: CloudTable | None = None  # see clouds
 
     ROW_FIELDS = (
@@ -316,6 +321,10 @@ class Particles(_Tensors):
             torch.arange(self.n_clouds, device=counts.device), counts, output_size=self.n_rows
         )
 
+    def row_offset(self) -> Tensor | None:
+        """float64 [N, 3], the ``world_offset`` of each row's scene."""
+        return None if self.world_offset is None else self.world_offset[self.cloud_scene[self.row_cloud()]]
+
     def select_rows(self, rows: Tensor) -> Particles:
         """Keeps ``rows`` (bool [N]); clouds stay, even where they become empty."""
         kept = torch.zeros(self.n_rows + 1, dtype=torch.int64, device=rows.device)
@@ -344,7 +353,8 @@ class Gaussians(_Tensors):
     means [N, 3] metres, quats [N, 4] (w, x, y, z), scales [N, 3] metres, opacities [N] in (0, 1),
     sh [N, K, 3] coefficients of the standard 3DGS basis (K = (degree + 1)^2; colour = sum + 0.5, clamped at 0); None
     where no colour is asked for,
-    cu_rows int64 [Q + 1].
+    cu_rows int64 [Q + 1],
+    world_offset float64 [Q, 3] metres, what positions of a cloud count from; None: 0.
     """
 
     means: Tensor
@@ -353,3 +363,4 @@ class Gaussians(_Tensors):
     opacities: Tensor
     sh: Tensor | None
     cu_rows: Tensor
+    world_offset: Tensor | None = None

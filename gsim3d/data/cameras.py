@@ -5,6 +5,7 @@ Everything here is float64, world-to-camera, OpenCV axes (x right, y down, z for
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ MAX_ERROR = 0.5  # of axes that meet: their distance from the point over its dis
 MIN_SPREAD = 0.02  # mean squared sine of the optical axes around their mean: about 8 degrees
 MANY_STEPS = 64  # of moving cameras, so many steps are enough to see where they look
 NEAR_SHARE, FAR_SHARE = 0.3, 2.0  # near and far relative to the distances of the point that the cameras look at
+FAR_FROM_ZERO = 16  # near depths; from there on float32 moves what is near by more than 2^-20 of its depth
 SAMPLES = 12  # points along each side of a frustum
 
 
@@ -30,6 +32,22 @@ def inverse(viewmats: np.ndarray) -> np.ndarray:
     result[..., :3, 3] = -(rotation @ viewmats[..., :3, 3:])[..., 0]
     result[..., 3, 3] = 1
     return result
+
+
+def near_zero(recording: Recording) -> Recording:
+    """``recording`` with positions that float32 holds: where cameras are far from 0 for what they see, positions count
+    from a ``world_offset`` amid them, whole metres. Survey coordinates are an example."""
+    middle = inverse(recording.viewmats)[..., :3, 3].reshape(-1, 3).mean(0)
+    near = recording.near or min(depth_range(spread_steps(recording.viewmats).reshape(-1, 4, 4)) or (np.inf,))
+    offset = np.round(middle)
+    if not np.abs(middle).max() > FAR_FROM_ZERO * near or not offset.any():
+        return recording
+    viewmats = recording.viewmats.copy()
+    viewmats[..., :3, 3] += viewmats[..., :3, :3] @ offset
+    places = {
+        name: value - offset for name in ("origin", "bounds") if (value := getattr(recording, name)) is not None
+    }
+    return dataclasses.replace(recording, viewmats=viewmats, world_offset=recording.world_offset + offset, **places)
 
 
 def by_step(matrices: Sequence[np.ndarray], n_steps: int) -> np.ndarray:

@@ -143,11 +143,13 @@ def describe(scene: Scene) -> str:
     pixels = ", ".join(f"{width}x{height}" for width, height in sizes[:2]) + (", ..." if len(sizes) > 2 else "")
     moves = ", moving" if len(scene.recording.viewmats) > 1 else ""
     labels = "subtracted" if scene.recording.subtract_background else "yes" if scene.has_segmentation() else "none"
+    offset = ", ".join(f"{x:.0f}" for x in scene.world_offset) if scene.world_offset.any() else None
+    where = "" if offset is None else f", positions count from ({offset})"
     return (
         f"{scene.name}: {scene.layout}, {scene.n_steps} steps at {scene.fps:g} a second, "
         f"{scene.n_cams} cameras{moves}, "
-        f"{pixels} pixels, depth {scene.near:.2f} to {scene.far:.2f} m, bounds {size} m, masks: {labels}"
-        + "".join(f"; {note}" for note in scene.recording.notes)
+        f"{pixels} pixels, depth {scene.near:.2f} to {scene.far:.2f} m, bounds {size} m{where}, "
+        f"masks: {labels}" + "".join(f"; {note}" for note in scene.recording.notes)
     )
 
 

@@ -94,6 +94,7 @@ def make_frames(
         raise InputError("make_frames needs at least one step")
     labels = torch.cat(labels) if masked else None
     valid = _join_valid(valid, images)
+    offsets = np.stack([scene.world_offset for scene in scenes])
     return Frames(
         images=torch.cat(images).float().div_(255),
         cameras=_join_cameras(cameras, image_cloud),
@@ -103,6 +104,7 @@ def make_frames(
         masks=labels != BACKGROUND if masked else valid,
         dynamic=labels == MOVING if masked else None,
         valid=valid,
+        world_offset=torch.from_numpy(offsets) if offsets.any() else None,
     )
 
 

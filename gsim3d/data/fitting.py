@@ -73,7 +73,7 @@ def _in_units_of_cameras(recording: Recording) -> Recording:
     viewmats[..., :3, 3] /= extent
     lengths = {
         name: value / extent
-        for name in ("near", "far", "origin", "bounds")
+        for name in ("near", "far", "origin", "bounds", "world_offset")
         if (value := getattr(recording, name)) is not None
     }
     return dataclasses.replace(recording, viewmats=viewmats, **lengths)

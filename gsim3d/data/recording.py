@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +62,7 @@ class Recording:
     read_images: uint8 [h, w, 3], RGB.   read_labels: uint8 [h, w] of BACKGROUND, FIXED, MOVING; None: no labels.
     distortions: per camera its lens, None for a pinhole; images are not undistorted yet.
     near, far, origin, bounds: None where nobody gave them.
+    world_offset: float64 [3], what all positions count from; a reader leaves them where they are, at 0.
     is_film: shows a real background: it is painted black where labels say so.
     subtract_background: labels come from what differs from the median image of the camera.
     notes: what was left out or changed on reading; check-data prints them.
@@ -85,6 +86,7 @@ class Recording:
     is_film: bool = False
     subtract_background: bool = False
     notes: tuple[str, ...] = ()
+    world_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
 def read_json(file: Path) -> dict:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.data import layouts
-from gsim3d.data.cameras import check_directions, frusta_origin, shared_view, spread_steps
+from gsim3d.data.cameras import check_directions, frusta_origin, near_zero, shared_view, spread_steps
 from gsim3d.data.fitting import Fitting, fit, own_depths
 from gsim3d.data.images import ImageCache
 from gsim3d.data.lenses import Undistorter
@@ -32,6 +32,8 @@ class Scene:
     near, far: metres, the depth range in which the scene lies.
     width, height: pixels of all images: those of the largest camera, padded on the right and below to multiples of 16.
     origin: float64 [3] metres, lower corner of the workspace.
+    world_offset: float64 [3] metres, the point that cameras, origin and bounds count from, so that float32 holds them:
+        a position plus it has the coordinates of the scene's files. 0, except for scenes that lie far from 0.
     """
 
     def __init__(
@@ -39,13 +41,14 @@ class Scene:
     ):
         self.path = path
         self.filmed_sizes = recording.sizes
-        self._filmed, self.fitting = recording, fitting
-        recording = fit(recording, fitting)
+        self._filmed, self.fitting = near_zero(recording), fitting
+        recording = fit(self._filmed, fitting)
         self.name = "/".join(path.absolute().parts[-2:])
         self.recording = recording
         self.layout, self.camera_names = recording.layout, recording.camera_names
         self.n_steps, self.fps, self.n_cams = recording.n_steps, recording.fps, len(recording.camera_names)
         self.near, self.far = _depths(recording)
+        self.world_offset = recording.world_offset
         largest = fitting.size or np.array(recording.sizes).max(0)
         self.width, self.height = (int(-(-side // SIZE_MULTIPLE) * SIZE_MULTIPLE) for side in largest)
         if recording.origin is not None:

@@ -79,10 +79,11 @@ def _check_layout(frames: Frames, config: EncoderConfig, dtype: torch.dtype) -> 
         "cloud_scene": (frames.cloud_scene, whole, clouds),
         "cloud_step": (frames.cloud_step, whole, clouds),
         "origin": (frames.origin, FLOATS, (*frames.origin.shape[:1], 3)),
+        "world_offset": (frames.world_offset, (torch.float64,), tuple(frames.origin.shape)),
         **{name: (getattr(frames, name), *masks) for name in ("masks", "dynamic", "valid")},
     }
     for name, (value, dtypes, shape) in fields.items():
-        if value is None and name in ("masks", "dynamic", "valid"):
+        if value is None and name in ("masks", "dynamic", "valid", "world_offset"):
             continue
         if not isinstance(value, Tensor) or value.dtype not in dtypes or tuple(value.shape) != shape:
             got = f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
@@ -103,6 +104,7 @@ def _wanted(frames: Frames) -> list[_Wanted]:
     error = (rotation @ rotation.mT - torch.eye(3, dtype=rotation.dtype, device=rotation.device)).abs().amax((1, 2))
     focal = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1]], 1)
     lower = torch.stack([Ks[:, 1, 0], Ks[:, 2, 0], Ks[:, 2, 1], Ks[:, 2, 2] - 1], 1).abs().amax(1)
+    offset = origin if frames.world_offset is None else frames.world_offset
     finite, size = "must be finite", f"must be at most {FARTHEST:g} m in size"
     in_range = (near >= NEAREST) & (near <= FARTHEST), (far >= NEAREST) & (far <= FARTHEST)
     bounds = f"must be from {NEAREST:g} to {FARTHEST:g} m"
@@ -111,6 +113,7 @@ def _wanted(frames: Frames) -> list[_Wanted]:
         _Wanted("cloud_scene", (scenes >= 0) & (scenes < n_scenes), f"must be in [0, {n_scenes}), rows of origin", ""),
         _Wanted("cloud_step", steps >= 0, "must not be negative", ""),
         _Wanted("origin", at_most(origin, FARTHEST), f"{finite} and at most {FARTHEST:g} m in size", "scene", NEARER),
+        _Wanted("world_offset", at_most(offset, FARTHEST), f"{finite} and at most {FARTHEST:g} m in size", "scene"),
         _Wanted("cameras.viewmats", viewmats.flatten(1).isfinite().all(1), finite),
         _Wanted("cameras.viewmats", at_most(viewmats, FARTHEST), size, advice=NEARER),
         _Wanted(

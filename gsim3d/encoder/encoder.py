@@ -119,6 +119,7 @@ class Encoder(nn.Module):
             cloud_step=cloud_step,
             activity=activity,
             origin=frames.origin,
+            world_offset=frames.world_offset,
             known=known,
         )
 
@@ -187,6 +188,7 @@ class Encoder(nn.Module):
             cloud_step=frames.cloud_step,
             activity=activity if kept is None else activity[kept_rows],
             origin=frames.origin,
+            world_offset=frames.world_offset,
         )
 
 

@@ -380,7 +380,7 @@ class _Step:
         for own, given in ((self._context, batch.context), (self._targets, batch.targets)):
             for mine, value in ((own, given), (own.cameras, given.cameras)):
                 for name, tensor in vars(value).items():
-                    if isinstance(tensor, Tensor):
+                    if isinstance(tensor, Tensor) and name != "world_offset":  # nothing here reads it
                         getattr(mine, name).copy_(tensor)
 
 

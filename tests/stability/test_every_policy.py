@@ -1,4 +1,4 @@
-"""Under every policy, whatever frames, cameras, origins and particles hold: finite outputs and gradients, or an error."""
+"""Every policy on hostile frames, cameras, origins and particles: finite outputs and gradients, or a typed error."""
 
 import dataclasses
 
