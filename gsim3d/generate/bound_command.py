@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 
 from gsim3d.errors import InputError
+from gsim3d.terminal import whole
 
 EPILOG = """\
 The scenes of a set that gsim3d generate made are simulated again, with errors in how bodies start that images leave
@@ -40,9 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DB|FILE",
         help="a model's error of given steps: masked PSNR in dB, or metrics.json of gsim3d evaluate",
     )
-    parser.add_argument("--trajectories", type=int, metavar="N", help="the first N of the set (default: all)")
+    parser.add_argument("--trajectories", type=whole(1), metavar="N", help="the first N of the set (default: all)")
     parser.add_argument("--out", metavar="DIR", help="folder for bound.json and what each scene gave")
-    parser.add_argument("--processes", type=int, metavar="N", help="default: one a core")
+    parser.add_argument("--processes", type=whole(1), metavar="N", help="default: one a core")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
