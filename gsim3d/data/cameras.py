@@ -50,6 +50,17 @@ def near_zero(recording: Recording) -> Recording:
     return dataclasses.replace(recording, viewmats=viewmats, world_offset=recording.world_offset + offset, **places)
 
 
+def rotations(quaternions: np.ndarray) -> np.ndarray:
+    """Rotation matrices [S, 3, 3] of unit quaternions (w, x, y, z) [S, 4]."""
+    w, x, y, z = quaternions.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
 def by_step(matrices: Sequence[np.ndarray], n_steps: int) -> np.ndarray:
     """[S, V, ...] of V cameras with [...] each that stands still or [n_steps, ...] that moves; S is 1 if none moves."""
     full = np.stack([np.broadcast_to(matrix, (n_steps, *matrix.shape[-2:])) for matrix in matrices], 1)

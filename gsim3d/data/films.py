@@ -259,7 +259,8 @@ def _steps(
         notes.append(f"videos of {told:g} frames a second are taken to have {fps:g}, as fps says")
     if resample is not None:
         numbers, more = _resampled({**folders, **videos}, fps, resample, source)
-        return [numbers.get(name, []) for name in sources], resample, notes + more
+        n_steps = max(map(len, numbers.values()), default=1)
+        return [numbers.get(name, [0] * n_steps) for name in sources], resample, notes + more
     rate = fps or told or 1.0
     first = {name: round(video.times[0] * (video.rate or 0)) for name, video in videos.items()}
     ticks = {name: [first[name] + number for number in video.numbers] for name, video in videos.items()}
@@ -282,6 +283,8 @@ def _resampled(
     sources: dict[str, _Frames | Video], fps: float | None, rate: float, source: Path
 ) -> tuple[dict[str, list[int]], list[str]]:
     """For every camera the frames nearest to steps at ``rate`` a second, from where all have one to where all end."""
+    if not sources:
+        raise InputError(f"{source}: the cameras have no frame in common")
     times = {}
     for name, frames in sources.items():
         own = frames.times if isinstance(frames, Video) else np.array(frames.numbers) / fps

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.data.cameras import OPENGL, by_step, check_intrinsics, inverse
+from gsim3d.data.cameras import OPENGL, by_step, check_intrinsics, inverse, rotations
 from gsim3d.data.images import as_color, is_marked, is_opaque, read_files, read_image
 from gsim3d.data.recording import (
     BACKGROUND,
@@ -162,7 +162,7 @@ class _Camera:
             bad = int(np.argmax(wrong))
             problems.add(f"{what}, frame {numbers[bad]}: the quaternion must have length 1; got {lengths[bad]:.4g}")
             return matrices
-        matrices[:, :3, :3] = _rotations(quaternions[numbers] / lengths[:, None])
+        matrices[:, :3, :3] = rotations(quaternions[numbers] / lengths[:, None])
         matrices[:, :3, 3] = positions[numbers]
         return OPENGL @ inverse(matrices)
 
@@ -192,14 +192,3 @@ class _Camera:
             if number is not None:
                 found[number] = inside(scene, file.relative_to(scene).as_posix(), f"camera {folder.name}")
         return found
-
-
-def _rotations(quaternions: np.ndarray) -> np.ndarray:
-    """Rotation matrices [S, 3, 3] of unit quaternions (w, x, y, z) [S, 4]."""
-    w, x, y, z = quaternions.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)

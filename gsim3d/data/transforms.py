@@ -57,9 +57,9 @@ def read(folder: Path, problems: Problems) -> Recording:
     sources = [folder / name for name in (FILE, *SPLITS) if (folder / name).is_file()]
     source, *splits = sources[:1] if sources[0].name == FILE else sources
     description, notes = read_json(source), []
-    frames = _frames(folder, source, description)
+    frames = frames_of(folder, source, description)
     for other in splits:
-        more = _frames(folder, other, read_json(other))
+        more = frames_of(folder, other, read_json(other))
         if _times(more) == _times(frames):
             frames += more
             notes.append(f"the views of {other.name} are cameras, too")
@@ -121,7 +121,7 @@ def recording_of(folder: Path, source: Path, description: dict, frames: list[dic
     )
 
 
-def _frames(folder: Path, source: Path, description: dict) -> list[dict]:
+def frames_of(folder: Path, source: Path, description: dict) -> list[dict]:
     """The frames of a file, with its keys in each; their paths lie in the folder."""
     frames = description.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):

@@ -43,8 +43,8 @@ class Video:
         if self.rate is None:
             gaps = (1000 * np.diff(found.times)).round(1)
             self.unevenness = (
-                f"its {len(found.times)} frames are {gaps.min():g} to {gaps.max():g} ms apart, though its header tells of "
-                f"{found.rate:.4g} a second"
+                f"its {len(found.times)} frames are {gaps.min():g} to {gaps.max():g} ms apart, though its header tells "
+                f"of {found.rate:.4g} a second"
             )
 
     def read(self, numbers: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:

@@ -141,5 +141,5 @@ def test_the_number_of_a_kubric_frame_is_that_of_its_pose(tmp_path):
 
 
 def test_a_folder_without_any_layout_is_named(tmp_path):
-    with pytest.raises(InputError, match="no metadata.json, transforms.json or cameras.json"):
+    with pytest.raises(InputError, match="no metadata.json, transforms.json, cameras.json or sparse/0"):
         Scene.open(tmp_path)

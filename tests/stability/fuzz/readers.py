@@ -41,7 +41,11 @@ from gsim3d.train.config import DataConfig, TrainConfig
 from gsim3d.train.restore import restore
 from gsim3d.train.settings import from_dict, load_yaml, to_dict
 from gsim3d.types import Gaussians
-from tests.data.made_scenes import WRITERS, make_scene
+from tests.data.made_scenes import WRITERS, edit_json, make_scene
+from tests.data.made_videos import trimmed, with_gaps, write_plain
+from tests.data.made_videos import write_scene as write_videos
+from tests.data.test_colmap import seen_points, write_colmap
+from tests.data.test_transforms import write_synthetic
 from tests.interop.release import random_weights, settings_of, small_config, write_release
 from tests.stability.fuzz.engine import Failure, Target, finite
 from tests.stability.fuzz.files import damage
@@ -69,6 +73,39 @@ def _write_video(file: Path) -> None:
     for step in range(SMALL["n_steps"]):
         writer.write(np.full((SMALL["height"], SMALL["width"], 3), 40 * step, np.uint8))
     writer.release()
+
+
+def _write_colmap(folder: Path, binary: bool) -> None:
+    """Lenses, points, and names that are times."""
+    made, names = make_scene(**SMALL), lambda step, cam: f"cam{cam}/{step}.jpg"
+    lens = {"model": "OPENCV_FISHEYE", "params": [17, 18, 8, 8, 0.1, 0, 0, 0]}
+    write_colmap(folder, made, binary=binary, names=names, points=seen_points(20), **lens)
+    (folder / "scene.json").write_text('{"fps": 12}')
+
+
+def _write_synthetic(folder: Path) -> None:
+    rows = [(step, cam) for step in range(2) for cam in range(2)]
+    write_synthetic(folder, make_scene(**SMALL), {"train": rows[:2], "test": rows[2:]}, suffix=".webp")
+
+
+def _write_images(folder: Path) -> None:
+    """Frames and masks of several formats, and a lens by its keys."""
+    WRITERS["films"](folder, make_scene(**SMALL))
+    (folder / "labels").rename(folder / "masks")
+    for number, file in enumerate(sorted(folder.rglob("*.png"))):
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        image = 80 * image if image.ndim == 2 else image
+        cv2.imwrite(str(file.with_suffix((".tif", ".webp", ".jpg")[number % 3 if image.ndim == 3 else 0])), image)
+        file.unlink()
+    lens = {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k2": 0.01}
+    edit_json(folder / "cameras.json", lambda content: [camera.update(lens) for camera in content["cameras"]])
+
+
+def _write_times(folder: Path) -> None:
+    """Videos of uneven and late frames."""
+    with_gaps(write_plain(folder / "a.mkv"), [50] * 9 + [100] * 10)
+    trimmed(write_plain(folder / "b.mp4"), 0.2, late=0.1)
+    write_videos(folder, ["a", "b"], resample=10)
 
 
 def _read_scene(folder: Path, what: str) -> None:
@@ -245,6 +282,15 @@ _JSON = ("metadata.json", "transforms.json", "cameras.json")
 READERS = {
     **{f"scene_{layout.split()[-1]}": Reader(partial(_write_scene, layout), _read_scene, _JSON) for layout in WRITERS},
     "scene_video": Reader(_write_video_scene, _read_scene, (*_JSON, "cam_0.mp4")),
+    "scene_colmap": Reader(
+        partial(_write_colmap, binary=True), _read_scene, ("cameras.bin", "images.bin", "points3D.bin")
+    ),
+    "scene_colmap_text": Reader(
+        partial(_write_colmap, binary=False), _read_scene, ("scene.json", "cameras.txt", "images.txt", "points3D.txt")
+    ),
+    "scene_synthetic": Reader(_write_synthetic, _read_scene, ("transforms_train.json", "transforms_test.json")),
+    "scene_images": Reader(_write_images, _read_scene, _JSON),
+    "scene_video_times": Reader(_write_times, _read_scene, (*_JSON, "a.mkv", "b.mp4")),
     "checkpoint": Reader(
         lambda folder: checkpoint.write(folder / "step", _saved()),
         lambda folder, what: _read_checkpoint(folder / "step", what),
