@@ -15,6 +15,7 @@ import struct
 from array import array as numbers_of
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
+from typing import BinaryIO
 
 import numpy as np
 
@@ -198,7 +199,7 @@ def _lines(file: Path, pairs: bool = False) -> Iterator[tuple[str, str]]:
     """(line, its place for messages) without comments; ``pairs``: the line after each, of points, is left out."""
     with open(file, "rb") as opened:
         number = 0
-        while raw := opened.readline(MAX_LINE):
+        while raw := _line(opened, file):
             number += 1
             what = f"{file}: line {number}"
             try:
@@ -212,8 +213,15 @@ def _lines(file: Path, pairs: bool = False) -> Iterator[tuple[str, str]]:
             yield line, what
             if pairs:
                 number += 1
-                if len(opened.readline(MAX_LINE).split()) % 3:
+                if len(_line(opened, file).split()) % 3:
                     raise InputError(f"{file}: line {number} must hold the points of the image before it, or be empty")
+
+
+def _line(opened: BinaryIO, file: Path) -> bytes:
+    try:
+        return opened.readline(MAX_LINE)
+    except OSError as error:
+        raise InputError(f"{file} cannot be read: {error.strerror}") from None
 
 
 class _Binary:

@@ -191,11 +191,11 @@ def test_utm_coordinates_keep_their_digits(tmp_path):
             frame["transform_matrix"] = matrix.tolist()
 
     edit_json(tmp_path / "transforms.json", move)
-    viewmats = Scene.open(tmp_path).recording.viewmats
+    scene = Scene.open(tmp_path)
+    viewmats, point = scene.recording.viewmats, np.array([0.3, 0.2, 0.1])
     assert viewmats.dtype == np.float64
-    point = np.array([0.3, 0.2, 0.1])
     for found, wanted in zip(viewmats[0], made.viewmats[0], strict=True):
-        seen = found[:3, :3] @ (point + where) + found[:3, 3]
+        seen = found[:3, :3] @ (point + where - scene.world_offset) + found[:3, 3]
         np.testing.assert_allclose(seen, wanted[:3, :3] @ point + wanted[:3, 3], atol=1e-8)
 
 
