@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gsim3d.pretrained import CHECKPOINT_HELP, add_keep
+from gsim3d.pretrained import CHECKPOINT_HELP, add_fitting
 from gsim3d.terminal import progress
 
 EPILOG = """\
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     parser.add_argument("--tolerance", default="0.1dB", metavar="X", help="PSNR that may be lost (default: 0.1dB)")
     parser.add_argument("--out", metavar="FILE", help="file to write; must not exist yet (default: SCENE/effects.yaml)")
-    add_keep(parser)
+    add_fitting(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
 
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     tolerance = _decibels(args.tolerance)
     out = new_place(args.out or Path(args.scene) / FILE, "file")
     restored = restore(args.checkpoint, args.device)
-    scene = restored.open_scene(args.scene, args.keep)
+    scene = restored.open_scene(args.scene, args.keep, args.resample)
     base = restored.plan.spec
     settings = smaller(base, restored.simulator.config)
     with progress(None, "settings", 2 + sum(map(len, settings.values())), unit="setting", quiet=args.quiet) as bar:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gsim3d.pretrained import CHECKPOINT_HELP, add_keep
+from gsim3d.pretrained import CHECKPOINT_HELP, add_fitting
 
 EPILOG = """\
 Without --effects the spec is effects.yaml of the scene or of the data set around it, else that of the checkpoint,
@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/data.md)")
     parser.add_argument("checkpoint", metavar="CHECKPOINT", nargs="?", help=CHECKPOINT_HELP)
-    add_keep(parser)
+    add_fitting(parser)
     parser.add_argument("--effects", metavar="FILE", help="YAML file of what to compute (default: see below)")
 
 
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.train.restore import build_simulator, restore
 
     restored = None if args.checkpoint is None else restore(args.checkpoint)
-    scene = Scene.open(args.scene) if restored is None else restored.open_scene(args.scene, args.keep)
+    scene = Scene.open(args.scene) if restored is None else restored.open_scene(args.scene, args.keep, args.resample)
     simulator = build_simulator(presets.tiny(), seed=0) if restored is None else restored.simulator
     data = DataConfig() if restored is None else restored.data_of(scene)
     spec, source = EffectsSpec.of_scene(args.scene), "the scene's own"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gsim3d.pretrained import CHECKPOINT_HELP, add_keep
+from gsim3d.pretrained import CHECKPOINT_HELP, add_fitting
 from gsim3d.terminal import progress, whole
 
 EPILOG = """\
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--context", type=whole(0), nargs="+", metavar="CAM", help="input cameras (default: spread evenly)"
     )
-    add_keep(parser)
+    add_fitting(parser)
     parser.add_argument("--edit", metavar="FILE", help="YAML file of changes of the scene on the way")
     parser.add_argument("--effects", metavar="FILE", help="YAML file of what to compute (default: as in training)")
     parser.add_argument(
@@ -73,14 +73,14 @@ def run(args: argparse.Namespace) -> int:
 
     out = new_place(args.out)
     restored = restore(args.checkpoint, args.device)
-    scene = restored.open_scene(args.scene, args.keep)
+    scene = restored.open_scene(args.scene, args.keep, args.resample)
     context, target = default_views(restored, scene, args.context)
     cams = args.cameras or list(target[:4])
     n_future = args.steps if args.steps is not None else max(1, scene.n_steps - args.start - restored.data.history)
     if bad := [cam for cam in (*cams, *context) if not 0 <= cam < scene.n_cams]:
         raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
     spec = restored.plan.spec if args.effects is None else EffectsSpec.load(args.effects)
-    edits = () if args.edit is None else load_edits(args.edit, partial(_encode, restored))
+    edits = () if args.edit is None else load_edits(args.edit, partial(_encode, restored, args.resample))
     if edits:
         changes = (edit.operation for edit in edits)
         structure = StructureEffects(*map(any, zip(*((change.inserts, change.removes) for change in changes))))
@@ -114,9 +114,9 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _encode(restored, folder):
+def _encode(restored, resample, folder):
     """The particles of another scene."""
     from gsim3d.evaluate.protocol import default_views, encode_steps
 
-    scene = restored.open_scene(folder)
+    scene = restored.open_scene(folder, resample=resample)
     return encode_steps(restored, scene, default_views(restored, scene)[0])

@@ -18,6 +18,46 @@ from gsim3d.errors import InputError
 MIN_EXTENT = 1e-3  # metres; cameras nearer to the origin than this have no length to divide by
 
 
+RATE_TOLERANCE = 1.0001e-3  # relative difference of frame rates that are the same: 29.97 and 30 are
+
+
+def frame_stride(rate: float, wanted: float) -> int | None:
+    """k where ``rate`` is k times ``wanted`` frames per second; None where it is no whole multiple."""
+    stride = max(1, round(rate / wanted))
+    return stride if math.isclose(rate, stride * wanted, rel_tol=RATE_TOLERANCE) else None
+
+
+def resample(recording: Recording, fps: float) -> Recording:
+    """Every k-th frame of ``recording``, which has k times ``fps`` frames per second.
+
+    Raises:
+        InputError: its rate is no whole multiple.
+    """
+    if recording.n_steps == 1:
+        return recording
+    stride = frame_stride(recording.fps, fps)
+    if stride is None:
+        raise InputError(
+            f"{recording.source}: {recording.fps:g} frames per second are no whole multiple of the {fps:g} wanted"
+        )
+    if stride == 1:
+        return recording
+
+    def kept(read: ReadImages) -> ReadImages:
+        return lambda cam, steps, problems: read(cam, [stride * step for step in steps], problems)
+
+    viewmats, Ks = (values[::stride] if len(values) > 1 else values for values in (recording.viewmats, recording.Ks))
+    return dataclasses.replace(
+        recording,
+        n_steps=-(-recording.n_steps // stride),
+        fps=recording.fps / stride,
+        viewmats=viewmats,
+        Ks=Ks,
+        read_images=kept(recording.read_images),
+        read_labels=None if recording.read_labels is None else kept(recording.read_labels),
+    )
+
+
 @dataclass(frozen=True)
 class Fitting:
     """What is done to every scene; the defaults change nothing.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsim3d.data import layouts
 from gsim3d.data.cameras import check_directions, frusta_origin, near_zero, shared_view, spread_steps
-from gsim3d.data.fitting import Fitting, fit, own_depths
+from gsim3d.data.fitting import Fitting, fit, own_depths, resample
 from gsim3d.data.images import ImageCache
 from gsim3d.data.lenses import Undistorter
 from gsim3d.data.masks import foreground, median_image
@@ -67,13 +67,20 @@ class Scene:
         self._labels = ImageCache(shape, self._read_labels, cache_dir, (*stamp, "seg"))
 
     @staticmethod
-    def open(folder: str | Path, *, cache_dir: str | Path | None = None, fitting: Fitting = Fitting()) -> Scene:
+    def open(
+        folder: str | Path,
+        *,
+        cache_dir: str | Path | None = None,
+        fitting: Fitting = Fitting(),
+        fps: float | None = None,
+    ) -> Scene:
         """Reads the description of the scene in ``folder``; images are decoded when they are asked for, each once.
 
         Args:
             cache_dir: folder for decoded images as memory-mapped files, for sets larger than the memory;
                 default: they stay in memory.
             fitting: image size, depth range and unit that a model wants; default: as recorded.
+            fps: frames per second; of a recording with k times as many every k-th is kept. Default: all.
 
         Raises: InputError that names file, camera and frame, and what is wrong with it.
         """
@@ -81,6 +88,8 @@ class Scene:
         problems = Problems()
         recording = layouts.layout_of(path).read(path, problems)
         check_directions(recording, problems)
+        if fps is not None:
+            recording = resample(recording, fps)
         return Scene(path, recording, cache_dir, fitting)
 
     @cached_property

@@ -24,10 +24,15 @@ FRAME_SIZE = 256  # pixels; smaller frames are enlarged by a whole factor to at 
 GAP = 4  # pixels of white between frames
 SPLAT_SIZE = 320  # pixels, height and width of the picture of the Gaussians
 SPLAT_SHRINK = 0.45  # of their scales there, so that single ones can be told apart
-CURVE_LABELS = {"constant": "constant (last encoded particles)", "copy": "copy (last true frame)",
-                "constant_velocity": "constant velocity", "release_constant": "constant (first predicted)"}  # fmt: skip
-CURVE_COLORS = {"model": "#1f5fbf", "constant": "#c0504d", "copy": "#7f7f7f", "constant_velocity": "#e0a030",
-                "release_constant": "#d8a0a0"}  # fmt: skip
+CURVES = {  # method -> label, colour
+    "model": ("model", "#1f5fbf"),
+    "constant": ("constant (last encoded particles)", "#c0504d"),
+    "copy": ("copy (last true frame)", "#7f7f7f"),
+    "constant_velocity": ("constant velocity", "#e0a030"),
+    "release_constant": ("constant (first predicted)", "#d8a0a0"),
+    "perfect_ground": ("constant on exact ground", "#4f9d4f"),
+    "perfect_body": ("exact bodies on constant ground", "#8064a2"),
+}
 
 
 def as_bytes(images: Tensor) -> np.ndarray:
@@ -149,12 +154,14 @@ def write_curves(path: str | Path, summary: dict, fps: float | None, metrics: Se
     unit = 1 if fps is None else fps
     for axes, metric in zip(panels.flat, drawn):
         for k, method in enumerate(methods):
+            if f"{prefixes[method]}{metric}" not in summary["by_step"]:
+                continue
             values, deviation = (
                 np.array(summary[key][f"{prefixes[method]}{metric}"], dtype=float) for key in ("by_step", "by_step_std")
             )
             times = (np.arange(len(values)) - (n_encoded - 1)) / unit
-            color = CURVE_COLORS.get(method, f"C{k}")
-            axes.plot(times, values, color=color, linewidth=1.3 if k else 2.4, label=CURVE_LABELS.get(method, method))
+            label, color = CURVES.get(method, (method, f"C{k}"))
+            axes.plot(times, values, color=color, linewidth=1.3 if k else 2.4, label=label)
             if k == 0:
                 axes.fill_between(times, values - deviation, values + deviation, color=color, alpha=0.15, linewidth=0)
         axes.axvspan((0.5 - n_encoded) / unit, 0.5 / unit, color="#eeeeee", zorder=0)
@@ -164,7 +171,7 @@ def write_curves(path: str | Path, summary: dict, fps: float | None, metrics: Se
         axes.grid(alpha=0.3)
     for axes in panels.flat[len(drawn) :]:
         axes.remove()
-    panels[0, 0].legend(fontsize=8)
+    max(panels.flat[: len(drawn)], key=lambda axes: len(axes.lines)).legend(fontsize=8)
     _save(figure, path)
 
 

@@ -22,7 +22,8 @@ from gsim3d.data.recording import Problems
 from gsim3d.errors import InputError
 
 VIDEOS = (".mp4", ".webm", ".mov", ".mkv", ".avi")
-RESERVED = ("model", "constant", "copy", "constant_velocity", "release_constant", "truth", "past", "future")
+RESERVED = ("model", "constant", "copy", "constant_velocity", "release_constant", "perfect_ground", "perfect_body",
+            "truth", "past", "future")  # fmt: skip
 
 
 class Predictions:

@@ -5,7 +5,9 @@ Baselines:
 - ``constant``: the model's own last encoded particles, held still (what the dynamics adds);
 - ``copy``: the true last input frame of the same camera (no model at all);
 - ``constant_velocity``: the last encoded step; what may move goes on as far a step as its centroid went last;
-- ``release_constant``: the first predicted step, held still (the baseline of the published evaluation).
+- ``release_constant``: the first predicted step, held still (the baseline of the published evaluation);
+- ``perfect_ground``, ``perfect_body``: ``constant`` with the true pixels of the ground, or of the bodies (masked PSNR
+  alone): what the other pixels cost.
 
 Predictions of other models (predictions.py) are scored on the same steps, views and scenes.
 """
@@ -13,6 +15,7 @@ Predictions of other models (predictions.py) are scored on the same steps, views
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -24,15 +27,20 @@ from gsim3d.data import Scene, make_frames
 from gsim3d.data.recording import BACKGROUND
 from gsim3d.dynamics import RestLog, concatenate
 from gsim3d.edits import Edit
-from gsim3d.errors import FitWarning, InputError
+from gsim3d.errors import FitWarning, HardCaseError, InputError
 from gsim3d.evaluate.predictions import Predictions
-from gsim3d.evaluate.scoring import PLAIN_METRICS, SceneScores, SceneTruth
+from gsim3d.evaluate.scoring import EXACT_PARTS, PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.layers import exact_convolutions
+from gsim3d.terminal import progress
+from gsim3d.train.processes import Processes
 from gsim3d.train.restore import Restored
 from gsim3d.train.samples import context_cameras, spread_views, thinned
 from gsim3d.types import DYNAMIC, Particles
 
-METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant")
+METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant", *EXACT_PARTS)
+TOGETHER = 6  # scenes that a GPU predicts in one rollout, fewer where they are large
+MOST_PIXELS = 2**21  # of the input images of one rollout
+CLIPS = 48  # of which FVD is measured
 
 
 @dataclass(frozen=True)
@@ -124,11 +132,17 @@ def encode_steps(restored: Restored, scene: Scene, context_cams: Sequence[int], 
 
 
 @torch.no_grad()
-def predict_together(restored: Restored, scenes: Sequence[Scene], n_future: int) -> list[Prediction]:
-    """:func:`predict` of several scenes from their first steps and default views, in one rollout."""
+def predict_together(
+    restored: Restored, scenes: Sequence[Scene], n_future: int, contexts: Sequence[Sequence[int]] | None = None
+) -> list[Prediction]:
+    """:func:`predict` of several scenes from their first steps, in one rollout.
+
+    Args:
+        contexts: input cameras of each scene; default: those of :func:`default_views`.
+    """
     for scene in scenes:
         restored.check_scene(scene)
-    contexts = [default_views(restored, scene)[0] for scene in scenes]
+    contexts = [default_views(restored, scene)[0] for scene in scenes] if contexts is None else contexts
     n_encoded, masked = restored.data.history, all(scene.has_segmentation() for scene in scenes)
     frames = make_frames(scenes, contexts, [range(n_encoded)] * len(scenes), masked=masked)
     with exact_convolutions():
@@ -136,9 +150,26 @@ def predict_together(restored: Restored, scenes: Sequence[Scene], n_future: int)
         together = concatenate([encoded, *restored.simulator.rollout(encoded, n_future, restored.plan)])
     n_steps = n_encoded + n_future
     return [
-        Prediction(together.select_clouds(range(b * n_steps, (b + 1) * n_steps)), n_encoded, context)
+        Prediction(together.select_clouds(range(b * n_steps, (b + 1) * n_steps)), n_encoded, tuple(context))
         for b, context in enumerate(contexts)
     ]
+
+
+def _batches(restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Sequence[int]]) -> list[list[int]]:
+    """Numbers of the scenes that are predicted together: neighbours, alone on a CPU.
+
+    They depend on the scenes and the device only, so that any number of processes gets the same numbers.
+    """
+    found: list[list[int]] = []
+    for number, (scene, context) in enumerate(zip(scenes, contexts, strict=True)):
+        kind = scene.has_segmentation(), len(context)
+        most = min(TOGETHER, MOST_PIXELS // (scene.width * scene.height * restored.data.history * len(context)))
+        room = restored.device.type == "cuda" and found and len(found[-1]) < most
+        if room and kind == (scenes[found[-1][0]].has_segmentation(), len(contexts[found[-1][0]])):
+            found[-1].append(number)
+        else:
+            found.append([number])
+    return found
 
 
 @torch.no_grad()
@@ -217,8 +248,11 @@ def score_scene(
     n_future = horizon(scene, n_given, n_future)
     cams, steps = list(target_cams), range(start, n_given + n_future)
     device = torch.device("cpu") if restored is None else restored.device
-    images = scene.images(cams, steps).permute(0, 1, 3, 4, 2).to(device).float() / 255
-    labels = scene.segmentation(cams, steps).to(device) if scene.has_segmentation() else None
+    images = scene.images(cams, steps)
+    labels = scene.segmentation(cams, steps) if scene.has_segmentation() else None
+    digest = _digest(images, labels)
+    images = images.permute(0, 1, 3, 4, 2).to(device).float() / 255
+    labels = None if labels is None else labels.to(device)
     filmed = scene.valid(cams, steps)
     filmed = None if filmed is None else filmed.to(device)
     truth = SceneTruth(scene.name, images, labels, filmed, n_encoded, metrics)
@@ -241,7 +275,81 @@ def score_scene(
             yield "constant_velocity", render_steps(restored, constant_velocity(prediction), scene, cams, n_given)
             yield "release_constant", _held(restored, prediction, rendered, n_encoded, scene, cams, start)
 
-    return truth.score(methods())
+    return dataclasses.replace(truth.score(methods()), digest=digest)
+
+
+def score_scenes(
+    restored: Restored | None,
+    scenes: Sequence[Scene],
+    views: Sequence[tuple[Sequence[int] | None, Sequence[int]]],
+    *,
+    n_encoded: int,
+    n_future: int,
+    metrics: Sequence[str] = PLAIN_METRICS,
+    others: Sequence[Predictions] = (),
+    clips: int = CLIPS,
+    processes: Processes | None = None,
+    quiet: bool = True,
+) -> list[SceneScores]:
+    """:func:`score_scene` of every scene, in their order; a GPU predicts several together.
+
+    Args:
+        views: (context, target) cameras of each scene.
+        clips: of which FVD is measured, at most: those of scenes spread evenly.
+        processes: that share the scenes; every one must call it, and each returns all scores: those of one process,
+            bit for bit.
+        quiet: show no progress.
+    """
+    processes = processes or Processes()
+    groups = [[number] for number in range(len(scenes))]
+    if restored is not None:
+        groups = _batches(restored, scenes, [context for context, _ in views])
+    n_for_fvd = min(len(scenes), max(1, clips // max(len(targets) for _, targets in views)))
+    for_fvd = {k * len(scenes) // n_for_fvd for k in range(n_for_fvd)}
+
+    def scored(group: Sequence[int]) -> Iterator[tuple[int, SceneScores]]:
+        predictions = [None] * len(group)
+        if len(group) > 1:
+            chosen, contexts = ([given[number] for number in group] for given in (scenes, [c for c, _ in views]))
+            predictions = predict_together(restored, chosen, n_future, contexts)
+        for number, prediction in zip(group, predictions, strict=True):
+            context, targets = views[number]
+            yield number, score_scene(
+                restored,
+                scenes[number],
+                context_cams=context,
+                target_cams=targets,
+                n_encoded=n_encoded,
+                n_future=n_future,
+                metrics=[metric for metric in metrics if metric != "fvd" or number in for_fvd],
+                others=others,
+                prediction=prediction,
+            )
+
+    scores: dict[int, SceneScores] = {}
+    quiet = quiet or not processes.is_first
+    with progress(None, "scenes", len(scenes), unit="scene", quiet=quiet) as bar:
+        for first in range(0, len(groups), processes.count):
+            mine = first + processes.rank
+            try:
+                found = [pair for group in groups[mine : mine + 1] for pair in scored(group)]
+            except (InputError, HardCaseError) as error:  # raised in all processes: none waits for another
+                found = error
+            for part in processes.gather(found):
+                if isinstance(part, Exception):
+                    raise part
+                scores.update(part)
+            bar.update(len(scores) - bar.n)
+    return [scores[number] for number in range(len(scenes))]
+
+
+def _digest(images: Tensor, labels: Tensor | None) -> str:
+    """Hash of the true images and labels."""
+    digest = hashlib.sha256(repr([images.shape, labels is None]).encode())
+    for values in (images, labels):
+        if values is not None:
+            digest.update(values.contiguous().numpy())
+    return digest.hexdigest()
 
 
 def _held(

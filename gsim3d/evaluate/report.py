@@ -7,6 +7,7 @@ import io
 import json
 import math
 import os
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,8 +15,15 @@ import torch
 from torch import Tensor
 
 from gsim3d.evaluate.metrics import mean_of_counted
-from gsim3d.evaluate.scoring import METRICS, SceneScores
+from gsim3d.evaluate.scoring import METRICS, RING_WIDTH, SceneScores
+from gsim3d.generate.held_out import describe_set
 from gsim3d.perceptual.fvd import MIN_CLIPS, TREND_CLIPS, frechet_distance
+
+REGIONS = (
+    "masked: without background; body: what may move; ground: the rest of the mask; ring: ground within "
+    f"{RING_WIDTH:g} diameters of a body"
+)
+ADDED = ("masked", "body", "ground")  # parts of the mask of which it is said how much error the future adds
 
 
 def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None = None) -> dict:
@@ -24,6 +32,8 @@ def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None
     ``past.M`` and ``future.M``: the mean over steps of the mean over scenes of metric M; ``future_late.M`` over the
     second half of the horizon only; ``future_std.M``: the mean over steps of the standard deviation between scenes. The
     same with a prefix (``constant.``, ``copy.``, the name of other predictions) for all methods but the model.
+    ``body_share``: share of the mask that bodies cover. ``added_mse.P``: the error that the future adds: 10^(-PSNR /
+    10) of a scene at a step in part P of the mask, the mean over predicted steps less that over given ones.
     ``future.fvd``: one distance between all predicted clips and the true ones; it has neither steps nor deviation.
     ``by_step``, ``by_step_std``: means over scenes, and deviations between them, for each step. A value that does not
     exist (an empty mask everywhere, one scene's deviation) is null. ``not_measured``: metric -> why.
@@ -32,7 +42,7 @@ def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None
         not_measured: what was not even tried.
     """
     n_encoded = scores[0].n_encoded
-    methods = list(scores[0].values)
+    methods = [method for method in scores[0].values if all(method in s.values for s in scores)]
     n_steps = min(s.n_steps for s in scores)
     late = n_encoded + (n_steps - n_encoded) // 2
     missing = dict(not_measured or {})
@@ -61,32 +71,50 @@ def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None
             result[f"{prefix}future_std.{metric}"] = mean_of_counted(deviation[n_encoded:])
             by_step[f"{prefix}{metric}"] = _numbers(mean)
             by_step_std[f"{prefix}{metric}"] = _numbers(deviation)
-    if scores[0].clips and "fvd" not in missing:
-        _add_fvd(result, missing, scores, methods)
+    if all(s.body_share is not None for s in scores):
+        by_step["body_share"] = _numbers(torch.stack([s.body_share[:n_steps] for s in scores]).nanmean(0))
+    scenes = {s.scene: _of_scene(s, missing) for s in scores}
+    for key in ("body_share", *(f"added_mse.{part}" for part in ADDED)):
+        if known := [scene[key] for scene in scenes.values() if scene.get(key) is not None]:
+            result[key] = statistics.fmean(known)
+    if any(s.clips for s in scores) and "fvd" not in missing:
+        _add_fvd(result, missing, scores)
     result["not_measured"] = missing
     result["by_step"] = by_step
     result["by_step_std"] = by_step_std
-    result["scenes"] = {s.scene: _of_scene(s, missing) for s in scores}
+    result["scenes"] = scenes
     return result
 
 
-def _add_fvd(result: dict, missing: dict, scores: Sequence[SceneScores], methods: Sequence[str]) -> None:
-    clips = {method: torch.cat([s.clips[method] for s in scores]) for method in ("truth", *methods)}
-    result["n_clips"] = len(clips["truth"])
-    if result["n_clips"] < MIN_CLIPS:
+def _add_fvd(result: dict, missing: dict, scores: Sequence[SceneScores]) -> None:
+    counted = [s.clips for s in scores if s.clips]
+    clips = {method: torch.cat([clips[method] for clips in counted]) for method in counted[0]}
+    truth = clips.pop("truth")
+    result["n_clips"] = len(truth)
+    if len(truth) < MIN_CLIPS:
         missing["fvd"] = f"it needs {MIN_CLIPS} clips (scenes times target views); there is one"
         return
-    for method in methods:
-        result[f"{_prefix(method)}future.fvd"] = frechet_distance(clips[method], clips["truth"])
+    for method, features in clips.items():
+        result[f"{_prefix(method)}future.fvd"] = frechet_distance(features, truth)
 
 
 def _of_scene(scores: SceneScores, missing: dict) -> dict:
-    return {
-        f"{_prefix(method)}future.{metric}": mean_of_counted(values[scores.n_encoded :])
-        for method, metrics in scores.values.items()
-        for metric, values in metrics.items()
-        if metric not in missing
-    }
+    """Means over the parts of the horizon, the share of bodies, and what the future adds to the model's error."""
+    first, late = scores.n_encoded, (scores.n_encoded + scores.n_steps) // 2
+    parts = {"past": slice(first), "future": slice(first, None), "future_late": slice(late, None)}
+    found = {"digest": scores.digest} if scores.digest else {}
+    if scores.body_share is not None:
+        found["body_share"] = mean_of_counted(scores.body_share)
+    for method, metrics in scores.values.items():
+        for metric, values in metrics.items():
+            for part, steps in parts.items():
+                if metric not in missing and (method == "model" or part != "past"):
+                    found[f"{_prefix(method)}{part}.{metric}"] = mean_of_counted(values[steps])
+    for part in ADDED:
+        if found.get(f"past.psnr_{part}") is not None and found.get(f"future.psnr_{part}") is not None:
+            errors = 10 ** (-scores.values["model"][f"psnr_{part}"] / 10)
+            found[f"added_mse.{part}"] = float(errors[first:].nanmean() - errors[:first].nanmean())
+    return found
 
 
 def write_json(path: str | Path, content: dict) -> None:
@@ -136,8 +164,21 @@ def markdown(summary: dict, dataset: str) -> str:
                 lines.append(_row([name, method, *(_number(summary.get(f"{key}.{m}"), m) for m in by_step)]))
     lines += ["", f"{summary['n_scenes']} scenes; {summary['n_encoded_steps']} steps given, "
               f"{summary['n_future_steps']} predicted. Mean over steps of the mean over scenes ± mean over steps of "
-              "the standard deviation between scenes. Masked: without background; body: what may move."]  # fmt: skip
-    return "\n".join([*lines, *(f"\n{note}" for note in notes(summary))]) + "\n"
+              f"the standard deviation between scenes. Of PSNR, {REGIONS}."]  # fmt: skip
+    return "\n".join([*lines, *(f"\n{note}" for note in [*facts(summary), *notes(summary)])]) + "\n"
+
+
+def facts(summary: dict) -> list[str]:
+    """Which set was scored, how large its bodies are in the images, and what the future adds to the error."""
+    found = [describe_set(summary["set"])] if summary.get("set") else []
+    if summary.get("body_share") is not None:
+        found.append(f"Bodies: {summary['body_share']:.1%} of the mask.")
+    added = {part: value for part in ADDED if (value := summary.get(f"added_mse.{part}")) is not None}
+    if added:
+        decibels = {part: f" ({-10 * math.log10(mse):.2f} dB)" for part, mse in added.items() if mse > 0}
+        numbers = ", ".join(f"{part} {mse:.5f}{decibels.get(part, '')}" for part, mse in added.items())
+        found.append(f"Mean squared error that the future adds to that of given steps: {numbers}.")
+    return found
 
 
 def notes(summary: dict) -> list[str]:
@@ -155,13 +196,16 @@ def table(summary: dict) -> str:
     by_step = [m for m in shown if METRICS[m].by_step]
     lines = [
         f"{summary['n_scenes']} scenes, {summary['n_encoded_steps']} steps given, {summary['n_future_steps']} predicted"
-        " (PSNR in dB; masked: without background; body: what may move)",
+        f" (PSNR in dB; {REGIONS})",
+        *facts(summary),
         "",
         f"{'':34}" + "".join(f"{METRICS[m].label:>13}" for m in shown),
     ]
     rows = [("model, given steps", "past")] if "model" in methods else []
     for method in methods:
         prefix = _prefix(method)
+        if not any(f"{prefix}future.{m}" in summary for m in shown):
+            continue
         rows += [(f"{method}, predicted steps", f"{prefix}future"), ("  second half of them", f"{prefix}future_late")]
     for name, key in rows:
         lines.append(f"{name:34}" + "".join(f"{_number(summary.get(f'{key}.{m}'), m):>13}" for m in shown))

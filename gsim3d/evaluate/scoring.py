@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from gsim3d.data.recording import BACKGROUND, MOVING
+from gsim3d.data.recording import BACKGROUND, FIXED, MOVING
 from gsim3d.errors import InputError, did_you_mean
 from gsim3d.evaluate.metrics import SSIM_WINDOW, psnr, ssim
 from gsim3d.perceptual import fvd, lpips, weights
@@ -33,12 +34,18 @@ METRICS = {
     "psnr": Metric("PSNR", 2),
     "psnr_masked": Metric("PSNR masked", 2),
     "psnr_body": Metric("PSNR body", 2),
+    "psnr_ground": Metric("PSNR ground", 2),
+    "psnr_ring": Metric("PSNR ring", 2),
     "ssim": Metric("SSIM", 4),
     "lpips_alex": Metric("LPIPS alex", 4, rises=False, weights="lpips_alex"),
     "lpips_vgg": Metric("LPIPS vgg", 4, rises=False, weights="lpips_vgg"),
     "fvd": Metric("FVD", 1, rises=False, weights="fvd_i3d", by_step=False),
 }
 PLAIN_METRICS = tuple(name for name, metric in METRICS.items() if metric.weights is None)
+NEEDS_LABELS = ("psnr_masked", "psnr_body", "psnr_ground", "psnr_ring")
+# Images of "constant" in which the pixels of one label are exact: what the other pixels cost.
+EXACT_PARTS = {"perfect_ground": FIXED, "perfect_body": MOVING}
+RING_WIDTH = 0.3  # of the diameter of a body in the image
 
 
 @dataclass(frozen=True)
@@ -49,6 +56,8 @@ class SceneScores:
         reconstructions, which only the model has; a value that no image has (that step, or an empty mask) is NaN.
     clips: method (and ``"truth"``) -> I3D features [V, 400] of the predicted steps in each target view, for FVD.
     not_measured: metric -> why this scene has no value.
+    body_share: float64 [S], share of the mask that bodies cover, mean over the target views; None without labels.
+    digest: hash of the true images and labels that were compared.
     """
 
     scene: str
@@ -57,6 +66,32 @@ class SceneScores:
     values: dict[str, dict[str, Tensor]]
     clips: dict[str, Tensor]
     not_measured: dict[str, str]
+    body_share: Tensor | None = None
+    digest: str = ""
+
+
+def ring_around_bodies(labels: Tensor) -> Tensor:
+    """Ground within ``RING_WIDTH`` diameters of the nearest body, where its shadow falls.
+
+    The diameter of a body (a connected region that moves) is that of a disc of as many pixels.
+
+    Args:
+        labels: uint8 [..., H, W].
+    Returns:
+        bool [..., H, W], on the device of ``labels``.
+    """
+    import cv2
+
+    images = labels.cpu().numpy().reshape(-1, *labels.shape[-2:])
+    ring = np.zeros(images.shape, bool)
+    for image, near in zip(images, ring):
+        body = image == MOVING
+        if not body.any():
+            continue
+        distance, nearest = cv2.distanceTransformWithLabels((~body).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+        diameter = np.sqrt(4 / np.pi * np.bincount(nearest[body], minlength=nearest.max() + 1))
+        near[:] = (distance <= RING_WIDTH * diameter[nearest]) & (image == FIXED)
+    return torch.from_numpy(ring).view(labels.shape).to(labels.device)
 
 
 def measurable(names: Sequence[str] | None = None) -> tuple[tuple[str, ...], dict[str, str]]:
@@ -104,29 +139,42 @@ class SceneTruth:
         self.name, self.images, self.labels, self.filmed, self.n_encoded = name, images, labels, filmed, n_encoded
         self.not_measured = {m: reason for m in metrics if (reason := self._problem(m))}
         self.metrics = [metric for metric in metrics if metric not in self.not_measured]
+        self.ring = ring_around_bodies(labels) if "psnr_ring" in self.metrics else None
 
     def score(self, methods: Iterable[tuple[str, Tensor]]) -> SceneScores:
         """Scores of (name, images) one after another, so that only one method's images need to be in memory.
 
         Images are [S, V, H, W, 3], colours in [0, 1], or only the predicted steps of them.
         """
-        values, clips = {}, {}
+        values, clips, parts = {}, {}, {}
         with_clips = "fvd" in self.metrics
         if with_clips:
             clips["truth"] = self._clip_features(self.images)
         for name, images in methods:
             if self.filmed is not None:
                 images = images * self.filmed[-len(images) :, ..., None]
-            values[name] = self._by_step(images)
+            values[name] = self._by_step(images, self.metrics)
             if with_clips:
                 clips[name] = self._clip_features(images)
-        return SceneScores(self.name, self.n_encoded, len(self.images), values, clips, self.not_measured)
+            if name == "constant" and "psnr_masked" in self.metrics:
+                parts = {part: self._by_step(images, ["psnr_masked"], label) for part, label in EXACT_PARTS.items()}
+        values |= parts
+        return SceneScores(
+            self.name, self.n_encoded, len(self.images), values, clips, self.not_measured, self._body_share()
+        )
+
+    def _body_share(self) -> Tensor | None:
+        """float64 [S]; NaN at steps without a mask."""
+        if self.labels is None:
+            return None
+        bodies, mask = (part.sum((2, 3)).double() for part in (self.labels == MOVING, self.labels != BACKGROUND))
+        return (bodies / mask).nanmean(1).cpu()
 
     def _problem(self, metric: str) -> str | None:
         """Why ``metric`` cannot be measured here."""
         n_steps, _, height, width = self.images.shape[:4]
         smallest = {"ssim": SSIM_WINDOW, "lpips_alex": lpips.MIN_SIZE["alex"], "lpips_vgg": lpips.MIN_SIZE["vgg"]}
-        if metric in ("psnr_masked", "psnr_body") and self.labels is None:
+        if metric in NEEDS_LABELS and self.labels is None:
             return f"{self.name} has no segmentation"
         if min(height, width) < smallest.get(metric, 1):
             return f"{self.name} has images of {width}x{height} pixels; it needs {smallest[metric]}"
@@ -134,17 +182,27 @@ class SceneTruth:
             return f"it needs {fvd.MIN_FRAMES} predicted steps; {self.name} has {n_steps - self.n_encoded}"
         return None
 
-    def _by_step(self, images: Tensor) -> dict[str, Tensor]:
-        """Metric -> float64 [S], means over the views that have a value; NaN for steps without images."""
+    def _by_step(self, images: Tensor, metrics: Sequence[str], exact: int | None = None) -> dict[str, Tensor]:
+        """Metric -> float64 [S], means over the views that have a value; NaN for steps without images.
+
+        Args:
+            exact: label of the pixels that are replaced by the true ones.
+        """
         n_steps = len(self.images)
-        scores = {m: torch.full((n_steps,), torch.nan, dtype=torch.float64) for m in self.metrics if METRICS[m].by_step}
+        scores = {m: torch.full((n_steps,), torch.nan, dtype=torch.float64) for m in metrics if METRICS[m].by_step}
         for step, pred in enumerate(images, n_steps - len(images)):
             true = self.images[step]
-            labels, filmed = (None if mask is None else mask[step] for mask in (self.labels, self.filmed))
+            labels, filmed, ring = (
+                None if mask is None else mask[step] for mask in (self.labels, self.filmed, self.ring)
+            )
+            if exact is not None:
+                pred = torch.where((labels == exact)[..., None], true, pred)
             measure = {
                 "psnr": lambda: psnr(pred, true, filmed),
                 "psnr_masked": lambda: psnr(pred, true, labels != BACKGROUND),
                 "psnr_body": lambda: psnr(pred, true, labels == MOVING),
+                "psnr_ground": lambda: psnr(pred, true, labels == FIXED),
+                "psnr_ring": lambda: psnr(pred, true, ring),
                 "ssim": lambda: ssim(pred, true),
                 "lpips_alex": lambda: lpips.lpips(pred, true, "alex"),
                 "lpips_vgg": lambda: lpips.lpips(pred, true, "vgg"),

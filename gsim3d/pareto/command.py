@@ -256,6 +256,8 @@ def _scenes(args: argparse.Namespace, restored, out, count: int | None) -> list:
         from gsim3d.generate.worlds import VALIDATION_SEED
 
         world, preset, options = _world(args.checkpoint, quick)
+        if restored.fps is not None:
+            options["fps"] = restored.fps
         folders = generate(
             out / "data",
             world,

@@ -12,19 +12,24 @@ from pathlib import Path
 from gsim3d.errors import InputError, did_you_mean
 
 FOLDER = Path(__file__).parent
-WEIGHTS = "model.safetensors"
+WEIGHTS, CONFIG = "model.safetensors", "config.yaml"
 CHECKPOINT_HELP = "run folder, checkpoint folder, .safetensors file, or name of a simulator that comes with gsim3d"
 KEEP = ("image", "depth")  # parts of a scene that need not be fitted to a model
 
 
-def add_keep(parser: argparse.ArgumentParser) -> None:
-    """Adds the option of commands that open one scene for a model."""
+def add_fitting(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of commands that open scenes for a model."""
     parser.add_argument(
         "--keep",
         nargs="+",
         choices=KEEP,
         default=(),
         help="what of the scene is not fitted to the model: image: scaled, not cropped; depth: near and far",
+    )
+    parser.add_argument(
+        "--resample",
+        action="store_true",
+        help="of a scene with k times the frame rate that the model was trained at, take every k-th frame",
     )
 
 
@@ -46,3 +51,16 @@ def located(checkpoint: str | Path) -> Path:
         return FOLDER / str(checkpoint) / WEIGHTS
     known = f"simulators that come with gsim3d: {', '.join(names())}" if names() else "none comes with gsim3d"
     raise InputError(f"{checkpoint}: no such checkpoint ({known}{did_you_mean(checkpoint, names())})")
+
+
+def frame_rate(checkpoint: str | Path) -> float | None:
+    """Frames per second of the training of a simulator that comes with gsim3d; None: of others, or not stated.
+
+    Its config.yaml says so where the metadata of its weights, which are older, do not.
+    """
+    config = located(checkpoint).resolve().parent / CONFIG
+    if not config.is_relative_to(FOLDER.resolve()) or not config.is_file():
+        return None
+    import yaml
+
+    return yaml.safe_load(config.read_text())["data"].get("fps")

@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.data import Scene, find_scenes, split_scenes
     from gsim3d.errors import InputError
     from gsim3d.files import made_around, place_of
+    from gsim3d.generate.held_out import origin_of
     from gsim3d.train import checkpoint
     from gsim3d.train.config import TrainConfig
     from gsim3d.train.settings import from_dict, load_yaml, to_dict
@@ -68,6 +69,12 @@ def run(args: argparse.Namespace) -> int:
     if args.export:
         place_of(args.export, ".safetensors", "--export")
     folders, _ = split_scenes(find_scenes(args.data))
+    for folder in folders:
+        if (origin := origin_of(folder)) and origin.set_name:
+            raise InputError(
+                f"{folder}: of the {origin.set_name} set (seed {origin.seed}), which no training may see; generate "
+                "trajectories with another --seed"
+            )
     if args.cache:
         Path(args.cache).mkdir(parents=True, exist_ok=True)  # a folder that cannot be is told before work begins
     scenes = [Scene.open(folder, cache_dir=args.cache, fitting=config.data.fitting) for folder in folders]

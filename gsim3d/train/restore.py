@@ -17,8 +17,9 @@ from torch.nn.modules.module import (
 )
 from torch.overrides import TorchFunctionMode
 
-from gsim3d import presets
+from gsim3d import presets, pretrained
 from gsim3d.data import Scene
+from gsim3d.data.fitting import frame_stride
 from gsim3d.effects import EffectsSpec
 from gsim3d.errors import FitWarning, InputError, did_you_mean
 from gsim3d.ops import cuda_compiled
@@ -42,6 +43,7 @@ class Restored:
     data: which frames and views it saw.   image_size: (width, height) pixels.
     plan: of the effects it was trained with.
     checkpoint: where it came from.
+    fps: frames per second of the scenes it was trained on; None: the checkpoint does not say.
     """
 
     simulator: Simulator
@@ -49,19 +51,21 @@ class Restored:
     image_size: tuple[int, int]
     plan: Plan
     checkpoint: checkpoint.Checkpoint
+    fps: float | None = None
 
     @property
     def device(self) -> torch.device:
         """Where the simulator's weights are, and where it predicts."""
         return next(self.simulator.parameters()).device
 
-    def open_scene(self, folder: str | Path, keep: Sequence[str] = ()) -> Scene:
+    def open_scene(self, folder: str | Path, keep: Sequence[str] = (), resample: bool = False) -> Scene:
         """The scene in ``folder`` as the model expects it; a :class:`gsim3d.errors.FitWarning` says what is changed.
 
         Args:
             keep: parts of KEEP that stay as they are: "image", scaled into the model's size instead of cropped to it,
                 and "depth", near and far. Without it, near and far are those of the training where the scene's own
                 differ from them by at most a factor of SIMILAR: elsewhere the model sees less with them.
+            resample: take every k-th frame of a scene with k times the model's frame rate.
         Raises:
             InputError: as :meth:`check_scene` and the reader, or ``keep`` names another part.
         """
@@ -73,8 +77,13 @@ class Restored:
         )
         if "depth" in keep:
             fitting = dataclasses.replace(fitting, near_far=None)
-        scene = Scene.open(folder, fitting=fitting)
+        if resample and self.fps is None:
+            raise InputError("--resample: the checkpoint does not say at which frame rate it was trained")
+        scene = Scene.open(folder, fitting=fitting, fps=self.fps if resample else None)
         self.check_scene(scene)
+        if self.fps is None and scene.n_steps > 1:
+            said = "frame rate not checked: the checkpoint does not say at which one it was trained"
+            warnings.warn(said, FitWarning, stacklevel=2)
         if changes := self._changes(scene):
             warnings.warn(f"fitted to the model: {'; '.join(changes)}", FitWarning, stacklevel=2)
         return scene
@@ -102,7 +111,7 @@ class Restored:
         return changes
 
     def check_scene(self, scene: Scene) -> None:
-        """Raises InputError where the scene's images or depths are others than those of the training."""
+        """Raises InputError where the scene's images, depths or frame rate are others than those of the training."""
         if (scene.width, scene.height) != self.image_size:
             raise InputError(
                 f"{scene.path}: images of {scene.width}x{scene.height} pixels; the model was trained on "
@@ -113,6 +122,18 @@ class Restored:
             raise InputError(
                 f"{scene.path}: depths from {scene.near:g} to {scene.far:g}; the model was trained on "
                 f"{self.data.near_far[0]:g} to {self.data.near_far[1]:g}: open the scene with open_scene, which fits it"
+            )
+        self._check_rate(scene)
+
+    def _check_rate(self, scene: Scene) -> None:
+        if self.fps is None or scene.n_steps == 1:
+            return
+        stride = frame_stride(scene.fps, self.fps)
+        if stride != 1:
+            how = f"--resample, or open_scene(folder, resample=True), takes one frame in {stride}"
+            remedy = how if stride else "no whole multiple: resample the scene"
+            raise InputError(
+                f"{scene.path}: {scene.fps:g} frames per second; the model was trained at {self.fps:g} ({remedy})"
             )
 
     def data_of(self, scene: Scene) -> DataConfig:
@@ -195,9 +216,10 @@ def check_sizes(config: ModelConfig, spec: EffectsSpec, weights: dict[str, Tenso
 
 def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: EffectsSpec) -> dict:
     """The content of a checkpoint's config.yaml."""
+    rate = {"fps": float(scene.fps)} if scene.n_steps > 1 else {}
     return {
         "model": to_dict(model),
-        "data": {**to_dict(config.data), "image_size": [scene.width, scene.height]},
+        "data": {**to_dict(config.data), "image_size": [scene.width, scene.height], **rate},
         "effects": {"spec": effects.to_dict(), "hash": effects.hash},
         "train": to_dict(config),
     }
@@ -231,10 +253,15 @@ def restore(path: str | Path, device: str = "cpu") -> Restored:
 def _restored(path: str | Path, saved: checkpoint.Checkpoint, device: str) -> Restored:
     data = dict(saved.config["data"])
     image_size = tuple(data.pop("image_size", None) or ())
+    fps = data.pop("fps", None)
     if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
         data.pop("near_far")
     if len(image_size) != 2 or not all(isinstance(size, int) for size in image_size):
         raise InputError(f"{path}: data.image_size must be [width, height]; got {list(image_size)}")
+    if fps is None:
+        fps = pretrained.frame_rate(path)
+    if fps is not None and (isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 1e-3 <= fps <= 1e6):
+        raise InputError(f"{path}: data.fps must be frames per second, a number from 0.001 to 1e6; got {fps!r}")
     try:
         model = from_dict(ModelConfig, without_old_switches(saved.config["model"]), "model")
         settings = from_dict(DataConfig, data, "data")
@@ -249,4 +276,4 @@ def _restored(path: str | Path, saved: checkpoint.Checkpoint, device: str) -> Re
     except RuntimeError as error:
         raise InputError(f"{path}: the weights do not fit the model: {str(error).splitlines()[-1].strip()}") from None
     simulator.absent = frozenset(own)
-    return Restored(simulator.eval().to(device), settings, image_size, simulator.plan(spec), saved)
+    return Restored(simulator.eval().to(device), settings, image_size, simulator.plan(spec), saved, fps)

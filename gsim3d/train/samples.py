@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.data import Scene, Window, generator, make_frames
+from gsim3d.data.fitting import frame_stride
 from gsim3d.errors import InputError
 from gsim3d.train.config import DataConfig, StageConfig
 from gsim3d.types import Frames
@@ -60,6 +61,10 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, stages: Sequence[Sta
             raise InputError(
                 f"{scene.path}: images of {scene.width}x{scene.height} pixels, those of {first.path} have "
                 f"{first.width}x{first.height}; data.resize brings all to one size"
+            )
+        if frame_stride(scene.fps, first.fps) != 1 and min(scene.n_steps, first.n_steps) > 1:
+            raise InputError(
+                f"{scene.path}: {scene.fps:g} frames per second, {first.path} has {first.fps:g}; a model has one rate"
             )
         for stage in stages:
             n_steps = (stage.history or data.history) + stage.lead + stage.horizon + longest_gap(stage)

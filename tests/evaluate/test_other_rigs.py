@@ -31,7 +31,7 @@ def restored():
     simulator = build_simulator(presets.tiny(), seed=0).eval()
     data = DataConfig(history=2, target_only_cameras=(2, 7), background_stride=2, body_stride=2, resize=(32, 32))
     data = dataclasses.replace(data, near_far=(1.2, 4.0))
-    return Restored(simulator, data, (32, 32), simulator.plan(EffectsSpec()), Checkpoint({}, {}))
+    return Restored(simulator, data, (32, 32), simulator.plan(EffectsSpec()), Checkpoint({}, {}), fps=12.0)
 
 
 def rig(folder, n_cams, size=32, **keys):
@@ -176,6 +176,6 @@ def test_an_unknown_part_is_named(restored, tmp_path):
 
 @pytest.mark.skipif("elastic-small" not in names(), reason="no simulator is shipped")
 def test_a_shipped_model_says_in_one_line_what_it_changed(tmp_path, capsys):
-    folder = rig(tmp_path / "scene", 3, size=16)
+    folder = rig(tmp_path / "scene", 3, size=16, fps=42.0)
     assert main(["plan", str(folder), "elastic-small"]) == 0
     assert capsys.readouterr().err == "gsim3d: fitted to the model: images of 16x16 pixels scaled to 128x128\n"

@@ -178,7 +178,7 @@ def test_baselines_of_a_body_that_translates(restored, scene, monkeypatch):
     monkeypatch.setattr(
         scene, "images", lambda cams, steps: (film * 255).round().to(torch.uint8).permute(0, 1, 4, 2, 3)
     )
-    values = {name: v["psnr"] for name, v in score_scene(restored, scene).values.items()}
+    values = {name: v["psnr"] for name, v in score_scene(restored, scene).values.items() if "psnr" in v}
     assert (values["model"] > 50).all() and (values["constant_velocity"][2:] > 50).all()  # rounded to 8 bits
     for name in ("constant", "copy", "release_constant"):
         assert (values[name][3:] < 40).all() and values[name][5] < values[name][3]
@@ -219,7 +219,7 @@ def test_baselines_are_seen_by_cameras_that_move(restored, scene, tmp_path, monk
     monkeypatch.setattr(
         moving, "images", lambda cams, steps: (film * 255).round().to(torch.uint8).permute(0, 1, 4, 2, 3)
     )
-    values = {name: v["psnr"] for name, v in score_scene(restored, moving).values.items()}
+    values = {name: v["psnr"] for name, v in score_scene(restored, moving).values.items() if "psnr" in v}
     assert (values["model"] > 50).all() and (values["constant_velocity"][2:] > 50).all()
     assert (values["copy"][4:] < values["constant"][4:]).all()  # a still image does not follow the camera
 

@@ -67,6 +67,8 @@ def test_what_cannot_be_measured_is_told(monkeypatch):
     assert judge.not_measured == {
         "psnr_masked": "ball/3 has no segmentation",
         "psnr_body": "ball/3 has no segmentation",
+        "psnr_ground": "ball/3 has no segmentation",
+        "psnr_ring": "ball/3 has no segmentation",
         "ssim": "ball/3 has images of 14x10 pixels; it needs 11",
         "lpips_alex": "ball/3 has images of 14x10 pixels; it needs 31",
         "lpips_vgg": "ball/3 has images of 14x10 pixels; it needs 16",
@@ -145,7 +147,8 @@ def test_means_and_deviations_by_hand(two_scenes, tmp_path):
     assert summary["future.psnr"] == 16.5 and summary["past.psnr"] == 9 and summary["past_std.psnr"] == 0
     assert summary["future_std.psnr"] == pytest.approx((math.sqrt(8) + math.sqrt(2)) / 2)
     assert summary["by_step"]["other.psnr"] == [None, 2, None] and summary["other.future.psnr"] == 2
-    assert summary["scenes"]["b"] == {"future.psnr": 18, "other.future.psnr": 3}
+    of_b = {"past.psnr": 9, "future.psnr": 18, "future_late.psnr": 22, "other.future.psnr": 3}
+    assert summary["scenes"]["b"] == {**of_b, "other.future_late.psnr": None}
     write_json(tmp_path / "m.json", summary)  # no NaN in it
 
 

@@ -234,7 +234,7 @@ def test_conversion_fits_the_network():
 def test_metrics_without_weights_are_told(monkeypatch, tmp_path):
     monkeypatch.setenv("GSIM3D_CACHE_DIR", str(tmp_path))
     chosen, missing = measurable()
-    assert chosen == PLAIN_METRICS == ("psnr", "psnr_masked", "psnr_body", "ssim")
+    assert chosen == PLAIN_METRICS == ("psnr", "psnr_masked", "psnr_body", "psnr_ground", "psnr_ring", "ssim")
     assert missing == {
         "lpips_alex": "run gsim3d weights lpips",
         "lpips_vgg": "run gsim3d weights lpips",

@@ -1,0 +1,131 @@
+"""Two reports on the same scenes: the mean difference of each score with its paired standard error."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Iterator
+from numbers import Real
+from pathlib import Path
+
+from gsim3d.data.recording import read_json
+from gsim3d.errors import InputError
+from gsim3d.evaluate.scoring import METRICS
+
+PARTS = ("past", "future", "future_late")
+LEAST = 2.0  # standard errors; nothing below is called better or worse
+SAME = {"n_encoded_steps": "given steps", "n_future_steps": "predicted steps"}
+
+
+def read_report(file: str | Path) -> dict:
+    """The content of a metrics.json, or of the scores of a shipped simulator, a report for each of its sets.
+
+    Raises:
+        InputError: the file cannot be read, or is no report.
+    """
+    content = read_json(Path(file))
+    if not list(_reports(content)):
+        raise InputError(f"{file}: not a report of gsim3d evaluate: it has no scores of scenes")
+    return content
+
+
+def compare(report: dict, other: dict, file: str | Path) -> dict:
+    """Scores of ``report`` less those of ``other``, of the first method of each.
+
+    Args:
+        file: where ``other`` is from, for messages.
+    Returns:
+        set -> score -> difference, standard_error (None of one scene), scenes (that have a value in both), verdict.
+        A report of one set has the name "".
+    Raises:
+        InputError: the reports share no set, or are of other scenes, steps or images.
+    """
+    ours, others = dict(_reports(report)), dict(_reports(other))
+    shared = [name for name in ours if name in others]
+    if not shared:
+        raise InputError(f"{file}: has no set in common with this report: {sorted(others)}, here {sorted(ours)}")
+    return {name: _compare(ours[name], others[name], f"{file}: {name}".removesuffix(": ")) for name in shared}
+
+
+def table(comparison: dict, file: str | Path) -> str:
+    """The text of what :func:`compare` returned."""
+    lines = [f"difference to {file} (mean over scenes ± paired standard error):"]
+    for name, scores in comparison.items():
+        lines += [f"  {name}"] if name else []
+        for score, row in scores.items():
+            digits, error = METRICS[score.split(".")[-1]].digits, row["standard_error"]
+            numbers = f"{row['difference']:+.{digits}f} ± {'-' if error is None else f'{error:.{digits}f}'}"
+            lines.append(f"  {score:26}{numbers:>20}  {row['scenes']} scenes: {row['verdict']}")
+    return "\n".join(lines)
+
+
+def _reports(content: dict) -> Iterator[tuple[str, dict]]:
+    """The content itself, named "", or else each set in it."""
+
+    def is_report(part) -> bool:
+        return isinstance(part, dict) and isinstance(part.get("scenes"), dict) and bool(part.get("methods"))
+
+    if is_report(content):
+        yield "", content
+    else:
+        yield from ((name, part) for name, part in content.items() if is_report(part))
+
+
+def check_same(steps: dict, names: Iterable[str], other: dict, where: str | Path) -> None:
+    """Raises InputError where the report ``other`` is of other steps or scenes than those.
+
+    Args:
+        steps: n_encoded_steps, n_future_steps.
+        names: of the scenes.
+        where: the other report is from.
+    """
+    for key, what in SAME.items():
+        if steps.get(key) != other.get(key):
+            raise InputError(
+                f"{where}: {other.get(key)} {what}, here {steps.get(key)}; compare the same steps (--steps, --given)"
+            )
+    known = set(names)
+    if differing := sorted(known ^ set(other.get("scenes", ()))):
+        missing = "not scored there" if differing[0] in known else "scored there alone"
+        raise InputError(f"{where}: other scenes: {differing[0]} is {missing} ({len(differing)} scenes differ)")
+
+
+def _compare(ours: dict, other: dict, where: str) -> dict:
+    known, its = ours["scenes"], other["scenes"]
+    check_same(ours, known, other, where)
+    for scene, scores in known.items():
+        digests = [found.get("digest") if isinstance(found, dict) else None for found in (scores, its[scene])]
+        if None in digests:
+            raise InputError(f"{where}: nothing says which images of {scene} were scored; evaluate again")
+        if digests[0] != digests[1]:
+            raise InputError(f"{where}: {scene} has other images, labels or target cameras there than here")
+    found = {}
+    for score in (f"{part}.{metric}" for part in PARTS for metric in METRICS):
+        pairs = [
+            (a, b)
+            for scene in known
+            for a, b in [(_score(ours, scene, score), _score(other, scene, score))]
+            if a is not None and b is not None
+        ]
+        if pairs:
+            found[score] = _difference([a - b for a, b in pairs], METRICS[score.split(".")[-1]].rises)
+    return found
+
+
+def _score(report: dict, scene: str, score: str) -> float | None:
+    """Of the first method; None where it has none."""
+    method = report["methods"][0]
+    value = report["scenes"][scene].get(score if method == "model" else f"{method}.{score}")
+    return float(value) if isinstance(value, Real) and math.isfinite(value) else None
+
+
+def _difference(differences: list[float], rises: bool) -> dict:
+    mean, n = statistics.fmean(differences), len(differences)
+    error = statistics.stdev(differences) / math.sqrt(n) if n > 1 else None
+    if error is None:
+        verdict = "of one scene: no standard error"
+    elif abs(mean) > LEAST * error:
+        verdict = "better" if (mean > 0) == rises else "worse"
+    else:
+        verdict = "the same within two standard errors"
+    return {"difference": mean, "standard_error": error, "scenes": n, "verdict": verdict}
