@@ -21,6 +21,7 @@ MIN_SPREAD = 0.02  # mean squared sine of the optical axes around their mean: ab
 MANY_STEPS = 64  # of moving cameras, so many steps are enough to see where they look
 NEAR_SHARE, FAR_SHARE = 0.3, 2.0  # near and far relative to the distances of the point that the cameras look at
 FAR_FROM_ZERO = 16  # near depths; from there on float32 moves what is near by more than 2^-20 of its depth
+MAX_REACH = 1000  # times far: how far away from the cameras the lower corner of the workspace may lie
 SAMPLES = 12  # points along each side of a frustum
 
 
@@ -153,6 +154,7 @@ class _Convergence:
 def check_directions(recording: Recording, problems: Problems) -> None:
     """Do the cameras look at one scene? Finds flipped axes and exchanged directions, which no single matrix shows."""
     viewmats, where = spread_steps(recording.viewmats), recording.source
+    _check_origin(recording, viewmats.reshape(-1, 4, 4), problems)
     if recording.bounds is not None:
         _check_view_of_bounds(recording, viewmats, problems)
         return
@@ -171,6 +173,21 @@ def check_directions(recording: Recording, problems: Problems) -> None:
         problems.add(
             f"{where}: camera {recording.camera_names[cam]}{frame} looks away from the point that the others look at: "
             "are its y and z axes flipped? (if it is right, give the bounds of the scene)"
+        )
+
+
+def _check_origin(recording: Recording, viewmats: np.ndarray, problems: Problems) -> None:
+    """Voxels are counted from it: from a far one they cannot be told apart."""
+    key = "bounds" if recording.origin is None else "origin"
+    corner = recording.bounds[0] if recording.origin is None and recording.bounds is not None else recording.origin
+    if corner is None:
+        return
+    far = recording.far or (depth_range(viewmats) or (0.0, np.inf))[1]
+    distance = float(np.linalg.norm(positions_and_axes(viewmats)[0] - corner, axis=1).min())
+    if distance > MAX_REACH * far:
+        problems.add(
+            f"{recording.source}: {key} lies {distance:.3g} m from the nearest camera, though far is {far:.3g} m; it "
+            "must be the lower corner of the box in which the scene happens"
         )
 
 

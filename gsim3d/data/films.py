@@ -178,6 +178,7 @@ def _camera(
 def _lens(entry: dict, what: str, problems: Problems) -> Lens | None:
     """The lens of distortion, or of keys as in transforms.json."""
     given = entry.get("distortion", entry.get("dist_k1k2p1p2k3"))
+    entry = {key: value for key, value in entry.items() if key != "distortion"}
     if given is None:
         return lens_of(entry, what, problems)
     numbers = array(given, DISTORTIONS, f"{what}: distortion", problems)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
@@ -27,21 +28,25 @@ FISHEYE = {
     "RADIAL_FISHEYE": ("k1", "k2"),
     "SIMPLE_RADIAL_FISHEYE": ("k1",),
 }
-# Keys of lenses that no image is undistorted from, wherever they say more than 0 or false.
+# Keys of lenses that no image is undistorted from, and names that others have for coefficients.
 OTHER_KEYS = (
     *(f"ftheta_p{i}" for i in range(5)), "latlong", "equirectangular", "rolling_shutter",
     "s1", "s2", "s3", "s4", "sx1", "sy1", "tau_x", "tau_y", "b1", "b2", "p3", "p4", "omega", "xi", "skew",
 )  # fmt: skip
-KEYS = ("camera_model", "is_fisheye", "distortion_params", *COEFFICIENTS, *OTHER_KEYS)
+UNREAD = re.compile(
+    r"(dist|distortion)(_?(coeffs?|coefficients))?|D|lens(_?(coeffs?|params))?|(radial|tangential)_distortion",
+    re.IGNORECASE,
+)
 SAMPLES = 2000  # of the radius, where it is asked whether it grows
 WIDEST = 1.55  # radians from the axis: a pinhole sees less than 90 degrees of it
 
 
 def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
     """The lens that the keys of a description tell of; None: a pinhole. ``what``: for messages."""
-    for key in OTHER_KEYS:
-        if key in values and values[key] not in (0, None) and not _zeros(values[key]):
-            problems.add(f"{what}: the lens key {key} is not read; undistort the images to a pinhole")
+    for key, value in values.items():
+        if (key in OTHER_KEYS or UNREAD.fullmatch(str(key))) and _says(value):
+            known = ", ".join(COEFFICIENTS)
+            problems.add(f"{what}: the lens key {key:.80} is not read; use {known}, or undistort the images")
             return None
     model, flag = values.get("camera_model"), values.get("is_fisheye", False)
     if not isinstance(flag, bool):
@@ -71,8 +76,11 @@ def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
     return Lens(short) if coefficients.any() else None
 
 
-def _zeros(value) -> bool:
-    return isinstance(value, list) and all(number in (0, None) for number in value)
+def _says(value) -> bool:
+    """Whether a value is more than 0, false, nothing or a word."""
+    if isinstance(value, (list, dict)):
+        return any(map(_says, value.values() if isinstance(value, dict) else value))
+    return isinstance(value, (int, float)) and value != 0
 
 
 def _coefficients(values: Mapping, what: str, problems: Problems) -> dict[str, float]:

@@ -44,7 +44,7 @@ NAME = "transforms"
 FILE = "transforms.json"
 SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 ANGLES = ("camera_angle_x", "camera_angle_y")
-SHARED = ("fl_x", "fl_y", "cx", "cy", "w", "h", *ANGLES, *lenses.KEYS)  # of the file; frames may have their own
+OWN = ("frames", "file_path", "transform_matrix", "time", "camera", "mask_path", "label_path")  # others may be shared
 SAME_TIME = 1e-6  # of the whole duration: times closer than that are one step
 
 
@@ -133,7 +133,7 @@ def frames_of(folder: Path, source: Path, description: dict) -> list[dict]:
             if not isinstance(frame.get(key), str):
                 raise InputError(f"{source}: frames[{number}].{key} must be text; got {str(frame.get(key))[:80]!r}")
             inside(folder, frame[key], f"{source}: frames[{number}].{key}")
-    shared = {key: description[key] for key in SHARED if key in description}
+    shared = {key: value for key, value in description.items() if key not in OWN}
     return [{**shared, **frame} for frame in frames]
 
 
@@ -145,7 +145,7 @@ def _table(frames: list[dict], source: Path, problems: Problems) -> tuple[dict, 
     """(camera -> its frames step by step, times of the steps)."""
     timeless = [number for number, frame in enumerate(frames) if "time" not in frame]
     if len(timeless) == len(frames):
-        table = {str(frame.get("camera", frame["file_path"])): [frame] for frame in frames}
+        table = {str(frame.get("camera", Path(frame["file_path"]))): [frame] for frame in frames}
         if len(table) < len(frames):
             raise InputError(
                 f"{source}: {len(frames)} frames without time are of {len(table)} cameras; give every frame its time"

@@ -291,6 +291,16 @@ def test_a_camera_that_sees_nothing_of_the_bounds(copy):
     assert "bounds must be [lower corner, upper corner]" in message_of(folder)
 
 
+@pytest.mark.parametrize("layout", FILES)
+def test_an_origin_that_is_far_from_all_cameras(copy, layout):
+    folder = copy(layout)
+    for key, value in (("origin", [1e9, 0, 0]), ("origin", [0, 0, -5001]), ("bounds", [[-1e9] * 3, [1e9] * 3])):
+        for file in folder.rglob(FILES[layout]):
+            edit_json(file, lambda content: content.update({"origin": [0, 0, 0], key: value}))
+            key == "bounds" and edit_json(file, lambda content: content.pop("origin"))
+        assert f"{key} lies" in message_of(folder)
+
+
 def test_near_and_far_follow_from_the_cameras_or_are_asked_for(copy):
     folder = copy("films")
     edit_json(folder / "cameras.json", lambda content: [content.pop("near"), content.pop("far")])

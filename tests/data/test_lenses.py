@@ -98,6 +98,9 @@ REFUSED = [
     ({"ftheta_p1": 0.4}, "ftheta_p1"),
     ({"rolling_shutter": [0, 0, 0.1, 0]}, "rolling_shutter"),
     ({"latlong": True}, "latlong"),
+    ({"distortion": [0.1, 0, 0, 0]}, "the lens key distortion is not read; use k1"),
+    ({"dist_coeffs": [0.1]}, "the lens key dist_coeffs"),
+    ({"radial_distortion": [0, 0.1]}, "the lens key radial_distortion"),
     ({"k1": None}, "k1 holds null"),
     ({"k2": "0.1"}, "k2 must be numbers"),
     ({"distortion_params": [0.1]}, "distortion_params"),
@@ -112,7 +115,7 @@ def test_other_lenses_are_refused_by_name(tmp_path, keys, message, where):
 
 
 def test_keys_of_other_lenses_that_say_nothing_are_no_lens(tmp_path):
-    assert opened(tmp_path, {"rolling_shutter": [0, 0, 0, 0], "latlong": False, "s1": 0}).valid([0], [0]) is None
+    assert opened(tmp_path, {"rolling_shutter": [0, 0, 0, 0], "latlong": False, "s1": 0, "lens": "50 mm"}).valid([0], [0]) is None
 
 
 def test_masks_of_a_fisheye_keep_their_values(tmp_path):
@@ -176,6 +179,7 @@ def test_lenses_of_films(tmp_path):
     assert lens(distortion=four) == Lens(np.array([0.03, 0.005, 0.0007, 0.0001, 0]))
     assert lens(k1=0.1) == Lens(np.array([0.1, 0, 0, 0, 0])) and lens(distortion=[0.0] * 5) is None
     for keys, message in (({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"), ({"xi": 0.4}, "xi"),
+                          ({"distCoeffs": [0.1]}, "distCoeffs"), ({"D": [0.1]}, "lens key D"),
                           ({"is_fisheye": True, "distortion": [0.1] * 5}, "distortion of a fisheye"),
                           ({"distortion": four, "k1": 0.3}, "k1 is given twice")):  # fmt: skip
         with pytest.raises(InputError, match="cameras.json: camera cam_0.*" + message):

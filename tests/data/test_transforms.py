@@ -39,8 +39,8 @@ def test_the_views_of_nerf_synthetic_are_cameras_of_one_step(tmp_path):
     made = make_scene(n_steps=1, n_cams=5)
     focal = write_synthetic(tmp_path, made, {"train": [(0, 0), (0, 1), (0, 2)], "test": [(0, 3)], "val": [(0, 4)]})
     scene = Scene.open(tmp_path)
-    assert (scene.n_steps, scene.n_cams) == (1, 5) and scene.camera_names[0] == "./test/r_0"
-    order = [int(scene.camera_names.index(name)) for name in ("./train/r_0", "./train/r_1", "./train/r_2")]
+    assert (scene.n_steps, scene.n_cams) == (1, 5) and scene.camera_names[0] == "test/r_0"
+    order = [int(scene.camera_names.index(name)) for name in ("train/r_0", "train/r_1", "train/r_2")]
     cameras = scene.cameras_at(order, [0])
     np.testing.assert_allclose(cameras.viewmats, made.viewmats[0, :3], atol=1e-6)
     np.testing.assert_allclose(cameras.Ks, [[[focal, 0, 24], [0, focal, 16], [0, 0, 1]]] * 3, rtol=1e-6)
