@@ -11,6 +11,7 @@ import torch
 from gsim3d import check_stability
 from gsim3d.__main__ import main
 from gsim3d.check_stability import CHECKS, Job, check, describe, load_sample, open_subject, random_sample, replay, run
+from gsim3d.data import Scene
 from gsim3d.errors import InputError
 from gsim3d.laws import Deviation
 from gsim3d.quirks import Quirks
@@ -49,6 +50,39 @@ def test_random_weights_on_random_images_keep_every_law_and_case(tmp_path):
     page = (tmp_path / "report.md").read_text()
     assert all(f"| {name} | holds |" in page for name in CHECKS)
     assert not list((tmp_path / "failures").iterdir())
+
+
+def test_the_small_preset_keeps_every_law_and_case_with_all_particles(tmp_path, capsys):
+    scenes = write_scenes(tmp_path / "data", 2, n_steps=2, size=16)
+    arguments = ["--stability", "small", scenes, "--full", "--steps", "3", "--out", tmp_path / "report"]
+    assert main(["doctor", *map(str, arguments)]) == 0, capsys.readouterr().out
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert report["subject"]["preset"] == "small, random weights"
+    assert [(finding["check"], finding["outcome"]) for finding in report["findings"]] == [(c, "holds") for c in CHECKS]
+    assert all(finding["n_compared"] > 0 for finding in report["findings"])
+
+
+def test_a_full_check_has_all_particles_four_views_and_the_whole_history(tmp_path):
+    folders = sorted((write_scenes(tmp_path, 2, n_steps=6, size=64) / "ball").iterdir())
+    subject = open_subject("small")
+    few, full = (check_stability.sample_of_scenes(subject, folders, full)[0].frames for full in (False, True))
+    opened = [Scene.open(folder) for folder in folders]
+    shown = sum(int((scene.segmentation([0, 1, 2, 3], range(4)) > 0).sum()) for scene in opened)
+    assert len(few.images) == 2 * 2 * 3 and int(few.masks.sum()) <= len(few.images) * 150
+    assert len(full.images) == 2 * 4 * 4 and int(full.masks.sum()) == shown > 10 * len(full.images) * 15
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--stability", "smal"], "smal: no such file or folder; did you mean small?"),
+        (["--stability", "--full"], "--full needs scenes"),
+        (["--stability", "small", "--full"], "--full needs scenes"),
+    ],
+)
+def test_what_a_full_check_needs_is_said(tmp_path, capsys, arguments, message):
+    assert main(["doctor", *arguments, "--out", str(tmp_path / "r")]) == 2
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -99,6 +133,19 @@ def test_a_failure_is_named_and_can_be_made_again(tmp_path, broken_law, scenes, 
     again = replay(file)
     assert not again.healthy and again.findings[0].failures[0].error == found["failures"][0]["error"] > 0
     assert main(["doctor", "--replay", str(file)]) == 1
+
+
+def test_what_the_model_card_has_is_a_known_failure(tmp_path, broken_law, monkeypatch, trained, scenes):
+    known = {"repeat": {"what": "step means", "error": 0.25, "bound": 1e-9}}
+    monkeypatch.setattr(check_stability, "broken_laws", lambda path: known)
+    report = run(job(tmp_path, trained, scenes))
+    assert [finding.outcome for finding in report.findings] == ["known failure", "holds"] and not report.healthy
+    printed = describe(report)
+    assert "known failure, in the model card: step means 0.25 (at most 1e-09)" in printed
+    assert printed.endswith("known failures that stand in the model card: 1; no other check fails")
+    assert "| repeat | known failure |" in (tmp_path / "report.md").read_text()
+    known.clear()
+    assert run(job(tmp_path, trained, scenes)).findings[0].outcome == "fails"
 
 
 def test_a_check_that_ends_with_an_error_fails_and_the_others_go_on(tmp_path, monkeypatch):

@@ -1,18 +1,20 @@
 """Trained simulators that come with gsim3d: a folder each, named like the model, whose name stands for its checkpoint.
 
 A folder holds model.safetensors (bfloat16 weights with their configuration), config.yaml, training.jsonl (the log),
-recipe.json (what it was trained on, and for how long), scores.json and README.md, the model card.
+recipe.json (what it was trained on, and for how long), scores.json, README.md, the model card, and laws.json where
+the model breaks laws of docs/stability.md: the worst number of each, as the card has it.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 from gsim3d.errors import InputError, did_you_mean
 
 FOLDER = Path(__file__).parent
-WEIGHTS, CONFIG = "model.safetensors", "config.yaml"
+WEIGHTS, CONFIG, LAWS = "model.safetensors", "config.yaml", "laws.json"
 CHECKPOINT_HELP = "run folder, checkpoint folder, .safetensors file, or name of a simulator that comes with gsim3d"
 KEEP = ("image", "depth")  # parts of a scene that need not be fitted to a model
 
@@ -31,6 +33,13 @@ def add_fitting(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="of a scene with k times the frame rate that the model was trained at, take every k-th frame",
     )
+
+
+def broken_laws(checkpoint: str | Path) -> dict[str, dict]:
+    """Check -> {"what", "error", "bound"}: what a simulator that comes with gsim3d is known to break; {} of others."""
+    folder = Path(checkpoint).resolve().parent
+    file = folder / LAWS
+    return json.loads(file.read_text()) if folder.parent == FOLDER.resolve() and file.is_file() else {}
 
 
 def names() -> list[str]:
