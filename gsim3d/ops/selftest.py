@@ -202,6 +202,63 @@ def _raster(device: str) -> float:
     return _compare(device, function, reference, means, scales, opacities, colors)
 
 
+def _decode(device: str) -> float:
+    def reference(raw: Tensor) -> Tensor:
+        quats = torch.nn.functional.normalize(raw[:, 3:7].roll(1, 1), dim=1)
+        return torch.cat([quats, 0.01 + 0.09 * raw[:, 7:].sigmoid(), raw[:, :3]], 1)
+
+    def function(raw: Tensor) -> Tensor:
+        table = torch.zeros(128, device=raw.device)  # harmonics of degree 0 do not turn
+        quats, scales, sh = ops.decode_gaussians(raw, table, degree=0, scale_min=0.01, scale_max=0.1)
+        return torch.cat([quats, scales, sh[:, 0]], 1)
+
+    return _compare(device, function, reference, _random(30, 10))
+
+
+def _background(device: str) -> float:
+    grid = torch.randint(0, 3, (40, 3), generator=torch.Generator().manual_seed(0))
+    scene = torch.arange(40) // 20
+    keys = scene << 48 | grid[:, 0] << 32 | grid[:, 1] << 16 | grid[:, 2]
+    cells = torch.cat([keys[::2].unique(), torch.tensor([torch.iinfo(torch.int64).max])])
+    places = ops.find_cells(*(t.to(device) for t in (cells, scene, grid)))
+    equal = keys[:, None] == cells
+    if not torch.equal(places.cpu(), torch.where(equal.any(1), equal.int().argmax(1), len(cells) - 1)):
+        raise AssertionError("cells are found in other places than by comparing all")
+    one_by_one = ops.Segments(torch.arange(40, device=device), torch.arange(41, device=device))
+    clouds = torch.tensor([0, 1], device=device), torch.tensor([0, 20, 40], device=device)
+    if not torch.equal(ops.row_scenes(*clouds, [one_by_one])[0].cpu(), scene):
+        raise AssertionError("rows are in other scenes than their clouds")
+    codes, cu = torch.stack([torch.randperm(40, generator=torch.Generator().manual_seed(1))]), torch.tensor([0, 5, 9])
+    first, order = torch.tensor([[0, 20]]), codes.argsort(1)
+    lists = (first, torch.arange(9)[None], cu, codes, order, torch.tensor([0, 40]))
+    table = ops.overlapping_patches(*(t.to(device) for t in lists), patch_size=20)[0]
+    if not torch.equal(table.q_rows.cpu(), order[0]) or table.cu_q[:3].tolist() != [0, 20, 40]:
+        raise AssertionError("rows are in other patches than those in whose intervals they lie")
+    x, field = _random(40, 6), _random(len(cells), 6, seed=1)
+    return _compare(device, lambda x, f: ops.add_cells(x, f, places), lambda x, f: x + f[places.cpu()], x, field)
+
+
+def _sentinel(device: str) -> float:
+    means, opacities, cu_rows = _random(50, 3), torch.linspace(0, 1, 50), torch.tensor([0, 20, 50])
+    means[7, 1], opacities[30] = torch.nan, 2.0
+    clouds = {"cloud_scene": torch.tensor([0, 1]), "origin": torch.full((2, 3), -9.0, dtype=torch.float64)}
+    clouds |= {"activity": torch.zeros(50, dtype=torch.uint8)}
+    watched = ops.watch_rows(
+        [means.to(device), opacities.to(device)],
+        [(-9, 9), (0, 1)],
+        cu_rows.to(device),
+        **{name: value.to(device) for name, value in clouds.items()},
+    )
+    bad = (~(means.abs() <= 9).all(1)).int() | (opacities > 1).int() << 1
+    if not torch.equal(watched.status.cpu(), bad) or watched.record[:, :4].tolist() != [[1, 7, 0, -1], [0, -1, 1, 30]]:
+        raise AssertionError("rows that cannot be used are not those that are out of bounds")
+    awake = [(bad == 0)[:20].sum(), (bad == 0)[20:].sum()]
+    if watched.record[:, 8].tolist() != [float(n) for n in awake]:
+        raise AssertionError("rows that are awake are counted wrongly")
+    opacity = torch.stack([opacities[:20].double().sum(), opacities[20:][opacities[20:] <= 1].double().sum()])
+    return float(((watched.record[:, 10].cpu() - opacity) / opacity).abs().max())
+
+
 CHECKS: dict[str, Callable[[str], float]] = {
     "curve": _curve,
     "sparse_conv": _sparse_conv,
@@ -209,5 +266,8 @@ CHECKS: dict[str, Callable[[str], float]] = {
     "pool": _pool,
     "row_norm": _row_norm,
     "plane_sweep": _plane_sweep,
+    "decode": _decode,
+    "background": _background,
+    "sentinel": _sentinel,
     "raster": _raster,
 }
