@@ -25,8 +25,8 @@ examples:
   gsim3d doctor --stability small my_scene --steps 1000
   gsim3d doctor --stability --replay runs/stability/failures/translate.safetensors
 
-Exit code 0: everything required works, every law and case holds. 1: something is broken, known or not; the lines say what. 2: the
-check could not run.
+Exit code 0: everything required works, every law and case holds. 1: something is broken, known or not; the lines say
+what. 2: the check could not run.
 """
 
 # distribution -> (import name, what it is for, how to get it)
@@ -48,8 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--stability",
         nargs="*",
         metavar="PATH",
-        help="check laws and hard cases instead: of a checkpoint, or of a preset with random weights (default: tiny), on "
-        "a scene or folder of scenes (default: random images)",
+        help="check laws and hard cases instead: of a checkpoint, or of a preset with random weights (default: tiny), "
+        "on a scene or folder of scenes (default: random images)",
     )
     group.add_argument(
         "--out", metavar="DIR", default="runs/stability", help="folder of the report (default: %(default)s)"
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--steps", type=whole(1), default=100, help="length of the long rollout (default: %(default)s)")
     group.add_argument("--only", nargs="+", metavar="CHECK", default=(), help="checks to make (default: all)")
     group.add_argument(
-        "--full", action="store_true", help="all particles, four views and the whole history (default: a sample of them)"
+        "--full", action="store_true", help="all particles, four views and the whole history (default: a sample)"
     )
     group.add_argument("--replay", metavar="FILE", help="make the check again that FILE, from a report, reproduces")
     group.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: cpu)")
