@@ -211,7 +211,7 @@ def _masks(folder: Path, description: dict, source: Path, sources: list[_Frames 
         return wanted
     own = next((name for name in reversed(OWN_FOLDERS) if (folder / name).is_dir()), None)
     cut_out = all(isinstance(frames, _Frames) for frames in sources) and any(map(_Frames.is_cut_out, sources))
-    return own or ("alpha" if cut_out else wanted)
+    return own or ("alpha" if cut_out and "masks" not in description else wanted)
 
 
 def _frames_of(folder: Path, name: str, size: tuple[int, int], source: Path, problems: Problems) -> _Frames | Video:

@@ -79,7 +79,7 @@ def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
 def _says(value) -> bool:
     """Whether a value is more than 0, false, nothing or a word."""
     if isinstance(value, (list, dict)):
-        return any(map(_says, value.values() if isinstance(value, dict) else value))
+        return any(item not in (0, None) for item in (value.values() if isinstance(value, dict) else value))
     return isinstance(value, (int, float)) and value != 0
 
 
@@ -119,9 +119,11 @@ class Undistorter:
             centred = K.copy()
             centred[:2, 2] -= 0.5  # OpenCV's pixel centres are whole numbers
             make = cv2.fisheye.initUndistortRectifyMap if self._lens.fisheye else cv2.initUndistortRectifyMap
-            maps = make(centred, self._lens.coefficients, np.eye(3), centred, self._size, cv2.CV_32FC1)
+            # As a camera of focal length 1, because OpenCV's lenses know no skew.
+            x, y = make(np.eye(3), self._lens.coefficients, np.eye(3), centred, self._size, cv2.CV_32FC1)
             folded = self._radius(K) > _reach(self._lens)
-            self._maps = tuple(np.where(folded, np.float32(-2), places) for places in maps)
+            places = centred[0, 0] * x + centred[0, 1] * y + centred[0, 2], centred[1, 1] * y + centred[1, 2]
+            self._maps = tuple(np.where(folded, -2, place).astype(np.float32) for place in places)
             self._key = K.copy()
         return self._maps
 

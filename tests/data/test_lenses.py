@@ -14,14 +14,16 @@ from tests.data.made_scenes import edit_json, make_scene, write_films, write_tra
 
 FISHEYE = {"k1": 0.03, "k2": 0.005, "k3": 0.0007, "k4": 0.0001}
 RATIONAL = {"k1": 0.2, "k2": 0.05, "p1": 0.002, "p2": -0.004, "k3": 0.01, "k4": 0.1, "k5": 0.02, "k6": 0.003}
-K = np.array([[90.0, 0, 101.5], [0, 95.0, 76.0], [0, 0, 1]])
+K = np.array([[90.0, 3.0, 101.5], [0, 95.0, 76.0], [0, 0, 1]])
 
 
 def in_lens(ray: np.ndarray, lens: Lens) -> np.ndarray:
     """The pixel that sees a ray, by OpenCV's forward models."""
     if lens.fisheye:
-        return cv2.fisheye.distortPoints((ray[:2] / ray[2])[None, None], K, lens.coefficients)[0, 0]
-    return cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), K, lens.coefficients)[0].ravel()
+        place = cv2.fisheye.distortPoints((ray[:2] / ray[2])[None, None], np.eye(3), lens.coefficients)[0, 0]
+    else:
+        place = cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), np.eye(3), lens.coefficients)[0].ravel()
+    return K[:2, :2] @ place + K[:2, 2]
 
 
 @pytest.mark.parametrize("model, keys", [
@@ -152,7 +154,7 @@ def test_a_fisheye_scene_shows_what_a_pinhole_sees(tmp_path):
 def test_where_a_polynomial_turns_back_nothing_was_filmed(lens):
     """Beyond that radius it would show again, mirrored, what lies farther inside."""
     undistorter = Undistorter(lens, (200, 160))
-    wide = K * [[0.4, 0, 1], [0, 0.4, 1], [0, 0, 1]]
+    wide = K * [[0.4, 0, 1], [0, 0.4, 1], [0, 0, 1]]  # without the skew
     valid = undistorter.valid(wide)
     x, y = undistorter._sources(wide)
     for values in (x[76, 101:][valid[76, 101:]], y[76:, 101][valid[76:, 101]]):
