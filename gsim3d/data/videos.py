@@ -102,7 +102,7 @@ def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
     finally:
         capture.release()
     if not times:
-        raise InputError("cannot be decoded: it has no frame")
+        raise InputError("cannot be decoded: damaged, or of a codec that this OpenCV lacks")
     times = np.array(times)
     back = np.flatnonzero(np.diff(times) < 0)
     if len(times) > 1 and (len(back) or times[-1] <= times[0]):

@@ -81,6 +81,8 @@ class Restored:
             raise InputError("--resample: the checkpoint does not say at which frame rate it was trained")
         scene = Scene.open(folder, fitting=fitting, fps=self.fps if resample else None)
         self.check_scene(scene)
+        if scene.recording.notes:
+            warnings.warn(f"{folder}: {'; '.join(scene.recording.notes)}", FitWarning, stacklevel=2)
         if self.fps is None and scene.n_steps > 1:
             said = "frame rate not checked: the checkpoint does not say at which one it was trained"
             warnings.warn(said, FitWarning, stacklevel=2)

@@ -20,6 +20,8 @@ from gsim3d.quirks import Quirks
 from gsim3d.train.checkpoint import Checkpoint
 from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import Restored, build_simulator
+from tests.data.made_videos import trimmed, write_plain
+from tests.data.made_videos import write_scene as write_videos
 from tests.tiny_scenes import write_scene
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -62,6 +64,15 @@ VIEWS = {
     7: ((0, 1, 3, 5), (2, 4, 6)),
     8: ((0, 1, 4, 5), (2, 7)),
 }
+
+
+def test_what_a_reader_changed_is_said(restored, tmp_path):
+    for name in ("a", "b"):
+        write_plain(tmp_path / f"{name}.mp4")
+    trimmed(tmp_path / "b.mp4", 0.0, late=0.3)
+    folder = write_videos(tmp_path, ["a", "b"], resample=12)
+    said = opened(restored, folder)[1]
+    assert f"{folder}: resampled: frames lie up to" in said
 
 
 @pytest.mark.parametrize("n_cams", VIEWS)
