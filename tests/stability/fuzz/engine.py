@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
+import math
 import mmap
 import os
 import pickle
@@ -24,10 +25,11 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[3]
-MEMORY = 2**30  # bytes of address space that inputs may take beyond what the loaded libraries have
-PATIENCE = 30.0  # seconds
+MEMORY = 2**30  # bytes that an input may take beyond what the process has
+CEILING = 4 * MEMORY  # of address space: more is never given, so that the machine goes on
+PATIENCE = 10.0  # seconds
 PROGRESS = struct.Struct("<qq")  # number of the job, number of the input
-GROUPS = ("ops", "readers", "commands", "misbehaving")  # modules of this package with TARGETS
+GROUPS = ("ops", "readers", "commands")  # modules of this package with TARGETS
 
 
 @dataclass(frozen=True)
@@ -74,10 +76,19 @@ class Outcome:
 def targets() -> dict[str, Target]:
     """All targets, by name; they are in the modules GROUPS. Names that start with _ are for tests of this engine."""
     found = {}
-    for group in GROUPS:
+    for group in (*GROUPS, "misbehaving"):
         for target in importlib.import_module(f"tests.stability.fuzz.{group}").TARGETS:
             assert target.name not in found, target.name
             found[target.name] = target
+    return found
+
+
+def chosen(names: Sequence[str]) -> list[str]:
+    """Names of targets, in order; a group stands for all of its targets on the CPU."""
+    found = []
+    for name in names:
+        members = importlib.import_module(f"tests.stability.fuzz.{name}").TARGETS if name in GROUPS else []
+        found += [target.name for target in members if not target.on_gpu] if members else [name]
     return found
 
 
@@ -106,6 +117,21 @@ def _line(error: Exception) -> str:
     return " ".join(str(error).split())[:300]
 
 
+class Peak:
+    """The most memory that this process has had since it was made."""
+
+    def __init__(self):
+        Path("/proc/self/clear_refs").write_text("5")
+        self.before = self._bytes("VmRSS")
+
+    def extra(self) -> int:
+        return self._bytes("VmHWM") - self.before
+
+    def _bytes(self, name: str) -> int:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
+
+
 def limit_memory(extra: int) -> None:
     """This process may take ``extra`` bytes of address space more than it has: what the libraries took when they were
     loaded does not count, and a thread's stack and arena do."""
@@ -122,8 +148,8 @@ def limit_memory_of_gpu(extra: int) -> None:
     torch.cuda.set_per_process_memory_fraction(extra / torch.cuda.get_device_properties(0).total_memory)
 
 
-def work(jobs: list[tuple[str, int, int]], seed: int, out: Path) -> None:
-    """The child: inputs ``first`` to ``end - 1`` of each target (name, first, end) of ``jobs``.
+def work(jobs: list[tuple[str, int, int]], seed: int, out: Path, seconds: float) -> None:
+    """The child: inputs ``first`` to ``end - 1`` of each target (name, first, end) of ``jobs``, none after ``seconds``.
 
     ``out/progress`` holds the numbers of the job and of the input under way, ``out/answers.jsonl`` what came of others.
     """
@@ -138,15 +164,20 @@ def work(jobs: list[tuple[str, int, int]], seed: int, out: Path) -> None:
         if any(known[name].on_gpu for name, _, _ in jobs):
             limit_memory_of_gpu(MEMORY)
         else:
-            limit_memory(MEMORY)
+            limit_memory(CEILING)
         for number, (name, first, end) in enumerate(jobs):
-            target = known[name]
+            target, end_of_job = known[name], time.monotonic() + seconds
             for index in range(first, end):
+                if time.monotonic() > end_of_job:
+                    break
                 progress[:] = PROGRESS.pack(number, index)
                 folder = out / "input"
                 folder.mkdir()
                 case = make_case(target, seed, index, folder)
+                peak = Peak()
                 answer, problem = judge(target, case, folder)
+                if not target.on_gpu and (extra := peak.extra()) > MEMORY:
+                    problem = f"takes {extra >> 20} MiB; {problem or answer}"
                 if problem:
                     keep(name, seed, index, case, folder, out, problem)
                 answers.write(json.dumps([name, index, answer, problem]) + "\n")
@@ -165,11 +196,17 @@ def keep(name: str, seed: int, index: int, case: Any, folder: Path, out: Path, p
 
 
 def run(
-    names: Sequence[str], count: int, seed: int = 0, out: Path | None = None, patience: float = PATIENCE
+    names: Sequence[str],
+    count: int,
+    seed: int = 0,
+    out: Path | None = None,
+    patience: float = PATIENCE,
+    seconds: float = math.inf,
 ) -> list[Outcome]:
     """Feeds ``count`` inputs to each of the targets ``names``, in one child or, after a crash, the next.
 
     patience: seconds after which an input counts as hanging.
+    seconds: after which a target gets no further input.
     """
     out = Path(tempfile.mkdtemp(prefix="fuzz-")) if out is None else out
     out.mkdir(parents=True, exist_ok=True)
@@ -177,7 +214,7 @@ def run(
     outcomes = {name: Outcome(name) for name in names}
     jobs = [(name, 0, count) for name in names]
     while jobs:
-        problem, number, index = _child(jobs, seed, out, patience)
+        problem, number, index = _child(jobs, seed, out, patience, seconds)
         if problem is not None:
             name, _, end = jobs[number]
             _keep_again(name, seed, index, out, problem)
@@ -198,14 +235,16 @@ def run(
     return list(outcomes.values())
 
 
-def _child(jobs: list[tuple[str, int, int]], seed: int, out: Path, patience: float) -> tuple[str | None, int, int]:
+def _child(
+    jobs: list[tuple[str, int, int]], seed: int, out: Path, patience: float, seconds: float
+) -> tuple[str | None, int, int]:
     """(what ended the child before it was done or None, number of the job, number of the input under way)."""
     shutil.rmtree(out / "input", ignore_errors=True)
     progress = out / "progress"
     progress.write_bytes(PROGRESS.pack(0, jobs[0][1]))
     code = "import json, sys; from pathlib import Path; from tests.stability.fuzz import engine; "
-    code += "engine.work(json.loads(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]))"
-    command = [sys.executable, "-c", code, json.dumps(jobs), str(seed), str(out)]
+    code += "engine.work(json.loads(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4]))"
+    command = [sys.executable, "-c", code, json.dumps(jobs), str(seed), str(out), str(seconds)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
     with open(out / "log", "wb") as log:
         child = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=log, stdout=log)

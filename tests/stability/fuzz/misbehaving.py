@@ -32,7 +32,7 @@ def _call(what: str):
         elif what == "hang" and count == BAD + 1:
             time.sleep(1000)
         elif what == "memory":
-            torch.ones(2**29)  # 2 GiB
+            torch.ones(2**28 + 2**26)  # 1.25 GiB
         elif what == "nan":
             finite({"x": [torch.tensor([1.0, float("nan")])]})
         elif what == "unnamed":
