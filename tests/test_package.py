@@ -162,3 +162,10 @@ def test_sdist_becomes_a_wheel_that_predicts_without_a_compiler(sdist, tmp_path)
     python(*command, *"simulate elastic-small films/ball/0000 --steps 1 --out predicted".split(), cwd=tmp_path, PATH="")
     assert (tmp_path / "predicted" / "rollout.mp4").stat().st_size > 1000
     assert str(site) in python(fresh, "-I", "-c", "import gsim3d.ops; print(gsim3d.__file__)", cwd=tmp_path)
+
+
+def test_wheels_are_built_for_pythons_that_are_known():
+    done = subprocess.run(
+        ["bash", ROOT / "tools" / "build_wheels.sh"], capture_output=True, text=True, env={**os.environ, "PYTHONS": "false"}
+    )
+    assert done.returncode == 1 and "PYTHONS: false is no Python 3.11, 3.12 or 3.13" in done.stderr

