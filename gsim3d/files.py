@@ -70,8 +70,8 @@ def write_picture(path: Path, image: np.ndarray) -> None:
         file.write(cv2.imencode(".png", image[..., ::-1])[1])
 
 
-def read_file(path: str | Path, most: int) -> bytes:
-    """The bytes of a file.
+def read_file(path: str | Path, most: int, first: int | None = None) -> bytes:
+    """The bytes of a file, or its ``first``.
 
     Raises:
         InputError: it is missing, no file (pipes and devices are not opened), has more than ``most`` bytes, or cannot
@@ -85,7 +85,7 @@ def read_file(path: str | Path, most: int) -> bytes:
         if size > most:
             raise InputError(f"{path} cannot be read: it has {size} bytes; more than {most} are refused")
         with open(path, "rb") as file:
-            return file.read(size)
+            return file.read(size if first is None else first)
     except MemoryError:
         raise InputError(f"{path} cannot be read: no memory for {size} bytes") from None
     except OSError as error:

@@ -6,7 +6,7 @@
 #
 # PYTHONS="python3.11 /opt/python/cp312-cp312/bin/python"   default: python3.11, 3.12 and 3.13, those that are found
 # TORCH="torch==2.13.0"                                     what to build with; wheels run with torch 2.11 and later
-# GSIM3D_CUDA=1                                             CUDA kernels too: needs nvcc of the CUDA version of that torch
+# GSIM3D_CUDA=1                                             CUDA kernels too: needs nvcc of that torch's CUDA version
 # MAX_JOBS=1                                                compile one file at a time
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -55,7 +55,7 @@ for python in "${pythons[@]}"; do
     cp "$sdist" "$out"
   fi
   say "$name: building"
-  PATH="$work/$name/bin:$PATH" "$work/$name/bin/pip" wheel -q --no-build-isolation --no-deps -w "$work/$name/raw" "$sdist"
+  PATH="$work/$name/bin:$PATH" pip wheel -q --no-build-isolation --no-deps -w "$work/$name/raw" "$sdist"
   PATH="$work/tools/bin:$PATH" auditwheel repair "${outside[@]}" -w "$work/$name/wheel" "$work/$name"/raw/*.whl
   say "$name: installing and predicting in a new environment"
   "$python" -m venv "$work/$name/fresh"

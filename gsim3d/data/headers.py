@@ -42,8 +42,13 @@ def read_header(data: bytes) -> Header | None:
 def _png(data: bytes) -> Header | None:
     if len(data) < 33 or data[12:16] != b"IHDR":
         return None
-    alpha = data[25] in (4, 6) or b"tRNS" in data.partition(b"IDAT")[0]
-    return Header(struct.unpack_from(">II", data, 16), data.rfind(b"IEND") > 24, alpha)
+    # Chunk by chunk: decoders take memory for as many bytes as a chunk claims to have, up to 2 GiB.
+    place, alpha, whole = 8, data[25] in (4, 6), False
+    while place + 12 <= len(data) and not whole:
+        kind = data[place + 4 : place + 8]
+        alpha, whole = alpha or kind == b"tRNS", kind == b"IEND"
+        place += 12 + int.from_bytes(data[place : place + 4], "big")
+    return Header(struct.unpack_from(">II", data, 16), whole, alpha)
 
 
 def _jpeg(data: bytes) -> Header | None:

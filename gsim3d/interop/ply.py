@@ -19,7 +19,7 @@ from torch import Tensor
 from gsim3d.errors import InputError
 from gsim3d.files import read_file
 from gsim3d.harmonics import SH_0
-from gsim3d.interop.ply_format import Header, read_columns, read_header
+from gsim3d.interop.ply_format import MAX_HEADER, Header, read_columns, read_header
 from gsim3d.rotations import unit_quats
 from gsim3d.types import Gaussians
 
@@ -94,8 +94,8 @@ def read_ply(path: str | Path) -> Gaussians:
     """
     path = Path(path)
     try:
+        header = read_header(path, read_file(path, MAX_BYTES, MAX_HEADER))
         content = read_file(path, MAX_BYTES)
-        header = read_header(path, content)
         _check_kind(path, header)
         return _gaussians(path, read_columns(path, content, header, "vertex"), header)
     except MemoryError:

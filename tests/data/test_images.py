@@ -175,6 +175,18 @@ def test_headers_of_every_format(tmp_path):
             assert short is None or not short.whole or name == "a.tif", (name, cut)
 
 
+@pytest.mark.parametrize("chunk", [8, 33])
+def test_chunks_that_claim_more_than_the_file_has_are_not_decoded(chunk, tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), COLOUR)
+    data = bytearray((tmp_path / "a.png").read_bytes())
+    for claimed in (len(data), 2**31 - 1, 2**32 - 1):
+        data[chunk : chunk + 4] = struct.pack(">I", claimed)
+        (tmp_path / "a.png").write_bytes(data)
+        assert not read_header(bytes(data)).whole
+        with pytest.raises(InputError, match="its end is missing"):
+            read_image(tmp_path / "a.png", SIZE, "camera a, frame 0", Problems())
+
+
 def big_endian_tiff() -> bytes:
     entries = [(256, 3, SIZE[0]), (257, 3, SIZE[1]), (258, 3, 8), (259, 3, 1), (262, 3, 1), (273, 4, 8),
                (277, 3, 1), (278, 3, SIZE[1]), (279, 4, SIZE[0] * SIZE[1])]  # fmt: skip

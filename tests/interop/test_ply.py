@@ -2,6 +2,7 @@
 
 import dataclasses
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -302,3 +303,15 @@ def test_clouds_are_written_with_their_own_offsets(tmp_path):
         rows = slice(*before.cu_rows[cloud : cloud + 2].tolist())
         expected = before.means[rows].double() + offsets[cloud]
         torch.testing.assert_close(after.means.double() + after.world_offset, expected, rtol=0, atol=1e-6)
+
+
+def test_large_files_that_are_no_ply_are_not_read(tmp_path):
+    with open(tmp_path / "a.ply", "wb") as file:
+        file.truncate(2**30)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="not a .ply file"):
+            read_ply(tmp_path / "a.ply")
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
