@@ -5,16 +5,15 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import reprlib
-import sys
 import types
 import typing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from gsim3d.errors import InputError, did_you_mean
+from gsim3d.plain import is_number, parse_yaml
 
 _BOUNDED = reprlib.Repr()
 _BOUNDED.maxstring = _BOUNDED.maxother = 80
@@ -100,9 +99,9 @@ def read_yaml(path: str | Path, subject: str) -> Any:
     """
     text = read_file(path, MAX_TEXT)
     try:
-        return yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError, MemoryError) as error:
-        raise InputError(f"{subject}: {path} cannot be read: {' '.join(str(error).split())[:300]}") from None
+        return parse_yaml(text)
+    except ValueError as error:
+        raise InputError(f"{subject}: {path} cannot be read: {error}") from None
 
 
 def shown(value: Any) -> str:
@@ -152,9 +151,9 @@ def _value(hint: Any, value: Any, subject: str, where: str) -> Any:
         if not isinstance(value, (list, tuple)) or n not in (None, len(value)):
             raise InputError(f"{subject}: {where} must be a list{'' if n is None else f' of {n}'}; got {shown(value)}")
         return tuple(_value(item, v, subject, where) for item, v in zip(items if n else items[:1] * len(value), value))
-    number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-    fits = {bool: isinstance(value, bool), str: isinstance(value, str), float: number}
+    fits = {bool: isinstance(value, bool), str: isinstance(value, str)}
+    fits |= {kind: is_number(value, kind) for kind in (int, float)}
     if not fits.get(hint, True):
-        wanted = {bool: "true or false", str: "a text", float: "a number"}[hint]
+        wanted = {bool: "true or false", str: "a text", int: "a whole number", float: "a number"}[hint]
         raise InputError(f"{subject}: {where} must be {wanted}; got {shown(value)}")
     return value

@@ -66,7 +66,7 @@ def test_view_dependence_beyond_the_model_raises():
         ({"dynamics": 3}, "dynamics must be a mapping; got 3"),
         ({"dynamics": {"background": "gone"}}, "dynamics.background must be one of frozen, masked_out, dynamic"),
         ({"dynamics": {"history": 0}}, "dynamics.history must be an integer of at least 1; got 0"),
-        ({"dynamics": {"history": "2"}}, "dynamics.history must be an integer of at least 1; got '2'"),
+        ({"dynamics": {"history": "2"}}, "dynamics.history must be a whole number; got '2'"),
         ({"appearance": {"view_dependent": 4}}, "view_dependent must be 0 to 3; got 4"),
         ({"appearance": {"changing": "bunny"}}, "appearance.changing must be one of"),
         ({"dynamics": {"sleep": {"policy": "soundly"}}}, "dynamics.sleep.policy must be one of exact, approx"),

@@ -6,13 +6,15 @@ checkpoint folder holds
 - ``model.safetensors``, ``ema.safetensors`` (float32 weights; the second averaged, absent without averaging),
 - ``optimizer.safetensors`` (moments by parameter name; absent when the weights only were saved),
 - ``config.yaml`` (model, data, effects, training),
-- ``state.json`` (step, next sample, versions, hash of every file, hash of the checkpoint it continued).
+- ``state.json`` (step, next sample, versions, hash of every file and of its own content, hash of the checkpoint it
+  continued). One without a hash of its own, as earlier versions wrote it, is read as it is.
 
 Nothing here is a pickle: reading a checkpoint runs no code.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
@@ -28,14 +30,45 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from gsim3d import __version__
-from gsim3d.errors import InputError
+from gsim3d.errors import HardCaseError, InputError
 from gsim3d.files import MAX_TEXT, read_file, sha256_of
+from gsim3d.plain import is_number
 from gsim3d.pretrained import located
 from gsim3d.train.settings import load_yaml
 
 FORMAT = 1
 STATE, CONFIG, POINTER = "state.json", "config.yaml", "last"
 _WEIGHTS = {"model": "model.safetensors", "ema": "ema.safetensors", "optimizer": "optimizer.safetensors"}
+MAX_STATE = 16 * 2**20  # bytes: of the names of many scenes
+OWN_HASH = "sha256_of_state"
+
+
+def _is_count(value: Any) -> bool:
+    return is_number(value, int) and value >= 0
+
+
+def _is_time(value: Any) -> bool:
+    return is_number(value, float) and value >= 0
+
+
+def _are_texts(values: Any) -> bool:
+    return isinstance(values, (list, tuple)) and all(isinstance(value, str) for value in values)
+
+
+def _is_scale(value: Any) -> bool:
+    return isinstance(value, (list, tuple)) and len(value) == 2 and _is_time(value[0]) and _is_count(value[1])
+
+
+_STATE_VALUES = {
+    **dict.fromkeys(
+        ("step", "next_sample", "n_skipped", "n_skipped_in_a_row"), (_is_count, "a whole number of at least 0")
+    ),
+    "seconds": (_is_time, "a number of at least 0"),
+    "loss_scale": (_is_scale, "a number and a count"),
+    "scenes": (_are_texts, "names"),
+    "parent": (lambda value: value is None or isinstance(value, str), "a hash"),
+    "sha256": (lambda value: isinstance(value, dict) and _are_texts(list(value.values())), "hashes by file"),
+}
 
 
 @dataclass(frozen=True)
@@ -67,6 +100,7 @@ def save(run: str | Path, checkpoint: Checkpoint, keep: int = 2) -> Path:
     A process that is killed at any moment leaves the previous checkpoint good and pointed to.
 
     Raises:
+        HardCaseError: weights that are not finite; the previous checkpoint stays.
         InputError: the disk is full, or the folder cannot be written; the previous checkpoint stays as well.
     """
     root = Path(run) / "checkpoints"
@@ -92,7 +126,7 @@ def write(folder: Path, checkpoint: Checkpoint) -> Path:
     shutil.rmtree(part, ignore_errors=True)
     try:
         _write_files(part, checkpoint)
-    except OSError:
+    except (OSError, HardCaseError):
         shutil.rmtree(part, ignore_errors=True)  # it may be what fills the disk
         raise
     shutil.rmtree(folder, ignore_errors=True)
@@ -112,7 +146,7 @@ def _write_files(part: Path, checkpoint: Checkpoint) -> None:
         "versions": {"gsim3d": __version__, "torch": str(torch.__version__), "python": platform.python_version()},
         "sha256": {path.name: sha256_of(path) for path in sorted(part.iterdir())},
     }
-    (part / STATE).write_text(json.dumps(state, indent=1))
+    (part / STATE).write_text(json.dumps({**state, OWN_HASH: hash_of_state(state)}, indent=1))
     for path in [*part.iterdir(), part]:
         _sync(path)
 
@@ -169,10 +203,12 @@ def _load_folder(path: Path) -> Checkpoint:
     if not (path / STATE).is_file():
         raise InputError(f"{path}: not a checkpoint (a run folder, a folder with {STATE}, or a .safetensors file)")
     try:
-        state = json.loads(read_file(path / STATE, MAX_TEXT))
-        hashes = dict(state["sha256"])
-    except (ValueError, KeyError, TypeError, RecursionError):
+        state = json.loads(read_file(path / STATE, MAX_STATE))
+    except (ValueError, RecursionError):
         raise InputError(f"{path / STATE}: not a checkpoint's state, the checkpoint is broken") from None
+    hashes = _checked_state(state, path / STATE).get("sha256", {})
+    if state.pop(OWN_HASH, None) not in (None, hash_of_state(state)):
+        raise InputError(f"{path / STATE}: changed since it was written")
     for name, expected in hashes.items():
         file = path / Path(name).name
         if not file.is_file() or sha256_of(file) != expected:
@@ -182,6 +218,23 @@ def _load_folder(path: Path) -> Checkpoint:
     config = _known_format(load_yaml(path / CONFIG), path / CONFIG)
     tensors = {name: _read_tensors(path / file) if file in hashes else {} for name, file in _WEIGHTS.items()}
     return Checkpoint(config=config, state=state, digest=digest_of(path), **tensors)
+
+
+def hash_of_state(state: dict[str, Any]) -> str:
+    """The hash of a state's content without its own hash."""
+    return hashlib.sha256(json.dumps(state, sort_keys=True).encode()).hexdigest()
+
+
+def _checked_state(state: Any, where: Path) -> dict[str, Any]:
+    """``state``, whose known values have their types. Raises InputError that names the first that has not."""
+    if not isinstance(state, dict):
+        raise InputError(f"{where}: a checkpoint's state must be a mapping")
+    for name, (fits, wanted) in _STATE_VALUES.items():
+        if name in state and not fits(state[name]):
+            raise InputError(f"{where}: {name} must be {wanted}; the checkpoint is broken")
+    if "step" not in state:
+        raise InputError(f"{where}: step is missing; the checkpoint is broken")
+    return state
 
 
 def export(checkpoint: Checkpoint, path: str | Path) -> None:
@@ -199,8 +252,22 @@ def export(checkpoint: Checkpoint, path: str | Path) -> None:
 
 
 def _bytes_of(tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:
-    """A .safetensors file. (Its own writer makes files that nobody else may read.)"""
+    """A .safetensors file. (Its own writer makes files that nobody else may read.)
+
+    Raises HardCaseError where a tensor is not finite.
+    """
+    if name := _first_not_finite(tensors):
+        raise HardCaseError(
+            f"{name}: holds numbers that are not finite; nothing is written: lower the learning rate and go on from the "
+            "last checkpoint",
+            tensor=name,
+        )
     return safetensors.torch.save({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, metadata)
+
+
+def _first_not_finite(tensors: dict[str, Tensor]) -> str | None:
+    floating = ((name, value) for name, value in tensors.items() if value.is_floating_point())
+    return next((name for name, value in floating if not bool(value.isfinite().all())), None)
 
 
 def _load_single(path: Path) -> Checkpoint:
@@ -208,16 +275,18 @@ def _load_single(path: Path) -> Checkpoint:
         with safetensors.safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
         config, state = json.loads(metadata["gsim3d_config"]), json.loads(metadata["gsim3d_state"])
-    except (safetensors.SafetensorError, KeyError, ValueError):
+    except (safetensors.SafetensorError, KeyError, ValueError, RecursionError):
         raise InputError(f"{path}: not a gsim3d checkpoint file") from None
-    return Checkpoint(
-        model=_read_tensors(path), config=_known_format(config, path), state=state, digest=sha256_of(path)
-    )
+    config, state = _known_format(config, path), _checked_state(state, path)
+    return Checkpoint(model=_read_tensors(path), config=config, state=state, digest=sha256_of(path))
 
 
 def _known_format(config: dict, where: Path) -> dict:
+    if not isinstance(config, dict):
+        raise InputError(f"{where}: a checkpoint's configuration must be a mapping")
     if config.get("format") != FORMAT:
-        raise InputError(f"{where}: checkpoint format {config.get('format')!r}; this version reads {FORMAT}")
+        found = str(config["format"])[:20] if isinstance(config.get("format"), (int, str)) else "unknown"
+        raise InputError(f"{where}: checkpoint format {found}; this version reads {FORMAT}")
     missing = [name for name in ("model", "data") if not isinstance(config.get(name), dict)]
     if missing:
         raise InputError(f"{where}: the section {missing[0]} is missing")
@@ -226,9 +295,12 @@ def _known_format(config: dict, where: Path) -> dict:
 
 def _read_tensors(path: Path) -> dict[str, Tensor]:
     try:
-        return load_file(path)
-    except (safetensors.SafetensorError, OSError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from None
+        tensors = load_file(path)
+    except (safetensors.SafetensorError, OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: cannot be read: {' '.join(str(error).split())[:300]}") from None
+    if name := _first_not_finite(tensors):
+        raise InputError(f"{path}: {name} holds numbers that are not finite: the weights are broken")
+    return tensors
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -248,7 +320,12 @@ def _sync(path: Path) -> None:
 
 
 def laid_out_as(weight: Tensor, value: Tensor) -> Tensor:
-    """``value`` with device and strides of ``weight``: few kernels update tensors that are alike, else one for each."""
-    if value.stride() == weight.stride() and value.shape == weight.shape and value.device == weight.device:
+    """``value`` with device and strides of ``weight``: few kernels update tensors that are alike, else one for each.
+
+    Raises ValueError where their shapes differ.
+    """
+    if value.shape != weight.shape:
+        raise ValueError(f"a tensor of shape {tuple(value.shape)} instead of {tuple(weight.shape)}")
+    if value.stride() == weight.stride() and value.device == weight.device:
         return value
     return torch.empty_like(weight, dtype=value.dtype, requires_grad=False).copy_(value)

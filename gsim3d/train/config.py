@@ -13,10 +13,17 @@ from gsim3d.train.losses import BALANCE, DISCOUNT
 from gsim3d.train.precision import PrecisionConfig
 
 
-def _at_least(config: Any, **bounds: float) -> None:
-    for name, bound in bounds.items():
-        if getattr(config, name) < bound:
-            raise InputError(f"{name} must be at least {bound}; got {getattr(config, name)}")
+MANY = 10**9  # steps; more than any run has
+LARGEST_SIDE = 2**15  # pixels of an image
+
+
+def check_ranges(config: Any, **ranges: tuple[float, float]) -> None:
+    """Raises InputError where a number of ``config`` lies outside of its (least, most)."""
+    for name, (least, most) in ranges.items():
+        value = getattr(config, name)
+        if not least <= value <= most:
+            bound = f"at most {most}" if value > most else f"at least {least}"
+            raise InputError(f"{name} must be {bound}; got {value}")
 
 
 @dataclass(frozen=True)
@@ -63,15 +70,14 @@ class StageConfig:
     warm_up: float = 0.01
 
     def __post_init__(self):
-        _at_least(self, steps=1, horizon=0, lead=0, lit_before=0, cut=0, history=0, batch=1, target_views=1)
-        _at_least(self, begin_within=0, from_start=0, learning_rate=0, warm_up=0)
+        check_ranges(self, steps=(1, MANY), batch=(1, 10**5), target_views=(1, 10**4), learning_rate=(0, 1))
+        check_ranges(self, **dict.fromkeys(("horizon", "lead", "lit_before", "cut", "history"), (0, 10**5)))
+        check_ranges(self, begin_within=(0, MANY), from_start=(0, 1), warm_up=(0, 1), masked_out=(0, 1))
         for name in ("lead", "dynamics_alone"):
             if getattr(self, name) and not self.horizon:
                 raise InputError(f"{name}: needs a horizon of 1 or more")
         if self.lit_before and not self.dynamics_alone:
             raise InputError("lit_before: needs dynamics_alone: true")
-        if not 0 <= self.masked_out <= 1:
-            raise InputError(f"masked_out: must be from 0 to 1; got {self.masked_out}")
         if self.masked_out and self.horizon:
             raise InputError(f"masked_out: needs horizon: 0; got {self.horizon}")
 
@@ -113,17 +119,16 @@ class DataConfig:
     unit_cameras: bool = False
 
     def __post_init__(self):
-        _at_least(self, history=1, shortest_history=0, context_views=1, fewest_views=0)
-        _at_least(self, background_stride=1, body_stride=1)
-        if not 0 <= self.thawed <= 1:
-            raise InputError(f"data.thawed: must be from 0 to 1; got {self.thawed}")
+        check_ranges(self, history=(1, 10**5), shortest_history=(0, 10**5), thawed=(0, 1))
+        check_ranges(self, context_views=(1, 10**4), fewest_views=(0, 10**4))
+        check_ranges(self, background_stride=(1, LARGEST_SIDE), body_stride=(1, LARGEST_SIDE))
         for least, most in (("shortest_history", "history"), ("fewest_views", "context_views")):
             if getattr(self, least) > getattr(self, most):
                 raise InputError(
                     f"data.{least}: must be at most data.{most}, {getattr(self, most)}; got {getattr(self, least)}"
                 )
-        if self.resize and (len(self.resize) != 2 or any(side < 1 or side % SIZE_MULTIPLE for side in self.resize)):
-            wanted = f"must be [width, height], multiples of {SIZE_MULTIPLE}"
+        if self.resize and (len(self.resize) != 2 or not all(map(_is_side, self.resize))):
+            wanted = f"must be [width, height], multiples of {SIZE_MULTIPLE} up to {LARGEST_SIDE}"
             raise InputError(f"data.resize: {wanted}; got {list(self.resize)}")
         if self.near_far and (len(self.near_far) != 2 or not 0 < self.near_far[0] < self.near_far[1]):
             raise InputError(f"data.near_far: must be two rising distances above 0; got {list(self.near_far)}")
@@ -158,9 +163,8 @@ class LossConfig:
     shape_length: float = 0.2
 
     def __post_init__(self):
-        _at_least(self, balance=0, discount=0, body_weight=0, perceptual=0, bodies=0, shape=0)
-        if not self.shape_length > 0:
-            raise InputError(f"loss.shape_length: must be above 0; got {self.shape_length}")
+        check_ranges(self, balance=(0, 1), discount=(0, 1), shape_length=(1e-6, 1e6))
+        check_ranges(self, **dict.fromkeys(("body_weight", "perceptual", "bodies", "shape"), (0, 1e6)))
 
 
 @dataclass(frozen=True)
@@ -183,8 +187,9 @@ class OptimizerConfig:
     max_skipped: int = 20
 
     def __post_init__(self):
-        _at_least(self, beta1=0, beta2=0, eps=0, weight_decay=0, clip_norm=0, encoder_rate=0)
-        _at_least(self, ema_decay=0, max_skipped=1)
+        check_ranges(self, **dict.fromkeys(("beta1", "beta2", "ema_decay"), (0, 1)))
+        check_ranges(self, eps=(1e-12, 1), weight_decay=(0, 1e3), clip_norm=(0, 1e6), encoder_rate=(0, 1e3))
+        check_ranges(self, max_skipped=(1, MANY))
         for name in ("beta1", "beta2", "ema_decay"):
             if getattr(self, name) >= 1:
                 raise InputError(f"optimizer.{name} must be below 1; got {getattr(self, name)}")
@@ -232,7 +237,8 @@ class TrainConfig:
     log_every: int = 10
 
     def __post_init__(self):
-        _at_least(self, rounds=1, seed=0, workers=0, checkpoint_every=1, keep_checkpoints=1, log_every=1)
+        check_ranges(self, seed=(0, 2**63 - 1), workers=(0, 10**4), rounds=(1, MANY), keep_checkpoints=(1, MANY))
+        check_ranges(self, checkpoint_every=(1, MANY), log_every=(1, MANY))
         if not self.stages:
             raise InputError("stages: at least one is needed")
 
@@ -254,6 +260,10 @@ class TrainConfig:
                 return stage, step
             step -= stage.steps
         raise IndexError("step lies after the last stage")
+
+
+def _is_side(pixels: int) -> bool:
+    return 1 <= pixels <= LARGEST_SIDE and pixels % SIZE_MULTIPLE == 0
 
 
 def _count(stages: tuple[StageConfig, ...]) -> int:

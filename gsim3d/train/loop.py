@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 import signal
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -23,7 +22,6 @@ from gsim3d.data import Scene, generator, make_frames
 from gsim3d.dynamics import concatenate
 from gsim3d.effects import EffectsSpec
 from gsim3d.errors import HardCaseError, InputError, RunStopped
-from gsim3d.layers import tf32_only_if_asked
 from gsim3d.perceptual.lpips import LPIPS
 from gsim3d.perceptual.weights import load
 from gsim3d.plans import Plan
@@ -36,7 +34,7 @@ from gsim3d.train.log import Log, memory_gib, plain, progress_note
 from gsim3d.train.losses import bodies_alone, time_weights
 from gsim3d.train.optimizer import Optimizer
 from gsim3d.train.parts import in_parts, with_first_background
-from gsim3d.train.precision import FIRST_SCALE, LossScale
+from gsim3d.train.precision import FIRST_SCALE, LossScale, deterministic
 from gsim3d.train.processes import Processes
 from gsim3d.train.profile import check_profile, profiler
 from gsim3d.train.recompute import recomputing
@@ -514,10 +512,17 @@ class Trainer:
                 "give the same ones, or more, or use another folder"
             )
         self.same_scenes = known == names
+        try:
+            self._load(saved)
+        except (RuntimeError, KeyError, ValueError) as error:
+            reason = str(error).splitlines()[-1].strip()[:200]
+            raise InputError(f"{self.out}: its checkpoint does not fit the configuration: {reason}") from None
+
+    def _load(self, saved: checkpoint.Checkpoint) -> None:
         self.simulator.load_state_dict(saved.model)
         if self.average:
             weights = self.simulator.state_dict()
-            self.average = {name: checkpoint.laid_out_as(weights[name], value) for name, value in saved.ema.items()}
+            self.average = {name: checkpoint.laid_out_as(value, saved.ema[name]) for name, value in weights.items()}
         moments = defaultdict(dict)
         for key, value in saved.optimizer.items():
             kind, name = key.split(".", 1)
@@ -525,10 +530,11 @@ class Trainer:
         for name, parameter in self.parameters.items():
             if name in moments:
                 self.optimizer.restore(parameter, moments[name])
-        self.step, self.n_skipped = saved.state["step"], saved.state["n_skipped"]
-        self.n_skipped_in_a_row = saved.state.get("n_skipped_in_a_row", 0)
-        self.seconds, self.parent = saved.state["seconds"], saved.digest
-        self.scale = LossScale(*saved.state.get("loss_scale", (self.scale.value, 0)))
+        state = saved.state
+        self.step, self.n_skipped = state["step"], state.get("n_skipped", 0)
+        self.n_skipped_in_a_row = state.get("n_skipped_in_a_row", 0)
+        self.seconds, self.parent = state.get("seconds", 0.0), saved.digest
+        self.scale = LossScale(*state.get("loss_scale", (self.scale.value, 0)))
 
     def _update_average(self, gradients: Sequence[Tensor | None]) -> None:
         decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (EMA_WARM_UP + self.step))
@@ -556,25 +562,6 @@ class _Loss(nn.Module):
             return self._trainer.loss(*arguments)
         zero = sum(parameter.sum() * 0 for parameter in self.simulator.parameters())
         return zero, zero.detach()
-
-
-@contextmanager
-def deterministic() -> Iterator[None]:
-    """Within it torch uses deterministic algorithms only, and TF32 only if asked."""
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-    before = torch.are_deterministic_algorithms_enabled()
-    fill = torch.utils.deterministic.fill_uninitialized_memory
-    cudnn = torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark
-    torch.use_deterministic_algorithms(True)
-    torch.utils.deterministic.fill_uninitialized_memory = False  # costs time and changes no result of a correct op
-    torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = True, False
-    try:
-        with tf32_only_if_asked():
-            yield
-    finally:
-        torch.use_deterministic_algorithms(before)
-        torch.utils.deterministic.fill_uninitialized_memory = fill
-        torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = cudnn
 
 
 def _start_worker(n_threads: int) -> None:

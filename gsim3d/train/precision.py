@@ -1,11 +1,16 @@
-"""In which precision the parts of a model are trained."""
+"""In which precision the parts of a model are trained, and algorithms that repeat their bits."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
+
+from gsim3d.layers import tf32_only_if_asked
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 FIRST_SCALE, LARGEST_SCALE = 2.0**16, 2.0**24
@@ -55,3 +60,22 @@ class LossScale:
         self.n_good += 1
         if self.n_good == STEPS_TO_DOUBLE:
             self.value, self.n_good = min(LARGEST_SCALE, 2 * self.value), 0
+
+
+@contextmanager
+def deterministic() -> Iterator[None]:
+    """Within it torch uses deterministic algorithms only, and TF32 only if asked."""
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    before = torch.are_deterministic_algorithms_enabled()
+    fill = torch.utils.deterministic.fill_uninitialized_memory
+    cudnn = torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark
+    torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # costs time and changes no result of a correct op
+    torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = True, False
+    try:
+        with tf32_only_if_asked():
+            yield
+    finally:
+        torch.use_deterministic_algorithms(before)
+        torch.utils.deterministic.fill_uninitialized_memory = fill
+        torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = cudnn

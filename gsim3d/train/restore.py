@@ -171,10 +171,19 @@ def without_old_switches(model: dict) -> dict:
 
 
 def build_simulator(config: ModelConfig, seed: int) -> Simulator:
-    """A simulator whose first weights are a function of the seed; torch's own random state stays as it was."""
+    """A simulator whose first weights are a function of the seed; torch's own random state stays as it was.
+
+    Raises InputError where ``config`` describes none.
+    """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return Simulator(config)
+        try:
+            return Simulator(config)
+        except InputError:
+            raise
+        except Exception as error:  # sizes of which no layer can be made raise anything
+            said = " ".join(str(error).split())[:200]
+            raise InputError(f"model: no model has these sizes: {type(error).__name__}: {said}") from None
 
 
 class _WithoutFirstWeights(TorchFunctionMode):

@@ -8,21 +8,21 @@ import typing
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
 from gsim3d.errors import InputError, did_you_mean
-from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.files import MAX_TEXT, read_file, shown
+from gsim3d.plain import is_number, parse_yaml
 
 T = TypeVar("T")
 
 
 def load_yaml(path: str | Path) -> dict:
     """A YAML file that holds a mapping; plain data only."""
-    text = read_file(path, MAX_TEXT)
     try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError, MemoryError) as error:
-        raise InputError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+        content = parse_yaml(read_file(path, MAX_TEXT))
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{path}: not valid YAML: {error}") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: must hold a mapping of settings")
     return content
@@ -46,13 +46,13 @@ def from_dict(cls: type[T], content: dict, where: str = "", base: T | None = Non
         InputError: an unknown key, a missing one or a value of another type; the message names the key.
     """
     if not isinstance(content, dict):
-        raise InputError(f"{where or cls.__name__}: must be a mapping of settings; got {content!r}")
+        raise InputError(f"{where or cls.__name__}: must be a mapping of settings; got {shown(content)}")
     hints = typing.get_type_hints(cls)
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     unknown = [str(key) for key in content if key not in fields]
     if unknown:
         hint = did_you_mean(unknown[0], fields)
-        raise InputError(f"{_join(where, unknown[0])}: unknown setting; known here: {', '.join(fields)}{hint}")
+        raise InputError(f"{_join(where, unknown[0])[:200]}: unknown setting; known here: {', '.join(fields)}{hint}")
     values = {}
     for name, field in fields.items():
         if name in content:
@@ -88,7 +88,7 @@ def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:
         return from_dict(hint, value, where, base)
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
-            raise InputError(f"{where}: must be a list; got {value!r}")
+            raise InputError(f"{where}: must be a list; got {shown(value)}")
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             arguments = (arguments[0],) * len(value)
         if arguments and len(arguments) != len(value):
@@ -98,7 +98,7 @@ def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:
     if origin is typing.Literal:
         if value not in arguments:
             raise InputError(
-                f"{where}: must be one of {', '.join(map(repr, arguments))}; got {value!r}"
+                f"{where}: must be one of {', '.join(map(repr, arguments))}; got {shown(value)}"
                 f"{did_you_mean(value, map(str, arguments))}"
             )
         return value
@@ -107,15 +107,12 @@ def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:
             value = float(value)
         except ValueError:
             pass
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
     plain = {bool: "true or false", int: "a whole number", float: "a number", str: "text", dict: "a mapping"}
     if hint in plain or origin is dict:
         kind = hint if hint in plain else dict
-        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-            raise InputError(f"{where}: must be {plain[kind]}; got {value!r}")
-        if kind is float and value != value:
-            raise InputError(f"{where}: must be a number; got {value!r}")
+        if not (is_number(value, kind) if kind in (int, float) else isinstance(value, kind)):
+            raise InputError(f"{where}: must be {plain[kind]}; got {shown(value)}")
+        return float(value) if kind is float else value
     return value
 
 

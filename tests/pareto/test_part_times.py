@@ -65,7 +65,7 @@ def test_times_are_kept_beside_presets(tmp_path, subject):
     ("change", "message"),
     [
         ({"dynamics": "long"}, "speeds.json: cpu: measured: dynamics must be a number; got 'long'"),
-        ({"work": {"moving": "many", "frozen": 0}}, "speeds.json: cpu: measured: work must hold counts"),
+        ({"work": {"moving": "many", "frozen": 0}}, "speeds.json: cpu: measured: work.moving must be a whole number"),
         ({"until": 3}, "speeds.json: cpu: measured: unknown key until"),
     ],
 )

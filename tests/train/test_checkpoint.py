@@ -1,6 +1,8 @@
 """Checkpoints: whole or absent, checked when read, readable without running code."""
 
+import dataclasses
 import json
+import math
 import os
 import resource
 import signal
@@ -8,10 +10,10 @@ import subprocess
 import sys
 
 import pytest
-import safetensors
+import safetensors.torch
 import torch
 
-from gsim3d.errors import InputError
+from gsim3d.errors import HardCaseError, InputError
 from gsim3d.files import sha256_of
 from gsim3d.train import checkpoint
 from gsim3d.train.checkpoint import Checkpoint
@@ -137,13 +139,99 @@ def test_what_is_not_a_checkpoint_is_refused(tmp_path):
         checkpoint.load(folder)
 
 
+def write_state(folder, state):
+    """With a hash that fits."""
+    state.pop(checkpoint.OWN_HASH, None)
+    (folder / "state.json").write_text(json.dumps({**state, checkpoint.OWN_HASH: checkpoint.hash_of_state(state)}))
+
+
+@pytest.mark.parametrize("key, value", [("step", 4), ("n_skipped", 3), ("loss_scale", [1.0, 3]), ("scenes", ["b"])])
+def test_a_changed_state_is_refused(tmp_path, key, value):
+    folder = checkpoint.save(tmp_path, example())
+    state = json.loads((folder / "state.json").read_text())
+    (folder / "state.json").write_text(json.dumps({**state, key: value}))
+    with pytest.raises(InputError, match="state.json: changed since it was written"):
+        checkpoint.load(folder)
+
+
+def test_a_state_without_its_own_hash_is_one_of_an_earlier_version(tmp_path):
+    folder = checkpoint.save(tmp_path, example())
+    state = json.loads((folder / "state.json").read_text())
+    del state[checkpoint.OWN_HASH]
+    (folder / "state.json").write_text(json.dumps(state))
+    assert checkpoint.load(folder).state["step"] == 10
+
+
+WRONG = [
+    ("step", "10"), ("step", 1.5), ("step", -1), ("step", True), ("step", None), ("step", 2**70),
+    ("next_sample", []), ("n_skipped", "none"), ("n_skipped_in_a_row", 0.5), ("seconds", "long"),
+    ("seconds", float("inf")), ("seconds", float("nan")), ("loss_scale", 3), ("loss_scale", ["a", 0]), ("scenes", "ab"),
+    ("scenes", [1]), ("parent", 3), ("sha256", ["a"]), ("sha256", {"config.yaml": 3}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("key, value", WRONG)
+def test_values_of_a_wrong_type_are_named(tmp_path, key, value):
+    folder = checkpoint.save(tmp_path, example())
+    write_state(folder, {**json.loads((folder / "state.json").read_text()), key: value})
+    with pytest.raises(InputError, match=f"state.json: {key} must be .*; the checkpoint is broken"):
+        checkpoint.load(folder)
+
+
+def single(path, config=None, state=None):
+    """A single file of hostile metadata."""
+    good = json.dumps({"format": 1, "model": {}, "data": {}}), json.dumps({"step": 3})
+    texts = [text if given is None else given for given, text in zip((config, state), good)]
+    metadata = dict(zip(("gsim3d_config", "gsim3d_state"), texts))
+    path.write_bytes(safetensors.torch.save({"a": torch.zeros(1)}, metadata))
+    return path
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [
+        {"config": "[]"}, {"config": "3"}, {"config": "null"}, {"config": "[" * 100_000}, {"config": '{"format": [[1]]}'},
+        {"config": '{"format": 1, "model": [], "data": {}}'}, {"config": "{"}, {"state": "[]"}, {"state": '"text"'},
+        {"state": '{"step": "three"}'}, {"state": "{}"}, {"state": "[" * 100_000}, {"state": '{"step": 1e999}'},
+        {"config": "1" + "0" * 5000},
+    ],
+)  # fmt: skip
+def test_a_single_file_with_hostile_metadata_is_refused(tmp_path, metadata):
+    assert checkpoint.load(single(tmp_path / "good.safetensors")).state["step"] == 3
+    with pytest.raises(InputError, match="m.safetensors: ") as error:
+        checkpoint.load(single(tmp_path / "m.safetensors", **metadata))
+    assert len(str(error.value)) < 300 + len(str(tmp_path))
+
+
+@pytest.mark.parametrize("part", ["model", "ema", "optimizer"])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_weights_that_are_not_finite_are_neither_written_nor_read(tmp_path, part, bad, monkeypatch):
+    checkpoint.save(tmp_path, example(5))
+    wrong = example(10)
+    name = next(iter(getattr(wrong, part)))
+    getattr(wrong, part)[name][1, 1] = bad
+    with pytest.raises(HardCaseError, match=f"{name}: holds numbers that are not finite; nothing is written") as error:
+        checkpoint.save(tmp_path, wrong)
+    assert error.value.tensor == name
+    assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["last", "step_000005"]
+    if part != "optimizer":
+        with pytest.raises(HardCaseError, match="not finite"):
+            checkpoint.export(dataclasses.replace(wrong, ema=getattr(wrong, part)), tmp_path / "a.safetensors")
+        assert not list(tmp_path.glob("*.safetensors"))
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "_first_not_finite", lambda tensors: None)
+        folder = checkpoint.save(tmp_path, wrong)
+    with pytest.raises(InputError, match=f"{part}.safetensors: {name} holds numbers that are not finite"):
+        checkpoint.load(folder)
+
+
 def test_another_format_is_refused(tmp_path):
     folder = checkpoint.save(tmp_path, example())
     config = (folder / "config.yaml").read_text().replace("format: 1", "format: 99")
     (folder / "config.yaml").write_text(config)
     state = json.loads((folder / "state.json").read_text())
     state["sha256"]["config.yaml"] = sha256_of(folder / "config.yaml")
-    (folder / "state.json").write_text(json.dumps(state))
+    write_state(folder, state)
     with pytest.raises(InputError, match="format 99"):
         checkpoint.load(folder)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import typing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,9 +11,11 @@ import yaml
 
 from gsim3d import presets
 from gsim3d.data import Fitting
+from gsim3d.edits import load_edits
+from gsim3d.effects import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.train.config import StageConfig, TrainConfig
-from gsim3d.train.restore import model_config
+from gsim3d.train.restore import build_simulator, model_config
 from gsim3d.train.settings import from_dict, load_yaml, to_dict
 
 
@@ -40,7 +43,7 @@ def test_what_is_left_out_comes_from_the_base():
         ({"seed": -1}, r"seed must be at least 0"),
         (
             {"data": {"resize": [100, 128]}},
-            r"data\.resize: must be \[width, height\], multiples of 16; got \[100, 128\]",
+            r"data\.resize: must be \[width, height\], multiples of 16 up to 32768; got \[100, 128\]",
         ),
         ({"data": {"resize": [128]}}, r"data\.resize: must be \[width, height\]"),
         ({"data": {"near_far": [2, 1]}}, r"data\.near_far: must be two rising distances above 0; got \[2.0, 1.0\]"),
@@ -62,6 +65,87 @@ def test_what_is_left_out_comes_from_the_base():
 def test_mistakes_are_named(content, message):
     with pytest.raises(InputError, match=message):
         from_dict(TrainConfig, content)
+
+
+def numbers_of(cls, where=()):
+    """Paths of all numbers of a configuration, with their types."""
+    for field in dataclasses.fields(cls):
+        hint = typing.get_type_hints(cls)[field.name]
+        if dataclasses.is_dataclass(hint):
+            yield from numbers_of(hint, (*where, field.name))
+        elif hint in (int, float):
+            yield (*where, field.name), hint
+
+
+NUMBERS = [*numbers_of(TrainConfig), *(((name,), hint) for (name,), hint in numbers_of(StageConfig))]
+HUGE = {int: 2**62, float: 1e30}
+
+
+@pytest.mark.parametrize("text", [".inf", "-.inf", ".nan", "1e39", "-1", "huge"])
+def test_every_number_of_a_run_has_a_finite_range(tmp_path, text):
+    file = tmp_path / "a.yaml"
+    for (*sections, name), hint in NUMBERS:
+        content = {name: yaml.safe_load(text)} if text != "huge" else {name: HUGE[hint]}
+        cls = TrainConfig if sections or hasattr(TrainConfig, name) else StageConfig
+        if cls is StageConfig:
+            content = {"stages": [{"steps": 1, **content}]}
+        for section in reversed(sections):
+            content = {section: content}
+        file.write_text(yaml.safe_dump(content))
+        if (text, name) == ("huge", "seed"):
+            assert from_dict(TrainConfig, load_yaml(file)).seed == 2**62
+            continue
+        with pytest.raises(InputError, match=rf"{name}:? must be|{name}: must be"):
+            from_dict(TrainConfig, load_yaml(file))
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        ({"dynamics": {"grid_size": float("inf")}}, "model.dynamics.grid_size: must be a number"),
+        ({"dynamics": {"gravity": [0, 0, float("nan")]}}, r"model.dynamics.gravity\[2\]: must be a number"),
+        ({"stability": {"max_speed": 1e39}}, "model.stability.max_speed: must be a number"),
+        ({"encoder": {"n_depths": 2**70}}, "model.encoder.n_depths: must be a whole number"),
+        ({"encoder": {"cnn_dims": [-3, 32]}}, "model: no model has these sizes"),
+    ],
+)
+def test_a_model_that_cannot_be_is_refused(content, message):
+    with pytest.raises(InputError, match=message):
+        build_simulator(model_config(TrainConfig(model=content)), 0)
+
+
+def doubled(levels, line="a{i}: &a{i} [*a{b}, *a{b}]"):
+    lines = ["a0: &a0 [1, 1]"] + [line.format(i=i, b=i - 1) for i in range(1, levels)]
+    return "\n".join(lines)
+
+
+HOSTILE = {
+    "aliases": doubled(60),
+    "aliases_of_mappings": doubled(60, "a{i}: &a{i} {{x: *a{b}, y: *a{b}}}"),
+    "merges": "a0: &a0 {x: 1}\n" + "\n".join(f"a{i}: &a{i} {{<<: [*a{i - 1}, *a{i - 1}]}}" for i in range(1, 60)),
+    "endless": "a: &a [*a]",
+    "endless_mapping": "a: &a {b: *a}",
+    "base_60": "seed: 1" + ":59" * 100_000,
+    "base_60_float": "seed: 1" + ":59" * 100_000 + ".5",
+    "digits": "seed: 1" + "0" * 100_000,
+    "binary": "seed: 0b" + "1" * 100_000,
+    "deep": "a: " + "[" * 5_000,
+    "large": "a: '" + "x" * (5 * 2**20) + "'",
+    "no_utf8": b"a: \xff\xfe\xff",
+    "date": "a: 2001-99-99",
+    "key": "[1, 2]: 3",
+    "merge_of_text": "a: {<<: text}",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_files_end_with_one_short_line(tmp_path, name):
+    content = HOSTILE[name]
+    (tmp_path / "a.yaml").write_bytes(content if isinstance(content, bytes) else content.encode())
+    for read in (load_yaml, EffectsSpec.load, lambda path: load_edits(path, None)):
+        with pytest.raises(InputError) as error:
+            from_dict(TrainConfig, read(tmp_path / "a.yaml"))
+        assert len(str(error.value)) < 600 + len(str(tmp_path)) and "\n" not in str(error.value)
 
 
 def test_numbers_as_yaml_writes_them(tmp_path):

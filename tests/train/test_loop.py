@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 
 from gsim3d.data import Scene, find_scenes
 from gsim3d.dynamics import concatenate
-from gsim3d.errors import InputError
+from gsim3d.errors import HardCaseError, InputError
 from gsim3d.perceptual.lpips import LPIPS
 from gsim3d.perceptual.weights import SOURCES, cache_folder
 from gsim3d.train import checkpoint
@@ -128,6 +128,28 @@ def test_killed_after_the_last_checkpoint_repeats_those_steps(folder, finished, 
     Trainer(CONFIG, scenes(folder), tmp_path).run(progress=False)
     assert curve(tmp_path) == curve(finished)
     assert_same_checkpoint(tmp_path, finished)
+
+
+def test_weights_that_are_not_finite_are_not_saved(folder, tmp_path):
+    trainer = Trainer(CONFIG, scenes(folder), tmp_path)
+    trainer.run(until=1, progress=False)
+    trainer.average[min(trainer.average)][0] = math.nan
+    with pytest.raises(HardCaseError, match="holds numbers that are not finite; nothing is written"):
+        trainer.run(until=2, progress=False)
+    assert checkpoint.load(tmp_path).state["step"] == 1
+
+
+@pytest.mark.parametrize("part", ["model", "ema", "optimizer"])
+def test_a_checkpoint_of_other_tensors_is_refused(folder, finished, tmp_path, part):
+    saved = checkpoint.load(finished)
+    tensors = dict(getattr(saved, part))
+    name = min(tensors)
+    for wrong in ({**tensors, name: torch.zeros(1)}, {**tensors, "other": torch.zeros(1)}):
+        checkpoint.save(tmp_path, dataclasses.replace(saved, **{part: wrong}))
+        if part == "ema" and "other" in wrong:
+            continue
+        with pytest.raises(InputError, match="its checkpoint does not fit the configuration"):
+            Trainer(CONFIG, scenes(folder), tmp_path)
 
 
 def test_any_number_of_workers_gives_the_same_bits(folder, tmp_path):
