@@ -25,7 +25,7 @@ from torch.nn import functional as F
 from gsim3d.dynamics.clouds import OPTIONAL_FIELDS, alike, newest_clouds, with_field
 from gsim3d.dynamics.state import rotate_left
 from gsim3d.errors import InputError
-from gsim3d.files import read_yaml, typed
+from gsim3d.files import read_yaml, shown, typed
 from gsim3d.harmonics import painted, rotate_harmonics
 from gsim3d.rotations import quat_product, rotation_matrices
 from gsim3d.selections import Selection, Vector, newest_rows
@@ -266,18 +266,18 @@ def load_edits(path: str | Path, encode: Callable[[Path], Particles]) -> list[Ed
 
 def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Particles]) -> Edit:
     if not isinstance(values, dict):
-        raise InputError(f"{where} must be a mapping; got {values!r}")
+        raise InputError(f"{where} must be a mapping; got {shown(values)}")
     values = dict(values)
     step, op = values.pop("step", None), values.pop("op", None)
     if isinstance(step, bool) or not isinstance(step, int):
-        raise InputError(f"{where}: step must be a whole number; got {step!r}")
+        raise InputError(f"{where}: step must be a whole number; got {shown(step)}")
     if not isinstance(op, str) or op not in OPERATIONS:
-        raise InputError(f"{where} at step {step}: op must be one of {', '.join(OPERATIONS)}; got {op!r}")
+        raise InputError(f"{where} at step {step}: op must be one of {', '.join(OPERATIONS)}; got {shown(op)}")
     where = f"{where} at step {step}, {op}"
     kind, given = OPERATIONS[op], {}
     if kind is Insert:
         if "particles" in values or not isinstance(values.get("scene"), str):
-            raise InputError(f"{where}: scene must name a scene folder; got {values.get('scene')!r}")
+            raise InputError(f"{where}: scene must name a scene folder; got {shown(values.get('scene'))}")
         try:
             given["particles"] = encode(folder / values.pop("scene"))
         except InputError as error:

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from gsim3d.errors import InputError, did_you_mean
-from gsim3d.files import read_yaml, typed
+from gsim3d.files import read_yaml, shown, typed
 from gsim3d.selections import Selection
 
 VERSION = 1
@@ -209,7 +209,7 @@ class EffectsSpec:
 def _one_of(name: str, value: Any, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         raise InputError(
-            f"effects: {name} must be one of {', '.join(allowed)}; got {value!r}"
+            f"effects: {name} must be one of {', '.join(allowed)}; got {shown(value)}"
             f"{did_you_mean(value, allowed)}"
         )
 
@@ -218,7 +218,7 @@ def _at_least(name: str, value: Any, least: int) -> None:
     whole = least == 1
     kind = "an integer" if whole else "a number"
     if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)) or not value >= least:
-        raise InputError(f"effects: {name} must be {kind} of at least {least}; got {value!r}")
+        raise InputError(f"effects: {name} must be {kind} of at least {least}; got {shown(value)}")
 
 
 def _differences(value: Any) -> dict[str, Any]:

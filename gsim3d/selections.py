@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import InputError, did_you_mean
+from gsim3d.files import shown
 from gsim3d.types import DYNAMIC, FROZEN, Particles
 
 Vector = tuple[float, float, float]
@@ -33,7 +34,7 @@ class Selection:
     def __post_init__(self):
         if self.which not in WHICH:
             raise InputError(
-                f"which must be one of {', '.join(WHICH)}; got {self.which!r}"
+                f"which must be one of {', '.join(WHICH)}; got {shown(self.which)}"
                 f"{did_you_mean(self.which, WHICH)}"
             )
         if self.box is not None and any(low > high for low, high in zip(*self.box, strict=True)):

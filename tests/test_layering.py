@@ -9,7 +9,7 @@ ROOT = Path(__file__).parent.parent
 
 # Each room may import the rooms before it (and its own), never one after it.
 ROOMS = [
-    {"errors", "quirks"},
+    {"errors", "quirks", "plain", "pickles"},
     {"types", "stability", "terminal", "files", "pretrained", "branches", "processor"},
     {"selections"},
     {"ops", "effects", "harmonics", "rotations"},

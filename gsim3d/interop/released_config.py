@@ -15,6 +15,7 @@ from gsim3d.dynamics import DynamicsConfig
 from gsim3d.effects import DynamicsEffects, EffectsSpec
 from gsim3d.encoder import EncoderConfig
 from gsim3d.errors import InputError
+from gsim3d.files import shown
 from gsim3d.interop.released import DYNAMICS, ENCODER, HEAD, LATENTS
 from gsim3d.presets import ModelConfig
 from gsim3d.quirks import Quirks
@@ -89,38 +90,38 @@ class _Settings:
         if isinstance(value, str) and re.fullmatch(r"-?\d+[eE][-+]?\d+", value):  # YAML 1.1 reads 4e-3 as text
             value = float(value)
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise InputError(f"{path}: must be a number; got {value!r}")
+            raise InputError(f"{path}: must be a number; got {shown(value)}")
         return float(value)
 
     def positive(self, path: str, default: Any = NO_MEANING) -> float:
         value = self.number(path, default)
         if value <= 0:
-            raise InputError(f"{path}: must be above 0; got {value!r}")
+            raise InputError(f"{path}: must be above 0; got {shown(value)}")
         return value
 
     def whole(self, path: str, default: Any = NO_MEANING) -> int:
         value = self.get(path, default)
         if isinstance(value, bool) or not isinstance(value, int):
-            raise InputError(f"{path}: must be a whole number; got {value!r}")
+            raise InputError(f"{path}: must be a whole number; got {shown(value)}")
         return value
 
     def flag(self, path: str, default: Any = NO_MEANING) -> bool:
         value = self.get(path, default)
         if not isinstance(value, bool):
-            raise InputError(f"{path}: must be true or false; got {value!r}")
+            raise InputError(f"{path}: must be true or false; got {shown(value)}")
         return value
 
     def wholes(self, path: str, count: int | None = None, default: Any = NO_MEANING) -> tuple[int, ...]:
         value = self.get(path, default)
         good = isinstance(value, list) and all(type(n) is int and 0 < n < 2**20 for n in value)
         if not good or (count is not None and len(value) != count):
-            raise InputError(f"{path}: must be a list of {count or 'any number of'} whole numbers; got {value!r}")
+            raise InputError(f"{path}: must be a list of {count or 'any number of'} whole numbers; got {shown(value)}")
         return tuple(value)
 
     def names(self, path: str) -> set[str]:
         value = self.get(path)
         if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
-            raise InputError(f"{path}: must be a list of names; got {value!r}")
+            raise InputError(f"{path}: must be a list of names; got {shown(value)}")
         return set(value)
 
     def unread(self) -> list[str]:
@@ -157,7 +158,7 @@ class _Sizes:
         """``found``, with a note where the settings have another value at ``path``."""
         said = self.settings.get(path, default)
         if said is not NO_MEANING and said is not None and said != found:
-            self.notes.append(f"{path} is {said!r}, but the weights have {found!r}, which holds")
+            self.notes.append(f"{path} is {shown(said)}, but the weights have {shown(found)}, which holds")
         return found
 
     def count(self, pattern: str) -> int:
@@ -180,7 +181,7 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
         for key, value in values.items():
             said = settings.get(f"{section}.{key}", value)
             if said != value:
-                raise InputError(f"{section}.{key}: {said!r} is not supported; only {value!r} is")
+                raise InputError(f"{section}.{key}: {shown(said)} is not supported; only {value!r} is")
     explicit = _is_explicit(settings, sizes)
     n_dynamic, n_static = (
         sizes.agreed(f"model.state_adapter.{kind}_latent_feature_dim", sizes.of(f"{ENCODER}{prefix}weight"), 0)
@@ -423,7 +424,7 @@ def _views(settings: _Settings) -> tuple[dict[str, Any], list[str]]:
     targets = targets if isinstance(targets, list) else []
     for name, cams in (("test_context_views or context_views", inputs), ("test_target_views", targets)):
         if not isinstance(cams, list) or not all(type(cam) is int and cam >= 0 for cam in cams):
-            raise InputError(f"{sampler}.{name}: must be a list of camera numbers; got {cams!r}")
+            raise InputError(f"{sampler}.{name}: must be a list of camera numbers; got {shown(cams)}")
     count = settings.whole(f"{sampler}.num_context_views")
     if inputs:  # all of those given for tests; as many as asked for, of those to draw from
         count = len(inputs) if fixed else min(count, len(inputs))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import math
 import pickle
-import pickletools
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,8 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import InputError
+from gsim3d.files import shown
+from gsim3d.pickles import check_pickle
 
 # What zipfile raises for an archive that is broken, encrypted or larger than memory.
 BROKEN = (zipfile.BadZipFile, EOFError, OSError, MemoryError, RuntimeError)
@@ -125,7 +126,7 @@ class _Unpickler(pickle.Unpickler):
         match pid:
             case ("storage", torch.dtype() as dtype, str() as key, str(), int()):
                 return key, dtype
-        raise InputError(f"{self.path}: a tensor's storage is described in an unknown way: {pid!r}")
+        raise InputError(f"{self.path}: a tensor's storage is described in an unknown way: {shown(pid)}")
 
 
 def _stored_tensor(storage, offset, shape, stride, *_) -> StoredTensor:
@@ -212,14 +213,12 @@ class ReleasedFile:
             raise InputError(f"{self.path}: data.pkl has {info.file_size} bytes; more than {MAX_INDEX} are refused")
         try:
             data = self._bytes_of(info)
-            for opcode, argument, _ in pickletools.genops(data):
-                if "PUT" in opcode.name and argument is not None and int(argument) > len(data):
-                    raise ValueError("an index of its memo is out of range")  # would allocate that many slots
+            check_pickle(data)
             return _Unpickler(data, self.path).load()
         except InputError:
             raise
         except Exception as error:  # a broken pickle raises anything
-            raise InputError(f"{self.path}: data.pkl is broken: {error}") from None
+            raise InputError(f"{self.path}: data.pkl is broken: {str(error)[:200]}") from None
 
 
 def state_dict(file: ReleasedFile) -> tuple[dict[str, StoredTensor], dict[str, int]]:
@@ -232,7 +231,7 @@ def state_dict(file: ReleasedFile) -> tuple[dict[str, StoredTensor], dict[str, i
         raise InputError(f"{file.path}: its state_dict is not a table of named tensors")
     tensors = {name: value for name, value in weights.items() if isinstance(value, StoredTensor)}
     if not tensors:
-        known = ", ".join(str(name) for name in list(content)[:8])
+        known = ", ".join(str(name)[:80] if isinstance(name, str) else shown(name) for name in list(content)[:8])
         raise InputError(f"{file.path}: holds no weights: no state_dict, and no tensors; it has {known or 'nothing'}")
     counts = {name: content[name] for name in ("epoch", "global_step") if type(content.get(name)) is int}
     return tensors, counts

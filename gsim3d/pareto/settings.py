@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from gsim3d.errors import InputError, did_you_mean
+from gsim3d.files import shown
 from gsim3d.ops.raster import CUTOFFS
 from gsim3d.pareto.products import compiler_problem, why_not
 
@@ -197,7 +198,7 @@ def _as_run(setting: Setting, subject: Subject) -> Setting:
 
 def _require(name: str, value: object, fine: bool, what: str) -> None:
     if not fine:
-        raise InputError(f"setting: {name} must be {what}; got {value!r}")
+        raise InputError(f"setting: {name} must be {what}; got {shown(value)}")
 
 
 def _short(value: object) -> str:

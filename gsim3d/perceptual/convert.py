@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import InputError
+from gsim3d.pickles import check_pickle
 
 BATCH_NORM_EPSILON = 1e-3  # of the network that the I3D weights come from
 
@@ -42,11 +43,12 @@ class _ArrayUnpickler(pickle.Unpickler):
 def read_arrays(content: bytes) -> dict:
     """Nested dicts of numpy arrays from a pickle. Raises InputError where it holds anything else."""
     try:
+        check_pickle(content)
         tree = _ArrayUnpickler(io.BytesIO(content)).load()
     except InputError:
         raise
     except Exception as error:  # a broken pickle raises whatever its bytes happen to mean
-        raise InputError(f"not a readable pickle: {error}") from None
+        raise InputError(f"not a readable pickle: {str(error)[:200]}") from None
     _check_tree(tree)
     return tree
 

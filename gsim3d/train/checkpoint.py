@@ -258,8 +258,8 @@ def _bytes_of(tensors: dict[str, Tensor], metadata: dict[str, str] | None = None
     """
     if name := _first_not_finite(tensors):
         raise HardCaseError(
-            f"{name}: holds numbers that are not finite; nothing is written: lower the learning rate and go on from the "
-            "last checkpoint",
+            f"{name}: holds numbers that are not finite; nothing is written: lower the learning rate and go on "
+            "from the last checkpoint",
             tensor=name,
         )
     return safetensors.torch.save({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, metadata)

@@ -22,6 +22,7 @@ from gsim3d.data import Scene
 from gsim3d.data.fitting import frame_stride
 from gsim3d.effects import EffectsSpec
 from gsim3d.errors import FitWarning, InputError, did_you_mean
+from gsim3d.files import shown
 from gsim3d.ops import cuda_compiled
 from gsim3d.plans import Plan
 from gsim3d.presets import ModelConfig
@@ -152,7 +153,7 @@ def model_config(config: TrainConfig) -> ModelConfig:
     """The preset with the configuration's changes."""
     if config.preset not in PRESETS:
         raise InputError(
-            f"preset: must be one of {', '.join(PRESETS)}; got {config.preset!r}"
+            f"preset: must be one of {', '.join(PRESETS)}; got {shown(config.preset)}"
             f"{did_you_mean(config.preset, PRESETS)}"
         )
     base = getattr(presets, config.preset)()
@@ -272,7 +273,7 @@ def _restored(path: str | Path, saved: checkpoint.Checkpoint, device: str) -> Re
     if fps is None:
         fps = pretrained.frame_rate(path)
     if fps is not None and (isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 1e-3 <= fps <= 1e6):
-        raise InputError(f"{path}: data.fps must be frames per second, a number from 0.001 to 1e6; got {fps!r}")
+        raise InputError(f"{path}: data.fps must be frames per second, a number from 0.001 to 1e6; got {shown(fps)}")
     try:
         model = from_dict(ModelConfig, without_old_switches(saved.config["model"]), "model")
         settings = from_dict(DataConfig, data, "data")

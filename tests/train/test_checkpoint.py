@@ -190,7 +190,8 @@ def single(path, config=None, state=None):
 @pytest.mark.parametrize(
     "metadata",
     [
-        {"config": "[]"}, {"config": "3"}, {"config": "null"}, {"config": "[" * 100_000}, {"config": '{"format": [[1]]}'},
+        {"config": "[]"}, {"config": "3"}, {"config": "null"}, {"config": "[" * 100_000},
+        {"config": '{"format": [[1]]}'},
         {"config": '{"format": 1, "model": [], "data": {}}'}, {"config": "{"}, {"state": "[]"}, {"state": '"text"'},
         {"state": '{"step": "three"}'}, {"state": "{}"}, {"state": "[" * 100_000}, {"state": '{"step": 1e999}'},
         {"config": "1" + "0" * 5000},
