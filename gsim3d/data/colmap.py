@@ -26,7 +26,7 @@ from gsim3d.errors import InputError
 
 NAME = "colmap"
 FILE = "sparse/0"
-PLACES = (FILE, "sparse", "colmap/sparse/0", ".")
+FOLDERS = (FILE, "sparse", "colmap/sparse/0", ".")
 SETTINGS = "scene.json"
 MODELS = (  # in the order of their numbers in binary files
     ("SIMPLE_PINHOLE", "f cx cy"), ("PINHOLE", "fl_x fl_y cx cy"), ("SIMPLE_RADIAL", "f cx cy k1"),
@@ -37,7 +37,7 @@ MODELS = (  # in the order of their numbers in binary files
 )  # fmt: skip
 MAX_LINE, MAX_PATH = 1 << 25, 4096  # bytes of a line of text, and of the name of an image
 MAX_POINTS, FEW_POINTS = 3_000_000, 20_000  # read, and projected
-MIN_SEEN = 8  # points; cameras that see fewer tell nothing of depths
+MIN_SEEN = 8  # points; cameras that see fewer say nothing of depths
 QUANTILES, MARGINS = (0.01, 0.99), (0.8, 1.2)  # of the depths of points
 QUATERNION_TOLERANCE = 1e-2
 
@@ -80,8 +80,8 @@ def read(folder: Path, problems: Problems) -> Recording:
 
 
 def _model_of(folder: Path) -> Path | None:
-    for place in PLACES:
-        model = folder / place
+    for name in FOLDERS:
+        model = folder / name
         if all(_file(model, kind) is not None for kind in ("cameras", "images")) and (folder / "images").is_dir():
             return model
     return None
@@ -196,7 +196,7 @@ def _unreadable(what: str, line: str) -> InputError:
 
 
 def _lines(file: Path, pairs: bool = False) -> Iterator[tuple[str, str]]:
-    """(line, its place for messages) without comments; ``pairs``: the line after each, of points, is left out."""
+    """(line, its number for messages) without comments; ``pairs``: the line after each, of points, is left out."""
     with open(file, "rb") as opened:
         number = 0
         while raw := _line(opened, file):

@@ -63,7 +63,8 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 DISTORTIONS = [(4,), (5,), (8,)]
 OWN_FOLDERS = ("masks", "labels")  # not names of cameras
 CONVERT = {"labels": as_labels, "masks": as_mask, "alpha": as_opaque}
-MAX_DRIFT = 0.5  # frames by which films of nearly one rate may run apart
+SAME_RATE = 5e-3  # 29.97 frames a second are called 30
+MAX_DRIFT = 0.5  # frames by which videos of nearly one rate may run apart
 
 
 def recognises(folder: Path) -> bool:
@@ -236,8 +237,8 @@ def _steps(
     videos = {name: frames for name, frames in sources.items() if isinstance(frames, Video) and frames.numbers}
     folders = {name: frames for name, frames in sources.items() if isinstance(frames, _Frames) and frames.numbers}
     if folders and fps is None:
-        told = sorted({video.rate for video in videos.values() if video.rate})
-        problems.add(f"{source}: fps is needed" + (f": the videos have {told}" if told else ""))
+        known = sorted({video.rate for video in videos.values() if video.rate})
+        problems.add(f"{source}: fps is needed" + (f": the videos have {known}" if known else ""))
         fps = 1.0
     notes = []
     for video in videos.values():
@@ -246,23 +247,23 @@ def _steps(
             problems.add(f"{video.what} is uneven: {video.unevenness}; {hint}")
     rates = {name: video.rate for name, video in videos.items() if video.rate}
     slow, fast = min(rates, key=rates.get, default=None), max(rates, key=rates.get, default=None)
-    told = rates.get(slow)
+    own_rate = rates.get(slow)
     if rates and resample is None:
-        drift = max(len(video.numbers) for video in videos.values()) * (rates[fast] / told - 1)
+        drift = max(len(video.numbers) for video in videos.values()) * (rates[fast] / own_rate - 1)
         if drift > MAX_DRIFT:
             problems.add(
-                f"{source}: the videos have {told:.5g} (camera {slow}) and {rates[fast]:.5g} (camera {fast}) frames a "
-                'second; give "resample", steps a second'
+                f"{source}: the videos have {own_rate:.5g} (camera {slow}) and {rates[fast]:.5g} (camera {fast}) frames "
+                'a second; give "resample", steps a second'
             )
-    if rates and fps and abs(fps / told - 1) > 1e-3:
+    if rates and fps and abs(fps / own_rate - 1) > SAME_RATE:
         if folders:
-            problems.add(f"{source}: fps is {fps:g}, but the videos have {told:g} frames a second")
-        notes.append(f"videos of {told:g} frames a second are taken to have {fps:g}, as fps says")
+            problems.add(f"{source}: fps is {fps:g}, but the videos have {own_rate:g} frames a second")
+        notes.append(f"videos of {own_rate:g} frames a second are taken to have {fps:g}, as fps says")
     if resample is not None:
         numbers, more = _resampled({**folders, **videos}, fps, resample, source)
         n_steps = max(map(len, numbers.values()), default=1)
         return [numbers.get(name, [0] * n_steps) for name in sources], resample, notes + more
-    rate = fps or told or 1.0
+    rate = fps or own_rate or 1.0
     first = {name: round(video.times[0] * (video.rate or 0)) for name, video in videos.items()}
     ticks = {name: [first[name] + number for number in video.numbers] for name, video in videos.items()}
     ticks = {name: ticks.get(name) or sources[name].numbers for name in sources if sources[name].numbers}
@@ -299,8 +300,7 @@ def _resampled(
     grid = low + np.arange(count) / rate
     numbers, off, again = {}, 0.0, 0
     for name, own in times.items():
-        after = np.searchsorted(own, grid).clip(1, max(len(own) - 1, 1)) if len(own) > 1 else np.zeros(count, int)
-        nearest = np.where(grid - own[after - 1] <= own[after] - grid, after - 1, after) if len(own) > 1 else after
+        nearest = np.searchsorted((own[1:] + own[:-1]) / 2, grid)
         numbers[name] = [sources[name].numbers[at] for at in nearest]
         off, again = max(off, np.abs(own[nearest] - grid).max()), max(again, int((np.diff(nearest) == 0).sum()))
     return numbers, [

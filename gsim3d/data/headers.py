@@ -52,17 +52,17 @@ def _png(data: bytes) -> Header | None:
 
 
 def _jpeg(data: bytes) -> Header | None:
-    place, size = 2, None
-    while place + 9 < len(data) and data[place] == 0xFF:
-        marker = data[place + 1]
+    at, size = 2, None
+    while at + 9 < len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
         if marker == 0xFF:  # fill byte
-            place += 1
+            at += 1
             continue
         if marker == 0xDA:  # start of scan; inside a scan 0xFF 0xD9 can only be the end of the image
-            return size and Header(size, data.rfind(b"\xff\xd9") > place)
+            return size and Header(size, data.rfind(b"\xff\xd9") > at)
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            size = struct.unpack_from(">HH", data, place + 5)[::-1]
-        place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+            size = struct.unpack_from(">HH", data, at + 5)[::-1]
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return size and Header(size, False)
 
 
@@ -70,7 +70,7 @@ def _webp(data: bytes) -> Header | None:
     whole = len(data) >= 8 + struct.unpack_from("<I", data, 4)[0]
     kind = data[12:16]
     if kind == b"VP8X":
-        width, height = (1 + int.from_bytes(data[place : place + 3], "little") for place in (24, 27))
+        width, height = (1 + int.from_bytes(data[at : at + 3], "little") for at in (24, 27))
         return Header((width, height), whole, bool(data[20] & 0x10), "is animated" if data[20] & 0x02 else "")
     if kind == b"VP8L":
         bits = struct.unpack_from("<I", data, 21)[0]
@@ -91,7 +91,7 @@ def _tiff(data: bytes, order: str) -> Header | None:
         if kind in TIFF_TYPES and 0 < count <= MAX_VALUES:
             form = f"{order}{count}{TIFF_TYPES[kind]}"
             inline = struct.calcsize(form) <= 4
-            tags[tag] = struct.unpack_from(form, data, entry + 8 if inline else _at(data, order, entry + 8))
+            tags[tag] = struct.unpack_from(form, data, entry + 8 if inline else _long(data, order, entry + 8))
     if WIDTH not in tags or HEIGHT not in tags:
         return None
     parts = zip(
@@ -99,11 +99,11 @@ def _tiff(data: bytes, order: str) -> Header | None:
     )
     ends = [start + length for start, length in parts]
     refused = "" if tags.get(PHOTOMETRIC, (1,))[0] in READ_PHOTOMETRIC else "is inverted or CMYK"
-    if _at(data, order, first + 2 + 12 * n_tags):
+    if _long(data, order, first + 2 + 12 * n_tags):
         refused = "has several pages"
     alpha = EXTRA_SAMPLES in tags or tags.get(SAMPLES, (1,))[0] in (2, 4)
     return Header((tags[WIDTH][0], tags[HEIGHT][0]), bool(ends) and max(ends) <= len(data), alpha, refused)
 
 
-def _at(data: bytes, order: str, place: int) -> int:
-    return struct.unpack_from(order + "I", data, place)[0]
+def _long(data: bytes, order: str, at: int) -> int:
+    return struct.unpack_from(order + "I", data, at)[0]

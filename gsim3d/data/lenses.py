@@ -42,7 +42,7 @@ WIDEST = 1.55  # radians from the axis: a pinhole sees less than 90 degrees of i
 
 
 def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
-    """The lens that the keys of a description tell of; None: a pinhole. ``what``: for messages."""
+    """The lens that the keys of a description give; None: a pinhole. ``what``: for messages."""
     for key, value in values.items():
         if (key in OTHER_KEYS or UNREAD.fullmatch(str(key))) and _says(value):
             known = ", ".join(COEFFICIENTS)
@@ -122,8 +122,8 @@ class Undistorter:
             # As a camera of focal length 1, because OpenCV's lenses know no skew.
             x, y = make(np.eye(3), self._lens.coefficients, np.eye(3), centred, self._size, cv2.CV_32FC1)
             folded = self._radius(K) > _reach(self._lens)
-            places = centred[0, 0] * x + centred[0, 1] * y + centred[0, 2], centred[1, 1] * y + centred[1, 2]
-            self._maps = tuple(np.where(folded, -2, place).astype(np.float32) for place in places)
+            sources = centred[0, 0] * x + centred[0, 1] * y + centred[0, 2], centred[1, 1] * y + centred[1, 2]
+            self._maps = tuple(np.where(folded, -2, source).astype(np.float32) for source in sources)
             self._key = K.copy()
         return self._maps
 

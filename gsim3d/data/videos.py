@@ -16,7 +16,7 @@ from gsim3d.data.recording import MAX_STEPS, Problems
 from gsim3d.errors import InputError
 
 RESOLUTION = 1.01e-3  # seconds: many containers round times to a millisecond
-UNEVEN = 0.1  # of the time between two frames: a frame that is off by more makes a film uneven
+UNEVEN = 0.1  # of the time between two frames: a frame that is off by more makes a video uneven
 TURNS = (0, 90, 180, 270)  # degrees that decoded frames are turned by
 MP4_KINDS = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 EBML, SEGMENT = b"\x1aE\xdf\xa3", b"\x18S\x80g"
@@ -43,8 +43,8 @@ class Video:
         if self.rate is None:
             gaps = (1000 * np.diff(found.times)).round(1)
             self.unevenness = (
-                f"its {len(found.times)} frames are {gaps.min():g} to {gaps.max():g} ms apart, though its header tells "
-                f"of {found.rate:.4g} a second"
+                f"its {len(found.times)} frames are {gaps.min():g} to {gaps.max():g} ms apart, though its header says "
+                f" {found.rate:.4g} a second"
             )
 
     def read(self, numbers: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
@@ -84,7 +84,7 @@ def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
     index = _index(file)
     capture = _open(file)
     try:
-        rate, told, turn = (
+        rate, count, turn = (
             capture.get(key) for key in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_ORIENTATION_META)
         )
         found = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
@@ -109,12 +109,12 @@ def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
         at = f"go back after frame {back[0]}" if len(back) else "are all equal"
         raise InputError(f"has no usable time stamps: they {at}; convert it to a constant rate")
     times += _start(times, np.array(marks), rate)
-    if len(times) < told and index.duration:
+    if len(times) < count and index.duration:
         gap = (times[-1] - times[0]) / max(len(times) - 1, 1)
         if times[-1] + 2.5 * gap < index.duration:
             raise InputError(
                 f"cannot be decoded to its end: {times[-1] + gap:.4g} of {index.duration:.4g} s, {len(times)} of "
-                f"{told:g} frames; it is damaged"
+                f"{count:g} frames; it is damaged"
             )
     return _Scan(times, rate)
 
@@ -131,20 +131,20 @@ def _open(file: Path, what: str = ""):
 
 
 def _start(times: np.ndarray, marks: np.ndarray, rate: float) -> float:
-    """Seconds from the start of the container to the first frame: OpenCV counts ``times`` from that frame, and tells
-    of its own time in ``marks``, rounded to whole frames of ``rate``."""
+    """Seconds from the start of the container to the first frame: OpenCV counts ``times`` from that frame, and
+    reports its own time in ``marks``, rounded to whole frames of ``rate``."""
     if not 0 < rate < 1e6:
         return 0.0
     low, high = ((marks - 0.5) / rate - times).max(), ((marks + 0.5) / rate - times).min()
     return float((low + high) / 2 if low <= high else marks[0] / rate)
 
 
-def _even_rate(times: np.ndarray, told: float) -> float | None:
-    """Frames a second, as the header tells or as measured; None where neither fits."""
-    told = told if 0 < told < 1e6 else None
+def _even_rate(times: np.ndarray, header: float) -> float | None:
+    """Frames a second, as the header says or as measured; None where neither fits."""
+    header = header if 0 < header < 1e6 else None
     if len(times) == 1:
-        return told or 1.0
-    for rate in filter(None, (told, (len(times) - 1) / (times[-1] - times[0]))):
+        return header or 1.0
+    for rate in filter(None, (header, (len(times) - 1) / (times[-1] - times[0]))):
         off = np.abs(times - times[0] - np.arange(len(times)) / rate).max()
         if off <= max(RESOLUTION, UNEVEN / rate):
             return rate
@@ -153,10 +153,10 @@ def _even_rate(times: np.ndarray, told: float) -> float | None:
 
 @dataclass(frozen=True)
 class _Index:
-    """What OpenCV does not tell of a file.
+    """What OpenCV does not report of a file.
 
     mirrored: the display matrix of an MP4 mirrors it.   duration: seconds of its video track with what was cut off by
-    edits left out; None where nothing tells of it.
+    edits left out; None where it is not known.
     """
 
     mirrored: bool = False
@@ -164,7 +164,7 @@ class _Index:
 
 
 def _index(file: Path) -> _Index:
-    """Raises InputError where the container tells of more bytes than the file has."""
+    """Raises InputError where the container declares more bytes than the file has."""
     size = file.stat().st_size
     with open(file, "rb") as opened:
         start = opened.read(12)
@@ -220,7 +220,7 @@ def _mp4(file: BinaryIO, size: int) -> tuple[int, _Index]:
 
 
 def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """(kind, where its content starts, where it ends) of the boxes between two places."""
+    """(kind, where its content starts, where it ends) of the boxes between two offsets."""
     while start + 8 <= end:
         file.seek(start)
         length, kind = struct.unpack(">I4s", file.read(8))
