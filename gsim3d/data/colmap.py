@@ -21,7 +21,7 @@ import numpy as np
 
 from gsim3d.data import transforms
 from gsim3d.data.cameras import OPENGL, inverse, project, rotations, spread_steps
-from gsim3d.data.recording import Problems, Recording, positive, read_json, trailing_number
+from gsim3d.data.recording import MAX_NUMBER, Problems, Recording, positive, read_json, trailing_number
 from gsim3d.errors import InputError
 
 NAME = "colmap"
@@ -82,7 +82,7 @@ def read(folder: Path, problems: Problems) -> Recording:
 def _model_of(folder: Path) -> Path | None:
     for name in FOLDERS:
         model = folder / name
-        if all(_file(model, kind) is not None for kind in ("cameras", "images")) and (folder / "images").is_dir():
+        if all(_file(model, kind) for kind in ("cameras", "images")) and (name != "." or (folder / "images").is_dir()):
             return model
     return None
 
@@ -105,7 +105,7 @@ def _depths(model: Path, recording: Recording) -> tuple[float, float] | None:
     """near and far around the points that the cameras see; None where they see too few."""
     file = _file(model, "points3D")
     points = np.frombuffer(_points(file) if file else b"", dtype=np.float64).reshape(-1, 3)
-    points = points[np.isfinite(points).all(1)]
+    points = points[(np.abs(points) <= MAX_NUMBER).all(1)]
     points = points[:: -(-len(points) // FEW_POINTS) or 1]
     viewmats, Ks, sizes = spread_steps(recording.viewmats), spread_steps(recording.Ks), np.array(recording.sizes)
     ends = []

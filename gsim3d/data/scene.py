@@ -21,6 +21,7 @@ from gsim3d.data.recording import BACKGROUND, MOVING, Problems, ReadImages, Reco
 from gsim3d.errors import InputError
 from gsim3d.types import Cameras
 
+CACHE_VERSION = 2  # counts changes of what readers make of the same files
 SIZE_MULTIPLE = 16  # pixels; images are padded to it, so that the encoders of all presets can read them
 
 
@@ -61,7 +62,7 @@ class Scene:
         ]
         self._medians: dict[int, np.ndarray] = {}
         shape = (self.n_steps, self.n_cams, self.height, self.width)
-        stamp = (str(path.resolve()), recording.source.stat().st_mtime_ns, *(fitting.size or ()))
+        stamp = (CACHE_VERSION, str(path.resolve()), recording.source.stat().st_mtime_ns, *(fitting.size or ()))
         stamp += ("whole",) * fitting.whole
         self._images = ImageCache((*shape, 3), self._read_images, cache_dir, (*stamp, "rgb"))
         self._labels = ImageCache(shape, self._read_labels, cache_dir, (*stamp, "seg"))

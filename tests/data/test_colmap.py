@@ -86,7 +86,7 @@ def test_near_and_far_are_those_of_the_points(tmp_path, binary):
     made, points = make_scene(n_steps=1), seen_points()
     local = points @ made.viewmats[0, :, :3, :3].swapaxes(1, 2) + made.viewmats[0, :, None, :3, 3]
     depths = local[..., 2]
-    outliers = np.array([[0.0, 0.0, 400.0], [np.nan, 0, 0]])
+    outliers = np.array([[0.0, 0.0, 400.0], [np.nan, 0, 0], [1e300, 0, 0], [0, np.inf, 0]])
     folder = write_colmap(tmp_path, made, binary=binary, points=np.concatenate([points, outliers]))
     scene = Scene.open(folder)
     assert 0.7 * depths.min() < scene.near < depths.min() and depths.max() < scene.far < 1.3 * depths.max()
@@ -233,3 +233,5 @@ def test_an_image_that_is_missing_is_named(tmp_path):
         Scene.open(folder).images([1], [0])
     assert cv2.imwrite(str(folder / "images" / "view 11.png"), np.zeros((4, 4, 3), np.uint8))
     assert any("4x4 pixels" in line for line in check_scene(folder).problems)
+    (folder / "images").rename(folder / "elsewhere")
+    assert any("images/view 10.png" in line and "missing" in line for line in check_scene(folder).problems)
