@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Callable
 
 import numpy as np
 
 from gsim3d.errors import InputError
+from gsim3d.generate.mesh_files import Piece, joined_paint, read_pieces
 from gsim3d.generate.shapes import PALETTE, PATTERNS, Body, normalise
 
 COLLISION_VERTICES = 300  # a mesh file is clustered to at most about so many vertices for contacts
@@ -33,56 +33,35 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, limit: int) -> tuple[np.nda
     return merged[used], light.reshape(-1, 3)
 
 
-def _texture_lookup(image: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Bilinear, repeating texture; v counts from the bottom row, as in .obj files."""
-    texels = image.astype(np.float64) / 255
-    height, width = texels.shape[:2]
-
-    def paint(uv):
-        x = (uv[:, 0] % 1) * width - 0.5
-        y = (1 - uv[:, 1] % 1) * height - 0.5
-        x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-        fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-        top = texels[y0 % height, x0 % width] * (1 - fx) + texels[y0 % height, (x0 + 1) % width] * fx
-        low = texels[(y0 + 1) % height, x0 % width] * (1 - fx) + texels[(y0 + 1) % height, (x0 + 1) % width] * fx
-        return top * (1 - fy) + low * fy
-
-    return paint
-
-
 def load_body(path: str | Path, up: str = "y") -> Body:
-    """A body from a mesh file (anything that trimesh reads), with its texture or vertex colours where it has any.
+    """A body from a mesh file (:data:`gsim3d.generate.mesh_files.SUFFIXES`), all its objects together, with their textures and
+    colours; a pattern where it has none.
 
     Args:
-        path: mesh file; a texture named by its material must lie beside it.
+        path: mesh file; material files and textures that it names must lie beside it.
         up: "y" (usual for .obj and .glb) or "z", the axis that points up in the file.
 
     Copies of a vertex along texture seams are merged by position; the surface must be closed then.
 
-    Raises InputError when the file cannot be read, or holds no closed surface.
+    Raises InputError when the file cannot be read, holds no closed surface or a face twice, or colours are lost.
     """
-    import trimesh
-
     path = Path(path)
     if not path.is_file():
         raise InputError(f"mesh {path} is not a file")
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:  # trimesh raises whatever its parsers raise
-        raise InputError(f"mesh {path} cannot be read: {error}") from error
-    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-    if len(faces) < 4 or not np.isfinite(vertices).all():
-        raise InputError(f"mesh {path} must be a closed surface with finite vertices; got {len(faces)} faces")
+    pieces = read_pieces(path)
+    triangles = np.concatenate([piece.triangles for piece in pieces] or [np.zeros((0, 3, 3))])
+    if len(triangles) < 4 or not np.isfinite(triangles).all():
+        raise InputError(f"mesh {path} must be a closed surface with finite vertices; got {len(triangles)} faces")
     if up == "y":
-        vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
-    centre, diameter = normalise(vertices)
+        triangles = triangles[:, :, [0, 2, 1]] * [1, -1, 1]
+    centre, diameter = normalise(triangles.reshape(-1, 3))
     if not diameter > 0:
         raise InputError(f"mesh {path} has no size: all vertices coincide")
-    vertices = (vertices - centre) / diameter
-    corners, paint = _mesh_paint(mesh, vertices, faces)
+    triangles = (triangles - centre) / diameter
+    corners, paint = joined_paint(_with_patterns(pieces, triangles))
     # One vertex for each position: copies along texture seams would tear the shading and collide twice.
-    positions, label = np.unique(vertices, axis=0, return_inverse=True)
-    faces = label.reshape(-1)[faces]
+    positions, label = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    faces = label.reshape(-1, 3)
     proper = (faces != np.roll(faces, 1, axis=1)).all(1)
     faces, corners = faces[proper], corners[proper]
     _, uses = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
@@ -91,9 +70,45 @@ def load_body(path: str | Path, up: str = "y") -> Body:
             f"mesh {path} is not closed: {int((uses % 2).sum())} edges have a face on one side only, also after "
             "vertices at the same position are merged; fill its holes"
         )
-    if np.einsum("fk,fk->", *_corner_and_cross(positions, faces)) < 0:
-        faces, corners = faces[:, ::-1], corners[:, ::-1]
+    n_different = len(np.unique(np.sort(faces, axis=1), axis=0))
+    if n_different < len(faces):
+        raise InputError(f"mesh {path} holds {len(faces) - n_different} faces twice; remove the copies")
+    inwards = _turned_inwards(positions, faces)
+    faces[inwards], corners[inwards] = faces[inwards, ::-1], corners[inwards, ::-1]
     return Body(path.stem, positions, faces, *cluster(positions, faces, COLLISION_VERTICES), corners, paint)
+
+
+def _with_patterns(pieces: list[Piece], triangles: np.ndarray) -> list[Piece]:
+    """``pieces`` of which those without colours have a pattern of the places of ``triangles``."""
+    colors, found, begin = PALETTE[[5, 8, 1]], [], 0
+    for piece in pieces:
+        end = begin + len(piece.triangles)
+        if piece.paint is None:
+            piece = Piece(piece.triangles, triangles[begin:end], lambda p: PATTERNS["patches"](p, colors))
+        found.append(piece)
+        begin = end
+    return found
+
+
+def _turned_inwards(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """bool [F], faces of bodies that are turned inside out; cavities inside of a body stay as they are to it."""
+    label, before = np.arange(len(positions)), None
+    while before is None or (label != before).any():  # every vertex gets the lowest number of its body
+        before = label.copy()
+        np.minimum.at(label, faces, label[faces].min(1)[:, None])
+        label = label[label]
+    bodies, body = np.unique(label[faces[:, 0]], return_inverse=True)
+    corner, cross = _corner_and_cross(positions, faces)
+    volume = np.bincount(body, (corner * cross).sum(1), len(bodies))
+    inverted = volume.sum() < 0
+    low, high = np.full((len(bodies), 3), np.inf), np.full((len(bodies), 3), -np.inf)
+    np.minimum.at(low, body, positions[faces].min(1))
+    np.maximum.at(high, body, positions[faces].max(1))
+    turned = np.full(len(bodies), inverted)
+    for k in np.flatnonzero(volume < 0 if not inverted else volume > 0):
+        if ((low <= low[k]) & (high >= high[k])).all(1).sum() == 1:  # in no other body
+            turned[k] = not inverted
+    return turned[body]
 
 
 def _corner_and_cross(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -131,15 +146,3 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     )
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return normals / np.where(length > 0, length, 1)
-
-
-def _mesh_paint(mesh, vertices, faces):
-    visual = mesh.visual
-    image = getattr(getattr(visual, "material", None), "image", None)
-    if getattr(visual, "uv", None) is not None and image is not None:
-        texture = _texture_lookup(np.asarray(image.convert("RGB")))
-        return np.asarray(visual.uv, dtype=np.float64)[faces], texture
-    if getattr(visual, "kind", None) == "vertex":
-        return np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3][faces] / 255, lambda c: c
-    colors = PALETTE[[5, 8, 1]]
-    return vertices[faces], lambda p: PATTERNS["patches"](p, colors)
