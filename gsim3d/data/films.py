@@ -252,8 +252,8 @@ def _steps(
         drift = max(len(video.numbers) for video in videos.values()) * (rates[fast] / own_rate - 1)
         if drift > MAX_DRIFT:
             problems.add(
-                f"{source}: the videos have {own_rate:.5g} (camera {slow}) and {rates[fast]:.5g} (camera {fast}) frames "
-                'a second; give "resample", steps a second'
+                f"{source}: the videos have {own_rate:.5g} (camera {slow}) and {rates[fast]:.5g} (camera {fast}) "
+                'frames a second; give "resample", steps a second'
             )
     if rates and fps and abs(fps / own_rate - 1) > SAME_RATE:
         if folders:

@@ -21,6 +21,7 @@ IMAGE_SUFFIXES = (".png", ".tif", ".tiff", *LOSSY_SUFFIXES)
 MAX_FILE = 1 << 30  # bytes of one image file
 HEADER = 1 << 16  # bytes that most headers lie in
 MAX_ID = 16  # masks whose values are all below it hold ids of bodies
+MAX_SOFT = 0.2  # of the pixels of a mask may be nearer to half of its range than to its ends
 MAX_LABELS = 256  # masks of more values hold none
 
 
@@ -165,7 +166,7 @@ def _marked(grey: np.ndarray, lossy: bool) -> np.ndarray | None:
     if len(levels) == 1 or lossy:  # compression leaves the ends of the range where they are
         low, high = 0, full
     soft = (grey > low + (high - low) // 4) & (grey < high - (high - low) // 4)
-    if _blocks(soft).any() or (lossy and not (grey > high - (high - low) // 4).any()):
+    if soft.mean() > MAX_SOFT or _blocks(soft).any() or (lossy and not (grey > high - (high - low) // 4).any()):
         return None
     return grey > (low + high) // 2
 
@@ -183,10 +184,10 @@ def _are_labels(grey: np.ndarray, levels: np.ndarray) -> bool:
 
 
 def _blocks(where: np.ndarray) -> np.ndarray:
-    """bool [h, w]: pixels whose neighbours all belong to ``where``, as they do."""
+    """bool [h, w]: pixels whose neighbours, up to 2 pixels away, belong to ``where`` like themselves."""
     import cv2
 
-    block = np.ones((3, 3), np.uint8)
+    block = np.ones((5, 5), np.uint8)  # borders of colours, which JPEG stores at half of the resolution, are narrower
     return cv2.erode(where.astype(np.uint8), block, borderType=cv2.BORDER_REPLICATE) > 0
 
 

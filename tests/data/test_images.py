@@ -37,6 +37,7 @@ def moving(image, file) -> np.ndarray:
 MASKS = {
     "jpeg 95": ("m.jpg", lambda m: m, (cv2.IMWRITE_JPEG_QUALITY, 95)),
     "jpeg 75": ("m.jpg", lambda m: m, (cv2.IMWRITE_JPEG_QUALITY, 75)),
+    "jpeg 90, red": ("m.jpg", lambda m: cv2.merge([m * 0, m * 0, m]), (cv2.IMWRITE_JPEG_QUALITY, 90)),
     "jpeg 30, colour": ("m.jpg", lambda m: cv2.merge([m] * 3), (cv2.IMWRITE_JPEG_QUALITY, 30)),
     "webp 80": ("m.webp", lambda m: cv2.merge([m] * 3), (cv2.IMWRITE_WEBP_QUALITY, 80)),
     "png": ("m.png", lambda m: m, ()),
@@ -55,7 +56,7 @@ def test_masks_of_two_values_are_set_above_half_of_their_range(tmp_path, kind):
     name, convert, options = MASKS[kind]
     got = moving(stored(tmp_path, name, convert(discs()), *options), tmp_path / name)
     wrong = (got != (discs() > 0)).sum()
-    assert wrong <= (6 if "30" in kind or "webp" in kind else 0)
+    assert wrong <= (16 if "red" in kind and "jpeg" in kind else 6 if "30" in kind or "webp" in kind else 0)
 
 
 @pytest.mark.parametrize("quality", [100, 95, 75, 50])

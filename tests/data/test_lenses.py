@@ -117,7 +117,8 @@ def test_other_lenses_are_refused_by_name(tmp_path, keys, message, where):
 
 
 def test_keys_of_other_lenses_that_say_nothing_are_no_lens(tmp_path):
-    assert opened(tmp_path, {"rolling_shutter": [0, 0, 0, 0], "latlong": False, "s1": 0, "lens": "50 mm"}).valid([0], [0]) is None
+    keys = {"rolling_shutter": [0, 0, 0, 0], "latlong": False, "s1": 0, "lens": "50 mm"}
+    assert opened(tmp_path, keys).valid([0], [0]) is None
 
 
 def test_masks_of_a_fisheye_keep_their_values(tmp_path):
