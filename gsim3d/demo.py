@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from gsim3d.errors import InputError
+from gsim3d.locks import only_one_writer
 from gsim3d.pretrained import names
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
 
@@ -98,6 +99,11 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, *, progress: boo
         raise InputError(f"--out: {out} is not a folder")
     start = time.perf_counter()
     out.mkdir(parents=True, exist_ok=True)
+    with only_one_writer(out):
+        return _run(out, config, progress, start)
+
+
+def _run(out: Path, config: DemoConfig, progress: bool, start: float) -> dict:
     seconds = _Stopwatch(out / "seconds.json")
 
     from gsim3d.data import split_scenes

@@ -79,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.ablate.study import Study
     from gsim3d.ablate.table import markdown
     from gsim3d.data import find_scenes
+    from gsim3d.locks import only_one_writer
     from gsim3d.train.config import TrainConfig
     from gsim3d.train.settings import from_dict, load_yaml
 
@@ -94,6 +95,8 @@ def run(args: argparse.Namespace) -> int:
     study = Study(base, rows, find_scenes(args.data), n_seeds=args.seeds, device=args.device)
     command = shlex.join(["gsim3d", "ablate", *sys.argv[2:]])
     limits = {"together": args.together, "minutes": math.inf if args.minutes is None else args.minutes}
-    content = study.run(out, command, **limits, progress=not args.quiet, say=partial(print, flush=True))
+    out.mkdir(parents=True, exist_ok=True)
+    with only_one_writer(out):
+        content = study.run(out, command, **limits, progress=not args.quiet, say=partial(print, flush=True))
     print(markdown(content), f"written: {out / 'ablation.md'}, {out / 'ablation.json'}", sep="\n")
     return 1 if any("failure" in run for row in content["rows"] for run in row["runs"]) else 0

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
-import fcntl
 import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,8 +16,8 @@ from gsim3d.effects import FILE as EFFECTS_FILE
 from gsim3d.errors import InputError
 from gsim3d.generate import writer
 from gsim3d.generate.worlds import build_world
+from gsim3d.locks import only_one_writer
 
-LOCK_FILE = ".lock"
 NEEDED = {"embreex": "embreex", "trimesh": "trimesh", "PIL": "pillow"}
 
 
@@ -76,7 +73,7 @@ def generate(
     out.mkdir(parents=True, exist_ok=True)
     scenes = settings.scenes()
     mine = None if part is None else range(part[0] - 1, len(scenes), part[1])
-    with _only_one_writer(out, mine):
+    with only_one_writer(out, mine):
         scenes = scenes if mine is None else [scenes[i] for i in mine]
         fingerprints = {name: settings.fingerprint(name) for name in settings.object_names()}
         folders = [writer.scene_folder(out, *scene) for scene in scenes]
@@ -113,43 +110,6 @@ def require_engine(engine: str) -> None:
             f"engine {engine} needs the package genesis-world, 4 GB with what it needs: "
             "pip install 'gsim3d[genesis]'; leave --engine out to simulate with MuJoCo"
         )
-
-
-@contextmanager
-def _only_one_writer(out: Path, scenes: range | None) -> Iterator[None]:
-    """Locks the scenes with these numbers, or all, for this process; also where ``out`` is on a network file system.
-
-    Each scene is one byte of a file, which calls that lock all of it remove when they end.
-    """
-    file = out / LOCK_FILE
-    while True:
-        handle = os.open(file, os.O_RDWR | os.O_CREAT)
-        try:
-            _lock(handle, scenes)
-            if file.exists() and os.path.samestat(os.fstat(handle), os.stat(file)):
-                break  # else another call has removed it meanwhile
-        except BlockingIOError:
-            os.close(handle)
-            raise InputError(f"another process is writing to {out}; wait for it or choose another folder") from None
-        os.close(handle)
-    try:
-        yield
-    finally:
-        if scenes is None:
-            file.unlink()
-        os.close(handle)
-
-
-def _lock(handle: int, scenes: range | None) -> None:
-    ranges = [(0, 0)] if scenes is None else [(1, number) for number in scenes]  # length 0: to the end, however far
-    try:
-        for length, start in ranges:
-            fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB, length, start)
-    except PermissionError as error:  # what some systems say instead
-        raise BlockingIOError from error
-    except OSError as error:
-        if error.errno not in (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP):  # file systems that know no locks
-            raise
 
 
 def check_processes(processes: int | None) -> None:

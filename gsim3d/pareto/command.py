@@ -85,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.errors import InputError, did_you_mean
     from gsim3d.evaluate.pictures import pyplot
     from gsim3d.evaluate.scoring import measurable
+    from gsim3d.locks import only_one_writer
     from gsim3d.pareto import autotune, budget, machine, report
     from gsim3d.pareto.limit import REGIMES, TimeLimit
     from gsim3d.pareto.measure import FULL, QUICK, QUICK_ON_CPU, Comparison, measure, n_runs, points_of
@@ -125,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
     clock = DeviceClock(restored.device)
     knobs = [known[name] for name in args.knobs] if args.knobs else KNOBS
     out.mkdir(parents=True, exist_ok=True)
-    with progress(total=REST, unit="run", quiet=args.quiet) as bar:
+    with only_one_writer(out), progress(total=REST, unit="run", quiet=args.quiet) as bar:
 
         def advance(doing: str, runs: int = 1) -> None:
             bar.set_description(doing[:60], refresh=False)

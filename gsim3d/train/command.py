@@ -47,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    from contextlib import nullcontext
     from pathlib import Path
 
     import yaml
@@ -79,10 +80,13 @@ def run(args: argparse.Namespace) -> int:
         Path(args.cache).mkdir(parents=True, exist_ok=True)  # a folder that cannot be is told before work begins
     scenes = [Scene.open(folder, cache_dir=args.cache, fitting=config.data.fitting) for folder in folders]
 
+    from gsim3d.locks import only_one_writer
     from gsim3d.train.loop import Trainer
     from gsim3d.train.processes import joined
 
-    with joined(args.device) as processes:
+    out = Path(args.out)
+    out.mkdir(parents=True, exist_ok=True)
+    with joined(args.device) as processes, only_one_writer(out) if processes.is_first else nullcontext():
         say = print if processes.is_first else lambda *_: None
         trainer = Trainer(config, scenes, args.out, device=args.device, processes=processes)
         if trainer.step:

@@ -22,6 +22,7 @@ from gsim3d.data import Scene, generator, make_frames
 from gsim3d.dynamics import concatenate
 from gsim3d.effects import EffectsSpec
 from gsim3d.errors import HardCaseError, InputError, RunStopped
+from gsim3d.locks import only_one_writer
 from gsim3d.perceptual.lpips import LPIPS
 from gsim3d.perceptual.weights import load
 from gsim3d.plans import Plan
@@ -163,8 +164,9 @@ class Trainer:
         if profile:
             check_profile(until - self.step)
         tracer = profiler(self.out, self.processes.rank) if profile else nullcontext()
-        signals = noted_signals()
-        with bar, deterministic(), self.log.opened(tensorboard=tensorboard), tracer, signals as self._signals:
+        lock = only_one_writer(self.out) if self.processes.is_first else nullcontext()
+        log, signals = self.log.opened(tensorboard=tensorboard), noted_signals()
+        with lock, bar, deterministic(), log, tracer, signals as self._signals:
             stops = self.step >= until
             while not stops:
                 start = time.perf_counter()

@@ -277,14 +277,14 @@ def test_impossible_options_say_why(tmp_path):
 
 def test_two_writers_do_not_share_a_folder(tmp_path):
     """One that makes the second of two parts, in another process, leaves the first part to others, and no more."""
-    hold = "import sys; from pathlib import Path; from gsim3d.generate.run import _only_one_writer\n"
-    hold += "with _only_one_writer(Path(sys.argv[1]), range(1, 3, 2)): print(flush=True), sys.stdin.read()"
+    hold = "import sys; from pathlib import Path; from gsim3d.locks import only_one_writer\n"
+    hold += "with only_one_writer(Path(sys.argv[1]), range(1, 3, 2)): print(flush=True), sys.stdin.read()"
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", hold, str(tmp_path)], **pipes, cwd=Path.cwd()) as other:
         other.stdout.readline()
         assert generate(tmp_path, processes=1, part=(1, 2), progress=False, **SMALL).n_made == 2
         for part in (None, (2, 2), (2, 3)):
-            with pytest.raises(InputError, match="another process"):
+            with pytest.raises(InputError, match="another process is writing to"):
                 generate(tmp_path, processes=1, part=part, progress=False, **SMALL)
         other.stdin.close()
     assert generate(tmp_path, processes=1, progress=False, **SMALL).n_made == 1
