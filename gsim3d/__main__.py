@@ -19,6 +19,7 @@ COMMANDS = {
     "check-data": ("gsim3d.check_data", "what is wrong with recorded scenes, and a picture of their cameras"),
     "train": ("gsim3d.train.command", "learn a simulator from a data set"),
     "simulate": ("gsim3d.simulate", "predict the future of one scene: video and .ply"),
+    "export": ("gsim3d.export", "write 3D Gaussians for other tools: .spz, .splat, .glb, USD, a film"),
     "plan": ("gsim3d.show_plan", "which effects of a scene are computed, which are not, and what that costs"),
     "effects": ("gsim3d.infer_effects", "find out which effects a scene needs"),
     "evaluate": (

@@ -231,7 +231,7 @@ def _pictures(out: Path, predictor: _Predictor, scenes: list, summary: dict) -> 
     import numpy as np
 
     scene, prediction, rendered, cam = first
-    write_gaussians(out / "gaussians", restored, prediction)
+    write_gaussians(out / "gaussians", restored, prediction, scene.fps)
     write_curves(made[1], summary, scene.fps, ("psnr", "psnr_masked"))
     write_overview(made[2], restored, scene, prediction, rendered, cam)
     write_video(made[0], comparison_frames(np.concatenate(truth, 1), np.concatenate(images, 1)), scene.fps)

@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
                 write_picture(part / "frames" / f"cam_{cam}_{step:04d}.png", image)
         truth = true_images(scene, cams, range(first, first + len(images)))
         write_video(part / "rollout.mp4", comparison_frames(truth, images), scene.fps)
-        write_gaussians(part / "gaussians", restored, prediction)
+        write_gaussians(part / "gaussians", restored, prediction, scene.fps)
         os.replace(part, out)
     finally:
         shutil.rmtree(part, ignore_errors=True)

@@ -21,12 +21,13 @@ ROOMS = [
     {"laws", "graphs", "by_scene", "agreement"},
     {"endurance"},
     {"data", "interop", "perceptual"},
+    {"io"},
     {"generate"},
     {"train"},
     {"evaluate", "check_stability"},
     {"pareto"},
     {"ablate"},
-    {"simulate", "show_plan", "infer_effects", "check_data", "import_released", "demo", "doctor"},
+    {"simulate", "show_plan", "infer_effects", "check_data", "import_released", "demo", "doctor", "export"},
     {"__main__"},
 ]
 LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}

@@ -16,6 +16,7 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import Prediction
 from gsim3d.evaluate.scoring import METRICS
 from gsim3d.interop import write_ply
+from gsim3d.io.sequence import write_about
 from gsim3d.renderer import render
 from gsim3d.train.restore import Restored
 from gsim3d.types import Cameras
@@ -69,13 +70,14 @@ def _grid(rows: list[list[np.ndarray]]) -> np.ndarray:
 
 
 @torch.no_grad()
-def write_gaussians(folder: str | Path, restored: Restored, prediction: Prediction) -> None:
-    """One .ply a step into ``folder``: step_0000.ply, ..."""
+def write_gaussians(folder: str | Path, restored: Restored, prediction: Prediction, fps: float) -> None:
+    """One .ply a step into ``folder``: step_0000.ply, ...; their rate in sequence.json."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     gaussians = restored.simulator.renderer(prediction.particles).to("cpu")
     for step in range(prediction.n_steps):
         write_ply(folder / f"step_{step:04d}.ply", gaussians, step)
+    write_about(folder, fps)
 
 
 @torch.no_grad()

@@ -34,6 +34,7 @@ from gsim3d.errors import HardCaseError, InputError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.interop import read_ply, write_ply
 from gsim3d.interop.released_import import import_released
+from gsim3d.io import read_splats, write_splats
 from gsim3d.perceptual import weights
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
@@ -188,6 +189,14 @@ def _read_ply(folder: Path, what: str) -> None:
     finite(read_ply(folder / "a.ply"))
 
 
+def _write_splats(suffix: str, folder: Path) -> None:
+    write_splats(folder / f"a{suffix}", _gaussians())
+
+
+def _read_splats(suffix: str, folder: Path, what: str) -> None:
+    finite(read_splats(folder / f"a{suffix}"))
+
+
 TRAINING = {
     "preset": "tiny",
     "data": {"history": 2, "context_views": 2, "target_only_cameras": [3]},
@@ -303,6 +312,10 @@ READERS = {
     "released": Reader(_write_release, _read_release, ("model.yaml",)),
     "ply": Reader(lambda folder: write_ply(folder / "a.ply", _gaussians()), _read_ply),
     "ply_text": Reader(lambda folder: _write_text_ply(folder / "a.ply"), _read_ply),
+    **{
+        f"splats{suffix}": Reader(partial(_write_splats, suffix), partial(_read_splats, suffix))
+        for suffix in (".splat", ".compressed.ply", ".spz", ".glb")
+    },
     "train_yaml": Reader(
         lambda folder: (folder / "train.yaml").write_text(yaml.safe_dump(TRAINING)),
         lambda folder, what: from_dict(TrainConfig, load_yaml(folder / "train.yaml")),

@@ -1,0 +1,79 @@
+"""``gsim3d export``: Gaussians as a file that other tools open, or as a film."""
+
+from __future__ import annotations
+
+import argparse
+
+EPILOG = """\
+FILE's suffix chooses the format (docs/formats.md has their bounds):
+  .ply             3DGS layout, read by everything               .spz              Niantic, Babylon, Cesium
+  .compressed.ply  PlayCanvas, SuperSplat                        .glb              glTF with KHR_gaussian_splatting
+  .splat           web viewers; no view dependence               .usdc .usda       USD with time (gsim3d[usd])
+  .mp4             a film from a camera that circles around
+
+examples:
+  gsim3d export runs/ball --to ball.usdc                  all predicted frames of gsim3d simulate
+  gsim3d export runs/ball --frame -1 --to ball.spz        the last one
+  gsim3d export runs/ball --to ball.mp4 --size 720
+  gsim3d export garden.ply --to garden.splat
+"""
+FPS = 24.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of `gsim3d export` to ``parser``."""
+    parser.description = "Write 3D Gaussians in a format that other tools open, or as a film."
+    parser.epilog = EPILOG
+    parser.add_argument(
+        "target", metavar="TARGET", help="a file of Gaussians, a folder with one a frame, or what gsim3d simulate wrote"
+    )
+    parser.add_argument("--to", metavar="FILE", required=True, help="file to write; must not exist yet")
+    parser.add_argument("--frame", type=int, metavar="N", help="only this frame; negative: from the end")
+    parser.add_argument("--fps", type=float, help="frames a second (default: as TARGET says, else 24)")
+    parser.add_argument("--up", choices=("y", "z"), help="axis that points up in TARGET (default: as its format says)")
+    parser.add_argument("--up-to", choices=("y", "z"), help="likewise in FILE (default: as its readers expect)")
+    parser.add_argument("--size", type=int, default=512, metavar="PX", help="width and height of a film (default 512)")
+    parser.add_argument("--turns", type=float, default=0.25, help="of a film's camera around the scene (default 0.25)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Writes the file; returns the exit code."""
+    from tqdm import tqdm
+
+    from gsim3d.errors import InputError
+    from gsim3d.files import new_place
+    from gsim3d.interop import write_video
+    from gsim3d.io.formats import format_of, write_splats
+    from gsim3d.io.orbit import orbit_frames
+    from gsim3d.io.sequence import open_sequence
+
+    out, sequence = new_place(args.to, "file"), open_sequence(args.target, args.up)
+    fps = args.fps or sequence.fps or FPS
+    if not 0 < fps < 1e6:
+        raise InputError(f"--fps must be positive; got {args.fps:g}")
+    chosen = range(len(sequence))
+    if args.frame is not None:
+        if not -len(sequence) <= args.frame < len(sequence):
+            raise InputError(f"--frame {args.frame}: {args.target} has {len(sequence)} frames, from 0")
+        chosen = [args.frame % len(sequence)]
+    frames = (sequence[frame] for frame in tqdm(chosen, unit="frame", disable=None, leave=False))
+    if out.suffix.lower() == ".mp4":
+        if args.size < 16 or args.size % 2:
+            raise InputError(f"--size must be an even number of pixels, 16 or more; got {args.size}")
+        write_video(out, list(orbit_frames(frames, len(chosen), args.size, args.turns)), fps)
+        what = f"a film of {args.size}x{args.size} pixels"
+    else:
+        suffix, kind = format_of(out)
+        if len(chosen) > 1 and not kind.has_time:
+            raise InputError(
+                f"--to {args.to}: {suffix} holds one frame, and {args.target} has {len(sequence)}: choose one with "
+                "--frame, or write .usdc or .mp4"
+            )
+        made = list(frames)
+        write_splats(out, made if kind.has_time else made[0], fps=fps, up=args.up_to)
+        lost = max(made, key=lambda one: one.sh.shape[1]).sh.shape[1] > (kind.most_degree + 1) ** 2
+        what = f"{made[0].means.shape[0]:,} Gaussians, {kind.about}"
+        what += f"; colours that depend on the view are not kept by {suffix}" if lost else ""
+    rate = f"{len(chosen)} frames, {fps:g} a second, " if len(chosen) > 1 else ""
+    print(f"{out}: {rate}{what}; {out.stat().st_size / 1e6:.2f} MB")
+    return 0

@@ -1,0 +1,143 @@
+"""All formats by suffix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsim3d.errors import InputError
+from gsim3d.interop.ply import read_ply, write_ply
+from gsim3d.io import compressed_ply, gltf, splat, spz, usd
+from gsim3d.io.arrays import Y_TO_Z_UP, Z_TO_Y_UP, Splats, gaussians_of, read_bytes, splats_of, turned
+from gsim3d.types import Gaussians
+
+UPS = ("y", "z")
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format of Gaussians.
+
+    Attributes:
+        about: one line of what it keeps.
+        write: writes one frame; frames and their rate where ``has_time``.
+        read: reads the (first) frame; None: it is not read.
+        up: axis that points up in a file, unless it is said otherwise; None: the file says it itself.
+        most_degree: of spherical harmonics that it keeps.
+        has_time: whether one file holds a sequence.
+    """
+
+    about: str
+    write: Callable
+    read: Callable[[Path], Splats] | None
+    up: str | None = "z"
+    most_degree: int = 3
+    has_time: bool = False
+
+
+FORMATS = {
+    ".compressed.ply": Format(
+        "positions in 11, 10 and 11 bits of a chunk of 256, colours in 8", compressed_ply.write, compressed_ply.read
+    ),
+    ".ply": Format("3DGS layout, float32", None, None),
+    ".splat": Format("float32 positions and scales, colours in 8 bits", splat.write, splat.read, most_degree=0),
+    ".spz": Format("positions to 0.13 mm, colours in 8 bits; version 3", spz.write, spz.read, up="y"),
+    ".glb": Format("glTF with KHR_gaussian_splatting, float32", gltf.write, gltf.read, up=None),
+    ".usdc": Format("USD particle field, float32, with time", usd.write, usd.read, up=None, has_time=True),
+    ".usda": Format("USD as text", usd.write, usd.read, up=None, has_time=True),
+}
+
+
+def format_of(path: str | Path) -> tuple[str, Format]:
+    """Suffix and format of a file name.
+
+    Raises:
+        InputError: no format has this suffix.
+    """
+    name = Path(path).name.lower()
+    for suffix, found in FORMATS.items():  # .compressed.ply stands before .ply
+        if name.endswith(suffix):
+            return suffix, found
+    raise InputError(f"{path}: no format of Gaussians has this suffix; choose from {', '.join(FORMATS)}")
+
+
+def write_splats(
+    path: str | Path,
+    gaussians: Gaussians | Sequence[Gaussians],
+    *,
+    frame: int | None = None,
+    fps: float = 24.0,
+    up: str | None = None,
+) -> None:
+    """Writes Gaussians to ``path`` in the format of its suffix; the file appears complete or not at all.
+
+    Args:
+        path: ends in one of FORMATS.
+        gaussians: packed frames, z up, metres; or a sequence of single frames for formats with time.
+        frame: of ``gaussians``; None: all rows as one frame (formats without time) or all frames.
+        fps: frames a second, of formats with time.
+        up: "y" or "z", the axis that points up in the file (default: as the format's readers expect).
+    Raises:
+        InputError: an unknown suffix, values that are not finite, or what the format cannot hold.
+    """
+    path, (suffix, chosen) = Path(path), format_of(path)
+    if not fps > 0:
+        raise InputError(f"{path}: frames a second must be positive; got {fps}")
+    parts = [gaussians] if isinstance(gaussians, Gaussians) else list(gaussians)
+    turn = _turn(path, chosen, up, Z_TO_Y_UP)
+    if chosen.has_time:
+        frames = [
+            splats_of(part, index, path)
+            for part in parts
+            for index in (range(len(part.cu_rows) - 1) if frame is None else (frame,))
+        ]
+        if not frames:
+            raise InputError(f"{path}: there is no frame to write")
+        chosen.write(path, frames, fps)
+        return
+    if len(parts) != 1:
+        raise InputError(f"{path}: {suffix} holds one frame; got {len(parts)}: choose a frame, or .usdc, .html or .mp4")
+    if suffix == ".ply" and turn is None:
+        write_ply(path, parts[0], frame)
+        return
+    splats = splats_of(parts[0], frame, path)
+    splats = splats if turn is None else turned(splats, turn)
+    if suffix == ".ply":
+        write_ply(path, gaussians_of(splats, path))
+    else:
+        chosen.write(path, splats)
+
+
+def read_splats(path: str | Path, *, up: str | None = None) -> Gaussians:
+    """The Gaussians of a file (the first frame of formats with time), z up, as one packed frame.
+
+    Args:
+        path: ends in one of FORMATS; a .ply may be compressed.
+        up: "y" or "z", the axis that points up in the file (default: as the format says, or as its writers do).
+    Raises:
+        InputError: the file is damaged or of no known format; the message names it.
+    """
+    path, (suffix, chosen) = Path(path), format_of(path)
+    turn = _turn(path, chosen, up, Y_TO_Z_UP)
+    if suffix == ".glb":
+        turn = Y_TO_Z_UP
+    if suffix == ".ply" and compressed_ply.is_compressed(read_bytes(path)[:4096]):
+        chosen = FORMATS[".compressed.ply"]
+    if chosen.read is None:
+        gaussians = read_ply(path)
+        return gaussians if turn is None else gaussians_of(turned(splats_of(gaussians, None, path), turn), path)
+    try:
+        splats = gaussians_of(chosen.read(path), path)
+    except MemoryError:
+        raise InputError(f"{path} cannot be read: no memory for its Gaussians") from None
+    return splats if turn is None else gaussians_of(turned(splats_of(splats, None, path), turn), path)
+
+
+def _turn(path: Path, chosen: Format, up: str | None, turn: tuple) -> tuple | None:
+    """``turn`` where the file has y up."""
+    if up is not None and up not in UPS:
+        raise InputError(f"up must be y or z; got {up!r}")
+    if up is not None and chosen.up is None:
+        raise InputError(f"{path}: this format says itself which axis points up; leave it out")
+    return turn if (up or chosen.up) == "y" else None

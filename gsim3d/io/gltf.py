@@ -1,0 +1,157 @@
+""".glb: glTF 2.0 with KHR_gaussian_splatting, float32, one frame.
+
+Positions keep their axes; the node turns z up to glTF's y up, so that no number is changed.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.errors import InputError
+from gsim3d.io.arrays import Z_TO_Y_UP, Splats, colors_of, read_bytes, turned, unorm, write_bytes
+
+EXTENSION = "KHR_gaussian_splatting"
+MAGIC, JSON_CHUNK, BIN_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
+FLOAT, UBYTE, POINTS = 5126, 5121, 0
+MOST_JSON = 2**26  # bytes
+DEGREES = 4
+
+
+def write(path: Path, splats: Splats) -> None:
+    """Writes ``splats`` without loss; COLOR_0 holds degree 0 for viewers without the extension."""
+    quats = splats.quats[:, [1, 2, 3, 0]]
+    columns = {"POSITION": splats.means, f"{EXTENSION}:ROTATION": quats, f"{EXTENSION}:SCALE": splats.scales}
+    columns |= {f"{EXTENSION}:OPACITY": splats.opacities[:, None]}
+    columns |= {_coefficient(k): splats.sh[:, k] for k in range(splats.sh.shape[1])}
+    colors = np.concatenate([unorm(colors_of(splats), 8), unorm(splats.opacities, 8)[:, None]], 1)
+    columns["COLOR_0"] = colors.astype(np.uint8)
+    views, accessors, attributes, parts, place = [], [], {}, [], 0
+    for name, values in columns.items():
+        is_float = values.dtype != np.uint8
+        data = np.ascontiguousarray(values, "<f4" if is_float else "u1").tobytes()
+        views.append({"buffer": 0, "byteOffset": place, "byteLength": len(data), "target": 34962})
+        attributes[name] = len(accessors)
+        kind = "SCALAR" if values.shape[1] == 1 else f"VEC{values.shape[1]}"
+        accessor = {"bufferView": len(accessors), "count": splats.count, "type": kind}
+        accessor |= {"componentType": FLOAT} if is_float else {"componentType": UBYTE, "normalized": True}
+        if name == "POSITION" and splats.count:
+            accessor |= {"min": splats.means.min(0).tolist(), "max": splats.means.max(0).tolist()}
+        accessors.append(accessor)
+        parts.append(data)
+        place += len(data)
+    how = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
+    how["sortingMethod"] = "cameraDistance"
+    w, x, y, z = Z_TO_Y_UP
+    document = {
+        "asset": {"version": "2.0", "generator": "gsim3d"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": [x, y, z, w]}],
+        "meshes": [{"primitives": [{"mode": POINTS, "attributes": attributes, "extensions": {EXTENSION: how}}]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": place}],
+    }
+    if not splats.count:
+        raise InputError(f"{path}: a glTF accessor needs one Gaussian at least; there is none")
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    data = b"".join(parts) + b"\0" * (-place % 4)
+    total = 12 + 8 + len(text) + 8 + len(data)
+    head = struct.pack("<III", MAGIC, 2, total) + struct.pack("<II", len(text), JSON_CHUNK)
+    write_bytes(path, head, text, struct.pack("<II", len(data), BIN_CHUNK), data)
+
+
+def read(path: Path) -> Splats:
+    """The Gaussians of the first primitive with the extension, turned as its node says.
+
+    Raises:
+        InputError: the file is damaged, or holds no Gaussians that are read here.
+    """
+    content = read_bytes(path)
+    document, data = _chunks(path, content)
+    try:
+        index, primitive = next(
+            (index, primitive)
+            for index, mesh in enumerate(document["meshes"])
+            for primitive in mesh["primitives"]
+            if EXTENSION in primitive.get("extensions", {})
+        )
+        attributes = primitive["attributes"]
+        column = {name: _accessor(path, document, data, attributes[name]) for name in attributes if name != "COLOR_0"}
+        coefficients = [column[_coefficient(0)]]
+        for degree in range(1, DEGREES):
+            names = [_coefficient(k) for k in range(degree**2, (degree + 1) ** 2)]
+            if names[0] not in column:
+                break
+            coefficients += [column[name] for name in names]
+        quats = column[f"{EXTENSION}:ROTATION"][:, [3, 0, 1, 2]]
+        scales, opacities = column[f"{EXTENSION}:SCALE"], column[f"{EXTENSION}:OPACITY"][:, 0]
+        splats = Splats(column["POSITION"], quats, scales, opacities, np.stack(coefficients, 1))
+        if len({len(value) for value in (*column.values(),)}) > 1 or splats.means.shape[1:] != (3,):
+            raise InputError(f"{path}: its attributes have different counts")
+        return _placed(path, document, index, splats)
+    except StopIteration:
+        raise InputError(f"{path}: no primitive has the extension {EXTENSION}") from None
+    except InputError:
+        raise
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
+        raise InputError(f"{path}: damaged, or not as {EXTENSION} says: {str(error)[:100]}") from None
+
+
+def _coefficient(k: int) -> str:
+    degree = int(k**0.5)
+    return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree**2}"
+
+
+def _chunks(path: Path, content: bytes) -> tuple[dict, bytes]:
+    if len(content) < 20 or struct.unpack_from("<II", content) != (MAGIC, 2):
+        raise InputError(f"{path}: not a .glb file of glTF 2.0")
+    length, kind = struct.unpack_from("<II", content, 12)
+    if kind != JSON_CHUNK or length > min(MOST_JSON, len(content) - 20):
+        raise InputError(f"{path}: truncated within its JSON chunk")
+    try:
+        document = json.loads(content[20 : 20 + length])
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: its JSON chunk is damaged: {str(error)[:100]}") from None
+    start = 20 + length
+    size, kind = struct.unpack_from("<II", content, start) if start + 8 <= len(content) else (0, 0)
+    if kind != BIN_CHUNK or start + 8 + size > len(content):
+        raise InputError(f"{path}: truncated within its binary chunk")
+    return document, content[start + 8 : start + 8 + size]
+
+
+def _accessor(path: Path, document: dict, data: bytes, index: int) -> np.ndarray:
+    """float32 [N, channels]."""
+    accessor = document["accessors"][index]
+    view = document["bufferViews"][accessor["bufferView"]]
+    channels = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+    packed = view.get("byteStride", 4 * channels) == 4 * channels
+    if accessor["componentType"] != FLOAT or "sparse" in accessor or not packed:
+        raise InputError(f"{path}: attributes must be packed floats to be read here")
+    count, place = accessor["count"], view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    if not all(type(value) is int and value >= 0 for value in (count, place)):
+        raise InputError(f"{path}: an accessor has a count or an offset that is none")
+    if view.get("buffer", 0) != 0 or place + 4 * channels * count > len(data):
+        raise InputError(f"{path}: truncated: an accessor ends behind the file")
+    return np.frombuffer(data, "<f4", count * channels, place).reshape(count, channels)
+
+
+def _placed(path: Path, document: dict, mesh: int, splats: Splats) -> Splats:
+    """``splats`` as the node of the mesh places them: turned, scaled alike along all axes, moved."""
+    node = next((node for node in document.get("nodes", ()) if node.get("mesh") == mesh), {})
+    if "matrix" in node or any(mesh in other.get("children", ()) for other in document.get("nodes", ())):
+        raise InputError(f"{path}: nodes with a matrix or a parent are not read; apply transforms before exporting")
+    x, y, z, w = map(float, node.get("rotation", (0, 0, 0, 1)))
+    size = {float(value) for value in node.get("scale", (1, 1, 1))}
+    if len(size) != 1 or not 0 < min(size) < np.inf or not np.isclose(x * x + y * y + z * z + w * w, 1, atol=1e-3):
+        raise InputError(f"{path}: its node must be scaled alike along all axes, and turned by a unit quaternion")
+    moved = turned(splats, (w, x, y, z))
+    shift = np.array([float(value) for value in node.get("translation", (0, 0, 0))], np.float32)
+    means = moved.means * np.float32(min(size)) + shift
+    return Splats(means, moved.quats, moved.scales * np.float32(min(size)), moved.opacities, moved.sh)

@@ -1,0 +1,63 @@
+"""A film of Gaussians from a camera that circles around them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+
+from gsim3d.ops import rasterize_gaussians
+from gsim3d.types import Cameras, Gaussians
+
+ELEVATION, FIELD_OF_VIEW = 25.0, 42.0  # degrees
+MARGIN = 1.15  # of the distance at which all is in view
+QUANTILE = 0.98  # of the distances from the middle, that is in view
+FAINT = 0.1  # opacity below which a Gaussian does not count for the view
+
+
+@torch.no_grad()
+def orbit_frames(frames: Iterable[Gaussians], count: int, size: int, turns: float) -> Iterable[np.ndarray]:
+    """Images uint8 [size, size, 3] of ``frames``, from a camera that turns about the vertical through their middle.
+
+    Args:
+        frames: one packed frame each, z up.
+        count: how many there are.
+        turns: of the camera, over all frames.
+    """
+    centre = distance = None
+    for index, gaussians in enumerate(frames):
+        if centre is None:
+            shown = gaussians.means[gaussians.opacities > FAINT]
+            shown = shown if len(shown) else gaussians.means
+            centre = shown.median(0).values if len(shown) else torch.zeros(3)
+            reach = torch.quantile((shown - centre).norm(dim=1)[:1_000_000], QUANTILE) if len(shown) else 1.0
+            distance = MARGIN * max(float(reach), 1e-3) / math.sin(math.radians(FIELD_OF_VIEW / 2))
+        camera = _camera(centre, distance, 2 * math.pi * turns * index / count, size)
+        image = rasterize_gaussians(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales,
+            gaussians.opacities,
+            camera,
+            sh=gaussians.sh,
+            near_plane=1e-3 * distance,
+            on_bad="drop",
+        ).color[0]
+        yield (image.clamp(0, 1) * 255).round().byte().numpy()
+
+
+def _camera(centre: torch.Tensor, distance: float, azimuth: float, size: int) -> Cameras:
+    elevation = math.radians(ELEVATION)
+    toward = [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
+    position = centre.double() + distance * torch.tensor(toward, dtype=torch.float64)
+    forward = torch.nn.functional.normalize(centre.double() - position, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0, 1]).double()), dim=0)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+    focal = size / 2 / math.tan(math.radians(FIELD_OF_VIEW) / 2)
+    K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    near, far = torch.tensor([1e-2 * distance]), torch.tensor([10 * distance])
+    return Cameras(viewmat.float()[None], K[None], near, far, torch.tensor([0]), size, size)

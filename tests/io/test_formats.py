@@ -1,0 +1,344 @@
+"""Formats of Gaussians: bounds of every field, golden bytes, foreign readers, sequences, damage."""
+
+import dataclasses
+import gzip
+import json
+import struct
+
+import numpy as np
+import pytest
+import torch
+
+from gsim3d.__main__ import main
+from gsim3d.errors import InputError
+from gsim3d.interop import write_ply
+from gsim3d.io import FORMATS, read_splats, write_splats
+from gsim3d.io.arrays import Y_TO_Z_UP, Z_TO_Y_UP, splats_of, turned
+from gsim3d.io.orbit import orbit_frames
+from gsim3d.io.sequence import open_sequence, write_about
+from gsim3d.ops import rasterize_gaussians
+from gsim3d.types import Cameras, Gaussians
+
+WITHOUT_USD = [suffix for suffix in FORMATS if not suffix.startswith(".usd")]
+COUNTS = (1, 255, 256, 257)
+# Largest errors: position [m, of a scene of about 5 m], angle, log-scale, opacity, constant and other coefficients.
+BOUNDS = {
+    ".ply": (0, 3e-3, 1e-6, 1e-6, 0, 0),
+    ".splat": (0, 3e-2, 0, 2e-3, 7e-3, None),
+    ".compressed.ply": (5e-3, 5e-3, 5e-3, 2e-3, 2e-2, 1.6e-2),
+    ".spz": (1.3e-4, 5e-3, 3.2e-2, 2e-3, 1.4e-2, 7e-2),
+    ".glb": (0, 3e-3, 0, 0, 0, 1e-6),
+    ".usdc": (0, 3e-3, 0, 0, 0, 0),
+    ".usda": (0, 3e-3, 0, 0, 0, 0),
+}
+
+
+def make(count, degree, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    constant = torch.rand(count, 1, 3, generator=g) * 3 - 1.5  # colours in [0, 1]: .splat clamps others
+    rest = (torch.rand(count, (degree + 1) ** 2 - 1, 3, generator=g) - 0.5) * 1.8
+    return Gaussians(
+        means=torch.rand(count, 3, generator=g) * 5 - 2.5,
+        quats=torch.nn.functional.normalize(torch.randn(count, 4, generator=g), dim=1),
+        scales=torch.exp(torch.rand(count, 3, generator=g) * 4 - 6),
+        opacities=torch.rand(count, generator=g) * 0.98 + 0.01,
+        sh=torch.cat([constant, rest], 1),
+        cu_rows=torch.tensor([0, count]),
+    )
+
+
+def needs(suffix):
+    if suffix.startswith(".usd"):
+        pytest.importorskip("pxr", reason="usd-core is not installed")
+
+
+def partners(read, given):
+    """Row of ``given`` of each row read: some formats sort."""
+    return torch.cdist(read.means.double(), given.means.double()).argmin(1)
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_what_is_read_is_within_the_bounds_of_what_was_written(suffix, degree, tmp_path):
+    needs(suffix)
+    position, angle, scale, opacity, constant, rest = BOUNDS[suffix]
+    for count in COUNTS:
+        given, file = make(count, degree), tmp_path / f"{count}{suffix}"
+        axes = {"up": "z"} if suffix == ".spz" else {}  # bounds hold in the axes of the file
+        write_splats(file, given, **axes)
+        read = read_splats(file, **axes)
+        of = partners(read, given)
+        assert sorted(of.tolist()) == list(range(count))
+        kept = min(degree, FORMATS[suffix].most_degree)
+        assert read.sh.shape == (count, (kept + 1) ** 2, 3)
+        assert (read.means - given.means[of]).abs().max() <= position
+        turn = (read.quats.double() * given.quats[of].double()).sum(1).abs().clamp(max=1).arccos() * 2
+        assert turn.max() <= angle
+        assert (read.scales.log() - given.scales[of].log()).abs().max() <= scale
+        assert (read.opacities - given.opacities[of]).abs().max() <= opacity
+        errors = (read.sh - given.sh[of, : read.sh.shape[1]]).abs()
+        assert errors[:, 0].max() <= constant
+        assert kept == 0 or errors[:, 1:].max() <= rest
+
+
+@pytest.mark.parametrize("suffix", [suffix for suffix in WITHOUT_USD if suffix != ".glb"])
+def test_no_gaussians_are_none(suffix, tmp_path):
+    write_splats(tmp_path / f"none{suffix}", make(0, 1))
+    assert read_splats(tmp_path / f"none{suffix}").means.shape == (0, 3)
+
+
+GOLDEN = (
+    "4e4753500300000002000000000c0000000800" "00ecff002000fcffff000000003c00" "80e1" "80a659cc6c89"
+    "606850807c78" "de50aac4521e9d19"
+)  # fmt: skip
+
+
+def test_spz_has_golden_bytes(tmp_path):
+    quats = torch.tensor([[0.9, 0.1, -0.2, 0.3], [-0.1, 0.6, 0.5, -0.4]])
+    given = Gaussians(
+        means=torch.tensor([[0.5, -1.25, 2], [-0.001, 0, 3.75]]),
+        quats=quats / quats.norm(dim=1, keepdim=True),
+        scales=torch.tensor([[-4, -3.5, -5], [-2, -2.25, -2.5]]).exp(),
+        opacities=torch.sigmoid(torch.tensor([0.0, 2])),
+        sh=torch.tensor([[[0.0, 1, -1]], [[2, -0.5, 0.25]]]),
+        cu_rows=torch.tensor([0, 2]),
+    )
+    write_splats(tmp_path / "two.spz", given, up="z")
+    assert gzip.decompress((tmp_path / "two.spz").read_bytes()).hex() == GOLDEN
+    read = read_splats(tmp_path / "two.spz", up="z")
+    assert read.means[1].tolist() == pytest.approx([-0.0009766, 0, 3.75], abs=1e-7)
+    assert read.quats.flatten().tolist() == pytest.approx(
+        [0.9237, 0.1024, -0.2048, 0.3072, -0.1135, 0.6798, 0.5660, -0.4525], abs=1e-4
+    )
+    assert torch.logit(read.opacities).tolist() == pytest.approx([0.0078, 2.0149], abs=1e-4)
+    assert read.sh.flatten().tolist() == pytest.approx([0.0131, 1.0065, -1.0065, 2.0, -0.5098, 0.2484], abs=1e-4)
+
+
+def spz(version=3, count=1, degree=0, body=b"", packed=True):
+    content = struct.pack("<IIIBBBB", 0x5053474E, version, count, degree, 12, 0, 0) + body
+    return gzip.compress(content) if packed else content
+
+
+def test_spz_of_version_2_is_read(tmp_path):
+    body = bytes([0, 16, 0, 0, 240, 255, 0, 0, 0]) + bytes([255]) + bytes([128] * 3) + bytes([160] * 3)
+    (tmp_path / "old.spz").write_bytes(spz(2, body=body + bytes([127, 127, 255])))
+    read = read_splats(tmp_path / "old.spz", up="z")
+    assert read.means.tolist() == [[1.0, -1.0, 0.0]] and read.opacities.tolist() == [1.0]
+    assert read.scales.tolist() == [[1.0] * 3] and read.quats[0, 3] == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize("degree, streams", [(0, 5), (1, 6)])
+def test_spz_of_version_4_is_read(degree, streams, tmp_path):
+    zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")
+    given = make(10, degree)
+    write_splats(tmp_path / "three.spz", given)
+    content = gzip.decompress((tmp_path / "three.spz").read_bytes())
+    sizes, place, parts = [90, 10, 30, 30, 40, 90][:streams], 16, []
+    for size in sizes:
+        parts.append(content[place : place + size])
+        place += size
+    packed = [zstandard.ZstdCompressor().compress(part) for part in parts]
+    head = content[:4] + struct.pack("<I", 4) + content[8:15] + struct.pack("<BI", streams, 32) + bytes(12)
+    table = b"".join(struct.pack("<QQ", len(p), len(part)) for p, part in zip(packed, parts, strict=True))
+    (tmp_path / "four.spz").write_bytes(head + table + b"".join(packed))
+    three, four = read_splats(tmp_path / "three.spz"), read_splats(tmp_path / "four.spz")
+    assert all(torch.equal(getattr(three, name), getattr(four, name)) for name in ("means", "quats", "scales", "sh"))
+    wrong = head[:15] + bytes([11 - streams]) + head[16:]
+    (tmp_path / "four.spz").write_bytes(wrong + table + b"".join(packed))
+    with pytest.raises(InputError, match="streams"):
+        read_splats(tmp_path / "four.spz")
+
+
+def test_a_splat_record_by_hand(tmp_path):
+    record = struct.pack("<6f", 1, 2, 3, 0.1, 0.2, 0.3) + bytes([255, 0, 51, 102]) + bytes([128, 255, 128, 128])
+    (tmp_path / "one.splat").write_bytes(record)
+    read = read_splats(tmp_path / "one.splat")
+    assert read.means.tolist() == [[1, 2, 3]] and read.scales[0].tolist() == pytest.approx([0.1, 0.2, 0.3])
+    assert read.opacities.tolist() == pytest.approx([0.4]) and read.quats.tolist() == [[0, 1, 0, 0]]
+    assert (0.5 + 0.28209479 * read.sh[0, 0]).tolist() == pytest.approx([1, 0, 0.2], abs=1e-6)
+
+
+def test_foreign_readers_agree(tmp_path):
+    gsply = pytest.importorskip("gsply", reason="gsply is not installed")
+    given = make(300, 3)
+    for suffix in (".ply", ".compressed.ply", ".spz"):
+        file = tmp_path / f"a{suffix}"
+        write_splats(file, given, up="z")
+        theirs = gsply.read_spz(str(file)) if suffix == ".spz" else gsply.plyread(str(file))
+        assert np.abs(theirs.means - read_splats(file, up="z").means.numpy()).max() < 1e-5, suffix
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_other_axes_show_the_same_scene(degree):
+    given = make(40, degree)
+    splats = splats_of(given, None, "scene")
+    other = turned(splats, Z_TO_Y_UP)
+    assert other.means[:, 1] == pytest.approx(splats.means[:, 2], abs=1e-6)  # up stays up
+    back = turned(other, Y_TO_Z_UP)
+    for name in ("means", "sh"):
+        assert np.abs(getattr(back, name) - getattr(splats, name)).max() < 1e-5
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    viewmat[2, 3] = 8
+    turn = torch.eye(4)
+    turn[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z up to y up
+    images = [picture(one, view) for one, view in ((splats, viewmat), (other, viewmat @ turn.T))]
+    assert images[0].max() > 0.2 and (images[0] - images[1]).abs().max() < 1e-3
+
+
+def picture(splats, viewmat):
+    K, one = torch.tensor([[[60.0, 0, 32], [0, 60, 32], [0, 0, 1]]]), torch.ones(1)
+    camera = Cameras(viewmat[None], K, one * 0.1, one * 20, torch.tensor([0]), 64, 64)
+    fields = (torch.from_numpy(getattr(splats, name)) for name in ("means", "quats", "scales", "opacities"))
+    return rasterize_gaussians(*fields, camera, sh=torch.from_numpy(splats.sh)).color
+
+
+@pytest.mark.parametrize("suffix", WITHOUT_USD)
+def test_a_cut_off_file_is_refused_by_name(suffix, tmp_path):
+    file = tmp_path / f"cut{suffix}"
+    write_splats(file, make(3, 1))
+    content = file.read_bytes()
+    for length in range(0, len(content) - 1, 7):
+        if suffix == ".splat" and length % 32 == 0:
+            continue
+        file.write_bytes(content[:length])
+        with pytest.raises(InputError, match="cut"):
+            read_splats(file)
+
+
+@pytest.mark.parametrize(
+    "content, says",
+    [
+        (spz(9, body=bytes(99)), "version 9"),
+        (spz(3, count=2**31), "cannot lie in"),
+        (spz(3, degree=7), "degree 7"),
+        (spz(3, body=bytes(5)), "truncated"),
+        (b"NGSP" + bytes(8), "truncated"),
+        (b"\x1f\x8bnothing", "damaged"),
+        (b"PLY", "not a .spz"),
+    ],
+)
+def test_a_damaged_spz_is_refused(content, says, tmp_path):
+    (tmp_path / "bad.spz").write_bytes(content)
+    with pytest.raises(InputError, match=says):
+        read_splats(tmp_path / "bad.spz")
+
+
+def edited_glb(tmp_path, change):
+    file = tmp_path / "a.glb"
+    write_splats(file, make(3, 0))
+    content = file.read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    document = json.loads(content[20 : 20 + length])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + length :]
+    head = struct.pack("<5I", 0x46546C67, 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+    file.write_bytes(head + text + rest)
+    return file
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        (lambda d: d["accessors"][0].update(count=10**9), "behind the file"),
+        (lambda d: d["accessors"][0].update(count=2), "different counts"),
+        (lambda d: d["accessors"][0].update(componentType=5123), "packed floats"),
+        (lambda d: d["bufferViews"][0].update(byteOffset=-4), "an offset"),
+        (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "no primitive"),
+        (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), "damaged"),
+        (lambda d: d["nodes"][0].update(matrix=[1] * 16), "matrix"),
+        (lambda d: d["nodes"][0].update(scale=[1, 2, 3]), "scaled alike"),
+        (lambda d: d.update(meshes=7), "damaged"),
+    ],
+)
+def test_a_damaged_glb_is_refused(change, says, tmp_path):
+    with pytest.raises(InputError, match=says):
+        read_splats(edited_glb(tmp_path, change))
+
+
+def test_a_glb_stands_where_its_node_places_it(tmp_path):
+    move = {"translation": [0, 5, 0], "scale": [2, 2, 2]}  # up in glTF's axes
+    read = read_splats(edited_glb(tmp_path, lambda d: d["nodes"][0].update(move)))
+    given = make(3, 0)
+    torch.testing.assert_close(read.means, 2 * given.means + torch.tensor([0.0, 0, 5]))
+    torch.testing.assert_close(read.scales, 2 * given.scales)
+
+
+def test_a_compressed_ply_is_read_under_a_plain_name(tmp_path):
+    write_splats(tmp_path / "a.compressed.ply", make(5, 0))
+    (tmp_path / "a.compressed.ply").rename(tmp_path / "b.ply")
+    assert read_splats(tmp_path / "b.ply").means.shape == (5, 3)
+
+
+def moving(n_frames):
+    """Frames in which 20 of 60 Gaussians move."""
+    first = make(60, 1)
+    shift = torch.zeros(60, 3)
+    shift[:20, 2] = 0.1
+    return [dataclasses.replace(first, means=first.means + step * shift) for step in range(n_frames)]
+
+
+def test_usd_writes_what_is_still_once(tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd
+
+    frames = moving(4)
+    write_splats(tmp_path / "a.usdc", frames, fps=42)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    assert stage.GetTimeCodesPerSecond() == 42 and stage.GetEndTimeCode() == 3
+    prims = {prim.GetName(): prim for prim in stage.Traverse() if prim.GetTypeName().startswith("Particle")}
+    positions = {name: prim.GetAttribute("positions") for name, prim in prims.items()}
+    assert not positions["still"].GetTimeSamples() and len(positions["still"].Get()) == 40
+    assert positions["moving"].GetTimeSamples() == [0, 1, 2, 3]
+    for step, frame in enumerate(frames):
+        assert np.array_equal(np.array(positions["moving"].Get(step)), frame.means[:20].numpy())
+    assert not prims["moving"].GetAttribute("opacities").GetTimeSamples()
+
+
+def test_a_sequence_has_the_rate_that_stands_beside_it(tmp_path):
+    folder = tmp_path / "run" / "gaussians"
+    folder.mkdir(parents=True)
+    for step, frame in enumerate(moving(3)):
+        write_ply(folder / f"step_{step:04d}.ply", frame)
+    assert open_sequence(tmp_path / "run").fps is None
+    write_about(folder, 42.0)
+    sequence = open_sequence(tmp_path / "run")
+    assert sequence.fps == 42 and len(sequence) == 3 and torch.equal(sequence[2].means, moving(3)[2].means)
+    (folder / "sequence.json").write_text('{"fps": "fast"}')
+    with pytest.raises(InputError, match="sequence.json"):
+        open_sequence(folder)
+    write_splats(folder / "other.splat", make(2, 0))
+    with pytest.raises(InputError, match="several formats"):
+        open_sequence(folder)
+
+
+def test_an_orbit_shows_the_scene():
+    frames = list(orbit_frames(moving(3), 3, 64, 0.5))
+    assert len(frames) == 3 and frames[0].shape == (64, 64, 3) and frames[0].dtype == np.uint8
+    assert all((frame.max(2) > 20).mean() > 0.02 for frame in frames) and not np.array_equal(frames[0], frames[2])
+
+
+def test_the_command_exports_files_and_films(tmp_path, capsys):
+    folder = tmp_path / "gaussians"
+    folder.mkdir()
+    for step, frame in enumerate(moving(3)):
+        write_ply(folder / f"step_{step:04d}.ply", frame)
+    write_about(folder, 12.0)
+    assert main(["export", str(folder), "--frame", "-1", "--to", str(tmp_path / "last.spz")]) == 0
+    assert "60 Gaussians" in capsys.readouterr().out
+    assert main(["export", str(tmp_path), "--to", str(tmp_path / "a.mp4"), "--size", "64"]) == 0
+    assert "3 frames, 12 a second" in capsys.readouterr().out
+    assert main(["export", str(tmp_path / "last.spz"), "--to", str(tmp_path / "last.splat")]) == 0
+    assert "not kept" in capsys.readouterr().out
+    for arguments, says in (
+        ([str(folder), "--to", str(tmp_path / "b.spz")], "--frame"),
+        ([str(folder), "--to", str(tmp_path / "last.spz")], "exists already"),
+        ([str(folder), "--frame", "3", "--to", str(tmp_path / "b.spz")], "3 frames"),
+        ([str(folder), "--to", str(tmp_path / "b.obj")], "suffix"),
+        ([str(tmp_path / "none"), "--to", str(tmp_path / "b.spz")], "no such file"),
+        ([str(folder), "--to", str(tmp_path / "b.mp4"), "--size", "33"], "--size"),
+    ):
+        assert main(["export", *arguments]) == 2
+        assert says in capsys.readouterr().err
