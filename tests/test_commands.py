@@ -149,7 +149,7 @@ def test_simulate_writes_video_frames_and_gaussians(capsys, work, tmp_path):
     assert code == 0
     assert b"vp09" in (out / "rollout.mp4").read_bytes()
     assert len(list((out / "frames").iterdir())) == 2 * 9
-    files = sorted((out / "gaussians").iterdir())
+    files = sorted((out / "gaussians").glob("*.ply"))
     assert [file.name for file in files] == [f"step_{step:04d}.ply" for step in range(9)]
     assert read_ply(files[2]).means.shape == read_ply(files[8]).means.shape
     assert [path.name for path in tmp_path.iterdir()] == ["out"]

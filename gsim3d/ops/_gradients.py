@@ -33,8 +33,11 @@ def register_gradients(
 
 
 def refuse(op: str, tensors: dict[str, Tensor], *, forward_only: bool = False) -> None:
-    """Raises GradientError where one of ``tensors`` asks for a gradient, in forward mode or, unless ``forward_only``, in
-    reverse mode."""
+    """Raises GradientError where one of ``tensors`` asks for a gradient that ``op`` does not have.
+
+    Args:
+        forward_only: whether reverse mode has one.
+    """
     is_forward = forward_ad._current_level >= 0
     if not is_forward and (forward_only or not torch.is_grad_enabled()):
         return
