@@ -9,7 +9,7 @@ PNG_START, JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 TIFF_STARTS = {b"II*\0": "<", b"MM\0*": ">"}
 TIFF_TYPES = {1: "B", 3: "H", 4: "I"}  # bytes, shorts and longs are all that the tags below hold
 WIDTH, HEIGHT, PHOTOMETRIC, STRIPS, SAMPLES, STRIP_BYTES, TILES, TILE_BYTES = 256, 257, 262, 273, 277, 279, 324, 325
-EXTRA_SAMPLES = 338
+ORIENTATION, EXTRA_SAMPLES = 274, 338
 READ_PHOTOMETRIC = (1, 2, 3, 6)  # grey, RGB, palette, YCbCr; not: white is zero, CMYK
 MAX_TAGS, MAX_VALUES = 1000, 1 << 20
 
@@ -99,6 +99,8 @@ def _tiff(data: bytes, order: str) -> Header | None:
     )
     ends = [start + length for start, length in parts]
     refused = "" if tags.get(PHOTOMETRIC, (1,))[0] in READ_PHOTOMETRIC else "is inverted or CMYK"
+    if tags.get(ORIENTATION, (1,))[0] != 1:
+        refused = "is turned by its orientation tag"
     if _long(data, order, first + 2 + 12 * n_tags):
         refused = "has several pages"
     alpha = EXTRA_SAMPLES in tags or tags.get(SAMPLES, (1,))[0] in (2, 4)

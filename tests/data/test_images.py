@@ -206,6 +206,10 @@ def test_tiff_of_either_byte_order_and_of_one_page(tmp_path):
     file.write_bytes(big_endian_tiff()[:-60])
     with pytest.raises(InputError, match="cannot be decoded"):
         read_image(file, SIZE, "", Problems())
+    rows, orientation = struct.pack(">HHI", 278, 3, 1), struct.pack(">HHI", 274, 3, 1)  # optional here
+    file.write_bytes(big_endian_tiff().replace(rows, orientation))
+    with pytest.raises(InputError, match="turned by its orientation tag"):
+        read_image(file, SIZE, "", Problems())
     white_is_zero = big_endian_tiff().replace(struct.pack(">HHIH", 262, 3, 1, 1), struct.pack(">HHIH", 262, 3, 1, 0))
     file.write_bytes(white_is_zero)
     with pytest.raises(InputError, match="inverted"):
