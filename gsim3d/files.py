@@ -69,6 +69,15 @@ def write_picture(path: Path, image: np.ndarray) -> None:
         file.write(cv2.imencode(".png", image[..., ::-1])[1])
 
 
+def opencv_path(path: str | Path) -> str:
+    """``path`` for a function of OpenCV, which ends the process where a name is not UTF-8. Raises InputError there."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"the path {str(path)!a} is not UTF-8; rename what it names") from None
+    return str(path)
+
+
 def read_file(path: str | Path, most: int, first: int | None = None) -> bytes:
     """The bytes of a file, or its ``first``.
 

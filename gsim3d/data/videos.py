@@ -14,6 +14,7 @@ import numpy as np
 
 from gsim3d.data.recording import MAX_STEPS, Problems
 from gsim3d.errors import InputError
+from gsim3d.files import opencv_path
 
 RESOLUTION = 1.01e-3  # seconds: many containers round times to a millisecond
 UNEVEN = 0.1  # of the time between two frames: a frame that is off by more makes a video uneven
@@ -123,7 +124,7 @@ def _open(file: Path, what: str = ""):
     import cv2
 
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # errors are reported here, with their file and camera
-    capture = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG)
+    capture = cv2.VideoCapture(opencv_path(file), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         capture.release()
         raise InputError(f"{what}cannot be opened: broken, cut off or no video")

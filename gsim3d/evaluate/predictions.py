@@ -20,6 +20,7 @@ from gsim3d.data import Scene
 from gsim3d.data.images import IMAGE_SUFFIXES, as_color, read_image
 from gsim3d.data.recording import Problems
 from gsim3d.errors import InputError
+from gsim3d.files import opencv_path
 
 VIDEOS = (".mp4", ".webm", ".mov", ".mkv", ".avi")
 RESERVED = ("model", "constant", "copy", "constant_velocity", "release_constant", "perfect_ground", "perfect_body",
@@ -150,7 +151,7 @@ def _decode(video: Path, size: tuple[int, int], film: int) -> list[np.ndarray]:
     """All frames, RGB; of a video longer than the film, one frame more than the film has."""
     import cv2
 
-    capture = cv2.VideoCapture(str(video))
+    capture = cv2.VideoCapture(opencv_path(video))
     try:
         frames: list[np.ndarray] = []
         while len(frames) <= film:

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.errors import InputError
+from gsim3d.files import opencv_path
 from gsim3d.generate import writer
 from gsim3d.generate.render import BACKGROUND, BODY
 from gsim3d.generate.run import NEEDED, check_processes, each, require_engine, require_packages
@@ -159,7 +160,7 @@ def _truth(world: World, folder: Path) -> tuple[np.ndarray, np.ndarray]:
             row = []
             for cam in range(world.n_cams):
                 name = writer.FILE_TEMPLATE.format(cam_ix=cam, img_type=kind, n_step=step)
-                image = cv2.imread(str(folder / f"{name}.png"), flag)
+                image = cv2.imread(opencv_path(folder / f"{name}.png"), flag)
                 if image is None or image.shape[:2] != (world.image_size, world.image_size):
                     raise InputError(f"{folder / name}.png cannot be read as an image of {world.image_size} pixels")
                 row.append(image)

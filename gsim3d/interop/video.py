@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.errors import InputError
+from gsim3d.files import opencv_path
 
 
 def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
@@ -36,7 +37,8 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> N
     log_level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"vp09"), float(fps), (shape[1], shape[0]))
+        codec = cv2.VideoWriter_fourcc(*"vp09")
+        writer = cv2.VideoWriter(opencv_path(temporary), codec, float(fps), (shape[1], shape[0]))
         if not writer.isOpened():
             raise InputError(f"{path}: this OpenCV cannot write VP9 video here (folder missing or codec not built in)")
         for frame in frames:

@@ -1,5 +1,8 @@
 """Videos by the times in them: variable rates, edit lists, late starts, longer sound, turned, without a duration."""
 
+import os
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -7,6 +10,7 @@ import pytest
 from gsim3d.data import Scene
 from gsim3d.data.check import check_scene, describe
 from gsim3d.errors import InputError
+from gsim3d.interop import write_video
 from tests.data.made_videos import (
     N_FRAMES,
     RATE,
@@ -189,3 +193,14 @@ def test_time_stamps_that_stand_still_are_none(tmp_path):
     edit_boxes(file, {b"stts": lambda old: old[:-4] + bytes(4)})
     with pytest.raises(InputError, match=r"a.mp4 \(camera a\) (has no usable time stamps|is uneven|cannot be decoded)"):
         Scene.open(write_scene(tmp_path, ["a"]))
+
+
+def test_a_path_that_is_not_utf8_is_refused(tmp_path):
+    """OpenCV ends the process there."""
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff"))
+    folder.mkdir()
+    write_plain(tmp_path / "a.mp4").rename(folder / "a.mp4")
+    with pytest.raises(InputError, match="not UTF-8"):
+        Scene.open(write_scene(folder, ["a"]))
+    with pytest.raises(InputError, match="not UTF-8"):
+        write_video(folder / "b.mp4", [np.zeros((48, 64, 3), np.uint8)], 20)
