@@ -81,6 +81,12 @@ def _command(arguments: list[str]) -> int:
     except OSError as error:  # a full disk names no file
         place = error.filename or getattr(args, "out", None)
         return _fail(f"{place}: {error.strerror}" if place and error.strerror else str(error))
+    except (RuntimeError, MemoryError) as error:
+        from gsim3d.graphs import has_no_room
+
+        if not has_no_room(error):
+            raise
+        return _fail(f"out of memory: {str(error).splitlines()[0][:200] if str(error) else type(error).__name__}")
     except KeyboardInterrupt:
         print("gsim3d: interrupted", file=sys.stderr)
         return 130

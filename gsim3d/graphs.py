@@ -37,7 +37,8 @@ from gsim3d.stability import StabilityReport, pack
 from gsim3d.types import DYNAMIC, Cameras, CloudTable, Particles, keeping_constants
 
 FACTOR = 1.25  # room over what was observed
-NO_ROOM = "out of memory", "aten::new_empty"  # what errors for it say: torch's, and those of ops, which say no more
+# What errors for it say: torch's, and those of ops, which say no more.
+NO_ROOM = "out of memory", "DefaultCPUAllocator", "STATUS_ALLOC_FAILED", "aten::new_empty"
 
 
 class Captured:

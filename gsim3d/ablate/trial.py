@@ -17,7 +17,7 @@ from gsim3d.evaluate.protocol import score_scene
 from gsim3d.evaluate.report import summarize, write_json
 from gsim3d.files import MAX_TEXT, read_file
 from gsim3d.train.config import TrainConfig
-from gsim3d.train.log import LOG
+from gsim3d.train.log import LOG, read_entry
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import restore
 from gsim3d.train.samples import context_cameras, spread_views
@@ -108,6 +108,6 @@ def _read(file: Path) -> dict:
 def _step_seconds(run: Path, config: TrainConfig) -> float | None:
     """Of an optimizer step: the median of those logged in the last stage."""
     first = config.n_steps - config.stages[-1].steps
-    entries = [json.loads(line) for line in (run / LOG).read_text().splitlines()]
+    entries = filter(None, map(read_entry, (run / LOG).read_bytes().splitlines()))
     spent = [entry["machine"]["step_seconds"] for entry in entries if entry["step"] >= first]
     return statistics.median(spent) if spent else None

@@ -70,8 +70,9 @@ def read_log(file: Path) -> Training | None:
             values = [_number(entry.get(f"{name}_psnr")) for name in ("past", "future")]
             if any(map(math.isfinite, values)):
                 rows.append((int(entry["step"]), float(entry["machine"]["seconds"]) / 3600, *values))
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{file}: not the log of a training: {error!r}") from None
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        said = f"{type(error).__name__}: {str(error)[:100]}"
+        raise InputError(f"{file}: not the log of a training: {said}") from None
     if not rows:
         return None
     steps, hours, past, future = zip(*sorted(rows), strict=True)

@@ -80,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
         Path(args.cache).mkdir(parents=True, exist_ok=True)  # a folder that cannot be is told before work begins
     scenes = [Scene.open(folder, cache_dir=args.cache, fitting=config.data.fitting) for folder in folders]
 
+    from gsim3d.graphs import has_no_room
     from gsim3d.locks import only_one_writer
     from gsim3d.train.loop import Trainer
     from gsim3d.train.processes import joined
@@ -92,7 +93,16 @@ def run(args: argparse.Namespace) -> int:
         if trainer.step:
             came = "" if trainer.same_scenes else "; scenes have come since, so the curve is another one from here on"
             say(f"going on from step {trainer.step} of {config.n_steps}{came}")
-        trainer.run(until=args.until, tensorboard=args.tensorboard, profile=args.profile)
+        try:
+            trainer.run(until=args.until, tensorboard=args.tensorboard, profile=args.profile)
+        except (RuntimeError, MemoryError) as error:
+            if not has_no_room(error):
+                raise
+            raise InputError(
+                f"step {trainer.step}: out of memory ({args.device}): a smaller batch or fewer target_views, larger "
+                f"strides of data, or recompute: [encoder, steps, images] need less; {args.out} goes on from its last "
+                "checkpoint"
+            ) from None
         say(f"trained to step {trainer.step} of {config.n_steps}: {args.out}")
         if args.export and processes.is_first:
             checkpoint.export(checkpoint.load(args.out), made_around(Path(args.export)))

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import InputError
+from gsim3d.plain import is_number
 
 LOG, BOARD = "metrics.jsonl", "tensorboard"
 VIDEO_MS = 80  # that a frame of a sample video is shown
@@ -36,11 +37,11 @@ class Log:
     def cut(self, step: int) -> None:
         """Drops what was logged from ``step`` on: those steps will be repeated."""
         if self.writes and self.file.exists():
-            lines = self.file.read_text().splitlines()
+            lines = self.file.read_bytes().splitlines()
             kept = [line for line in lines if _step_of(line) < step]
             if kept != lines:
                 part = self.file.with_name(f".{self.file.name}.part")
-                part.write_text("".join(line + "\n" for line in kept))
+                part.write_bytes(b"".join(line + b"\n" for line in kept))
                 os.replace(part, self.file)
 
     @contextmanager
@@ -139,8 +140,15 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _step_of(line: str) -> float:
+def read_entry(line: bytes) -> dict[str, Any] | None:
+    """A line of a log, or None: of a killed process the last one may be cut, and a disk may have changed others."""
     try:
-        return json.loads(line)["step"]
-    except (ValueError, KeyError, TypeError):
-        return math.inf  # the last line of a killed process
+        entry = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return entry if isinstance(entry, dict) and is_number(entry.get("step"), int) else None
+
+
+def _step_of(line: bytes) -> float:
+    entry = read_entry(line)
+    return math.inf if entry is None else entry["step"]

@@ -6,7 +6,6 @@ runs fill the gaps.
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import threading
@@ -19,7 +18,7 @@ from typing import Any
 import torch
 
 from gsim3d.errors import InputError
-from gsim3d.train.log import LOG
+from gsim3d.train.log import LOG, read_entry
 
 TELL_EVERY = 20.0  # seconds
 
@@ -94,8 +93,8 @@ def _work(sender: Connection, place: int, n_threads: int, function: Callable, ar
 def last_entry(run: Path) -> dict:
     """What a run folder's log says last; empty where it says nothing."""
     try:
-        return json.loads((run / LOG).read_text().splitlines()[-1])
-    except (OSError, IndexError, ValueError):  # a line may be half written
+        return read_entry((run / LOG).read_bytes().splitlines()[-1]) or {}
+    except (OSError, IndexError):
         return {}
 
 

@@ -53,6 +53,22 @@ def test_a_file_that_is_no_log_is_told(tmp_path):
             budget.read_log(tmp_path / "metrics.jsonl")
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"\xff" * 5000,
+        b'{"past_psnr": 1.0, "step": 1e999, "machine": {"seconds": 1}}',
+        b"[" * 50_000,
+        b'{"past_psnr": 1.0, "step": "' + b"x" * 5000 + b'", "machine": {}}',
+    ],
+)
+def test_a_log_of_anything_is_told_in_one_short_line(tmp_path, line):
+    (tmp_path / "metrics.jsonl").write_bytes(line + b"\n")
+    with pytest.raises(InputError, match="not the log of a training") as error:
+        budget.read_log(tmp_path / "metrics.jsonl")
+    assert len(str(error.value)) < 250 + len(str(tmp_path))
+
+
 def test_where_a_log_lies(tmp_path):
     checkpoints = tmp_path / "run" / "checkpoints"
     for step in (100, 200, 300):

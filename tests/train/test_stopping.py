@@ -77,6 +77,53 @@ def test_the_command_ends_with_the_code_of_the_signal(folder, tmp_path, monkeypa
     assert capsys.readouterr().err.splitlines()[-1].startswith("gsim3d: error: SIGTERM: step 2 of 6 is saved in ")
 
 
+NO_ROOM = {
+    "gpu": torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 3 GiB.\nmore lines"),
+    "cpu": RuntimeError("[enforce fail at alloc_cpu.cpp:126] DefaultCPUAllocator: can't allocate memory: you tried"),
+    "cublas": RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
+    "python": MemoryError(),
+}
+
+
+@pytest.mark.parametrize("name", NO_ROOM)
+@pytest.mark.parametrize("place", ["train_step", "__init__"])
+def test_without_memory_the_command_ends_with_one_line(folder, tmp_path, monkeypatch, capsys, name, place):
+    def full(*_, **__):
+        raise NO_ROOM[name]
+
+    config = tmp_path / "train.yaml"
+    config.write_text(yaml.safe_dump(to_dict(CONFIG)))
+    monkeypatch.setattr(Trainer, place, full)
+    command = ["train", str(config), "--data", str(folder), "--out", str(tmp_path / "run")]
+    assert __main__.main(command) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said.startswith("gsim3d: error: ") and "out of memory" in said and len(said) < 500
+    assert ("step 0: " in said and "smaller batch" in said) == (place == "train_step")
+
+
+def test_other_errors_of_torch_are_not_hidden(monkeypatch):
+    module = type(sys)("broken")
+    module.add_arguments, module.run = lambda parser: None, lambda args: torch.zeros(2) @ torch.zeros(3)
+    monkeypatch.setitem(sys.modules, "broken", module)
+    monkeypatch.setitem(__main__.COMMANDS, "broken", ("broken", ""))
+    with pytest.raises(RuntimeError, match="inconsistent tensor size"):
+        __main__.main(["broken"])
+
+
+def test_a_log_with_lines_that_are_none_is_cut_all_the_same(folder, tmp_path):
+    trainer = Trainer(CONFIG, scenes(folder), tmp_path)
+    trainer.run(until=3, progress=False)
+    log = tmp_path / "metrics.jsonl"
+    first, second, third = log.read_bytes().splitlines(keepends=True)
+    deep = b"[" * 100_000
+    for wrong in (b"\xff\xfe\x00", b"[1]", b'{"step": "two"}', b'{"step": NaN}', deep, b'"text"', b""):
+        log.write_bytes(first + wrong + b"\n" + second + third + b'{"step": 3')
+        trainer = Trainer(CONFIG, scenes(folder), tmp_path)
+        assert log.read_bytes() == first + second + third
+    trainer.run(progress=False)
+    assert [line["step"] for line in curve(tmp_path)] == list(range(6))
+
+
 def endless(out: str, folder: str = "") -> int:
     """A run that ends if another process, its launcher or a signal ends it; with a folder it trains."""
     liveness.INTERVAL, liveness.SILENCE, liveness.GRACE = 0.1, 2.0, 20.0 if folder else 0.5
