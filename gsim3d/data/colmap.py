@@ -36,6 +36,7 @@ MODELS = (  # in the order of their numbers in binary files
     ("THIN_PRISM_FISHEYE", ""), ("RAD_TAN_THIN_PRISM_FISHEYE", ""),
 )  # fmt: skip
 MAX_LINE, MAX_PATH = 1 << 25, 4096  # bytes of a line of text, and of the name of an image
+MAX_ENTRIES = 100_000
 MAX_POINTS, FEW_POINTS = 3_000_000, 20_000  # read, and projected
 MIN_SEEN = 8  # points; cameras that see fewer say nothing of depths
 QUANTILES, MARGINS = (0.01, 0.99), (0.8, 1.2)  # of the depths of points
@@ -52,9 +53,9 @@ def read(folder: Path, problems: Problems) -> Recording:
     settings = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
     fps = positive(settings.get("fps"), f"{folder / SETTINGS}: fps", problems)
     source = _file(model, "images")
-    cameras = dict(_cameras(_file(model, "cameras")))
+    cameras = dict(_bounded(_cameras(_file(model, "cameras")), model))
     frames = []
-    for name, camera, quaternion, translation in _images(source):
+    for name, camera, quaternion, translation in _bounded(_images(source), model):
         if camera not in cameras:
             raise InputError(f"{source}: image {name} is of camera {camera}, which is not in {_file(model, 'cameras')}")
         pose = inverse(_viewmat(quaternion, translation, f"{source}: image {name}")) @ OPENGL
@@ -89,6 +90,13 @@ def _model_of(folder: Path) -> Path | None:
 
 def _file(model: Path, kind: str) -> Path | None:
     return next((file for suffix in (".bin", ".txt") if (file := model / f"{kind}{suffix}").is_file()), None)
+
+
+def _bounded(entries: Iterator[tuple], model: Path) -> Iterator[tuple]:
+    for number, entry in enumerate(entries):
+        if number == MAX_ENTRIES:
+            raise InputError(f"{model} has more than {MAX_ENTRIES} images or cameras")
+        yield entry
 
 
 def _viewmat(quaternion: tuple, translation: tuple, what: str) -> np.ndarray:

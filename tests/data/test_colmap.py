@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsim3d.data import Scene, find_scenes
+from gsim3d.data import Scene, colmap, find_scenes
 from gsim3d.data.check import check_scene, describe
 from gsim3d.data.colmap import MODELS
 from gsim3d.errors import InputError
@@ -206,6 +206,15 @@ def test_text_that_is_damaged(tmp_path, kind):
     with pytest.raises(InputError, match=message):
         Scene.open(tmp_path)
     assert check_scene(tmp_path).problems
+
+
+def test_models_of_any_number_of_images_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(colmap, "MAX_ENTRIES", 3)
+    folder = write_colmap(tmp_path, make_scene(n_steps=1))
+    assert Scene.open(folder).n_cams == 3
+    write_colmap(tmp_path, make_scene(n_steps=1, n_cams=4))
+    with pytest.raises(InputError, match="more than 3 images or cameras"):
+        Scene.open(folder)
 
 
 def test_a_quaternion_has_length_one(tmp_path):
