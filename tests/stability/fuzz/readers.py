@@ -145,6 +145,8 @@ def _sign(folder: Path) -> None:
         state = json.loads((folder / "state.json").read_text())
         for name in state["sha256"]:
             state["sha256"][name] = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        state.pop(checkpoint.OWN_HASH)
+        state[checkpoint.OWN_HASH] = checkpoint.hash_of_state(state)
         (folder / "state.json").write_text(json.dumps(state))
 
 
