@@ -17,10 +17,10 @@ import numpy as np
 from torch import Tensor
 
 from gsim3d.data import Scene
-from gsim3d.data.images import IMAGE_SUFFIXES, as_color, read_image
+from gsim3d.data.images import IMAGE_SUFFIXES, as_color, read_files
 from gsim3d.data.recording import Problems
+from gsim3d.data.videos import Video
 from gsim3d.errors import InputError
-from gsim3d.files import opencv_path
 
 VIDEOS = (".mp4", ".webm", ".mov", ".mkv", ".avi")
 RESERVED = ("model", "constant", "copy", "constant_velocity", "release_constant", "perfect_ground", "perfect_body",
@@ -98,8 +98,11 @@ def _view(
     found = _find(place, steps)
     if isinstance(found, Path):
         return _from_video(found, size, film, n_encoded, n_future)
-    named = [(file, f"predicted step {step}") for file, step in zip(found, steps, strict=True)]
-    return [as_color(read_image(file, size, what, problems), file, what, problems) for file, what in named]
+    named = ((file, f"predicted step {step}") for file, step in zip(found, steps, strict=True))
+    frames = list(read_files(named, size, as_color, problems))
+    if max(int(frame.max()) for frame in frames) == 1:
+        raise InputError(f"{place}: colours are 0 and 1 of 255, as of images in [0, 1] that were saved unscaled")
+    return frames
 
 
 def _find(place: Path, steps: range) -> Path | list[Path]:
@@ -129,41 +132,20 @@ def _frames(folder: Path, steps: range) -> list[Path]:
     return [files[step] for step in steps]
 
 
-def _from_video(video: Path, size: tuple[int, int], film: int, n_encoded: int, n_future: int) -> list[np.ndarray]:
-    frames = _decode(video, size, film)
-    last = n_encoded + n_future
+def _from_video(file: Path, size: tuple[int, int], film: int, n_encoded: int, n_future: int) -> list[np.ndarray]:
+    problems = Problems()
+    video = Video(file, file.stem, size, problems)
+    n_frames, last = len(video.numbers), n_encoded + n_future
+    if video.rate is None and n_frames > 2:
+        raise InputError(f"{file}: {video.unevenness}; write its frames at an even rate, or as images")
     first = {film: 0, film - n_encoded: n_encoded, last: 0, n_future: n_encoded}
-    if len(frames) not in first:
+    if n_frames not in first:
         raise InputError(
-            f"{video} has {'more than ' if len(frames) > film else ''}{min(len(frames), film)} frames; to compare the "
+            f"{file} has {'more than ' if n_frames > film else ''}{min(n_frames, film)} frames; to compare the "
             f"{n_future} steps after the {n_encoded} given ones, it must have {last} (or the film's {film}), or "
             f"without the given ones {n_future} (or {film - n_encoded})"
         )
-    if len(frames) == film - n_encoded == last:
-        raise InputError(
-            f"{video} has {len(frames)} frames: is the first one step 0 or {n_encoded}? Use frames instead"
-        )
-    start = n_encoded - first[len(frames)]
-    return frames[start : start + n_future]
-
-
-def _decode(video: Path, size: tuple[int, int], film: int) -> list[np.ndarray]:
-    """All frames, RGB; of a video longer than the film, one frame more than the film has."""
-    import cv2
-
-    capture = cv2.VideoCapture(opencv_path(video))
-    try:
-        frames: list[np.ndarray] = []
-        while len(frames) <= film:
-            more, frame = capture.read()
-            if not more:
-                break
-            if frame.shape[1::-1] != size:
-                found = f"{frame.shape[1]}x{frame.shape[0]}"
-                raise InputError(f"{video} has {found} pixels, its camera {size[0]}x{size[1]}: resize it")
-            frames.append(frame[..., ::-1])
-    finally:
-        capture.release()
-    if not frames:
-        raise InputError(f"{video} cannot be decoded")
-    return frames
+    if n_frames == film - n_encoded == last:
+        raise InputError(f"{file} has {n_frames} frames: is the first one step 0 or {n_encoded}? Use frames instead")
+    start = n_encoded - first[n_frames]
+    return list(video.read(range(start, start + n_future), problems))

@@ -14,6 +14,7 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.interop import write_video
+from tests.data.made_videos import with_gaps, write_plain
 from tests.data.test_films import write_odd_films
 from tests.tiny_scenes import write_scenes
 
@@ -150,6 +151,62 @@ def broken_video(place):
     (place / "cam_1.mp4").write_bytes(b"no video")
 
 
+def uneven_video(place):
+    remove_camera(place)
+    with_gaps(write_plain(place / "cam_1.mp4", 4, size=(32, 32)), [40, 400, 40])
+
+
+def cut_video(place):
+    remove_camera(place)
+    data = write_plain(place / "cam_1.mp4", 6, size=(32, 32)).read_bytes()
+    (place / "cam_1.mp4").write_bytes(data[: len(data) // 2])
+
+
+def float_tiff(place):
+    (place / "cam_1" / "frame4.png").unlink()
+    cv2.imwrite(str(place / "cam_1" / "frame4.tif"), np.full((32, 32, 3), 0.5, np.float32))
+
+
+def unscaled_steps(place):
+    for file in (place / "cam_1").iterdir():
+        cv2.imwrite(str(file), np.arange(32 * 32 * 3).reshape(32, 32, 3).astype(np.uint8) % 2)
+
+
+def endless_png(place):
+    file = place / "cam_1" / "frame4.png"
+    data = bytearray(file.read_bytes())
+    data[16:20] = (2**31 - 1).to_bytes(4, "big")
+    file.write_bytes(data)
+
+
+def cut_png(place):
+    file = place / "cam_1" / "frame4.png"
+    file.write_bytes(file.read_bytes()[:-20])
+
+
+def folder_as_step(place):
+    (place / "cam_1" / "frame4.png").unlink()
+    (place / "cam_1" / "frame4.png").mkdir()
+
+
+def two_dozen_digits(place):
+    (place / "cam_1" / "frame4.png").rename(place / "cam_1" / ("frame" + "4" * 200 + ".png"))
+
+
+def test_sixteen_bits_and_alpha_are_read_as_those_of_films(data, folder):
+    place = folder / "ball" / "0000" / "cam_1"
+    before = Predictions.open(str(folder), data).images(scene_of(data), [1], GIVEN, 4)
+    for number, file in enumerate(sorted(place.iterdir())):
+        image = cv2.imread(str(file))
+        if number % 2:
+            cv2.imwrite(str(file), image.astype(np.uint16) * 257)
+        else:
+            noise = np.full_like(image, 200)
+            hidden = (image.max(-1) == 0)[..., None]
+            cv2.imwrite(str(file), np.concatenate([np.where(hidden, noise, image), 255 * ~hidden], 2).astype(np.uint8))
+    assert torch.equal(Predictions.open(str(folder), data).images(scene_of(data), [1], GIVEN, 4), before)
+
+
 @pytest.mark.parametrize(
     "damage, message",
     [
@@ -161,8 +218,16 @@ def broken_video(place):
         (break_step, r"frame4.png .*cannot be decoded"),
         (short_video, r"cam_1.mp4 has 3 frames; .* must have 6 .* or without the given ones 4"),
         (long_video, r"cam_1.mp4 has more than 6 frames"),
-        (large_video, r"cam_1.mp4 has 34x32 pixels, its camera 32x32: resize it"),
-        (broken_video, r"cam_1.mp4 cannot be decoded"),
+        (large_video, r"cam_1.mp4 .*has 34x32 pixels, its camera 32x32"),
+        (uneven_video, r"cam_1.mp4: its 4 frames are 40 to 400 ms apart"),
+        (cut_video, r"cam_1.mp4 .*cannot be (opened|decoded)"),
+        (float_tiff, r"frame4.tif .*must have 8 or 16 bits a channel; got float32"),
+        (unscaled_steps, r"cam_1: colours are 0 and 1 of 255"),
+        (endless_png, r"frame4.png .*has 2147483647x32 pixels, its camera 32x32"),
+        (cut_png, r"frame4.png .*cannot be decoded"),
+        (folder_as_step, r"frame4.png .*is missing"),
+        (two_dozen_digits, r"cam_1: step 4 is missing"),
+        (broken_video, r"cam_1.mp4 .*cannot be opened: broken, cut off or no video"),
     ],
 )
 def test_what_does_not_fit_is_named(data, folder, damage, message, capfd):
