@@ -207,6 +207,7 @@ class StabilityReport:
         self._found: dict[tuple, Finding] = {}
         self._total, self._raised = 0, 0
         self._errors: list[Finding] = []
+        self._first_error: Finding | None = None
         self._sentinels: dict[tuple[int, int], Sentinels] = {}
         self._unsent: list[_Record] = []
         self._stream: torch.cuda.Stream | None = None  # that computes what is unsent
@@ -227,13 +228,14 @@ class StabilityReport:
         place += (finding.scene, finding.step, finding.camera)
         with self._lock:
             self._total += finding.count
+            if finding.action == "error":
+                self._errors.append(finding)  # of this call alone, whose rows its message counts
+                self._first_error = self._first_error or finding
             known = self._found.get(place)
             if known is not None:
                 finding = Finding(*place[:4], known.count + finding.count, known.row, *place[4:])
             if known is not None or len(self._found) < MAX_FINDINGS:
                 self._found[place] = finding
-            if finding.action == "error":
-                self._errors.append(finding)
 
     def record(
         self,
@@ -365,10 +367,10 @@ class StabilityReport:
         Raises:
             HardCaseError: naming scene, step, row or camera and tensor, and what to do.
         """
-        for finding in self.findings:
-            if finding.action == "error":
-                self._errors = []
-                raise finding.error()
+        self._collect(wait=True)
+        if self._first_error is not None:
+            self._errors = []
+            raise self._first_error.error()
 
     @property
     def findings(self) -> tuple[Finding, ...]:

@@ -12,8 +12,8 @@ from gsim3d import presets
 from gsim3d.dynamics import last_steps
 from gsim3d.errors import HardCaseError, InputError
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.stability import Reading, Sentinels, StabilityConfig, StabilityReport, _Record, pack
-from gsim3d.types import ASLEEP
+from gsim3d.stability import Finding, Reading, Sentinels, StabilityConfig, StabilityReport, _Record, pack
+from gsim3d.types import ASLEEP, Cameras
 from tests.asserts import assert_same_bits
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
 
@@ -485,3 +485,32 @@ def test_one_bad_gaussian_in_one_camera_is_named():
     with pytest.raises(HardCaseError, match=r"opacities: outside \[0, 1\] at row 1 \(camera 0\)") as caught:
         rasterize_gaussians(*arguments, cameras, colors=torch.ones(n, 3))
     assert (caught.value.camera, caught.value.row) == (0, 1)
+
+
+def test_an_error_counts_the_rows_of_its_own_call():
+    """One report of several calls: what earlier ones found is neither in the message nor in its count."""
+    report, finding = StabilityReport(), Finding("not finite", "rollout", "means", "error", 1, row=4, scene=0, step=2)
+    for row, count in ((4, 1), (7, 1), (1, 3), (4, 1)):
+        report.add(dataclasses.replace(finding, row=row, count=count))
+        with pytest.raises(HardCaseError) as error:
+            report.poll()
+        more = f" and {count - 1} more" if count > 1 else ""
+        assert str(error.value).startswith(f"rollout: means: not finite at row {row} (scene 0, step 2){more};")
+        assert error.value.row == row
+    assert [found.count for found in report.findings] == [6] and report.total == 6
+    for _ in range(2):
+        with pytest.raises(HardCaseError, match=r"at row 4 \(scene 0, step 2\);"):
+            report.check()
+    report.clear()
+    report.check()
+
+
+@pytest.mark.parametrize("calls", [1, 3])
+def test_every_call_of_an_op_says_how_many_rows_are_bad(calls):
+    report, bad = StabilityReport(), torch.tensor([[0.0, 0, 3], [torch.nan, 0, 4], [0, torch.inf, 4]])
+    K = torch.tensor([[[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]])
+    cameras = Cameras(torch.eye(4)[None], K, torch.ones(1), torch.full((1,), 9.0), torch.tensor([0]), 64, 48)
+    arguments = (torch.tensor([[1.0, 0, 0, 0]] * 3), torch.full((3, 3), 0.2), torch.full((3,), 0.9), cameras)
+    for _ in range(calls):
+        with pytest.raises(HardCaseError, match="at row 1 .* and 1 more;"):
+            rasterize_gaussians(bad, *arguments, colors=torch.eye(3), report=report)
