@@ -32,6 +32,17 @@ def check_tensors(op: str, **tensors: Any) -> None:
             raise TypeError(f"{op}: {name} is on {value.device}, but {first[0]} on {first[1]}")
 
 
+def check_floating(op: str, **first: Tensor) -> None:
+    """Raises ValueError, naming the argument whose dtype all others follow, unless it is float32 or float64.
+
+    On a GPU, where some ops take half precision, and under autocast, which casts, the op itself looks.
+    """
+    for name, value in first.items():
+        on_cpu = value.device.type == "cpu" and not torch.is_autocast_enabled("cpu")
+        if on_cpu and value.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"{op}: {name} must be float32 or float64; got {str(value.dtype).removeprefix('torch.')}")
+
+
 def check_numbers(op: str, **tensors: Tensor | None) -> None:
     """Raises HardCaseError, naming the argument and its row, where a number is not finite or too large.
 

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from gsim3d.errors import HardCaseError
 from gsim3d.ops import _load  # noqa: F401
-from gsim3d.ops._arguments import check_numbers, check_tensors
+from gsim3d.ops._arguments import check_floating, check_numbers, check_tensors
 from gsim3d.ops._gradients import register_gradients
 
 
@@ -129,6 +129,7 @@ def plane_sweep(
     if check:
         geometry = {"homographies": homographies, "translations": translations, "inverse_depths": inverse_depths}
         check_tensors("plane_sweep", features=features, **geometry, src_images=src_images, cu_src=cu_src)
+        check_floating("plane_sweep", features=features)
         check_numbers("plane_sweep", features=features)
     return torch.ops.gsim3d.plane_sweep(features, homographies, translations, inverse_depths, src_images, cu_src)
 

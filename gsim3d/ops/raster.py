@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
-from gsim3d.ops._arguments import check_real, check_tensors, check_whole, within_memory
+from gsim3d.ops._arguments import check_floating, check_real, check_tensors, check_whole, within_memory
 from gsim3d.ops._gradients import register_gradients
 from gsim3d.stability import Finding, OnBad, Reading, StabilityReport, check_on_bad
 from gsim3d.types import Cameras
@@ -218,6 +218,7 @@ def _check_arguments(rows: dict[str, Tensor], optional: dict[str, Tensor], camer
         raise TypeError(f"rasterize_gaussians: cameras must be gsim3d.Cameras; got {type(cameras).__name__}")
     of_cameras = {f"cameras.{name}": getattr(cameras, name) for name in ("viewmats", "Ks", "image_cloud")}
     check_tensors("rasterize_gaussians", **rows, **optional, **of_cameras)
+    check_floating("rasterize_gaussians", means=rows["means"])
     check_whole("rasterize_gaussians", **{f"cameras.{name}": getattr(cameras, name) for name in ("width", "height")})
     check_real("rasterize_gaussians", near_plane=near_plane)
     shapes = {"means": "[N, 3]", "cameras.viewmats": "[I, 4, 4]", "cameras.Ks": "[I, 3, 3]", "cu_rows": "[Q + 1]"}

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops import _load  # noqa: F401
-from gsim3d.ops._arguments import check_numbers, check_real, check_tensors
+from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_tensors
 from gsim3d.ops._gradients import register_gradients
 
 
@@ -44,6 +44,7 @@ def row_norm(
     if check:
         tensors = {"x": x, "weight": weight, "bias": bias} | ({} if residual is None else {"residual": residual})
         check_tensors("row_norm", **tensors)
+        check_floating("row_norm", x=x)
         check_real("row_norm", eps=eps)
         check_numbers("row_norm", **tensors)
     dtype = x.dtype if residual is None else residual.dtype
@@ -92,6 +93,7 @@ def residual_norm(
                 raise TypeError(f"residual_norm: {name} must be a pair (weight, bias); got {type(pair).__name__}")
             tensors |= {} if pair is None else {f"{name}[0]": pair[0], f"{name}[1]": pair[1]}
         check_tensors("residual_norm", **tensors)
+        check_floating("residual_norm", x=x)
         check_real("residual_norm", eps=eps)
         check_numbers("residual_norm", **tensors)
     weights = *(branch_norm or (None, None)), *(norm or (None, None))
