@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import zlib
 from functools import cache
 from importlib.util import find_spec
@@ -11,12 +12,12 @@ import numpy as np
 
 from gsim3d.errors import InputError
 from gsim3d.generate import meshes, shapes
+from gsim3d.generate.mesh_files import SUFFIXES
 
 ASSETS = Path(__file__).parent / "assets"
 MESH_BODIES = {"spot": ASSETS / "spot.obj"}
 OBJECTS = (*shapes.SHAPES, *MESH_BODIES)
 GENESIS = "genesis:"  # begins names of meshes of the package genesis-world
-MESH_SUFFIXES = (".glb", ".obj", ".ply", ".stl")
 
 # Friction and bounce of rigid bodies whose properties are functions of their names.
 CONTACTS = {
@@ -48,34 +49,47 @@ def _mesh_body(name: str) -> shapes.Body:
     return meshes.load_body(MESH_BODIES[name])
 
 
-def mesh_file(text: str, up: str = "y") -> str:
-    """The path of a mesh: ``text`` itself, or the file that ``genesis:NAME`` means.
+def mesh_name(text: str) -> str:
+    """Name of the body whose mesh is ``text``: a file, or ``genesis:NAME``."""
+    return text.removeprefix(GENESIS) if text.startswith(GENESIS) else Path(text).stem
 
-    That is the first closed mesh in the folder NAME of the meshes of an installed genesis-world, else NAME beside these
-    folders. The package is not imported.
 
-    Raises: InputError when there is none.
-    """
-    if not text.startswith(GENESIS):
-        return text
+def load_mesh(text: str, up: str = "y") -> shapes.Body:
+    """The body of a mesh file, or of a mesh of an installed genesis-world, ``genesis:NAME``, whose holes are filled."""
+    return _genesis_body(_genesis_folder(text), text, up)[1] if text.startswith(GENESIS) else meshes.load_body(text, up)
+
+
+def mesh_bytes(text: str, up: str = "y") -> bytes:
+    """What decides the shape of :func:`load_mesh`: the content of its file."""
+    file = _genesis_body(_genesis_folder(text), text, up)[0] if text.startswith(GENESIS) else Path(text)
+    return file.read_bytes()
+
+
+def _genesis_folder(text: str) -> Path:
+    """The meshes of genesis-world, which is not imported.   Raises: InputError when it is not installed."""
     spec = find_spec("genesis")
-    folders = [Path(place) / "assets" / "meshes" for place in (spec and spec.submodule_search_locations) or ()]
-    folder = next((folder for folder in folders if folder.is_dir()), None)
-    if folder is None:
-        raise InputError(
-            f"mesh {text} is a file of the package genesis-world, which is not installed: "
-            "pip install --no-deps genesis-world==1.4.5 (84 MB; nothing of it is executed)"
-        )
-    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in MESH_SUFFIXES)
-    names = {file: file.relative_to(folder).parts[0].removesuffix(file.suffix) for file in files}
-    chosen = [file for file in files if names[file] == text.removeprefix(GENESIS)]
-    if not chosen:
-        raise InputError(f"mesh {text} does not exist; choose from {', '.join(sorted(set(names.values())))}")
-    problems = []
-    for file in sorted(chosen, key=lambda file: -len(file.parts)):
+    for place in (spec and spec.submodule_search_locations) or ():
+        if (folder := Path(place) / "assets" / "meshes").is_dir():
+            return folder
+    raise InputError(
+        f"mesh {text} is a file of the package genesis-world, which is not installed: "
+        "pip install --no-deps genesis-world==1.4.5 (84 MB; nothing of it is executed)"
+    )
+
+
+@cache
+def _genesis_body(folder: Path, text: str, up: str) -> tuple[Path, shapes.Body]:
+    """The first mesh that can be read in the subfolder that ``text`` names, else beside the subfolders."""
+    names: dict[str, list[Path]] = {}
+    for file in sorted(folder.rglob("*"), key=lambda file: (-len(file.parts), file)):
+        if file.suffix.lower() in SUFFIXES:
+            names.setdefault(file.relative_to(folder).parts[0].removesuffix(file.suffix), []).append(file)
+    name, problems = mesh_name(text), []
+    if name not in names:
+        raise InputError(f"mesh {text} does not exist; choose from {', '.join(sorted(names))}")
+    for file in names[name]:
         try:
-            meshes.load_body(file, up)
-            return str(file)
+            return file, dataclasses.replace(meshes.load_body(file, up, fill_holes=True), name=name)
         except InputError as problem:
             problems.append(str(problem))
     raise InputError(f"mesh {text}: {'; '.join(problems)}")

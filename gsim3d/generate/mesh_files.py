@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,6 +131,8 @@ def _read_obj(path: Path, data: bytes) -> list[Piece]:
     for name, found in faces.items():
         index = np.array(found, dtype=np.int64)  # [F, 3, 2]
         triangles = points[index[..., 0]]
+        if len(faces) == len(materials) == 1:
+            name = next(iter(materials))  # whatever it is called in the other file
         if name is not None and name not in materials:
             raise InputError(f"mesh {path}: material {name!r} stands in none of its material files: {libraries}")
         colour = materials.get(name)
@@ -177,6 +180,7 @@ def _read_mtl(path: Path, file: Path) -> dict[str, np.ndarray | None]:
     found, name = {}, None
     for line in read_file(file, MAX_MESH).decode(errors="surrogateescape").splitlines():
         key, _, rest = line.strip().partition(" ")
+        rest = re.split(r"(?:^|\s)#", rest)[0]
         key, words = key.lower(), rest.split()
         if key == "newmtl":
             name = rest.strip()

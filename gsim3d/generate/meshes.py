@@ -33,13 +33,14 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, limit: int) -> tuple[np.nda
     return merged[used], light.reshape(-1, 3)
 
 
-def load_body(path: str | Path, up: str = "y") -> Body:
-    """A body from a mesh file (:data:`gsim3d.generate.mesh_files.SUFFIXES`), all its objects together, with their textures and
+def load_body(path: str | Path, up: str = "y", *, fill_holes: bool = False) -> Body:
+    """A body from a mesh file (:data:`gsim3d.generate.mesh_files.SUFFIXES`), all its objects together, with textures and
     colours; a pattern where it has none.
 
     Args:
         path: mesh file; material files and textures that it names must lie beside it.
         up: "y" (usual for .obj and .glb) or "z", the axis that points up in the file.
+        fill_holes: close each border of the surface by a fan of triangles around its middle.
 
     Copies of a vertex along texture seams are merged by position; the surface must be closed then.
 
@@ -64,6 +65,8 @@ def load_body(path: str | Path, up: str = "y") -> Body:
     faces = label.reshape(-1, 3)
     proper = (faces != np.roll(faces, 1, axis=1)).all(1)
     faces, corners = faces[proper], corners[proper]
+    if fill_holes:
+        positions, faces, corners = _filled(positions, faces, corners)
     _, uses = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
     if not len(faces) or (uses % 2).any():
         raise InputError(
@@ -90,14 +93,36 @@ def _with_patterns(pieces: list[Piece], triangles: np.ndarray) -> list[Piece]:
     return found
 
 
+def _filled(positions: np.ndarray, faces: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Positions, faces and corners of a surface whose borders, chains of edges with one face, are closed by fans."""
+    sides = [[0, 1], [1, 2], [2, 0]]
+    edges, ends = faces[:, sides].reshape(-1, 2), corners[:, sides].reshape(-1, 2, corners.shape[2])
+    _, label, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    border = uses[label.reshape(-1)] == 1
+    edges, ends = edges[border], ends[border]
+    hole, middle = np.unique(_components(len(positions), edges)[edges[:, 0]], return_inverse=True)
+    count = np.maximum(np.bincount(middle, minlength=len(hole)), 1)[:, None]
+    middles = np.stack([np.bincount(middle, positions[edges[:, 0], k], len(hole)) for k in range(3)], 1) / count
+    fans = np.stack([edges[:, 1], edges[:, 0], len(positions) + middle], 1)
+    fan_corners = np.stack([ends[:, 1], ends[:, 0], ends.mean(1)], 1)
+    return (
+        np.concatenate([positions, middles]), np.concatenate([faces, fans]), np.concatenate([corners, fan_corners])
+    )  # fmt: skip
+
+
+def _components(n: int, cells: np.ndarray) -> np.ndarray:
+    """Of each of ``n`` vertices the lowest that ``cells`` [C, K], rows of vertices, connect with it."""
+    label, before = np.arange(n), None
+    while before is None or (label != before).any():
+        before = label.copy()
+        np.minimum.at(label, cells, label[cells].min(1)[:, None])
+        label = label[label]
+    return label
+
+
 def _turned_inwards(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """bool [F], faces of bodies that are turned inside out; cavities inside of a body stay as they are to it."""
-    label, before = np.arange(len(positions)), None
-    while before is None or (label != before).any():  # every vertex gets the lowest number of its body
-        before = label.copy()
-        np.minimum.at(label, faces, label[faces].min(1)[:, None])
-        label = label[label]
-    bodies, body = np.unique(label[faces[:, 0]], return_inverse=True)
+    bodies, body = np.unique(_components(len(positions), faces)[faces[:, 0]], return_inverse=True)
     corner, cross = _corner_and_cross(positions, faces)
     volume = np.bincount(body, (corner * cross).sum(1), len(bodies))
     inverted = volume.sum() < 0

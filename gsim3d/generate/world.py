@@ -12,14 +12,13 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects
 from gsim3d.errors import InputError, did_you_mean
-from gsim3d.generate import cameras, meshes, render, shapes, writer
-from gsim3d.generate.bodies import OBJECTS, name_rng, named_body
+from gsim3d.generate import cameras, render, shapes, writer
+from gsim3d.generate.bodies import OBJECTS, load_mesh, mesh_bytes, mesh_name, name_rng, named_body
 from gsim3d.generate.carriers import Carrier, grid_faces
 from gsim3d.generate.stage import (
     GRAVITY,
@@ -149,7 +148,7 @@ class World(ABC):
         if repeated or not names:
             raise InputError(f"objects and mesh files need names of their own; repeated: {repeated}, all: {names}")
         for path in self.meshes:
-            meshes.load_body(path, self.mesh_up)
+            load_mesh(path, self.mesh_up)
         self._check_ground()
 
     def _check_ground(self) -> None:
@@ -171,7 +170,7 @@ class World(ABC):
 
     def object_names(self) -> list[str]:
         """Names of objects and mesh files, in the order in which trajectories are dealt to them."""
-        return [*self.objects, *(Path(path).stem for path in self.meshes)]
+        return [*self.objects, *map(mesh_name, self.meshes)]
 
     def scenes(self) -> list[tuple[str, int]]:
         """(object, sample) of every trajectory: one of each object in turn."""
@@ -191,8 +190,8 @@ class World(ABC):
         text = json.dumps([writer.GENERATOR_VERSION, self.name, fields, name], sort_keys=True)
         digest = hashlib.sha256(text.encode())
         for path in self.meshes:
-            if others or Path(path).stem == name:
-                digest.update(Path(path).read_bytes())
+            if others or mesh_name(path) == name:
+                digest.update(mesh_bytes(path, self.mesh_up))
         return digest.hexdigest()
 
     def rig(self, scene: tuple[str, int] | None = None) -> cameras.Rig:
@@ -301,11 +300,11 @@ class World(ABC):
         return ground, cloth, actors
 
     def _draw_actor(self, name: str, floor: float, before: list[Actor], rng: np.random.Generator) -> Actor:
-        path = next((path for path in self.meshes if Path(path).stem == name), None)
+        path = next((path for path in self.meshes if mesh_name(path) == name), None)
         if path is None:
             body = named_body(name, name_rng(name) if self.by_name else rng)
         else:
-            body = meshes.load_body(path, self.mesh_up)
+            body = load_mesh(path, self.mesh_up)
         # Mesh files keep their feet down and turn about the vertical; bodies of the package have no top.
         rotation = _random_rotation(rng) if path is None else _turn(rng.uniform(0, 2 * np.pi))
         size = rng.uniform(*self.body_size)

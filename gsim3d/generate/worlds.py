@@ -292,8 +292,6 @@ def build_world(world: str, preset: str, changes: dict) -> World:
         raise InputError(f"world {world!r} has no option {unknown[0]!r}; it has {', '.join(sorted(known))}{hint}")
     chosen = {**PRESETS[preset][world], **_held_out(world, preset, changes.get("subset", TRAIN)), **changes}
     settings = WORLDS[world](**chosen)
-    files = tuple(bodies.mesh_file(path, settings.mesh_up) for path in settings.meshes)
-    settings = dataclasses.replace(settings, meshes=files)
     if not settings.ground and "n_frames" not in changes:
         settings = dataclasses.replace(settings, n_frames=int(_SECONDS_WITHOUT_GROUND * settings.fps))
     settings.check()

@@ -243,6 +243,16 @@ def test_textures_that_are_not_there_are_named(tmp_path):
         load_body(path)
 
 
+def test_remarks_in_material_files_and_another_name_of_the_only_material(tmp_path):
+    path = write(tmp_path, "mtllib skin.mtl\nusemtl exported\n" + vertices() + sides(1))
+    (tmp_path / "skin.mtl").write_text("newmtl skin # the one\nKd 0.25 0.5 1.000  # red, green, blue\n")
+    body = load_body(path)
+    np.testing.assert_allclose(body.paint(body.corners[0]), [[0.25, 0.5, 1.0]] * 3)
+    (tmp_path / "skin.mtl").write_text("newmtl skin\nKd 1 1 1\nnewmtl other\nKd 0 0 0\n")
+    with pytest.raises(InputError, match="material 'exported' stands in none of"):
+        load_body(path)
+
+
 def test_an_stl_with_colours_is_refused(tmp_path):
     data = bytearray(trimesh.exchange.stl.export_stl(box(0)))
     data[:80] = b"COLOR=" + struct.pack("4B", 255, 0, 0, 255) + bytes(70)

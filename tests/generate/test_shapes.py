@@ -107,24 +107,46 @@ def test_meshes_of_an_installed_genesis_are_found_without_importing_it(tmp_path,
     folder = tmp_path / "genesis" / "assets" / "meshes"
     (folder / "duck").mkdir(parents=True)
     (tmp_path / "genesis" / "__init__.py").write_text("raise RuntimeError('imported')")
-    (folder / "duck" / "duck.obj").write_text(CUBE.replace("f 4 5 8\n", "").replace("f 4 1 5\n", ""))  # open
+    (folder / "duck" / "body.obj").write_text(CUBE.replace("f 4 5 8\n", "").replace("f 4 1 5\n", ""))  # open
     (folder / "duck.obj").write_text(CUBE)
     (folder / "worm").mkdir()
-    (folder / "worm" / "worm.obj").write_text(CUBE)
+    (folder / "worm" / "worm.obj").write_text("mtllib absent.mtl\nusemtl skin\n" + CUBE)
+    (folder / "worm.obj").write_text(CUBE)
     (folder / "broken.stl").write_text("")
     monkeypatch.setattr(bodies, "find_spec", lambda name: None)
     with pytest.raises(InputError, match="genesis:duck.*pip install --no-deps genesis-world"):
-        bodies.mesh_file("genesis:duck")
+        bodies.load_mesh("genesis:duck")
     monkeypatch.undo()
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "genesis", raising=False)
-    assert bodies.mesh_file("genesis:worm") == str(folder / "worm" / "worm.obj")
-    assert bodies.mesh_file("genesis:duck") == str(folder / "duck.obj")  # the other one is open
-    assert bodies.mesh_file("cow.obj") == "cow.obj"
+    duck = bodies.load_mesh("genesis:duck")
+    assert duck.name == "duck" and len(duck.vertices) == 9 and len(duck.faces) == 14  # of the folder, closed by a fan
+    assert trimesh.Trimesh(duck.vertices, duck.faces, process=False).is_watertight
+    assert bodies.mesh_bytes("genesis:worm") == CUBE.encode()  # the other one lacks its colours
     with pytest.raises(InputError, match="genesis:pig does not exist; choose from broken, duck, worm"):
-        bodies.mesh_file("genesis:pig")
+        bodies.load_mesh("genesis:pig")
     with pytest.raises(InputError, match="genesis:broken.*broken.stl"):
-        bodies.mesh_file("genesis:broken")
+        bodies.load_mesh("genesis:broken")
     settings = build_world("elastic", "published", {"meshes": ("genesis:worm",)})
-    assert settings.meshes == (str(folder / "worm" / "worm.obj"),) and settings.object_names()[-1] == "worm"
+    assert settings.object_names()[-1] == "worm" and settings.fingerprint("worm") != settings.fingerprint("spot")
+    assert settings.draw("worm", 0, 0).actors[0].facts["object"] == "worm"
     assert "genesis" not in sys.modules
+
+
+def test_holes_are_filled_with_the_colours_of_their_borders(tmp_path):
+    """Two holes of a painted body, each closed by a fan whose corners have the colours of the edges beside it."""
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    colours = np.clip(mesh.vertices * 0.4 + 0.5, 0, 1)
+    kept = np.abs(mesh.triangles_center[:, 2]) < 0.9
+    lines = [f"v {' '.join(map(str, (*v, *c)))}" for v, c in zip(mesh.vertices, colours)]
+    faces = [f"f {' '.join(str(k + 1) for k in face)}" for face in mesh.faces[kept]]
+    (tmp_path / "cut.obj").write_text("\n".join([*lines, *faces]))
+    with pytest.raises(InputError, match="cut.obj is not closed"):
+        meshes.load_body(tmp_path / "cut.obj")
+    body = meshes.load_body(tmp_path / "cut.obj", "z", fill_holes=True)
+    surface = trimesh.Trimesh(body.vertices, body.faces, process=False)
+    assert surface.is_watertight and surface.is_winding_consistent and surface.volume > 0
+    added = body.corners[kept.sum() :]
+    heights = body.vertices[body.faces[kept.sum() :]][..., 2]
+    assert len(added) >= 10 and (np.sign(added[..., 2] - 0.5) == np.sign(heights)).all()
+    assert (np.abs(added[..., 2] - 0.5) > 0.3).all()
