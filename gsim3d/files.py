@@ -126,7 +126,7 @@ def typed(cls: type, values: Any, subject: str, where: str = "") -> Any:
     an attribute ``alone``, a text by itself is the field of this name.
 
     Raises:
-        InputError: a key is unknown or a value of another type; the message starts with ``subject`` and names the key.
+        InputError: a key is unknown or missing, or a value of another type; the message starts with ``subject`` and names the key.
     """
     if not isinstance(values, dict):
         raise InputError(f"{subject}: {where.rstrip('.')} must be a mapping; got {shown(values)}")
@@ -136,6 +136,9 @@ def typed(cls: type, values: Any, subject: str, where: str = "") -> Any:
         hint = did_you_mean(unknown[0], hints)
         raise InputError(f"{subject}: unknown key {where}{str(unknown[0])[:80]}; known: {', '.join(hints)}{hint}")
     fields = {name: _value(hints[name], value, subject, where + name) for name, value in values.items()}
+    for field in dataclasses.fields(cls):
+        if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
+            raise InputError(f"{subject}: key {where}{field.name} is missing")
     try:
         return cls(**fields)
     except InputError as error:

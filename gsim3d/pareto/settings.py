@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from gsim3d.errors import InputError, did_you_mean
-from gsim3d.files import shown
+from gsim3d.errors import InputError
+from gsim3d.files import shown, typed
 from gsim3d.ops.raster import CUTOFFS
 from gsim3d.pareto.products import compiler_problem, why_not
 
@@ -79,6 +79,7 @@ class Setting:
         _require("orders", self.orders, self.orders in (1, 2, 4), "1, 2 or 4")
         if self.captured and self._needs_python:
             raise InputError("setting: captured does not fit " + " and ".join(self._needs_python))
+        _require("sh_degree", self.sh_degree, self.sh_degree in (None, 0, 1, 2, 3), "0, 1, 2 or 3")
         for name in ("context_views", "history", "patch_size", "shrink", "every"):
             value = getattr(self, name)
             _require(name, value, value is None or (isinstance(value, int) and value >= 1), "an integer of at least 1")
@@ -136,14 +137,8 @@ class Setting:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Setting:
-        """Raises InputError for an unknown key."""
-        known = [f.name for f in dataclasses.fields(cls)]
-        if unknown := sorted(set(values) - set(known)):
-            raise InputError(
-                f"setting: unknown key {unknown[0]}; known: {', '.join(known)}"
-                f"{did_you_mean(unknown[0], known)}"
-            )
-        return cls(**values)
+        """Raises InputError for an unknown key or a value of another type."""
+        return typed(cls, values, "setting")
 
 
 @dataclass(frozen=True)

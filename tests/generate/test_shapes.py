@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from gsim3d.errors import InputError
-from gsim3d.generate import bodies, meshes, shapes
+from gsim3d.generate import bodies, mesh_files, meshes, shapes
 from gsim3d.generate.worlds import build_world
 
 CUBE = """v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 2\nv 1 0 2\nv 1 1 2\nv 0 1 2
@@ -101,6 +101,13 @@ def test_mesh_that_cannot_be_used(tmp_path, text):
         path.write_text(text)
     with pytest.raises(InputError, match="bad.obj"):
         meshes.load_body(path)
+
+
+def test_meshes_of_many_bytes_are_refused_unread(tmp_path):
+    with open(tmp_path / "large.stl", "wb") as file:
+        file.truncate(mesh_files.MAX_MESH + 1)
+    with pytest.raises(InputError, match="large.stl .*it has .* bytes; more than .* are refused"):
+        meshes.load_body(tmp_path / "large.stl")
 
 
 def test_meshes_of_an_installed_genesis_are_found_without_importing_it(tmp_path, monkeypatch):

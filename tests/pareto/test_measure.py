@@ -247,6 +247,10 @@ def test_a_wrong_setting_is_told():
         ({"kept": 0}, "kept"),
         ({"every": 0}, "every"),
         ({"no": 1}, "no"),
+        ({"kept": "half"}, "kept must be a number"),
+        ({"captured": 1}, "captured must be true or false"),
+        ({"sh_degree": "x"}, "sh_degree"),
+        ([1], "must be a mapping"),
     ]:
         with pytest.raises(InputError, match=f"setting: .*{what}"):
             Setting.from_dict(values)

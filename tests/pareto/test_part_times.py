@@ -67,6 +67,7 @@ def test_times_are_kept_beside_presets(tmp_path, subject):
         ({"dynamics": "long"}, "speeds.json: cpu: measured: dynamics must be a number; got 'long'"),
         ({"work": {"moving": "many", "frozen": 0}}, "speeds.json: cpu: measured: work.moving must be a whole number"),
         ({"until": 3}, "speeds.json: cpu: measured: unknown key until"),
+        ({"work": {"moving": 3}}, "speeds.json: cpu: measured: key work.frozen is missing"),
     ],
 )
 def test_files_that_hold_no_times(tmp_path, subject, change, message):

@@ -100,6 +100,8 @@ def test_the_engine_finds_what_must_not_happen_and_keeps_it(target, misbehaved):
     description = json.loads((kept / "case.json").read_text())
     assert description["target"] == target and description["index"] == 3 and description["problem"] in text
     assert (kept / "input" / "note.txt").read_text() == "a file of the input"
+    large = (kept / "input" / "large").stat()
+    assert (kept / "input" / "pipe").is_fifo() and large.st_size == 2**32 and large.st_blocks < 2**11
     assert f"python -m tests.stability.fuzz --replay {kept}" in str(outcome)
 
 
@@ -112,5 +114,9 @@ def test_a_kept_input_can_be_run_again(misbehaved):
 
 def test_inputs_are_a_function_of_seed_and_number(tmp_path):
     target = targets()["_good"]
-    cases = [make_case(target, seed, index, tmp_path) for seed, index in ((7, 0), (7, 0), (8, 0), (7, 1))]
+    folders = [tmp_path / str(number) for number in range(4)]
+    for folder in folders:
+        folder.mkdir()
+    places = zip(((7, 0), (7, 0), (8, 0), (7, 1)), folders)
+    cases = [make_case(target, seed, index, folder) for (seed, index), folder in places]
     assert cases[0] == cases[1] and len(set(cases)) == 3

@@ -16,9 +16,10 @@ from functools import partial
 from pathlib import Path
 
 from gsim3d.__main__ import COMMANDS, main
+from gsim3d.interop import write_ply
 from gsim3d.train import checkpoint
 from tests.stability.fuzz.engine import Failure, Target
-from tests.stability.fuzz.readers import _saved
+from tests.stability.fuzz.readers import _gaussians, _saved
 from tests.tiny_scenes import write_scenes
 
 TRAINING = """
@@ -29,9 +30,11 @@ stages:
 # What each command takes: {good} has files to read, {out} does not exist, {file} is in the way of every output.
 RIGHT = {
     "generate": "elastic --out {out} --frames 2 --trajectories 1 --size 8 --processes 1",
+    "bound": "{good}/data --given 34.4 --out {out}",
     "check-data": "{good}/data --out {out}.png",
     "train": "{good}/train.yaml --data {good}/data --out {out} --until 1",
     "simulate": "{good}/model.safetensors {good}/data/ball/0000 --out {out} --steps 1",
+    "export": "{good}/a.ply --to {out}.splat",
     "plan": "{good}/data/ball/0000 {good}/model.safetensors",
     "effects": "infer {good}/data/ball/0000 {good}/model.safetensors --out {out}.yaml",
     "pareto": "{good}/model.safetensors {good}/data --out {out} --quiet",
@@ -42,8 +45,8 @@ RIGHT = {
     "demo": "--out {out}",
     "doctor": "--stability {good}/model.safetensors --out {out} --steps 1",
 }
-FREE = ("check-data", "train", "effects", "evaluate", "doctor")  # their outputs have a default
-OUTPUTS = ("out", "export", "cache")
+FREE = ("bound", "check-data", "train", "effects", "evaluate", "doctor")  # their outputs have a default
+OUTPUTS = ("out", "to", "export", "cache")
 NO_NUMBER = ("", "x", "nan", "inf", "-inf", "1e400", "0x10", "1,5", "--", "²", "1" * 5000)
 NO_WHOLE_NUMBER = (*NO_NUMBER, "-1", "1.5", "1e3")
 NO_CHOICE = ("", "x", "CPU", "a" * 5000, "\udcff")
@@ -60,6 +63,7 @@ def _good() -> Path:
     write_scenes(place / "data", 3)
     (place / "train.yaml").write_text(TRAINING)
     checkpoint.export(_saved(), place / "model.safetensors")
+    write_ply(place / "a.ply", _gaussians())
     return place
 
 
@@ -72,7 +76,7 @@ def _options(command: str) -> list[argparse.Action]:
 
 def _wrong(action: argparse.Action, rng: random.Random) -> str:
     if action.type is int:
-        return rng.choice(NO_WHOLE_NUMBER if action.dest not in ("seed", "start") else NO_NUMBER)
+        return rng.choice(NO_WHOLE_NUMBER if action.dest not in ("seed", "start", "frame") else NO_NUMBER)
     if action.type is float:
         return rng.choice(NO_NUMBER)
     if action.choices is not None:

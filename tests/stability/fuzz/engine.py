@@ -13,6 +13,7 @@ import random
 import resource
 import shutil
 import signal
+import stat
 import struct
 import subprocess
 import sys
@@ -29,6 +30,7 @@ MEMORY = 2**30  # bytes that an input may take beyond what the process has
 CEILING = 4 * MEMORY  # of address space: more is never given, so that the machine goes on
 PATIENCE = 10.0  # seconds of processor time
 WAITING = 3  # times as many seconds of the clock: on a busy machine a process gets a share
+LARGE = 2**28  # bytes of a file
 PROGRESS = struct.Struct("<qq")  # number of the job, number of the input
 GROUPS = ("ops", "readers", "commands")  # modules of this package with TARGETS
 
@@ -191,9 +193,21 @@ def keep(name: str, seed: int, index: int, case: Any, folder: Path, out: Path, p
     """Saves an input: its place in the sequence, its values and its files."""
     kept = out / "failures" / f"{name}-{index}"
     shutil.rmtree(kept, ignore_errors=True)
-    shutil.copytree(folder, kept / "input", symlinks=True)
+    shutil.copytree(folder, kept / "input", symlinks=True, copy_function=_copy)
     (kept / "case.pickle").write_bytes(pickle.dumps(case))
     (kept / "case.json").write_text(json.dumps({"target": name, "seed": seed, "index": index, "problem": problem}))
+
+
+def _copy(source: str, target: str) -> None:
+    """A file or pipe. Large files, all of which are of zeros, take no place on the disk."""
+    found = os.stat(source)
+    if stat.S_ISFIFO(found.st_mode):
+        os.mkfifo(target)
+    elif found.st_size > LARGE:
+        Path(target).touch()
+        os.truncate(target, found.st_size)
+    else:
+        shutil.copyfile(source, target)
 
 
 def run(
@@ -292,7 +306,7 @@ def replay(kept: Path) -> tuple[str, str | None]:
     target = targets()[description["target"]]
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "input"
-        shutil.copytree(kept / "input", folder, symlinks=True)
+        shutil.copytree(kept / "input", folder, symlinks=True, copy_function=_copy)
         return judge(target, pickle.loads((kept / "case.pickle").read_bytes()), folder)
 
 

@@ -16,6 +16,9 @@ BAD = 3  # the input that goes wrong
 
 def _make(rng: random.Random, folder: Path) -> int:
     (folder / "note.txt").write_text("a file of the input")
+    os.mkfifo(folder / "pipe")
+    (folder / "large").touch()
+    os.truncate(folder / "large", 2**32)
     return int(rng.random() * 1e6)
 
 

@@ -18,11 +18,13 @@ import zipfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
+import trimesh
 import yaml
 
 from gsim3d import check_stability
@@ -32,13 +34,16 @@ from gsim3d.edits import load_edits
 from gsim3d.effects import EffectsSpec
 from gsim3d.errors import HardCaseError, InputError
 from gsim3d.evaluate.predictions import Predictions
+from gsim3d.generate.meshes import load_body
 from gsim3d.interop import read_ply, write_ply
 from gsim3d.interop.released_import import import_released
 from gsim3d.io import read_splats, write_splats
+from gsim3d.pareto.autotune import TIMES, load_speed, load_times
 from gsim3d.perceptual import weights
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, TrainConfig
+from gsim3d.train.log import LOG, Log
 from gsim3d.train.restore import restore
 from gsim3d.train.settings import from_dict, load_yaml, to_dict
 from gsim3d.types import Gaussians
@@ -48,6 +53,7 @@ from tests.data.made_videos import write_scene as write_videos
 from tests.data.test_colmap import seen_points, write_colmap
 from tests.data.test_transforms import write_synthetic
 from tests.interop.release import random_weights, settings_of, small_config, write_release
+from tests.interop.test_ply import DC, REST, SHAPE, XYZ, rows_of
 from tests.stability.fuzz.engine import Failure, Target, finite
 from tests.stability.fuzz.files import damage
 from tests.test_simulator import CONFIG
@@ -187,6 +193,15 @@ def _write_text_ply(file: Path) -> None:
     file.write_text("\n".join([*lines, " ".join(["0.5"] * len(names)), " ".join(["0.25"] * len(names))]) + "\n")
 
 
+def _write_list_ply(file: Path, form: str) -> None:
+    """Lists of other lengths in every row, and elements around the vertices."""
+    properties = [*XYZ, ("uchar", "int", "tags"), *DC, *REST]
+    rows = [[i, 2, 3, tags, 0.1, 0.2, 0.3, *SHAPE] for i, tags in enumerate([[7], [8, 9]])]
+    before = [("camera", [("float", "f"), ("uchar", "double", "matrix")], [[1.0, [0.5, 0.5]]])]
+    after = [("face", [("uchar", "int", "vertex_indices")], [[[0, 1, 0]]])]
+    file.write_bytes(rows_of(properties, rows, form, before, ["SplatRenderMode: classic"], after))
+
+
 def _read_ply(folder: Path, what: str) -> None:
     finite(read_ply(folder / "a.ply"))
 
@@ -249,6 +264,39 @@ def _read_weights(folder: Path, what: str) -> None:
                 weights.read_arrays(content)
     finally:
         del weights.SOURCES["fuzzed"]
+
+
+CUBE = trimesh.creation.box((1, 2, 3))
+MESHES = ("m.obj", "m.ply", "m.stl", "m.glb", "m.off")
+
+
+def _write_meshes(folder: Path) -> None:
+    for name in MESHES:
+        CUBE.export(folder / name)
+
+
+def _read_meshes(folder: Path, what: str) -> None:
+    name = what.partition(":")[0]
+    body = load_body(folder / (name if name in MESHES else MESHES[0]))
+    corners = body.corners.reshape(-1, body.corners.shape[-1])
+    finite([torch.from_numpy(values) for values in (body.vertices, body.paint(corners))], "body")
+
+
+def _write_speeds(folder: Path) -> None:
+    times = {"on": "a machine", "work": {"moving": 100, "frozen": 50}, "dynamics": 1.5, "images": 2.5}
+    content = {"digest": {"cpu": {"fast": {"sleep": 0.1, "sh_degree": 0, "every": 2}, TIMES: times}}}
+    (folder / "speeds.json").write_text(json.dumps(content))
+
+
+def _read_speeds(folder: Path, what: str) -> None:
+    restored = SimpleNamespace(checkpoint=SimpleNamespace(digest="digest"), device=torch.device("cpu"))
+    load_speed(folder, restored, "fast")
+    load_times(folder, restored)
+
+
+def _write_log(folder: Path) -> None:
+    lines = [json.dumps({"step": step, "loss": 0.5, "machine": {"step_seconds": 0.1}}) for step in range(4)]
+    (folder / LOG).write_text("\n".join(lines) + "\n")
 
 
 def _write_predictions(folder: Path, video: bool) -> None:
@@ -318,6 +366,11 @@ READERS = {
         f"splats{suffix}": Reader(partial(_write_splats, suffix), partial(_read_splats, suffix))
         for suffix in (".splat", ".compressed.ply", ".spz", ".glb")
     },
+    "ply_lists": Reader(lambda folder: _write_list_ply(folder / "a.ply", "binary_big_endian"), _read_ply),
+    "ply_lists_text": Reader(lambda folder: _write_list_ply(folder / "a.ply", "ascii"), _read_ply),
+    "meshes": Reader(_write_meshes, _read_meshes),
+    "speeds": Reader(_write_speeds, _read_speeds),
+    "log": Reader(_write_log, lambda folder, what: Log(folder).cut(2)),
     "train_yaml": Reader(
         lambda folder: (folder / "train.yaml").write_text(yaml.safe_dump(TRAINING)),
         lambda folder, what: from_dict(TrainConfig, load_yaml(folder / "train.yaml")),
