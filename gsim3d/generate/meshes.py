@@ -34,7 +34,7 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, limit: int) -> tuple[np.nda
 
 
 def load_body(path: str | Path, up: str = "y", *, fill_holes: bool = False) -> Body:
-    """A body from a mesh file (:data:`gsim3d.generate.mesh_files.SUFFIXES`), all its objects together, with textures and
+    """A body from a mesh file (:data:`gsim3d.generate.mesh_files.SUFFIXES`): all its objects, with their textures and
     colours; a pattern where it has none.
 
     Args:
