@@ -12,22 +12,23 @@ from tests.stability.fuzz.ops import OPS, public_ops
 from tests.stability.fuzz.readers import READERS
 
 FEW, PER_OP = 25, 2000  # inputs of each op in the fast tests, and in the full ones
-FEW_FILES, PER_READER = 4, 500  # damaged files of each reader, likewise
+FEW_FILES, PER_READER = 4, 2000  # damaged files of each reader, likewise
+READER_SECONDS, LEAST_FILES = 60, 300  # no further file after so long; so many are read on a busy machine, too
 FEW_COMMANDS, PER_COMMAND = 4, 200  # wrong arguments of each command, likewise
 
 
-def assert_none_failed(outcomes: list[Outcome], count: int) -> None:
+def assert_none_failed(outcomes: list[Outcome], count: int, least: int | None = None) -> None:
     failed = [outcome for outcome in outcomes if outcome.failures]
     assert not failed, "\n".join(map(str, failed))
     for outcome in outcomes:
-        assert outcome.count == count == sum(outcome.answers.values()), outcome
+        assert (least or count) <= outcome.count <= count and outcome.count == sum(outcome.answers.values()), outcome
 
 
-def assert_all_answered(outcomes: list[Outcome], count: int) -> None:
-    assert_none_failed(outcomes, count)
+def assert_all_answered(outcomes: list[Outcome], count: int, least: int | None = None) -> None:
+    assert_none_failed(outcomes, count, least)
     for outcome in outcomes:
         # Inputs that are all refused, or all computed, test nothing.
-        assert 0.03 * count < outcome.answers.get("ok", 0) < 0.97 * count, outcome
+        assert 0.03 * outcome.count < outcome.answers.get("ok", 0) < 0.97 * outcome.count, outcome
 
 
 def test_every_public_op_is_fuzzed():
@@ -56,8 +57,10 @@ def test_readers_answer_a_few_files(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("quarter", range(4))
-def test_readers_answer_hundreds_of_files(quarter, tmp_path):
-    assert_all_answered(run(sorted(READERS)[quarter::4], PER_READER, out=tmp_path), PER_READER)
+def test_readers_answer_thousands_of_files(quarter, tmp_path):
+    names = sorted(READERS)[quarter::4]
+    outcomes = run(names, PER_READER, out=tmp_path, seconds=READER_SECONDS)
+    assert_all_answered(outcomes, PER_READER, LEAST_FILES)
 
 
 def test_every_command_is_fuzzed():
