@@ -126,7 +126,8 @@ def typed(cls: type, values: Any, subject: str, where: str = "") -> Any:
     an attribute ``alone``, a text by itself is the field of this name.
 
     Raises:
-        InputError: a key is unknown or missing, or a value of another type; the message starts with ``subject`` and names the key.
+        InputError: a key is unknown or missing, or a value of another type; the message starts with ``subject`` and
+            names the key.
     """
     if not isinstance(values, dict):
         raise InputError(f"{subject}: {where.rstrip('.')} must be a mapping; got {shown(values)}")
