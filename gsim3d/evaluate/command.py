@@ -178,11 +178,17 @@ def _evaluate(args: argparse.Namespace, metrics: tuple, not_measured: dict, agai
     scores = [replace(score, scene=_name(scene, args.data)) for score, scene in zip(scores, scenes, strict=True)]
     summary = {**conditions, **summarize(scores, not_measured)}
     print(table(summary))
+    refused = None
     if against is not None:
-        comparison = compare.compare(summary, against, args.against)
-        summary["against"] = {"file": str(args.against), "checkpoint": against.get("checkpoint"), **comparison}
-        print(f"\n{compare.table(comparison, args.against)}")
+        try:
+            comparison = compare.compare(summary, against, args.against)
+            summary["against"] = {"file": args.against, "checkpoint": against.get("checkpoint"), **comparison[""]}
+            print(f"\n{compare.table(comparison, args.against)}")
+        except InputError as error:  # the scores are written before it ends the command
+            refused = error
     print("\nwritten: " + ", ".join(str(path) for path in _write(out, args, scenes, scores, summary)))
+    if refused is not None:
+        raise refused
     return 0
 
 

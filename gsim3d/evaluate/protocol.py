@@ -38,7 +38,7 @@ from gsim3d.train.samples import context_cameras, spread_views, thinned
 from gsim3d.types import DYNAMIC, Particles
 
 METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant", *EXACT_PARTS)
-TOGETHER = 6  # scenes that a GPU predicts in one rollout, fewer where they are large
+TOGETHER = 8  # scenes that a GPU predicts in one rollout, fewer where they are large
 MOST_PIXELS = 2**21  # of the input images of one rollout
 CLIPS = 48  # of which FVD is measured
 
