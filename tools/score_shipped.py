@@ -55,7 +55,6 @@ def score(
     import cv2
     import numpy as np
 
-    from gsim3d.data import find_scenes
     from gsim3d.evaluate.protocol import default_views, score_scenes
     from gsim3d.evaluate.report import summarize, write_json
     from gsim3d.evaluate.scoring import PLAIN_METRICS, measurable
@@ -80,11 +79,12 @@ def score(
         for subset in subsets or (KIND, *(subset for subset in OTHER_SETS if world in HELD_OUT["diverse"][subset])):
             metrics, missing = measurable(None if subset == KIND else PLAIN_METRICS)
             place, count, begin = data / held_out / world / subset, counts[subset != KIND], time.monotonic()
+            folders = None
             if processes.is_first:
                 options = {**changes, **({} if subset == KIND else {"subset": subset})}
-                generate(place, world, preset=preset, n_trajectories=count, seed=seed, **options)
-            processes.gather(None)  # the others wait for the trajectories
-            filmed, folders = time.monotonic(), find_scenes(place)
+                folders = generate(place, world, preset=preset, n_trajectories=count, seed=seed, **options).folders
+            folders = processes.gather(folders)[0]  # the others wait for the trajectories
+            filmed = time.monotonic()
             scenes = [restored.open_scene(folder) for folder in folders]
             views, n_encoded = [default_views(restored, scene) for scene in scenes], restored.data.history
             n_future = min(scene.n_steps for scene in scenes) - n_encoded

@@ -12,7 +12,7 @@ import pytest
 from gsim3d import pretrained
 from gsim3d.errors import InputError
 from gsim3d.generate.film import film
-from gsim3d.generate.worlds import build_world
+from gsim3d.generate.worlds import TEST_SEED, build_world
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
 from gsim3d.train.restore import restore
 from tools.release.films import FilmStore
@@ -89,6 +89,11 @@ def test_some_sets_are_measured_anew(scored, tmp_path):
     tool("score_shipped").score(weights, NAME, scored / "films", tmp_path, **given)
     after = json.loads(file.read_text())
     assert after["raised"]["n_scenes"] == 1 and after["unseen"] == {"n_scenes": 6}
+    assert after["raised"]["set"]["name"] == "validation" and after["raised"]["set"]["subset"] == "raised"
+    tool("score_shipped").score(weights, NAME, scored / "films", tmp_path, held_out="test", **given)
+    assert json.loads(file.read_text()) == after
+    test = json.loads((tmp_path / f"{NAME}.test.scores.json").read_text())
+    assert test["raised"]["set"]["seed"] == TEST_SEED and test["raised"]["scenes"] != after["raised"]["scenes"]
     file.write_text(json.dumps({**before, "checkpoint": "0"}))
     with pytest.raises(InputError, match="of other weights"):
         tool("score_shipped").score(weights, NAME, scored / "films", tmp_path, **given)
