@@ -18,6 +18,7 @@ import dataclasses
 import hashlib
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -328,7 +329,7 @@ def score_scenes(
 
     scores: dict[int, SceneScores] = {}
     quiet = quiet or not processes.is_first
-    with progress(None, "scenes", len(scenes), unit="scene", quiet=quiet) as bar:
+    with _two_threads(), progress(None, "scenes", len(scenes), unit="scene", quiet=quiet) as bar:
         for first in range(0, len(groups), processes.count):
             mine = first + processes.rank
             try:
@@ -341,6 +342,17 @@ def score_scenes(
                 scores.update(part)
             bar.update(len(scores) - bar.n)
     return [scores[number] for number in range(len(scenes))]
+
+
+@contextmanager
+def _two_threads() -> Iterator[None]:
+    """At least two: with one, torch convolves by other kernels, and torchrun gives each process one."""
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(max(2, n_threads))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(n_threads)
 
 
 def _digest(images: Tensor, labels: Tensor | None) -> str:
