@@ -240,7 +240,7 @@ def _steps(
         known = sorted({video.rate for video in videos.values() if video.rate})
         problems.add(f"{source}: fps is needed" + (f": the videos have {known}" if known else ""))
         fps = 1.0
-    notes = []
+    notes = [video.note for video in videos.values() if video.note]
     for video in videos.values():
         if video.rate is None and resample is None:
             hint = f'give "resample", steps a second, in {source.name}'

@@ -18,7 +18,7 @@ from gsim3d.errors import InputError
 
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", *LOSSY_SUFFIXES)
-MAX_FILE = 1 << 30  # bytes of one image file
+MAX_FILE = 1 << 29  # bytes of one image file
 HEADER = 1 << 16  # bytes that most headers lie in
 MAX_ID = 16  # masks whose values are all below it hold ids of bodies
 MAX_SOFT = 0.2  # of the pixels of a mask may be nearer to half of its range than to its ends

@@ -18,6 +18,7 @@ from gsim3d.files import opencv_path
 
 RESOLUTION = 1.01e-3  # seconds: many containers round times to a millisecond
 UNEVEN = 0.1  # of the time between two frames: a frame that is off by more makes a video uneven
+MAX_APART, MIN_EVEN = 2, 8  # frames that may lie apart at the end, of more than so many
 TURNS = (0, 90, 180, 270)  # degrees that decoded frames are turned by
 MP4_KINDS = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 EBML, SEGMENT = b"\x1aE\xdf\xa3", b"\x18S\x80g"
@@ -27,25 +28,28 @@ class Video:
     """A video file. It is opened for each read and closed after it; frames are decoded from the first one on.
 
     numbers: of its frames, from 0; none where there is a problem.    times: float64 [N], seconds.
-    rate: frames a second; None where they are not evenly spaced.
+    rate: frames a second; None where they are not evenly spaced.    note: what is left out, "" where nothing is.
     """
 
     def __init__(self, file: Path, name: str, size: tuple[int, int], problems: Problems):
         self.what, self._file, self._size = f"video {file} (camera {name})", file, size
-        self.numbers, self.times, self.rate = [], np.zeros(0), None
+        self.numbers, self.times, self.rate, self.note = [], np.zeros(0), None, ""
         try:
             stat = file.stat()
             found = _scan(file, size, (stat.st_mtime_ns, stat.st_size))
         except (InputError, OSError) as error:
             problems.add(f"{self.what} {error if isinstance(error, InputError) else error.strerror}")
             return
-        self.numbers, self.times = list(range(len(found.times))), found.times
-        self.rate = _even_rate(found.times, found.rate)
+        cut, self.rate = _even_part(found.times, found.rate)
+        self.times = found.times[: len(found.times) - cut]
+        self.numbers = list(range(len(self.times)))
+        if cut:
+            self.note = f"{self.what}: its last {cut} of {len(found.times)} frames lie apart and are left out"
         if self.rate is None:
             gaps = (1000 * np.diff(found.times)).round(1)
             self.unevenness = (
                 f"its {len(found.times)} frames are {gaps.min():g} to {gaps.max():g} ms apart, though its header says "
-                f" {found.rate:.4g} a second"
+                f"{found.rate:.4g} a second"
             )
 
     def read(self, numbers: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
@@ -138,6 +142,16 @@ def _start(times: np.ndarray, marks: np.ndarray, rate: float) -> float:
         return 0.0
     low, high = ((marks - 0.5) / rate - times).max(), ((marks + 0.5) / rate - times).min()
     return float((low + high) / 2 if low <= high else marks[0] / rate)
+
+
+def _even_part(times: np.ndarray, header: float) -> tuple[int, float | None]:
+    """How many frames at the end lie apart, and the rate of the others. Editors that cut without encoding anew leave
+    such frames: those that were stored after them, and are shown before, are gone."""
+    for cut in range(MAX_APART + 1 if len(times) > MIN_EVEN else 1):
+        rate = _even_rate(times[: len(times) - cut], header)
+        if rate is not None:
+            return cut, rate
+    return 0, None
 
 
 def _even_rate(times: np.ndarray, header: float) -> float | None:

@@ -43,7 +43,7 @@ def test_frames_are_counted_by_decoding(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-@pytest.mark.parametrize("gaps", [UNEVEN, [50] * 12 + [100] + [50] * 6, [50] * 18 + [100], [33, 67] * 9 + [33]])
+@pytest.mark.parametrize("gaps", [UNEVEN, [50] * 12 + [100] + [50] * 6, [100] + [50] * 18, [33, 67] * 9 + [33]])
 def test_uneven_films_are_refused_with_both_numbers(tmp_path, suffix, gaps):
     with_gaps(write_plain(tmp_path / f"a{suffix}"), gaps)
     write_scene(tmp_path, ["a"])
@@ -69,6 +69,15 @@ def test_uneven_films_are_resampled_on_request(tmp_path, suffix):
     for value in (0, -1, "4", 1e9):
         with pytest.raises(InputError, match="resample"):
             Scene.open(write_scene(tmp_path, ["a"], resample=value))
+
+
+@pytest.mark.parametrize("apart", [1, 2])
+def test_frames_that_lie_apart_at_the_end_are_left_out(tmp_path, apart):
+    """A cut without encoding anew takes away the frames before them."""
+    with_gaps(write_plain(tmp_path / "a.mp4"), [50] * (19 - apart) + [100] * apart)
+    scene = Scene.open(write_scene(tmp_path, ["a"]))
+    assert scene.fps == pytest.approx(RATE) and frames_of(scene) == [list(range(20 - apart))]
+    assert f"its last {apart} of 20 frames lie apart and are left out" in describe(scene)
 
 
 def test_small_jitter_is_no_unevenness(tmp_path):
