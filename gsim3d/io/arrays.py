@@ -129,9 +129,18 @@ def unorm(x: np.ndarray, bits: int) -> np.ndarray:
     return np.clip(np.floor(x.astype(np.float64) * most + 0.5), 0, most).astype(np.uint32)
 
 
-def read_bytes(path: Path) -> bytes:
-    """The content of a file of Gaussians; InputError as :func:`gsim3d.files.read_file`."""
-    return read_file(path, MAX_BYTES)
+def read_bytes(path: Path, *starts: bytes) -> bytes:
+    """The content of a file of Gaussians; of one that begins with none of ``starts``, the first bytes alone.
+
+    Raises: InputError as :func:`gsim3d.files.read_file`.
+    """
+    head = read_head(path)
+    return read_file(path, MAX_BYTES) if not starts or head.startswith(starts) else head
+
+
+def read_head(path: Path) -> bytes:
+    """The first 4 KiB of a file, likewise."""
+    return read_file(path, MAX_BYTES, 4096)
 
 
 def write_bytes(path: Path, *parts: bytes) -> None:

@@ -61,7 +61,7 @@ def is_compressed(content: bytes) -> bool:
 
 def read(path: Path) -> Splats:
     """The Gaussians of a file. Raises InputError where it is damaged or another .ply."""
-    content = read_bytes(path)
+    content = read_bytes(path, b"ply")
     end = re.search(rb"end_header\r?\n", content[:65536])
     if not content.startswith(b"ply") or end is None or not is_compressed(content):
         raise InputError(f"{path}: not a compressed .ply")

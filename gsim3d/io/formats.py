@@ -9,7 +9,7 @@ from pathlib import Path
 from gsim3d.errors import InputError
 from gsim3d.interop.ply import read_ply, write_ply
 from gsim3d.io import compressed_ply, gltf, splat, spz, usd
-from gsim3d.io.arrays import Y_TO_Z_UP, Z_TO_Y_UP, Splats, gaussians_of, read_bytes, splats_of, turned
+from gsim3d.io.arrays import Y_TO_Z_UP, Z_TO_Y_UP, Splats, gaussians_of, read_head, splats_of, turned
 from gsim3d.types import Gaussians
 
 UPS = ("y", "z")
@@ -122,7 +122,7 @@ def read_splats(path: str | Path, *, up: str | None = None) -> Gaussians:
     turn = _turn(path, chosen, up, Y_TO_Z_UP)
     if suffix == ".glb":
         turn = Y_TO_Z_UP
-    if suffix == ".ply" and compressed_ply.is_compressed(read_bytes(path)[:4096]):
+    if suffix == ".ply" and compressed_ply.is_compressed(read_head(path)):
         chosen = FORMATS[".compressed.ply"]
     if chosen.read is None:
         gaussians = read_ply(path)

@@ -73,7 +73,7 @@ def read(path: Path) -> Splats:
     Raises:
         InputError: the file is damaged, or holds no Gaussians that are read here.
     """
-    content = read_bytes(path)
+    content = read_bytes(path, b"glTF")
     document, data = _chunks(path, content)
     try:
         index, primitive = next(

@@ -17,6 +17,7 @@ from gsim3d.errors import InputError
 from gsim3d.io.arrays import Splats, read_bytes, write_bytes
 
 MAGIC = 0x5053474E
+GZIP, ZSTD = b"\x1f\x8b", b"NGSP"  # beginnings of versions 2 and 3, and of version 4
 FRACTION_BITS = 12
 LEAST_RATIO = 1024 / 9  # points a byte: gzip packs no better
 COLOR_SCALE = 0.15
@@ -43,10 +44,10 @@ def write(path: Path, splats: Splats) -> None:
 
 def read(path: Path) -> Splats:
     """The Gaussians of a file. Raises InputError where it is damaged, of another version or needs ``zstandard``."""
-    content = read_bytes(path)
-    if content[:2] == b"\x1f\x8b":
+    content = read_bytes(path, GZIP, ZSTD)
+    if content.startswith(GZIP):
         return _read_gzip(path, content)
-    if content[:4] == b"NGSP":
+    if content.startswith(ZSTD):
         return _read_streams(path, content)
     raise InputError(f"{path}: not a .spz file")
 

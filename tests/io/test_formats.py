@@ -4,6 +4,7 @@ import dataclasses
 import gzip
 import json
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -342,3 +343,16 @@ def test_the_command_exports_files_and_films(tmp_path, capsys):
     ):
         assert main(["export", *arguments]) == 2
         assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".glb"])
+def test_large_files_of_another_kind_are_not_read(suffix, tmp_path):
+    with open(tmp_path / f"a{suffix}", "wb") as file:
+        file.truncate(2**30)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="not a "):
+            read_splats(tmp_path / f"a{suffix}")
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()

@@ -54,7 +54,7 @@ from tests.data.test_colmap import seen_points, write_colmap
 from tests.data.test_transforms import write_synthetic
 from tests.interop.release import random_weights, settings_of, small_config, write_release
 from tests.interop.test_ply import DC, REST, SHAPE, XYZ, rows_of
-from tests.stability.fuzz.engine import Failure, Target, finite
+from tests.stability.fuzz.engine import LARGE, Failure, Target, finite
 from tests.stability.fuzz.files import damage
 from tests.test_simulator import CONFIG
 
@@ -329,12 +329,14 @@ def _write_sample(folder: Path) -> None:
 @dataclasses.dataclass(frozen=True)
 class Reader:
     """write: good files into a folder.   read: (folder, what was damaged).   descriptions: files that say what the
-    others hold.   among: where damage is done, below the folder."""
+    others hold.   among: where damage is done, below the folder.   headless: what is in a file is as long as the file,
+    whatever it begins with."""
 
     write: Write
     read: Callable[[Path, str], Any]
     descriptions: tuple[str, ...] = ()
     among: str = "."
+    headless: bool = False
 
 
 _JSON = ("metadata.json", "transforms.json", "cameras.json")
@@ -363,7 +365,9 @@ READERS = {
     "ply": Reader(lambda folder: write_ply(folder / "a.ply", _gaussians()), _read_ply),
     "ply_text": Reader(lambda folder: _write_text_ply(folder / "a.ply"), _read_ply),
     **{
-        f"splats{suffix}": Reader(partial(_write_splats, suffix), partial(_read_splats, suffix))
+        f"splats{suffix}": Reader(
+            partial(_write_splats, suffix), partial(_read_splats, suffix), headless=suffix == ".splat"
+        )
         for suffix in (".splat", ".compressed.ply", ".spz", ".glb")
     },
     "ply_lists": Reader(lambda folder: _write_list_ply(folder / "a.ply", "binary_big_endian"), _read_ply),
@@ -409,6 +413,10 @@ def _make(name: str, rng: random.Random, folder: Path) -> str:
     if rng.random() < 0.04:
         return "nothing"
     done = damage(folder / reader.among, rng, reader.descriptions)
+    if reader.headless:
+        for file in folder.iterdir():
+            if file.is_file() and not file.is_symlink() and file.stat().st_size > LARGE:
+                os.truncate(file, LARGE // 8)
     if name == "checkpoint" and rng.random() < 0.6:
         _sign(folder / "step")
         done += "; signed again"
