@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -41,6 +42,7 @@ class RendererConfig:
     sh_degree: 0 to 3, of the view-dependent colour.
     scale_min, scale_max: metres, limits of predicted scales.
     initial_scale: metres, scale that an untrained head predicts; None: the middle of the limits.
+    jacobian: "exact", or "clamped" of models that were trained so; as of :func:`gsim3d.ops.rasterize_gaussians`.
     quirks: published behaviour to imitate.
     """
 
@@ -49,6 +51,7 @@ class RendererConfig:
     scale_min: float = 0.0002
     scale_max: float = 0.1
     initial_scale: float | None = None
+    jacobian: Literal["exact", "clamped"] = "exact"
     quirks: Quirks = field(default_factory=Quirks)
 
     @property
@@ -136,6 +139,7 @@ def render(
     near_plane: float = NEAR_PLANE,
     features: Tensor | None = None,
     cutoff: str = "exact",
+    jacobian: str = "exact",
     on_bad: OnBad = "raise",
     report: StabilityReport | None = None,
 ) -> Rendering:
@@ -156,13 +160,19 @@ def render(
         cu_rows=gaussians.cu_rows,
         near_plane=near_plane,
         cutoff=cutoff,
+        jacobian=jacobian,
         on_bad=on_bad,
         report=report,
     )
 
 
 def render_as_published(
-    gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None, *, quirks: Quirks
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: Tensor | None = None,
+    *,
+    quirks: Quirks,
+    jacobian: str = "clamped",
 ) -> Rendering:
     """:func:`render` with the quirks of the published renderer, image by image as there."""
     if len(cameras) == 0:
@@ -189,6 +199,7 @@ def render_as_published(
                 background=background if background is None or background.dim() == 1 else background[one],
                 near_plane=RELEASED_NEAR_SHARE * float(camera.near) if quirks.far_near_plane else NEAR_PLANE,
                 cutoff="tile3sigma" if quirks.three_sigma_tiles else "exact",
+                jacobian=jacobian,
             )
         )
     color, alpha, depth = (

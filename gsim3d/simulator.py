@@ -278,14 +278,13 @@ class Simulator(nn.Module):
         on_bad, report = on_bad or self.config.stability.on_bad, self.report if report is None else report
         outputs = plan.spec.outputs if plan else OutputEffects(depth=True, alpha=True)
         gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None, rgb=outputs.rgb)
-        quirks = self.config.renderer.quirks
+        quirks, jacobian = self.config.renderer.quirks, self.config.renderer.jacobian
         if quirks != Quirks():
-            image = render_as_published(gaussians, cameras, background, quirks=quirks)
+            image = render_as_published(gaussians, cameras, background, quirks=quirks, jacobian=jacobian)
         else:
             features = particles.latents if outputs.features else None
-            image = render(
-                gaussians, cameras, background, features=features, cutoff=cutoff, on_bad=on_bad, report=report
-            )
+            options = {"cutoff": cutoff, "jacobian": jacobian, "on_bad": on_bad, "report": report}
+            image = render(gaussians, cameras, background, features=features, **options)
         asked = (outputs.rgb, outputs.alpha, outputs.depth, outputs.features)
         return Rendering(*(made if wanted else None for made, wanted in zip(image, asked, strict=True)))
 

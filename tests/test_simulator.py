@@ -199,7 +199,8 @@ def test_the_published_renderer_draws_each_camera_s_cloud():
         one = torch.tensor([i])
         alone = simulator.renderer(particles.select_clouds([cloud]))
         camera = cameras.select(one, torch.zeros_like(one))
-        image = render_as_published(alone, camera, background[i], quirks=Quirks.release()).color
+        options = {"quirks": Quirks.release(), "jacobian": CONFIG.renderer.jacobian}
+        image = render_as_published(alone, camera, background[i], **options).color
         assert_same_bits(image[0], images[i])
         assert not torch.equal(render(alone, camera, background[i]).color[0], images[i])
     none = simulator.render(particles, cameras.select(torch.zeros(0, dtype=torch.int64)))

@@ -92,7 +92,8 @@ def splat_picture(restored: Restored, prediction: Prediction, scene: Scene, cam:
     )
     gaussians = restored.simulator.renderer(prediction.particles.select_clouds(torch.tensor([step], device=device)))
     gaussians = dataclasses.replace(gaussians, scales=gaussians.scales * SPLAT_SHRINK)
-    return as_bytes(render(gaussians, camera, torch.ones(3, device=device)).color[0].clamp(0, 1))
+    jacobian = restored.simulator.config.renderer.jacobian
+    return as_bytes(render(gaussians, camera, torch.ones(3, device=device), jacobian=jacobian).color[0].clamp(0, 1))
 
 
 def write_overview(

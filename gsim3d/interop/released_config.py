@@ -211,6 +211,7 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
             sh_degree=sh_degree,
             scale_min=scale_min,
             scale_max=scale_max,
+            jacobian="clamped",
             quirks=common["quirks"],
         )
         model = ModelConfig(encoder, dynamics, renderer)

@@ -1,5 +1,7 @@
 """Loads the compiled op library, once; says what to type when it is missing."""
 
+import os
+
 import torch  # its libraries must be in the process before ours
 
 try:
@@ -10,6 +12,9 @@ except ImportError as error:
         "    pip install --no-build-isolation -e .\n"
         f"(torch {torch.__version__}; the loader said: {error})"
     ) from error
+
+# The threads of torch's pool stay behind in a fork: whatever asks for several of them in the child waits for ever.
+os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 def cuda_compiled() -> bool:

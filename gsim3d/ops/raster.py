@@ -18,6 +18,7 @@ from gsim3d.types import Cameras
 OP = "rasterize_gaussians"
 LARGEST = 1e15  # kLargest of csrc/gsim3d/raster/raster_math.h
 CUTOFFS = {"exact": 0, "tile3sigma": 1, "smooth": 2}
+JACOBIANS = {"exact": 0, "clamped": 1}
 # RasterFault of csrc/gsim3d/raster/raster.h
 FAULTS = (
     "not finite or beyond 1e15",
@@ -62,6 +63,7 @@ def rasterize_gaussians(
     cu_rows: Tensor | None = None,
     near_plane: float = 0.01,
     cutoff: str = "exact",
+    jacobian: str = "exact",
     on_bad: OnBad = "raise",
     report: StabilityReport | None = None,
 ) -> Rendering:
@@ -91,6 +93,9 @@ def rasterize_gaussians(
         cutoff: "exact"; "tile3sigma" also drops pixels outside the 16 x 16 tiles that a square of 3 standard deviations
             touches, as the published model's renderer does; "smooth" fades alpha between 2/255 and 1/255, so that the
             result is differentiable everywhere: for tests of gradients.
+        jacobian: where the projection of a Gaussian centred outside of the image is linearised. "exact": at its centre,
+            so an image is what a larger one of the same camera has there; "clamped": at most 0.15 of the image outside
+            of it, as 3DGS and gsplat do, and models trained so expect.
         on_bad: what happens to a row that cannot be used (:mod:`gsim3d.stability`). "raise": an error on the CPU, left
             out on a GPU; "drop": left out, its gradients are 0; "clamp": bounded, NaN counts as 0 (rotation: identity).
         report: counts such rows by image; on a GPU its ``check()`` raises what "raise" could not. Without one a GPU
@@ -129,6 +134,8 @@ def rasterize_gaussians(
         raise ValueError("rasterize_gaussians: give one of sh and colors")
     if not isinstance(cutoff, str) or cutoff not in CUTOFFS:
         raise ValueError(f"rasterize_gaussians: cutoff must be one of {', '.join(CUTOFFS)}; got {cutoff!r}")
+    if not isinstance(jacobian, str) or jacobian not in JACOBIANS:
+        raise ValueError(f"rasterize_gaussians: jacobian must be one of {', '.join(JACOBIANS)}; got {jacobian!r}")
     color = sh if colors is None else colors
     dims = 3 if colors is None else 2
     if color.dim() != dims:
@@ -161,6 +168,7 @@ def rasterize_gaussians(
         cameras.height,
         near_plane,
         CUTOFFS[cutoff],
+        JACOBIANS[jacobian],
         *_sizes_of_state(means, n_images, cu_rows.shape[0] - 1, cameras.width, cameras.height),
     )
     raises = on_bad == "raise" and means.device.type == "cpu"
@@ -269,7 +277,7 @@ def _state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_slots)
 
 @torch.library.register_fake("gsim3d::rasterize_gaussians")
 def _(means, quats, scales, opacities, color, features, background, viewmats, *rest):
-    _, _, cu_rows, width, height, _, _, *sizes, watch = rest  # Ks, image_cloud, near_plane and cutoff do not count
+    _, _, cu_rows, width, height, _, _, _, *sizes, watch = rest  # Ks, image_cloud, near_plane and modes do not count
     n_images = viewmats.shape[0]
     shape = (n_images, height, width)
     state = _state_bytes(means, n_images, cu_rows.shape[0] - 1, width, height, sizes[0], sizes[2])
@@ -296,7 +304,7 @@ def _setup(ctx, inputs, output):
     ctx.set_materialize_grads(False)  # else what is kept for the backward pass gets a gradient of zeros as large
     ctx.mark_non_differentiable(*output[4:])
     ctx.save_for_backward(*output[4:7], *inputs[:11])
-    ctx.options = inputs[11:18]
+    ctx.options = inputs[11:19]
 
 
 def _backward(ctx, *grads):
@@ -309,7 +317,7 @@ def _backward(ctx, *grads):
     ]
     viewmats_grad = ctx.needs_input_grad[7]
     *grads, viewmats = torch.ops.gsim3d.rasterize_gaussians_backward(*images, *saved, *ctx.options, viewmats_grad)
-    return (*grads, viewmats if viewmats_grad else None, *[None] * 11)
+    return (*grads, viewmats if viewmats_grad else None, *[None] * 12)
 
 
 _gradient_ops = ["rasterize_gaussians_backward"]

@@ -109,16 +109,41 @@ def _patch_attn(device: str) -> float:
             out = out.index_copy(0, queries, torch.einsum("hij,jhd->ihd", scores.softmax(-1), v[keys]))
         return out
 
-    inputs = [_random(n, 2, 8, seed=seed) for seed in range(3)]
-    return _compare(device, lambda q, k, v: ops.patch_attention(q, k, v, table), reference, *inputs)
+    inputs = [_random(n, 2, 8, seed=seed) for seed in range(5)]
+    alone = _compare(device, lambda q, k, v: ops.patch_attention(q, k, v, table), reference, *inputs[:3])
+    rows, cu = torch.arange(n), torch.tensor([0, n])
+    every = ops.PatchTable(*(t.to(device) for t in (rows, rows, cu, cu)))
+
+    def joint_reference(q: Tensor, *keys: Tensor) -> Tensor:
+        k, v = torch.cat(keys[::2]), torch.cat(keys[1::2])
+        return torch.einsum("hij,jhd->ihd", (torch.einsum("ihd,jhd->hij", q, k) * q.shape[-1] ** -0.5).softmax(-1), v)
+
+    return max(alone, _compare(device, lambda *x: ops.joint_attention(*x, every, every), joint_reference, *inputs))
 
 
 def _row_norm(device: str) -> float:
-    def reference(x: Tensor, weight: Tensor, bias: Tensor, residual: Tensor) -> Tensor:
-        return torch.nn.functional.layer_norm(x, weight.shape, weight, bias) + residual
+    def norm(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        return torch.nn.functional.layer_norm(x, weight.shape, weight, bias)
 
-    inputs = _random(30, 20), _random(20, seed=1), _random(20, seed=2), _random(30, 20, seed=3)
-    return _compare(device, ops.row_norm, reference, *inputs)
+    def stream(x: Tensor, branch: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        return torch.cat(ops.residual_norm(x, branch, branch_norm=(weight, bias), norm=(bias, weight)))
+
+    def stream_reference(x: Tensor, branch: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        x = x + norm(branch, weight, bias)
+        return torch.cat([x, norm(x, bias, weight)])
+
+    def gelu_reference(x: Tensor, mean: Tensor, scale: Tensor, bias: Tensor) -> Tensor:
+        return torch.nn.functional.gelu((x - mean) * scale + bias)
+
+    rows, (weight, bias, mean), more = _random(30, 20), _random(3, 20, seed=1), _random(30, 20, seed=3)
+    summed = torch.ops.gsim3d.linear_grad_bias(rows.to(device)).cpu()
+    if not torch.allclose(summed, rows.sum(0), atol=TOLERANCE):
+        raise AssertionError("the gradient of a bias is not the sum over rows")
+    return max(
+        _compare(device, ops.row_norm, lambda x, w, b, y: norm(x, w, b) + y, rows, weight, bias, more),
+        _compare(device, stream, stream_reference, rows, more, weight, bias),
+        _compare(device, ops.norm_gelu, gelu_reference, rows, mean, weight, bias),
+    )
 
 
 def _pool(device: str) -> float:
@@ -243,12 +268,11 @@ def _sentinel(device: str) -> float:
     means[7, 1], opacities[30] = torch.nan, 2.0
     clouds = {"cloud_scene": torch.tensor([0, 1]), "origin": torch.full((2, 3), -9.0, dtype=torch.float64)}
     clouds |= {"activity": torch.zeros(50, dtype=torch.uint8)}
-    watched = ops.watch_rows(
-        [means.to(device), opacities.to(device)],
-        [(-9, 9), (0, 1)],
-        cu_rows.to(device),
-        **{name: value.to(device) for name, value in clouds.items()},
-    )
+    arguments = [means.to(device), opacities.to(device)], [(-9, 9), (0, 1)], cu_rows.to(device)
+    options = {name: value.to(device) for name, value in clouds.items()}
+    watched, parts = ops.watch_rows(*arguments, **options), ops.watch_rows(*arguments, **options, join=False)
+    if not torch.equal(ops.sentinel.joined([parts.record]).reshape(watched.record.shape), watched.record):
+        raise AssertionError("the parts of a record do not join")
     bad = (~(means.abs() <= 9).all(1)).int() | (opacities > 1).int() << 1
     if not torch.equal(watched.status.cpu(), bad) or watched.record[:, :4].tolist() != [[1, 7, 0, -1], [0, -1, 1, 30]]:
         raise AssertionError("rows that cannot be used are not those that are out of bounds")

@@ -39,7 +39,7 @@ from gsim3d.train.precision import FIRST_SCALE, LossScale, deterministic
 from gsim3d.train.processes import Processes
 from gsim3d.train.profile import check_profile, profiler
 from gsim3d.train.recompute import recomputing
-from gsim3d.train.restore import build_simulator, check_device, describe, model_config
+from gsim3d.train.restore import build_simulator, check_device, describe, keep_jacobian, model_config
 from gsim3d.train.samples import Batch, check_scenes, context_cameras, draw_batch, history_at, spread_views, thinned
 from gsim3d.train.schedule import one_cycle
 from gsim3d.train.signals import noted_signals
@@ -506,6 +506,7 @@ class Trainer:
     def _resume(self) -> None:
         saved = checkpoint.load(self.out)
         check_same_run(self.config, saved.config.get("train", {}), self.out)
+        keep_jacobian(self.simulator, saved.config["model"])
         names = [scene.name for scene in self.scenes]
         known = saved.state.get("scenes", names)
         if missing := sorted(set(known) - set(names)):

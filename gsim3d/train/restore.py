@@ -161,14 +161,24 @@ def model_config(config: TrainConfig) -> ModelConfig:
 
 
 def without_old_switches(model: dict) -> dict:
-    """A saved model section without quirks that are off and that this version has under other names."""
+    """A saved model section without quirks that are off and that this version has under other names; one that says
+    nothing of the Jacobian is older than the choice, and clamped."""
     known = {field.name for field in dataclasses.fields(Quirks)}
     parts = {}
     for name, part in model.items():
         if isinstance(part, dict) and isinstance(part.get("quirks"), dict):
             part = {**part, "quirks": {key: on for key, on in part["quirks"].items() if on or key in known}}
         parts[name] = part
+    if isinstance(parts.get("renderer"), dict):
+        parts["renderer"] = {"jacobian": "clamped", **parts["renderer"]}
     return parts
+
+
+def keep_jacobian(simulator: Simulator, saved: dict) -> None:
+    """``simulator`` draws as the run whose model section was ``saved``."""
+    jacobian = without_old_switches(saved)["renderer"]["jacobian"]
+    renderer = dataclasses.replace(simulator.config.renderer, jacobian=jacobian)
+    simulator.config = dataclasses.replace(simulator.config, renderer=renderer)
 
 
 def build_simulator(config: ModelConfig, seed: int) -> Simulator:

@@ -79,6 +79,7 @@ def renderer_config(name: str, quirks: Quirks = FULL_PRECISION) -> RendererConfi
         sh_degree=state["gaussians"]["sh_degree"],
         scale_min=state["gaussians"]["scale_min"],
         scale_max=state["gaussians"]["scale_max"],
+        jacobian="clamped",
         quirks=quirks,
     )
 

@@ -77,7 +77,8 @@ def render(file, view, means, quats, scales, opacities, harmonics, cutoff):
     sh = torch.einsum("kj,nck->njc", basis_change().to(harmonics), harmonics)
     background = file["in/background"][view].to(means)
     scene = means / near, quats, scales / near, opacities, camera(file, view).to(means.device)
-    return rasterize_gaussians(*scene, sh=sh, background=background, near_plane=NEAR_PLANE, cutoff=cutoff)
+    options = {"background": background, "near_plane": NEAR_PLANE, "cutoff": cutoff, "jacobian": "clamped"}
+    return rasterize_gaussians(*scene, sh=sh, **options)
 
 
 @pytest.mark.parametrize("view", [0, 1])
@@ -128,7 +129,7 @@ def projected_by_oracle(file, view):
     near = file["in/near"][view].double()
     cameras = camera(file, view)
     K, size = cameras.Ks[0], image_size(file)
-    return *project(means / near, quats, scales / near, cameras.viewmats[0], K, size, size), K
+    return *project(means / near, quats, scales / near, cameras.viewmats[0], K, size, size, "clamped"), K
 
 
 @pytest.mark.parametrize("view", [0, 1])

@@ -35,7 +35,7 @@ def small_config(explicit=False, dynamic=4, static=3, **dynamics) -> ModelConfig
             encoder_depths=(1, 2, 1), encoder_channels=(8, 16, 16), encoder_heads=(2, 4, 4),
             decoder_depths=(1, 1), decoder_channels=(8, 16), decoder_heads=(2, 4), quirks=quirks, **scales, **dynamics,
         ),
-        RendererConfig(latents=0 if explicit else dynamic + static, quirks=quirks, **scales),
+        RendererConfig(latents=0 if explicit else dynamic + static, jacobian="clamped", quirks=quirks, **scales),
     )  # fmt: skip
 
 
@@ -44,7 +44,8 @@ def full_config(preset="paper_latent", *arguments) -> ModelConfig:
     config = getattr(presets, preset)(*arguments)
     quirks = Quirks.release()
     parts = (dataclasses.replace(part, quirks=quirks) for part in (config.encoder, config.dynamics, config.renderer))
-    return ModelConfig(*parts)
+    encoder, dynamics, renderer = parts
+    return ModelConfig(encoder, dynamics, dataclasses.replace(renderer, jacobian="clamped"))
 
 
 def random_weights(config: ModelConfig, seed=0) -> dict[str, torch.Tensor]:

@@ -17,7 +17,7 @@ DTYPES = {torch.float32: "float32", torch.float64: "float64"}
 def operator_args(scene):
     leaves = [x.clone().requires_grad_() for x in scene.inputs]
     sizes = [factor * len(scene.means) if scene.means.is_cuda else 0 for factor in (2, 4, 8)]
-    return (*leaves, scene.Ks, scene.image_cloud, scene.cu_rows, scene.width, scene.height, 0.01, 0, *sizes)
+    return (*leaves, scene.Ks, scene.image_cloud, scene.cu_rows, scene.width, scene.height, 0.01, 0, 0, *sizes)
 
 
 # ---- 1 forward against the oracle ----------------------------------------------------------------------------------
@@ -26,10 +26,11 @@ def operator_args(scene):
 @pytest.mark.parametrize("dtype", DTYPES, ids=DTYPES.values())
 @pytest.mark.parametrize("sh_terms", [0, 1, 4, 9, 16])
 @pytest.mark.parametrize("cutoff", ["exact", "tile3sigma", "smooth"])
-def test_forward(device, sh_terms, cutoff, dtype):
+@pytest.mark.parametrize("jacobian", ["exact", "clamped"])
+def test_forward(device, sh_terms, cutoff, jacobian, dtype):
     scene = random_scene(sh_terms=sh_terms, seed=sh_terms)
-    expected = scene.render_oracle(cutoff=cutoff)
-    actual = scene.to(dtype).to(device).render(cutoff=cutoff)
+    expected = scene.render_oracle(cutoff=cutoff, jacobian=jacobian)
+    actual = scene.to(dtype).to(device).render(cutoff=cutoff, jacobian=jacobian)
     for name, a, e in zip(OUTPUTS, actual, expected, strict=True):
         assert a.dtype == dtype
         assert_close_relative_to_max(a, e, f"raster_{DTYPES[dtype]}", name)
@@ -52,11 +53,12 @@ def test_long_lists_are_sorted_by_depth(device):
 @pytest.mark.parametrize("dtype", DTYPES, ids=DTYPES.values())
 @pytest.mark.parametrize("sh_terms", [0, 1, 4, 9, 16])
 @pytest.mark.parametrize("cutoff", ["exact", "tile3sigma", "smooth"])
-def test_backward(device, sh_terms, cutoff, dtype):
-    scene = random_scene(sh_terms=sh_terms, seed=sh_terms)
-    expected = gradients(scene.render_oracle, scene, cutoff=cutoff)
+@pytest.mark.parametrize("jacobian", ["exact", "clamped"])
+def test_backward(device, sh_terms, cutoff, jacobian, dtype):
+    scene, options = random_scene(sh_terms=sh_terms, seed=sh_terms), {"cutoff": cutoff, "jacobian": jacobian}
+    expected = gradients(scene.render_oracle, scene, **options)
     moved = scene.to(dtype).to(device)
-    for name, a, e in zip(Scene.NAMES, gradients(moved.render, moved, cutoff=cutoff), expected, strict=True):
+    for name, a, e in zip(Scene.NAMES, gradients(moved.render, moved, **options), expected, strict=True):
         assert e.abs().max() > 0
         assert_close_relative_to_max(a, e, f"raster_grad_{DTYPES[dtype]}", name)
 
@@ -114,18 +116,20 @@ def test_unused_inputs_have_no_gradient(device):
 
 
 @pytest.mark.unsanitized("runs the kernels of test_any_number_of_features thousands of times")
-@pytest.mark.parametrize("sh_terms", [0, 4, 16])
-def test_gradcheck(device, sh_terms):
+@pytest.mark.parametrize(("sh_terms", "jacobian"), [(0, "exact"), (4, "exact"), (16, "exact"), (0, "clamped")])
+def test_gradcheck(device, sh_terms, jacobian):
     scene = random_scene(
         n=5, clouds=2, images=2, width=11, height=9, n_features=2, sh_terms=sh_terms, seed=3, spread=0.3
     )
     color = scene.color + (0.5 if sh_terms else 0)  # away from the clamp at 0
-    scene = scene.replace(scales=2 * scene.scales, color=color).to(device)
+    scales, means = 2 * scene.scales, scene.means.clone()
+    means[0], scales[0] = torch.tensor([2.5, 0.3, -1.0]), 1.0  # far outside of the image, where a Jacobian is clamped
+    scene = scene.replace(means=means, scales=scales, color=color).to(device)
     leaves = [x.clone().requires_grad_() for x in scene.inputs]
     mixes = [scene.cotangents(seed) for seed in range(6)]
 
     def mixed(*inputs):  # six random mixtures of all pixels of all images
-        out = scene.render(*inputs, cutoff="smooth")
+        out = scene.render(*inputs, cutoff="smooth", jacobian=jacobian)
         return torch.stack([sum((m * o).sum() for m, o in zip(mix, out, strict=True)) for mix in mixes])
 
     assert torch.autograd.gradcheck(mixed, leaves, atol=1e-6, nondet_tol=0.0)

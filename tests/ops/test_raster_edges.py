@@ -407,6 +407,8 @@ def test_options_are_checked(device):
     scene = facing([0, 0, 2.0]).to(device)
     with pytest.raises(ValueError, match="cutoff must be one of exact, tile3sigma, smooth; got 'soft'"):
         scene.render(cutoff="soft")
+    with pytest.raises(ValueError, match="jacobian must be one of exact, clamped; got 'free'"):
+        scene.render(jacobian="free")
     with pytest.raises(ValueError, match="give one of sh and colors"):
         rasterize_gaussians(*scene.inputs[:4], scene.cameras())
     with pytest.raises(ValueError, match=r"sh must be \[N, K, 3\]; got \[1, 3\]"):

@@ -6,14 +6,37 @@ from pathlib import Path
 import pytest
 import torch
 
+from torch.utils._python_dispatch import TorchDispatchMode
+
 from gsim3d import ops
 from gsim3d.ops import selftest
 
+# What a fused network calls itself (tests/dynamics/test_fused_block.py), and a GPU alone needs.
+NOT_ALONE = {"patch_attention_backward_packed", "sparse_conv_plan"}
 CORE = Path(__file__).parents[2] / "csrc" / "gsim3d"
 
 
 def test_every_op_is_tested():
     assert set(selftest.CHECKS) == {file.name.removesuffix("_torch.cpp") for file in CORE.glob("*/*_torch.cpp")}
+
+
+class Called(TorchDispatchMode):
+    def __init__(self):
+        super().__init__()
+        self.names = set()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        if function.namespace == "gsim3d":
+            self.names.add(function._schema.name.removeprefix("gsim3d::"))
+        return function(*args, **(kwargs or {}))
+
+
+def test_every_registered_op_is_called_forward_and_backward():
+    names = {name.split(".")[0] for name in torch._C._dispatch_get_all_op_names() if name.startswith("gsim3d::")}
+    with Called() as called:
+        for check in selftest.CHECKS.values():
+            check("cpu")
+    assert called.names == {name.removeprefix("gsim3d::") for name in names} - NOT_ALONE
 
 
 @pytest.mark.parametrize("name", selftest.CHECKS)
@@ -38,6 +61,9 @@ def _off(value):
         ("background", "add_cells"),
         ("background", "overlapping_patches"),
         ("sentinel", "watch_rows"),
+        ("patch_attn", "joint_attention"),
+        ("row_norm", "residual_norm"),
+        ("row_norm", "norm_gelu"),
     ],
 )
 def test_an_op_that_computes_wrongly_is_noticed(monkeypatch, check, op):

@@ -49,24 +49,26 @@ def rotation_matrix(quats):
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def project(means, quats, scales, viewmat, K, width, height):
+def project(means, quats, scales, viewmat, K, width, height, jacobian="exact"):
     """Mean [N, 2] and dilated covariance [N, 2, 2] in pixels, camera point [N, 3]."""
     W, t = viewmat[:3, :3], viewmat[:3, 3]
     point = means @ W.T + t
     pixels = point @ K.T
     mean2d = pixels[:, :2] / pixels[:, 2:]
-    # The Jacobian of the pixel coordinates, taken where they are at most a margin outside of the image.
-    size = torch.tensor([width, height], dtype=means.dtype)
-    seen = mean2d.clamp(-FIELD_MARGIN * size, (1 + FIELD_MARGIN) * size)
-    z = point[:, 2]
-    jacobian = torch.zeros(len(means), 2, 3, dtype=means.dtype)
-    jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 1] = K[0, 0] / z, K[0, 1] / z, K[1, 1] / z
-    jacobian[:, :, 2] = -(seen - K[:2, 2]) / z[:, None]
-    axes = jacobian @ W @ rotation_matrix(quats) @ torch.diag_embed(scales)
+    seen, z = mean2d, point[:, 2]
+    if jacobian == "clamped":  # taken where pixel coordinates are at most a margin outside of the image
+        size = torch.tensor([width, height], dtype=means.dtype)
+        seen = mean2d.clamp(-FIELD_MARGIN * size, (1 + FIELD_MARGIN) * size)
+    J = torch.zeros(len(means), 2, 3, dtype=means.dtype)
+    J[:, 0, 0], J[:, 0, 1], J[:, 1, 1] = K[0, 0] / z, K[0, 1] / z, K[1, 1] / z
+    J[:, :, 2] = -(seen - K[:2, 2]) / z[:, None]
+    axes = J @ W @ rotation_matrix(quats) @ torch.diag_embed(scales)
     return mean2d, axes @ axes.mT + DILATION * torch.eye(2, dtype=means.dtype), point
 
 
-def render_image(gaussians, background, viewmat, K, width, height, *, near_plane=0.01, cutoff="exact"):
+def render_image(
+    gaussians, background, viewmat, K, width, height, *, near_plane=0.01, cutoff="exact", jacobian="exact"
+):
     """One image of (means, quats, scales, opacities, color, features); color [N, K, 3] or [N, 3]."""
     with torch.no_grad():
         means = gaussians[0]
@@ -74,7 +76,7 @@ def render_image(gaussians, background, viewmat, K, width, height, *, near_plane
         order = torch.argsort(z, stable=True)
         order = order[z[order] > near_plane]
     means, quats, scales, opacities, color, features = (x[order] for x in gaussians)
-    mean2d, covariance, point = project(means, quats, scales, viewmat, K, width, height)
+    mean2d, covariance, point = project(means, quats, scales, viewmat, K, width, height, jacobian)
     if color.dim() == 3:
         direction = torch.nn.functional.normalize(point @ viewmat[:3, :3], dim=-1)
         degree = math.isqrt(color.shape[1]) - 1

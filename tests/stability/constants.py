@@ -53,7 +53,7 @@ CONSTANTS = (
         "0.15",
         "of the image's size",
         _RASTER,
-        "the Jacobian is taken at most so far outside of the image: no coordinate over depth beyond it",
+        "a clamped Jacobian is taken at most so far outside of the image",
     ),
     Constant(
         "kLargest",

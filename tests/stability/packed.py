@@ -53,11 +53,12 @@ def render_beside_another(setting: Setting, measured: Measured, hard: Scene, **o
     both, alone = setting.to(pack([hard, mate])), setting.to(mate)
     out, grads = both.render(**options), gradients(both.render, both, **options)
     measured.finite(*out, *grads)
-    for a, e in zip(out, alone.render(), strict=True):
+    jacobian = {"jacobian": options.get("jacobian", "exact")}
+    for a, e in zip(out, alone.render(**jacobian), strict=True):
         measured.same_bits(a[1:], e, "image of the other scene")
     second = [x[1:] for x in both.cotangents()]
     leaves = [x.detach().clone().requires_grad_() for x in alone.inputs]
-    expected = torch.autograd.grad(alone.render(*leaves), leaves, second)
+    expected = torch.autograd.grad(alone.render(*leaves, **jacobian), leaves, second)
     for name, a, e in zip(Scene.NAMES, grads, expected, strict=True):
         measured.same_bits(a[n:] if name in ROWS else a[1:], e, f"gradient of the other scene's {name}")
     own = {name: g[:n] if name in ROWS else g[:1] for name, g in zip(Scene.NAMES, grads, strict=True)}
@@ -65,19 +66,24 @@ def render_beside_another(setting: Setting, measured: Measured, hard: Scene, **o
 
 
 def check_against_oracle(
-    setting: Setting, measured: Measured, hard: Scene, *, bounds: tuple[str, str] = ("raster", "raster_grad")
+    setting: Setting,
+    measured: Measured,
+    hard: Scene,
+    *,
+    bounds: tuple[str, str] = ("raster", "raster_grad"),
+    jacobian: str = "exact",
 ) -> Result:
     """:func:`render_beside_another`, and the hard scene's outputs and gradients against the float64 oracle.
 
     bounds: names in tests/tolerances.py, without the precision, of the largest errors of outputs and gradients.
     """
     of_output, of_gradient = (f"{name}_{setting.exact}" for name in bounds)
-    result = render_beside_another(setting, measured, hard)
+    result = render_beside_another(setting, measured, hard, jacobian=jacobian)
     hard = hard.to(setting.dtype)
     cotangents = [x[:1].double() for x in pack([hard, ordinary(hard)]).cotangents()]
     exact = hard.to(torch.float64)
     leaves = [x.detach().clone().requires_grad_() for x in exact.inputs]
-    outputs = exact.render_oracle(*leaves)
+    outputs = exact.render_oracle(*leaves, jacobian=jacobian)
     for name, expected in zip(("color", "alpha", "depth", "features"), outputs, strict=True):
         measured.close(getattr(result, name), expected, of_output, name)
     sum((x * c).sum() for x, c in zip((*outputs, *leaves), (*cotangents, *[0] * len(leaves)))).backward()

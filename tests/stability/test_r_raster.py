@@ -156,10 +156,12 @@ def test_r09_straddling_the_near_plane(setting, measured, z):
     assert result.grads["color"][1].abs().max() > 0
 
 
-def test_r09_far_beside_the_image(setting, measured):
-    """A centre outside of the camera's field whose Gaussian reaches into it: the Jacobian is that at the margin."""
+@pytest.mark.parametrize("jacobian", ["exact", "clamped"])
+def test_r09_far_beside_the_image(setting, measured, jacobian):
+    """A centre outside of the camera's field whose Gaussian reaches into it; clamped, the Jacobian is that at the
+    margin."""
     scene = change(change(three(), "means", 1, torch.tensor([3.0, -2.0, 1.0])), "scales", 1, 1.5)
-    result = check_against_oracle(setting, measured, scene)
+    result = check_against_oracle(setting, measured, scene, jacobian=jacobian)
     assert result.grads["color"][1].abs().max() > 0
 
 
@@ -226,6 +228,30 @@ def test_r13_an_image_is_a_crop_of_a_padded_one(setting, measured):
     padded = render_beside_another(setting, measured, small.replace(width=48, height=64, Ks=K))
     expected = render_beside_another(setting, measured, small)
     measured.close(padded.color[:, 11:44, 20:37], expected.color, f"raster_{setting.exact}")
+
+
+OUTSIDE = {  # centres beside a crop, and most beside the padded image; shapes of Gaussians that reach into both
+    "a needle": ([[2.6, 1.9, 1.0]], [[2.5, 0.02, 0.02]], [[0.5628, 0.0, -0.8408, -0.3195]]),
+    "a pancake": ([[-1.5, 0.3, 1.5]], [[1.2, 1.2, 0.01]], [[0.92, 0.0, -0.38, 0.1]]),
+    "round": ([[0.5, -3.0, 2.0], [4.0, 0.0, 1.0]], [[1.5, 1.5, 1.5], [2.0, 2.0, 2.0]], [[1.0, 0, 0, 0]] * 2),
+}
+
+
+@pytest.mark.parametrize("shape", OUTSIDE)
+def test_r13_a_crop_of_gaussians_centred_outside(setting, measured, shape):
+    """Exactly linearised, they are drawn into a crop as into the image that it is of; clamped, they are not."""
+    means, scales, quats = (torch.tensor(x) for x in OUTSIDE[shape])
+    small = facing(means, scales=scales, quats=quats, opacities=0.8, width=20, height=20, focal=20.0)
+    K = small.Ks.clone()
+    K[:, :2, 2] += 40
+    for jacobian in ("exact", "clamped"):
+        wide = render_beside_another(setting, measured, small.replace(width=100, height=100, Ks=K), jacobian=jacobian)
+        crop, expected = wide.alpha[:, 40:60, 40:60], render_beside_another(setting, measured, small, jacobian=jacobian)
+        assert expected.alpha.max() > 0.05
+        if jacobian == "exact":
+            measured.close(crop, expected.alpha, f"raster_{setting.exact}")
+        else:
+            assert (crop - expected.alpha).abs().max() > 0.01
 
 
 def test_r14_off_centre_and_skewed_cameras(setting, measured):

@@ -2,8 +2,13 @@
 
 #include <atomic>
 #include <condition_variable>
+#include <memory>
 #include <thread>
 #include <vector>
+
+#if __has_include(<pthread.h>)
+#include <pthread.h>
+#endif
 
 namespace gsim3d {
 namespace {
@@ -86,12 +91,30 @@ void run_serial(void*, int64_t n_chunks, Parallel::Body body, void* state) {
   for (int64_t chunk = 0; chunk < n_chunks; ++chunk) body(state, chunk);
 }
 
+// Never destroyed: workers sleep until the process ends, and in a forked child there is none that could be joined.
+std::atomic<Pool*> shared_pool{nullptr};
+std::atomic<bool> forked{false};
+
+#if __has_include(<pthread.h>)
+// The child of a fork has one thread, and locks as they were at that moment: it makes another pool.
+const int on_fork = pthread_atfork(nullptr, nullptr, [] {
+  shared_pool.store(nullptr);
+  forked.store(true);
+});
+#endif
+
 }  // namespace
 
 Parallel thread_pool() {
-  static Pool pool;
-  return {run_pool, &pool};
+  Pool* pool = shared_pool.load();
+  if (pool == nullptr) {
+    auto made = std::make_unique<Pool>();
+    if (shared_pool.compare_exchange_strong(pool, made.get())) pool = made.release();
+  }
+  return {run_pool, pool};
 }
+
+bool is_forked() { return forked.load(); }
 
 Parallel serial() { return {run_serial, nullptr}; }
 

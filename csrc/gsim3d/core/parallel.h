@@ -63,9 +63,11 @@ class Parallel {
   void* pool_;
 };
 
-// A pool of std::thread workers shared by callers without torch; threads start on first use. n_threads() tells its
-// size.
+// A pool of std::thread workers shared by callers without torch; threads start on first use, and anew in a forked
+// child.
 Parallel thread_pool();
+// Whether this process was forked from one that had loaded this library: the threads of any pool stayed behind.
+bool is_forked();
 // One thread: the loop runs where it is called.
 Parallel serial();
 

@@ -25,6 +25,12 @@ enum class RasterCutoff : int64_t {
   kSmooth = 2,      // alpha fades to 0 between 2/255 and 1/255: once differentiable everywhere, for tests of gradients
 };
 
+// Where J, the derivative of the image coordinates, is taken for Gaussians centred outside of the image.
+enum class RasterJacobian : int64_t {
+  kExact = 0,    // at the centre: an image is what a larger one of the same camera has there
+  kClamped = 1,  // at most 0.15 of the image outside of it, as 3DGS and gsplat do
+};
+
 template <typename T>
 struct RasterScene {
   const T* means;       // [n_rows, 3] metres, world
@@ -43,6 +49,7 @@ struct RasterScene {
   int64_t n_features, width, height;
   T near_plane;  // metres; Gaussians whose centre is not beyond it are left out
   RasterCutoff cutoff;
+  RasterJacobian jacobian = RasterJacobian::kExact;
 };
 
 // What makes a row unusable; bits. Such a row is left out of the images, and its gradients are 0.

@@ -21,6 +21,8 @@ void check_options(const RasterScene<T>& s) {
   check(std::isfinite(s.near_plane) && s.near_plane > 0, kOp, ": near_plane must be positive; got ", s.near_plane);
   const auto cutoff = static_cast<int64_t>(s.cutoff);
   check(cutoff >= 0 && cutoff <= 2, kOp, ": cutoff must be 0 (exact), 1 (tile3sigma) or 2 (smooth); got ", cutoff);
+  const auto jacobian = static_cast<int64_t>(s.jacobian);
+  check(jacobian >= 0 && jacobian <= 1, kOp, ": jacobian must be 0 (exact) or 1 (clamped); got ", jacobian);
 }
 
 template <typename T>

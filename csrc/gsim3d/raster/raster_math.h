@@ -13,7 +13,8 @@ constexpr double kMinAlpha = 1.0 / 255;       // weaker than the smallest step o
 constexpr double kMaxAlpha = 0.99;            // keeps 1 / (1 - alpha) in the backward pass below 100
 constexpr double kMinTransmittance = 1e-4;    // a pixel ends before falling below it; what is behind is invisible
 constexpr double kDilation = 0.3;             // px^2, added to both variances: no Gaussian falls between pixels
-constexpr double kFieldMargin = 0.15;         // the Jacobian is taken at most this part of the image outside of it
+constexpr double kFieldMargin = 0.15;         // how far outside of the image, in its size, a clamped Jacobian is taken
+constexpr double kUnbounded = 3e38;           // no ratio of usable numbers is larger in float32
 constexpr double kLargest = 1e15;              // beyond it a number is not used: products and squares stay finite
 constexpr double kMinQuat = 1e-6;             // shorter quaternions have no direction: identity, no gradient
 constexpr int kTile = 16;                     // pixels; part of the meaning of RasterCutoff::kTile3Sigma
@@ -59,16 +60,20 @@ struct Camera {
 };
 
 template <typename S>
-GSIM3D_HD Camera<S> make_camera(const S* viewmat, const S* K, int64_t width, int64_t height, S near_plane) {
+GSIM3D_HD Camera<S> make_camera(const S* viewmat, const S* K, int64_t width, int64_t height, S near_plane,
+                                bool clamped) {
   Camera<S> camera;
   for (int row = 0; row < 3; ++row) {
     for (int column = 0; column < 3; ++column) camera.rotation[row * 3 + column] = viewmat[row * 4 + column];
     camera.translation[row] = viewmat[row * 4 + 3];
   }
   camera.fx = K[0], camera.skew = K[1] / K[0], camera.cx = K[2], camera.fy = K[4], camera.cy = K[5];
-  const S margin_x = S(kFieldMargin) * S(width), margin_y = S(kFieldMargin) * S(height);
-  camera.low_x = (-margin_x - camera.cx) / camera.fx, camera.high_x = (S(width) + margin_x - camera.cx) / camera.fx;
-  camera.low_y = (-margin_y - camera.cy) / camera.fy, camera.high_y = (S(height) + margin_y - camera.cy) / camera.fy;
+  camera.low_x = camera.low_y = S(-kUnbounded), camera.high_x = camera.high_y = S(kUnbounded);
+  if (clamped) {
+    const S margin_x = S(kFieldMargin) * S(width), margin_y = S(kFieldMargin) * S(height);
+    camera.low_x = (-margin_x - camera.cx) / camera.fx, camera.high_x = (S(width) + margin_x - camera.cx) / camera.fx;
+    camera.low_y = (-margin_y - camera.cy) / camera.fy, camera.high_y = (S(height) + margin_y - camera.cy) / camera.fy;
+  }
   camera.near_plane = near_plane;
   return camera;
 }
@@ -154,7 +159,7 @@ struct Projection {
   V xx, xy, yy;      // covariance, px^2, dilated
   V determinant;     // xx yy - xy^2
   V point[3];        // camera frame
-  V inverse_z, ratio_x, ratio_y;  // ratios as the Jacobian sees them: clamped
+  V inverse_z, ratio_x, ratio_y;  // ratios as the Jacobian sees them: clamped, where it is
   V free_x, free_y;               // 1, or 0 where clamped
   V jw[6];        // J W
   V half[6];      // J W R diag(scale): covariance = half half^T + dilation

@@ -153,7 +153,7 @@ void choose_images(const RasterScene<T>& scene, Group<T>& group) {
     group.image_pair.push_back(pairs + end - begin);
     group.image_chunk.push_back(static_cast<int64_t>(group.chunks.size()));
     group.cameras.push_back(make_camera(scene.viewmats + 16 * image, scene.Ks + 9 * image, scene.width, scene.height,
-                                        scene.near_plane));
+                                        scene.near_plane, scene.jacobian == RasterJacobian::kClamped));
     group.last = image + 1;
   }
 }

@@ -10,7 +10,7 @@ struct SceneTensors {
   Tensor means, quats, scales, opacities, color, features, background, viewmats, Ks, image_cloud, cu_rows;
   int64_t width, height;
   double near_plane;
-  int64_t cutoff;
+  int64_t cutoff, jacobian;
 
   SceneTensors contiguous() const {
     SceneTensors copy = *this;
@@ -81,7 +81,8 @@ struct SceneTensors {
             .width = width,
             .height = height,
             .near_plane = static_cast<T>(near_plane),
-            .cutoff = static_cast<RasterCutoff>(cutoff)};
+            .cutoff = static_cast<RasterCutoff>(cutoff),
+            .jacobian = static_cast<RasterJacobian>(jacobian)};
   }
 };
 
@@ -90,10 +91,10 @@ using Images = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor
 Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
                            const Tensor& color, const Tensor& features, const Tensor& background,
                            const Tensor& viewmats, const Tensor& Ks, const Tensor& image_cloud, const Tensor& cu_rows,
-                           int64_t width, int64_t height, double near_plane, int64_t cutoff, int64_t max_pairs,
-                           int64_t max_entries, int64_t max_slots, bool watch) {
+                           int64_t width, int64_t height, double near_plane, int64_t cutoff, int64_t jacobian,
+                           int64_t max_pairs, int64_t max_entries, int64_t max_slots, bool watch) {
   const SceneTensors given{"rasterize_gaussians", means, quats, scales, opacities, color, features, background,
-                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff};
+                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff, jacobian};
   given.check_all();
   const SceneTensors in = given.contiguous();
   const int64_t n = in.n_images();
@@ -135,11 +136,11 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
                                         const Tensor& opacities, const Tensor& color, const Tensor& features,
                                         const Tensor& background, const Tensor& viewmats, const Tensor& Ks,
                                         const Tensor& image_cloud, const Tensor& cu_rows, int64_t width, int64_t height,
-                                        double near_plane, int64_t cutoff, int64_t max_pairs, int64_t max_entries,
-                                        int64_t max_slots, bool viewmats_grad) {
+                                        double near_plane, int64_t cutoff, int64_t jacobian, int64_t max_pairs,
+                                        int64_t max_entries, int64_t max_slots, bool viewmats_grad) {
   const char* op = "rasterize_gaussians_backward";
   const SceneTensors given{op, means, quats, scales, opacities, color, features, background,
-                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff};
+                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff, jacobian};
   given.check_all();
   const SceneTensors in = given.contiguous();
   const Tensor grad_color = rows_of(grad_color_), grad_alpha = rows_of(grad_alpha_), grad_depth = rows_of(grad_depth_);

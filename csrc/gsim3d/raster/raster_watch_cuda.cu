@@ -43,7 +43,8 @@ __device__ bool overflows(const RasterScene<T>& s, int64_t row, int64_t image) {
   for (int i = 0; i < 4; ++i) quat[i] = s.quats[4 * row + i];
   for (int i = 0; i < 3; ++i) scale[i] = s.scales[3 * row + i];
   const Camera<T> camera =
-      make_camera(s.viewmats + 16 * image, s.Ks + 9 * image, s.width, s.height, s.near_plane);
+      make_camera(s.viewmats + 16 * image, s.Ks + 9 * image, s.width, s.height, s.near_plane,
+                  s.jacobian == RasterJacobian::kClamped);
   const Projection<T> p = project(camera, mean, axes_of(quat, scale));
   return p.z > camera.near_plane && !isfinite(p.determinant);
 }

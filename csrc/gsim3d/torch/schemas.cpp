@@ -116,12 +116,14 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor src_images, Tensor cu_src) -> Tensor");
 
   // raster: 3D Gaussian projection and blending. color is [N, K, 3] SH coefficients or [N, 3]; cutoff 0 exact, 1
-  // tile3sigma, 2 smooth; transmittance, last and state are kept for the backward pass. max_* (CUDA) size the state.
+  // tile3sigma, 2 smooth; jacobian 0 exact, 1 clamped; transmittance, last and state are kept for the backward pass.
+  // max_* (CUDA) size the state.
   // unusable [I, 2] counts the rows that were left out, [0, 2] unless `watch`.
   m.def(
       "rasterize_gaussians(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, Tensor features, "
       "Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, int width, int height, "
-      "float near_plane, int cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots, bool watch) -> "
+      "float near_plane, int cutoff, int jacobian, SymInt max_pairs, SymInt max_entries, SymInt max_slots, bool watch) "
+      "-> "
       "(Tensor color, Tensor alpha, Tensor depth, Tensor features, Tensor transmittance, Tensor last, Tensor state, "
       "Tensor unusable)");
   m.def(
@@ -129,8 +131,8 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor transmittance, Tensor last, Tensor state, Tensor means, Tensor quats, Tensor scales, Tensor opacities, "
       "Tensor color, Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor "
       "cu_rows, "
-      "int width, int height, float near_plane, int cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots, "
-      "bool viewmats_grad) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
+      "int width, int height, float near_plane, int cutoff, int jacobian, SymInt max_pairs, SymInt max_entries, SymInt "
+      "max_slots, bool viewmats_grad) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
       "Tensor features, Tensor background, Tensor viewmats)");
 }
 

@@ -28,8 +28,10 @@ namespace gsim3d::binding {
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
 
-// Runs chunks on torch's intra-op pool.
+// Runs chunks on torch's intra-op pool; on one thread in a forked child, where that pool would wait for threads that
+// are not there.
 inline Parallel torch_parallel() {
+  if (is_forked()) return serial();
   return {[](void*, int64_t n_chunks, Parallel::Body body, void* state) {
             torch::stable::parallel_for(0, n_chunks, 1, [&](int64_t begin, int64_t end) {
               for (int64_t chunk = begin; chunk < end; ++chunk) body(state, chunk);
