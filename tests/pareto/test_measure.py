@@ -48,7 +48,7 @@ def test_the_reference_agrees_with_itself(comparison):
     found = comparison.of(Setting())
     task, by_step = found.task, found.by_step
     assert found.agreement == measure.Agreement(100.0, 100.0, 0.0, 0.0)
-    assert set(task) == {"psnr", "psnr_masked", "psnr_body", "ssim"}
+    assert set(task) == {"psnr", "psnr_masked", "psnr_body", "psnr_ground", "psnr_ring", "ssim"}
     assert len(by_step["psnr"]) == comparison.subject.n_steps
     gains = [ours - constant for ours, constant in zip(by_step["psnr_masked"], comparison.constant["psnr_masked"])]
     assert comparison.gain(by_step) == pytest.approx(sum(gains) / len(gains))
