@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from gsim3d import ops
+from gsim3d.errors import InputError
 from gsim3d.harmonics import (
     degree_damping,
     lit,
@@ -25,6 +26,7 @@ from gsim3d.harmonics import (
 from gsim3d.layers import RowLinear, widened
 from gsim3d.ops.raster import Rendering
 from gsim3d.quirks import Quirks
+from gsim3d.ranges import check_ranges
 from gsim3d.rotations import quat_product, rotation_matrices, unit_quats
 from gsim3d.stability import OnBad, StabilityReport
 from gsim3d.types import Cameras, Gaussians, Particles
@@ -53,6 +55,11 @@ class RendererConfig:
     initial_scale: float | None = None
     jacobian: Literal["exact", "clamped"] = "exact"
     quirks: Quirks = field(default_factory=Quirks)
+
+    def __post_init__(self):
+        check_ranges(self, latents=(0, 10**5), sh_degree=(0, 3), scale_max=(1e-6, 1e6), scale_min=(0, self.scale_max))
+        if self.initial_scale is not None and not self.scale_min < self.initial_scale < self.scale_max:
+            raise InputError(f"initial_scale must be between scale_min and scale_max; got {self.initial_scale}")
 
     @property
     def n_harmonics(self) -> int:

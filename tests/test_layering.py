@@ -10,7 +10,7 @@ ROOT = Path(__file__).parent.parent
 # Each room may import the rooms before it (and its own), never one after it.
 ROOMS = [
     {"errors", "quirks", "plain", "pickles"},
-    {"types", "stability", "terminal", "files", "locks", "pretrained", "branches", "processor"},
+    {"types", "stability", "terminal", "files", "locks", "ranges", "pretrained", "branches", "processor"},
     {"selections"},
     {"ops", "effects", "harmonics", "rotations"},
     {"layers", "guards"},

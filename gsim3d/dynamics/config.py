@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from gsim3d.ops.curve import PyramidSpec
 from gsim3d.quirks import Quirks
+from gsim3d.ranges import check_ranges
 from gsim3d.stability import LARGEST
 
 PREDICTS = ("from_newest", "from_previous", "absolute")
@@ -207,6 +208,14 @@ class DynamicsConfig:
             )
         if self.steps_per_call < 1:
             raise ValueError(f"DynamicsConfig: steps_per_call must be at least 1; got {self.steps_per_call}")
+        lengths = ("position_length", "motion_length", "contact_length", "grid_size", "scale_max")
+        check_ranges(self, **dict.fromkeys(lengths, (1e-6, 1e6)), scale_min=(0, self.scale_max))
+        check_ranges(self, **dict.fromkeys(("max_step", "max_latent_step"), (0, 1e6)))
+        check_ranges(self, **dict.fromkeys(("gravity", "lights"), (-1e6, 1e6)), drop_path=(0, 1), sh_degree=(0, 3))
+        check_ranges(self, **dict.fromkeys(("dynamic_latents", "static_latents"), (0, 10**4)), mlp_ratio=(1, 100))
+        counts = ("strides", "merge_windows", "patch_sizes", "encoder_heads", "decoder_heads", "steps_per_call")
+        check_ranges(self, **dict.fromkeys((*counts, "encoder_channels", "decoder_channels"), (1, 10**5)))
+        check_ranges(self, **dict.fromkeys(("encoder_depths", "decoder_depths"), (0, 100)))
 
     @property
     def n_stages(self) -> int:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from gsim3d.errors import InputError
 from gsim3d.quirks import Quirks
+from gsim3d.ranges import check_ranges
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,15 @@ class EncoderConfig:
             dim = getattr(self, name)
             if dim % 8 or (dim > 32 and dim % 32):
                 raise InputError(f"EncoderConfig: {name} must be 8, 16, 24 or a multiple of 32; got {dim}")
+        widths = ("feature_dim", "cnn_dims", "cost_unet_dim", "refine_unet_dim", "disparity_dim")
+        check_ranges(self, **dict.fromkeys(widths, (1, 10**5)), n_depths=(2, 10**4), sh_degree=(0, 3))
+        check_ranges(self, **dict.fromkeys(("upsampled_dim", "dynamic_dim", "static_dim", "condition_dim"), (0, 10**5)))
+        check_ranges(self, **dict.fromkeys(("cnn_blocks", "transformer_layers"), (0, 100)), window_split=(1, 1000))
+        check_ranges(self, **dict.fromkeys(("cost_unet_attention", "refine_unet_attention"), (1, 10**4)))
+        check_ranges(self, cost_unet_levels=(1, 20), refine_unet_levels=(1, 20), transformer_mlp_ratio=(1, 100))
+        check_ranges(self, scale_range=(0, 1e6))
+        if self.scale_range[0] > self.scale_range[1]:
+            raise InputError(f"EncoderConfig: scale_range must rise; got {self.scale_range}")
 
     @classmethod
     def tiny(cls) -> EncoderConfig:

@@ -9,21 +9,13 @@ from typing import Any, Literal
 from gsim3d.data import Fitting
 from gsim3d.data.scene import SIZE_MULTIPLE
 from gsim3d.errors import InputError
+from gsim3d.ranges import check_ranges
 from gsim3d.train.losses import BALANCE, DISCOUNT
 from gsim3d.train.precision import PrecisionConfig
 
 
 MANY = 10**9  # steps; more than any run has
 LARGEST_SIDE = 2**15  # pixels of an image
-
-
-def check_ranges(config: Any, **ranges: tuple[float, float]) -> None:
-    """Raises InputError where a number of ``config`` lies outside of its (least, most)."""
-    for name, (least, most) in ranges.items():
-        value = getattr(config, name)
-        if not least <= value <= most:
-            bound = f"at most {most}" if value > most else f"at least {least}"
-            raise InputError(f"{name} must be {bound}; got {value}")
 
 
 @dataclass(frozen=True)

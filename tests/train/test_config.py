@@ -1,12 +1,14 @@
 """Configurations: typed, and nothing unknown is accepted."""
 
 import dataclasses
+import math
 import re
 import typing
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
 from gsim3d import presets
@@ -14,6 +16,7 @@ from gsim3d.data import Fitting
 from gsim3d.edits import load_edits
 from gsim3d.effects import EffectsSpec
 from gsim3d.errors import InputError
+from gsim3d.train import restore
 from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.restore import build_simulator, model_config
 from gsim3d.train.settings import from_dict, load_yaml, to_dict
@@ -106,12 +109,36 @@ def test_every_number_of_a_run_has_a_finite_range(tmp_path, text):
         ({"dynamics": {"gravity": [0, 0, float("nan")]}}, r"model.dynamics.gravity\[2\]: must be a number"),
         ({"stability": {"max_speed": 1e39}}, "model.stability.max_speed: must be a number"),
         ({"encoder": {"n_depths": 2**70}}, "model.encoder.n_depths: must be a whole number"),
-        ({"encoder": {"cnn_dims": [-3, 32]}}, "model: no model has these sizes"),
+        ({"encoder": {"cnn_dims": [-3, 32]}}, "encoder: cnn_dims must be at least 1"),
     ],
 )
 def test_a_model_that_cannot_be_is_refused(content, message):
     with pytest.raises(InputError, match=message):
         build_simulator(model_config(TrainConfig(model=content)), 0)
+
+
+def test_sizes_of_which_no_layer_can_be_made_are_told(monkeypatch):
+    monkeypatch.setattr(restore, "Simulator", lambda config: torch.zeros(3) @ torch.zeros(2))
+    with pytest.raises(InputError, match="model: no model has these sizes: RuntimeError: inconsistent tensor size"):
+        build_simulator(presets.tiny(), 0)
+
+
+def test_every_number_of_a_model_has_a_finite_range():
+    base = to_dict(presets.tiny())
+    for part, settings in base.items():
+        for name, value in settings.items():
+            items = value if isinstance(value, list) else [value]
+            if not items or isinstance(items[0], (bool, str, dict, type(None))):
+                continue
+            huge = (10**39,) if part == "stability" else (2**40, 10**30)  # limits of others: float32's
+            for bad in (math.inf, math.nan, -1, *huge):
+                content = {part: {name: [bad, *items[1:]] if isinstance(value, list) else bad}}
+                with pytest.raises(InputError, match=rf"^model\.{part}"):
+                    model_config(TrainConfig(model=content))
+    lengths = {"motion_length": -1.0, "contact_length": 1e30, "gravity": [0, 0, 1e30], "lights": [[1e30, 0, 1]]}
+    for name, bad in lengths.items():
+        with pytest.raises(InputError, match=name):
+            model_config(TrainConfig(model={"dynamics": {name: bad}}))
 
 
 def doubled(levels, line="a{i}: &a{i} [*a{b}, *a{b}]"):
