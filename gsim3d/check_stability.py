@@ -20,6 +20,7 @@ from gsim3d.data import Scene, find_scenes, make_frames
 from gsim3d.data.check import check_scene
 from gsim3d.endurance import CASES
 from gsim3d.errors import InputError, did_you_mean
+from gsim3d.files import write_whole
 from gsim3d.laws import LAWS, Deviation, Sample
 from gsim3d.quirks import Quirks
 from gsim3d.pretrained import broken_laws, located, names
@@ -293,9 +294,7 @@ def write_report(report: Report, out: Path) -> None:
             lines += ["", f"Again: `gsim3d doctor --stability --replay {finding.file}`"]
     text = "\n".join(lines) + "\n"
     for name, content in {"report.md": text, "report.json": json.dumps(_plain(report), indent=1) + "\n"}.items():
-        part = out / f".{name}.part"
-        part.write_text(content)
-        os.replace(part, out / name)
+        write_whole(out / name, content)
 
 
 def _plain(report: Report) -> dict:

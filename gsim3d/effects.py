@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 import yaml
 
 from gsim3d.errors import InputError, did_you_mean
-from gsim3d.files import read_yaml, shown, typed
+from gsim3d.files import read_yaml, shown, typed, write_whole
 from gsim3d.selections import Selection
 
 VERSION = 1
@@ -195,10 +194,8 @@ class EffectsSpec:
     def save(self, path: str | Path) -> None:
         """Writes YAML, or JSON where the name ends in .json."""
         path = Path(path)
-        part = path.with_name(f".{path.name}.part")
         as_json = path.suffix == ".json"
-        part.write_text(json.dumps(self.to_dict(), indent=2) if as_json else yaml.safe_dump(self.to_dict()))
-        os.replace(part, path)
+        write_whole(path, json.dumps(self.to_dict(), indent=2) if as_json else yaml.safe_dump(self.to_dict()))
 
     @property
     def hash(self) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 import reprlib
 import types
 import typing
@@ -59,6 +60,18 @@ def made_around(path: Path) -> Path:
     """``path``, the folders around which exist from here on."""
     path.absolute().parent.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def write_whole(path: str | Path, text: str) -> None:
+    """Writes a text file that appears whole or not at all. Raises OSError where it cannot be written."""
+    path = Path(path)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8", errors="backslashreplace")
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from None
 
 
 def write_picture(path: Path, image: np.ndarray) -> None:

@@ -4,6 +4,7 @@ import errno
 import io
 import json
 import os
+import pathlib
 import re
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 from gsim3d import __main__ as command_line
 from gsim3d.__main__ import COMMANDS, main
 from gsim3d.errors import InputError, did_you_mean
-from gsim3d.files import made_around, new_place, place_of, shown
+from gsim3d.files import made_around, new_place, place_of, shown, write_whole
 from gsim3d.terminal import Parser, Terminal, number, plain, progress, whole
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.restore import model_config
@@ -224,6 +225,29 @@ def test_a_full_disk_is_named_with_the_place(tmp_path, capsys, monkeypatch):
     scene = write_scene(tmp_path / "scene", n_steps=3, size=128)
     done = limited(tmp_path, 1000, "check-data", scene, "--out", "sheet.png")
     assert done.returncode == 2 and done.stderr == "gsim3d: error: sheet.png: File too large\n"
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_full_disk_while_scenes_are_made(tmp_path, processes):
+    made = ["generate", "elastic", "--size", "16", "--frames", "2", "--trajectories", "2", "--out", "made", "--quiet"]
+    done = limited(tmp_path, 50, *made, "--processes", processes)
+    assert done.returncode == 2 and done.stderr == "gsim3d: error: made: File too large\n"
+
+
+def test_a_text_appears_whole_or_not_at_all(tmp_path, monkeypatch):
+    write_whole(tmp_path / "a.txt", "before \udcff")
+    assert (tmp_path / "a.txt").read_text() == "before \\udcff"
+
+    def full(self, text, **options):
+        self.touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(pathlib.Path, "write_text", full)
+    with pytest.raises(OSError, match="No space left on device: '.*a.txt'"):
+        write_whole(tmp_path / "a.txt", "after")
+    monkeypatch.undo()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text().startswith("before")
 
 
 def test_a_closed_pipe_is_no_error(tmp_path):

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import math
-import os
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from gsim3d.evaluate.metrics import mean_of_counted
 from gsim3d.evaluate.scoring import METRICS, RING_WIDTH, SceneScores
+from gsim3d.files import write_whole
 from gsim3d.generate.held_out import describe_set
 from gsim3d.perceptual.fvd import MIN_CLIPS, TREND_CLIPS, frechet_distance
 
@@ -119,7 +119,7 @@ def _of_scene(scores: SceneScores, missing: dict) -> dict:
 
 def write_json(path: str | Path, content: dict) -> None:
     """Writes ``content``; the file appears complete or not at all."""
-    _write(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_whole(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def write_csv(path: str | Path, scores: Sequence[SceneScores]) -> None:
@@ -138,12 +138,12 @@ def write_csv(path: str | Path, scores: Sequence[SceneScores]) -> None:
                 numbers = [float(values[m][step]) if m in values else math.nan for m in metrics]
                 part = "given" if step < s.n_encoded else "predicted"
                 rows.writerow([s.scene, method, step, part, *("" if math.isnan(v) else repr(v) for v in numbers)])
-    _write(path, text.getvalue())
+    write_whole(path, text.getvalue())
 
 
 def write_markdown(path: str | Path, summary: dict, dataset: str) -> None:
     """Tables as the paper prints them: a row for each method, mean and deviation between scenes; then the horizons."""
-    _write(path, markdown(summary, dataset))
+    write_whole(path, markdown(summary, dataset))
 
 
 def markdown(summary: dict, dataset: str) -> str:
@@ -246,10 +246,3 @@ def _numbers(values: Tensor) -> list[float | None]:
 
 def _number(value: float | None, metric: str) -> str:
     return "-" if value is None else f"{value:.{METRICS[metric].digits}f}"
-
-
-def _write(path: str | Path, text: str) -> None:
-    path = Path(path)
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text)
-    os.replace(part, path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,8 +44,23 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> N
             raise InputError(f"{path}: this OpenCV cannot write VP9 video here (folder missing or codec not built in)")
         for frame in frames:
             writer.write(np.ascontiguousarray(frame[..., ::-1]))
-        writer.release()
+        writer.release()  # says nothing of a full disk, which leaves a file without an index
+        if not _is_whole(temporary):
+            raise OSError(errno.EIO, "the video could not be written as a whole; is the disk full?", str(path))
         os.replace(temporary, path)
     finally:
         cv2.utils.logging.setLogLevel(log_level)
         temporary.unlink(missing_ok=True)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether the boxes of an MP4 file fill it, and its index is one of them."""
+    size, place, kinds = path.stat().st_size, 0, []
+    with open(path, "rb") as file:
+        while place + 8 <= size:
+            file.seek(place)
+            length, kind = int.from_bytes(file.read(4)), file.read(4)
+            length = int.from_bytes(file.read(8)) if length == 1 else length
+            place += max(8, length)
+            kinds.append(kind)
+    return place == size and b"moov" in kinds

@@ -48,3 +48,30 @@ def test_bad_input_leaves_nothing_behind(tmp_path, name, frames, fps, message):
     with pytest.raises(InputError, match=message):
         write_video(tmp_path / name, frames, fps)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_video_that_is_cut_off_is_an_error(tmp_path, monkeypatch):
+    """A full disk ends the file before its index, and the writer of OpenCV says nothing."""
+
+    class Full:
+        def __init__(self, path, *_):
+            self.path = path
+
+        def isOpened(self):
+            return True
+
+        def write(self, frame):
+            pass
+
+        def release(self):
+            with open(self.path, "wb") as file:
+                file.write(whole[: len(whole) // 2])
+
+    frames = [np.full((32, 32, 3), 40 * k, np.uint8) for k in range(4)]
+    write_video(tmp_path / "whole.mp4", frames, 12)
+    whole = (tmp_path / "whole.mp4").read_bytes()
+    monkeypatch.setattr(cv2, "VideoWriter", Full)
+    monkeypatch.setattr(cv2, "VideoWriter_fourcc", lambda *_: 0, raising=False)
+    with pytest.raises(OSError, match="could not be written as a whole.*cut.mp4"):
+        write_video(tmp_path / "cut.mp4", frames, 12)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.mp4"]
