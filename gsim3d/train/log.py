@@ -20,6 +20,7 @@ from gsim3d.errors import InputError
 from gsim3d.plain import is_number
 
 LOG, BOARD = "metrics.jsonl", "tensorboard"
+MAX_LINE = 2**20  # bytes; what is longer is no entry
 VIDEO_MS = 80  # that a frame of a sample video is shown
 
 
@@ -35,14 +36,20 @@ class Log:
         self._stream = None
 
     def cut(self, step: int) -> None:
-        """Drops what was logged from ``step`` on: those steps will be repeated."""
-        if self.writes and self.file.exists():
-            lines = self.file.read_bytes().splitlines()
-            kept = [line for line in lines if _step_of(line) < step]
-            if kept != lines:
-                part = self.file.with_name(f".{self.file.name}.part")
-                part.write_bytes(b"".join(line + b"\n" for line in kept))
-                os.replace(part, self.file)
+        """Drops what was logged from ``step`` on: those steps will be repeated.
+
+        Raises: InputError where a folder or a device stands in the place of the log.
+        """
+        if not self.writes or not self.file.exists():
+            return
+        if not self.file.is_file():
+            raise InputError(f"{self.file}: cannot be read: it is not a file")
+        part = self.file.with_name(f".{self.file.name}.part")
+        with open(self.file, "rb") as lines, open(part, "wb") as kept:
+            while line := lines.readline(MAX_LINE):
+                if _step_of(line) < step:
+                    kept.write(line.rstrip(b"\r\n") + b"\n")
+        os.replace(part, self.file)
 
     @contextmanager
     def opened(self, *, tensorboard: bool) -> Iterator[None]:
