@@ -1,6 +1,7 @@
 """Names of simulators stand for checkpoints; what is shipped is whole, small and described."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from safetensors.torch import load_file
 from gsim3d import pretrained
 from gsim3d.__main__ import main
 from gsim3d.errors import InputError
+from gsim3d.laws import LAWS
 from gsim3d.pareto.autotune import SPEEDS
 from gsim3d.train import checkpoint
 from gsim3d.train.restore import restore
@@ -63,7 +65,7 @@ def test_commands_name_what_they_do_not_know(command, capsys, tmp_path, monkeypa
 @pytest.mark.parametrize("name", pretrained.names())
 def test_what_is_shipped_is_whole_and_described(name):
     folder = pretrained.FOLDER / name
-    assert {path.name for path in folder.iterdir()} == {*PARTS, SPEEDS}
+    assert {path.name for path in folder.iterdir()} - {pretrained.LAWS} == {*PARTS, SPEEDS}
     weights = load_file(folder / pretrained.WEIGHTS)
     assert all(value.dtype == torch.bfloat16 for value in weights.values())
     assert all(bool(value.isfinite().all()) for value in weights.values())
@@ -76,6 +78,25 @@ def test_what_is_shipped_is_whole_and_described(name):
     card = (folder / "README.md").read_text()
     assert f"{recipe['steps']:,}" in card and f"{scores['held_out']['future.psnr_masked']:.2f}" in card
     assert "What is wrong" in card
+
+
+@pytest.mark.parametrize("name", pretrained.names())
+def test_broken_laws_stand_in_the_model_card_and_on_the_page(name):
+    laws = pretrained.broken_laws(pretrained.located(name))
+    assert set(laws) <= set(LAWS)
+    card = (pretrained.FOLDER / name / "README.md").read_text()
+    page = (Path(pretrained.FOLDER).parents[1] / "docs" / "trained.md").read_text()
+    assert ("## Laws that it breaks" in card) == bool(laws)
+    for law, found in laws.items():
+        assert found["error"] > found["bound"]
+        row = f"| {law} | {found['what']} | {found['error']:.3g} | {found['bound'] or 'equal bits'} |"
+        assert row in card and row in page
+
+
+def test_other_checkpoints_have_no_known_failures(folder):
+    (folder / "ball-tiny").mkdir()
+    assert pretrained.broken_laws(folder / "ball-tiny" / pretrained.WEIGHTS) == {}
+    assert pretrained.broken_laws(folder / "elsewhere" / "run" / pretrained.WEIGHTS) == {}
 
 
 def test_all_that_is_shipped_is_small():

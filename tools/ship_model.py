@@ -42,6 +42,7 @@ SETS = {
     "no-ground": "no ground",
     "raised": "raised ground",
 }
+LAWS_HEAD = "## Laws that it breaks\n\n"
 WRONG_HEAD = "## What is wrong with it\n\n"
 INTRO = """# Trained simulators
 
@@ -73,6 +74,7 @@ def ship(name: str, made: Recipe, state: Path, scores: Path, wrong: str) -> Path
     speeds = folder / SPEEDS
     if speeds.is_file() and saved.digest not in json.loads(speeds.read_text()):
         speeds.unlink()  # of the weights before
+    (folder / pretrained.LAWS).unlink(missing_ok=True)  # likewise; measured by gsim3d doctor --stability --full
     (folder / "config.yaml").write_text(yaml.safe_dump(saved.config, sort_keys=False))
     kept = progress.curve[:: max(1, -(-len(progress.curve) // LOGGED))]
     (folder / "training.jsonl").write_text("".join(json.dumps(logged(row)) + "\n" for row in kept))
@@ -154,6 +156,23 @@ def score_table(scores: dict) -> str:
     return "\n".join(lines)
 
 
+def with_laws(card: str, name: str) -> str:
+    """The model card with a table of laws.json, where the model breaks laws."""
+    head, wrong = card.split(WRONG_HEAD)
+    head = head.split(LAWS_HEAD)[0].rstrip()
+    laws = pretrained.broken_laws(pretrained.FOLDER / name / pretrained.WEIGHTS)
+    if not laws:
+        return f"{head}\n\n{WRONG_HEAD}{wrong}"
+    rows = "\n".join(
+        f"| {law} | {found['what']} | {found['error']:.3g} | {found['bound'] or 'equal bits'} |"
+        for law, found in laws.items()
+    )
+    command = f"gsim3d doctor --stability {name} DATA"
+    said = f"Largest errors that `{command}`, sampled and with `--full`, found on two scenes:"
+    table = f"| law | number | error | allowed |\n| --- | --- | ---: | ---: |\n{rows}"
+    return f"{head}\n\n{LAWS_HEAD}{said}\n\n{table}\n\n{WRONG_HEAD}{wrong}"
+
+
 def write_page() -> None:
     """docs/trained.md of all simulators in the package, and their curves."""
     history = {checkpoint.load(name).config["data"]["history"] for name in pretrained.names()}
@@ -163,7 +182,8 @@ def write_page() -> None:
         scores, recipe = (json.loads((folder / f"{part}.json").read_text()) for part in ("scores", "recipe"))
         curves = PAGE.parent / f"trained-{name}.png"
         write_curves(curves, scores["held_out"], recipe["world"]["fps"], CURVES)
-        text = (folder / "README.md").read_text()
+        text = with_laws((folder / "README.md").read_text(), name)
+        (folder / "README.md").write_text(text)
         _, body = text.split("\n", 1)
         parts.append(f"## {name}\n{body.replace(chr(10) + '## ', chr(10) + '### ')}")
         parts.append(f"![Scores by step]({curves.name})\n")
