@@ -1,0 +1,206 @@
+"""One HTML file that plays moving Gaussians in a browser, from disk and without a network.
+
+All values are rounded to integers once, so that errors do not grow over time: positions to a grid of 1 mm, the others as
+``CHANNELS`` says. What never changes is stored once; else the second difference over time (positions) or the first
+(others), as unsigned zigzag numbers, low and high bytes apart, deflated.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gsim3d.errors import InputError
+from gsim3d.harmonics import SH_0
+from gsim3d.io.arrays import Splats, colors_of, splats_of
+from gsim3d.types import Gaussians
+
+POSITION_STEP = 1e-3  # metres between grid points: positions are right to half of it
+LARGEST_POSITION = 1e6  # metres from the middle of the first frame
+LOG_SCALE_STEP, QUAT_STEP, UNIT_STEP, SH_STEP = 1 / 32, 1 / 2047, 1 / 255, 1 / 128
+LARGEST_COLOR, LARGEST_SH = 4.0, 15.0
+MOST_IMAGES = 2**27  # bytes of encoded images
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera of the first look at a scene.
+
+    Attributes:
+        viewmat: [4, 4] world to camera, x right, y down, z forward.
+        K: [3, 3] pixels.
+        width, height: of its images.
+    """
+
+    viewmat: np.ndarray
+    K: np.ndarray
+    width: int
+    height: int
+
+
+def write_player(
+    path: str | Path,
+    frames: Gaussians | Sequence[Gaussians],
+    *,
+    fps: float,
+    title: str = "gsim3d",
+    view: View | None = None,
+    truth: Sequence[np.ndarray] | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    start: int = 0,
+) -> None:
+    """Writes an HTML file that plays ``frames``; it appears complete or not at all.
+
+    Args:
+        path: ends in .html.
+        frames: z up, metres: packed frames, or a sequence of single ones. Row n of one frame is row n of the next;
+            where frames have fewer rows than others, the rest is invisible.
+        fps: frames a second.
+        title: shown above the scene.
+        view: the camera of the first look (default: one that sees all).
+        truth: uint8 [H, W, 3] images, one a frame, shown beside the scene; seen by ``view``.
+        background: colour behind the scene, in [0, 1].
+        start: number of the first predicted frame; earlier ones are labelled as given.
+    Raises:
+        InputError: a wrong name or rate, no frame, values that are not finite, or images of another count.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{path}: a player must end in .html")
+    if not 0 < fps < float("inf"):
+        raise InputError(f"{path}: frames a second must be positive; got {fps}")
+    parts = [frames] if isinstance(frames, Gaussians) else list(frames)
+    splats = [splats_of(part, index, path) for part in parts for index in range(len(part.cu_rows) - 1)]
+    if not splats:
+        raise InputError(f"{path}: there is no frame to play")
+    if truth is not None and len(truth) != len(splats):
+        raise InputError(f"{path}: {len(truth)} true images for {len(splats)} frames")
+    header, blobs = _packed(path, splats)
+    header |= {"fps": fps, "title": title, "background": list(background), "start": start}
+    header["view"] = None if view is None else _view(view)
+    header["truth"] = _encoded(path, truth) if truth is not None else []
+    scripts = "".join(
+        f'<script type="text/plain" id="blob{index}">{base64.b64encode(blob).decode()}</script>\n'
+        for index, blob in enumerate(blobs)
+    )
+    page = files("gsim3d.viewer").joinpath("player.html").read_text()
+    script = files("gsim3d.viewer").joinpath("player.js").read_text()
+    filled = page.replace("{{title}}", _escaped(title)).replace("{{script}}", script).replace("{{blobs}}", scripts)
+    content = filled.replace("{{header}}", json.dumps(header).replace("<", "\\u003c"))
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        temporary.write_text(content, encoding="utf-8")
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _packed(path: Path, frames: Sequence[Splats]) -> tuple[dict, list[bytes]]:
+    """Header and blobs of all channels of ``frames``."""
+    count, n_sh = max(frame.count for frame in frames), max(frame.sh.shape[1] for frame in frames)
+    first = frames[0].means
+    middle = first.mean(0, dtype=np.float64) if len(first) else np.zeros(3)
+    channels: dict[str, tuple[np.ndarray, float]] = {}
+
+    def stacked(values: Sequence[np.ndarray], width: int, step: float, most: float) -> np.ndarray:
+        """int32 [frames, count, width]; rows that a frame lacks stay where they were, at 0 before."""
+        table = np.zeros((len(values), count, width), np.int32)
+        for index, value in enumerate(values):
+            if index:
+                table[index] = table[index - 1]
+            rounded = np.round(np.clip(value.astype(np.float64), -most, most) / step)
+            table[index, : len(value), : value.shape[1]] = rounded
+        return table
+
+    offsets = [frame.means - middle for frame in frames]
+    if any(len(offset) and np.abs(offset).max() > LARGEST_POSITION for offset in offsets):
+        raise InputError(f"{path}: positions reach over {LARGEST_POSITION:g} m; leave out what is far away")
+    channels["means"] = stacked(offsets, 3, POSITION_STEP, LARGEST_POSITION), POSITION_STEP
+    channels["scales"] = stacked([np.log(f.scales) for f in frames], 3, LOG_SCALE_STEP, 30.0), LOG_SCALE_STEP
+    channels["quats"] = stacked(_continuous([frame.quats for frame in frames]), 4, QUAT_STEP, 1.0), QUAT_STEP
+    opacities = stacked([frame.opacities[:, None] for frame in frames], 1, UNIT_STEP, 1.0)
+    for index, frame in enumerate(frames):
+        opacities[index, frame.count :] = 0
+    channels["opacities"] = opacities, UNIT_STEP
+    channels["colors"] = stacked([colors_of(f) for f in frames], 3, UNIT_STEP, LARGEST_COLOR), UNIT_STEP
+    if n_sh > 1:
+        rest = [frame.sh[:, 1:].reshape(frame.count, 3 * (frame.sh.shape[1] - 1)) for frame in frames]
+        channels["sh"] = stacked(rest, 3 * (n_sh - 1), SH_STEP, LARGEST_SH), SH_STEP
+    header: dict = {"count": count, "frames": len(frames), "middle": middle.tolist(), "n_sh": n_sh, "sh0": SH_0}
+    header["channels"], blobs = {}, []
+    for name, (table, step) in channels.items():
+        order = _order(name, table)
+        blobs.append(_deflated(table, order))
+        about = {"step": step, "width": table.shape[2], "order": order, "blob": len(blobs) - 1}
+        header["channels"][name] = about
+    return header, blobs
+
+
+def _order(name: str, table: np.ndarray) -> int:
+    """0: only the first frame is stored; 1 or 2: which difference over time."""
+    if len(table) == 1 or (table == table[:1]).all():
+        return 0
+    return 2 if name == "means" else 1
+
+
+def _deflated(table: np.ndarray, order: int) -> bytes:
+    """Differences as zigzag uint32, in byte planes that are not zero everywhere: a byte with their number first."""
+    if order == 0:
+        values = table[:1].astype(np.int64)
+    else:
+        values = table.astype(np.int64)
+        for _ in range(order):
+            values = np.concatenate([values[:1], np.diff(values, axis=0)])
+    zigzag = np.where(values < 0, -2 * values - 1, 2 * values).astype("<u4").transpose(0, 2, 1)
+    planes = np.ascontiguousarray(zigzag).view(np.uint8).reshape(-1, 4).T
+    n_planes = max(1, next((k + 1 for k in range(3, -1, -1) if planes[k].any()), 1))
+    packer = zlib.compressobj(9, zlib.DEFLATED, -15)
+    return packer.compress(bytes([n_planes]) + planes[:n_planes].tobytes()) + packer.flush()
+
+
+def _continuous(quats: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The same rotations with signs that change as little as possible over time."""
+    out = [quats[0] * np.where(quats[0][:, :1] < 0, -1, 1)]
+    for now in quats[1:]:
+        n = min(len(now), len(out[-1]))
+        sign = np.where(now[:, :1] < 0, -1.0, 1.0)
+        sign[:n, 0] = np.where((now[:n] * out[-1][:n]).sum(1) < 0, -1, 1)
+        out.append(now * sign)
+    return out
+
+
+def _view(view: View) -> dict:
+    viewmat, K = np.asarray(view.viewmat, np.float64), np.asarray(view.K, np.float64)
+    if viewmat.shape != (4, 4) or K.shape != (3, 3) or not np.isfinite(viewmat).all() or not np.isfinite(K).all():
+        raise InputError("view: viewmat must be [4, 4] and K [3, 3], finite")
+    return {"viewmat": viewmat.tolist(), "K": K.tolist(), "width": int(view.width), "height": int(view.height)}
+
+
+def _encoded(path: Path, images: Sequence[np.ndarray]) -> list[str]:
+    """Images as base64 of JPEG."""
+    import cv2
+
+    out = []
+    for index, image in enumerate(images):
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            raise InputError(f"{path}: true images must be uint8 [H, W, 3]; image {index} is not")
+        _, content = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+        out.append(base64.b64encode(content.tobytes()).decode())
+    if sum(map(len, out)) > MOST_IMAGES:
+        raise InputError(f"{path}: its true images take over {MOST_IMAGES >> 20} MiB; give smaller ones")
+    return out
+
+
+def _escaped(text: str) -> str:
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
