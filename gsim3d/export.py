@@ -9,7 +9,7 @@ FILE's suffix chooses the format (docs/formats.md has their bounds):
   .ply             3DGS layout, read by everything               .spz              Niantic, Babylon, Cesium
   .compressed.ply  PlayCanvas, SuperSplat                        .glb              glTF with KHR_gaussian_splatting
   .splat           web viewers; no view dependence               .usdc .usda       USD with time (gsim3d[usd])
-  .mp4             a film from a camera that circles around
+  .mp4             a film from a camera that circles around      .html             plays in a browser, one file
 
 examples:
   gsim3d export runs/ball --to ball.usdc                  all predicted frames of gsim3d simulate
@@ -46,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.io.formats import format_of, write_splats
     from gsim3d.io.orbit import orbit_frames
     from gsim3d.io.sequence import open_sequence
+    from gsim3d.viewer import write_player
 
     out, sequence = new_place(args.to, "file"), open_sequence(args.target, args.up)
     fps = args.fps or sequence.fps or FPS
@@ -62,12 +63,16 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"--size must be an even number of pixels, 16 or more; got {args.size}")
         write_video(out, list(orbit_frames(frames, len(chosen), args.size, args.turns)), fps)
         what = f"a film of {args.size}x{args.size} pixels"
+    elif out.suffix.lower() == ".html":
+        made = list(frames)
+        write_player(out, made, fps=fps, title=out.stem)
+        what = f"{max(one.means.shape[0] for one in made):,} Gaussians for any browser"
     else:
         suffix, kind = format_of(out)
         if len(chosen) > 1 and not kind.has_time:
             raise InputError(
                 f"--to {args.to}: {suffix} holds one frame, and {args.target} has {len(sequence)}: choose one with "
-                "--frame, or write .usdc or .mp4"
+                "--frame, or write .html, .usdc or .mp4"
             )
         made = list(frames)
         write_splats(out, made if kind.has_time else made[0], fps=fps, up=args.up_to)

@@ -39,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--context", type=whole(0), nargs="+", metavar="CAM", help="input cameras (default: spread evenly)"
     )
     add_fitting(parser)
+    parser.add_argument("--html", action="store_true", help="also write player.html, which plays in any browser")
     parser.add_argument("--edit", metavar="FILE", help="YAML file of changes of the scene on the way")
     parser.add_argument("--effects", metavar="FILE", help="YAML file of what to compute (default: as in training)")
     parser.add_argument(
@@ -70,6 +71,8 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.pareto.runner import Runner
     from gsim3d.pretrained import located
     from gsim3d.train.restore import restore
+    from gsim3d.viewer import write_player
+    from gsim3d.viewer.player import View
 
     out = new_place(args.out)
     restored = restore(args.checkpoint, args.device)
@@ -106,6 +109,17 @@ def run(args: argparse.Namespace) -> int:
         truth = true_images(scene, cams, range(first, first + len(images)))
         write_video(part / "rollout.mp4", comparison_frames(truth, images), scene.fps)
         write_gaussians(part / "gaussians", restored, prediction, scene.fps)
+        if args.html:
+            camera = scene.cameras_at(cams[:1], [first])
+            write_player(
+                part / "player.html",
+                restored.simulator.renderer(prediction.particles).to("cpu"),
+                fps=scene.fps,
+                title=scene.name,
+                view=View(camera.viewmats[0].numpy(), camera.Ks[0].numpy(), camera.width, camera.height),
+                truth=truth[:, 0] if len(truth) == len(images) else None,
+                start=prediction.n_encoded,
+            )
         os.replace(part, out)
     finally:
         shutil.rmtree(part, ignore_errors=True)

@@ -22,6 +22,7 @@ ROOMS = [
     {"endurance"},
     {"data", "interop", "perceptual"},
     {"io"},
+    {"viewer"},
     {"generate"},
     {"train"},
     {"evaluate", "check_stability"},

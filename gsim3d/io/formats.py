@@ -97,7 +97,7 @@ def write_splats(
         chosen.write(path, frames, fps)
         return
     if len(parts) != 1:
-        raise InputError(f"{path}: {suffix} holds one frame; got {len(parts)}: choose a frame, or .usdc, .html or .mp4")
+        raise InputError(f"{path}: {suffix} holds one frame; got {len(parts)}: choose a frame, or .usdc")
     if suffix == ".ply" and turn is None:
         write_ply(path, parts[0], frame)
         return

@@ -165,7 +165,7 @@ def _deflated(table: np.ndarray, order: int) -> bytes:
     zigzag = np.where(values < 0, -2 * values - 1, 2 * values).astype("<u4").transpose(0, 2, 1)
     planes = np.ascontiguousarray(zigzag).view(np.uint8).reshape(-1, 4).T
     n_planes = max(1, next((k + 1 for k in range(3, -1, -1) if planes[k].any()), 1))
-    packer = zlib.compressobj(9, zlib.DEFLATED, -15)
+    packer = zlib.compressobj(6, zlib.DEFLATED, -15)
     return packer.compress(bytes([n_planes]) + planes[:n_planes].tobytes()) + packer.flush()
 
 

@@ -331,6 +331,8 @@ def test_the_command_exports_files_and_films(tmp_path, capsys):
     assert "60 Gaussians" in capsys.readouterr().out
     assert main(["export", str(tmp_path), "--to", str(tmp_path / "a.mp4"), "--size", "64"]) == 0
     assert "3 frames, 12 a second" in capsys.readouterr().out
+    assert main(["export", str(tmp_path), "--to", str(tmp_path / "a.html")]) == 0
+    assert "any browser" in capsys.readouterr().out and "<canvas" in (tmp_path / "a.html").read_text()
     assert main(["export", str(tmp_path / "last.spz"), "--to", str(tmp_path / "last.splat")]) == 0
     assert "not kept" in capsys.readouterr().out
     for arguments, says in (
