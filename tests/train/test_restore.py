@@ -96,7 +96,7 @@ def test_sizes_are_compared_without_memory():
 def test_comparing_sizes_leaves_torch_as_it_was():
     config = presets.tiny()
     before = build_simulator(config, 0).state_dict()
-    dynamics = dataclasses.replace(config.dynamics, mlp_ratio=10**6)
+    dynamics = dataclasses.replace(config.dynamics, mlp_ratio=100)
     with pytest.raises(RuntimeError, match="more than twice"):
         check_sizes(dataclasses.replace(config, dynamics=dynamics), EffectsSpec(), before)
     for name, value in build_simulator(config, 0).state_dict().items():
