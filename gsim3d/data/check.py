@@ -13,6 +13,7 @@ from gsim3d.data.cameras import check_directions, positions_and_axes, project
 from gsim3d.data.recording import MOVING, Problems, Recording
 from gsim3d.data.scene import Scene
 from gsim3d.errors import InputError
+from gsim3d.terminal import plain
 
 SHEET = 1440  # pixels, aimed width of the sheet
 TILE = 200, 420  # pixels, smallest and largest height of one frame in it
@@ -211,7 +212,7 @@ def _tile(scene: Scene, cam: int, step: int, tile_height: int, body: np.ndarray 
         cv2.drawContours(tile, outlines, -1, MASK, 1)
     _draw_scene(tile, scene, cam, step, zoom, body)
     label = f"{scene.camera_names[cam][-24:]}, frame {step}"
-    (label_width, _), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, TEXT, 1)
+    (label_width, _), _ = cv2.getTextSize(plain(label), cv2.FONT_HERSHEY_SIMPLEX, TEXT, 1)
     tile[:17, : label_width + 8] = INK
     _write(tile, label, (4, 13), PAPER)
     return tile
@@ -256,7 +257,7 @@ def _draw_scene(tile: np.ndarray, scene: Scene, cam: int, step: int, zoom: float
 def _write(image: np.ndarray, text: str, place: Sequence[int], color: tuple) -> None:
     import cv2
 
-    cv2.putText(image, text, tuple(place), cv2.FONT_HERSHEY_SIMPLEX, TEXT, color, 1, cv2.LINE_AA)
+    cv2.putText(image, plain(text), tuple(place), cv2.FONT_HERSHEY_SIMPLEX, TEXT, color, 1, cv2.LINE_AA)
 
 
 def _row(tiles: list[np.ndarray]) -> np.ndarray:
@@ -268,7 +269,7 @@ def _row(tiles: list[np.ndarray]) -> np.ndarray:
 def _text(text: str) -> np.ndarray:
     import cv2
 
-    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT, 1)
+    (width, _), _ = cv2.getTextSize(plain(text), cv2.FONT_HERSHEY_SIMPLEX, TEXT, 1)
     line = np.full((LINE, width + 8, 3), PAPER, np.uint8)
     _write(line, text, (4, LINE - 7), INK)
     return line

@@ -1,5 +1,8 @@
 """gsim3d check-data: every problem of every scene, exit codes, and what the contact sheet shows."""
 
+import os
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -8,6 +11,7 @@ from gsim3d.__main__ import main
 from gsim3d.data import Scene
 from gsim3d.data.check import check_scene, contact_sheet, moving_box
 from tests.data.made_scenes import RADIUS, WRITERS, edit_json, make_scene, write_films, write_genesis
+from tests.tiny_scenes import write_scene
 
 
 @pytest.fixture
@@ -127,3 +131,12 @@ def test_unreadable_frames_do_not_stop_the_sheet(tmp_path):
     sheet = contact_sheet([check_scene(folder).scene])
     assert (sheet == 190).all(-1).mean() > 0.3
     assert cv2.imwrite(str(tmp_path / "sheet.png"), sheet)
+
+
+def test_names_that_are_not_utf8_are_drawn_and_printed_with_escapes(tmp_path, capsys):
+    """OpenCV ends the process at letters that no encoding has."""
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/sc\xff\x1bne"))
+    write_scene(tmp_path / "scene", n_steps=2).rename(folder)
+    assert main(["check-data", str(folder), "--out", str(tmp_path / "sheet.png")]) == 0
+    assert "sc\\udcff\\x1bne" in capsys.readouterr().out
+    assert cv2.imread(str(tmp_path / "sheet.png")) is not None
