@@ -24,7 +24,7 @@ from gsim3d.train.restore import build_simulator, model_config, restore
 from gsim3d.train.samples import draw_batch
 from gsim3d.train.log import plain
 from gsim3d.train.samples import longest_gap
-from tools.release import recipes, runs
+from tools.release import curve, recipes, runs
 from tools.release.films import Filming, FilmStore
 from tools.release.recipes import ARMS, WORLDS, recipe
 from tools.release.runs import RunTrainer, train
@@ -332,3 +332,21 @@ def test_a_step_that_was_skipped_is_said_to_be_whatever_its_numbers():
     why = "the gradient is not finite, first that of dynamics.gravity"
     said = runs.line(plain({**entry, "skipped": why}), {"step_seconds": 0.1, "memory_gib": 1.0})
     assert said == f"step      7  skipped: {why}"
+
+
+def test_scores_against_windows_are_printed_with_paired_differences(first_run, tmp_path, capsys):
+    trainer, state, done = first_run
+    for name, shift in (("a", 0.0), ("b", 1.0)):
+        scenes = {f"s{k}": [20.0 + k, 18 + k + shift * (k % 2), 12.0, 16.0] for k in range(4)}
+        entry = {"windows": 1, "past": 21.5, "future": 19.5, "body": 12.0, "constant": 16.0, "scenes": scenes}
+        save_state(trainer, state, name, dataclasses.replace(done, scores=[entry]))
+    curve.main([str(state_file(state, name)) for name in ("a", "b")])
+    said = capsys.readouterr().out
+    assert "| 1 | 0 | 21.50 | 19.50 | 12.00 | 16.00 |" in said
+    assert "b against a: past +0.00 ± 0.00 (not told apart), future +0.50 ± 0.29 (not told apart)" in said
+    other = dataclasses.replace(done, scores=[{**entry, "scenes": {"t": [1.0] * 4}}])
+    save_state(trainer, state, "b", other)
+    with pytest.raises(InputError, match="different trajectories"):
+        curve.main([str(state_file(state, name)) for name in ("a", "b")])
+    with pytest.raises(InputError, match="no state"):
+        curve.main([str(tmp_path / "c.state.safetensors")])
