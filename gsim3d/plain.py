@@ -1,7 +1,8 @@
-"""Plain values from YAML text that somebody else wrote, in bounded time and memory."""
+"""Plain values from YAML and JSON text that somebody else wrote, in bounded time and memory."""
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import yaml
@@ -45,6 +46,14 @@ def parse_yaml(text: bytes) -> Any:
         return yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError, MemoryError) as error:
         raise ValueError((" ".join(str(error).split()) or type(error).__name__)[:300]) from None
+
+
+def parse_json(text: bytes) -> Any:
+    """Values of a JSON document. Raises ValueError where it is none, or nested too deeply."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
 
 
 def is_number(value: Any, kind: type) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from gsim3d.errors import CaptureError, HardCaseError, InputError
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.evaluate.report import summarize, write_json
 from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.plain import parse_json
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.log import LOG, read_entry
 from gsim3d.train.loop import Trainer
@@ -99,7 +99,7 @@ def context(scene: Scene, config: TrainConfig) -> list[int]:
 
 def _read(file: Path) -> dict:
     try:
-        known = json.loads(read_file(file, MAX_TEXT)) if file.is_file() else {}
+        known = parse_json(read_file(file, MAX_TEXT)) if file.is_file() else {}
     except ValueError:  # nothing but time is lost
         known = {}
     return known if isinstance(known, dict) and isinstance(known.get("result"), dict) else {}

@@ -24,6 +24,7 @@ from gsim3d.generate.run import NEEDED, check_processes, each, require_engine, r
 from gsim3d.generate.stage import SoftBody, Unstable
 from gsim3d.generate.world import Actor, World
 from gsim3d.generate.worlds import WORLDS
+from gsim3d.plain import parse_json
 
 GIVEN = 4  # steps that a model is given; the errors are those of the last one
 SAMPLES = 4  # simulations of each scene
@@ -107,7 +108,7 @@ def read_world(folder: Path) -> World:
     """The settings of the set in ``folder``, from its manifest."""
     file = folder / "manifest.json"
     try:
-        settings = json.loads(file.read_text())["settings"]
+        settings = parse_json(file.read_bytes())["settings"]
         settings = {key: tuple(value) if isinstance(value, list) else value for key, value in settings.items()}
         world = WORLDS[settings.pop("world")](**settings)
     except FileNotFoundError:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from pathlib import Path
 
 from gsim3d.errors import InputError
+from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.plain import parse_json
 from gsim3d.terminal import whole
 
 EPILOG = """\
@@ -73,7 +74,7 @@ def read_given(text: str) -> dict[str, float]:
         given = {"psnr_masked": float(text)}
     except ValueError:
         try:
-            scores = json.loads(Path(text).read_text())
+            scores = parse_json(read_file(text, MAX_TEXT))
             given = {metric: scores.get(f"past.{metric}") for metric in ("psnr_masked", "psnr_body")}
             given = {metric: float(value) for metric, value in given.items() if value is not None}
         except (OSError, ValueError, TypeError, AttributeError) as error:

@@ -251,6 +251,8 @@ def _of_trimesh(mesh, place: np.ndarray, path: Path) -> Piece:
     faces, vertices = np.asarray(mesh.faces, dtype=np.int64), np.asarray(mesh.vertices, dtype=np.float64)
     if not np.array_equal(place, np.eye(4)):
         vertices = vertices @ place[:3, :3].T + place[:3, 3]
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise InputError(f"mesh {path} cannot be read: a face names a vertex that it does not have")
     triangles = vertices[faces]
     visual = mesh.visual
     if visual.kind == "vertex":

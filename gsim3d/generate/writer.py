@@ -22,6 +22,7 @@ import numpy as np
 from gsim3d.errors import InputError
 from gsim3d.generate.cameras import Rig, workspace_origin
 from gsim3d.generate.render import View
+from gsim3d.plain import parse_json
 
 GENERATOR_VERSION = 3  # raise it whenever the same options would give other bytes
 FILE_TEMPLATE = "cam_{cam_ix}/{img_type}_{n_step:04d}"
@@ -64,7 +65,7 @@ def is_finished(folder: Path, fingerprint: str) -> bool:
 
 def read_metadata(folder: Path) -> dict:
     try:
-        return json.loads((folder / "metadata.json").read_text())
+        return parse_json((folder / "metadata.json").read_bytes())
     except (OSError, ValueError) as error:
         raise InputError(f"{folder / 'metadata.json'} cannot be read: {error}") from error
 

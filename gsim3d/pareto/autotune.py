@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from gsim3d.pareto.part_times import PartTimes
 from gsim3d.pareto.settings import KNOBS, NOT_TUNED, Knob, Setting
 from gsim3d.pareto.subject import Subject
 from gsim3d.pareto.timing import Clock, DeviceClock
+from gsim3d.plain import parse_json
 from gsim3d.train.restore import Restored
 
 # preset -> share of the reference's gain over the constant baseline, in dB, that it keeps at least
@@ -212,7 +212,7 @@ def load_times(folder: Path, restored: Restored) -> dict[str, PartTimes]:
 
 def _read(path: Path) -> dict:
     try:
-        content = json.loads(read_file(path, MAX_TEXT))
+        content = parse_json(read_file(path, MAX_TEXT))
     except ValueError as error:
         raise InputError(f"{path} cannot be read: {error}") from None
     if not isinstance(content, dict):

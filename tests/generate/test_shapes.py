@@ -103,6 +103,22 @@ def test_mesh_that_cannot_be_used(tmp_path, text):
         meshes.load_body(path)
 
 
+@pytest.mark.parametrize("suffix", [".off", ".stl", ".ply", ".glb"])
+def test_faces_of_vertices_that_are_not_there(suffix, tmp_path):
+    mesh = trimesh.creation.box()
+    mesh.export(tmp_path / f"bad{suffix}")
+    data = (tmp_path / f"bad{suffix}").read_bytes()
+    if suffix == ".off":
+        data = data.replace(b"\n3 ", b"\n3 9", 1)
+    elif suffix == ".ply":
+        data = data[:-4] + (99).to_bytes(4, "little")
+    else:
+        data = data[: len(data) // 2]
+    (tmp_path / f"bad{suffix}").write_bytes(data)
+    with pytest.raises(InputError, match=f"bad{suffix}"):
+        meshes.load_body(tmp_path / f"bad{suffix}")
+
+
 def test_meshes_of_many_bytes_are_refused_unread(tmp_path):
     with open(tmp_path / "large.stl", "wb") as file:
         file.truncate(mesh_files.MAX_MESH + 1)
