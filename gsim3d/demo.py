@@ -17,6 +17,7 @@ from typing import Any
 from gsim3d.errors import InputError
 from gsim3d.locks import only_one_writer
 from gsim3d.pretrained import names
+from gsim3d.terminal import progress as shown
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
 
 EPILOG = """\
@@ -123,7 +124,7 @@ def _run(out: Path, config: DemoConfig, progress: bool, start: float) -> dict:
     with seconds.measure("evaluation"):
         predictor = _Predictor(config.simulator or out / "model")
         scenes = [predictor.restored.open_scene(folder) for folder in folders]
-        summary = _evaluate(out, predictor, scenes)
+        summary = _evaluate(out, predictor, scenes, progress)
     print("pictures", flush=True)
     with seconds.measure("pictures"):
         _pictures(out, predictor, scenes, summary)
@@ -185,7 +186,7 @@ class _Predictor:
         return self._known[scene.path]
 
 
-def _evaluate(out: Path, predictor: _Predictor, scenes: list) -> dict:
+def _evaluate(out: Path, predictor: _Predictor, scenes: list, progress: bool) -> dict:
     from gsim3d.evaluate.protocol import score_scene
     from gsim3d.evaluate.report import summarize, write_json
 
@@ -195,6 +196,7 @@ def _evaluate(out: Path, predictor: _Predictor, scenes: list) -> dict:
     except (OSError, ValueError):
         summary = {}
     if summary.get("checkpoint") != digest or "methods" not in summary:
+        scenes = shown(scenes, "scenes", unit="scene", quiet=not progress)
         scores = [score_scene(predictor.restored, scene, prediction=predictor(scene)) for scene in scenes]
         summary = {"checkpoint": digest, **summarize(scores)}
         write_json(file, summary)
