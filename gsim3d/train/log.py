@@ -38,18 +38,22 @@ class Log:
     def cut(self, step: int) -> None:
         """Drops what was logged from ``step`` on: those steps will be repeated.
 
-        Raises: InputError where a folder or a device stands in the place of the log.
+        Raises: InputError where the log is no file, or cannot be read or written.
         """
         if not self.writes or not self.file.exists():
             return
         if not self.file.is_file():
             raise InputError(f"{self.file}: cannot be read: it is not a file")
         part = self.file.with_name(f".{self.file.name}.part")
-        with open(self.file, "rb") as lines, open(part, "wb") as kept:
-            while line := lines.readline(MAX_LINE):
-                if _step_of(line) < step:
-                    kept.write(line.rstrip(b"\r\n") + b"\n")
-        os.replace(part, self.file)
+        try:
+            with open(self.file, "rb") as lines, open(part, "wb") as kept:
+                while line := lines.readline(MAX_LINE):
+                    if _step_of(line) < step:
+                        kept.write(line.rstrip(b"\r\n") + b"\n")
+            os.replace(part, self.file)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise InputError(f"{self.file}: cannot be cut to step {step}: {error.strerror}") from None
 
     @contextmanager
     def opened(self, *, tensorboard: bool) -> Iterator[None]:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 import tracemalloc
 
 import pytest
@@ -33,3 +34,11 @@ def test_what_is_no_file_is_not_opened(tmp_path):
     os.mkfifo(tmp_path / LOG)
     with pytest.raises(InputError, match=f"{LOG}: cannot be read: it is not a file"):
         Log(tmp_path).cut(4)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_what_cannot_be_read_is_named(tmp_path):
+    (tmp_path / LOG).symlink_to("/proc/self/mem")
+    with pytest.raises(InputError, match=f"{LOG}: cannot be cut to step 4: Input/output error"):
+        Log(tmp_path).cut(4)
+    assert os.listdir(tmp_path) == [LOG]
