@@ -1,7 +1,7 @@
 """One HTML file that plays moving Gaussians in a browser, from disk and without a network.
 
-All values are rounded to integers once, so that errors do not grow over time: positions to a grid of 1 mm, the others as
-``CHANNELS`` says. What never changes is stored once; else the second difference over time (positions) or the first
+All values are rounded to integers once, so that errors do not grow over time: positions to a grid of 1 mm, the others
+to the steps below. What never changes is stored once; else the second difference over time (positions) or the first
 (others), as unsigned zigzag numbers, low and high bytes apart, deflated.
 """
 

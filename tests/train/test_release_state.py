@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from gsim3d.data import Scene, find_scenes
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, RunStopped
 from gsim3d.data.recording import BACKGROUND, FIXED, MOVING
 from gsim3d.generate import generate
 from gsim3d.generate.cameras import two_rings
@@ -20,6 +20,7 @@ from gsim3d.generate.film import film
 from gsim3d.generate.worlds import VALIDATION_SEED, build_world
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import deterministic
+from gsim3d.train.processes import Processes
 from gsim3d.train.restore import build_simulator, model_config, restore
 from gsim3d.train.samples import draw_batch
 from gsim3d.train.log import plain
@@ -150,6 +151,25 @@ def test_batches_drawn_ahead_are_those_of_their_steps(tmp_path, device):
             assert ahead._next[0] == step + 1 and a["particles"] == b["particles"]
             assert a["loss"] == pytest.approx(b["loss"], rel=1e-3)
     assert ahead.captured.captures == 2  # one for each kind of step
+
+
+def test_a_run_whose_launcher_is_gone_saves_and_ends(store, tmp_path):
+    class Lonely(Processes):
+        lost = None
+
+    processes = Lonely()
+    trainer = RunTrainer(CONFIG, store, tmp_path / "run", "cpu", processes)
+    step = trainer.train_step
+
+    def last_step():
+        processes.lost = "torchrun is gone"
+        return step()
+
+    trainer.train_step = last_step
+    given = {"end": time.monotonic() + 1e4, "out": tmp_path / "state", "name": NAME, "say": lambda _: None}
+    with pytest.raises(RunStopped, match="torchrun is gone; the state of step 1 is saved"):
+        train(trainer, NoFilming(), Progress(), {}, **given)
+    assert load_progress(tmp_path / "state", NAME).step == 1
 
 
 class NoFilming:

@@ -1,4 +1,4 @@
-"""A headless Chromium that tests talk to over pipes, as its DevTools protocol allows; nothing but the standard library."""
+"""A headless Chromium that tests drive over the pipes of its DevTools protocol, with the standard library alone."""
 
 from __future__ import annotations
 

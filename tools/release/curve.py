@@ -3,9 +3,9 @@
 
     python tools/release/curve.py tools/release/state/elastic-pure.state.safetensors [OTHER.state.safetensors ...]
 
-Scores are masked PSNR [dB] of validation trajectories: given steps, future steps over the full horizon, bodies in future
-steps, and the last given step held still. Differences are those of the first state's newest score and every other one's,
-trajectory by trajectory, with their standard errors; nothing below two of them is a difference.
+Scores are masked PSNR [dB] of validation trajectories: given steps, future steps over the full horizon, bodies in
+future steps, and the last given step held still. Differences are those of the first state's newest score and every
+other one's, trajectory by trajectory, with their standard errors; nothing below two of them is a difference.
 """
 
 import argparse
@@ -23,8 +23,9 @@ SCORES = ("past", "future", "body", "constant")
 
 def table(name: str, progress: Progress) -> str:
     """Markdown: a row for each score on the way."""
+    minutes = f"{progress.seconds / 60:.0f} minutes"
     lines = [
-        f"{name}: {progress.step:,} steps, {progress.windows:,} windows, {progress.seconds / 60:.0f} minutes of training",
+        f"{name}: {progress.step:,} steps, {progress.windows:,} windows, {minutes} of training",
         "",
         "| windows | minutes | given steps | future | bodies | constant |",
         "| ---: | ---: | ---: | ---: | ---: | ---: |",

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from gsim3d.errors import HardCaseError
+from gsim3d.errors import HardCaseError, RunStopped
 from gsim3d.train.captured import CapturedLoss, Prepared
 from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import memory_gib
@@ -43,6 +43,7 @@ class RunTrainer(Trainer):
         config = of_processes(config, processes.count if processes else 1)
         super().__init__(config, store.films[:1], out, device=device, processes=processes)
         self.first_step, self.begin, self.now, self.end, self.is_last = 0, 0.0, 0.0, math.inf, False
+        self.gone: str | None = None
         self._side = torch.cuda.Stream() if device == "cuda" else None
         self._next: tuple[int, Future] | None = None
 
@@ -60,9 +61,10 @@ class RunTrainer(Trainer):
         self.simulator.train()
 
     def goes_on(self) -> bool:
-        """Reads the clock: whether the run is not over."""
-        self.now = self.processes.gather(time.monotonic())[0]
-        return self.now < self.end
+        """Reads the clock: whether the run is not over, and no process of it is gone."""
+        seen = self.processes.gather((time.monotonic(), self.processes.lost))
+        self.now, self.gone = seen[0][0], next((lost for _, lost in seen if lost), None)
+        return self.now < self.end and self.gone is None
 
     def learning_rate(self, stage: StageConfig, place: int) -> float:
         rate = stage.learning_rate * min(1.0, (self.step - self.first_step + 1) / WARM_UP)
@@ -129,6 +131,7 @@ def train(
         The progress after it.
     Raises:
         HardCaseError: too many steps in a row were skipped.
+        RunStopped: the launcher or a partner is gone; the state is saved.
     """
     settings, gather, is_first = trainer.config, trainer.processes.gather, trainer.processes.is_first
     first, before, curve = trainer.step, trainer.seconds, list(progress.curve)
@@ -180,6 +183,8 @@ def train(
                 save()
                 saved = trainer.now
     done = save()
+    if trainer.gone:
+        raise RunStopped(f"{trainer.gone}; the state of step {trainer.step} is saved, call again to go on")
     trainer.processes.check_same(weights=trainer.parameters.values())
     return done
 

@@ -24,7 +24,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 sys.path.insert(0, str(ROOT))
-from gsim3d.errors import CaptureError, HardCaseError, InputError  # noqa: E402
+from gsim3d.errors import CaptureError, HardCaseError, InputError, RunStopped  # noqa: E402
 
 SCORING_SHARE, SCORING_MOST = 0.2, 150.0  # of a run, seconds: for validation at its end
 SPARE_CORES = 3  # that each training process keeps
@@ -162,5 +162,8 @@ def main(arguments: list[str] | None = None) -> None:
 if __name__ == "__main__":
     try:
         main()
+    except RunStopped as error:
+        print(f"train: {error}", file=sys.stderr)
+        sys.exit(error.code)
     except (InputError, HardCaseError, CaptureError) as error:
         sys.exit(f"train: error: {error}")
