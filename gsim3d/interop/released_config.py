@@ -406,7 +406,7 @@ def _data(settings: _Settings, history: int, size_multiple: int) -> tuple[dict[s
         )
     if settings.get("dataset.workspace_limits", None) is not None:
         notes.append("dataset.workspace_limits is set: published dynamics leave out what began outside, these do not")
-    if any(settings.get("dataset.background_color", [0, 0, 0])):
+    if settings.get("dataset.background_color", [0, 0, 0]) not in (None, 0, [0, 0, 0]):
         notes.append("dataset.background_color is not black: pass it as background when you render")
     if settings.get("dataset.speedup", 1) != 1:
         notes.append(f"dataset.speedup is {settings.get('dataset.speedup')}: it saw every such frame only")

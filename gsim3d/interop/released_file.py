@@ -11,6 +11,7 @@ import io
 import math
 import pickle
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from gsim3d.files import shown
 from gsim3d.pickles import check_pickle
 
 # What zipfile raises for an archive that is broken, encrypted or larger than memory.
-BROKEN = (zipfile.BadZipFile, EOFError, OSError, MemoryError, RuntimeError)
+BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, OSError, MemoryError, RuntimeError, ValueError)
 MAX_INDEX = 256 * 2**20  # bytes of data.pkl; that of a model with a million tensors is smaller
 
 _DTYPES = {
@@ -154,7 +155,7 @@ class ReleasedFile:
             raise InputError(f"{self.path}: no such file")
         try:
             self._zip = zipfile.ZipFile(self.path)
-        except (*BROKEN, ValueError):
+        except BROKEN:
             raise InputError(
                 f"{self.path}: not a checkpoint that torch.save wrote as a zip archive (it is truncated, another kind "
                 "of file, or older than torch 1.6; the last can be saved again with a newer torch)"
