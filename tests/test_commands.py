@@ -253,9 +253,11 @@ def test_weights_of_another_model_are_refused(capsys, work, tmp_path):
     code, _, err = call(capsys, "evaluate", run, work / "data")
     assert code == 2 and "config.yaml: missing, truncated or changed" in err
     from gsim3d.files import sha256_of
+    from gsim3d.train.checkpoint import OWN_HASH, hash_of_state
 
+    state.pop(OWN_HASH)
     state["sha256"]["config.yaml"] = sha256_of(folder / "config.yaml")
-    (folder / "state.json").write_text(json.dumps(state))
+    (folder / "state.json").write_text(json.dumps({**state, OWN_HASH: hash_of_state(state)}))
     code, _, err = call(capsys, "evaluate", run, work / "data")
     assert code == 2 and "the weights do not fit the model" in err and len(err.splitlines()) == 1
 

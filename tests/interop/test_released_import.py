@@ -276,7 +276,7 @@ def test_weights_without_latent_heads_have_no_signs_of_them():
         (("model.yaml", "model.yaml", "model"), "model.yaml: not a checkpoint that torch.save wrote"),
         (("model.ckpt", "missing.yaml", "model"), "missing.yaml cannot be read"),
         (("model.ckpt", "model.yaml", "there"), "exists already"),
-        (("model.ckpt", "model.yaml", "a/b"), "does not exist"),
+        (("model.ckpt", "model.yaml", "model.yaml/b"), "model.yaml"),
     ],
 )
 def test_bad_input_gets_one_line_and_exit_code_2(capsys, tmp_path, arguments, message):
