@@ -6,6 +6,7 @@ the CPU that features and weights are numbers that an op can use; looking for th
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -43,17 +44,20 @@ def check_floating(op: str, **first: Tensor) -> None:
             raise ValueError(f"{op}: {name} must be float32 or float64; got {str(value.dtype).removeprefix('torch.')}")
 
 
-def check_numbers(op: str, **tensors: Tensor | None) -> None:
+def check_numbers(op: str, *, largest_of: float = math.inf, **tensors: Tensor | None) -> None:
     """Raises HardCaseError, naming the argument and its row, where a number is not finite or too large.
 
     None and tensors without numbers, or on a GPU, are passed over.
+
+    Args:
+        largest_of: bound of the size of these tensors' numbers, where it is below that of their dtype.
     """
     if torch.compiler.is_compiling():
         return
     for name, value in tensors.items():
         if value is None or value.device.type != "cpu" or value.dtype not in LARGEST or value.numel() == 0:
             continue
-        largest = LARGEST[value.dtype]
+        largest = min(LARGEST[value.dtype], largest_of)
         low, high = torch.aminmax(value.detach())
         if not (low >= -largest and high <= largest):  # NaN is in neither range
             _refuse(op, name, value.detach(), largest)

@@ -7,6 +7,8 @@ from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_real, check_tensors, check_whole
 from gsim3d.ops._gradients import register_gradients
 
+LARGEST_READING = 1e3  # cubes of readings times the largest numbers of ``raw`` stay finite; those of the table are below 2
+
 
 def decode_gaussians(
     raw: Tensor, readings: Tensor, *, degree: int, scale_min: float, scale_max: float, check: bool = True
@@ -28,7 +30,7 @@ def decode_gaussians(
         quats [N, 4] (w, x, y, z), scales [N, 3], sh [N, (degree + 1)^2, 3]; float32, float64 with float64 rows.
     Gradients: ``raw``, once.
     Raises:
-        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150; readings: 1e3); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it.
 
     Example:
@@ -40,7 +42,8 @@ def decode_gaussians(
         check_tensors("decode_gaussians", raw=raw, readings=readings)
         check_whole("decode_gaussians", degree=degree)
         check_real("decode_gaussians", scale_min=scale_min, scale_max=scale_max)
-        check_numbers("decode_gaussians", raw=raw, readings=readings)
+        check_numbers("decode_gaussians", raw=raw)
+        check_numbers("decode_gaussians", readings=readings, largest_of=LARGEST_READING)
     return torch.ops.gsim3d.decode_gaussians(raw, readings, degree, scale_min, scale_max)
 
 

@@ -173,3 +173,24 @@ def test_numbers_that_are_none_raise():
     raw[2, 7] = torch.nan
     with pytest.raises(HardCaseError, match="raw must be finite .* row 2"):
         decode(raw, table)
+
+
+@pytest.mark.parametrize("size", [-9.9e14, 2e3, torch.inf])
+@pytest.mark.parametrize("place", [0, 74, 127])
+def test_readings_too_large_for_products_raise(place, size):
+    raw, table = inputs(4)
+    table = table.clone()
+    table[place] = size
+    with pytest.raises(HardCaseError, match=f"readings must be finite and at most 1000 .* row {place}"):
+        decode(raw, table)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_the_largest_numbers_stay_finite(degree):
+    raw = torch.full((3, 55), 1e15, requires_grad=True)
+    with torch.no_grad():
+        raw[1] *= -1
+        raw[2, ::2] *= -1
+    outputs = decode_gaussians(raw, torch.full((128,), 1e3), degree=degree, scale_min=0.0, scale_max=1.0)
+    (grad,) = torch.autograd.grad(sum(x.sum() for x in outputs), raw)
+    assert all(x.isfinite().all() for x in outputs) and grad.isfinite().all()
