@@ -15,6 +15,7 @@ from gsim3d.data.recording import Problems, Recording
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes (y up, z backwards) <-> OpenCV's
 ROTATION_TOLERANCE = 1e-3
+MIN_FOCAL = 1e-3  # pixels; shorter ones make rays that overflow
 NORMALISED_FOCAL = 8.0  # pixels; a focal length below it, of an image larger than it, is no focal length in pixels
 MAX_ERROR = 0.5  # of axes that meet: their distance from the point over its distance
 MIN_SPREAD = 0.02  # mean squared sine of the optical axes around their mean: about 8 degrees
@@ -103,8 +104,8 @@ def check_intrinsics(Ks: np.ndarray, size: tuple[int, int], what: str, problems:
         (fx, fy), (cx, cy) = np.diag(K)[:2], K[:2, 2]
         if np.abs(K[2] - [0, 0, 1]).max() > ROTATION_TOLERANCE or abs(K[1, 0]) > ROTATION_TOLERANCE * abs(K[1, 1]):
             problems.add(f"{place} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
-        elif not (fx > 0 and fy > 0):
-            problems.add(f"{place}: focal lengths must be positive; got fx {fx:g}, fy {fy:g}")
+        elif not (fx >= MIN_FOCAL and fy >= MIN_FOCAL):
+            problems.add(f"{place}: focal lengths must be positive, {MIN_FOCAL:g} or more; got fx {fx:g}, fy {fy:g}")
         elif min(fx, fy) < NORMALISED_FOCAL < max(size) and max(cx, cy) <= 2:
             problems.add(
                 f"{place}: focal lengths must be in pixels; fx {fx:g}, fy {fy:g} of a {size[0]}x{size[1]} image look "

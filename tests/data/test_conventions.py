@@ -182,6 +182,7 @@ def edit_intrinsics(layout, folder, step, **values):
     [
         ({"fx": 0.0}, "focal lengths must be positive"),
         ({"fy": -50.0}, "focal lengths must be positive"),
+        ({"fx": 1e-30}, "focal lengths must be positive"),
         ({"fx": 1.1, "fy": 1.4, "cx": 0.5, "cy": 0.5}, "in pixels"),
         ({"cx": 60.0}, "principal point"),
         ({"cy": -3.0}, "principal point"),
