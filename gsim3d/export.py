@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from gsim3d.terminal import number, whole
+
 EPILOG = """\
 FILE's suffix chooses the format (docs/formats.md has their bounds):
   .ply             3DGS layout, read by everything               .spz              Niantic, Babylon, Cesium
@@ -28,12 +30,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "target", metavar="TARGET", help="a file of Gaussians, a folder with one a frame, or what gsim3d simulate wrote"
     )
     parser.add_argument("--to", metavar="FILE", required=True, help="file to write; must not exist yet")
-    parser.add_argument("--frame", type=int, metavar="N", help="only this frame; negative: from the end")
-    parser.add_argument("--fps", type=float, help="frames a second (default: as TARGET says, else 24)")
+    parser.add_argument("--frame", type=whole(-(10**6), 10**6), metavar="N", help="one frame; negative: from the end")
+    parser.add_argument("--fps", type=number(0, 1e6, above=True), help="frames a second (default: TARGET's, else 24)")
     parser.add_argument("--up", choices=("y", "z"), help="axis that points up in TARGET (default: as its format says)")
     parser.add_argument("--up-to", choices=("y", "z"), help="likewise in FILE (default: as its readers expect)")
-    parser.add_argument("--size", type=int, default=512, metavar="PX", help="width and height of a film (default 512)")
-    parser.add_argument("--turns", type=float, default=0.25, help="of a film's camera around the scene (default 0.25)")
+    parser.add_argument("--size", type=whole(16, 4096), default=512, metavar="PX", help="of a film (default 512)")
+    parser.add_argument("--turns", type=number(-1e3, 1e3), default=0.25, help="of a film's camera (default 0.25)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -50,8 +52,6 @@ def run(args: argparse.Namespace) -> int:
 
     out, sequence = new_place(args.to, "file"), open_sequence(args.target, args.up)
     fps = args.fps or sequence.fps or FPS
-    if not 0 < fps < 1e6:
-        raise InputError(f"--fps must be positive; got {args.fps:g}")
     chosen = range(len(sequence))
     if args.frame is not None:
         if not -len(sequence) <= args.frame < len(sequence):
@@ -59,8 +59,8 @@ def run(args: argparse.Namespace) -> int:
         chosen = [args.frame % len(sequence)]
     frames = (sequence[frame] for frame in tqdm(chosen, unit="frame", disable=None, leave=False))
     if out.suffix.lower() == ".mp4":
-        if args.size < 16 or args.size % 2:
-            raise InputError(f"--size must be an even number of pixels, 16 or more; got {args.size}")
+        if args.size % 2:
+            raise InputError(f"--size must be even, as films are; got {args.size}")
         write_video(out, list(orbit_frames(frames, len(chosen), args.size, args.turns)), fps)
         what = f"a film of {args.size}x{args.size} pixels"
     elif out.suffix.lower() == ".html":

@@ -230,7 +230,10 @@ class Scene:
     def _padded(self, image: np.ndarray) -> np.ndarray:
         if image.shape[:2] == (self.height, self.width):
             return image
-        padded = np.zeros((self.height, self.width, *image.shape[2:]), image.dtype)
+        try:
+            padded = np.zeros((self.height, self.width, *image.shape[2:]), image.dtype)
+        except MemoryError:
+            raise InputError(f"{self.path}: no memory for images of {self.width}x{self.height} pixels") from None
         padded[: image.shape[0], : image.shape[1]] = image
         return padded
 

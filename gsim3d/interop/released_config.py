@@ -262,7 +262,7 @@ def _updates(settings: _Settings, sizes: _Sizes, explicit: bool, n_dynamic: int,
     changing = (EXPLICIT if explicit else {"means"}) | ({"dynamic_latent_features"} if n_dynamic else set())
     given = settings.get(f"{adapter}.pred_modality", {})
     said = {key: given.get(key, "z_x") if isinstance(given, dict) else given for key in sorted(changing)}
-    if len(set(said.values())) > 1 or said["means"] not in PREDICTS:
+    if any(one != said["means"] for one in said.values()) or str(said["means"]) not in PREDICTS:
         known = ", ".join(PREDICTS)
         raise InputError(f"{adapter}.pred_modality: must be one of {known} for all that changes; got {said}")
     immune = settings.names(f"{adapter}.immune_to_static") if explicit else {"harmonics"}

@@ -7,7 +7,7 @@ from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_real, check_tensors, check_whole
 from gsim3d.ops._gradients import register_gradients
 
-LARGEST_READING = 1e3  # cubes of readings times the largest numbers of ``raw`` stay finite; those of the table are below 2
+LARGEST_READING = 1e3  # cubes of readings times the largest ``raw`` stay finite; those of the table are below 2
 
 
 def decode_gaussians(

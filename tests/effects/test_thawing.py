@@ -95,5 +95,5 @@ def test_recomputed_steps_change_no_bit(scenes, tmp_path):
 def test_a_symmetric_model_cannot_be_trained_so(scenes, tmp_path):
     with pytest.raises(InputError, match="data.thawed"):
         Trainer(dataclasses.replace(CONFIG, model={}), scenes, tmp_path)
-    with pytest.raises(InputError, match="data.thawed"):
+    with pytest.raises(InputError, match="thawed must be at most 1"):
         DataConfig(thawed=1.5)

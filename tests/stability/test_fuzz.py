@@ -13,7 +13,7 @@ from tests.stability.fuzz.readers import READERS
 
 FEW, PER_OP = 25, 2000  # inputs of each op in the fast tests, and in the full ones
 FEW_FILES, PER_READER = 4, 2000  # damaged files of each reader, likewise
-READER_SECONDS, LEAST_FILES = 12, 150  # no further file after so long; so many are read on a busy machine, too
+READER_SECONDS, LEAST_FILES = 10, 30  # no further file after so long; so many are read on a busy machine, too
 FEW_COMMANDS, PER_COMMAND = 4, 200  # wrong arguments of each command, likewise
 
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from gsim3d import ops
+from gsim3d.errors import GradientError
 from gsim3d.harmonics import readings
 from gsim3d.types import ASLEEP, Cameras
 from tests.stability.fuzz.engine import Failure, Target, finite
@@ -451,7 +452,7 @@ def _call_with(name: str, arguments: Arguments, must_be_finite: bool) -> None:
     for argument, value in arguments.items():
         is_leaf = isinstance(value, Tensor) and value.is_floating_point() and value.layout == torch.strided
         leaves[argument] = value.detach().requires_grad_() if is_leaf else value
-    result = OPS[name][1](leaves)
+    result = _result(name, leaves)
     if must_be_finite:
         finite(result)
     outputs = [t for t in _tensors(result) if t.requires_grad and not t.is_meta]
@@ -467,6 +468,18 @@ def _call_with(name: str, arguments: Arguments, must_be_finite: bool) -> None:
                 finite(grad, f"gradient of {argument}")
             if grad.shape != value.shape:
                 raise Failure(f"gradient of {argument} has shape {list(grad.shape)}, not {list(value.shape)}")
+
+
+def _result(name: str, leaves: Arguments) -> Any:
+    """What the op returns; arguments whose gradient it refuses become plain numbers in ``leaves``."""
+    for _ in leaves:
+        try:
+            return OPS[name][1](leaves)
+        except GradientError as error:
+            refused = [error.argument] if error.argument in leaves else list(leaves)
+            plain = {key: leaves[key].detach() for key in refused if isinstance(leaves[key], Tensor)}
+            leaves.update(plain)
+    return OPS[name][1](leaves)
 
 
 def _tensors(value: Any) -> list[Tensor]:
