@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frame", type=whole(-(10**6), 10**6), metavar="N", help="one frame; negative: from the end")
     parser.add_argument("--fps", type=number(0, 1e6, above=True), help="frames a second (default: TARGET's, else 24)")
     parser.add_argument("--up", choices=("y", "z"), help="axis that points up in TARGET (default: as its format says)")
-    parser.add_argument("--up-to", choices=("y", "z"), help="likewise in FILE (default: as its readers expect)")
+    parser.add_argument("--up-to", choices=("y", "z"), help="the same in FILE (default: as its readers expect)")
     parser.add_argument("--size", type=whole(16, 4096), default=512, metavar="PX", help="of a film (default 512)")
     parser.add_argument("--turns", type=number(-1e3, 1e3), default=0.25, help="of a film's camera (default 0.25)")
 

@@ -1,4 +1,4 @@
-"""Plain values from YAML and JSON text that somebody else wrote, in bounded time and memory."""
+"""Plain values from untrusted YAML and JSON text, in bounded time and memory."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ def plain(text: str) -> str:
 class Terminal:
     """A text stream whose text is :func:`plain`, whatever names of files are in it.
 
-    A carriage return passes at the begin of a text: progress bars write them. Once nobody reads a pipe, what is
+    A carriage return passes at the begin of a text: progress bars write them. Once a pipe has no reader, what is
     written to it is lost, and the command goes on.
     """
 

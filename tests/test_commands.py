@@ -145,8 +145,11 @@ def test_a_gpu_that_is_not_there_is_named(capsys, work):
 
 def test_simulate_writes_video_frames_and_gaussians(capsys, work, tmp_path):
     scene, out = work / "data" / "ball" / "0000", tmp_path / "out"
-    code, _, _ = call(capsys, "simulate", work / "run", scene, "--out", out, "--steps", "7", "--cameras", "3", "1")
+    chosen = ("--steps", "7", "--cameras", "3", "1", "--html")
+    code, _, _ = call(capsys, "simulate", work / "run", scene, "--out", out, *chosen)
     assert code == 0
+    page = (out / "player.html").read_text()
+    assert '"start": 2' in page and '"viewmat"' in page and "<canvas" in page
     assert b"vp09" in (out / "rollout.mp4").read_bytes()
     assert len(list((out / "frames").iterdir())) == 2 * 9
     files = sorted((out / "gaussians").glob("*.ply"))

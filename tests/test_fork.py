@@ -69,7 +69,7 @@ run(0)
 
 
 def test_a_child_that_uses_the_core_ends():
-    """Its pool is made anew, and nobody waits for the workers of its parent at the end."""
+    """Its pool is made anew, and the workers of its parent are not waited for."""
     script = f'''{CALLS}
 CALLS["core"]()
 child = os.fork()

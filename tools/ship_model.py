@@ -74,7 +74,7 @@ def ship(name: str, made: Recipe, state: Path, scores: Path, wrong: str) -> Path
     speeds = folder / SPEEDS
     if speeds.is_file() and saved.digest not in json.loads(speeds.read_text()):
         speeds.unlink()  # of the weights before
-    (folder / pretrained.LAWS).unlink(missing_ok=True)  # likewise; measured by gsim3d doctor --stability --full
+    (folder / pretrained.LAWS).unlink(missing_ok=True)  # of old weights; measured by gsim3d doctor --stability --full
     (folder / "config.yaml").write_text(yaml.safe_dump(saved.config, sort_keys=False))
     kept = progress.curve[:: max(1, -(-len(progress.curve) // LOGGED))]
     (folder / "training.jsonl").write_text("".join(json.dumps(logged(row)) + "\n" for row in kept))

@@ -178,7 +178,7 @@ def check_directions(recording: Recording, problems: Problems) -> None:
 
 
 def _check_origin(recording: Recording, viewmats: np.ndarray, problems: Problems) -> None:
-    """Voxels are counted from it: from a far one they cannot be told apart."""
+    """Voxels are counted from it: far from it float32 cannot separate them."""
     key = "bounds" if recording.origin is None else "origin"
     corner = recording.bounds[0] if recording.origin is None and recording.bounds is not None else recording.origin
     if corner is None:

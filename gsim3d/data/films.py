@@ -156,7 +156,7 @@ def _name(entry: dict, number: int, source: Path) -> str:
 def _camera(
     entry: dict, name: str, size: tuple[int, int], n_steps: int, description: dict, source: Path, problems: Problems
 ) -> tuple[np.ndarray, np.ndarray, Lens | None]:
-    """viewmat [4, 4] or [S, 4, 4], K likewise, lens."""
+    """viewmat [4, 4] or [S, 4, 4], K [3, 3] or [S, 3, 3], lens."""
     what = f"{source}: camera {name}"
     viewmat, K = np.eye(4), np.eye(3)
     R = array(entry.get("R"), [(3, 3), (n_steps, 3, 3)], f"{what}: R", problems)

@@ -139,7 +139,7 @@ def read_bytes(path: Path, *starts: bytes) -> bytes:
 
 
 def read_head(path: Path) -> bytes:
-    """The first 4 KiB of a file, likewise."""
+    """The first 4 KiB of a file; errors as :func:`read_bytes`."""
     return read_file(path, MAX_BYTES, 4096)
 
 

@@ -125,7 +125,7 @@ def test_colours_of_8_and_16_bits_with_and_without_alpha(tmp_path, name, deep):
         wanted = np.repeat(image[..., None], 3, 2) if image.ndim == 2 else image[..., :3]
         if image is rgba:
             wanted = wanted * (ALPHA[..., None] / 255)
-        seen = ALPHA > 0 if image is rgba else np.ones_like(ALPHA, bool)  # WebP drops colours that nobody sees
+        seen = ALPHA > 0 if image is rgba else np.ones_like(ALPHA, bool)  # WebP drops invisible colours
         assert got.dtype == np.uint8 and np.abs(got.astype(float) - wanted)[seen].max() <= 0.51
         assert not got[~seen].any() or image is not rgba
 

@@ -160,7 +160,7 @@ def test_depths_are_kept_unless_they_are_those_of_the_training(restored, tmp_pat
     restored.check_scene(scene)
 
 
-def test_depths_that_nobody_gave_are_guessed_and_kept(restored, tmp_path):
+def test_missing_depths_are_guessed_and_kept(restored, tmp_path):
     folder = rig(tmp_path / "scene", 5)
     metadata = json.loads((folder / "metadata.json").read_text())
     del metadata["near"], metadata["far"]

@@ -90,7 +90,7 @@ def test_the_report_says_how_much_the_future_adds():
         assert "Bodies: 33.3% of the mask." in text and "that the future adds" in text and "perfect_body" in text
 
 
-def test_nothing_is_said_of_parts_that_nobody_knows():
+def test_unknown_parts_are_not_reported():
     truth = torch.full((S, 1, H, W, 3), 0.5)
     bare = SceneTruth("b", truth, None, None, GIVEN, METRICS).score([("constant", truth[GIVEN:])])
     summary = summarize([bare])

@@ -1,4 +1,4 @@
-"""The log of a run: cut where training goes on, whatever a killed process or somebody else left in it."""
+"""The log of a run: cut where training goes on, whatever a killed process or another program left in it."""
 
 import json
 import os

@@ -50,7 +50,8 @@ def difference(first: dict, second: dict) -> str:
         gaps = [second["scenes"][name][index] - first["scenes"][name][index] for name in first["scenes"]]
         mean = sum(gaps) / len(gaps)
         error = math.sqrt(sum((gap - mean) ** 2 for gap in gaps) / (len(gaps) - 1) / len(gaps))
-        parts.append(f"{score} {mean:+.2f} ± {error:.2f} ({'apart' if abs(mean) > 2 * error else 'not told apart'})")
+        where = "beyond" if abs(mean) > 2 * error else "within"
+        parts.append(f"{score} {mean:+.2f} ± {error:.2f} ({where} two standard errors)")
     return ", ".join(parts)
 
 
