@@ -218,6 +218,7 @@ def test_a_cut_off_file_is_refused_by_name(suffix, tmp_path):
         (b"\x1f\x8bnothing", "damaged"),
         (b"PLY", "not a .spz"),
     ],
+    ids=["version", "count", "degree", "short", "short header", "not gzip", "not spz"],
 )
 def test_a_damaged_spz_is_refused(content, says, tmp_path):
     (tmp_path / "bad.spz").write_bytes(content)
