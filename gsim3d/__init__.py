@@ -6,25 +6,25 @@ use, so ``gsim3d._core`` (the kernels on numpy arrays) works without torch.
 
 import importlib
 
-from gsim3d.processor import check_processor
+from gsim3d.errors import check_processor
 
 __version__ = "0.1.0"
 
 check_processor()
 
 _HOME = {
-    "Cameras": "gsim3d.types",
-    "EffectsSpec": "gsim3d.effects",
-    "Frames": "gsim3d.types",
-    "Gaussians": "gsim3d.types",
+    "Cameras": "gsim3d.cameras",
+    "EffectsSpec": "gsim3d.effects.spec",
+    "Frames": "gsim3d.cameras",
+    "Gaussians": "gsim3d.state",
     "GradientError": "gsim3d.errors",
     "HardCaseError": "gsim3d.errors",
     "InputError": "gsim3d.errors",
-    "Particles": "gsim3d.types",
+    "Particles": "gsim3d.state",
     "ProcessorError": "gsim3d.errors",
     "Simulator": "gsim3d.simulator",
-    "StabilityReport": "gsim3d.stability",
-    "autotune": "gsim3d.pareto.autotune",
+    "StabilityReport": "gsim3d.numerics.policy",
+    "autotune": "gsim3d.profile.autotune",
 }
 
 __all__ = ["__version__", *_HOME]

@@ -1,9 +1,14 @@
-"""Typed errors, which the command line turns into one line and exit code 2, and hints for their messages."""
+"""Typed errors, which the command line turns into one line and exit code 2, and the checks that every module shares."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import platform
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+X86_64_V3 = {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe", "xsave"}  # as Linux names them
 
 
 class InputError(ValueError):
@@ -78,3 +83,36 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     lower = {str(word).lower(): str(word) for word in known}
     near = difflib.get_close_matches(str(name)[:100].lower(), lower, 1)
     return f"; did you mean {lower[near[0]]}?" if near else ""
+
+
+def check_ranges(config: Any, **ranges: tuple[float, float]) -> None:
+    """Raises InputError where a number of ``config``, or one of a tuple of it, lies outside of its (least, most)."""
+    for name, (least, most) in ranges.items():
+        for value in _numbers(getattr(config, name)):
+            if not least <= value <= most:  # NaN does not, either
+                bound = f"at most {most}" if value > most else f"at least {least}"
+                raise InputError(f"{name} must be {bound}; got {value}")
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, tuple):
+        for item in value:
+            yield from _numbers(item)
+    elif value is not None:
+        yield value
+
+
+def check_processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> None:
+    """Raises ProcessorError where the processor is known to lack an instruction of x86-64-v3."""
+    if platform.machine() not in ("x86_64", "AMD64"):
+        return
+    try:
+        with open(cpuinfo) as lines:
+            flags = next((line.split(":", 1)[1].split() for line in lines if line.startswith("flags")), None)
+    except OSError:
+        return
+    if flags is not None and (missing := sorted(X86_64_V3.difference(flags))):
+        raise ProcessorError(
+            "gsim3d needs an x86-64-v3 processor (Intel Haswell, AMD Zen or later); "
+            f"this one lacks {', '.join(missing)}"
+        )

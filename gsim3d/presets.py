@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from gsim3d.dynamics import DynamicsConfig
-from gsim3d.encoder import EncoderConfig
-from gsim3d.renderer import RendererConfig
-from gsim3d.stability import StabilityConfig
+from gsim3d.nn.gaussian_head import RendererConfig
+from gsim3d.nn.multiview_encoder import EncoderConfig
+from gsim3d.numerics.policy import StabilityConfig
 
 
 @dataclass(frozen=True)

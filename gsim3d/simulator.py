@@ -6,11 +6,11 @@
     steps = simulator.rollout(state, 12, plan)        # particles of the next 12 steps
     images = simulator.render(steps[-1], cameras)     # any camera, pixels and depth
 
-A state holds the last steps of each scene (:class:`gsim3d.types.Particles`, clouds sorted by scene and step). Scenes
+A state holds the last steps of each scene (:class:`gsim3d.state.Particles`, clouds sorted by scene and step). Scenes
 are packed, not padded: particle counts, numbers of views and lengths of history may all differ.
 
-Every call takes ``on_bad``, the policy for numbers that cannot be used (:mod:`gsim3d.stability`; default the model's),
-and ``report``, which counts them (default ``simulator.report``).
+Every call takes ``on_bad``, the policy for numbers that cannot be used (:mod:`gsim3d.numerics.policy`; default the
+model's), and ``report``, which counts them (default ``simulator.report``).
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from gsim3d.cameras import Cameras, Frames
+from gsim3d.compat.quirks import Quirks
 from gsim3d.dynamics import (
     Background,
     Dynamics,
@@ -36,20 +38,19 @@ from gsim3d.dynamics import (
     rollout_in_parts,
 )
 from gsim3d.dynamics.follow import follow
-from gsim3d.edits import Edit, by_step
-from gsim3d.effects import EffectsSpec, OutputEffects, UnsupportedEffect
-from gsim3d.encoder import Encoder, Room, pixel_rows
-from gsim3d.guards import check_particles, drop_rows, guard_frames, guard_particles
-from gsim3d.harmonics import SH_0
+from gsim3d.effects.edits import Edit, by_step
+from gsim3d.effects.plan import Plan, make_plan, unused_parameters
+from gsim3d.effects.selection import rows_of_any
+from gsim3d.effects.spec import EffectsSpec, OutputEffects, UnsupportedEffect
+from gsim3d.math.spherical_harmonics import SH_0
+from gsim3d.nn.gaussian_head import GaussianHead, render, render_as_published
+from gsim3d.nn.multiview_encoder import Encoder, Room, pixel_rows
+from gsim3d.numerics.policy import OnBad, StabilityReport, check_on_bad
+from gsim3d.numerics.validate import check_particles, drop_rows, guard_frames, guard_particles
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
-from gsim3d.plans import Plan, make_plan, unused_parameters
 from gsim3d.presets import ModelConfig
-from gsim3d.quirks import Quirks
-from gsim3d.renderer import GaussianHead, render, render_as_published
-from gsim3d.selections import rows_of_any
-from gsim3d.stability import OnBad, StabilityReport, check_on_bad
-from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames, Particles
+from gsim3d.state import DYNAMIC, FROZEN, Particles
 
 
 class Simulator(nn.Module):
@@ -159,7 +160,7 @@ class Simulator(nn.Module):
             geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
             wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
             log: is told which rows rested and were not computed.
-            edits: changes of the scene on the way (:mod:`gsim3d.edits`); they wake everybody.
+            edits: changes of the scene on the way (:mod:`gsim3d.effects.edits`); they wake everybody.
         Raises:
             InputError: an edit cannot be made; the message names its step and operation.
         """

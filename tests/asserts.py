@@ -26,9 +26,9 @@ def assert_close_relative_to_max(actual: Tensor, expected: Tensor, tolerance: fl
 
 def assert_same_bits(actual: Tensor, expected: Tensor, what: str = "") -> None:
     """Fails unless dtype, shape and every bit agree (NaN equals the same NaN, 0 differs from -0)."""
-    assert (
-        actual.dtype == expected.dtype and actual.shape == expected.shape
-    ), f"{what or 'result'}: {actual.dtype} {tuple(actual.shape)}, expected {expected.dtype} {tuple(expected.shape)}"
+    assert actual.dtype == expected.dtype and actual.shape == expected.shape, (
+        f"{what or 'result'}: {actual.dtype} {tuple(actual.shape)}, expected {expected.dtype} {tuple(expected.shape)}"
+    )
     actual, expected = (t.detach().cpu().contiguous().reshape(-1).view(torch.uint8) for t in (actual, expected))
     assert torch.equal(actual, expected), f"{what or 'result'}: {int((actual != expected).sum())} bytes differ"
 

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-CALLS = '''
+CALLS = """
 import os, sys
 import numpy as np
 import torch
@@ -32,13 +32,13 @@ CALLS = {
     "rasterize_gaussians": lambda: ops.rasterize_gaussians(m, *shape, camera, colors=m).color,
     "core": lambda: torch.from_numpy(_core.pool_mean(x.numpy(), rows.numpy(), cu.numpy())),
 }
-'''
+"""
 
 
 @pytest.mark.parametrize("used", [True, False], ids=["after_use", "before_use"])
 def test_a_forked_child_goes_on(used):
     """And its own child. Equal bits there; each ends by itself, and the parent goes on."""
-    script = f'''{CALLS}
+    script = f"""{CALLS}
 torch.set_num_threads(2)
 if {used}:
     expected = {{name: call().numpy().copy() for name, call in CALLS.items()}}
@@ -63,20 +63,20 @@ def wait(depth):
 
 wait(1)
 run(0)
-'''
+"""
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_a_child_that_uses_the_core_ends():
     """Its pool is made anew, and the workers of its parent are not waited for."""
-    script = f'''{CALLS}
+    script = f"""{CALLS}
 CALLS["core"]()
 child = os.fork()
 CALLS["core"]()
 if child:
     assert os.waitpid(child, 0)[1] == 0
 sys.exit(0)
-'''
+"""
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gsim3d import presets
+from gsim3d.cameras import Cameras, Frames
 from gsim3d.simulator import Simulator
-from gsim3d.types import Cameras, Frames
 from tests.asserts import assert_close_relative_to_max
 from tests.test_simulator import look_at
 

@@ -7,39 +7,69 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 
-# Each room may import the rooms before it (and its own), never one after it.
-ROOMS = [
-    {"errors", "quirks", "plain", "pickles"},
-    {"types", "stability", "terminal", "files", "locks", "ranges", "pretrained", "branches", "processor"},
-    {"selections"},
-    {"ops", "effects", "harmonics", "rotations"},
-    {"layers", "guards"},
-    {"encoder", "dynamics", "renderer"},
-    {"presets", "edits"},
-    {"plans"},
-    {"simulator"},
-    {"laws", "graphs", "by_scene", "agreement"},
-    {"endurance"},
-    {"data", "interop", "perceptual"},
-    {"io"},
-    {"viewer"},
-    {"generate"},
-    {"train"},
-    {"evaluate", "check_stability"},
-    {"pareto"},
-    {"ablate"},
-    {"simulate", "show_plan", "infer_effects", "check_data", "import_released", "demo", "doctor", "export"},
-    {"__main__"},
-]
-LEVEL = {room: level for level, rooms in enumerate(ROOMS) for room in rooms}
+# Three rings: the workshop imports the library and the commands import both, never the other way round. Inside a ring
+# a line may import the lines above it. A name is a module, or a package with all modules that have no line of its own.
+RINGS = {
+    "library": """
+        errors effects numerics
+        numerics.policy compat.quirks
+        io.terminal io.plain io.pickles io.locks
+        cameras
+        state
+        ops.streams
+        ops
+        math
+        io.files
+        numerics.validate effects.rules
+        nn
+        dynamics.config dynamics.background
+        nn.point_transformer
+        dynamics
+        io
+        effects.selection
+        effects.spec effects.edits
+        presets
+        effects.plan
+        simulator
+        effects.by_scene
+        cuda_graphs
+        pretrained
+    """,
+    "workshop": """
+        data evaluate.perceptual
+        evaluate.metrics
+        train
+        viewer compat
+        synth
+        evaluate
+        testing
+        profile
+        ablate
+    """,
+    "commands": """
+        cli.arguments
+        cli
+        __main__
+    """,
+}
+LINES = [set(line.split()) for ring in RINGS.values() for line in ring.strip().splitlines()]
+LEVEL = {name: level for level, names in enumerate(LINES) for name in names}
+MOST_AT_THE_TOP = 8  # modules directly below gsim3d/
 
 
-def room_of(path: Path) -> str:
-    return path.relative_to(ROOT / "gsim3d").parts[0].removesuffix(".py")
+def home_of(module: str) -> str:
+    """The longest name in LEVEL that ``module`` (without "gsim3d.") is, or lies in."""
+    parts = module.split(".")
+    names = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
+    return next((name for name in names if name in LEVEL), parts[0])
 
 
-def imported_rooms(path: Path) -> set[str]:
-    rooms = set()
+def module_of(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT / "gsim3d").with_suffix("").parts).removesuffix(".__init__")
+
+
+def imported_homes(path: Path) -> set[str]:
+    found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         names = []
         if isinstance(node, ast.Import):
@@ -47,31 +77,34 @@ def imported_rooms(path: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: imports are absolute"
             names = [f"{node.module}.{alias.name}" for alias in node.names]
-        for name in names:
-            parts = name.split(".")
-            if parts[0] == "gsim3d" and len(parts) > 1 and parts[1] in LEVEL:
-                rooms.add(parts[1])
-    return rooms
+        found |= {home_of(name.removeprefix("gsim3d.")) for name in names if name.startswith("gsim3d.")}
+    return found & set(LEVEL)
 
 
 def python_files():
     files = sorted((ROOT / "gsim3d").rglob("*.py"))
     assert len(files) > 10
-    return [path for path in files if room_of(path) != "__init__"]
+    return [path for path in files if module_of(path) != "__init__"]
 
 
-def test_every_room_has_a_level():
-    assert {room_of(path) for path in python_files()} <= set(LEVEL)
+def test_every_module_has_a_level():
+    assert {home_of(module_of(path)) for path in python_files()} <= set(LEVEL)
 
 
 def test_imports_flow_one_way():
     wrong = [
         f"{path.relative_to(ROOT)} imports gsim3d.{other}"
         for path in python_files()
-        for other in imported_rooms(path)
-        if other != room_of(path) and LEVEL[other] >= LEVEL[room_of(path)] and not (room_of(path) == "__main__")
+        for home in [home_of(module_of(path))]
+        for other in imported_homes(path)
+        if other != home and LEVEL[other] >= LEVEL[home]
     ]
     assert not wrong, "\n".join(wrong)
+
+
+def test_the_top_level_is_small():
+    modules = [path for path in (ROOT / "gsim3d").glob("*.py")]
+    assert len(modules) <= MOST_AT_THE_TOP, sorted(path.name for path in modules)
 
 
 def test_oracles_do_not_import_what_they_judge():

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gsim3d import _core, ops
-from gsim3d.types import Cameras
+from gsim3d.cameras import Cameras
 
 DTYPES = [np.float32, np.float64]
 

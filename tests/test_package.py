@@ -19,7 +19,7 @@ import torch
 from torch.utils import cpp_extension
 
 import gsim3d
-from gsim3d.processor import X86_64_V3, check_processor
+from gsim3d.errors import X86_64_V3, check_processor
 
 ROOT = Path(__file__).parent.parent
 

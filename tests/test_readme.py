@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from gsim3d.__main__ import COMMANDS
 from gsim3d.ablate.rows import rows_named
-from gsim3d.generate.worlds import build_world
+from gsim3d.cli.arguments import Parser
+from gsim3d.cli.main import COMMANDS
 from gsim3d.pretrained import located
-from gsim3d.terminal import Parser
+from gsim3d.synth.worlds import build_world
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()

@@ -7,17 +7,18 @@ import pytest
 import torch
 
 from gsim3d import presets
+from gsim3d.cameras import Cameras, Frames
+from gsim3d.compat.quirks import Quirks
 from gsim3d.dynamics import last_steps
-from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, UnsupportedEffect
+from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, UnsupportedEffect
+from gsim3d.nn.gaussian_head import RendererConfig, render, render_as_published
 from gsim3d.presets import ModelConfig
-from gsim3d.quirks import Quirks
-from gsim3d.renderer import RendererConfig, render, render_as_published
 from gsim3d.simulator import Simulator
+from gsim3d.state import DYNAMIC, FROZEN
 from gsim3d.train.loop import deterministic
-from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import TINY
-from tests.encoder.scenes import CONFIG as TINY_ENCODER
+from tests.nn.multiview_encoder.scenes import CONFIG as TINY_ENCODER
 
 SIZE = 16
 ENCODER = dataclasses.replace(TINY_ENCODER, transformer_layers=1, upsampled_dim=4, dynamic_dim=4, static_dim=3)

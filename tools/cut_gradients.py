@@ -26,9 +26,9 @@ from torch import nn
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 from gsim3d.data import Scene, find_scenes, split_scenes  # noqa: E402
-from gsim3d.dynamics.point_transformer import Block  # noqa: E402
 from gsim3d.evaluate.protocol import score_scene  # noqa: E402
 from gsim3d.evaluate.report import summarize, write_json  # noqa: E402
+from gsim3d.nn.point_transformer import Block  # noqa: E402
 from gsim3d.simulator import Simulator  # noqa: E402
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig  # noqa: E402
 from gsim3d.train.loop import Trainer  # noqa: E402

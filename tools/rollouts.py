@@ -20,12 +20,12 @@ import torch
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 from gsim3d import presets  # noqa: E402
-from gsim3d.check_stability import Subject, open_subject, sample_of_scenes  # noqa: E402
+from gsim3d.cli.demo import DemoConfig  # noqa: E402
 from gsim3d.data import Scene, find_scenes, split_scenes  # noqa: E402
-from gsim3d.demo import DemoConfig  # noqa: E402
-from gsim3d.endurance import Curves, gradient_norms, rollout_curves  # noqa: E402
 from gsim3d.evaluate.pictures import pyplot  # noqa: E402
-from gsim3d.laws import Sample  # noqa: E402
+from gsim3d.testing.check_stability import Subject, open_subject, sample_of_scenes  # noqa: E402
+from gsim3d.testing.invariances import Sample  # noqa: E402
+from gsim3d.testing.stress import Curves, gradient_norms, rollout_curves  # noqa: E402
 from gsim3d.train.loop import Trainer  # noqa: E402
 from gsim3d.train.restore import build_simulator  # noqa: E402
 

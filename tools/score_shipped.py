@@ -58,9 +58,9 @@ def score(
     from gsim3d.evaluate.protocol import default_views, score_scenes
     from gsim3d.evaluate.report import summarize, write_json
     from gsim3d.evaluate.scoring import PLAIN_METRICS, measurable
-    from gsim3d.generate import generate
-    from gsim3d.generate.held_out import SETS, set_of
-    from gsim3d.generate.worlds import HELD_OUT
+    from gsim3d.synth import generate
+    from gsim3d.synth.held_out import SETS, set_of
+    from gsim3d.synth.worlds import HELD_OUT
     from gsim3d.train.processes import joined
     from gsim3d.train.restore import restore
 

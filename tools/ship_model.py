@@ -26,8 +26,8 @@ from gsim3d import pretrained  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402
 from gsim3d.evaluate.pictures import write_curves  # noqa: E402
 from gsim3d.evaluate.report import markdown  # noqa: E402
-from gsim3d.generate.worlds import VALIDATION_SEED  # noqa: E402
-from gsim3d.pareto.autotune import SPEEDS  # noqa: E402
+from gsim3d.profile.autotune import SPEEDS  # noqa: E402
+from gsim3d.synth.worlds import VALIDATION_SEED  # noqa: E402
 from gsim3d.train import checkpoint  # noqa: E402
 from tools.release.recipes import Recipe, recipe  # noqa: E402
 from tools.release.state import CURVE, load_progress, weights_file  # noqa: E402
@@ -107,9 +107,7 @@ def card(name: str, recipe: dict, scores: dict, config: dict, wrong: str) -> str
     """The model card."""
     data, devices = config["data"], sorted({run["device"] for run in recipe["runs"]})
     used = sum(run["trajectories"] for run in recipe["runs"])
-    changes = [
-        json.dumps(options) for run in recipe["runs"] for options in run.get("in_turn", ()) if options
-    ]
+    changes = [json.dumps(options) for run in recipe["runs"] for options in run.get("in_turn", ()) if options]
     changed = f" (some with {', '.join(dict.fromkeys(changes))})" if changes else ""
     world, begun = recipe["world"], recipe["runs"][0].get("began_with")
     n_runs = len(recipe["runs"])

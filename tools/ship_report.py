@@ -23,9 +23,9 @@ sys.path.insert(0, str(ROOT))
 from gsim3d import pretrained  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402
 from gsim3d.evaluate.report import write_json  # noqa: E402
-from gsim3d.pareto.autotune import SPEEDS  # noqa: E402
-from gsim3d.pareto.page import share_in_words  # noqa: E402
-from gsim3d.pareto.report import regimes_in_words  # noqa: E402
+from gsim3d.profile.autotune import SPEEDS  # noqa: E402
+from gsim3d.profile.page import share_in_words  # noqa: E402
+from gsim3d.profile.report import regimes_in_words  # noqa: E402
 
 DOCS = ROOT / "docs"
 PICTURES = ("cost.png", "stages.png", "horizon.png")

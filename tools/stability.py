@@ -35,7 +35,7 @@ Written by `python tools/stability.py` from the tests in `tests/stability`; do n
 never an abort of the process, never a changed result for another member of the batch.**
 
 What happens to a number that cannot be used is a policy, of a model or of a call: `on_bad="raise"` (default), `"drop"`
-or `"clamp"`; a `StabilityReport` counts what, where and how many. `gsim3d/stability.py` has the rules.
+or `"clamp"`; a `StabilityReport` counts what, where and how many. `gsim3d/numerics/policy.py` has the rules.
 
 Every case below is a test that is named after it (`test_r01_...`), forward and backward. Most of them run beside an
 ordinary scene in the same call, which must not notice: its rows have equal bits in float32 on the CPU, and everywhere

@@ -176,8 +176,7 @@ def rows_named(names: str) -> list[Row]:
     found = [name.strip() for name in names.split(",")]
     if unknown := [name for name in found if name not in ROWS]:
         raise InputError(
-            f"--rows: {unknown[0]!r} does not exist; rows: {', '.join(ROWS)}"
-            f"{did_you_mean(unknown[0], ROWS)}"
+            f"--rows: {unknown[0]!r} does not exist; rows: {', '.join(ROWS)}{did_you_mean(unknown[0], ROWS)}"
         )
     if len(set(found)) < len(found):
         raise InputError(f"--rows: a row is named twice in {names!r}")

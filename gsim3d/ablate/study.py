@@ -13,11 +13,11 @@ from gsim3d.ablate.rows import Row
 from gsim3d.ablate.table import as_dict, markdown, told
 from gsim3d.ablate.trial import Trial, attempt, context
 from gsim3d.data import Scene, split_scenes
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.plan import make_plan
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import horizon
 from gsim3d.evaluate.report import write_json
-from gsim3d.plans import make_plan
 from gsim3d.train.captured import check_capturable
 from gsim3d.train.checks import check_history, check_sharing
 from gsim3d.train.config import TrainConfig

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from gsim3d.pareto import machine
+from gsim3d.profile import machine
 from gsim3d.train.settings import to_dict
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from gsim3d.data import Scene
 from gsim3d.errors import CaptureError, HardCaseError, InputError
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.evaluate.report import summarize, write_json
-from gsim3d.files import MAX_TEXT, read_file
-from gsim3d.plain import parse_json
+from gsim3d.io.files import MAX_TEXT, read_file
+from gsim3d.io.plain import parse_json
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.log import LOG, read_entry
 from gsim3d.train.loop import Trainer

@@ -46,9 +46,7 @@ def near_zero(recording: Recording) -> Recording:
         return recording
     viewmats = recording.viewmats.copy()
     viewmats[..., :3, 3] += viewmats[..., :3, :3] @ offset
-    places = {
-        name: value - offset for name in ("origin", "bounds") if (value := getattr(recording, name)) is not None
-    }
+    places = {name: value - offset for name in ("origin", "bounds") if (value := getattr(recording, name)) is not None}
     return dataclasses.replace(recording, viewmats=viewmats, world_offset=recording.world_offset + offset, **places)
 
 
@@ -81,8 +79,10 @@ def check_pose(matrices: np.ndarray, what: str, problems: Problems) -> bool:
         (last_row > ROTATION_TOLERANCE, lambda s: f"must end in the row 0 0 0 1; got {stack[s, 3].tolist()}"),
         (
             skewed > ROTATION_TOLERANCE,
-            lambda s: f"must be a rigid motion: its rotation is not orthonormal (off by {skewed[s]:.3g}); "
-            "it holds a scale or shear, or is cut off",
+            lambda s: (
+                f"must be a rigid motion: its rotation is not orthonormal (off by {skewed[s]:.3g}); "
+                "it holds a scale or shear, or is cut off"
+            ),
         ),
         (
             determinant < 0,

@@ -13,7 +13,7 @@ from gsim3d.data.cameras import check_directions, positions_and_axes, project
 from gsim3d.data.recording import MOVING, Problems, Recording
 from gsim3d.data.scene import Scene
 from gsim3d.errors import InputError
-from gsim3d.terminal import plain
+from gsim3d.io.terminal import plain
 
 SHEET = 1440  # pixels, aimed width of the sheet
 TILE = 200, 420  # pixels, smallest and largest height of one frame in it

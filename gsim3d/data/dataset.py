@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsim3d.cameras import Cameras, Frames
 from gsim3d.data.recording import BACKGROUND, MOVING
 from gsim3d.data.scene import Scene
 from gsim3d.errors import InputError
-from gsim3d.types import Cameras, Frames
 
 FEW_SCENES = 15  # below so many, one scene is held out
 

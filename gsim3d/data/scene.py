@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsim3d.cameras import Cameras
 from gsim3d.data import layouts
 from gsim3d.data.cameras import check_directions, frusta_origin, near_zero, shared_view, spread_steps
 from gsim3d.data.fitting import Fitting, fit, own_depths, resample
@@ -19,7 +20,6 @@ from gsim3d.data.lenses import Undistorter
 from gsim3d.data.masks import foreground, median_image
 from gsim3d.data.recording import BACKGROUND, MOVING, Problems, ReadImages, Recording
 from gsim3d.errors import InputError
-from gsim3d.types import Cameras
 
 CACHE_VERSION = 2  # counts changes of what readers make of the same files
 SIZE_MULTIPLE = 16  # pixels; images are padded to it, so that the encoders of all presets can read them

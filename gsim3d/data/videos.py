@@ -14,7 +14,7 @@ import numpy as np
 
 from gsim3d.data.recording import MAX_STEPS, Problems
 from gsim3d.errors import InputError
-from gsim3d.files import opencv_path
+from gsim3d.io.files import opencv_path
 
 RESOLUTION = 1.01e-3  # seconds: many containers round times to a millisecond
 UNEVEN = 0.1  # of the time between two frames: a frame that is off by more makes a video uneven

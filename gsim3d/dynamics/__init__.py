@@ -3,7 +3,7 @@
 from gsim3d.dynamics.background import Background
 from gsim3d.dynamics.clouds import append_step, concatenate, last_steps, with_field
 from gsim3d.dynamics.config import DynamicsConfig
-from gsim3d.dynamics.dynamics import Dynamics
+from gsim3d.dynamics.model import Dynamics
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.rollout import rollout, rollout_in_parts
 from gsim3d.dynamics.sleep import RestLog, Sleepers

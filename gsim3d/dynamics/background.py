@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import accumulate
 
@@ -25,9 +25,9 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d import ops
-from gsim3d.branches import MANY_STREAMS, Branches
 from gsim3d.ops.curve import CURVES, KernelMap, PatchTable, Pyramid, PyramidSpec, Segments, Stage, Voxels
-from gsim3d.types import Particles
+from gsim3d.ops.streams import MANY_STREAMS, Branches
+from gsim3d.state import Particles
 
 DEPTH = 16  # levels of the curves at stage 0, and bits of a cell along an axis
 SPACE_BITS = 3 * DEPTH  # below the scene in a key

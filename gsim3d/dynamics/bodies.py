@@ -8,7 +8,7 @@ from torch import Tensor
 from gsim3d.dynamics.clouds import with_field
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.samples import SAMPLES, squares
-from gsim3d.types import Particles, constant, take_runs
+from gsim3d.state import Particles, constant, take_runs
 
 NEIGHBOURS = 8  # within reach of every second row, itself one of them
 LEAST = 0.1  # of the rows of the largest part: smaller ones belong to what is nearest

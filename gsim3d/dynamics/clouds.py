@@ -1,6 +1,6 @@
 """Clouds of particles as a history: which is newest, which are the last, and what comes behind them.
 
-All of it is bookkeeping on numbers that the host knows (:class:`gsim3d.types.CloudTable`); nothing waits for a device.
+All of it is bookkeeping on numbers that the host knows (:class:`gsim3d.state.CloudTable`); nothing waits for a device.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.types import CloudTable, Particles, split_rows
+from gsim3d.state import CloudTable, Particles, split_rows
 
 # That only some particles have.
 OPTIONAL_FIELDS = ("turns", "paint", "held", "unlit", "velocity", "light", "shaded", "reference", "body")

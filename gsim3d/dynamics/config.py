@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from gsim3d.compat.quirks import Quirks
+from gsim3d.errors import check_ranges
+from gsim3d.numerics.policy import LARGEST
 from gsim3d.ops.curve import PyramidSpec
-from gsim3d.quirks import Quirks
-from gsim3d.ranges import check_ranges
-from gsim3d.stability import LARGEST
 
 PREDICTS = ("from_newest", "from_previous", "absolute")
 BACKGROUNDS = ("symmetric", "asymmetric", "relit")

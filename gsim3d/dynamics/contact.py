@@ -8,7 +8,7 @@ from torch import Tensor
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.planes import planes
 from gsim3d.dynamics.samples import FAINTEST, Samples, grouped, squares, ungrouped, weights
-from gsim3d.types import FROZEN, Particles
+from gsim3d.state import FROZEN, Particles
 
 CONTACT_CHANNELS = 4
 WINDOW = 0.5  # of the length: standard deviation of the window in which places of the background are averaged

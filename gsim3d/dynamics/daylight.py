@@ -12,7 +12,7 @@ from gsim3d.dynamics.planes import planes
 from gsim3d.dynamics.rigid import SMALLEST
 from gsim3d.dynamics.samples import FAINTEST, Few, Samples, grouped, squares, ungrouped
 from gsim3d.dynamics.shade import EDGE, between
-from gsim3d.types import DYNAMIC, FROZEN, Particles
+from gsim3d.state import DYNAMIC, FROZEN, Particles
 
 OPAQUE = 0.3  # opacity; below it are rows at silhouettes, whose depth was not known
 # Standard deviations of windows, in cells.

@@ -8,7 +8,7 @@ from torch import Tensor
 from gsim3d.dynamics.clouds import with_field
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.rigid import turned_most
-from gsim3d.types import Particles, constant, take_runs
+from gsim3d.state import Particles, constant, take_runs
 
 DEFORMATION_CHANNELS = 3
 

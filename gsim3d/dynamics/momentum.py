@@ -9,7 +9,7 @@ from gsim3d.dynamics.clouds import newest_clouds, with_field
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.rigid import LITTLE, RigidFit, onward_at, spin_of
 from gsim3d.dynamics.state import rotate_left
-from gsim3d.types import Particles, take_runs
+from gsim3d.state import Particles, take_runs
 
 
 def momentum(history: Particles, length: float, grid_size: float, matter: Matter | None = None) -> Tensor:

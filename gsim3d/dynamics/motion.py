@@ -8,7 +8,7 @@ from torch import Tensor
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.rigid import RigidFit, onward_at
 from gsim3d.dynamics.samples import Padded, Rows, Samples, squares, weights
-from gsim3d.types import CloudTable, Particles, constant
+from gsim3d.state import CloudTable, Particles, constant
 
 PASSES = 3  # in which the window follows the matter, and in which rows are matched
 REACH = 0.2  # of the window's length: how far from where it is expected a row is looked for

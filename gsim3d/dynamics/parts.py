@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.dynamics.clouds import last_steps, newest_clouds
-from gsim3d.types import ASLEEP, FROZEN, CloudTable, Particles
+from gsim3d.state import ASLEEP, FROZEN, CloudTable, Particles
 
 
 @dataclass(frozen=True)

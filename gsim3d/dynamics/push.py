@@ -8,7 +8,7 @@ from torch import Tensor
 from gsim3d.dynamics.contact import FIRM, Beside
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.rigid import LITTLE, SMALLEST, RigidFit
-from gsim3d.types import Particles, take_runs
+from gsim3d.state import Particles, take_runs
 
 REACHING = 4  # power of the nearness to the background, which is as much as a row is pushed by it
 LEAST = 1e-6  # metres a step along a surface: slower rows are held

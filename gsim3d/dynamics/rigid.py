@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.dynamics.samples import grouped, ungrouped
-from gsim3d.types import constant
+from gsim3d.state import constant
 
 SQUARINGS = 10  # of a matrix: what is left is its largest eigenvalue's, to the power 2^10
 NODES = 6  # of the lattice that spans the movable rows of a scene, along each axis

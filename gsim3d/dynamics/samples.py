@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from gsim3d.ops.sentinel import CELLS
-from gsim3d.types import DYNAMIC, Particles, constant
+from gsim3d.state import DYNAMIC, Particles, constant
 
 SAMPLES = 1024  # rows of a cloud that are looked at, evenly spread over them
 FAINTEST = -60.0  # logarithm of a weight: a CPU takes many times as long for numbers that are almost 0

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.samples import FAINTEST, Samples, grouped, squares, ungrouped
-from gsim3d.types import FROZEN, Particles
+from gsim3d.state import FROZEN, Particles
 
 BEAM = 2.0  # cells: standard deviation of the beam of light in which matter is counted
 NEAREST = 3.0  # cells towards the light, from which on matter counts half; less is the surface that a row is part of

@@ -21,8 +21,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from gsim3d.effects import Sleep
-from gsim3d.types import ASLEEP, FROZEN, Particles, constant
+from gsim3d.effects.rules import Sleep
+from gsim3d.state import ASLEEP, FROZEN, Particles, constant
 
 NEVER_PREDICTED = {"activity", "static_latents", "turns", "paint", "held", "unlit", "shaded", "reference", "body"}
 CUBE_BITS = 16  # of a cube along an axis; cubes further out share the outermost

@@ -15,10 +15,10 @@ from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import CONTACT_CHANNELS
 from gsim3d.dynamics.deformation import DEFORMATION_CHANNELS
 from gsim3d.dynamics.flight import BACK, STIFF_BACK, Flight
-from gsim3d.harmonics import degree_damping
-from gsim3d.layers import widened
-from gsim3d.rotations import unit_quats
-from gsim3d.types import FROZEN, Particles
+from gsim3d.math.rotations import unit_quats
+from gsim3d.math.spherical_harmonics import degree_damping
+from gsim3d.nn.layers import widened
+from gsim3d.state import FROZEN, Particles
 
 SCALE_STEP_SHARE = 1 / 6  # of the range of scales, the most that one step changes a scale
 POSITION_CHANNELS = MOTION_CHANNELS = 6

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsim3d.errors import InputError
-from gsim3d.perceptual.colors import as_colors
+from gsim3d.evaluate.perceptual.colors import as_colors
 
 PSNR_CAP = 100.0  # dB, given to images whose mean squared error is below 1e-10, perfect ones included
 

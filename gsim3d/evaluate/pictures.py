@@ -11,15 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsim3d.cameras import Cameras
 from gsim3d.data import Scene
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import Prediction
 from gsim3d.evaluate.scoring import METRICS
-from gsim3d.interop import write_ply
+from gsim3d.io import write_ply
 from gsim3d.io.sequence import write_about
-from gsim3d.renderer import render
+from gsim3d.nn.gaussian_head import render
 from gsim3d.train.restore import Restored
-from gsim3d.types import Cameras
 
 FRAME_SIZE = 256  # pixels; smaller frames are enlarged by a whole factor to at most this height
 GAP = 4  # pixels of white between frames

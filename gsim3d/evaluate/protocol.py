@@ -27,16 +27,16 @@ from torch import Tensor
 from gsim3d.data import Scene, make_frames
 from gsim3d.data.recording import BACKGROUND
 from gsim3d.dynamics import RestLog, concatenate
-from gsim3d.edits import Edit
+from gsim3d.effects.edits import Edit
 from gsim3d.errors import FitWarning, HardCaseError, InputError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.scoring import EXACT_PARTS, PLAIN_METRICS, SceneScores, SceneTruth
-from gsim3d.layers import exact_convolutions
-from gsim3d.terminal import progress
+from gsim3d.io.terminal import progress
+from gsim3d.nn.layers import exact_convolutions
+from gsim3d.state import DYNAMIC, Particles
 from gsim3d.train.processes import Processes
 from gsim3d.train.restore import Restored
 from gsim3d.train.samples import context_cameras, spread_views, thinned
-from gsim3d.types import DYNAMIC, Particles
 
 METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant", *EXACT_PARTS)
 TOGETHER = 8  # scenes that a GPU predicts in one rollout, fewer where they are large
@@ -315,16 +315,19 @@ def score_scenes(
             predictions = predict_together(restored, chosen, n_future, contexts)
         for number, prediction in zip(group, predictions, strict=True):
             context, targets = views[number]
-            yield number, score_scene(
-                restored,
-                scenes[number],
-                context_cams=context,
-                target_cams=targets,
-                n_encoded=n_encoded,
-                n_future=n_future,
-                metrics=[metric for metric in metrics if metric != "fvd" or number in for_fvd],
-                others=others,
-                prediction=prediction,
+            yield (
+                number,
+                score_scene(
+                    restored,
+                    scenes[number],
+                    context_cams=context,
+                    target_cams=targets,
+                    n_encoded=n_encoded,
+                    n_future=n_future,
+                    metrics=[metric for metric in metrics if metric != "fvd" or number in for_fvd],
+                    others=others,
+                    prediction=prediction,
+                ),
             )
 
     scores: dict[int, SceneScores] = {}

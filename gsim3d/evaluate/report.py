@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from gsim3d.evaluate.metrics import mean_of_counted
+from gsim3d.evaluate.perceptual.fvd import MIN_CLIPS, TREND_CLIPS, frechet_distance
 from gsim3d.evaluate.scoring import METRICS, RING_WIDTH, SceneScores
-from gsim3d.files import write_whole
-from gsim3d.generate.held_out import describe_set
-from gsim3d.perceptual.fvd import MIN_CLIPS, TREND_CLIPS, frechet_distance
+from gsim3d.io.files import write_whole
+from gsim3d.synth.held_out import describe_set
 
 REGIONS = (
     "masked: without background; body: what may move; ground: the rest of the mask; ring: ground within "

@@ -12,14 +12,14 @@ from torch import Tensor
 from gsim3d.data.recording import BACKGROUND, FIXED, MOVING
 from gsim3d.errors import InputError, did_you_mean
 from gsim3d.evaluate.metrics import SSIM_WINDOW, psnr, ssim
-from gsim3d.perceptual import fvd, lpips, weights
+from gsim3d.evaluate.perceptual import fvd, lpips, weights
 
 
 @dataclass(frozen=True)
 class Metric:
     """label: its name in tables.   digits: after the point.   rises: whether more is better.
 
-    weights: what must be installed to measure it (a key of gsim3d.perceptual.weights.SOURCES), or nothing.
+    weights: what must be installed to measure it (a key of gsim3d.evaluate.perceptual.weights.SOURCES), or nothing.
     by_step: whether each image has a value of its own.
     """
 
@@ -107,8 +107,7 @@ def measurable(names: Sequence[str] | None = None) -> tuple[tuple[str, ...], dic
     for name in names:
         if name not in METRICS:
             raise InputError(
-                f"metric {name!r} does not exist; metrics: {', '.join(METRICS)}"
-                f"{did_you_mean(name, METRICS)}"
+                f"metric {name!r} does not exist; metrics: {', '.join(METRICS)}{did_you_mean(name, METRICS)}"
             )
         if name in missing:
             raise weights.WeightsMissing(f"metric {name} needs weights: {weights.how_to_install(missing[name])}")

@@ -1,5 +1,21 @@
-"""Files of 3D Gaussians that other tools open, by suffix: ``read_splats`` and ``write_splats``."""
+"""Files: splat formats by suffix (``read_splats``, ``write_splats``), .ply, video, and safe reading and writing."""
 
-from gsim3d.io.formats import FORMATS, format_of, read_splats, write_splats
+import importlib
 
-__all__ = ["FORMATS", "format_of", "read_splats", "write_splats"]
+_HOME = {
+    "FORMATS": "formats",
+    "format_of": "formats",
+    "read_ply": "ply",
+    "read_splats": "formats",
+    "write_ply": "ply",
+    "write_splats": "formats",
+    "write_video": "video",
+}
+
+__all__ = list(_HOME)
+
+
+def __getattr__(name):
+    if name in _HOME:
+        return getattr(importlib.import_module(f"gsim3d.io.{_HOME[name]}"), name)
+    raise AttributeError(f"module 'gsim3d.io' has no attribute {name!r}")

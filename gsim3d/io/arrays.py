@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from gsim3d.errors import InputError
-from gsim3d.files import read_file
-from gsim3d.harmonics import SH_0, rotate_harmonics
-from gsim3d.rotations import quat_product, unit_quats
-from gsim3d.types import Gaussians
+from gsim3d.io.files import read_file
+from gsim3d.math.rotations import quat_product, unit_quats
+from gsim3d.math.spherical_harmonics import SH_0, rotate_harmonics
+from gsim3d.state import Gaussians
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 MAX_BYTES = 2**36  # of a file: 10^8 Gaussians and more
@@ -132,7 +132,7 @@ def unorm(x: np.ndarray, bits: int) -> np.ndarray:
 def read_bytes(path: Path, *starts: bytes) -> bytes:
     """The content of a file of Gaussians; of one that begins with none of ``starts``, the first bytes alone.
 
-    Raises: InputError as :func:`gsim3d.files.read_file`.
+    Raises: InputError as :func:`gsim3d.io.files.read_file`.
     """
     head = read_head(path)
     return read_file(path, MAX_BYTES) if not starts or head.startswith(starts) else head

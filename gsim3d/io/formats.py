@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsim3d.errors import InputError
-from gsim3d.interop.ply import read_ply, write_ply
 from gsim3d.io import compressed_ply, gltf, splat, spz, usd
 from gsim3d.io.arrays import Y_TO_Z_UP, Z_TO_Y_UP, Splats, gaussians_of, read_head, splats_of, turned
-from gsim3d.types import Gaussians
+from gsim3d.io.ply import read_ply, write_ply
+from gsim3d.state import Gaussians
 
 UPS = ("y", "z")
 

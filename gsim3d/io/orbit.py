@@ -8,8 +8,9 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 
+from gsim3d.cameras import Cameras
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.types import Cameras, Gaussians
+from gsim3d.state import Gaussians
 
 ELEVATION, FIELD_OF_VIEW = 25.0, 42.0  # degrees
 MARGIN = 1.15  # of the distance at which all is in view

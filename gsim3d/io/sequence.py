@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsim3d.errors import InputError
-from gsim3d.files import MAX_TEXT, read_file
+from gsim3d.io.files import MAX_TEXT, read_file
 from gsim3d.io.formats import FORMATS, read_splats
-from gsim3d.types import Gaussians
+from gsim3d.state import Gaussians
 
 ABOUT = "sequence.json"
 GAUSSIANS = "gaussians"  # folder of a run

@@ -22,8 +22,8 @@ from gsim3d.ops.curve import (
 )
 from gsim3d.ops.decode import decode_gaussians
 from gsim3d.ops.patch_attn import joint_attention, patch_attention
-from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
+from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.raster import Rendering, rasterize_gaussians
 from gsim3d.ops.row_norm import norm_gelu, residual_norm, row_norm
 from gsim3d.ops.sentinel import Watched, watch_rows

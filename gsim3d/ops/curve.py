@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsim3d.branches import MANY_STREAMS, Branches
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_real, check_tensors, check_whole
+from gsim3d.ops.streams import MANY_STREAMS, Branches
 
 CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
 

@@ -22,7 +22,7 @@ def decode_gaussians(
     Args:
         raw: [N, 3 K + 7], K = 0, 1, 4, 9 or 16: harmonics (3, K), rotation (x, y, z, w), scales; float32 or float64, on
             CUDA also float16 and bfloat16 (computed in float32).
-        readings: [128], :func:`gsim3d.harmonics.readings`, float32; float64 with float64 rows.
+        readings: [128], :func:`gsim3d.math.spherical_harmonics.readings`, float32; float64 with float64 rows.
         degree: of the harmonics that are returned, at most that of ``raw``; -1: none.
         scale_min, scale_max: metres, 0 to 1e15.
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsim3d.cameras import Cameras
+from gsim3d.numerics.policy import Finding, OnBad, Reading, StabilityReport, check_on_bad
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_floating, check_real, check_tensors, check_whole, within_memory
 from gsim3d.ops._gradients import register_gradients
-from gsim3d.stability import Finding, OnBad, Reading, StabilityReport, check_on_bad
-from gsim3d.types import Cameras
 
 OP = "rasterize_gaussians"
 LARGEST = 1e15  # kLargest of csrc/gsim3d/raster/raster_math.h
@@ -96,8 +96,9 @@ def rasterize_gaussians(
         jacobian: where the projection of a Gaussian centred outside of the image is linearised. "exact": at its centre,
             so an image is what a larger one of the same camera has there; "clamped": at most 0.15 of the image outside
             of it, as 3DGS and gsplat do, and models trained so expect.
-        on_bad: what happens to a row that cannot be used (:mod:`gsim3d.stability`). "raise": an error on the CPU, left
-            out on a GPU; "drop": left out, its gradients are 0; "clamp": bounded, NaN counts as 0 (rotation: identity).
+        on_bad: what happens to a row that cannot be used (:mod:`gsim3d.numerics.policy`). "raise": an error on the
+            CPU, left out on a GPU; "drop": left out, its gradients are 0; "clamp": bounded, NaN counts as 0
+            (rotation: identity).
         report: counts such rows by image; on a GPU its ``check()`` raises what "raise" could not. Without one a GPU
             does not count.
     Returns:
@@ -117,7 +118,7 @@ def rasterize_gaussians(
     Source: Zwicker et al. 2002 (EWA splatting), Kerbl et al. 2023 (3D Gaussian splatting); conventions of gsplat.
 
     Example:
-        >>> from gsim3d.types import Cameras
+        >>> from gsim3d.cameras import Cameras
         >>> K = torch.tensor([[[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]])
         >>> one, first = torch.ones(1), torch.zeros(1, dtype=torch.int64)
         >>> cameras = Cameras(torch.eye(4)[None], K, 0.1 * one, 10 * one, first, width=8, height=8)

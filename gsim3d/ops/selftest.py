@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsim3d import ops
-from gsim3d.types import Cameras
+from gsim3d.cameras import Cameras
 
 TOLERANCE = 1e-4  # float32, relative to the largest value of the expected tensor
 

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsim3d.numerics.policy import LARGEST
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_real, check_tensors
 from gsim3d.ops._gradients import refuse
-from gsim3d.stability import LARGEST
 
 # As in csrc/gsim3d/sentinel/sentinel.h
 CELLS = 2**16  # of a workspace along each axis

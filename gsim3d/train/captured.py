@@ -22,21 +22,22 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from gsim3d.cameras import Frames
+from gsim3d.cuda_graphs import Captured, with_background_as_it_is
 from gsim3d.dynamics import DynamicsConfig, concatenate
-from gsim3d.encoder import Room
+from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
-from gsim3d.graphs import Captured, with_background_as_it_is
+from gsim3d.nn.multiview_encoder import Room
+from gsim3d.numerics.policy import StabilityReport
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
-from gsim3d.plans import Plan
 from gsim3d.simulator import Simulator
-from gsim3d.stability import StabilityReport
+from gsim3d.state import ASLEEP, DYNAMIC, Particles
 from gsim3d.train.checkpoint import laid_out_as
 from gsim3d.train.losses import bodies_alone
 from gsim3d.train.parts import in_parts, with_first_background
 from gsim3d.train.recompute import recomputing
 from gsim3d.train.samples import Batch
-from gsim3d.types import ASLEEP, DYNAMIC, Frames, Particles
 
 FACTOR = 1.5  # room for geometry over what was observed: little costs captures, much costs time in every step
 ROWS_FACTOR = 1.15  # likewise, for the particles of a cloud

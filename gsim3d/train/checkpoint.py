@@ -31,8 +31,8 @@ from torch import Tensor
 
 from gsim3d import __version__
 from gsim3d.errors import HardCaseError, InputError
-from gsim3d.files import MAX_TEXT, read_file, sha256_of
-from gsim3d.plain import is_number
+from gsim3d.io.files import MAX_TEXT, read_file, sha256_of
+from gsim3d.io.plain import is_number
 from gsim3d.pretrained import located
 from gsim3d.train.settings import load_yaml
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gsim3d.effects.plan import Plan
 from gsim3d.errors import InputError
-from gsim3d.plans import Plan
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.settings import from_dict, to_dict
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from gsim3d.data import Fitting
 from gsim3d.data.scene import SIZE_MULTIPLE
-from gsim3d.errors import InputError
-from gsim3d.ranges import check_ranges
+from gsim3d.errors import InputError, check_ranges
 from gsim3d.train.losses import BALANCE, DISCOUNT
 from gsim3d.train.precision import PrecisionConfig
-
 
 MANY = 10**9  # steps; more than any run has
 LARGEST_SIDE = 2**15  # pixels of an image
@@ -193,7 +191,7 @@ class TrainConfig:
 
     preset: the model's sizes, a function of gsim3d.presets such as ``tiny``.
     model: changes of the preset, nested like the model section of a checkpoint's config.yaml.
-    effects: what a scene calls for, as :class:`gsim3d.effects.EffectsSpec` reads it.
+    effects: what a scene calls for, as :class:`gsim3d.effects.spec.EffectsSpec` reads it.
     stages: run one after another.
     in_turn, rounds: stages behind these that take turns: all of them one after another, so many times.
     precision: "fp32", "bf16" or "fp16" for each part of the model.

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import InputError
-from gsim3d.plain import is_number
+from gsim3d.io.plain import is_number
 
 LOG, BOARD = "metrics.jsonl", "tensorboard"
 MAX_LINE = 2**20  # bytes; what is longer is no entry

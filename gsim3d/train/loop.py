@@ -20,13 +20,11 @@ from tqdm import tqdm
 
 from gsim3d.data import Scene, generator, make_frames
 from gsim3d.dynamics import concatenate
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import HardCaseError, InputError, RunStopped
-from gsim3d.locks import only_one_writer
-from gsim3d.perceptual.lpips import LPIPS
-from gsim3d.perceptual.weights import load
-from gsim3d.plans import Plan
-from gsim3d.simulator import Simulator
+from gsim3d.evaluate.perceptual.lpips import LPIPS
+from gsim3d.evaluate.perceptual.weights import load
+from gsim3d.io.locks import only_one_writer
 from gsim3d.train import checkpoint
 from gsim3d.train.captured import CapturedLoss, Gradients, Prepared
 from gsim3d.train.checks import check_history, check_same_run, check_sharing
@@ -46,7 +44,6 @@ from gsim3d.train.signals import noted_signals
 from gsim3d.train.thawing import check_thawing, thaw
 from gsim3d.train.training_loss import training_loss
 from gsim3d.train.watch import Seen, StepWatch, first_not_finite, mean_of_norms, norms_by_module
-from gsim3d.types import Frames, Particles
 
 READERS = 2  # threads that read batches; so many steps are read ahead
 EMA_WARM_UP = 10  # the average forgets its first values: decay is at most (1 + step) / (10 + step)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.dynamics import last_steps
-from gsim3d.types import DYNAMIC, Particles, constant
+from gsim3d.state import DYNAMIC, Particles, constant
 
 BALANCE = 0.5  # lambda of the paper: weight of the first simulated step; the encoded ones share the rest
 DISCOUNT = 0.87  # gamma of the paper: weight of a simulated step relative to the one before it

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import torch
 
-from gsim3d.dynamics import concatenate
+from gsim3d.dynamics import Dynamics, concatenate
 from gsim3d.dynamics.clouds import newest_clouds
-from gsim3d.types import ASLEEP, DYNAMIC, FROZEN, CloudTable, Particles
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, CloudTable, Particles
 
 
 def in_parts(

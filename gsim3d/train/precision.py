@@ -10,7 +10,7 @@ from typing import Literal
 
 import torch
 
-from gsim3d.layers import tf32_only_if_asked
+from gsim3d.nn.layers import tf32_only_if_asked
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 FIRST_SCALE, LARGEST_SCALE = 2.0**16, 2.0**24

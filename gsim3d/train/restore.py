@@ -18,16 +18,16 @@ from torch.nn.modules.module import (
 from torch.overrides import TorchFunctionMode
 
 from gsim3d import presets, pretrained
+from gsim3d.compat.quirks import Quirks
 from gsim3d.data import Scene
 from gsim3d.data.fitting import frame_stride
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.plan import Plan
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import FitWarning, InputError, did_you_mean
-from gsim3d.files import shown
+from gsim3d.io.files import shown
 from gsim3d.ops import cuda_compiled
-from gsim3d.plans import Plan
 from gsim3d.presets import ModelConfig
 from gsim3d.pretrained import KEEP
-from gsim3d.quirks import Quirks
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, TrainConfig

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsim3d.cameras import Frames
 from gsim3d.data import Scene, Window, generator, make_frames
 from gsim3d.data.fitting import frame_stride
 from gsim3d.errors import InputError
 from gsim3d.train.config import DataConfig, StageConfig
-from gsim3d.types import Frames
 
 LONG_AGO = 1000  # steps: more than any history has
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gsim3d.errors import InputError, did_you_mean
-from gsim3d.files import MAX_TEXT, read_file, shown
-from gsim3d.plain import is_number, parse_yaml
+from gsim3d.io.files import MAX_TEXT, read_file, shown
+from gsim3d.io.plain import is_number, parse_yaml
 
 T = TypeVar("T")
 

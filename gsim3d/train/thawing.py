@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from gsim3d.dynamics import DynamicsConfig
-from gsim3d.effects import EffectsSpec, Sleep
+from gsim3d.effects.spec import EffectsSpec, Sleep
 from gsim3d.errors import InputError
+from gsim3d.state import DYNAMIC, FROZEN, Particles
 from gsim3d.train.config import DataConfig
-from gsim3d.types import DYNAMIC, FROZEN, Particles
 
 
 def check_thawing(data: DataConfig, dynamics: DynamicsConfig) -> None:

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gsim3d.perceptual.lpips import LPIPS
+from gsim3d.cameras import Frames
+from gsim3d.evaluate.perceptual.lpips import LPIPS
+from gsim3d.state import Particles
 from gsim3d.train.config import LossConfig
 from gsim3d.train.losses import body_errors, image_errors, image_loss, mean_by_step, shape_errors
-from gsim3d.types import Frames, Particles
 
 
 def training_loss(

@@ -10,8 +10,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gsim3d.stability import StabilityReport
-from gsim3d.types import Particles
+from gsim3d.numerics.policy import StabilityReport
+from gsim3d.state import Particles
 
 
 @dataclass(frozen=True)

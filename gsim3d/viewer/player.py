@@ -17,12 +17,11 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from gsim3d.errors import InputError
-from gsim3d.harmonics import SH_0
 from gsim3d.io.arrays import Splats, colors_of, splats_of
-from gsim3d.types import Gaussians
+from gsim3d.math.spherical_harmonics import SH_0
+from gsim3d.state import Gaussians
 
 POSITION_STEP = 1e-3  # metres between grid points: positions are right to half of it
 LARGEST_POSITION = 1e6  # metres from the middle of the first frame

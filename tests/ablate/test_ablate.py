@@ -5,10 +5,10 @@ import json
 
 import pytest
 
-from gsim3d.__main__ import main
 from gsim3d.ablate.rows import ROWS, base_run, rows_named, with_steps
 from gsim3d.ablate.study import Study
 from gsim3d.ablate.table import as_dict, markdown
+from gsim3d.cli.main import main
 from gsim3d.data import find_scenes
 from gsim3d.errors import CaptureError, HardCaseError, InputError
 from gsim3d.train.captured import check_capturable

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from gsim3d.ablate.rows import ROWS
-from gsim3d.pareto.settings import KNOBS
+from gsim3d.profile.settings import KNOBS
 
 PAGE = Path(__file__).parents[2] / "docs" / "accuracy-time.md"
 

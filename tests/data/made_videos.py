@@ -80,9 +80,7 @@ def trimmed(file: Path, skipped: float, late: float = 0.0) -> Path:
     entries.append((round(1000 * kept), round(skipped * SCALE)))
     table = struct.pack(">II", 0, len(entries)) + b"".join(struct.pack(">IiI", *entry, 1 << 16) for entry in entries)
     duration = struct.pack(">I", round(1000 * (kept + late)))
-    return edit_boxes(
-        file, {b"elst": lambda old: table, b"tkhd": lambda old: old[:20] + duration + old[24:]}
-    )
+    return edit_boxes(file, {b"elst": lambda old: table, b"tkhd": lambda old: old[:20] + duration + old[24:]})
 
 
 def with_matrix(file: Path, a: int, b: int, c: int, d: int) -> Path:
@@ -96,8 +94,8 @@ def with_duration(file: Path, seconds: float | None) -> Path:
     data = bytearray(file.read_bytes())
     place = data.find(b"\x44\x89\x88")
     assert place > 0
-    data[place : place + 11] = b"\xec\x89" + bytes(9) if seconds is None else data[place : place + 3] + struct.pack(
-        ">d", 1000 * seconds
+    data[place : place + 11] = (
+        b"\xec\x89" + bytes(9) if seconds is None else data[place : place + 3] + struct.pack(">d", 1000 * seconds)
     )
     file.write_bytes(data)
     return file

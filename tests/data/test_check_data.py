@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsim3d.__main__ import main
+from gsim3d.cli.main import main
 from gsim3d.data import Scene
 from gsim3d.data.check import check_scene, contact_sheet, moving_box
 from tests.data.made_scenes import RADIUS, WRITERS, edit_json, make_scene, write_films, write_genesis

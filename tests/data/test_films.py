@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from gsim3d.__main__ import main
+from gsim3d.cli.main import main
 from gsim3d.data import Scene, make_frames
 from gsim3d.data.check import check_scene
 from gsim3d.data.lenses import Lens, Undistorter
 from gsim3d.errors import InputError
-from gsim3d.interop import write_video
+from gsim3d.io import write_video
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.samples import draw_batch

@@ -10,7 +10,7 @@ import pytest
 from gsim3d.data import Scene
 from gsim3d.data.check import check_scene, describe
 from gsim3d.errors import InputError
-from gsim3d.interop import write_video
+from gsim3d.io import write_video
 from tests.data.made_videos import (
     N_FRAMES,
     RATE,
@@ -116,7 +116,7 @@ def test_labels_of_a_film_that_starts_late_count_its_own_frames(tmp_path):
         (tmp_path / "labels" / name).mkdir(parents=True)
         for number in range(N_FRAMES):
             labels = np.zeros((48, 64), np.uint8)
-            labels[:number + 1] = 3  # as many rows as the number tells
+            labels[: number + 1] = 3  # as many rows as the number tells
             cv2.imwrite(str(tmp_path / "labels" / name / f"{number}.png"), labels)
     write_scene(tmp_path, ["a", "b"], masks="subtract")
     rows = (Scene.open(tmp_path).segmentation([0, 1], range(14)) == 3).sum((2, 3)) // 64 - 1

@@ -10,11 +10,11 @@ from gsim3d import presets
 from gsim3d.data.dataset import make_frames
 from gsim3d.data.fitting import Fitting
 from gsim3d.data.scene import Scene
-from gsim3d.edits import Duplicate, Insert, Move, Rotate, Selection
+from gsim3d.effects.edits import Duplicate, Insert, Move, Rotate, Selection
 from gsim3d.errors import InputError
-from gsim3d.interop import read_ply, write_ply
-from gsim3d.laws import take_scenes, take_scenes_of_particles
+from gsim3d.io import read_ply, write_ply
 from gsim3d.simulator import Simulator
+from gsim3d.testing.invariances import take_scenes, take_scenes_of_particles
 from tests.data import made_scenes
 
 PLACES = [(500000.0, 4649776.0, 100.0), (-1e7, 3.0, 0.0), (0.0, 0.0, 6378137.0), (1e4, -1e4, 0.0)]

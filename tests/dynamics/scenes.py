@@ -5,7 +5,7 @@ import dataclasses
 import torch
 
 from gsim3d.dynamics import Dynamics, DynamicsConfig
-from gsim3d.types import FROZEN, Particles
+from gsim3d.state import FROZEN, Particles
 
 TINY = DynamicsConfig(
     dynamic_latents=4,

@@ -9,8 +9,8 @@ from gsim3d.dynamics import DynamicsConfig, with_field
 from gsim3d.dynamics.bodies import LEAST, NEIGHBOURS, bodies
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.samples import SAMPLES
-from gsim3d.edits import Duplicate, Move
-from gsim3d.types import DYNAMIC, FROZEN
+from gsim3d.effects.edits import Duplicate, Move
+from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import batch, make_dynamics, make_history
 from tests.dynamics.test_flight import CELL, FLYING

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsim3d.ops import PyramidCapacity
-from gsim3d.types import ASLEEP
+from gsim3d.state import ASLEEP
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
 

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from gsim3d.dynamics import DynamicsConfig, last_steps, rollout
 from gsim3d.dynamics.daylight import SOFT, daylight
-from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history, permute_rows
 from tests.dynamics.test_shade import CELL, HEIGHT, RADIUS, under_a_ball

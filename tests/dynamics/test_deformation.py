@@ -10,8 +10,8 @@ from gsim3d.dynamics import DynamicsConfig, last_steps, rollout, with_field
 from gsim3d.dynamics.deformation import deformation
 from gsim3d.dynamics.rigid import turned_most
 from gsim3d.dynamics.state import BACK
-from gsim3d.edits import Move, Rotate
-from gsim3d.types import FROZEN
+from gsim3d.effects.edits import Move, Rotate
+from gsim3d.state import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
 

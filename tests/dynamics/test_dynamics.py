@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsim3d.dynamics import Dynamics, DynamicsConfig, append_step, concatenate, last_steps, rollout
-from gsim3d.types import FROZEN
+from gsim3d.state import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
 

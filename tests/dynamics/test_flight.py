@@ -8,7 +8,7 @@ import torch
 from gsim3d.dynamics import DynamicsConfig, last_steps, rollout
 from gsim3d.dynamics.flight import touching
 from gsim3d.dynamics.matter import Matter
-from gsim3d.types import DYNAMIC, FROZEN
+from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
 

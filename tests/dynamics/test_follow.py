@@ -5,9 +5,10 @@ import dataclasses
 import pytest
 import torch
 
+from gsim3d.cameras import Cameras, Frames
 from gsim3d.dynamics import last_steps
 from gsim3d.dynamics.follow import INSIDE, follow
-from gsim3d.types import DYNAMIC, FROZEN, Cameras, Frames
+from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import batch, make_history
 
@@ -147,9 +148,7 @@ def test_clouds_older_than_a_history_are_not_looked_at():
     particles, frames = filmed()
     velocity = 0.01 * torch.rand(3)
     moved = torch.where((particles.row_cloud() == 0)[:, None], particles.means + 20 * velocity, particles.means)
-    long_ago = dataclasses.replace(
-        particles, means=moved, cloud_step=torch.tensor([0, 7, 8, 9]), known=None
-    )
+    long_ago = dataclasses.replace(particles, means=moved, cloud_step=torch.tensor([0, 7, 8, 9]), known=None)
     found = follow(long_ago, frames, LENGTH, CELL, STEPS)
     newer = dataclasses.replace(frames, images=frames.images.clone())
     newer.images[:4] = 0.5

@@ -7,7 +7,7 @@ import torch
 
 from gsim3d.dynamics import with_field
 from gsim3d.dynamics.matter import Matter
-from gsim3d.types import DYNAMIC
+from gsim3d.state import DYNAMIC
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import SEEING, TINY, batch, float_fields, make_dynamics, make_history
 

@@ -8,9 +8,9 @@ import torch
 from gsim3d.dynamics import DynamicsConfig, last_steps, rollout, with_field
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.momentum import momentum, turned
-from gsim3d.edits import Rotate, Throw
-from gsim3d.rotations import rotation_matrices
-from gsim3d.types import DYNAMIC, FROZEN
+from gsim3d.effects.edits import Rotate, Throw
+from gsim3d.math.rotations import rotation_matrices
+from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
 

@@ -8,7 +8,7 @@ import torch
 from gsim3d.dynamics import DynamicsConfig, last_steps
 from gsim3d.dynamics.motion import motion
 from gsim3d.dynamics.parts import Parts
-from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
 

@@ -10,7 +10,7 @@ from gsim3d.dynamics.bodies import bodies
 from gsim3d.dynamics.contact import FIRM, Beside
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.push import Pushes
-from gsim3d.types import DYNAMIC
+from gsim3d.state import DYNAMIC
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import batch, make_dynamics
 from tests.dynamics.test_flight import CELL, CONTACT, FALL, FLYING, RADIUS, ball

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsim3d.dynamics import append_step, concatenate, last_steps, rollout, with_field
-from gsim3d.types import DYNAMIC, FROZEN
+from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
 
@@ -67,10 +67,7 @@ def test_what_was_predicted_of_bodies_is_not_seen_again_where_their_look_changes
 def test_a_background_in_front_of_which_nothing_changes_does_not_change():
     """Else the same prediction would be added in every step."""
     dynamics, history = make_dynamics(RELIT), make_history((30, 30, 30, 30))
-    still = {
-        name: value[:30].repeat(4, *[1] * (value.dim() - 1))
-        for name, value in history.row_fields().items()
-    }
+    still = {name: value[:30].repeat(4, *[1] * (value.dim() - 1)) for name, value in history.row_fields().items()}
     history = history.with_clouds(history.clouds, **still)
     bodies, frozen = (last_steps(history, 1).activity == kind for kind in (DYNAMIC, FROZEN))
 

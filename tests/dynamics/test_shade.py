@@ -11,7 +11,7 @@ from gsim3d.dynamics import DynamicsConfig, last_steps, rollout
 from gsim3d.dynamics.clouds import single_steps
 from gsim3d.dynamics.samples import SAMPLES
 from gsim3d.dynamics.shade import shade
-from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history, permute_rows
 
@@ -32,9 +32,7 @@ def under_a_ball(n=600, seed=0, n_steps=2, height=HEIGHT):
     places = torch.cat([torch.stack([x, y, 0 * x], 1), ball + torch.tensor([0.0, 0.0, height])]) + 1.0
     history = make_history((len(places),) * n_steps, seed=seed)
     activity = torch.tensor([FROZEN] * len(x) + [DYNAMIC] * n).repeat(n_steps)
-    return dataclasses.replace(
-        history, means=places.repeat(n_steps, 1), activity=activity.to(history.activity.dtype)
-    )
+    return dataclasses.replace(history, means=places.repeat(n_steps, 1), activity=activity.to(history.activity.dtype))
 
 
 def ground_of(history, lights=ZENITH):

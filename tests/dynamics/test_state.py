@@ -5,10 +5,10 @@ import dataclasses
 import pytest
 import torch
 
+from gsim3d.compat.quirks import Quirks
 from gsim3d.dynamics.state import StateLayout, bounded, position_features, rotate_left
-from gsim3d.quirks import Quirks
-from gsim3d.renderer import rotation_matrices
-from gsim3d.types import FROZEN
+from gsim3d.nn.gaussian_head import rotation_matrices
+from gsim3d.state import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, TINY, float_fields, make_history
 

@@ -4,9 +4,9 @@ import dataclasses
 
 import torch
 
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.spec import EffectsSpec
+from gsim3d.nn.gaussian_head import RendererConfig
 from gsim3d.presets import ModelConfig
-from gsim3d.renderer import RendererConfig
 from tests.dynamics.scenes import EXPLICIT
 from tests.effects.counting import counted, entered
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from gsim3d.agreement import compare_backgrounds, compare_sleep
-from gsim3d.effects import DynamicsEffects, EffectsSpec, Sleep
+from gsim3d.cameras import Cameras
+from gsim3d.effects.spec import DynamicsEffects, EffectsSpec, Sleep
 from gsim3d.errors import InputError
-from gsim3d.types import Cameras
+from gsim3d.testing.approximation import compare_backgrounds, compare_sleep
 from tests.dynamics.scenes import TINY, make_history
 from tests.effects.resting import make_simulator
 

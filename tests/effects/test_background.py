@@ -5,14 +5,14 @@ import dataclasses
 import pytest
 import torch
 
+from gsim3d.compat.quirks import Quirks
+from gsim3d.cuda_graphs import CapturedRollout
 from gsim3d.dynamics import DynamicsConfig, Parts, RestLog, last_steps, rollout, rollout_in_parts
 from gsim3d.dynamics.background import Background
-from gsim3d.dynamics.point_transformer import SparseConv
-from gsim3d.graphs import CapturedRollout
+from gsim3d.nn.point_transformer import SparseConv
 from gsim3d.ops import PatchTable, PyramidCapacity, curve_encode, joint_attention
 from gsim3d.ops.curve import CURVES
-from gsim3d.quirks import Quirks
-from gsim3d.types import ASLEEP, FROZEN
+from gsim3d.state import ASLEEP, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
 from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
 from tests.effects.resting import ASYMMETRIC, make_scenes, make_simulator, newest_rows

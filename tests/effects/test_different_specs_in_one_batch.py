@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from gsim3d.by_scene import render_by_scene, rollout_by_scene
-from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects, Sleep
+from gsim3d.effects.by_scene import render_by_scene, rollout_by_scene
+from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects, Sleep
 from gsim3d.errors import InputError
 from tests.asserts import assert_same_bits
 from tests.test_simulator import awake, make_frames, make_simulator, target_cameras

@@ -8,7 +8,7 @@ import torch
 import yaml
 
 from gsim3d.dynamics import RestLog, append_step, last_steps
-from gsim3d.edits import (
+from gsim3d.effects.edits import (
     Duplicate,
     Edit,
     Insert,
@@ -20,9 +20,9 @@ from gsim3d.edits import (
     Throw,
     load_edits,
 )
-from gsim3d.effects import DynamicsEffects, EffectsSpec, Sleep, StructureEffects
+from gsim3d.effects.spec import DynamicsEffects, EffectsSpec, Sleep, StructureEffects
 from gsim3d.errors import InputError
-from gsim3d.types import DYNAMIC, FROZEN
+from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.effects.models import MODELS
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras

@@ -7,15 +7,15 @@ import re
 import pytest
 
 from gsim3d import presets
-from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec
-from gsim3d.infer_effects import propose, smaller
-from gsim3d.interop import read_ply
-from gsim3d.pareto import autotune
-from gsim3d.pareto.part_times import PartTimes
-from gsim3d.show_plan import workload
+from gsim3d.cli.effects import propose, smaller
+from gsim3d.cli.plan import workload
+from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec
+from gsim3d.io import read_ply
+from gsim3d.profile import autotune
+from gsim3d.profile.part_times import PartTimes
 from gsim3d.train.restore import build_simulator, restore
+from tests.cli.test_commands import call, work  # noqa: F401
 from tests.effects.test_round_trip import saved
-from tests.test_commands import call, work  # noqa: F401
 from tests.tiny_scenes import write_scene
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -6,13 +6,13 @@ import json
 import pytest
 import torch
 
+from gsim3d.cuda_graphs import CapturedRollout
 from gsim3d.dynamics import concatenate, last_steps
-from gsim3d.edits import Duplicate, Edit, Insert, Move, Remove
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.edits import Duplicate, Edit, Insert, Move, Remove
+from gsim3d.effects.selection import Selection
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
-from gsim3d.graphs import CapturedRollout
-from gsim3d.selections import Selection
-from gsim3d.types import FROZEN
+from gsim3d.state import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.effects.models import MODELS, Case
 
@@ -116,7 +116,7 @@ def test_with_every_background(model, background):
 def test_a_captured_rollout_holds_who_is_named_in_each_state(model, device):
     """Of a state that a rollout left, those who were named before, though all have moved away."""
     case = Case(MODELS[model], steps=(1,))
-    dtype = torch.float32 if device.type == "cpu" else torch.float64  # see tests/test_graphs.py
+    dtype = torch.float32 if device.type == "cpu" else torch.float64  # see tests/test_cuda_graphs.py
     simulator = case.simulator.to(device, dtype)
     state = case.state.map(lambda t: t.to(dtype) if t.is_floating_point() and t is not case.state.origin else t)
     state = state.to(device)
@@ -189,8 +189,9 @@ def test_a_body_that_is_not_there():
 def test_bodies_keep_their_look_while_shadows_fall(model):
     """``changing: frozen``: features of what may move stay, bit by bit; the background's are those of ``all``."""
     case = Case(MODELS[model])
-    start, (first, *_), (free, *_) = last_steps(case.state, 1), *(
-        rolled(case, {"appearance": {"changing": who}}) for who in ("frozen", "all")
+    start, (first, *_), (free, *_) = (
+        last_steps(case.state, 1),
+        *(rolled(case, {"appearance": {"changing": who}}) for who in ("frozen", "all")),
     )
     frozen = start.activity == FROZEN
     assert 0 < int(frozen.sum()) < start.n_rows

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from gsim3d.dynamics import Dynamics
-from gsim3d.effects import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects
-from gsim3d.plans import make_plan, unused_parameters
+from gsim3d.effects.plan import make_plan, unused_parameters
+from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects
 from gsim3d.presets import paper_latent
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import make_dynamics, make_history

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.simulator import Simulator
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.effects.models import MODELS, Case

@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-import gsim3d.edits
+import gsim3d.effects.edits
 import gsim3d.simulator
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.spec import EffectsSpec
 from tests.effects.models import MODELS, Case
 from tests.test_simulator import CONFIG
 
@@ -70,7 +70,7 @@ def test_nobody_keeps_a_log_of_rest_without_sleep_or_background(monkeypatch):
 
     for name in ("rollout_in_parts", "Sleepers"):
         monkeypatch.setattr(gsim3d.simulator, name, refuse)
-    monkeypatch.setattr(gsim3d.edits.Edit, "apply", refuse)
+    monkeypatch.setattr(gsim3d.effects.edits.Edit, "apply", refuse)
     case = Case()
     monkeypatch.setattr(case.simulator, "_colors", refuse)
     steps, image = case(EffectsSpec())

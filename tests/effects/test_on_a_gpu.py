@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from gsim3d.by_scene import render_by_scene, rollout_by_scene
-from gsim3d.edits import Duplicate, Edit, Move, Recolor, Remove, Rotate, Throw
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.by_scene import render_by_scene, rollout_by_scene
+from gsim3d.effects.edits import Duplicate, Edit, Move, Recolor, Remove, Rotate, Throw
+from gsim3d.effects.spec import EffectsSpec
 from tests.asserts import assert_close_relative_to_max
 from tests.effects.models import MODELS, Case
 from tests.effects.test_different_specs_in_one_batch import SPECS

@@ -7,10 +7,10 @@ import torch
 
 from gsim3d.dynamics import Parts
 from gsim3d.dynamics.background import Reader
-from gsim3d.dynamics.point_transformer import Attention
-from gsim3d.effects import DynamicsEffects, EffectsSpec
-from gsim3d.plans import Workload, background_cost, predicted_cost
-from gsim3d.types import FROZEN
+from gsim3d.effects.plan import Workload, background_cost, predicted_cost
+from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
+from gsim3d.nn.point_transformer import Attention
+from gsim3d.state import FROZEN
 from tests.dynamics.scenes import TINY, make_history
 from tests.effects.resting import ASYMMETRIC, make_simulator
 

@@ -8,7 +8,8 @@ import pytest
 import yaml
 
 from gsim3d import presets
-from gsim3d.effects import (
+from gsim3d.effects.selection import Selection
+from gsim3d.effects.spec import (
     Actions,
     AppearanceEffects,
     Contact,
@@ -20,7 +21,6 @@ from gsim3d.effects import (
     UnsupportedEffect,
 )
 from gsim3d.errors import InputError
-from gsim3d.selections import Selection
 from gsim3d.train import checkpoint
 from gsim3d.train.restore import build_simulator, restore
 from gsim3d.train.settings import to_dict

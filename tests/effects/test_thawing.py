@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from gsim3d.data import Scene, find_scenes
-from gsim3d.effects import DynamicsEffects, EffectsSpec, Sleep
+from gsim3d.effects.spec import DynamicsEffects, EffectsSpec, Sleep
 from gsim3d.errors import InputError
+from gsim3d.state import DYNAMIC, FROZEN
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.thawing import thaw
-from gsim3d.types import DYNAMIC, FROZEN
 from tests.asserts import assert_same_bits
 from tests.effects.resting import make_scenes
 from tests.tiny_scenes import write_scenes

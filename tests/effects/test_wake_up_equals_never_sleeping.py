@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from gsim3d.dynamics import RestLog, Sleepers, concatenate, last_steps, rollout_in_parts
-from gsim3d.effects import DynamicsEffects, EffectsSpec, Sleep
+from gsim3d.effects.spec import DynamicsEffects, EffectsSpec, Sleep
 from gsim3d.errors import InputError
-from gsim3d.types import ASLEEP, FROZEN, Particles
+from gsim3d.state import ASLEEP, FROZEN, Particles
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, float_fields, make_history
 from tests.effects.resting import ASYMMETRIC, make_scenes, make_simulator
@@ -236,8 +236,9 @@ def test_sleep_repeats_bit_by_bit():
 
 def test_gradients_reach_what_slept():
     """Rows asleep hold their state, and its gradient: that of the last step in which they were awake."""
-    simulator, state = make_simulator(dtype=torch.float64), make_history(
-        (30, 40), frozen_share=0.3, dtype=torch.float64
+    simulator, state = (
+        make_simulator(dtype=torch.float64),
+        make_history((30, 40), frozen_share=0.3, dtype=torch.float64),
     )
     latents = state.dynamic_latents.clone().requires_grad_()
     plan = simulator.plan(asleep_by("exact", eps=1e6))

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from gsim3d.__main__ import main
+from gsim3d.cli.main import main
 from gsim3d.errors import InputError
 from gsim3d.evaluate.compare import compare, read_report, table
 

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from gsim3d import pretrained
-from gsim3d.__main__ import main
+from gsim3d.cli.main import main
 from gsim3d.data import Scene
 from gsim3d.data.fitting import frame_stride
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import FitWarning, InputError
 from gsim3d.evaluate.predictions import Predictions
-from gsim3d.generate.worlds import build_world
+from gsim3d.synth.worlds import build_world
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
 from gsim3d.train.restore import build_simulator, describe, model_config, restore

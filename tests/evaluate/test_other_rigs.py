@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from gsim3d import presets
-from gsim3d.__main__ import main
+from gsim3d.cli.main import main
+from gsim3d.compat.quirks import Quirks
 from gsim3d.data import Scene
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import FitWarning, InputError
 from gsim3d.evaluate.protocol import default_views, predict
 from gsim3d.pretrained import names
-from gsim3d.quirks import Quirks
 from gsim3d.train.checkpoint import Checkpoint
 from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import Restored, build_simulator

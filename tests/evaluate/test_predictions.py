@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from gsim3d.__main__ import main
+from gsim3d.cli.main import main
 from gsim3d.data import Fitting, Scene
 from gsim3d.errors import InputError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.protocol import score_scene
-from gsim3d.interop import write_video
+from gsim3d.io import write_video
 from tests.data.made_videos import with_gaps, write_plain
 from tests.data.test_films import write_odd_films
 from tests.tiny_scenes import write_scenes

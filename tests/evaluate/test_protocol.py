@@ -12,7 +12,7 @@ import torch
 from gsim3d import presets
 from gsim3d.data import Scene
 from gsim3d.dynamics import concatenate
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.evaluate import protocol
 from gsim3d.evaluate.pictures import as_bytes, comparison_frames, splat_picture, true_images, write_curves

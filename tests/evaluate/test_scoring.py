@@ -6,11 +6,11 @@ import math
 import pytest
 import torch
 
-from gsim3d.__main__ import main
+from gsim3d.cli.main import main
 from gsim3d.evaluate import scoring
+from gsim3d.evaluate.perceptual import fvd
 from gsim3d.evaluate.report import markdown, notes, summarize, table, write_csv, write_json
 from gsim3d.evaluate.scoring import METRICS, SceneScores, SceneTruth
-from gsim3d.perceptual import fvd
 
 S, V, H, W, GIVEN = 5, 2, 12, 14, 2
 

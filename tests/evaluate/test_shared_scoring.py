@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from gsim3d.__main__ import main
+from gsim3d.cli.main import main
 from gsim3d.data import Scene
 from gsim3d.evaluate import protocol
 from gsim3d.train.processes import Processes

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gsim3d.__main__ import main
+from gsim3d.cli.main import main
 from gsim3d.data import find_scenes, published_split, split_scenes
 from tests.tiny_scenes import write_scene
 

@@ -7,13 +7,13 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d import ops
+from gsim3d.compat.quirks import Quirks
+from gsim3d.compat.released import dynamics_weights
 from gsim3d.dynamics import DynamicsConfig
-from gsim3d.encoder import EncoderConfig
-from gsim3d.interop.released import dynamics_weights
+from gsim3d.nn.gaussian_head import RendererConfig
+from gsim3d.nn.multiview_encoder import EncoderConfig
 from gsim3d.ops import CURVES, PatchTable, Stage, curve_encode, curve_sort
-from gsim3d.quirks import Quirks
-from gsim3d.renderer import RendererConfig
-from gsim3d.types import DYNAMIC, FROZEN, Particles
+from gsim3d.state import DYNAMIC, FROZEN, Particles
 from tests.asserts import assert_close_relative_to_max
 from tests.golden_files import Golden, published_config
 

@@ -55,9 +55,9 @@ def test_every_array_is_read_or_listed(tmp_path):
     present = {name for name, _ in arrays}
     for name, key in unused():
         if name in present or name == "*":
-            assert any(
-                fnmatch(array, key) for file, array in arrays if fnmatch(file, name)
-            ), f"no array is {name}: {key}"
+            assert any(fnmatch(array, key) for file, array in arrays if fnmatch(file, name)), (
+                f"no array is {name}: {key}"
+            )
 
 
 def test_every_unused_array_has_a_reason():

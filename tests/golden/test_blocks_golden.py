@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics.point_transformer import Block, EncoderStage
+from gsim3d.compat.quirks import Quirks
+from gsim3d.nn.point_transformer import Block, EncoderStage
 from gsim3d.ops import pool_mean, unpool
-from gsim3d.quirks import Quirks
 from tests.golden.published import (
     FULL_PRECISION,
     assert_published_patches,

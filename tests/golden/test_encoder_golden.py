@@ -5,11 +5,11 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.encoder import Encoder, EncoderConfig
-from gsim3d.encoder.depth import Views
-from gsim3d.encoder.heads import Conditioning, PixelRays, pluecker
-from gsim3d.interop.released import encoder_weights
-from gsim3d.types import Cameras, Frames
+from gsim3d.cameras import Cameras, Frames
+from gsim3d.compat.released import encoder_weights
+from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig
+from gsim3d.nn.multiview_encoder.depth import Views
+from gsim3d.nn.multiview_encoder.heads import Conditioning, PixelRays, pluecker
 from tests.asserts import assert_close_relative_to_max, relative_to_max
 from tests.golden.published import FULL_PRECISION, encoder_config
 from tests.golden_files import golden

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from gsim3d import ops
-from gsim3d.dynamics import point_transformer
-from gsim3d.dynamics.point_transformer import PointTransformer
-from gsim3d.quirks import Quirks
+from gsim3d.compat.quirks import Quirks
+from gsim3d.nn import point_transformer
+from gsim3d.nn.point_transformer import PointTransformer
 from tests.asserts import relative_to_max
 from tests.golden.published import (
     FULL_PRECISION,

@@ -7,9 +7,9 @@ both sides start from the same numbers.
 import pytest
 import torch
 
-from gsim3d.harmonics import sh_basis
+from gsim3d.cameras import Cameras
+from gsim3d.math.spherical_harmonics import sh_basis
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.types import Cameras
 from tests.asserts import assert_close_relative_to_max
 from tests.golden_files import golden
 from tests.oracle.raster import MIN_ALPHA, MIN_TRANSMITTANCE, legendre_basis, project, rotation_matrix, tiles_touched

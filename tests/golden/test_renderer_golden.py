@@ -5,24 +5,25 @@ import dataclasses
 import pytest
 import torch
 
+from gsim3d.cameras import Cameras
+from gsim3d.compat.released import head_weights
 from gsim3d.dynamics.state import rotate_left
-from gsim3d.harmonics import (
+from gsim3d.math.spherical_harmonics import (
     clamp_polar_axis,
     degree_damping,
     published_axes,
     rotate_harmonics,
     turn_predicted_harmonics,
 )
-from gsim3d.interop.released import head_weights
-from gsim3d.ops.raster import Rendering
-from gsim3d.renderer import (
+from gsim3d.nn.gaussian_head import (
     GaussianHead,
     render_as_published,
     rotation_matrices,
     unit_quats,
     with_centered_principal_point,
 )
-from gsim3d.types import Cameras, Gaussians, Particles
+from gsim3d.ops.raster import Rendering
+from gsim3d.state import Gaussians, Particles
 from tests.golden.published import FULL_PRECISION, close, renderer_config
 from tests.golden_files import golden
 from tests.tolerances import tolerance
@@ -150,9 +151,9 @@ def close_but_for_flips(actual, expected, what):
     error = (actual - expected).abs() / expected.abs().max()
     far = error.flatten(0, -3).amax(0) if error.dim() > 2 else error
     off = far > tolerance("raster_golden_float32")
-    assert (
-        off.sum() <= 3 and far.max() < 1.5 / 255
-    ), f"{what}: {int(off.sum())} pixels are off, by up to {far.max():.3g}"
+    assert off.sum() <= 3 and far.max() < 1.5 / 255, (
+        f"{what}: {int(off.sum())} pixels are off, by up to {far.max():.3g}"
+    )
 
 
 def test_images_of_the_published_renderer(device):
@@ -169,8 +170,9 @@ def test_images_of_the_published_renderer(device):
 
 def test_masked_rows_are_absent():
     file = golden("j_raster")
-    gaussians, cameras = gaussians_of(file, file["masked/mask"][:, 0]), published_cameras(file).select(
-        torch.tensor([0])
+    gaussians, cameras = (
+        gaussians_of(file, file["masked/mask"][:, 0]),
+        published_cameras(file).select(torch.tensor([0])),
     )
     out = render_as_published(gaussians, cameras, file["in/background"][:1], quirks=FULL_PRECISION)
     expected = file["f64/masked/view0_image"].float()

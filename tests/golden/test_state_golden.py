@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch.nn import functional as F
 
+from gsim3d.compat.quirks import Quirks
 from gsim3d.dynamics import Dynamics, DynamicsConfig, last_steps, rollout
 from gsim3d.dynamics.state import StateLayout
-from gsim3d.harmonics import degree_damping
-from gsim3d.quirks import Quirks
-from gsim3d.types import FROZEN
+from gsim3d.math.spherical_harmonics import degree_damping
+from gsim3d.state import FROZEN
 from tests.asserts import relative_to_max
 from tests.golden.published import close, dynamics_config, particles_of, renamed
 from tests.golden_files import golden

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import torch
 
-from gsim3d.__main__ import main
+from gsim3d.cameras import Cameras
+from gsim3d.cli.main import main
 from gsim3d.errors import InputError
-from gsim3d.interop import write_ply
-from gsim3d.io import FORMATS, read_splats, write_splats
+from gsim3d.io import FORMATS, read_splats, write_ply, write_splats
 from gsim3d.io.arrays import Y_TO_Z_UP, Z_TO_Y_UP, splats_of, turned
 from gsim3d.io.orbit import orbit_frames
 from gsim3d.io.sequence import open_sequence, write_about
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.types import Cameras, Gaussians
+from gsim3d.state import Gaussians
 
 WITHOUT_USD = [suffix for suffix in FORMATS if not suffix.startswith(".usd")]
 COUNTS = (1, 255, 256, 257)

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gsim3d.cameras import Cameras
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.types import Cameras
 from tests.oracle import raster as oracle
 
 

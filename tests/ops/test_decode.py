@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from gsim3d.errors import HardCaseError
-from gsim3d.harmonics import degree_damping, readings, rotate_harmonics
+from gsim3d.math.rotations import rotation_matrices, unit_quats
+from gsim3d.math.spherical_harmonics import degree_damping, readings, rotate_harmonics
 from gsim3d.ops import decode_gaussians
-from gsim3d.rotations import rotation_matrices, unit_quats
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
 
 LOW, HIGH = 0.001, 0.1

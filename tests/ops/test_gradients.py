@@ -7,8 +7,8 @@ import torch
 from torch.autograd import forward_ad
 
 from gsim3d import GradientError, ops
-from gsim3d.harmonics import readings
-from gsim3d.types import Cameras
+from gsim3d.cameras import Cameras
+from gsim3d.math.spherical_harmonics import readings
 
 ROWS, CU = torch.arange(6), torch.tensor([0, 2, 6])
 READINGS = readings(torch.float32, torch.device("cpu"))
@@ -101,6 +101,7 @@ def test_first_gradients_are_there(op):
 def test_forward_mode_is_refused(op):
     function, inputs = CALLS[op]
     for i, x in enumerate(inputs):
+
         def of_one(value):
             return function(*inputs[:i], value, *inputs[i + 1 :])
 

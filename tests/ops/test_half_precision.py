@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsim3d import ops
-from gsim3d.types import Cameras
+from gsim3d.cameras import Cameras
 
 K = torch.tensor([[[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]])
 CAMERAS = Cameras(torch.eye(4)[None], K, torch.ones(1), torch.full((1,), 9.0), torch.tensor([0]), 64, 48)

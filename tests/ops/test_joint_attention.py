@@ -13,8 +13,8 @@ from tests.asserts import (
     assert_same_bits_for_any_threads,
     gradients,
 )
-from tests.oracle import patch_attn as oracle
 from tests.ops.test_patch_attn import DIMS, DTYPES, RAGGED, cotangent_of, lists, offsets, random_case
+from tests.oracle import patch_attn as oracle
 
 LOW_PRECISION = {torch.bfloat16: "bfloat16", torch.float16: "float16"}
 NAMES = ("out", "q", "k", "v", "other_k", "other_v")

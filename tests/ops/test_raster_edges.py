@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from gsim3d.errors import HardCaseError
+from gsim3d.numerics.policy import StabilityReport
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.stability import StabilityReport
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.ops.raster_scene import Scene, facing, gradients, random_scene
 

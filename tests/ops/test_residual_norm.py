@@ -224,9 +224,10 @@ def test_no_rows_no_channels_and_one_value(shape, parts, device):
 @pytest.mark.parametrize("channels", [48, 19])
 def test_a_row_does_not_depend_on_the_rows_it_is_packed_with(channels, device):
     x, branch, keep, *weights = (t.to(device) for t in inputs(130, channels, dtype=torch.float32))
-    run = lambda rows, **kw: residual_norm(  # noqa: E731
-        x[rows], branch[rows], keep=keep[rows], branch_norm=weights[:2], norm=weights[2:], **kw
-    )
+
+    def run(rows, **kw):
+        return residual_norm(x[rows], branch[rows], keep=keep[rows], branch_norm=weights[:2], norm=weights[2:], **kw)
+
     alone = run(slice(77, 78))
     for a, b in zip(run(slice(None)), alone, strict=True):
         assert_same_bits(a[77:78], b)

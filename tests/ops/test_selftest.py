@@ -5,13 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
-
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsim3d import ops
 from gsim3d.ops import selftest
 
-# What a fused network calls itself (tests/dynamics/test_fused_block.py), and a GPU alone needs.
+# What a fused network calls itself (tests/nn/test_fused_block.py), and a GPU alone needs.
 NOT_ALONE = {"patch_attention_backward_packed", "sparse_conv_plan"}
 CORE = Path(__file__).parents[2] / "csrc" / "gsim3d"
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsim3d.encoder import Encoder
+from gsim3d.cameras import Frames
+from gsim3d.nn.multiview_encoder import Encoder
 from gsim3d.train.loop import deterministic
-from gsim3d.types import Frames
-from tests.encoder.scenes import ROW_FIELDS, SIZE, make_encoder, make_frames
+from tests.nn.multiview_encoder.scenes import ROW_FIELDS, SIZE, make_encoder, make_frames
 from tests.stability.setting import Measured, Setting
 from tests.stability.steps import EXACT
 

@@ -81,7 +81,7 @@ CASES = {
     "R13": Case(
         "images of one pixel, one row, one column, sizes that are no multiple of 16",
         "as the formula; equal to a crop of a padded image, also for Gaussians centred outside of both",
-        "3DGS and gsplat clamp the Jacobian there (gsplat#305, PR#977); `jacobian=\"clamped\"` does",
+        '3DGS and gsplat clamp the Jacobian there (gsplat#305, PR#977); `jacobian="clamped"` does',
     ),
     "R14": Case(
         "principal point off centre, two focal lengths, skew",

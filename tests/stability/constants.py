@@ -5,7 +5,7 @@ from dataclasses import dataclass
 _RASTER = "csrc/gsim3d/raster/raster_math.h"
 _STATE = "gsim3d/dynamics/state.py"
 _CONFIG = "gsim3d/dynamics/config.py"
-_STABILITY = "gsim3d/stability.py"
+_STABILITY = "gsim3d/numerics/policy.py"
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ CONSTANTS = (
         "NEAR_PLANE",
         "0.01",
         "metres",
-        "gsim3d/renderer.py",
+        "gsim3d/nn/gaussian_head.py",
         "what is nearer to a camera is not drawn; nothing is divided by a smaller depth",
     ),
     Constant(
@@ -96,17 +96,17 @@ CONSTANTS = (
         "HALF_MAX",
         "torch.finfo(torch.float16).max",
         "1",
-        "gsim3d/dynamics/point_transformer.py",
+        "gsim3d/nn/point_transformer.py",
         "65504: larger numbers become it where the release's half precision is imitated",
     ),
     Constant(
         "MASKED",
         "-100.0",
         "1",
-        "gsim3d/encoder/transformer.py",
+        "gsim3d/nn/multiview_encoder/transformer.py",
         "added to masked scores: weights of 4e-44, and a row of masked keys is finite",
     ),
-    Constant("EPS", "1e-3", "variance", "gsim3d/layers.py", "batch normalisation divides by at least 0.03"),
+    Constant("EPS", "1e-3", "variance", "gsim3d/nn/layers.py", "batch normalisation divides by at least 0.03"),
     Constant("eps", "1e-5", "variance", "gsim3d/ops/row_norm.py", "layer normalisation divides by at least 0.003"),
     Constant(
         "kMinEps", "1e-30", "variance", "csrc/gsim3d/row_norm/row_norm_torch.cpp", "no smaller eps can be asked for"
@@ -122,14 +122,14 @@ CONSTANTS = (
         "MIN_ROWS",
         "16",
         "rows",
-        "gsim3d/layers.py",
+        "gsim3d/nn/layers.py",
         "products of fewer rows are padded: a row's bits on the CPU do not depend on how many there are",
     ),
     Constant(
         "MIN_QUAT_NORM",
         "1e-6",
         "1",
-        "gsim3d/rotations.py",
+        "gsim3d/math/rotations.py",
         "a shorter quaternion is the identity, without a gradient",
     ),
     Constant("SMALL_ANGLE_SQUARED", "1e-8", "radians^2", _STATE, "a smaller rotation is its series, exact to float32"),
@@ -172,14 +172,14 @@ CONSTANTS = (
         "OPACITY_MARGIN",
         "1e-6",
         "1",
-        "gsim3d/interop/ply.py",
+        "gsim3d/io/ply.py",
         "opacities are written as at least that far from 0 and 1: finite logits",
     ),
     Constant(
         "SMALLEST_SCALE",
         "1e-9",
         "metres",
-        "gsim3d/interop/ply.py",
+        "gsim3d/io/ply.py",
         "smaller scales are written as it: finite logarithms",
     ),
     Constant(
@@ -193,7 +193,7 @@ CONSTANTS = (
         "MIN_SQUARE",
         "1e-10",
         "squared feature",
-        "gsim3d/perceptual/lpips.py",
+        "gsim3d/evaluate/perceptual/lpips.py",
         "added where LPIPS divides by a length: finite gradients where no feature fires",
     ),
     Constant("LEAST_WEIGHT", "1e-12", "pixels", "gsim3d/train/losses.py", "a loss over no pixel is 0"),

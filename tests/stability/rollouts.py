@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import HardCaseError
+from gsim3d.numerics.policy import StabilityReport
 from gsim3d.presets import ModelConfig
 from gsim3d.simulator import Simulator
-from gsim3d.stability import StabilityReport
-from gsim3d.types import Particles
+from gsim3d.state import Particles
 from tests.dynamics.scenes import float_fields, make_history
 from tests.stability.setting import Measured, Setting
 from tests.test_simulator import CONFIG

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from gsim3d.types import Frames, Particles
+from gsim3d.cameras import Frames
+from gsim3d.state import Particles
 from tests.asserts import assert_same_bits, relative_to_max
 from tests.tolerances import tolerance
 

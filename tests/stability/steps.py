@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.dynamics import DynamicsConfig
-from gsim3d.types import Particles
+from gsim3d.state import Particles
 from tests.dynamics.scenes import TINY, batch, float_fields, make_dynamics, make_history
 from tests.stability.setting import Measured, Setting
 

@@ -6,15 +6,15 @@ import pytest
 import torch
 
 from gsim3d import ops
-from gsim3d.dynamics.point_transformer import Attention
-from gsim3d.encoder.heads import PixelRays
+from gsim3d.compat.quirks import Quirks
 from gsim3d.errors import HardCaseError
-from gsim3d.layers import RowBatchNorm, RowLayerNorm
+from gsim3d.nn.layers import RowBatchNorm, RowLayerNorm
+from gsim3d.nn.multiview_encoder.heads import PixelRays
+from gsim3d.nn.point_transformer import Attention
 from gsim3d.ops._arguments import LARGEST
-from gsim3d.quirks import Quirks
 from tests.asserts import gradients
 from tests.dynamics.scenes import TINY, batch, make_history
-from tests.encoder.scenes import SIZE, make_encoder, make_frames
+from tests.nn.multiview_encoder.scenes import SIZE, make_encoder, make_frames
 from tests.ops.raster_scene import random_scene
 from tests.ops.test_patch_attn import RAGGED, Case, cotangent_of, offsets, random_case
 from tests.oracle import row_norm as norm_oracle

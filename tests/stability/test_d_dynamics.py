@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from gsim3d.dynamics.state import SCALE_STEP_SHARE, rotate_left
-from gsim3d.guards import guard_particles
-from gsim3d.stability import StabilityConfig, StabilityReport
-from gsim3d.types import ASLEEP
+from gsim3d.numerics.policy import StabilityConfig, StabilityReport
+from gsim3d.numerics.validate import guard_particles
+from gsim3d.state import ASLEEP
 from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_history
 from tests.stability.rollouts import finite, make_simulator, of_scene, ordinary, raised
 from tests.stability.steps import EXACT, check_step, simulate

@@ -11,11 +11,11 @@ import torch
 from gsim3d import ops
 from gsim3d.data import Scene
 from gsim3d.errors import HardCaseError, InputError
-from gsim3d.interop.ply import read_ply, write_ply
-from gsim3d.types import Gaussians
+from gsim3d.io.ply import read_ply, write_ply
+from gsim3d.state import Gaussians
 from tests.asserts import gradients
 from tests.data.made_scenes import WRITERS, edit_json, make_scene
-from tests.encoder.scenes import SIZE, make_encoder
+from tests.nn.multiview_encoder.scenes import SIZE, make_encoder
 from tests.ops.test_plane_sweep import make as make_sweep
 from tests.oracle import plane_sweep as sweep_oracle
 from tests.stability.beside import check_encoding, encode, ordinary, with_cameras
@@ -209,7 +209,7 @@ def test_e39_values_keep_their_meaning_without_a_zero(scene_folder, tmp_path, me
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 CONVENTIONS = {
-    "OpenGL axes": ("extrinsics", lambda m: (FLIP @ m), "OpenGL"),
+    "OpenGL axes": ("extrinsics", lambda m: FLIP @ m, "OpenGL"),
     "camera-to-world": ("extrinsics", np.linalg.inv, "camera-to-world"),
     "mirrored": ("extrinsics", lambda m: np.diag([-1.0, 1, 1, 1]) @ m, "left-handed"),
     "scaled": ("extrinsics", lambda m: np.diag([2.0, 2, 2, 1]) @ m, "not orthonormal"),

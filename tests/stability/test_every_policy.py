@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gsim3d import GradientError, HardCaseError, InputError
-from gsim3d.guards import guard_particles
-from gsim3d.stability import StabilityConfig, StabilityReport
+from gsim3d.numerics.policy import StabilityConfig, StabilityReport
+from gsim3d.numerics.validate import guard_particles
 from tests.test_simulator import awake, make_frames, make_simulator, target_cameras
 
 NAN, INF = float("nan"), float("inf")

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from gsim3d.__main__ import COMMANDS
+from gsim3d.cli.main import COMMANDS
 from tests.stability.fuzz import commands
 from tests.stability.fuzz.engine import Outcome, make_case, replay, run, targets
 from tests.stability.fuzz.ops import OPS, public_ops

@@ -1,14 +1,14 @@
-"""Laws of the simulator (gsim3d/laws.py): the same scene told otherwise has the same future."""
+"""Laws of the simulator (gsim3d/testing/invariances.py): the same scene told otherwise has the same future."""
 
 import dataclasses
 
 import pytest
 import torch
 
-from gsim3d import laws
-from gsim3d.effects import DynamicsEffects, EffectsSpec
-from gsim3d.laws import LAWS, Sample, take_scenes
+from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.simulator import Simulator
+from gsim3d.testing import invariances as laws
+from gsim3d.testing.invariances import LAWS, Sample, take_scenes
 from tests.dynamics.scenes import EXPLICIT
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
 

@@ -1,4 +1,4 @@
-"""A thousand steps, gradients through many of them, and hard input made of ordinary scenes (gsim3d/endurance.py)."""
+"""A thousand steps, gradients through many of them, and hard input from ordinary scenes (gsim3d/testing/stress.py)."""
 
 import dataclasses
 import math
@@ -8,9 +8,9 @@ import torch
 
 from gsim3d import presets
 from gsim3d.dynamics import last_steps
-from gsim3d.endurance import CASES, gradient_norms, rollout_curves
-from gsim3d.laws import Sample
 from gsim3d.simulator import Simulator
+from gsim3d.testing.invariances import Sample
+from gsim3d.testing.stress import CASES, gradient_norms, rollout_curves
 from gsim3d.train.loop import deterministic
 from tests.dynamics.scenes import batch, float_fields, make_history
 from tests.stability.test_laws import CONFIGS, make_sample, simulators  # noqa: F401

@@ -6,8 +6,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.harmonics import rotate_harmonics
-from gsim3d.laws import random_motion
+from gsim3d.math.spherical_harmonics import rotate_harmonics
 from gsim3d.ops import (
     PatchTable,
     build_pyramid,
@@ -23,6 +22,7 @@ from gsim3d.ops import (
     sweep_geometry,
     unpool,
 )
+from gsim3d.testing.invariances import random_motion
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, gradients
 from tests.ops.raster_scene import Scene, random_scene
 from tests.ops.raster_scene import gradients as raster_gradients

@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from gsim3d import presets
+from gsim3d.cameras import Cameras
 from gsim3d.dynamics import last_steps
 from gsim3d.errors import HardCaseError, InputError
+from gsim3d.numerics.policy import Finding, Reading, Sentinels, StabilityConfig, StabilityReport, _Record, pack
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.stability import Finding, Reading, Sentinels, StabilityConfig, StabilityReport, _Record, pack
-from gsim3d.types import ASLEEP, Cameras
+from gsim3d.state import ASLEEP
 from tests.asserts import assert_same_bits
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
 

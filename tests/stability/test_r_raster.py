@@ -6,8 +6,8 @@ import itertools
 import pytest
 import torch
 
+from gsim3d.numerics.policy import StabilityReport
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.stability import StabilityReport
 from tests.ops.raster_scene import Scene, facing
 from tests.stability.packed import (
     check_against_oracle,

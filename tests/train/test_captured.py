@@ -9,10 +9,10 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsim3d.ablate.rows import ROWS
+from gsim3d.cuda_graphs import Captured
 from gsim3d.data import Scene, find_scenes
 from gsim3d.errors import CaptureError, InputError
-from gsim3d.graphs import Captured
-from gsim3d.stability import StabilityReport
+from gsim3d.numerics.policy import StabilityReport
 from gsim3d.train.captured import CapturedLoss
 from gsim3d.train.config import DataConfig, LossConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer, deterministic
@@ -47,7 +47,11 @@ RELIT = dataclasses.replace(
     MOVING,
     model={
         "dynamics": {
-            "motion_length": 0.3, "velocity": True, "background": "relit", "position_waves": 2, "contact_length": 0.15,
+            "motion_length": 0.3,
+            "velocity": True,
+            "background": "relit",
+            "position_waves": 2,
+            "contact_length": 0.15,
             "lights": ((0.1, 0.2, 1.0),),
         }
     },
@@ -129,9 +133,21 @@ def run(captured, batch, trainer, report=None, factor=1.0):
         ({"dynamics_alone": True, "lit_before": 1, "horizon": 1}, "flying"),
     ],
     ids=[
-        "rollout", "lead", "encoded", "explicit", "masked", "dynamics alone, cut", "dynamics alone, masked", "moving",
-        "moving, masked", "all moving", "relit", "relit, dynamics alone", "relit, background of its own",
-        "flying, dynamics alone", "flying, background of its own",
+        "rollout",
+        "lead",
+        "encoded",
+        "explicit",
+        "masked",
+        "dynamics alone, cut",
+        "dynamics alone, masked",
+        "moving",
+        "moving, masked",
+        "all moving",
+        "relit",
+        "relit, dynamics alone",
+        "relit, background of its own",
+        "flying, dynamics alone",
+        "flying, background of its own",
     ],
     indirect=["trainer"],
 )

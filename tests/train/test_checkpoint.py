@@ -14,7 +14,7 @@ import safetensors.torch
 import torch
 
 from gsim3d.errors import HardCaseError, InputError
-from gsim3d.files import sha256_of
+from gsim3d.io.files import sha256_of
 from gsim3d.train import checkpoint
 from gsim3d.train.checkpoint import Checkpoint
 

@@ -13,8 +13,8 @@ import yaml
 
 from gsim3d import presets
 from gsim3d.data import Fitting
-from gsim3d.edits import load_edits
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.edits import load_edits
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.train import restore
 from gsim3d.train.config import StageConfig, TrainConfig

@@ -12,8 +12,8 @@ from gsim3d import presets
 from gsim3d.train.config import DataConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import build_simulator
-from tests.train.test_loop import scenes
 from tests.tiny_scenes import write_scenes
+from tests.train.test_loop import scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).parents[2]

@@ -16,8 +16,8 @@ from safetensors.torch import save_file
 from gsim3d.data import Scene, find_scenes
 from gsim3d.dynamics import concatenate
 from gsim3d.errors import HardCaseError, InputError
-from gsim3d.perceptual.lpips import LPIPS
-from gsim3d.perceptual.weights import SOURCES, cache_folder
+from gsim3d.evaluate.perceptual.lpips import LPIPS
+from gsim3d.evaluate.perceptual.weights import SOURCES, cache_folder
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer, deterministic

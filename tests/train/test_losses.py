@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
 from gsim3d.train.losses import (
     bodies_alone,
     body_errors,
@@ -16,7 +17,6 @@ from gsim3d.train.losses import (
     time_weights,
 )
 from gsim3d.train.schedule import one_cycle
-from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
 from tests.dynamics.scenes import batch, make_history
 
 

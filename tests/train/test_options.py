@@ -10,6 +10,7 @@ import torch
 
 from gsim3d.errors import InputError
 from gsim3d.presets import paper_latent, small
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, StageConfig
 from gsim3d.train.loop import Trainer, deterministic
@@ -18,10 +19,9 @@ from gsim3d.train.precision import STEPS_TO_DOUBLE, LossScale, PrecisionConfig
 from gsim3d.train.samples import LONG_AGO, draw_batch, draw_windows
 from gsim3d.train.settings import from_dict
 from gsim3d.train.watch import StepWatch
-from gsim3d.types import ASLEEP, DYNAMIC, FROZEN
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
-from tests.train.test_loop import CONFIG, curve, scenes
 from tests.tiny_scenes import write_scenes
+from tests.train.test_loop import CONFIG, curve, scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 LATER = 4  # a step of the second stage, which rolls out

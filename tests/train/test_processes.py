@@ -16,7 +16,7 @@ import yaml
 from torch.nn.parallel import DistributedDataParallel
 
 from gsim3d.errors import InputError
-from gsim3d.layers import RowBatchNorm
+from gsim3d.nn.layers import RowBatchNorm
 from gsim3d.train import checkpoint
 from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer
@@ -24,9 +24,9 @@ from gsim3d.train.processes import Processes, joined
 from gsim3d.train.restore import build_simulator, model_config
 from gsim3d.train.settings import to_dict
 from tests.asserts import assert_close_relative_to_max
+from tests.tiny_scenes import write_scenes
 from tests.train.test_loop import CONFIG, assert_same_checkpoint, curve, scenes
 from tests.train.test_watch import spoil
-from tests.tiny_scenes import write_scenes
 from tests.two_processes import run_in_two_processes
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -11,20 +11,19 @@ import numpy as np
 import pytest
 import torch
 
-from gsim3d.data import Scene, find_scenes
-from gsim3d.errors import InputError, RunStopped
+from gsim3d.data import Scene
 from gsim3d.data.recording import BACKGROUND, FIXED, MOVING
-from gsim3d.generate import generate
-from gsim3d.generate.cameras import two_rings
-from gsim3d.generate.film import film
-from gsim3d.generate.worlds import VALIDATION_SEED, build_world
+from gsim3d.errors import InputError, RunStopped
+from gsim3d.synth import generate
+from gsim3d.synth.cameras import two_rings
+from gsim3d.synth.film import film
+from gsim3d.synth.worlds import VALIDATION_SEED, build_world
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.log import plain
 from gsim3d.train.loop import deterministic
 from gsim3d.train.processes import Processes
 from gsim3d.train.restore import build_simulator, model_config, restore
-from gsim3d.train.samples import draw_batch
-from gsim3d.train.log import plain
-from gsim3d.train.samples import longest_gap
+from gsim3d.train.samples import draw_batch, longest_gap
 from tools.release import curve, recipes, runs
 from tools.release.films import Filming, FilmStore
 from tools.release.recipes import ARMS, WORLDS, recipe

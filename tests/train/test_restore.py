@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsim3d import Simulator, presets
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.train.checkpoint import Checkpoint, export
 from gsim3d.train.config import DataConfig

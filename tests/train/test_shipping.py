@@ -11,8 +11,8 @@ import pytest
 
 from gsim3d import pretrained
 from gsim3d.errors import InputError
-from gsim3d.generate.film import film
-from gsim3d.generate.worlds import TEST_SEED, build_world
+from gsim3d.synth.film import film
+from gsim3d.synth.worlds import TEST_SEED, build_world
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
 from gsim3d.train.restore import restore
 from tools.release.films import FilmStore

@@ -11,15 +11,15 @@ import pytest
 import torch
 import yaml
 
-from gsim3d import __main__
+from gsim3d.cli import main as __main__
 from gsim3d.errors import RunStopped
 from gsim3d.train import checkpoint, liveness
 from gsim3d.train.loop import Trainer
 from gsim3d.train.processes import joined
 from gsim3d.train.settings import to_dict
+from tests.tiny_scenes import write_scenes
 from tests.train.test_loop import CONFIG, assert_same_checkpoint, curve, scenes
 from tests.train.test_processes import LAYER
-from tests.tiny_scenes import write_scenes
 from tests.two_processes import free_port
 
 pytestmark = pytest.mark.usefixtures("one_thread")

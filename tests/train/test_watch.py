@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from gsim3d.errors import HardCaseError, InputError
-from gsim3d.stability import StabilityReport
+from gsim3d.numerics.policy import StabilityReport
 from gsim3d.train import checkpoint
 from gsim3d.train.config import StageConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.watch import StepWatch, mean_of_norms, norms_by_module
 from tests.test_simulator import awake, make_frames, make_simulator
-from tests.train.test_loop import CONFIG, curve, scenes
 from tests.tiny_scenes import write_scenes
+from tests.train.test_loop import CONFIG, curve, scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 STAGE = StageConfig(steps=8, horizon=2, target_views=1, learning_rate=1e-3)

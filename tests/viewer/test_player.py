@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import torch
 
+from gsim3d.cameras import Cameras
 from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import psnr
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.types import Cameras, Gaussians
+from gsim3d.state import Gaussians
 from gsim3d.viewer import write_player
 from gsim3d.viewer.player import POSITION_STEP, View
 from tests.viewer.browser import Browser, chromium

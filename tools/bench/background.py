@@ -55,8 +55,11 @@ def cases(device: torch.device, n: int, n_rest: int, dtype: torch.dtype):
     x, field = (torch.randn(k, CHANNELS, generator=g).to(device, dtype) for k in (n, len(cells)))
     places = find_cells(cells, scene, grid)
     name = str(dtype).removeprefix("torch.")
-    yield "cells, added", name, lambda: add_cells(x, field, places, check=False), lambda: x + field.index_select(
-        0, places
+    yield (
+        "cells, added",
+        name,
+        lambda: add_cells(x, field, places, check=False),
+        lambda: x + field.index_select(0, places),
     )
 
     codes, of_rest = (curve_encode(part.to(device), None, CURVES, depth=16, shift=48) for part in (moving, rest))
@@ -83,8 +86,9 @@ def cases(device: torch.device, n: int, n_rest: int, dtype: torch.dtype):
     def joined():
         """The values of two calls do not say how much weight each table has: it is found from the logits' sums."""
         attend, lists = torch.ops.gsim3d.patch_attention, lambda t: (t.q_rows, t.kv_rows, t.cu_q, t.cu_k)
-        (out, stats), (more, its_stats) = attend(q, k, v, *lists(own), 0.25), attend(
-            q, other_k, other_v, *lists(other), 0.25
+        (out, stats), (more, its_stats) = (
+            attend(q, k, v, *lists(own), 0.25),
+            attend(q, other_k, other_v, *lists(other), 0.25),
         )
         weight, its_weight = (s[..., 1:].log() + 0.25 * s[..., :1] for s in (stats, its_stats))
         share = torch.where(its_stats[..., 1:] > 0, (its_weight - weight).sigmoid(), 0.0)

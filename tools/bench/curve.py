@@ -74,7 +74,7 @@ def plain_kernel_map(keys, kernel_size):
 def plain_pyramid(grid, spec):
     """Cells, orders, clusters and convolution maps of one cloud whose points have a cell each."""
     results = []
-    cloud = torch.zeros_like(grid[:, 0])
+    order, cloud = None, torch.zeros_like(grid[:, 0])
     codes = torch.stack([plain_code(grid, cloud, curve) for curve in CURVES])
     for s, kernel_sizes in enumerate(spec.kernel_sizes):
         if s > 0:

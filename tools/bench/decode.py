@@ -3,9 +3,9 @@
 import torch
 from harness import Bench
 
-from gsim3d.harmonics import degree_damping, readings, rotate_harmonics
+from gsim3d.math.rotations import rotation_matrices, unit_quats
+from gsim3d.math.spherical_harmonics import degree_damping, readings, rotate_harmonics
 from gsim3d.ops import decode_gaussians
-from gsim3d.rotations import rotation_matrices, unit_quats
 
 SCALES = {"scale_min": 0.0002, "scale_max": 0.1}  # metres
 COLUMNS = {1: 19, 3: 55}  # degree -> of a row

@@ -17,9 +17,9 @@ from harness import Bench
 from sleeping import scene, view
 
 from gsim3d import Simulator, presets
-from gsim3d.effects import EffectsSpec
-from gsim3d.graphs import CapturedRollout
-from gsim3d.types import Particles
+from gsim3d.cuda_graphs import CapturedRollout
+from gsim3d.effects.spec import EffectsSpec
+from gsim3d.state import Particles
 
 STEPS = 4  # of a rollout
 FROZEN_SHARE = 0.5
@@ -85,9 +85,12 @@ def rows(config, n: int, device: str):
     plain = rollout(simulator, state, {}), images(simulator, large, {})
     flat = {"appearance": {"view_dependent": 0}}
     yield "off: time merging", rollout(one, first, {}), rollout(without_merging(one), first, {}), OFF
-    yield "off: view-dependent colour", images(simulator, large, flat), images(
-        of_degree_zero(simulator), large, {}
-    ), OFF
+    yield (
+        "off: view-dependent colour",
+        images(simulator, large, flat),
+        images(of_degree_zero(simulator), large, {}),
+        OFF,
+    )
     yield "idle: insertion, removal, actions, contact", rollout(simulator, state, HALF_ON), plain[0], IDLE
     yield "idle: sleep", rollout(simulator, state, {"dynamics": {"sleep": {"eps": 0.0}}}), plain[0], IDLE
     yield "idle: depth and alpha images", images(simulator, large, EVERY_IMAGE), plain[1], IDLE
@@ -99,9 +102,12 @@ def rows(config, n: int, device: str):
     ):
         without = rollout(simulator, state, less) if device == "cpu" else captured(simulator, many, less)
         yield f"on: {case}", whole, without, None
-    yield f"on: view-dependent colour, degree {config.renderer.sh_degree}", plain[1], images(
-        simulator, large, flat
-    ), None
+    yield (
+        f"on: view-dependent colour, degree {config.renderer.sh_degree}",
+        plain[1],
+        images(simulator, large, flat),
+        None,
+    )
     features = images(simulator, large, {"outputs": {"features": True}})
     yield f"on: feature images, {config.renderer.latents} channels", features, plain[1], None
     depth = images(simulator, large, {"outputs": {"rgb": False, "depth": True}})

@@ -22,13 +22,14 @@ import training
 from harness import Bench
 
 from gsim3d import presets
+from gsim3d.cameras import Cameras
+from gsim3d.cuda_graphs import Captured, CapturedRollout, rounded
 from gsim3d.dynamics import Dynamics
-from gsim3d.graphs import Captured, CapturedRollout, rounded
 from gsim3d.ops import PyramidCapacity
 from gsim3d.simulator import Simulator
+from gsim3d.state import Particles
 from gsim3d.train.loop import deterministic
 from gsim3d.train.processes import Processes
-from gsim3d.types import Cameras, Particles
 
 SIZE = 128
 RELEASE = "authors' release, recorded"

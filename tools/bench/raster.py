@@ -7,8 +7,8 @@ import torch
 from harness import Bench
 from raster_scenes import layered_scene, packed, pixel_aligned_scene, repeated, sh_of
 
+from gsim3d.cameras import Cameras
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.types import Cameras
 
 SIZE, IMAGES, TILE = 128, 4, 16
 FOCAL = 1.1 * SIZE

@@ -5,7 +5,7 @@ import math
 import torch
 import torch.nn.functional as F
 
-from gsim3d.types import Cameras
+from gsim3d.cameras import Cameras
 
 RING, CONTEXT, FOCAL = 12, 4, 1.1  # cameras of the ring, of them those that give Gaussians, focal length / width
 

@@ -17,10 +17,11 @@ import torch
 from harness import Bench
 
 from gsim3d import presets
+from gsim3d.cameras import Cameras
+from gsim3d.cuda_graphs import CapturedRollout
 from gsim3d.dynamics import Parts, RestLog, append_step, last_steps
-from gsim3d.graphs import CapturedRollout
 from gsim3d.simulator import Simulator
-from gsim3d.types import DYNAMIC, FROZEN, Cameras, Particles
+from gsim3d.state import DYNAMIC, FROZEN, Particles
 
 SHARES = (0.5, 0.9, 0.99)
 SIZE = 128

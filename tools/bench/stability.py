@@ -14,12 +14,13 @@ from functools import partial
 import torch
 from harness import Bench
 
-import gsim3d.guards
+import gsim3d.numerics.validate
 import gsim3d.simulator
 from gsim3d import Simulator, ops, presets
-from gsim3d.graphs import CapturedRollout
-from gsim3d.stability import StabilityReport
-from gsim3d.types import Cameras, Particles
+from gsim3d.cameras import Cameras
+from gsim3d.cuda_graphs import CapturedRollout
+from gsim3d.numerics.policy import StabilityReport
+from gsim3d.state import Particles
 
 STEPS = 4  # of a rollout
 

@@ -19,8 +19,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gsim3d.cameras import Cameras, Frames
 from gsim3d.simulator import Simulator
-from gsim3d.types import Cameras, Frames, Particles
+from gsim3d.state import Particles
 
 N_CAMS = 12
 DISC_RADIUS, HALF_AXES, FIRST_HEIGHT, FALL = 1.5, (0.25, 0.2, 0.22), 0.9, 0.04  # metres; FALL a step

@@ -15,17 +15,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
+from gsim3d.cameras import Cameras, Frames
 from gsim3d.data import Window, generator
 from gsim3d.data.recording import BACKGROUND, MOVING
-from gsim3d.generate.cameras import Rig, workspace_origin
-from gsim3d.generate.film import film, start_filming
-from gsim3d.generate.world import World
+from gsim3d.synth.cameras import Rig, workspace_origin
+from gsim3d.synth.film import film, start_filming
+from gsim3d.synth.world import World
 from gsim3d.train.config import DataConfig, StageConfig
 from gsim3d.train.processes import Processes
 from gsim3d.train.samples import Batch, batch_of, draw_windows, first_target, thinned
-from gsim3d.types import Cameras, Frames
 
 QUEUED = 2  # trajectories that wait for each process that films
 
@@ -76,7 +75,7 @@ class FilmStore:
         ]
 
     def put(self, images: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> None:
-        """Keeps a trajectory, as :func:`gsim3d.generate.film.film` writes it."""
+        """Keeps a trajectory, as :func:`gsim3d.synth.film.film` writes it."""
         rig = Rig(viewmats, Ks, images.shape[2], self._near, self._far)
         with self.lock:
             slot = self.count % self.capacity

@@ -11,9 +11,9 @@ from functools import partial
 from typing import Any
 
 from gsim3d.errors import InputError
-from gsim3d.generate.stage import GRAVITY
-from gsim3d.generate.world import World
-from gsim3d.generate.worlds import VALIDATION_SEED, build_world
+from gsim3d.synth.stage import GRAVITY
+from gsim3d.synth.world import World
+from gsim3d.synth.worlds import VALIDATION_SEED, build_world
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.precision import PrecisionConfig
 
@@ -49,7 +49,7 @@ class Recipe:
         return build_world(self.world, self.preset, {"seed": SEED, **self.options})
 
     def validation(self) -> dict[str, Any]:
-        """Arguments of :func:`gsim3d.generate.generate` that make the validation set: the stream's, another seed."""
+        """Arguments of :func:`gsim3d.synth.generate` that make the validation set: the stream's, another seed."""
         given = {"seed": VALIDATION_SEED, "n_trajectories": self.n_validation, **self.options}
         return {"world": self.world, "preset": self.preset, **given}
 

@@ -71,9 +71,7 @@ def run(recipe, state: Path, out: Path, *, minutes: float, device: str, processe
                 "seed": world.seed,
                 "is_last": is_last,
             }
-            progress = train(
-                trainer, filming, progress, about, end=end, out=out, name=name, is_last=is_last, say=tell
-            )
+            progress = train(trainer, filming, progress, about, end=end, out=out, name=name, is_last=is_last, say=tell)
         tell(f"{name}: step {trainer.step}, {progress.windows} windows, {trainer.seconds:.0f} s of training in all")
         del trainer, store, filming
         gc.collect()  # the trainer and its graphs refer to each other
@@ -96,7 +94,7 @@ def film_validation(recipe, folder: Path) -> multiprocessing.Process:
 
 
 def _generate(folder: str, given: dict) -> None:
-    from gsim3d.generate import generate
+    from gsim3d.synth import generate
 
     os.environ["OMP_NUM_THREADS"] = "1"
     generate(folder, processes=VALIDATION_PROCESSES, progress=False, **given)

@@ -11,7 +11,7 @@ import torch
 from gsim3d.evaluate.pictures import as_bytes, comparison_frames
 from gsim3d.evaluate.protocol import default_views, predict_together, render_steps
 from gsim3d.evaluate.scoring import SceneTruth
-from gsim3d.interop import write_video
+from gsim3d.io import write_video
 from gsim3d.train.restore import restore
 
 TOGETHER = 8  # trajectories that are predicted at the same time

@@ -15,7 +15,7 @@ namespace gsim3d {
 
 constexpr int kMaxWatchedFields = 9;
 constexpr int32_t kOutside = 1 << 29, kFast = 1 << 30;
-constexpr uint8_t kAsleep = 2;         // Particles.activity of gsim3d/types.py
+constexpr uint8_t kAsleep = 2;         // Particles.activity of gsim3d/state.py
 constexpr double kWatchedCells = 65536;  // of a workspace along each axis: codes have 16 bits
 // Columns of a record: count and first row (-1: none) of every field, of kOutside and of kFast; then how many rows are
 // usable and awake, half their squared displacements, the opacities of all rows that have one in bounds, and the lowest

@@ -16,9 +16,7 @@ def main() -> int:
     )
     parser.add_argument("--count", type=int, default=2000, help="inputs of each target (default 2000)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--patience", type=float, default=PATIENCE, help="seconds for an input (default %(default)s)"
-    )
+    parser.add_argument("--patience", type=float, default=PATIENCE, help="seconds for an input (default %(default)s)")
     parser.add_argument("--out", type=Path, help="folder for failing inputs (default: a temporary one)")
     parser.add_argument("--replay", type=Path, metavar="FAILURE", help="run a kept input again and show what happens")
     parser.add_argument("--list", action="store_true", help="print the names of the targets")

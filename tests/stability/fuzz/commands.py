@@ -15,8 +15,8 @@ import tempfile
 from functools import partial
 from pathlib import Path
 
-from gsim3d.__main__ import COMMANDS, main
-from gsim3d.interop import write_ply
+from gsim3d.cli.main import COMMANDS, main
+from gsim3d.io import write_ply
 from gsim3d.train import checkpoint
 from tests.stability.fuzz.engine import Failure, Target
 from tests.stability.fuzz.readers import _gaussians, _saved

@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from gsim3d import ops
+from gsim3d.cameras import Cameras
 from gsim3d.errors import GradientError
-from gsim3d.harmonics import readings
-from gsim3d.types import ASLEEP, Cameras
+from gsim3d.math.spherical_harmonics import readings
+from gsim3d.state import ASLEEP
 from tests.stability.fuzz.engine import Failure, Target, finite
 from tests.stability.fuzz.poison import mutate, tensor
 

@@ -27,33 +27,32 @@ import torch
 import trimesh
 import yaml
 
-from gsim3d import check_stability
+from gsim3d.compat.released_import import import_released
 from gsim3d.data import Scene
 from gsim3d.data.check import check_scene
-from gsim3d.edits import load_edits
-from gsim3d.effects import EffectsSpec
+from gsim3d.effects.edits import load_edits
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import HardCaseError, InputError
+from gsim3d.evaluate.perceptual import weights
 from gsim3d.evaluate.predictions import Predictions
-from gsim3d.generate.meshes import load_body
-from gsim3d.interop import read_ply, write_ply
-from gsim3d.interop.released_import import import_released
-from gsim3d.io import read_splats, write_splats
-from gsim3d.pareto.autotune import TIMES, load_speed, load_times
-from gsim3d.perceptual import weights
+from gsim3d.io import read_ply, read_splats, write_ply, write_splats
+from gsim3d.profile.autotune import TIMES, load_speed, load_times
 from gsim3d.simulator import Simulator
+from gsim3d.state import Gaussians
+from gsim3d.synth.meshes import load_body
+from gsim3d.testing import check_stability
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, TrainConfig
 from gsim3d.train.log import LOG, Log
 from gsim3d.train.restore import restore
 from gsim3d.train.settings import from_dict, load_yaml, to_dict
-from gsim3d.types import Gaussians
+from tests.compat.release import random_weights, settings_of, small_config, write_release
 from tests.data.made_scenes import WRITERS, edit_json, make_scene
 from tests.data.made_videos import trimmed, with_gaps, write_plain
 from tests.data.made_videos import write_scene as write_videos
 from tests.data.test_colmap import seen_points, write_colmap
 from tests.data.test_transforms import write_synthetic
-from tests.interop.release import random_weights, settings_of, small_config, write_release
-from tests.interop.test_ply import DC, REST, SHAPE, XYZ, rows_of
+from tests.io.test_ply import DC, REST, SHAPE, XYZ, rows_of
 from tests.stability.fuzz.engine import LARGE, Failure, Target, finite
 from tests.stability.fuzz.files import damage
 from tests.test_simulator import CONFIG

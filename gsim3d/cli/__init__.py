@@ -1,0 +1,1 @@
+"""The ``gsim3d`` command: one module a subcommand."""

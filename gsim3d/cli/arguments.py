@@ -1,0 +1,65 @@
+"""Argument parsing of all commands: no abbreviations, hints for unknown words, numbers with a range."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from typing import Any
+
+from gsim3d.errors import InputError, did_you_mean
+
+
+class Parser(argparse.ArgumentParser):
+    """Takes no abbreviations; its errors are InputErrors that suggest the nearest known word."""
+
+    def __init__(self, *args: Any, **options: Any):
+        options = {"formatter_class": argparse.RawDescriptionHelpFormatter, **options, "allow_abbrev": False}
+        super().__init__(*args, **options)
+
+    def parsed(self, arguments: list[str]) -> argparse.Namespace:
+        """The arguments; options may stand between and behind the others."""
+        for word in arguments[: arguments.index("--")] if "--" in arguments else arguments:
+            name = word.partition("=")[0]
+            if word.startswith("--") and name not in self._option_string_actions:
+                self.error(f"unrecognized arguments: {name}{did_you_mean(name, self._option_string_actions)}")
+        return self.parse_intermixed_args(arguments)
+
+    def error(self, message: str) -> None:
+        raise InputError(f"{message} (see {self.prog} --help)")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            known = [str(choice) for choice in action.choices]
+            hint = did_you_mean(str(value), known)
+            raise argparse.ArgumentError(action, f"invalid choice: {value!r} (choose from {', '.join(known)}){hint}")
+
+
+def whole(least: int, most: float = math.inf) -> Callable[[str], int]:
+    """The type of an option that takes a whole number from ``least`` to ``most``."""
+
+    def convert(text: str) -> int:
+        return _within(int(text), least, most)
+
+    convert.__name__ = "int"
+    return convert
+
+
+def number(least: float, most: float = math.inf, *, above: bool = False) -> Callable[[str], float]:
+    """The type of an option that takes a finite number of at least ``least`` (or ``above`` it) and at most ``most``."""
+
+    def convert(text: str) -> float:
+        value = float(text)
+        if above and value == least or not math.isfinite(value):
+            raise argparse.ArgumentTypeError(f"must be a finite number above {least:g}; got {text}")
+        return _within(value, least, most)
+
+    convert.__name__ = "float"
+    return convert
+
+
+def _within(value: float, least: float, most: float) -> Any:
+    if not least <= value <= most:
+        wanted = f"at least {least:g}" if most == math.inf else f"from {least:g} to {most:g}"
+        raise argparse.ArgumentTypeError(f"must be {wanted}; got {value}")
+    return value

@@ -1,0 +1,71 @@
+"""``gsim3d check-data``: what is wrong with recorded scenes, and a picture that shows whether the cameras are right."""
+
+from __future__ import annotations
+
+import argparse
+
+EPILOG = """\
+Every file of every scene is read: descriptions, cameras, all images and masks. Each problem is one line that names
+file, camera and frame. Exit code: 0 nothing is wrong, 1 there are problems, 2 the check could not run.
+
+Layouts that load (docs/data.md has every key):
+  genesis      metadata.json with n_steps, n_cams, file_path_template and cam_<j>: as `gsim3d generate` writes
+  kubric       cam_<j>/metadata.json with rgba_<t>.png and segmentation_<t>.png: Kubric and MOVi
+  transforms   transforms.json of nerfstudio, with a time for every frame
+  films        cameras.json, and for each camera one video <name>.mp4 or one folder <name>/<number>.png or .jpg
+
+Look at the picture: in every frame the orange box must stand around what moves, the world's axes (x red, y green,
+z blue) must point the same ways, and the other cameras (magenta) must be where you see them. The blue box is the
+bounds of the scene: given, or what most cameras see; the yellow line is the outline of the masks.
+  no axes and no orange box         y and z axes flipped (OpenGL for OpenCV), or camera-to-world for world-to-camera
+  the box is beside what moves      intrinsics of another image size, or a principal point that was not cropped along
+  it is so in one camera only       that camera's pose is wrong, or two cameras are exchanged
+
+examples:
+  gsim3d check-data runs/data --out check-data.png
+  gsim3d check-data my_recording --out my_recording.png
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Reads recorded scenes, lists every problem, and draws a picture of frames and cameras on request."
+    )
+    parser.epilog = EPILOG
+    parser.add_argument("data", metavar="DIR", help="folder with scenes of any layout, or one scene folder")
+    parser.add_argument("--out", metavar="FILE.png", help="picture to draw (default: none)")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar, only problems and the last line")
+
+
+def run(args: argparse.Namespace) -> int:
+    import os
+    from concurrent.futures import ThreadPoolExecutor
+
+    from gsim3d.data import find_scenes
+    from gsim3d.data.check import check_scene, contact_sheet, describe
+    from gsim3d.io.files import made_around, place_of, write_picture
+    from gsim3d.io.terminal import progress
+
+    out = None if args.out is None else place_of(args.out, ".png")
+    folders = find_scenes(args.data)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        hidden = args.quiet or len(folders) == 1
+        checks = pool.map(check_scene, folders)
+        checks = list(progress(checks, "scenes", len(folders), unit="scene", quiet=hidden))
+    for check in checks:
+        if check.problems or not args.quiet:
+            print(describe(check.scene) if check.scene else f"{check.path}: cannot be opened")
+        for problem in check.problems:
+            print(f"  problem: {problem}")
+    scenes = [check.scene for check in checks if check.scene]
+    if scenes and out is not None:
+        part = made_around(out).with_name(f".{out.stem}.part.png")
+        write_picture(part, contact_sheet(scenes)[..., ::-1])
+        os.replace(part, out)
+    n_problems = sum(len(check.problems) for check in checks)
+    n_bad = sum(bool(check.problems) for check in checks)
+    read = f"{len(checks)} scene{'s' if len(checks) > 1 else ''} read"
+    found = f"{n_problems} problem{'s' if n_problems > 1 else ''} in {n_bad}" if n_problems else "no problem"
+    drawn = "--out draws a picture of the cameras" if out is None else f"look at {out}"
+    print(f"{read}, {found}; {drawn if scenes else 'no scene could be drawn'}")
+    return 1 if n_problems else 0

@@ -1,0 +1,183 @@
+"""Weights of the published model under the names of this one, and back.
+
+Two things differ beside the names: latents come from one convolution here, and explicit particles carry harmonics in
+the standard basis, so the layers of the dynamics that read and write them absorb a fixed change of basis.
+"""
+
+from __future__ import annotations
+
+import re
+
+import torch
+from torch import Tensor
+
+from gsim3d.dynamics.state import StateLayout
+from gsim3d.math.spherical_harmonics import rotate_harmonics
+from gsim3d.presets import ModelConfig
+
+ENCODER, DYNAMICS, HEAD = "encoder.", "dynamic_model.net.", "decoder."  # the published model's parts
+_COUNTER = "num_batches_tracked"  # of batch norms; nothing reads it
+
+# (published, ours); # is a number. The first that matches the start of a name counts, in either direction.
+_BLOCK = [
+    ("cpe.0", "position.conv"),
+    ("cpe.1", "position.linear"),
+    ("cpe.2", "position.norm"),
+    ("norm1.0", "norm1"),
+    ("attn", "attention"),
+    ("norm2.0", "norm2"),
+    ("mlp.0", "mlp"),
+]
+_DYNAMICS = [
+    ("embedding.stem", "stem"),
+    ("enc.enc#.down.proj", "encoder.#.pool.proj"),
+    ("enc.enc#.down.norm.0", "encoder.#.pool.norm"),
+    ("enc.enc#.merger.pos_emb", "encoder.#.merge.time_embedding"),
+    ("dec.dec#.up.proj.0", "decoder.#.unpool.proj"),
+    ("dec.dec#.up.proj.1", "decoder.#.unpool.proj_norm"),
+    ("dec.dec#.up.proj_skip.0", "decoder.#.unpool.skip"),
+    ("dec.dec#.up.proj_skip.1", "decoder.#.unpool.skip_norm"),
+    *((f"enc.enc#.block#.{theirs}", f"encoder.#.blocks.#.{ours}") for theirs, ours in _BLOCK),
+    *((f"dec.dec#.block#.{theirs}", f"decoder.#.blocks.#.{ours}") for theirs, ours in _BLOCK),
+    ("dec.{head}.norm_pre", "head.norm"),
+    ("dec.{head}", "head"),
+]
+_ENCODER = [
+    *((f"backbone.backbone.layer{i + 1}.#.downsample.0", f"cnn.stages.{i}.#.downsample") for i in range(3)),
+    *((f"backbone.backbone.layer{i + 1}", f"cnn.stages.{i}") for i in range(3)),
+    ("backbone.backbone", "cnn"),
+    ("backbone.transformer", "transformer"),
+    ("depth_predictor.corr_refine_net.0", "depth.cost_volume.refine_in.0"),
+    ("depth_predictor.corr_refine_net.1", "depth.cost_volume.refine_in.1"),
+    ("depth_predictor.corr_refine_net.3", "depth.cost_volume.unet"),
+    ("depth_predictor.corr_refine_net.4", "depth.cost_volume.refine_out"),
+    ("depth_predictor.regressor_residual", "depth.cost_volume.residual"),
+    ("depth_predictor.depth_head_lowres", "depth.cost_volume.head"),
+    ("depth_predictor.upsampler.0", "depth.upsampler"),
+    ("depth_predictor.proj_feature", "depth.proj_feature"),
+    ("depth_predictor.refine_unet.0", "depth.refine_in.0"),
+    ("depth_predictor.refine_unet.1", "depth.refine_in.1"),
+    ("depth_predictor.refine_unet.3", "depth.refine_unet"),
+    ("depth_predictor.to_disparity", "depth.to_disparity"),
+    ("depth_predictor.to_gaussians", "heads.to_gaussians"),
+    ("depth_predictor.global_cond", "heads.conditioning.net"),
+]
+LATENTS = [f"depth_predictor.to_mono_features.{kind}_latent_features." for kind in ("dynamic", "static")]
+
+
+def _rename(name: str, pairs: list[tuple[str, str]], head: str = "#") -> str:
+    """``name`` with the start that a pair names first replaced by its second; as it is where no pair fits."""
+    for before, after in pairs:
+        pattern = re.escape(before.format(head=head)).replace(r"\#", r"(\d+)")
+        if match := re.match(rf"{pattern}(?=\.|$)", name):
+            numbers = iter(match.groups())
+            after = re.sub("#", lambda _: next(numbers), after.format(head=head))
+            return after + name[match.end() :]
+    return name
+
+
+def _reversed(pairs: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    return [(ours, theirs) for theirs, ours in pairs]
+
+
+def encoder_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
+    """State dict below "encoder." -> that of :class:`gsim3d.nn.multiview_encoder.Encoder`."""
+    weights = {}
+    for name, value in published.items():
+        if not name.startswith(tuple(LATENTS)):
+            weights[_rename(name, _ENCODER)] = value
+    for kind in ("weight", "bias"):
+        parts = [published[prefix + kind] for prefix in LATENTS if prefix + kind in published]
+        if parts:
+            weights[f"heads.to_latents.{kind}"] = torch.cat(parts)
+    return weights
+
+
+def dynamics_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
+    """State dict below "dynamic_model.net." -> that of :class:`gsim3d.nn.point_transformer.PointTransformer`."""
+    return {_rename(name, _DYNAMICS): value for name, value in published.items() if not name.endswith(_COUNTER)}
+
+
+def head_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
+    """State dict below "decoder." -> that of :class:`gsim3d.nn.gaussian_head.GaussianHead`."""
+    weight = published["to_missing_3dgs.2.weight"]
+    return {
+        "fc1.weight": published["to_missing_3dgs.0.weight"],
+        "fc1.bias": published["to_missing_3dgs.0.bias"],
+        "fc2.weight": weight,
+        "fc2.bias": torch.zeros_like(weight[:, 0]),
+    }
+
+
+def from_published(published: dict[str, Tensor], config: ModelConfig) -> dict[str, Tensor]:
+    """The published model's state dict -> that of :class:`gsim3d.Simulator`; all names must be known."""
+    parts = {part: _below(published, part) for part in (ENCODER, DYNAMICS, HEAD)}
+    weights = {f"encoder.{name}": value for name, value in encoder_weights(parts[ENCODER]).items()}
+    weights |= {f"dynamics.net.{name}": value for name, value in dynamics_weights(parts[DYNAMICS]).items()}
+    if config.encoder.explicit:
+        return _change_basis(weights, config, harmonics_matrix(config.encoder.sh_degree))
+    return weights | {f"renderer.{name}": value for name, value in head_weights(parts[HEAD]).items()}
+
+
+def to_published(weights: dict[str, Tensor], config: ModelConfig) -> dict[str, Tensor]:
+    """The way back. (The published head has no bias in its last layer: one that is not zero is lost.)"""
+    if config.encoder.explicit:
+        weights = _change_basis(dict(weights), config, harmonics_matrix(config.encoder.sh_degree).T)
+    published = {}
+    for name, value in _below(weights, "encoder.").items():
+        if name.startswith("heads.to_latents."):
+            sizes = [config.encoder.dynamic_dim, config.encoder.static_dim]
+            parts = zip(LATENTS, value.split(sizes), strict=True)
+            published |= {ENCODER + prefix + name.rsplit(".", 1)[1]: part for prefix, part in parts if len(part)}
+        else:
+            published[ENCODER + _rename(name, _reversed(_ENCODER))] = value
+    head = str(config.dynamics.n_stages - 1)
+    for name, value in _below(weights, "dynamics.net.").items():
+        name = DYNAMICS + _rename(name, _reversed(_DYNAMICS), head)
+        published[name] = value
+        if name.endswith("running_mean"):
+            counter = torch.zeros((), dtype=torch.int64, device=value.device)
+            published[name.replace("running_mean", _COUNTER)] = counter
+    for name, value in _below(weights, "renderer.").items():
+        if name != "fc2.bias":
+            published[HEAD + {"fc1": "to_missing_3dgs.0", "fc2": "to_missing_3dgs.2"}[name[:3]] + name[3:]] = value
+    return published
+
+
+def harmonics_matrix(degree: int) -> Tensor:
+    """float64 [K, K]: coefficients in the published basis -> in the standard one, for the same colours.
+
+    The published basis is the standard one of (z, x, y) instead of (x, y, z). The matrix is orthogonal.
+    """
+    permute = torch.eye(3, dtype=torch.float64)[[2, 0, 1]]
+    each = torch.eye((degree + 1) ** 2, dtype=torch.float64)
+    return rotate_harmonics(each[None], permute.T[None])[0]
+
+
+def _change_basis(weights: dict[str, Tensor], config: ModelConfig, matrix: Tensor) -> dict[str, Tensor]:
+    """Weights of dynamics that see harmonics c as ``matrix @ c``."""
+    layout = StateLayout.of(config.dynamics)
+    wide = torch.block_diag(*[matrix] * 3)  # of the channels (3, K)
+    for names, fields, axis, repeats in (
+        (["stem.conv.weight"], layout.inputs, -1, 1),
+        (["head.fc2.weight", "head.fc2.bias"], layout.outputs, 0, config.dynamics.steps_per_call),
+    ):
+        first, width, total = _columns("sh", fields)
+        for name in names:
+            after = weights[f"dynamics.net.{name}"].clone()
+            for start in range(first, repeats * total, total):
+                part = after.narrow(axis, start, width).movedim(axis, -1)
+                part.copy_(part.double() @ wide.T.to(part.device))
+            weights[f"dynamics.net.{name}"] = after
+    return weights
+
+
+def _columns(field: str, fields: tuple[tuple[str, int], ...]) -> tuple[int, int, int]:
+    """First channel and width of a field, and the width of all."""
+    names, widths = zip(*fields, strict=True)
+    place = names.index(field)
+    return sum(widths[:place]), widths[place], sum(widths)
+
+
+def _below(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in weights.items() if name.startswith(prefix)}

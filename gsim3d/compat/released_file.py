@@ -1,0 +1,238 @@
+"""Tensors of a file that ``torch.save`` wrote, read without running anything that is in it.
+
+Such a file is a zip archive: ``data.pkl`` says what there is, ``data/0``, ``data/1`` ... hold the numbers. A pickle can
+name any function to be called. Here tensors are rebuilt by this module, a few packages that training tools leave traces
+of become empty placeholders, and every other name is refused.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsim3d.errors import InputError
+from gsim3d.io.files import shown
+from gsim3d.io.pickles import check_pickle
+
+# What zipfile raises for an archive that is broken, encrypted or larger than memory.
+BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, OSError, MemoryError, RuntimeError, ValueError)
+MAX_INDEX = 256 * 2**20  # bytes of data.pkl; that of a model with a million tensors is smaller
+
+_DTYPES = {
+    "FloatStorage": torch.float32, "DoubleStorage": torch.float64, "HalfStorage": torch.float16,
+    "BFloat16Storage": torch.bfloat16, "LongStorage": torch.int64, "IntStorage": torch.int32,
+    "ShortStorage": torch.int16, "CharStorage": torch.int8, "ByteStorage": torch.uint8, "BoolStorage": torch.bool,
+}  # fmt: skip
+# What Lightning, its callbacks and OmegaConf put beside the weights: nothing of it is needed, so nothing of it is made.
+_PLACEHOLDER_PACKAGES = {
+    "pytorch_lightning", "lightning", "lightning_fabric", "lightning_utilities", "omegaconf", "numpy", "pathlib",
+    "typing", "argparse", "datetime",
+}  # fmt: skip
+_PLACEHOLDER_NAMES = {
+    "collections.defaultdict", "collections.Counter", "collections.deque", "_codecs.encode",
+    "builtins.set", "builtins.frozenset", "builtins.dict", "builtins.list", "builtins.tuple", "builtins.int",
+    "builtins.long", "builtins.float", "builtins.complex", "builtins.str", "builtins.unicode", "builtins.bytes",
+    "builtins.bytearray", "builtins.bool", "builtins.slice",
+    "torch.Size", "torch.device", "torch.Generator", "torch.float32", "torch.float64", "torch.float16",
+    "torch.bfloat16", "torch.int64", "torch.int32",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StoredTensor:
+    """A tensor still in the file: elements of storage ``key`` from ``offset`` on, by ``shape`` and ``stride``."""
+
+    key: str
+    dtype: torch.dtype
+    offset: int
+    shape: tuple[int, ...]
+    stride: tuple[int, ...]
+
+    @property
+    def n_elements(self) -> int:
+        return math.prod(self.shape)
+
+    @property
+    def end(self) -> int:
+        """One past the last element of the storage that the tensor uses."""
+        if self.n_elements == 0:
+            return self.offset
+        return self.offset + sum((n - 1) * step for n, step in zip(self.shape, self.stride, strict=True)) + 1
+
+
+class Ignored:
+    """Stands for an object that is not needed; takes whatever it is given and keeps nothing."""
+
+    def __new__(cls, *args, **kwargs):
+        return object.__new__(cls)
+
+    def __init__(self, *args, **kwargs):
+        pass
+
+    def __call__(self, *args, **kwargs):
+        return self
+
+    def __setitem__(self, key, value):
+        pass
+
+    def __setstate__(self, state):
+        pass
+
+    def append(self, value):
+        pass
+
+    def extend(self, values):
+        pass
+
+
+class _Table(dict):
+    """A dictionary that takes no attributes: a state dict's are version numbers of its modules."""
+
+    def __setstate__(self, state):
+        pass
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, data: bytes, path: Path):
+        super().__init__(io.BytesIO(data))
+        self.path = path
+
+    def find_class(self, module: str, name: str) -> Any:
+        full = f"{module}.{name}".replace("__builtin__.", "builtins.")  # torch.save writes Python 2's names
+        if full == "collections.OrderedDict":
+            return _Table
+        if full == "torch._utils._rebuild_tensor_v2":
+            return _stored_tensor
+        if full == "torch._utils._rebuild_parameter":
+            return _stored_parameter
+        if module == "torch" and name in _DTYPES:
+            return _DTYPES[name]
+        if full in _PLACEHOLDER_NAMES or module.split(".")[0] in _PLACEHOLDER_PACKAGES:
+            return Ignored
+        raise InputError(
+            f"{self.path}: refused, it asks for {full}, which is no part of a checkpoint's weights and could run code; "
+            "do not load this file with other programs either unless you trust where it comes from"
+        )
+
+    def persistent_load(self, pid: Any) -> tuple[str, torch.dtype]:
+        match pid:
+            case ("storage", torch.dtype() as dtype, str() as key, str(), int()):
+                return key, dtype
+        raise InputError(f"{self.path}: a tensor's storage is described in an unknown way: {shown(pid)}")
+
+
+def _stored_tensor(storage, offset, shape, stride, *_) -> StoredTensor:
+    key, dtype = storage
+    values = (offset, *shape, *stride)
+    if len(shape) != len(stride) or not all(type(n) is int and 0 <= n < 2**48 for n in values):
+        raise ValueError("a tensor's size or stride is out of range")
+    return StoredTensor(key, dtype, offset, tuple(shape), tuple(stride))
+
+
+def _stored_parameter(data, *_) -> StoredTensor:
+    return data
+
+
+class ReleasedFile:
+    """An open file: ``content`` is its object with every tensor a :class:`StoredTensor`; ``read`` fetches one.
+
+    Raises:
+        InputError: not such a file, broken, or it holds something that could run code; the message names the file.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise InputError(f"{self.path}: no such file")
+        try:
+            self._zip = zipfile.ZipFile(self.path)
+        except BROKEN:
+            raise InputError(
+                f"{self.path}: not a checkpoint that torch.save wrote as a zip archive (it is truncated, another kind "
+                "of file, or older than torch 1.6; the last can be saved again with a newer torch)"
+            ) from None
+        try:
+            self._root, self._members = self._index()
+            self.content = self._unpickle()
+        except InputError:
+            self._zip.close()
+            raise
+
+    def __enter__(self) -> ReleasedFile:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._zip.close()
+
+    def read(self, stored: StoredTensor) -> Tensor:
+        """The tensor's values; floating-point ones as float32."""
+        member = self._members.get(f"{self._root}data/{stored.key}")
+        item = stored.dtype.itemsize
+        available = member.file_size // item if member else 0
+        if member is None or stored.end > available or stored.n_elements > available:
+            raise InputError(f"{self.path}: a tensor of {list(stored.shape)} does not fit its storage; it is broken")
+        if stored.n_elements == 0:
+            values = torch.zeros(stored.shape, dtype=stored.dtype)
+        else:
+            flat = torch.frombuffer(bytearray(self._bytes_of(member)), dtype=stored.dtype)
+            values = flat.as_strided(stored.shape, stored.stride, stored.offset)
+        return values.to(torch.float32 if stored.dtype.is_floating_point else stored.dtype).clone()
+
+    def _bytes_of(self, member: zipfile.ZipInfo) -> bytes:
+        try:
+            return self._zip.read(member)
+        except BROKEN as error:
+            raise InputError(f"{self.path}: truncated or changed: {error or 'no memory'}") from None
+
+    def _index(self) -> tuple[str, dict[str, zipfile.ZipInfo]]:
+        """The folder that everything is in, and the archive's members by name."""
+        members = {info.filename: info for info in self._zip.infolist()}
+        roots = [name.removesuffix("data.pkl") for name in members if name.split("/")[1:] == ["data.pkl"]]
+        if len(roots) != 1:
+            raise InputError(f"{self.path}: a zip archive, but not one that torch.save wrote: it holds no data.pkl")
+        for info in members.values():
+            # Stored as they are, members cannot be larger than the file: nothing unpacks to more than the disk holds.
+            if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
+                raise InputError(f"{self.path}: {info.filename} is compressed, which torch.save never does; refused")
+        order = members.get(f"{roots[0]}byteorder")
+        if order is not None and self._bytes_of(order) != b"little":
+            raise InputError(f"{self.path}: written on a big-endian machine, which is not supported")
+        return roots[0], members
+
+    def _unpickle(self) -> Any:
+        info = self._members[f"{self._root}data.pkl"]
+        if info.file_size > MAX_INDEX:
+            raise InputError(f"{self.path}: data.pkl has {info.file_size} bytes; more than {MAX_INDEX} are refused")
+        try:
+            data = self._bytes_of(info)
+            check_pickle(data)
+            return _Unpickler(data, self.path).load()
+        except InputError:
+            raise
+        except Exception as error:  # a broken pickle raises anything
+            raise InputError(f"{self.path}: data.pkl is broken: {str(error)[:200]}") from None
+
+
+def state_dict(file: ReleasedFile) -> tuple[dict[str, StoredTensor], dict[str, int]]:
+    """The weights of a Lightning checkpoint, or of a file of nothing but weights; and epoch and step, if given."""
+    content = file.content
+    if not isinstance(content, dict):
+        raise InputError(f"{file.path}: holds a {type(content).__name__}, not a checkpoint")
+    weights = content.get("state_dict", content)
+    if not isinstance(weights, dict) or not all(isinstance(name, str) for name in weights):
+        raise InputError(f"{file.path}: its state_dict is not a table of named tensors")
+    tensors = {name: value for name, value in weights.items() if isinstance(value, StoredTensor)}
+    if not tensors:
+        known = ", ".join(str(name)[:80] if isinstance(name, str) else shown(name) for name in list(content)[:8])
+        raise InputError(f"{file.path}: holds no weights: no state_dict, and no tensors; it has {known or 'nothing'}")
+    counts = {name: content[name] for name in ("epoch", "global_step") if type(content.get(name)) is int}
+    return tensors, counts

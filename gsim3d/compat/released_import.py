@@ -1,0 +1,135 @@
+"""A published checkpoint and its settings -> a model of this package, with every tensor accounted for."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gsim3d.compat.released import DYNAMICS, ENCODER, LATENTS, from_published, to_published
+from gsim3d.compat.released_config import ReleasedConfig, Shapes, read_config
+from gsim3d.compat.released_file import ReleasedFile, state_dict
+from gsim3d.errors import InputError
+from gsim3d.presets import ModelConfig
+from gsim3d.simulator import Simulator
+
+MAX_NAMED = 8  # tensors that a message lists
+
+
+@dataclass(frozen=True)
+class UntrainedSigns:
+    """Whether parts of a model never learned: see :func:`untrained_signs`.
+
+    blocks, n_blocks: attention-and-MLP blocks of the dynamics whose weights look as they were drawn, of all.
+    latent_heads: the same of the encoder's latent heads and their conditioning; None where it has none.
+    """
+
+    blocks: int
+    n_blocks: int
+    latent_heads: bool | None
+
+    def sentence(self) -> str:
+        if self.blocks == 0 and not self.latent_heads:
+            return "attention, MLP and latent heads have been trained"
+        heads = {True: "the latent heads too", False: "the latent heads have learned", None: "it has no latent heads"}
+        return (
+            f"{self.blocks} of {self.n_blocks} attention and MLP blocks look as they were drawn at random, never "
+            f"trained; {heads[self.latent_heads]} (the published training could lose these gradients: see "
+            "docs/migration.md)"
+        )
+
+
+@dataclass(frozen=True)
+class Imported:
+    """weights: of :class:`gsim3d.Simulator`.   n_parameters: published ones.   ignored: tensors that the model has not.
+    counts: epoch and global_step where the file tells them."""
+
+    config: ReleasedConfig
+    weights: dict[str, Tensor]
+    n_parameters: int
+    ignored: tuple[str, ...]
+    counts: dict[str, int]
+    signs: UntrainedSigns
+
+
+def import_released(checkpoint: str | Path, settings: dict) -> Imported:
+    """Reads a published checkpoint; ``settings`` is the mapping of its resolved YAML file.
+
+    Raises:
+        InputError: the file is not such a checkpoint or could run code, a setting is not supported, or tensors are
+            missing or have another shape than the settings say; the message names them.
+    """
+    with ReleasedFile(checkpoint) as file:
+        stored, counts = state_dict(file)
+        shapes = {name: tensor.shape for name, tensor in stored.items()}
+        config = read_config(settings, shapes)
+        expected = published_shapes(config.model)
+        check_shapes(shapes, expected, file.path)
+        published = {name: file.read(stored[name]) for name in expected if name in stored}
+    weights = from_published(published, config.model)
+    n_parameters = sum(
+        value.numel() for name, value in published.items() if not re.search(r"running_|num_batches", name)
+    )
+    ignored = tuple(name for name in stored if name not in expected)
+    return Imported(config, weights, n_parameters, ignored, counts, untrained_signs(published))
+
+
+def published_shapes(config: ModelConfig) -> Shapes:
+    """Names and shapes that a published checkpoint of this model has; no memory is taken for it."""
+    with torch.device("meta"):
+        weights = Simulator(config).state_dict()
+    return {name: tuple(value.shape) for name, value in to_published(weights, config).items()}
+
+
+def check_shapes(found: Shapes, expected: Shapes, where: Path) -> None:
+    """Raises InputError naming tensors that are missing or have another shape."""
+    missing = [name for name in expected if name not in found and not name.endswith("num_batches_tracked")]
+    wrong = [
+        f"{name} is {list(found[name])} instead of {list(shape)}"
+        for name, shape in expected.items()
+        if name in found and found[name] != shape
+    ]
+    unexpected = [name for name in found if name not in expected]
+    if missing or wrong:
+        parts = [f"{len(missing)} missing: {_few(missing)}"] if missing else []
+        parts += [f"{len(wrong)} of another shape: {_few(wrong)}"] if wrong else []
+        parts += [f"{len(unexpected)} unexpected: {_few(unexpected)}"] if unexpected else []
+        raise InputError(f"{where}: its tensors do not fit the configuration; {'; '.join(parts)}")
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join(names[:MAX_NAMED]) + (f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else "")
+
+
+def untrained_signs(published: dict[str, Tensor]) -> UntrainedSigns:
+    """Looks for weights that are still as an initialisation draws them.
+
+    The published training could cut the gradients of attention, MLPs and latent heads. What never had a gradient keeps
+    norms of one constant with no bias, and uniform weights of at most 1 / sqrt(inputs), less where weight decay acted.
+    """
+    blocks = {match[1] for name in published if (match := re.match(rf"{re.escape(DYNAMICS)}(.*\.block\d+)\.", name))}
+    untrained = [block for block in blocks if _drawn_block(published, f"{DYNAMICS}{block}.")]
+    heads = [f"{ENCODER}{prefix}" for prefix in LATENTS] + [
+        f"{ENCODER}depth_predictor.global_cond.{i}." for i in (0, 2)
+    ]
+    heads = [head for head in heads if f"{head}weight" in published]
+    drawn = all(_drawn_layer(published, head) for head in heads)
+    return UntrainedSigns(len(untrained), len(blocks), drawn if heads else None)
+
+
+def _drawn_block(published: dict[str, Tensor], prefix: str) -> bool:
+    norms = [f"{prefix}norm{i}.0." for i in (1, 2)]
+    weights = torch.cat([published[f"{norm}weight"] for norm in norms])
+    constant = bool((weights == weights[0]).all()) and 0.5 < weights[0].item() <= 1
+    zero = all(not published[f"{norm}bias"].any() for norm in norms)
+    layers = [f"{prefix}{name}." for name in ("attn.qkv", "attn.proj", "mlp.0.fc1", "mlp.0.fc2")]
+    return constant and zero and all(_drawn_layer(published, layer) for layer in layers)
+
+
+def _drawn_layer(published: dict[str, Tensor], prefix: str) -> bool:
+    weight, bias = published[f"{prefix}weight"], published[f"{prefix}bias"]
+    bound = weight[0].numel() ** -0.5 * (1 + 1e-6)
+    return weight.abs().max().item() <= bound and bias.abs().max().item() <= bound

@@ -1,0 +1,338 @@
+"""Changes of a scene at any step of a rollout: typed operations on particles.
+
+    edits = [Edit(0, Remove("frozen")), Edit(8, Throw((0.0, 0.0, 0.05), of="moving"))]
+    plan = simulator.plan(EffectsSpec(structure=StructureEffects(remove=True)))
+    steps = simulator.rollout(state, 24, plan, edits=edits)
+
+An operation changes all steps that the model sees, the past too: what is moved has always been there, and keeps its
+speed. Who is meant is asked of each step by itself, so a box must hold its body in all of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from gsim3d.dynamics.clouds import OPTIONAL_FIELDS, alike, newest_clouds, with_field
+from gsim3d.dynamics.state import rotate_left
+from gsim3d.effects.selection import Selection, Vector, newest_rows
+from gsim3d.errors import InputError
+from gsim3d.io.files import read_yaml, shown, typed
+from gsim3d.math.rotations import quat_product, rotation_matrices
+from gsim3d.math.spherical_harmonics import painted, rotate_harmonics
+from gsim3d.state import FROZEN, CloudTable, Particles
+
+Colors = Callable[[Particles], Tensor]  # particles -> [N, 3], their colours
+
+GREY = (0.2126, 0.7152, 0.0722)  # how bright red, green and blue look
+DARKEST = 0.05  # grey value; what is darker is not brightened further than from this to the colour asked for
+
+
+@dataclass(frozen=True)
+class Operation:
+    """of: which particles, a Selection or its ``which``."""
+
+    of: Selection = Selection()
+
+    name: ClassVar[str] = ""
+    inserts: ClassVar[bool] = False
+    removes: ClassVar[bool] = False
+
+    def __post_init__(self):
+        if isinstance(self.of, str):
+            object.__setattr__(self, "of", Selection(self.of))
+
+    @abstractmethod
+    def apply(self, state: Particles, colors: Colors) -> Particles:
+        """``state``, changed."""
+
+
+@dataclass(frozen=True)
+class Remove(Operation):
+    """They are gone: ``Remove("frozen")`` takes the ground away."""
+
+    name: ClassVar[str] = "remove"
+    removes: ClassVar[bool] = True
+
+    def apply(self, state, colors):
+        return state.select_rows(~self.of.rows(state))
+
+
+@dataclass(frozen=True)
+class Move(Operation):
+    """They are ``by`` [metres] away from where they were: ``Move("frozen", (0, 0, 0.1))`` raises the ground."""
+
+    by: Vector = (0.0, 0.0, 0.0)
+    name: ClassVar[str] = "move"
+
+    def apply(self, state, colors):
+        return _moved(state, self.of.rows(state), self.by)
+
+
+@dataclass(frozen=True)
+class Rotate(Operation):
+    """They turn by ``degrees`` about an axis through ``about``, a place in the world (default: each scene's middle); so
+    does their speed."""
+
+    axis: Vector = (0.0, 0.0, 1.0)
+    degrees: float = 0.0
+    about: Vector | None = None
+    name: ClassVar[str] = "rotate"
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not math.hypot(*self.axis) > 0:
+            raise InputError(f"axis must have a direction; got {list(self.axis)}")
+
+    def apply(self, state, colors):
+        rows, means = self.of.rows(state), state.means
+        vector = F.normalize(torch.tensor(self.axis, dtype=torch.float64), dim=0) * math.radians(self.degrees)
+        quat = rotate_left(torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64), vector[None])
+        matrix = rotation_matrices(quat)[0].to(means)
+        pivots = _middles(state, rows) if self.about is None else _from_world(state, self.about)
+        fields = {"means": (means - pivots) @ matrix.T + pivots}
+        if state.quats is not None:
+            fields["quats"] = rotate_left(state.quats, vector.to(means).expand(state.n_rows, 3))
+            fields["sh"] = rotate_harmonics(state.sh, matrix.expand(state.n_rows, 3, 3))
+        else:
+            state = with_field(state, "turns")
+            fields["turns"] = quat_product(quat.to(means).expand_as(state.turns), state.turns)
+        if state.velocity is not None:
+            fields["velocity"] = state.velocity @ matrix.T
+        return _changed(state, rows, fields)
+
+
+@dataclass(frozen=True)
+class Throw(Operation):
+    """Their velocity grows by so many metres a step."""
+
+    velocity: Vector = (0.0, 0.0, 0.0)
+    name: ClassVar[str] = "throw"
+
+    def apply(self, state, colors):
+        rows, table = self.of.rows(state), state.clouds
+        if bool((state.activity[rows] == FROZEN).any()):
+            raise InputError("frozen particles cannot be thrown; name others")
+        newest = {table.scenes[q]: table.steps[q] for q in newest_clouds(table)}
+        if len(newest) == len(table):
+            raise InputError("a history of one step holds no velocity; give the model two steps or more")
+        ages = torch.tensor([newest[scene] - step for scene, step in zip(table.scenes, table.steps)])
+        back = ages.to(state.means)[state.row_cloud()][:, None] * state.means.new_tensor(self.velocity)
+        fields = {"means": state.means - back}
+        if state.velocity is not None:
+            fields["velocity"] = state.velocity + state.velocity.new_tensor(self.velocity)
+        return _changed(state, rows, fields)
+
+
+@dataclass(frozen=True)
+class Recolor(Operation):
+    """Their mean colour is ``color`` (0 to 1, red, green, blue) from now on; light and shadow stay."""
+
+    color: Vector = (0.5, 0.5, 0.5)
+    name: ClassVar[str] = "recolor"
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not all(0 <= value <= 1 for value in self.color):
+            raise InputError(f"color must be three numbers from 0 to 1; got {list(self.color)}")
+
+    def apply(self, state, colors):
+        rows = self.of.rows(state)
+        newest = rows & newest_rows(state)
+        grey = state.means.new_tensor(GREY)
+        mean = (colors(state)[newest] @ grey).mean().clamp(min=DARKEST)
+        paint = torch.outer(state.means.new_tensor(self.color) / mean, grey).expand(state.n_rows, 3, 3)
+        if state.sh is not None:
+            return _changed(state, rows, {"sh": painted(state.sh, paint)})
+        state = with_field(state, "paint")
+        return _changed(state, rows, {"paint": paint @ state.paint})
+
+
+@dataclass(frozen=True)
+class Duplicate(Operation):
+    """There is a second one of them, ``by`` [metres] away."""
+
+    by: Vector = (0.0, 0.0, 0.0)
+    name: ClassVar[str] = "duplicate"
+    inserts: ClassVar[bool] = True
+
+    def apply(self, state, colors):
+        rows = self.of.rows(state)
+        return _joined(state, _moved(state, rows, self.by).select_rows(rows))
+
+
+@dataclass(frozen=True)
+class Insert(Operation):
+    """Of another scene they are added, ``by`` [metres] away from their place there; its newest step is now. Nobody of
+    them is held.
+
+    particles: one scene, encoded or simulated by the same model. In a file ``scene`` names its folder.
+    """
+
+    particles: Particles | None = None
+    by: Vector = (0.0, 0.0, 0.0)
+    name: ClassVar[str] = "insert"
+    inserts: ClassVar[bool] = True
+
+    def apply(self, state, colors):
+        rows, given = self.of.rows(self.particles), dataclasses.replace(self.particles, held=None)
+        if len(newest_clouds(given.clouds)) != 1:
+            raise InputError("particles must be of one scene")
+        for field, value in given.row_fields().items():
+            mine = getattr(state, field)
+            if field not in OPTIONAL_FIELDS and (mine is None or mine.shape[1:] != value.shape[1:]):
+                raise InputError(f"particles.{field} must be as those of the state; were they made by another model?")
+        given = given.select_rows(rows).to(state.means.device)
+        table, newest = (
+            state.clouds,
+            {state.clouds.scenes[q]: state.clouds.steps[q] for q in newest_clouds(state.clouds)},
+        )
+        ages = [given.clouds.steps[-1] - step for step in given.clouds.steps]
+        runs = []
+        for scene, step in zip(table.scenes, table.steps):
+            age = newest[scene] - step
+            q = ages.index(age) if age in ages else None
+            runs.append((0, 0) if q is None else given.clouds.row_runs([q])[0])
+        counts = CloudTable.make((b - a for a, b in runs), table.scenes, table.steps, state.cu_rows.device)
+        fields = {name: torch.cat([x[a:b] for a, b in runs]) for name, x in given.row_fields().items()}
+        own = {"origin": state.origin, "world_offset": state.world_offset}
+        here = dataclasses.replace(given, **own).with_clouds(counts, **fields)
+        there = None if given.world_offset is None else given.world_offset[given.clouds.scenes[-1]]
+        by = _between(there, here.row_offset(), self.by)
+        return _joined(state, _moved(here, torch.ones_like(here.activity, dtype=torch.bool), by))
+
+
+OPERATIONS = {kind.name: kind for kind in (Remove, Move, Rotate, Throw, Recolor, Duplicate, Insert)}
+
+
+@dataclass(frozen=True)
+class Edit:
+    """step: of the rollout, counted from 0; the operation comes before this step is predicted."""
+
+    step: int
+    operation: Operation
+
+    @property
+    def place(self) -> str:
+        return f"edit at step {self.step}, {self.operation.name}"
+
+    def apply(self, state: Particles, colors: Colors) -> Particles:
+        """Raises InputError that names step and operation."""
+        try:
+            return self.operation.apply(state, colors)
+        except InputError as error:
+            raise InputError(f"{self.place}: {error}") from None
+
+
+def by_step(edits: Iterable[Edit], n_steps: int, *, insert: bool, remove: bool) -> dict[int, list[Edit]]:
+    """Edits by the step that they come before, ascending; those of one step in their order.
+
+    Raises:
+        InputError: one lies beyond ``n_steps``, or adds or removes particles where this is off.
+    """
+    found: dict[int, list[Edit]] = {}
+    for edit in sorted(edits, key=lambda edit: edit.step):
+        if not 0 <= edit.step < n_steps:
+            raise InputError(f"{edit.place}: the rollout has steps 0 to {n_steps - 1}")
+        for asked, on, name in ((edit.operation.inserts, insert, "insert"), (edit.operation.removes, remove, "remove")):
+            if asked and not on:
+                raise InputError(f"{edit.place}: the plan has structure.{name} off")
+        found.setdefault(edit.step, []).append(edit)
+    return found
+
+
+def load_edits(path: str | Path, encode: Callable[[Path], Particles]) -> list[Edit]:
+    """Reads a YAML file: a list of mappings with ``step``, ``op`` and the operation's fields.
+
+    Args:
+        encode: scene folder -> its particles, for ``insert``; folders are relative to the file's.
+    Raises:
+        InputError: names file, step and operation.
+    """
+    path = Path(path)
+    values = read_yaml(path, "edits")
+    if not isinstance(values, list):
+        raise InputError(f"edits: {path} must hold a list; got {type(values).__name__}")
+    return [_edit(value, f"{path}: edit {i}", path.parent, encode) for i, value in enumerate(values)]
+
+
+def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Particles]) -> Edit:
+    if not isinstance(values, dict):
+        raise InputError(f"{where} must be a mapping; got {shown(values)}")
+    values = dict(values)
+    step, op = values.pop("step", None), values.pop("op", None)
+    if isinstance(step, bool) or not isinstance(step, int):
+        raise InputError(f"{where}: step must be a whole number; got {shown(step)}")
+    if not isinstance(op, str) or op not in OPERATIONS:
+        raise InputError(f"{where} at step {step}: op must be one of {', '.join(OPERATIONS)}; got {shown(op)}")
+    where = f"{where} at step {step}, {op}"
+    kind, given = OPERATIONS[op], {}
+    if kind is Insert:
+        if "particles" in values or not isinstance(values.get("scene"), str):
+            raise InputError(f"{where}: scene must name a scene folder; got {shown(values.get('scene'))}")
+        try:
+            given["particles"] = encode(folder / values.pop("scene"))
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+    return Edit(step, dataclasses.replace(typed(kind, values, where), **given))
+
+
+def _changed(state: Particles, rows: Tensor, fields: dict[str, Tensor]) -> Particles:
+    """``state`` whose ``rows`` have other values."""
+    mixed = {
+        name: torch.where(rows.reshape(-1, *[1] * (value.dim() - 1)), value, getattr(state, name))
+        for name, value in fields.items()
+    }
+    return dataclasses.replace(state, **mixed)
+
+
+def _moved(state: Particles, rows: Tensor, by: Vector | Tensor) -> Particles:
+    moved = (name for name in ("means", "body") if getattr(state, name) is not None)
+    by = by.to(state.means) if isinstance(by, Tensor) else state.means.new_tensor(by)
+    return _changed(state, rows, {name: getattr(state, name) + by for name in moved})
+
+
+def _from_world(state: Particles, place: Vector) -> Tensor:
+    """[N, 3], ``place`` in the world as rows of ``state`` count positions."""
+    offset = state.row_offset()
+    place = torch.tensor(place, dtype=torch.float64, device=state.means.device).expand(state.n_rows, 3)
+    return (place if offset is None else place - offset).to(state.means)
+
+
+def _between(there: Tensor | None, here: Tensor | None, by: Vector) -> Vector | Tensor:
+    """What positions that count from ``there`` [3] change by where they are moved and count from ``here`` [N, 3]."""
+    if there is None and here is None:
+        return by
+    known = there if here is None else here
+    there, here = (known.new_zeros(3) if offset is None else offset for offset in (there, here))
+    return known.new_tensor(by) + there - here
+
+
+def _middles(state: Particles, rows: Tensor) -> Tensor:
+    """[N, 3], for each row the mean place of those ``rows`` of the newest cloud of its scene."""
+    scene = state.cloud_scene[state.row_cloud()]
+    chosen = rows & newest_rows(state)
+    one = F.one_hot(scene, int(scene.max()) + 1).to(state.means)
+    sums = (one * chosen[:, None]).mT @ torch.cat([state.means, torch.ones_like(state.means[:, :1])], 1)
+    return (sums[:, :3] / sums[:, 3:].clamp(min=1))[scene]
+
+
+def _joined(state: Particles, more: Particles) -> Particles:
+    """The clouds of ``state``, each followed by the rows of the same cloud of ``more``."""
+    parts = alike([state, more])
+    clouds = torch.cat([part.row_cloud() for part in parts])
+    order = torch.argsort(clouds, stable=True)
+    fields = {name: torch.cat([value, getattr(parts[1], name)])[order] for name, value in parts[0].row_fields().items()}
+    tables = [part.clouds for part in parts]
+    counts = [sum(table.count(q) for table in tables) for q in range(len(tables[0]))]
+    table = CloudTable.make(counts, tables[0].scenes, tables[0].steps, state.cu_rows.device)
+    return state.with_clouds(table, **fields)

@@ -1,7 +1,0 @@
-"""Images of calibrated cameras -> particles: multi-view features, cost volume, depth, view-independent latents."""
-
-from gsim3d.encoder.config import EncoderConfig
-from gsim3d.encoder.encoder import Encoder, pixel_rows
-from gsim3d.encoder.room import Room
-
-__all__ = ["Encoder", "EncoderConfig", "Room", "pixel_rows"]

@@ -1,6 +1,0 @@
-"""Physics scenes filmed by many cameras: data to train and test a simulator on (MuJoCo moves, Embree draws)."""
-
-from gsim3d.generate.run import Report, generate
-from gsim3d.generate.worlds import HELD_OUT, PRESETS, WORLDS
-
-__all__ = ["HELD_OUT", "PRESETS", "WORLDS", "Report", "generate"]

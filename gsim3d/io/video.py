@@ -1,0 +1,66 @@
+"""Video files that browsers play: VP9 in MP4."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.errors import InputError
+from gsim3d.io.files import opencv_path
+
+
+def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
+    """Writes RGB frames as VP9 in MP4; the file appears complete or not at all.
+
+    Args:
+        path: ends in .mp4.
+        frames: uint8 [H, W, 3] each, RGB, H and W even and the same for all; at least one.
+        fps: frames a second, positive.
+    Raises:
+        InputError: wrong name, shape or rate, or OpenCV cannot write VP9 here.
+    """
+    import cv2
+
+    path = Path(path)
+    if path.suffix != ".mp4":
+        raise InputError(f"{path}: a video file must end in .mp4")
+    if not fps > 0:
+        raise InputError(f"{path}: frames a second must be positive; got {fps}")
+    shapes = {(frame.dtype.name, frame.shape) for frame in frames}
+    kind, shape = next(iter(shapes), ("nothing", ()))
+    if len(shapes) != 1 or kind != "uint8" or len(shape) != 3 or shape[2] != 3 or shape[0] % 2 or shape[1] % 2:
+        raise InputError(f"{path}: frames must be uint8 [H, W, 3] of one even size; got {sorted(map(str, shapes))[:3]}")
+    temporary = path.with_name(f".{path.stem}.part.mp4")
+    log_level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        codec = cv2.VideoWriter_fourcc(*"vp09")
+        writer = cv2.VideoWriter(opencv_path(temporary), codec, float(fps), (shape[1], shape[0]))
+        if not writer.isOpened():
+            raise InputError(f"{path}: this OpenCV cannot write VP9 video here (folder missing or codec not built in)")
+        for frame in frames:
+            writer.write(np.ascontiguousarray(frame[..., ::-1]))
+        writer.release()  # says nothing of a full disk, which leaves a file without an index
+        if not _is_whole(temporary):
+            raise OSError(errno.EIO, "the video could not be written as a whole; is the disk full?", str(path))
+        os.replace(temporary, path)
+    finally:
+        cv2.utils.logging.setLogLevel(log_level)
+        temporary.unlink(missing_ok=True)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether the boxes of an MP4 file fill it, and its index is one of them."""
+    size, place, kinds = path.stat().st_size, 0, []
+    with open(path, "rb") as file:
+        while place + 8 <= size:
+            file.seek(place)
+            length, kind = int.from_bytes(file.read(4)), file.read(4)
+            length = int.from_bytes(file.read(8)) if length == 1 else length
+            place += max(8, length)
+            kinds.append(kind)
+    return place == size and b"moov" in kinds

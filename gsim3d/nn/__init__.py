@@ -1,0 +1,1 @@
+"""Networks: multi-view encoder, Point Transformer, Gaussian head and their layers."""

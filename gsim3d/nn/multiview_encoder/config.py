@@ -1,0 +1,120 @@
+"""What sizes an encoder has."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from gsim3d.compat.quirks import Quirks
+from gsim3d.errors import InputError, check_ranges
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """Sizes of the inverse renderer; the defaults are the paper's.
+
+    Features:
+        feature_dim: C, channels of the multi-view features; a multiple of 4.
+        downscale_factor: s, image pixels a feature pixel along each axis: 2, 4 or 8.
+        cnn_dims: channels of the CNN's stages at strides 2, 4, 8 ... until s is reached, then at s.
+        cnn_blocks: residual blocks of each stage.
+        transformer_layers: layers of self- and cross-view attention.
+        transformer_mlp_ratio: hidden channels of their feed-forward parts over 2 C.
+        window_split: K; attention sees windows of 1/K of the feature map along each axis, shifted in every other layer.
+    Depth:
+        n_depths: D, depth candidates between far and near, evenly spaced in disparity.
+        cost_unet_dim, cost_unet_levels: channels and resolutions of the U-Net on the cost volume.
+        cost_unet_attention: its downsampling factors at which views attend to each other.
+        refine_unet_dim, refine_unet_levels, refine_unet_attention: the same for the U-Net on full-resolution images.
+        upsampled_dim: channels of the features brought to full resolution; 0: feature_dim.
+        disparity_dim: hidden channels of the full-resolution disparity and opacity head.
+    Particles:
+        dynamic_dim, static_dim: channels of the latents that change with time and that do not.
+        condition_dim: hidden channels of the network that scales and shifts features by depth and viewing ray.
+        explicit: also predict rotation, scale and spherical harmonics of each particle.
+        sh_degree: degree of these harmonics.
+        scale_range: smallest and largest predicted scale, in tenths of a pixel's width plus height at its depth.
+    quirks: published behaviour to imitate.
+    """
+
+    feature_dim: int = 128
+    downscale_factor: int = 4
+    cnn_dims: tuple[int, ...] = (64, 96, 128)
+    cnn_blocks: int = 2
+    transformer_layers: int = 6
+    transformer_mlp_ratio: int = 4
+    window_split: int = 2
+    n_depths: int = 64
+    cost_unet_dim: int = 128
+    cost_unet_levels: int = 3
+    cost_unet_attention: tuple[int, ...] = (4,)
+    refine_unet_dim: int = 32
+    refine_unet_levels: int = 5
+    refine_unet_attention: tuple[int, ...] = (16,)
+    upsampled_dim: int = 0
+    disparity_dim: int = 64
+    dynamic_dim: int = 32
+    static_dim: int = 32
+    condition_dim: int = 20
+    explicit: bool = False
+    sh_degree: int = 3
+    scale_range: tuple[float, float] = (0.5, 15.0)
+    quirks: Quirks = Quirks()
+
+    def __post_init__(self):
+        if self.downscale_factor not in (2, 4, 8) or self.downscale_factor > 2 ** len(self.cnn_dims):
+            raise InputError(
+                "EncoderConfig: downscale_factor must be 2, 4 or 8 and at most 2^len(cnn_dims); "
+                f"got {self.downscale_factor}"
+            )
+        if self.feature_dim % 4 or self.feature_dim < 4:
+            raise InputError(f"EncoderConfig: feature_dim must be a multiple of 4; got {self.feature_dim}")
+        if self.n_depths < 2:
+            raise InputError(f"EncoderConfig: n_depths must be at least 2; got {self.n_depths}")
+        for name in ("cost_unet_dim", "refine_unet_dim"):
+            dim = getattr(self, name)
+            if dim % 8 or (dim > 32 and dim % 32):
+                raise InputError(f"EncoderConfig: {name} must be 8, 16, 24 or a multiple of 32; got {dim}")
+        widths = ("feature_dim", "cnn_dims", "cost_unet_dim", "refine_unet_dim", "disparity_dim")
+        check_ranges(self, **dict.fromkeys(widths, (1, 10**5)), n_depths=(2, 10**4), sh_degree=(0, 3))
+        check_ranges(self, **dict.fromkeys(("upsampled_dim", "dynamic_dim", "static_dim", "condition_dim"), (0, 10**5)))
+        check_ranges(self, **dict.fromkeys(("cnn_blocks", "transformer_layers"), (0, 100)), window_split=(1, 1000))
+        check_ranges(self, **dict.fromkeys(("cost_unet_attention", "refine_unet_attention"), (1, 10**4)))
+        check_ranges(self, cost_unet_levels=(1, 20), refine_unet_levels=(1, 20), transformer_mlp_ratio=(1, 100))
+        check_ranges(self, scale_range=(0, 1e6))
+        if self.scale_range[0] > self.scale_range[1]:
+            raise InputError(f"EncoderConfig: scale_range must rise; got {self.scale_range}")
+
+    @classmethod
+    def tiny(cls) -> EncoderConfig:
+        """Images of 64 pixels in a few tens of milliseconds on two CPU cores."""
+        return cls(
+            feature_dim=32,
+            cnn_dims=(16, 32),
+            cnn_blocks=1,
+            transformer_layers=2,
+            transformer_mlp_ratio=1,
+            n_depths=24,
+            cost_unet_dim=32,
+            cost_unet_levels=2,
+            cost_unet_attention=(2,),
+            refine_unet_dim=8,
+            refine_unet_levels=3,
+            refine_unet_attention=(),
+            upsampled_dim=13,  # the heads then read 24 channels, whole vectors
+            disparity_dim=16,
+            dynamic_dim=16,
+            static_dim=8,
+            condition_dim=8,
+        )
+
+    @property
+    def size_multiple(self) -> int:
+        """Image height and width must be multiples of this."""
+        at_features = math.lcm(self.window_split, 2 ** (self.cost_unet_levels - 1))
+        return math.lcm(self.downscale_factor * at_features, 2 ** (self.refine_unet_levels - 1))
+
+    @property
+    def head_dim(self) -> int:
+        """Channels of the full-resolution features that the heads read: U-Net, image, upsampled features."""
+        return self.refine_unet_dim + 3 + (self.upsampled_dim or self.feature_dim)

@@ -1,0 +1,221 @@
+"""The inverse renderer: images of calibrated cameras -> particles."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from gsim3d.cameras import Frames
+from gsim3d.errors import InputError
+from gsim3d.nn.layers import tf32_only_if_asked
+from gsim3d.nn.multiview_encoder.checks import check_frames
+from gsim3d.nn.multiview_encoder.cnn import CNN
+from gsim3d.nn.multiview_encoder.config import EncoderConfig
+from gsim3d.nn.multiview_encoder.depth import DepthPredictor, Views
+from gsim3d.nn.multiview_encoder.heads import ParticleHeads, PixelParticles, PixelRays
+from gsim3d.nn.multiview_encoder.room import Places, Room, ViewGeometry
+from gsim3d.nn.multiview_encoder.transformer import MultiViewTransformer
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, CloudTable, Particles
+
+
+def pixel_rows(frames: Frames, values: Tensor, room: Room | None = None) -> Tensor:
+    """``values`` [I, H, W] of the pixels that become particles, in the order of their rows; 0 in rows of ``room`` that
+    have none."""
+    if room is not None:
+        places = Places.of(frames, room)
+        return torch.where(places.is_one, values.flatten()[places.pixel], 0)
+    order = torch.argsort(frames.cameras.image_cloud, stable=True)
+    flat = values[order].flatten()
+    return flat if frames.masks is None else flat[frames.masks[order].flatten()]
+
+
+class Encoder(nn.Module):
+    """Multi-view features, a plane sweep, depth refinement and view-independent latents: one particle a pixel.
+
+    Clouds are encoded independently of each other; each may have any number of views, one included (its depth then
+    rests on its features alone).
+
+    Example:
+        >>> encoder = Encoder(EncoderConfig.tiny())
+        >>> encoder.config.size_multiple
+        8
+    """
+
+    def __init__(self, config: EncoderConfig):
+        super().__init__()
+        self.config = config
+        self.cnn = CNN(config)
+        self.transformer = MultiViewTransformer(config)
+        self.depth = DepthPredictor(config)
+        self.heads = ParticleHeads(config)
+        self.to(memory_format=torch.channels_last)  # convolutions with few channels are faster on it, on CPU and GPU
+
+    def check(self, frames: Frames, *, pixels: bool = True) -> None:
+        """Raises as :meth:`forward` does for ``frames``; ``pixels``: the values of images are looked at, too."""
+        check_frames(frames, self.config, next(self.parameters()).dtype, pixels=pixels)
+
+    def forward(self, frames: Frames, room: Room | None = None, *, check: bool = True) -> Particles:
+        """Particles of every cloud: its images in ascending order, pixels row by row, those outside ``masks`` left out.
+
+        On a GPU it computes in float32 unless autocast, or torch's switch for TF32 in matrix products, says otherwise.
+
+        Args:
+            room: of :meth:`room`, for frames like these in all but their numbers. Nothing then waits for the device,
+                and nothing is checked; particles that have no row are left out.
+            check: look for what cannot be used; a caller that has done so leaves it out.
+        Gradients: ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
+        Raises:
+            InputError: sizes do not fit the network's strides or each other; the message names the argument.
+            HardCaseError: an image, camera or origin is not finite or out of range; the message names scene, step and
+                tensor.
+        """
+        if room is not None:
+            with tf32_only_if_asked():
+                return self._encode_into(frames, room)
+        if check:
+            self.check(frames)
+        with tf32_only_if_asked():
+            return self._encode(frames)
+
+    @torch.no_grad()
+    def room(self, frames: Frames, size: int) -> Room:
+        """Room for ``size`` rows a cloud. It is made of the cameras; images and masks may then be others.
+
+        Raises:
+            InputError, HardCaseError: as :meth:`forward`; or clouds have different numbers of views.
+        """
+        self.check(frames)
+        n_clouds, cameras = frames.cloud_scene.shape[0], frames.cameras
+        n_views = len(cameras) // n_clouds
+        ordered = torch.arange(n_clouds, device=cameras.image_cloud.device).repeat_interleave(n_views)
+        if not torch.equal(ordered, cameras.image_cloud):
+            raise InputError("Encoder.room: cameras.image_cloud must ascend, with as many views for each cloud")
+        views = _views(frames, n_views)
+        geometry = ViewGeometry(PixelRays.of(views), *self.depth.cost_volume.sweep_geometry(views))
+        scenes, steps = torch.stack([frames.cloud_scene, frames.cloud_step]).tolist()
+        return Room(CloudTable.make([size] * n_clouds, scenes, steps, frames.images.device), geometry)
+
+    def _encode_into(self, frames: Frames, room: Room) -> Particles:
+        n_views, places = len(frames.cameras) // len(room.clouds), Places.of(frames, room)
+        part = self._predict(_views(frames, n_views, room.geometry), frames.origin[_scene_of_image(frames)])
+        (cu_rows, cloud_scene, cloud_step), known = room.clouds.tensors, room.clouds
+        fields = {}
+        for name in PixelParticles.__dataclass_fields__:
+            values = getattr(part, name)
+            if values is not None:
+                values = _Kept.apply(values.flatten(0, 1), places.pixel, places.row)
+                nothing = torch.eye(1, 4, dtype=values.dtype, device=values.device) if name == "quats" else 0
+                fields[name] = torch.where(places.is_one.reshape(-1, *[1] * (values.dim() - 1)), values, nothing)
+        activity = torch.full_like(places.pixel, DYNAMIC, dtype=torch.uint8)
+        if frames.dynamic is not None:
+            activity.masked_fill_(~frames.dynamic.flatten()[places.pixel], FROZEN)
+        activity.masked_fill_(~places.is_one, ASLEEP)
+        return Particles(
+            **fields,
+            cu_rows=cu_rows,
+            cloud_scene=cloud_scene,
+            cloud_step=cloud_step,
+            activity=activity,
+            origin=frames.origin,
+            world_offset=frames.world_offset,
+            known=known,
+        )
+
+    def _encode(self, frames: Frames) -> Particles:
+        n_clouds = frames.cloud_scene.shape[0]
+        image_cloud = frames.cameras.image_cloud
+        n_views = torch.bincount(image_cloud, minlength=n_clouds)
+        order = torch.argsort(image_cloud, stable=True)
+        parts, images_of_parts = [], []
+        for count in n_views.unique().tolist():
+            if count > 0:
+                images = order[n_views[image_cloud[order]] == count]
+                parts.append(self._encode_images(frames, images, count))
+                images_of_parts.append(images)
+        return self._assemble(frames, parts, images_of_parts, order, n_views)
+
+    def _encode_images(self, frames: Frames, images: Tensor, n_views: int) -> PixelParticles:
+        """Images of clouds with ``n_views`` views each, cloud by cloud."""
+        chosen = dataclasses.replace(frames, images=frames.images[images], cameras=frames.cameras.select(images))
+        return self._predict(_views(chosen, n_views), frames.origin[_scene_of_image(chosen)])
+
+    def _predict(self, views: Views, origin: Tensor) -> PixelParticles:
+        """origin: [I, 3], of the scene that each image shows."""
+        cnn_features = self.cnn(views.images)
+        view_features = self.transformer(cnn_features.unflatten(0, (-1, views.n_views))).flatten(0, 1)
+        depth = self.depth(view_features, cnn_features, views)
+        return self.heads(depth, views, origin * 0 if self.config.quirks.world_moments else origin)
+
+    def _assemble(
+        self, frames: Frames, parts: list[PixelParticles], images_of_parts: list[Tensor], order: Tensor, n_views: Tensor
+    ) -> Particles:
+        """Puts the images of all parts in the order of clouds and drops masked pixels."""
+        device, n_pixels = frames.images.device, frames.images.shape[2] * frames.images.shape[3]
+        place = None
+        if len(parts) > 1:
+            place = torch.empty_like(order)
+            place[torch.cat(images_of_parts)] = torch.arange(order.shape[0], device=device)
+        kept, kept_rows, row_of_pixel = None, None, None
+        if frames.masks is not None:
+            kept = frames.masks[order].flatten()
+            kept_rows = kept.nonzero()[:, 0]
+            row_of_pixel = torch.where(kept, kept.cumsum(0) - 1, kept_rows.shape[0])
+
+        def rows(name: str) -> Tensor | None:
+            values = [getattr(part, name) for part in parts]
+            if any(value is None for value in values):
+                return None
+            joined = (values[0] if place is None else torch.cat(values)[place[order]]).flatten(0, 1)
+            return joined if kept is None else _Kept.apply(joined, kept_rows, row_of_pixel)
+
+        if frames.masks is None:
+            per_image = torch.full_like(order, n_pixels)
+        else:
+            per_image = frames.masks[order].flatten(1).sum(1, dtype=torch.int64)
+        per_cloud = torch.zeros_like(n_views).index_add_(0, frames.cameras.image_cloud[order], per_image)
+        cu_rows = torch.zeros(n_views.shape[0] + 1, dtype=torch.int64, device=device)
+        cu_rows[1:] = per_cloud.cumsum(0)
+        if frames.dynamic is None:
+            activity = torch.full((order.shape[0] * n_pixels,), DYNAMIC, dtype=torch.uint8, device=device)
+        else:
+            activity = torch.where(frames.dynamic[order].flatten(), DYNAMIC, FROZEN).to(torch.uint8)
+        return Particles(
+            **{name: rows(name) for name in PixelParticles.__dataclass_fields__},
+            cu_rows=cu_rows,
+            cloud_scene=frames.cloud_scene,
+            cloud_step=frames.cloud_step,
+            activity=activity if kept is None else activity[kept_rows],
+            origin=frames.origin,
+            world_offset=frames.world_offset,
+        )
+
+
+def _views(frames: Frames, n_views: int, geometry: ViewGeometry | None = None) -> Views:
+    cameras, images = frames.cameras, frames.images.contiguous(memory_format=torch.channels_last)
+    Ks, viewmats = cameras.Ks.double(), cameras.viewmats.double()
+    return Views(images, Ks, viewmats, cameras.near, cameras.far, n_views, geometry)
+
+
+def _scene_of_image(frames: Frames) -> Tensor:
+    return frames.cloud_scene[frames.cameras.image_cloud]
+
+
+class _Kept(torch.autograd.Function):
+    """Some rows of x, each once. The gradient takes rows too; torch would sort them and add them to zeros.
+
+    rows: which, int64. place: of each row of x its place among ``rows``, or their number.
+    """
+
+    @staticmethod
+    def forward(ctx, x: Tensor, rows: Tensor, place: Tensor) -> Tensor:
+        ctx.save_for_backward(place)
+        return x.index_select(0, rows)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:
+        (place,) = ctx.saved_tensors
+        return torch.cat([grad, grad.new_zeros(1, *grad.shape[1:])]).index_select(0, place), None, None

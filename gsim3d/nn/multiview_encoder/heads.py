@@ -1,0 +1,153 @@
+"""From depth and features of pixels to particles in the world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from gsim3d.math.rotations import unit_quats
+from gsim3d.math.spherical_harmonics import degree_damping, turn_predicted_harmonics
+from gsim3d.nn.layers import widened
+from gsim3d.nn.multiview_encoder import camera_frame
+from gsim3d.nn.multiview_encoder.config import EncoderConfig
+from gsim3d.nn.multiview_encoder.depth import Depth, Views
+from gsim3d.nn.multiview_encoder.layout import for_convolution
+
+
+@dataclass(frozen=True)
+class PixelRays:
+    """Where pixels look. centers [I, 3] and rotations [I, 3, 3] (camera-to-world) of the cameras, world frame;
+    inverse_Ks [I, 3, 3]. Made in float64."""
+
+    centers: Tensor
+    rotations: Tensor
+    inverse_Ks: Tensor
+
+    @classmethod
+    def of(cls, views: Views) -> PixelRays:
+        poses = torch.linalg.inv(views.viewmats)
+        return cls(poses[:, :3, 3], poses[:, :3, :3], torch.linalg.inv(views.Ks))
+
+    def directions(self, height: int, width: int, offset: Tensor) -> Tensor:
+        """[I, 3, H, W] world directions of z-depth 1 through pixel centres + ``offset`` [I or 1, 2, H, W] pixels."""
+        v, u = torch.meshgrid(
+            torch.arange(height, device=offset.device) + 0.5,
+            torch.arange(width, device=offset.device) + 0.5,
+            indexing="ij",
+        )
+        x, y = (offset + torch.stack([u, v]).to(offset.dtype)).split(1, 1)
+        to_world = (self.rotations @ self.inverse_Ks).to(offset.dtype)[:, :, :, None, None]
+        return to_world[:, :, 0] * x + to_world[:, :, 1] * y + to_world[:, :, 2]
+
+
+def unit_vectors(x: Tensor) -> Tensor:
+    """[I, 3, H, W], along axis 1. (Written out: torch's norm over that axis is slow on the CPU.)"""
+    return x * (x * x).sum(1, keepdim=True).rsqrt()
+
+
+def pluecker(centers: Tensor, directions: Tensor) -> Tensor:
+    """[I, 3] and [I, 3, H, W] -> [I, 6, H, W]: unit direction and moment, the same for every point of a ray."""
+    unit = unit_vectors(directions)
+    origin = centers.to(unit.dtype)[:, :, None, None].expand_as(unit)
+    return torch.cat([unit, torch.linalg.cross(origin, unit, dim=1)], 1)
+
+
+class Conditioning(nn.Module):
+    """Scales and shifts features by what depends on the view: y = x (1 + softplus(scale)) + shift."""
+
+    def __init__(self, hidden: int, dim: int):
+        super().__init__()
+        self.net = nn.Sequential(nn.Conv2d(10, hidden, 3, 1, 1), nn.GELU(), nn.Conv2d(hidden, 2 * dim, 3, 1, 1))
+
+    def forward(self, x: Tensor, depth: Tensor, opacity_logit: Tensor, raw_offset: Tensor, rays: Tensor) -> Tensor:
+        """x [I, F, H, W]; depth and opacity_logit [I, 1, H, W]; raw_offset [I, 2, H, W]; rays [I, 6, H, W]."""
+        seen = for_convolution(torch.cat([depth, opacity_logit, raw_offset, rays], 1))
+        scale, shift = self.net(seen).chunk(2, 1)
+        return x * (1 + F.softplus(scale)) + shift
+
+
+@dataclass(frozen=True)
+class PixelParticles:
+    """One particle a pixel, [I, H * W, .]; pixel (u, v) is row v * W + u. Fields as in Particles."""
+
+    means: Tensor
+    opacities: Tensor
+    dynamic_latents: Tensor
+    static_latents: Tensor
+    quats: Tensor | None = None
+    scales: Tensor | None = None
+    sh: Tensor | None = None
+
+
+class ParticleHeads(nn.Module):
+    """Depth and features of pixels -> particles."""
+
+    def __init__(self, config: EncoderConfig):
+        super().__init__()
+        self.config = config
+        dim = config.head_dim
+        n_harmonics = (config.sh_degree + 1) ** 2
+        n_raw = 2 + (3 + 4 + 3 * n_harmonics if config.explicit else 0)
+        self.to_gaussians = nn.Sequential(
+            nn.Conv2d(dim, 2 * n_raw, 3, 1, 1), nn.GELU(), nn.Conv2d(2 * n_raw, n_raw, 3, 1, 1)
+        )
+        n_latents = config.dynamic_dim + config.static_dim
+        self.conditioning = Conditioning(config.condition_dim, dim) if n_latents else None
+        self.to_latents = nn.Conv2d(dim, n_latents, 3, 1, 1) if n_latents else None
+
+    def forward(self, depth: Depth, views: Views, origin: Tensor) -> PixelParticles:
+        """origin: [I, 3] world point from which the moments of viewing rays are taken."""
+        geometry = PixelRays.of(views) if views.geometry is None else views.geometry.rays
+        raw = widened(self.to_gaussians(depth.features))
+        raw_offset = raw[:, :2]
+        means = geometry.centers.to(raw.dtype)[:, :, None, None] + depth.depth * self._rays(geometry, raw_offset)
+        latents = self._latents(depth, raw_offset, geometry, geometry.centers - origin)
+        dynamic, static = latents.split([self.config.dynamic_dim, self.config.static_dim], -1)
+        explicit = explicit_gaussians(raw[:, 2:], depth.depth, geometry, self.config) if self.config.explicit else {}
+        return PixelParticles(
+            means=_rows(means),
+            opacities=_rows(depth.opacity_logit.sigmoid())[..., 0],
+            dynamic_latents=dynamic,
+            static_latents=static,
+            **explicit,
+        )
+
+    def _latents(self, depth: Depth, raw_offset: Tensor, geometry: PixelRays, centers: Tensor) -> Tensor:
+        n_images, _, height, width = depth.depth.shape
+        if self.to_latents is None:
+            return depth.depth.new_zeros(n_images, height * width, 0)
+        central = geometry.directions(height, width, raw_offset.new_zeros(1, 2, height, width))
+        rays = pluecker(centers, central)
+        features = self.conditioning(depth.features, depth.depth, depth.opacity_logit, raw_offset, rays)
+        return _rows(widened(self.to_latents(features)))
+
+    def _rays(self, geometry: PixelRays, raw_offset: Tensor) -> Tensor:
+        directions = geometry.directions(*raw_offset.shape[-2:], raw_offset.sigmoid() - 0.5)
+        return unit_vectors(directions) if self.config.quirks.ray_depth else directions
+
+
+def _rows(maps: Tensor) -> Tensor:
+    """[I, C, H, W] -> [I, H * W, C]."""
+    return maps.flatten(2).transpose(1, 2)
+
+
+def explicit_gaussians(raw: Tensor, depth: Tensor, geometry: PixelRays, config: EncoderConfig) -> dict[str, Tensor]:
+    """quats, scales and sh of the explicit variant, predicted in the camera frame and turned into the world."""
+    n_images = raw.shape[0]
+    raw_scales, raw_quats, raw_sh = _rows(raw).split([3, 4, raw.shape[1] - 7], -1)
+    smallest, largest = config.scale_range
+    pixel_size = geometry.inverse_Ks[:, :2, :2].sum((1, 2)).to(raw.dtype)[:, None, None]
+    scales = (smallest + (largest - smallest) * raw_scales.sigmoid()) * (_rows(depth) * 0.1 * pixel_size)
+    rotations = geometry.rotations.to(raw.dtype)
+    turn = camera_frame.rotation_to_quat(rotations)[:, None]
+    quats = camera_frame.quat_multiply(turn, unit_quats(raw_quats.roll(1, -1)))  # raw: real part last
+    quats = camera_frame.with_positive_largest(quats)  # as those that the dynamics writes and reads
+    damping = degree_damping(config.sh_degree, raw)
+    in_camera = raw_sh.reshape(n_images, -1, 3, damping.shape[0]) * damping
+    each = torch.eye(len(damping), dtype=geometry.rotations.dtype, device=raw.device).repeat(n_images, 1, 1)
+    turn_sh = turn_predicted_harmonics(each, geometry.rotations, config.quirks)
+    turned = torch.einsum("ikl,incl->inkc", turn_sh.to(raw.dtype), in_camera)
+    return {"quats": quats, "scales": scales, "sh": turned}

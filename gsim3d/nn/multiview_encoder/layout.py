@@ -1,0 +1,51 @@
+"""Where a GPU wants feature maps in memory: one pass takes them there, in the precision in which they are read.
+
+Its convolutions read the channels of a pixel side by side, its group norms the pixels of a channel. Left to themselves,
+both copy what lies otherwise, beside every change of precision, and again in the backward pass.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from gsim3d.nn.layers import product_dtype
+
+
+def for_convolution(x: Tensor) -> Tensor:
+    """``x`` [N, C, H, W] as a convolution reads it; on the CPU as it is."""
+    return _relaid(x, product_dtype(x), torch.channels_last) if _matters(x) else x
+
+
+def by_pixel(x: Tensor) -> Tensor:
+    """``x`` [N, C, H, W] as convolutions on a GPU write it, in its own precision; on the CPU as it is."""
+    return _relaid(x, x.dtype, torch.channels_last) if _matters(x) else x
+
+
+class GroupNorm(nn.GroupNorm):
+    """torch's."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(_relaid(x, self.weight.dtype, torch.contiguous_format) if _matters(x) else x)
+
+
+def _matters(x: Tensor) -> bool:
+    return x.is_cuda and not torch.compiler.is_compiling()
+
+
+def _relaid(x: Tensor, dtype: torch.dtype, memory_format: torch.memory_format) -> Tensor:
+    return _Relaid.apply(x, dtype, memory_format)
+
+
+class _Relaid(torch.autograd.Function):
+    """``x.to(dtype, memory_format=...)``, whose gradient comes back as ``x`` lies in memory."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, dtype: torch.dtype, memory_format: torch.memory_format) -> Tensor:
+        by_pixel = x.dim() == 4 and x.is_contiguous(memory_format=torch.channels_last)
+        ctx.dtype, ctx.format = x.dtype, torch.channels_last if by_pixel else torch.contiguous_format
+        return x.to(dtype, memory_format=memory_format)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:
+        return grad.to(ctx.dtype, memory_format=ctx.format), None, None

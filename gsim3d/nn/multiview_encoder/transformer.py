@@ -1,0 +1,190 @@
+"""Attention inside each view and between the views of a cloud, in shifted windows."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from gsim3d.compat.quirks import Quirks
+from gsim3d.nn.layers import RowLayerNorm, widened
+from gsim3d.nn.multiview_encoder.config import EncoderConfig
+
+MASKED = -100.0  # added to a score that must not count; finite, so that a row of masked keys stays finite
+
+
+def sine_position_code(height: int, width: int, channels: int, like: Tensor) -> Tensor:
+    """[height * width, channels]: the first half of the channels encodes the row, the second the column."""
+    half = channels // 2
+    j = torch.arange(half, device=like.device)
+    wavelength = 10000.0 ** (2 * (j // 2) / half)
+
+    def encode(n: int) -> Tensor:
+        angle = torch.arange(1, n + 1, device=like.device)[:, None] / (n + 1e-6) * (2 * math.pi) / wavelength
+        return torch.where(j % 2 == 0, angle.sin(), angle.cos())
+
+    rows = encode(height)[:, None].expand(height, width, half)
+    cols = encode(width)[None].expand(height, width, half)
+    return torch.cat([rows, cols], -1).reshape(height * width, channels).to(like.dtype)
+
+
+class Windows:
+    """Cuts feature maps [n, V, h, w, C] into K x K windows and back; shifted windows wrap around the border."""
+
+    def __init__(self, height: int, width: int, split: int):
+        self.height, self.width, self.split = height, width, split
+        self.rows, self.cols = height // split, width // split
+        self.shift = (self.rows // 2, self.cols // 2)
+
+    def cut(self, x: Tensor, shifted: bool) -> Tensor:
+        """[n, V, h, w, C] -> [n * V, K * K, rows * cols, C]."""
+        k = self.split
+        if shifted:
+            x = x.roll((-self.shift[0], -self.shift[1]), (2, 3))
+        x = x.reshape(-1, k, self.rows, k, self.cols, x.shape[-1]).transpose(2, 3)
+        return x.reshape(-1, k * k, self.rows * self.cols, x.shape[-1])
+
+    def join(self, x: Tensor, n_views: int, shifted: bool) -> Tensor:
+        """The way back."""
+        k = self.split
+        x = x.reshape(-1, k, k, self.rows, self.cols, x.shape[-1]).transpose(2, 3)
+        x = x.reshape(-1, n_views, self.height, self.width, x.shape[-1])
+        return x.roll(self.shift, (2, 3)) if shifted else x
+
+    def shift_mask(self, like: Tensor) -> Tensor:
+        """[K * K, L, L] with L = rows * cols: MASKED between pixels that only wrapping around made neighbours."""
+
+        def bands(n: int, size: int, shift: int) -> Tensor:
+            i = torch.arange(n, device=like.device)
+            return (i >= n - size).long() + (i >= n - shift).long()
+
+        row_band = bands(self.height, self.rows, self.shift[0])
+        col_band = bands(self.width, self.cols, self.shift[1])
+        labels = self.cut((3 * row_band[:, None] + col_band)[None, None, ..., None], False)[0, ..., 0]
+        return (labels[:, :, None] != labels[:, None, :]).to(like.dtype) * MASKED
+
+    def cross_mask(self, like: Tensor, n_views: int, quirks: Quirks) -> Tensor:
+        """[1 or V, K * K, L, (V - 1) * L], between the pixels of a view and those of the others, in the order of
+        :class:`OtherViews`, in shifted windows."""
+        mask = self.shift_mask(like)
+        if not quirks.tiled_shift_mask:
+            return mask.repeat(1, 1, n_views - 1)[None]
+        view, position = torch.arange(n_views, device=like.device), torch.arange(mask.shape[1], device=like.device)
+        other = (view[:, None] + view[1:]) % n_views
+        rank = other - (other > view[:, None]).long()  # of a key view among the others of a query view
+        column = (position * (n_views - 1) + rank[..., None]) % len(position)  # [V, V - 1, L]
+        return mask[:, :, column].permute(2, 0, 1, 3, 4).flatten(3)
+
+
+class OtherViews(torch.autograd.Function):
+    """[n * V, K * K, L, C] -> [n * V, K * K, (V - 1) * L, C]: what the other views show in the same window, from the
+    next one on. Its gradient is a plain sum, in one order."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, n_views: int) -> Tensor:
+        ctx.n_views = n_views
+        n_images, n_windows, length, dim = x.shape
+        image, window, offset = _grid(n_images, n_windows, range(1, n_views), x)
+        rows = _turned(image, offset, n_views) * n_windows + window
+        return x.reshape(-1, length * dim)[rows.flatten()].view(n_images, n_windows, -1, dim)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
+        n_views = ctx.n_views
+        n_images, n_windows, length, dim = grad.shape
+        image, window, offset = _grid(n_images, n_windows, range(1, n_views), grad)
+        rows = (_turned(image, -offset, n_views) * n_windows + window) * (n_views - 1) + offset - 1
+        length //= n_views - 1
+        shown = grad.reshape(-1, length * dim)[rows.flatten()]
+        return shown.view(n_images, n_windows, n_views - 1, length, dim).sum(2), None
+
+
+def _grid(n_images: int, n_windows: int, offsets: range, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Numbers of images, windows and offsets, to be broadcast."""
+    image, window = torch.arange(n_images, device=like.device), torch.arange(n_windows, device=like.device)
+    offset = torch.arange(offsets.start, offsets.stop, device=like.device)
+    return image[:, None, None], window[:, None], offset
+
+
+def _turned(image: Tensor, offset: Tensor, n_views: int) -> Tensor:
+    """The image that is ``offset`` views behind ``image`` in its cloud."""
+    view = image % n_views
+    return image - view + (view + offset) % n_views
+
+
+class Attention(nn.Module):
+    """One head of attention whose normalised message joins the residual stream, through an MLP where one is given."""
+
+    def __init__(self, dim: int, mlp_dim: int = 0):
+        super().__init__()
+        self.q_proj = nn.Linear(dim, dim, bias=False)
+        self.k_proj = nn.Linear(dim, dim, bias=False)
+        self.v_proj = nn.Linear(dim, dim, bias=False)
+        self.merge = nn.Linear(dim, dim, bias=False)
+        self.norm1 = RowLayerNorm(dim)
+        if mlp_dim:
+            self.mlp = nn.Sequential(
+                nn.Linear(2 * dim, mlp_dim, bias=False), nn.GELU(), nn.Linear(mlp_dim, dim, bias=False)
+            )
+            self.norm2 = RowLayerNorm(dim)
+        else:
+            self.mlp = None
+
+    def forward(self, x: Tensor, source: Tensor, attend) -> Tensor:
+        """x asks, source answers; attend(q, k, v) knows who sees whom."""
+        message = self.merge(attend(self.q_proj(x), self.k_proj(source), self.v_proj(source))).flatten(0, -2)
+        rows = x.flatten(0, -2)
+        if self.mlp is None:
+            return self.norm1(message, rows).view(x.shape)
+        message = self.norm1(message)
+        message = self.mlp(torch.cat([rows.to(message.dtype), message], -1))
+        return self.norm2(message, rows).view(x.shape)
+
+
+class Layer(nn.Module):
+    def __init__(self, dim: int, mlp_dim: int):
+        super().__init__()
+        self.self_attn = Attention(dim)
+        self.cross_attn_ffn = Attention(dim, mlp_dim)
+
+
+class MultiViewTransformer(nn.Module):
+    """[n, V, C, h, w] features of n clouds with V views each -> the same shape, informed by all views."""
+
+    def __init__(self, config: EncoderConfig):
+        super().__init__()
+        dim, self.split, self.quirks = config.feature_dim, config.window_split, config.quirks
+        mlp_dim = 2 * dim * config.transformer_mlp_ratio
+        self.layers = nn.ModuleList(Layer(dim, mlp_dim) for _ in range(config.transformer_layers))
+        for parameter in self.parameters():
+            if parameter.dim() > 1:
+                nn.init.xavier_uniform_(parameter)
+
+    def forward(self, x: Tensor) -> Tensor:
+        n, n_views, dim, height, width = x.shape
+        windows = Windows(height, width, self.split)
+        code = sine_position_code(windows.rows, windows.cols, dim, x).reshape(windows.rows, windows.cols, dim)
+        x = widened(x.permute(0, 1, 3, 4, 2) + code.repeat(self.split, self.split, 1))
+        for i, layer in enumerate(self.layers):
+            shifted = i % 2 == 1 and self.split > 1
+            within = windows.shift_mask(x)[None] if shifted else None
+
+            def attend_self(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+                q, k, v = (windows.cut(t, shifted) for t in (q, k, v))
+                return windows.join(F.scaled_dot_product_attention(q, k, v, within), n_views, shifted)
+
+            def attend_others(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+                if n_views == 1:
+                    return torch.zeros_like(v)
+                mask = windows.cross_mask(x, n_views, self.quirks) if shifted else None
+                if mask is not None and mask.shape[0] > 1:
+                    mask = mask.repeat(n, 1, 1, 1)
+                q, k, v = (windows.cut(t, shifted) for t in (q, k, v))
+                k, v = (OtherViews.apply(t, n_views) for t in (k, v))
+                return windows.join(F.scaled_dot_product_attention(q, k, v, mask), n_views, shifted)
+
+            # Other views are read as they entered the layer, before they looked at themselves.
+            x = layer.cross_attn_ffn(layer.self_attn(x, x, attend_self), x, attend_others)
+        return x.permute(0, 1, 4, 2, 3)

@@ -1,0 +1,1 @@
+"""Policies for invalid values, and the validation of frames and particles."""

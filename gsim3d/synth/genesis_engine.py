@@ -1,0 +1,134 @@
+"""Motion by Genesis, as the paper made its data: MPM for soft bodies, PBD for cloth; needs the package genesis-world.
+
+Bodies are clouds of particles that carry the surface. Bits repeat on one machine and device only as far as Genesis
+repeats them, which its GPU atomics do not promise.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.synth.carriers import Cloud, Sheet, grid_faces
+from gsim3d.synth.stage import GRAVITY, Cloth, SoftBody, Stage, Unstable
+
+TIMESTEP, SUBSTEPS = 1e-3, 20  # seconds, and parts of it: the paper's
+GRID_DENSITY = 64  # cells a metre
+POISSON = 0.2
+GROUND_RADIUS, GROUND_DEPTH = 2.0, 0.1
+DOMAIN = 2.0  # metres along x and y, and above the highest point of a body, that particles may reach
+FIX_DISTANCE = 1e-3  # metres between a corner of the cloth and its particle
+
+
+def simulate(stage: Stage, n_frames: int, fps: float, max_timestep: float) -> list[Cloud | Sheet]:
+    """What carries each body at every frame, and the cloth last; ``max_timestep`` is not used, the paper's is.
+
+    Bodies must be soft.
+
+    Raises: Unstable when particles are not finite.
+    """
+    import genesis as gs
+
+    if not getattr(gs, "_initialized", False):
+        gs.init(logging_level="warning", seed=0)
+    with tempfile.TemporaryDirectory() as folder:
+        scene, bodies, cloth = _build(gs, stage, Path(folder))
+    for entity, body in zip(bodies, stage.bodies):
+        places = _places(entity)
+        entity.set_velocity((body.velocity + np.cross(body.spin, places - places.mean(0))).astype(np.float32))
+    order = None if cloth is None else _pin(cloth, stage.cloth)
+    frames = [[_places(entity) for entity in bodies]]
+    sheets = [] if cloth is None else [_places(cloth)[order]]
+    n_steps = 0
+    for frame in range(1, n_frames):
+        wanted = round(frame / (fps * TIMESTEP))
+        for _ in range(wanted - n_steps):
+            scene.step()
+        n_steps = wanted
+        frames.append([_places(entity) for entity in bodies])
+        if cloth is not None:
+            sheets.append(_places(cloth)[order])
+    carriers = [Cloud(np.stack(nodes)) for nodes in zip(*frames)]
+    if cloth is not None:
+        carriers.append(Sheet(np.stack(sheets).reshape(n_frames, stage.cloth.count, stage.cloth.count, 3)))
+    if not all(np.isfinite(carrier.nodes).all() for carrier in carriers):
+        raise Unstable("the solver gave up")
+    return carriers
+
+
+def _build(gs, stage: Stage, folder: Path):
+    """Scene, soft entities and cloth entity (or None), built."""
+    top = max(float(body.vertices[:, 2].max()) for body in stage.bodies)
+    low = stage.ground if stage.ground is not None else -DOMAIN
+    lower, upper = (-DOMAIN, -DOMAIN, low - GROUND_DEPTH), (DOMAIN, DOMAIN, top + DOMAIN)
+    scene = gs.Scene(
+        sim_options=gs.options.SimOptions(dt=TIMESTEP, substeps=SUBSTEPS, gravity=(0.0, 0.0, -GRAVITY)),
+        mpm_options=gs.options.MPMOptions(lower_bound=lower, upper_bound=upper, grid_density=GRID_DENSITY),
+        pbd_options=gs.options.PBDOptions(lower_bound=lower, upper_bound=upper),
+        show_viewer=False,
+    )
+    if stage.ground is not None:
+        scene.add_entity(
+            material=gs.materials.Rigid(needs_coup=True, coup_friction=0.5),
+            morph=gs.morphs.Cylinder(
+                pos=(0.0, 0.0, stage.ground - GROUND_DEPTH / 2), radius=GROUND_RADIUS, height=GROUND_DEPTH, fixed=True
+            ),
+        )
+    bodies = [_add_soft(gs, scene, body, folder / f"body_{index}.obj") for index, body in enumerate(stage.bodies)]
+    cloth = None if stage.cloth is None else _add_cloth(gs, scene, stage.cloth, folder / "cloth.obj")
+    scene.build()
+    return scene, bodies, cloth
+
+
+def _add_soft(gs, scene, body: SoftBody, path: Path):
+    _write_obj(path, body.vertices, body.faces)
+    material, volume = body.material, _volume(body.vertices, body.faces)
+    common = {"E": material.young, "nu": POISSON, "rho": body.mass / volume, "sampler": "regular"}
+    if material.yield_strain:
+        shear = material.young / (2 * (1 + POISSON))
+        chosen = gs.materials.MPM.ElastoPlastic(von_mises_yield_stress=2 * shear * material.yield_strain, **common)
+    else:
+        chosen = gs.materials.MPM.Elastic(**common)
+    return scene.add_entity(material=chosen, morph=gs.morphs.Mesh(file=str(path), file_meshes_are_zup=True))
+
+
+def _add_cloth(gs, scene, cloth: Cloth, path: Path):
+    _write_obj(path, _corners_of(cloth).reshape(-1, 3), grid_faces(cloth.count))
+    return scene.add_entity(
+        material=gs.materials.PBD.Cloth(rho=cloth.mass / cloth.width**2),
+        morph=gs.morphs.Mesh(file=str(path), file_meshes_are_zup=True),
+    )
+
+
+def _corners_of(cloth: Cloth) -> np.ndarray:
+    part = cloth.width * (np.arange(cloth.count) / (cloth.count - 1) - 0.5)
+    return np.stack(np.meshgrid(part, part, [cloth.height], indexing="ij"), -1)[:, :, 0]
+
+
+def _pin(entity, cloth: Cloth) -> np.ndarray:
+    """Fixes the four corners; returns the particle of every node of the grid, row by row."""
+    nodes, places = _corners_of(cloth).reshape(-1, 3), _places(entity)
+    distance = np.linalg.norm(nodes[:, None] - places[None], axis=-1)
+    order = distance.argmin(1)
+    if distance.min(1).max() > FIX_DISTANCE:
+        raise RuntimeError("Genesis has made other particles of the cloth than the vertices of its mesh")
+    n = cloth.count
+    entity.fix_particles(order[[0, n - 1, n * (n - 1), n * n - 1]])
+    return order
+
+
+def _places(entity) -> np.ndarray:
+    return entity.get_particles_pos().cpu().numpy().astype(np.float64)
+
+
+def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return abs(float((a * np.cross(b, c)).sum())) / 6
+
+
+def _write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+    path.write_text("\n".join(lines) + "\n")

@@ -1,0 +1,76 @@
+"""The sets that models are scored on: trajectories with seeds of their own, which no training sees."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsim3d.data.recording import read_json
+from gsim3d.errors import InputError
+from gsim3d.synth.world import TRAIN
+from gsim3d.synth.worlds import TEST_SEED, VALIDATION_SEED, WORLDS
+
+# name -> seed and number of trajectories. Models are chosen on the first; the second is scored once a release.
+SETS = {"validation": (VALIDATION_SEED, 24), "test": (TEST_SEED, 56)}
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What `gsim3d generate` says of a scene. subset: of the held-out kinds of scenes; None: as in training."""
+
+    world: str
+    subset: str | None
+    seed: int
+    body: str
+
+    @property
+    def set_name(self) -> str | None:
+        """Of :data:`SETS`."""
+        return next((name for name, (seed, _) in SETS.items() if seed == self.seed), None)
+
+
+def origin_of(folder: Path) -> Origin | None:
+    """Of the scene in ``folder``; None where `gsim3d generate` did not make it."""
+    try:
+        metadata = read_json(folder / "metadata.json")
+    except (InputError, OSError):
+        return None
+    world, seed, subset = (metadata.get(key) for key in ("world", "seed", "subset"))
+    if not isinstance(world, str) or world not in WORLDS or not isinstance(seed, int):
+        return None
+    return Origin(world, None if subset == TRAIN else str(subset), seed, str(metadata.get("object")))
+
+
+def set_of(folders: Sequence[Path]) -> dict | None:
+    """Which generated set the scenes are of; None: of several, or not of `gsim3d generate`.
+
+    Returns:
+        name ("validation", "test" or None), world, subset, seed, bodies (number of trajectories of each).
+    """
+    first, bodies = None, Counter()
+    for folder in folders:
+        if (origin := origin_of(folder)) is None:
+            return None
+        first = first or origin
+        if (origin.world, origin.subset, origin.seed) != (first.world, first.subset, first.seed):
+            return None
+        bodies[origin.body] += 1
+    if first is None:
+        return None
+    found = {"name": first.set_name, "world": first.world, "subset": first.subset, "seed": first.seed}
+    return {**found, "bodies": dict(sorted(bodies.items()))}
+
+
+def describe_set(found: dict) -> str:
+    """One sentence on what :func:`set_of` returned."""
+    n_trajectories, counts = sum(found["bodies"].values()), sorted(set(found["bodies"].values()))
+    each = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+    of = f"{found['world']} ({found['subset']})" if found["subset"] else found["world"]
+    text = f"{n_trajectories} trajectories of {of} with seed {found['seed']}, {each} a body"
+    if found["name"] is None:
+        return f"Neither the validation nor the test set: {text}."
+    whole = SETS[found["name"]][1]
+    part = "" if n_trajectories == whole or found["subset"] else f"; all of it are {whole}"
+    return f"{found['name'].capitalize()} set: {text}{part}."

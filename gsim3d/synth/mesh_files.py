@@ -1,0 +1,283 @@
+"""Triangles of mesh files and their colours: every object, every material, or an error that says what is not read."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.errors import InputError
+from gsim3d.io.files import read_file
+
+SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+MAX_MESH, MAX_TEXTURE = 1 << 28, 1 << 28  # bytes of a file
+SLOTS = 3  # numbers a corner that a piece's colour needs at most
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Triangles of one material.
+
+    triangles: [F, 3, 3] positions.
+    corners: [F, 3, C], what is interpolated over a face and given to ``paint``; None with ``paint`` None: no colour.
+    paint: [N, C] -> colours [N, 3] in [0, 1].
+    """
+
+    triangles: np.ndarray
+    corners: np.ndarray | None = None
+    paint: Callable[[np.ndarray], np.ndarray] | None = None
+
+
+def read_pieces(path: Path) -> list[Piece]:
+    """All triangles of a mesh file, a piece for each material.
+
+    Raises:
+        InputError: the file cannot be read, or holds colours that are not read; the message says which.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"mesh {path}: files that end in {', '.join(SUFFIXES)} are read")
+    data = read_file(path, MAX_MESH)
+    pieces = _read_obj(path, data) if path.suffix.lower() == ".obj" else _read_other(path, data)
+    return [piece for piece in pieces if len(piece.triangles)]
+
+
+def texture_lookup(image: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Bilinear, repeating texture; v counts from the bottom row, as in .obj files."""
+    texels = image.astype(np.float64) / 255
+    height, width = texels.shape[:2]
+
+    def paint(uv):
+        x = (uv[:, 0] % 1) * width - 0.5
+        y = (1 - uv[:, 1] % 1) * height - 0.5
+        x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+        fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+        top = texels[y0 % height, x0 % width] * (1 - fx) + texels[y0 % height, (x0 + 1) % width] * fx
+        low = texels[(y0 + 1) % height, x0 % width] * (1 - fx) + texels[(y0 + 1) % height, (x0 + 1) % width] * fx
+        return top * (1 - fy) + low * fy
+
+    return paint
+
+
+def joined_paint(pieces: list[Piece]) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """Corners [F, 3, C] and the paint of all pieces together: a first number says which piece it is."""
+    if len(pieces) == 1:
+        return pieces[0].corners, pieces[0].paint
+    widths = [piece.corners.shape[2] for piece in pieces]
+    padded = [np.pad(piece.corners, ((0, 0), (0, 0), (1, SLOTS - w))) for piece, w in zip(pieces, widths, strict=True)]
+    corners = np.concatenate(padded)
+    corners[:, :, 0] = np.repeat(np.arange(len(pieces)), [len(piece.triangles) for piece in pieces])[:, None]
+
+    def paint(values):
+        number, colours = np.round(values[:, 0]).astype(np.int64), np.empty((len(values), 3))
+        for k in np.unique(number):
+            colours[number == k] = pieces[k].paint(values[number == k, 1 : 1 + widths[k]])
+        return colours
+
+    return corners, paint
+
+
+def _constant(triangles: np.ndarray, colour) -> Piece:
+    colour = np.clip(np.asarray(colour, dtype=np.float64)[:3], 0, 1)
+    return Piece(triangles, np.zeros((len(triangles), 3, 1)), lambda corners: np.tile(colour, (len(corners), 1)))
+
+
+def _image(data: bytes, what: str) -> np.ndarray:
+    """uint8 [H, W, 3]."""
+    from PIL import Image
+
+    try:
+        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+    except Exception as error:  # PIL raises whatever its decoders raise
+        raise InputError(f"{what} cannot be decoded: {' '.join(str(error).split())[:200]}") from None
+
+
+# ---- Wavefront .obj ----
+
+
+def _read_obj(path: Path, data: bytes) -> list[Piece]:
+    vertices, colours, uvs, libraries = [], [], [], []
+    faces: dict[str | None, list] = {}  # material -> corners of triangles: (vertex, uv or -1)
+    material = None
+    text = data.decode(errors="surrogateescape").replace("\\\n", " ").replace("\\\r\n", " ")
+    for number, line in enumerate(text.splitlines(), 1):
+        key, _, rest = line.strip().partition(" ")
+        words = rest.split("#")[0].split()
+        try:
+            if key == "v":
+                vertices.append([float(x) for x in words[:3]])
+                colours.append([float(x) for x in words[3:6]] if len(words) >= 6 else None)
+                if len(vertices[-1]) != 3:
+                    raise ValueError("a vertex needs three numbers")
+            elif key == "vt":
+                uvs.append([float(x) for x in (*words, "0")[:2]])
+            elif key == "f":
+                corners = [_corner(word, len(vertices), len(uvs)) for word in words]
+                fan = [(corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1)]
+                faces.setdefault(material, []).extend(fan)
+            elif key == "usemtl":
+                material = rest.strip()
+            elif key == "mtllib":
+                libraries.append(rest.strip())
+        except (ValueError, IndexError) as error:
+            raise InputError(f"mesh {path} cannot be read: line {number}: {str(error)[:100]}") from None
+    materials = _materials(path, libraries) if any(name is not None for name in faces) else {}
+    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+    has_colours = bool(colours) and all(colour is not None for colour in colours)
+    pieces = []
+    for name, found in faces.items():
+        index = np.array(found, dtype=np.int64)  # [F, 3, 2]
+        triangles = points[index[..., 0]]
+        if len(faces) == len(materials) == 1:
+            name = next(iter(materials))  # whatever it is called in the other file
+        if name is not None and name not in materials:
+            raise InputError(f"mesh {path}: material {name!r} stands in none of its material files: {libraries}")
+        colour = materials.get(name)
+        if isinstance(colour, np.ndarray) and colour.ndim == 3:
+            if (index[..., 1] < 0).any():
+                raise InputError(f"mesh {path}: faces of material {name!r} have a texture, but no coordinates in it")
+            pieces.append(Piece(triangles, np.array(uvs)[index[..., 1]], texture_lookup(colour)))
+        elif has_colours:
+            pieces.append(_vertex_colours(triangles, np.array(colours)[index[..., 0]], path))
+        elif colour is not None:
+            pieces.append(_constant(triangles, colour))
+        else:
+            pieces.append(Piece(triangles))
+    return pieces
+
+
+def _corner(word: str, n_vertices: int, n_uvs: int) -> tuple[int, int]:
+    """Rows of vertex and texture coordinate (-1: none) of "v/vt/vn"; negative numbers count back from the line."""
+    parts, rows = (word.split("/") + ["", ""])[:2], []
+    for part, count in zip(parts, (n_vertices, n_uvs), strict=True):
+        place = int(part) if part or not rows else 0
+        row = place - 1 if place > 0 else count + place
+        if not part:
+            row = -1
+        elif not 0 <= row < count:
+            raise ValueError(f"{word}: there are {count} before it")
+        rows.append(row)
+    return rows[0], rows[1]
+
+
+def _materials(path: Path, libraries: list[str]) -> dict[str, np.ndarray | None]:
+    """Name -> texture uint8 [H, W, 3], colour [3], or None where the material says neither."""
+    found: dict[str, np.ndarray | None] = {}
+    for library in libraries:
+        names = [library] if (path.parent / library).is_file() else library.split()
+        for name in names:
+            file = path.parent / name.replace("\\", "/")
+            if not file.is_file():
+                raise InputError(f"mesh {path}: its material file {name} is not beside it")
+            found |= _read_mtl(path, file)
+    return found
+
+
+def _read_mtl(path: Path, file: Path) -> dict[str, np.ndarray | None]:
+    found, name = {}, None
+    for line in read_file(file, MAX_MESH).decode(errors="surrogateescape").splitlines():
+        key, _, rest = line.strip().partition(" ")
+        rest = re.split(r"(?:^|\s)#", rest)[0]
+        key, words = key.lower(), rest.split()
+        if key == "newmtl":
+            name = rest.strip()
+            found[name] = None
+        elif key == "kd" and not (isinstance(found.get(name), np.ndarray) and found[name].ndim == 3):
+            try:
+                found[name] = np.array([float(word) for word in words] * (3 if len(words) == 1 else 1))
+            except ValueError:
+                found[name] = np.zeros(0)
+            if found[name].shape != (3,) or not np.isfinite(found[name]).all():
+                raise InputError(f"mesh {path}: Kd of material {name!r} must be three numbers; got {rest[:80]!r}")
+        elif key == "map_kd" and words:
+            texture = words[-1] if words[0].startswith("-") else rest.strip()
+            image = file.parent / texture.replace("\\", "/")
+            if not image.is_file():
+                raise InputError(f"mesh {path}: texture {texture} of material {name!r} is not beside {file.name}")
+            found[name] = _image(read_file(image, MAX_TEXTURE), f"mesh {path}: texture {texture}")
+    return found
+
+
+def _vertex_colours(triangles: np.ndarray, colours: np.ndarray, path: Path) -> Piece:
+    """Colours [F, 3, 3] from 0 to 1, or to 255 where any is above 1."""
+    if not (colours >= 0).all() or not (colours <= 255).all():
+        raise InputError(f"mesh {path}: colours of vertices must lie from 0 to 1, or to 255")
+    return Piece(triangles, colours / (255 if (colours > 1).any() else 1), lambda corners: corners)
+
+
+# ---- everything else, by trimesh ----
+
+
+def _read_other(path: Path, data: bytes) -> list[Piece]:
+    import trimesh
+
+    kind, start = path.suffix.lower(), data[:4096]
+    if kind == ".off" and _has_off_colours(data):
+        raise InputError(f"mesh {path} has colours, which are not read from OFF files: save it as PLY or OBJ")
+    if kind == ".stl" and b"COLOR=" in start[:80]:
+        raise InputError(f"mesh {path} has colours, which are not read from STL files: save it as PLY or OBJ")
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        placed = [(scene.graph[node][0], scene.geometry[scene.graph[node][1]]) for node in scene.graph.nodes_geometry]
+    except Exception as error:  # trimesh raises whatever its parsers raise
+        raise InputError(f"mesh {path} cannot be read: {' '.join(str(error).split())[:200]}") from error
+    pieces = [_of_trimesh(mesh, place, path) for place, mesh in placed if isinstance(mesh, trimesh.Trimesh)]
+    if kind == ".ply" and b"TextureFile" in start and any(piece.corners is None for piece in pieces):
+        raise InputError(f"mesh {path} names a texture that is not beside it, or has no coordinates in it")
+    return pieces
+
+
+def _has_off_colours(data: bytes) -> bool:
+    """Whether an OFF file is a COFF, or any face has numbers behind its corners."""
+    lines = [line.split(b"#")[0].split() for line in data.splitlines()]
+    lines = [words for words in lines if words]
+    if not lines or lines[0][0] != b"OFF":
+        return bool(lines) and b"C" in lines[0][0]
+    counts = lines[0][1:] or (lines[1] if len(lines) > 1 else [])
+    first = 1 if lines[0][1:] else 2
+    try:
+        n_vertices, n_faces = int(counts[0]), int(counts[1])
+        faces = lines[first + n_vertices : first + n_vertices + n_faces]
+        return any(len(words) > int(words[0]) + 1 for words in faces)
+    except (ValueError, IndexError):
+        return False
+
+
+def _of_trimesh(mesh, place: np.ndarray, path: Path) -> Piece:
+    """``mesh`` moved by the matrix ``place`` [4, 4]."""
+    faces, vertices = np.asarray(mesh.faces, dtype=np.int64), np.asarray(mesh.vertices, dtype=np.float64)
+    if not np.array_equal(place, np.eye(4)):
+        vertices = vertices @ place[:3, :3].T + place[:3, 3]
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise InputError(f"mesh {path} cannot be read: a face names a vertex that it does not have")
+    triangles = vertices[faces]
+    visual = mesh.visual
+    if visual.kind == "vertex":
+        return Piece(triangles, np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3][faces] / 255, lambda c: c)
+    if visual.kind == "face":
+        colours = np.asarray(visual.face_colors, dtype=np.float64)[:, None, :3].repeat(3, 1)
+        return Piece(triangles, colours / 255, lambda c: c)
+    if visual.kind != "texture":
+        return Piece(triangles)
+    material = visual.material
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    factor = getattr(material, "baseColorFactor", None)
+    factor = np.ones(3) if factor is None else np.asarray(factor, dtype=np.float64)[:3] / 255
+    colours = visual.vertex_attributes.get("color")
+    if image is not None:
+        if visual.uv is None:
+            raise InputError(f"mesh {path} has a texture, but no coordinates in it")
+        if colours is not None:
+            raise InputError(f"mesh {path} has a texture and colours of vertices on it; keep one of them")
+        lookup = texture_lookup(np.asarray(image.convert("RGB")))
+        return Piece(triangles, np.asarray(visual.uv, dtype=np.float64)[faces], lambda uv: factor * lookup(uv))
+    if colours is not None:
+        colours = np.asarray(colours)
+        scale = 255 if colours.dtype == np.uint8 else 65535 if colours.dtype == np.uint16 else 1
+        return Piece(triangles, factor * (colours[:, :3].astype(np.float64) / scale)[faces], lambda c: c)
+    if not hasattr(material, "baseColorFactor"):
+        factor = np.asarray(material.main_color, dtype=np.float64)[:3] / 255
+    return _constant(triangles, factor)

@@ -1,0 +1,173 @@
+"""Bodies from mesh files, with their textures, and the light meshes and convex pieces that collide."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.errors import InputError
+from gsim3d.synth.mesh_files import Piece, joined_paint, read_pieces
+from gsim3d.synth.shapes import PALETTE, PATTERNS, Body, normalise
+
+COLLISION_VERTICES = 300  # a mesh file is clustered to at most about so many vertices for contacts
+NEARLY_CONVEX = 0.06  # of the body's size: hollows that are no deeper are filled by the hull that collides
+SLAB_CELLS = 4  # along the longest side of a body's box; hollows of a quarter of the body stay hollow
+SLAB_THICKNESS = 0.04  # of the body's size
+
+
+def cluster(vertices: np.ndarray, faces: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
+    """Merges vertices that share a cell of a grid, the finest that leaves at most ``limit`` of them."""
+    for n_cells in range(64, 1, -2):
+        cells = np.floor((vertices + 0.5) * n_cells).astype(np.int64)
+        _, first, label = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        label = label.reshape(-1)
+        if len(first) <= limit:
+            break
+    count = np.bincount(label)
+    merged = np.stack([np.bincount(label, vertices[:, a]) / count for a in range(3)], 1)
+    light = label[faces]
+    proper = (light[:, 0] != light[:, 1]) & (light[:, 1] != light[:, 2]) & (light[:, 2] != light[:, 0])
+    light = light[proper]
+    used, light = np.unique(light, return_inverse=True)
+    return merged[used], light.reshape(-1, 3)
+
+
+def load_body(path: str | Path, up: str = "y", *, fill_holes: bool = False) -> Body:
+    """A body from a mesh file (:data:`gsim3d.synth.mesh_files.SUFFIXES`): all its objects, with their textures and
+    colours; a pattern where it has none.
+
+    Args:
+        path: mesh file; material files and textures that it names must lie beside it.
+        up: "y" (usual for .obj and .glb) or "z", the axis that points up in the file.
+        fill_holes: close each border of the surface by a fan of triangles around its middle.
+
+    Copies of a vertex along texture seams are merged by position; the surface must be closed then.
+
+    Raises InputError when the file cannot be read, holds no closed surface or a face twice, or colours are lost.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"mesh {path} is not a file")
+    pieces = read_pieces(path)
+    triangles = np.concatenate([piece.triangles for piece in pieces] or [np.zeros((0, 3, 3))])
+    if len(triangles) < 4 or not np.isfinite(triangles).all():
+        raise InputError(f"mesh {path} must be a closed surface with finite vertices; got {len(triangles)} faces")
+    if up == "y":
+        triangles = triangles[:, :, [0, 2, 1]] * [1, -1, 1]
+    centre, diameter = normalise(triangles.reshape(-1, 3))
+    if not diameter > 0:
+        raise InputError(f"mesh {path} has no size: all vertices coincide")
+    triangles = (triangles - centre) / diameter
+    corners, paint = joined_paint(_with_patterns(pieces, triangles))
+    # One vertex for each position: copies along texture seams would tear the shading and collide twice.
+    positions, label = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
+    faces = label.reshape(-1, 3)
+    proper = (faces != np.roll(faces, 1, axis=1)).all(1)
+    faces, corners = faces[proper], corners[proper]
+    if fill_holes:
+        positions, faces, corners = _filled(positions, faces, corners)
+    _, uses = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    if not len(faces) or (uses % 2).any():
+        raise InputError(
+            f"mesh {path} is not closed: {int((uses % 2).sum())} edges have a face on one side only, also after "
+            "vertices at the same position are merged; fill its holes"
+        )
+    n_different = len(np.unique(np.sort(faces, axis=1), axis=0))
+    if n_different < len(faces):
+        raise InputError(f"mesh {path} holds {len(faces) - n_different} faces twice; remove the copies")
+    inwards = _turned_inwards(positions, faces)
+    faces[inwards], corners[inwards] = faces[inwards, ::-1], corners[inwards, ::-1]
+    return Body(path.stem, positions, faces, *cluster(positions, faces, COLLISION_VERTICES), corners, paint)
+
+
+def _with_patterns(pieces: list[Piece], triangles: np.ndarray) -> list[Piece]:
+    """``pieces`` of which those without colours have a pattern of the places of ``triangles``."""
+    colors, found, begin = PALETTE[[5, 8, 1]], [], 0
+    for piece in pieces:
+        end = begin + len(piece.triangles)
+        if piece.paint is None:
+            piece = Piece(piece.triangles, triangles[begin:end], lambda p: PATTERNS["patches"](p, colors))
+        found.append(piece)
+        begin = end
+    return found
+
+
+def _filled(positions: np.ndarray, faces: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Positions, faces and corners of a surface whose borders, chains of edges with one face, are closed by fans."""
+    sides = [[0, 1], [1, 2], [2, 0]]
+    edges, ends = faces[:, sides].reshape(-1, 2), corners[:, sides].reshape(-1, 2, corners.shape[2])
+    _, label, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    border = uses[label.reshape(-1)] == 1
+    edges, ends = edges[border], ends[border]
+    hole, middle = np.unique(_components(len(positions), edges)[edges[:, 0]], return_inverse=True)
+    count = np.maximum(np.bincount(middle, minlength=len(hole)), 1)[:, None]
+    middles = np.stack([np.bincount(middle, positions[edges[:, 0], k], len(hole)) for k in range(3)], 1) / count
+    fans = np.stack([edges[:, 1], edges[:, 0], len(positions) + middle], 1)
+    fan_corners = np.stack([ends[:, 1], ends[:, 0], ends.mean(1)], 1)
+    return (
+        np.concatenate([positions, middles]), np.concatenate([faces, fans]), np.concatenate([corners, fan_corners])
+    )  # fmt: skip
+
+
+def _components(n: int, cells: np.ndarray) -> np.ndarray:
+    """Of each of ``n`` vertices the lowest that ``cells`` [C, K], rows of vertices, connect with it."""
+    label, before = np.arange(n), None
+    while before is None or (label != before).any():
+        before = label.copy()
+        np.minimum.at(label, cells, label[cells].min(1)[:, None])
+        label = label[label]
+    return label
+
+
+def _turned_inwards(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """bool [F], faces of bodies that are turned inside out; cavities inside of a body stay as they are to it."""
+    bodies, body = np.unique(_components(len(positions), faces)[faces[:, 0]], return_inverse=True)
+    corner, cross = _corner_and_cross(positions, faces)
+    volume = np.bincount(body, (corner * cross).sum(1), len(bodies))
+    inverted = volume.sum() < 0
+    low, high = np.full((len(bodies), 3), np.inf), np.full((len(bodies), 3), -np.inf)
+    np.minimum.at(low, body, positions[faces].min(1))
+    np.maximum.at(high, body, positions[faces].max(1))
+    turned = np.full(len(bodies), inverted)
+    for k in np.flatnonzero(volume < 0 if not inverted else volume > 0):
+        if ((low <= low[k]) & (high >= high[k])).all(1).sum() == 1:  # in no other body
+            turned[k] = not inverted
+    return turned[body]
+
+
+def _corner_and_cross(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two arrays [F, 3] whose product, summed, is six times the volume that faces turned outwards enclose."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return a, np.cross(b, c)
+
+
+def convex_pieces(vertices: np.ndarray, faces: np.ndarray) -> list[np.ndarray]:
+    """Vertices of convex bodies that together cover the surface, for engines that collide convex bodies only.
+
+    One piece, the hull, where the body is nearly convex; otherwise a slab of the surface for each cell of a grid.
+    """
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    size = float(np.ptp(vertices, axis=0).max())
+    above = (normals[:, None] * vertices[None]).sum(-1).max(1) - (normals * a).sum(-1)
+    if above.max() < NEARLY_CONVEX * size:
+        return [vertices]
+    inner = vertices - SLAB_THICKNESS * size * vertex_normals(vertices, faces)
+    cells = np.floor(((a + b + c) / 3 - vertices.min(0)) / size * SLAB_CELLS).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    rows = [np.unique(faces[cell == k]) for k in range(cell.max() + 1)]
+    return [np.concatenate([vertices[row], inner[row]]) for row in rows]
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals [V, 3]: the sum of the normals of the faces around each vertex, weighted by their areas."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    face_normals = np.cross(b - a, c - a)
+    normals = np.stack(
+        [np.bincount(faces.reshape(-1), np.repeat(face_normals[:, k], 3), len(vertices)) for k in range(3)], 1
+    )
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.where(length > 0, length, 1)

@@ -1,0 +1,215 @@
+"""Motion by MuJoCo: soft bodies are flexes on a control lattice, rigid ones convex pieces, cloth is a flex."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from gsim3d.synth.carriers import Frame, Lattice, Sheet
+from gsim3d.synth.stage import GRAVITY, Cloth, RigidBody, SoftBody, Stage, Unstable
+
+NAME = "mujoco"
+CONTACT_RADIUS = 0.005  # metres around every collision vertex; the ground plane is lowered by it
+CLOTH_RADIUS = 0.012  # around cloth: thin sheets need more, lest vertices meet between its triangles
+CONTACT_TIME = 0.005  # seconds; a slower contact lets a body sink in by centimetres at impact
+MIN_STEPS_PER_CONTACT = 2.0  # MuJoCo's own limit: the contact time spans at least two steps
+RIGID_CONTACT = 300.0  # rad/s of the spring between rigid bodies: at 3 m/s they overlap by a centimetre
+POISSON = 0.3
+
+
+def simulate(stage: Stage, n_frames: int, fps: float, max_timestep: float) -> list[Lattice | Frame | Sheet]:
+    """What carries each body at every frame, and the cloth last, if there is one.
+
+    A soft body's lattice is the bounding box of its collision mesh at time 0.
+
+    Raises: Unstable when the solver gives up.
+    """
+    os.environ.setdefault("MUJOCO_GL", "disable")
+    import mujoco
+
+    mujoco.set_mju_user_warning(lambda text: None)  # it would write a file into the working directory
+    substeps = int(np.ceil(1 / (fps * max_timestep) - 1e-9))
+    model = mujoco.MjModel.from_xml_string(model_xml(stage, 1 / (fps * substeps)))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    followers = [_Soft(model, data, i, b) if isinstance(b, SoftBody) else _Rigid(model, data, i, b)
+                 for i, b in enumerate(stage.bodies)]  # fmt: skip
+    if stage.cloth is not None:
+        followers.append(_Cloth(model, data, stage.cloth))
+    frames = [[follower.start()] for follower in followers]
+    for _ in range(1, n_frames):
+        mujoco.mj_step(model, data, substeps)
+        mujoco.mj_kinematics(model, data)
+        for follower, nodes in zip(followers, frames):
+            nodes.append(follower.nodes())
+    carriers = [follower.carrier(np.stack(nodes)) for follower, nodes in zip(followers, frames)]
+    if any(w.number for w in data.warning) or not all(np.isfinite(carrier.nodes).all() for carrier in carriers):
+        raise Unstable("the solver gave up")
+    return carriers
+
+
+def model_xml(stage: Stage, timestep: float) -> str:
+    """The scene in MuJoCo's language."""
+    contact_time = max(CONTACT_TIME, MIN_STEPS_PER_CONTACT * timestep)
+    contact = f'solref="{contact_time:.9g} 1"'
+    assets, bodies = [], []
+    for index, body in enumerate(stage.bodies):
+        asset, element = _soft_xml(index, body, contact) if isinstance(body, SoftBody) else _rigid_xml(index, body)
+        assets.append(asset)
+        bodies.append(element)
+    if stage.cloth is not None:
+        bodies.append(_cloth_xml(stage.cloth, contact))
+    if stage.ground is not None:
+        soft = any(isinstance(body, SoftBody) for body in stage.bodies)
+        height = stage.ground - (CONTACT_RADIUS if soft else 0)
+        bodies.append(f'<geom type="plane" size="9 9 .1" pos="0 0 {height:.9g}" {contact}/>')
+    iterations = 50 if stage.cloth is None else 100  # a cloth that carries a soft body converges slowly
+    return f"""<mujoco>
+  <option timestep="{timestep:.12g}" integrator="discrete" iterations="{iterations}" gravity="0 0 {-GRAVITY}"/>
+  <size memory="256M"/>
+  <asset>{"".join(assets)}</asset>
+  <worldbody>{"".join(bodies)}</worldbody>
+</mujoco>"""
+
+
+def _numbers(values) -> str:
+    return " ".join(f"{x:.9g}" for x in np.ravel(values))
+
+
+def _soft_xml(index: int, body: SoftBody, contact: str) -> tuple[str, str]:
+    centre = (body.vertices.min(0) + body.vertices.max(0)) / 2  # the lattice always contains the flex's origin
+    material = body.material
+    lasting = f' yield="{material.yield_strain:.9g}"' if material.yield_strain else ""
+    asset = f'<mesh name="m{index}" vertex="{_numbers(body.vertices)}" face="{_numbers(body.faces)}"/>'
+    element = f"""<body name="b{index}">
+      <flexcomp name="b{index}" type="mesh" dim="3" mesh="m{index}" dof="trilinear"
+                cellcount="{body.cells} {body.cells} {body.cells}"
+                origin="{_numbers(centre)}" mass="{body.mass:.9g}" radius="{CONTACT_RADIUS}">
+        <elasticity young="{material.young:.9g}" poisson="{POISSON}" damping="{material.damping:.9g}"{lasting}/>
+        <contact selfcollide="none" {contact}/>
+      </flexcomp></body>"""
+    return asset, element
+
+
+def _rigid_xml(index: int, body: RigidBody) -> tuple[str, str]:
+    centre = _centre(body)
+    # A contact is a damped spring; the damping ratio follows from the part of the speed that half a period leaves.
+    loss = np.log(max(body.bounce, 1e-3))
+    ratio = -loss / np.hypot(np.pi, loss)
+    contact = f'solref="{-(RIGID_CONTACT**2):.9g} {-2 * ratio * RIGID_CONTACT:.9g}" priority="1"'
+    friction = f'friction="{body.friction:.9g} 0.01 0.004" condim="6"'
+    names = [f"m{index}p{part}" for part in range(len(body.parts))]
+    assets = [f'<mesh name="{name}" vertex="{_numbers(part - centre)}"/>' for name, part in zip(names, body.parts)]
+    geoms = [f'<geom type="mesh" mesh="{name}" mass="{body.mass / len(names):.9g}" {contact} {friction}/>'
+             for name in names]  # fmt: skip
+    return "".join(assets), f'<body name="b{index}" pos="{_numbers(centre)}"><freejoint/>{"".join(geoms)}</body>'
+
+
+def _cloth_xml(cloth: Cloth, contact: str) -> str:
+    n = cloth.count
+    return f"""<body name="cloth"><flexcomp name="cloth" type="grid" dim="2" count="{n} {n} 1"
+      spacing="{cloth.width / (n - 1):.9g} {cloth.width / (n - 1):.9g} 1" pos="0 0 {cloth.height:.9g}"
+      mass="{cloth.mass:.9g}" radius="{CLOTH_RADIUS}">
+      <elasticity young="{cloth.young:.9g}" poisson="{POISSON}" thickness="{cloth.thickness:.9g}"
+                  damping="{cloth.damping:.9g}" elastic2d="both"/>
+      <contact selfcollide="none" {contact}/>
+      <pin id="0 {n - 1} {n * (n - 1)} {n * n - 1}"/>
+    </flexcomp></body>"""
+
+
+def _centre(body: RigidBody) -> np.ndarray:
+    vertices = np.concatenate(body.parts)
+    return (vertices.min(0) + vertices.max(0)) / 2
+
+
+def _flex_id(model, name: str) -> int:
+    import mujoco
+
+    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, name)
+
+
+class _Soft:
+    def __init__(self, model, data, index: int, body: SoftBody):
+        flex = _flex_id(model, f"b{index}")
+        first = model.flex_nodeadr[flex]
+        self.data, self.body, self.bodies = data, body, model.flex_nodebodyid[first : first + model.flex_nodenum[flex]]
+        self.shape = (body.cells + 1,) * 3
+        self.rest = _box_lattice(body)
+        movable = model.body_dofnum[self.bodies] == 3  # a node without mass is welded to the world
+        self.occupied = _occupied_cells(body)
+        used = np.zeros(self.shape, dtype=bool)
+        corners = [tuple(slice(s, s + body.cells) for s in step) for step in np.ndindex(2, 2, 2)]
+        for corner in corners:
+            self.occupied &= movable.reshape(self.shape)[corner]
+        for corner in corners:
+            used[corner] |= self.occupied
+        if not used.any() or np.abs(self.nodes() - self.rest)[used].max() > 1e-5:
+            raise RuntimeError("MuJoCo has laid out the nodes of the flex otherwise than by x, y, z")
+        velocity = body.velocity + np.cross(body.spin, self.rest - self.rest[used].mean(0))
+        dofs = model.body_dofadr[self.bodies[movable]][:, None] + np.arange(3)
+        data.qvel[dofs] = velocity.reshape(-1, 3)[movable]
+
+    def start(self) -> np.ndarray:
+        return self.rest
+
+    def nodes(self) -> np.ndarray:
+        return self.data.xpos[self.bodies].reshape(*self.shape, 3)
+
+    def carrier(self, nodes: np.ndarray) -> Lattice:
+        return Lattice(nodes, self.occupied)
+
+
+class _Rigid:
+    def __init__(self, model, data, index: int, body: RigidBody):
+        self.data, self.id = data, model.body(f"b{index}").id
+        first = model.body_dofadr[self.id]
+        # The velocity of the body's frame; spin turns about the centre of mass, which need not be its origin.
+        arm = data.xipos[self.id] - data.xpos[self.id]
+        data.qvel[first : first + 3] = body.velocity - np.cross(body.spin, arm)
+        data.qvel[first + 3 : first + 6] = body.spin  # the frame starts unturned, so local axes are the world's
+
+    def start(self) -> np.ndarray:
+        return self.nodes()
+
+    def nodes(self) -> np.ndarray:
+        origin = self.data.xpos[self.id]
+        return np.concatenate([origin[None], origin + self.data.xmat[self.id].reshape(3, 3).T])
+
+    def carrier(self, nodes: np.ndarray) -> Frame:
+        return Frame(nodes)
+
+
+class _Cloth:
+    def __init__(self, model, data, cloth: Cloth):
+        flex = _flex_id(model, "cloth")
+        first = model.flex_vertadr[flex]
+        self.data, self.rows = data, slice(first, first + model.flex_vertnum[flex])
+        self.n = cloth.count
+        part = cloth.width * (np.arange(self.n) / (self.n - 1) - 0.5)
+        self.rest = np.stack(np.meshgrid(part, part, [cloth.height], indexing="ij"), -1)[:, :, 0]
+        if np.abs(self.nodes() - self.rest).max() > 1e-5:
+            raise RuntimeError("MuJoCo has laid out the nodes of the cloth otherwise than by x, y")
+
+    def start(self) -> np.ndarray:
+        return self.rest
+
+    def nodes(self) -> np.ndarray:
+        return self.data.flexvert_xpos[self.rows].reshape(self.n, self.n, 3).copy()
+
+    def carrier(self, nodes: np.ndarray) -> Sheet:
+        return Sheet(nodes)
+
+
+def _box_lattice(body: SoftBody) -> np.ndarray:
+    low, high = body.vertices.min(0), body.vertices.max(0)
+    part = np.arange(body.cells + 1) / body.cells
+    return np.stack(np.meshgrid(*(a + (b - a) * part for a, b in zip(low, high)), indexing="ij"), -1)
+
+
+def _occupied_cells(body: SoftBody) -> np.ndarray:
+    low, high = body.vertices.min(0), body.vertices.max(0)
+    cell = np.floor((body.vertices - low) / (high - low) * body.cells).astype(np.int64)
+    occupied = np.zeros((body.cells,) * 3, dtype=bool)
+    occupied[tuple(np.clip(cell, 0, body.cells - 1).T)] = True
+    return occupied

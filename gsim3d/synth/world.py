@@ -1,0 +1,433 @@
+"""What all worlds share: options and their checks, and how one scene is drawn, simulated, validated and filmed."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib
+import itertools
+import json
+import zlib
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects
+from gsim3d.errors import InputError, did_you_mean
+from gsim3d.synth import cameras, render, shapes, writer
+from gsim3d.synth.bodies import OBJECTS, load_mesh, mesh_bytes, mesh_name, name_rng, named_body
+from gsim3d.synth.carriers import Carrier, grid_faces
+from gsim3d.synth.stage import (
+    GRAVITY,
+    Cloth,
+    RigidBody,
+    SoftBody,
+    Stage,
+    Unstable,
+    check_cloth,
+    check_energy,
+    check_motion,
+)
+
+MAX_ATTEMPTS = 40  # draws of one scene before the options are called impossible
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+MESH_UPS = ("y", "z")
+ENGINES = {"mujoco": "gsim3d.synth.mujoco_engine", "genesis": "gsim3d.synth.genesis_engine"}
+CLOTH_REFINEMENT = 3  # drawn cloth is so many times finer than the simulated one
+GAP = 0.03  # metres between the spheres around two bodies at the start
+TRAIN = "train"
+CLOTH_COLOR = (0.78, 0.14, 0.12)  # where looks are functions of the name
+LATER_OPTIONS = ("by_name", "ground_albedo")  # at their defaults, sets that are older than them go on
+MAX_SPREAD = 0.25  # of cameras: bodies leave the views of closer ones
+HIGHER, STEEPER = 0.5, 45.0  # times the spread: the target in distances, the rings in degrees
+
+
+class Rejected(Exception):
+    """A drawn trajectory that is not filmed: it leaves the view, the ground or the depth range."""
+
+
+@dataclass(frozen=True)
+class Actor:
+    """One drawn body: what is simulated, what is seen, and where its visible vertices [V, 3] are at time 0."""
+
+    body: SoftBody | RigidBody
+    surface: render.Surface
+    vertices: np.ndarray
+    facts: dict
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One draw of a trajectory.
+
+    ground: height, metres, or None.   cloth: or None.   surfaces: of the actors, and of the cloth last.
+    """
+
+    ground: float | None
+    cloth: Cloth | None
+    actors: list[Actor]
+    surfaces: list[render.Surface]
+
+
+@dataclass(frozen=True)
+class World(ABC):
+    """Options of a data set. Lengths in metres, times in seconds; pairs are ranges that every trajectory draws from."""
+
+    n_trajectories: int = 34  # the usual split keeps 30 for training and 4 for tests
+    n_frames: int = 24
+    fps: float = 24.0
+    image_size: int = 64
+    n_cams: int = 12
+    seed: int = 0
+    subset: str = TRAIN  # which set of scenes; a held-out one draws other random numbers
+    engine: str = "mujoco"
+    objects: tuple[str, ...] = shapes.SOFT_SHAPES
+    meshes: tuple[str, ...] = ()  # files; they take part like objects, and alone where objects is empty
+    mesh_up: str = "y"
+    by_name: bool = False  # paint, friction and bounce are functions of the body's name, not drawn; the cloth is red
+    background: str = "black"
+    depth: bool = False
+    samples: int = 2  # rays along each side of a pixel
+    n_bodies: tuple[int, int] = (1, 1)  # the first is the scene's object, others are any
+    body_size: tuple[float, float] = (0.6, 0.76)  # diameter of the sphere that holds the body
+    drop_height: tuple[float, float] = (0.5, 0.7)  # of the lowest point above what it falls on
+    speed: float = 0.35  # largest horizontal speed at the start, m/s
+    lift: tuple[float, float] = (0.0, 0.0)  # upward speed at the start, m/s
+    spin: float = 1.2  # largest, rad/s
+    spread: float = 0.08  # largest distance from the middle, along x and y, of the place aimed at
+    max_timestep: float = 1 / 480
+    distance: float = 2.6
+    elevations: tuple[float, float] = (18.0, 42.0)  # degrees, of the low and the high ring
+    target_height: float = 0.52
+    fov: float = 42.0  # degrees
+    camera_spread: float = 0.0  # how much cameras differ from scene to scene, see rig(); 0: not at all
+    ground: bool = True
+    ground_height: tuple[float, float] = (0.0, 0.0)
+    ground_radius: float = 0.85
+    ground_albedo: float | None = None  # grey of the whole ground; None: rings cut into sectors of three colours
+    near: float = 1.5
+    far: float = 3.8
+
+    name = ""
+    engines = tuple(ENGINES)
+
+    def check(self) -> None:
+        """Raises InputError for options that cannot make a scene."""
+        for field in ("n_trajectories", "n_frames", "image_size", "n_cams", "samples"):
+            if not (isinstance(getattr(self, field), int) and getattr(self, field) >= 1):
+                raise InputError(f"{field} must be a whole number, 1 or more; got {getattr(self, field)!r}")
+        for field in ("fps", "max_timestep", "distance", "fov", "ground_radius", "near"):
+            if not 0 < getattr(self, field) < np.inf:
+                raise InputError(f"{field} must be positive; got {getattr(self, field)!r}")
+        for field in ("body_size", "drop_height", "n_bodies"):
+            low, high = getattr(self, field)
+            if not 0 < low <= high < np.inf:
+                raise InputError(f"{field} must be two positive numbers, the smaller first; got {low} {high}")
+        if not self.near < self.far < np.inf:
+            raise InputError(f"far must lie beyond near; got near {self.near} and far {self.far}")
+        if self.depth and self.far > writer.MAX_DEPTH:
+            raise InputError(f"depth images reach to {writer.MAX_DEPTH} m; got far {self.far}")
+        if not 0 <= self.camera_spread <= MAX_SPREAD:
+            raise InputError(f"camera_spread must be from 0 to {MAX_SPREAD:g}; got {self.camera_spread!r}")
+        if self.ground_albedo is not None and not 0 <= self.ground_albedo <= 1:
+            raise InputError(f"ground_albedo must be from 0 to 1, or None; got {self.ground_albedo!r}")
+        if not self.seed >= 0:
+            raise InputError(f"seed must be 0 or more; got {self.seed}")
+        for field, allowed in (("background", BACKGROUNDS), ("mesh_up", MESH_UPS), ("engine", self.engines)):
+            if getattr(self, field) not in allowed:
+                raise InputError(f"{field} must be one of {', '.join(allowed)}; got {getattr(self, field)!r}")
+        for name in self.objects:
+            if name not in OBJECTS:
+                known, hint = ", ".join(OBJECTS), did_you_mean(name, OBJECTS)
+                raise InputError(f"object {name!r} is not known; choose from {known}{hint}")
+        names = self.object_names()
+        repeated = [name for name, count in Counter(names).items() if count > 1]
+        if repeated or not names:
+            raise InputError(f"objects and mesh files need names of their own; repeated: {repeated}, all: {names}")
+        for path in self.meshes:
+            load_mesh(path, self.mesh_up)
+        self._check_ground()
+
+    def _check_ground(self) -> None:
+        if not self.ground:
+            return
+        angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+        extremes = itertools.product((-1.0, 1.0), repeat=3) if self.camera_spread else [(0.0, 0.0, 0.0)]
+        for height, extreme in itertools.product(self.ground_height, extremes):
+            rig = self._rig(*extreme)
+            rim = np.stack([np.cos(angle), np.sin(angle), np.full(64, height)], 1)
+            rim[:, :2] *= self.ground_radius
+            pixels, depth = cameras.project(rim, rig.viewmats, rig.Ks)
+            seen = (depth > 0) & (pixels >= 0).all(-1) & (pixels <= rig.size).all(-1)
+            if seen.any() and not (rig.near <= depth[seen].min() and depth[seen].max() <= rig.far):
+                low, high = depth[seen].min(), depth[seen].max()
+                raise InputError(
+                    f"the ground is seen from {low:.2f} to {high:.2f} m, beyond near {rig.near} and far {rig.far}"
+                )
+
+    def object_names(self) -> list[str]:
+        """Names of objects and mesh files, in the order in which trajectories are dealt to them."""
+        return [*self.objects, *map(mesh_name, self.meshes)]
+
+    def scenes(self) -> list[tuple[str, int]]:
+        """(object, sample) of every trajectory: one of each object in turn."""
+        names = self.object_names()
+        return [(names[i % len(names)], i // len(names)) for i in range(self.n_trajectories)]
+
+    def fingerprint(self, name: str) -> str:
+        """Hash of all that the scenes of object ``name`` depend on, apart from their sample number."""
+        fields = dataclasses.asdict(self)
+        others = self.n_bodies[1] > 1  # then any object may appear in a scene of this one
+        one_rig = not self.camera_spread
+        for field in ("n_trajectories", "meshes", *(() if others else ("objects",)), *(("camera_spread",) * one_rig)):
+            del fields[field]
+        for field in LATER_OPTIONS:
+            if fields[field] == getattr(World, field):
+                del fields[field]
+        text = json.dumps([writer.GENERATOR_VERSION, self.name, fields, name], sort_keys=True)
+        digest = hashlib.sha256(text.encode())
+        for path in self.meshes:
+            if others or mesh_name(path) == name:
+                digest.update(mesh_bytes(path, self.mesh_up))
+        return digest.hexdigest()
+
+    def rig(self, scene: tuple[str, int] | None = None) -> cameras.Rig:
+        """The cameras of a scene; None: those that all scenes differ from.
+
+        With a ``camera_spread`` of s they stand up to s times their distance nearer or farther, look at a place up to
+        s / 2 distances higher or lower, from up to 45 s degrees less or more above the horizon, and both rings are
+        turned by any angle.
+        """
+        if scene is None or not self.camera_spread:
+            return self._rig()
+        rng = np.random.default_rng([self.seed, zlib.crc32(scene[0].encode()), scene[1], zlib.crc32(b"cameras")])
+        return self._rig(*rng.uniform(-1, 1, 3), turned=rng.uniform(0, 2 * np.pi))
+
+    def _rig(self, farther: float = 0.0, higher: float = 0.0, steeper: float = 0.0, turned: float = 0.0) -> cameras.Rig:
+        """The cameras, each difference as a share of the largest."""
+        spread = self.camera_spread
+        return cameras.two_rings(
+            self.n_cams,
+            self.image_size,
+            self.near,
+            self.far,
+            distance=self.distance * (1 + spread * farther),
+            target_height=self.target_height + HIGHER * spread * self.distance * higher,
+            elevations=tuple(degrees + STEEPER * spread * steeper for degrees in self.elevations),
+            fov=self.fov,
+            turned=turned,
+        )
+
+    def effects(self) -> EffectsSpec:
+        """What its scenes call for: positions and velocities, matt surfaces, and shadows where there is a ground."""
+        return EffectsSpec(
+            DynamicsEffects("frozen" if self.ground else "masked_out", history=2),
+            AppearanceEffects(view_dependent=0, changing="all" if self.ground else "dynamic"),
+            outputs=OutputEffects(depth=self.depth),
+        )
+
+    def make(self, name: str, sample: int) -> writer.Scene:
+        """Simulates and films trajectory ``sample`` of object ``name``; draws again until one can be used."""
+        rejected = []
+        rig = self.rig((name, sample))
+        for attempt in range(MAX_ATTEMPTS):
+            drawn = self.draw(name, sample, attempt)
+            try:
+                # Before the costly part.
+                self._check_view(rig, drawn.ground, [actor.vertices[None] for actor in drawn.actors])
+                states, frames = self._move(rig, drawn)
+            except (Unstable, Rejected) as reason:
+                rejected.append(str(reason))
+                continue
+            renderer = self.renderer(rig, drawn)
+            return writer.Scene(
+                name,
+                sample,
+                self.fps,
+                rig,
+                views=[renderer.draw(vertices) for vertices in zip(*frames)],
+                states=states,
+                extras={
+                    **{"world": self.name, "subset": self.subset, "engine": self.engine, "seed": self.seed},
+                    **{"attempt": attempt, "rejected": rejected, "ground_height": drawn.ground},
+                    "bodies": [actor.facts for actor in drawn.actors],
+                },
+                fingerprint=self.fingerprint(name),
+            )
+        raise InputError(
+            f"{name}: none of {MAX_ATTEMPTS} draws could be used ({Counter(rejected).most_common(1)[0][0]}); "
+            "lower the drop height or the body size, or widen the view"
+        )
+
+    def draw(self, name: str, sample: int, attempt: int) -> Drawn:
+        """What is simulated and seen in trajectory ``sample`` of object ``name``, at its ``attempt``-th draw."""
+        subset = [zlib.crc32(text.encode()) for text in (self.name, self.subset) if text not in ("elastic", TRAIN)]
+        rng = np.random.default_rng([self.seed, zlib.crc32(name.encode()), sample, attempt, *subset])
+        ground, cloth, actors = self._draw(name, rng)
+        surfaces = [actor.surface for actor in actors]
+        if cloth is not None:
+            surfaces.append(self._cloth_surface(cloth, rng))
+        return Drawn(ground, cloth, actors, surfaces)
+
+    def renderer(self, rig: cameras.Rig, drawn: Drawn) -> render.Renderer:
+        """What films ``drawn`` with the cameras of ``rig``."""
+        ground = None if drawn.ground is None else render.Ground(self.ground_radius, drawn.ground, self.ground_albedo)
+        return render.Renderer(
+            rig,
+            drawn.surfaces,
+            ground=ground,
+            background=BACKGROUNDS[self.background],
+            samples=self.samples,
+            depth=self.depth,
+        )
+
+    def _draw(self, name: str, rng: np.random.Generator) -> tuple[float | None, Cloth | None, list[Actor]]:
+        others = []
+        if self.n_bodies[1] > 1:
+            count = int(rng.integers(self.n_bodies[0], self.n_bodies[1] + 1))
+            names = self.object_names()
+            others = [names[rng.integers(len(names))] for _ in range(count - 1)]
+        low, high = self.ground_height
+        ground = (float(rng.uniform(low, high)) if high > low else low) if self.ground else None
+        cloth = self._draw_cloth(rng)
+        floor = cloth.height if cloth is not None else ground or 0.0
+        actors = []
+        for body_name in (name, *others):
+            actors.append(self._draw_actor(body_name, floor, actors, rng))
+        return ground, cloth, actors
+
+    def _draw_actor(self, name: str, floor: float, before: list[Actor], rng: np.random.Generator) -> Actor:
+        path = next((path for path in self.meshes if mesh_name(path) == name), None)
+        if path is None:
+            body = named_body(name, name_rng(name) if self.by_name else rng)
+        else:
+            body = load_mesh(path, self.mesh_up)
+        # Mesh files keep their feet down and turn about the vertical; bodies of the package have no top.
+        rotation = _random_rotation(rng) if path is None else _turn(rng.uniform(0, 2 * np.pi))
+        size = rng.uniform(*self.body_size)
+        vertices = size * (body.vertices[:, None, :] * rotation).sum(-1)
+        collision = size * (body.collision_vertices[:, None, :] * rotation).sum(-1)
+        drop = self._drop(rng.uniform(*self.drop_height), float(np.ptp(vertices[:, 2])))
+        heading, speed = rng.uniform(0, 2 * np.pi), rng.uniform(0, self.speed)
+        velocity = speed * np.array([np.cos(heading), np.sin(heading), 0])
+        if self.lift[1] > 0:
+            velocity[2] = rng.uniform(*self.lift)
+        aim = rng.uniform(-self.spread, self.spread, 2)
+        place = np.array([*aim, floor + drop - vertices[:, 2].min()])
+        # A body that will drift starts upwind, so that it lands, or is halfway, near the middle.
+        place[:2] -= velocity[:2] * self._flight(drop, velocity[2])
+        place = _clear_of(place, size / 2, before)
+        axis = rng.normal(size=3)
+        spin = rng.uniform(0, self.spin) * axis / np.linalg.norm(axis)
+        simulated, facts = self._make_body(name, collision + place, body.collision_faces, velocity, spin, rng)
+        facts = {"object": name, "mass": round(simulated.mass, 6), "size": round(size, 6), **facts}
+        surface = render.Surface(body.faces, body.corners, self._painted(body.paint, facts))
+        return Actor(simulated, surface, vertices + place, facts)
+
+    def _drop(self, height: float, body_height: float) -> float:
+        """Height of the lowest point above what the body falls on, from the drawn one."""
+        return height
+
+    def _flight(self, drop: float, lift: float) -> float:
+        """Seconds after which a body should pass over the place that it is aimed at."""
+        if not self.ground:
+            return self.n_frames / self.fps / 2
+        return (lift + np.sqrt(lift**2 + 2 * GRAVITY * drop)) / GRAVITY
+
+    @abstractmethod
+    def _make_body(self, name, vertices, faces, velocity, spin, rng) -> tuple[SoftBody | RigidBody, dict]:
+        """The body with its collision mesh at time 0, and what metadata.json tells of it."""
+
+    def _painted(self, paint: Callable[[np.ndarray], np.ndarray], facts: dict) -> Callable[[np.ndarray], np.ndarray]:
+        """The paint of a body of which metadata.json tells ``facts``, from the one that was drawn."""
+        return paint
+
+    def _draw_cloth(self, rng: np.random.Generator) -> Cloth | None:
+        return None
+
+    def _cloth_surface(self, cloth: Cloth, rng: np.random.Generator) -> render.Surface:
+        n = (cloth.count - 1) * CLOTH_REFINEMENT + 1
+        part = np.arange(n) / (n - 1) - 0.5
+        places = np.stack(np.meshgrid(part, part, [0.0], indexing="ij"), -1).reshape(-1, 3)
+        faces = grid_faces(n)
+        paint = _plain_cloth if self.by_name else shapes.random_paint(rng)
+        return render.Surface(faces, places[faces], paint, two_sided=True)
+
+    def simulate(self, drawn: Drawn) -> tuple[list[Carrier], list[np.ndarray]]:
+        """What carries each body, and the cloth last; and the vertices [T, V, 3] of every surface.
+
+        Raises: Unstable when the solver gives up; nothing else is checked.
+        """
+        engine = importlib.import_module(ENGINES[self.engine])
+        stage = Stage(tuple(actor.body for actor in drawn.actors), drawn.ground, drawn.cloth)
+        carriers = engine.simulate(stage, self.n_frames, self.fps, self.max_timestep)
+        bindings = [carrier.bind(actor.vertices) for actor, carrier in zip(drawn.actors, carriers)]
+        if drawn.cloth is not None:
+            bindings.append(carriers[-1].refine(CLOTH_REFINEMENT))
+        moved = [np.stack([b.move(nodes) for nodes in c.nodes]) for b, c in zip(bindings, carriers, strict=True)]
+        return carriers, moved
+
+    def _move(self, rig: cameras.Rig, drawn: Drawn) -> tuple[dict, list[np.ndarray]]:
+        """States by name, and the vertices [T, V, 3] of every surface, checked."""
+        carriers, moved = self.simulate(drawn)
+        actors, cloth, bodies = drawn.actors, drawn.cloth, moved[: len(drawn.actors)]
+        for vertices in bodies:
+            check_motion(vertices, drawn.ground)
+        self._check_view(rig, drawn.ground, bodies)
+        centres = np.stack([vertices.mean(1) for vertices in bodies])
+        masses = np.array([actor.body.mass for actor in actors])
+        spins = [((actor.body.spin**2).sum() * (actor.facts["size"] / 2) ** 2) / 2 for actor in actors]
+        check_energy(centres, masses, max(spins), self.fps)
+        states = {f"body_{index}": carrier.nodes.astype(np.float32) for index, carrier in enumerate(carriers)}
+        if cloth is not None:
+            states["cloth"] = states.pop(f"body_{len(actors)}")
+            n = (cloth.count - 1) * CLOTH_REFINEMENT + 1
+            check_cloth(bodies, moved[-1].reshape(self.n_frames, n, n, 3), drawn.ground)
+        return states, moved
+
+    def _check_view(self, rig: cameras.Rig, ground: float | None, bodies: list[np.ndarray]) -> None:
+        for vertices in bodies:
+            for frame in vertices:
+                pixels, depth = cameras.project(frame, rig.viewmats, rig.Ks)
+                if depth.min() < rig.near or depth.max() > rig.far:
+                    raise Rejected("a body leaves the depth range")
+                if pixels.min() < 0 or pixels.max() > rig.size:
+                    raise Rejected("a body leaves the view of a camera")
+                if ground is not None and np.hypot(frame[:, 0], frame[:, 1]).max() > 1.25 * self.ground_radius:
+                    raise Rejected("a body leaves the ground")
+
+
+def _clear_of(place: np.ndarray, radius: float, before: list[Actor]) -> np.ndarray:
+    """``place`` raised until a sphere around the body touches no other body's."""
+    place = place.copy()
+    for actor in sorted(before, key=lambda actor: actor.vertices[:, 2].mean()):
+        centre = (actor.vertices.min(0) + actor.vertices.max(0)) / 2
+        reach = radius + actor.facts["size"] / 2 + GAP
+        aside = ((place[:2] - centre[:2]) ** 2).sum()
+        if aside < reach**2 and abs(place[2] - centre[2]) ** 2 + aside < reach**2:
+            place[2] = centre[2] + np.sqrt(reach**2 - aside)
+    return place
+
+
+def _plain_cloth(points: np.ndarray) -> np.ndarray:
+    return np.broadcast_to(CLOTH_COLOR, points.shape)
+
+
+def _turn(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def _random_rotation(rng: np.random.Generator) -> np.ndarray:
+    """Uniform rotation matrix, from a random unit quaternion."""
+    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

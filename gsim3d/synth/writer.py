@@ -1,0 +1,188 @@
+"""Scene folders and the manifest of a generated data set.
+
+Layout: OUT/<object>/<sample>/metadata.json, cam_<j>/{rgb,seg,inst,depth}_<step>.png, states.npz; OUT/manifest.json,
+OUT/effects.yaml (what the scenes call for, see gsim3d.effects.spec).
+A scene is written to a hidden folder beside its place and renamed when it is whole.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import shutil
+from collections import Counter
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.errors import InputError
+from gsim3d.io.plain import parse_json
+from gsim3d.synth.cameras import Rig, workspace_origin
+from gsim3d.synth.render import View
+
+GENERATOR_VERSION = 3  # raise it whenever the same options would give other bytes
+FILE_TEMPLATE = "cam_{cam_ix}/{img_type}_{n_step:04d}"
+PNG_COMPRESSION = 3
+DEPTH_UNIT = 1e-4  # metres a count of the 16-bit depth images
+MAX_DEPTH = 6.5  # metres that fit
+PACKAGES = ("numpy", "mujoco-core", "embreex", "trimesh", "opencv-contrib-python-headless")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One filmed trajectory, ready to be written.
+
+    states: float32 [T, ..., 3] by name: what carries each body (lattice nodes, axes, particles) and the cloth, metres.
+    """
+
+    object: str
+    sample: int
+    fps: float
+    rig: Rig
+    views: list[View]
+    states: dict[str, np.ndarray]
+    extras: dict
+    fingerprint: str
+
+
+def scene_folder(out: Path, name: str, sample: int) -> Path:
+    return out / name / f"{sample:04d}"
+
+
+def is_finished(folder: Path, fingerprint: str) -> bool:
+    """Whether ``folder`` holds a finished scene; InputError when it was made with other options."""
+    metadata = folder / "metadata.json"
+    if not metadata.is_file():
+        return False
+    if read_metadata(folder).get("fingerprint") != fingerprint:
+        raise InputError(f"{folder} was made with other options; choose another folder or remove it")
+    return True
+
+
+def read_metadata(folder: Path) -> dict:
+    try:
+        return parse_json((folder / "metadata.json").read_bytes())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder / 'metadata.json'} cannot be read: {error}") from error
+
+
+def write_scene(out: Path, scene: Scene) -> Path:
+    """Writes ``scene`` below ``out``; the folder appears whole or not at all."""
+    folder = scene_folder(out, scene.object, scene.sample)
+    unfinished = folder.with_name(f".{folder.name}.unfinished")
+    for leftover in (unfinished, folder):
+        if leftover.exists():
+            shutil.rmtree(leftover)
+    unfinished.mkdir(parents=True)
+    images_hash, states_hash = hashlib.sha256(), hashlib.sha256()
+    for cam in range(scene.rig.n_cams):
+        (unfinished / f"cam_{cam}").mkdir()
+    for step, view in enumerate(scene.views):
+        for image_type, images in _images(view):
+            images_hash.update(np.ascontiguousarray(images).tobytes())
+            for cam, image in enumerate(images):
+                file = FILE_TEMPLATE.format(cam_ix=cam, img_type=image_type, n_step=step) + ".png"
+                (unfinished / file).write_bytes(_png(image))
+    for name, nodes in scene.states.items():
+        states_hash.update(name.encode() + nodes.tobytes())
+    np.savez(unfinished / "states.npz", **scene.states)
+    hashes = {"states_sha256": states_hash.hexdigest(), "images_sha256": images_hash.hexdigest()}
+    write_json(unfinished / "metadata.json", {**_metadata(scene), **hashes})
+    os.replace(unfinished, folder)
+    return folder
+
+
+def _images(view: View) -> list[tuple[str, np.ndarray]]:
+    """Type and pixels [V, H, W, ...] of the images of one step, in the order in which they are hashed."""
+    images = [("rgb", view.rgb[..., ::-1]), ("seg", view.segmentation), ("inst", view.instances)]
+    if view.depth is not None:
+        images.append(("depth", np.rint(view.depth / DEPTH_UNIT).astype(np.uint16)))
+    return images
+
+
+def _png(image: np.ndarray) -> bytes:
+    import cv2
+
+    done, data = cv2.imencode(".png", np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
+    if not done:
+        raise RuntimeError("OpenCV could not encode a PNG")
+    return data.tobytes()
+
+
+def _metadata(scene: Scene) -> dict:
+    rig = scene.rig
+    cams = {
+        f"cam_{cam}": {
+            "extrinsics": rig.viewmats[cam].tolist(),
+            "intrinsics": rig.Ks[cam].tolist(),
+            "resolution": [rig.size, rig.size],
+        }
+        for cam in range(rig.n_cams)
+    }
+    return {
+        "n_steps": len(scene.views),
+        "n_cams": rig.n_cams,
+        "file_path_template": FILE_TEMPLATE,
+        "fps": scene.fps,
+        "near": rig.near,
+        "far": rig.far,
+        "origin": workspace_origin(rig).tolist(),
+        "object": scene.object,
+        "sample": scene.sample,
+        "generator_version": GENERATOR_VERSION,
+        "fingerprint": scene.fingerprint,
+        **({} if scene.views[0].depth is None else {"depth_unit": DEPTH_UNIT}),
+        **scene.extras,
+        **cams,
+    }
+
+
+def write_json(path: Path, content: dict) -> None:
+    text = json.dumps(content, indent=1) + "\n"
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    unfinished.write_text(text)
+    os.replace(unfinished, path)
+
+
+def write_manifest(out: Path, folders: list[Path], settings: dict) -> dict:
+    """Writes OUT/manifest.json: options, hashes of every scene, rejected draws, machine and versions."""
+    scenes = {}
+    for folder in folders:
+        metadata = read_metadata(folder)
+        scenes[folder.relative_to(out).as_posix()] = {
+            key: metadata[key] for key in ("states_sha256", "images_sha256", "fingerprint", "attempt")
+        }
+    manifest = {
+        "generator_version": GENERATOR_VERSION,
+        "settings": settings,
+        "machine": {"processor": _processor(), "system": platform.platform(), "python": platform.python_version()},
+        "versions": {package: _version(package) for package in PACKAGES},
+        "rejected": rejected_draws(folders),
+        "scenes": scenes,
+    }
+    write_json(out / "manifest.json", manifest)
+    return manifest
+
+
+def rejected_draws(folders: list[Path]) -> dict[str, int]:
+    """Number of draws that were not filmed, by reason."""
+    return dict(Counter(reason for folder in folders for reason in read_metadata(folder)["rejected"]))
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "absent"
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())

@@ -1,0 +1,1 @@
+"""Invariances, stress tests and approximation errors of a model."""

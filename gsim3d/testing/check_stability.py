@@ -1,0 +1,402 @@
+"""``gsim3d doctor --stability``: laws and hard cases on one's own model and scenes: a report, a file a failure."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from gsim3d import presets
+from gsim3d.cameras import Cameras, Frames
+from gsim3d.compat.quirks import Quirks
+from gsim3d.data import Scene, find_scenes, make_frames
+from gsim3d.data.check import check_scene
+from gsim3d.errors import InputError, did_you_mean
+from gsim3d.io.files import write_whole
+from gsim3d.io.terminal import progress
+from gsim3d.pretrained import broken_laws, located, names
+from gsim3d.simulator import Simulator
+from gsim3d.testing.invariances import LAWS, Deviation, Sample
+from gsim3d.testing.stress import CASES
+from gsim3d.train.restore import PRESETS, Restored, build_simulator, restore
+from gsim3d.train.samples import context_cameras, spread_views, thinned
+
+CHECKS = {**LAWS, **CASES}
+LONG, SHORT = "a long rollout", 3  # steps of all other checks
+N_STEPS = 100
+MAX_SCENES, MAX_HISTORY, MAX_PIXELS = 2, 2, 150  # what a quick check computes with (pixels of an image)
+FULL_VIEWS = 4  # of a full one, which has every particle
+FORMAT = 1
+RANDOM_SIZE = 32  # pixels of the images that are made where there are none
+# Laws that published behaviour breaks: in it the clouds of a call, their order and the world's axes change each other.
+UNPROMISED = {
+    "anchor_at_minimum": ("translate", "permute scenes", "repeat a scene", "split the batch", "append a far particle"),
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one check found. outcome: "holds", "fails", "known failure" (the model card has it) or "not promised".
+    worst: the deviation nearest to, or farthest beyond, its bound.   failures: those that do not hold.   file: it
+    reproduces them.   reason: why it is not promised, or what the model card says."""
+
+    check: str
+    outcome: str
+    n_compared: int = 0
+    seconds: float = 0.0
+    worst: Deviation | None = None
+    failures: tuple[Deviation, ...] = ()
+    file: str | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True)
+class Report:
+    """subject: what was checked, by name.   problems: of scenes that could not be read.   findings: one a check."""
+
+    subject: dict[str, str]
+    problems: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def healthy(self) -> bool:
+        return not self.problems and all(finding.outcome in ("holds", "not promised") for finding in self.findings)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A simulator to check, how to have it again, and what to call it."""
+
+    simulator: Simulator
+    origin: dict[str, str]
+    restored: Restored | None = None
+    known: dict[str, dict] = dataclasses.field(default_factory=dict)  # what the model card says that it breaks
+
+
+def is_checkpoint(path: Path) -> bool:
+    """A run folder, a checkpoint folder or an exported file."""
+    if path.is_file():
+        return path.suffix == ".safetensors"
+    return (path / "checkpoints").is_dir() or (path / "state.json").is_file()
+
+
+def open_subject(path: str | Path | None, device: str = "cpu") -> Subject:
+    """The simulator of a checkpoint, or of a preset ("tiny" where None) with random weights of which none is zero."""
+    preset = "tiny" if path is None else str(path)
+    if preset not in PRESETS:
+        restored = restore(path, device)
+        restored.simulator.requires_grad_()
+        return Subject(restored.simulator, {"checkpoint": str(path)}, restored, broken_laws(path))
+    simulator = build_simulator(getattr(presets, preset)(), seed=0)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in simulator.parameters():
+            parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
+    return Subject(simulator.eval().to(device), {"preset": f"{preset}, random weights"})
+
+
+def sample_of_scenes(subject: Subject, folders: Sequence[Path], full: bool = False) -> tuple[Sample | None, list[str]]:
+    """The first steps and evenly spread views of up to two scenes that load; what is wrong with those that do not.
+
+    full: four views, the whole history and every particle that the model makes of them.
+    """
+    scenes, problems = [], []
+    for folder in folders:
+        if len(scenes) == MAX_SCENES:
+            break
+        found = check_scene(folder).problems
+        problems += found
+        if found:
+            continue
+        scene = subject.restored.open_scene(folder) if subject.restored else Scene.open(folder)
+        if not scenes or (scene.width, scene.height) == (scenes[0].width, scenes[0].height):
+            scenes.append(scene)
+    if not scenes:
+        return None, problems
+    longest = 2**subject.simulator.config.dynamics.history_bits
+    history = min(longest if full else MAX_HISTORY, longest, *(scene.n_steps for scene in scenes))
+    cams = [_views(subject, scene, FULL_VIEWS if full else None) for scene in scenes]
+    masked = all(scene.has_segmentation() for scene in scenes)
+    frames = make_frames(scenes, cams, [range(history)] * len(scenes), masked=masked)
+    frames = _as_trained(subject, frames) if full else _thinned(frames)
+    return _sample(subject, frames), problems
+
+
+def _as_trained(subject: Subject, frames: Frames) -> Frames:
+    return frames if subject.restored is None else thinned(frames, subject.restored.data)
+
+
+def _views(subject: Subject, scene: Scene, count: int | None = None) -> list[int]:
+    if subject.restored is not None:
+        data = subject.restored.data_of(scene)
+        cameras = context_cameras(scene, data)
+        return list(spread_views(cameras, min(len(cameras), count or data.context_views), 0))
+    return list(spread_views(range(scene.n_cams), min(count or 3, scene.n_cams), 0))
+
+
+def random_sample(subject: Subject) -> Sample:
+    """Two scenes of random images with two and one steps, three cameras on a ring around the origin each."""
+    size = (RANDOM_SIZE, RANDOM_SIZE) if subject.restored is None else subject.restored.image_size
+    generator = torch.Generator().manual_seed(0)
+    n_steps = (min(MAX_HISTORY, 2**subject.simulator.config.dynamics.history_bits), 1)
+    n_clouds, n_views = sum(n_steps), 3
+    viewmats = torch.stack([_looking_at_the_origin(0.4 + 2.0 * v) for v in range(n_views)]).float()
+    K = torch.tensor([[1.2 * size[0], 0, size[0] / 2], [0, 1.2 * size[0], size[1] / 2], [0, 0, 1]])
+    n = n_clouds * n_views
+    cameras = Cameras(
+        viewmats.repeat(n_clouds, 1, 1),
+        K.repeat(n, 1, 1),
+        torch.full((n,), 1.0),
+        torch.full((n,), 4.0),
+        torch.arange(n_clouds).repeat_interleave(n_views),
+        *size,
+    )
+    frames = Frames(
+        images=torch.rand(n, 3, size[1], size[0], generator=generator),
+        cameras=cameras,
+        cloud_scene=torch.repeat_interleave(torch.arange(2), torch.tensor(n_steps)),
+        cloud_step=torch.cat([torch.arange(steps) for steps in n_steps]),
+        origin=torch.full((2, 3), -5.0, dtype=torch.float64),
+        masks=torch.rand(n, size[1], size[0], generator=generator) < 0.3,
+        dynamic=torch.rand(n, size[1], size[0], generator=generator) < 0.7,
+    )
+    return _sample(subject, _thinned(frames))
+
+
+def _looking_at_the_origin(angle: float) -> Tensor:
+    """World-to-camera [4, 4] of a camera 2.2 m away, 1 m above."""
+    center = torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64)
+    turn = torch.tensor(angle, dtype=torch.float64)
+    center = torch.stack([center[0] * turn.cos(), center[0] * turn.sin(), center[2]])
+    forward = -center / center.norm()
+    right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    right = right / right.norm()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ center
+    return pose
+
+
+def _thinned(frames: Frames) -> Frames:
+    """At most MAX_PIXELS of the pixels that an image keeps, evenly spread."""
+    kept = torch.ones_like(frames.images[:, 0], dtype=torch.bool) if frames.masks is None else frames.masks
+    number = kept.flatten(1).cumsum(1)
+    every = (number[:, -1:] + MAX_PIXELS - 1).div(MAX_PIXELS, rounding_mode="floor").clamp(min=1)
+    return dataclasses.replace(frames, masks=kept & ((number - 1) % every == 0).view(kept.shape))
+
+
+def _sample(subject: Subject, frames: Frames) -> Sample:
+    """Every scene also rendered by the cameras of its first step."""
+    scene_of_image = frames.cloud_scene[frames.cameras.image_cloud]
+    first = (frames.cloud_step[frames.cameras.image_cloud] == 0).nonzero()[:, 0]
+    targets = frames.cameras.select(first, scene_of_image[first])
+    device = next(subject.simulator.parameters()).device
+    plan = subject.restored.plan if subject.restored else None
+    return Sample(frames.to(device), targets.to(device), SHORT, plan)
+
+
+def check(
+    subject: Subject,
+    sample: Sample,
+    n_steps: int = N_STEPS,
+    only: Sequence[str] = (),
+    on_check: Callable = lambda name: None,
+) -> Iterator[tuple[Finding, Sample]]:
+    """Every check, or those of ``only``, with the sample it was tried on."""
+    quirks = subject.simulator.config.dynamics.quirks
+    for name in only or CHECKS:
+        on_check(name)
+        tried = dataclasses.replace(sample, n_steps=n_steps if name == LONG else SHORT)
+        broken_by = [quirk for quirk, laws in UNPROMISED.items() if getattr(quirks, quirk) and name in laws]
+        if broken_by or (quirks != Quirks() and name in LAWS and name != "repeat"):
+            reason = f"the model imitates published behaviour ({broken_by[0] if broken_by else 'quirks'})"
+            yield Finding(name, "not promised", reason=reason), tried
+            continue
+        start, crash = time.perf_counter(), None
+        deviations: list[Deviation] = []
+        try:
+            deviations.extend(CHECKS[name](subject.simulator, tried))
+        except Exception as error:  # whatever goes wrong is what is looked for, and the other checks go on
+            crash = Deviation(
+                f"ends with {type(error).__name__}", float("inf"), 0.0, " ".join(str(error).split())[:300]
+            )
+            deviations.append(crash)
+        failures = tuple(deviation for deviation in deviations if not deviation.holds)
+        worst = max(deviations, key=lambda d: d.error / d.bound if d.bound else d.error, default=None)
+        seconds = time.perf_counter() - start
+        outcome, reason = "fails" if failures else "holds", None
+        if failures and (card := subject.known.get(name)) and crash is None:
+            outcome = "known failure"
+            reason = f"known failure, in the model card: {card['what']} {card['error']:.3g} (at most {card['bound']:g})"
+        yield Finding(name, outcome, len(deviations), seconds, worst, failures, reason=reason), tried
+
+
+def save_sample(path: Path, sample: Sample, what: dict) -> None:
+    """Everything that a check is a function of, but the model: tensors, and ``what`` as text."""
+    tensors = {f"frames.{k}": v for k, v in vars(sample.frames).items() if isinstance(v, Tensor)}
+    tensors |= {f"cameras.{k}": v for k, v in vars(sample.frames.cameras).items() if isinstance(v, Tensor)}
+    tensors |= {f"targets.{k}": v for k, v in vars(sample.targets).items() if isinstance(v, Tensor)}
+    size = {"width": sample.targets.width, "height": sample.targets.height, "n_steps": sample.n_steps}
+    part = path.with_name(f".{path.name}.part")
+    text = {"gsim3d_stability": json.dumps({"format": FORMAT, **size, **what})}
+    save_file({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, part, text)
+    os.replace(part, path)
+
+
+def load_sample(path: str | Path) -> tuple[Sample, dict]:
+    """What :func:`save_sample` wrote. Raises InputError where it is no such file."""
+    try:
+        if not Path(path).is_file():  # a pipe would be waited for
+            raise InputError(f"{path}: no such file")
+        with safe_open(path, "pt") as file:
+            what = json.loads((file.metadata() or {})["gsim3d_stability"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+        if what.get("format") != FORMAT or what["check"] not in CHECKS:
+            raise KeyError("format")
+        parts: dict[str, dict] = {"frames": {}, "cameras": {}, "targets": {}}
+        for name, value in tensors.items():
+            part, _, key = name.partition(".")
+            parts[part][key] = value
+        size = {"width": int(what["width"]), "height": int(what["height"])}
+        frames = Frames(cameras=Cameras(**parts["cameras"], **size), **parts["frames"])
+        return Sample(frames, Cameras(**parts["targets"], **size), int(what["n_steps"])), what
+    except (OSError, MemoryError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: not a file that gsim3d doctor --stability wrote ({type(error).__name__})") from None
+
+
+def write_report(report: Report, out: Path) -> None:
+    """report.md and report.json in ``out``."""
+    lines = ["# Stability", "", *(f"- {name}: {value}" for name, value in report.subject.items()), ""]
+    if report.problems:
+        lines += ["## Scenes that cannot be read", "", *(f"- {problem}" for problem in report.problems), ""]
+    lines += ["| check | outcome | compared | worst | seconds |", "| --- | --- | --- | --- | --- |"]
+    for finding in report.findings:
+        worst = "; ".join(filter(None, (finding.reason, str(finding.worst) if finding.worst else None)))
+        cells = [finding.check, finding.outcome, str(finding.n_compared), worst, f"{finding.seconds:.1f}"]
+        lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
+    for finding in report.findings:
+        if finding.failures:
+            lines += ["", f"## {finding.check}", "", (CHECKS[finding.check].__doc__ or "").strip(), ""]
+            lines += [f"- {deviation}" for deviation in finding.failures[:20]]
+            more = len(finding.failures) - 20
+            lines += [f"- and {more} more"] if more > 0 else []
+            lines += ["", f"Again: `gsim3d doctor --stability --replay {finding.file}`"]
+    text = "\n".join(lines) + "\n"
+    for name, content in {"report.md": text, "report.json": json.dumps(_plain(report), indent=1) + "\n"}.items():
+        write_whole(out / name, content)
+
+
+def _plain(report: Report) -> dict:
+    """The report as JSON holds it: an infinite error as text."""
+
+    def plain(value):
+        if dataclasses.is_dataclass(value):
+            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        if isinstance(value, (tuple, list)):
+            return [plain(item) for item in value]
+        if isinstance(value, dict):
+            return {key: plain(item) for key, item in value.items()}
+        return str(value) if isinstance(value, float) and not value < float("inf") else value
+
+    return {"healthy": report.healthy, **plain(report)}
+
+
+@dataclass
+class Job:
+    """What the command was asked for.
+
+    paths: a checkpoint, a scene or a folder of scenes, in any order; none: random weights and images.
+    out: folder of the report.   n_steps: of the long rollout.   only: names of checks; all where empty.
+    full: all particles, four views and the model's whole history.
+    """
+
+    paths: Sequence[str] = ()
+    out: Path = Path("runs/stability")
+    n_steps: int = N_STEPS
+    only: Sequence[str] = ()
+    device: str = "cpu"
+    progress: bool = True
+    full: bool = False
+
+
+def run(job: Job) -> Report:
+    """Checks, writes the report and the files that reproduce failures, and returns the report.
+
+    Raises:
+        InputError: a path is neither a checkpoint nor a scene nor a folder of scenes, or a check is unknown.
+    """
+    if unknown := [name for name in job.only if name not in CHECKS]:
+        raise InputError(
+            f"--only: unknown check {unknown[0]!r}; checks: {', '.join(CHECKS)}{did_you_mean(unknown[0], CHECKS)}"
+        )
+    if job.n_steps < 1:
+        raise InputError(f"--steps must be at least 1; got {job.n_steps}")
+    paths = [located(path) if str(path) in names() else Path(path) for path in job.paths]
+    named = [*names(), *PRESETS]
+    for path in paths:
+        if not path.exists() and str(path) not in PRESETS:
+            raise InputError(f"{path}: no such file or folder{did_you_mean(path, named)}")
+    checkpoints = [path for path in paths if str(path) in PRESETS or is_checkpoint(path)]
+    others = [path for path in paths if path not in checkpoints]
+    if len(checkpoints) > 1 or len(others) > 1:
+        raise InputError("--stability takes one checkpoint, and one scene or folder of scenes")
+    if job.full and not others:
+        raise InputError("--full needs scenes: gsim3d doctor --stability NAME DATA --full")
+    folders = find_scenes(others[0]) if others else []
+    subject = open_subject(checkpoints[0] if checkpoints else None, job.device)
+    origin = subject.origin | ({"scenes": str(others[0])} if others else {"scenes": "random images"})
+    sample, problems = sample_of_scenes(subject, folders, job.full) if folders else (random_sample(subject), [])
+    findings: list[Finding] = []
+    if sample is not None:
+        (job.out / "failures").mkdir(parents=True, exist_ok=True)
+        with progress(None, "checks", len(job.only or CHECKS), unit="check", quiet=not job.progress) as bar:
+            for finding, tried in check(subject, sample, job.n_steps, job.only, bar.set_description):
+                if finding.failures:
+                    file = job.out / "failures" / f"{finding.check.replace(' ', '_')}.safetensors"
+                    save_sample(file, tried, {"check": finding.check, **subject.origin})
+                    finding = dataclasses.replace(finding, file=str(file))
+                findings.append(finding)
+                bar.update()
+    report = Report(origin, tuple(problems), tuple(findings))
+    job.out.mkdir(parents=True, exist_ok=True)
+    write_report(report, job.out)
+    return report
+
+
+def replay(path: str | Path, device: str = "cpu") -> Report:
+    """The check that a file reproduces, once more, on the model that it names."""
+    sample, what = load_sample(path)
+    subject = open_subject(what.get("checkpoint") or what["preset"].partition(",")[0], device)
+    plan = subject.restored.plan if subject.restored else None
+    place = next(subject.simulator.parameters()).device
+    sample = dataclasses.replace(sample, frames=sample.frames.to(place), targets=sample.targets.to(place), plan=plan)
+    findings = [finding for finding, _ in check(subject, sample, sample.n_steps, [what["check"]])]
+    return Report(subject.origin | {"replayed": str(path)}, (), tuple(findings))
+
+
+def describe(report: Report) -> str:
+    """The report as the terminal shows it."""
+    lines = [f"{name}: {value}" for name, value in report.subject.items()]
+    lines += [f"  FAIL problem: {problem}" for problem in report.problems]
+    for finding in report.findings:
+        mark = {"holds": "ok", "fails": "FAIL", "known failure": "FAIL", "not promised": "-"}[finding.outcome]
+        what = f"{finding.n_compared} compared in {finding.seconds:.1f} s" if finding.n_compared else ""
+        what = "; ".join(filter(None, (what, finding.reason)))
+        lines.append(f"  {mark:<4} {finding.check:<24} {what}")
+        lines += [f"       {deviation}" for deviation in finding.failures[:3]]
+        if finding.file:
+            lines.append(f"       again: gsim3d doctor --stability --replay {finding.file}")
+    count = [finding.outcome for finding in report.findings].count
+    if known := count("known failure"):
+        new = f"{count('fails')} more" if count("fails") else "no other"
+        lines.append(f"known failures that stand in the model card: {known}; {new} check fails")
+    return "\n".join(lines)

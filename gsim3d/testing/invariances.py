@@ -1,0 +1,465 @@
+"""Laws that hold for a simulator with any weights: the same scene, told otherwise, has the same future.
+
+    for deviation in LAWS["permute particles"](simulator, sample):
+        assert deviation.holds, deviation
+
+Each law tells a scene in two ways, moved or reordered or packed with others, and compares what the simulator makes of
+them: exactly where the same sums are formed, to a bound where they are formed in another order or at another place.
+A rollout amplifies the last bit as the world does, so laws that hold to a bound are checked step by step, each from one
+state; laws that hold exactly are checked on the whole rollout.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsim3d.cameras import Cameras, Frames
+from gsim3d.dynamics import last_steps
+from gsim3d.dynamics.clouds import newest_clouds
+from gsim3d.dynamics.state import rotate_left
+from gsim3d.effects.plan import Plan
+from gsim3d.math.spherical_harmonics import rotate_harmonics
+from gsim3d.nn.gaussian_head import render, rotation_matrices
+from gsim3d.simulator import Simulator
+from gsim3d.state import DYNAMIC, CloudTable, Gaussians, Particles, take_runs
+
+EXACT = {torch.float32: 0.0, torch.float64: 1e-12}  # BLAS rounds a row of float64 as the number of rows suggests
+BOUND = 1e-4  # error over the largest value: float32 sums in another order; worst seen 7e-6, on small random models
+FOLLOWED_BOUND = 1e-3  # of velocities, fitted to pixels: images of noise have no motion to find; worst seen 2.9e-4
+IMAGE_BOUND = 1e-3  # root mean square of a pixel's error: one splat whose alpha crosses 1/255 moves one pixel by 0.004
+GRAIN = 2.0**-18  # metres; positions are rounded to it before a scene is moved, so that sums of float32 are exact
+PLACES = ("means", "reference", "body")  # fields of particles
+OF_PLACES = (*PLACES, "velocity", "light", "shaded")  # which a step leaves where it ends, rounded as that is
+FAR = 2.0**17  # cells: outside of the 2^16 that a grid has
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What the laws are tried on.
+
+    frames: images of one or more scenes.   targets: cameras to render, ``image_cloud`` is the scene of each.
+    n_steps: length of a rollout.   plan: what to compute; None: all that the model can.
+    """
+
+    frames: Frames
+    targets: Cameras
+    n_steps: int = 3
+    plan: Plan | None = None
+
+    @property
+    def n_scenes(self) -> int:
+        return self.frames.origin.shape[0]
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How far one tensor is from what a law says. bound 0: every bit must agree. where: of the largest error."""
+
+    what: str
+    error: float
+    bound: float
+    where: str
+
+    @property
+    def holds(self) -> bool:
+        return self.error <= self.bound
+
+    def __str__(self) -> str:
+        wanted = f"at most {self.bound:g}" if self.bound else "equal bits"
+        return f"{self.what}: error {self.error:.3g} ({wanted}), largest at {self.where}"
+
+
+Law = Callable[[Simulator, Sample], Iterator[Deviation]]
+
+
+def compare(what: str, actual: Tensor, expected: Tensor, bound: float, place: Callable[[int], str]) -> Deviation:
+    """``actual`` against ``expected``, both [N, ...]; the error is relative to the largest expected value.
+
+    place: the name of row i. What is not finite on either side is an infinite error, unless both have the same bits.
+    """
+    if actual.shape != expected.shape:
+        return Deviation(what, float("inf"), bound, f"shape {list(actual.shape)}, expected {list(expected.shape)}")
+    if actual.numel() == 0:
+        return Deviation(what, 0.0, bound, "nothing")
+    error = (actual.detach().double() - expected.detach().double()).abs()
+    error = torch.where(error.isfinite(), error, torch.inf).reshape(len(error), -1).amax(1)
+    row = int(error.argmax())
+    scale = float(expected.detach().abs().max()) if bound else 1.0
+    return Deviation(what, float(error[row]) / max(scale, 1e-30), bound, place(row))
+
+
+def compare_particles(
+    what: str, actual: Particles, expected: Particles, bound: float, names: Sequence[str] = ()
+) -> Iterator[Deviation]:
+    """All floating-point fields of two sets of particles, or those of ``names``."""
+    for name, value in expected.row_fields().items():
+        if value.is_floating_point() and (not names or name in names):
+            most = FOLLOWED_BOUND if bound == BOUND and name == "velocity" else bound
+            yield compare(f"{what} {name}", getattr(actual, name), value, most, lambda i: particle_name(expected, i))
+
+
+def compare_images(what: str, actual: Tensor, expected: Tensor, bound: float) -> Deviation:
+    """Images [I, H, W, 3]: bits where the bound is 0, else the root mean square error of the worst image."""
+    if not bound or actual.shape != expected.shape:
+        return compare(what, actual, expected, bound, lambda i: f"camera {i}")
+    error = (actual.detach().double() - expected.detach().double()).square().flatten(1).mean(1).sqrt()
+    error = torch.where(error.isfinite(), error, torch.inf)
+    return Deviation(what, float(error.max()), bound, f"camera {int(error.argmax())}")
+
+
+def particle_name(particles: Particles, row: int) -> str:
+    """ "scene 0, step 3, particle 17" of a row."""
+    table = particles.clouds
+    cloud = next(q for q in range(len(table)) if row < table.starts[q + 1])
+    return f"scene {table.scenes[cloud]}, step {table.steps[cloud]}, particle {row - table.starts[cloud]}"
+
+
+def take_scenes(frames: Frames, scenes: Sequence[int]) -> Frames:
+    """The frames of ``scenes``, in that order; one may be taken several times."""
+    cloud_scene, image_cloud = frames.cloud_scene.tolist(), frames.cameras.image_cloud.tolist()
+    clouds = [(new, q) for new, scene in enumerate(scenes) for q, own in enumerate(cloud_scene) if own == scene]
+    images = [(i, new) for new, (_, q) in enumerate(clouds) for i, cloud in enumerate(image_cloud) if cloud == q]
+    device = frames.images.device
+    rows, image_cloud = (torch.tensor(column, device=device) for column in zip(*images, strict=True))
+    new_scene, chosen = (torch.tensor(column, device=device) for column in zip(*clouds, strict=True))
+    maps = {name: getattr(frames, name) for name in ("images", "masks", "dynamic", "valid")}
+    return dataclasses.replace(
+        frames,
+        **{name: None if value is None else value[rows] for name, value in maps.items()},
+        cameras=frames.cameras.select(rows, image_cloud),
+        cloud_scene=new_scene,
+        cloud_step=frames.cloud_step[chosen],
+        origin=frames.origin[list(scenes)],
+        world_offset=None if frames.world_offset is None else frames.world_offset[list(scenes)],
+    )
+
+
+def take_scenes_of_particles(particles: Particles, scenes: Sequence[int]) -> Particles:
+    """The particles of ``scenes``, in that order; one may be taken several times."""
+    table = particles.clouds
+    clouds = [(new, q) for new, scene in enumerate(scenes) for q in range(len(table)) if table.scenes[q] == scene]
+    runs = table.row_runs([q for _, q in clouds])
+    new = CloudTable.make(
+        (table.count(q) for _, q in clouds),
+        (scene for scene, _ in clouds),
+        (table.steps[q] for _, q in clouds),
+        particles.cu_rows.device,
+    )
+    fields = {name: take_runs(value, runs) for name, value in particles.row_fields().items()}
+    offset = None if particles.world_offset is None else particles.world_offset[list(scenes)]
+    fields |= {"origin": particles.origin[list(scenes)], "world_offset": offset}
+    return particles.with_clouds(new, **fields)
+
+
+def permute_rows(particles: Particles, seed: int = 0) -> tuple[Particles, Tensor]:
+    """The particles of each cloud in another order, and where each new row came from. Clouds of as many rows have the
+    same order: in simulated steps a row is one particle throughout."""
+    table = particles.clouds
+    counts = [table.count(q) for q in range(len(table))]
+    order = [torch.randperm(n, generator=torch.Generator().manual_seed(seed)) for n in counts]
+    order = torch.cat([start + rows for start, rows in zip(table.starts[:-1], order, strict=True)])
+    order = order.to(particles.means.device)
+    return dataclasses.replace(particles, **{n: v[order] for n, v in particles.row_fields().items()}), order
+
+
+def move_cameras(cameras: Cameras, rotation: Tensor, translation: Tensor) -> Cameras:
+    """Cameras of a world moved by ``x -> rotation x + translation``, in float64."""
+    viewmats = cameras.viewmats.double()
+    motion = torch.eye(4, dtype=torch.float64, device=viewmats.device)
+    motion[:3, :3], motion[:3, 3] = rotation.T, -rotation.T @ translation
+    return dataclasses.replace(cameras, viewmats=viewmats @ motion)
+
+
+def move_gaussians(gaussians: Gaussians, rotation: Tensor, translation: Tensor) -> Gaussians:
+    """Gaussians of a world moved by ``x -> rotation x + translation``: positions, rotations and harmonics."""
+    vector = rotation_vector(rotation).to(gaussians.quats)
+    matrices = rotation.to(gaussians.sh).expand(gaussians.sh.shape[0], 3, 3)
+    return dataclasses.replace(
+        gaussians,
+        means=(gaussians.means.double() @ rotation.T + translation).to(gaussians.means),
+        quats=rotate_left(gaussians.quats, vector.expand(gaussians.quats.shape[0], 3)),
+        sh=rotate_harmonics(gaussians.sh, matrices),
+    )
+
+
+def rotation_vector(rotation: Tensor) -> Tensor:
+    """[3] radians of a rotation [3, 3] by less than half a turn."""
+    axis = torch.stack(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    sine = axis.norm() / 2
+    if float(sine) < 1e-12:
+        return torch.zeros_like(axis)
+    return axis / (2 * sine) * torch.atan2(sine, (rotation.diagonal().sum() - 1) / 2)
+
+
+def random_motion(seed: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """A rotation about any axis by a third to two thirds of half a turn, and a translation of about a metre."""
+    g = torch.Generator().manual_seed(seed)
+    quat = torch.randn(1, 4, generator=g, dtype=torch.float64)
+    quat[0, 0] = quat[0, 1:].norm() * (0.6 + torch.rand((), generator=g, dtype=torch.float64))
+    rotation = rotation_matrices(quat / quat.norm())[0]
+    return rotation.to(like.device), torch.randn(3, generator=g, dtype=torch.float64).to(like.device)
+
+
+def voxel_shift(simulator: Simulator, like: Tensor) -> Tensor:
+    """float64 [3] metres, about (2, -3, 1) in whole voxels, rounded to GRAIN."""
+    grid = simulator.config.dynamics.grid_size
+    cells = (torch.tensor([2.0, -3.0, 1.0], dtype=torch.float64) / grid).round()
+    return ((cells * grid / GRAIN).round() * GRAIN).to(like.device)
+
+
+def on_grain(particles: Particles) -> Particles:
+    """Particles whose positions are multiples of GRAIN."""
+    return _at(particles, lambda places: (places / GRAIN).round() * GRAIN)
+
+
+def _at(particles: Particles, moved: Callable[[Tensor], Tensor]) -> Particles:
+    """``particles`` at other places, now and where they began; ``moved`` of float64."""
+    known = {name: value for name in PLACES if (value := getattr(particles, name)) is not None}
+    return dataclasses.replace(
+        particles, **{name: moved(places.double()).to(places.dtype) for name, places in known.items()}
+    )
+
+
+def _states(simulator: Simulator, sample: Sample) -> Iterator[Particles]:
+    """The encoded state and those of a rollout, each with its history."""
+    state = simulator.encode(sample.frames).detach()
+    for step in range(sample.n_steps):
+        yield state
+        if step + 1 < sample.n_steps:
+            state = simulator.step(state, sample.plan).detach()
+
+
+def _future(simulator: Simulator, state: Particles, sample: Sample) -> list[Particles]:
+    return [step.detach() for step in simulator.rollout(state, sample.n_steps, sample.plan)]
+
+
+def _exact(particles: Particles) -> float:
+    """The bound of what has equal bits on the CPU: a GPU's BLAS rounds a row as the number of rows suggests, too."""
+    dtype = particles.means.dtype
+    return BOUND if particles.means.is_cuda and dtype == torch.float32 else EXACT[dtype]
+
+
+def _color(simulator: Simulator, particles: Particles, cameras: Cameras) -> Tensor:
+    return simulator.render(particles, cameras).color.detach()
+
+
+def _scene_cameras(cameras: Cameras, scenes: Sequence[int]) -> Cameras:
+    """The cameras of ``scenes``, in that order, with the numbers of their new places."""
+    owner = cameras.image_cloud.tolist()
+    images = [(i, new) for new, scene in enumerate(scenes) for i, own in enumerate(owner) if own == scene]
+    rows, clouds = zip(*images, strict=True)
+    return cameras.select(*(torch.tensor(x, device=cameras.near.device) for x in (rows, clouds)))
+
+
+@torch.no_grad()
+def repeat(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """The same input twice: equal bits."""
+    runs = []
+    for _ in range(2):
+        state = simulator.encode(sample.frames)
+        steps = _future(simulator, state, sample)
+        runs.append((state, steps, _color(simulator, steps[-1], sample.targets)))
+    (state, steps, image), (again, later, picture) = runs
+    yield from compare_particles("encode", again, state, 0)
+    for step, other in zip(steps, later, strict=True):
+        yield from compare_particles("rollout", other, step, 0)
+    yield compare_images("render", picture, image, 0)
+
+
+@torch.no_grad()
+def translate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """Scene, cameras and origin moved by whole voxels: the same particles there, the same images."""
+    shift = voxel_shift(simulator, sample.frames.origin)
+    still = torch.eye(3, dtype=torch.float64, device=shift.device)
+    frames = dataclasses.replace(sample.frames, cameras=move_cameras(sample.frames.cameras, still, 0 * shift))
+    moved = dataclasses.replace(
+        frames, cameras=move_cameras(frames.cameras, still, shift), origin=frames.origin + shift
+    )
+    expected = simulator.encode(frames)
+    yield from compare_particles("encode", _moved(simulator.encode(moved), -shift), expected, BOUND)
+    for state in _states(simulator, sample):
+        state = on_grain(state)
+        step, there = simulator.step(state, sample.plan), simulator.step(_moved(state, shift), sample.plan)
+        step, there = last_steps(step, 1), last_steps(there, 1)
+        moved = [name for name in step.row_fields() if name in OF_PLACES]
+        unmoved = [name for name in step.row_fields() if name not in moved]
+        yield from compare_particles("step", there, step, 0, unmoved)
+        yield from compare_particles("step", _moved(there, -shift), step, BOUND, moved)
+        targets = move_cameras(sample.targets, still, 0 * shift)
+        image = _color(simulator, step, targets)
+        picture = _color(simulator, _moved(step, shift), move_cameras(targets, still, shift))
+        yield compare_images("render", picture, image, IMAGE_BOUND)
+
+
+def _moved(particles: Particles, shift: Tensor) -> Particles:
+    particles = _at(particles, lambda places: places + shift)
+    return dataclasses.replace(particles, origin=particles.origin + shift)
+
+
+@torch.no_grad()
+def rotate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """Cameras turned and moved together: depths stay; Gaussians and cameras moved together: images stay."""
+    rotation, translation = random_motion(0, sample.frames.origin)
+    cameras = move_cameras(sample.frames.cameras, torch.eye(3).to(rotation), 0 * translation)
+    frames = dataclasses.replace(sample.frames, cameras=cameras)
+    moved = dataclasses.replace(frames, cameras=move_cameras(cameras, rotation, translation))
+    expected, there = simulator.encode(frames), simulator.encode(moved)
+    means = (expected.means.double() @ rotation.T + translation).to(expected.means)
+    yield from compare_particles(
+        "encode", there, dataclasses.replace(expected, means=means), BOUND, ["means", "opacities"]
+    )
+    newest = last_steps(expected, 1)
+    gaussians = simulator.renderer(newest)
+    targets = move_cameras(sample.targets, torch.eye(3).to(rotation), 0 * translation)
+    image = render(gaussians, targets).color
+    picture = render(
+        move_gaussians(gaussians, rotation, translation), move_cameras(targets, rotation, translation)
+    ).color
+    yield compare_images("render", picture, image, IMAGE_BOUND)
+
+
+@torch.no_grad()
+def permute_particles(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """The particles of each cloud in another order: each has the same future, and the image stays."""
+    for state in _states(simulator, sample):
+        shuffled, order = permute_rows(state)
+        step, other = (last_steps(simulator.step(s, sample.plan), 1) for s in (state, shuffled))
+        runs = state.clouds.row_runs(newest_clouds(state.clouds))
+        place = torch.empty_like(order)
+        place[take_runs(torch.arange(len(order), device=order.device), runs)] = torch.arange(step.n_rows).to(order)
+        came_from = place[take_runs(order, runs)]
+        expected = dataclasses.replace(step, **{n: v[came_from] for n, v in step.row_fields().items()})
+        yield from compare_particles("step", other, expected, BOUND)
+        image = _color(simulator, step, sample.targets)
+        yield compare_images("render", _color(simulator, expected, sample.targets), image, IMAGE_BOUND)
+
+
+@torch.no_grad()
+def permute_views(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """The views of each step in another order: the same particles; target cameras in another order: the same images."""
+    frames = sample.frames
+    n_images = len(frames.cameras)
+    reverse = torch.arange(n_images - 1, -1, -1, device=frames.images.device)
+    maps = {name: getattr(frames, name) for name in ("images", "masks", "dynamic", "valid")}
+    turned = dataclasses.replace(
+        frames,
+        **{name: None if value is None else value[reverse] for name, value in maps.items()},
+        cameras=frames.cameras.select(reverse),
+    )
+    state, other = simulator.encode(frames), simulator.encode(turned)
+    n_pixels = frames.images[0, 0].numel()
+    pixels = _pixels_of_rows(turned)  # of the turned images; in terms of the images as they were:
+    pixels = (n_images - 1 - pixels // n_pixels) * n_pixels + pixels % n_pixels
+    back = torch.argsort(pixels)[torch.argsort(torch.argsort(_pixels_of_rows(frames)))]
+    ordered = dataclasses.replace(other, **{name: value[back] for name, value in other.row_fields().items()})
+    yield from compare_particles("encode", ordered, state, BOUND)
+    newest = last_steps(state, 1)
+    image = _color(simulator, newest, sample.targets)
+    reverse = torch.arange(len(sample.targets) - 1, -1, -1, device=image.device)
+    yield compare_images("render", _color(simulator, newest, sample.targets.select(reverse)), image[reverse], 0)
+
+
+def _pixels_of_rows(frames: Frames) -> Tensor:
+    """int64 [N], image * H * W + pixel of each encoded particle."""
+    n_pixels = frames.images[0, 0].numel()
+    order = torch.argsort(frames.cameras.image_cloud, stable=True)
+    pixels = order[:, None] * n_pixels + torch.arange(n_pixels, device=order.device)
+    return pixels.flatten() if frames.masks is None else pixels[frames.masks[order].flatten(1)]
+
+
+def _together_and_apart(simulator: Simulator, sample: Sample, scenes: Sequence[int]) -> Iterator[Deviation]:
+    """Scenes packed in the order ``scenes`` against the order of ``sample``. Equal bits from the particles on; how
+    torch's dense convolutions round in the encoder depends on the number of images."""
+    state = simulator.encode(sample.frames)
+    packed = take_scenes_of_particles(state, scenes)
+    yield from compare_particles("encode", simulator.encode(take_scenes(sample.frames, scenes)), packed, BOUND)
+    step, other = simulator.step(state, sample.plan), simulator.step(packed, sample.plan)
+    exact = _exact(state)
+    yield from compare_particles("step", other, take_scenes_of_particles(step, scenes), exact)
+    for step, other in zip(_future(simulator, state, sample), _future(simulator, packed, sample), strict=True):
+        yield from compare_particles("rollout", other, take_scenes_of_particles(step, scenes), exact)
+    image = _color(simulator, step, sample.targets)
+    owner = sample.targets.image_cloud.tolist()
+    images = [i for scene in scenes for i, own in enumerate(owner) if own == scene]
+    picture = _color(simulator, other, _scene_cameras(sample.targets, scenes))
+    yield compare_images("render", picture, image[images], IMAGE_BOUND if exact == BOUND else exact)
+
+
+@torch.no_grad()
+def permute_scenes(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """The scenes of a batch in another order: the same futures."""
+    yield from _together_and_apart(simulator, sample, range(sample.n_scenes - 1, -1, -1))
+
+
+@torch.no_grad()
+def repeat_scene(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """A scene twice in the batch: the same future in both places, and the others do not notice."""
+    yield from _together_and_apart(simulator, sample, [*range(sample.n_scenes), 0])
+
+
+@torch.no_grad()
+def split_batch(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """Each scene alone: the same future as in the batch."""
+    for scene in range(sample.n_scenes):
+        yield from _together_and_apart(simulator, sample, [scene])
+
+
+@torch.no_grad()
+def append_sleeper(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """One more particle in each cloud, far outside the grid: it stays as it is, and the others do not notice."""
+    state = simulator.encode(sample.frames).detach()
+    far, exact = FAR * simulator.config.dynamics.grid_size, _exact(state)
+    grown = _with_far_particle(state, far)
+    sleepers = _beyond(last_steps(grown, 1), far)
+    for step, other in zip(_future(simulator, state, sample), _future(simulator, grown, sample), strict=True):
+        yield from compare_particles("rollout", _beyond(other, far, False), step, exact)
+        yield from compare_particles("the far particle's", _beyond(other, far), sleepers, 0)
+    hidden = other.means[:, 0] > far / 2
+    invisible = dataclasses.replace(other, opacities=other.opacities.masked_fill(hidden, 0))
+    image = _color(simulator, step, sample.targets)
+    yield compare_images(
+        "render", _color(simulator, invisible, sample.targets), image, IMAGE_BOUND if exact == BOUND else exact
+    )
+
+
+def _beyond(particles: Particles, far: float, wanted: bool = True) -> Particles:
+    return particles.select_rows((particles.means[:, 0] > far / 2) == wanted)
+
+
+def _with_far_particle(state: Particles, far: float) -> Particles:
+    """``state`` and behind the rows of each cloud that has any a copy of its first row, ``far`` metres away."""
+    table, rows, counts = state.clouds, [], []
+    for q in range(len(table)):
+        begin, count = table.starts[q], table.count(q)
+        rows += [*range(begin, begin + count), *[begin] * min(1, count)]
+        counts.append(count + min(1, count))
+    rows = torch.tensor(rows, device=state.means.device)
+    fields = {name: value[rows] for name, value in state.row_fields().items()}
+    new = CloudTable.make(counts, table.scenes, table.steps, state.cu_rows.device)
+    is_copy = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
+    is_copy[[new.starts[q + 1] - 1 for q in range(len(new)) if new.count(q)]] = True
+    fields["means"] = fields["means"] + far * is_copy[:, None]
+    fields["activity"] = fields["activity"].masked_fill(is_copy, DYNAMIC)
+    if state.velocity is not None:
+        fields["velocity"] = fields["velocity"] * ~is_copy[:, None]
+    return state.with_clouds(new, **fields)
+
+
+LAWS: dict[str, Law] = {
+    "repeat": repeat,
+    "translate": translate,
+    "rotate": rotate,
+    "permute particles": permute_particles,
+    "permute views": permute_views,
+    "permute scenes": permute_scenes,
+    "repeat a scene": repeat_scene,
+    "split the batch": split_batch,
+    "append a far particle": append_sleeper,
+}

@@ -1,0 +1,296 @@
+"""How long a simulator stays in bounds: curves over a rollout, gradients through it, and hard input made of a sample.
+
+The checks have the form of those in :mod:`gsim3d.testing.invariances`: (simulator, sample) -> deviations.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsim3d.cameras import Cameras, Frames
+from gsim3d.dynamics import last_steps
+from gsim3d.effects.plan import Plan
+from gsim3d.errors import HardCaseError
+from gsim3d.numerics.policy import StabilityReport
+from gsim3d.simulator import Simulator
+from gsim3d.state import CloudTable, Particles, take_runs
+from gsim3d.testing.invariances import Deviation, Law, Sample, particle_name, take_scenes_of_particles
+
+MAX_MASS_DRIFT = 0.01  # share of the opacity mass that a rollout of a model that holds opacities may lose or gain
+GRADIENT_STEPS = 12
+
+
+@dataclass(frozen=True)
+class Curves:
+    """One number a step, over all scenes. kinetic_energy: metres^2 a step^2, for unit masses. opacity_mass: sum of
+    opacities. extent: metres, the largest of a scene. speed: metres, the longest way of a particle in the step.
+    awake: particles that may still change."""
+
+    kinetic_energy: list[float]
+    opacity_mass: list[float]
+    extent: list[float]
+    speed: list[float]
+    awake: list[int]
+
+
+def rollout_curves(
+    simulator: Simulator, state: Particles, n_steps: int, plan: Plan | None = None, on_step=None
+) -> Curves:
+    """Energy, opacity, extent and speed of a rollout of any length, in the memory of one step.
+
+    Args:
+        on_step: called with the newest particles after each step.
+    Raises:
+        HardCaseError: as :meth:`Simulator.step`.
+    """
+    report, curves = StabilityReport(), Curves([], [], [], [], [])
+    for _ in range(n_steps):
+        before = last_steps(state, 1)
+        state = simulator.step(state, plan, report=report).detach()
+        newest = last_steps(state, 1)
+        rows = report.sentinels.values()
+        curves.kinetic_energy.append(sum(row.kinetic_energy for row in rows))
+        curves.opacity_mass.append(sum(row.opacity_mass for row in rows))
+        curves.extent.append(max((row.extent for row in rows), default=0.0))
+        same_rows = before.n_rows == newest.n_rows and newest.n_rows
+        moved = (newest.means - before.means).norm(dim=1).max() if same_rows else 0.0
+        curves.speed.append(float(moved))
+        curves.awake.append(sum(row.awake for row in rows))
+        report.clear()
+        if on_step is not None:
+            on_step(newest)
+    return curves
+
+
+def gradient_norms(
+    simulator: Simulator, state: Particles, targets: Cameras, n_steps: int, plan: Plan | None = None
+) -> tuple[list[float], dict[str, Tensor]]:
+    """How the image of the last step depends on the states before it, and on the parameters.
+
+    Returns:
+        The norm of the gradient of the image's mean squared value with respect to the state (positions and dynamic
+        latents) before step 1, 2, ... ``n_steps``; and its gradient with respect to every parameter that has one.
+    """
+    state = state.detach()
+    taps = []
+    for _ in range(n_steps):
+        leaf = {name: getattr(state, name) for name in ("means", "dynamic_latents")}
+        leaf = {name: value if value.requires_grad else value.requires_grad_() for name, value in leaf.items()}
+        state = dataclasses.replace(state, **leaf)
+        taps.append(tuple(leaf.values()))
+        state = simulator.step(state, plan)
+    loss = simulator.render(last_steps(state, 1), targets).color.square().mean()
+    parameters = dict(simulator.named_parameters())
+    sources = [*(value for pair in taps for value in pair), *parameters.values()]
+    found = torch.autograd.grad(loss, sources, allow_unused=True)
+    squares = [0.0 if g is None else float(g.double().square().sum()) for g in found[: 2 * n_steps]]
+    norms = [math.sqrt(a + b) for a, b in zip(squares[::2], squares[1::2], strict=True)]
+    gradients = dict(zip(parameters, found[2 * n_steps :], strict=True))
+    return norms, {name: value for name, value in gradients.items() if value is not None}
+
+
+def _holds(what: str, ok: bool, where: str) -> Deviation:
+    return Deviation(what, 0.0 if ok else math.inf, 0.0, where)
+
+
+def _finite(what: str, particles: Particles) -> Iterator[Deviation]:
+    """Every number of particles; the first row that holds another is named."""
+    for name, value in particles.row_fields().items():
+        if value.is_floating_point() and value.numel():
+            bad = ~value.detach().flatten(1).isfinite().all(1) if value.dim() > 1 else ~value.detach().isfinite()
+            row = int(bad.int().argmax())
+            yield _holds(f"{what} {name} is finite", not bool(bad.any()), particle_name(particles, row))
+
+
+def _finite_image(what: str, simulator: Simulator, particles: Particles, cameras: Cameras) -> Deviation:
+    color = simulator.render(particles, cameras).color
+    bad = ~color.isfinite().flatten(1).all(1)
+    camera = int(bad.int().argmax()) if len(bad) else 0
+    return _holds(f"{what} image is finite", not bool(bad.any()), f"camera {camera}")
+
+
+def _goes_through(what: str, simulator: Simulator, frames: Frames, sample: Sample) -> Iterator[Deviation]:
+    """Encoded, rolled out and rendered, all of it finite."""
+    state = simulator.encode(frames)
+    yield from _finite(f"{what}: encoded", state)
+    steps = simulator.rollout(state, sample.n_steps, sample.plan, report=StabilityReport())
+    yield from _finite(f"{what}: rollout's", steps[-1])
+    yield _finite_image(f"{what}:", simulator, steps[-1], sample.targets)
+
+
+@torch.no_grad()
+def images(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """Black, white and grey images, and images without a pixel to keep: finite particles, futures and images."""
+    frames = sample.frames
+    for name, value in {"black": 0.0, "white": 1.0, "grey": 0.5}.items():
+        painted = dataclasses.replace(frames, images=torch.full_like(frames.images, value))
+        yield from _goes_through(f"{name} images", simulator, painted, sample)
+    none = torch.zeros_like(frames.images[:, 0], dtype=torch.bool)
+    yield from _goes_through("nothing kept", simulator, dataclasses.replace(frames, masks=none), sample)
+
+
+@torch.no_grad()
+def few_views(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """Each step seen by one camera only, and by the same camera twice: finite."""
+    frames = sample.frames
+    cloud = frames.cameras.image_cloud.tolist()
+    firsts = [cloud.index(q) for q in sorted(set(cloud))]
+    for name, rows in {
+        "one camera": firsts,
+        "the same camera twice": [i for first in firsts for i in (first, first)],
+    }.items():
+        rows = torch.tensor(rows, device=frames.images.device)
+        maps = {key: getattr(frames, key) for key in ("images", "masks", "dynamic", "valid")}
+        chosen = {key: None if value is None else value[rows] for key, value in maps.items()}
+        few = dataclasses.replace(frames, **chosen, cameras=frames.cameras.select(rows))
+        yield from _goes_through(name, simulator, few, sample)
+
+
+@torch.no_grad()
+def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """A pixel, a camera and a particle that are no numbers: named errors, or under "drop" one particle that sleeps."""
+    frames = sample.frames
+    last = len(frames.cameras) - 1
+    pixels, viewmats = frames.images.clone(), frames.cameras.viewmats.clone()
+    pixels[last, 0, 0, 0] = math.nan
+    viewmats[last, 0, 0] = math.inf
+    broken = {
+        "a pixel": dataclasses.replace(frames, images=pixels),
+        "a camera": dataclasses.replace(frames, cameras=dataclasses.replace(frames.cameras, viewmats=viewmats)),
+    }
+    for name, bad in broken.items():
+        yield _refuses(f"{name} that is no number", lambda bad=bad: simulator.encode(bad), f"image {last}")
+    state = simulator.encode(frames).detach()
+    if not state.n_rows:
+        return
+    means = state.means.clone()
+    means[-1, 1] = math.nan
+    bad = dataclasses.replace(state, means=means)
+    name = particle_name(state, state.n_rows - 1)
+    scene = int(state.cloud_scene[-1])
+
+    def rollout() -> None:
+        report = StabilityReport()
+        simulator.rollout(bad, 1, sample.plan, on_bad="raise", report=report)
+        report.check()  # a GPU is not waited for before
+
+    yield _refuses("a particle that is no number", rollout, f"scene {scene}")
+    steps = simulator.rollout(bad, sample.n_steps, sample.plan, on_bad="drop", report=StabilityReport())
+    yield from _finite(f"on_bad='drop' with {name} no number: rollout's", steps[-1])
+    if sample.n_scenes > 1 and simulator.config.dynamics.origin_of_scene:
+        clean = simulator.rollout(state, sample.n_steps, sample.plan)
+        for step, expected in zip(steps, clean, strict=True):
+            others = range(scene)
+            step, expected = (take_scenes_of_particles(p, others) for p in (step, expected))
+            same = torch.equal(step.means, expected.means) or step.means.dtype == torch.float64
+            yield _holds(
+                "scenes beside a particle that is no number go on bit-equal",
+                same,
+                f"step {expected.cloud_step.tolist()}",
+            )
+
+
+def _refuses(what: str, call: Callable, names: str) -> Deviation:
+    """Whether ``call`` raises a HardCaseError that names the place."""
+    try:
+        call()
+    except HardCaseError as error:
+        return _holds(f"{what}: a HardCaseError names it", names in str(error), f"{names}; it says: {error}")
+    return _holds(f"{what}: a HardCaseError names it", False, f"{names}; there was no error")
+
+
+@torch.no_grad()
+def crowds(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """One particle, all particles in one place, and every particle twice: finite futures and images."""
+    state = simulator.encode(sample.frames).detach()
+    table, device = state.clouds, state.means.device
+    first = [(table.starts[q], table.starts[q] + min(1, table.count(q))) for q in range(len(table))]
+    counts = [end - begin for begin, end in first]
+    lonely = state.with_clouds(
+        CloudTable.make(counts, table.scenes, table.steps, device),
+        **{name: take_runs(value, first) for name, value in state.row_fields().items()},
+    )
+    start = torch.tensor(table.starts[:-1], device=device).clamp(max=max(0, state.n_rows - 1))
+    gathered = dataclasses.replace(state, means=state.means[start[state.row_cloud()]])
+    twice = torch.arange(state.n_rows, device=device).repeat_interleave(2)
+    doubled = state.with_clouds(
+        CloudTable.make((2 * table.count(q) for q in range(len(table))), table.scenes, table.steps, device),
+        **{name: value[twice] for name, value in state.row_fields().items()},
+    )
+    for name, crowd in {"one particle": lonely, "all in one place": gathered, "every particle twice": doubled}.items():
+        steps = simulator.rollout(crowd, sample.n_steps, sample.plan, report=StabilityReport())
+        yield from _finite(f"{name}: rollout's", steps[-1])
+        yield _finite_image(f"{name}:", simulator, steps[-1], sample.targets)
+
+
+@torch.no_grad()
+def strange_cameras(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """A camera inside of a particle, one that looks away, one with the scene far off: finite images."""
+    newest = last_steps(simulator.encode(sample.frames).detach(), 1)
+    targets = sample.targets.select(torch.zeros(1, dtype=torch.int64, device=newest.means.device))
+    if not newest.n_rows:
+        return
+    rotation, inside = targets.viewmats[0, :3, :3], targets.viewmats.clone()
+    inside[0, :3, 3] = -rotation @ newest.means[0].to(rotation)
+    away, far = targets.viewmats.clone(), targets.viewmats.clone()
+    away[0, 1:3] = -away[0, 1:3]
+    far[0, 2, 3] += 1e6
+    for name, viewmats in {
+        "inside of a particle": inside,
+        "looking away": away,
+        "a thousand kilometres off": far,
+    }.items():
+        camera = dataclasses.replace(targets, viewmats=viewmats)
+        yield _finite_image(f"a camera {name}:", simulator, newest, camera)
+
+
+def long_rollout(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """A rollout of many steps stays finite and bounded: speed, extent, and opacity where the model holds it."""
+    state, bad = simulator.encode(sample.frames).detach(), []
+
+    def look(newest: Particles) -> None:
+        bad.extend(deviation for deviation in _finite("rollout's", newest) if not deviation.holds)
+
+    with torch.no_grad():
+        curves = rollout_curves(simulator, state, sample.n_steps, sample.plan, look)
+    yield bad[0] if bad else _holds("every step of the rollout is finite", True, f"{sample.n_steps} steps")
+    numbers = [*curves.kinetic_energy, *curves.extent]
+    yield _holds("energy and extent are finite", all(map(math.isfinite, numbers)), f"{sample.n_steps} steps")
+    limit, step = simulator.config.dynamics.max_step, max(range(sample.n_steps), key=curves.speed.__getitem__)
+    limit = simulator.config.stability.max_speed if limit is None else math.sqrt(3) * limit
+    yield Deviation("speed over its limit", curves.speed[step] / limit, 1 + 1e-6, f"step {step + 1} of the rollout")
+    held = not simulator.config.dynamics.explicit
+    first = curves.opacity_mass[0] if curves.opacity_mass else 0.0
+    if held and first:
+        drift = [abs(mass / first - 1) for mass in curves.opacity_mass]
+        step = max(range(len(drift)), key=drift.__getitem__)
+        yield Deviation("opacity mass drifts", drift[step], MAX_MASS_DRIFT, f"step {step + 1} of the rollout")
+
+
+def gradients(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """Gradients of the last image with respect to every state before it and every parameter are finite."""
+    state, n = simulator.encode(sample.frames).detach(), min(sample.n_steps, GRADIENT_STEPS)
+    norms, of_parameters = gradient_norms(simulator, state, sample.targets, n, sample.plan)
+    for step, norm in enumerate(norms):
+        yield _holds(
+            "the gradient with respect to a state is finite", math.isfinite(norm), f"{n - step} steps before the image"
+        )
+    for name, gradient in of_parameters.items():
+        yield _holds("the gradient of a parameter is finite", bool(gradient.isfinite().all()), name)
+
+
+CASES: dict[str, Law] = {
+    "images without content": images,
+    "few and equal views": few_views,
+    "what is not a number": not_a_number,
+    "crowds": crowds,
+    "strange cameras": strange_cameras,
+    "a long rollout": long_rollout,
+    "gradients": gradients,
+}

@@ -1,0 +1,108 @@
+"""What a scene calls for: typed, serialisable, and honest about what cannot be done."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+
+from gsim3d import presets
+from gsim3d.effects.edits import OPERATIONS, load_edits
+from gsim3d.effects.plan import make_plan
+from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects, Sleep, UnsupportedEffect
+from gsim3d.errors import InputError
+
+MODEL = presets.paper_latent(4)  # holds opacities
+SOME = EffectsSpec(
+    DynamicsEffects(background="masked_out", history=2),
+    AppearanceEffects(view_dependent=1, changing="dynamic"),
+    outputs=OutputEffects(depth=True),
+)
+
+
+def test_absent_is_off():
+    spec = EffectsSpec()
+    assert spec.to_dict() == {"version": 1} and EffectsSpec.from_dict(None) == spec == EffectsSpec.from_dict({})
+    plan = make_plan(spec, MODEL)
+    assert (plan.history, plan.sh_degree) == (4, 3)
+    assert {"depth images", "actions", "insertion", "removal", "changing opacities"} <= set(plan.skipped)
+
+
+def test_plan_says_what_is_kept_and_why_the_rest_is_not():
+    plan = make_plan(SOME, MODEL)
+    assert (plan.history, plan.sh_degree) == (2, 1)
+    assert "view-dependent colour" in plan.kept and "depth images" in plan.kept
+    assert plan.skipped["frozen background"] == "background is masked_out"
+    assert not set(plan.kept) & set(plan.skipped)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"dynamics": {"actions": {"names": ["hand"]}}}, "unsupported effect dynamics.actions"),
+        ({"dynamics": {"contact": {"pairs": [["a", "b"]]}}}, "unsupported effect dynamics.contact"),
+        ({"dynamics": {"sleep": {"policy": "approx"}}}, "unsupported effect dynamics.sleep.policy approx"),
+        ({"dynamics": {"background": "asymmetric"}}, "unsupported effect dynamics.background asymmetric"),
+        ({"outputs": {"rgb": False}}, "unsupported effect outputs: there is no image to make"),
+        ({"dynamics": {"history": 5}}, "unsupported effect dynamics.history: this model goes up to 4; got 5"),
+        ({"appearance": {"opacity_changes": True}}, "unsupported effect appearance.opacity_changes"),
+    ],
+)
+def test_what_cannot_be_simulated_raises(values, message):
+    with pytest.raises(UnsupportedEffect, match=message):
+        make_plan(EffectsSpec.from_dict(values), MODEL)
+
+
+def test_view_dependence_beyond_the_model_raises():
+    with pytest.raises(UnsupportedEffect, match="view_dependent: this model goes up to 0; got 2"):
+        make_plan(EffectsSpec(appearance=AppearanceEffects(view_dependent=2)), presets.tiny())
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"dynamic": {}}, "unknown key dynamic; known: dynamics, appearance"),
+        ({"dynamics": {"backgroud": "frozen"}}, "unknown key dynamics.backgroud"),
+        ({"dynamics": 3}, "dynamics must be a mapping; got 3"),
+        ({"dynamics": {"background": "gone"}}, "dynamics.background must be one of frozen, masked_out, dynamic"),
+        ({"dynamics": {"history": 0}}, "dynamics.history must be an integer of at least 1; got 0"),
+        ({"dynamics": {"history": "2"}}, "dynamics.history must be a whole number; got '2'"),
+        ({"appearance": {"view_dependent": 4}}, "view_dependent must be 0 to 3; got 4"),
+        ({"appearance": {"changing": "bunny"}}, "appearance.changing must be one of"),
+        ({"dynamics": {"sleep": {"policy": "soundly"}}}, "dynamics.sleep.policy must be one of exact, approx"),
+        ({"dynamics": {"sleep": {"patience": 0}}}, "dynamics.sleep.patience must be an integer of at least 1; got 0"),
+        ({"dynamics": {"sleep": {"eps": "1e-3"}}}, "dynamics.sleep.eps must be a number; got '1e-3'"),
+        ({"dynamics": {"actions": {"names": "hand"}}}, "dynamics.actions.names must be a list; got 'hand'"),
+        ({"dynamics": {"contact": {"pairs": [["a"]]}}}, r"dynamics.contact.pairs must be a list of 2; got \['a'\]"),
+        ({"outputs": {"depth": "yes"}}, "outputs.depth must be true or false; got 'yes'"),
+        ({"version": 2}, "version must be 1; got 2"),
+    ],
+)
+def test_malformed_specs_raise(values, message):
+    with pytest.raises(InputError, match=message):
+        EffectsSpec.from_dict(values)
+
+
+def test_the_page_tells_of_every_field_and_its_examples_can_be_read(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text()
+    spec, edits = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    for name, text in (("spec.yaml", spec), ("edits.yaml", edits)):
+        (tmp_path / name).write_text(text)
+    read = EffectsSpec.load(tmp_path / "spec.yaml")
+    assert read.structure.insert and read.dynamics.sleep == Sleep()
+    operations = {edit.operation.name for edit in load_edits(tmp_path / "edits.yaml", lambda folder: None)}
+    assert operations == set(OPERATIONS)
+    keys = re.findall(r"^\| (`.*?) \|", page, re.MULTILINE)
+    table = " ".join(keys)
+    for room in ("dynamics", "appearance", "structure"):
+        for field in dataclasses.fields(getattr(read, room)):
+            assert f"`{room}.{field.name}`" in table or f"`.{field.name}`" in table, field.name
+    assert all(f"`{field.name}" in page for field in dataclasses.fields(read.outputs))
+
+
+def test_a_file_that_is_no_spec(tmp_path):
+    (tmp_path / "bad.yaml").write_text("- 1\n- 2\n")
+    with pytest.raises(InputError, match="must hold a mapping"):
+        EffectsSpec.load(tmp_path / "bad.yaml")
+    with pytest.raises(InputError, match="cannot be read"):
+        EffectsSpec.load(tmp_path / "absent.yaml")

@@ -1,0 +1,261 @@
+"""Mesh files of several objects, materials and kinds: all bodies and colours arrive, or the file is refused by name."""
+
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from gsim3d.errors import InputError
+from gsim3d.synth.meshes import load_body
+
+CORNERS = [(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]
+SIDES = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+INWARDS = [side[::-1] for side in SIDES]
+RED, GREEN, BLUE = (1, 0, 0), (0, 1, 0), (0, 0, 1)
+
+
+def vertices(at=0, colour=None):
+    more = "" if colour is None else " " + " ".join(map(str, colour))
+    return "".join(f"v {x + at} {y} {z}{more}\n" for x, y, z in CORNERS)
+
+
+def sides(before, chosen=SIDES):
+    return "".join("f " + " ".join(str(k + before) for k in side) + "\n" for side in chosen)
+
+
+def write(folder, text, name="body.obj"):
+    (folder / "two.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl deep blue\nKd 0 0 1\nnewmtl none\n")
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def seen(body, at):
+    """Colours in the middle of the faces of the left or right half."""
+    middle = body.vertices[body.faces].mean(1)[:, 0] < 0
+    colours = body.paint(body.corners.mean(1))
+    assert ((colours >= 0) & (colours <= 1)).all()
+    return colours[middle if at == "left" else ~middle]
+
+
+def volume(body):
+    return trimesh.Trimesh(body.vertices, body.faces, process=False).volume
+
+
+TWO = {
+    "forwards": vertices() + sides(1) + vertices(3) + sides(9),
+    "backwards": vertices() + sides(-8) + vertices(3) + sides(-8),
+    "all before": vertices() + vertices(3) + "o a\n" + sides(1) + "o b\n" + sides(9),
+    "backwards, all before": vertices() + vertices(3) + "o a\n" + sides(-16) + "g b\n" + sides(-8),
+    "one inside out": vertices() + sides(1) + vertices(3) + sides(9, INWARDS),
+    "both inside out": vertices() + sides(1, INWARDS) + vertices(3) + sides(9, INWARDS),
+}
+
+
+@pytest.mark.parametrize("name", TWO)
+def test_all_objects_arrive(tmp_path, name):
+    body = load_body(write(tmp_path, TWO[name]), "z")
+    assert len(body.vertices) == 16 and len(body.faces) == 24
+    assert len(np.unique(np.sort(body.faces, 1), axis=0)) == 24
+    size = np.ptp(body.vertices, axis=0)
+    np.testing.assert_allclose(size / size[1], [4, 1, 1])
+    np.testing.assert_allclose(volume(body) / size[1] ** 3, 2)
+    assert np.ptp(body.collision_vertices, axis=0)[0] > 0.9 * size[0]
+
+
+def test_a_cavity_stays_a_cavity(tmp_path):
+    inner = "".join(f"v {0.25 + x / 2} {0.25 + y / 2} {0.25 + z / 2}\n" for x, y, z in CORNERS)
+    for outer, hole in ((SIDES, INWARDS), (INWARDS, SIDES)):
+        body = load_body(write(tmp_path, vertices() + sides(1, outer) + inner + sides(9, hole)), "z")
+        np.testing.assert_allclose(volume(body) / np.ptp(body.vertices[:, 0]) ** 3, 7 / 8)
+
+
+MATERIALS = {
+    "two bodies": "usemtl red\n" + vertices() + sides(1) + "usemtl deep blue\n" + vertices(3) + sides(9),
+    "back and forth": vertices() + vertices(3) + "usemtl red\n" + sides(1, SIDES[:3]) + "usemtl deep blue\n" + sides(9)
+    + "usemtl red\n" + sides(1, SIDES[3:]),
+    "continued lines": "usemtl red\n" + vertices() + sides(1).replace(" 5 7", " 5 \\\n 7") + "usemtl deep blue\n"
+    + vertices(3) + sides(9) + "# f 1 2 99\n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_every_material_has_its_colour(tmp_path, name):
+    body = load_body(write(tmp_path, "mtllib two.mtl\n" + MATERIALS[name]), "z")
+    assert len(body.faces) == 24
+    np.testing.assert_allclose(seen(body, "left"), np.tile(RED, (12, 1)))
+    np.testing.assert_allclose(seen(body, "right"), np.tile(BLUE, (12, 1)))
+
+
+def test_one_body_of_several_materials_and_files(tmp_path):
+    (tmp_path / "more.mtl").write_text("newmtl leaf\nKd 0 1 0\n")
+    text = "mtllib two.mtl\nmtllib more.mtl\n" + vertices() + "usemtl red\n" + sides(1, SIDES[:1]) + "usemtl leaf\n"
+    body = load_body(write(tmp_path, text + sides(1, SIDES[1:])), "z")
+    colours = body.paint(body.corners.mean(1))
+    low = body.vertices[body.faces][:, :, 2].max(1) < 0
+    np.testing.assert_allclose(colours[low], [RED] * 2)
+    np.testing.assert_allclose(colours[~low], [GREEN] * 10)
+    (one := write(tmp_path, "mtllib two.mtl more.mtl\nusemtl leaf\n" + vertices() + sides(1)))
+    np.testing.assert_allclose(load_body(one).paint(load_body(one).corners[:, 0]), [GREEN] * 12)
+
+
+def test_a_texture_beside_a_colour_and_a_pattern(tmp_path):
+    Image.fromarray(np.full((2, 2, 3), [0, 255, 0], np.uint8)).save(tmp_path / "skin.png")
+    (tmp_path / "skin.mtl").write_text("newmtl skin\nKd 0.8 0.8 0.8\nmap_Kd -s 1 1 1 skin.png\n")
+    textured = "".join("f " + " ".join(f"{k + 1}/1" for k in side) + "\n" for side in SIDES)
+    text = "mtllib skin.mtl\nmtllib two.mtl\nvt 0.5 0.5\nusemtl skin\n" + vertices() + textured + "usemtl {}\n"
+    body = load_body(write(tmp_path, text.format("red") + vertices(3) + sides(9)), "z")
+    np.testing.assert_allclose(seen(body, "left"), np.tile(GREEN, (12, 1)))
+    np.testing.assert_allclose(seen(body, "right"), np.tile(RED, (12, 1)))
+    body = load_body(write(tmp_path, text.format("none") + vertices(3) + sides(9)), "z")
+    np.testing.assert_allclose(seen(body, "left"), np.tile(GREEN, (12, 1)))
+    assert len(np.unique(seen(body, "right"), axis=0)) > 1
+
+
+@pytest.mark.parametrize("colours", [(RED, BLUE), ((255, 0, 0), (0, 0, 255))])
+def test_colours_of_vertices_of_an_obj(tmp_path, colours):
+    text = vertices(0, colours[0]) + sides(1) + vertices(3, colours[1]) + sides(9)
+    body = load_body(write(tmp_path, text), "z")
+    np.testing.assert_allclose(seen(body, "left"), np.tile(RED, (12, 1)))
+    np.testing.assert_allclose(seen(body, "right"), np.tile(BLUE, (12, 1)))
+
+
+def box(at, colour=None):
+    mesh = trimesh.creation.box().apply_translation([at, 0, 0])
+    if colour is not None:
+        mesh.visual.vertex_colors = [*(255 * np.array(colour)), 255]
+    return mesh
+
+
+def pbr(mesh, **options):
+    uv = mesh.vertices[:, :2] if "baseColorTexture" in options else None
+    material = trimesh.visual.material.PBRMaterial(**options)
+    mesh.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    return mesh
+
+
+def test_pieces_of_a_glb(tmp_path):
+    blue = Image.fromarray(np.full((2, 2, 3), [0, 0, 255], np.uint8))
+    lefts = (box(0, RED), pbr(box(0), baseColorFactor=[255, 0, 0, 255]))
+    rights = (box(3, BLUE), pbr(box(3), baseColorTexture=blue), pbr(box(3), baseColorFactor=[0, 0, 255, 255]))
+    for left in lefts:
+        for right in rights:
+            trimesh.Scene([left, right]).export(tmp_path / "two.glb")
+            body = load_body(tmp_path / "two.glb")
+            assert len(body.faces) == 24
+            np.testing.assert_allclose(seen(body, "left"), np.tile(RED, (12, 1)))
+            np.testing.assert_allclose(seen(body, "right"), np.tile(BLUE, (12, 1)))
+
+
+def test_instances_of_a_glb_lie_where_they_are_put(tmp_path):
+    scene = trimesh.Scene()
+    scene.add_geometry(box(0, RED), geom_name="box")
+    scene.graph.update("again", matrix=trimesh.transformations.translation_matrix([3, 0, 0]), geometry="box")
+    scene.export(tmp_path / "two.glb")
+    body = load_body(tmp_path / "two.glb")
+    size = np.ptp(body.vertices, axis=0)
+    assert len(body.faces) == 24 and size[0] / size[1] == pytest.approx(4)
+
+
+def ply(folder, vertex_type, colours_of):
+    """Two boxes; ``colours_of`` "vertex" or "face"."""
+    points = [(x + at, y, z) for at in (0, 3) for x, y, z in CORNERS]
+    faces = [tuple(k + b for k in t) for b in (0, 8) for s in SIDES for t in ((s[0], s[1], s[2]), (s[0], s[2], s[3]))]
+    one = 255 if vertex_type == "uchar" else 1
+    paint = [" ".join(str(one * c) for c in (RED if i < n // 2 else BLUE)) for n in (16, 24) for i in range(n)]
+    names = "".join(f"property {vertex_type} {name}\n" for name in ("red", "green", "blue"))
+    own = {part: names if part == colours_of else "" for part in ("vertex", "face")}
+    text = "ply\nformat ascii 1.0\nelement vertex 16\nproperty float x\nproperty float y\nproperty float z\n"
+    text += own["vertex"] + "element face 24\nproperty list uchar int vertex_indices\n" + own["face"] + "end_header\n"
+    for i, point in enumerate(points):
+        text += " ".join(map(str, point)) + (f" {paint[i]}" if own["vertex"] else "") + "\n"
+    for i, face in enumerate(faces):
+        text += "3 " + " ".join(map(str, face)) + (f" {paint[16 + i]}" if own["face"] else "") + "\n"
+    (folder / "two.ply").write_text(text)
+    return folder / "two.ply"
+
+
+@pytest.mark.parametrize("kind", [("uchar", "vertex"), ("float", "vertex"), ("uchar", "face")])
+def test_colours_of_a_ply(tmp_path, kind):
+    body = load_body(ply(tmp_path, *kind), "z")
+    assert len(body.faces) == 24
+    np.testing.assert_allclose(seen(body, "left"), np.tile(RED, (12, 1)))
+    np.testing.assert_allclose(seen(body, "right"), np.tile(BLUE, (12, 1)))
+
+
+def test_several_bodies_of_stl_and_off(tmp_path):
+    both = trimesh.util.concatenate([box(0), box(3)])
+    both.export(tmp_path / "two.off")
+    both.export(tmp_path / "two.stl")
+    ascii_stl = "\n".join(trimesh.exchange.stl.export_stl_ascii(box(at)) for at in (0, 3))
+    (tmp_path / "solids.stl").write_text(ascii_stl)
+    for name in ("two.off", "two.stl", "solids.stl"):
+        body = load_body(tmp_path / name, "z")
+        assert len(body.vertices) == 16 and len(body.faces) == 24
+
+
+def off(folder, header, colours="", faces=""):
+    points = "".join(f"{x} {y} {z}{colours}\n" for x, y, z in CORNERS)
+    text = f"{header}\n8 6 0\n{points}" + "".join("4 " + " ".join(map(str, side)) + faces + "\n" for side in SIDES)
+    (folder / "body.off").write_text(text)
+    return folder / "body.off"
+
+
+REFUSED = {
+    "a face twice": (lambda d: write(d, vertices() + sides(1) + sides(1)), "holds 12 faces twice"),
+    "a side twice": (lambda d: write(d, vertices() + sides(1) + sides(1, [SIDES[0][::-1]] * 2)), "faces twice"),
+    "no material file": (lambda d: write(d, "mtllib no.mtl\nusemtl red\n" + vertices() + sides(1)), "no.mtl is not"),
+    "no material": (lambda d: write(d, "mtllib two.mtl\nusemtl rde\n" + vertices() + sides(1)), "material 'rde'"),
+    "a vertex too many": (lambda d: write(d, vertices() + sides(1) + "f 1 2 9\n"), "line 15: 9: there are 8 before it"),
+    "vertex 0": (lambda d: write(d, vertices() + sides(0)), "line 9: 0: there are 8"),
+    "too far back": (lambda d: write(d, vertices() + sides(-9)), "there are 8 before it"),
+    "no number": (lambda d: write(d, "v 0 0 x\n"), "line 1: "),
+    "colours out of range": (lambda d: write(d, vertices(0, (-1, 0, 0)) + sides(1)), "colours of vertices must lie"),
+    "an archive": (lambda d: write(d, "", "body.zip"), "files that end in .glb, .gltf, .obj"),
+    "COFF": (lambda d: off(d, "COFF", " 255 0 0 255"), "colours, which are not read from OFF"),
+    "colours of OFF faces": (lambda d: off(d, "OFF", faces=" 255 0 0"), "colours, which are not read from OFF"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_would_be_lost_is_refused(tmp_path, name):
+    make, message = REFUSED[name]
+    path = make(tmp_path)
+    with pytest.raises(InputError, match=message) as error:
+        load_body(path)
+    assert str(path) in str(error.value)
+
+
+def test_textures_that_are_not_there_are_named(tmp_path):
+    path = write(tmp_path, "mtllib skin.mtl\nvt 0 0\nusemtl skin\n" + vertices() + sides(1))
+    (tmp_path / "skin.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
+    with pytest.raises(InputError, match="texture skin.png of material 'skin' is not beside skin.mtl"):
+        load_body(path)
+    (tmp_path / "skin.png").write_bytes(b"no image")
+    with pytest.raises(InputError, match="texture skin.png cannot be decoded"):
+        load_body(path)
+    Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "skin.png")
+    with pytest.raises(InputError, match="have a texture, but no coordinates"):
+        load_body(path)
+    (tmp_path / "skin.mtl").write_text("newmtl skin\nKd 1 red 0\n")
+    with pytest.raises(InputError, match="Kd of material 'skin' must be three numbers"):
+        load_body(path)
+
+
+def test_remarks_in_material_files_and_another_name_of_the_only_material(tmp_path):
+    path = write(tmp_path, "mtllib skin.mtl\nusemtl exported\n" + vertices() + sides(1))
+    (tmp_path / "skin.mtl").write_text("newmtl skin # the one\nKd 0.25 0.5 1.000  # red, green, blue\n")
+    body = load_body(path)
+    np.testing.assert_allclose(body.paint(body.corners[0]), [[0.25, 0.5, 1.0]] * 3)
+    (tmp_path / "skin.mtl").write_text("newmtl skin\nKd 1 1 1\nnewmtl other\nKd 0 0 0\n")
+    with pytest.raises(InputError, match="material 'exported' stands in none of"):
+        load_body(path)
+
+
+def test_an_stl_with_colours_is_refused(tmp_path):
+    data = bytearray(trimesh.exchange.stl.export_stl(box(0)))
+    data[:80] = b"COLOR=" + struct.pack("4B", 255, 0, 0, 255) + bytes(70)
+    (tmp_path / "body.stl").write_bytes(bytes(data))
+    with pytest.raises(InputError, match="not read from STL"):
+        load_body(tmp_path / "body.stl")
