@@ -18,7 +18,7 @@ _HOME = {
     "Frames": "gsim3d.cameras",
     "Gaussians": "gsim3d.state",
     "GradientError": "gsim3d.errors",
-    "HardCaseError": "gsim3d.errors",
+    "NumericalError": "gsim3d.errors",
     "InputError": "gsim3d.errors",
     "Particles": "gsim3d.state",
     "ProcessorError": "gsim3d.errors",

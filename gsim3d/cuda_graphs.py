@@ -232,7 +232,7 @@ class CapturedRollout:
         an asymmetric one from what moves).
 
         Raises:
-            HardCaseError: of an earlier call, under the policy "raise".
+            NumericalError: of an earlier call, under the policy "raise".
         """
         state = self._simulator.prepare(state, self._plan)
         self._check(state, self._table)

@@ -15,7 +15,7 @@ class InputError(ValueError):
     """A file, folder, option or argument is not what it must be; the message names it and says what to do."""
 
 
-class HardCaseError(ValueError):
+class NumericalError(ValueError):
     """Numbers that no op can use (NaN, Inf, out of range); the message names where they are and what to do.
 
     tensor: name of the tensor. scene, step: of the particle's cloud. row: of the packed rows of the call.

@@ -9,7 +9,7 @@
 A state holds the last steps of each scene (:class:`gsim3d.state.Particles`, clouds sorted by scene and step). Scenes
 are packed, not padded: particle counts, numbers of views and lengths of history may all differ.
 
-Every call takes ``on_bad``, the policy for numbers that cannot be used (:mod:`gsim3d.numerics.policy`; default the
+Every call takes ``on_invalid``, the policy for numbers that cannot be used (:mod:`gsim3d.numerics.policy`; default the
 model's), and ``report``, which counts them (default ``simulator.report``).
 """
 
@@ -45,7 +45,7 @@ from gsim3d.effects.spec import EffectsSpec, OutputEffects, UnsupportedEffect
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.nn.gaussian_head import GaussianHead, render, render_as_published
 from gsim3d.nn.multiview_encoder import Encoder, Room, pixel_rows
-from gsim3d.numerics.policy import OnBad, StabilityReport, check_on_bad
+from gsim3d.numerics.policy import OnInvalid, StabilityReport, check_on_invalid
 from gsim3d.numerics.validate import check_particles, drop_rows, guard_frames, guard_particles
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
@@ -73,7 +73,7 @@ class Simulator(nn.Module):
         self,
         frames: Frames,
         *,
-        on_bad: OnBad | None = None,
+        on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
         room: Room | None = None,
     ) -> Particles:
@@ -81,10 +81,10 @@ class Simulator(nn.Module):
 
         room: as of ``encoder``.
         """
-        guard = self._guard("encode", on_bad, report)
+        guard = self._guard("encode", on_invalid, report)
         config = guard.keywords["config"]
         if room is None:
-            self.encoder.check(frames, pixels=config.on_bad == "raise")
+            self.encoder.check(frames, pixels=config.on_invalid == "raise")
         frames, spoiled = guard_frames(frames, config, guard.keywords["report"], "encode")
         particles = self.encoder(frames, room, check=False)
         particles = guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled, room)))
@@ -120,7 +120,7 @@ class Simulator(nn.Module):
         plan: Plan | None = None,
         *,
         generator: torch.Generator | None = None,
-        on_bad: OnBad | None = None,
+        on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
     ) -> Particles:
         """The state one call of the dynamics later: each scene's oldest steps leave once the history is full.
@@ -130,7 +130,7 @@ class Simulator(nn.Module):
             plan: what to compute; default everything the model can. Nobody sleeps: that is decided along a rollout.
             generator: randomness of training (drop path, curve shuffling); None: none.
         """
-        plan, guard = plan or self.plan(), self._guard("step", on_bad, report)
+        plan, guard = plan or self.plan(), self._guard("step", on_invalid, report)
         self._check(state, "step")
         state = guard(self.prepare(state, plan))
         step = self._predict(state, plan=plan, generator=generator, guard=guard)
@@ -144,7 +144,7 @@ class Simulator(nn.Module):
         plan: Plan | None = None,
         *,
         generator: torch.Generator | None = None,
-        on_bad: OnBad | None = None,
+        on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
         geometry: Callable[[Particles], Pyramid] | None = None,
         wrap: Callable[[Callable], Callable] | None = None,
@@ -164,7 +164,7 @@ class Simulator(nn.Module):
         Raises:
             InputError: an edit cannot be made; the message names its step and operation.
         """
-        plan, guard = plan or self.plan(), self._guard("rollout", on_bad, report)
+        plan, guard = plan or self.plan(), self._guard("rollout", on_invalid, report)
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
         predict = predict if wrap is None else wrap(predict)
         self._check(state, "rollout")
@@ -218,10 +218,10 @@ class Simulator(nn.Module):
         return self.dynamics.begin(self.dynamics.in_light(state))
 
     def parts(
-        self, prepared: Particles, *, on_bad: OnBad | None = None, report: StabilityReport | None = None
+        self, prepared: Particles, *, on_invalid: OnInvalid | None = None, report: StabilityReport | None = None
     ) -> Parts:
         """What moves and what rests of a state that :meth:`prepare` made, for a model with an asymmetric background."""
-        return Parts.of(self._guard("rollout", on_bad, report)(prepared), asymmetric=True)
+        return Parts.of(self._guard("rollout", on_invalid, report)(prepared), asymmetric=True)
 
     def advance(
         self,
@@ -246,7 +246,7 @@ class Simulator(nn.Module):
         plan: Plan | None = None,
         *,
         cutoff: str = "exact",
-        on_bad: OnBad | None = None,
+        on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
     ) -> Rendering:
         """Images of ``cameras``; camera i shows cloud ``cameras.image_cloud[i]`` of ``particles``.
@@ -258,9 +258,11 @@ class Simulator(nn.Module):
             plan: which images, and the degree of view-dependent colour; default colour as the model's, alpha and depth.
             cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
         """
-        guard = self._guard("render", on_bad, report, in_workspace=False)
+        guard = self._guard("render", on_invalid, report, in_workspace=False)
         self._check(particles, "render")
-        image = self.draw(guard(particles), cameras, background, plan, cutoff=cutoff, on_bad=on_bad, report=report)
+        image = self.draw(
+            guard(particles), cameras, background, plan, cutoff=cutoff, on_invalid=on_invalid, report=report
+        )
         guard.keywords["report"].send()
         return image
 
@@ -272,11 +274,11 @@ class Simulator(nn.Module):
         plan: Plan | None = None,
         *,
         cutoff: str = "exact",
-        on_bad: OnBad | None = None,
+        on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
     ) -> Rendering:
         """As :meth:`render`, of particles as :meth:`rollout` returned them: their numbers are not looked at again."""
-        on_bad, report = on_bad or self.config.stability.on_bad, self.report if report is None else report
+        on_invalid, report = on_invalid or self.config.stability.on_invalid, self.report if report is None else report
         outputs = plan.spec.outputs if plan else OutputEffects(depth=True, alpha=True)
         gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None, rgb=outputs.rgb)
         quirks, jacobian = self.config.renderer.quirks, self.config.renderer.jacobian
@@ -284,7 +286,7 @@ class Simulator(nn.Module):
             image = render_as_published(gaussians, cameras, background, quirks=quirks, jacobian=jacobian)
         else:
             features = particles.latents if outputs.features else None
-            options = {"cutoff": cutoff, "jacobian": jacobian, "on_bad": on_bad, "report": report}
+            options = {"cutoff": cutoff, "jacobian": jacobian, "on_invalid": on_invalid, "report": report}
             image = render(gaussians, cameras, background, features=features, **options)
         asked = (outputs.rgb, outputs.alpha, outputs.depth, outputs.features)
         return Rendering(*(made if wanted else None for made, wanted in zip(image, asked, strict=True)))
@@ -305,13 +307,13 @@ class Simulator(nn.Module):
         check_particles(particles, where, next(self.parameters()).dtype, widths)
 
     def _guard(
-        self, where: str, on_bad: OnBad | None, report: StabilityReport | None, in_workspace: bool = True
+        self, where: str, on_invalid: OnInvalid | None, report: StabilityReport | None, in_workspace: bool = True
     ) -> partial[Particles]:
         """guard_particles with the limits of this model."""
         limits, dynamics = self.config.stability, self.config.dynamics
-        if on_bad is not None:
-            check_on_bad(on_bad)
-            limits = dataclasses.replace(limits, on_bad=on_bad)
+        if on_invalid is not None:
+            check_on_invalid(on_invalid)
+            limits = dataclasses.replace(limits, on_invalid=on_invalid)
         report = self.report if report is None else report
         report.poll()
         return partial(

@@ -11,7 +11,7 @@ from gsim3d.cameras import Cameras
 from gsim3d.compat.quirks import Quirks
 from gsim3d.cuda_graphs import Captured, CapturedRollout, collecting_nothing, has_no_room
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
-from gsim3d.errors import CaptureError, HardCaseError, InputError
+from gsim3d.errors import CaptureError, InputError, NumericalError
 from gsim3d.numerics.policy import StabilityConfig, StabilityReport
 from gsim3d.ops import PyramidCapacity
 from gsim3d.simulator import Simulator
@@ -178,7 +178,7 @@ def test_a_graph_can_be_launched_without_waiting(device):
 
 
 def test_a_graph_tells_the_report(device):
-    simulator = make_simulator(device, stability=StabilityConfig(on_bad="drop"))
+    simulator = make_simulator(device, stability=StabilityConfig(on_invalid="drop"))
     state, report = make_state(device=device), StabilityReport()
     captured = CapturedRollout(simulator, state, 2, report=report)
     captured(state)
@@ -196,7 +196,7 @@ def test_bad_numbers_raise_behind_a_graph(device):
     captured = CapturedRollout(simulator, state, 1)
     means = state.means.clone()
     means[3] = torch.inf
-    with pytest.raises(HardCaseError, match="means"):
+    with pytest.raises(NumericalError, match="means"):
         captured(dataclasses.replace(state, means=means))
         simulator.report.check()
     simulator.report.clear()

@@ -140,7 +140,7 @@ def test_what_a_broken_row_remembers_is_not_used(name, activity):
     values = getattr(state, name).clone()
     values[row] = torch.nan
     state = dataclasses.replace(state, **{name: values})
-    step = simulator.rollout(state, 3, plan, on_bad="drop")[-1]
+    step = simulator.rollout(state, 3, plan, on_invalid="drop")[-1]
     for seen in ("means", "opacities", "dynamic_latents", "light"):
         assert getattr(step, seen).isfinite().all(), seen
     assert simulator.render(step, target_cameras(frames, 1), torch.ones(3)).color.isfinite().all()

@@ -31,11 +31,11 @@ INTRODUCTION = """# Stability
 Written by `python tools/stability.py` from the tests in `tests/stability`; do not edit.
 
 **For every input, every op and the whole simulator either return finite outputs and finite gradients, or raise a typed
-`gsim3d.HardCaseError` that names scene, step, particle or camera and tensor, and says what to do. Never a silent NaN,
+`gsim3d.NumericalError` that names scene, step, particle or camera and tensor, and says what to do. Never a silent NaN,
 never an abort of the process, never a changed result for another member of the batch.**
 
-What happens to a number that cannot be used is a policy, of a model or of a call: `on_bad="raise"` (default), `"drop"`
-or `"clamp"`; a `StabilityReport` counts what, where and how many. `gsim3d/numerics/policy.py` has the rules.
+What happens to a number that cannot be used is a policy, of a model or of a call: `on_invalid="raise"` (default),
+`"drop"` or `"clamp"`; a `StabilityReport` counts what, where and how many. `gsim3d/numerics/policy.py` has the rules.
 
 Every case below is a test that is named after it (`test_r01_...`), forward and backward. Most of them run beside an
 ordinary scene in the same call, which must not notice: its rows have equal bits in float32 on the CPU, and everywhere
@@ -45,8 +45,9 @@ it unless told otherwise; the encoder and training do only where matrix products
 
 Every policy is run over hostile frames, cameras, origins and particles, forward and backward
 (`tests/stability/test_every_policy.py`). Where rows were dropped or clamped, a backward pass on the CPU raises
-`HardCaseError` where a gradient behind them is not finite. On a GPU gradients are not looked at, as that would wait for
-it: the encoder refuses the frames that make such gradients there, too, and training skips steps that are not finite.
+`NumericalError` where a gradient behind them is not finite. On a GPU gradients are not looked at, as that would
+wait for it: the encoder refuses the frames that make such gradients there, too, and training skips steps that are not
+finite.
 
 Index lists that the CPU refuses are not looked at on a GPU, which would have to be waited for: entries out of range
 take no part, nothing else is read or written, and rows that no entry names are 0.

@@ -11,7 +11,7 @@ import torch
 
 from gsim3d.ablate.table import METHODS, PSNRS
 from gsim3d.data import Scene
-from gsim3d.errors import CaptureError, HardCaseError, InputError
+from gsim3d.errors import CaptureError, InputError, NumericalError
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.evaluate.report import summarize, write_json
 from gsim3d.io.files import MAX_TEXT, read_file
@@ -86,7 +86,7 @@ def attempt(folder: Path, trial: Trial, end: float, progress: bool) -> dict:
     """:meth:`Trial.run`, or why there is nothing to score."""
     try:
         return trial.run(folder, end, progress)
-    except (HardCaseError, CaptureError) as error:
+    except (NumericalError, CaptureError) as error:
         return {"failure": str(error)}
     except torch.OutOfMemoryError:
         return {"failure": "out of memory"}

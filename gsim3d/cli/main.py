@@ -10,7 +10,7 @@ import warnings
 from functools import partial
 
 from gsim3d.cli.arguments import Parser
-from gsim3d.errors import CaptureError, FitWarning, HardCaseError, InputError, RunStopped, did_you_mean
+from gsim3d.errors import CaptureError, FitWarning, InputError, NumericalError, RunStopped, did_you_mean
 from gsim3d.io.terminal import Terminal
 
 # command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called
@@ -72,7 +72,7 @@ def _command(arguments: list[str]) -> int:
             module.add_arguments(parser)
             args = parser.parsed(arguments[1:])
             return module.run(args) or 0
-    except (InputError, HardCaseError, CaptureError) as error:
+    except (InputError, NumericalError, CaptureError) as error:
         return _fail(str(error))
     except RunStopped as error:
         _fail(str(error))

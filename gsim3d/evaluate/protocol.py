@@ -28,7 +28,7 @@ from gsim3d.data import Scene, make_frames
 from gsim3d.data.recording import BACKGROUND
 from gsim3d.dynamics import RestLog, concatenate
 from gsim3d.effects.edits import Edit
-from gsim3d.errors import FitWarning, HardCaseError, InputError
+from gsim3d.errors import FitWarning, InputError, NumericalError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.scoring import EXACT_PARTS, PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.io.terminal import progress
@@ -337,7 +337,7 @@ def score_scenes(
             mine = first + processes.rank
             try:
                 found = [pair for group in groups[mine : mine + 1] for pair in scored(group)]
-            except (InputError, HardCaseError) as error:  # raised in all processes: none waits for another
+            except (InputError, NumericalError) as error:  # raised in all processes: none waits for another
                 found = error
             for part in processes.gather(found):
                 if isinstance(part, Exception):

@@ -44,7 +44,7 @@ def orbit_frames(frames: Iterable[Gaussians], count: int, size: int, turns: floa
             camera,
             sh=gaussians.sh,
             near_plane=1e-3 * distance,
-            on_bad="drop",
+            on_invalid="drop",
         ).color[0]
         yield (image.clamp(0, 1) * 255).round().byte().numpy()
 

@@ -27,7 +27,7 @@ from gsim3d.math.spherical_harmonics import (
     turn_predicted_harmonics,
 )
 from gsim3d.nn.layers import RowLinear, widened
-from gsim3d.numerics.policy import OnBad, StabilityReport
+from gsim3d.numerics.policy import OnInvalid, StabilityReport
 from gsim3d.ops.raster import Rendering
 from gsim3d.state import Gaussians, Particles
 
@@ -147,7 +147,7 @@ def render(
     features: Tensor | None = None,
     cutoff: str = "exact",
     jacobian: str = "exact",
-    on_bad: OnBad = "raise",
+    on_invalid: OnInvalid = "raise",
     report: StabilityReport | None = None,
 ) -> Rendering:
     """Images of ``cameras``; camera i shows cloud ``cameras.image_cloud[i]`` of ``gaussians``.
@@ -168,7 +168,7 @@ def render(
         near_plane=near_plane,
         cutoff=cutoff,
         jacobian=jacobian,
-        on_bad=on_bad,
+        on_invalid=on_invalid,
         report=report,
     )
 

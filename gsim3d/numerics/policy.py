@@ -1,7 +1,7 @@
 """What happens to numbers that cannot be used, and how one learns of it.
 
 For every input, the simulator and every op return finite outputs and finite gradients, or raise a
-:class:`gsim3d.HardCaseError` that names scene, step, particle or camera and tensor. A policy says which:
+:class:`gsim3d.NumericalError` that names scene, step, particle or camera and tensor. A policy says which:
 
 - ``"raise"`` (default): an error. The CPU raises at once. On a GPU nothing waits for the device: the row sleeps as
   under "drop", and the error comes from the next call that finds the flag, or from :meth:`StabilityReport.check`.
@@ -24,12 +24,12 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 
-OnBad = Literal["raise", "drop", "clamp"]
+OnInvalid = Literal["raise", "drop", "clamp"]
 LARGEST = torch.finfo(torch.float32).max
 ACTIONS = {"raise": "error", "drop": "dropped", "clamp": "clamped"}
-ADVICE = 'on_bad="drop" goes on without such rows, on_bad="clamp" bounds them'
+ADVICE = 'on_invalid="drop" goes on without such rows, on_invalid="clamp" bounds them'
 NEAREST = 1e-6  # metres: no depth range begins nearer
 FARTHEST = 1e9  # metres: no depth range ends further away, and no camera or origin is further from 0
 PIXEL_SLACK = 1e-3  # colours may leave [0, 1] by as much: resampling rounds
@@ -37,10 +37,10 @@ MAX_FINDINGS = 1000  # of a report, then only its total goes on counting
 MAX_QUIET = 1000  # records kept as they came
 
 
-def check_on_bad(on_bad: str) -> None:
+def check_on_invalid(on_invalid: str) -> None:
     """Raises InputError where it is no policy."""
-    if on_bad not in get_args(OnBad):
-        raise InputError(f"on_bad must be one of {', '.join(get_args(OnBad))}; got {on_bad!r}")
+    if on_invalid not in get_args(OnInvalid):
+        raise InputError(f"on_invalid must be one of {', '.join(get_args(OnInvalid))}; got {on_invalid!r}")
 
 
 def at_most(values: Tensor, largest: float) -> Tensor:
@@ -57,19 +57,19 @@ def usable_pixels(images: Tensor) -> Tensor:
 class StabilityConfig:
     """Limits that a model's particles keep, and what happens where one does not.
 
-    on_bad: "raise", "drop" or "clamp": the policy where a call names no other.
+    on_invalid: "raise", "drop" or "clamp": the policy where a call names no other.
     max_speed: metres a step. A particle that moves further falls asleep where it was. Less than a model's own
         ``max_step`` stops motion that was learned; far more lets a runaway drag others along before it leaves.
     max_latent: largest size of a latent or colour coefficient. Beyond it a value counts as not finite: from about 6e4
         half precision overflows, from 1e19 a squared norm in float32.
     """
 
-    on_bad: OnBad = "raise"
+    on_invalid: OnInvalid = "raise"
     max_speed: float = 10.0
     max_latent: float = 1e4
 
     def __post_init__(self):
-        check_on_bad(self.on_bad)
+        check_on_invalid(self.on_invalid)
         for name in ("max_speed", "max_latent"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise InputError(f"{name} must be positive and finite; got {getattr(self, name)}")
@@ -105,9 +105,9 @@ class Finding:
         more = f" and {self.count - 1} more" if self.count > 1 else ""
         return f"{self.where}: {self.tensor}: {self.what}{row}{place}{more}"
 
-    def error(self) -> HardCaseError:
+    def error(self) -> NumericalError:
         """As the error that names it and says what to do."""
-        return HardCaseError(
+        return NumericalError(
             f"{self}; {ADVICE}", tensor=self.tensor, scene=self.scene, step=self.step, row=self.row, camera=self.camera
         )
 
@@ -365,7 +365,7 @@ class StabilityReport:
         """Waits for the device and raises the first error of the report.
 
         Raises:
-            HardCaseError: naming scene, step, row or camera and tensor, and what to do.
+            NumericalError: naming scene, step, row or camera and tensor, and what to do.
         """
         self._collect(wait=True)
         if self._first_error is not None:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.cameras import Frames
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.numerics.policy import (
     ACTIONS,
     FARTHEST,
@@ -59,7 +59,7 @@ def _looks_at(names: tuple[str, ...], config: StabilityConfig, max_opacity: floa
         "scales": (0.0, LARGEST),
     }
     bounds = [limits.get(name, (-config.max_latent, config.max_latent)) for name in names]
-    action, by_rule = ACTIONS[config.on_bad], "clamped" if config.on_bad == "clamp" else "asleep"
+    action, by_rule = ACTIONS[config.on_invalid], "clamped" if config.on_invalid == "clamp" else "asleep"
     kinds = [(f"particles.{name}", BOUNDED.get(name) or _what(high), action) for name, (_, high) in zip(names, bounds)]
     kinds += [("particles.means", "outside the workspace", by_rule), ("particles.means", "speed limit", by_rule)]
     return _Looks(bounds, kinds, [float(name == "quats") for name in names])
@@ -79,7 +79,7 @@ def guard_particles(
     changed: Collection[str] | None = None,
     max_opacity: float = 1.0,
 ) -> Particles:
-    """``particles`` with finite, bounded numbers only; rows that had others are handled by ``config.on_bad``.
+    """``particles`` with finite, bounded numbers only; rows that had others are handled by ``config.on_invalid``.
 
     Args:
         particles: any clouds.
@@ -95,7 +95,7 @@ def guard_particles(
     Gradients: through all rows that stay as they are. On the CPU a backward pass raises where a gradient behind rows
         that did not stay is not finite, unless ``report`` is closed.
     Raises:
-        HardCaseError: ``config.on_bad`` is "raise", on the CPU.
+        NumericalError: ``config.on_invalid`` is "raise", on the CPU.
     """
     fields = {
         name: value
@@ -104,7 +104,7 @@ def guard_particles(
     }
     looks = (_looks_at if torch.compiler.is_compiling() else _recent_looks)(tuple(fields), config, max_opacity)
     before = None if previous is None else [getattr(previous, name) for name in fields]
-    clamps = config.on_bad == "clamp"
+    clamps = config.on_invalid == "clamp"
     is_told = particles.means.is_cuda and not torch.compiler.is_compiling()  # the report, later
     # the copies that the kernel mends carry no gradients
     in_kernel = not clamps and not (torch.is_grad_enabled() and _have_gradients(fields.values(), before or ()))
@@ -146,14 +146,14 @@ def guard_frames(
     "raise" leaves them to the encoder, as every policy does with all other fields of ``frames``: these raise always.
     """
     images = frames.images
-    if config.on_bad == "raise":
+    if config.on_invalid == "raise":
         return frames, None
     usable = usable_pixels(images)
     bad = (~usable).any(1)
-    report.record(bad.sum((1, 2)), partial(_read_images, frames, where, ACTIONS[config.on_bad]))
-    nearest = images.nan_to_num(0.0, 1.0, 0.0).clamp(0, 1) if config.on_bad == "clamp" else torch.zeros_like(images)
+    report.record(bad.sum((1, 2)), partial(_read_images, frames, where, ACTIONS[config.on_invalid]))
+    nearest = images.nan_to_num(0.0, 1.0, 0.0).clamp(0, 1) if config.on_invalid == "clamp" else torch.zeros_like(images)
     images = torch.where(usable, images, nearest)
-    return dataclasses.replace(frames, images=images), bad if config.on_bad == "drop" else None
+    return dataclasses.replace(frames, images=images), bad if config.on_invalid == "drop" else None
 
 
 # Shapes of the fields of particles behind their N rows; None: any.
@@ -173,7 +173,7 @@ def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths
         widths: channels of fields that the network reads.
     Raises:
         InputError: the message names the field and what it must be.
-        HardCaseError: an origin, or what is remembered of a row, is not finite or too far; on a GPU these are not
+        NumericalError: an origin, or what is remembered of a row, is not finite or too far; on a GPU these are not
             looked at: rows far from their origin sleep.
     """
     if torch.compiler.is_compiling():
@@ -220,7 +220,7 @@ def _check_choices(particles: Particles, where: str) -> None:
             continue
         row, one = int(good.logical_not().nonzero()[0]), "scene" if name in _OF_SCENES else "row"
         largest = f" and at most {FARTHEST:g} m in size" if name in _OF_SCENES else ""
-        raise HardCaseError(
+        raise NumericalError(
             f"{where}: particles.{name} must be finite{largest}; {one} {row} is not",
             tensor=f"particles.{name}",
             **{one: row},
@@ -293,7 +293,7 @@ def _watch_gradients(values: Iterable[Tensor], finding: Finding, report: Stabili
 
     def look(gradients, _):
         if not report.is_closed and not all(bool(g.isfinite().all()) for g in gradients if g is not None):
-            raise HardCaseError(
+            raise NumericalError(
                 f"{finding}, {finding.action}, and gradients behind it are not finite; mend the inputs of its scene or "
                 "leave it out, or go on under torch.no_grad()",
                 tensor=finding.tensor,

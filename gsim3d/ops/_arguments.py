@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsim3d.errors import HardCaseError
+from gsim3d.errors import NumericalError
 
 # Sums of products of so large numbers are finite, forward and backward, for any size of a tensor.
 LARGEST = {torch.float32: 1e15, torch.float64: 1e150, torch.float16: 65504.0, torch.bfloat16: 1e15}
@@ -45,7 +45,7 @@ def check_floating(op: str, **first: Tensor) -> None:
 
 
 def check_numbers(op: str, *, largest_of: float = math.inf, **tensors: Tensor | None) -> None:
-    """Raises HardCaseError, naming the argument and its row, where a number is not finite or too large.
+    """Raises NumericalError, naming the argument and its row, where a number is not finite or too large.
 
     None and tensors without numbers, or on a GPU, are passed over.
 
@@ -67,7 +67,7 @@ def _refuse(op: str, name: str, value: Tensor, largest: float) -> None:
     bad = ~(value.abs() <= largest)
     row = int(bad.reshape(len(value), -1).any(1).nonzero()[0]) if value.dim() else 0
     first = float(value[bad][0])
-    raise HardCaseError(
+    raise NumericalError(
         f"{op}: {name} must be finite and at most {largest:g} in size; got {first:g} in row {row}", tensor=name, row=row
     )
 

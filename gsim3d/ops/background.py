@@ -75,7 +75,7 @@ def add_cells(x: Tensor, field: Tensor, places: Tensor, *, check: bool = True) -
         [N, C], dtype of ``x``.
     Gradients: ``x`` and ``field``, once; sums over the rows of a cell have one order.
     Raises:
-        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        NumericalError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it.
 
     Example:

@@ -30,7 +30,7 @@ def decode_gaussians(
         quats [N, 4] (w, x, y, z), scales [N, 3], sh [N, (degree + 1)^2, 3]; float32, float64 with float64 rows.
     Gradients: ``raw``, once.
     Raises:
-        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150; readings: 1e3); CPU only.
+        NumericalError: a number is not finite or beyond 1e15 (float64: 1e150; readings: 1e3); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it.
 
     Example:

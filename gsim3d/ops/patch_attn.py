@@ -34,7 +34,7 @@ def patch_attention(
     Determinism: equal bits for any number of threads, with AVX2 and AVX-512, on one GPU in every run, for any numbering
         of the rows, and with any other patches beside; only the order of the keys inside a patch rounds differently.
     Raises:
-        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        NumericalError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: a shape, dtype, head dim, scale or table is malformed; the message names the argument.
             CUDA does not look into the table: rows out of range take no part.
     Source: Dao et al. 2022 (FlashAttention), applied to the patches of Point Transformer V3 (Wu et al. 2024).

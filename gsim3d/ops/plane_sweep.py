@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from gsim3d.errors import HardCaseError
+from gsim3d.errors import NumericalError
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_floating, check_numbers, check_tensors
 from gsim3d.ops._gradients import register_gradients
@@ -28,7 +28,7 @@ def sweep_geometry(
         homographies [P, 3, 3] and translations [P, 3] (metres), dtype of ``Ks``.
     Gradients: none.
     Raises:
-        HardCaseError: a matrix is not finite or cannot be inverted; CPU only.
+        NumericalError: a matrix is not finite or cannot be inverted; CPU only.
         ValueError, TypeError: an argument has a wrong shape, dtype or range; the message names it.
 
     Example:
@@ -61,7 +61,7 @@ def _inverse(name: str, matrices: Tensor) -> Tensor:
         return torch.linalg.inv(matrices)
     except torch.linalg.LinAlgError:
         image = int((torch.linalg.inv_ex(matrices).info != 0).nonzero()[0])
-        raise HardCaseError(f"sweep_geometry: {name} cannot be inverted for image {image}", camera=image) from None
+        raise NumericalError(f"sweep_geometry: {name} cannot be inverted for image {image}", camera=image) from None
 
 
 def _check_geometry(Ks: Tensor, viewmats: Tensor, src_images: Tensor, cu_src: Tensor, Ks_target: Tensor | None) -> None:
@@ -114,7 +114,7 @@ def plane_sweep(
     Gradients: ``features``, once.
     Determinism: every output and gradient element has one owner that sums in a fixed order.
     Raises:
-        HardCaseError: a feature is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        NumericalError: a feature is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument has a wrong shape, dtype or range, or geometry is not finite; the message
             names it. On CUDA values are not looked at: a source out of range sees nothing.
     Source: plane sweep of Collins (1996) as in MVSplat (Chen et al. 2024), with dot products interpolated.

@@ -22,7 +22,7 @@ def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) ->
         [M, C], dtype of ``x``.
     Gradients: ``x``, once; of equal maxima the one listed first receives it.
     Raises:
-        HardCaseError: a number of ``x`` is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        NumericalError: a number of ``x`` is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it. CUDA does not look into the index lists:
             rows out of range take no part.
     Source: grid pooling of Point Transformer V2/V3 (Wu et al. 2022, 2024).

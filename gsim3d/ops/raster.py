@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.cameras import Cameras
-from gsim3d.numerics.policy import Finding, OnBad, Reading, StabilityReport, check_on_bad
+from gsim3d.numerics.policy import Finding, OnInvalid, Reading, StabilityReport, check_on_invalid
 from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_floating, check_real, check_tensors, check_whole, within_memory
 from gsim3d.ops._gradients import register_gradients
@@ -64,7 +64,7 @@ def rasterize_gaussians(
     near_plane: float = 0.01,
     cutoff: str = "exact",
     jacobian: str = "exact",
-    on_bad: OnBad = "raise",
+    on_invalid: OnInvalid = "raise",
     report: StabilityReport | None = None,
 ) -> Rendering:
     """Renders clouds of 3D Gaussians into pinhole images.
@@ -96,7 +96,7 @@ def rasterize_gaussians(
         jacobian: where the projection of a Gaussian centred outside of the image is linearised. "exact": at its centre,
             so an image is what a larger one of the same camera has there; "clamped": at most 0.15 of the image outside
             of it, as 3DGS and gsplat do, and models trained so expect.
-        on_bad: what happens to a row that cannot be used (:mod:`gsim3d.numerics.policy`). "raise": an error on the
+        on_invalid: what happens to a row that cannot be used (:mod:`gsim3d.numerics.policy`). "raise": an error on the
             CPU, left out on a GPU; "drop": left out, its gradients are 0; "clamp": bounded, NaN counts as 0
             (rotation: identity).
         report: counts such rows by image; on a GPU its ``check()`` raises what "raise" could not. Without one a GPU
@@ -110,8 +110,8 @@ def rasterize_gaussians(
     GPU: nothing waits for the device. Its memory is made for Gaussians of a few pixels and clouds shown by equally many
         images; what exceeds it is rendered in further groups of images, slower.
     Raises:
-        HardCaseError: ``on_bad`` is "raise" on the CPU, and a number is not finite or beyond 1e15 (rotations: of any
-            length), an opacity outside [0, 1], a scale negative, or a projection overflows; names argument, row
+        NumericalError: ``on_invalid`` is "raise" on the CPU, and a number is not finite or beyond 1e15 (rotations:
+            of any length), an opacity outside [0, 1], a scale negative, or a projection overflows; names argument, row
             and camera.
         ValueError: a shape, dtype, offset or camera is not as above. On a GPU an image whose camera or cloud is not
             shows its background, and a background that is not finite is black.
@@ -142,12 +142,12 @@ def rasterize_gaussians(
     if color.dim() != dims:
         name, wanted = ("sh", "[N, K, 3]") if colors is None else ("colors", "[N, 3]")
         raise ValueError(f"rasterize_gaussians: {name} must be {wanted}; got {list(color.shape)}")
-    check_on_bad(on_bad)
+    check_on_invalid(on_invalid)
     features_given = means.new_empty(means.shape[0], 0) if features is None else features
     color_name = "sh" if colors is None else "colors"
     names = ("means", "quats", "scales", "opacities", color_name, "features")
     rows = (means, quats, scales, opacities, color, features_given)
-    if on_bad == "clamp":
+    if on_invalid == "clamp":
         _check_rows(dict(zip(names, rows, strict=True)))
         rows = _clamped(dict(zip(names, rows, strict=True)), report).values()
     n_images = cameras.viewmats.shape[0]
@@ -172,7 +172,7 @@ def rasterize_gaussians(
         JACOBIANS[jacobian],
         *_sizes_of_state(means, n_images, cu_rows.shape[0] - 1, cameras.width, cameras.height),
     )
-    raises = on_bad == "raise" and means.device.type == "cpu"
+    raises = on_invalid == "raise" and means.device.type == "cpu"
     watch = (raises or report is not None) and not torch.compiler.is_compiling()
     if torch.compiler.is_compiling():
         out = torch.ops.gsim3d.rasterize_gaussians(*args, watch)
@@ -180,7 +180,7 @@ def rasterize_gaussians(
         size = f"cameras.width={cameras.width}, cameras.height={cameras.height}"
         out = within_memory(OP, size, torch.ops.gsim3d.rasterize_gaussians, *args, watch)
     if watch:
-        action = "error" if on_bad == "raise" else "dropped"
+        action = "error" if on_invalid == "raise" else "dropped"
         read = partial(_unusable, names=(*names, "scales", "scales", "cameras"), action=action)
         (StabilityReport() if report is None else report).record(out[7], read, counts=range(0, out[7].numel(), 2))
     return Rendering(out[0], out[1], out[2], None if features is None else out[3])

@@ -33,7 +33,7 @@ def row_norm(
         is no residual, ready for the matrix product that follows; the CPU computes in float32.
     Gradients: ``x``, ``weight``, ``bias``, ``residual``, once; sums over rows have one order.
     Raises:
-        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        NumericalError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it.
     Source: Ba et al. 2016, Layer Normalization.
 
@@ -77,7 +77,7 @@ def residual_norm(
         sum [N, C], dtype of ``x``; out [N, C], dtype of ``branch``.
     Gradients: ``x``, ``branch``, weights and biases, once; sums over rows have one order.
     Raises:
-        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        NumericalError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it.
 
     Example:
@@ -196,7 +196,7 @@ def norm_gelu(x: Tensor, mean: Tensor, scale: Tensor, bias: Tensor, *, check: bo
         [N, C], float32; float64 with float64 rows.
     Gradients: all arguments, once; sums over rows have one order.
     Raises:
-        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        NumericalError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it.
     Source: Ioffe & Szegedy 2015, Batch Normalization; Hendrycks & Gimpel 2016, GELU (the exact one).
 

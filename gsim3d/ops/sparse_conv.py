@@ -43,7 +43,7 @@ def sparse_conv(
     Determinism: the same bits for any number of threads, and in every run on CUDA. On the CPU an output is one chain of
         sums in the order of taps.
     Raises:
-        HardCaseError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
+        NumericalError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: shapes, dtypes, ``voxels`` or ``kernel_map`` are malformed; the message names it.
             CUDA does not look into the index lists: pairs and rows out of range take no part, rows not listed are 0.
     Source: Graham et al., "3D semantic segmentation with submanifold sparse convolutional networks", 2018.

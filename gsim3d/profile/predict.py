@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.dynamics import RestLog
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.profile.runner import Runner
 from gsim3d.profile.subject import Subject
 from gsim3d.profile.timing import Clock, Stopwatch, Timing, watched
@@ -39,7 +39,7 @@ class Unusable(Exception):
     """A setting has no result; the message says why."""
 
 
-FAILURES = (Unusable, torch.OutOfMemoryError, HardCaseError, InputError)
+FAILURES = (Unusable, torch.OutOfMemoryError, NumericalError, InputError)
 
 
 def predict(subject: Subject, runner: Runner, number: int) -> Predicted:
@@ -153,6 +153,6 @@ def told(error: Exception, step: int) -> Unusable:
         return error
     if isinstance(error, torch.OutOfMemoryError):
         return Unusable(f"out of memory at step {step + 1}")
-    if isinstance(error, (HardCaseError, InputError)):
+    if isinstance(error, (NumericalError, InputError)):
         return Unusable(f"step {step + 1}: {error}")
     return Unusable(f"cannot be compiled: {type(error).__name__}: {(str(error).splitlines() or [''])[0][:120]}")

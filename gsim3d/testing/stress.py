@@ -16,7 +16,7 @@ from torch import Tensor
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.dynamics import last_steps
 from gsim3d.effects.plan import Plan
-from gsim3d.errors import HardCaseError
+from gsim3d.errors import NumericalError
 from gsim3d.numerics.policy import StabilityReport
 from gsim3d.simulator import Simulator
 from gsim3d.state import CloudTable, Particles, take_runs
@@ -47,7 +47,7 @@ def rollout_curves(
     Args:
         on_step: called with the newest particles after each step.
     Raises:
-        HardCaseError: as :meth:`Simulator.step`.
+        NumericalError: as :meth:`Simulator.step`.
     """
     report, curves = StabilityReport(), Curves([], [], [], [], [])
     for _ in range(n_steps):
@@ -177,12 +177,12 @@ def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
     def rollout() -> None:
         report = StabilityReport()
-        simulator.rollout(bad, 1, sample.plan, on_bad="raise", report=report)
+        simulator.rollout(bad, 1, sample.plan, on_invalid="raise", report=report)
         report.check()  # a GPU is not waited for before
 
     yield _refuses("a particle that is no number", rollout, f"scene {scene}")
-    steps = simulator.rollout(bad, sample.n_steps, sample.plan, on_bad="drop", report=StabilityReport())
-    yield from _finite(f"on_bad='drop' with {name} no number: rollout's", steps[-1])
+    steps = simulator.rollout(bad, sample.n_steps, sample.plan, on_invalid="drop", report=StabilityReport())
+    yield from _finite(f"on_invalid='drop' with {name} no number: rollout's", steps[-1])
     if sample.n_scenes > 1 and simulator.config.dynamics.origin_of_scene:
         clean = simulator.rollout(state, sample.n_steps, sample.plan)
         for step, expected in zip(steps, clean, strict=True):
@@ -197,12 +197,12 @@ def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
 
 def _refuses(what: str, call: Callable, names: str) -> Deviation:
-    """Whether ``call`` raises a HardCaseError that names the place."""
+    """Whether ``call`` raises a NumericalError that names the place."""
     try:
         call()
-    except HardCaseError as error:
-        return _holds(f"{what}: a HardCaseError names it", names in str(error), f"{names}; it says: {error}")
-    return _holds(f"{what}: a HardCaseError names it", False, f"{names}; there was no error")
+    except NumericalError as error:
+        return _holds(f"{what}: a NumericalError names it", names in str(error), f"{names}; it says: {error}")
+    return _holds(f"{what}: a NumericalError names it", False, f"{names}; there was no error")
 
 
 @torch.no_grad()

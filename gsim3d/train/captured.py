@@ -181,7 +181,7 @@ class CapturedLoss:
         """Waits for the device; may be called while a graph runs.
 
         Raises:
-            InputError, HardCaseError: the encoder cannot read the batch.
+            InputError, NumericalError: the encoder cannot read the batch.
         """
         context = batch.context
         n_clouds, (n_images, _, *size) = context.cloud_scene.shape[0], context.images.shape
@@ -279,7 +279,7 @@ class _Step:
             state, plan = _without_background(state), with_background_as_it_is(plan)
         else:
             state = owner.simulator.prepare(state, plan)
-        rollout = partial(owner.simulator.rollout, plan=plan, geometry=geometry, report=report, on_bad="drop")
+        rollout = partial(owner.simulator.rollout, plan=plan, geometry=geometry, report=report, on_invalid="drop")
         with owner.precision("dynamics"):
             if self._n_lead:
                 with torch.no_grad():
@@ -302,7 +302,7 @@ class _Step:
         begin, steps = self._rollout(state, geometry, report, with_own_weights)
         particles = concatenate(steps if self._dynamics_alone else [state, *steps])
         with owner.precision("renderer"):
-            shown = {"plan": owner.plan, "report": report, "on_bad": "drop"}
+            shown = {"plan": owner.plan, "report": report, "on_invalid": "drop"}
             draw = owner.again("images")(lambda p: owner.simulator.draw(p, self._targets.cameras, **shown).color)
             images = draw(particles)
             bodies = draw(bodies_alone(particles)) if owner.bodies and steps else None

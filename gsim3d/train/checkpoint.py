@@ -30,7 +30,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from gsim3d import __version__
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.io.files import MAX_TEXT, read_file, sha256_of
 from gsim3d.io.plain import is_number
 from gsim3d.pretrained import located
@@ -100,7 +100,7 @@ def save(run: str | Path, checkpoint: Checkpoint, keep: int = 2) -> Path:
     A process that is killed at any moment leaves the previous checkpoint good and pointed to.
 
     Raises:
-        HardCaseError: weights that are not finite; the previous checkpoint stays.
+        NumericalError: weights that are not finite; the previous checkpoint stays.
         InputError: the disk is full, or the folder cannot be written; the previous checkpoint stays as well.
     """
     root = Path(run) / "checkpoints"
@@ -126,7 +126,7 @@ def write(folder: Path, checkpoint: Checkpoint) -> Path:
     shutil.rmtree(part, ignore_errors=True)
     try:
         _write_files(part, checkpoint)
-    except (OSError, HardCaseError):
+    except (OSError, NumericalError):
         shutil.rmtree(part, ignore_errors=True)  # it may be what fills the disk
         raise
     shutil.rmtree(folder, ignore_errors=True)
@@ -265,10 +265,10 @@ def export(checkpoint: Checkpoint, path: str | Path) -> None:
 def _bytes_of(tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:
     """A .safetensors file. (Its own writer makes files that nobody else may read.)
 
-    Raises HardCaseError where a tensor is not finite.
+    Raises NumericalError where a tensor is not finite.
     """
     if name := _first_not_finite(tensors):
-        raise HardCaseError(
+        raise NumericalError(
             f"{name}: holds numbers that are not finite; nothing is written: lower the learning rate and go on "
             "from the last checkpoint",
             tensor=name,

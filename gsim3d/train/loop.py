@@ -21,7 +21,7 @@ from tqdm import tqdm
 from gsim3d.data import Scene, generator, make_frames
 from gsim3d.dynamics import concatenate
 from gsim3d.effects.spec import EffectsSpec
-from gsim3d.errors import HardCaseError, InputError, RunStopped
+from gsim3d.errors import InputError, NumericalError, RunStopped
 from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.evaluate.perceptual.weights import load
 from gsim3d.io.locks import only_one_writer
@@ -149,7 +149,7 @@ class Trainer:
             tensorboard: also log for TensorBoard, with a sample video at each checkpoint.
             profile: write a trace of two steps.
         Raises:
-            HardCaseError: ``optimizer.max_skipped`` steps in a row were skipped; the message says what to do.
+            NumericalError: ``optimizer.max_skipped`` steps in a row were skipped; the message says what to do.
             RunStopped: after SIGINT, SIGTERM or SIGUSR1, or without its launcher, it saved and ended before ``until``.
         """
         until = self.config.n_steps if until is None else min(until, self.config.n_steps)
@@ -206,7 +206,7 @@ class Trainer:
         try:
             loss, errors, gradients, norm, seen = self._whole_batch(stage.batch)
             problem = self._look_at(entry, loss, gradients, norm, seen)
-        except HardCaseError as error:
+        except NumericalError as error:
             problem = str(error)
         if problem is None:
             self.optimizer.update(gradients, norm, rate)
@@ -248,7 +248,7 @@ class Trainer:
             self._stop = next(filter(None, reasons), None)
             for rank, part in enumerate(seen):
                 if part.error:
-                    raise HardCaseError(f"process {rank}: {part.error}")
+                    raise NumericalError(f"process {rank}: {part.error}")
             loss = sum(loss * share for loss, share in zip(losses, shares, strict=True))
             errors = sum(values * share for values, share in zip(errors, shares, strict=True))
             if self.captured is not None:
@@ -309,7 +309,7 @@ class Trainer:
             return
         found = checkpoint.exists(self.out)
         good = f"its last checkpoint in {self.out}" if found else "its start: no checkpoint was written yet"
-        raise HardCaseError(
+        raise NumericalError(
             f"training: {n} steps in a row were skipped up to step {entry['step']}, "
             f"the last because {entry['skipped']}; lower stages.learning_rate or optimizer.clip_norm and train again: "
             f"the run goes on from {good}",
@@ -350,10 +350,10 @@ class Trainer:
         one's, or None."""
         stage, _ = self.config.stage_of(self.step)
         # One that raises within a step leaves the others waiting: what cannot be used is dropped, and told afterwards.
-        watch, error = StepWatch(strict=self.simulator.config.stability.on_bad == "raise"), None
+        watch, error = StepWatch(strict=self.simulator.config.stability.on_invalid == "raise"), None
         try:
             loss, errors = self.shared(self._batch(samples), samples[0], watch)
-        except HardCaseError as found:  # the others wait for gradients all the same
+        except NumericalError as found:  # the others wait for gradients all the same
             error = str(found)
             loss, errors = self.shared()
         for parameter in self.parameters.values():
@@ -367,7 +367,7 @@ class Trainer:
         watch = StepWatch()
         try:
             found = self._captured_gradients(samples, watch)
-        except HardCaseError as error:  # the others wait
+        except NumericalError as error:  # the others wait
             nothing = torch.full((), math.nan)
             return nothing, nothing, (), watch, str(error)
         return found.loss / self.scale.value, found.errors, found.parameters, watch, None
@@ -407,7 +407,7 @@ class Trainer:
         simulation begins, and its steps. Each part of the model in its precision."""
         simulator, precision = self.simulator, self.config.precision
         again = recomputing(self.config.recompute, simulator)
-        options = {"report": watch.report, "on_bad": "drop" if watch.strict else None}
+        options = {"report": watch.report, "on_invalid": "drop" if watch.strict else None}
         rng = generator(self.config.seed, self.step, sample, "dynamics")
         noise = torch.Generator().manual_seed(int(rng.integers(2**63)))
 
@@ -457,12 +457,12 @@ class Trainer:
         self.simulator.eval()
         try:
             frames = thinned(frames, data).to(self.device)
-            state = self.simulator.encode(frames, on_bad="drop")
+            state = self.simulator.encode(frames, on_invalid="drop")
             if stage.horizon:
-                later = self.simulator.rollout(state, stage.horizon, self.plan, on_bad="drop")
+                later = self.simulator.rollout(state, stage.horizon, self.plan, on_invalid="drop")
                 state = concatenate([state, *later])
             cameras = scene.cameras_at(cams[:1], steps).to(self.device)
-            predicted = self.simulator.render(state, cameras, plan=self.plan, on_bad="drop").color
+            predicted = self.simulator.render(state, cameras, plan=self.plan, on_invalid="drop").color
         finally:
             self.simulator.train()
         filmed = scene.images(cams[:1], steps)[:, 0].permute(0, 2, 3, 1)

@@ -10,7 +10,7 @@ from gsim3d.ablate.study import Study
 from gsim3d.ablate.table import as_dict, markdown
 from gsim3d.cli.main import main
 from gsim3d.data import find_scenes
-from gsim3d.errors import CaptureError, HardCaseError, InputError
+from gsim3d.errors import CaptureError, InputError, NumericalError
 from gsim3d.train.captured import check_capturable
 from gsim3d.train.config import DataConfig, OptimizerConfig, StageConfig, TrainConfig
 from gsim3d.train.loop import Trainer
@@ -174,7 +174,7 @@ def test_differences_within_the_spread_of_seeds_are_a_tie(folders):
     assert single["rows"][1]["tie"] is None and "| +0.40 |" in markdown(single)
 
 
-@pytest.mark.parametrize("error", [HardCaseError, CaptureError])
+@pytest.mark.parametrize("error", [NumericalError, CaptureError])
 def test_a_row_that_fails_is_told_and_the_others_go_on(error, folders, tmp_path, monkeypatch):
     step = Trainer.train_step
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gsim3d.errors import HardCaseError
+from gsim3d.errors import NumericalError
 from gsim3d.math.rotations import rotation_matrices, unit_quats
 from gsim3d.math.spherical_harmonics import degree_damping, readings, rotate_harmonics
 from gsim3d.ops import decode_gaussians
@@ -171,7 +171,7 @@ def test_malformed_arguments_raise():
 def test_numbers_that_are_none_raise():
     raw, table = inputs(4)
     raw[2, 7] = torch.nan
-    with pytest.raises(HardCaseError, match="raw must be finite .* row 2"):
+    with pytest.raises(NumericalError, match="raw must be finite .* row 2"):
         decode(raw, table)
 
 
@@ -181,7 +181,7 @@ def test_readings_too_large_for_products_raise(place, size):
     raw, table = inputs(4)
     table = table.clone()
     table[place] = size
-    with pytest.raises(HardCaseError, match=f"readings must be finite and at most 1000 .* row {place}"):
+    with pytest.raises(NumericalError, match=f"readings must be finite and at most 1000 .* row {place}"):
         decode(raw, table)
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.errors import HardCaseError
+from gsim3d.errors import NumericalError
 from gsim3d.ops import PatchTable, joint_attention, patch_attention
 from tests.asserts import (
     assert_close_relative_to_max,
@@ -289,7 +289,7 @@ def test_poison_is_refused_on_the_cpu(which):
     case = joint_case(dtype=torch.float32)
     inputs = [x.clone() for x in case.inputs]
     inputs[which][3, 1, 2] = float("nan")
-    with pytest.raises(HardCaseError, match=f"joint_attention: {NAMES[1:][which]} must be finite"):
+    with pytest.raises(NumericalError, match=f"joint_attention: {NAMES[1:][which]} must be finite"):
         case.attend(*inputs)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsim3d.errors import HardCaseError
+from gsim3d.errors import NumericalError
 from gsim3d.ops import PatchTable, patch_attention
 from tests.asserts import (
     assert_close_relative_to_max,
@@ -330,7 +330,7 @@ def test_poison_is_refused_on_the_cpu(which, poison):
     inputs = {"q": case.q, "k": case.k, "v": case.v}
     inputs[which] = inputs[which].clone()
     inputs[which][5, 1, 3] = poison
-    with pytest.raises(HardCaseError, match=f"patch_attention: {which} must be finite .* in row 5") as caught:
+    with pytest.raises(NumericalError, match=f"patch_attention: {which} must be finite .* in row 5") as caught:
         patch_attention(**inputs, table=case.table)
     assert caught.value.tensor == which and caught.value.row == 5
 

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 
-from gsim3d.errors import HardCaseError
+from gsim3d.errors import NumericalError
 from gsim3d.numerics.policy import StabilityReport
 from gsim3d.ops import rasterize_gaussians
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -284,9 +284,9 @@ def test_bad_rows_are_left_out_and_counted(device, name, value, message):
     rows = {field: getattr(four_rows(), field)[kept] for field in Scene.NAMES[:6]}
     rest = four_rows().replace(**rows, cu_rows=torch.tensor([0, 3])).to(device)
     report = StabilityReport()
-    for a, e in zip(scene.render(on_bad="drop", report=report), rest.render(), strict=True):
+    for a, e in zip(scene.render(on_invalid="drop", report=report), rest.render(), strict=True):
         assert_same_bits(a, e)
-    render = partial(scene.render, on_bad="drop")
+    render = partial(scene.render, on_invalid="drop")
     for field, a, e in zip(Scene.NAMES, gradients(render, scene), gradients(rest.render, rest), strict=True):
         if field in rows:
             assert a[2].abs().max() == 0, field
@@ -301,7 +301,7 @@ def test_bad_rows_are_left_out_and_counted(device, name, value, message):
 @pytest.mark.parametrize("name, value, message", BAD_ROWS)
 def test_bad_rows_are_bounded(device, name, value, message):
     scene, report = change(four_rows(), name, 2, value).to(device), StabilityReport()
-    render = partial(scene.render, on_bad="clamp")
+    render = partial(scene.render, on_invalid="clamp")
     for x in (*render(report=report), *gradients(render, scene)):
         assert torch.isfinite(x).all()
     assert {finding.tensor for finding in report.findings} == {message.split(":")[0]}
@@ -311,7 +311,7 @@ def test_a_gpu_raises_where_the_report_is_read(devices):
     report = StabilityReport()
     change(four_rows(), "means", 2, NAN).to(devices[1]).render(report=report)
     with pytest.raises(
-        HardCaseError, match=r"rasterize_gaussians: means: not finite or beyond 1e15 at row 2 \(camera 0\)"
+        NumericalError, match=r"rasterize_gaussians: means: not finite or beyond 1e15 at row 2 \(camera 0\)"
     ):
         report.check()
 
@@ -324,7 +324,7 @@ def test_rows_are_counted_in_every_image(device):
     scene = scene.replace(cu_rows=torch.tensor([0, 3, 4]), image_cloud=torch.tensor([0, 1, 0]), **cameras)
     scene = change(change(scene, "opacities", 1, 2.0), "scales", 3, 1e30).to(device)
     report = StabilityReport()
-    scene.render(on_bad="drop", report=report)
+    scene.render(on_invalid="drop", report=report)
     assert [(f.camera, f.tensor, f.row, f.count) for f in report.findings] == [
         (0, "opacities", 1, 1),
         (1, "scales", 3, 1),
@@ -360,7 +360,7 @@ def test_images_of_bad_cameras_and_clouds_are_empty_on_cuda(devices, broken):
 
 @pytest.mark.parametrize("name, value, message", BAD_ROWS)
 def test_bad_rows_are_named(name, value, message):
-    with pytest.raises(HardCaseError, match="rasterize_gaussians: " + message + r" at row 2 \(camera 0\)") as caught:
+    with pytest.raises(NumericalError, match="rasterize_gaussians: " + message + r" at row 2 \(camera 0\)") as caught:
         change(four_rows(), name, 2, value).render()
     assert (caught.value.tensor, caught.value.row, caught.value.camera) == (message.split(":")[0], 2, 0)
 

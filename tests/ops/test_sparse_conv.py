@@ -9,7 +9,7 @@ import sys
 import pytest
 import torch
 
-from gsim3d.errors import HardCaseError
+from gsim3d.errors import NumericalError
 from gsim3d.ops import KernelMap, PyramidSpec, Voxels, build_pyramid, sparse_conv
 from tests.asserts import (
     assert_close_relative_to_max,
@@ -448,7 +448,7 @@ def test_poison_is_refused_on_the_cpu(which):
     arguments = {"x": x, "weight": weight, "bias": bias}
     arguments[which][1] = float("nan")
     voxels, kernel_map = geometry(torch.tensor([[0, 0, 0, 0], [0, 1, 0, 0], [0, 5, 5, 5]]), 3)
-    with pytest.raises(HardCaseError, match=f"sparse_conv: {which} must be finite .* got nan in row 1"):
+    with pytest.raises(NumericalError, match=f"sparse_conv: {which} must be finite .* got nan in row 1"):
         sparse_conv(**arguments, voxels=voxels, kernel_map=kernel_map)
 
 

@@ -101,7 +101,7 @@ CASES = {
     ),
     "S17": Case(
         "coordinates that are no numbers",
-        'an error that names scene, step, row and tensor; with `on_bad="drop"` the particle sleeps and is counted; '
+        'an error that names scene, step, row and tensor; with `on_invalid="drop"` the particle sleeps and is counted; '
         'with `"clamp"` it goes on',
         "release: goes on silently; PTv3#32: a grid of 9.2e18 cells",
     ),

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsim3d.errors import HardCaseError
+from gsim3d.errors import NumericalError
 from gsim3d.numerics.policy import StabilityReport
 from gsim3d.presets import ModelConfig
 from gsim3d.simulator import Simulator
@@ -40,9 +40,9 @@ def finite(measured: Measured, steps: list[Particles]) -> None:
         measured.finite(*float_fields(step).values())
 
 
-def raised(call, report: StabilityReport) -> HardCaseError:
+def raised(call, report: StabilityReport) -> NumericalError:
     """The error of a call, from the call itself or, on a GPU, from its report."""
-    with pytest.raises(HardCaseError) as caught:
+    with pytest.raises(NumericalError) as caught:
         call()
         report.check()
     return caught.value

@@ -7,7 +7,7 @@ import torch
 
 from gsim3d import ops
 from gsim3d.compat.quirks import Quirks
-from gsim3d.errors import HardCaseError
+from gsim3d.errors import NumericalError
 from gsim3d.nn.layers import RowBatchNorm, RowLayerNorm
 from gsim3d.nn.multiview_encoder.heads import PixelRays
 from gsim3d.nn.point_transformer import Attention
@@ -58,10 +58,10 @@ def test_a25_numbers_beyond_the_range_are_refused(setting, measured, name):
     case = random_case(dtype=setting.dtype)
     values = getattr(case, name).clone()
     values[5] = 2 * LARGEST[setting.dtype]
-    with pytest.raises(HardCaseError, match="must be finite and at most") as caught:
+    with pytest.raises(NumericalError, match="must be finite and at most") as caught:
         dataclasses.replace(case, **{name: values}).attend()
     assert (caught.value.tensor, caught.value.row) == (name, 5)
-    measured.outcome("HardCaseError names tensor and row")
+    measured.outcome("NumericalError names tensor and row")
 
 
 QUIRKS = pytest.mark.parametrize("quirks", [Quirks(), Quirks(half_attention=True)], ids=["", "half"])

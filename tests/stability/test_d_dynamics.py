@@ -236,7 +236,7 @@ def test_d47_numbers_that_are_none_are_an_error(setting, measured, name):
     state = setting.to(batch([ordinary(), poisoned(name, 17)]))
     error = raised(lambda: simulator.rollout(state, 2, report=report), report)
     assert (error.tensor, error.scene, error.step, error.row) == (f"particles.{name}", 1, 1, 21 + 17)
-    measured.outcome("HardCaseError names scene, step, row, tensor")
+    measured.outcome("NumericalError names scene, step, row, tensor")
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -244,10 +244,10 @@ def test_d47_numbers_that_are_none_are_dropped(setting, measured, name):
     """As if the particle were not there, for its scene and for the other one."""
     simulator, report = make_simulator(setting), StabilityReport()
     hard, kept = poisoned(name, 17), torch.arange(26) != 17
-    steps = simulator.rollout(setting.to(batch([hard, ordinary()])), 3, on_bad="drop", report=report)
+    steps = simulator.rollout(setting.to(batch([hard, ordinary()])), 3, on_invalid="drop", report=report)
     finite(measured, steps)
     absent = batch([hard.select_rows(kept), ordinary()])
-    expected = simulator.rollout(setting.to(absent), 3, on_bad="drop", report=StabilityReport())
+    expected = simulator.rollout(setting.to(absent), 3, on_invalid="drop", report=StabilityReport())
     rows = torch.cat([kept[14:], torch.ones(9, dtype=torch.bool)]).to(setting.device)
     assert all(step.opacities[3] == 0 and step.activity[3] == ASLEEP for step in steps)
     for step, other in zip(steps, expected, strict=True):
@@ -292,7 +292,7 @@ def test_d47_what_a_scene_holds_never_reaches_another(setting, measured, value):
 @pytest.mark.parametrize("name", FIELDS)
 def test_d47_numbers_that_are_none_are_clamped(setting, measured, name):
     simulator, report = make_simulator(setting), StabilityReport()
-    steps = simulator.rollout(setting.to(batch([poisoned(name, 17), ordinary()])), 3, on_bad="clamp", report=report)
+    steps = simulator.rollout(setting.to(batch([poisoned(name, 17), ordinary()])), 3, on_invalid="clamp", report=report)
     finite(measured, steps)
     alone = simulator.rollout(setting.to(ordinary()), 3, report=StabilityReport())
     for step, expected in zip(steps, alone, strict=True):

@@ -10,7 +10,7 @@ import torch
 
 from gsim3d import ops
 from gsim3d.data import Scene
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.io.ply import read_ply, write_ply
 from gsim3d.state import Gaussians
 from tests.asserts import gradients
@@ -265,9 +265,9 @@ def test_r15_near_and_far_of_the_encoder(setting, measured, what):
     frames = ordinary()
     bound = getattr(frames.cameras, name).clone()
     bound[3] = value
-    with pytest.raises(HardCaseError, match=f"{message}; image 3 .scene 0, step 1. is not"):
+    with pytest.raises(NumericalError, match=f"{message}; image 3 .scene 0, step 1. is not"):
         setting.to(make_encoder())(setting.to(with_cameras(frames, **{name: bound})))
-    measured.outcome("HardCaseError names the camera")
+    measured.outcome("NumericalError names the camera")
 
 
 @pytest.mark.parametrize("value", [NAN, INF])
@@ -278,9 +278,9 @@ def test_e51_images_and_cameras_that_are_no_numbers(setting, measured, what, val
     tensor = getattr(owner, what).clone()
     tensor[2].view(-1)[1] = value
     frames = dataclasses.replace(frames, images=tensor) if what == "images" else with_cameras(frames, **{what: tensor})
-    with pytest.raises(HardCaseError, match=f"{what} must be finite; image 2 .scene 0, step 1. is not"):
+    with pytest.raises(NumericalError, match=f"{what} must be finite; image 2 .scene 0, step 1. is not"):
         setting.to(make_encoder())(setting.to(frames))
-    measured.outcome("HardCaseError names the image")
+    measured.outcome("NumericalError names the image")
 
 
 def test_e52_ply_of_extreme_gaussians(tmp_path, measured):

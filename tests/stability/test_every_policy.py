@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d import GradientError, HardCaseError, InputError
+from gsim3d import GradientError, InputError, NumericalError
 from gsim3d.numerics.policy import StabilityConfig, StabilityReport
 from gsim3d.numerics.validate import guard_particles
 from tests.test_simulator import awake, make_frames, make_simulator, target_cameras
@@ -13,7 +13,7 @@ from tests.test_simulator import awake, make_frames, make_simulator, target_came
 NAN, INF = float("nan"), float("inf")
 POLICIES = ("raise", "drop", "clamp")
 SCENES = (1, 2)
-TYPED = (HardCaseError, InputError, GradientError)
+TYPED = (NumericalError, InputError, GradientError)
 NUMBERS = (NAN, INF, -INF, 0.0, -1.0, 1e-38, 1e-12, 1e4, 1e6, 1e12, 1e19, 1e30, 3e38)
 
 
@@ -38,11 +38,11 @@ def check(simulator, call):
     return False
 
 
-def encoded_and_simulated(simulator, frames, on_bad):
+def encoded_and_simulated(simulator, frames, on_invalid):
     """What comes out of frames, from encoding to the image of the second step."""
 
     def call(report):
-        options = {"on_bad": on_bad, "report": report}
+        options = {"on_invalid": on_invalid, "report": report}
         state = simulator.encode(frames, **options)
         steps = simulator.rollout(state, 2, **options)
         images = simulator.render(steps[-1], target_cameras(make_frames(SCENES), 2), **options)
@@ -72,20 +72,20 @@ def hostile_frames():
     return made
 
 
-@pytest.mark.parametrize("on_bad", POLICIES)
-def test_hostile_frames(on_bad, simulator):
+@pytest.mark.parametrize("on_invalid", POLICIES)
+def test_hostile_frames(on_invalid, simulator):
     refused = set()
     for name, frames in hostile_frames().items():
-        if check(simulator, encoded_and_simulated(simulator, frames, on_bad)):
+        if check(simulator, encoded_and_simulated(simulator, frames, on_invalid)):
             refused.add(name)
     assert {"origin nan", "origin 1e+19", "near 0.0", "near 1e-38", "far inf", "Ks 0.0", "viewmats 1e+30"} <= refused
     assert {"origin 10000.0", "Ks 10000.0"}.isdisjoint(refused)
-    assert ("images nan" in refused) == ("images 1e+30" in refused) == (on_bad == "raise")
+    assert ("images nan" in refused) == ("images 1e+30" in refused) == (on_invalid == "raise")
 
 
-@pytest.mark.parametrize("on_bad", POLICIES)
+@pytest.mark.parametrize("on_invalid", POLICIES)
 @pytest.mark.parametrize("field", ["means", "opacities", "dynamic_latents", "static_latents", "origin"])
-def test_hostile_particles(field, on_bad, simulator):
+def test_hostile_particles(field, on_invalid, simulator):
     with torch.no_grad():
         state = simulator.encode(make_frames(SCENES))
     for number in NUMBERS:
@@ -94,12 +94,12 @@ def test_hostile_particles(field, on_bad, simulator):
             leaf = getattr(state, field).clone()
             leaf.view(-1)[5] = number
             leaf.requires_grad_(field != "origin")
-            options = {"on_bad": on_bad, "report": report}
+            options = {"on_invalid": on_invalid, "report": report}
             steps = simulator.rollout(dataclasses.replace(state, **{field: leaf}), 2, **options)
             images = simulator.render(steps[-1], target_cameras(make_frames(SCENES), 2), **options)
             return [steps[-1].means, images.color], [leaf] if leaf.requires_grad else []
 
-        assert check(simulator, call) or number == number or on_bad != "raise"
+        assert check(simulator, call) or number == number or on_invalid != "raise"
 
 
 def overflows(x):
@@ -114,10 +114,10 @@ def has_no_root(x):
     return (-x.abs()).sqrt() + x
 
 
-@pytest.mark.parametrize("on_bad", ["drop", "clamp"])
+@pytest.mark.parametrize("on_invalid", ["drop", "clamp"])
 @pytest.mark.parametrize("spoil", [overflows, divides, has_no_root])
 @pytest.mark.parametrize("call", ["rollout", "render"])
-def test_gradients_behind_numbers_that_overflowed(call, spoil, on_bad, simulator):
+def test_gradients_behind_numbers_that_overflowed(call, spoil, on_invalid, simulator):
     """Forward such rows are dropped or bounded; what made them has no gradient, and says so."""
     with torch.no_grad():
         state = simulator.encode(make_frames(SCENES))
@@ -125,12 +125,12 @@ def test_gradients_behind_numbers_that_overflowed(call, spoil, on_bad, simulator
     means = torch.cat([spoil(weight[:4]) * state.means[:4], (weight * state.means)[4:]])
     spoiled, report = dataclasses.replace(state, means=means), StabilityReport()
     if call == "rollout":
-        out = simulator.rollout(spoiled, 1, on_bad=on_bad, report=report)[-1].means
+        out = simulator.rollout(spoiled, 1, on_invalid=on_invalid, report=report)[-1].means
     else:
         cameras = target_cameras(make_frames(SCENES), 1)
-        out = simulator.render(spoiled, cameras, on_bad=on_bad, report=report).color
+        out = simulator.render(spoiled, cameras, on_invalid=on_invalid, report=report).color
     assert bool(out.isfinite().all())
-    with pytest.raises(HardCaseError, match=f"{call}: particles.means: not finite at row 0 .*gradients behind it"):
+    with pytest.raises(NumericalError, match=f"{call}: particles.means: not finite at row 0 .*gradients behind it"):
         torch.autograd.grad(out.square().sum(), weight, retain_graph=True)
     report.close()  # as training does, which looks at all gradients itself
     torch.autograd.grad(out.square().sum(), weight)

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.numerics.policy import StabilityReport
 from tests.test_simulator import make_frames, make_simulator
 
@@ -54,9 +54,9 @@ FRAMES = [
     ("masks", lambda x: x.float(), InputError, "masks must be bool"),
     ("dynamic", lambda x: torch.ones(2, 2, dtype=torch.bool), InputError, "dynamic must be bool"),
     ("valid", lambda x: torch.ones(1, 4, 4, dtype=torch.bool), InputError, "valid must be bool"),
-    ("origin", entry((1, 0), 1e39), HardCaseError, "origin must be finite .* scene 1"),
-    ("origin", entry((0, 2), NAN), HardCaseError, "origin must be finite .* scene 0"),
-    ("origin", entry((0, 2), -1e10), HardCaseError, "origin .* at most 1e.09 m"),
+    ("origin", entry((1, 0), 1e39), NumericalError, "origin must be finite .* scene 1"),
+    ("origin", entry((0, 2), NAN), NumericalError, "origin must be finite .* scene 0"),
+    ("origin", entry((0, 2), -1e10), NumericalError, "origin .* at most 1e.09 m"),
     ("origin", lambda x: x[:, :2], InputError, "origin must be"),
     ("origin", lambda x: x.long(), InputError, "origin must be"),
     ("cloud_scene", entry(0, 7), InputError, r"cloud_scene must be in \[0, 2\)"),
@@ -67,27 +67,27 @@ FRAMES = [
     ("cloud_step", lambda x: x[:1], InputError, "cloud_step must be"),
     ("cameras.image_cloud", entry(0, 99), InputError, "image_cloud must be in"),
     ("cameras.image_cloud", entry(0, -1), InputError, "image_cloud must be in"),
-    ("cameras.near", entry(1, 1e-30), HardCaseError, "near must be from 1e-06"),
-    ("cameras.far", entry(1, 1e30), HardCaseError, "far must be from 1e-06"),
+    ("cameras.near", entry(1, 1e-30), NumericalError, "near must be from 1e-06"),
+    ("cameras.far", entry(1, 1e30), NumericalError, "far must be from 1e-06"),
     ("cameras.near", lambda x: x.long(), InputError, "near must be"),
-    ("cameras.Ks", entry((1, 0, 0), 0.0), HardCaseError, "cameras.Ks must be"),
-    ("cameras.Ks", entry((1, 1, 1), -20.0), HardCaseError, "cameras.Ks must be"),
-    ("cameras.Ks", entry((1, 0, 2), 1e20), HardCaseError, "cameras.Ks must be"),
-    ("cameras.Ks", entry((1, 2, 2), 0.5), HardCaseError, "cameras.Ks must be"),
+    ("cameras.Ks", entry((1, 0, 0), 0.0), NumericalError, "cameras.Ks must be"),
+    ("cameras.Ks", entry((1, 1, 1), -20.0), NumericalError, "cameras.Ks must be"),
+    ("cameras.Ks", entry((1, 0, 2), 1e20), NumericalError, "cameras.Ks must be"),
+    ("cameras.Ks", entry((1, 2, 2), 0.5), NumericalError, "cameras.Ks must be"),
     ("cameras.Ks", lambda x: x.half(), InputError, "cameras.Ks must be"),
-    ("cameras.viewmats", entry((1, 0, 3), 1e12), HardCaseError, "viewmats must be at most"),
-    ("cameras.viewmats", entry((1, slice(0, 3), slice(0, 3)), 0.0), HardCaseError, "viewmats must be a rotation"),
-    ("cameras.viewmats", lambda x: 2 * x, HardCaseError, "viewmats must be a rotation"),
-    ("cameras.viewmats", entry((1, 3, 0), 1.0), HardCaseError, "viewmats must be a rotation"),
+    ("cameras.viewmats", entry((1, 0, 3), 1e12), NumericalError, "viewmats must be at most"),
+    ("cameras.viewmats", entry((1, slice(0, 3), slice(0, 3)), 0.0), NumericalError, "viewmats must be a rotation"),
+    ("cameras.viewmats", lambda x: 2 * x, NumericalError, "viewmats must be a rotation"),
+    ("cameras.viewmats", entry((1, 3, 0), 1.0), NumericalError, "viewmats must be a rotation"),
 ]
 
 
-@pytest.mark.parametrize("on_bad", POLICIES)
+@pytest.mark.parametrize("on_invalid", POLICIES)
 @pytest.mark.parametrize(("field", "change", "error", "message"), FRAMES)
-def test_frames_are_refused_by_name(field, change, error, message, on_bad, simulator):
+def test_frames_are_refused_by_name(field, change, error, message, on_invalid, simulator):
     frames = changed_frames(field, change)
     with torch.no_grad(), pytest.raises(error, match=message) as caught:
-        simulator.encode(frames, on_bad=on_bad, report=StabilityReport())
+        simulator.encode(frames, on_invalid=on_invalid, report=StabilityReport())
     assert "\n" not in str(caught.value)
 
 
@@ -98,22 +98,22 @@ def test_pixels_out_of_range_follow_the_policy(value, simulator):
     bad = dataclasses.replace(frames, images=with_entry(frames.images, (image, 1, y, x), value))
     instead = {"drop": 0.0, "clamp": 1.0 if value > 1 else 0.0}
     with torch.no_grad():
-        with pytest.raises(HardCaseError, match="images must be"):
-            simulator.encode(bad, on_bad="raise", report=StabilityReport())
-        for on_bad, pixel in instead.items():
+        with pytest.raises(NumericalError, match="images must be"):
+            simulator.encode(bad, on_invalid="raise", report=StabilityReport())
+        for on_invalid, pixel in instead.items():
             report = StabilityReport()
-            actual = simulator.encode(bad, on_bad=on_bad, report=report)
+            actual = simulator.encode(bad, on_invalid=on_invalid, report=report)
             replaced = with_entry(frames.images, (image, 1, y, x), pixel)
             expected = simulator.encode(dataclasses.replace(frames, images=replaced))
             assert torch.equal(actual.means, expected.means) and report.total == 1
-            assert int((actual.activity == 2).sum()) == (on_bad == "drop")
+            assert int((actual.activity == 2).sum()) == (on_invalid == "drop")
 
 
 def test_pixels_that_resampling_rounded_are_colours(simulator):
     frames = make_frames(SCENES)
     images = with_entry(frames.images, (0, 0, 0, 0), 1 + 1e-6)
     with torch.no_grad():
-        simulator.encode(dataclasses.replace(frames, images=images), on_bad="raise", report=StabilityReport())
+        simulator.encode(dataclasses.replace(frames, images=images), on_invalid="raise", report=StabilityReport())
 
 
 PARTICLES = [
@@ -131,8 +131,8 @@ PARTICLES = [
     ("cloud_scene", entry(-1, 2), InputError, "cloud_scene must be in"),
     ("cloud_scene", entry(0, -1), InputError, "cloud_scene must be in"),
     ("cloud_step", lambda x: x[:1], InputError, "cloud_step"),
-    ("origin", entry((0, 0), INF), HardCaseError, "origin must be finite"),
-    ("origin", entry((1, 0), 1e39), HardCaseError, "origin must be finite"),
+    ("origin", entry((0, 0), INF), NumericalError, "origin must be finite"),
+    ("origin", entry((1, 0), 1e39), NumericalError, "origin must be finite"),
     ("origin", lambda x: x.float()[:, :1], InputError, "origin must be"),
 ]
 
@@ -155,5 +155,5 @@ def test_what_rows_remember_is_looked_at(field, simulator, state):
     bad = dataclasses.replace(state, **{field: values})
     with pytest.raises(ValueError, match=f"step: particles.{field} must be") as caught:
         simulator.step(bad)
-    assert isinstance(caught.value, (HardCaseError, InputError))
+    assert isinstance(caught.value, (NumericalError, InputError))
     assert field in ("held", "unlit") or caught.value.row == 7

@@ -11,7 +11,7 @@ import torch
 from gsim3d import presets
 from gsim3d.cameras import Cameras
 from gsim3d.dynamics import last_steps
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.numerics.policy import Finding, Reading, Sentinels, StabilityConfig, StabilityReport, _Record, pack
 from gsim3d.ops import rasterize_gaussians
 from gsim3d.state import ASLEEP
@@ -62,23 +62,23 @@ BAD = [
 def test_raise_names_scene_step_row_and_tensor(name, value, what, simulator, state):
     row = int(state.cu_rows[-2]) + 4  # of the last step of scene 1
     bad = with_value(state, name, row, value)
-    with pytest.raises(HardCaseError) as caught:
+    with pytest.raises(NumericalError) as caught:
         simulator.rollout(bad, 1)
         simulator.report.check()  # a GPU raises here, the CPU before
     error = caught.value
     assert str(error).startswith(f"rollout: particles.{name}: {what} at row {row} (scene 1, step 2)")
-    assert 'on_bad="drop"' in str(error) and "\n" not in str(error)
+    assert 'on_invalid="drop"' in str(error) and "\n" not in str(error)
     assert (error.tensor, error.scene, error.step, error.row) == (f"particles.{name}", 1, 2, row)
     assert pickle.loads(pickle.dumps(error)).row == row
 
 
-@pytest.mark.parametrize("on_bad", ["drop", "clamp"])
+@pytest.mark.parametrize("on_invalid", ["drop", "clamp"])
 @pytest.mark.parametrize("name, value, what", BAD)
-def test_the_other_scene_keeps_its_bits(name, value, what, on_bad, simulator, state):
+def test_the_other_scene_keeps_its_bits(name, value, what, on_invalid, simulator, state):
     row, report = int(state.cu_rows[-2]) + 4, StabilityReport()
     with torch.no_grad():
         good = simulator.rollout(state, 3)
-        steps = simulator.rollout(with_value(state, name, row, value), 3, on_bad=on_bad, report=report)
+        steps = simulator.rollout(with_value(state, name, row, value), 3, on_invalid=on_invalid, report=report)
     for before, after in zip(good, steps, strict=True):
         assert_finite(after)
         other = rows_of_scene(after, 0)
@@ -86,9 +86,9 @@ def test_the_other_scene_keeps_its_bits(name, value, what, on_bad, simulator, st
         assert_same_bits(after.dynamic_latents[other], before.dynamic_latents[other])
     first = report.findings[0]
     assert (first.what, first.tensor, first.row, first.scene, first.step) == (what, f"particles.{name}", row, 1, 2)
-    assert first.action == {"drop": "dropped", "clamp": "clamped"}[on_bad]
+    assert first.action == {"drop": "dropped", "clamp": "clamped"}[on_invalid]
     report.check()
-    assert int((steps[-1].activity == ASLEEP).sum()) == (on_bad == "drop")
+    assert int((steps[-1].activity == ASLEEP).sum()) == (on_invalid == "drop")
 
 
 @pytest.mark.parametrize("name, value, what", BAD)
@@ -97,7 +97,7 @@ def test_a_dropped_row_is_as_if_it_were_absent(name, value, what, simulator, sta
     row = int(state.cu_rows[-2]) + 4
     kept = torch.arange(state.n_rows, device=state.means.device) != row
     with torch.no_grad():
-        dropped = simulator.rollout(with_value(state, name, row, value), 2, on_bad="drop")[-1]
+        dropped = simulator.rollout(with_value(state, name, row, value), 2, on_invalid="drop")[-1]
         absent = simulator.rollout(state.select_rows(kept), 2)[-1]
         cameras = target_cameras(make_frames(SCENES).to(state.means.device), 2)
         images = [simulator.render(particles, cameras).color for particles in (dropped, absent)]
@@ -113,9 +113,9 @@ def test_gradients_of_dropped_rows_are_zero_and_of_all_others_finite(simulator, 
     latents = state.dynamic_latents.clone()
     latents[-1, 0] = NAN
     latents.requires_grad_()
-    steps = simulator.rollout(dataclasses.replace(state, dynamic_latents=latents), 2, on_bad="drop")
+    steps = simulator.rollout(dataclasses.replace(state, dynamic_latents=latents), 2, on_invalid="drop")
     cameras = target_cameras(make_frames(SCENES).to(latents.device), 2)
-    image = simulator.render(steps[-1], cameras, on_bad="drop").color
+    image = simulator.render(steps[-1], cameras, on_invalid="drop").color
     parameters = list(simulator.dynamics.parameters())
     grad, *others = torch.autograd.grad(image.square().sum(), [latents, *parameters], allow_unused=True)
     assert grad[-1].abs().max() == 0 and bool(torch.isfinite(grad).all()) and grad.abs().max() > 0
@@ -155,13 +155,13 @@ def test_a_closed_report_keeps_what_it_knows_and_takes_nothing_more(simulator, s
     row, report = int(state.cu_rows[-2]) + 4, StabilityReport()
     bad = with_value(state, "means", row, NAN)
     with torch.no_grad():
-        simulator.rollout(bad, 1, on_bad="drop", report=report)
+        simulator.rollout(bad, 1, on_invalid="drop", report=report)
         known = report.total
         report.close()
-        steps = simulator.rollout(bad, 1, on_bad="drop", report=report)
+        steps = simulator.rollout(bad, 1, on_invalid="drop", report=report)
         assert known == report.total == 1 and int((steps[0].activity == ASLEEP).sum()) == 1
         report.clear()
-        simulator.rollout(bad, 1, on_bad="drop", report=report)
+        simulator.rollout(bad, 1, on_invalid="drop", report=report)
     assert report.total == 1
 
 
@@ -192,7 +192,7 @@ def test_a_runaway_sleeps_and_the_rest_go_on(kick, what, stays, simulator, state
         limits = StabilityConfig(max_speed=10.0 if stays else 1e5)
         simulator.config = dataclasses.replace(simulator.config, stability=limits)
         report = StabilityReport()
-        steps = simulator.rollout(state, 4, on_bad="drop", report=report)
+        steps = simulator.rollout(state, 4, on_invalid="drop", report=report)
     (finding,) = report.findings
     assert (finding.what, finding.scene, finding.step, finding.row) == (what, 0, 3, 3)
     assert finding.action == ("dropped" if what == "not finite" else "asleep")
@@ -213,7 +213,7 @@ def test_a_runaway_sleeps_and_the_rest_go_on(kick, what, stays, simulator, state
 def test_leaving_the_workspace_is_no_error(simulator, state):
     report = StabilityReport()
     far = with_value(state, "means", -1, 1e6)
-    steps = simulator.rollout(far, 2, report=report)  # on_bad is "raise"
+    steps = simulator.rollout(far, 2, report=report)  # on_invalid is "raise"
     report.check()
     assert [(f.what, f.action, f.count) for f in report.findings] == [("outside the workspace", "asleep", 1)]
     assert_same_bits(steps[-1].means[-1], far.means[-1])
@@ -233,8 +233,8 @@ def test_clamped_particles_stay_inside_and_below_the_speed_limit(simulator, stat
 def test_a_good_state_is_left_as_it_is(simulator, state):
     report = StabilityReport()
     with torch.no_grad():
-        for on_bad in ("raise", "drop", "clamp"):
-            step = simulator.rollout(state, 1, on_bad=on_bad, report=report)[0]
+        for on_invalid in ("raise", "drop", "clamp"):
+            step = simulator.rollout(state, 1, on_invalid=on_invalid, report=report)[0]
             assert_same_bits(step.means, simulator.dynamics(state).means)
     assert report.total == 0 and str(report).startswith("nothing was")
     assert sorted(report.sentinels) == [(0, 2), (1, 3)]
@@ -258,8 +258,8 @@ def test_the_model_s_policy_holds_where_a_call_names_none(simulator, state):
     simulator.config = dataclasses.replace(simulator.config, stability=StabilityConfig("drop"))
     simulator.step(bad)
     assert simulator.report.total == 1
-    with pytest.raises(HardCaseError):
-        simulator.step(bad, on_bad="raise")
+    with pytest.raises(NumericalError):
+        simulator.step(bad, on_invalid="raise")
         simulator.report.check()
     simulator.report.clear()
     assert simulator.report.total == 0
@@ -267,12 +267,12 @@ def test_the_model_s_policy_holds_where_a_call_names_none(simulator, state):
 
 def test_an_error_is_raised_once(simulator, state):
     """The next good call on the same report does not fail for the bad one; check() still tells."""
-    with pytest.raises(HardCaseError):
+    with pytest.raises(NumericalError):
         simulator.step(with_value(state, "opacities", 0, -0.5))
         simulator.report.findings  # a GPU: waits for the flag
         simulator.step(state)
     simulator.step(state)
-    with pytest.raises(HardCaseError):
+    with pytest.raises(NumericalError):
         simulator.report.check()
 
 
@@ -340,7 +340,7 @@ def spoiled_frames(device, value=NAN):
 def test_a_pixel_that_is_no_number(simulator, device):
     frames, row = spoiled_frames(device)
     with pytest.raises(
-        HardCaseError, match=r"images must be finite; image 1 \(scene 0, step 0\) is not; on_bad=\"drop\""
+        NumericalError, match=r"images must be finite; image 1 \(scene 0, step 0\) is not; on_invalid=\"drop\""
     ) as caught:
         simulator.encode(frames)
     assert (caught.value.tensor, caught.value.camera) == ("images", 1)
@@ -348,8 +348,8 @@ def test_a_pixel_that_is_no_number(simulator, device):
     with torch.no_grad():
         expected = simulator.encode(black)
         report = StabilityReport()
-        dropped = simulator.encode(frames, on_bad="drop", report=report)
-        clamped = simulator.encode(frames, on_bad="clamp", report=report)
+        dropped = simulator.encode(frames, on_invalid="drop", report=report)
+        clamped = simulator.encode(frames, on_invalid="clamp", report=report)
     assert [(f.tensor, f.action, f.count, f.scene, f.step, f.camera) for f in report.findings] == [
         ("frames.images", action, 1, 0, 0, 1) for action in ("dropped", "clamped")
     ]
@@ -359,26 +359,26 @@ def test_a_pixel_that_is_no_number(simulator, device):
     assert (dropped.activity == ASLEEP).nonzero()[:, 0].tolist() == [row] and float(dropped.opacities[row]) == 0
 
 
-@pytest.mark.parametrize("on_bad", ["drop", "clamp"])
-def test_gradients_of_spoiled_images_are_finite(simulator, device, on_bad):
+@pytest.mark.parametrize("on_invalid", ["drop", "clamp"])
+def test_gradients_of_spoiled_images_are_finite(simulator, device, on_invalid):
     frames, _ = spoiled_frames(device, INF)
     images = frames.images.clone().requires_grad_()
-    particles = simulator.encode(dataclasses.replace(frames, images=images), on_bad=on_bad)
+    particles = simulator.encode(dataclasses.replace(frames, images=images), on_invalid=on_invalid)
     total = sum(value.float().sum() for name, value in particles.row_fields().items() if name != "activity")
     for grad in torch.autograd.grad(total, [images, *simulator.encoder.parameters()], allow_unused=True):
         assert grad is None or bool(torch.isfinite(grad).all())
 
 
-@pytest.mark.parametrize("on_bad", ["raise", "drop", "clamp"])
-def test_a_camera_that_cannot_see_raises_under_every_policy(simulator, device, on_bad):
+@pytest.mark.parametrize("on_invalid", ["raise", "drop", "clamp"])
+def test_a_camera_that_cannot_see_raises_under_every_policy(simulator, device, on_invalid):
     frames = make_frames((1,)).to(device)
     near = frames.cameras.near.clone()
     near[1] = 0
     frames = dataclasses.replace(frames, cameras=dataclasses.replace(frames.cameras, near=near))
     with pytest.raises(
-        HardCaseError, match="cameras.near must be positive; image 1 .*; mend its calibration"
+        NumericalError, match="cameras.near must be positive; image 1 .*; mend its calibration"
     ) as caught:
-        simulator.encode(frames, on_bad=on_bad)
+        simulator.encode(frames, on_invalid=on_invalid)
     assert (caught.value.tensor, caught.value.camera, caught.value.scene) == ("cameras.near", 1, 0)
 
 
@@ -387,7 +387,7 @@ def test_a_camera_that_cannot_see_raises_under_every_policy(simulator, device, o
 
 def test_a_report_is_a_table_plain_data_and_forgets(simulator, state):
     report = StabilityReport()
-    simulator.step(with_value(state, "opacities", slice(0, 3), 2.0), on_bad="drop", report=report)
+    simulator.step(with_value(state, "opacities", slice(0, 3), 2.0), on_invalid="drop", report=report)
     header, line, total = str(report).splitlines()
     assert header.split() == ["where", "tensor", "what", "action", "scene", "step", "camera", "row", "count"]
     assert line.split() == ["step", "particles.opacities", "outside", "[0,", "1]", "dropped", "0", "0", "-", "0", "3"]
@@ -442,18 +442,18 @@ def test_records_without_findings_are_read_when_somebody_asks():
 def test_drawing_is_rendering_without_a_look(simulator, state):
     report = StabilityReport()
     with torch.no_grad():
-        (step,) = simulator.rollout(with_value(state, "means", 1, NAN), 1, on_bad="drop", report=report)
+        (step,) = simulator.rollout(with_value(state, "means", 1, NAN), 1, on_invalid="drop", report=report)
         found = report.total
         cameras = make_frames(SCENES).cameras
         cameras = dataclasses.replace(cameras, image_cloud=cameras.image_cloud % len(SCENES)).to(step.means.device)
-        drawn = simulator.draw(step, cameras, on_bad="drop", report=report)
-        rendered = simulator.render(step, cameras, on_bad="drop", report=report)
+        drawn = simulator.draw(step, cameras, on_invalid="drop", report=report)
+        rendered = simulator.render(step, cameras, on_invalid="drop", report=report)
     assert_same_bits(drawn.color, rendered.color)
     assert found == report.total > 0 and float(drawn.alpha.max()) > 0
 
 
 def test_a_copied_model_has_a_report_of_its_own(simulator, state):
-    simulator.step(with_value(state, "opacities", 0, 2.0), on_bad="drop")
+    simulator.step(with_value(state, "opacities", 0, 2.0), on_invalid="drop")
     other = copy.deepcopy(simulator)
     assert other.report is not simulator.report and other.report.total == 0 and simulator.report.total == 1
 
@@ -461,10 +461,10 @@ def test_a_copied_model_has_a_report_of_its_own(simulator, state):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: StabilityConfig("ignore"), "on_bad must be one of raise, drop, clamp; got 'ignore'"),
+        (lambda: StabilityConfig("ignore"), "on_invalid must be one of raise, drop, clamp; got 'ignore'"),
         (lambda: StabilityConfig(max_speed=0.0), "max_speed must be positive and finite"),
         (lambda: StabilityConfig(max_latent=INF), "max_latent must be positive and finite"),
-        (lambda: make_simulator().step(None, on_bad="sleep"), "on_bad must be one of"),
+        (lambda: make_simulator().step(None, on_invalid="sleep"), "on_invalid must be one of"),
     ],
 )
 def test_what_is_no_policy_or_limit(make, message):
@@ -474,7 +474,7 @@ def test_what_is_no_policy_or_limit(make, message):
 
 def test_every_preset_has_the_default_policy():
     for preset in (presets.tiny, presets.small, presets.paper_latent, presets.paper_explicit):
-        assert preset().stability == StabilityConfig() and preset().stability.on_bad == "raise"
+        assert preset().stability == StabilityConfig() and preset().stability.on_invalid == "raise"
 
 
 def test_one_bad_gaussian_in_one_camera_is_named():
@@ -483,7 +483,7 @@ def test_one_bad_gaussian_in_one_camera_is_named():
     means = torch.zeros(n, 3)
     arguments = means, torch.tensor([[1.0, 0, 0, 0]] * n), torch.full((n, 3), 0.1), torch.tensor([0.5, NAN, 0.5])
     cameras = frames.cameras.select(torch.tensor([0, 1]), torch.tensor([0, 0]))
-    with pytest.raises(HardCaseError, match=r"opacities: outside \[0, 1\] at row 1 \(camera 0\)") as caught:
+    with pytest.raises(NumericalError, match=r"opacities: outside \[0, 1\] at row 1 \(camera 0\)") as caught:
         rasterize_gaussians(*arguments, cameras, colors=torch.ones(n, 3))
     assert (caught.value.camera, caught.value.row) == (0, 1)
 
@@ -493,14 +493,14 @@ def test_an_error_counts_the_rows_of_its_own_call():
     report, finding = StabilityReport(), Finding("not finite", "rollout", "means", "error", 1, row=4, scene=0, step=2)
     for row, count in ((4, 1), (7, 1), (1, 3), (4, 1)):
         report.add(dataclasses.replace(finding, row=row, count=count))
-        with pytest.raises(HardCaseError) as error:
+        with pytest.raises(NumericalError) as error:
             report.poll()
         more = f" and {count - 1} more" if count > 1 else ""
         assert str(error.value).startswith(f"rollout: means: not finite at row {row} (scene 0, step 2){more};")
         assert error.value.row == row
     assert [found.count for found in report.findings] == [6] and report.total == 6
     for _ in range(2):
-        with pytest.raises(HardCaseError, match=r"at row 4 \(scene 0, step 2\);"):
+        with pytest.raises(NumericalError, match=r"at row 4 \(scene 0, step 2\);"):
             report.check()
     report.clear()
     report.check()
@@ -513,5 +513,5 @@ def test_every_call_of_an_op_says_how_many_rows_are_bad(calls):
     cameras = Cameras(torch.eye(4)[None], K, torch.ones(1), torch.full((1,), 9.0), torch.tensor([0]), 64, 48)
     arguments = (torch.tensor([[1.0, 0, 0, 0]] * 3), torch.full((3, 3), 0.2), torch.full((3,), 0.9), cameras)
     for _ in range(calls):
-        with pytest.raises(HardCaseError, match="at row 1 .* and 1 more;"):
+        with pytest.raises(NumericalError, match="at row 1 .* and 1 more;"):
             rasterize_gaussians(bad, *arguments, colors=torch.eye(3), report=report)

@@ -108,10 +108,10 @@ def check_refused(setting, measured, name: str, value: float) -> None:
     scene, report = setting.to(pack([three(), three()]).to(setting.dtype)), StabilityReport()
     error = raised(lambda: change(scene, name, 4, value).render(report=report), report)
     assert (error.tensor, error.row, error.camera) == (name, 4, 1)
-    measured.outcome("HardCaseError names tensor, row and camera")
+    measured.outcome("NumericalError names tensor, row and camera")
     report = StabilityReport()
     check_left_out(
-        setting, measured, change(three().to(setting.dtype), name, 1, value), [1], on_bad="drop", report=report
+        setting, measured, change(three().to(setting.dtype), name, 1, value), [1], on_invalid="drop", report=report
     )
     assert {(f.tensor, f.action, f.row, f.camera) for f in report.findings} == {(name, "dropped", 1, 0)}
 

@@ -75,7 +75,7 @@ def test_s17_places_that_are_none_are_dropped(setting, measured, value):
     simulator, report = make_simulator(setting), StabilityReport()
     states = [setting.to(batch([h, ordinary()])) for h in (displaced(history, odd, value), history.select_rows(~odd))]
     means = states[0].means.clone().requires_grad_()
-    step = simulator.rollout(dataclasses.replace(states[0], means=means), 1, on_bad="drop", report=report)[0]
+    step = simulator.rollout(dataclasses.replace(states[0], means=means), 1, on_invalid="drop", report=report)[0]
     (grad,) = torch.autograd.grad(step.means.sum() + step.dynamic_latents.sum(), means)
     measured.finite(*float_fields(step).values(), grad)
     absent = simulator.rollout(states[1], 1, report=StabilityReport())[0]
@@ -96,14 +96,14 @@ def test_s17_places_that_are_none_are_an_error(setting, measured, value):
     state = setting.to(batch([ordinary(), displaced(make_history((25, 30)), 30, value)]))
     error = raised(lambda: simulator.rollout(state, 1, report=report), report)
     assert (error.tensor, error.scene, error.step, error.row) == ("particles.means", 1, 1, 21 + 30)
-    measured.outcome("HardCaseError names scene, step, row, tensor")
+    measured.outcome("NumericalError names scene, step, row, tensor")
 
 
 @pytest.mark.parametrize("value", [NAN, INF])
 def test_s17_places_that_are_none_are_clamped(setting, measured, value):
     simulator, report = make_simulator(setting), StabilityReport()
     state = setting.to(batch([displaced(make_history((25, 30)), 30, value), ordinary()]))
-    step = simulator.rollout(state, 1, on_bad="clamp", report=report)[0]
+    step = simulator.rollout(state, 1, on_invalid="clamp", report=report)[0]
     measured.finite(*float_fields(step).values())
     assert [(f.tensor, f.action, f.row) for f in report.findings if f.step == 1][:1] == [
         ("particles.means", "clamped", 30)

@@ -13,7 +13,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.io.files import sha256_of
 from gsim3d.train import checkpoint
 from gsim3d.train.checkpoint import Checkpoint
@@ -211,12 +211,12 @@ def test_weights_that_are_not_finite_are_neither_written_nor_read(tmp_path, part
     wrong = example(10)
     name = next(iter(getattr(wrong, part)))
     getattr(wrong, part)[name][1, 1] = bad
-    with pytest.raises(HardCaseError, match=f"{name}: holds numbers that are not finite; nothing is written") as error:
+    with pytest.raises(NumericalError, match=f"{name}: holds numbers that are not finite; nothing is written") as error:
         checkpoint.save(tmp_path, wrong)
     assert error.value.tensor == name
     assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["last", "step_000005"]
     if part != "optimizer":
-        with pytest.raises(HardCaseError, match="not finite"):
+        with pytest.raises(NumericalError, match="not finite"):
             checkpoint.export(dataclasses.replace(wrong, ema=getattr(wrong, part)), tmp_path / "a.safetensors")
         assert not list(tmp_path.glob("*.safetensors"))
     with monkeypatch.context() as patch:

@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 
 from gsim3d.data import Scene, find_scenes
 from gsim3d.dynamics import concatenate
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.evaluate.perceptual.weights import SOURCES, cache_folder
 from gsim3d.train import checkpoint
@@ -134,7 +134,7 @@ def test_weights_that_are_not_finite_are_not_saved(folder, tmp_path):
     trainer = Trainer(CONFIG, scenes(folder), tmp_path)
     trainer.run(until=1, progress=False)
     trainer.average[min(trainer.average)][0] = math.nan
-    with pytest.raises(HardCaseError, match="holds numbers that are not finite; nothing is written"):
+    with pytest.raises(NumericalError, match="holds numbers that are not finite; nothing is written"):
         trainer.run(until=2, progress=False)
     assert checkpoint.load(tmp_path).state["step"] == 1
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.train.loop import deterministic
 from gsim3d.train.processes import Processes, joined
 from gsim3d.train.restore import build_simulator, model_config
@@ -69,7 +69,7 @@ def run_together(rank: int, out: str) -> None:
 
 
 def broken(*_):
-    raise HardCaseError("broken")
+    raise NumericalError("broken")
 
 
 @pytest.fixture(scope="module")

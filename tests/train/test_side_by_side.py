@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.train.side_by_side import last_entry, side_by_side
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def work(folder, action):
     if action == "raise":
-        raise HardCaseError("step 7 is not finite", step=7)
+        raise NumericalError("step 7 is not finite", step=7)
     if action == "die":
         os._exit(9)
     if action == "wait":
@@ -45,7 +45,7 @@ def test_every_job_is_done_once(together, tmp_path):
         assert all(result[2] == max(1, len(os.sched_getaffinity(0)) // 2) for result in done.values())
 
 
-@pytest.mark.parametrize("action, error", [("raise", HardCaseError), ("die", InputError)])
+@pytest.mark.parametrize("action, error", [("raise", NumericalError), ("die", InputError)])
 def test_what_a_job_raises_ends_the_others(action, error, tmp_path):
     with pytest.raises(error, match="step 7 is not finite" if action == "raise" else "job 1: its process was killed"):
         list(side_by_side(work, jobs(tmp_path, "wait", action), 2))

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.numerics.policy import StabilityReport
 from gsim3d.train import checkpoint
 from gsim3d.train.config import StageConfig
@@ -83,7 +83,7 @@ def test_a_number_that_cannot_be_used_skips_the_step(folder, tmp_path):
     entry = trainer.train_step()
     assert entry["skipped"].startswith("rollout: particles.dynamic_latents: not finite")
     assert entry["loss"] == "nan" and trainer.n_skipped == 1
-    settings = dataclasses.replace(SETTINGS, model={"stability": {"on_bad": "drop"}})
+    settings = dataclasses.replace(SETTINGS, model={"stability": {"on_invalid": "drop"}})
     trainer = Trainer(settings, scenes(folder), tmp_path)
     encode, trainer.simulator.encode = trainer.simulator.encode, broken
     entry = trainer.train_step()
@@ -95,7 +95,7 @@ def test_a_run_that_only_skips_stops_and_can_go_on_with_another_rate(folder, tmp
     settings = dataclasses.replace(SETTINGS, optimizer=optimizer)
     trainer = Trainer(settings, scenes(folder), tmp_path)
     spoil(trainer, range(3, 9))
-    with pytest.raises(HardCaseError) as caught:
+    with pytest.raises(NumericalError) as caught:
         trainer.run(progress=False)
     message = str(caught.value)
     assert message.startswith(

@@ -62,8 +62,8 @@ def no_guards():
     guard, render = gsim3d.simulator.guard_particles, gsim3d.simulator.render
     gsim3d.simulator.guard_particles = lambda particles, *args, **options: particles
 
-    def uncounted(*args, report, on_bad, **options):
-        return render(*args, **options, on_bad="drop")
+    def uncounted(*args, report, on_invalid, **options):
+        return render(*args, **options, on_invalid="drop")
 
     gsim3d.simulator.render = uncounted
     try:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from gsim3d.errors import HardCaseError, RunStopped
+from gsim3d.errors import NumericalError, RunStopped
 from gsim3d.train.captured import CapturedLoss, Prepared
 from gsim3d.train.config import StageConfig, TrainConfig
 from gsim3d.train.log import memory_gib
@@ -130,7 +130,7 @@ def train(
     Returns:
         The progress after it.
     Raises:
-        HardCaseError: too many steps in a row were skipped.
+        NumericalError: too many steps in a row were skipped.
         RunStopped: the launcher or a partner is gone; the state is saved.
     """
     settings, gather, is_first = trainer.config, trainer.processes.gather, trainer.processes.is_first
@@ -175,7 +175,7 @@ def train(
                 row = {**entry, **machine}
                 curve.append([math.nan if row.get(column) is None else float(row[column]) for column in CURVE])
             if trainer.n_skipped_in_a_row >= settings.optimizer.max_skipped:
-                raise HardCaseError(f"{name}: step {entry['step']}: {entry['skipped']}", step=entry["step"])
+                raise NumericalError(f"{name}: step {entry['step']}: {entry['skipped']}", step=entry["step"])
             filming.check()
             if is_first and windows // SCORED_EVERY > was // SCORED_EVERY:
                 save_weights(trainer, out / "scored" / f"{name}.{windows:07d}.weights.safetensors")

@@ -24,7 +24,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 sys.path.insert(0, str(ROOT))
-from gsim3d.errors import CaptureError, HardCaseError, InputError, RunStopped  # noqa: E402
+from gsim3d.errors import CaptureError, InputError, NumericalError, RunStopped  # noqa: E402
 
 SCORING_SHARE, SCORING_MOST = 0.2, 150.0  # of a run, seconds: for validation at its end
 SPARE_CORES = 3  # that each training process keeps
@@ -36,7 +36,7 @@ def run(recipe, state: Path, out: Path, *, minutes: float, device: str, processe
 
     Raises:
         InputError: the state in ``state`` is broken or of another recipe, or the time is too short.
-        HardCaseError: too many steps in a row were skipped; ``out`` has the last good state.
+        NumericalError: too many steps in a row were skipped; ``out`` has the last good state.
     """
     begin = time.monotonic()
     deadline = begin + 60 * minutes
@@ -163,5 +163,5 @@ if __name__ == "__main__":
     except RunStopped as error:
         print(f"train: {error}", file=sys.stderr)
         sys.exit(error.code)
-    except (InputError, HardCaseError, CaptureError) as error:
+    except (InputError, NumericalError, CaptureError) as error:
         sys.exit(f"train: error: {error}")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.cameras import Cameras, Frames
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
 from gsim3d.numerics.policy import ADVICE, FARTHEST, NEAREST, at_most, usable_pixels
 
@@ -30,7 +30,7 @@ class _Wanted(NamedTuple):
 
 
 def check_frames(frames: Frames, config: EncoderConfig, dtype: torch.dtype, *, pixels: bool = True) -> None:
-    """Raises InputError or HardCaseError naming the field that is wrong, and where.
+    """Raises InputError or NumericalError naming the field that is wrong, and where.
 
     Args:
         dtype: of the network, and so of images.
@@ -142,8 +142,8 @@ def _refuse(frames: Frames, check: _Wanted) -> None:
         raise InputError(f"encoder: {check.name} {check.what}; image {index} is not")
     what = f"encoder: {check.name} {check.what}; {check.of} {index}"
     if check.of == "scene":
-        raise HardCaseError(f"{what} is not; {check.advice}", tensor=check.name, scene=index)
+        raise NumericalError(f"{what} is not; {check.advice}", tensor=check.name, scene=index)
     cloud = int(frames.cameras.image_cloud[index])
     scene, step = int(frames.cloud_scene[cloud]), int(frames.cloud_step[cloud])
     where = {"tensor": check.name, "scene": scene, "step": step, "camera": index}
-    raise HardCaseError(f"{what} (scene {scene}, step {step}) is not; {check.advice}", **where)
+    raise NumericalError(f"{what} (scene {scene}, step {step}) is not; {check.advice}", **where)

@@ -69,7 +69,7 @@ class Encoder(nn.Module):
         Gradients: ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
         Raises:
             InputError: sizes do not fit the network's strides or each other; the message names the argument.
-            HardCaseError: an image, camera or origin is not finite or out of range; the message names scene, step and
+            NumericalError: an image, camera or origin is not finite or out of range; the message names scene, step and
                 tensor.
         """
         if room is not None:
@@ -85,7 +85,7 @@ class Encoder(nn.Module):
         """Room for ``size`` rows a cloud. It is made of the cameras; images and masks may then be others.
 
         Raises:
-            InputError, HardCaseError: as :meth:`forward`; or clouds have different numbers of views.
+            InputError, NumericalError: as :meth:`forward`; or clouds have different numbers of views.
         """
         self.check(frames)
         n_clouds, cameras = frames.cloud_scene.shape[0], frames.cameras

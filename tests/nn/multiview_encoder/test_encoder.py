@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsim3d.cameras import Frames
 from gsim3d.compat.quirks import Quirks
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.math.spherical_harmonics import rotate_harmonics
 from gsim3d.nn.gaussian_head import rotation_matrices, unit_quats
 from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig, pixel_rows
@@ -350,10 +350,10 @@ def broken(frames: Frames, name: str) -> Frames:
         ("cameras", InputError, r"cameras.Ks must be \[2, 3, 3\]"),
         ("cloud", InputError, r"image_cloud must be in \[0, 1\)"),
         ("mask", InputError, "masks must be bool"),
-        ("pose", HardCaseError, r"cameras.viewmats must be finite; image 1 \(scene 0, step 0\)"),
-        ("image", HardCaseError, r"images must be finite; image 1"),
-        ("near", HardCaseError, "cameras.near must be positive; image 1"),
-        ("far", HardCaseError, "cameras.far must be finite and larger than near; image 1"),
+        ("pose", NumericalError, r"cameras.viewmats must be finite; image 1 \(scene 0, step 0\)"),
+        ("image", NumericalError, r"images must be finite; image 1"),
+        ("near", NumericalError, "cameras.near must be positive; image 1"),
+        ("far", NumericalError, "cameras.far must be finite and larger than near; image 1"),
     ],
 )
 def test_errors_name_what_is_wrong(fault, error, message):

@@ -371,7 +371,7 @@ def _raster(rng: random.Random) -> Arguments:
         "cu_rows": _offsets(rng, n, clouds),
         "near_plane": 0.01,
         "cutoff": rng.choice(("exact", "exact", "tile3sigma", "smooth")),
-        "on_bad": rng.choice(("raise", "raise", "drop", "clamp")),
+        "on_invalid": rng.choice(("raise", "raise", "drop", "clamp")),
     }
 
 

@@ -32,7 +32,7 @@ from gsim3d.data import Scene
 from gsim3d.data.check import check_scene
 from gsim3d.effects.edits import load_edits
 from gsim3d.effects.spec import EffectsSpec
-from gsim3d.errors import HardCaseError, InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.evaluate.perceptual import weights
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.io import read_ply, read_splats, write_ply, write_splats
@@ -57,7 +57,7 @@ from tests.stability.fuzz.engine import LARGE, Failure, Target, finite
 from tests.stability.fuzz.files import damage
 from tests.test_simulator import CONFIG
 
-EXPECTED = (InputError, HardCaseError, OSError)
+EXPECTED = (InputError, NumericalError, OSError)
 SMALL = {"width": 16, "height": 16, "n_steps": 2, "n_cams": 2}
 Write = Callable[[Path], None]
 
@@ -123,7 +123,7 @@ def _read_scene(folder: Path, what: str) -> None:
         images = scene.images(cams, steps)
         labels = scene.segmentation(cams, steps) if scene.has_segmentation() else None
         cameras = scene.cameras_at(cams, [0])
-    except (InputError, HardCaseError):
+    except (InputError, NumericalError):
         if not found.problems:
             raise Failure("check-data sees nothing wrong with a scene that cannot be read") from None
         raise
