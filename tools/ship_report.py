@@ -1,11 +1,11 @@
 #!/usr/bin/env python
 """Puts reports of accuracy against time of a trained simulator into the documentation, its speeds into the package.
 
-    gsim3d pareto elastic-small --out runs/cpu                                    # on 2 CPU cores
-    gsim3d pareto elastic-small DATA --scenes all --device cuda --self-check --out runs/h200
+    gsim3d profile elastic-small --out runs/cpu                                    # on 2 CPU cores
+    gsim3d profile elastic-small DATA --scenes all --device cuda --self-check --out runs/h200
     python tools/ship_report.py elastic-small cpu=runs/cpu h200=runs/h200
 
-Every DIR holds report.json and the pictures, and speeds.json where `gsim3d pareto` could not write beside the
+Every DIR holds report.json and the pictures, and speeds.json where `gsim3d profile` could not write beside the
 checkpoint. Written: docs/cost-NAME.md and its pictures, where reports of other machines stay, marked if they are of
 other weights; NAME's speeds.json for `gsim3d simulate --speed`.
 """
@@ -126,7 +126,7 @@ def keep_speeds(folder: Path, reports: dict[str, Path]) -> Path:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("name", help="such as elastic-small")
-    parser.add_argument("reports", nargs="+", metavar="MACHINE=DIR", help="what gsim3d pareto wrote, by machine")
+    parser.add_argument("reports", nargs="+", metavar="MACHINE=DIR", help="what gsim3d profile wrote, by machine")
     args = parser.parse_args(arguments)
     reports = {}
     for given in args.reports:

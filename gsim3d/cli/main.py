@@ -27,7 +27,7 @@ COMMANDS = {
         "gsim3d.cli.evaluate",
         "measure predictions on a data set, by step, beside baselines and other models",
     ),
-    "pareto": ("gsim3d.cli.profile", "what accuracy costs in time: a report, and settings that keep a promise"),
+    "profile": ("gsim3d.cli.profile", "what accuracy costs in time: a report, and settings that keep a promise"),
     "ablate": (
         "gsim3d.cli.ablate",
         "the paper's ablations: the same training with one thing changed, in one table",
@@ -40,6 +40,7 @@ COMMANDS = {
     "demo": ("gsim3d.cli.demo", "all of it at a small size, in minutes on a CPU"),
     "doctor": ("gsim3d.cli.doctor", "what is installed, what was compiled, and whether every kernel works here"),
 }
+RENAMED = {"pareto": "profile"}
 
 
 def _overview() -> str:
@@ -115,6 +116,8 @@ def _no_command(arguments: list[str]) -> int:
     given = known.command or arguments[0]
     if given in COMMANDS:
         parser.error(f"the command comes first: gsim3d {given} ...; got {arguments[0]!r} before it")
+    if given in RENAMED:
+        parser.error(f"gsim3d {given} is now gsim3d {RENAMED[given]}")
     parser.error(f"unknown command {given!r}; commands: {', '.join(COMMANDS)}{did_you_mean(given, COMMANDS)}")
 
 

@@ -10,7 +10,7 @@ EPILOG = """\
 Without --effects the spec is effects.yaml of the scene or of the data set around it, else that of the checkpoint,
 which is what gsim3d simulate computes without --effects. Without a checkpoint the model is the preset tiny.
 Multiply-adds are predicted from the sizes of layers and the scene's masks, for matrix products, attention and splats:
-what they tell is how two plans compare (docs/effects.md). Where gsim3d pareto has timed the checkpoint, milliseconds
+what they tell is how two plans compare (docs/effects.md). Where gsim3d profile has timed the checkpoint, milliseconds
 are predicted from them.
 
 examples:
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"and of the background, once a rollout: {once / 1e6:.1f}")
     for device, times in ({} if restored is None else _times(args.checkpoint, restored)).items():
         ours, all_on = (times.predicted(restored.plan, p, simulator.config, work) for p in (plan, most))
-        print(f"\npredicted milliseconds on {device}, from those that gsim3d pareto measured ({times.on})")
+        print(f"\npredicted milliseconds on {device}, from those that gsim3d profile measured ({times.on})")
         print(in_columns(_beside(ours, all_on)))
     return 0
 

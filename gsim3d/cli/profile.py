@@ -1,4 +1,4 @@
-"""``gsim3d pareto``: what accuracy costs in time."""
+"""``gsim3d profile``: what accuracy costs in time."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ that a simulator that comes with gsim3d was trained on, else soft bodies of the 
 LPIPS and FVD are measured where `gsim3d weights` has installed them; quick leaves out the slow ones, lpips_vgg and fvd.
 
 examples:
-  gsim3d pareto runs/model runs/data --out runs/pareto
-  gsim3d pareto runs/model runs/data --preset full --device cuda --self-check --out runs/pareto
-  gsim3d pareto elastic-small data/elastic-unseen --scenes all --out runs/pareto
-  gsim3d pareto runs/model runs/data --others runs/two_a_call runs/larger --out runs/pareto
+  gsim3d profile runs/model runs/data --out runs/profile
+  gsim3d profile runs/model runs/data --preset full --device cuda --self-check --out runs/profile
+  gsim3d profile elastic-small data/elastic-unseen --scenes all --out runs/profile
+  gsim3d profile runs/model runs/data --others runs/two_a_call runs/larger --out runs/profile
 """
 
 
@@ -148,7 +148,7 @@ def run(args: argparse.Namespace) -> int:
         comparison = Comparison(subject, metrics, None if effort.apart else clock)
         conditions = {
             "regimes": NO_REGIMES,
-            "command": shlex.join(["gsim3d", "pareto", *sys.argv[2:]]),
+            "command": shlex.join(["gsim3d", "profile", *sys.argv[2:]]),
             "machine": machine.facts(restored.device),
             "subject": _facts(subject),
             "self_check": [str(check) for check in checks],

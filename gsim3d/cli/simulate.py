@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--speed",
         default="exact",
         metavar="PRESET",
-        help="exact (default), or balanced or fast: tuned by gsim3d pareto to keep 99.9 %% or 99 %% of the gain",
+        help="exact (default), or balanced or fast: tuned by gsim3d profile to keep 99.9 %% or 99 %% of the gain",
     )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")

@@ -196,7 +196,7 @@ def load_speed(folder: Path, restored: Restored, preset: str) -> Setting:
         if not isinstance(found, dict):
             raise InputError(
                 f"--speed {preset}: this checkpoint is not tuned for {device} (in {path}); run "
-                "gsim3d pareto CHECKPOINT first"
+                "gsim3d profile CHECKPOINT first"
             )
     return Setting.from_dict(found)
 

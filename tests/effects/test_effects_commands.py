@@ -71,7 +71,7 @@ def test_plan_predicts_milliseconds_of_a_checkpoint_that_was_timed(capsys, work)
     code, out, _ = call(capsys, "plan", scene, run)
     (run / autotune.SPEEDS).unlink()
     assert code == 0 and out.startswith(before)
-    assert "predicted milliseconds on cpu, from those that gsim3d pareto measured (a clock)\n" in out
+    assert "predicted milliseconds on cpu, from those that gsim3d profile measured (a clock)\n" in out
     table = re.findall(r"^(\w+) +(\d+\.\d) +\d+\.\d +\d\.\d\d$", out[len(before) :], re.MULTILINE)
     assert table == [("dynamics", "8.0"), ("gaussians", "4.0"), ("images", "2.0"), ("all", "14.0")]
 

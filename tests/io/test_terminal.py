@@ -92,6 +92,7 @@ def test_progress_is_for_terminals(capsys, monkeypatch):
     "arguments, message",
     [
         (["simulat"], "unknown command 'simulat'; .*; did you mean simulate?"),
+        (["pareto", "x"], "gsim3d pareto is now gsim3d profile"),
         (["chekdata"], "; did you mean check-data?"),
         (["xyzzy"], "unknown command 'xyzzy'; commands: generate.*, doctor (see"),
         (["--quiet", "train"], "the command comes first: gsim3d train ...; got '--quiet' before it"),
@@ -164,7 +165,7 @@ def test_no_option_may_be_abbreviated(capsys):
         ("evaluate a b", "--steps", ["0"]),
         ("evaluate a b", "--given", ["0"]),
         ("train c --data d --out x", "--until", ["0"]),
-        ("pareto a b --out x", "--minutes", ["0", "nan"]),
+        ("profile a b --out x", "--minutes", ["0", "nan"]),
         ("ablate a --out x", "--seeds", ["0"]),
         ("ablate a --out x", "--minutes", ["-1", "inf"]),
         ("doctor --stability", "--steps", ["0"]),

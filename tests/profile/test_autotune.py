@@ -149,7 +149,7 @@ def test_tuned_presets_are_found_again(tmp_path, subject):
     assert autotune.load_speed(tmp_path, restored, "fast") == Setting(history=1, kept=0.9)
     assert autotune.load_speed(tmp_path, other, "fast") == Setting(grid=2.0)
     assert autotune.load_speed(tmp_path / "none", restored, "exact") == Setting()
-    with pytest.raises(InputError, match="not tuned for cpu .*run gsim3d pareto"):
+    with pytest.raises(InputError, match="not tuned for cpu .*run gsim3d profile"):
         autotune.load_speed(tmp_path, restored, "balanced")
     with pytest.raises(InputError, match="must be one of exact, balanced, fast"):
         autotune.load_speed(tmp_path, restored, "warp")

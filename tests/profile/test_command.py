@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[2]
 REGIMES = {"throughput": [], "training": {"problem": "no configuration"}, "gpu": []}
 CONDITIONS = {
     "regimes": REGIMES,
-    "command": "gsim3d pareto <x>",
+    "command": "gsim3d profile <x>",
     "machine": {"device": "here"},
     "subject": {
         "checkpoint": "1f",
@@ -88,7 +88,7 @@ def test_the_page_needs_nothing_from_elsewhere(written):
     page = (written[0] / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 6
     assert not re.findall(r"(?:src|href)=['\"](?!data:)", page) and "<script" not in page
-    assert "gsim3d pareto &lt;x&gt;" in page and "out of memory at step 3" in page and "holds: a" in page
+    assert "gsim3d profile &lt;x&gt;" in page and "out of memory at step 3" in page and "holds: a" in page
     assert "training step: not measured: no configuration" in page
     assert "fp8 products: needs a GPU &lt;sic&gt;" in page and "fvd: run gsim3d weights fvd" in page
     assert all(escape(line) in page for line in published.INCONSISTENT)
@@ -177,7 +177,7 @@ def test_the_command_from_end_to_end(subject, run, tmp_path, capsys, monkeypatch
     other, out = tmp_path / "other.safetensors", tmp_path / "out"
     checkpoint.export(checkpoint.load(run), other)
     data = str(subject.scenes[0].path.parent)
-    arguments = ["pareto", str(run), data, "--scenes", "all", "--out", str(out), "--quiet", "--others", str(other)]
+    arguments = ["profile", str(run), data, "--scenes", "all", "--out", str(out), "--quiet", "--others", str(other)]
     arguments += ["--knobs", "history", "training steps", "horizon", "--metrics", "psnr", "psnr_masked"]
     assert main(arguments) == 0
     content = json.loads((out / "report.json").read_text())
@@ -206,7 +206,7 @@ def test_what_was_measured_before_an_end_is_kept(subject, run, tmp_path, monkeyp
     monkeypatch.setattr(command, "HURRIED_REPEATS", 1)
     monkeypatch.setattr("gsim3d.profile.autotune.tune", ended)
     data, out = str(subject.scenes[0].path.parent), tmp_path / "out"
-    arguments = ["pareto", str(run), data, "--scenes", "all", "--out", str(out), "--quiet", "--knobs", "history"]
+    arguments = ["profile", str(run), data, "--scenes", "all", "--out", str(out), "--quiet", "--knobs", "history"]
     with pytest.raises((KeyboardInterrupt, SystemExit)):
         raise SystemExit(main(arguments))
     content = json.loads((out / "report.json").read_text())
@@ -221,7 +221,7 @@ def test_what_there_is_no_time_for_is_named(subject, run, tmp_path, monkeypatch)
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(measuring, "QUICK_ON_CPU", dataclasses.replace(measuring.QUICK_ON_CPU, repeats=2, n_rounds=1))
     data, out = str(subject.scenes[0].path.parent), tmp_path / "out"
-    arguments = ["pareto", str(run), data, "--scenes", "all", "--out", str(out), "--quiet", "--minutes", "1e-4"]
+    arguments = ["profile", str(run), data, "--scenes", "all", "--out", str(out), "--quiet", "--minutes", "1e-4"]
     assert main([*arguments, "--self-check", "--knobs", "history", "grid size"]) == 1
     content = json.loads((out / "report.json").read_text())
     assert [point["name"] for point in content["points"]] == ["reference"]
@@ -235,8 +235,8 @@ def test_what_there_is_no_time_for_is_named(subject, run, tmp_path, monkeypatch)
 
 
 def test_wrong_arguments_are_one_line(capsys, tmp_path):
-    assert main(["pareto", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 2
-    assert main(["pareto", str(tmp_path / "none"), "--out", str(tmp_path / "out"), "--knobs", "volume"]) == 2
+    assert main(["profile", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 2
+    assert main(["profile", str(tmp_path / "none"), "--out", str(tmp_path / "out"), "--knobs", "volume"]) == 2
     error = capsys.readouterr().err.strip().splitlines()
     assert len(error) == 2 and "'volume' does not exist; knobs: 'precision'" in error[1]
     assert not (tmp_path / "out").exists()
@@ -251,7 +251,7 @@ def test_a_report_goes_into_the_documentation(written, tmp_path, monkeypatch):
     for picture in re.findall(r"\]\((\S+\.png)\)", page):
         assert (tmp_path / picture).is_file()
     assert page.count(".png)") == len(tool.PICTURES)
-    assert "gsim3d pareto <x>" in page and "failed: out of memory at step 3" in page and "holds: a" in page
+    assert "gsim3d profile <x>" in page and "failed: out of memory at step 3" in page and "holds: a" in page
     assert "| 1 | history 1 | model |" in page
     both = tool.write_page("ball-small", {"h200": written[0]}, tmp_path).read_text()
     assert both.count("\n## ") == 2 and tool.OTHER_WEIGHTS not in both and page.split("\n## ")[1] in both

@@ -37,7 +37,7 @@ RIGHT = {
     "export": "{good}/a.ply --to {out}.splat",
     "plan": "{good}/data/ball/0000 {good}/model.safetensors",
     "effects": "infer {good}/data/ball/0000 {good}/model.safetensors --out {out}.yaml",
-    "pareto": "{good}/model.safetensors {good}/data --out {out} --quiet",
+    "profile": "{good}/model.safetensors {good}/data --out {out} --quiet",
     "ablate": "{good}/data --rows latent --config {good}/train.yaml --out {out} --quiet",
     "evaluate": "{good}/model.safetensors {good}/data --out {out} --steps 1",
     "weights": "lpips --from {good}/train.yaml",
