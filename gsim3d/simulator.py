@@ -206,10 +206,10 @@ class Simulator(nn.Module):
         the bodies that it names."""
         background, appearance = plan.spec.dynamics.background, plan.spec.appearance
         held = () if appearance.changing == "none" else appearance.held
-        if held and state.held is None:
-            state = dataclasses.replace(state, held=rows_of_any(held, state, "effects: appearance.held"))
-        elif not held and state.held is not None:
-            state = dataclasses.replace(state, held=None)
+        if held and state.frozen_appearance is None:
+            state = dataclasses.replace(state, frozen_appearance=rows_of_any(held, state, "effects: appearance.held"))
+        elif not held and state.frozen_appearance is not None:
+            state = dataclasses.replace(state, frozen_appearance=None)
         if background == "masked_out":
             state = state.select_rows(state.activity == DYNAMIC)
         if background == "dynamic":

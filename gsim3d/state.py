@@ -142,22 +142,22 @@ class Particles(TensorRecord):
     world_offset: float64 [B, 3] metres, the point of each scene's world that cameras, origin and positions count from,
         so that float32 holds them; None: 0. Coordinates in edits and files are those of the world.
     quats [N, 4] (w, x, y, z), scales [N, 3] metres, sh [N, K, 3]: only in explicit models.
-    turns: [N, 4] (w, x, y, z), by which what is drawn of a latent look is turned further: where an edit turned it
-        (:mod:`gsim3d.effects.edits`), and of a model with ``turning`` with the matter since rows were encoded.
-    paint: [N, 3, 3], only where an edit painted particles whose look is latent: their colours go through the matrix.
-    held: bool [N], rows whose changing latents and colours stay; only where a spec of effects names bodies
-        (``appearance.held``). Rollouts hand it on; None in a state: the next one asks who is meant.
-    unlit: [N, Fd], the dynamic latents of frozen rows where their simulation began; only of a model that relights its
-        background (:class:`gsim3d.dynamics.DynamicsConfig`).
-    velocity: [N, 3] metres a step, how rows came to where they are: simulated ones in their last step, encoded ones of
-        the newest step on average since the oldest, 0 of others; only of a model with ``velocity``.
-    light: [N, 3], factors of the colours of simulated rows: the light that reaches them over that where they were
-        encoded; only of a model with ``lights``.
-    shaded: [N, 2 L], what stood in the light of each lamp where rows were encoded and what stands there now
-        (:func:`gsim3d.dynamics.shade.shade`), or [N, 3 L]: how much light reached them there, how much they faced the
-        lamp, and how much reaches them now (:func:`gsim3d.dynamics.daylight.daylight`); negative where not known.
-    reference: [N, 3] metres, where rows were when their simulation began: the shape that elastic bodies go back to;
-        only of a model with ``deformation``.
+    orientations: [N, 4] (w, x, y, z), a rotation of the drawn appearance since encoding, from edits
+        (:mod:`gsim3d.effects.edits`) and, in models with ``turning``, from the rotation of the surrounding particles.
+    color_transform: [N, 3, 3], a matrix that decoded colours of latent models are multiplied by; set by edits.
+    frozen_appearance: bool [N], particles whose changing latents and colours stay constant; only where an effects spec
+        selects them (``appearance.held``). Resolved once at the start of a rollout and carried along.
+    initial_latents: [N, Fd], the dynamic latents of frozen particles at the start of the simulation; only in models
+        with ``background="relightable"``.
+    velocity: [N, 3] metres a step: the last displacement of simulated particles, the mean displacement since the oldest
+        step for encoded particles of the newest step, 0 elsewhere; only in models with ``velocity``.
+    irradiance_gain: [N, 3], factors of the colours of simulated particles: irradiance now over irradiance at encoding;
+        only in models with ``lights``.
+    light_occlusion: [N, 2 L], optical depth towards each light at encoding and now
+        (:func:`gsim3d.dynamics.shade.shade`), or [N, 3 L]: irradiance at encoding, n.l, and irradiance now
+        (:func:`gsim3d.dynamics.daylight.daylight`); negative where unknown.
+    rest_positions: [N, 3] metres, positions at the start of the simulation, the rest shape of elastic bodies; only in
+        models with ``deformation``.
     body: [N, 3] metres, a place of the body that a row is a part of, the same for all its rows: where the middle of
         what is seen of it was when it was encoded (:func:`gsim3d.dynamics.bodies.bodies`); only of a model with
         ``pushes``.
@@ -177,14 +177,14 @@ class Particles(TensorRecord):
     quats: Tensor | None = None
     scales: Tensor | None = None
     sh: Tensor | None = None
-    turns: Tensor | None = None
-    paint: Tensor | None = None
-    held: Tensor | None = None
-    unlit: Tensor | None = None
+    orientations: Tensor | None = None
+    color_transform: Tensor | None = None
+    frozen_appearance: Tensor | None = None
+    initial_latents: Tensor | None = None
     velocity: Tensor | None = None
-    light: Tensor | None = None
-    shaded: Tensor | None = None
-    reference: Tensor | None = None
+    irradiance_gain: Tensor | None = None
+    light_occlusion: Tensor | None = None
+    rest_positions: Tensor | None = None
     body: Tensor | None = None
     world_offset: Tensor | None = None
     known: CloudTable | None = None  # see clouds
@@ -198,14 +198,14 @@ class Particles(TensorRecord):
         "quats",
         "scales",
         "sh",
-        "turns",
-        "paint",
-        "held",
-        "unlit",
+        "orientations",
+        "color_transform",
+        "frozen_appearance",
+        "initial_latents",
         "velocity",
-        "light",
-        "shaded",
-        "reference",
+        "irradiance_gain",
+        "light_occlusion",
+        "rest_positions",
         "body",
     )
 

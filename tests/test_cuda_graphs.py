@@ -67,7 +67,7 @@ def rolled_out(simulator, state, n_steps, plan=None):
 
 
 @pytest.mark.parametrize(
-    "n_steps, changes", [(1, {}), (5, {}), (3, {"steps_per_call": 2}), (5, {"background": "relit"})]
+    "n_steps, changes", [(1, {}), (5, {}), (3, {"steps_per_call": 2}), (5, {"background": "relightable"})]
 )
 def test_a_graph_repeats_the_rollout_with_other_particles(n_steps, changes, device):
     simulator = make_simulator(device, dynamics=dataclasses.replace(CONFIG.dynamics, **changes))
@@ -104,16 +104,16 @@ def test_a_state_that_is_prepared_knows_how_its_background_began(device):
     state = make_state(device=device)
     symmetric, relit = (
         make_simulator(device, dynamics=dataclasses.replace(CONFIG.dynamics, background=background))
-        for background in ("symmetric", "relit")
+        for background in ("symmetric", "relightable")
     )
-    assert symmetric.prepare(state, symmetric.plan()).unlit is None
+    assert symmetric.prepare(state, symmetric.plan()).initial_latents is None
     prepared = relit.prepare(state, relit.plan())
-    assert_same_bits(prepared.unlit, prepared.dynamic_latents)
+    assert_same_bits(prepared.initial_latents, prepared.dynamic_latents)
     step = rolled_out(relit, state, 2)[-1]
     frozen = step.activity == FROZEN
-    assert frozen.any() and not torch.equal(step.unlit[frozen], step.dynamic_latents[frozen])
+    assert frozen.any() and not torch.equal(step.initial_latents[frozen], step.dynamic_latents[frozen])
     again = relit.prepare(step, relit.plan())
-    assert_same_bits(again.unlit, step.unlit)
+    assert_same_bits(again.initial_latents, step.initial_latents)
 
 
 def test_a_graph_counts_steps_from_those_given(device):

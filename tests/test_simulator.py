@@ -103,7 +103,11 @@ def test_encoded_particles_know_how_fast_they_are_and_what_stands_in_their_light
     newest = in_history.row_cloud() == 2
     for state in (in_history, too_old):
         assert state.velocity[newest].any() and not state.velocity[~newest].any()
-        assert (state.shaded[newest] >= 0).all() and state.shaded.max() > 0 and (state.shaded[~newest] < 0).all()
+        assert (
+            (state.light_occlusion[newest] >= 0).all()
+            and state.light_occlusion.max() > 0
+            and (state.light_occlusion[~newest] < 0).all()
+        )
     first = dataclasses.replace(frames, images=frames.images.clone(), cloud_step=torch.tensor([0, 3, 4]))
     first.images[:2] = 0.5
     again = simulator.encode(first)
@@ -131,7 +135,7 @@ def test_with_gravity_encoded_particles_in_flight_are_as_fast_as_in_their_last_s
 @pytest.mark.parametrize("name", ["means", "dynamic_latents"])
 @pytest.mark.parametrize("activity", [DYNAMIC, FROZEN])
 def test_what_a_broken_row_remembers_is_not_used(name, activity):
-    more = {"motion_length": 0.5, "deformation": True, "lights": ((0.0, 0.0, 1.0),), "background": "relit"}
+    more = {"motion_length": 0.5, "deformation": True, "lights": ((0.0, 0.0, 1.0),), "background": "relightable"}
     config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **more))
     simulator, frames = awake(make_simulator(config)), make_frames()
     plan = simulator.plan(EffectsSpec(appearance=AppearanceEffects(changing="all")))
@@ -141,7 +145,7 @@ def test_what_a_broken_row_remembers_is_not_used(name, activity):
     values[row] = torch.nan
     state = dataclasses.replace(state, **{name: values})
     step = simulator.rollout(state, 3, plan, on_invalid="drop")[-1]
-    for seen in ("means", "opacities", "dynamic_latents", "light"):
+    for seen in ("means", "opacities", "dynamic_latents", "irradiance_gain"):
         assert getattr(step, seen).isfinite().all(), seen
     assert simulator.render(step, target_cameras(frames, 1), torch.ones(3)).color.isfinite().all()
 

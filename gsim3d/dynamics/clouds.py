@@ -15,7 +15,17 @@ from torch.nn import functional as F
 from gsim3d.state import CloudTable, Particles, split_rows
 
 # That only some particles have.
-OPTIONAL_FIELDS = ("turns", "paint", "held", "unlit", "velocity", "light", "shaded", "reference", "body")
+OPTIONAL_FIELDS = (
+    "orientations",
+    "color_transform",
+    "frozen_appearance",
+    "initial_latents",
+    "velocity",
+    "irradiance_gain",
+    "light_occlusion",
+    "rest_positions",
+    "body",
+)
 
 
 def newest_clouds(clouds: CloudTable) -> list[int]:
@@ -63,14 +73,14 @@ def with_field(particles: Particles, name: str, width: int = 3) -> Particles:
         return particles
     like = particles.means.new_ones(particles.n_rows, 1)
     identity = {
-        "turns": lambda: F.pad(like, (0, 3)),
-        "paint": lambda: torch.diag_embed(like.expand(-1, 3)),
-        "held": lambda: torch.zeros_like(particles.activity, dtype=torch.bool),
-        "unlit": lambda: _finite(particles.dynamic_latents),
+        "orientations": lambda: F.pad(like, (0, 3)),
+        "color_transform": lambda: torch.diag_embed(like.expand(-1, 3)),
+        "frozen_appearance": lambda: torch.zeros_like(particles.activity, dtype=torch.bool),
+        "initial_latents": lambda: _finite(particles.dynamic_latents),
         "velocity": lambda: torch.zeros_like(particles.means),
-        "light": lambda: torch.ones_like(particles.means),
-        "shaded": lambda: -like.expand(-1, width),
-        "reference": lambda: _finite(particles.means.detach()),
+        "irradiance_gain": lambda: torch.ones_like(particles.means),
+        "light_occlusion": lambda: -like.expand(-1, width),
+        "rest_positions": lambda: _finite(particles.means.detach()),
         "body": lambda: _finite(particles.means.detach()),
     }
     return dataclasses.replace(particles, **{name: identity[name]()})

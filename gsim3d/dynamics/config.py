@@ -10,7 +10,7 @@ from gsim3d.numerics.policy import LARGEST
 from gsim3d.ops.curve import PyramidSpec
 
 PREDICTS = ("from_newest", "from_previous", "absolute")
-BACKGROUNDS = ("symmetric", "asymmetric", "relit")
+BACKGROUNDS = ("symmetric", "asymmetric", "relightable")
 STEM_KERNEL, BLOCK_KERNEL = 5, 3  # edges of the convolutions, in cells
 MAX_HISTORY_BITS = 32  # that the geometry counts
 MOST_WAVES = 16  # further ones are shorter than rounding
@@ -83,8 +83,8 @@ class DynamicsConfig:
         zero_init: the last layer starts at zero: an untrained model that predicts differences predicts none.
         background: "symmetric": frozen rows are rows like others to the network, and their latents change;
             "asymmetric": frozen rows of the newest step read each other only, never change, and are computed once a
-            rollout; the others read both (:mod:`gsim3d.dynamics.background`); "relit": the network sees frozen rows in
-            the newest step only and as they were when the simulation began; what it predicts is by how much their
+            rollout; the others read both (:mod:`gsim3d.dynamics.background`); "relightable": the network sees frozen
+            rows in the newest step only and as they were when the simulation began; it predicts by how much their
             latents differ from that now, so that the errors of shadows do not add up; likewise the looks of bodies,
             where a plan lets them change. Weights fit all; train as you simulate.
     Training:
@@ -167,8 +167,8 @@ class DynamicsConfig:
             )
         if self.is_asymmetric and (self.norm == "batch" or self.quirks != Quirks()):
             raise ValueError('DynamicsConfig: background="asymmetric" needs norm="layer" and no quirks')
-        if self.is_relit and self.explicit:
-            raise ValueError('DynamicsConfig: background="relit" needs a model that is not explicit')
+        if self.is_relightable and self.explicit:
+            raise ValueError('DynamicsConfig: background="relightable" needs a model that is not explicit')
         if self.motion_length is not None and (self.predicts == "absolute" or not self.motion_length > 0):
             raise ValueError(
                 'DynamicsConfig: motion_length must be positive, and predicts "from_newest" or "from_previous"; '
@@ -179,12 +179,12 @@ class DynamicsConfig:
                 raise ValueError(f"DynamicsConfig: {name} needs motion_length")
         if self.contact_length is not None and (self.is_asymmetric or not self.contact_length > 0):
             raise ValueError(
-                'DynamicsConfig: contact_length must be positive, and background "symmetric" or "relit"; '
+                'DynamicsConfig: contact_length must be positive, and background "symmetric" or "relightable"; '
                 f"got {self.contact_length} and {self.background!r}"
             )
         if any(len(light) != 3 or not any(light) for light in self.lights) or self.lights and self.is_asymmetric:
             raise ValueError(
-                'DynamicsConfig: lights must be directions (x, y, z), and background "symmetric" or "relit"; '
+                'DynamicsConfig: lights must be directions (x, y, z), and background "symmetric" or "relightable"; '
                 f"got {self.lights} and {self.background!r}"
             )
         needed = (self.velocity, self.deformation, self.contact_length is not None, self.steps_per_call == 1)
@@ -231,8 +231,8 @@ class DynamicsConfig:
         return self.background == "asymmetric"
 
     @property
-    def is_relit(self) -> bool:
-        return self.background == "relit"
+    def is_relightable(self) -> bool:
+        return self.background == "relightable"
 
     @property
     def origin_of_scene(self) -> bool:

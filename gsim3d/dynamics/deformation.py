@@ -16,7 +16,7 @@ DEFORMATION_CHANNELS = 3
 @torch.no_grad()
 def deformation(history: Particles, length: float, grid_size: float, matter: Matter | None = None) -> Tensor:
     """[N, 3] metres, from each movable row of the newest clouds to where it would be if the matter in a Gaussian window
-    around it had only moved and turned since ``history.reference``; 0 of other rows.
+    around it had only moved and turned since ``history.rest_positions``; 0 of other rows.
 
     What pulls an elastic body back is a function of it, and a history of a few steps does not tell it: a body that is
     squeezed looks like one that was made so.
@@ -33,7 +33,7 @@ def deformation(history: Particles, length: float, grid_size: float, matter: Mat
     if matter is None:
         return history.means.new_zeros(0, 3)
     clouds = history.clouds
-    reference = take_runs(with_field(history, "reference").reference, clouds.row_runs(matter.newest))
+    reference = take_runs(with_field(history, "rest_positions").rest_positions, clouds.row_runs(matter.newest))
     with torch.autocast(reference.device.type, enabled=False):
         scenes = constant(tuple(clouds.scenes[q] for q in matter.newest), reference.device)
         before = (matter.padded(reference).double() - history.origin[scenes][:, None]).to(reference.dtype)

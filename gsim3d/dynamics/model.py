@@ -126,7 +126,7 @@ class Dynamics(nn.Module):
     def room(self, history: Particles) -> int:
         """Rows that the network needs room for in calls like that of ``history``: with a background that is relit only
         those that it sees, which waits for the device."""
-        if not self.config.is_relit:
+        if not self.config.is_relightable:
             return history.n_rows
         return min(history.n_rows, math.ceil(ROOM * int(self._seen(history).sum())))
 
@@ -154,9 +154,9 @@ class Dynamics(nn.Module):
         if self.lights is None:
             return particles
         runs = particles.clouds.row_runs(newest_clouds(particles.clouds))
-        known = None if particles.shaded is None else take_runs(particles.shaded, runs)
+        known = None if particles.light_occlusion is None else take_runs(particles.light_occlusion, runs)
         shaded = self._shaded(particles, known)
-        return dataclasses.replace(particles, shaded=_put_runs(shaded, runs, particles.n_rows, -1.0))
+        return dataclasses.replace(particles, light_occlusion=_put_runs(shaded, runs, particles.n_rows, -1.0))
 
     def with_bodies(self, particles: Particles) -> Particles:
         """``particles`` of which the newest clouds know their bodies, if that is asked for; others know no more than
@@ -186,14 +186,14 @@ class Dynamics(nn.Module):
 
     def begin(self, state: Particles) -> Particles:
         """``state`` with the fields in which simulated rows know how they began."""
-        if self.config.is_relit:
-            state = with_field(state, "unlit")
+        if self.config.is_relightable:
+            state = with_field(state, "initial_latents")
         if self.config.deformation:
-            state = with_field(state, "reference")
+            state = with_field(state, "rest_positions")
         if self.config.turning:
-            state = with_field(state, "turns")
+            state = with_field(state, "orientations")
         state = self.with_bodies(state)
-        return state if self.lights is None else with_field(state, "light")
+        return state if self.lights is None else with_field(state, "irradiance_gain")
 
     def forward(
         self,
@@ -225,8 +225,8 @@ class Dynamics(nn.Module):
         changes = changes or self.layout.changes()
         if background is None and self.config.is_asymmetric:
             return self._forward_in_parts(history, generator, changes)
-        history = self.begin(history if history.shaded is not None else self.in_light(history))
-        if self.config.is_relit:
+        history = self.begin(history if history.light_occlusion is not None else self.in_light(history))
+        if self.config.is_relightable:
             history = _as_it_began(history, changes["dynamic_latents"] in ("all", "dynamic"))
         clouds = history.clouds
         newest = newest_clouds(clouds)
@@ -256,7 +256,7 @@ class Dynamics(nn.Module):
             flight = self.flight(history, matter, beside)
             near = _put_runs(beside.contact, runs, history.n_rows)
         if self.lights is not None:
-            shaded, n_lights = take_runs(history.shaded, runs), len(self.lights)
+            shaded, n_lights = take_runs(history.light_occlusion, runs), len(self.lights)
             dark = torch.cat([shaded[:, -n_lights:], shaded[:, :n_lights]], 1)  # now and then
             dark = _put_runs(dark, runs, history.n_rows)
         features, is_awake = self.layout.pack(history, moved, near, dark), None
@@ -291,15 +291,15 @@ class Dynamics(nn.Module):
                 for before, step in zip([state, *steps], steps)
             ]
         if config.turning:
-            turns = turned(state.turns, steps[0].velocity, config.motion_length, matter)
-            steps = [dataclasses.replace(steps[0], turns=turns)]
+            turns = turned(state.orientations, steps[0].velocity, config.motion_length, matter)
+            steps = [dataclasses.replace(steps[0], orientations=turns)]
         if self.lights is not None:
             # Where rows have come to: with the light of where they were shadows would lag behind their bodies.
             found = [self._shaded(step, shaded) for step in steps]
             brighter = torch.stack([self._brighter(values) for values in found])
             light = self.layout.later_light(state, prediction, brighter, is_awake, changes)
             steps = [
-                dataclasses.replace(step, shaded=values, light=lit)
+                dataclasses.replace(step, light_occlusion=values, irradiance_gain=lit)
                 for step, values, lit in zip(steps, found, light.unbind(0), strict=True)
             ]
         return steps[0] if len(steps) == 1 else concatenate(steps)
@@ -347,7 +347,7 @@ class Dynamics(nn.Module):
     def _seen(self, history: Particles) -> Tensor:
         """bool [N], rows that the network sees."""
         seen = history.activity != ASLEEP
-        if self.config.is_relit:
+        if self.config.is_relightable:
             runs = history.clouds.row_runs(newest_clouds(history.clouds))
             newest = torch.ones_like(seen[: sum(end - begin for begin, end in runs)])
             seen = seen & ((history.activity != FROZEN) | _put_runs(newest, runs, history.n_rows))
@@ -426,5 +426,5 @@ def _packed(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor,
 def _as_it_began(history: Particles, bodies: bool) -> Particles:
     """``history`` whose frozen rows look as they did when the simulation began; with ``bodies`` all rows."""
     relit = ((history.activity == FROZEN) | bodies & (history.activity != ASLEEP))[:, None]
-    latents = torch.where(relit, history.unlit, history.dynamic_latents)
+    latents = torch.where(relit, history.initial_latents, history.dynamic_latents)
     return dataclasses.replace(history, dynamic_latents=latents)

@@ -24,7 +24,17 @@ from torch import Tensor
 from gsim3d.effects.rules import Sleep
 from gsim3d.state import ASLEEP, FROZEN, Particles, constant
 
-NEVER_PREDICTED = {"activity", "static_latents", "turns", "paint", "held", "unlit", "shaded", "reference", "body"}
+NEVER_PREDICTED = {
+    "activity",
+    "static_latents",
+    "orientations",
+    "color_transform",
+    "frozen_appearance",
+    "initial_latents",
+    "light_occlusion",
+    "rest_positions",
+    "body",
+}
 CUBE_BITS = 16  # of a cube along an axis; cubes further out share the outermost
 WEIGHTS = (1 << 3 * CUBE_BITS, 1 << 2 * CUBE_BITS, 1 << CUBE_BITS, 1)  # of scene, x, y, z in the number of a cube
 

@@ -29,7 +29,7 @@ ONWARD = 1  # of the motions that gsim3d.dynamics.motion tells, the one that goe
 MOST_KEPT = 2.0  # how much more or less of a motion may go on
 LIGHT_CHANNELS = 3  # of colours
 MOST_LIGHT = 2.0  # logarithm of how much more or less light there may be
-FEATURES = ("dynamic_latents", "sh", "light")  # that rows which are held keep
+FEATURES = ("dynamic_latents", "sh", "irradiance_gain")  # that rows which are held keep
 SMALL_ANGLE_SQUARED = 1e-8  # radians^2; smaller rotations are their series: a square root has no gradient at 0
 
 
@@ -66,7 +66,7 @@ class StateLayout:
             outputs = [("dynamic_latents", dynamic), ("sh", sh), ("means", means), ("opacities", 1)]
             outputs += [("quats", rotation), ("scales", 3)]
         if config.lights:
-            outputs.append(("light", LIGHT_CHANNELS))
+            outputs.append(("irradiance_gain", LIGHT_CHANNELS))
         return cls(config, *(tuple((name, n) for name, n in fields if n > 0) for fields in (inputs, outputs)))
 
     @property
@@ -185,7 +185,7 @@ class StateLayout:
         changes = changes or self.changes()
         later = {}
         for name, part in self._parts(prediction, changes).items():
-            if name == "light":
+            if name == "irradiance_gain":
                 continue
             share = self._share(particles, changes[name], awake, name in FEATURES)
             onward = (drift, flight) if name == "means" else ()
@@ -210,7 +210,7 @@ class StateLayout:
             others: as of :meth:`advance`.
         """
         changes = changes or self.changes()
-        who, predicted = changes["light"], self._parts(prediction, changes).get("light")
+        who, predicted = changes["irradiance_gain"], self._parts(prediction, changes).get("irradiance_gain")
         share = self._share(particles, who, awake, True)
         if self.config.surfaces:  # their light has bounds of its own, and reaches all, whose look changes otherwise
             if predicted is not None:
@@ -218,7 +218,7 @@ class StateLayout:
             share = self._share(particles, "all", awake, True)
         elif predicted is not None:
             brighter = bounded((predicted + brighter) / MOST_LIGHT, MOST_LIGHT)
-        return hold(share, particles.light, brighter.exp())
+        return hold(share, particles.irradiance_gain, brighter.exp())
 
     def _parts(self, prediction: Tensor, changes: Mapping[str, str]) -> dict[str, Tensor]:
         """[S, N, channels] of each output that changes."""
@@ -233,8 +233,8 @@ class StateLayout:
         rows = {"all": torch.ones_like(frozen), "dynamic": ~frozen, "frozen": frozen}.get(who, torch.zeros_like(frozen))
         if awake is not None:
             rows = rows & awake
-        if is_look and particles.held is not None:
-            rows = rows.masked_fill(particles.held, False)
+        if is_look and particles.frozen_appearance is not None:
+            rows = rows.masked_fill(particles.frozen_appearance, False)
         return rows[:, None].to(particles.means)
 
     def later_values(

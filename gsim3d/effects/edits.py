@@ -104,8 +104,8 @@ class Rotate(Operation):
             fields["quats"] = rotate_left(state.quats, vector.to(means).expand(state.n_rows, 3))
             fields["sh"] = rotate_harmonics(state.sh, matrix.expand(state.n_rows, 3, 3))
         else:
-            state = with_field(state, "turns")
-            fields["turns"] = quat_product(quat.to(means).expand_as(state.turns), state.turns)
+            state = with_field(state, "orientations")
+            fields["orientations"] = quat_product(quat.to(means).expand_as(state.orientations), state.orientations)
         if state.velocity is not None:
             fields["velocity"] = state.velocity @ matrix.T
         return _changed(state, rows, fields)
@@ -153,8 +153,8 @@ class Recolor(Operation):
         paint = torch.outer(state.means.new_tensor(self.color) / mean, grey).expand(state.n_rows, 3, 3)
         if state.sh is not None:
             return _changed(state, rows, {"sh": painted(state.sh, paint)})
-        state = with_field(state, "paint")
-        return _changed(state, rows, {"paint": paint @ state.paint})
+        state = with_field(state, "color_transform")
+        return _changed(state, rows, {"color_transform": paint @ state.color_transform})
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class Insert(Operation):
     inserts: ClassVar[bool] = True
 
     def apply(self, state, colors):
-        rows, given = self.of.rows(self.particles), dataclasses.replace(self.particles, held=None)
+        rows, given = self.of.rows(self.particles), dataclasses.replace(self.particles, frozen_appearance=None)
         if len(newest_clouds(given.clouds)) != 1:
             raise InputError("particles must be of one scene")
         for field, value in given.row_fields().items():

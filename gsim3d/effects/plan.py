@@ -183,7 +183,7 @@ def predicted_cost(plan: Plan, model: ModelConfig, work: Workload) -> dict[str, 
     frozen = work.frozen if background in ("frozen", "asymmetric") else 0
     beside = frozen if _is_asymmetric(plan.spec, model) else 0
     drawn = moving + frozen
-    frozen_steps = 1 if model.dynamics.is_relit else plan.history
+    frozen_steps = 1 if model.dynamics.is_relightable else plan.history
     seen = moving * plan.history + (frozen - beside) * frozen_steps
     renderer, outputs = model.renderer, plan.spec.outputs
     harmonics = 3 * (plan.sh_degree + 1) ** 2 if outputs.rgb else 0

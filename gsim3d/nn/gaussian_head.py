@@ -92,8 +92,8 @@ class GaussianHead(nn.Module):
         """The Gaussians of all rows; ``sh_degree``: without colours of higher degrees; not ``rgb``: without any."""
         n_harmonics = (self.config.n_harmonics if sh_degree is None else (sh_degree + 1) ** 2) if rgb else 0
         sh, quats, scales = self._shape_and_color(particles, n_harmonics)
-        if sh is not None and particles.light is not None:
-            sh = lit(sh, particles.light)
+        if sh is not None and particles.irradiance_gain is not None:
+            sh = lit(sh, particles.irradiance_gain)
         offset = None if particles.world_offset is None else particles.world_offset[particles.cloud_scene]
         return Gaussians(particles.means, quats, scales, particles.opacities, sh, particles.cu_rows, offset)
 
@@ -106,7 +106,7 @@ class GaussianHead(nn.Module):
         else:
             wanted = [(c * K, c * K + n_harmonics) for c in range(3)] if n_harmonics else []
             raw = self.fc2.some(hidden, [*wanted, (3 * K, 3 * K + 7)])
-        turns = particles.turns
+        turns = particles.orientations
         if self.config.quirks == Quirks():
             wide = torch.float64 if raw.dtype == torch.float64 else torch.float32
             quats, scales, sh = ops.decode_gaussians(
@@ -123,7 +123,7 @@ class GaussianHead(nn.Module):
                 return None, quats, scales
             if turns is not None and n_harmonics > 1:  # the constant looks the same from everywhere
                 sh = rotate_harmonics(sh, rotation_matrices(turns))
-            return sh if particles.paint is None else painted(sh, particles.paint), quats, scales
+            return sh if particles.color_transform is None else painted(sh, particles.color_transform), quats, scales
         sh, quats, scales = widened(raw).split([raw.shape[1] - 7, 4, 3], 1)
         quats = unit_quats(quats.roll(1, 1))
         if turns is not None:
@@ -135,7 +135,7 @@ class GaussianHead(nn.Module):
         sh = sh.unflatten(1, (3, -1)).mT * degree_damping(self.config.sh_degree, sh)[:n_harmonics, None]
         if n_harmonics > 1:
             sh = turn_predicted_harmonics(sh, rotation_matrices(quats), self.config.quirks)
-        return sh if particles.paint is None else painted(sh, particles.paint), quats, scales
+        return sh if particles.color_transform is None else painted(sh, particles.color_transform), quats, scales
 
 
 def render(

@@ -33,7 +33,7 @@ from gsim3d.state import ASLEEP, CloudTable, Particles
 BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
 ALWAYS = ("means", "opacities")  # are looked at, changed or not
 # Choices, and what others were when the simulation began: those are looked at.
-NOT_LOOKED_AT = ("activity", "held", "unlit", "shaded", "reference", "body")
+NOT_LOOKED_AT = ("activity", "frozen_appearance", "initial_latents", "light_occlusion", "rest_positions", "body")
 
 
 _WATCHED = "gsim3d.watched"  # a node of a graph whose gradients are looked at
@@ -158,10 +158,16 @@ def guard_frames(
 
 # Shapes of the fields of particles behind their N rows; None: any.
 _SHAPES = {"means": (3,), "opacities": (), "activity": (), "quats": (4,), "scales": (3,), "sh": (None, 3)}
-_SHAPES |= {"turns": (4,), "paint": (3, 3), "held": (), "velocity": (3,), "light": (3,)}
-_SHAPES |= {"reference": (3,), "body": (3,)}
+_SHAPES |= {
+    "orientations": (4,),
+    "color_transform": (3, 3),
+    "frozen_appearance": (),
+    "velocity": (3,),
+    "irradiance_gain": (3,),
+}
+_SHAPES |= {"rest_positions": (3,), "body": (3,)}
 _OF_SCENES = ("origin", "world_offset")  # float64, one row a scene
-_DTYPES = {"activity": torch.uint8, "held": torch.bool}
+_DTYPES = {"activity": torch.uint8, "frozen_appearance": torch.bool}
 
 
 def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths: dict[str, int]) -> None:

@@ -33,8 +33,13 @@ BOUND = 1e-4  # error over the largest value: float32 sums in another order; wor
 FOLLOWED_BOUND = 1e-3  # of velocities, fitted to pixels: images of noise have no motion to find; worst seen 2.9e-4
 IMAGE_BOUND = 1e-3  # root mean square of a pixel's error: one splat whose alpha crosses 1/255 moves one pixel by 0.004
 GRAIN = 2.0**-18  # metres; positions are rounded to it before a scene is moved, so that sums of float32 are exact
-PLACES = ("means", "reference", "body")  # fields of particles
-OF_PLACES = (*PLACES, "velocity", "light", "shaded")  # which a step leaves where it ends, rounded as that is
+PLACES = ("means", "rest_positions", "body")  # fields of particles
+OF_PLACES = (
+    *PLACES,
+    "velocity",
+    "irradiance_gain",
+    "light_occlusion",
+)  # which a step leaves where it ends, rounded as that is
 FAR = 2.0**17  # cells: outside of the 2^16 that a grid has
 
 

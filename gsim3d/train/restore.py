@@ -171,6 +171,8 @@ def without_old_switches(model: dict) -> dict:
         parts[name] = part
     if isinstance(parts.get("renderer"), dict):
         parts["renderer"] = {"jacobian": "clamped", **parts["renderer"]}
+    if isinstance(parts.get("dynamics"), dict) and parts["dynamics"].get("background") == "relit":
+        parts["dynamics"] = {**parts["dynamics"], "background": "relightable"}
     if isinstance(parts.get("stability"), dict):
         parts["stability"] = {"on_invalid" if k == "on_bad" else k: v for k, v in parts["stability"].items()}
     return parts

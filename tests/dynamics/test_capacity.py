@@ -11,7 +11,7 @@ from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
 
 MOVING = dataclasses.replace(TINY, **SEEING)
-RELIT = dataclasses.replace(MOVING, background="relit")
+RELIT = dataclasses.replace(MOVING, background="relightable")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SIZES = [[(40, 30)], [(1,)], [(0, 12)], [(12, 0)], [(40, 30), (3,), (5, 6, 7), (60, 0, 1, 2)]]

@@ -135,7 +135,7 @@ def test_waves_tell_places():
 
 
 def test_beside_the_background_of_the_newest_step_it_is_the_same_when_relit():
-    relit = dataclasses.replace(TOLD, background="relit", motion_length=0.2)
+    relit = dataclasses.replace(TOLD, background="relightable", motion_length=0.2)
     dynamics, history = make_dynamics(relit), above_ground([0.02, 0.05])
     older = (history.activity == FROZEN) & (history.row_cloud() == 0)
     moved = dataclasses.replace(history, means=torch.where(older[:, None], history.means + 0.05, history.means))

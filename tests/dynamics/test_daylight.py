@@ -172,7 +172,7 @@ def test_compiled_it_is_the_same(device):
         assert_close_relative_to_max(actual, expected, 1e-3)
 
 
-@pytest.mark.parametrize("background", ["symmetric", "relit"])
+@pytest.mark.parametrize("background", ["symmetric", "relightable"])
 def test_colours_follow_the_light(background):
     """That of where rows are over that of where they were encoded, times what is predicted."""
     dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True, background=background)), scene(600)
@@ -180,24 +180,24 @@ def test_colours_follow_the_light(background):
     dynamics.strength.data = strength
     known = dynamics.in_light(history)
     newest = last_steps(known, 1)
-    lit, facing, now = newest.shaded.split(2, 1)
+    lit, facing, now = newest.light_occlusion.split(2, 1)
     assert_same_bits(lit, now)
     found = daylight(history, dynamics.lights, CELL)
     assert_close_relative_to_max(lit, found[0], 1e-6)
     assert_close_relative_to_max(facing, found[1], 1e-6)
-    assert (known.shaded[: -newest.n_rows] == -1).all()
-    assert (dynamics(known).light - 1).abs().max() < 1e-5  # nothing moved
+    assert (known.light_occlusion[: -newest.n_rows] == -1).all()
+    assert (dynamics(known).irradiance_gain - 1).abs().max() < 1e-5  # nothing moved
     moves = newest.activity == DYNAMIC
     aside = torch.where((known.activity == DYNAMIC)[:, None], torch.tensor([0.3, 0.0, 0.0]), 0)
     moved = dataclasses.replace(known, means=known.means + aside)
     step = dynamics(moved)
     then, now = ((1 + values @ strength) for values in (lit, daylight(moved, dynamics.lights, CELL, facing=facing)[0]))
-    assert_close_relative_to_max(step.light, now / then, 1e-4)
-    assert step.light[~moves].min() < 0.6 and step.light[~moves].max() > 1.5
-    assert_same_bits(step.shaded[:, :4], newest.shaded[:, :4])
+    assert_close_relative_to_max(step.irradiance_gain, now / then, 1e-4)
+    assert step.irradiance_gain[~moves].min() < 0.6 and step.irradiance_gain[~moves].max() > 1.5
+    assert_same_bits(step.light_occlusion[:, :4], newest.light_occlusion[:, :4])
     dynamics.net.head.fc2.bias.detach()[-3:] = torch.tensor([0.1, 0.0, -0.4])
     more = (2 * (torch.tensor([0.1, 0.0, -0.4]) / 2).tanh()).exp()
-    assert_close_relative_to_max(dynamics(moved).light, step.light * more, 1e-4)
+    assert_close_relative_to_max(dynamics(moved).irradiance_gain, step.irradiance_gain * more, 1e-4)
 
 
 def test_the_light_reaches_all_whoever_may_change_but_not_rows_that_are_held():
@@ -205,13 +205,15 @@ def test_the_light_reaches_all_whoever_may_change_but_not_rows_that_are_held():
     known = dynamics.in_light(history)
     aside = torch.where((known.activity == DYNAMIC)[:, None], torch.tensor([0.3, 0.0, 0.0]), 0)
     held = torch.arange(known.n_rows) % 3 == 0
-    known = dataclasses.replace(known, means=known.means + aside, held=held)
+    known = dataclasses.replace(known, means=known.means + aside, frozen_appearance=held)
     moves = last_steps(known, 1).activity == DYNAMIC
     light = {}
     for who in ("all", "dynamic", "frozen", "none"):
         *_, last = rollout(partial(dynamics, changes=dynamics.layout.changes(who)), known, 2, 2)
-        assert (last.light[last.held] == 1).all() and (last.light[~last.held] != 1).any()
-        light[who] = last.light
+        assert (last.irradiance_gain[last.frozen_appearance] == 1).all() and (
+            last.irradiance_gain[~last.frozen_appearance] != 1
+        ).any()
+        light[who] = last.irradiance_gain
     assert_close_relative_to_max(light["frozen"][~moves], light["all"][~moves], 0.2)
     assert (light["none"][~moves] - light["all"][~moves]).abs().max() > 1e-4  # what is predicted is not of all
     assert (light["none"][~moves] - light["dynamic"][~moves]).abs().max() < 0.2
@@ -222,7 +224,7 @@ def test_the_network_reads_it_and_training_reaches_strength_and_direction():
     known = dynamics.in_light(history)
     aside = torch.where((known.activity == DYNAMIC)[:, None], torch.tensor([0.1, 0.0, 0.0]), 0)
     step = dynamics(dataclasses.replace(known, means=known.means + aside))
-    step.light.square().sum().backward()
+    step.irradiance_gain.square().sum().backward()
     assert dynamics.lights.grad.abs().amax(1).gt(0).all() and dynamics.strength.grad.abs().gt(0).all()
     assert dynamics.net.stem.told.weight.grad[:, : 2 * len(LIT.lights)].abs().amax(0).gt(0).all()
 
@@ -239,9 +241,9 @@ def test_a_step_of_training_turns_a_lamp_by_little():
 def test_rows_that_were_not_encoded_are_lit_as_where_they_begin():
     dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True)), scene(300)
     step = dynamics(history)
-    assert (step.light - 1).abs().max() < 1e-5
-    assert_close_relative_to_max(step.shaded[:, :2], daylight(history, dynamics.lights, CELL)[0], 0.3)
-    assert (step.shaded >= 0).all()
+    assert (step.irradiance_gain - 1).abs().max() < 1e-5
+    assert_close_relative_to_max(step.light_occlusion[:, :2], daylight(history, dynamics.lights, CELL)[0], 0.3)
+    assert (step.light_occlusion >= 0).all()
 
 
 @pytest.mark.parametrize("change", [{"lights": ()}, {"background": "asymmetric"}])

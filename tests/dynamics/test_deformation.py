@@ -30,7 +30,7 @@ def bent(matrix, n=300, seed=0, frozen_share=0.0):
     ball = 0.1 * torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
     history = make_history((n,), seed=seed, frozen_share=frozen_share)
     now = ball @ matrix.T + torch.tensor([1.2, 1.0, 0.9])
-    return dataclasses.replace(history, means=now, reference=1.0 + ball)
+    return dataclasses.replace(history, means=now, rest_positions=1.0 + ball)
 
 
 def random_rotations(n, dtype=torch.float64):
@@ -72,14 +72,14 @@ def test_a_squeezed_body_is_told_the_way_back(turn):
     """In a window that is larger than the body, so that all of it counts."""
     history = bent(turn @ SQUEEZED)
     way = deformation(history, 1.0, TINY.grid_size)
-    expected = (history.reference - 1) @ turn.T - (history.means - torch.tensor([1.2, 1.0, 0.9]))
+    expected = (history.rest_positions - 1) @ turn.T - (history.means - torch.tensor([1.2, 1.0, 0.9]))
     assert_close_relative_to_max(way, expected - expected.mean(0), 0.05)
 
 
 def test_in_a_window_of_its_size_it_is_told_part_of_it():
     history = bent(SQUEEZED)
     way = deformation(history, 0.05, TINY.grid_size)
-    top = history.reference[:, 2] > 1.08
+    top = history.rest_positions[:, 2] > 1.08
     assert 0.002 < way[top, 2].mean() < 0.028
 
 
@@ -100,15 +100,15 @@ def test_frozen_rows_are_not_bent_and_do_not_count():
 def test_nothing_is_bent_where_nothing_is_or_nothing_is_remembered():
     history = bent(SQUEEZED)
     assert deformation(history.select_rows(torch.zeros(300, dtype=torch.bool)), *HOW).shape == (0, 3)
-    assert deformation(dataclasses.replace(history, reference=None), *HOW).abs().max() < 1e-6
+    assert deformation(dataclasses.replace(history, rest_positions=None), *HOW).abs().max() < 1e-6
 
 
 def test_a_place_that_is_none_spoils_nothing():
     history = bent(SQUEEZED)
     means, others = history.means.clone(), torch.arange(300) != 7
     means[7] = torch.nan
-    reference = torch.where(others[:, None], history.reference, torch.nan)
-    way = deformation(dataclasses.replace(history, means=means, reference=reference), *HOW)
+    reference = torch.where(others[:, None], history.rest_positions, torch.nan)
+    way = deformation(dataclasses.replace(history, means=means, rest_positions=reference), *HOW)
     assert way.isfinite().all()
     assert_close_relative_to_max(way[others], deformation(history, *HOW)[others], 0.05)
 
@@ -117,10 +117,10 @@ def test_simulated_rows_remember_where_they_were():
     dynamics, history = make_dynamics(REMEMBERING), make_history((60, 60))
     steps = rollout(dynamics, history, 3, max_steps=2)
     for step in steps:
-        assert_same_bits(step.reference, last_steps(history, 1).means)
+        assert_same_bits(step.rest_positions, last_steps(history, 1).means)
 
 
-@pytest.mark.parametrize("background", ["asymmetric", "relit"])
+@pytest.mark.parametrize("background", ["asymmetric", "relightable"])
 def test_where_the_background_is_not_computed_anew_bodies_remember_too(background):
     config = dataclasses.replace(REMEMBERING, norm="layer", background=background, zero_init=True, velocity=True)
     history = with_field(bent(SQUEEZED, frozen_share=0.3), "velocity")

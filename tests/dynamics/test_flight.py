@@ -39,7 +39,7 @@ def ball(height, velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.0, 0.0), n=300, ground=T
         activity=activity,
         opacities=torch.full_like(history.opacities, 0.9),
         velocity=torch.cat([0 * floor, turning + torch.tensor(velocity)]),
-        reference=means,
+        rest_positions=means,
     )
 
 

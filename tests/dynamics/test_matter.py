@@ -14,7 +14,7 @@ from tests.dynamics.scenes import SEEING, TINY, batch, float_fields, make_dynami
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SEEN = {**SEEING, "deformation": True, "surfaces": True, "gravity": (0.0, 0.0, -0.005), "turning": True}
-TOLD = dataclasses.replace(TINY, background="relit", **SEEN)
+TOLD = dataclasses.replace(TINY, background="relightable", **SEEN)
 
 
 def scenes(device="cpu"):
@@ -68,7 +68,12 @@ def test_room_for_more_changes_nothing(device):
             with dynamics.moving_at_most(n):
                 step = dynamics(given)
         (gradient,) = torch.autograd.grad(step.means.square().sum(), velocity)
-        found[n] = {**float_fields(step), "turns": step.turns, "light": step.light, "gradient": gradient}
+        found[n] = {
+            **float_fields(step),
+            "orientations": step.orientations,
+            "irradiance_gain": step.irradiance_gain,
+            "gradient": gradient,
+        }
     assert found[None]["gradient"].any()
     for n in (most(history), 36, 40):
         for name, value in found[n].items():

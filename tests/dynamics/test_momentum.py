@@ -219,43 +219,45 @@ def test_what_is_drawn_turns_with_the_body_and_what_is_frozen_does_not():
     history = dataclasses.replace(history, activity=torch.where(frozen, FROZEN, history.activity).to(torch.uint8))
     steps = rollout(make_dynamics(TURNING), history, 6, max_steps=2)
     expected = torch.linalg.matrix_exp(6 * cross_matrix(SPIN))
-    found = rotation_matrices(steps[-1].turns)
+    found = rotation_matrices(steps[-1].orientations)
     assert_close_relative_to_max(found[5:], expected.expand(195, 3, 3), 0.02)
-    assert_same_bits(steps[-1].turns[:5], torch.tensor([1.0, 0, 0, 0]).expand(5, 4))
+    assert_same_bits(steps[-1].orientations[:5], torch.tensor([1.0, 0, 0, 0]).expand(5, 4))
     edited = Rotate(axis=(1.0, 0.0, 0.0), degrees=90.0).apply(history, None)
-    again = rollout(make_dynamics(TURNING), edited, 1, max_steps=2)[0].turns
+    again = rollout(make_dynamics(TURNING), edited, 1, max_steps=2)[0].orientations
     about_x = torch.linalg.matrix_exp(cross_matrix((torch.pi / 2, 0.0, 0.0)))
     one = about_x @ torch.linalg.matrix_exp(cross_matrix(SPIN)) @ about_x.T @ about_x
     assert_close_relative_to_max(rotation_matrices(again)[5:], one.expand(195, 3, 3), 0.02)
 
 
 def test_without_turning_nothing_turns():
-    assert make_dynamics(CARRYING)(flying()).turns is None
+    assert make_dynamics(CARRYING)(flying()).orientations is None
 
 
 def test_where_there_is_nothing_nothing_turns():
     """Nor where a place is none."""
     history = flying()
     nobody = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
-    assert make_dynamics(TURNING)(nobody).turns.shape == (0, 4)
+    assert make_dynamics(TURNING)(nobody).orientations.shape == (0, 4)
     means = history.means.clone()
     means[250] = torch.nan
-    found = make_dynamics(TURNING)(dataclasses.replace(history, means=means)).turns
+    found = make_dynamics(TURNING)(dataclasses.replace(history, means=means)).orientations
     assert_same_bits(found[50], torch.tensor([1.0, 0, 0, 0]))
     others = torch.arange(200) != 50
-    assert_close_relative_to_max(found[others], make_dynamics(TURNING)(history).turns[others], 0.02)
+    assert_close_relative_to_max(found[others], make_dynamics(TURNING)(history).orientations[others], 0.02)
 
 
 def test_scenes_turn_each_for_itself():
     one, other = flying(), flying(n=150, seed=3, spin=(0.1, 0.0, 0.0))
-    both = make_dynamics(TURNING)(batch([one, other])).turns
-    alone = torch.cat([make_dynamics(TURNING)(q).turns for q in (one, other)])
+    both = make_dynamics(TURNING)(batch([one, other])).orientations
+    alone = torch.cat([make_dynamics(TURNING)(q).orientations for q in (one, other)])
     assert_close_relative_to_max(both, alone, 1e-5)
 
 
 def test_a_gpu_turns_the_same(devices):
     history = flying()
-    expected, actual, again = (make_dynamics(TURNING).to(d)(history.to(d)).turns.cpu() for d in (*devices, devices[1]))
+    expected, actual, again = (
+        make_dynamics(TURNING).to(d)(history.to(d)).orientations.cpu() for d in (*devices, devices[1])
+    )
     assert_close_relative_to_max(actual, expected, 1e-4)
     assert_same_bits(again, actual)
 

@@ -227,7 +227,7 @@ def test_rows_that_cannot_move_keep_what_they_were_given_and_scenes_do_not_meet(
 
 @pytest.mark.parametrize("solid", [False, True])
 def test_gradients(solid):
-    history = dataclasses.replace(ball(0.01, n=20), velocity=None, reference=None)
+    history = dataclasses.replace(ball(0.01, n=20), velocity=None, rest_positions=None)
     history = dataclasses.replace(history, means=history.means.double())
     moving = history.activity == DYNAMIC
     rows = [torch.where(moving[:, None], noise(history, seed).double(), 0)[moving] for seed in range(3)]

@@ -140,8 +140,8 @@ def test_the_network_reads_it_and_turns_its_lights():
     """Without the columns that read it the next step is another one. Training is told by how a step is lit."""
     dynamics, history = make_dynamics(LIT), under_a_ball(100)
     step = dynamics(history)
-    assert not (step.light == 1).all()
-    step.light.square().sum().backward()
+    assert not (step.irradiance_gain == 1).all()
+    step.irradiance_gain.square().sum().backward()
     assert dynamics.lights.grad.abs().amax(1).gt(0).all()
     for columns in (slice(0, 2), slice(2, 4)):  # now, and where rows were encoded
         other = copy.deepcopy(dynamics)
@@ -155,7 +155,7 @@ def unlit(n_rows, n_lights=2):
 
 
 @pytest.mark.parametrize("steps_per_call", [1, 2])
-@pytest.mark.parametrize("background", ["symmetric", "relit"])
+@pytest.mark.parametrize("background", ["symmetric", "relightable"])
 def test_light_is_that_of_where_rows_are_over_that_of_where_they_were_encoded(background, steps_per_call):
     config = dataclasses.replace(LIT, zero_init=True, background=background, steps_per_call=steps_per_call)
     dynamics, history = make_dynamics(config), under_a_ball()
@@ -163,9 +163,9 @@ def test_light_is_that_of_where_rows_are_over_that_of_where_they_were_encoded(ba
     shaded = shade(history, torch.tensor(LIT.lights), LIT.grid_size)
     assert shaded.amin(0).max() < 0.1 and shaded.amax(0).min() > 2
     began = 0.5 + unlit(history.n_rows)
-    step = dynamics(dynamics.in_light(dataclasses.replace(history, shaded=began)))
+    step = dynamics(dynamics.in_light(dataclasses.replace(history, light_occlusion=began)))
     expected = (2 * (((0.5 - shaded) @ dynamics.dimming) / 2).tanh()).exp()
-    for light, known in ((x.unflatten(0, (steps_per_call, -1)) for x in (step.light, step.shaded)),):
+    for light, known in ((x.unflatten(0, (steps_per_call, -1)) for x in (step.irradiance_gain, step.light_occlusion)),):
         for k in range(steps_per_call):
             assert_close_relative_to_max(light[k], expected, 1e-5)
             assert_same_bits(known[k][:, :2], began[: len(shaded)])
@@ -173,8 +173,8 @@ def test_light_is_that_of_where_rows_are_over_that_of_where_they_were_encoded(ba
     change = torch.tensor([0.1, 0.0, -0.4])
     dynamics.net.head.fc2.bias.detach().unflatten(0, (steps_per_call, -1))[:, -3:] = change
     step = dynamics(history)  # as far as is known they began here
-    assert_close_relative_to_max(step.shaded, torch.cat([shaded.repeat(1, 2)] * steps_per_call), 1e-5)
-    brighter = step.light.unflatten(0, (steps_per_call, -1))[0]
+    assert_close_relative_to_max(step.light_occlusion, torch.cat([shaded.repeat(1, 2)] * steps_per_call), 1e-5)
+    brighter = step.irradiance_gain.unflatten(0, (steps_per_call, -1))[0]
     assert_close_relative_to_max(brighter, (2 * (change / 2).tanh()).exp().expand_as(brighter), 1e-5)
 
 
@@ -183,13 +183,15 @@ def test_light_does_not_add_up_and_is_not_of_rows_that_keep_their_look():
     dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True)), under_a_ball()
     held = torch.zeros(history.n_rows, dtype=torch.bool)
     held[::3] = True
-    history = dynamics.in_light(dataclasses.replace(history, shaded=0.5 + unlit(history.n_rows), held=held))
+    history = dynamics.in_light(
+        dataclasses.replace(history, light_occlusion=0.5 + unlit(history.n_rows), frozen_appearance=held)
+    )
     for who in ("all", "dynamic", "frozen", "none"):
         first, *_, last = rollout(partial(dynamics, changes=dynamics.layout.changes(who)), history, 3, 2)
-        rows, moves = last_steps(history, 1).held, last_steps(history, 1).activity == DYNAMIC
+        rows, moves = last_steps(history, 1).frozen_appearance, last_steps(history, 1).activity == DYNAMIC
         kept = rows | {"all": rows, "dynamic": ~moves, "frozen": moves, "none": ~rows}[who]
-        assert (last.light[kept] == 1).all() and (last.light[~kept] != 1).any() == (who != "none")
-        assert_same_bits(last.light, first.light)  # nothing moved
+        assert (last.irradiance_gain[kept] == 1).all() and (last.irradiance_gain[~kept] != 1).any() == (who != "none")
+        assert_same_bits(last.irradiance_gain, first.irradiance_gain)  # nothing moved
 
 
 def test_encoded_rows_know_what_stood_in_their_light():
@@ -197,12 +199,12 @@ def test_encoded_rows_know_what_stood_in_their_light():
     known = dynamics.in_light(history)
     newest = known.row_cloud() == 1
     shaded = shade(history, dynamics.lights, LIT.grid_size)
-    assert_close_relative_to_max(known.shaded[newest], shaded.repeat(1, 2), 1e-6)
-    assert (known.shaded[~newest] == -1).all()
+    assert_close_relative_to_max(known.light_occlusion[newest], shaded.repeat(1, 2), 1e-6)
+    assert (known.light_occlusion[~newest] == -1).all()
     gone = known.select_rows(known.activity == FROZEN)  # the ball is taken away: its shadow goes with it
     step = make_dynamics(dataclasses.replace(LIT, zero_init=True))(gone)
-    before = last_steps(gone, 1).shaded[:, :2].sum(1)
-    assert (step.light[before > 2] > 1.2).all() and (step.light[before == 0] == 1).all()
+    before = last_steps(gone, 1).light_occlusion[:, :2].sum(1)
+    assert (step.irradiance_gain[before > 2] > 1.2).all() and (step.irradiance_gain[before == 0] == 1).all()
 
 
 @pytest.mark.parametrize(
@@ -226,10 +228,10 @@ def test_a_shadow_does_not_lag_behind_its_body(surfaces, steps_per_call):
         moved = (step.means - last_steps(known, 1).means)[:, 0].abs().max()
         here = dynamics.in_light(step)
         assert moved > 0.2
-        assert_close_relative_to_max(step.shaded, here.shaded, 1e-6)
+        assert_close_relative_to_max(step.light_occlusion, here.light_occlusion, 1e-6)
         n_lights = len(LIT.lights)
-        assert (step.shaded[:, :n_lights] - step.shaded[:, -n_lights:]).abs().max() > 0.3
-        assert (step.light[step.activity == FROZEN] - 1).abs().max() > 0.1
+        assert (step.light_occlusion[:, :n_lights] - step.light_occlusion[:, -n_lights:]).abs().max() > 0.3
+        assert (step.irradiance_gain[step.activity == FROZEN] - 1).abs().max() > 0.1
 
 
 @pytest.mark.parametrize("surfaces", [False, True])
@@ -241,6 +243,8 @@ def test_rows_that_sleep_keep_what_they_knew(surfaces):
     known = dataclasses.replace(known, activity=torch.where(asleep, ASLEEP, known.activity))
     rows = last_steps(known, 1).activity == ASLEEP
     step = dynamics(known)
-    assert_same_bits(step.shaded[rows], last_steps(known, 1).shaded[rows])
-    assert_same_bits(dynamics.in_light(step).shaded[rows], step.shaded[rows])
-    assert (step.shaded[rows] > 0).any() and not torch.equal(step.shaded[~rows], last_steps(known, 1).shaded[~rows])
+    assert_same_bits(step.light_occlusion[rows], last_steps(known, 1).light_occlusion[rows])
+    assert_same_bits(dynamics.in_light(step).light_occlusion[rows], step.light_occlusion[rows])
+    assert (step.light_occlusion[rows] > 0).any() and not torch.equal(
+        step.light_occlusion[~rows], last_steps(known, 1).light_occlusion[~rows]
+    )

@@ -159,7 +159,7 @@ def test_recolor_changes_the_look_and_for_latent_models_nothing_else(model):
         for step, other in zip(future(simulator, red, 2), future(simulator, state, 2), strict=True):
             assert_same_bits(step.means, other.means)
             assert_same_bits(step.dynamic_latents, other.dynamic_latents)
-            assert step.paint is not None
+            assert step.color_transform is not None
 
 
 def test_two_scenes_are_merged():
@@ -172,7 +172,7 @@ def test_two_scenes_are_merged():
         assert_same_bits(all_rows.means[: one.n_rows], one.means)
         assert_close_relative_to_max(all_rows.means[one.n_rows :], more.means + torch.tensor([0.5, 0, 0]), 1e-6)
     painted = edited(simulator, here, Recolor("moving", (1.0, 0.0, 0.0)), Insert("all", there))
-    assert_same_bits(painted.paint[-1], torch.eye(3))
+    assert_same_bits(painted.color_transform[-1], torch.eye(3))
     assert future(simulator, here, 2, [Edit(1, Insert("moving", there))])[-1].n_rows > last_steps(here, 1).n_rows
     other, foreign, _ = encoded(MODELS["explicit"], (1,))
     with pytest.raises(InputError, match="edit at step 0, insert: particles.quats must be as those of the state"):
@@ -289,14 +289,17 @@ def test_files_that_are_no_edits(tmp_path, text, message):
 def test_a_model_that_is_told_everything_goes_on_from_edits(model):
     """Its particles have every field that there is."""
     more = {"motion_length": 0.5, "velocity": True, "deformation": True, "lights": ((0.0, 0.0, 1.0),)}
-    more |= {"background": "relit"} if model == "latent" else {}
+    more |= {"background": "relightable"} if model == "latent" else {}
     config = CONFIGS[model]
     config = dataclasses.replace(config, dynamics=dataclasses.replace(config.dynamics, **more))
     simulator, state, _ = encoded(config)
     edits = [Edit(step, Rotate("moving", degrees=30.0)) for step in (0, 1)] + [Edit(1, Recolor("moving", (1.0, 0, 0)))]
     step = future(simulator, state, 2, edits)[-1]
-    own = {"sh", "quats"} if model == "explicit" else {"turns", "paint", "unlit"}
-    assert own | {"light", "velocity", "reference"} <= step.row_fields().keys() and step.means.isfinite().all()
+    own = {"sh", "quats"} if model == "explicit" else {"orientations", "color_transform", "initial_latents"}
+    assert (
+        own | {"irradiance_gain", "velocity", "rest_positions"} <= step.row_fields().keys()
+        and step.means.isfinite().all()
+    )
 
 
 @pytest.mark.parametrize("step", [0, 1])
@@ -306,6 +309,8 @@ def test_who_is_removed_stands_in_no_light(step):
     config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **more))
     simulator, state, _ = encoded(config)
     told = []
-    simulator.dynamics.register_forward_pre_hook(lambda _, args: told.append(last_steps(args[0], 1).shaded[:, 1]))
+    simulator.dynamics.register_forward_pre_hook(
+        lambda _, args: told.append(last_steps(args[0], 1).light_occlusion[:, 1])
+    )
     future(simulator, state, 2, [Edit(step, Remove("moving"))])
     assert len(told) == 2 and [bool(now.any()) for now in told] == [step > 0, False]

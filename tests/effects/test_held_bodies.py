@@ -80,7 +80,7 @@ def test_who_is_held_is_asked_once_where_a_rollout_starts():
     later = rolled(case, values, state=concatenate([case.state, *steps]))[-1]
     assert_same_bits(later.dynamic_latents[rows], start.dynamic_latents[rows])
     free = rolled(case, {}, state=concatenate([case.state, *steps]))[-1]
-    assert free.held is None and not torch.equal(free.dynamic_latents[rows], start.dynamic_latents[rows])
+    assert free.frozen_appearance is None and not torch.equal(free.dynamic_latents[rows], start.dynamic_latents[rows])
     state, one_by_one = case.state, rolled(case, values, 3)
     for expected in one_by_one:
         with torch.no_grad():
@@ -95,8 +95,8 @@ def test_edits_keep_the_marks_with_their_particles():
     edits.append(Edit(1, Insert("all", rolled(case, values)[-1])))
     first, second = rolled(case, values, edits=edits)
     moving = start.dynamic_latents[start.activity == 0]
-    assert_same_bits(first.dynamic_latents[first.held], torch.cat([moving, moving]))
-    assert_same_bits(second.dynamic_latents[second.held], torch.cat([moving, moving]))
+    assert_same_bits(first.dynamic_latents[first.frozen_appearance], torch.cat([moving, moving]))
+    assert_same_bits(second.dynamic_latents[second.frozen_appearance], torch.cat([moving, moving]))
     assert second.n_rows == 2 * len(moving) + start.n_rows, "what is inserted is held by nobody"
 
 
@@ -130,19 +130,24 @@ def test_a_captured_rollout_holds_who_is_named_in_each_state(model, device):
             expected = simulator.rollout(given, 2, plan)
         actual = captured(given).steps
         for step, other in zip(actual, expected, strict=True):
-            assert torch.equal(step.held, other.held) and 0 < int(step.held.sum()) < step.n_rows
+            assert (
+                torch.equal(step.frozen_appearance, other.frozen_appearance)
+                and 0 < int(step.frozen_appearance.sum()) < step.n_rows
+            )
             start = last_steps(given, 1)
-            assert torch.equal(step.dynamic_latents[step.held], start.dynamic_latents[step.held])
+            assert torch.equal(
+                step.dynamic_latents[step.frozen_appearance], start.dynamic_latents[step.frozen_appearance]
+            )
             for name, value in other.row_fields().items():
                 assert_close_relative_to_max(getattr(step, name), value, 1e-11 if device.type == "cuda" else 0, name)
-    assert not torch.equal(captured(state).steps[0].held, captured(moved).steps[0].held)
+    assert not torch.equal(captured(state).steps[0].frozen_appearance, captured(moved).steps[0].frozen_appearance)
 
 
 def test_nobody_is_marked_where_no_features_change():
     case = Case()
     plan = case.simulator.plan(EffectsSpec.from_dict(holding(half(case.state), changing="none")))
     assert plan.skipped["held bodies"] == "nobody's features change"
-    assert rolled(case, holding(half(case.state), changing="none"))[-1].held is None
+    assert rolled(case, holding(half(case.state), changing="none"))[-1].frozen_appearance is None
     kept = {e.name: e.why for e in case.simulator.plan(EffectsSpec.from_dict(holding(half(case.state)))).effects}
     assert kept["held bodies"] == "appearance.held names 1, whose features stay"
 

@@ -75,7 +75,7 @@ def test_nobody_keeps_a_log_of_rest_without_sleep_or_background(monkeypatch):
     monkeypatch.setattr(case.simulator, "_colors", refuse)
     steps, image = case(EffectsSpec())
     assert len(steps) == 2 and image.alpha is None and image.depth is None and image.features is None
-    assert steps[0].turns is None and steps[0].paint is None and steps[0].held is None
+    assert steps[0].orientations is None and steps[0].color_transform is None and steps[0].frozen_appearance is None
     with pytest.raises(AssertionError, match="although it is off"):
         case(EffectsSpec.from_dict({"dynamics": {"sleep": {}}}))
 

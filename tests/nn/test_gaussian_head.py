@@ -69,7 +69,7 @@ def test_what_is_turned_further_is_seen_from_as_far_round(degree):
     head, particles = make_head(dtype=torch.float64), make_history((10,), dtype=torch.float64)
     turns = torch.nn.functional.normalize(torch.randn(10, 4, dtype=torch.float64), dim=1)
     before = head(particles, sh_degree=degree)
-    after = head(dataclasses.replace(particles, turns=turns), sh_degree=degree)
+    after = head(dataclasses.replace(particles, orientations=turns), sh_degree=degree)
     turn = rotation_matrices(turns)
     assert_close_relative_to_max(rotation_matrices(after.quats), turn @ rotation_matrices(before.quats), 1e-12)
     assert_same_bits(after.scales, before.scales)
@@ -89,8 +89,8 @@ def test_light_multiplies_the_colours_that_are_seen_from_anywhere(config):
         gaussians = head(dataclasses.replace(particles, **look))
         return 0.5 + torch.einsum("nk,nkc->nc", sh_basis(d, config.sh_degree), gaussians.sh), gaussians
 
-    for look in ({}, {"paint": paint}):
-        (plain, before), (seen, gaussians) = colours(**look), colours(**look, light=light)
+    for look in ({}, {"color_transform": paint}):
+        (plain, before), (seen, gaussians) = colours(**look), colours(**look, irradiance_gain=light)
         assert_close_relative_to_max(seen, light * plain, 1e-5)
         assert_same_bits(gaussians.scales, before.scales)
         assert_same_bits(gaussians.opacities, before.opacities)

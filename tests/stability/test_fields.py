@@ -148,7 +148,7 @@ def test_particles_are_refused_by_name(call, field, change, error, message, simu
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("field", ["body", "reference", "unlit", "shaded", "held"])
+@pytest.mark.parametrize("field", ["body", "rest_positions", "initial_latents", "light_occlusion", "frozen_appearance"])
 def test_what_rows_remember_is_looked_at(field, simulator, state):
     values = torch.zeros(state.n_rows, 3)
     values[7, 1] = math.nan
@@ -156,4 +156,4 @@ def test_what_rows_remember_is_looked_at(field, simulator, state):
     with pytest.raises(ValueError, match=f"step: particles.{field} must be") as caught:
         simulator.step(bad)
     assert isinstance(caught.value, (NumericalError, InputError))
-    assert field in ("held", "unlit") or caught.value.row == 7
+    assert field in ("frozen_appearance", "initial_latents") or caught.value.row == 7

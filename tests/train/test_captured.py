@@ -49,7 +49,7 @@ RELIT = dataclasses.replace(
         "dynamics": {
             "motion_length": 0.3,
             "velocity": True,
-            "background": "relit",
+            "background": "relightable",
             "position_waves": 2,
             "contact_length": 0.15,
             "lights": ((0.1, 0.2, 1.0),),

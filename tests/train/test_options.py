@@ -251,8 +251,8 @@ def test_the_background_of_the_first_step_lies_behind_the_bodies_of_the_last():
             assert torch.equal(seen.means[rows], source.means[wanted])
             assert torch.equal(seen.opacities[rows], source.opacities[wanted])
         assert not seen.opacities[seen.activity == ASLEEP].any()
-        lit = dynamics.in_light(given[0]).shaded[given[0].activity == FROZEN]
-        assert torch.equal(seen.shaded[seen.activity == FROZEN], lit) and lit.any()
+        lit = dynamics.in_light(given[0]).light_occlusion[given[0].activity == FROZEN]
+        assert torch.equal(seen.light_occlusion[seen.activity == FROZEN], lit) and lit.any()
     assert torch.equal(state.select_clouds([0]).activity, history.select_clouds([1]).activity)
 
 

@@ -62,7 +62,7 @@ MODEL = {
         "drop_path": 0.0,
         "shuffle_orders": False,
         "position_features": False,  # as published: no absolute positions, so that scenes may be edited
-        "background": "relit",  # frozen particles are computed once a step
+        "background": "relightable",  # frozen particles are computed once a step
         "max_latent_step": 8.0,
     },
     "renderer": {"scale_min": 0.002, "initial_scale": 0.03},

@@ -10,7 +10,7 @@ from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
 
-RELIT = dataclasses.replace(TINY, background="relit", **SEEING)
+RELIT = dataclasses.replace(TINY, background="relightable", **SEEING)
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -41,7 +41,7 @@ def test_the_network_sees_the_background_in_the_newest_step_only():
 
 def test_what_was_predicted_of_the_background_is_not_seen_again():
     dynamics, history = make_dynamics(RELIT), make_history((30, 30))
-    history = with_field(history, "unlit")
+    history = with_field(history, "initial_latents")
     frozen = frozen_rows(history)
     dark = with_latents(history, frozen, torch.full_like(history.dynamic_latents, -3.0))
     expected, step = dynamics(history), dynamics(dark)
@@ -49,14 +49,14 @@ def test_what_was_predicted_of_the_background_is_not_seen_again():
         assert_same_bits(getattr(step, name), value, name)
     newest = last_steps(history, 1)
     frozen = frozen_rows(newest)
-    assert_same_bits(step.unlit[frozen], newest.dynamic_latents[frozen])
+    assert_same_bits(step.initial_latents[frozen], newest.dynamic_latents[frozen])
     assert not torch.equal(step.dynamic_latents[frozen], newest.dynamic_latents[frozen])
 
 
 @pytest.mark.parametrize("features, is_seen", [("all", False), ("dynamic", False), ("frozen", True), ("none", True)])
 def test_what_was_predicted_of_bodies_is_not_seen_again_where_their_look_changes(features, is_seen):
     """Else it is what they were given, or were made to be."""
-    dynamics, history = make_dynamics(RELIT), with_field(make_history((30, 30)), "unlit")
+    dynamics, history = make_dynamics(RELIT), with_field(make_history((30, 30)), "initial_latents")
     bodies = history.activity == DYNAMIC
     dark = with_latents(history, bodies, torch.full_like(history.dynamic_latents, -3.0))
     changes = dynamics.layout.changes(features)
@@ -120,5 +120,5 @@ def test_gradients_flow_to_how_the_background_began():
 
 
 def test_explicit_models_have_no_such_background():
-    with pytest.raises(ValueError, match='background="relit" needs a model that is not explicit'):
-        dataclasses.replace(EXPLICIT, background="relit")
+    with pytest.raises(ValueError, match='background="relightable" needs a model that is not explicit'):
+        dataclasses.replace(EXPLICIT, background="relightable")
