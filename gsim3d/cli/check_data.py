@@ -12,7 +12,7 @@ Layouts that load (docs/data.md has every key):
   genesis      metadata.json with n_steps, n_cams, file_path_template and cam_<j>: as `gsim3d generate` writes
   kubric       cam_<j>/metadata.json with rgba_<t>.png and segmentation_<t>.png: Kubric and MOVi
   transforms   transforms.json of nerfstudio, with a time for every frame
-  films        cameras.json, and for each camera one video <name>.mp4 or one folder <name>/<number>.png or .jpg
+  videos       cameras.json, and for each camera one video <name>.mp4 or one folder <name>/<number>.png or .jpg
 
 Look at the picture: in every frame the orange box must stand around what moves, the world's axes (x red, y green,
 z blue) must point the same ways, and the other cameras (magenta) must be where you see them. The blue box is the
@@ -43,10 +43,10 @@ def run(args: argparse.Namespace) -> int:
 
     from gsim3d.data import find_scenes
     from gsim3d.data.check import check_scene, contact_sheet, describe
-    from gsim3d.io.files import made_around, place_of, write_picture
+    from gsim3d.io.files import output_path, with_parents, write_picture
     from gsim3d.io.terminal import progress
 
-    out = None if args.out is None else place_of(args.out, ".png")
+    out = None if args.out is None else output_path(args.out, ".png")
     folders = find_scenes(args.data)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         hidden = args.quiet or len(folders) == 1
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
             print(f"  problem: {problem}")
     scenes = [check.scene for check in checks if check.scene]
     if scenes and out is not None:
-        part = made_around(out).with_name(f".{out.stem}.part.png")
+        part = with_parents(out).with_name(f".{out.stem}.part.png")
         write_picture(part, contact_sheet(scenes)[..., ::-1])
         os.replace(part, out)
     n_problems = sum(len(check.problems) for check in checks)

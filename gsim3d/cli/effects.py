@@ -44,11 +44,11 @@ def run(args: argparse.Namespace) -> int:
 
     from gsim3d.effects.plan import in_columns
     from gsim3d.effects.spec import FILE
-    from gsim3d.io.files import made_around, new_place
+    from gsim3d.io.files import new_output_path, with_parents
     from gsim3d.train.restore import restore
 
     tolerance = _decibels(args.tolerance)
-    out = new_place(args.out or Path(args.scene) / FILE, "file")
+    out = new_output_path(args.out or Path(args.scene) / FILE, "file")
     restored = restore(args.checkpoint, args.device)
     scene = restored.open_scene(args.scene, args.keep, args.resample)
     base = restored.plan.spec
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
         f"still; {1e3 * seconds:.1f} ms a step with images of {len(trial.cams)} cameras\n"
     )
     print(in_columns([("effect", "setting", "worth dB", "costs ms", ""), *rows]))
-    spec.save(made_around(out))
+    spec.save(with_parents(out))
     print(f"\nproposed: {now:.2f} dB ({now - psnr:+.3f}), {seconds / time:.2f} times as fast; written to {out}:")
     print(textwrap.indent(out.read_text(), "  ").rstrip())
     return 0

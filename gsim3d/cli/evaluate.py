@@ -195,10 +195,10 @@ def _evaluate(args: argparse.Namespace, metrics: tuple, not_measured: dict, agai
 def _out_file(args: argparse.Namespace, others: list):
     from pathlib import Path
 
-    from gsim3d.io.files import place_of
+    from gsim3d.io.files import output_path
 
     if args.out:
-        out = place_of(args.out, ".json")
+        out = output_path(args.out, ".json")
     else:
         place = located(args.checkpoint) if args.checkpoint else Path(others[0].folder)
         shipped = place.is_relative_to(FOLDER)  # nothing is written into the package
@@ -252,9 +252,9 @@ def _write(out, args: argparse.Namespace, scenes: list, scores: list, summary: d
     from gsim3d.errors import InputError
     from gsim3d.evaluate.pictures import write_curves
     from gsim3d.evaluate.report import write_csv, write_json, write_markdown
-    from gsim3d.io.files import made_around
+    from gsim3d.io.files import with_parents
 
-    made_around(out)
+    with_parents(out)
     files = [out, out.with_suffix(".csv"), out.with_suffix(".md"), out.with_suffix(".png")]
     write_json(files[0], summary)
     write_csv(files[1], scores)

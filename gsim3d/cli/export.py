@@ -44,13 +44,13 @@ def run(args: argparse.Namespace) -> int:
 
     from gsim3d.errors import InputError
     from gsim3d.io import write_video
-    from gsim3d.io.files import new_place
+    from gsim3d.io.files import new_output_path
     from gsim3d.io.formats import format_of, write_splats
     from gsim3d.io.orbit import orbit_frames
     from gsim3d.io.sequence import open_sequence
     from gsim3d.viewer import write_player
 
-    out, sequence = new_place(args.to, "file"), open_sequence(args.target, args.up)
+    out, sequence = new_output_path(args.to, "file"), open_sequence(args.target, args.up)
     fps = args.fps or sequence.fps or FPS
     chosen = range(len(sequence))
     if args.frame is not None:

@@ -31,11 +31,11 @@ def run(args: argparse.Namespace) -> int:
 
     from gsim3d.compat.released_import import import_released
     from gsim3d.errors import InputError
-    from gsim3d.io.files import made_around, new_place
+    from gsim3d.io.files import new_output_path, with_parents
     from gsim3d.train import checkpoint
     from gsim3d.train.settings import load_yaml, to_dict
 
-    out = new_place(args.out)
+    out = new_output_path(args.out)
     source, settings = Path(args.checkpoint), load_yaml(args.config)
     try:
         imported = import_released(source, settings)
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(message if message.startswith(str(source)) else f"{args.config}: {message}") from None
     config, effects = imported.config, imported.config.effects
     checkpoint.write(
-        made_around(out),
+        with_parents(out),
         checkpoint.Checkpoint(
             model=imported.weights,
             config={

@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.evaluate.pictures import as_bytes, comparison_frames, true_images, write_gaussians
     from gsim3d.evaluate.protocol import default_views, render_steps
     from gsim3d.io import write_video
-    from gsim3d.io.files import new_place, write_picture
+    from gsim3d.io.files import new_output_path, write_picture
     from gsim3d.pretrained import located
     from gsim3d.profile.autotune import load_speed
     from gsim3d.profile.runner import Runner
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.viewer import write_player
     from gsim3d.viewer.player import View
 
-    out = new_place(args.out)
+    out = new_output_path(args.out)
     restored = restore(args.checkpoint, args.device)
     scene = restored.open_scene(args.scene, args.keep, args.resample)
     context, target = default_views(restored, scene, args.context)

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
 
     from gsim3d.data import Scene, find_scenes, split_scenes
     from gsim3d.errors import InputError
-    from gsim3d.io.files import made_around, place_of
+    from gsim3d.io.files import output_path, with_parents
     from gsim3d.synth.held_out import origin_of
     from gsim3d.train import checkpoint
     from gsim3d.train.config import TrainConfig
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         if getattr(args, name) is None:
             raise InputError(f"{'CONFIG' if name == 'config' else f'--{name}'} is needed (see gsim3d train --help)")
     if args.export:
-        place_of(args.export, ".safetensors", "--export")
+        output_path(args.export, ".safetensors", "--export")
     folders, _ = split_scenes(find_scenes(args.data))
     for folder in folders:
         if (origin := origin_of(folder)) and origin.set_name:
@@ -105,6 +105,6 @@ def run(args: argparse.Namespace) -> int:
             ) from None
         say(f"trained to step {trainer.step} of {config.n_steps}: {args.out}")
         if args.export and processes.is_first:
-            checkpoint.export(checkpoint.load(args.out), made_around(Path(args.export)))
+            checkpoint.export(checkpoint.load(args.out), with_parents(Path(args.export)))
             say(f"written: {args.export}")
     return 0

@@ -199,7 +199,9 @@ def _tile(scene: Scene, cam: int, step: int, tile_height: int, body: np.ndarray 
     width, height = scene.recording.sizes[cam]
     zoom = tile_height / height
     size = max(1, round(width * zoom)), tile_height
-    film = _try(lambda: scene.film([cam], [step])[0, 0, :, :height, :width].permute(1, 2, 0).numpy()[..., ::-1])
+    film = _try(
+        lambda: scene.recorded_images([cam], [step])[0, 0, :, :height, :width].permute(1, 2, 0).numpy()[..., ::-1]
+    )
     if film is None:
         tile = np.full((size[1], size[0], 3), MISSING, np.uint8)
         _write(tile, "unreadable", (8, tile_height // 2), INK)

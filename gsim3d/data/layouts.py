@@ -9,11 +9,11 @@ from __future__ import annotations
 from pathlib import Path
 from types import ModuleType
 
-from gsim3d.data import colmap, films, genesis, kubric, transforms
+from gsim3d.data import colmap, genesis, kubric, transforms, videos
 from gsim3d.data.recording import natural_order
 from gsim3d.errors import InputError
 
-LAYOUTS = (kubric, genesis, transforms, films, colmap)  # the first that recognises a folder reads it
+LAYOUTS = (kubric, genesis, transforms, videos, colmap)  # the first that recognises a folder reads it
 MAX_DEPTH = 3  # folders below the one that is searched
 
 

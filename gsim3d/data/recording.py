@@ -62,7 +62,7 @@ class Recording:
     distortions: per camera its lens, None for a pinhole; images are not undistorted yet.
     near, far, origin, bounds: None where nobody gave them.
     world_offset: float64 [3], what all positions count from; a reader leaves them where they are, at 0.
-    is_film: shows a real background: it is painted black where labels say so.
+    real_background: shows a real background: it is painted black where labels say so.
     subtract_background: labels come from what differs from the median image of the camera.
     notes: what was left out or changed on reading; check-data prints them.
     """
@@ -82,7 +82,7 @@ class Recording:
     far: float | None = None
     origin: np.ndarray | None = None
     bounds: np.ndarray | None = None
-    is_film: bool = False
+    real_background: bool = False
     subtract_background: bool = False
     notes: tuple[str, ...] = ()
     world_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))

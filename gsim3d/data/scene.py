@@ -41,9 +41,9 @@ class Scene:
         self, path: Path, recording: Recording, cache_dir: str | Path | None = None, fitting: Fitting = Fitting()
     ):
         self.path = path
-        self.filmed_sizes = recording.sizes
-        self._filmed, self.fitting = near_zero(recording), fitting
-        recording = fit(self._filmed, fitting)
+        self.recorded_sizes = recording.sizes
+        self._recorded, self.fitting = near_zero(recording), fitting
+        recording = fit(self._recorded, fitting)
         self.name = "/".join(path.absolute().parts[-2:])
         self.recording = recording
         self.layout, self.camera_names = recording.layout, recording.camera_names
@@ -101,7 +101,7 @@ class Scene:
     @property
     def own_depths(self) -> tuple[float, float] | None:
         """near and far without ``fitting.near_far``; None where nothing tells them."""
-        return own_depths(fit(self._filmed, Fitting(unit_cameras=self.fitting.unit_cameras)))
+        return own_depths(fit(self._recorded, Fitting(unit_cameras=self.fitting.unit_cameras)))
 
     def _view(self) -> tuple:
         recording = self.recording
@@ -145,12 +145,12 @@ class Scene:
 
         Padding is black; so is the real background of films that have labels, because nothing of it is simulated.
         """
-        images = self.film(cams, steps)
-        if self.recording.is_film and self.has_segmentation():
+        images = self.recorded_images(cams, steps)
+        if self.recording.real_background and self.has_segmentation():
             images *= (self.segmentation(cams, steps) != BACKGROUND)[:, :, None]
         return images
 
-    def film(self, cams, steps) -> Tensor:
+    def recorded_images(self, cams, steps) -> Tensor:
         """As :meth:`images`, background included."""
         images = self._images.get(*self._numbers(cams, steps))
         return torch.from_numpy(images).permute(0, 1, 4, 2, 3).contiguous()
@@ -194,9 +194,9 @@ class Scene:
     def _K(self, cam: int, step: int) -> np.ndarray:
         return self.recording.Ks[step if len(self.recording.Ks) > 1 else 0, cam]
 
-    def filmed_as(self, read_images: ReadImages) -> Scene:
-        """The same scene with other images of sizes ``filmed_sizes``, which are fitted and undistorted like its own."""
-        return Scene(self.path, dataclasses.replace(self._filmed, read_images=read_images), None, self.fitting)
+    def with_images(self, read_images: ReadImages) -> Scene:
+        """The scene with other images, of ``recorded_sizes``: they are fitted and undistorted as its own are."""
+        return Scene(self.path, dataclasses.replace(self._recorded, read_images=read_images), None, self.fitting)
 
     def _read_images(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
         undistorter = self._undistorters[cam]

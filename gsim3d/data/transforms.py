@@ -116,7 +116,7 @@ def recording_of(folder: Path, source: Path, description: dict, frames: list[dic
         read_images=read_images,
         read_labels=read_labels if has_labels or any(camera.has_alpha() for camera in cameras) else None,
         distortions=tuple(camera.lens for camera in cameras),
-        is_film=True,
+        real_background=True,
         **workspace(description, source, problems),
     )
 

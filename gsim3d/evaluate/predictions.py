@@ -19,7 +19,7 @@ from torch import Tensor
 from gsim3d.data import Scene
 from gsim3d.data.images import IMAGE_SUFFIXES, as_color, read_files
 from gsim3d.data.recording import Problems
-from gsim3d.data.videos import Video
+from gsim3d.data.video_file import Video
 from gsim3d.errors import InputError
 
 VIDEOS = (".mp4", ".webm", ".mov", ".mkv", ".avi")
@@ -77,11 +77,13 @@ class Predictions:
         folder = self._scene_folder(scene)
 
         def read(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray]:
-            size = scene.filmed_sizes[cam]
+            size = scene.recorded_sizes[cam]
             frames = _view(folder / f"cam_{cam}", size, scene.n_steps, n_encoded, n_future, problems)
             return (frames[step - n_encoded] for step in steps)
 
-        return scene.filmed_as(read).film(cams, range(n_encoded, n_encoded + n_future)).permute(0, 1, 3, 4, 2)
+        return (
+            scene.with_images(read).recorded_images(cams, range(n_encoded, n_encoded + n_future)).permute(0, 1, 3, 4, 2)
+        )
 
     def _scene_folder(self, scene: Scene) -> Path:
         folder = self.folder / scene.path.relative_to(self.root)

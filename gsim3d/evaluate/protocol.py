@@ -266,7 +266,7 @@ def score_scene(
             yield "model", rendered
         for other in others:
             predicted = other.images(scene, cams, n_given, n_future).to(device).float() / 255
-            if scene.recording.is_film and labels is not None:  # the film's own background is black there
+            if scene.recording.real_background and labels is not None:  # the film's own background is black there
                 predicted *= (labels[n_encoded:] != BACKGROUND)[..., None]
             yield other.name, predicted
         if restored is not None:

@@ -28,20 +28,20 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def new_place(out: str | Path, kind: str = "folder") -> Path:
+def new_output_path(out: str | Path, kind: str = "folder") -> Path:
     """Where a command will write a file or folder that is not there yet.
 
     Raises:
         InputError: something is there, or what should be a folder around it is a file; the message starts with
             ``--out``.
     """
-    out = place_of(out)
+    out = output_path(out)
     if out.exists() or out.is_symlink():
         raise InputError(f"--out: {out} exists already; name another {kind} or remove it")
     return out
 
 
-def place_of(out: str | Path, suffix: str = "", option: str = "--out") -> Path:
+def output_path(out: str | Path, suffix: str = "", option: str = "--out") -> Path:
     """Where a command will write a file that ends in ``suffix``, or a folder; folders around it need not exist.
 
     Raises:
@@ -56,7 +56,7 @@ def place_of(out: str | Path, suffix: str = "", option: str = "--out") -> Path:
     return out
 
 
-def made_around(path: Path) -> Path:
+def with_parents(path: Path) -> Path:
     """``path``, the folders around which exist from here on."""
     path.absolute().parent.mkdir(parents=True, exist_ok=True)
     return path

@@ -22,7 +22,7 @@ from gsim3d.io.plain import parse_json
 from gsim3d.synth import writer
 from gsim3d.synth.render import BACKGROUND, BODY
 from gsim3d.synth.run import NEEDED, check_processes, each, require_engine, require_packages
-from gsim3d.synth.stage import SoftBody, Unstable
+from gsim3d.synth.scene_setup import SoftBody, Unstable
 from gsim3d.synth.world import Actor, World
 from gsim3d.synth.worlds import WORLDS
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.synth.carriers import Cloud, Sheet, grid_faces
-from gsim3d.synth.stage import GRAVITY, Cloth, SoftBody, Stage, Unstable
+from gsim3d.synth.embedding import ClothGrid, ParticleCloud, grid_faces
+from gsim3d.synth.scene_setup import GRAVITY, Cloth, SceneSetup, SoftBody, Unstable
 
 TIMESTEP, SUBSTEPS = 1e-3, 20  # seconds, and parts of it: the paper's
 GRID_DENSITY = 64  # cells a metre
@@ -22,7 +22,7 @@ DOMAIN = 2.0  # metres along x and y, and above the highest point of a body, tha
 FIX_DISTANCE = 1e-3  # metres between a corner of the cloth and its particle
 
 
-def simulate(stage: Stage, n_frames: int, fps: float, max_timestep: float) -> list[Cloud | Sheet]:
+def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) -> list[ParticleCloud | ClothGrid]:
     """What carries each body at every frame, and the cloth last; ``max_timestep`` is not used, the paper's is.
 
     Bodies must be soft.
@@ -34,11 +34,11 @@ def simulate(stage: Stage, n_frames: int, fps: float, max_timestep: float) -> li
     if not getattr(gs, "_initialized", False):
         gs.init(logging_level="warning", seed=0)
     with tempfile.TemporaryDirectory() as folder:
-        scene, bodies, cloth = _build(gs, stage, Path(folder))
-    for entity, body in zip(bodies, stage.bodies):
+        scene, bodies, cloth = _build(gs, setup, Path(folder))
+    for entity, body in zip(bodies, setup.bodies):
         places = _places(entity)
         entity.set_velocity((body.velocity + np.cross(body.spin, places - places.mean(0))).astype(np.float32))
-    order = None if cloth is None else _pin(cloth, stage.cloth)
+    order = None if cloth is None else _pin(cloth, setup.cloth)
     frames = [[_places(entity) for entity in bodies]]
     sheets = [] if cloth is None else [_places(cloth)[order]]
     n_steps = 0
@@ -50,18 +50,18 @@ def simulate(stage: Stage, n_frames: int, fps: float, max_timestep: float) -> li
         frames.append([_places(entity) for entity in bodies])
         if cloth is not None:
             sheets.append(_places(cloth)[order])
-    carriers = [Cloud(np.stack(nodes)) for nodes in zip(*frames)]
+    embeddings = [ParticleCloud(np.stack(nodes)) for nodes in zip(*frames)]
     if cloth is not None:
-        carriers.append(Sheet(np.stack(sheets).reshape(n_frames, stage.cloth.count, stage.cloth.count, 3)))
-    if not all(np.isfinite(carrier.nodes).all() for carrier in carriers):
+        embeddings.append(ClothGrid(np.stack(sheets).reshape(n_frames, setup.cloth.count, setup.cloth.count, 3)))
+    if not all(np.isfinite(embedding.nodes).all() for embedding in embeddings):
         raise Unstable("the solver gave up")
-    return carriers
+    return embeddings
 
 
-def _build(gs, stage: Stage, folder: Path):
+def _build(gs, setup: SceneSetup, folder: Path):
     """Scene, soft entities and cloth entity (or None), built."""
-    top = max(float(body.vertices[:, 2].max()) for body in stage.bodies)
-    low = stage.ground if stage.ground is not None else -DOMAIN
+    top = max(float(body.vertices[:, 2].max()) for body in setup.bodies)
+    low = setup.ground if setup.ground is not None else -DOMAIN
     lower, upper = (-DOMAIN, -DOMAIN, low - GROUND_DEPTH), (DOMAIN, DOMAIN, top + DOMAIN)
     scene = gs.Scene(
         sim_options=gs.options.SimOptions(dt=TIMESTEP, substeps=SUBSTEPS, gravity=(0.0, 0.0, -GRAVITY)),
@@ -69,15 +69,15 @@ def _build(gs, stage: Stage, folder: Path):
         pbd_options=gs.options.PBDOptions(lower_bound=lower, upper_bound=upper),
         show_viewer=False,
     )
-    if stage.ground is not None:
+    if setup.ground is not None:
         scene.add_entity(
             material=gs.materials.Rigid(needs_coup=True, coup_friction=0.5),
             morph=gs.morphs.Cylinder(
-                pos=(0.0, 0.0, stage.ground - GROUND_DEPTH / 2), radius=GROUND_RADIUS, height=GROUND_DEPTH, fixed=True
+                pos=(0.0, 0.0, setup.ground - GROUND_DEPTH / 2), radius=GROUND_RADIUS, height=GROUND_DEPTH, fixed=True
             ),
         )
-    bodies = [_add_soft(gs, scene, body, folder / f"body_{index}.obj") for index, body in enumerate(stage.bodies)]
-    cloth = None if stage.cloth is None else _add_cloth(gs, scene, stage.cloth, folder / "cloth.obj")
+    bodies = [_add_soft(gs, scene, body, folder / f"body_{index}.obj") for index, body in enumerate(setup.bodies)]
+    cloth = None if setup.cloth is None else _add_cloth(gs, scene, setup.cloth, folder / "cloth.obj")
     scene.build()
     return scene, bodies, cloth
 

@@ -6,8 +6,8 @@ import os
 
 import numpy as np
 
-from gsim3d.synth.carriers import Frame, Lattice, Sheet
-from gsim3d.synth.stage import GRAVITY, Cloth, RigidBody, SoftBody, Stage, Unstable
+from gsim3d.synth.embedding import ClothGrid, ControlGrid, RigidFrame
+from gsim3d.synth.scene_setup import GRAVITY, Cloth, RigidBody, SceneSetup, SoftBody, Unstable
 
 NAME = "mujoco"
 CONTACT_RADIUS = 0.005  # metres around every collision vertex; the ground plane is lowered by it
@@ -18,7 +18,9 @@ RIGID_CONTACT = 300.0  # rad/s of the spring between rigid bodies: at 3 m/s they
 POISSON = 0.3
 
 
-def simulate(stage: Stage, n_frames: int, fps: float, max_timestep: float) -> list[Lattice | Frame | Sheet]:
+def simulate(
+    setup: SceneSetup, n_frames: int, fps: float, max_timestep: float
+) -> list[ControlGrid | RigidFrame | ClothGrid]:
     """What carries each body at every frame, and the cloth last, if there is one.
 
     A soft body's lattice is the bounding box of its collision mesh at time 0.
@@ -30,41 +32,41 @@ def simulate(stage: Stage, n_frames: int, fps: float, max_timestep: float) -> li
 
     mujoco.set_mju_user_warning(lambda text: None)  # it would write a file into the working directory
     substeps = int(np.ceil(1 / (fps * max_timestep) - 1e-9))
-    model = mujoco.MjModel.from_xml_string(model_xml(stage, 1 / (fps * substeps)))
+    model = mujoco.MjModel.from_xml_string(model_xml(setup, 1 / (fps * substeps)))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     followers = [_Soft(model, data, i, b) if isinstance(b, SoftBody) else _Rigid(model, data, i, b)
-                 for i, b in enumerate(stage.bodies)]  # fmt: skip
-    if stage.cloth is not None:
-        followers.append(_Cloth(model, data, stage.cloth))
+                 for i, b in enumerate(setup.bodies)]  # fmt: skip
+    if setup.cloth is not None:
+        followers.append(_Cloth(model, data, setup.cloth))
     frames = [[follower.start()] for follower in followers]
     for _ in range(1, n_frames):
         mujoco.mj_step(model, data, substeps)
         mujoco.mj_kinematics(model, data)
         for follower, nodes in zip(followers, frames):
             nodes.append(follower.nodes())
-    carriers = [follower.carrier(np.stack(nodes)) for follower, nodes in zip(followers, frames)]
-    if any(w.number for w in data.warning) or not all(np.isfinite(carrier.nodes).all() for carrier in carriers):
+    embeddings = [follower.embedding(np.stack(nodes)) for follower, nodes in zip(followers, frames)]
+    if any(w.number for w in data.warning) or not all(np.isfinite(embedding.nodes).all() for embedding in embeddings):
         raise Unstable("the solver gave up")
-    return carriers
+    return embeddings
 
 
-def model_xml(stage: Stage, timestep: float) -> str:
+def model_xml(setup: SceneSetup, timestep: float) -> str:
     """The scene in MuJoCo's language."""
     contact_time = max(CONTACT_TIME, MIN_STEPS_PER_CONTACT * timestep)
     contact = f'solref="{contact_time:.9g} 1"'
     assets, bodies = [], []
-    for index, body in enumerate(stage.bodies):
+    for index, body in enumerate(setup.bodies):
         asset, element = _soft_xml(index, body, contact) if isinstance(body, SoftBody) else _rigid_xml(index, body)
         assets.append(asset)
         bodies.append(element)
-    if stage.cloth is not None:
-        bodies.append(_cloth_xml(stage.cloth, contact))
-    if stage.ground is not None:
-        soft = any(isinstance(body, SoftBody) for body in stage.bodies)
-        height = stage.ground - (CONTACT_RADIUS if soft else 0)
+    if setup.cloth is not None:
+        bodies.append(_cloth_xml(setup.cloth, contact))
+    if setup.ground is not None:
+        soft = any(isinstance(body, SoftBody) for body in setup.bodies)
+        height = setup.ground - (CONTACT_RADIUS if soft else 0)
         bodies.append(f'<geom type="plane" size="9 9 .1" pos="0 0 {height:.9g}" {contact}/>')
-    iterations = 50 if stage.cloth is None else 100  # a cloth that carries a soft body converges slowly
+    iterations = 50 if setup.cloth is None else 100  # a cloth that carries a soft body converges slowly
     return f"""<mujoco>
   <option timestep="{timestep:.12g}" integrator="discrete" iterations="{iterations}" gravity="0 0 {-GRAVITY}"/>
   <size memory="256M"/>
@@ -156,8 +158,8 @@ class _Soft:
     def nodes(self) -> np.ndarray:
         return self.data.xpos[self.bodies].reshape(*self.shape, 3)
 
-    def carrier(self, nodes: np.ndarray) -> Lattice:
-        return Lattice(nodes, self.occupied)
+    def embedding(self, nodes: np.ndarray) -> ControlGrid:
+        return ControlGrid(nodes, self.occupied)
 
 
 class _Rigid:
@@ -176,8 +178,8 @@ class _Rigid:
         origin = self.data.xpos[self.id]
         return np.concatenate([origin[None], origin + self.data.xmat[self.id].reshape(3, 3).T])
 
-    def carrier(self, nodes: np.ndarray) -> Frame:
-        return Frame(nodes)
+    def embedding(self, nodes: np.ndarray) -> RigidFrame:
+        return RigidFrame(nodes)
 
 
 class _Cloth:
@@ -197,8 +199,8 @@ class _Cloth:
     def nodes(self) -> np.ndarray:
         return self.data.flexvert_xpos[self.rows].reshape(self.n, self.n, 3).copy()
 
-    def carrier(self, nodes: np.ndarray) -> Sheet:
-        return Sheet(nodes)
+    def embedding(self, nodes: np.ndarray) -> ClothGrid:
+        return ClothGrid(nodes)
 
 
 def _box_lattice(body: SoftBody) -> np.ndarray:

@@ -12,12 +12,16 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
+
 from gsim3d.effects.spec import FILE as EFFECTS_FILE
 from gsim3d.errors import InputError
 from gsim3d.io.locks import only_one_writer
 from gsim3d.synth import writer
+from gsim3d.synth.world import World
 from gsim3d.synth.worlds import build_world
 
+NICENESS = 10  # of the data workers of a training run: the run goes first
 NEEDED = {"embreex": "embreex", "trimesh": "trimesh", "PIL": "pillow"}
 
 
@@ -157,3 +161,25 @@ def start_worker() -> None:
     # A worker whose parent was killed would wait for work for ever.
     parent = multiprocessing.parent_process()
     threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+
+
+def start_data_worker() -> None:
+    """To be called first in a process that makes scenes beside a training run."""
+    os.nice(NICENESS)
+    start_worker()
+
+
+def write_trajectory(world: World, scene: tuple[str, int], file: str) -> str:
+    """Writes one trajectory as arrays, without files of images.
+
+    Args:
+        file: name of the .npz: images uint8 [T, V, H, W, 4], colours and the label of seg images; viewmats
+            [V, 4, 4] and Ks [V, 3, 3].
+
+    Returns:
+        ``file``.
+    """
+    made = world.make(*scene)
+    images = np.stack([np.concatenate([view.rgb, view.segmentation[..., None]], -1) for view in made.views])
+    np.savez(file, images=images, viewmats=made.rig.viewmats, Ks=made.rig.Ks)
+    return file

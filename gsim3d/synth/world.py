@@ -19,13 +19,13 @@ from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec,
 from gsim3d.errors import InputError, did_you_mean
 from gsim3d.synth import cameras, render, shapes, writer
 from gsim3d.synth.bodies import OBJECTS, load_mesh, mesh_bytes, mesh_name, name_rng, named_body
-from gsim3d.synth.carriers import Carrier, grid_faces
-from gsim3d.synth.stage import (
+from gsim3d.synth.embedding import Embedding, grid_faces
+from gsim3d.synth.scene_setup import (
     GRAVITY,
     Cloth,
     RigidBody,
+    SceneSetup,
     SoftBody,
-    Stage,
     Unstable,
     check_cloth,
     check_energy,
@@ -356,23 +356,23 @@ class World(ABC):
         paint = _plain_cloth if self.by_name else shapes.random_paint(rng)
         return render.Surface(faces, places[faces], paint, two_sided=True)
 
-    def simulate(self, drawn: Drawn) -> tuple[list[Carrier], list[np.ndarray]]:
+    def simulate(self, drawn: Drawn) -> tuple[list[Embedding], list[np.ndarray]]:
         """What carries each body, and the cloth last; and the vertices [T, V, 3] of every surface.
 
         Raises: Unstable when the solver gives up; nothing else is checked.
         """
         engine = importlib.import_module(ENGINES[self.engine])
-        stage = Stage(tuple(actor.body for actor in drawn.actors), drawn.ground, drawn.cloth)
-        carriers = engine.simulate(stage, self.n_frames, self.fps, self.max_timestep)
-        bindings = [carrier.bind(actor.vertices) for actor, carrier in zip(drawn.actors, carriers)]
+        setup = SceneSetup(tuple(actor.body for actor in drawn.actors), drawn.ground, drawn.cloth)
+        embeddings = engine.simulate(setup, self.n_frames, self.fps, self.max_timestep)
+        bindings = [embedding.bind(actor.vertices) for actor, embedding in zip(drawn.actors, embeddings)]
         if drawn.cloth is not None:
-            bindings.append(carriers[-1].refine(CLOTH_REFINEMENT))
-        moved = [np.stack([b.move(nodes) for nodes in c.nodes]) for b, c in zip(bindings, carriers, strict=True)]
-        return carriers, moved
+            bindings.append(embeddings[-1].refine(CLOTH_REFINEMENT))
+        moved = [np.stack([b.move(nodes) for nodes in c.nodes]) for b, c in zip(bindings, embeddings, strict=True)]
+        return embeddings, moved
 
     def _move(self, rig: cameras.Rig, drawn: Drawn) -> tuple[dict, list[np.ndarray]]:
         """States by name, and the vertices [T, V, 3] of every surface, checked."""
-        carriers, moved = self.simulate(drawn)
+        embeddings, moved = self.simulate(drawn)
         actors, cloth, bodies = drawn.actors, drawn.cloth, moved[: len(drawn.actors)]
         for vertices in bodies:
             check_motion(vertices, drawn.ground)
@@ -381,7 +381,7 @@ class World(ABC):
         masses = np.array([actor.body.mass for actor in actors])
         spins = [((actor.body.spin**2).sum() * (actor.facts["size"] / 2) ** 2) / 2 for actor in actors]
         check_energy(centres, masses, max(spins), self.fps)
-        states = {f"body_{index}": carrier.nodes.astype(np.float32) for index, carrier in enumerate(carriers)}
+        states = {f"body_{index}": embedding.nodes.astype(np.float32) for index, embedding in enumerate(embeddings)}
         if cloth is not None:
             states["cloth"] = states.pop(f"body_{len(actors)}")
             n = (cloth.count - 1) * CLOTH_REFINEMENT + 1

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsim3d.errors import InputError, did_you_mean
 from gsim3d.synth import bodies, meshes, shapes
-from gsim3d.synth.stage import Cloth, Material, RigidBody, SoftBody
+from gsim3d.synth.scene_setup import Cloth, Material, RigidBody, SoftBody
 from gsim3d.synth.world import TRAIN, World
 
 # Seeds of held-out trajectories: models are chosen on the first; the second is scored once a release.

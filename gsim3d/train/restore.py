@@ -94,7 +94,7 @@ class Restored:
     def _changes(self, scene: Scene) -> list[str]:
         """What fitting changed of a scene, in words."""
         changes, (width, height) = [], self.image_size
-        sizes = sorted(set(scene.filmed_sizes) - {self.image_size})
+        sizes = sorted(set(scene.recorded_sizes) - {self.image_size})
         if sizes and self.data.resize:
             filmed = ", ".join(f"{w}x{h}" for w, h in sizes)
             areas = [w * h * max(width / w, height / h) ** 2 for w, h in sizes]

@@ -173,7 +173,7 @@ def write_transforms(folder: Path, made: Made) -> Path:
     return folder
 
 
-def write_films(folder: Path, made: Made, stride=2) -> Path:
+def write_videos(folder: Path, made: Made, stride=2) -> Path:
     """Folders of frames whose numbers are ``stride`` apart, filmed at ``stride`` times the rate."""
     n_steps, n_cams, height, width = made.labels.shape
     cameras = []
@@ -205,5 +205,5 @@ WRITERS = {
     "kubric": write_kubric,
     "kubric's own names": write_kubric_flat,
     "transforms": write_transforms,
-    "films": write_films,
+    "videos": write_videos,
 }

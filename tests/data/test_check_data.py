@@ -10,14 +10,14 @@ import pytest
 from gsim3d.cli.main import main
 from gsim3d.data import Scene
 from gsim3d.data.check import check_scene, contact_sheet, moving_box
-from tests.data.made_scenes import RADIUS, WRITERS, edit_json, make_scene, write_films, write_genesis
+from tests.data.made_scenes import RADIUS, WRITERS, edit_json, make_scene, write_genesis, write_videos
 from tests.tiny_scenes import write_scene
 
 
 @pytest.fixture
 def data(tmp_path):
     """Three sound scenes in three layouts."""
-    for layout in ("genesis", "kubric", "films"):
+    for layout in ("genesis", "kubric", "videos"):
         WRITERS[layout](tmp_path / "data" / layout, make_scene())
     return tmp_path / "data"
 
@@ -27,7 +27,7 @@ def test_sound_data(data, capsys):
     assert main(["check-data", str(data), "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "3 scenes read, no problem" in printed and "problem:" not in printed
-    for layout in ("genesis", "kubric", "films"):
+    for layout in ("genesis", "kubric", "videos"):
         assert f"data/{layout}: {layout}, 4 steps at 12 a second, 3 cameras, 48x32 pixels" in printed
     assert [path.name for path in data.parent.iterdir() if path != data] == ["sheet.png"]
 
@@ -36,7 +36,7 @@ def test_every_problem_of_every_scene(data, capsys):
     (data / "genesis/cam_0/rgb_0001.png").unlink()
     (data / "genesis/cam_2/rgb_0003.png").write_bytes(b"x")
     edit_json(data / "kubric/cam_1/metadata.json", lambda content: content["camera"]["positions"].pop())
-    (data / "films/cameras.json").write_text("{")
+    (data / "videos/cameras.json").write_text("{")
     out = data.parent / "sheet.png"
     assert main(["check-data", str(data), "--out", str(out)]) == 1
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  problem: ")]
@@ -59,11 +59,11 @@ def test_nothing_is_written_without_being_asked(data, capsys, monkeypatch):
 
 
 def test_quiet_prints_problems_only(data, capsys):
-    (data / "films/cameras.json").write_text("{")
+    (data / "videos/cameras.json").write_text("{")
     assert main(["check-data", str(data), "--quiet"]) == 1
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
-    assert lines[0].startswith(f"{data / 'films'}: ") and lines[1].startswith("  problem: ")
+    assert lines[0].startswith(f"{data / 'videos'}: ") and lines[1].startswith("  problem: ")
     assert all(line.startswith("  problem: ") for line in lines[1:-1]) and lines[-1].startswith("3 scenes read, ")
     assert printed.err == ""
 
@@ -89,7 +89,7 @@ def test_the_sheet_draws_the_bounds_where_they_project(tmp_path):
     """On black frames only the drawing is left: corners of the bounds are where a plain projection puts them."""
     made = make_scene()
     made.rgb[:], made.labels[:] = 0, 0
-    scene = Scene.open(write_films(tmp_path, made))
+    scene = Scene.open(write_videos(tmp_path, made))
     sheet = contact_sheet([scene])
     rows = sheet[22:, :].astype(int)
     height = (len(sheet) - 2 * 22) // 3 - 6

@@ -150,7 +150,7 @@ def test_images_of_a_lens_are_undistorted(tmp_path):
     made = make_scene(n_steps=1)
     scene = Scene.open(write_colmap(tmp_path, made, model="OPENCV_FISHEYE", params=[50, 51, 24, 16, 0.1, 0, 0, 0]))
     assert scene.valid(range(3), [0]) is not None
-    assert not np.array_equal(scene.film(range(3), [0])[0].permute(0, 2, 3, 1), made.rgb[0])
+    assert not np.array_equal(scene.recorded_images(range(3), [0])[0].permute(0, 2, 3, 1), made.rgb[0])
 
 
 def test_alpha_is_the_mask(tmp_path):

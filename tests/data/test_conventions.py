@@ -17,7 +17,7 @@ FILES = {
     "genesis": "metadata.json",
     "kubric": "metadata.json",
     "transforms": "transforms.json",
-    "films": "cameras.json",
+    "videos": "cameras.json",
 }
 
 
@@ -83,7 +83,7 @@ def edit_poses(layout, folder, change, cams=range(3), steps=range(4)):
             edit_json(folder / "cameras.json", edit)
 
 
-STORED_MATRICES = ["genesis", "transforms", "films"]
+STORED_MATRICES = ["genesis", "transforms", "videos"]
 
 
 def flipped(layout):
@@ -159,7 +159,7 @@ def edit_intrinsics(layout, folder, step, **values):
 
     if layout == "genesis":
         edit_json(folder / "metadata.json", lambda content: put(content["cam_1"]["intrinsics"]))
-    elif layout == "films":
+    elif layout == "videos":
         edit_json(folder / "cameras.json", lambda content: put(content["cameras"][1]["K"]))
     elif layout == "transforms":
         edit_json(
@@ -201,9 +201,9 @@ FRAMES = {
     "genesis": ("cam_1/rgb_0002.png", "cam_1/seg_0002.png"),
     "kubric": ("cam_1/rgba/rgba_2.png", "cam_1/segmentation/segmentation_2.png"),
     "transforms": ("images/cam_1/frame_00003.png", "labels/cam_1/frame_00003.png"),
-    "films": ("cam_1/004.png", "labels/cam_1/004.png"),
+    "videos": ("cam_1/004.png", "labels/cam_1/004.png"),
 }
-NUMBER = {"genesis": 2, "kubric": 2, "transforms": 2, "films": 4}
+NUMBER = {"genesis": 2, "kubric": 2, "transforms": 2, "videos": 4}
 
 
 @pytest.mark.parametrize("layout", FILES)
@@ -229,7 +229,7 @@ def test_files(copy, layout, kind, damage):
 
 
 def test_a_camera_with_fewer_frames(copy):
-    for layout, last in (("kubric", "cam_2/rgba/rgba_3.png"), ("films", "cam_2/006.png")):
+    for layout, last in (("kubric", "cam_2/rgba/rgba_3.png"), ("videos", "cam_2/006.png")):
         folder = copy(layout)
         (folder / last).unlink()
         message = message_of(folder)
@@ -246,7 +246,7 @@ def test_a_camera_with_fewer_frames(copy):
 
 
 def test_a_frame_that_no_camera_has(copy):
-    folder = copy("films")
+    folder = copy("videos")
     for cam in range(3):
         (folder / f"cam_{cam}" / "002.png").unlink()
     assert "evenly spaced" in message_of(folder)
@@ -263,7 +263,7 @@ def test_a_frame_that_no_camera_has(copy):
 OUTSIDE = {
     "genesis": lambda content: content.update(file_path_template="../x/cam_{cam_ix}/{img_type}_{n_step:04d}"),
     "transforms": lambda content: content["frames"][0].update(file_path="../../etc/passwd"),
-    "films": lambda content: content["cameras"][0].update(name="../cam_0"),
+    "videos": lambda content: content["cameras"][0].update(name="../cam_0"),
 }
 
 
@@ -303,7 +303,7 @@ def test_an_origin_that_is_far_from_all_cameras(copy, layout):
 
 
 def test_near_and_far_follow_from_the_cameras_or_are_asked_for(copy):
-    folder = copy("films")
+    folder = copy("videos")
     edit_json(folder / "cameras.json", lambda content: [content.pop("near"), content.pop("far")])
     scene = Scene.open(folder)
     assert 0.3 < scene.near < 1.5 and 4 < scene.far < 8

@@ -35,7 +35,7 @@ FILES = {
     "genesis": "metadata.json",
     "kubric": "cam_1/metadata.json",
     "transforms": "transforms.json",
-    "films": "cameras.json",
+    "videos": "cameras.json",
 }
 N_CASES = 60
 
@@ -46,7 +46,7 @@ def folders(tmp_path_factory):
     made = make_scene(moving=True, width=16, height=16, n_steps=2, n_cams=2)
     written = {layout: WRITERS[layout](root / layout, made) for layout in FILES}
     optional = {
-        "films": {"units": "m", "pixel_center": 0.5, "masks": "subtract"},
+        "videos": {"units": "m", "pixel_center": 0.5, "masks": "subtract"},
         "transforms": {"k1": 0.1, "p2": 0.01},
     }
     for layout, keys in optional.items():

@@ -12,7 +12,7 @@ from gsim3d.data.headers import read_header
 from gsim3d.data.images import as_color, as_labels, as_mask, read_image
 from gsim3d.data.recording import MOVING, Problems
 from gsim3d.errors import InputError
-from tests.data.made_scenes import edit_json, make_scene, write_films, write_genesis, write_transforms
+from tests.data.made_scenes import edit_json, make_scene, write_genesis, write_transforms, write_videos
 
 SIZE = (64, 48)
 
@@ -94,7 +94,7 @@ def test_what_is_neither_mask_nor_labels_is_refused(tmp_path):
 
 
 def test_jpeg_masks_of_a_scene(tmp_path):
-    folder, made = write_films(tmp_path, make_scene(width=64, height=48)), make_scene(width=64, height=48)
+    folder, made = write_videos(tmp_path, make_scene(width=64, height=48)), make_scene(width=64, height=48)
     (folder / "labels").rename(folder / "masks")
     for file in list((folder / "masks").rglob("*.png")):
         mask = (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) == 3).astype(np.uint8) * 255
@@ -130,11 +130,11 @@ def test_colours_of_8_and_16_bits_with_and_without_alpha(tmp_path, name, deep):
         assert not got[~seen].any() or image is not rgba
 
 
-@pytest.mark.parametrize("layout, pattern", [("transforms", "images/**/*.png"), ("films", "cam_*/*.png")])
+@pytest.mark.parametrize("layout, pattern", [("transforms", "images/**/*.png"), ("videos", "cam_*/*.png")])
 @pytest.mark.parametrize("deep", [False, True])
 def test_alpha_is_the_mask_where_there_is_none(tmp_path, layout, pattern, deep):
     made = make_scene()
-    folder = {"transforms": write_transforms, "films": write_films}[layout](tmp_path, made)
+    folder = {"transforms": write_transforms, "videos": write_videos}[layout](tmp_path, made)
     for file in folder.glob(pattern):
         image = cv2.imread(str(file))
         cut = (image == [20, 90, 250]).all(-1)
@@ -147,12 +147,12 @@ def test_alpha_is_the_mask_where_there_is_none(tmp_path, layout, pattern, deep):
     scene = Scene.open(folder)
     labels = scene.segmentation(range(3), range(4)).numpy()
     np.testing.assert_array_equal(labels, np.where(made.labels == MOVING, MOVING, 0))
-    film = scene.film(range(3), range(4)).permute(0, 1, 3, 4, 2).numpy()
-    np.testing.assert_array_equal(film, np.where((made.labels == MOVING)[..., None], made.rgb, 0))
+    video = scene.recorded_images(range(3), range(4)).permute(0, 1, 3, 4, 2).numpy()
+    np.testing.assert_array_equal(video, np.where((made.labels == MOVING)[..., None], made.rgb, 0))
 
 
 def test_films_that_are_opaque_have_no_mask(tmp_path):
-    folder = write_films(tmp_path, make_scene())
+    folder = write_videos(tmp_path, make_scene())
     (folder / "labels").rename(folder / "elsewhere")
     for file in folder.glob("cam_*/*.png"):
         cv2.imwrite(str(file), cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2BGRA))

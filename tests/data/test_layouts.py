@@ -20,10 +20,10 @@ from tests.data.made_scenes import (
     WRITERS,
     edit_json,
     make_scene,
-    write_films,
     write_genesis,
     write_kubric,
     write_transforms,
+    write_videos,
 )
 
 CAMS, STEPS = range(N_CAMS), range(N_STEPS)
@@ -74,7 +74,7 @@ def test_frames_carry_the_cameras_of_their_step(tmp_path, layout):
         np.testing.assert_array_equal(frames.dynamic[row], made.labels[step, cam] == 3)
 
 
-@pytest.mark.parametrize("layout", ["genesis", "transforms", "films"])
+@pytest.mark.parametrize("layout", ["genesis", "transforms", "videos"])
 @pytest.mark.parametrize("moving", [False, True])
 def test_intrinsics_may_change_with_time(tmp_path, layout, moving):
     made = make_scene(moving=moving, zoom=0.1)
@@ -88,22 +88,22 @@ def test_intrinsics_may_change_with_time(tmp_path, layout, moving):
 def test_the_same_lens_in_two_layouts(tmp_path):
     lens = {"k1": 0.2, "k2": 0.05, "p1": 0.002, "p2": -0.004, "k3": 0.01}
     made = make_scene(zoom=0.05)
-    films, transforms = write_films(tmp_path / "films", made), write_transforms(tmp_path / "transforms", made)
-    plain = Scene.open(films).film(CAMS, STEPS)
+    videos, transforms = write_videos(tmp_path / "videos", made), write_transforms(tmp_path / "transforms", made)
+    plain = Scene.open(videos).recorded_images(CAMS, STEPS)
     edit_json(
-        films / "cameras.json", lambda content: [c.update(distortion=[*lens.values()]) for c in content["cameras"]]
+        videos / "cameras.json", lambda content: [c.update(distortion=[*lens.values()]) for c in content["cameras"]]
     )
     edit_json(transforms / "transforms.json", lambda content: content.update(lens))
-    one, other = Scene.open(films), Scene.open(transforms)
+    one, other = Scene.open(videos), Scene.open(transforms)
     assert torch.equal(one.images(CAMS, STEPS), other.images(CAMS, STEPS))
     assert torch.equal(one.segmentation(CAMS, STEPS), other.segmentation(CAMS, STEPS))
     assert torch.equal(one.valid(CAMS, STEPS), other.valid(CAMS, STEPS)) and not one.valid(CAMS, STEPS).all()
-    assert not torch.equal(one.film(CAMS, STEPS), plain)
+    assert not torch.equal(one.recorded_images(CAMS, STEPS), plain)
     assert not (one.segmentation(CAMS, STEPS)[~one.valid(CAMS, STEPS)]).any()
 
 
 def test_cameras_stand_still_after_the_end_of_the_film(tmp_path):
-    scene = Scene.open(write_films(tmp_path, make_scene(moving=True)))
+    scene = Scene.open(write_videos(tmp_path, make_scene(moving=True)))
     cameras = scene.cameras_at([1], [2, 3, 4, 9])
     assert torch.equal(cameras.viewmats[1], cameras.viewmats[3]) and cameras.image_cloud.tolist() == [0, 1, 2, 3]
     assert not torch.equal(cameras.viewmats[0], cameras.viewmats[1])
@@ -111,12 +111,12 @@ def test_cameras_stand_still_after_the_end_of_the_film(tmp_path):
 
 def test_a_data_set_may_mix_layouts(tmp_path):
     made = make_scene()
-    for name, write in (("a/2", write_genesis), ("a/10", write_films), ("b", write_kubric), (".c", write_films)):
+    for name, write in (("a/2", write_genesis), ("a/10", write_videos), ("b", write_kubric), (".c", write_videos)):
         write(tmp_path / name, made)
     write_transforms(tmp_path / "d" / "e" / "f", made)
     found = [path.relative_to(tmp_path).as_posix() for path in find_scenes(tmp_path)]
     assert found == ["a/2", "a/10", "b", "d/e/f"]
-    assert [Scene.open(tmp_path / name).layout for name in found] == ["genesis", "films", "kubric", "transforms"]
+    assert [Scene.open(tmp_path / name).layout for name in found] == ["genesis", "videos", "kubric", "transforms"]
     assert find_scenes(tmp_path / "b") == [tmp_path / "b"]
 
 

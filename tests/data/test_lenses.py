@@ -10,7 +10,7 @@ from gsim3d.data import Scene
 from gsim3d.data.lenses import Lens, Undistorter, lens_of
 from gsim3d.data.recording import Problems
 from gsim3d.errors import InputError
-from tests.data.made_scenes import edit_json, make_scene, write_films, write_transforms
+from tests.data.made_scenes import edit_json, make_scene, write_transforms, write_videos
 
 FISHEYE = {"k1": 0.03, "k2": 0.005, "k3": 0.0007, "k4": 0.0001}
 RATIONAL = {"k1": 0.2, "k2": 0.05, "p1": 0.002, "p2": -0.004, "k3": 0.01, "k4": 0.1, "k5": 0.02, "k6": 0.003}
@@ -146,7 +146,7 @@ def test_a_fisheye_scene_shows_what_a_pinhole_sees(tmp_path):
     scene = Scene.open(tmp_path)
     valid, labels = scene.valid(range(3), range(4)).numpy(), scene.segmentation(range(3), range(4)).numpy()
     assert valid.mean() > 0.9 and (labels != made.labels)[valid].mean() < 0.02
-    error = np.abs(scene.film(range(3), range(4)).permute(0, 1, 3, 4, 2).numpy().astype(float) - made.rgb)
+    error = np.abs(scene.recorded_images(range(3), range(4)).permute(0, 1, 3, 4, 2).numpy().astype(float) - made.rgb)
     stored = cv2.imread(str(tmp_path / "images/cam_0/frame_00001.png"))[..., ::-1].astype(float)
     assert 3 * error[valid].mean() < np.abs(stored - made.rgb[0, 0]).mean()
 
@@ -164,7 +164,7 @@ def test_where_a_polynomial_turns_back_nothing_was_filmed(lens):
 
 
 def test_lenses_of_films(tmp_path):
-    folder = write_films(tmp_path, make_scene())
+    folder = write_videos(tmp_path, make_scene())
 
     def lens(**keys):
         edit_json(folder / "cameras.json", lambda content: [camera.update(keys) for camera in content["cameras"]])

@@ -80,7 +80,7 @@ def test_paths_without_suffix(tmp_path, suffix):
         tmp_path / "transforms_train.json",
         lambda content: [frame.update(file_path=frame["file_path"] + ".5") for frame in content["frames"]],
     )
-    assert Scene.open(tmp_path).film([0, 1], [0]).float().mean() > 5
+    assert Scene.open(tmp_path).recorded_images([0, 1], [0]).float().mean() > 5
 
 
 def test_the_angles_of_both_axes_and_of_single_frames(tmp_path):

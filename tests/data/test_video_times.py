@@ -30,8 +30,8 @@ UNEVEN = [50] * 9 + [250] * 10
 
 def frames_of(scene: Scene) -> list[list[int]]:
     """The numbers of the frames that each camera shows, step by step."""
-    film = scene.film(range(scene.n_cams), range(scene.n_steps))
-    return [[shown(film[step, cam, 0]) for step in range(scene.n_steps)] for cam in range(scene.n_cams)]
+    video = scene.recorded_images(range(scene.n_cams), range(scene.n_steps))
+    return [[shown(video[step, cam, 0]) for step in range(scene.n_steps)] for cam in range(scene.n_cams)]
 
 
 @pytest.mark.parametrize("suffix", [*SUFFIXES, ".avi"])
@@ -137,9 +137,9 @@ def test_the_duration_of_a_container_is_not_that_of_its_film(tmp_path, suffix, s
 def test_turned_films_are_turned(tmp_path, matrix, turn, corner):
     with_matrix(write_plain(tmp_path / "a.mp4"), *matrix)
     size = (64, 48) if turn == 180 else (48, 64)
-    film = Scene.open(write_scene(tmp_path, ["a"], size=size)).film([0], [3])[0, 0, 0, : size[1], : size[0]]
+    video = Scene.open(write_scene(tmp_path, ["a"], size=size)).recorded_images([0], [3])[0, 0, 0, : size[1], : size[0]]
     rows, columns = ((slice(0, 12), slice(-12, None))[side] for side in corner)
-    assert film[rows, columns].float().mean() > 230 and film.float().median() < 50
+    assert video[rows, columns].float().mean() > 230 and video.float().median() < 50
     if turn != 180:
         with pytest.raises(InputError, match=f"has 48x64 pixels \\(turned by {turn} degrees.*its camera 64x48"):
             Scene.open(write_scene(tmp_path, ["a"]))

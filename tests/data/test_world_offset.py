@@ -18,7 +18,7 @@ from gsim3d.testing.invariances import take_scenes, take_scenes_of_particles
 from tests.data import made_scenes
 
 PLACES = [(500000.0, 4649776.0, 100.0), (-1e7, 3.0, 0.0), (0.0, 0.0, 6378137.0), (1e4, -1e4, 0.0)]
-WRITERS = ("genesis", "kubric", "transforms", "films")
+WRITERS = ("genesis", "kubric", "transforms", "videos")
 
 
 def write(folder, layout, monkeypatch, where=(0.0, 0.0, 0.0), moving=False):

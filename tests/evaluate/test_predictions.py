@@ -15,7 +15,7 @@ from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.io import write_video
 from tests.data.made_videos import with_gaps, write_plain
-from tests.data.test_films import write_odd_films
+from tests.data.test_video_scenes import write_odd_videos
 from tests.tiny_scenes import write_scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -68,9 +68,9 @@ def test_perfect_predictions_score_perfectly_and_the_copy_beside_them_does_not(d
 
 def test_what_is_done_to_the_film_is_done_to_its_predictions(tmp_path):
     """Odd sizes, a lens, a real background: a prediction that repeats the camera's own frames is perfect."""
-    write_odd_films(tmp_path / "room")
+    write_odd_videos(tmp_path / "room")
     scene = Scene.open(tmp_path / "room")
-    assert scene.recording.is_film and scene.valid([0], [0]) is not None
+    assert scene.recording.real_background and scene.valid([0], [0]) is not None
     same = Predictions.open(f"same={scene.path}", scene.path)
     values = score_scene(None, scene, target_cams=(0, 1, 2), n_encoded=2, n_future=3, others=[same]).values
     for metric, best in (("psnr", 100.0), ("psnr_masked", 100.0), ("ssim", 1.0)):

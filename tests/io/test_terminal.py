@@ -15,7 +15,7 @@ from gsim3d.cli import main as command_line
 from gsim3d.cli.arguments import Parser, number, whole
 from gsim3d.cli.main import COMMANDS, main
 from gsim3d.errors import InputError, did_you_mean
-from gsim3d.io.files import made_around, new_place, place_of, shown, write_whole
+from gsim3d.io.files import new_output_path, output_path, shown, with_parents, write_whole
 from gsim3d.io.terminal import Terminal, progress
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.restore import model_config
@@ -185,18 +185,21 @@ def test_ranges():
 
 
 def test_folders_around_what_is_written_are_made_and_files_are_no_folders(tmp_path):
-    assert made_around(new_place(tmp_path / "a" / "b" / "c")).parent.is_dir()
+    assert with_parents(new_output_path(tmp_path / "a" / "b" / "c")).parent.is_dir()
     with pytest.raises(InputError, match="--out: .* exists already; name another folder"):
-        new_place(tmp_path / "a")
+        new_output_path(tmp_path / "a")
     (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
     with pytest.raises(InputError, match="exists already"):
-        new_place(tmp_path / "dangling")
+        new_output_path(tmp_path / "dangling")
     (tmp_path / "file").write_text("")
-    for place in (lambda: new_place(tmp_path / "file" / "b"), lambda: place_of(tmp_path / "file" / "b" / "c.json")):
+    for place in (
+        lambda: new_output_path(tmp_path / "file" / "b"),
+        lambda: output_path(tmp_path / "file" / "b" / "c.json"),
+    ):
         with pytest.raises(InputError, match="file, which is no folder"):
             place()
     with pytest.raises(InputError, match=r"--export: the name must end in .png; got"):
-        place_of(tmp_path / "a.jpg", ".png", "--export")
+        output_path(tmp_path / "a.jpg", ".png", "--export")
 
 
 def test_values_of_files_are_shown_in_few_letters():

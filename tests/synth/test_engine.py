@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gsim3d.synth import carriers, meshes, mujoco_engine, shapes, stage
+from gsim3d.synth import embedding, meshes, mujoco_engine, scene_setup, shapes
 from tests.tolerances import TOLERANCES
 
 FPS, DROP = 24.0, 0.6
-JELLY = stage.Material(7e3, 0.01)
+JELLY = scene_setup.Material(7e3, 0.01)
 STILL = np.zeros(3)
 
 
@@ -22,20 +22,20 @@ def body_of(name, height, size=0.7, seed=0):
 
 def soft(name, height, material=JELLY, *, size=0.7, mass=15.0, cells=3):
     drawn, vertices, faces = body_of(name, height, size)
-    return drawn, stage.SoftBody(vertices, faces, STILL, STILL, material, mass, cells)
+    return drawn, scene_setup.SoftBody(vertices, faces, STILL, STILL, material, mass, cells)
 
 
 def rigid(name, height, *, size=0.5, bounce=0.3, velocity=STILL, spin=STILL):
     drawn, vertices, faces = body_of(name, height, size)
     parts = tuple(meshes.convex_pieces(vertices, faces))
-    return drawn, stage.RigidBody(parts, np.asarray(velocity), np.asarray(spin), 10.0, 0.6, bounce)
+    return drawn, scene_setup.RigidBody(parts, np.asarray(velocity), np.asarray(spin), 10.0, 0.6, bounce)
 
 
 def move(cast, n_frames, *, ground=0.0, cloth=None, fps=FPS, max_timestep=1 / 480):
-    """Moved vertices [T, V, 3] of each of ``cast`` (vertices, body), and all carriers."""
-    setting = stage.Stage(tuple(body for _, body in cast), ground, cloth)
+    """Moved vertices [T, V, 3] of each of ``cast`` (vertices, body), and all embeddings."""
+    setting = scene_setup.SceneSetup(tuple(body for _, body in cast), ground, cloth)
     carried = mujoco_engine.simulate(setting, n_frames, fps, max_timestep)
-    bindings = [carrier.bind(vertices) for (vertices, _), carrier in zip(cast, carried)]
+    bindings = [tie.bind(vertices) for (vertices, _), tie in zip(cast, carried)]
     return [np.stack([b.move(nodes) for nodes in c.nodes]) for b, c in zip(bindings, carried)], carried
 
 
@@ -88,7 +88,7 @@ def test_materials_bounce_and_keep_dents_as_named():
 
     jump, left = {}, {}
     for name, (young, damping, lasting) in MATERIALS.items():
-        material = stage.Material(np.mean(young), damping, np.mean(lasting) if lasting else 0.0)
+        material = scene_setup.Material(np.mean(young), damping, np.mean(lasting) if lasting else 0.0)
         (vertices,), _ = move([soft("ball", 1.1, material)], 60, fps=42.0)
         centre, height = vertices[..., 2].mean(1), np.ptp(vertices[..., 2], axis=1)
         landed = centre[:30].argmin()
@@ -109,12 +109,12 @@ def test_energy_does_not_grow(name):
         turning = (cast[0][1].spin ** 2).sum() * 0.35**2 / 2
         assert energy.max() < energy[0] + turning + 0.1
         assert energy[-1] < 0.75 * energy[0]
-        stage.check_energy(centre[None], np.ones(1), turning, 42.0)
+        scene_setup.check_energy(centre[None], np.ones(1), turning, 42.0)
         late = centre.copy()
         late[-8:, 2] += np.linspace(0, 0.3, 8) ** 2 / 0.3  # what has landed rises by itself
         for spoiled in (1.5 * centre, late):
-            with pytest.raises(stage.Unstable, match="gained energy"):
-                stage.check_energy(spoiled[None], np.ones(1), turning, 42.0)
+            with pytest.raises(scene_setup.Unstable, match="gained energy"):
+                scene_setup.check_energy(spoiled[None], np.ones(1), turning, 42.0)
 
 
 def test_rigid_bodies_keep_their_shape_and_stay_above_the_ground():
@@ -161,7 +161,7 @@ def test_bodies_do_not_pass_through_each_other():
 
 @pytest.fixture(scope="module")
 def on_cloth():
-    cloth = stage.Cloth(1.7, 0.8, 13, mass=0.8, young=6e4, thickness=0.008, damping=0.015)
+    cloth = scene_setup.Cloth(1.7, 0.8, 13, mass=0.8, young=6e4, thickness=0.008, damping=0.015)
     cast = [soft("ball", 1.15, size=0.5, mass=2.0)]
     moved, carried = move(cast, 36, cloth=cloth, fps=42.0, max_timestep=1 / 504)
     return moved, carried[-1], cloth
@@ -175,11 +175,11 @@ def test_a_body_rests_on_cloth_that_hangs_from_its_corners(on_cloth):
     sag = cloth.height - sheet.nodes[..., 2].min((1, 2))
     assert sag.max() > 0.15 and sheet.nodes[..., 2].min() > 0
     fine = np.stack([sheet.refine(3).move(nodes) for nodes in sheet.nodes]).reshape(36, 37, 37, 3)
-    stage.check_cloth([body], fine, 0.0)
-    with pytest.raises(stage.Unstable, match="through the cloth"):
-        stage.check_cloth([body - [0, 0, 0.1]], fine, 0.0)
-    with pytest.raises(stage.Unstable, match="the cloth sank"):
-        stage.check_cloth([body], fine - [0, 0, 0.8], 0.0)
+    scene_setup.check_cloth([body], fine, 0.0)
+    with pytest.raises(scene_setup.Unstable, match="through the cloth"):
+        scene_setup.check_cloth([body - [0, 0, 0.1]], fine, 0.0)
+    with pytest.raises(scene_setup.Unstable, match="the cloth sank"):
+        scene_setup.check_cloth([body], fine - [0, 0, 0.8], 0.0)
 
 
 def test_cloth_is_drawn_through_its_nodes(on_cloth):
@@ -200,11 +200,11 @@ def test_rigid_motion_of_the_nodes_moves_points_rigidly(motion, ball):
     points = np.concatenate([ball[0], ball[0] * 1.3 - 0.2])  # also outside the lattice
     particles = np.random.default_rng(0).normal(0, 0.2, (1, 300, 3)) + [0, 0, 0.95]
     axes = np.concatenate([np.zeros((1, 3)), np.eye(3)])[None]
-    for carrier in (motion[0], carriers.Cloud(particles), carriers.Frame(axes)):
-        binding = carrier.bind(points)
+    for tie in (motion[0], embedding.ParticleCloud(particles), embedding.RigidFrame(axes)):
+        binding = tie.bind(points)
         rotation = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
         rotation *= np.linalg.det(rotation)
-        moved = binding.move(carrier.nodes[0] @ rotation.T + [3.0, -1.0, 2.0])
+        moved = binding.move(tie.nodes[0] @ rotation.T + [3.0, -1.0, 2.0])
         expected = points @ rotation.T + [3.0, -1.0, 2.0]
         np.testing.assert_allclose(moved, expected, atol=TOLERANCES["generate_binding"].value)
 
@@ -219,7 +219,7 @@ def test_points_follow_the_simulated_mesh(ball, cells):
 
     body = dataclasses.replace(ball[1], cells=cells)
     (moved,), _ = move([(body.vertices, body)], 12)
-    setting = stage.Stage((body,), 0.0)
+    setting = scene_setup.SceneSetup((body,), 0.0)
     model = mujoco.MjModel.from_xml_string(mujoco_engine.model_xml(setting, 1 / 480))
     data = mujoco.MjData(model)
     for _ in range(11):
@@ -234,7 +234,7 @@ def test_points_are_bound_to_occupied_cells_only():
     occupied = np.zeros((3, 3, 3), dtype=bool)
     occupied[1, 1, 1] = True
     points = np.random.default_rng(0).uniform(-0.2, 1.2, (50, 3))
-    binding = carriers.Lattice(rest[None], occupied).bind(points)
+    binding = embedding.ControlGrid(rest[None], occupied).bind(points)
     np.testing.assert_allclose(binding.move(rest), points, atol=1e-12)
     assert set(np.unique(binding.corners)) == {(x * 4 + y) * 4 + z for x in (1, 2) for y in (1, 2) for z in (1, 2)}
 
@@ -266,6 +266,6 @@ def test_start_velocity_and_spin(ball):
     ],
 )
 def test_motion_that_is_no_motion(motion, spoil, message):
-    stage.check_motion(motion[1], 0.0)
-    with pytest.raises(stage.Unstable, match=message):
-        stage.check_motion(spoil(motion[1]), 0.0)
+    scene_setup.check_motion(motion[1], 0.0)
+    with pytest.raises(scene_setup.Unstable, match=message):
+        scene_setup.check_motion(spoil(motion[1]), 0.0)

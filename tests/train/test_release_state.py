@@ -16,7 +16,7 @@ from gsim3d.data.recording import BACKGROUND, FIXED, MOVING
 from gsim3d.errors import InputError, RunStopped
 from gsim3d.synth import generate
 from gsim3d.synth.cameras import two_rings
-from gsim3d.synth.film import film
+from gsim3d.synth.run import write_trajectory
 from gsim3d.synth.worlds import VALIDATION_SEED, build_world
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
 from gsim3d.train.log import plain
@@ -49,7 +49,7 @@ def world():
 @pytest.fixture(scope="module")
 def films(world, tmp_path_factory):
     out = tmp_path_factory.mktemp("films")
-    return [dict(np.load(film(world, scene, str(out / f"{scene[1]}.npz")))) for scene in world.scenes()]
+    return [dict(np.load(write_trajectory(world, scene, str(out / f"{scene[1]}.npz")))) for scene in world.scenes()]
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def store(world, films):
 def test_a_store_gives_what_scene_folders_give(world, spread, tmp_path):
     world, store = dataclasses.replace(world, camera_spread=spread), FilmStore(world, 2, "cpu")
     for scene in world.scenes():
-        store.put(**np.load(film(world, scene, str(tmp_path / "film.npz"))))
+        store.put(**np.load(write_trajectory(world, scene, str(tmp_path / "film.npz"))))
     options = {**OPTIONS, "camera_spread": spread}
     folders = generate(tmp_path / "data", preset="mini", processes=1, progress=False, **options).folders
     scenes = [Scene.open(folder) for folder in folders]

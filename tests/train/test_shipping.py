@@ -11,7 +11,7 @@ import pytest
 
 from gsim3d import pretrained
 from gsim3d.errors import InputError
-from gsim3d.synth.film import film
+from gsim3d.synth.run import write_trajectory
 from gsim3d.synth.worlds import TEST_SEED, build_world
 from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
 from gsim3d.train.restore import restore
@@ -48,7 +48,7 @@ def scored(tmp_path_factory, one_thread):
     out = tmp_path_factory.mktemp("shipping")
     world = build_world("elastic", "diverse", OPTIONS)
     store = FilmStore(world, 1, "cpu")
-    store.put(**np.load(film(world, ("ball", 0), str(out / "film.npz"))))
+    store.put(**np.load(write_trajectory(world, ("ball", 0), str(out / "film.npz"))))
     trainer = RunTrainer(CONFIG, store, out / "run", "cpu")
     trainer.begin_run(time.monotonic() + 60)
     for _ in range(2):

@@ -20,7 +20,7 @@ from gsim3d.cameras import Cameras, Frames
 from gsim3d.data import Window, generator
 from gsim3d.data.recording import BACKGROUND, MOVING
 from gsim3d.synth.cameras import Rig, workspace_origin
-from gsim3d.synth.film import film, start_filming
+from gsim3d.synth.run import start_data_worker, write_trajectory
 from gsim3d.synth.world import World
 from gsim3d.train.config import DataConfig, StageConfig
 from gsim3d.train.processes import Processes
@@ -75,7 +75,7 @@ class FilmStore:
         ]
 
     def put(self, images: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> None:
-        """Keeps a trajectory, as :func:`gsim3d.synth.film.film` writes it."""
+        """Keeps a trajectory, as :func:`gsim3d.synth.run.write_trajectory` writes it."""
         rig = Rig(viewmats, Ks, images.shape[2], self._near, self._far)
         with self.lock:
             slot = self.count % self.capacity
@@ -170,7 +170,7 @@ class Filming:
 
     def __enter__(self) -> Filming:
         context = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(self._processes, context, start_filming)
+        self._pool = ProcessPoolExecutor(self._processes, context, start_data_worker)
         threads = os.environ.get("OMP_NUM_THREADS")
         os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that start now
         try:
@@ -210,7 +210,7 @@ class Filming:
             self.next, self._begun = self.next + self._together.count, self._begun + 1
             scene = names[number % len(names)], number // len(names)
             world = self._worlds[scene[1] % len(self._worlds)]
-            job = self._pool.submit(film, world, scene, str(self._cache / f"{number}.npz"))
+            job = self._pool.submit(write_trajectory, world, scene, str(self._cache / f"{number}.npz"))
             job.add_done_callback(self._take)
 
     def _take(self, job: Future) -> None:

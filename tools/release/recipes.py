@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from gsim3d.errors import InputError
-from gsim3d.synth.stage import GRAVITY
+from gsim3d.synth.scene_setup import GRAVITY
 from gsim3d.synth.world import World
 from gsim3d.synth.worlds import VALIDATION_SEED, build_world
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig

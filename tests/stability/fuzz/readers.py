@@ -67,7 +67,7 @@ def _write_scene(layout: str, folder: Path) -> None:
 
 
 def _write_video_scene(folder: Path) -> None:
-    WRITERS["films"](folder, make_scene(**SMALL))
+    WRITERS["videos"](folder, make_scene(**SMALL))
     shutil.rmtree(folder / "labels")  # they are of other frames than a video's, which count from 0
     for cam in range(SMALL["n_cams"]):
         shutil.rmtree(folder / f"cam_{cam}")
@@ -96,7 +96,7 @@ def _write_synthetic(folder: Path) -> None:
 
 def _write_images(folder: Path) -> None:
     """Frames and masks of several formats, and a lens by its keys."""
-    WRITERS["films"](folder, make_scene(**SMALL))
+    WRITERS["videos"](folder, make_scene(**SMALL))
     (folder / "labels").rename(folder / "masks")
     for number, file in enumerate(sorted(folder.rglob("*.png"))):
         image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)

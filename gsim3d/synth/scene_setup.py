@@ -11,7 +11,7 @@ MAX_STRETCH = 2.0  # a body's bounding box longer or shorter than so many times 
 MAX_SINK = 0.1  # of the body height below the ground: likewise
 MAX_THROUGH = 0.03  # metres of a body below the cloth over it, or of the cloth below the ground: likewise
 STORED = 0.5  # seconds that a body stays squeezed at most
-MAX_GAIN = 0.3  # J/kg that a stage may gain: what a fall of 3 cm gives; centres are known to about a third of it
+MAX_GAIN = 0.3  # J/kg that a setup may gain: what a fall of 3 cm gives; centres are known to about a third of it
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Cloth:
 
 
 @dataclass(frozen=True)
-class Stage:
+class SceneSetup:
     """bodies: soft or rigid.   ground: height of the ground, or None.   cloth: or None."""
 
     bodies: tuple[SoftBody | RigidBody, ...]

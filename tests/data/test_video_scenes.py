@@ -26,8 +26,8 @@ from tests.data.made_scenes import (
     edit_json,
     make_scene,
     save,
-    write_films,
     write_transforms,
+    write_videos,
 )
 
 LENS = [-0.25, 0.08, 0.004, -0.003, 0.02]
@@ -45,7 +45,7 @@ def distorted(image: np.ndarray, K: np.ndarray, lens) -> np.ndarray:
     return cv2.remap(image, place[..., 0], place[..., 1], cv2.INTER_LINEAR)
 
 
-def write_odd_films(folder, n_steps=N_LONG, lens=LENS, background=True):
+def write_odd_videos(folder, n_steps=N_LONG, lens=LENS, background=True):
     """Three cameras of different odd sizes, with a lens and a textured room behind a ball that crosses the view.
 
     Returns what a pinhole would see, [T][V] -> (rgb, labels), and the intrinsics.
@@ -78,7 +78,7 @@ def write_odd_films(folder, n_steps=N_LONG, lens=LENS, background=True):
 @pytest.fixture(scope="module")
 def odd(tmp_path_factory):
     folder = tmp_path_factory.mktemp("odd") / "room"
-    return folder, write_odd_films(folder)
+    return folder, write_odd_videos(folder)
 
 
 def test_odd_sizes_are_padded_and_the_padding_is_no_pixel(odd):
@@ -86,12 +86,12 @@ def test_odd_sizes_are_padded_and_the_padding_is_no_pixel(odd):
     scene = Scene.open(folder)
     assert (scene.width, scene.height) == (48, 32)
     valid = scene.valid(range(3), [0, 5])
-    film, labels = scene.film(range(3), [0, 5]), scene.segmentation(range(3), [0, 5])
+    video, labels = scene.recorded_images(range(3), [0, 5]), scene.segmentation(range(3), [0, 5])
     for cam, (width, height) in enumerate(SIZES):
         outside = torch.ones(32, 48, dtype=torch.bool)
         outside[:height, :width] = False
         assert not valid[:, cam, outside].any() and valid[:, cam, :height, :width].float().mean() > 0.8
-        assert not film[:, cam, :, outside].any() and not labels[:, cam, outside].any()
+        assert not video[:, cam, :, outside].any() and not labels[:, cam, outside].any()
     cameras = scene.cameras_at(range(3), [0])
     Ks = np.array([camera["K"] for camera in json.loads((folder / "cameras.json").read_text())["cameras"]])
     np.testing.assert_allclose(cameras.Ks, Ks, rtol=1e-6)
@@ -100,16 +100,16 @@ def test_odd_sizes_are_padded_and_the_padding_is_no_pixel(odd):
 
 
 def test_lenses_are_undistorted(odd):
-    """The undistorted film is what a pinhole sees, up to the blur of two interpolations."""
+    """The undistorted video is what a pinhole sees, up to the blur of two interpolations."""
     folder, truth = odd
     scene = Scene.open(folder)
-    film, valid = scene.film(range(3), range(N_LONG)), scene.valid(range(3), [0])[0]
+    video, valid = scene.recorded_images(range(3), range(N_LONG)), scene.valid(range(3), [0])[0]
     with_lens = []
     for cam, (width, height) in enumerate(SIZES):
         seen = valid[cam, :height, :width].numpy()
         for step in range(N_LONG):
             wanted = truth[step][cam][0].astype(float)
-            got = film[step, cam, :, :height, :width].permute(1, 2, 0).numpy().astype(float)
+            got = video[step, cam, :, :height, :width].permute(1, 2, 0).numpy().astype(float)
             assert np.abs(got - wanted)[seen].mean() < 6
             stored = cv2.imread(str(folder / f"cam_{cam}" / f"{step}.png"))[..., ::-1].astype(float)
             with_lens.append(np.abs(stored - wanted)[seen].mean() > 1.2 * np.abs(got - wanted)[seen].mean())
@@ -153,7 +153,7 @@ def test_the_background_is_subtracted_and_painted_black(odd):
 
 def test_masks_beside_the_frames(tmp_path):
     made = make_scene()
-    folder = write_films(tmp_path, made)
+    folder = write_videos(tmp_path, made)
     (folder / "labels").rename(folder / "masks")
     for file in (folder / "masks").rglob("*.png"):
         mask = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) == 3
@@ -162,9 +162,9 @@ def test_masks_beside_the_frames(tmp_path):
     np.testing.assert_array_equal(scene.segmentation(range(3), range(4)), np.where(made.labels == 3, 3, 0))
 
 
-def write_videos(folder, made, fps=FPS):
+def write_encoded(folder, made, fps=FPS):
     """The same cameras, one .mp4 each, 96x64 (video coding blurs single pixels)."""
-    write_films(folder, made, stride=1)
+    write_videos(folder, made, stride=1)
     for cam in range(made.rgb.shape[1]):
         write_video(folder / f"video_{cam}.mp4", list(made.rgb[:, cam]), fps)
 
@@ -182,25 +182,25 @@ def write_videos(folder, made, fps=FPS):
 @pytest.fixture(scope="module")
 def videos(tmp_path_factory):
     made = make_scene(width=96, height=64, n_steps=9)
-    return write_videos(tmp_path_factory.mktemp("videos") / "scene", made), made
+    return write_encoded(tmp_path_factory.mktemp("videos") / "scene", made), made
 
 
 def test_videos(videos):
     folder, made = videos
     scene = Scene.open(folder)
     assert (scene.n_steps, scene.n_cams, scene.fps) == (9, 3, FPS)
-    whole = scene.film(range(3), range(9))
+    whole = scene.recorded_images(range(3), range(9))
     error = whole.permute(0, 1, 3, 4, 2).float() - torch.from_numpy(made.rgb)
     assert error.abs().mean() < 3
     for steps in ([4], [7, 2], [8, 8, 0]):
-        assert torch.equal(Scene.open(folder).film([1], steps), whole[steps][:, [1]])
+        assert torch.equal(Scene.open(folder).recorded_images([1], steps), whole[steps][:, [1]])
 
 
 def test_no_file_stays_open(videos):
     folder, _ = videos
     scene = Scene.open(folder)
     before = len(os.listdir("/proc/self/fd"))
-    scene.film(range(3), [0, 5])
+    scene.recorded_images(range(3), [0, 5])
     reader = scene.recording.read_images(0, range(9), None)
     next(reader)
     reader.close()
@@ -210,13 +210,13 @@ def test_no_file_stays_open(videos):
 
 def test_broken_videos(videos, tmp_path):
     folder, made = videos
-    broken = write_videos(tmp_path / "scene", make_scene(width=96, height=64, n_steps=9))
+    broken = write_encoded(tmp_path / "scene", make_scene(width=96, height=64, n_steps=9))
     file = broken / "video_1.mp4"
     data = file.read_bytes()
     for content in (b"", b"no video at all", data[: len(data) // 2]):
         file.write_bytes(content)
         with pytest.raises(InputError, match=r"video_1.mp4 \(camera video_1\)"):
-            Scene.open(broken).film([1], range(9))
+            Scene.open(broken).recorded_images([1], range(9))
     write_video(file, list(made.rgb[:7, 1]), FPS)
     with pytest.raises(InputError, match="camera video_1 has 7 frames, camera video_0 9; missing: frame 7, 8"):
         Scene.open(broken)
@@ -232,45 +232,45 @@ def test_broken_videos(videos, tmp_path):
 def test_a_video_that_is_cut_off_is_named(videos, tmp_path):
     """In AVI the frames come before their index, so that a file without its end can still be opened."""
     _, made = videos
-    folder = write_videos(tmp_path / "scene", made)
+    folder = write_encoded(tmp_path / "scene", made)
     (folder / "video_2.mp4").unlink()
     writer = cv2.VideoWriter(str(folder / "video_2.avi"), cv2.VideoWriter_fourcc(*"MJPG"), FPS, (96, 64))
     for image in made.rgb[:, 2]:
         writer.write(np.ascontiguousarray(image[..., ::-1]))
     writer.release()
-    assert Scene.open(folder).film([2], [8]).float().mean() > 5
+    assert Scene.open(folder).recorded_images([2], [8]).float().mean() > 5
     data = (folder / "video_2.avi").read_bytes()
     (folder / "video_2.avi").write_bytes(data[: len(data) * 6 // 10])
     with pytest.raises(
         InputError, match=r"video_2.avi.*(ends before frame|cannot be opened|cannot be decoded)|video_2 has"
     ):
-        Scene.open(folder).film([2], range(9))
+        Scene.open(folder).recorded_images([2], range(9))
     assert any("video_2" in problem for problem in check_scene(folder).problems)
 
 
 def test_images_that_are_cut_off_are_named(tmp_path):
     """OpenCV fills the rest of a JPEG with grey; a thumbnail's end inside the header is not the end of the image."""
-    folder = write_films(tmp_path, make_scene())
+    folder = write_videos(tmp_path, make_scene())
     for file in (folder / "cam_1").glob("*.png"):
         cv2.imwrite(str(file.with_suffix(".jpg")), cv2.imread(str(file)))
         file.unlink()
-    assert Scene.open(folder).film([1], [0]).float().mean() > 5
+    assert Scene.open(folder).recorded_images([1], [0]).float().mean() > 5
     file = folder / "cam_1" / "004.jpg"
     data = file.read_bytes()
     thumbnail = b"\xff\xe1" + (2 + 400).to_bytes(2, "big") + b"\xff\xd8" + bytes(396) + b"\xff\xd9"
     whole = data[:2] + thumbnail + data[2:]
     file.write_bytes(whole)
-    assert Scene.open(folder).film([1], [2]).float().mean() > 5
+    assert Scene.open(folder).recorded_images([1], [2]).float().mean() > 5
     for cut in (whole[: len(whole) * 3 // 4], whole[:-2]):
         file.write_bytes(cut)
         with pytest.raises(
             InputError, match=r"004.jpg \(camera cam_1, frame 4\) cannot be decoded: its end is missing"
         ):
-            Scene.open(folder).film([1], [2])
+            Scene.open(folder).recorded_images([1], [2])
 
 
 def test_frame_numbers_are_times(tmp_path):
-    scene = Scene.open(write_films(tmp_path, make_scene(), stride=3))
+    scene = Scene.open(write_videos(tmp_path, make_scene(), stride=3))
     assert scene.fps == pytest.approx(FPS) and scene.n_steps == N_STEPS
     edit_json(tmp_path / "cameras.json", lambda content: content.pop("fps"))
     with pytest.raises(InputError, match="fps is needed"):
@@ -278,7 +278,7 @@ def test_frame_numbers_are_times(tmp_path):
 
 
 def test_units_and_pixel_centres(tmp_path):
-    plain = Scene.open(write_films(tmp_path, make_scene()))
+    plain = Scene.open(write_videos(tmp_path, make_scene()))
 
     def edit(content):
         content |= {"units": "mm", "pixel_center": 0, "origin": [-2000, -2500, -1000], "near": 1000, "far": 5000}

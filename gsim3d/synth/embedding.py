@@ -30,7 +30,7 @@ class Binding:
 
 
 @dataclass(frozen=True)
-class Lattice:
+class ControlGrid:
     """Control lattice of a soft body.
 
     nodes [T, c+1, c+1, c+1, 3]: metres, world; frame 0 is an axis-aligned box of equal cells.
@@ -63,7 +63,7 @@ class Lattice:
 
 
 @dataclass(frozen=True)
-class Frame:
+class RigidFrame:
     """A rigid body: nodes [T, 4, 3], its origin and the tips of its three unit axes, metres, world."""
 
     nodes: np.ndarray
@@ -77,7 +77,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Sheet:
+class ClothGrid:
     """A cloth: nodes [T, n, n, 3] of a square grid, metres, world."""
 
     nodes: np.ndarray
@@ -116,7 +116,7 @@ def grid_faces(n: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Cloud:
+class ParticleCloud:
     """Particles of a body: nodes [T, P, 3], metres, world."""
 
     nodes: np.ndarray
@@ -138,7 +138,7 @@ class Cloud:
         return Binding(corners, near * np.einsum("nki,ni->nk", design, multiplier))
 
 
-Carrier = Lattice | Frame | Sheet | Cloud
+Embedding = ControlGrid | RigidFrame | ClothGrid | ParticleCloud
 
 
 def _nearest(nodes: np.ndarray, point: np.ndarray, count: int) -> np.ndarray:

@@ -1,0 +1,272 @@
+"""Video files: frames counted by decoding, the times that stand in the file, and pixels."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from gsim3d.data.recording import MAX_STEPS, Problems
+from gsim3d.errors import InputError
+from gsim3d.io.files import opencv_path
+
+RESOLUTION = 1.01e-3  # seconds: many containers round times to a millisecond
+UNEVEN = 0.1  # of the time between two frames: a frame that is off by more makes a video uneven
+MAX_APART, MIN_EVEN = 2, 8  # frames that may lie apart at the end, of more than so many
+TURNS = (0, 90, 180, 270)  # degrees that decoded frames are turned by
+MP4_KINDS = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
+EBML, SEGMENT = b"\x1aE\xdf\xa3", b"\x18S\x80g"
+
+
+class Video:
+    """A video file. It is opened for each read and closed after it; frames are decoded from the first one on.
+
+    numbers: of its frames, from 0; none where there is a problem.    times: float64 [N], seconds.
+    rate: frames a second; None where they are not evenly spaced.    note: what is left out, "" where nothing is.
+    """
+
+    def __init__(self, file: Path, name: str, size: tuple[int, int], problems: Problems):
+        self.what, self._file, self._size = f"video {file} (camera {name})", file, size
+        self.numbers, self.times, self.rate, self.note = [], np.zeros(0), None, ""
+        try:
+            stat = file.stat()
+            found = _scan(file, size, (stat.st_mtime_ns, stat.st_size))
+        except (InputError, OSError) as error:
+            problems.add(f"{self.what} {error if isinstance(error, InputError) else error.strerror}")
+            return
+        cut, self.rate = _even_part(found.times, found.rate)
+        self.times = found.times[: len(found.times) - cut]
+        self.numbers = list(range(len(self.times)))
+        if cut:
+            self.note = f"{self.what}: its last {cut} of {len(found.times)} frames lie apart and are left out"
+        if self.rate is None:
+            gaps = (1000 * np.diff(found.times)).round(1)
+            self.unevenness = (
+                f"its {len(found.times)} frames are {gaps.min():g} to {gaps.max():g} ms apart, though its header says "
+                f"{found.rate:.4g} a second"
+            )
+
+    def read(self, numbers: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
+        """The frames of ascending ``numbers``, uint8 [h, w, 3], RGB. A number may come again."""
+        import cv2
+
+        capture = _open(self._file, self.what + " ")
+        try:
+            at, ended = -1, False
+            for number in numbers:
+                while at < number and not ended:
+                    ended = not capture.grab()
+                    at += 1
+                done, frame = (False, None) if ended else capture.retrieve()
+                if not done or frame.shape != (self._size[1], self._size[0], 3):
+                    problems.add(f"{self.what} cannot be decoded at frame {number}; has the file changed?")
+                    yield None
+                    continue
+                yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+        finally:
+            capture.release()
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """times: float64 [N] seconds, of all frames that can be decoded.   rate: as the header has it, may be nonsense."""
+
+    times: np.ndarray
+    rate: float
+
+
+@lru_cache(maxsize=10_000)
+def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
+    """Decodes a file once. ``stamp``: changes with the file. Raises InputError with what is wrong, without its name."""
+    import cv2
+
+    index = _index(file)
+    capture = _open(file)
+    try:
+        rate, count, turn = (
+            capture.get(key) for key in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_ORIENTATION_META)
+        )
+        found = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        if turn not in TURNS or index.mirrored:
+            raise InputError("is shown mirrored or aslant by its display matrix; only quarter turns are read")
+        if found != size:
+            turned = f" (turned by {turn:g} degrees, as its display matrix says)" if turn else ""
+            raise InputError(f"has {found[0]}x{found[1]} pixels{turned}, its camera {size[0]}x{size[1]}")
+        times, marks = [], []
+        while capture.grab():
+            times.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+            marks.append(capture.get(cv2.CAP_PROP_PTS))
+            if len(times) > MAX_STEPS:
+                raise InputError(f"has more than {MAX_STEPS} frames")
+    finally:
+        capture.release()
+    if not times:
+        raise InputError("cannot be decoded: damaged, or of a codec that this OpenCV lacks")
+    times = np.array(times)
+    back = np.flatnonzero(np.diff(times) < 0)
+    if len(times) > 1 and (len(back) or times[-1] <= times[0]):
+        at = f"go back after frame {back[0]}" if len(back) else "are all equal"
+        raise InputError(f"has no usable time stamps: they {at}; convert it to a constant rate")
+    times += _start(times, np.array(marks), rate)
+    if len(times) < count and index.duration:
+        gap = (times[-1] - times[0]) / max(len(times) - 1, 1)
+        if times[-1] + 2.5 * gap < index.duration:
+            raise InputError(
+                f"cannot be decoded to its end: {times[-1] + gap:.4g} of {index.duration:.4g} s, {len(times)} of "
+                f"{count:g} frames; it is damaged"
+            )
+    return _Scan(times, rate)
+
+
+def _open(file: Path, what: str = ""):
+    import cv2
+
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # errors are reported here, with their file and camera
+    capture = cv2.VideoCapture(opencv_path(file), cv2.CAP_FFMPEG)
+    if not capture.isOpened():
+        capture.release()
+        raise InputError(f"{what}cannot be opened: broken, cut off or no video")
+    return capture
+
+
+def _start(times: np.ndarray, marks: np.ndarray, rate: float) -> float:
+    """Seconds from the start of the container to the first frame: OpenCV counts ``times`` from that frame, and
+    reports its own time in ``marks``, rounded to whole frames of ``rate``."""
+    if not 0 < rate < 1e6:
+        return 0.0
+    low, high = ((marks - 0.5) / rate - times).max(), ((marks + 0.5) / rate - times).min()
+    return float((low + high) / 2 if low <= high else marks[0] / rate)
+
+
+def _even_part(times: np.ndarray, header: float) -> tuple[int, float | None]:
+    """How many frames at the end lie apart, and the rate of the others. Editors that cut without encoding anew leave
+    such frames: those that were stored after them, and are shown before, are gone."""
+    for cut in range(MAX_APART + 1 if len(times) > MIN_EVEN else 1):
+        rate = _even_rate(times[: len(times) - cut], header)
+        if rate is not None:
+            return cut, rate
+    return 0, None
+
+
+def _even_rate(times: np.ndarray, header: float) -> float | None:
+    """Frames a second, as the header says or as measured; None where neither fits."""
+    header = header if 0 < header < 1e6 else None
+    if len(times) == 1:
+        return header or 1.0
+    for rate in filter(None, (header, (len(times) - 1) / (times[-1] - times[0]))):
+        off = np.abs(times - times[0] - np.arange(len(times)) / rate).max()
+        if off <= max(RESOLUTION, UNEVEN / rate):
+            return rate
+    return None
+
+
+@dataclass(frozen=True)
+class _Index:
+    """What OpenCV does not report of a file.
+
+    mirrored: the display matrix of an MP4 mirrors it.   duration: seconds of its video track with what was cut off by
+    edits left out; None where it is not known.
+    """
+
+    mirrored: bool = False
+    duration: float | None = None
+
+
+def _index(file: Path) -> _Index:
+    """Raises InputError where the container declares more bytes than the file has."""
+    size = file.stat().st_size
+    with open(file, "rb") as opened:
+        start = opened.read(12)
+        try:
+            if start[:4] == b"RIFF":
+                end = 8 + int.from_bytes(start[4:8], "little")
+            elif start[:4] == EBML:
+                end = _segment_end(opened)
+            elif start[4:8] in MP4_KINDS:
+                end, index = _mp4(opened, size)
+                if end <= size:
+                    return index
+            else:
+                return _Index()
+        except (struct.error, IndexError, OverflowError):
+            return _Index()  # whether it can be read is for the decoder to say
+    if end > size:
+        raise InputError(f"cannot be decoded to its end: it has {size} of {end} bytes; it is cut off")
+    return _Index()
+
+
+def _segment_end(file: BinaryIO) -> int:
+    """Where the segment of a Matroska or WebM file ends; 0 where it does not say so, as in live recordings."""
+
+    def number() -> int:
+        first = file.read(1)[0]
+        length = 9 - first.bit_length()
+        value = int.from_bytes(bytes([first & (0xFF >> length)]) + file.read(length - 1), "big")
+        return 0 if value == (1 << 7 * length) - 1 else value
+
+    file.seek(4)
+    head = number()
+    file.seek(head, os.SEEK_CUR)
+    if file.read(4) != SEGMENT:
+        return 0
+    length = number()
+    return file.tell() + length if length else 0
+
+
+def _mp4(file: BinaryIO, size: int) -> tuple[int, _Index]:
+    """Where the last box of an MP4 or MOV file ends, and what its video track says."""
+    end, index = 0, _Index()
+    for kind, start, stop in _boxes(file, 0, size):
+        if kind in (b"mdat", b"moov", b"moof"):
+            end = max(end, stop)
+        if kind == b"moov" and stop <= size:
+            boxes = list(_boxes(file, start, stop))
+            scale = next((_clock(file, at)[0] for kind, at, _ in boxes if kind == b"mvhd"), 0)
+            for kind, at, last in boxes:
+                if kind == b"trak" and _is_video(file, at, last):
+                    index = next((_track(file, a, scale) for k, a, _ in _boxes(file, at, last) if k == b"tkhd"), index)
+    return end, index
+
+
+def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+    """(kind, where its content starts, where it ends) of the boxes between two offsets."""
+    while start + 8 <= end:
+        file.seek(start)
+        length, kind = struct.unpack(">I4s", file.read(8))
+        body = start + 8
+        if length == 1:
+            length, body = int.from_bytes(file.read(8), "big"), start + 16
+        stop = end if length == 0 else start + length
+        if stop < body:
+            return
+        yield kind, body, stop
+        start = stop
+
+
+def _is_video(file: BinaryIO, start: int, end: int) -> bool:
+    for kind, at, stop in _boxes(file, start, end):
+        if kind == b"mdia":
+            return any(k == b"hdlr" and _read(file, a + 8, 4) == b"vide" for k, a, _ in _boxes(file, at, stop))
+    return False
+
+
+def _track(file: BinaryIO, at: int, scale: int) -> _Index:
+    wide = _read(file, at, 1) == b"\1"
+    duration = int.from_bytes(_read(file, at + (28 if wide else 20), 8 if wide else 4), "big")
+    a, b, _, c, d = struct.unpack(">5i", _read(file, at + (52 if wide else 40), 20))
+    return _Index(a * d < b * c, duration / scale if scale and duration < 1 << 31 else None)
+
+
+def _clock(file: BinaryIO, at: int) -> tuple[int]:
+    return struct.unpack(">I", _read(file, at + (20 if _read(file, at, 1) == b"\1" else 12), 4))
+
+
+def _read(file: BinaryIO, at: int, count: int) -> bytes:
+    file.seek(at)
+    return file.read(count)
