@@ -27,7 +27,6 @@ from torch.nn import functional as F
 from gsim3d.cameras import Cameras
 from gsim3d.compat.quirks import Quirks
 from gsim3d.dynamics import Background, Parts
-from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.nn.point_transformer import SparseConv
@@ -35,7 +34,7 @@ from gsim3d.numerics.policy import StabilityReport, pack
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.ops.raster import Rendering
 from gsim3d.simulator import Simulator
-from gsim3d.state import DYNAMIC, CloudTable, Particles, keeping_constants
+from gsim3d.state import DYNAMIC, CloudTable, Particles, keeping_constants, newest_clouds
 
 FACTOR = 1.25  # room over what was observed
 # What errors for it say: torch's, and those of ops, which say no more.

@@ -16,6 +16,7 @@ from itertools import accumulate
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from gsim3d.cameras import TensorRecord
 
@@ -129,6 +130,66 @@ def split_rows(x: Tensor, runs: Sequence[tuple[int, int]]) -> list[Tensor]:
 
 
 @dataclass(frozen=True)
+class Attribute:
+    """How everything treats one per-particle tensor.
+
+    Attributes:
+        name: field of :class:`Particles`.
+        shape: behind the N particles; None where the model chooses the size.
+        kind: "scalar"; "point" (moves and turns with a body), "vector" and "quaternion" (turn with it), "harmonics",
+            "matrix", or "index" (a choice, without gradients).
+        default: value of particle sets without the attribute: a number, "identity", or the attribute that it begins as;
+            None: every particle set has it, or no other may stand in for it.
+        predicted: whether a step may change it.
+        validated: whether the guards of a step look at it; others are checked once, at the start.
+        dtype: other than that of the network.
+    """
+
+    name: str
+    shape: tuple[int | None, ...] = (None,)
+    kind: str = "scalar"
+    default: float | str | None = None
+    predicted: bool = True
+    validated: bool = True
+    dtype: torch.dtype | None = None
+
+    @property
+    def is_optional(self) -> bool:
+        """Whether a particle set may lack it while another has it."""
+        return self.default is not None
+
+
+_kept = functools.partial(Attribute, predicted=False)
+ATTRIBUTES = {
+    attribute.name: attribute
+    for attribute in (
+        Attribute("means", (3,), "point"),
+        Attribute("opacities", ()),
+        Attribute("dynamic_latents"),
+        _kept("static_latents"),
+        _kept("activity", (), "index", validated=False, dtype=torch.uint8),
+        Attribute("quats", (4,), "quaternion"),
+        Attribute("scales", (3,)),
+        Attribute("sh", (None, 3), "harmonics"),
+        _kept("orientations", (4,), "quaternion", "identity"),
+        _kept("color_transform", (3, 3), "matrix", "identity"),
+        _kept("frozen_appearance", (), "index", 0.0, validated=False, dtype=torch.bool),
+        _kept("initial_latents", default="dynamic_latents", validated=False),
+        Attribute("velocity", (3,), "vector", 0.0),
+        Attribute("irradiance_gain", (3,), "scalar", 1.0),
+        _kept("light_occlusion", default=-1.0, validated=False),
+        _kept("rest_positions", (3,), "point", "means", validated=False),
+        _kept("body", (3,), "point", "means", validated=False),
+    )
+}
+
+
+def attributes_of(*kinds: str) -> tuple[str, ...]:
+    """Names of the attributes of these kinds."""
+    return tuple(name for name, attribute in ATTRIBUTES.items() if attribute.kind in kinds)
+
+
+@dataclass(frozen=True)
 class Particles(TensorRecord):
     """The state of the simulator: particles with view-independent latent features.
 
@@ -189,25 +250,7 @@ class Particles(TensorRecord):
     world_offset: Tensor | None = None
     known: CloudTable | None = None  # see clouds
 
-    ROW_FIELDS = (
-        "means",
-        "opacities",
-        "dynamic_latents",
-        "static_latents",
-        "activity",
-        "quats",
-        "scales",
-        "sh",
-        "orientations",
-        "color_transform",
-        "frozen_appearance",
-        "initial_latents",
-        "velocity",
-        "irradiance_gain",
-        "light_occlusion",
-        "rest_positions",
-        "body",
-    )
+    ROW_FIELDS = tuple(ATTRIBUTES)
 
     @property
     def n_rows(self) -> int:
@@ -269,6 +312,109 @@ class Particles(TensorRecord):
             self.cu_rows.device,
         )
         return self.with_clouds(table, **{name: take_runs(x, runs) for name, x in self.row_fields().items()})
+
+
+def newest_clouds(clouds: CloudTable) -> list[int]:
+    """The last cloud of each scene that has one."""
+    return _newest(clouds.scenes, clouds.steps)
+
+
+def _newest(scenes: Sequence[int], steps: Sequence[int]) -> list[int]:
+    places = list(zip(scenes, steps))
+    if any(b <= a for a, b in zip(places, places[1:])):
+        raise ValueError(
+            "particles: clouds must be sorted by (scene, step), each once; "
+            f"got scenes {list(scenes)}, steps {list(steps)}"
+        )
+    return [q for q in range(len(scenes)) if q + 1 == len(scenes) or scenes[q + 1] != scenes[q]]
+
+
+def _last(scenes: Sequence[int], steps: Sequence[int], n_steps: int) -> list[int]:
+    """The last ``n_steps`` clouds of each scene."""
+    kept, begin = [], 0
+    for last in _newest(scenes, steps):
+        kept += range(max(begin, last + 1 - n_steps), last + 1)
+        begin = last + 1
+    return kept
+
+
+def append_step(history: Particles, step: Particles, max_steps: int) -> Particles:
+    """``history`` with the clouds of ``step`` behind it; of each scene the last ``max_steps`` clouds stay.
+
+    Scenes without a cloud in ``step`` stay as they are.
+    """
+    return concatenate([history, step], max_steps)
+
+
+def last_steps(particles: Particles, n_steps: int) -> Particles:
+    """The last ``n_steps`` clouds of each scene."""
+    kept = _last(particles.clouds.scenes, particles.clouds.steps, n_steps)
+    return particles if len(kept) == particles.n_clouds else particles.select_clouds(kept)
+
+
+def with_attribute(particles: Particles, name: str, width: int = 3) -> Particles:
+    """``particles`` with the attribute ``name``, at its default where they had none.
+
+    Args:
+        width: channels, where the attribute itself has no fixed number.
+    """
+    if getattr(particles, name) is not None:
+        return particles
+    attribute, means = ATTRIBUTES[name], particles.means
+    if attribute.default == "identity":
+        one = means.new_ones(particles.n_rows, 1)
+        value = F.pad(one, (0, 3)) if attribute.kind == "quaternion" else torch.diag_embed(one.expand(-1, 3))
+    elif isinstance(attribute.default, str):  # guards put broken particles to sleep, and do not look at copies
+        value = getattr(particles, attribute.default)
+        value = (value.detach() if attribute.kind == "point" else value).nan_to_num(0, 0, 0)
+    else:
+        shape = (particles.n_rows, *(width if n is None else n for n in attribute.shape))
+        value = means.new_full(shape, attribute.default, dtype=attribute.dtype or means.dtype)
+    return dataclasses.replace(particles, **{name: value})
+
+
+def with_same_attributes(parts: Sequence[Particles]) -> list[Particles]:
+    """``parts`` with the optional attributes that any of them has."""
+    for name in (name for name, attribute in ATTRIBUTES.items() if attribute.is_optional):
+        known = [getattr(part, name) for part in parts if getattr(part, name) is not None]
+        if known:
+            parts = [with_attribute(part, name, known[0].shape[-1]) for part in parts]
+    return list(parts)
+
+
+def concatenate(parts: Sequence[Particles], max_steps: int | None = None) -> Particles:
+    """The clouds of several particle sets of the same scenes in one, sorted by (scene, step); with ``max_steps`` the
+    last of each scene, each once."""
+    parts = with_same_attributes(parts)
+    tables = [part.clouds for part in parts]
+    places = [(table.scenes[q], table.steps[q], p, q) for p, table in enumerate(tables) for q in range(len(table))]
+    places.sort(key=lambda place: place[:2])
+    if max_steps is not None:
+        scenes, steps = [place[0] for place in places], [place[1] for place in places]
+        places = [places[i] for i in _last(scenes, steps, max_steps)]
+    table = CloudTable.make(
+        (tables[p].count(q) for _, _, p, q in places),
+        (scene for scene, *_ in places),
+        (step for _, step, *_ in places),
+        parts[0].cu_rows.device,
+    )
+    taken = [sorted(q for *_, of, q in places if of == p) for p in range(len(parts))]
+    runs = [[table.row_runs([q])[0] for q in clouds] for table, clouds in zip(tables, taken, strict=True)]
+    order = {cloud: i for i, cloud in enumerate((p, q) for p, clouds in enumerate(taken) for q in clouds)}
+    fields = {}
+    for name, value in parts[0].row_fields().items():
+        pieces = [rows for part, of in zip(parts, runs, strict=True) for rows in split_rows(getattr(part, name), of)]
+        fields[name] = torch.cat([pieces[order[p, q]] for *_, p, q in places]) if places else value
+    return parts[0].with_clouds(table, **fields)
+
+
+def single_steps(particles: Particles) -> list[Particles]:
+    """The clouds of scenes with equally many steps, step by step: one cloud a scene in each."""
+    n_scenes = len(newest_clouds(particles.clouds))
+    n_steps = particles.n_clouds // n_scenes if n_scenes else 1
+    if n_steps == 1:
+        return [particles]
+    return [particles.select_clouds(range(step, particles.n_clouds, n_steps)) for step in range(n_steps)]
 
 
 @dataclass(frozen=True)

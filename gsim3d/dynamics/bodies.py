@@ -5,10 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsim3d.dynamics.clouds import with_field
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.samples import SAMPLES, squares
-from gsim3d.state import Particles, constant, take_runs
+from gsim3d.state import Particles, constant, take_runs, with_attribute
 
 NEIGHBOURS = 8  # within reach of every second row, itself one of them
 LEAST = 0.1  # of the rows of the largest part: smaller ones belong to what is nearest
@@ -45,7 +44,7 @@ def bodies(history: Particles, grid_size: float) -> Tensor:
         found = middle.gather(1, nearest[:, :, None].expand(-1, -1, 3)).double()
         found = found + matter.here + history.origin[scenes][:, None]
         found, may_move = (matter.packed(x.to(history.means.dtype)) for x in (found, torch.ones_like(found[:, :, :1])))
-        here = take_runs(with_field(history, "body").body, clouds.row_runs(matter.newest))
+        here = take_runs(with_attribute(history, "body").body, clouds.row_runs(matter.newest))
         return torch.where(may_move > 0, found, here)
 
 

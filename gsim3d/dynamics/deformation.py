@@ -5,10 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsim3d.dynamics.clouds import with_field
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.rigid import turned_most
-from gsim3d.state import Particles, constant, take_runs
+from gsim3d.state import Particles, constant, take_runs, with_attribute
 
 DEFORMATION_CHANNELS = 3
 
@@ -33,7 +32,7 @@ def deformation(history: Particles, length: float, grid_size: float, matter: Mat
     if matter is None:
         return history.means.new_zeros(0, 3)
     clouds = history.clouds
-    reference = take_runs(with_field(history, "rest_positions").rest_positions, clouds.row_runs(matter.newest))
+    reference = take_runs(with_attribute(history, "rest_positions").rest_positions, clouds.row_runs(matter.newest))
     with torch.autocast(reference.device.type, enabled=False):
         scenes = constant(tuple(clouds.scenes[q] for q in matter.newest), reference.device)
         before = (matter.padded(reference).double() - history.origin[scenes][:, None]).to(reference.dtype)

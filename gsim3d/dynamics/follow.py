@@ -7,12 +7,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.cameras import Frames
-from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.motion import share_of_a_step, shift
 from gsim3d.dynamics.rigid import onward_at, solved
 from gsim3d.dynamics.samples import Padded, Rows, Samples
-from gsim3d.state import CloudTable, Particles, constant
+from gsim3d.state import CloudTable, Particles, constant, newest_clouds
 
 PASSES = 5
 BLUR = 1.0  # pixels: standard deviation of the window in which images are smoothed

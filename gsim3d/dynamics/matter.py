@@ -6,10 +6,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.dynamics.rigid import Lattice
 from gsim3d.dynamics.samples import Few, Padded, Rows, Samples, squares, weights
-from gsim3d.state import FROZEN, Particles, constant
+from gsim3d.state import FROZEN, Particles, constant, newest_clouds
 
 EVEN = 0.15  # of the windows' length: standard deviation of those in which rows are counted
 APART = 0.2  # of the windows' length: less than half as far as the middles of two bodies are apart

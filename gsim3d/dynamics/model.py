@@ -14,7 +14,6 @@ from torch.nn import functional as F
 from gsim3d import ops
 from gsim3d.dynamics.background import Background
 from gsim3d.dynamics.bodies import bodies
-from gsim3d.dynamics.clouds import concatenate, newest_clouds, single_steps, with_field
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.contact import FIRM, SOLID, Beside
 from gsim3d.dynamics.daylight import daylight
@@ -29,7 +28,18 @@ from gsim3d.dynamics.shade import shade
 from gsim3d.dynamics.state import LIGHT_CHANNELS, StateLayout
 from gsim3d.nn.point_transformer import PointTransformer
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
-from gsim3d.state import ASLEEP, FROZEN, CloudTable, Particles, constant, take_runs
+from gsim3d.state import (
+    ASLEEP,
+    FROZEN,
+    CloudTable,
+    Particles,
+    concatenate,
+    constant,
+    newest_clouds,
+    single_steps,
+    take_runs,
+    with_attribute,
+)
 
 ROOM = 1.1  # for rows that a call reads, over what was counted
 LIGHT_SIZE = 0.1  # of the parameter that is a direction: smaller ones are turned faster in training
@@ -164,7 +174,7 @@ class Dynamics(nn.Module):
         if not self.config.pushes or particles.body is not None:
             return particles
         runs = particles.clouds.row_runs(newest_clouds(particles.clouds))
-        here = with_field(particles, "body").body
+        here = with_attribute(particles, "body").body
         found = bodies(particles, self.config.grid_size)
         newest = _put_runs(torch.ones_like(found[:, :1], dtype=torch.bool), runs, particles.n_rows)
         return dataclasses.replace(particles, body=torch.where(newest, _put_runs(found, runs, particles.n_rows), here))
@@ -187,13 +197,13 @@ class Dynamics(nn.Module):
     def begin(self, state: Particles) -> Particles:
         """``state`` with the fields in which simulated rows know how they began."""
         if self.config.is_relightable:
-            state = with_field(state, "initial_latents")
+            state = with_attribute(state, "initial_latents")
         if self.config.deformation:
-            state = with_field(state, "rest_positions")
+            state = with_attribute(state, "rest_positions")
         if self.config.turning:
-            state = with_field(state, "orientations")
+            state = with_attribute(state, "orientations")
         state = self.with_bodies(state)
-        return state if self.lights is None else with_field(state, "irradiance_gain")
+        return state if self.lights is None else with_attribute(state, "irradiance_gain")
 
     def forward(
         self,

@@ -5,11 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsim3d.dynamics.clouds import newest_clouds, with_field
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.rigid import LITTLE, RigidFit, onward_at, spin_of
 from gsim3d.dynamics.state import rotate_left
-from gsim3d.state import Particles, take_runs
+from gsim3d.state import Particles, newest_clouds, take_runs, with_attribute
 
 
 def momentum(history: Particles, length: float, grid_size: float, matter: Matter | None = None) -> Tensor:
@@ -27,7 +26,7 @@ def momentum(history: Particles, length: float, grid_size: float, matter: Matter
         Rows of the newest clouds, packed. Gradients: of velocities.
     """
     clouds = history.clouds
-    own = take_runs(with_field(history, "velocity").velocity, clouds.row_runs(newest_clouds(clouds)))
+    own = take_runs(with_attribute(history, "velocity").velocity, clouds.row_runs(newest_clouds(clouds)))
     matter = matter or Matter.of(history, grid_size, length)
     moved = (own, own) if matter is None else _rigid(matter, own, length)
     return torch.stack([*moved, own], 1)

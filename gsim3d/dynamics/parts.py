@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsim3d.dynamics.clouds import last_steps, newest_clouds
-from gsim3d.state import ASLEEP, FROZEN, CloudTable, Particles
+from gsim3d.state import ASLEEP, FROZEN, CloudTable, Particles, last_steps, newest_clouds
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gsim3d.dynamics.background import Background
-from gsim3d.dynamics.clouds import append_step, concatenate, last_steps, single_steps
 from gsim3d.dynamics.parts import Parts
 from gsim3d.dynamics.sleep import RestLog, Sleepers
-from gsim3d.state import Particles
+from gsim3d.state import Particles, append_step, concatenate, last_steps, single_steps
 
 
 def rollout(

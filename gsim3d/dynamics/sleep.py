@@ -22,19 +22,8 @@ import torch
 from torch import Tensor
 
 from gsim3d.effects.rules import Sleep
-from gsim3d.state import ASLEEP, FROZEN, Particles, constant
+from gsim3d.state import ASLEEP, ATTRIBUTES, FROZEN, Particles, constant
 
-NEVER_PREDICTED = {
-    "activity",
-    "static_latents",
-    "orientations",
-    "color_transform",
-    "frozen_appearance",
-    "initial_latents",
-    "light_occlusion",
-    "rest_positions",
-    "body",
-}
 CUBE_BITS = 16  # of a cube along an axis; cubes further out share the outermost
 WEIGHTS = (1 << 3 * CUBE_BITS, 1 << 2 * CUBE_BITS, 1 << CUBE_BITS, 1)  # of scene, x, y, z in the number of a cube
 
@@ -76,7 +65,9 @@ class Sleepers:
     ):
         self.rule, self.patience = rule, max(rule.patience, history)
         self.reach = rule.eps * grid_size
-        self.changing = newest.row_fields().keys() - NEVER_PREDICTED if changing is None else set(changing)
+        self.changing = (
+            {name for name in newest.row_fields() if ATTRIBUTES[name].predicted} if changing is None else set(changing)
+        )
         self.asleep = torch.zeros(newest.n_rows, dtype=torch.bool, device=newest.means.device)
         self.anybody = False  # sleeps
         self.moved_last = torch.zeros_like(self.asleep, dtype=torch.int64)

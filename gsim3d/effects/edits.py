@@ -22,14 +22,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.dynamics.clouds import OPTIONAL_FIELDS, alike, newest_clouds, with_field
 from gsim3d.dynamics.state import rotate_left
 from gsim3d.effects.selection import Selection, Vector, newest_rows
 from gsim3d.errors import InputError
 from gsim3d.io.files import read_yaml, shown, typed
 from gsim3d.math.rotations import quat_product, rotation_matrices
 from gsim3d.math.spherical_harmonics import painted, rotate_harmonics
-from gsim3d.state import FROZEN, CloudTable, Particles
+from gsim3d.state import ATTRIBUTES, FROZEN, CloudTable, Particles, newest_clouds, with_attribute, with_same_attributes
 
 Colors = Callable[[Particles], Tensor]  # particles -> [N, 3], their colours
 
@@ -99,15 +98,14 @@ class Rotate(Operation):
         quat = rotate_left(torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64), vector[None])
         matrix = rotation_matrices(quat)[0].to(means)
         pivots = _middles(state, rows) if self.about is None else _from_world(state, self.about)
-        fields = {"means": (means - pivots) @ matrix.T + pivots}
+        fields = {name: (x - pivots) @ matrix.T + pivots for name, x in _attributes(state, "point").items()}
+        fields |= {name: x @ matrix.T for name, x in _attributes(state, "vector").items()}
         if state.quats is not None:
             fields["quats"] = rotate_left(state.quats, vector.to(means).expand(state.n_rows, 3))
             fields["sh"] = rotate_harmonics(state.sh, matrix.expand(state.n_rows, 3, 3))
         else:
-            state = with_field(state, "orientations")
+            state = with_attribute(state, "orientations")
             fields["orientations"] = quat_product(quat.to(means).expand_as(state.orientations), state.orientations)
-        if state.velocity is not None:
-            fields["velocity"] = state.velocity @ matrix.T
         return _changed(state, rows, fields)
 
 
@@ -153,7 +151,7 @@ class Recolor(Operation):
         paint = torch.outer(state.means.new_tensor(self.color) / mean, grey).expand(state.n_rows, 3, 3)
         if state.sh is not None:
             return _changed(state, rows, {"sh": painted(state.sh, paint)})
-        state = with_field(state, "color_transform")
+        state = with_attribute(state, "color_transform")
         return _changed(state, rows, {"color_transform": paint @ state.color_transform})
 
 
@@ -189,7 +187,7 @@ class Insert(Operation):
             raise InputError("particles must be of one scene")
         for field, value in given.row_fields().items():
             mine = getattr(state, field)
-            if field not in OPTIONAL_FIELDS and (mine is None or mine.shape[1:] != value.shape[1:]):
+            if not ATTRIBUTES[field].is_optional and (mine is None or mine.shape[1:] != value.shape[1:]):
                 raise InputError(f"particles.{field} must be as those of the state; were they made by another model?")
         given = given.select_rows(rows).to(state.means.device)
         table, newest = (
@@ -296,9 +294,13 @@ def _changed(state: Particles, rows: Tensor, fields: dict[str, Tensor]) -> Parti
 
 
 def _moved(state: Particles, rows: Tensor, by: Vector | Tensor) -> Particles:
-    moved = (name for name in ("means", "body") if getattr(state, name) is not None)
     by = by.to(state.means) if isinstance(by, Tensor) else state.means.new_tensor(by)
-    return _changed(state, rows, {name: getattr(state, name) + by for name in moved})
+    return _changed(state, rows, {name: x + by for name, x in _attributes(state, "point").items()})
+
+
+def _attributes(state: Particles, kind: str) -> dict[str, Tensor]:
+    """The attributes of ``kind`` that ``state`` has."""
+    return {name: value for name, value in state.row_fields().items() if ATTRIBUTES[name].kind == kind}
 
 
 def _from_world(state: Particles, place: Vector) -> Tensor:
@@ -328,7 +330,7 @@ def _middles(state: Particles, rows: Tensor) -> Tensor:
 
 def _joined(state: Particles, more: Particles) -> Particles:
     """The clouds of ``state``, each followed by the rows of the same cloud of ``more``."""
-    parts = alike([state, more])
+    parts = with_same_attributes([state, more])
     clouds = torch.cat([part.row_cloud() for part in parts])
     order = torch.argsort(clouds, stable=True)
     fields = {name: torch.cat([value, getattr(parts[1], name)])[order] for name, value in parts[0].row_fields().items()}

@@ -28,12 +28,10 @@ from gsim3d.numerics.policy import (
     usable_pixels,
 )
 from gsim3d.ops.sentinel import CELLS, FAST, OUTSIDE, joined, watch_rows
-from gsim3d.state import ASLEEP, CloudTable, Particles
+from gsim3d.state import ASLEEP, ATTRIBUTES, CloudTable, Particles
 
 BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
 ALWAYS = ("means", "opacities")  # are looked at, changed or not
-# Choices, and what others were when the simulation began: those are looked at.
-NOT_LOOKED_AT = ("activity", "frozen_appearance", "initial_latents", "light_occlusion", "rest_positions", "body")
 
 
 _WATCHED = "gsim3d.watched"  # a node of a graph whose gradients are looked at
@@ -100,7 +98,7 @@ def guard_particles(
     fields = {
         name: value
         for name, value in particles.row_fields().items()
-        if name not in NOT_LOOKED_AT and (changed is None or name in changed or name in ALWAYS)
+        if ATTRIBUTES[name].validated and (changed is None or name in changed or name in ALWAYS)
     }
     looks = (_looks_at if torch.compiler.is_compiling() else _recent_looks)(tuple(fields), config, max_opacity)
     before = None if previous is None else [getattr(previous, name) for name in fields]
@@ -156,18 +154,7 @@ def guard_frames(
     return dataclasses.replace(frames, images=images), bad if config.on_invalid == "drop" else None
 
 
-# Shapes of the fields of particles behind their N rows; None: any.
-_SHAPES = {"means": (3,), "opacities": (), "activity": (), "quats": (4,), "scales": (3,), "sh": (None, 3)}
-_SHAPES |= {
-    "orientations": (4,),
-    "color_transform": (3, 3),
-    "frozen_appearance": (),
-    "velocity": (3,),
-    "irradiance_gain": (3,),
-}
-_SHAPES |= {"rest_positions": (3,), "body": (3,)}
 _OF_SCENES = ("origin", "world_offset")  # float64, one row a scene
-_DTYPES = {"activity": torch.uint8, "frozen_appearance": torch.bool}
 
 
 def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths: dict[str, int]) -> None:
@@ -187,14 +174,16 @@ def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths
     if not isinstance(particles, Particles):
         raise InputError(f"{where}: particles must be gsim3d.Particles; got {type(particles).__name__}")
     rows, device = particles.row_fields(), particles.means.device
-    shapes = {name: (len(particles.means), *_SHAPES.get(name, (widths.get(name),))) for name in rows}
+    shapes = {name: (len(particles.means), *ATTRIBUTES[name].shape) for name in rows}
+    shapes |= {name: (len(particles.means), width) for name, width in widths.items()}
     shapes |= {"cu_rows": (len(particles.cloud_scene) + 1,), "cloud_scene": (None,), "cloud_step": (None,)}
     shapes["origin"] = (None, 3)
     if particles.world_offset is not None:
         shapes["world_offset"] = (len(particles.origin), 3)
     for name, shape in shapes.items():
         value = getattr(particles, name)
-        wanted = torch.int64 if name.startswith(("cu_", "cloud_")) else _DTYPES.get(name, dtype)
+        wanted = torch.int64 if name.startswith(("cu_", "cloud_")) else dtype
+        wanted = ATTRIBUTES[name].dtype or wanted if name in ATTRIBUTES else wanted
         if name in _OF_SCENES:
             wanted = torch.float32 if getattr(value, "dtype", None) == torch.float32 else torch.float64
         is_one = isinstance(value, Tensor) and value.dtype == wanted
@@ -217,9 +206,10 @@ def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths
 def _check_choices(particles: Particles, where: str) -> None:
     if bool((particles.activity > ASLEEP).any()):
         raise InputError(f"{where}: particles.activity must be 0 (dynamic), 1 (frozen) or 2 (asleep)")
-    for name in (*NOT_LOOKED_AT[2:], *_OF_SCENES):
+    unwatched = (name for name, attribute in ATTRIBUTES.items() if not attribute.validated and attribute.dtype is None)
+    for name in (*unwatched, *_OF_SCENES):
         value = getattr(particles, name)
-        if value is None or value.dtype == torch.bool:
+        if value is None:
             continue
         good = at_most(value, FARTHEST if name in _OF_SCENES else LARGEST)
         if bool(good.all()):

@@ -20,26 +20,20 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.dynamics import last_steps
-from gsim3d.dynamics.clouds import newest_clouds
 from gsim3d.dynamics.state import rotate_left
 from gsim3d.effects.plan import Plan
 from gsim3d.math.spherical_harmonics import rotate_harmonics
 from gsim3d.nn.gaussian_head import render, rotation_matrices
 from gsim3d.simulator import Simulator
-from gsim3d.state import DYNAMIC, CloudTable, Gaussians, Particles, take_runs
+from gsim3d.state import DYNAMIC, CloudTable, Gaussians, Particles, attributes_of, newest_clouds, take_runs
 
 EXACT = {torch.float32: 0.0, torch.float64: 1e-12}  # BLAS rounds a row of float64 as the number of rows suggests
 BOUND = 1e-4  # error over the largest value: float32 sums in another order; worst seen 7e-6, on small random models
 FOLLOWED_BOUND = 1e-3  # of velocities, fitted to pixels: images of noise have no motion to find; worst seen 2.9e-4
 IMAGE_BOUND = 1e-3  # root mean square of a pixel's error: one splat whose alpha crosses 1/255 moves one pixel by 0.004
 GRAIN = 2.0**-18  # metres; positions are rounded to it before a scene is moved, so that sums of float32 are exact
-PLACES = ("means", "rest_positions", "body")  # fields of particles
-OF_PLACES = (
-    *PLACES,
-    "velocity",
-    "irradiance_gain",
-    "light_occlusion",
-)  # which a step leaves where it ends, rounded as that is
+PLACES = attributes_of("point")
+OF_PLACES = (*PLACES, *attributes_of("vector"), "irradiance_gain", "light_occlusion")  # rounded as positions are
 FAR = 2.0**17  # cells: outside of the 2^16 that a grid has
 
 

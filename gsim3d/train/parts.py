@@ -8,8 +8,7 @@ from collections.abc import Callable
 import torch
 
 from gsim3d.dynamics import Dynamics, concatenate
-from gsim3d.dynamics.clouds import newest_clouds
-from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, CloudTable, Particles
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, CloudTable, Particles, newest_clouds
 
 
 def in_parts(

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import DynamicsConfig, with_field
+from gsim3d.dynamics import DynamicsConfig, with_attribute
 from gsim3d.dynamics.bodies import LEAST, NEIGHBOURS, bodies
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.samples import SAMPLES
@@ -154,7 +154,7 @@ def test_a_body_that_is_moved_or_copied_is_another_one():
 
 def test_rows_that_know_no_body_are_where_they_are():
     history, _ = scene(shell(0.2, (1.0, 1.0, 1.0), 30))
-    assert_same_bits(with_field(history, "body").body, history.means)
+    assert_same_bits(with_attribute(history, "body").body, history.means)
 
 
 def test_a_gpu_finds_the_same(devices):

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from gsim3d.dynamics import DynamicsConfig, last_steps, rollout, with_field
+from gsim3d.dynamics import DynamicsConfig, last_steps, rollout, with_attribute
 from gsim3d.dynamics.deformation import deformation
 from gsim3d.dynamics.rigid import turned_most
 from gsim3d.dynamics.state import BACK
@@ -123,13 +123,13 @@ def test_simulated_rows_remember_where_they_were():
 @pytest.mark.parametrize("background", ["asymmetric", "relightable"])
 def test_where_the_background_is_not_computed_anew_bodies_remember_too(background):
     config = dataclasses.replace(REMEMBERING, norm="layer", background=background, zero_init=True, velocity=True)
-    history = with_field(bent(SQUEEZED, frozen_share=0.3), "velocity")
+    history = with_attribute(bent(SQUEEZED, frozen_share=0.3), "velocity")
     moved = make_dynamics(config)(history).means - history.means
     assert_close_relative_to_max(moved, BACK * deformation(history, *HOW), 1e-3)
 
 
 def test_a_share_of_the_way_back_is_gone():
-    history = with_field(bent(SQUEEZED), "velocity")
+    history = with_attribute(bent(SQUEEZED), "velocity")
     dynamics = make_dynamics(dataclasses.replace(REMEMBERING, velocity=True, zero_init=True))
     dynamics.net.head.fc2.bias.detach()[-3:] = 2 * torch.tensor(0.1).atanh()
     moved = dynamics(history).means - history.means

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import with_field
+from gsim3d.dynamics import with_attribute
 from gsim3d.dynamics.matter import Matter
 from gsim3d.state import DYNAMIC
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -19,7 +19,9 @@ TOLD = dataclasses.replace(TINY, background="relightable", **SEEN)
 
 def scenes(device="cpu"):
     """Two, one of which has fewer rows; the first row that may move is outside of the workspace."""
-    history = with_field(batch([make_history((40, 40)), make_history((25, 25), seed=1, frozen_share=0.5)]), "velocity")
+    history = with_attribute(
+        batch([make_history((40, 40)), make_history((25, 25), seed=1, frozen_share=0.5)]), "velocity"
+    )
     means, velocity = history.means.clone(), 0.01 * torch.randn(130, 3, generator=torch.Generator().manual_seed(0))
     means[40 + int((history.activity[40:] == DYNAMIC).to(torch.uint8).argmax())] = -1.0
     return dataclasses.replace(history, means=means, velocity=velocity).to(device)

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import DynamicsConfig, last_steps, rollout, with_field
+from gsim3d.dynamics import DynamicsConfig, last_steps, rollout, with_attribute
 from gsim3d.dynamics.matter import Matter
 from gsim3d.dynamics.momentum import momentum, turned
 from gsim3d.effects.edits import Rotate, Throw
@@ -79,7 +79,7 @@ def test_untrained_a_body_flies_and_turns_on_and_knows_how():
 @pytest.mark.parametrize("steps_per_call", [1, 2])
 def test_every_step_knows_what_it_did_and_what_is_frozen_rests(steps_per_call):
     dynamics = make_dynamics(dataclasses.replace(CARRYING, steps_per_call=steps_per_call))
-    history = with_field(make_history((60, 60)), "velocity")
+    history = with_attribute(make_history((60, 60)), "velocity")
     before, steps = last_steps(history, 1).means, dynamics(history)
     for step in (steps.select_clouds([k]) for k in range(steps_per_call)):
         assert_same_bits(step.velocity, step.means - before)

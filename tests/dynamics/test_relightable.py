@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import append_step, concatenate, last_steps, rollout, with_field
+from gsim3d.dynamics import append_step, concatenate, last_steps, rollout, with_attribute
 from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
@@ -41,7 +41,7 @@ def test_the_network_sees_the_background_in_the_newest_step_only():
 
 def test_what_was_predicted_of_the_background_is_not_seen_again():
     dynamics, history = make_dynamics(RELIT), make_history((30, 30))
-    history = with_field(history, "initial_latents")
+    history = with_attribute(history, "initial_latents")
     frozen = frozen_rows(history)
     dark = with_latents(history, frozen, torch.full_like(history.dynamic_latents, -3.0))
     expected, step = dynamics(history), dynamics(dark)
@@ -56,7 +56,7 @@ def test_what_was_predicted_of_the_background_is_not_seen_again():
 @pytest.mark.parametrize("features, is_seen", [("all", False), ("dynamic", False), ("frozen", True), ("none", True)])
 def test_what_was_predicted_of_bodies_is_not_seen_again_where_their_look_changes(features, is_seen):
     """Else it is what they were given, or were made to be."""
-    dynamics, history = make_dynamics(RELIT), with_field(make_history((30, 30)), "initial_latents")
+    dynamics, history = make_dynamics(RELIT), with_attribute(make_history((30, 30)), "initial_latents")
     bodies = history.activity == DYNAMIC
     dark = with_latents(history, bodies, torch.full_like(history.dynamic_latents, -3.0))
     changes = dynamics.layout.changes(features)

@@ -8,10 +8,9 @@ import pytest
 import torch
 
 from gsim3d.dynamics import DynamicsConfig, last_steps, rollout
-from gsim3d.dynamics.clouds import single_steps
 from gsim3d.dynamics.samples import SAMPLES
 from gsim3d.dynamics.shade import shade
-from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, single_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history, permute_rows
 
