@@ -40,7 +40,7 @@ from gsim3d.dynamics import (
 from gsim3d.dynamics.follow import follow
 from gsim3d.effects.edits import Edit, by_step
 from gsim3d.effects.plan import Plan, make_plan, unused_parameters
-from gsim3d.effects.selection import rows_of_any
+from gsim3d.effects.selection import any_mask
 from gsim3d.effects.spec import EffectsSpec, OutputEffects, UnsupportedEffect
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.nn.gaussian_head import GaussianHead, render, render_as_published
@@ -205,11 +205,12 @@ class Simulator(nn.Module):
         """What the dynamics reads of ``state``: its last steps, with the background as the plan wants it, and marks on
         the bodies that it names."""
         background, appearance = plan.spec.dynamics.background, plan.spec.appearance
-        held = () if appearance.changing == "none" else appearance.held
-        if held and state.frozen_appearance is None:
-            state = dataclasses.replace(state, frozen_appearance=rows_of_any(held, state, "effects: appearance.held"))
-        elif not held and state.frozen_appearance is not None:
+        selections = () if appearance.changing == "none" else appearance.frozen_appearance
+        if not selections and state.frozen_appearance is not None:
             state = dataclasses.replace(state, frozen_appearance=None)
+        elif selections and state.frozen_appearance is None:
+            frozen = any_mask(selections, state, "effects: appearance.frozen_appearance")
+            state = dataclasses.replace(state, frozen_appearance=frozen)
         if background == "masked_out":
             state = state.select_rows(state.activity == DYNAMIC)
         if background == "dynamic":

@@ -207,7 +207,7 @@ class Particles(TensorRecord):
         (:mod:`gsim3d.effects.edits`) and, in models with ``turning``, from the rotation of the surrounding particles.
     color_transform: [N, 3, 3], a matrix that decoded colours of latent models are multiplied by; set by edits.
     frozen_appearance: bool [N], particles whose changing latents and colours stay constant; only where an effects spec
-        selects them (``appearance.held``). Resolved once at the start of a rollout and carried along.
+        selects them (``appearance.frozen_appearance``). Resolved once at the start of a rollout and carried along.
     initial_latents: [N, Fd], the dynamic latents of frozen particles at the start of the simulation; only in models
         with ``background="relightable"``.
     velocity: [N, 3] metres a step: the last displacement of simulated particles, the mean displacement since the oldest

@@ -20,14 +20,14 @@ RINGS = {
         ops
         math
         io.files
-        numerics.validate effects.rules
+        numerics.validate effects.selection
+        effects.spec
         nn
         dynamics.config dynamics.background
         nn.point_transformer
         dynamics
         io
-        effects.selection
-        effects.spec effects.edits
+        effects.edits
         presets
         effects.plan
         simulator

@@ -351,7 +351,7 @@ def test_one_step_of_history_equals_a_state_of_one_step():
     simulator, frames = make_simulator(), make_frames((3,))
     state = simulator.encode(frames)
     plan = simulator.plan(EffectsSpec(dynamics=DynamicsEffects(history=1)))
-    assert "time merging" in plan.skipped
+    assert "history" not in plan.on
     expected = simulator.rollout(last_steps(state, 1), 2, plan)
     for actual, step in zip(simulator.rollout(state, 2, plan), expected, strict=True):
         assert_same_bits(actual.means, step.means)

@@ -58,6 +58,17 @@ def number(least: float, most: float = math.inf, *, above: bool = False) -> Call
     return convert
 
 
+def decibels(text: str) -> float:
+    """The type of an option that takes a number of dB of at least 0, such as "0.1dB"."""
+    try:
+        value = float(text.removesuffix("dB"))
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a number of dB of at least 0, such as 0.1dB; got {text!r}")
+    return value
+
+
 def _within(value: float, least: float, most: float) -> Any:
     if not least <= value <= most:
         wanted = f"at least {least:g}" if most == math.inf else f"from {least:g} to {most:g}"

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from gsim3d.effects.rules import Sleep
+from gsim3d.effects.spec import Sleep
 from gsim3d.state import ASLEEP, ATTRIBUTES, FROZEN, Particles, constant
 
 CUBE_BITS = 16  # of a cube along an axis; cubes further out share the outermost

@@ -1,11 +1,11 @@
-"""Changes of a scene at any step of a rollout: typed operations on particles.
+"""Changes of a scene between steps of a rollout: typed operations on particles.
 
     edits = [Edit(0, Remove("frozen")), Edit(8, Throw((0.0, 0.0, 0.05), of="moving"))]
     plan = simulator.plan(EffectsSpec(structure=StructureEffects(remove=True)))
     steps = simulator.rollout(state, 24, plan, edits=edits)
 
-An operation changes all steps that the model sees, the past too: what is moved has always been there, and keeps its
-speed. Who is meant is asked of each step by itself, so a box must hold its body in all of them.
+An operation changes the whole history that the model sees, so that a moved body keeps its velocity. A selection is
+evaluated in each step of the history, so a box must contain its body in all of them.
 """
 
 from __future__ import annotations
@@ -23,22 +23,26 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.dynamics.state import rotate_left
-from gsim3d.effects.selection import Selection, Vector, newest_rows
+from gsim3d.effects.selection import Selection, Vector, newest_mask
 from gsim3d.errors import InputError
 from gsim3d.io.files import read_yaml, shown, typed
 from gsim3d.math.rotations import quat_product, rotation_matrices
 from gsim3d.math.spherical_harmonics import painted, rotate_harmonics
 from gsim3d.state import ATTRIBUTES, FROZEN, CloudTable, Particles, newest_clouds, with_attribute, with_same_attributes
 
-Colors = Callable[[Particles], Tensor]  # particles -> [N, 3], their colours
+Colors = Callable[[Particles], Tensor]  # particles -> [N, 3] colours
 
-GREY = (0.2126, 0.7152, 0.0722)  # how bright red, green and blue look
-DARKEST = 0.05  # grey value; what is darker is not brightened further than from this to the colour asked for
+GREY = (0.2126, 0.7152, 0.0722)  # luminance of red, green and blue
+DARKEST = 0.05  # luminance; darker particles are brightened as if they had this one
 
 
 @dataclass(frozen=True)
 class Operation:
-    """of: which particles, a Selection or its ``which``."""
+    """A change of the particles of a state.
+
+    Attributes:
+        of: which particles, a Selection or its ``which``.
+    """
 
     of: Selection = Selection()
 
@@ -52,35 +56,49 @@ class Operation:
 
     @abstractmethod
     def apply(self, state: Particles, colors: Colors) -> Particles:
-        """``state``, changed."""
+        """The changed ``state``.
+
+        Args:
+            state: the history that the model sees.
+            colors: colours of particles, as they are rendered.
+        """
 
 
 @dataclass(frozen=True)
 class Remove(Operation):
-    """They are gone: ``Remove("frozen")`` takes the ground away."""
+    """Removes particles: ``Remove("frozen")`` takes the ground away."""
 
     name: ClassVar[str] = "remove"
     removes: ClassVar[bool] = True
 
     def apply(self, state, colors):
-        return state.select_rows(~self.of.rows(state))
+        return state.select_rows(~self.of.mask(state))
 
 
 @dataclass(frozen=True)
 class Move(Operation):
-    """They are ``by`` [metres] away from where they were: ``Move("frozen", (0, 0, 0.1))`` raises the ground."""
+    """Moves particles: ``Move("frozen", (0, 0, 0.1))`` raises the ground.
+
+    Attributes:
+        by: metres.
+    """
 
     by: Vector = (0.0, 0.0, 0.0)
     name: ClassVar[str] = "move"
 
     def apply(self, state, colors):
-        return _moved(state, self.of.rows(state), self.by)
+        return _moved(state, self.of.mask(state), self.by)
 
 
 @dataclass(frozen=True)
 class Rotate(Operation):
-    """They turn by ``degrees`` about an axis through ``about``, a place in the world (default: each scene's middle); so
-    does their speed."""
+    """Rotates particles and their velocities.
+
+    Attributes:
+        axis: direction of the axis in the world.
+        degrees: angle, counter-clockwise.
+        about: metres, a position in the world on the axis; None: the mean of the selected particles of each scene.
+    """
 
     axis: Vector = (0.0, 0.0, 1.0)
     degrees: float = 0.0
@@ -93,11 +111,11 @@ class Rotate(Operation):
             raise InputError(f"axis must have a direction; got {list(self.axis)}")
 
     def apply(self, state, colors):
-        rows, means = self.of.rows(state), state.means
+        chosen, means = self.of.mask(state), state.means
         vector = F.normalize(torch.tensor(self.axis, dtype=torch.float64), dim=0) * math.radians(self.degrees)
         quat = rotate_left(torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64), vector[None])
         matrix = rotation_matrices(quat)[0].to(means)
-        pivots = _middles(state, rows) if self.about is None else _from_world(state, self.about)
+        pivots = _middles(state, chosen) if self.about is None else _from_world(state, self.about)
         fields = {name: (x - pivots) @ matrix.T + pivots for name, x in _attributes(state, "point").items()}
         fields |= {name: x @ matrix.T for name, x in _attributes(state, "vector").items()}
         if state.quats is not None:
@@ -106,19 +124,23 @@ class Rotate(Operation):
         else:
             state = with_attribute(state, "orientations")
             fields["orientations"] = quat_product(quat.to(means).expand_as(state.orientations), state.orientations)
-        return _changed(state, rows, fields)
+        return _changed(state, chosen, fields)
 
 
 @dataclass(frozen=True)
 class Throw(Operation):
-    """Their velocity grows by so many metres a step."""
+    """Adds to the velocity of particles.
+
+    Attributes:
+        velocity: m/step.
+    """
 
     velocity: Vector = (0.0, 0.0, 0.0)
     name: ClassVar[str] = "throw"
 
     def apply(self, state, colors):
-        rows, table = self.of.rows(state), state.clouds
-        if bool((state.activity[rows] == FROZEN).any()):
+        chosen, table = self.of.mask(state), state.clouds
+        if bool((state.activity[chosen] == FROZEN).any()):
             raise InputError("frozen particles cannot be thrown; name others")
         newest = {table.scenes[q]: table.steps[q] for q in newest_clouds(table)}
         if len(newest) == len(table):
@@ -128,12 +150,16 @@ class Throw(Operation):
         fields = {"means": state.means - back}
         if state.velocity is not None:
             fields["velocity"] = state.velocity + state.velocity.new_tensor(self.velocity)
-        return _changed(state, rows, fields)
+        return _changed(state, chosen, fields)
 
 
 @dataclass(frozen=True)
 class Recolor(Operation):
-    """Their mean colour is ``color`` (0 to 1, red, green, blue) from now on; light and shadow stay."""
+    """Changes the mean colour of particles; light and shadow stay.
+
+    Attributes:
+        color: red, green and blue, 0 to 1.
+    """
 
     color: Vector = (0.5, 0.5, 0.5)
     name: ClassVar[str] = "recolor"
@@ -144,36 +170,41 @@ class Recolor(Operation):
             raise InputError(f"color must be three numbers from 0 to 1; got {list(self.color)}")
 
     def apply(self, state, colors):
-        rows = self.of.rows(state)
-        newest = rows & newest_rows(state)
+        chosen = self.of.mask(state)
+        newest = chosen & newest_mask(state)
         grey = state.means.new_tensor(GREY)
         mean = (colors(state)[newest] @ grey).mean().clamp(min=DARKEST)
         paint = torch.outer(state.means.new_tensor(self.color) / mean, grey).expand(state.n_rows, 3, 3)
         if state.sh is not None:
-            return _changed(state, rows, {"sh": painted(state.sh, paint)})
+            return _changed(state, chosen, {"sh": painted(state.sh, paint)})
         state = with_attribute(state, "color_transform")
-        return _changed(state, rows, {"color_transform": paint @ state.color_transform})
+        return _changed(state, chosen, {"color_transform": paint @ state.color_transform})
 
 
 @dataclass(frozen=True)
 class Duplicate(Operation):
-    """There is a second one of them, ``by`` [metres] away."""
+    """Adds a copy of particles.
+
+    Attributes:
+        by: metres, from the particles to their copy.
+    """
 
     by: Vector = (0.0, 0.0, 0.0)
     name: ClassVar[str] = "duplicate"
     inserts: ClassVar[bool] = True
 
     def apply(self, state, colors):
-        rows = self.of.rows(state)
-        return _joined(state, _moved(state, rows, self.by).select_rows(rows))
+        chosen = self.of.mask(state)
+        return _joined(state, _moved(state, chosen, self.by).select_rows(chosen))
 
 
 @dataclass(frozen=True)
 class Insert(Operation):
-    """Of another scene they are added, ``by`` [metres] away from their place there; its newest step is now. Nobody of
-    them is held.
+    """Adds particles of another scene, whose newest step becomes the newest step here. Their appearance is not frozen.
 
-    particles: one scene, encoded or simulated by the same model. In a file ``scene`` names its folder.
+    Attributes:
+        particles: one scene, encoded or simulated by the same model. In a file ``scene`` names its folder.
+        by: metres, added to their positions there.
     """
 
     particles: Particles | None = None
@@ -182,14 +213,14 @@ class Insert(Operation):
     inserts: ClassVar[bool] = True
 
     def apply(self, state, colors):
-        rows, given = self.of.rows(self.particles), dataclasses.replace(self.particles, frozen_appearance=None)
+        chosen, given = self.of.mask(self.particles), dataclasses.replace(self.particles, frozen_appearance=None)
         if len(newest_clouds(given.clouds)) != 1:
             raise InputError("particles must be of one scene")
         for field, value in given.row_fields().items():
             mine = getattr(state, field)
             if not ATTRIBUTES[field].is_optional and (mine is None or mine.shape[1:] != value.shape[1:]):
                 raise InputError(f"particles.{field} must be as those of the state; were they made by another model?")
-        given = given.select_rows(rows).to(state.means.device)
+        given = given.select_rows(chosen).to(state.means.device)
         table, newest = (
             state.clouds,
             {state.clouds.scenes[q]: state.clouds.steps[q] for q in newest_clouds(state.clouds)},
@@ -214,42 +245,50 @@ OPERATIONS = {kind.name: kind for kind in (Remove, Move, Rotate, Throw, Recolor,
 
 @dataclass(frozen=True)
 class Edit:
-    """step: of the rollout, counted from 0; the operation comes before this step is predicted."""
+    """An operation at a step of a rollout.
+
+    Attributes:
+        step: step of the rollout, from 0; the operation is applied before this step is predicted.
+        operation: the change.
+    """
 
     step: int
     operation: Operation
 
     @property
-    def place(self) -> str:
+    def where(self) -> str:
         return f"edit at step {self.step}, {self.operation.name}"
 
     def apply(self, state: Particles, colors: Colors) -> Particles:
-        """Raises InputError that names step and operation."""
+        """The changed ``state``. Raises InputError that names step and operation."""
         try:
             return self.operation.apply(state, colors)
         except InputError as error:
-            raise InputError(f"{self.place}: {error}") from None
+            raise InputError(f"{self.where}: {error}") from None
 
 
 def by_step(edits: Iterable[Edit], n_steps: int, *, insert: bool, remove: bool) -> dict[int, list[Edit]]:
-    """Edits by the step that they come before, ascending; those of one step in their order.
+    """Edits by the step that they precede, ascending; those of one step in the given order.
 
+    Args:
+        insert: whether edits may add particles.
+        remove: whether edits may remove particles.
     Raises:
-        InputError: one lies beyond ``n_steps``, or adds or removes particles where this is off.
+        InputError: an edit lies beyond ``n_steps``, or adds or removes particles although this is off.
     """
     found: dict[int, list[Edit]] = {}
     for edit in sorted(edits, key=lambda edit: edit.step):
         if not 0 <= edit.step < n_steps:
-            raise InputError(f"{edit.place}: the rollout has steps 0 to {n_steps - 1}")
+            raise InputError(f"{edit.where}: the rollout has steps 0 to {n_steps - 1}")
         for asked, on, name in ((edit.operation.inserts, insert, "insert"), (edit.operation.removes, remove, "remove")):
             if asked and not on:
-                raise InputError(f"{edit.place}: the plan has structure.{name} off")
+                raise InputError(f"{edit.where}: the plan has structure.{name} off")
         found.setdefault(edit.step, []).append(edit)
     return found
 
 
 def load_edits(path: str | Path, encode: Callable[[Path], Particles]) -> list[Edit]:
-    """Reads a YAML file: a list of mappings with ``step``, ``op`` and the operation's fields.
+    """The edits of a YAML file: a list of mappings with ``step``, ``op`` and the operation's fields.
 
     Args:
         encode: scene folder -> its particles, for ``insert``; folders are relative to the file's.
@@ -284,18 +323,18 @@ def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Partic
     return Edit(step, dataclasses.replace(typed(kind, values, where), **given))
 
 
-def _changed(state: Particles, rows: Tensor, fields: dict[str, Tensor]) -> Particles:
-    """``state`` whose ``rows`` have other values."""
+def _changed(state: Particles, chosen: Tensor, fields: dict[str, Tensor]) -> Particles:
+    """``state`` with other values of the particles ``chosen`` (bool [N])."""
     mixed = {
-        name: torch.where(rows.reshape(-1, *[1] * (value.dim() - 1)), value, getattr(state, name))
+        name: torch.where(chosen.reshape(-1, *[1] * (value.dim() - 1)), value, getattr(state, name))
         for name, value in fields.items()
     }
     return dataclasses.replace(state, **mixed)
 
 
-def _moved(state: Particles, rows: Tensor, by: Vector | Tensor) -> Particles:
+def _moved(state: Particles, chosen: Tensor, by: Vector | Tensor) -> Particles:
     by = by.to(state.means) if isinstance(by, Tensor) else state.means.new_tensor(by)
-    return _changed(state, rows, {name: x + by for name, x in _attributes(state, "point").items()})
+    return _changed(state, chosen, {name: x + by for name, x in _attributes(state, "point").items()})
 
 
 def _attributes(state: Particles, kind: str) -> dict[str, Tensor]:
@@ -303,15 +342,15 @@ def _attributes(state: Particles, kind: str) -> dict[str, Tensor]:
     return {name: value for name, value in state.row_fields().items() if ATTRIBUTES[name].kind == kind}
 
 
-def _from_world(state: Particles, place: Vector) -> Tensor:
-    """[N, 3], ``place`` in the world as rows of ``state`` count positions."""
+def _from_world(state: Particles, position: Vector) -> Tensor:
+    """[N, 3], a world ``position`` in the coordinates of each particle of ``state``."""
     offset = state.row_offset()
-    place = torch.tensor(place, dtype=torch.float64, device=state.means.device).expand(state.n_rows, 3)
-    return (place if offset is None else place - offset).to(state.means)
+    position = torch.tensor(position, dtype=torch.float64, device=state.means.device).expand(state.n_rows, 3)
+    return (position if offset is None else position - offset).to(state.means)
 
 
 def _between(there: Tensor | None, here: Tensor | None, by: Vector) -> Vector | Tensor:
-    """What positions that count from ``there`` [3] change by where they are moved and count from ``here`` [N, 3]."""
+    """Displacement ``by`` of positions relative to ``there`` [3], as positions relative to ``here`` [N, 3]."""
     if there is None and here is None:
         return by
     known = there if here is None else here
@@ -319,17 +358,17 @@ def _between(there: Tensor | None, here: Tensor | None, by: Vector) -> Vector | 
     return known.new_tensor(by) + there - here
 
 
-def _middles(state: Particles, rows: Tensor) -> Tensor:
-    """[N, 3], for each row the mean place of those ``rows`` of the newest cloud of its scene."""
+def _middles(state: Particles, chosen: Tensor) -> Tensor:
+    """[N, 3], for each particle the mean position of the ``chosen`` particles of the newest cloud of its scene."""
     scene = state.cloud_scene[state.row_cloud()]
-    chosen = rows & newest_rows(state)
+    chosen = chosen & newest_mask(state)
     one = F.one_hot(scene, int(scene.max()) + 1).to(state.means)
     sums = (one * chosen[:, None]).mT @ torch.cat([state.means, torch.ones_like(state.means[:, :1])], 1)
     return (sums[:, :3] / sums[:, 3:].clamp(min=1))[scene]
 
 
 def _joined(state: Particles, more: Particles) -> Particles:
-    """The clouds of ``state``, each followed by the rows of the same cloud of ``more``."""
+    """The clouds of ``state``, each followed by the particles of the same cloud of ``more``."""
     parts = with_same_attributes([state, more])
     clouds = torch.cat([part.row_cloud() for part in parts])
     order = torch.argsort(clouds, stable=True)

@@ -1,4 +1,4 @@
-"""Which particles of a scene are meant, by kind and place: for edits, and for bodies that a spec of effects names."""
+"""Which particles of a scene are meant, by kind and position: for edits, and for a spec's frozen appearance."""
 
 from __future__ import annotations
 
@@ -16,73 +16,73 @@ from gsim3d.state import DYNAMIC, FROZEN, Particles
 Vector = tuple[float, float, float]
 Box = tuple[Vector, Vector]
 
-WHICH = ("all", "moving", "frozen")
+KINDS = {"all": None, "moving": DYNAMIC, "frozen": FROZEN}
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Which particles. which: "moving", "frozen" (the ground) or "all".
+    """Which particles.
 
-    box: lowest and highest corner in the world [metres].
+    Attributes:
+        which: "moving", "frozen" (the static background) or "all".
+        box: metres, lowest and highest corner in the world; None: everywhere.
     """
 
     which: str = "moving"
     box: Box | None = None
 
-    alone: ClassVar[str] = "which"  # what a text in a file says
+    alone: ClassVar[str] = "which"  # the field that a plain text in a file stands for
 
     def __post_init__(self):
-        if self.which not in WHICH:
+        if self.which not in KINDS:
             raise InputError(
-                f"which must be one of {', '.join(WHICH)}; got {shown(self.which)}{did_you_mean(self.which, WHICH)}"
+                f"which must be one of {', '.join(KINDS)}; got {shown(self.which)}{did_you_mean(self.which, KINDS)}"
             )
         if self.box is not None and any(low > high for low, high in zip(*self.box, strict=True)):
             corners = [list(corner) for corner in self.box]
             raise InputError(f"box must be the lowest and the highest corner; got {corners}")
 
-    def rows(self, particles: Particles) -> Tensor:
-        """bool [N]. Waits for the device, except in a CUDA graph, which has no error.
+    def mask(self, particles: Particles) -> Tensor:
+        """bool [N], the selected particles. Waits for the device, except in a CUDA graph, which raises no error.
 
         Raises:
-            InputError: the newest steps have none.
+            InputError: the selection is empty in the newest step of every scene.
         """
-        activity = {"moving": DYNAMIC, "frozen": FROZEN}.get(self.which)
-        rows = kind = torch.ones_like(particles.activity, dtype=torch.bool)
-        if activity is not None:
-            rows = kind = particles.activity == activity
-        places, offset = particles.means, None if self.box is None else particles.row_offset()
-        if offset is not None:
-            places = places + offset
+        activity = KINDS[self.which]
+        of_kind = particles.activity == activity if activity is not None else torch.ones_like(particles.activity) > 0
+        chosen, positions = of_kind, particles.means
         if self.box is not None:
-            for place, low, high in zip(places.unbind(1), *self.box, strict=True):
-                rows = rows & (place >= low) & (place <= high)
-        captured = rows.is_cuda and torch.cuda.is_current_stream_capturing()
-        if not captured and not bool(rows[newest_rows(particles)].any()):
-            raise InputError(self._nobody(places[kind & newest_rows(particles)]))
-        return rows
+            if (offset := particles.row_offset()) is not None:
+                positions = positions + offset
+            for coordinate, low, high in zip(positions.unbind(1), *self.box, strict=True):
+                chosen = chosen & (coordinate >= low) & (coordinate <= high)
+        captured = chosen.is_cuda and torch.cuda.is_current_stream_capturing()
+        if not captured and not bool(chosen[newest_mask(particles)].any()):
+            raise InputError(self._empty(positions[of_kind & newest_mask(particles)]))
+        return chosen
 
-    def _nobody(self, places: Tensor) -> str:
-        """Why nobody is meant, where particles of the kind are at ``places``."""
-        message = f"no particle is meant: there are none that are {self.which}"
-        if self.box is None or not len(places):
+    def _empty(self, positions: Tensor) -> str:
+        """The message about an empty selection; particles of its kind are at ``positions``."""
+        message = f"the selection is empty: no particle is {self.which}"
+        if self.box is None or not len(positions):
             return message
-        corners = [[round(x, 2) for x in corner.tolist()] for corner in (places.amin(0), places.amax(0))]
+        corners = [[round(x, 2) for x in corner.tolist()] for corner in (positions.amin(0), positions.amax(0))]
         return f"{message} in the box {[list(corner) for corner in self.box]}; theirs is {corners}"
 
 
-def rows_of_any(selections: Iterable[Selection], particles: Particles, where: str) -> Tensor:
-    """bool [N], rows that one of ``selections`` means; as :meth:`Selection.rows`, with errors that name ``where``."""
-    rows = torch.zeros_like(particles.activity, dtype=torch.bool)
+def any_mask(selections: Iterable[Selection], particles: Particles, where: str) -> Tensor:
+    """bool [N], particles of any of ``selections``; errors as :meth:`Selection.mask`, and they name ``where``."""
+    chosen = torch.zeros_like(particles.activity, dtype=torch.bool)
     for number, selection in enumerate(selections):
         try:
-            rows = rows | selection.rows(particles)
+            chosen = chosen | selection.mask(particles)
         except InputError as error:
             raise InputError(f"{where}[{number}]: {error}") from None
-    return rows
+    return chosen
 
 
-def newest_rows(particles: Particles) -> Tensor:
-    """bool [N], rows of the newest cloud of each scene."""
+def newest_mask(particles: Particles) -> Tensor:
+    """bool [N], particles of the newest cloud of each scene."""
     table = particles.clouds
     newest = set(dict(zip(table.scenes, range(len(table)))).values())
     marks = torch.tensor([q in newest for q in range(len(table))], dtype=torch.bool, device=particles.cu_rows.device)

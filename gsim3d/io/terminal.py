@@ -55,3 +55,10 @@ def progress(iterable: Any = None, what: str = "", total: int | None = None, *, 
     from tqdm import tqdm
 
     return tqdm(iterable, what, total, unit=unit, disable=True if quiet else None)
+
+
+def in_columns(rows: list[tuple[str, ...]]) -> str:
+    """A table whose columns are as wide as their longest entry."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = ("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) for row in rows)
+    return "\n".join(line.rstrip() for line in lines)

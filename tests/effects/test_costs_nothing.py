@@ -10,8 +10,6 @@ from tests.test_simulator import CONFIG
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 IDLE = {
-    "actions": {"dynamics": {"actions": {"names": []}}},
-    "contact": {"dynamics": {"contact": {"pairs": []}}},
     "insertion and removal": {"structure": {"insert": True, "remove": True}},
     "images in the same pass": {"outputs": {"depth": True, "alpha": True}},
 }

@@ -214,10 +214,10 @@ def test_a_box_means_what_is_inside():
     _, state, _ = encoded()
     means = last_steps(state, 1).means
     middle = means.median(0).values.tolist()
-    rows = Selection("all", ((-9.0, -9.0, -9.0), (middle[0], 9.0, 9.0))).rows(state)
+    rows = Selection("all", ((-9.0, -9.0, -9.0), (middle[0], 9.0, 9.0))).mask(state)
     assert torch.equal(rows, state.means[:, 0] <= middle[0]) and 0 < int(rows.sum()) < state.n_rows
-    with pytest.raises(InputError, match=r"there are none that are moving in the box \[\[8.0, 8.0, 8.0\]"):
-        Selection("moving", ((8.0, 8.0, 8.0), (9.0, 9.0, 9.0))).rows(state)
+    with pytest.raises(InputError, match=r"no particle is moving in the box \[\[8.0, 8.0, 8.0\]"):
+        Selection("moving", ((8.0, 8.0, 8.0), (9.0, 9.0, 9.0))).mask(state)
 
 
 @pytest.mark.parametrize(

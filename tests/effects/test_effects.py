@@ -25,15 +25,27 @@ def test_absent_is_off():
     assert spec.to_dict() == {"version": 1} and EffectsSpec.from_dict(None) == spec == EffectsSpec.from_dict({})
     plan = make_plan(spec, MODEL)
     assert (plan.history, plan.sh_degree) == (4, 3)
-    assert {"depth images", "actions", "insertion", "removal", "changing opacities"} <= set(plan.skipped)
+    assert plan.on == ("history", "background", "view_dependent", "changing", "rgb")
 
 
-def test_plan_says_what_is_kept_and_why_the_rest_is_not():
+def test_plan_lists_switches_with_settings_and_outputs():
     plan = make_plan(SOME, MODEL)
     assert (plan.history, plan.sh_degree) == (2, 1)
-    assert "view-dependent colour" in plan.kept and "depth images" in plan.kept
-    assert plan.skipped["frozen background"] == "background is masked_out"
-    assert not set(plan.kept) & set(plan.skipped)
+    assert plan.switches == (("history", "2 steps"), ("view_dependent", "degree 1"), ("changing", "dynamic"))
+    assert plan.outputs == ("rgb", "depth")
+
+
+def test_old_files_with_removed_keys_load_while_they_are_off():
+    off = {"actions": {"type": "keypoints3d", "names": []}, "contact": {"pairs": [], "halo": 0.05}}
+    assert EffectsSpec.from_dict({"dynamics": off}) == EffectsSpec()
+    assert EffectsSpec.from_dict({"dynamics": {"actions": None, "history": 2}}).dynamics.history == 2
+
+
+def test_old_key_of_frozen_appearance_is_converted():
+    old, new = (EffectsSpec.from_dict({"appearance": {name: ["moving"]}}) for name in ("held", "frozen_appearance"))
+    assert old == new and old.appearance.frozen_appearance[0].which == "moving"
+    with pytest.raises(InputError, match="appearance.held is the old name of frozen_appearance"):
+        EffectsSpec.from_dict({"appearance": {"held": [], "frozen_appearance": []}})
 
 
 @pytest.mark.parametrize(
@@ -72,8 +84,7 @@ def test_view_dependence_beyond_the_model_raises():
         ({"dynamics": {"sleep": {"policy": "soundly"}}}, "dynamics.sleep.policy must be one of exact, approx"),
         ({"dynamics": {"sleep": {"patience": 0}}}, "dynamics.sleep.patience must be an integer of at least 1; got 0"),
         ({"dynamics": {"sleep": {"eps": "1e-3"}}}, "dynamics.sleep.eps must be a number; got '1e-3'"),
-        ({"dynamics": {"actions": {"names": "hand"}}}, "dynamics.actions.names must be a list; got 'hand'"),
-        ({"dynamics": {"contact": {"pairs": [["a"]]}}}, r"dynamics.contact.pairs must be a list of 2; got \['a'\]"),
+        ({"dynamics": {"actions": 3}}, "unsupported effect dynamics.actions: no model simulates it"),
         ({"outputs": {"depth": "yes"}}, "outputs.depth must be true or false; got 'yes'"),
         ({"version": 2}, "version must be 1; got 2"),
     ],

@@ -7,9 +7,9 @@ import re
 import pytest
 
 from gsim3d import presets
-from gsim3d.cli.effects import propose, smaller
-from gsim3d.cli.plan import workload
 from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec
+from gsim3d.evaluate.infer_effects import propose, smaller_settings
+from gsim3d.evaluate.plan_report import workload
 from gsim3d.io import read_ply
 from gsim3d.profile import autotune
 from gsim3d.profile.part_times import PartTimes
@@ -25,8 +25,8 @@ def test_plan_is_a_table_with_reasons_and_costs(capsys, work):  # noqa: F811
     scene = work / "data" / "ball" / "0000"
     code, out, _ = call(capsys, "plan", scene, work / "run")
     assert code == 0 and re.search(r"ball/0000: \d+ moving and \d+ frozen particles a step, 1 image of 32x32", out)
-    assert re.search(r"^depth images +no +outputs.depth is off +nothing: the one pass blends it", out, re.MULTILINE)
-    assert re.search(r"^time merging +yes +2 steps of history", out, re.MULTILINE)
+    assert re.search(r"^history +switch +2 steps$", out, re.MULTILINE)
+    assert re.search(r"^rgb +output +image$", out, re.MULTILINE) and not re.search("^depth", out, re.MULTILINE)
     assert re.search(r"^parameters not needed: 0 of \d+", out, re.MULTILINE) and "the checkpoint's" in out
     assert re.search(r"^dynamics +\d+\.\d +\d+\.\d +1\.00$", out, re.MULTILINE)
 
@@ -36,14 +36,14 @@ def test_plan_reads_the_spec_that_the_data_ship(capsys, tmp_path):
     EffectsSpec(DynamicsEffects("masked_out", 1), AppearanceEffects(0)).save(tmp_path / "set" / "effects.yaml")
     code, out, _ = call(capsys, "plan", scene)
     assert code == 0 and "preset tiny, untrained; effects: the scene's own" in out
-    assert "a history of one step has nothing to merge" in out and "background is masked_out" in out
+    assert not re.search("^(history|background|view_dependent) ", out, re.MULTILINE)
     share = float(re.search(r"^dynamics .* (\d\.\d\d)$", out, re.MULTILINE)[1])
     assert share < 0.5
     file = tmp_path / "mine.yaml"
-    file.write_text("appearance: {held: [moving, {which: frozen, box: [[0, 0, 0], [1, 1, 1]]}]}")
+    file.write_text("appearance: {frozen_appearance: [moving, {which: frozen, box: [[0, 0, 0], [1, 1, 1]]}]}")
     code, out, _ = call(capsys, "plan", scene, "--effects", file)
     assert code == 0 and f"effects: {file}, {EffectsSpec.load(file).hash}" in out
-    assert re.search(r"^held bodies +yes +appearance.held names 2, whose features stay", out, re.MULTILINE)
+    assert re.search(r"^frozen_appearance +switch +selections: 2$", out, re.MULTILINE)
     (scene / "effects.yaml").write_text("dynamics: {history: 9}")
     code, out, err = call(capsys, "plan", scene)
     assert code == 2 and "unsupported effect dynamics.history: this model goes up to 2; got 9" in err
@@ -55,9 +55,7 @@ def test_plan_tells_what_a_background_costs_once(capsys, tmp_path):
     run = saved(tmp_path / "run", EffectsSpec(), build_simulator(model, 0).state_dict(), model)
     code, out, err = call(capsys, "plan", scene, run)
     assert code == 0, err
-    assert re.search(
-        r"^background made once +yes +in this model frozen particles see only each other", out, re.MULTILINE
-    )
+    assert re.search(r"^background +switch +computed once a rollout$", out, re.MULTILINE)
     assert float(re.search(r"^and of the background, once a rollout: (\d+\.\d)$", out, re.MULTILINE)[1]) > 0
 
 
@@ -82,10 +80,10 @@ def test_infer_measures_every_effect_and_writes_the_smallest_spec(capsys, work, 
     code, out, _ = call(capsys, "effects", "infer", scene, work / "run", "--tolerance", "100dB", "--out", out_file)
     assert code == 0
     for row in (
-        "time merging +1 step ",
-        "changing features +none ",
-        "changing features +dynamic ",
-        "frozen background +masked",
+        "history +1 step ",
+        "changing +none ",
+        "changing +dynamic ",
+        "background +masked",
     ):
         assert re.search(rf"^{row}.* [+-]\d+\.\d{{3}} +[+-]\d+\.\d", out, re.MULTILINE), row
     smallest = EffectsSpec(DynamicsEffects("masked_out", 1), AppearanceEffects(changing="none"))
@@ -116,21 +114,23 @@ def test_infer_puts_back_what_is_worth_most_when_together_too_much_is_lost():
         lost += 0.03 * (spec.appearance.changing != "all") + 0.5 * (spec.dynamics.background != "frozen")
         return 30 - lost, 1.0
 
-    rows, spec, (psnr, _) = propose(base, smaller(base, model), trial, (30.0, 1.0), 0.1)
+    rows, spec, (psnr, _) = propose(base, smaller_settings(base, model), trial, (30.0, 1.0), 0.1)
     assert spec == EffectsSpec(DynamicsEffects(history=1), AppearanceEffects(changing="none"))
     assert psnr == pytest.approx(30 - 0.08)
     notes = {(effect, setting): (worth, note) for effect, setting, worth, _, note in rows}
-    assert notes["frozen background", "masked out"] == ("+0.500", "")
-    assert notes["time merging", "1 step"] == ("+0.050", "proposed")
-    assert notes["view-dependent colour", "degree 0"] == ("+0.120", "")
-    assert notes["view-dependent colour", "degree 1"] == ("+0.080", "too much with the others")
-    assert notes["changing features", "none"] == ("+0.030", "proposed")
+    assert notes["background", "masked out"] == ("+0.500", "")
+    assert notes["history", "1 step"] == ("+0.050", "proposed")
+    assert notes["view_dependent", "degree 0"] == ("+0.120", "")
+    assert notes["view_dependent", "degree 1"] == ("+0.080", "too much with the others")
+    assert notes["changing", "none"] == ("+0.030", "proposed")
 
 
 def timed(cost):
     """Proposes from presets.paper_latent where a spec takes ``cost`` (spec) seconds and all are as good."""
     model, base = presets.paper_latent(2), EffectsSpec()
-    rows, spec, measured = propose(base, smaller(base, model), lambda spec: (30.0, cost(spec)), (30.0, 1.0), 0.1)
+    rows, spec, measured = propose(
+        base, smaller_settings(base, model), lambda spec: (30.0, cost(spec)), (30.0, 1.0), 0.1
+    )
     return {(effect, setting): note for effect, setting, _, _, note in rows}, spec, measured
 
 
@@ -140,7 +140,7 @@ def test_infer_proposes_nothing_that_it_measured_as_slower():
     assert spec == base and measured == (30.0, 1.0) and set(notes.values()) == {"slower"}
     notes, spec, (_, time) = timed(lambda spec: 0.9 if spec.dynamics.history == 1 else 1.01)
     assert spec == EffectsSpec(DynamicsEffects(history=1)) and time == 0.9
-    assert notes["time merging", "1 step"] == "proposed" and notes["frozen background", "masked out"] == "slower"
+    assert notes["history", "1 step"] == "proposed" and notes["background", "masked out"] == "slower"
 
 
 def test_infer_takes_settings_apart_that_are_slower_together():
@@ -153,7 +153,7 @@ def test_infer_takes_settings_apart_that_are_slower_together():
 
     notes, spec, (_, time) = timed(cost)
     assert time == 0.9 and spec.dynamics.history is None and spec.dynamics.background == "masked_out"
-    assert notes["time merging", "1 step"] == "slower with the others"
+    assert notes["history", "1 step"] == "slower with the others"
 
 
 @pytest.mark.parametrize("text", ["loud", "-1", "nandB", "inf"])

@@ -30,7 +30,7 @@ def half(state, which="all"):
 
 def holding(*selections, **appearance):
     plain = [{"which": s.which, "box": s.box} for s in selections]
-    return {"appearance": {"held": plain, **appearance}}
+    return {"appearance": {"frozen_appearance": plain, **appearance}}
 
 
 def rolled(case, values, n_steps=2, **options):
@@ -47,7 +47,7 @@ def test_a_named_body_keeps_its_features_and_moves(model):
     case = Case(MODELS[model])
     body, start = half(case.state), last_steps(case.state, 1)
     named, free = rolled(case, holding(body)), rolled(case, {})
-    rows = body.rows(start)
+    rows = body.mask(start)
     assert 0 < int(rows.sum()) < start.n_rows
     for step in named:
         for name in ("dynamic_latents",) if model == "latent" else ("dynamic_latents", "sh"):
@@ -64,7 +64,7 @@ def test_several_bodies_of_one_kind():
     start = last_steps(case.state, 1)
     moving = half(case.state, "moving")
     step = rolled(case, holding(moving, Selection("frozen")))[-1]
-    rows = moving.rows(start) | (start.activity == 1)
+    rows = moving.mask(start) | (start.activity == 1)
     assert_same_bits(step.dynamic_latents[rows], start.dynamic_latents[rows])
     assert not torch.equal(step.dynamic_latents[~rows], start.dynamic_latents[~rows])
 
@@ -75,7 +75,7 @@ def test_who_is_held_is_asked_once_where_a_rollout_starts():
     values = holding(half(case.state, "moving"))
     away, plan = [Edit(1, Move("moving", (FAR, 0.0, 0.0)))], case.simulator.plan(EffectsSpec.from_dict(values))
     steps = rolled(case, values, 4, edits=away)
-    rows, start = half(case.state, "moving").rows(last_steps(case.state, 1)), last_steps(case.state, 1)
+    rows, start = half(case.state, "moving").mask(last_steps(case.state, 1)), last_steps(case.state, 1)
     assert_same_bits(steps[-1].dynamic_latents[rows], start.dynamic_latents[rows])
     later = rolled(case, values, state=concatenate([case.state, *steps]))[-1]
     assert_same_bits(later.dynamic_latents[rows], start.dynamic_latents[rows])
@@ -107,7 +107,7 @@ def test_with_every_background(model, background):
     body, start = half(case.state), last_steps(case.state, 1)
     step = rolled(case, {"dynamics": {"background": background}} | holding(body))[-1]
     kept = start.activity == 0 if background == "masked_out" else torch.ones_like(start.activity, dtype=torch.bool)
-    rows = body.rows(start)[kept]
+    rows = body.mask(start)[kept]
     assert_same_bits(step.dynamic_latents[rows], start.dynamic_latents[kept][rows])
     assert not torch.equal(step.dynamic_latents[~rows], start.dynamic_latents[kept][~rows])
 
@@ -146,10 +146,10 @@ def test_a_captured_rollout_holds_who_is_named_in_each_state(model, device):
 def test_nobody_is_marked_where_no_features_change():
     case = Case()
     plan = case.simulator.plan(EffectsSpec.from_dict(holding(half(case.state), changing="none")))
-    assert plan.skipped["held bodies"] == "nobody's features change"
+    assert "frozen_appearance" not in plan.on
     assert rolled(case, holding(half(case.state), changing="none"))[-1].frozen_appearance is None
-    kept = {e.name: e.why for e in case.simulator.plan(EffectsSpec.from_dict(holding(half(case.state)))).effects}
-    assert kept["held bodies"] == "appearance.held names 1, whose features stay"
+    plan = case.simulator.plan(EffectsSpec.from_dict(holding(half(case.state))))
+    assert dict(plan.switches)["frozen_appearance"] == "selections: 1"
 
 
 def test_gradients_do_not_reach_what_is_predicted_for_a_held_row():
@@ -165,23 +165,31 @@ def test_gradients_do_not_reach_what_is_predicted_for_a_held_row():
 @pytest.mark.parametrize(
     ("held", "message"),
     [
-        ("moving", "effects: appearance.held must be a list; got 'moving'"),
-        ([3], "effects: appearance.held must be a mapping; got 3"),
-        (["ground"], "effects: appearance.held: which must be one of all, moving, frozen; got 'ground'"),
-        ([{"where": "here"}], "effects: unknown key appearance.held.where; known: which, box"),
-        ([{"box": [[0, 0, 0], [1, 1]]}], r"effects: appearance.held.box must be a list of 3; got \[1, 1\]"),
-        ([{"box": [[0, 0, 1], [1, 1, 0]]}], "effects: appearance.held: box must be the lowest and the highest corner"),
+        ("moving", "effects: appearance.frozen_appearance must be a list; got 'moving'"),
+        ([3], "effects: appearance.frozen_appearance must be a mapping; got 3"),
+        (["ground"], "effects: appearance.frozen_appearance: which must be one of all, moving, frozen; got 'ground'"),
+        ([{"where": "here"}], "effects: unknown key appearance.frozen_appearance.where; known: which, box"),
+        (
+            [{"box": [[0, 0, 0], [1, 1]]}],
+            r"effects: appearance.frozen_appearance.box must be a list of 3; got \[1, 1\]",
+        ),
+        (
+            [{"box": [[0, 0, 1], [1, 1, 0]]}],
+            "effects: appearance.frozen_appearance: box must be the lowest and the highest corner",
+        ),
     ],
 )
 def test_names_that_mean_nobody_can_be(held, message):
     with pytest.raises(InputError, match=message):
-        EffectsSpec.from_dict({"appearance": {"held": held}})
+        EffectsSpec.from_dict({"appearance": {"frozen_appearance": held}})
 
 
 def test_a_body_that_is_not_there():
     case = Case()
     nowhere = Selection("moving", ((8.0, 8.0, 8.0), (9.0, 9.0, 9.0)))
-    message = r"effects: appearance.held\[1\]: no particle is meant: there are none that are moving in the box \[\[8.0"
+    message = (
+        r"effects: appearance.frozen_appearance\[1\]: the selection is empty: no particle is moving in the box \[\[8.0"
+    )
     with pytest.raises(InputError, match=message) as error:
         rolled(case, holding(half(case.state), nowhere))
     start = last_steps(case.state, 1)

@@ -25,8 +25,6 @@ def assert_same_results(actual, expected):
 
 
 IRRELEVANT = {
-    "actions without a point": {"dynamics": {"actions": {"names": []}}},
-    "contact without a pair": {"dynamics": {"contact": {"pairs": []}}},
     "insertion and removal without an edit": {"structure": {"insert": True, "remove": True}},
     "sleep where nobody rests": {"dynamics": {"sleep": {"eps": 0.0}}},
     "as many steps as the model has": {"dynamics": {"history": 4}},

@@ -57,7 +57,7 @@ def launches(call) -> int:
     return sum(event.device_type == torch.autograd.DeviceType.CUDA for event in profile.events())
 
 
-LAUNCHED = ["time merging", "sleep", "changing features", "held bodies", "changing opacities", "feature images"]
+LAUNCHED = ["history", "sleep", "changing", "frozen_appearance", "opacity_changes", "features"]
 
 
 @pytest.mark.parametrize("name", LAUNCHED)

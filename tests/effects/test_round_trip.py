@@ -10,9 +10,7 @@ import yaml
 from gsim3d import presets
 from gsim3d.effects.selection import Selection
 from gsim3d.effects.spec import (
-    Actions,
     AppearanceEffects,
-    Contact,
     DynamicsEffects,
     EffectsSpec,
     OutputEffects,
@@ -32,7 +30,7 @@ ROOMS = {
     "dynamics": [
         DynamicsEffects(),
         DynamicsEffects("masked_out", 2),
-        DynamicsEffects("asymmetric", 1, Actions(names=("left", "right")), Contact((("a", "b"), ("b", "b")), 0.25)),
+        DynamicsEffects("asymmetric", 1),
         DynamicsEffects("dynamic", sleep=Sleep()),
         DynamicsEffects(sleep=Sleep("approx", 1e-4, 7)),
     ],
@@ -40,7 +38,7 @@ ROOMS = {
         AppearanceEffects(),
         AppearanceEffects(0, "none", False),
         AppearanceEffects(3, "dynamic", True),
-        AppearanceEffects(held=("moving", Selection("all", ((0.0, 0.5, -1.0), (1.0, 2.0, 3.0))))),
+        AppearanceEffects(frozen_appearance=("moving", Selection("all", ((0.0, 0.5, -1.0), (1.0, 2.0, 3.0))))),
     ],
     "structure": [StructureEffects(), StructureEffects(True, False), StructureEffects(True, True)],
     "outputs": [OutputEffects(), OutputEffects(False, True, True, True)],
@@ -72,7 +70,9 @@ def test_hashes_tell_all_specs_apart_and_do_not_depend_on_order():
 
 def test_whole_numbers_hash_as_what_they_are_equal_to():
     specs = [
-        EffectsSpec.from_dict({"dynamics": {"sleep": {"eps": zero}}, "appearance": {"held": [{"box": box}]}})
+        EffectsSpec.from_dict(
+            {"dynamics": {"sleep": {"eps": zero}}, "appearance": {"frozen_appearance": [{"box": box}]}}
+        )
         for zero, box in ((0, [[0, 0, 0], [1, 1, 1]]), (0.0, [[0.0, -0.0, 0.0], [1.0, 1.0, 1.0]]))
     ]
     assert specs[0] == specs[1] and specs[0].hash == specs[1].hash != EffectsSpec().hash

@@ -252,7 +252,7 @@ def test_gradients_reach_what_slept():
 
 def test_a_symmetric_model_sleeps_by_whole_scenes_only():
     simulator = make_simulator(TINY)
-    assert "sleep" in simulator.plan(asleep_by("exact")).kept
+    assert "sleep" in simulator.plan(asleep_by("exact")).on
     with pytest.raises(InputError, match="unsupported effect dynamics.sleep.policy approx"):
         simulator.plan(asleep_by("approx"))
 

@@ -108,7 +108,7 @@ def test_each_world_ships_the_spec_that_it_calls_for(made):
             spec = settings.effects()
             assert spec.outputs.depth and (spec.dynamics.background == "masked_out") == (subset == "no-ground")
             plan = make_plan(spec, presets.tiny())
-            assert plan.history == 2 and ("frozen background" in plan.kept) == settings.ground
+            assert plan.history == 2 and ("background" in plan.on) == settings.ground
 
 
 def test_manifest(made):

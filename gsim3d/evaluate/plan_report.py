@@ -1,0 +1,59 @@
+"""What a plan computes of a scene, and what that costs (``gsim3d plan``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from gsim3d.data import Scene, make_frames
+from gsim3d.effects.plan import Plan, Workload, background_cost, predicted_cost
+from gsim3d.effects.spec import EffectsSpec, OutputEffects
+from gsim3d.io.terminal import in_columns
+from gsim3d.simulator import Simulator
+from gsim3d.train.config import DataConfig
+from gsim3d.train.samples import context_cameras, spread_views, thinned
+
+
+def workload(scene: Scene, data: DataConfig) -> Workload:
+    """Particles of the first step of ``scene`` as a model trained on ``data`` sees it, and one image."""
+    cameras = context_cameras(scene, data)
+    views = spread_views(cameras, min(data.context_views, len(cameras)), 0)
+    frames = thinned(make_frames([scene], [list(views)], [range(1)], masked=scene.has_segmentation()), data)
+    moving = kept = frames.images.shape[0] * scene.height * scene.width
+    if frames.masks is not None:
+        moving = kept = int(frames.masks.sum())
+    if frames.dynamic is not None:
+        moving = int((frames.dynamic if frames.masks is None else frames.dynamic & frames.masks).sum())
+    return Workload(moving, kept - moving, 1, scene.height * scene.width)
+
+
+def plan_report(simulator: Simulator, plan: Plan, work: Workload, times: dict, own: Plan) -> Iterator[str]:
+    """Paragraphs: switches and outputs that are on, unused parameters, and the predicted costs of a step.
+
+    Args:
+        times: device -> times of parts of a step that were measured there under the plan ``own``.
+    """
+    switches = [(name, "switch", setting) for name, setting in plan.switches]
+    yield in_columns([("on", "", ""), *switches, *((name, "output", "image") for name in plan.outputs)])
+    sizes = {name: p.numel() * p.element_size() for name, p in simulator.named_parameters()}
+    unused = sum(sizes[name] for name in plan.unused)
+    count = f"{len(plan.unused)} of {len(sizes)}, {unused / 1024:.1f} of {sum(sizes.values()) / 1024:.1f} KiB"
+    yield "\n  ".join([f"parameters not needed: {count}", *plan.unused])
+    largest = simulator.plan(EffectsSpec(outputs=OutputEffects(depth=True, alpha=True)))
+    costs = [{k: v / 1e6 for k, v in predicted_cost(p, simulator.config, work).items()} for p in (plan, largest)]
+    once = background_cost(plan, simulator.config, work)
+    yield "\n".join(
+        ["predicted multiply-adds of one step and one image, in millions", _compared(*costs)]
+        + [f"and of the background, once a rollout: {once / 1e6:.1f}"] * (once > 0)
+    )
+    for device, measured in times.items():
+        costs = [measured.predicted(own, p, simulator.config, work) for p in (plan, largest)]
+        head = f"predicted milliseconds on {device}, from those that gsim3d profile measured ({measured.on})"
+        yield f"{head}\n{_compared(*costs)}"
+
+
+def _compared(costs: dict[str, float], largest: dict[str, float]) -> str:
+    """A table of the costs of the parts of a step under a plan and under the largest one."""
+    parts = [(part, costs[part], largest[part]) for part in largest]
+    parts.append(("all", sum(costs.values()), sum(largest.values())))
+    rows = [(part, f"{one:.1f}", f"{most:.1f}", f"{one / max(most, 1e-6):.2f}") for part, one, most in parts]
+    return in_columns([("part", "this plan", "all that the model can", "share"), *rows])
