@@ -17,7 +17,7 @@ SPECS = [
     EffectsSpec(DynamicsEffects("masked_out", history=2), outputs=OutputEffects(depth=True)),
     EffectsSpec(
         DynamicsEffects("dynamic", history=1, sleep=Sleep()),
-        AppearanceEffects(held=("frozen",)),
+        AppearanceEffects(frozen_appearance=("frozen",)),
         outputs=OutputEffects(depth=True),
     ),
 ]
