@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
 
     from gsim3d.effects.spec import FILE
     from gsim3d.evaluate.infer_effects import infer
-    from gsim3d.io.files import with_parents, new_output_path
+    from gsim3d.io.files import new_output_path, with_parents
     from gsim3d.train.restore import restore
 
     out = new_output_path(args.out or Path(args.scene) / FILE, "file")
