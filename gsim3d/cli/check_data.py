@@ -59,9 +59,7 @@ def run(args: argparse.Namespace) -> int:
             print(f"  problem: {problem}")
     scenes = [check.scene for check in checks if check.scene]
     if scenes and out is not None:
-        part = with_parents(out).with_name(f".{out.stem}.part.png")
-        write_picture(part, contact_sheet(scenes)[..., ::-1])
-        os.replace(part, out)
+        write_picture(with_parents(out), contact_sheet(scenes)[..., ::-1])
     n_problems = sum(len(check.problems) for check in checks)
     n_bad = sum(bool(check.problems) for check in checks)
     read = f"{len(checks)} scene{'s' if len(checks) > 1 else ''} read"

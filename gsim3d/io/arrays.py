@@ -1,8 +1,7 @@
-"""What all formats share: one frame of Gaussians as numpy arrays, quantisation, axes, files that appear whole."""
+"""One frame of Gaussians as numpy arrays, with the quantisation and the axes that the formats share."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import torch
 
 from gsim3d.errors import InputError
 from gsim3d.io.files import read_file
-from gsim3d.math.rotations import quat_product, unit_quats
+from gsim3d.math.rotations import quat_product, rotation_matrices, unit_quats
 from gsim3d.math.spherical_harmonics import SH_0, rotate_harmonics
 from gsim3d.state import Gaussians
 
@@ -53,15 +52,20 @@ class Splats:
 
 
 def splats_of(gaussians: Gaussians, frame: int | None, path: Path) -> Splats:
-    """One frame of ``gaussians``, or all rows where ``frame`` is None.
+    """One frame of ``gaussians`` to be written.
+
+    Args:
+        gaussians: packed frames.
+        frame: its number; None: all Gaussians as one frame.
+        path: for messages.
 
     Raises:
         InputError: a value is not finite, or there is no colour; the message names file and field.
     """
     if gaussians.sh is None:
-        raise InputError(f"{path}: cannot write Gaussians without colours: sh is None")
-    start, end = (0, gaussians.means.shape[0]) if frame is None else gaussians.cu_rows[frame : frame + 2].tolist()
-    values = {name: getattr(gaussians, name)[start:end].detach().cpu().float() for name in FIELDS}
+        raise InputError(f"{path}: cannot write Gaussians without colours: sh is None; ask the renderer for rgb")
+    chosen = span_of(gaussians, frame)
+    values = {name: getattr(gaussians, name)[chosen].detach().cpu().float() for name in FIELDS}
     for name, value in values.items():
         if not torch.isfinite(value).all():
             raise InputError(f"{path}: cannot write Gaussians, {name} holds values that are not finite")
@@ -69,6 +73,11 @@ def splats_of(gaussians: Gaussians, frame: int | None, path: Path) -> Splats:
     values["scales"] = values["scales"].clamp(min=SMALLEST_SCALE)
     values["opacities"] = values["opacities"].clamp(0, 1)
     return Splats(**{name: value.contiguous().numpy() for name, value in values.items()})
+
+
+def span_of(gaussians: Gaussians, frame: int | None) -> slice:
+    """The Gaussians of one frame; None: all."""
+    return slice(None) if frame is None else slice(*gaussians.cu_rows[frame : frame + 2].tolist())
 
 
 def gaussians_of(splats: Splats, path: Path) -> Gaussians:
@@ -90,21 +99,12 @@ def gaussians_of(splats: Splats, path: Path) -> Gaussians:
 
 def turned(splats: Splats, quat: tuple[float, ...]) -> Splats:
     """``splats`` in axes that are rotated by the unit quaternion ``quat`` (w, x, y, z)."""
-    w, x, y, z = quat
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).round(12)
+    turn = rotation_matrices(torch.tensor([quat], dtype=torch.float64))[0].numpy().round(12).astype(np.float32)
     quats = quat_product(torch.tensor([quat], dtype=torch.float32), torch.from_numpy(splats.quats))
     sh = torch.from_numpy(splats.sh)
     if splats.degree:
-        rotations = torch.from_numpy(turn).float().expand(splats.count, 3, 3)
-        sh = rotate_harmonics(sh, rotations)
-    means = splats.means @ turn.T.astype(np.float32)
-    return Splats(means, quats.numpy(), splats.scales, splats.opacities, sh.numpy())
+        sh = rotate_harmonics(sh, torch.from_numpy(turn).expand(splats.count, 3, 3))
+    return Splats(splats.means @ turn.T, quats.numpy(), splats.scales, splats.opacities, sh.numpy())
 
 
 def colors_of(splats: Splats) -> np.ndarray:
@@ -117,16 +117,44 @@ def dc_of(colors: np.ndarray) -> np.ndarray:
     return ((colors - 0.5) / SH_0).astype(np.float32)
 
 
-def logits(opacities: np.ndarray, margin: float) -> np.ndarray:
-    """Logits of opacities that are kept ``margin`` from 0 and 1."""
-    clamped = np.clip(opacities.astype(np.float64), margin, 1 - margin)
-    return np.log(clamped / (1 - clamped))
-
-
 def unorm(x: np.ndarray, bits: int) -> np.ndarray:
     """uint32, ``x`` in [0, 1] in ``bits`` bits, clamped."""
     most = 2**bits - 1
     return np.clip(np.floor(x.astype(np.float64) * most + 0.5), 0, most).astype(np.uint32)
+
+
+def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations without their largest component.
+
+    Args:
+        quats: [N, 4] unit.
+
+    Returns:
+        [N] index of the largest component, and [N, 3] the others, of the quaternions whose largest is positive.
+    """
+    largest, rows = np.abs(quats).argmax(1), np.arange(len(quats))
+    signed = quats * np.where(quats[rows, largest] < 0, -1, 1)[:, None]
+    return largest.astype(np.uint32), np.stack([signed[rows, k + (k >= largest)] for k in range(3)], 1)
+
+
+def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """[N, 4] unit quaternions of what :func:`smallest_three` returned."""
+    largest, rows, quats = largest.astype(np.int64), np.arange(len(largest)), np.zeros((len(largest), 4))
+    for k in range(3):
+        quats[rows, k + (k >= largest)] = others[:, k]
+    quats[rows, largest] = np.sqrt(np.clip(1 - (quats**2).sum(1), 0, 1))
+    return quats
+
+
+def pack_tens(first: np.ndarray, fields: np.ndarray) -> np.ndarray:
+    """uint32 [N]: 2 bits of ``first`` [N], then 10 of each of ``fields`` [N, 3]."""
+    a, b, c = fields.T.astype(np.uint32)
+    return (first << 30) | (a << 20) | (b << 10) | c
+
+
+def unpack_tens(packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What :func:`pack_tens` packed."""
+    return packed >> 30, np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], 1)
 
 
 def read_bytes(path: Path, *starts: bytes) -> bytes:
@@ -141,17 +169,3 @@ def read_bytes(path: Path, *starts: bytes) -> bytes:
 def read_head(path: Path) -> bytes:
     """The first 4 KiB of a file; errors as :func:`read_bytes`."""
     return read_file(path, MAX_BYTES, 4096)
-
-
-def write_bytes(path: Path, *parts: bytes) -> None:
-    """Writes a file that appears complete or not at all."""
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        with open(temporary, "wb") as file:
-            for part in parts:
-                file.write(part)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}") from None
-    finally:
-        temporary.unlink(missing_ok=True)

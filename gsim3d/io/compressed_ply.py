@@ -12,7 +12,20 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.errors import InputError
-from gsim3d.io.arrays import Splats, colors_of, dc_of, read_bytes, unorm, write_bytes
+from gsim3d.io.arrays import (
+    FIELDS,
+    Splats,
+    colors_of,
+    dc_of,
+    from_smallest_three,
+    pack_tens,
+    read_bytes,
+    smallest_three,
+    unorm,
+    unpack_tens,
+)
+from gsim3d.io.files import write_whole
+from gsim3d.io.ply_format import read_columns, read_header
 
 CHUNK = 256
 LOG_SCALES = 20.0  # limit of log-scales
@@ -51,7 +64,7 @@ def write(path: Path, splats: Splats) -> None:
     if rest.shape[1]:
         header += [f"element sh {splats.count}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
     header.append("end_header\n")
-    write_bytes(path, "\n".join(header).encode(), limits.tobytes(), vertices.tobytes(), levels.tobytes())
+    write_whole(path, "\n".join(header).encode(), limits.tobytes(), vertices.tobytes(), levels.tobytes())
 
 
 def is_compressed(content: bytes) -> bool:
@@ -62,71 +75,51 @@ def is_compressed(content: bytes) -> bool:
 def read(path: Path) -> Splats:
     """The Gaussians of a file. Raises InputError where it is damaged or another .ply."""
     content = read_bytes(path, b"ply")
-    end = re.search(rb"end_header\r?\n", content[:65536])
-    if not content.startswith(b"ply") or end is None or not is_compressed(content):
+    if not is_compressed(content):
         raise InputError(f"{path}: not a compressed .ply")
-    elements: dict[str, tuple[int, list[tuple[str, str]]]] = {}
-    kinds = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
-    for line in content[: end.start()].decode("ascii", "replace").splitlines():
-        words = line.split()
-        if words[:1] == ["element"] and len(words) == 3 and re.fullmatch(r"\d{1,12}", words[2]):
-            elements[words[1]] = int(words[2]), []
-        elif words[:1] == ["property"] and elements:
-            if len(words) != 3 or words[1] not in kinds:
-                raise InputError(f"{path}: unsupported line in the header: {line.strip()[:80]!r}")
-            elements[list(elements)[-1]][1].append((words[2], kinds[words[1]]))
-        elif words[:1] == ["format"] and words[1:] != ["binary_little_endian", "1.0"]:
-            raise InputError(f"{path}: a compressed .ply must be binary_little_endian 1.0")
-    tables, place = {}, end.end()
-    for name, (count, fields) in elements.items():
-        if not fields or len({field for field, _ in fields}) != len(fields):
-            raise InputError(f"{path}: element {name[:40]!r} has no usable properties")
-        dtype = np.dtype(fields)
-        if place + count * dtype.itemsize > len(content):
-            raise InputError(f"{path}: truncated: element {name[:40]!r} of {count} rows ends behind the file")
-        tables[name] = np.frombuffer(content, dtype, count, place)
-        place += count * dtype.itemsize
-    return _unpacked(path, tables)
-
-
-def _unpacked(path: Path, tables: dict[str, np.ndarray]) -> Splats:
-    for name, needed in (("chunk", LIMITS[:12]), ("vertex", PACKED)):
-        if name not in tables or (missing := [key for key in needed if key not in tables[name].dtype.names]):
+    tables = read_columns(path, content, read_header(path, content), "chunk", "vertex", "sh")
+    for name, needed, kind in (("chunk", LIMITS[:12], "f"), ("vertex", PACKED, "u")):
+        missing = [key for key in needed if key not in tables.get(name, ()) or tables[name][key].dtype.kind != kind]
+        if missing:
             raise InputError(f"{path}: element {name} lacks {missing[0] if name in tables else 'everything'}")
     chunk, vertex = tables["chunk"], tables["vertex"]
-    count = len(vertex)
-    if len(chunk) != -(-count // CHUNK):
-        raise InputError(f"{path}: {len(chunk)} chunks for {count} Gaussians; expected {-(-count // CHUNK)}")
+    count, n_chunks = len(vertex[PACKED[0]]), len(chunk[LIMITS[0]])
+    if n_chunks != -(-count // CHUNK):
+        raise InputError(f"{path}: {n_chunks} chunks for {count} Gaussians; expected {-(-count // CHUNK)}")
     of = np.arange(count) // CHUNK
-    ranges = {name: chunk[name][of].astype(np.float64) for name in LIMITS if name in chunk.dtype.names}
 
-    def between(values: np.ndarray, kind: str, axes: str, low: float = 0.0, high: float = 1.0) -> np.ndarray:
-        lows, highs = (
-            np.stack([np.broadcast_to(ranges.get(f"{end}{kind}_{axis}", other), count) for axis in axes], 1)
-            for end, other in (("min", low), ("max", high))
-        )
-        return lows + values * (highs - lows)
+    def between(values: np.ndarray, kind: str, axes: str) -> np.ndarray:
+        names = [[f"{end}{kind}_{axis}" for axis in axes] for end in ("min", "max")]
+        if not all(name in chunk for name in sum(names, [])):  # files of older writers have no limits of colours
+            return values
+        low, high = (np.stack([chunk[name][of].astype(np.float64) for name in some], 1) for some in names)
+        return low + values * (high - low)
 
-    means = between(_unpack(vertex["packed_position"]), "", "xyz")
-    scales = np.exp(np.clip(between(_unpack(vertex["packed_scale"]), "_scale", "xyz"), -LOG_SCALES, LOG_SCALES))
     packed = vertex["packed_color"]
     bytes_of = np.stack([(packed >> shift) & 255 for shift in (24, 16, 8, 0)], 1) / 255.0
-    colors = between(bytes_of[:, :3], "", "rgb")
-    sh = dc_of(colors)[:, None]
-    if "sh" in tables:
-        table = tables["sh"]
-        names = [name for name in table.dtype.names if re.fullmatch(r"f_rest_\d{1,2}", name)]
-        if len(table) != count or len(names) not in N_REST:
-            shape = f"{len(table)} of {len(names)}"
-            raise InputError(f"{path}: element sh must have {count} rows of 9, 24 or 45; got {shape}")
-        missing = [f"f_rest_{i}" for i in range(len(names)) if f"f_rest_{i}" not in names]
-        if missing:
-            raise InputError(f"{path}: element sh lacks {missing[0]}")
-        levels = np.stack([table[f"f_rest_{i}"] for i in range(len(names))], 1).astype(np.float32)
-        share = np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + 0.5) / 256))
-        rest = ((share - 0.5) * 8).reshape(count, 3, len(names) // 3).transpose(0, 2, 1)
-        sh = np.concatenate([sh, rest], 1)
-    return Splats(means, _unpack_rotations(vertex["packed_rotation"]), scales, bytes_of[:, 3], sh)
+    log_scales = between(_unpack(vertex["packed_scale"]), "_scale", "xyz")
+    return Splats(
+        means=between(_unpack(vertex["packed_position"]), "", "xyz"),
+        quats=_unpack_rotations(vertex["packed_rotation"]),
+        scales=np.exp(np.clip(log_scales, -LOG_SCALES, LOG_SCALES)),
+        opacities=bytes_of[:, 3],
+        sh=np.concatenate([dc_of(between(bytes_of[:, :3], "", "rgb"))[:, None], _rest(path, tables, count)], 1),
+    )
+
+
+def _rest(path: Path, tables: dict[str, dict[str, np.ndarray]], count: int) -> np.ndarray:
+    """[N, K - 1, 3], the harmonics above degree 0."""
+    table = tables.get("sh", {})
+    n_rest = len([name for name in table if re.fullmatch(r"f_rest_\d{1,2}", name)])
+    if n_rest not in N_REST or n_rest and len(table["f_rest_0"]) != count:
+        raise InputError(f"{path}: element sh must have {count} rows of 9, 24 or 45 harmonics; got {n_rest}")
+    if missing := [f"f_rest_{i}" for i in range(n_rest) if f"f_rest_{i}" not in table]:
+        raise InputError(f"{path}: element sh lacks {missing[0]}")
+    levels = np.zeros((count, n_rest), np.float32)
+    for i in range(n_rest):
+        levels[:, i] = table[f"f_rest_{i}"]
+    share = np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + 0.5) / 256))
+    return ((share - 0.5) * 8).reshape(count, 3, n_rest // 3).transpose(0, 2, 1)
 
 
 def _sorted(splats: Splats) -> Splats:
@@ -139,7 +132,7 @@ def _sorted(splats: Splats) -> Splats:
         for axis in range(3):
             code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
     order = np.argsort(code, kind="stable")
-    return Splats(*(getattr(splats, name)[order] for name in ("means", "quats", "scales", "opacities", "sh")))
+    return Splats(*(getattr(splats, name)[order] for name in FIELDS))
 
 
 def _between(values: np.ndarray, n_chunks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -163,20 +156,10 @@ def _unpack(packed: np.ndarray) -> np.ndarray:
 
 
 def _pack_rotations(quats: np.ndarray) -> np.ndarray:
-    largest = np.abs(quats).argmax(1)
-    rows = np.arange(len(quats))
-    signed = quats * np.where(quats[rows, largest] < 0, -1, 1)[:, None]
-    packed = largest.astype(np.uint32)
-    for smaller in range(3):
-        component = signed[rows, smaller + (smaller >= largest)]
-        packed = (packed << 10) | unorm(component * (0.5 * 2**0.5) + 0.5, 10)
-    return packed
+    largest, others = smallest_three(quats)
+    return pack_tens(largest, unorm(others * (0.5 * 2**0.5) + 0.5, 10))
 
 
 def _unpack_rotations(packed: np.ndarray) -> np.ndarray:
-    largest, rows = (packed >> 30).astype(np.int64), np.arange(len(packed))
-    quats = np.zeros((len(packed), 4))
-    for smaller, shift in enumerate((20, 10, 0)):
-        quats[rows, smaller + (smaller >= largest)] = (((packed >> shift) & 1023) / 1023.0 - 0.5) * 2**0.5
-    quats[rows, largest] = np.sqrt(np.clip(1 - (quats**2).sum(1), 0, 1))
-    return quats
+    largest, fields = unpack_tens(packed)
+    return from_smallest_three(largest, (fields / 1023.0 - 0.5) * 2**0.5)

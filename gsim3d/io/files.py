@@ -1,4 +1,4 @@
-"""Files that somebody else may have written, read with bounded memory; and places for new ones."""
+"""Files of unknown origin, read with bounded memory; and new files, which appear whole or not at all."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import os
 import reprlib
 import types
 import typing
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +31,10 @@ def sha256_of(path: Path) -> str:
 
 
 def new_output_path(out: str | Path, kind: str = "folder") -> Path:
-    """Where a command will write a file or folder that is not there yet.
+    """The path of a file or folder that a command will make.
 
     Raises:
-        InputError: something is there, or what should be a folder around it is a file; the message starts with
-            ``--out``.
+        InputError: it exists, or a folder around it is a file; the message starts with ``--out``.
     """
     out = output_path(out)
     if out.exists() or out.is_symlink():
@@ -42,10 +43,15 @@ def new_output_path(out: str | Path, kind: str = "folder") -> Path:
 
 
 def output_path(out: str | Path, suffix: str = "", option: str = "--out") -> Path:
-    """Where a command will write a file that ends in ``suffix``, or a folder; folders around it need not exist.
+    """The path of a file that ends in ``suffix``, or of a folder, that a command will write.
+
+    Args:
+        out: path; folders around it need not exist.
+        suffix: ending of a file; empty: any file or folder.
+        option: name of the option, for messages.
 
     Raises:
-        InputError: another ending, a folder where the file should be, or a file where a folder around it should be.
+        InputError: another ending, a folder in place of the file, or a file in place of a folder around it.
     """
     out = Path(out)
     if suffix and (out.suffix != suffix or out.is_dir()):
@@ -62,24 +68,36 @@ def with_parents(path: Path) -> Path:
     return path
 
 
-def write_whole(path: str | Path, text: str) -> None:
-    """Writes a text file that appears whole or not at all. Raises OSError where it cannot be written."""
+@contextmanager
+def whole_file(path: str | Path) -> Iterator[Path]:
+    """A hidden path beside ``path``, for a file that becomes ``path`` when the block ends, and is removed if it fails.
+
+    Raises:
+        OSError: it cannot be written; names ``path``.
+    """
     path = Path(path)
-    part = path.with_name(f".{path.name}.part")
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
-        part.write_text(text, encoding="utf-8", errors="backslashreplace")
+        yield part
         os.replace(part, path)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise OSError(error.errno, error.strerror, str(path)) from None
+    finally:
+        part.unlink(missing_ok=True)
 
 
-def write_picture(path: Path, image: np.ndarray) -> None:
-    """Writes uint8 [H, W, 3], RGB, as PNG. Raises OSError that names the file where it cannot be written."""
+def write_whole(path: str | Path, *parts: str | bytes) -> None:
+    """Writes text or bytes as a file that appears whole or not at all. Raises OSError as :func:`whole_file`."""
+    with whole_file(path) as part, open(part, "wb") as file:
+        for content in parts:
+            file.write(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
+
+
+def write_picture(path: str | Path, image: np.ndarray) -> None:
+    """Writes uint8 [H, W, 3], RGB, as PNG. Raises OSError as :func:`whole_file`."""
     import cv2
 
-    with open(path, "wb") as file:
-        file.write(cv2.imencode(".png", image[..., ::-1])[1])
+    write_whole(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())
 
 
 def opencv_path(path: str | Path) -> str:
@@ -92,7 +110,12 @@ def opencv_path(path: str | Path) -> str:
 
 
 def read_file(path: str | Path, most: int, first: int | None = None) -> bytes:
-    """The bytes of a file, or its ``first``.
+    """The bytes of a file.
+
+    Args:
+        path: a regular file.
+        most: bytes that it may have.
+        first: how many are read from its start; None: all.
 
     Raises:
         InputError: it is missing, no file (pipes and devices are not opened), has more than ``most`` bytes, or cannot
@@ -127,7 +150,7 @@ def read_yaml(path: str | Path, subject: str) -> Any:
 
 
 def shown(value: Any) -> str:
-    """The start of the repr of a value of a file, never made as a whole: lists may hold each other many times."""
+    """The start of the repr of a value. The whole is never made: lists may hold each other many times."""
     try:
         return _BOUNDED.repr(value)
     except ValueError:  # an integer of thousands of digits
@@ -135,8 +158,13 @@ def shown(value: Any) -> str:
 
 
 def typed(cls: type, values: Any, subject: str, where: str = "") -> Any:
-    """An object of the dataclass ``cls`` from plain values, whose types are those of its fields. Where a dataclass has
-    an attribute ``alone``, a text by itself is the field of this name.
+    """An object of the dataclass ``cls`` from plain values, checked against the types of its fields.
+
+    Args:
+        cls: dataclass. Where it has an attribute ``alone``, a text by itself is the field of this name.
+        values: mapping of plain values.
+        subject: what the values belong to, for messages.
+        where: path of keys before these, ending in a dot.
 
     Raises:
         InputError: a key is unknown or missing, or a value of another type; the message starts with ``subject`` and

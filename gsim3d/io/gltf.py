@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.errors import InputError
-from gsim3d.io.arrays import Z_TO_Y_UP, Splats, colors_of, read_bytes, turned, unorm, write_bytes
+from gsim3d.io.arrays import Z_TO_Y_UP, Splats, colors_of, read_bytes, turned, unorm
+from gsim3d.io.files import write_whole
 
 EXTENSION = "KHR_gaussian_splatting"
 MAGIC, JSON_CHUNK, BIN_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
@@ -64,7 +65,7 @@ def write(path: Path, splats: Splats) -> None:
     data = b"".join(parts) + b"\0" * (-place % 4)
     total = 12 + 8 + len(text) + 8 + len(data)
     head = struct.pack("<III", MAGIC, 2, total) + struct.pack("<II", len(text), JSON_CHUNK)
-    write_bytes(path, head, text, struct.pack("<II", len(data), BIN_CHUNK), data)
+    write_whole(path, head, text, struct.pack("<II", len(data), BIN_CHUNK), data)
 
 
 def read(path: Path) -> Splats:

@@ -7,7 +7,6 @@ One vertex a Gaussian, float32: x y z (float64 where they have a ``world_offset`
 
 from __future__ import annotations
 
-import os
 import re
 import warnings
 from pathlib import Path
@@ -17,14 +16,12 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import InputError
-from gsim3d.io.files import read_file
+from gsim3d.io.arrays import FIELDS, MAX_BYTES, SMALLEST_SCALE, dc_of, span_of, splats_of
+from gsim3d.io.files import read_file, write_whole
 from gsim3d.io.ply_format import MAX_HEADER, Header, read_columns, read_header
 from gsim3d.math.rotations import unit_quats
-from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.state import Gaussians
 
-SMALLEST_SCALE = 1e-9  # metres; keeps the logarithm finite and is far below a pixel
-MAX_BYTES = 2**36  # of a file: 10^8 Gaussians and more
 OPACITY_MARGIN = 1e-6  # opacities are clamped to [margin, 1 - margin]; keeps the logit finite
 COLORS = (("red", "green", "blue"), ("r", "g", "b"))
 READ_DEGREE = 3
@@ -40,46 +37,36 @@ def write_ply(path: str | Path, gaussians: Gaussians, cloud: int | None = None) 
         InputError: a value is not finite, or there are no colours; the message names the field.
     """
     path = Path(path)
-    if gaussians.sh is None:
-        raise InputError(f"{path}: cannot write Gaussians without colours: sh is None; ask the renderer for rgb")
-    start, end = (0, gaussians.means.shape[0]) if cloud is None else gaussians.cu_rows[cloud : cloud + 2].tolist()
-    rows = {
-        name: getattr(gaussians, name)[start:end].detach().cpu().float()
-        for name in ("means", "quats", "scales", "opacities", "sh")
-    }
-    positions = rows["means"].numpy() if gaussians.world_offset is None else _in_world(gaussians, start, end)
-    for name, values in rows.items():
-        if not torch.isfinite(values).all() or name == "means" and not np.isfinite(positions).all():
-            raise InputError(f"{path}: cannot write Gaussians, {name} holds values that are not finite")
-    opacities = rows["opacities"].double().clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
-    columns = [
-        torch.zeros(end - start, 3),
-        rows["sh"][:, 0],
-        rows["sh"][:, 1:].transpose(1, 2).flatten(1),
-        torch.logit(opacities).float()[:, None],
-        torch.log(rows["scales"].clamp(min=SMALLEST_SCALE)),
-        unit_quats(rows["quats"]),
-    ]
-    numbers = torch.cat(columns, 1).numpy()
-    names = _property_names(rows["sh"].shape[1] - 1)
+    splats = splats_of(gaussians, cloud, path)
+    positions = splats.means if gaussians.world_offset is None else _in_world(gaussians, span_of(gaussians, cloud))
+    if not np.isfinite(positions).all():
+        raise InputError(f"{path}: cannot write Gaussians, world_offset holds values that are not finite")
+    opacities = torch.from_numpy(splats.opacities).double().clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    numbers = np.concatenate(
+        [
+            np.zeros_like(splats.means),
+            splats.sh[:, 0],
+            splats.sh[:, 1:].transpose(0, 2, 1).reshape(splats.count, 3 * (splats.sh.shape[1] - 1)),
+            torch.logit(opacities).float().numpy()[:, None],
+            torch.from_numpy(splats.scales).log().numpy(),
+            splats.quats,
+        ],
+        1,
+    )
+    names = _property_names(splats.sh.shape[1] - 1)
     kinds = ["double" if positions.dtype == np.float64 else "float"] * 3 + ["float"] * (len(names) - 3)
-    table = np.empty(end - start, [(name, "<f8" if kind == "double" else "<f4") for name, kind in zip(names, kinds)])
+    table = np.empty(splats.count, [(name, "<f8" if kind == "double" else "<f4") for name, kind in zip(names, kinds)])
     for i, name in enumerate(names):
         table[name] = positions[:, i] if i < 3 else numbers[:, i - 3]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {end - start}"]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {splats.count}"]
     header += [f"property {kind} {name}" for name, kind in zip(names, kinds)] + ["end_header\n"]
-    temporary = path.with_name(f".{path.name}.part")
-    with open(temporary, "wb") as file:
-        file.write("\n".join(header).encode())
-        file.write(table.tobytes())
-    os.replace(temporary, path)
+    write_whole(path, "\n".join(header), table.tobytes())
 
 
-def _in_world(gaussians: Gaussians, start: int, end: int) -> np.ndarray:
-    """float64 [end - start, 3], positions with the offsets of their clouds."""
-    counts = gaussians.cu_rows.diff()
-    offset = gaussians.world_offset.double().repeat_interleave(counts, 0)[start:end]
-    return (gaussians.means[start:end].detach().double() + offset).cpu().numpy()
+def _in_world(gaussians: Gaussians, chosen: slice) -> np.ndarray:
+    """float64 [N, 3], positions with the offsets of their clouds."""
+    offset = gaussians.world_offset.double().repeat_interleave(gaussians.cu_rows.diff(), 0)
+    return (gaussians.means.detach().double() + offset)[chosen].cpu().numpy()
 
 
 def read_ply(path: str | Path) -> Gaussians:
@@ -97,7 +84,10 @@ def read_ply(path: str | Path) -> Gaussians:
         header = read_header(path, read_file(path, MAX_BYTES, MAX_HEADER))
         content = read_file(path, MAX_BYTES)
         _check_kind(path, header)
-        return _gaussians(path, read_columns(path, content, header, "vertex"), header)
+        table = read_columns(path, content, header, "vertex").get("vertex")
+        if table is None:
+            raise InputError(f"{path}: the header has no usable element vertex")
+        return _gaussians(path, table)
     except MemoryError:
         raise InputError(f"{path} cannot be read: no memory for its Gaussians") from None
 
@@ -119,7 +109,7 @@ def _check_kind(path: Path, header: Header) -> None:
         )
 
 
-def _gaussians(path: Path, table: dict[str, np.ndarray], header: Header) -> Gaussians:
+def _gaussians(path: Path, table: dict[str, np.ndarray]) -> Gaussians:
     def stack(names: list[str]) -> Tensor:
         missing = [name for name in names if name not in table]
         if missing:
@@ -139,7 +129,7 @@ def _gaussians(path: Path, table: dict[str, np.ndarray], header: Header) -> Gaus
         cu_rows=torch.tensor([0, means.shape[0]]),
         world_offset=offset,
     )
-    for name in ("means", "quats", "scales", "opacities", "sh"):
+    for name in FIELDS:
         if not torch.isfinite(getattr(gaussians, name)).all():
             raise InputError(f"{path}: {name} holds values that are not finite")
     return gaussians
@@ -185,10 +175,10 @@ def _of_bytes(path: Path, table: dict[str, np.ndarray], names: tuple[str, ...]) 
     """The constant harmonic [N, 3] of colours that are whole numbers of their type, or floats in [0, 1]."""
     rgb = np.stack([table[name] for name in names], 1)
     largest = np.iinfo(rgb.dtype).max if rgb.dtype.kind in "iu" else 1.0
-    colors = torch.from_numpy(rgb.astype(np.float32) / np.float32(largest))
-    if colors.numel() and not (colors.min() >= 0 and colors.max() <= 1):
+    colors = rgb.astype(np.float32) / np.float32(largest)
+    if not ((colors >= 0) & (colors <= 1)).all():
         raise InputError(f"{path}: {', '.join(names)} must be whole numbers, or floats in [0, 1]")
-    return (colors - 0.5) / SH_0
+    return torch.from_numpy(dc_of(colors))
 
 
 def _property_names(n_rest_per_colour: int) -> list[str]:

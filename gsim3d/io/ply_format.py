@@ -1,4 +1,4 @@
-"""The .ply container: the columns of one element of a file, whatever other elements and lists it holds."""
+"""The .ply container: columns of the elements of a file, whatever other elements and lists it holds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsim3d.errors import InputError
 
 MAX_HEADER = 65536  # bytes
 MAX_DIGITS = 15  # of a count
-MAX_RAGGED = 100_000  # rows of a file whose lists differ in length: they are read one by one
+MAX_LIST_ROWS = 100_000  # rows with lists are read one by one
 
 _DTYPES = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
@@ -25,20 +25,29 @@ _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass
 class Element:
-    """name and count, and of each property its name, the dtype of a list's length (None: no list) and its own."""
+    """One element of a header.
+
+    Attributes:
+        name: as the header has it.
+        count: rows.
+        properties: of each its name, the dtype of its length (None: a single number) and the dtype of its numbers.
+    """
 
     name: str
     count: int
     properties: list[tuple[str, str | None, str]] = field(default_factory=list)
 
-    @property
-    def has_lists(self) -> bool:
-        return any(length for _, length, _ in self.properties)
-
 
 @dataclass
 class Header:
-    """encoding, the elements in their order, the comments, and where the body begins."""
+    """The header of a file.
+
+    Attributes:
+        encoding: a key of _ORDERS.
+        elements: in the order of the body.
+        comments: also those of obj_info.
+        end: bytes before the body.
+    """
 
     encoding: str
     elements: list[Element]
@@ -47,7 +56,7 @@ class Header:
 
 
 def read_header(path: Path, content: bytes) -> Header:
-    """Raises InputError that names ``path`` and the line that cannot be used."""
+    """The header of a file's content. Raises InputError that names ``path`` and the line that cannot be used."""
     end = re.search(rb"end_header\r?\n", content[:MAX_HEADER])
     if content[:2] == b"\x1f\x8b":
         raise InputError(f"{path}: compressed with gzip; unpack it first (gunzip)")
@@ -74,23 +83,39 @@ def read_header(path: Path, content: bytes) -> Header:
     return header
 
 
-def read_columns(path: Path, content: bytes, header: Header, name: str) -> dict[str, np.ndarray]:
-    """The columns of the element ``name``, without its lists.
+def read_columns(path: Path, content: bytes, header: Header, *names: str) -> dict[str, dict[str, np.ndarray]]:
+    """The columns of elements, without their lists.
+
+    Args:
+        names: of the elements that are needed, in any order.
+
+    Returns:
+        Element -> property -> [count] numbers; elements that the file has not are absent.
 
     Raises:
-        InputError: there is no such element, the file is truncated, or lists of too many rows differ in length.
+        InputError: an element has no usable property, the file is truncated, or too many rows have lists.
     """
-    wanted = next((element for element in header.elements if element.name == name), None)
-    names = [] if wanted is None else [own for own, _, _ in wanted.properties]
-    if not names or len(set(names)) != len(names):
-        raise InputError(f"{path}: the header has no usable element {name}")
-    reader = _Text if header.encoding == "ascii" else _Binary
-    body = reader(path, memoryview(content)[header.end :], _ORDERS[header.encoding])
+    body = (_Text if header.encoding == "ascii" else _Binary)(content[header.end :], _ORDERS[header.encoding])
+    found = {}
+    wanted = {element.name for element in header.elements} & set(names)
     for element in header.elements:
-        columns = body.take(element, element is wanted)
-        if element is wanted:
-            return columns
-    raise AssertionError(name)
+        if found.keys() >= wanted:
+            break
+        properties = [name for name, _, _ in element.properties]
+        if element.name in wanted and (not properties or len(set(properties)) != len(properties)):
+            raise InputError(f"{path}: the header has no usable element {element.name[:80]}")
+        if element.count > MAX_LIST_ROWS and any(length for _, length, _ in element.properties):
+            raise InputError(
+                f"{path}: {element.count} rows of element {element.name[:80]} have lists; at most {MAX_LIST_ROWS} such "
+                "rows are read"
+            )
+        try:
+            found[element.name] = _columns(body, element)
+        except _Truncated:
+            raise InputError(
+                f"{path}: truncated or not numeric: expected {element.count} rows of element {element.name[:80]}"
+            ) from None
+    return found
 
 
 def _property(words: list[str]) -> tuple[str, str | None, str] | None:
@@ -101,130 +126,77 @@ def _property(words: list[str]) -> tuple[str, str | None, str] | None:
     return None
 
 
-class _Body:
-    """Takes one element after the other off a body: rows of one size at once, others one by one."""
-
-    def __init__(self, path: Path, order: str):
-        self.path, self.order, self.at, self.n_ragged = path, order, 0, 0
-
-    def take(self, element: Element, wanted: bool) -> dict[str, np.ndarray]:
-        lengths = [0] * len(element.properties)
-        if element.has_lists and element.count:
-            lengths = self.lengths(element, self.at)
-        columns, end = self.rows(element, lengths)
-        if columns is None:
-            columns, end = self._one_by_one(element, wanted)
-        self.at = end
-        return columns
-
-    def _one_by_one(self, element: Element, wanted: bool) -> tuple[dict[str, np.ndarray], int]:
-        self.n_ragged += element.count
-        if self.n_ragged > MAX_RAGGED:
-            raise InputError(
-                f"{self.path}: the lists of {element.count} rows of element {element.name} differ in length; at most "
-                f"{MAX_RAGGED} such rows are read"
-            )
-        one, found, at = Element(element.name, 1, element.properties), [], self.at
-        for _ in range(element.count):
-            columns, self.at = self.rows(one, self.lengths(one, self.at))
-            found.append(columns)
-        end, self.at = self.at, at
-        names = [name for name, length, _ in element.properties if not length]
-        return {name: np.concatenate([row[name] for row in found]) for name in names if wanted}, end
-
-    def _truncated(self, element: Element) -> InputError:
-        return InputError(
-            f"{self.path}: truncated or not numeric: expected {element.count} rows of element {element.name}"
-        )
-
-
-class _Binary(_Body):
-    def __init__(self, path: Path, body: memoryview, order: str):
-        super().__init__(path, order)
-        self.body = body
-
-    def lengths(self, element: Element, at: int) -> list[int]:
-        """How long the lists of the row at ``at`` are."""
-        found = []
+def _columns(body: _Binary | _Text, element: Element) -> dict[str, np.ndarray]:
+    names = [name for name, length, _ in element.properties if length is None]
+    if len(names) == len(element.properties):
+        return dict(zip(names, body.table(element.count, [kind for _, _, kind in element.properties]), strict=True))
+    rows = []
+    for _ in range(element.count):
+        row, run = [], []  # numbers of one row, and the kinds of those that stand before the next list
         for _, length, kind in element.properties:
-            found.append(0)
+            run.append(length or kind)
             if length is not None:
-                size = np.dtype(length).itemsize
-                if at + size > len(self.body):
-                    raise self._truncated(element)
-                found[-1] = max(0, int(np.frombuffer(self.body, self.order + length, 1, at)[0]))
-                at += size
-            at += np.dtype(kind).itemsize * (1 if length is None else found[-1])
-        if at > len(self.body):
-            raise self._truncated(element)
-        return found
-
-    def rows(self, element: Element, lengths: list[int]) -> tuple[dict[str, np.ndarray] | None, int]:
-        """The columns, and where they end; None where not all lists are so long."""
-        columns, size = [], 0  # of each property: where it begins, and the dtype of its number or of its length
-        for (_, length, kind), n in zip(element.properties, lengths, strict=True):
-            columns.append((size, np.dtype(self.order + (length or kind))))
-            size += columns[-1][1].itemsize + (0 if length is None else n * np.dtype(kind).itemsize)
-        end = self.at + element.count * size
-        if end > len(self.body):
-            if element.has_lists and element.count > 1:
-                return None, end
-            raise self._truncated(element)
-        found = {}
-        for (name, length, _), n, (begin, kind) in zip(element.properties, lengths, columns, strict=True):
-            column = np.empty(0, kind)
-            if element.count:
-                column = np.ndarray(element.count, kind, self.body, self.at + begin, (size,))
-            if length is None:
-                found[name] = column
-            elif (column != n).any():
-                return None, end
-        return found, end
+                *numbers, count = body.table(1, run)
+                body.skip(int(count[0]), kind)
+                row, run = row + numbers, []
+        rows.append(row + body.table(1, run))
+    return {name: np.concatenate([row[i] for row in rows] or [np.zeros(0)]) for i, name in enumerate(names)}
 
 
-class _Text(_Body):
-    def __init__(self, path: Path, body: memoryview, order: str):
-        super().__init__(path, order)
-        self.body = bytes(body).split()
+class _Truncated(Exception):
+    pass
 
-    def lengths(self, element: Element, at: int) -> list[int]:
-        found = []
-        for _, length, _ in element.properties:
-            found.append(0)
-            if length is not None:
-                if at >= len(self.body) or not self.body[at].isdigit() or len(self.body[at]) > MAX_DIGITS:
-                    raise self._truncated(element)
-                found[-1] = int(self.body[at])
-            at += 1 + found[-1]
-        if at > len(self.body):
-            raise self._truncated(element)
-        return found
 
-    def rows(self, element: Element, lengths: list[int]) -> tuple[dict[str, np.ndarray] | None, int]:
-        width = len(lengths) + sum(lengths)
-        end = self.at + element.count * width
+class _Binary:
+    """The bytes behind a header, taken off from their start."""
+
+    def __init__(self, body: bytes, order: str):
+        self.body, self.order, self.at = body, order, 0
+
+    def table(self, count: int, kinds: list[str]) -> list[np.ndarray]:
+        """``count`` rows of one number of each of ``kinds``, by column."""
+        dtype = np.dtype([(f"f{i}", self.order + kind) for i, kind in enumerate(kinds)])
+        begin = self.at
+        self._move(count * dtype.itemsize)
+        if not count * dtype.itemsize:
+            return [np.zeros(count, kind) for kind in kinds]
+        table = np.frombuffer(self.body, dtype, count, begin)
+        return [table[name] for name in dtype.names]
+
+    def skip(self, count: int, kind: str) -> None:
+        self._move(count * np.dtype(kind).itemsize)
+
+    def _move(self, count: int) -> None:
+        if not 0 <= count <= len(self.body) - self.at:
+            raise _Truncated
+        self.at += count
+
+
+class _Text(_Binary):
+    """The words behind a header."""
+
+    def __init__(self, body: bytes, order: str):
+        super().__init__(body.split(), order)
+
+    def table(self, count: int, kinds: list[str]) -> list[np.ndarray]:
+        begin = self.at
+        self._move(count * len(kinds))
         try:
-            values = np.array(self.body[self.at : end], dtype=np.float64).reshape(element.count, width)
+            values = np.array(self.body[begin : self.at], dtype=np.float64).reshape(count, len(kinds))
         except ValueError:
-            if element.has_lists and element.count > 1:
-                return None, end
-            raise self._truncated(element) from None
-        found, at = {}, 0
-        for (name, length, kind), n in zip(element.properties, lengths, strict=True):
-            column = values[:, at]
-            if length is None:
-                found[name] = self._typed(column, kind, element)
-            elif (column != n).any():
-                return None, end
-            at += 1 + n
-        return found, end
+            raise _Truncated from None
+        return [self._typed(column, kind) for column, kind in zip(values.T, kinds, strict=True)]
 
-    def _typed(self, column: np.ndarray, kind: str, element: Element) -> np.ndarray:
+    def skip(self, count: int, kind: str) -> None:
+        self._move(count)
+
+    @staticmethod
+    def _typed(column: np.ndarray, kind: str) -> np.ndarray:
         """Whole numbers in their type; others keep the digits of the text."""
         if kind[0] == "f":
             return column
         with np.errstate(invalid="ignore"):
             whole = column.astype(kind)
         if (whole != column).any():
-            raise self._truncated(element)
+            raise _Truncated
         return whole

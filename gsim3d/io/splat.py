@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.errors import InputError
-from gsim3d.io.arrays import Splats, colors_of, dc_of, read_bytes, unorm, write_bytes
+from gsim3d.io.arrays import Splats, colors_of, dc_of, read_bytes, unorm
+from gsim3d.io.files import write_whole
 
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
@@ -24,7 +25,7 @@ def write(path: Path, splats: Splats) -> None:
     table["rgba"][:, :3] = unorm(colors_of(splats), 8)
     table["rgba"][:, 3] = unorm(splats.opacities, 8)
     table["quats"] = np.clip(np.round(splats.quats * 128.0 + 128.0), 0, 255)
-    write_bytes(path, table[order].tobytes())
+    write_whole(path, table[order].tobytes())
 
 
 def read(path: Path) -> Splats:

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.errors import InputError
-from gsim3d.io.arrays import Splats, read_bytes, write_bytes
+from gsim3d.io.arrays import Splats, from_smallest_three, pack_tens, read_bytes, smallest_three, unpack_tens
+from gsim3d.io.files import write_whole
 
 MAGIC = 0x5053474E
 GZIP, ZSTD = b"\x1f\x8b", b"NGSP"  # beginnings of versions 2 and 3, and of version 4
@@ -39,7 +40,7 @@ def write(path: Path, splats: Splats) -> None:
     parts = [positions, alphas, colors, scales, _pack_rotations(splats.quats), _pack_harmonics(splats.sh[:, 1:])]
     header = HEADER.pack(MAGIC, 3, splats.count, splats.degree, bits, 0, 0)
     body = header + b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
-    write_bytes(path, gzip.compress(body, mtime=0))
+    write_whole(path, gzip.compress(body, mtime=0))
 
 
 def read(path: Path) -> Splats:
@@ -122,11 +123,11 @@ def _decoded(version: int, count: int, degree: int, bits: int, parts: list[bytes
     fixed[:, :, :3] = positions.reshape(count, 3, 3)
     fixed[:, :, 3] = np.where(fixed[:, :, 2] & 128, 255, 0)
     means = fixed.view("<i4")[..., 0] / 2.0**bits
-    unpack = _unpack_three if version == 2 else _unpack_rotations
+    quats = _unpack_three(rotations, count) if version == 2 else _unpack_rotations(rotations)
     dc = (colors.reshape(count, 3) / 255.0 - 0.5) / COLOR_SCALE
     harmonics = (rest.reshape(count, N_REST[degree], 3) - 128.0) / 128
     sh = np.concatenate([dc[:, None], harmonics], 1)
-    return Splats(means, unpack(rotations, count), np.exp(scales.reshape(count, 3) / 16.0 - 10), alphas / 255.0, sh)
+    return Splats(means, quats, np.exp(scales.reshape(count, 3) / 16.0 - 10), alphas / 255.0, sh)
 
 
 def _pack_harmonics(rest: np.ndarray) -> np.ndarray:
@@ -138,26 +139,15 @@ def _pack_harmonics(rest: np.ndarray) -> np.ndarray:
 
 def _pack_rotations(quats: np.ndarray) -> np.ndarray:
     """uint32 [N]: index of the largest of (x, y, z, w), then sign and 9 bits of each of the others."""
-    xyzw = quats[:, [1, 2, 3, 0]].astype(np.float64)
-    largest, rows = np.abs(xyzw).argmax(1), np.arange(len(xyzw))
-    xyzw *= np.where(xyzw[rows, largest] < 0, -1, 1)[:, None]
-    packed = largest.astype(np.uint32)
-    for smaller in range(3):
-        component = xyzw[rows, smaller + (smaller >= largest)]
-        size = np.clip(np.floor(511 * np.abs(component) * 2**0.5 + 0.5), 0, 511).astype(np.uint32)
-        packed = (packed << 10) | ((component < 0).astype(np.uint32) << 9) | size
-    return packed.astype("<u4")
+    largest, others = smallest_three(quats[:, [1, 2, 3, 0]].astype(np.float64))
+    sizes = np.clip(np.floor(511 * np.abs(others) * 2**0.5 + 0.5), 0, 511).astype(np.uint32)
+    return pack_tens(largest, ((others < 0).astype(np.uint32) << 9) | sizes).astype("<u4")
 
 
-def _unpack_rotations(rotations: np.ndarray, count: int) -> np.ndarray:
-    packed = np.ascontiguousarray(rotations).view("<u4")
-    largest, rows, xyzw = (packed >> 30).astype(np.int64), np.arange(count), np.zeros((count, 4))
-    for smaller, shift in enumerate((20, 10, 0)):
-        field = (packed >> shift) & 1023
-        size = (field & 511) / 511.0 / 2**0.5
-        xyzw[rows, smaller + (smaller >= largest)] = np.where(field >> 9, -size, size)
-    xyzw[rows, largest] = np.sqrt(np.clip(1 - (xyzw**2).sum(1), 0, 1))
-    return xyzw[:, [3, 0, 1, 2]]
+def _unpack_rotations(rotations: np.ndarray) -> np.ndarray:
+    largest, fields = unpack_tens(np.ascontiguousarray(rotations).view("<u4"))
+    sizes = (fields & 511) / 511.0 / 2**0.5
+    return from_smallest_three(largest, np.where(fields >> 9, -sizes, sizes))[:, [3, 0, 1, 2]]
 
 
 def _unpack_three(rotations: np.ndarray, count: int) -> np.ndarray:

@@ -6,16 +6,15 @@ move make a field of their own, which has no time samples.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from gsim3d.errors import InputError
-from gsim3d.io.arrays import Splats
+from gsim3d.io.arrays import FIELDS, Y_TO_Z_UP, Splats, turned
+from gsim3d.io.files import whole_file
 
-FIELDS = ("means", "quats", "scales", "opacities", "sh")
 TYPE = "ParticleField3DGaussianSplat"
 
 
@@ -30,9 +29,8 @@ def _pxr(path: Path):
 def write(path: Path, frames: Sequence[Splats], fps: float) -> None:
     """Writes frames without loss, z up, in metres; a single one without time."""
     _, Sdf, Usd, UsdGeom, Vt = _pxr(path)
-    temporary = path.with_name(f".part.{path.name}")
-    stage = Usd.Stage.CreateNew(str(temporary))
-    try:
+    with whole_file(path) as part:
+        stage = Usd.Stage.CreateNew(str(part))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         root = stage.DefinePrim("/Gaussians", "Xform")
@@ -42,13 +40,10 @@ def write(path: Path, frames: Sequence[Splats], fps: float) -> None:
             stage.SetFramesPerSecond(fps)
             stage.SetStartTimeCode(0)
             stage.SetEndTimeCode(len(frames) - 1)
-        for name, part in _split(frames):
-            _field(stage.DefinePrim(f"/Gaussians/{name}", TYPE), part, Sdf, Vt)
+        for name, chosen in _split(frames):
+            _field(stage.DefinePrim(f"/Gaussians/{name}", TYPE), chosen, Sdf, Vt)
         stage.GetRootLayer().Save()
         del stage
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read(path: Path) -> Splats:
@@ -72,8 +67,6 @@ def read(path: Path) -> Splats:
         raise InputError(f"{path}: its fields have different degrees of harmonics")
     whole = Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in FIELDS))
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
-        from gsim3d.io.arrays import Y_TO_Z_UP, turned
-
         whole = turned(whole, Y_TO_Z_UP)
     unit = np.float32(UsdGeom.GetStageMetersPerUnit(stage))
     return Splats(whole.means * unit, whole.quats, whole.scales * unit, whole.opacities, whole.sh)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import errno
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from gsim3d.errors import InputError
-from gsim3d.io.files import opencv_path
+from gsim3d.io.files import opencv_path, whole_file
 
 
 def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> None:
@@ -34,23 +33,21 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> N
     kind, shape = next(iter(shapes), ("nothing", ()))
     if len(shapes) != 1 or kind != "uint8" or len(shape) != 3 or shape[2] != 3 or shape[0] % 2 or shape[1] % 2:
         raise InputError(f"{path}: frames must be uint8 [H, W, 3] of one even size; got {sorted(map(str, shapes))[:3]}")
-    temporary = path.with_name(f".{path.stem}.part.mp4")
     log_level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        codec = cv2.VideoWriter_fourcc(*"vp09")
-        writer = cv2.VideoWriter(opencv_path(temporary), codec, float(fps), (shape[1], shape[0]))
-        if not writer.isOpened():
-            raise InputError(f"{path}: this OpenCV cannot write VP9 video here (folder missing or codec not built in)")
-        for frame in frames:
-            writer.write(np.ascontiguousarray(frame[..., ::-1]))
-        writer.release()  # says nothing of a full disk, which leaves a file without an index
-        if not _is_whole(temporary):
-            raise OSError(errno.EIO, "the video could not be written as a whole; is the disk full?", str(path))
-        os.replace(temporary, path)
+        with whole_file(path) as part:
+            codec = cv2.VideoWriter_fourcc(*"vp09")
+            writer = cv2.VideoWriter(opencv_path(part), codec, float(fps), (shape[1], shape[0]))
+            if not writer.isOpened():
+                raise InputError(f"{path}: this OpenCV cannot write VP9 here (folder missing or codec not built in)")
+            for frame in frames:
+                writer.write(np.ascontiguousarray(frame[..., ::-1]))
+            writer.release()  # reports no full disk, which leaves a file without an index
+            if not _is_whole(part):
+                raise OSError(errno.EIO, "the video could not be written as a whole; is the disk full?")
     finally:
         cv2.utils.logging.setLogLevel(log_level)
-        temporary.unlink(missing_ok=True)
 
 
 def _is_whole(path: Path) -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ import numpy as np
 
 from gsim3d.errors import InputError
 from gsim3d.io.arrays import Splats, colors_of, splats_of
+from gsim3d.io.files import write_whole
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.state import Gaussians
 
@@ -95,14 +95,7 @@ def write_player(
     script = files("gsim3d.viewer").joinpath("player.js").read_text()
     filled = page.replace("{{title}}", _escaped(title)).replace("{{script}}", script).replace("{{blobs}}", scripts)
     content = filled.replace("{{header}}", json.dumps(header).replace("<", "\\u003c"))
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        temporary.write_text(content, encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}") from None
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_whole(path, content)
 
 
 def _packed(path: Path, frames: Sequence[Splats]) -> tuple[dict, list[bytes]]:

@@ -227,7 +227,7 @@ def test_lists_and_further_elements(lists, form, tmp_path):
         (
             b"ply\nformat binary_little_endian 1.0\nelement a 99999999\nproperty list uint int l\nelement vertex 1\n"
             b"property float x\nend_header\n" + b"\xff" * 64,
-            "truncated",
+            "have lists",
         ),
     ],
 )
@@ -237,11 +237,11 @@ def test_what_is_no_file_of_gaussians(content, message, tmp_path):
     assert len(str(caught.value)) < 400 and "\n" not in str(caught.value)
 
 
-def test_rows_that_differ_are_read_up_to_a_bound(tmp_path, monkeypatch):
-    monkeypatch.setattr("gsim3d.io.ply_format.MAX_RAGGED", 3)
+def test_rows_with_lists_are_read_up_to_a_bound(tmp_path, monkeypatch):
+    monkeypatch.setattr("gsim3d.io.ply_format.MAX_LIST_ROWS", 3)
     faces = [[[0] * (1 + i % 2)] for i in range(4)]
     content = rows_of(XYZ + DC + REST, [[1, 2, 3, 0, 0, 0, *SHAPE]], before=[("face", [("uchar", "int", "v")], faces)])
-    with pytest.raises(InputError, match="differ in length"):
+    with pytest.raises(InputError, match="have lists"):
         read(tmp_path, content)
 
 
