@@ -16,18 +16,15 @@ from setuptools import setup
 from torch.utils import cpp_extension
 
 ROOT = Path(__file__).parent
-# one op, one folder
-OPS = "curve sparse_conv patch_attn pool row_norm plane_sweep raster sentinel decode background".split()
 CPU_FLAGS = ["-O3", "-std=c++20", "-fopenmp-simd", "-ffp-contract=off", "-fvisibility=hidden", "-Wall"]
 if platform.machine() in ("x86_64", "AMD64"):
     CPU_FLAGS.append("-march=x86-64-v3")  # a fixed baseline: the same bits on every machine, no -march=native
 
 
 def sources(*suffixes: str) -> list[str]:
-    found = []
-    for op in OPS:
-        folder = ROOT / "csrc" / "gsim3d" / op
-        found += [path for suffix in suffixes for path in sorted(folder.glob(f"*{suffix}"))]
+    """The files of all ops, one folder each, that end with one of ``suffixes``."""
+    folder = ROOT / "csrc" / "gsim3d"
+    found = [path for suffix in suffixes for path in sorted(folder.glob(f"*/*{suffix}"))]
     return [str(path.relative_to(ROOT)) for path in found]
 
 

@@ -5,6 +5,7 @@
 #include "gsim3d/background/background_math.h"
 #include "gsim3d/core/cuda_utils.cuh"
 #include "gsim3d/core/half.cuh"
+#include "gsim3d/core/pack.cuh"
 
 namespace gsim3d::cuda {
 namespace {
@@ -24,12 +25,6 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t i = static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x;
   if (i < n) places[i] = background::place_of(cells, n_cells, background::cell_key(scene[i], grid + 3 * i));
 }
-
-// N channels of a row at once.
-template <typename T, int N>
-struct alignas(sizeof(T) * N) Pack {
-  T lane[N];
-};
 
 template <typename T, int N>
 __global__ void __launch_bounds__(kThreads)

@@ -20,6 +20,7 @@
 #include "gsim3d/pool/pool.h"
 #include "gsim3d/raster/raster.h"
 #include "gsim3d/raster/raster_math.h"
+#include "gsim3d/sentinel/sentinel.h"
 #include "gsim3d/sparse_conv/sparse_conv.h"
 
 namespace py = pybind11;
@@ -233,6 +234,12 @@ py::dict build_info() {
   return info;
 }
 
+py::tuple tuple_of(const char* const* texts, int n) {
+  py::tuple values(n);
+  for (int i = 0; i < n; ++i) values[i] = texts[i];
+  return values;
+}
+
 py::dict constants() {
   py::dict values;
   values["raster_min_alpha"] = gsim3d::raster::kMinAlpha;
@@ -242,6 +249,23 @@ py::dict constants() {
   values["plane_sweep_min_depth"] = gsim3d::plane_sweep_math::kMinDepth<double>;
   values["patch_attn_max_head_dim"] = gsim3d::cpu::kMaxHeadDim;
   values["curve_max_depth"] = gsim3d::kMaxDepth;
+  // What gsim3d.ops says of calls and their faults.
+  using gsim3d::RasterCutoff, gsim3d::RasterJacobian;
+  values["raster_largest"] = gsim3d::raster::kLargest;
+  values["raster_faults"] = tuple_of(gsim3d::kFaultTexts, gsim3d::kFaultBits);
+  values["raster_row_faults"] = gsim3d::kRowFaults;
+  values["raster_cutoffs"] = py::dict(py::arg("exact") = static_cast<int64_t>(RasterCutoff::kExact),
+                                      py::arg("tile3sigma") = static_cast<int64_t>(RasterCutoff::kTile3Sigma),
+                                      py::arg("smooth") = static_cast<int64_t>(RasterCutoff::kSmooth));
+  values["raster_jacobians"] = py::dict(py::arg("exact") = static_cast<int64_t>(RasterJacobian::kExact),
+                                        py::arg("clamped") = static_cast<int64_t>(RasterJacobian::kClamped));
+  values["validate_cells"] = static_cast<int64_t>(gsim3d::kWatchedCells);
+  values["validate_outside"] = gsim3d::kOutside;
+  values["validate_fast"] = gsim3d::kFast;
+  values["validate_max_fields"] = gsim3d::kMaxWatchedFields;
+  values["validate_sums"] = tuple_of(gsim3d::kWatchedSumNames, gsim3d::kWatchedSums);
+  values["validate_rows_a_part"] = py::dict(py::arg("cpu") = gsim3d::cpu::kWatchedPiece,
+                                            py::arg("cuda") = gsim3d::cuda::kWatchedPiece);
   return values;
 }
 

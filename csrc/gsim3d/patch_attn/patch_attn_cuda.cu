@@ -1,6 +1,7 @@
 // Patch attention on a GPU: which kernels run, and gradients of rows that several slots list.
 #include <algorithm>
 
+#include "gsim3d/core/pack.cuh"
 #include "gsim3d/patch_attn/patch_attn_simple.cuh"
 #include "gsim3d/patch_attn/patch_attn_tensor.cuh"
 
@@ -9,11 +10,6 @@ namespace {
 
 constexpr int kThreads = 256;
 constexpr int kVector = 4;  // numbers written at once; a head has a multiple of it
-
-template <typename T>
-struct alignas(kVector * sizeof(T)) Vector {
-  T numbers[kVector];
-};
 
 template <typename T>
 HeadRows<Native<T>> device(const HeadRows<T>& x) {
@@ -47,7 +43,7 @@ __global__ void prepare_kernel(PatchTable table, RowUses uses, T* grad_q, int64_
   const int64_t n_warps = static_cast<int64_t>(gridDim.x) * (kThreads / kWarp);
   for (int64_t row = slot / kWarp; row < table.n_q; row += n_warps)
     for (int64_t i = lane; i < width / kVector; i += kWarp)
-      reinterpret_cast<Vector<T>*>(grad_q + row * row_stride)[i] = {};
+      reinterpret_cast<Pack<T, kVector>*>(grad_q + row * row_stride)[i] = {};
   const int64_t end = min(table.cu_k[table.n_patches], table.n_k_listed);
   if (slot >= end || slot < table.cu_k[0]) return;
   const int64_t row = table.kv_rows[slot];

@@ -137,7 +137,7 @@ template <typename T, int kVectors>
 __global__ void __launch_bounds__(kMaxWarps* kWarp, sizeof(T) == 4 ? 3 : 2)
     gather_kernel(Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s, Lines<T> lines, int64_t quads, bool add,
                   Pixels<T> grad_pixels) {
-  using Own = Pack<T, kVectors>;
+  using Own = Feature<T, kVectors>;
   extern __shared__ __align__(16) char shared[];
   const int lane = threadIdx.x % kWarp;
   const int64_t task = (int64_t{blockIdx.x} * blockDim.x + threadIdx.x) / kWarp;
@@ -166,11 +166,11 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, sizeof(T) == 4 ? 3 : 2)
 #pragma unroll 4
       for (int32_t r = 0; r < held; ++r) {
         const Own other = *reinterpret_cast<const Own*>(from + int64_t{list[r]} * pixels.stride);
-        const Pack<T, kQuad> weight = *reinterpret_cast<const Pack<T, kQuad>*>(weights + r * kQuad);
+        const Feature<T, kQuad> weight = *reinterpret_cast<const Feature<T, kQuad>*>(weights + r * kQuad);
 #pragma unroll
         for (int j = 0; j < kQuad; ++j)
 #pragma unroll
-          for (int v = 0; v < kVectors; ++v) sums[j].v[v] += weight.v[j] * other.v[v];
+          for (int v = 0; v < kVectors; ++v) sums[j].lane[v] += weight.lane[j] * other.lane[v];
       }
       __syncwarp();
       held = 0;
@@ -228,7 +228,7 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp, sizeof(T) == 4 ? 3 : 2)
     if (add) {
       const Own earlier = *to;
 #pragma unroll
-      for (int v = 0; v < kVectors; ++v) sums[j].v[v] += earlier.v[v];
+      for (int v = 0; v < kVectors; ++v) sums[j].lane[v] += earlier.lane[v];
     }
     *to = sums[j];
   }
@@ -264,7 +264,7 @@ template <typename T, int kVectors>
 __global__ void __launch_bounds__(kMaxWarps* kWarp)
     source_kernel(Pixels<const T> pixels, PlaneSweep<T> sweep, LineSizes s, Lines<T> lines, int64_t tasks_per_image,
                   Pixels<T> grad_pixels) {
-  using Own = Pack<T, kVectors>;
+  using Own = Feature<T, kVectors>;
   extern __shared__ __align__(16) char shared[];
   const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp, part = warp % kParts;
   const int64_t at = int64_t{blockIdx.x} * kTasks + warp / kParts;
@@ -317,7 +317,7 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
               if (!(touched >> q & 1)) continue;
               const T weight = __shfl_sync(kFullWarp, weights[q], hit);
 #pragma unroll
-              for (int v = 0; v < kVectors; ++v) sums[q].v[v] += weight * feature.v[v];
+              for (int v = 0; v < kVectors; ++v) sums[q].lane[v] += weight * feature.lane[v];
             }
           }
         };
@@ -335,7 +335,7 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
       for (int q = 0; q < kOwned; ++q) {
         Own sum = turn > 0 ? total[q * kWarp] : Own{};
 #pragma unroll
-        for (int v = 0; v < kVectors; ++v) sum.v[v] += sums[q].v[v];
+        for (int v = 0; v < kVectors; ++v) sum.lane[v] += sums[q].lane[v];
         total[q * kWarp] = sum;
       }
     }
@@ -348,7 +348,7 @@ __global__ void __launch_bounds__(kMaxWarps* kWarp)
     Own* to = reinterpret_cast<Own*>(grad_pixels.at(s, source, pixel) + channel);
     Own sum = *to;
 #pragma unroll
-    for (int v = 0; v < kVectors; ++v) sum.v[v] += total[q * kWarp].v[v];
+    for (int v = 0; v < kVectors; ++v) sum.lane[v] += total[q * kWarp].lane[v];
     *to = sum;
   }
 }

@@ -1,6 +1,7 @@
 // What the sweep's kernels share: features with channels last, and four neighbouring pixels with their lines.
 #pragma once
 
+#include "gsim3d/core/pack.cuh"
 #include "gsim3d/plane_sweep/plane_sweep_line.cuh"
 
 namespace gsim3d::cuda {
@@ -16,9 +17,7 @@ constexpr int64_t kListBytes = int64_t{512} << 20;  // lines kept at once in the
 
 // kVectors elements of a feature, one load.
 template <typename T, int kVectors>
-struct alignas(sizeof(T) * kVectors < 16 ? sizeof(T) * kVectors : 16) Pack {
-  T v[kVectors];
-};
+using Feature = Pack<T, kVectors, sizeof(T) * kVectors < 16 ? sizeof(T) * kVectors : 16>;
 
 // Channels-last features: image i, pixel p at data + (i n_pixels + p) stride; stride is a multiple of a warp's packs.
 template <typename T>
@@ -153,12 +152,12 @@ __device__ __forceinline__ int32_t mark(const Sample<T> (&samples)[kQuad], const
 template <typename T, int kVectors>
 struct Share {
   static constexpr int kWidth = kVectors == 1 ? 2 : 4, kPacks = 2 * kVectors / kWidth;
-  Pack<T, kWidth> packs[kPacks];
+  Feature<T, kWidth> packs[kPacks];
 
   __device__ __forceinline__ void load(const T* __restrict__ from) {
 #pragma unroll
     for (int e = 0; e < kPacks; ++e)
-      packs[e] = reinterpret_cast<const Pack<T, kWidth>*>(from)[threadIdx.x % kGroup + e * kGroup];
+      packs[e] = reinterpret_cast<const Feature<T, kWidth>*>(from)[threadIdx.x % kGroup + e * kGroup];
   }
 };
 
@@ -185,7 +184,7 @@ __device__ __forceinline__ void add_dots(const Share<T, kVectors> (&own)[kQuad],
 #pragma unroll
         for (int e = 0; e < Part::kPacks; ++e)
 #pragma unroll
-          for (int c = 0; c < Part::kWidth; ++c) sums[j] += own[j].packs[e].v[c] * other[t].packs[e].v[c];
+          for (int c = 0; c < Part::kWidth; ++c) sums[j] += own[j].packs[e].lane[c] * other[t].packs[e].lane[c];
       }
       // Lanes exchange halves of what they hold, so that every four lanes end with one pixel's sum.
       T a = upper_half ? sums[2] : sums[0], b = upper_half ? sums[3] : sums[1];

@@ -1,4 +1,5 @@
 #include "gsim3d/core/cuda_utils.cuh"
+#include "gsim3d/core/pack.cuh"
 #include "gsim3d/pool/pool.h"
 
 namespace gsim3d::cuda {
@@ -6,11 +7,6 @@ namespace {
 
 constexpr int kThreads = 256;
 
-// N channels that one thread moves at once; aligned, so that it is one load where 16 bytes hold them.
-template <typename T, int N>
-struct alignas(sizeof(T) * N) Pack {
-  T lane[N];
-};
 template <typename T, int N>
 __device__ __forceinline__ Pack<T, N> load(const T* at) {
   return *reinterpret_cast<const Pack<T, N>*>(at);

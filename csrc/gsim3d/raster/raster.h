@@ -64,7 +64,18 @@ enum RasterFault : int64_t {
   kFaultTiles = 128,      // not of a row: all Gaussians of the image together touch 2^31 tiles or more; none is drawn
   kFaultCamera = 256,     // not of a row: camera or cloud of the image is none (CUDA; the CPU throws)
 };
-constexpr int kFaultBits = 9;
+constexpr int kFaultBits = 9, kRowFaults = 7;  // the first ones are of rows
+constexpr const char* kFaultTexts[kFaultBits] = {
+    "not finite or beyond 1e15",
+    "not finite",
+    "negative, not finite or beyond 1e15",
+    "outside [0, 1]",
+    "not finite or beyond 1e15",
+    "not finite or beyond 1e15",
+    "too large, the projection overflows",
+    "too large, together they touch 2^31 tiles or more",
+    "not a camera, or it shows no cloud",
+};
 
 template <typename T>
 struct RasterImages {

@@ -6,6 +6,7 @@
 #include "gsim3d/core/cuda_utils.cuh"
 #include "gsim3d/core/half.cuh"
 #include "gsim3d/core/half.h"
+#include "gsim3d/core/pack.cuh"
 #include "gsim3d/row_norm/row_norm_math.h"
 
 // apply(In, Out) for the types of rows and results that row_norm and norm_gelu take.
@@ -43,11 +44,6 @@ __device__ __forceinline__ To narrow(S x) {
   else return x;
 }
 
-template <typename T>
-struct alignas(sizeof(T) * kVector) Pack {
-  T lane[kVector];
-};
-
 // A group of kGroup lanes owns a row; a lane holds kPacks times kVector of its channels. kExact: rows are whole vectors
 // and aligned, else single channels are moved.
 template <int kGroup, int kPacks, bool kExact>
@@ -60,8 +56,8 @@ struct Layout {
     for (int p = 0; p < kPacks; ++p) {
       const int c = channel(p, lane);
       if (kExact) {
-        Pack<T> pack{};
-        if (c < channels) pack = *reinterpret_cast<const Pack<T>*>(row + c);
+        Pack<T, kVector> pack{};
+        if (c < channels) pack = *reinterpret_cast<const Pack<T, kVector>*>(row + c);
 #pragma unroll
         for (int j = 0; j < kVector; ++j) to[p][j] = c < channels ? static_cast<S>(widen(pack.lane[j])) : S(0);
       } else {
@@ -77,10 +73,10 @@ struct Layout {
     for (int p = 0; p < kPacks; ++p) {
       const int c = channel(p, lane);
       if (kExact) {
-        Pack<T> pack;
+        Pack<T, kVector> pack;
 #pragma unroll
         for (int j = 0; j < kVector; ++j) pack.lane[j] = narrow<T>(from[p][j]);
-        if (c < channels) *reinterpret_cast<Pack<T>*>(row + c) = pack;
+        if (c < channels) *reinterpret_cast<Pack<T, kVector>*>(row + c) = pack;
       } else {
 #pragma unroll
         for (int j = 0; j < kVector; ++j)

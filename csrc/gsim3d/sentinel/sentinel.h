@@ -21,6 +21,8 @@ constexpr double kWatchedCells = 65536;  // of a workspace along each axis: code
 // usable and awake, half their squared displacements, the opacities of all rows that have one in bounds, and the lowest
 // and highest positions of the awake.
 constexpr int kWatchedSums = 9;
+constexpr const char* kWatchedSumNames[kWatchedSums] = {"awake", "kinetic_energy", "opacity_mass", "low_x", "low_y",
+                                                        "low_z", "high_x", "high_y", "high_z"};
 constexpr int watched_columns(int n_fields) { return 2 * (n_fields + 2) + kWatchedSums; }
 
 template <typename T>

@@ -3,6 +3,7 @@
 #include <algorithm>
 
 #include "gsim3d/core/cuda_utils.cuh"
+#include "gsim3d/core/pack.cuh"
 #include "gsim3d/sentinel/sentinel_math.h"
 
 namespace gsim3d::cuda {
@@ -17,23 +18,18 @@ constexpr int kBatch = 4;             // packs that a thread reads before it loo
 constexpr int kTeams = 1024 / kWarp;  // that share the partial records of a cloud
 static_assert(watched_columns(kMaxWatchedFields) <= kWarp);
 
-template <typename T>
-struct alignas(16) Pack {
-  static constexpr int kSize = 16 / sizeof(T);
-  T values[kSize];
-};
-
 // One field of a piece as a run of numbers, 16 bytes a read where its addresses allow it: copies it and says whether a
 // number that this thread read is out of bounds.
 template <typename T>
 __device__ bool look_at_field(const T* __restrict__ values, T* __restrict__ copy, int64_t count, T low, T high) {
-  constexpr int kSize = Pack<T>::kSize;
-  const bool aligned = (reinterpret_cast<uintptr_t>(values) | reinterpret_cast<uintptr_t>(copy)) % sizeof(Pack<T>) == 0;
+  constexpr int kSize = 16 / sizeof(T);
+  using Read = Pack<T, kSize>;
+  const bool aligned = (reinterpret_cast<uintptr_t>(values) | reinterpret_cast<uintptr_t>(copy)) % sizeof(Read) == 0;
   const int64_t n_packs = aligned ? count / kSize : 0;
-  const auto* packs = reinterpret_cast<const Pack<T>*>(values);
+  const auto* packs = reinterpret_cast<const Read*>(values);
   bool good = true;
   for (int64_t first = threadIdx.x; first < n_packs; first += kBatch * kPiece) {
-    Pack<T> read[kBatch];
+    Read read[kBatch];
 #pragma unroll
     for (int b = 0; b < kBatch; ++b) {
       if (first + b * kPiece < n_packs) read[b] = packs[first + b * kPiece];
@@ -42,9 +38,9 @@ __device__ bool look_at_field(const T* __restrict__ values, T* __restrict__ copy
     for (int b = 0; b < kBatch; ++b) {
       const int64_t at = first + b * kPiece;
       if (at < n_packs) {
-        if (copy != nullptr) reinterpret_cast<Pack<T>*>(copy)[at] = read[b];
+        if (copy != nullptr) reinterpret_cast<Read*>(copy)[at] = read[b];
 #pragma unroll
-        for (int i = 0; i < kSize; ++i) good &= read[b].values[i] >= low && read[b].values[i] <= high;
+        for (int i = 0; i < kSize; ++i) good &= read[b].lane[i] >= low && read[b].lane[i] <= high;
       }
     }
   }

@@ -1,5 +1,6 @@
 #include <algorithm>
 
+#include "gsim3d/core/pack.cuh"
 #include "gsim3d/sparse_conv/sparse_conv_device.cuh"
 
 namespace gsim3d::cuda {
@@ -27,11 +28,6 @@ void check_sizes(const char* op, const SparseConvMap& map, int64_t c_in, int64_t
   check(map.kernel_size <= kMaxKernel, op, ": CUDA takes kernels up to ", kMaxKernel, "; got ", map.kernel_size);
 }
 
-template <typename E, int kVector>
-struct alignas(sizeof(E) * kVector) Vector {
-  E values[kVector];
-};
-
 // One value for each voxel of several rows; a thread has kVector columns of a voxel and takes its rows in order.
 template <typename E, int kVector>
 __global__ void __launch_bounds__(kThreads)
@@ -48,15 +44,15 @@ __global__ void __launch_bounds__(kThreads)
   for (int64_t j = rows.begin; j < rows.end; ++j) {
     const int64_t row = sources.voxel_rows[j];
     if (!inside(row, sources.n_rows)) continue;
-    const auto values = *reinterpret_cast<const Vector<E, kVector>*>(x + row * channels + c);
+    const auto values = *reinterpret_cast<const Pack<E, kVector>*>(x + row * channels + c);
 #pragma unroll
-    for (int k = 0; k < kVector; ++k) sums[k] += static_cast<Sum<E>>(values.values[k]);
+    for (int k = 0; k < kVector; ++k) sums[k] += static_cast<Sum<E>>(values.lane[k]);
   }
   const Sum<E> count = kind == VoxelValue::kMean ? static_cast<Sum<E>>(rows.end - rows.begin) : Sum<E>(1);
-  Vector<E, kVector> result;
+  Pack<E, kVector> result;
 #pragma unroll
-  for (int k = 0; k < kVector; ++k) result.values[k] = static_cast<E>(sums[k] / count);
-  *reinterpret_cast<Vector<E, kVector>*>(shared + wide_product(source - sources.n_rows, channels) + c) = result;
+  for (int k = 0; k < kVector; ++k) result.lane[k] = static_cast<E>(sums[k] / count);
+  *reinterpret_cast<Pack<E, kVector>*>(shared + wide_product(source - sources.n_rows, channels) + c) = result;
 }
 
 // Clears the rows that no voxel lists. Every lane looks for one row among those of its voxel, which ascend; the warp
@@ -101,8 +97,8 @@ constexpr int kSquare = 64;
 template <typename E, bool kVectors>
 __global__ void __launch_bounds__(kThreads)
     transpose_weights(const E* from, int32_t taps, int32_t c_in, int32_t c_out, int32_t padded, E* to) {
-  using Eight = Vector<E, 8>;
-  using Two = Vector<E, 2>;
+  using Eight = Pack<E, 8>;
+  using Two = Pack<E, 2>;
   constexpr int kTwos = kSquare / 2, kEights = kSquare / 8;
   static_assert(kThreads == kTwos * kEights);
   __shared__ Two square[kSquare][kTwos + 1];
@@ -120,11 +116,11 @@ __global__ void __launch_bounds__(kThreads)
     } else {
 #pragma unroll
       for (int k = 0; k < 8; ++k)
-        if (ci + k < c_in) read[h].values[k] = values[k];
+        if (ci + k < c_in) read[h].lane[k] = values[k];
     }
   }
 #pragma unroll
-  for (int k = 0; k < 8; ++k) square[column * 8 + k][row] = Two{read[0].values[k], read[1].values[k]};
+  for (int k = 0; k < 8; ++k) square[column * 8 + k][row] = Two{read[0].lane[k], read[1].lane[k]};
   __syncthreads();
 #pragma unroll
   for (int r = row; r < kSquare; r += kTwos) {
@@ -134,8 +130,8 @@ __global__ void __launch_bounds__(kThreads)
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
       const Two two = square[r][column * 4 + k];
-      turned.values[2 * k] = two.values[0];
-      turned.values[2 * k + 1] = two.values[1];
+      turned.lane[2 * k] = two.lane[0];
+      turned.lane[2 * k + 1] = two.lane[1];
     }
     if (ci < c_in && co < padded) *reinterpret_cast<Eight*>(to + (ci * taps + tap) * padded + co) = turned;
   }
@@ -201,9 +197,9 @@ __global__ void __launch_bounds__(kThreads)
   if (c < channels)
 #pragma unroll 8
     for (int64_t row = begin + lane; row < end; row += kRowsAtOnce) {
-      const auto values = *reinterpret_cast<const Vector<E, kVector>*>(grad + row * channels + c);
+      const auto values = *reinterpret_cast<const Pack<E, kVector>*>(grad + row * channels + c);
 #pragma unroll
-      for (int i = 0; i < kVector; ++i) sum[i] += static_cast<Sum<E>>(values.values[i]);
+      for (int i = 0; i < kVector; ++i) sum[i] += static_cast<Sum<E>>(values.lane[i]);
     }
 #pragma unroll
   for (int i = 0; i < kVector; ++i) {
@@ -272,19 +268,19 @@ __global__ void __launch_bounds__(kThreads)
       for (int k = 0; k < kFewEach; ++k) {
         const int64_t i = first + k * kApart;
         if (i >= count) continue;
-        const auto part = *reinterpret_cast<const Vector<T, kFewColumns>*>(from + i);
+        const auto part = *reinterpret_cast<const Pack<T, kFewColumns>*>(from + i);
 #pragma unroll
-        for (int j = 0; j < kFewColumns; ++j) sums[k][j] += part.values[j];
+        for (int j = 0; j < kFewColumns; ++j) sums[k][j] += part.lane[j];
       }
     }
 #pragma unroll
     for (int k = 0; k < kFewEach; ++k) {
       const int64_t i = first + k * kApart;
       if (i >= count) continue;
-      Vector<R, kFewColumns> result;
+      Pack<R, kFewColumns> result;
 #pragma unroll
-      for (int j = 0; j < kFewColumns; ++j) result.values[j] = static_cast<R>(sums[k][j]);
-      *reinterpret_cast<Vector<R, kFewColumns>*>(result_at(i)) = result;
+      for (int j = 0; j < kFewColumns; ++j) result.lane[j] = static_cast<R>(sums[k][j]);
+      *reinterpret_cast<Pack<R, kFewColumns>*>(result_at(i)) = result;
     }
   } else {
     __shared__ T sums[kAdders][kEach][kElements];
