@@ -30,7 +30,7 @@ from gsim3d.evaluate.protocol import score_scene  # noqa: E402
 from gsim3d.evaluate.report import summarize, write_json  # noqa: E402
 from gsim3d.nn.point_transformer import Block  # noqa: E402
 from gsim3d.simulator import Simulator  # noqa: E402
-from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig  # noqa: E402
+from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseConfig, TrainConfig  # noqa: E402
 from gsim3d.train.loop import Trainer  # noqa: E402
 from gsim3d.train.restore import restore  # noqa: E402
 from gsim3d.train.settings import to_dict  # noqa: E402
@@ -40,10 +40,10 @@ RUN = TrainConfig(
     preset="tiny",
     model={"dynamics": {"zero_init": False}},  # else blocks learn nothing before the last layer has
     data=DataConfig(history=2, context_views=4, target_only_cameras=(2, 7), background_stride=2),
-    stages=(
-        StageConfig(steps=700, history=1, batch=2, target_views=2, learning_rate=2e-3),
-        StageConfig(steps=1200, horizon=4, batch=2, target_views=2, from_start=0.4, learning_rate=1e-3),
-        StageConfig(steps=1100, horizon=8, batch=2, target_views=2, from_start=0.4, learning_rate=1e-3),
+    phases=(
+        PhaseConfig(steps=700, history=1, batch=2, target_views=2, learning_rate=2e-3),
+        PhaseConfig(steps=1200, horizon=4, batch=2, target_views=2, from_start=0.4, learning_rate=1e-3),
+        PhaseConfig(steps=1100, horizon=8, batch=2, target_views=2, from_start=0.4, learning_rate=1e-3),
     ),
     loss=LossConfig(body_weight=2.0),
     optimizer=OptimizerConfig(ema_decay=0.98),

@@ -75,8 +75,8 @@ def random_subject(preset: str) -> Subject:
 
 def trained_small(demo: Path) -> Subject:
     train = DemoConfig().train
-    stages = tuple(dataclasses.replace(s, steps=n) for s, n in zip(train.stages, SMALL_STEPS, strict=False))
-    config = dataclasses.replace(train, preset="small", stages=stages, checkpoint_every=10)
+    phases = tuple(dataclasses.replace(s, steps=n) for s, n in zip(train.phases, SMALL_STEPS, strict=False))
+    config = dataclasses.replace(train, preset="small", phases=phases, checkpoint_every=10)
     folders, _ = split_scenes(find_scenes(demo / "data"))
     trainer = Trainer(config, [Scene.open(folder) for folder in folders], demo / "small")
     if trainer.step < config.n_steps:

@@ -39,12 +39,12 @@ def base_run(preset: str = "tiny") -> TrainConfig:
     config = dataclasses.replace(config, data=dataclasses.replace(config.data, history=history))
     if preset not in SHORT:
         return config
-    stage = partial(dataclasses.replace, batch=2, target_views=3, learning_rate=SHORT[preset])
+    phase = partial(dataclasses.replace, batch=2, target_views=3, learning_rate=SHORT[preset])
     return dataclasses.replace(
         config,
         model=DRAWS_NOTHING,
         data=dataclasses.replace(config.data, background_stride=2, targets_apart=True),
-        stages=tuple(stage(part) for part in config.stages),
+        phases=tuple(phase(part) for part in config.phases),
         loss=LossConfig(body_weight=2.0),
         optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.98),
         captured=True,
@@ -52,14 +52,14 @@ def base_run(preset: str = "tiny") -> TrainConfig:
 
 
 def with_steps(config: TrainConfig, n_steps: int) -> TrainConfig:
-    """The run in ``n_steps`` optimizer steps, shared by its stages as before. Raises InputError: they are too few."""
-    if n_steps < len(config.stages):
-        raise InputError(f"--steps: must be at least {len(config.stages)}, one for each stage; got {n_steps}")
+    """The run in ``n_steps`` optimizer steps, shared by its phases as before. Raises InputError: they are too few."""
+    if n_steps < len(config.phases):
+        raise InputError(f"--steps: must be at least {len(config.phases)}, one for each phase; got {n_steps}")
     before = config.n_steps
-    counts = [max(1, n_steps * stage.steps // before) for stage in config.stages]
+    counts = [max(1, n_steps * phase.steps // before) for phase in config.phases]
     counts[counts.index(max(counts))] += n_steps - sum(counts)
-    stages = [dataclasses.replace(stage, steps=count) for stage, count in zip(config.stages, counts, strict=True)]
-    return dataclasses.replace(config, stages=tuple(stages))
+    phases = [dataclasses.replace(phase, steps=count) for phase, count in zip(config.phases, counts, strict=True)]
+    return dataclasses.replace(config, phases=tuple(phases))
 
 
 def merged(settings: dict, changes: dict) -> dict:
@@ -102,8 +102,8 @@ def _grid(factor: float) -> Change:
 
 def _rollout(n: int) -> Change:
     def change(config: TrainConfig) -> TrainConfig:
-        stages = [dataclasses.replace(stage, horizon=n) if stage.horizon else stage for stage in config.stages]
-        return dataclasses.replace(config, stages=tuple(stages))
+        phases = [dataclasses.replace(phase, horizon=n) if phase.horizon else phase for phase in config.phases]
+        return dataclasses.replace(config, phases=tuple(phases))
 
     return change
 
@@ -111,9 +111,9 @@ def _rollout(n: int) -> Change:
 def _history(n: int) -> Change:
     def change(config: TrainConfig) -> TrainConfig:
         data = dataclasses.replace(config.data, history=n, shortest_history=min(n, config.data.shortest_history))
-        stages = [dataclasses.replace(stage, history=0) if stage.horizon else stage for stage in config.stages]
+        phases = [dataclasses.replace(phase, history=0) if phase.horizon else phase for phase in config.phases]
         bits = max(model_config(config).dynamics.history_bits, (n - 1).bit_length())
-        changed = dataclasses.replace(config, data=data, stages=tuple(stages))
+        changed = dataclasses.replace(config, data=data, phases=tuple(phases))
         return _model(dynamics={"history_bits": bits})(changed)
 
     return change

@@ -19,13 +19,11 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import horizon
 from gsim3d.evaluate.report import write_json
 from gsim3d.train.captured import check_capturable
-from gsim3d.train.checks import check_history, check_sharing
-from gsim3d.train.config import TrainConfig
+from gsim3d.train.config import TrainConfig, check_settings
 from gsim3d.train.restore import check_device, model_config
 from gsim3d.train.samples import check_scenes
 from gsim3d.train.settings import to_dict
 from gsim3d.train.side_by_side import side_by_side
-from gsim3d.train.thawing import check_thawing
 
 
 class Study:
@@ -67,11 +65,9 @@ class Study:
             config = row.change(self.base)
             model, effects = model_config(config), EffectsSpec.from_dict(config.effects)
             config = dataclasses.replace(config, model=to_dict(model), effects=effects.to_dict())
-            check_scenes(self.train, config.data, config.stages)
+            check_scenes(self.train, config.data, config.phases)
             check_scenes(self.test, config.data, ())
-            check_history(config, make_plan(effects, model))
-            check_thawing(config.data, model.dynamics)
-            check_sharing(config, 1, model.dynamics.norm)
+            check_settings(config, model.dynamics, make_plan(effects, model))
             if config.captured:
                 check_capturable(model.dynamics)
         except InputError as error:

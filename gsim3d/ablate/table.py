@@ -117,7 +117,7 @@ def markdown(content: dict) -> str:
 
 def _conditions(content: dict) -> str:
     base, scenes, steps, n_seeds = (content[name] for name in ("base", "scenes", "steps", "seeds"))
-    budget = sum(stage["steps"] for stage in base["stages"])
+    budget = sum(stage["steps"] for stage in base["phases"])
     return (
         f"Base run: preset {base['preset']}, {budget} optimizer steps; {scenes['trained']} scenes trained on, "
         f"{scenes['held_out']} held out and scored; {steps['predicted']} steps predicted after the first "

@@ -106,8 +106,8 @@ def _read(file: Path) -> dict:
 
 
 def _step_seconds(run: Path, config: TrainConfig) -> float | None:
-    """Of an optimizer step: the median of those logged in the last stage."""
-    first = config.n_steps - config.stages[-1].steps
+    """Of an optimizer step: the median of those logged in the last phase."""
+    first = config.n_steps - config.phases[-1].steps
     entries = filter(None, map(read_entry, (run / LOG).read_bytes().splitlines()))
     spent = [entry["machine"]["step_seconds"] for entry in entries if entry["step"] >= first]
     return statistics.median(spent) if spent else None

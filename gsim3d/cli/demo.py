@@ -18,7 +18,7 @@ from gsim3d.errors import InputError
 from gsim3d.io.locks import only_one_writer
 from gsim3d.io.terminal import progress as shown
 from gsim3d.pretrained import names
-from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseConfig, TrainConfig
 
 EPILOG = """\
 Writes into DIR:
@@ -41,7 +41,7 @@ examples:
 """
 
 
-_stage = partial(StageConfig, batch=2, target_views=2, warm_up=0.1)
+_phase = partial(PhaseConfig, batch=2, target_views=2, warm_up=0.1)
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,11 @@ class DemoConfig:
     train: TrainConfig = TrainConfig(
         preset="tiny",
         data=DataConfig(history=2, context_views=3, target_only_cameras=(2, 7), background_stride=2),
-        stages=(
-            _stage(steps=400, history=1, learning_rate=2e-3),
-            _stage(steps=100, horizon=3, from_start=0.4, learning_rate=2e-3),
-            _stage(steps=120, horizon=7, from_start=0.4, learning_rate=1.5e-3),
-            _stage(steps=110, horizon=14, from_start=0.5, learning_rate=1e-3),
+        phases=(
+            _phase(steps=400, history=1, learning_rate=2e-3),
+            _phase(steps=100, horizon=3, from_start=0.4, learning_rate=2e-3),
+            _phase(steps=120, horizon=7, from_start=0.4, learning_rate=1.5e-3),
+            _phase(steps=110, horizon=14, from_start=0.5, learning_rate=1e-3),
         ),
         loss=LossConfig(body_weight=2.0),
         optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.98),

@@ -11,7 +11,7 @@ CONFIG is a YAML file; what it leaves out has a default, what it does not know i
 
   preset: tiny
   data: {history: 2, context_views: 4, target_only_cameras: [2, 7]}
-  stages:
+  phases:
     - {steps: 400, history: 1, batch: 2, learning_rate: 2.0e-3}      # encoder and renderer
     - {steps: 800, horizon: 8, learning_rate: 1.0e-3}                # all parts, 8 simulated steps
 

@@ -154,10 +154,12 @@ def _join_cameras(cameras: list[Cameras], image_cloud: list[int]) -> Cameras:
 class Window:
     """Consecutive steps of one scene: the first ``n_context`` are given, the rest is to be predicted.
 
-    lead: steps behind the given ones that are predicted and not looked at.
-    gap: steps behind the first given one that are not looked at.
-    masked_out: images show what may move alone, as if there was no ground.
-    context_cams, target_cams: camera numbers for each step (targets at every step, context at the given ones).
+    Attributes:
+        scene: whose steps.
+        start: number of the first step.
+        n_context: given steps.
+        context_cams: camera numbers for each given step.
+        target_cams: camera numbers for each step.
     """
 
     scene: Scene
@@ -165,12 +167,8 @@ class Window:
     n_context: int
     context_cams: tuple[tuple[int, ...], ...]
     target_cams: tuple[tuple[int, ...], ...]
-    lead: int = 0
-    gap: int = 0
-    masked_out: bool = False
 
     @property
     def steps(self) -> list[int]:
-        """Those that are looked at."""
-        places = range(len(self.target_cams))
-        return [self.start + k + self.gap * (k > 0) + self.lead * (k >= self.n_context) for k in places]
+        """Their numbers in the scene."""
+        return list(range(self.start, self.start + len(self.target_cams)))

@@ -10,14 +10,14 @@ from gsim3d.effects.spec import EffectsSpec, OutputEffects
 from gsim3d.io.terminal import in_columns
 from gsim3d.simulator import Simulator
 from gsim3d.train.config import DataConfig
-from gsim3d.train.samples import context_cameras, spread_views, thinned
+from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
 
 def workload(scene: Scene, data: DataConfig) -> Workload:
     """Particles of the first step of ``scene`` as a model trained on ``data`` sees it, and one image."""
     cameras = context_cameras(scene, data)
     views = spread_views(cameras, min(data.context_views, len(cameras)), 0)
-    frames = thinned(make_frames([scene], [list(views)], [range(1)], masked=scene.has_segmentation()), data)
+    frames = subsampled(make_frames([scene], [list(views)], [range(1)], masked=scene.has_segmentation()), data)
     moving = kept = frames.images.shape[0] * scene.height * scene.width
     if frames.masks is not None:
         moving = kept = int(frames.masks.sum())

@@ -36,7 +36,7 @@ from gsim3d.nn.layers import exact_convolutions
 from gsim3d.state import DYNAMIC, Particles
 from gsim3d.train.processes import Processes
 from gsim3d.train.restore import Restored
-from gsim3d.train.samples import context_cameras, spread_views, thinned
+from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
 METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant", *EXACT_PARTS)
 TOGETHER = 8  # scenes that a GPU predicts in one rollout, fewer where they are large
@@ -127,7 +127,7 @@ def encode_steps(restored: Restored, scene: Scene, context_cams: Sequence[int], 
         raise InputError(f"{scene.path}: {n_encoded} steps from step {start} on do not fit its {scene.n_steps} steps")
     masked = scene.has_segmentation()
     frames = make_frames([scene], [list(context_cams)], [range(start, start + n_encoded)], masked=masked)
-    frames = thinned(frames, restored.data).to(restored.device)
+    frames = subsampled(frames, restored.data).to(restored.device)
     with exact_convolutions():
         return restored.simulator.encode(frames)
 
@@ -147,7 +147,7 @@ def predict_together(
     n_encoded, masked = restored.data.history, all(scene.has_segmentation() for scene in scenes)
     frames = make_frames(scenes, contexts, [range(n_encoded)] * len(scenes), masked=masked)
     with exact_convolutions():
-        encoded = restored.simulator.encode(thinned(frames, restored.data).to(restored.device))
+        encoded = restored.simulator.encode(subsampled(frames, restored.data).to(restored.device))
         together = concatenate([encoded, *restored.simulator.rollout(encoded, n_future, restored.plan)])
     n_steps = n_encoded + n_future
     return [

@@ -17,7 +17,7 @@ from gsim3d.profile.subject import Subject
 from gsim3d.profile.timing import Clock, Timing, time_call
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.loop import Trainer, deterministic
-from gsim3d.train.settings import from_dict
+from gsim3d.train.settings import from_dict, upgraded
 
 BATCH = 4
 LARGEST_KERNELS = 12  # that are listed
@@ -58,7 +58,7 @@ def throughput(
 
 @dataclass(frozen=True)
 class TrainingStep:
-    """Seconds of one optimizer step with the checkpoint's own configuration, last stage; or why it cannot be had."""
+    """Seconds of one optimizer step with the checkpoint's own configuration, last phase; or why it cannot be had."""
 
     batch: int = 0
     horizon: int = 0
@@ -135,14 +135,14 @@ def training_step(subject: Subject, clock: Clock, repeats: int = 3, quick: bool 
     if saved is None:
         return TrainingStep(problem="the checkpoint does not hold the configuration of its training")
     try:
-        config = from_dict(TrainConfig, saved, "train")
-        stage = dataclasses.replace(config.all_stages[-1], steps=10**6)
+        config = from_dict(TrainConfig, upgraded(TrainConfig, saved), "train")
+        phase = dataclasses.replace(config.phases[-1], steps=10**6)
         if quick:
-            stage = dataclasses.replace(stage, batch=1, lead=0, horizon=stage.cut or stage.horizon)
-        known = min(scene.n_steps for scene in subject.scenes) - (stage.history or config.data.history) - stage.lead
+            phase = dataclasses.replace(phase, batch=1, horizon=phase.cut or phase.horizon)
+        known = min(scene.n_steps for scene in subject.scenes) - (phase.history or config.data.history)
         if known > 0:
-            stage = dataclasses.replace(stage, horizon=min(stage.horizon, known))
-        config = dataclasses.replace(config, stages=(stage,), in_turn=())
+            phase = dataclasses.replace(phase, horizon=min(phase.horizon, known))
+        config = dataclasses.replace(config, phases=(phase,))
         with tempfile.TemporaryDirectory() as folder, deterministic():
             trainer = Trainer(config, subject.scenes, folder, device=subject.restored.device.type)
             trainer.simulator.train()
@@ -150,10 +150,10 @@ def training_step(subject: Subject, clock: Clock, repeats: int = 3, quick: bool 
     except (InputError, CaptureError) as error:
         return TrainingStep(problem=str(error))
     except torch.OutOfMemoryError:
-        return TrainingStep(problem=f"out of memory, with {stage.batch} scenes")
+        return TrainingStep(problem=f"out of memory, with {phase.batch} scenes")
     if timing is None:
         return TrainingStep(problem=f"every step was captured anew in {CAPTURE_SECONDS:.0f} s")
-    return TrainingStep(stage.batch, stage.horizon, timing)
+    return TrainingStep(phase.batch, phase.horizon, timing)
 
 
 def _steady_steps(trainer: Trainer, clock: Clock, repeats: int, warm_up: int) -> Timing | None:

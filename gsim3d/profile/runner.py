@@ -25,9 +25,9 @@ from gsim3d.nn.layers import exact_convolutions
 from gsim3d.profile.settings import Setting
 from gsim3d.simulator import Simulator
 from gsim3d.state import DYNAMIC, Particles
-from gsim3d.train.precision import PrecisionConfig
+from gsim3d.train.config import PrecisionConfig
 from gsim3d.train.restore import Restored
-from gsim3d.train.samples import thinned
+from gsim3d.train.samples import subsampled
 
 N_CURVES = 4  # along which a cloud is cut into patches
 TOGETHER = 4  # steps that are timed together where the first costs more than those that follow
@@ -76,7 +76,7 @@ class Runner:
             context = [_spread(cams, self.setting.context_views) for cams in context]
         masked = all(scene.has_segmentation() for scene in scenes)
         frames = make_frames(scenes, [list(cams) for cams in context], steps, masked=masked)
-        return thinned(frames, self.restored.data).to(self.device)
+        return subsampled(frames, self.restored.data).to(self.device)
 
     def encode(self, frames: Frames) -> Particles:
         """The state from which to simulate."""

@@ -28,7 +28,7 @@ from gsim3d.simulator import Simulator
 from gsim3d.testing.invariances import LAWS, Deviation, Sample
 from gsim3d.testing.stress import CASES
 from gsim3d.train.restore import PRESETS, Restored, build_simulator, restore
-from gsim3d.train.samples import context_cameras, spread_views, thinned
+from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
 CHECKS = {**LAWS, **CASES}
 LONG, SHORT = "a long rollout", 3  # steps of all other checks
@@ -132,7 +132,7 @@ def sample_of_scenes(subject: Subject, folders: Sequence[Path], full: bool = Fal
 
 
 def _as_trained(subject: Subject, frames: Frames) -> Frames:
-    return frames if subject.restored is None else thinned(frames, subject.restored.data)
+    return frames if subject.restored is None else subsampled(frames, subject.restored.data)
 
 
 def _views(subject: Subject, scene: Scene, count: int | None = None) -> list[int]:

@@ -2,9 +2,9 @@
 
 A training step launches tens of thousands of small kernels; a GPU would wait for Python most of the time. All of it
 (encoder, rollout, images, loss and their gradients) is captured once for each kind of batch and replayed with other
-images. A graph has fixed sizes: each cloud gets as many rows as the largest, those without a particle sleep, and
-geometry has room for more than was observed. Where a batch needs more, the graph is made anew, so results never depend
-on the room. Graphs have memory of their own as long as the GPU has room for all of them, then they share it.
+images. A graph has fixed sizes: each cloud has as many particles as the largest, padding particles sleep, and
+geometry has capacity for more than was observed. Where a batch needs more, the graph is made anew, so results never
+depend on the capacity. Graphs have memory of their own as long as the GPU can hold all of them, then they share it.
 """
 
 from __future__ import annotations
@@ -34,22 +34,24 @@ from gsim3d.ops.curve import Pyramid
 from gsim3d.simulator import Simulator
 from gsim3d.state import ASLEEP, DYNAMIC, Particles
 from gsim3d.train.checkpoint import laid_out_as
-from gsim3d.train.losses import bodies_alone
-from gsim3d.train.parts import in_parts, with_first_background
-from gsim3d.train.recompute import recomputing
+from gsim3d.train.gradients import in_segments, recomputing, total_norm
 from gsim3d.train.samples import Batch
 
-FACTOR = 1.5  # room for geometry over what was observed: little costs captures, much costs time in every step
-ROWS_FACTOR = 1.15  # likewise, for the particles of a cloud
-ROW_UNIT = 256  # rows of a cloud are a multiple of it
+FACTOR = 1.5  # capacity for geometry over what was observed: little costs captures, much costs time in every step
+PARTICLES_FACTOR = 1.15  # the same, for the particles of a cloud
+PARTICLES_UNIT = 256  # the capacity of a cloud is a multiple of it
 MOST_KINDS = 4  # of steps whose graphs are kept at a time
 
 
 @dataclass(frozen=True)
 class Gradients:
-    """loss: a number.   errors: [S], of each step.   norm: of all gradients together.
+    """What a call of :class:`CapturedLoss` found.
 
-    parameters: gradients of ``CapturedLoss.parameters``, or None.
+    Attributes:
+        loss: a number.
+        errors: [S], mean squared error of each step.
+        norm: of all gradients together.
+        parameters: gradients of ``CapturedLoss.parameters``, or None.
     """
 
     loss: Tensor
@@ -62,7 +64,11 @@ class Gradients:
 class Prepared:
     """A batch and what the host must know of it before its graph can run.
 
-    counts: particles of each cloud.   moving: of one cloud at most, that may move.
+    Attributes:
+        batch: the batch.
+        counts: particles of each cloud.
+        moving: of one cloud at most, that may move.
+        room: capacity of the encoder for it.
     """
 
     batch: Batch
@@ -75,8 +81,7 @@ class Prepared:
         """What batches have in common that one graph serves."""
         batch, table = self.batch, self.room.clouds
         images = len(batch.context.cameras), len(batch.targets.cameras)
-        how = batch.cut, batch.dynamics_alone, batch.has_own_background
-        return table.scenes, table.steps, batch.n_lead, batch.n_future, *how, images
+        return table.scenes, table.steps, batch.n_future, batch.cut, images
 
 
 def check_capturable(config: DynamicsConfig) -> None:
@@ -94,18 +99,17 @@ class CapturedLoss:
     Args:
         simulator: that is trained; without drop path and shuffled curves, whose draws a graph would repeat.
         plan: what a step computes.
-        loss: (images [I, H, W, 3], those of bodies alone or None, where the simulation begins, its steps, targets,
-            weights of the steps) -> loss and errors by step.
+        loss: (images [I, H, W, 3], targets, weights of the steps) -> loss and errors by step.
         precision: makes the context in which a part ("encoder", "dynamics", "renderer") computes.
-        bodies: whether the loss wants images of bodies alone.
-        recompute: as of TrainConfig.
+        recompute: of TrainConfig.
 
     Attributes:
         parameters: those whose gradients it returns, all of the simulator.
         alone: a context in which no other thread uses the GPU, for captures.
         meanwhile: is called in every call, while the graph runs: what else the host has to do delays no kernel then.
-        captures: how often a graph was made.
-        most_rows, most_moving: particles that any cloud had so far, and those of them that may move.
+        captures: count of graphs that were made.
+        most_particles: that any cloud had so far.
+        most_moving: those of them that may move.
         most: sizes of geometry that any simulated step needed so far, by scenes and times of the encoded clouds.
     """
 
@@ -113,31 +117,30 @@ class CapturedLoss:
         self,
         simulator: Simulator,
         plan: Plan,
-        loss: Callable[[Tensor, Tensor | None, Particles, list[Particles], Frames, Tensor], tuple[Tensor, Tensor]],
+        loss: Callable[[Tensor, Frames, Tensor], tuple[Tensor, Tensor]],
         precision: Callable[[str], torch.autocast],
-        bodies: bool = False,
         recompute: Collection[str] = (),
     ):
         check_capturable(simulator.config.dynamics)
         self.simulator, self.plan, self.loss, self.precision = simulator, plan, loss, precision
-        self.bodies, self.again = bodies, recomputing(recompute, simulator)
+        self.again = recomputing(recompute, simulator)
         self.parameters = list(simulator.parameters())
         self.alone: AbstractContextManager = nullcontext()
         self.meanwhile: Callable[[], None] = lambda: None
-        self.captures = self.most_rows = self.most_moving = 0
+        self.captures = self.most_particles = self.most_moving = 0
         self.most: dict[tuple, tuple[int, ...]] = {}
         self._steps: dict[tuple, _Step] = {}
         self._pool: tuple[int, int] | None = None
 
     @property
     def needed(self) -> dict[str, Any]:
-        """``most_rows``, ``most_moving`` and ``most`` as JSON knows them."""
+        """``most_particles``, ``most_moving`` and ``most`` as plain JSON values."""
         geometry = [[*map(list, clouds), list(sizes)] for clouds, sizes in self.most.items()]
-        return {"rows": self.most_rows, "moving": self.most_moving, "geometry": geometry}
+        return {"rows": self.most_particles, "moving": self.most_moving, "geometry": geometry}
 
-    def make_room(self, needed: dict[str, Any]) -> None:
-        """Graphs made from now on have room for what others (another run, another process) say was ``needed``."""
-        self.most_rows = max(self.most_rows, needed["rows"])
+    def reserve(self, needed: dict[str, Any]) -> None:
+        """Graphs made from now on have capacity for what was ``needed`` in another run or process."""
+        self.most_particles = max(self.most_particles, needed["rows"])
         self.most_moving = max(self.most_moving, needed.get("moving", 0))
         for scenes, times, sizes in needed["geometry"]:
             self.grow((tuple(scenes), tuple(times)), [tuple(sizes)])
@@ -149,11 +152,11 @@ class CapturedLoss:
         return self.most[clouds]
 
     def graph(self, step: _Step, function: Callable[[], Any]) -> Captured:
-        """The graph of ``step``. Where the GPU has no room for it those of other steps go, to be made anew when needed,
-        and from then on all share the memory of the largest.
+        """The graph of ``step``. Where it does not fit into the GPU's memory those of other steps go, to be made anew
+        when needed, and from then on all share the memory of the largest.
 
         Raises:
-            CaptureError: there is no room for this one alone, or it cannot be captured.
+            CaptureError: this one alone does not fit, or it cannot be captured.
         """
         device = self.parameters[0].device
         if self._pool is not None and all(other is step for other in self._steps.values()):
@@ -166,7 +169,7 @@ class CapturedLoss:
                     raise
                 if is_last:
                     raise CaptureError(
-                        f"captured: {error}; lower batch, target_views or horizon of the stage, or set captured: false "
+                        f"captured: {error}; lower batch, target_views or horizon of the phase, or set captured: false "
                         "and recompute: [encoder, steps]",
                         no_room=True,
                     ) from error
@@ -198,58 +201,56 @@ class CapturedLoss:
 
         Args:
             weights: of the steps.
-            report: is told what the simulator's guards find; rows of a rollout that cannot be used sleep.
+            report: receives what the simulator's guards find; unusable particles of a rollout sleep.
         """
         kind, largest = prepared.kind, max(prepared.counts)
-        self.most_rows = max(self.most_rows, largest)
+        self.most_particles = max(self.most_particles, largest)
         self.most_moving = max(self.most_moving, prepared.moving)
         step = self._steps.pop(kind, None)
-        if step is None or largest > step.rows or prepared.moving > step.moving:
+        if step is None or largest > step.particles or prepared.moving > step.moving:
             step = None  # its memory goes back first
             while len(self._steps) >= MOST_KINDS:
                 del self._steps[next(iter(self._steps))]
-            room = (_rounded_up(ROWS_FACTOR * most) for most in (self.most_rows, self.most_moving))
-            step = _Step(self, *room, prepared, weights)
+            capacity = (_rounded_up(PARTICLES_FACTOR * most) for most in (self.most_particles, self.most_moving))
+            step = _Step(self, *capacity, prepared, weights)
         self._steps[kind] = step  # now the newest
         return step(prepared, weights, report)
 
 
 class _Step:
-    """A step of one kind, with ``rows`` rows a cloud, of which ``moving`` may move."""
+    """A step of one kind, with a capacity of ``particles`` a cloud, of which ``moving`` may move."""
 
-    def __init__(self, owner: CapturedLoss, rows: int, moving: int, prepared: Prepared, weights: Tensor):
+    def __init__(self, owner: CapturedLoss, particles: int, moving: int, prepared: Prepared, weights: Tensor):
         self._owner, self._capacities, self._is_ready = owner, [], False
-        self.rows, self.moving = rows, moving
+        self.particles, self.moving = particles, moving
         self._graph = self._records = None
         batch, self._clouds = prepared.batch, prepared.kind[:2]
         self._context, self._targets = _own(batch.context), _own(batch.targets)
-        self._room = owner.simulator.encoder.room(batch.context, rows)
-        self._n_lead, self._n_future, self._weights = batch.n_lead, batch.n_future, weights.clone()
-        self._cut, self._dynamics_alone = batch.cut, batch.dynamics_alone
-        self._has_own_background = batch.has_own_background
+        self._room = owner.simulator.encoder.room(batch.context, particles)
+        self._n_future, self._cut, self._weights = batch.n_future, batch.cut, weights.clone()
 
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
         self._load(prepared, weights)
         if not self._is_ready:
-            self._make_room(self._observed())
+            self._grow(self._observed())
             self._capture()
         loss, errors, norm, gradients, found, records = self._replay()
         self._owner.meanwhile()
         while True:
             numbers = found.tolist()
-            if all([capacity.fits(row) for capacity, row in zip(self._capacities, numbers, strict=True)]):
+            if all([capacity.fits(found) for capacity, found in zip(self._capacities, numbers, strict=True)]):
                 break
             self._graph = self._records = loss = errors = gradients = found = None  # their memory goes back first
-            grown = [c.grown(row, FACTOR) for c, row in zip(self._capacities, numbers, strict=True)]
+            grown = [c.grown(number, FACTOR) for c, number in zip(self._capacities, numbers, strict=True)]
             observed = zip(grown, self._observed(), strict=True)  # behind what did not fit, found is of other particles
-            self._make_room([c.grown((0, *seen.sizes), 1) for c, seen in observed])
+            self._grow([c.grown((0, *seen.sizes), 1) for c, seen in observed])
             self._capture()
             loss, errors, norm, gradients, found, records = self._replay()
         records.replayed(report)
         return Gradients(loss, errors, norm, gradients)
 
-    def _make_room(self, needed: Sequence[PyramidCapacity]) -> None:
-        """What was too small for one simulated step, of whatever kind, will soon be too small for others."""
+    def _grow(self, needed: Sequence[PyramidCapacity]) -> None:
+        """Capacity that was too small for one simulated step, of whatever kind, will soon be for others."""
         if not needed:
             return
         most = self._owner.grow(self._clouds, [capacity.sizes for capacity in needed])
@@ -259,10 +260,9 @@ class _Step:
 
     def _encode(self, report: StabilityReport) -> Particles:
         owner = self._owner
-        with owner.precision("encoder"), torch.set_grad_enabled(not self._dynamics_alone):
+        with owner.precision("encoder"):
             encode = partial(owner.simulator.encode, room=self._room, report=report)
-            state = owner.again("encoder")(encode)(self._context)
-        return with_first_background(state, owner.simulator.dynamics) if self._has_own_background else state
+            return owner.again("encoder")(encode)(self._context)
 
     def _rollout(
         self,
@@ -270,21 +270,18 @@ class _Step:
         geometry: Callable[[Particles], Pyramid],
         report: StabilityReport,
         wrap: Callable[[Callable], Callable] | None = None,
-    ) -> tuple[Particles, list[Particles]]:
-        """Where the simulation begins, and its steps that are looked at; ``wrap`` as of Simulator.rollout."""
+    ) -> list[Particles]:
+        """The simulated steps; ``wrap`` as in Simulator.rollout."""
         owner, plan = self._owner, self._owner.plan
         if not self._n_future:
-            return state, []
+            return []
         if plan.spec.dynamics.background == "masked_out":
             state, plan = _without_background(state), with_background_as_it_is(plan)
         else:
             state = owner.simulator.prepare(state, plan)
         rollout = partial(owner.simulator.rollout, plan=plan, geometry=geometry, report=report, on_invalid="drop")
         with owner.precision("dynamics"):
-            if self._n_lead:
-                with torch.no_grad():
-                    state = concatenate([state, *rollout(state, self._n_lead)])
-            return state, in_parts(partial(rollout, wrap=wrap), state, self._n_future, self._cut)
+            return in_segments(partial(rollout, wrap=wrap), state, self._n_future, self._cut)
 
     def _compute(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> tuple:
         owner, dynamics, of_calls = self._owner, self._owner.simulator.dynamics, []
@@ -299,33 +296,29 @@ class _Step:
             return call
 
         state = self._encode(report)
-        begin, steps = self._rollout(state, geometry, report, with_own_weights)
-        particles = concatenate(steps if self._dynamics_alone else [state, *steps])
+        particles = concatenate([state, *self._rollout(state, geometry, report, with_own_weights)])
         with owner.precision("renderer"):
             shown = {"plan": owner.plan, "report": report, "on_invalid": "drop"}
             draw = owner.again("images")(lambda p: owner.simulator.draw(p, self._targets.cameras, **shown).color)
             images = draw(particles)
-            bodies = draw(bodies_alone(particles)) if owner.bodies and steps else None
         report.close()  # what the backward pass computes again would be counted twice
-        loss, errors = owner.loss(images, bodies, begin, steps, self._targets, self._weights)
-        parts = () if self._dynamics_alone else (owner.simulator.encoder, owner.simulator.renderer)
-        once = [parameter for part in parts for parameter in part.parameters()]
+        loss, errors = owner.loss(images, self._targets, self._weights)
+        once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]
         gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
         known = dict(zip(once, gradients))
         if of_calls:
             n = len(of_calls[0])
-            parts = [gradients[begin : begin + n] for begin in range(len(once), len(gradients), n)]
-            known |= zip(dynamics.parameters(), _sums(parts[::-1]), strict=True)
+            by_call = [gradients[begin : begin + n] for begin in range(len(once), len(gradients), n)]
+            known |= zip(dynamics.parameters(), _sums(by_call[::-1]), strict=True)
         gradients = tuple(
             None if (gradient := known.get(parameter)) is None else laid_out_as(parameter, gradient)
             for parameter in owner.parameters
         )
-        norm = torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
-        return loss.detach(), errors, norm, gradients
+        return loss.detach(), errors, total_norm(gradients), gradients
 
     @torch.no_grad()
     def _observed(self) -> list[PyramidCapacity]:
-        """What the geometry of each step needs, with room."""
+        """What the geometry of each step needs, and some more."""
         needed = []
 
         def geometry(history: Particles) -> Pyramid:
@@ -417,38 +410,38 @@ def _aliased(module: nn.Module) -> Iterator[list[Tensor]]:
     """Within it the parameters of ``module`` are others in the same memory, in the order of ``parameters()``.
 
     Calls that share weights would have the gradients of each weight added call by call, in thousands of small kernels;
-    those of aliases are added at once.
+    those of aliases are added in one.
     """
-    places = [
+    owners = [
         (part, name, value)
         for part in module.modules()
         for name, value in part._parameters.items()
         if value is not None
     ]
-    aliases = [value.detach().requires_grad_() for _, _, value in places]
+    aliases = [value.detach().requires_grad_() for _, _, value in owners]
     try:
-        for (part, name, _), alias in zip(places, aliases, strict=True):
+        for (part, name, _), alias in zip(owners, aliases, strict=True):
             part._parameters[name] = alias
         yield aliases
     finally:
-        for part, name, value in places:
+        for part, name, value in owners:
             part._parameters[name] = value
 
 
-def _sums(parts: Sequence[Sequence[Tensor | None]]) -> list[Tensor | None]:
-    """Sums over ``parts``, in their order, of each of as many tensors; None: zero."""
-    total = list(parts[0])
-    for part in parts[1:]:
-        both = [k for k, (a, b) in enumerate(zip(total, part, strict=True)) if a is not None and b is not None]
-        added = torch._foreach_add([total[k] for k in both], [part[k] for k in both]) if both else []
-        total = [b if a is None else a for a, b in zip(total, part, strict=True)]
+def _sums(by_call: Sequence[Sequence[Tensor | None]]) -> list[Tensor | None]:
+    """Sums over calls, in their order, of each of as many tensors; None: zero."""
+    total = list(by_call[0])
+    for call in by_call[1:]:
+        both = [k for k, (a, b) in enumerate(zip(total, call, strict=True)) if a is not None and b is not None]
+        added = torch._foreach_add([total[k] for k in both], [call[k] for k in both]) if both else []
+        total = [b if a is None else a for a, b in zip(total, call, strict=True)]
         for k, value in zip(both, added, strict=True):
             total[k] = value
     return total
 
 
 def _without_background(state: Particles) -> Particles:
-    """As if only what may move were there, in as many rows."""
+    """As if only what may move were there, in as many particles."""
     left_out = state.activity != DYNAMIC
     opacities = torch.where(left_out, 0.0, state.opacities)
     return dataclasses.replace(state, activity=torch.where(left_out, ASLEEP, state.activity), opacities=opacities)
@@ -458,5 +451,5 @@ def _own(frames: Frames) -> Frames:
     return dataclasses.replace(frames.map(torch.clone), cameras=frames.cameras.map(torch.clone))
 
 
-def _rounded_up(rows: float) -> int:
-    return math.ceil(rows / ROW_UNIT) * ROW_UNIT
+def _rounded_up(count: float) -> int:
+    return math.ceil(count / PARTICLES_UNIT) * PARTICLES_UNIT

@@ -1,4 +1,4 @@
-"""What a run tells while it goes on: a line of JSON for each logged step, TensorBoard, the progress bar."""
+"""What a run writes while it goes on: a line of JSON for each logged step, TensorBoard, a trace, the progress bar."""
 
 from __future__ import annotations
 
@@ -15,19 +15,31 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.profiler import ProfilerActivity, profile, schedule
 
+from gsim3d.data import Scene, make_frames
+from gsim3d.dynamics import concatenate
+from gsim3d.effects.plan import Plan
 from gsim3d.errors import InputError
 from gsim3d.io.plain import is_number
+from gsim3d.simulator import Simulator
+from gsim3d.train.config import DataConfig, PhaseConfig
+from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
 LOG, BOARD = "metrics.jsonl", "tensorboard"
 MAX_LINE = 2**20  # bytes; what is longer is no entry
 VIDEO_MS = 80  # that a frame of a sample video is shown
+TRACES = "profile"  # folder
+SKIPPED, WARM_UP, TRACED = 1, 1, 2  # steps of a trace; the first one of a run is like no other
 
 
 class Log:
     """The log of a run folder.
 
-    writes: whether this process is the one that writes.    board: TensorBoard while it is open, or None.
+    Attributes:
+        file: lines of JSON.
+        writes: whether this process is the one that writes.
+        board: TensorBoard while it is open, or None.
     """
 
     def __init__(self, out: Path, *, writes: bool = True):
@@ -38,7 +50,8 @@ class Log:
     def cut(self, step: int) -> None:
         """Drops what was logged from ``step`` on: those steps will be repeated.
 
-        Raises: InputError where the log is no file, or cannot be read or written.
+        Raises:
+            InputError: the log is no file, or cannot be read or written.
         """
         if not self.writes or not self.file.exists():
             return
@@ -46,10 +59,10 @@ class Log:
             raise InputError(f"{self.file}: cannot be read: it is not a file")
         part = self.file.with_name(f".{self.file.name}.part")
         try:
-            with open(self.file, "rb") as lines, open(part, "wb") as kept:
+            with open(self.file, "rb") as lines, open(part, "wb") as retained:
                 while line := lines.readline(MAX_LINE):
                     if _step_of(line) < step:
-                        kept.write(line.rstrip(b"\r\n") + b"\n")
+                        retained.write(line.rstrip(b"\r\n") + b"\n")
             os.replace(part, self.file)
         except OSError as error:
             part.unlink(missing_ok=True)
@@ -57,7 +70,7 @@ class Log:
 
     @contextmanager
     def opened(self, *, tensorboard: bool) -> Iterator[None]:
-        """Within it steps are written. Args: tensorboard: for it as well."""
+        """Within it steps are written; with ``tensorboard``, for it as well."""
         if not self.writes:
             yield
             return
@@ -71,7 +84,7 @@ class Log:
                 self.board = self._stream = None
 
     def write(self, entry: dict, machine: dict) -> None:
-        """Args: entry: what follows from the configuration; machine: time and memory, which do not."""
+        """Writes ``entry``, which follows from the configuration, and time and memory, which do not."""
         if self._stream is not None:
             rounded = {name: round(value, 4) for name, value in machine.items()}
             try:
@@ -86,10 +99,7 @@ class Log:
 
 
 class Board:
-    """TensorBoard's files in ``folder``.
-
-    Raises: InputError where the package is not installed.
-    """
+    """TensorBoard's files in ``folder``. Raises InputError where the package is not installed."""
 
     def __init__(self, folder: Path):
         try:
@@ -109,7 +119,7 @@ class Board:
                 self._writer.add_scalar(f"{prefix}/{name}", value, step)
 
     def video(self, frames: Tensor, step: int) -> None:
-        """Args: frames: uint8 [T, H, W, 3]."""
+        """Shows ``frames``, uint8 [T, H, W, 3]."""
         from PIL import Image
         from tensorboard.compat.proto.summary_pb2 import Summary
 
@@ -119,11 +129,33 @@ class Board:
         image = Summary.Image(
             height=frames.shape[1], width=frames.shape[2], colorspace=3, encoded_image_string=gif.getvalue()
         )
-        summary = Summary(value=[Summary.Value(tag="sample/filmed, predicted", image=image)])
+        summary = Summary(value=[Summary.Value(tag="sample/true, predicted", image=image)])
         self._writer._get_file_writer().add_summary(summary, step)
 
     def close(self) -> None:
         self._writer.close()
+
+
+@torch.no_grad()
+def sample_video(
+    simulator: Simulator, plan: Plan, scene: Scene, data: DataConfig, phase: PhaseConfig, device: str
+) -> Tensor:
+    """uint8 [T, H, 2 W, 3]: the first window of ``scene`` seen by one camera, recorded and predicted."""
+    n_past = phase.history or data.history
+    steps, cams = range(n_past + phase.horizon), context_cameras(scene, data)
+    views, masked = spread_views(cams, data.context_views, 0), scene.has_segmentation()
+    frames = make_frames([scene], [views], [list(steps[:n_past])], masked=masked)
+    simulator.eval()
+    try:
+        state = simulator.encode(subsampled(frames, data).to(device), on_invalid="drop")
+        if phase.horizon:
+            state = concatenate([state, *simulator.rollout(state, phase.horizon, plan, on_invalid="drop")])
+        cameras = scene.cameras_at(cams[:1], steps).to(device)
+        predicted = simulator.render(state, cameras, plan=plan, on_invalid="drop").color
+    finally:
+        simulator.train()
+    recorded = scene.images(cams[:1], steps)[:, 0].permute(0, 2, 3, 1)
+    return torch.cat([recorded, (predicted.clamp(0, 1) * 255).round().to(torch.uint8).cpu()], 2)
 
 
 def memory_gib(device: str) -> float:
@@ -163,3 +195,25 @@ def read_entry(line: bytes) -> dict[str, Any] | None:
 def _step_of(line: bytes) -> float:
     entry = read_entry(line)
     return math.inf if entry is None else entry["step"]
+
+
+def check_profile(n_steps: int) -> None:
+    """Raises InputError where too few steps are left to trace."""
+    if n_steps < SKIPPED + WARM_UP + TRACED:
+        raise InputError(f"--profile traces steps 3 and 4 of a run; this one has {n_steps}")
+
+
+def profiler(out: Path, rank: int) -> profile:
+    """Writes ``out/profile/process_<rank>.json`` once its ``step`` was called often enough."""
+    folder = out / TRACES
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"process_{rank}.json"
+
+    def write(traced: profile) -> None:
+        part = file.with_name(f".{file.stem}.part.json")
+        traced.export_chrome_trace(str(part))
+        os.replace(part, file)
+
+    activities = [ProfilerActivity.CPU] + [ProfilerActivity.CUDA] * torch.cuda.is_available()
+    plan = schedule(wait=SKIPPED, warmup=WARM_UP, active=TRACED, repeat=1)
+    return profile(activities=activities, schedule=plan, on_trace_ready=write, profile_memory=True)

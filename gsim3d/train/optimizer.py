@@ -1,16 +1,24 @@
-"""AdamW for models of many small tensors, whose host would work longer on a step than a GPU."""
+"""AdamW for models of many small tensors, its learning rate, averaged weights, scaled losses, repeatable bits."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
 
+from gsim3d.nn.layers import tf32_only_if_asked
 from gsim3d.train.checkpoint import laid_out_as
 from gsim3d.train.config import OptimizerConfig
+
+START_DIVISOR = 25  # the first rate is the peak over this
+END_DIVISOR = 1e4  # the last rate is the first over this
+FIRST_SCALE, LARGEST_SCALE = 2.0**16, 2.0**24
+STEPS_TO_DOUBLE = 2000  # good steps in a row; fewer: more skipped steps, more: small gradients stay zero for longer
 
 
 class Optimizer(torch.optim.AdamW):
@@ -49,7 +57,7 @@ class Optimizer(torch.optim.AdamW):
         for group in self.param_groups:
             group["lr"] = rate * group["factor"]
         if norm.is_cuda:
-            self._update_at_once(gradients, norm)
+            self._update_on_gpu(gradients, norm)
             return
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
@@ -63,7 +71,7 @@ class Optimizer(torch.optim.AdamW):
             for kind, value in moments.items()
         }
 
-    def _update_at_once(self, gradients: Sequence[Tensor | None], norm: Tensor) -> None:
+    def _update_on_gpu(self, gradients: Sequence[Tensor | None], norm: Tensor) -> None:
         pairs = zip(self._parameters, gradients, strict=True)
         known = {p: laid_out_as(p, gradient) for p, gradient in pairs if gradient is not None}
         if not known:
@@ -88,3 +96,89 @@ class Optimizer(torch.optim.AdamW):
         state["step"] = torch.zeros((), device=parameter.device)
         state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
         return state
+
+
+@torch.no_grad()
+def update_average(
+    average: Mapping[str, Tensor],
+    parameters: Mapping[str, Tensor],
+    buffers: Mapping[str, Tensor],
+    gradients: Sequence[Tensor | None],
+    decay: float,
+) -> None:
+    """Moves ``average`` towards parameters that had a gradient and floating buffers; other buffers are copied.
+
+    Args:
+        average: by name; changed in place.
+        parameters: by name.
+        buffers: by name.
+        gradients: of the parameters, in their order.
+        decay: of the average.
+    """
+    pairs = zip(parameters.items(), gradients, strict=True)
+    weights = {name: parameter for (name, parameter), gradient in pairs if gradient is not None}
+    weights |= {name: value for name, value in buffers.items() if value.is_floating_point()}
+    if weights:
+        torch._foreach_lerp_([average[name] for name in weights], list(weights.values()), 1 - decay)
+    for name in buffers.keys() - weights.keys():
+        average[name].copy_(buffers[name])
+
+
+def one_cycle(step: int, n_steps: int, peak: float, warm_up: float = 0.01) -> float:
+    """One-cycle rate at ``step``: a cosine from peak / 25 up to the peak, then a cosine down to peak / 250 000.
+
+    Args:
+        step: from 0 to n_steps - 1.
+        warm_up: share of the steps until the peak.
+    Source: Smith and Topin 2019, "Super-convergence".
+    """
+    start, end = peak / START_DIVISOR, peak / START_DIVISOR / END_DIVISOR
+    turn = max(1.0, warm_up * n_steps - 1)
+    if step <= turn:
+        return _cosine(start, peak, step / turn)
+    return _cosine(peak, end, min(1.0, (step - turn) / max(1.0, n_steps - 1 - turn)))
+
+
+def _cosine(a: float, b: float, share: float) -> float:
+    return b + (a - b) * (1 + math.cos(math.pi * share)) / 2
+
+
+class LossScale:
+    """What the loss is multiplied with, and gradients divided by, so that float16 holds the gradients between.
+
+    Halved where a gradient is not finite, doubled after STEPS_TO_DOUBLE steps without.
+
+    Attributes:
+        value: the factor.
+        n_good: steps since it changed.
+    """
+
+    def __init__(self, value: float = 1.0, n_good: int = 0):
+        self.value, self.n_good = value, n_good
+
+    def update(self, finite: bool) -> None:
+        if not finite:
+            self.value, self.n_good = max(1.0, self.value / 2), 0
+            return
+        self.n_good += 1
+        if self.n_good == STEPS_TO_DOUBLE:
+            self.value, self.n_good = min(LARGEST_SCALE, 2 * self.value), 0
+
+
+@contextmanager
+def deterministic() -> Iterator[None]:
+    """Within it torch uses deterministic algorithms only, and TF32 only if asked."""
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    before = torch.are_deterministic_algorithms_enabled()
+    fill = torch.utils.deterministic.fill_uninitialized_memory
+    cudnn = torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark
+    torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # costs time and changes no result of a correct op
+    torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = True, False
+    try:
+        with tf32_only_if_asked():
+            yield
+    finally:
+        torch.use_deterministic_algorithms(before)
+        torch.utils.deterministic.fill_uninitialized_memory = fill
+        torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = cudnn

@@ -1,4 +1,4 @@
-"""Training in several processes: who computes which samples, and what they tell each other."""
+"""Training in several processes: which samples each computes, and what they exchange."""
 
 from __future__ import annotations
 
@@ -6,22 +6,27 @@ import atexit
 import hashlib
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import torch
 import torch.distributed as dist
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
 from gsim3d.errors import InputError, RunStopped
-from gsim3d.train.liveness import Liveness
+from gsim3d.train.stopping import Liveness
 
 
 class Processes:
     """The processes of one training run; each has a replica of the model and computes its share of every batch.
 
-    rank: number of this one, from 0.    count: how many there are.    liveness: watches the others; None: nothing does.
+    Attributes:
+        rank: number of this one, from 0.
+        count: how many there are.
+        liveness: watches the others; None: nothing does.
     """
 
     def __init__(self, rank: int = 0, count: int = 1, liveness: Liveness | None = None):
@@ -51,8 +56,7 @@ class Processes:
         return values
 
     def add(self, tensors: Sequence[Tensor | None], factor: float) -> list[Tensor | None]:
-        """Sums over all processes, each with its ``factor``, in one message; what is None in one process must be None
-        in all."""
+        """Sums over all processes, each with its ``factor``, in one message; None must be None in all."""
         known = [tensor for tensor in tensors if tensor is not None]
         flat = torch.cat([tensor.reshape(-1) for tensor in known]).mul_(factor)
         dist.all_reduce(flat)
@@ -114,13 +118,43 @@ def joined(device: str) -> Iterator[Processes]:
     except RuntimeError as error:
         if not (isinstance(error, dist.DistError) or "gloo" in str(error)):
             raise
-        atexit.register(_exit_at_once)
+        atexit.register(_exit_immediately)
         raise liveness.error() from None
     finally:
         liveness.end(failed=failed)
 
 
-def _exit_at_once() -> None:
+def shared_loss(model: nn.Module, loss: Callable[..., tuple[Tensor, Tensor]]) -> DistributedDataParallel:
+    """``loss`` of this process's samples; its backward pass gives every process the gradient of all samples.
+
+    Without arguments it is a zero with all weights of ``model`` in it.
+    """
+    # Parts without gradients (the dynamics, in a phase that simulates nothing) are searched for in each step. Then
+    # torch also leaves its buckets as they are: it would order them anew after the first step, and a resumed run
+    # would add in another order. A group of its own, because batch normalisation communicates at the same time.
+    group = dist.new_group()
+    # What torch 2.13 warns about has no other name in 2.11.
+    with warnings.catch_warnings(category=FutureWarning, action="ignore"):
+        return DistributedDataParallel(
+            _Loss(model, loss), broadcast_buffers=False, find_unused_parameters=True, process_group=group
+        )
+
+
+class _Loss(nn.Module):
+    """The loss as a module that holds the model, as torch wants it."""
+
+    def __init__(self, model: nn.Module, loss: Callable[..., tuple[Tensor, Tensor]]):
+        super().__init__()
+        self.model, self._loss = model, loss
+
+    def forward(self, *arguments) -> tuple[Tensor, Tensor]:
+        if arguments:
+            return self._loss(*arguments)
+        zero = sum(parameter.sum() * 0 for parameter in self.model.parameters())
+        return zero, zero.detach()
+
+
+def _exit_immediately() -> None:
     """Else NCCL waits for the process that is gone, and threads of gloo abort this one while Python ends."""
     sys.stdout.flush()
     sys.stderr.flush()

@@ -31,7 +31,7 @@ from gsim3d.pretrained import KEEP
 from gsim3d.simulator import Simulator
 from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, TrainConfig
-from gsim3d.train.settings import from_dict, to_dict
+from gsim3d.train.settings import from_dict, to_dict, upgraded
 
 SIMILAR = 1.25  # near and far are replaced by those of the training where they differ by at most this factor
 PRESETS = ("tiny", "small", "paper_latent", "paper_explicit")
@@ -290,7 +290,7 @@ def _restored(path: str | Path, saved: checkpoint.Checkpoint, device: str) -> Re
         raise InputError(f"{path}: data.fps must be frames per second, a number from 0.001 to 1e6; got {shown(fps)}")
     try:
         model = from_dict(ModelConfig, without_old_switches(saved.config["model"]), "model")
-        settings = from_dict(DataConfig, data, "data")
+        settings = from_dict(DataConfig, upgraded(DataConfig, data), "data")
         spec = EffectsSpec.from_dict(saved.config.get("effects", {}).get("spec"))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -51,7 +51,7 @@ def from_dict(cls: type[T], content: dict, where: str = "", base: T | None = Non
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     unknown = [str(key) for key in content if key not in fields]
     if unknown:
-        hint = did_you_mean(unknown[0], fields)
+        hint = _old_name(cls, unknown[0]) or did_you_mean(unknown[0], fields)
         raise InputError(f"{_join(where, unknown[0])[:200]}: unknown setting; known here: {', '.join(fields)}{hint}")
     values = {}
     for name, field in fields.items():
@@ -68,6 +68,37 @@ def from_dict(cls: type[T], content: dict, where: str = "", base: T | None = Non
         raise InputError(f"{where}: {error}" if where else str(error)) from None
     except ValueError as error:
         raise InputError(f"{where or cls.__name__}: {error}") from None
+
+
+def upgraded(cls: type, content: Any) -> Any:
+    """Saved ``content`` of the dataclass ``cls`` as today's version names it.
+
+    A class may have ``RENAMED``, old names of its settings to new ones, and ``REMOVED``, settings that are gone to the
+    value with which they did nothing (``...``: with any value). What did something stays, for :func:`from_dict` to
+    refuse.
+    """
+    if not isinstance(content, dict):
+        return content
+    hints, result = typing.get_type_hints(cls), {}
+    renamed, removed = getattr(cls, "RENAMED", {}), getattr(cls, "REMOVED", {})
+    for name, value in content.items():
+        if name in removed and removed[name] in (value, ...):
+            continue
+        name = renamed.get(name, name)
+        hint = hints.get(name)
+        if dataclasses.is_dataclass(hint):
+            value = upgraded(hint, value)
+        elif typing.get_origin(hint) is tuple and dataclasses.is_dataclass(typing.get_args(hint)[0]):
+            value = [upgraded(typing.get_args(hint)[0], item) for item in value]
+        result[name] = value
+    return result
+
+
+def _old_name(cls: type, name: str) -> str:
+    """A hint for a setting of earlier versions."""
+    if name in getattr(cls, "RENAMED", {}):
+        return f"; it is now called {cls.RENAMED[name]!r}"
+    return "; this version no longer has it" if name in getattr(cls, "REMOVED", {}) else ""
 
 
 def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:

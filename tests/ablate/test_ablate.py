@@ -12,14 +12,14 @@ from gsim3d.cli.main import main
 from gsim3d.data import find_scenes
 from gsim3d.errors import CaptureError, InputError, NumericalError
 from gsim3d.train.captured import check_capturable
-from gsim3d.train.config import DataConfig, OptimizerConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, OptimizerConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import build_simulator, model_config
 from tests.tiny_scenes import write_scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 BASE = TrainConfig(
-    stages=(StageConfig(steps=2, horizon=1, target_views=1, learning_rate=1e-3),),
+    phases=(PhaseConfig(steps=2, horizon=1, target_views=1, learning_rate=1e-3),),
     data=DataConfig(context_views=2, target_only_cameras=(3,), background_stride=4),
     optimizer=OptimizerConfig(ema_decay=0),
     checkpoint_every=1,
@@ -51,7 +51,7 @@ def test_every_row_changes_what_it_says_and_has_a_model():
         config = row.change(base)
         model, before = model_config(config), model_config(base)
         parts = {part for part in ("encoder", "dynamics", "renderer") if getattr(model, part) != getattr(before, part)}
-        parts |= {part for part in ("data", "stages", "effects") if getattr(config, part) != getattr(base, part)}
+        parts |= {part for part in ("data", "phases", "effects") if getattr(config, part) != getattr(base, part)}
         changed[name] = parts
     assert {
         name: parts for name, parts in changed.items() if name.startswith(("latent", "explicit", "no-tem", "grid"))
@@ -62,7 +62,7 @@ def test_every_row_changes_what_it_says_and_has_a_model():
         "grid-half": {"dynamics"},
         "grid-double": {"dynamics"},
     }
-    assert changed["rollout-2"] == {"stages"} and changed["rollout-12"] == set() == changed["history-4"]
+    assert changed["rollout-2"] == {"phases"} and changed["rollout-12"] == set() == changed["history-4"]
     assert changed["history-1"] == {"data"} == changed["views-2"]
     assert changed["background-masked"] == {"effects"} and changed["calls-2"] == {"dynamics"}
 
@@ -77,14 +77,14 @@ def test_the_explicit_row_is_a_model(preset):
 
 def test_the_base_run_is_the_papers_as_far_as_the_preset_goes():
     assert [base_run(preset).data.history for preset in ("tiny", "small", "paper_latent")] == [2, 4, 4]
-    assert base_run().stages[-1].horizon == 12
+    assert base_run().phases[-1].horizon == 12
 
 
 def test_a_budget_is_shared_by_the_stages():
-    config = dataclasses.replace(BASE, stages=(StageConfig(steps=10), StageConfig(steps=40, horizon=1)))
+    config = dataclasses.replace(BASE, phases=(PhaseConfig(steps=10), PhaseConfig(steps=40, horizon=1)))
     for n_steps in (2, 7, 50, 333):
         assert with_steps(config, n_steps).n_steps == n_steps
-    assert [stage.steps for stage in with_steps(config, 100).stages] == [20, 80]
+    assert [phase.steps for phase in with_steps(config, 100).phases] == [20, 80]
     with pytest.raises(InputError, match="--steps: must be at least 2"):
         with_steps(config, 1)
 
@@ -193,7 +193,7 @@ def test_the_command_lists_rows_and_says_what_is_wrong(folders, tmp_path, capsys
     assert main(["ablate", "--list"]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(ROWS)
     data, out = str(folders[0].parents[1]), str(tmp_path / "out")
-    (tmp_path / "long.yaml").write_text("stages: [{steps: 2, horizon: 9, target_views: 1}]\n")
+    (tmp_path / "long.yaml").write_text("phases: [{steps: 2, horizon: 9, target_views: 1}]\n")
     for arguments, message in (
         ([data, "--rows", "latent,none", "--out", out], "--rows: 'none' does not exist; rows: latent, explicit"),
         ([data, "--rows", "latent,latent", "--out", out], "named twice"),
@@ -213,7 +213,7 @@ def test_the_command_lists_rows_and_says_what_is_wrong(folders, tmp_path, capsys
 def test_a_folder_of_another_run_is_refused(folders, tmp_path):
     study(folders, "latent").run(tmp_path, "c", progress=False, say=quiet)
     other = Study(with_steps(BASE, 3), rows_named("latent"), folders)
-    with pytest.raises(InputError, match="was started with another 'stages'"):
+    with pytest.raises(InputError, match="was started with another 'phases'"):
         other.run(tmp_path, "c", progress=False, say=quiet)
     fewer = Study(BASE, rows_named("latent"), folders[:2])
     fewer.run(tmp_path / "fewer", "c", progress=False, say=quiet)

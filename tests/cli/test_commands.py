@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 TRAINING = """
 data: {history: 2, context_views: 2, target_only_cameras: [3], background_stride: 2}
-stages:
+phases:
   - {steps: 2, horizon: 1, target_views: 2}
 """
 

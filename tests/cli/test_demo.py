@@ -8,21 +8,21 @@ import pytest
 from gsim3d.cli.demo import DemoConfig, comparisons, run_demo
 from gsim3d.errors import InputError
 from gsim3d.train import checkpoint
-from gsim3d.train.config import StageConfig, TrainConfig
+from gsim3d.train.config import PhaseConfig, TrainConfig
 from gsim3d.train.restore import model_config
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 DATA = {"n_trajectories": 2, "n_frames": 6, "image_size": 32, "processes": 1, "objects": ("ball",)}
-STAGES = (
-    StageConfig(steps=2, history=1, batch=2, target_views=2, learning_rate=1e-3),
-    StageConfig(steps=2, horizon=2, target_views=2, learning_rate=1e-3),
+PHASES = (
+    PhaseConfig(steps=2, history=1, batch=2, target_views=2, learning_rate=1e-3),
+    PhaseConfig(steps=2, horizon=2, target_views=2, learning_rate=1e-3),
 )
 FILES = ["gaussians", "metrics.json", "model", "model.safetensors", "overview.png", "psnr.png", "rollout.mp4"]
 
 
 def small_config() -> DemoConfig:
-    return DemoConfig(data=DATA, train=dataclasses.replace(DemoConfig().train, stages=STAGES))
+    return DemoConfig(data=DATA, train=dataclasses.replace(DemoConfig().train, phases=PHASES))
 
 
 @pytest.fixture(scope="module")

@@ -84,7 +84,3 @@ def test_draws_depend_on_seed_step_sample_and_purpose_only():
 def test_window_steps(scenes):
     window = Window(scenes[0], 2, 1, context_cams=((0, 1),), target_cams=((2,), (3,), (4,)))
     assert window.steps == [2, 3, 4]
-    apart = Window(scenes[0], 1, 2, context_cams=((0,), (1,)), target_cams=((2,), (3,), (4,)), gap=1)
-    assert apart.steps == [1, 3, 4]
-    ahead = Window(scenes[0], 2, 1, context_cams=((0, 1),), target_cams=((2,), (3,), (4,)), lead=2)
-    assert ahead.steps == [2, 5, 6]

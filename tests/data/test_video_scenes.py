@@ -15,7 +15,7 @@ from gsim3d.data.check import check_scene
 from gsim3d.data.lenses import Lens, Undistorter
 from gsim3d.errors import InputError
 from gsim3d.io import write_video
-from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.samples import draw_batch
 from tests.data.made_scenes import (
@@ -346,9 +346,9 @@ def test_transforms_name_cameras_by_key_or_path(tmp_path):
 def test_no_loss_and_no_metric_sees_the_padding(odd, tmp_path, one_thread):
     """Other colours in pixels that were not filmed change neither the loss nor its gradient, elsewhere they do."""
     scene = Scene.open(odd[0])
-    data, stage = DataConfig(history=1, context_views=2), StageConfig(steps=1, horizon=1, target_views=3)
-    trainer = Trainer(TrainConfig(data=data, stages=(stage,)), [scene], tmp_path / "run")
-    batch = draw_batch([scene], data, stage, 0, 0, [0])
+    data, phase = DataConfig(history=1, context_views=2), PhaseConfig(steps=1, horizon=1, target_views=3)
+    trainer = Trainer(TrainConfig(data=data, phases=(phase,)), [scene], tmp_path / "run")
+    batch = draw_batch([scene], data, phase, 0, 0, [0])
     assert batch.targets.valid is not None and not batch.targets.valid.all()
     noise = torch.rand(batch.targets.images.shape, generator=torch.Generator().manual_seed(0))
 

@@ -14,7 +14,7 @@ from gsim3d.errors import FitWarning, InputError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.synth.worlds import build_world
 from gsim3d.train import checkpoint
-from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.restore import build_simulator, describe, model_config, restore
 from gsim3d.train.samples import check_scenes
 from tests.data.made_scenes import make_scene, write_genesis
@@ -136,8 +136,8 @@ def test_a_rate_that_is_none_is_refused(folder, tmp_path, fps):
 def test_training_scenes_have_one_rate(folder, tmp_path):
     scenes = [Scene.open(folder), Scene.open(at_rate(write_scene(tmp_path / "c"), 24))]
     with pytest.raises(InputError, match="c: 24 frames per second, .* has 12; a model has one rate"):
-        check_scenes(scenes, CONFIG.data, [StageConfig(steps=1, target_views=2)])
-    check_scenes(scenes[:1] * 2, CONFIG.data, [StageConfig(steps=1, target_views=2)])
+        check_scenes(scenes, CONFIG.data, [PhaseConfig(steps=1, target_views=2)])
+    check_scenes(scenes[:1] * 2, CONFIG.data, [PhaseConfig(steps=1, target_views=2)])
 
 
 def test_commands_refuse_resample_and_say_once_what_is_not_checked(folder, tmp_path, capsys):

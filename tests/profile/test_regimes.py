@@ -13,7 +13,7 @@ from gsim3d.profile.regimes import _steady_steps, throughput, training_step
 from gsim3d.profile.settings import Setting
 from gsim3d.profile.timing import DeviceClock
 from gsim3d.train.checkpoint import Checkpoint
-from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.settings import to_dict
 from tests.profile.fakes import FakeClock
 
@@ -70,7 +70,7 @@ def test_what_has_no_memory_is_told(subject, monkeypatch):
     many = throughput(subject, Setting(), DeviceClock("cpu"), n_scenes=3)
     assert many.timing is None and many.steps_a_second is None
     config = TrainConfig(
-        stages=(StageConfig(steps=5, horizon=1, target_views=1),), data=DataConfig(history=2, context_views=2)
+        phases=(PhaseConfig(steps=5, horizon=1, target_views=1),), data=DataConfig(history=2, context_views=2)
     )
     saved = Checkpoint({}, {"train": to_dict(config)})
     copy = type(subject)(dataclasses.replace(subject.restored, checkpoint=saved), subject.scenes)
@@ -81,10 +81,10 @@ def test_what_has_no_memory_is_told(subject, monkeypatch):
     assert regimes["gpu"] == []
 
 
-def test_a_training_step_of_the_last_stage(subject):
+def test_training_step_is_of_the_last_phase(subject):
     assert "does not hold the configuration" in training_step(subject, DeviceClock("cpu")).problem
-    stages = (StageConfig(steps=5, horizon=1), StageConfig(steps=5, horizon=2, batch=2, target_views=1))
-    config = TrainConfig(stages=stages, data=DataConfig(history=2, context_views=2, background_stride=2), seed=3)
+    phases = (PhaseConfig(steps=5, horizon=1), PhaseConfig(steps=5, horizon=2, batch=2, target_views=1))
+    config = TrainConfig(phases=phases, data=DataConfig(history=2, context_views=2, background_stride=2), seed=3)
 
     def trained(config, **options):
         saved = Checkpoint({}, {"train": to_dict(config)})
@@ -94,12 +94,12 @@ def test_a_training_step_of_the_last_stage(subject):
 
     step = trained(config)
     assert (step.batch, step.horizon) == (2, 2) and step.timing.median > 0
-    long = StageConfig(steps=5, horizon=50, cut=2, target_views=1)
+    long = PhaseConfig(steps=5, horizon=50, cut=2, target_views=1)
     n_steps = min(scene.n_steps for scene in subject.scenes)
-    assert trained(dataclasses.replace(config, stages=(long,))).horizon == n_steps - 2
-    assert trained(dataclasses.replace(config, stages=(long,)), quick=True).horizon == 2
-    ahead = dataclasses.replace(long, lead=50)
-    assert "do not fit" in trained(dataclasses.replace(config, stages=(ahead,))).problem
+    assert trained(dataclasses.replace(config, phases=(long,))).horizon == n_steps - 2
+    assert trained(dataclasses.replace(config, phases=(long,)), quick=True).horizon == 2
+    ahead = dataclasses.replace(long, history=50)
+    assert "do not fit" in trained(dataclasses.replace(config, phases=(ahead,))).problem
     found = report.regimes_as_dict([], step)["training"]
     assert found["step_ms"]["median"] == pytest.approx(1e3 * step.timing.median)
 

@@ -9,7 +9,7 @@ import torch
 from gsim3d.data import Scene, find_scenes
 from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr, ssim
 from gsim3d.train import checkpoint
-from gsim3d.train.config import DataConfig, OptimizerConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, OptimizerConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.losses import image_errors
 from tests.stability.setting import NAMES
@@ -18,7 +18,7 @@ from tests.tiny_scenes import write_scenes
 NAN, INF = float("nan"), float("inf")
 FLOAT32 = pytest.mark.parametrize("setting", [name for name in NAMES if "float32" in name], indirect=True)
 TRAINING = TrainConfig(
-    stages=(StageConfig(steps=3, horizon=1, target_views=1, learning_rate=1e-3),),
+    phases=(PhaseConfig(steps=3, horizon=1, target_views=1, learning_rate=1e-3),),
     data=DataConfig(history=2, context_views=2, background_stride=2),
     optimizer=OptimizerConfig(ema_decay=0.9, clip_norm=0.5),
     log_every=1,

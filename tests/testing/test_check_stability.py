@@ -45,7 +45,7 @@ def scenes(tmp_path_factory):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory, scenes):
     root = tmp_path_factory.mktemp("trained")
-    settings = "data: {history: 2, context_views: 2}\nstages: [{steps: 1, horizon: 1, target_views: 1}]\n"
+    settings = "data: {history: 2, context_views: 2}\nphases: [{steps: 1, horizon: 1, target_views: 1}]\n"
     (root / "train.yaml").write_text(settings)
     assert main(["train", str(root / "train.yaml"), "--data", str(scenes), "--out", str(root / "run")]) == 0
     return root / "run"

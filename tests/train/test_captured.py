@@ -14,7 +14,7 @@ from gsim3d.data import Scene, find_scenes
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.numerics.policy import StabilityReport
 from gsim3d.train.captured import CapturedLoss
-from gsim3d.train.config import DataConfig, LossConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.samples import draw_batch
 from tests.asserts import assert_close_relative_to_max
@@ -23,7 +23,7 @@ from tests.tiny_scenes import write_scenes
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 CONFIG = TrainConfig(
-    stages=(StageConfig(steps=9, horizon=2, batch=2, target_views=2),),
+    phases=(PhaseConfig(steps=9, horizon=2, batch=2, target_views=2),),
     data=DataConfig(history=2, context_views=2, background_stride=2),
 )
 
@@ -41,7 +41,6 @@ MOVING = dataclasses.replace(
     CONFIG,
     model={"dynamics": {"motion_length": 0.3}},
     effects={"appearance": {"changing": "frozen"}},
-    loss=LossConfig(shape=0.5, shape_length=0.1),
 )
 RELIT = dataclasses.replace(
     MOVING,
@@ -55,7 +54,6 @@ RELIT = dataclasses.replace(
             "lights": ((0.1, 0.2, 1.0),),
         }
     },
-    loss=LossConfig(bodies=1.0),
 )
 FLYING = dataclasses.replace(
     RELIT,
@@ -96,16 +94,21 @@ def captured_loss(trainer, recompute=()):
     return CapturedLoss(
         trainer.simulator,
         trainer.plan,
-        trainer.loss_of_steps,
+        trainer.loss_of_images,
         lambda part: torch.autocast("cpu", enabled=False),
-        bodies=trainer.config.loss.bodies > 0,
         recompute=recompute,
     )
 
 
 def batches(scenes, count, **changes):
-    stage = dataclasses.replace(CONFIG.stages[0], **changes)
-    return [draw_batch(scenes, CONFIG.data, stage, 0, step, [0, 1]) for step in range(count)]
+    phase = dataclasses.replace(CONFIG.phases[0], **changes)
+    return [draw_batch(scenes, CONFIG.data, phase, 0, step, [0, 1]) for step in range(count)]
+
+
+def mixed_batches(scenes, count):
+    """Batches of two kinds in turn: of horizon 2, and of horizon 3."""
+    by_horizon = [batches(scenes, count, horizon=horizon) for horizon in (2, 3)]
+    return [by_horizon[step % 2][step] for step in range(count)]
 
 
 def run(captured, batch, trainer, report=None, factor=1.0):
@@ -114,59 +117,36 @@ def run(captured, batch, trainer, report=None, factor=1.0):
 
 
 @pytest.mark.parametrize(
-    "stage, trainer",
+    "phase, trainer",
     [
         ({}, "latent"),
-        ({"lead": 2}, "latent"),
         ({"horizon": 0}, "latent"),
         ({}, "explicit"),
-        ({"lead": 2}, "background-masked"),
-        ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "latent"),
-        ({"dynamics_alone": True, "lead": 2}, "background-masked"),
+        ({}, "background-masked"),
         ({"horizon": 3, "cut": 2}, "moving"),
         ({}, "moving, masked"),
-        ({"dynamics_alone": True}, "all moving"),
-        ({"lead": 2}, "relit"),
-        ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "relit"),
-        ({"dynamics_alone": True, "lit_before": 1, "horizon": 1}, "relit"),
-        ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "flying"),
-        ({"dynamics_alone": True, "lit_before": 1, "horizon": 1}, "flying"),
+        ({}, "all moving"),
+        ({"horizon": 3, "cut": 2}, "relit"),
+        ({"horizon": 3, "cut": 2}, "flying"),
     ],
-    ids=[
-        "rollout",
-        "lead",
-        "encoded",
-        "explicit",
-        "masked",
-        "dynamics alone, cut",
-        "dynamics alone, masked",
-        "moving",
-        "moving, masked",
-        "all moving",
-        "relit",
-        "relit, dynamics alone",
-        "relit, background of its own",
-        "flying, dynamics alone",
-        "flying, background of its own",
-    ],
+    ids=["rollout", "encoded", "explicit", "masked", "moving", "moving, masked", "all moving", "relit", "flying"],
     indirect=["trainer"],
 )
-def test_gradients_are_those_of_the_loss(stage, scenes, trainer, device):
+def test_gradients_are_those_of_the_loss(phase, scenes, trainer, device):
     captured, report = captured_loss(trainer), StabilityReport()
-    drawn = batches(scenes, 4, **stage)
-    assert {batch.n_lead for batch in drawn} == {0, stage.get("lead", 0)}
+    drawn = batches(scenes, 4, **phase)
     assert_gradients_of_the_loss(captured, drawn, trainer, device, report)
     assert captured.captures >= 1 and not report.total
 
 
 @pytest.mark.parametrize(
-    "stage, trainer",
-    [({"lead": 2}, "latent"), ({"dynamics_alone": True, "horizon": 3, "cut": 2}, "flying")],
-    ids=["lead", "flying, dynamics alone"],
+    "phase, trainer",
+    [({}, "latent"), ({"horizon": 3, "cut": 2}, "flying")],
+    ids=["rollout", "flying"],
     indirect=["trainer"],
 )
-def test_what_is_computed_again_changes_no_bit(stage, scenes, trainer, device):
-    batch, counts = batches(scenes, 2, **stage)[1].to(device), {"calls": 0, "geometry": 0}
+def test_what_is_computed_again_changes_no_bit(phase, scenes, trainer, device):
+    batch, counts = batches(scenes, 2, **phase)[1].to(device), {"calls": 0, "geometry": 0}
     reports, found, counted = (StabilityReport(), StabilityReport()), [], []
     dynamics, geometry = trainer.simulator.dynamics, trainer.simulator.dynamics.geometry
     dynamics.register_forward_pre_hook(lambda *_: counts.update(calls=counts["calls"] + 1))
@@ -188,9 +168,7 @@ def assert_gradients_of_the_loss(captured, drawn, trainer, device, report):
     for batch in drawn:
         batch = batch.to(device)
         loss, errors = trainer.loss(batch)
-        learning = [name for name in trainer.parameters if name.startswith("dynamics.") or not batch.dynamics_alone]
-        found = torch.autograd.grad(loss, [trainer.parameters[name] for name in learning], allow_unused=True)
-        expected = [dict(zip(learning, found, strict=True)).get(name) for name in trainer.parameters]
+        expected = torch.autograd.grad(loss, list(trainer.parameters.values()), allow_unused=True)
         loss = loss.detach()  # a capture waits for the stream of every graph that is kept
         actual = run(captured, batch, trainer, report)
         assert_close_relative_to_max(actual.loss, loss, 0.1 * TOLERANCE[device.type])
@@ -206,7 +184,7 @@ def assert_gradients_of_the_loss(captured, drawn, trainer, device, report):
 
 
 class FullGPU:
-    """In the place of Captured: has room for the graphs of one kind of step, or for any that share memory."""
+    """Instead of Captured: holds the graphs of one kind of step, or any that share memory."""
 
     def __init__(self, captured, make):
         self.captured, self.make, self.pools = captured, make, []
@@ -234,8 +212,7 @@ def test_graphs_that_share_memory_do_not_change_each_other(scenes, trainer, full
         pytest.skip("graphs need a GPU")
     captured, report = captured_loss(trainer), StabilityReport()
     gpu = full_gpu(captured, Captured)
-    drawn = batches(scenes, 8, lead=2)
-    assert {batch.n_lead for batch in drawn} == {0, 2}
+    drawn = mixed_batches(scenes, 8)
     assert_gradients_of_the_loss(captured, drawn, trainer, device, report)
     assert not report.total and len(captured._steps) == 2
     assert None not in gpu.pools[-2:]
@@ -243,10 +220,10 @@ def test_graphs_that_share_memory_do_not_change_each_other(scenes, trainer, full
     assert_gradients_of_the_loss(captured, drawn, trainer, device, report)  # in memory of its own again
 
 
-def test_where_a_gpu_is_full_other_graphs_go_and_memory_is_shared(scenes, trainer, full_gpu, monkeypatch):
+def test_full_gpu_drops_other_graphs_and_shares_memory(scenes, trainer, full_gpu, monkeypatch):
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 7))
     captured = captured_loss(trainer)
-    for batch in batches(scenes, 9, lead=2):
+    for batch in mixed_batches(scenes, 9):
         run(captured, batch.to(trainer.device), trainer)
     (_, first), (kind, last) = captured._steps.items()
     gpu = full_gpu(captured, lambda function, device, pool: (function, pool))
@@ -262,7 +239,7 @@ def test_memory_whose_graphs_are_all_gone_is_not_used_again(scenes, trainer, ful
     handles = ((0, number) for number in itertools.count(7))
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: next(handles))
     captured = captured_loss(trainer)
-    for batch in batches(scenes, 9, lead=2):
+    for batch in mixed_batches(scenes, 9):
         run(captured, batch.to(trainer.device), trainer)
     (_, first), (kind, last) = captured._steps.items()
     gpu = full_gpu(captured, lambda function, device, pool: pool)
@@ -273,7 +250,7 @@ def test_memory_whose_graphs_are_all_gone_is_not_used_again(scenes, trainer, ful
 
 
 @pytest.mark.parametrize("no_room, tries, match", [(True, 2, "lower batch, target_views or"), (False, 1, "^no$")])
-def test_what_no_room_can_be_made_for(no_room, tries, match, scenes, trainer, full_gpu, monkeypatch):
+def test_graph_that_does_not_fit_alone_is_refused(no_room, tries, match, scenes, trainer, full_gpu, monkeypatch):
     def make(function, device, pool):
         raise CaptureError("no", no_room=no_room)
 
@@ -315,35 +292,35 @@ def test_nothing_in_a_graph_has_a_size_that_depends_on_numbers(row, scenes, tmp_
     assert not ops.names & {"index by a mask", "nonzero", "masked_select", "unique_dim", "_unique2", "is_nonzero"}
 
 
-def test_room_that_one_kind_of_step_needed_is_there_for_others(scenes, trainer, device):
+def test_capacity_is_shared_between_kinds_of_steps(scenes, trainer, device):
     captured = captured_loss(trainer)
     run(captured, batches(scenes, 1)[0].to(device), trainer)
     ((clouds, most),) = captured.most.items()
     captured.most[clouds] = (most[0], *(size + 100 for size in most[1:]))
-    led = next(batch for batch in batches(scenes, 9, lead=2) if batch.n_lead)
-    run(captured, led.to(device), trainer)
+    longer = batches(scenes, 1, horizon=3)[0]
+    run(captured, longer.to(device), trainer)
     step = list(captured._steps.values())[-1]
-    assert captured.captures == 2 and len(step._capacities) == led.n_lead + led.n_future
+    assert captured.captures == 2 and len(step._capacities) == longer.n_future
     assert all(capacity.sizes[-1] == captured.most[clouds][-1] >= most[-1] + 100 for capacity in step._capacities)
 
 
-def test_room_that_another_run_needed_is_there_from_the_first_step(scenes, trainer, device):
+def test_reserved_capacity_is_there_from_the_first_step(scenes, trainer, device):
     captured, other = captured_loss(trainer), captured_loss(trainer)
     small, large = (batch.to(device) for batch in batches(scenes, 2))
     run(other, large, trainer)
     ((clouds, most),) = other.most.items()
     other.most[clouds] = (most[0], *(2 * size for size in most[1:]))
-    other.most_rows = 2 * max(other.prepare(large).counts)
-    captured.make_room(json.loads(json.dumps(other.needed)))
+    other.most_particles = 2 * max(other.prepare(large).counts)
+    captured.reserve(json.loads(json.dumps(other.needed)))
     assert captured.needed == other.needed
     loss = run(captured, small, trainer).loss.clone()
     (step,) = captured._steps.values()
-    assert captured.captures == 1 and step.rows >= other.most_rows
+    assert captured.captures == 1 and step.particles >= other.most_particles
     assert all(capacity.sizes[1:] == other.most[clouds][1:] for capacity in step._capacities)
     torch.testing.assert_close(loss, run(captured_loss(trainer), small, trainer).loss, rtol=1e-4, atol=0)
 
 
-def test_what_needs_more_room_gets_it(scenes, trainer, device):
+def test_capacity_grows_where_a_batch_needs_more(scenes, trainer, device):
     captured = captured_loss(trainer)
     batch = batches(scenes, 1)[0].to(device)
     loss = run(captured, batch, trainer).loss.clone()
@@ -356,9 +333,9 @@ def test_what_needs_more_room_gets_it(scenes, trainer, device):
     fewer = dataclasses.replace(batch.context, masks=batch.context.masks & ~batch.context.dynamic)
     captured = captured_loss(trainer)
     run(captured, dataclasses.replace(batch, context=fewer), trainer)
-    (before,) = (step.rows for step in captured._steps.values())
+    (before,) = (step.particles for step in captured._steps.values())
     torch.testing.assert_close(run(captured, batch, trainer).loss, loss, rtol=TOLERANCE[device.type], atol=0)
-    (after,) = (step.rows for step in captured._steps.values())
+    (after,) = (step.particles for step in captured._steps.values())
     assert max(captured.prepare(batch).counts) <= after and before <= after
 
 

@@ -17,13 +17,13 @@ from gsim3d.effects.edits import load_edits
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.train import restore
-from gsim3d.train.config import StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.restore import build_simulator, model_config
-from gsim3d.train.settings import from_dict, load_yaml, to_dict
+from gsim3d.train.settings import from_dict, load_yaml, to_dict, upgraded
 
 
 def test_round_trip():
-    config = TrainConfig(stages=(StageConfig(steps=3, horizon=2, learning_rate=1e-3),), seed=4, model={"a": [1]})
+    config = TrainConfig(phases=(PhaseConfig(steps=3, horizon=2, learning_rate=1e-3),), seed=4, model={"a": [1]})
     assert from_dict(TrainConfig, to_dict(config)) == config
 
 
@@ -37,10 +37,10 @@ def test_what_is_left_out_comes_from_the_base():
 @pytest.mark.parametrize(
     "content, message",
     [
-        ({"sed": 1}, r"^sed: unknown setting; known here: stages, preset"),
+        ({"sed": 1}, r"^sed: unknown setting; known here: phases, preset"),
         ({"optimizer": {"lr": 1}}, r"^optimizer\.lr: unknown setting"),
-        ({"stages": [{"steps": 5}, {"step": 5}]}, r"^stages\[1\]\.step: unknown setting"),
-        ({"stages": [{"horizon": 5}]}, r"^stages\[0\]\.steps: this setting is missing"),
+        ({"phases": [{"steps": 5}, {"step": 5}]}, r"^phases\[1\]\.step: unknown setting"),
+        ({"phases": [{"horizon": 5}]}, r"^phases\[0\]\.steps: this setting is missing"),
         ({"seed": 1.5}, r"^seed: must be a whole number; got 1.5"),
         ({"seed": True}, r"^seed: must be a whole number"),
         ({"seed": -1}, r"seed must be at least 0"),
@@ -54,14 +54,13 @@ def test_what_is_left_out_comes_from_the_base():
         ({"optimizer": {"beta1": "x"}}, r"^optimizer\.beta1: must be a number"),
         ({"optimizer": {"beta1": 1.0}}, r"beta1 must be below 1"),
         ({"optimizer": 3}, r"^optimizer: must be a mapping"),
-        ({"stages": 3}, r"^stages: must be a list"),
-        ({"stages": []}, r"stages: at least one"),
-        ({"stages": [{"steps": 1, "lead": 2}]}, r"stages\[0\]: lead: needs a horizon"),
-        ({"stages": [{"steps": 1, "dynamics_alone": True}]}, r"stages\[0\]: dynamics_alone: needs a horizon"),
-        ({"in_turn": [{"steps": 1, "lead": 1}]}, r"in_turn\[0\]: lead: needs a horizon"),
-        ({"stages": [{"steps": 1, "horizon": 1, "lit_before": 1}]}, r"stages\[0\]: lit_before: needs dynamics_alone"),
-        ({"rounds": 0}, r"rounds must be at least 1"),
-        ({"stages": [{"steps": 0}]}, r"stages\[0\]: steps must be at least 1"),
+        ({"phases": 3}, r"^phases: must be a list"),
+        ({"phases": []}, r"phases: at least one"),
+        ({"stages": [{"steps": 1}]}, r"^stages: unknown setting; .*; it is now called 'phases'$"),
+        ({"data": {"thawed": 0.5}}, r"^data\.thawed: .*; it is now called 'unfrozen_background'$"),
+        ({"phases": [{"steps": 1, "lead": 2}]}, r"^phases\[0\]\.lead: .*; this version no longer has it$"),
+        ({"loss": {"shape": 1}}, r"^loss\.shape: unknown setting; .*; this version no longer has it$"),
+        ({"phases": [{"steps": 0}]}, r"phases\[0\]: steps must be at least 1"),
         ({"data": {"context_cameras": [1], "target_only_cameras": [1]}}, r"share a camera"),
     ],
 )
@@ -80,7 +79,7 @@ def numbers_of(cls, where=()):
             yield (*where, field.name), hint
 
 
-NUMBERS = [*numbers_of(TrainConfig), *(((name,), hint) for (name,), hint in numbers_of(StageConfig))]
+NUMBERS = [*numbers_of(TrainConfig), *(((name,), hint) for (name,), hint in numbers_of(PhaseConfig))]
 HUGE = {int: 2**62, float: 1e30}
 
 
@@ -89,9 +88,9 @@ def test_every_number_of_a_run_has_a_finite_range(tmp_path, text):
     file = tmp_path / "a.yaml"
     for (*sections, name), hint in NUMBERS:
         content = {name: yaml.safe_load(text)} if text != "huge" else {name: HUGE[hint]}
-        cls = TrainConfig if sections or hasattr(TrainConfig, name) else StageConfig
-        if cls is StageConfig:
-            content = {"stages": [{"steps": 1, **content}]}
+        cls = TrainConfig if sections or hasattr(TrainConfig, name) else PhaseConfig
+        if cls is PhaseConfig:
+            content = {"phases": [{"steps": 1, **content}]}
         for section in reversed(sections):
             content = {section: content}
         file.write_text(yaml.safe_dump(content))
@@ -176,8 +175,8 @@ def test_hostile_files_end_with_one_short_line(tmp_path, name):
 
 
 def test_numbers_as_yaml_writes_them(tmp_path):
-    (tmp_path / "a.yaml").write_text("stages: [{steps: 5, learning_rate: 2e-4}]\n")
-    assert from_dict(TrainConfig, load_yaml(tmp_path / "a.yaml")).stages[0].learning_rate == 2e-4
+    (tmp_path / "a.yaml").write_text("phases: [{steps: 5, learning_rate: 2e-4}]\n")
+    assert from_dict(TrainConfig, load_yaml(tmp_path / "a.yaml")).phases[0].learning_rate == 2e-4
 
 
 @pytest.mark.parametrize(
@@ -210,22 +209,22 @@ def test_optional_fixed_length_and_nested_fields():
 
 
 def test_stages_follow_one_another():
-    config = TrainConfig(stages=(StageConfig(steps=3), StageConfig(steps=2, horizon=4)))
+    config = TrainConfig(phases=(PhaseConfig(steps=3), PhaseConfig(steps=2, horizon=4)))
     assert config.n_steps == 5
-    assert [(config.stage_of(i)[0].horizon, config.stage_of(i)[1]) for i in range(5)] == [
+    assert [(config.phase_of(i)[0].horizon, config.phase_of(i)[1]) for i in range(5)] == [
         (0, 0), (0, 1), (0, 2), (4, 0), (4, 1),
     ]  # fmt: skip
 
 
-def test_the_last_stages_take_turns():
-    stages = (StageConfig(steps=2), StageConfig(steps=1, horizon=4), StageConfig(steps=2, horizon=6))
-    config = TrainConfig(stages=stages[:1], in_turn=stages[1:], rounds=3)
-    assert config.n_steps == 2 + 3 * 3
-    found = [config.stage_of(step) for step in range(config.n_steps)]
-    assert [stage.horizon for stage, _ in found] == [0, 0] + 3 * [4, 6, 6]
-    assert [place for _, place in found] == [0, 1] + 3 * [0, 0, 1]
-    with pytest.raises(IndexError):
-        config.stage_of(config.n_steps)
+def test_settings_that_earlier_versions_saved_are_renamed():
+    phase = {"steps": 3, "horizon": 2, "lead": 0, "lit_before": 0, "dynamics_alone": False, "masked_out": 0.0}
+    saved = {"stages": [phase], "in_turn": [], "rounds": 1, "data": {"thawed": 0.5}}
+    saved["loss"] = {"bodies": 0.0, "shape": 0.0, "shape_length": 0.1}
+    config = from_dict(TrainConfig, upgraded(TrainConfig, saved))
+    expected = TrainConfig(phases=(PhaseConfig(steps=3, horizon=2),), data=DataConfig(unfrozen_background=0.5))
+    assert config == expected == from_dict(TrainConfig, upgraded(TrainConfig, to_dict(config)))
+    with pytest.raises(InputError, match="dynamics_alone: unknown setting.*no longer has it"):
+        from_dict(TrainConfig, upgraded(TrainConfig, {"stages": [{**phase, "dynamics_alone": True}]}))
 
 
 def test_the_documented_training_is_the_published_one():
@@ -239,5 +238,5 @@ def test_the_documented_training_is_the_published_one():
     optimizer = config.optimizer
     assert (optimizer.beta1, optimizer.beta2, optimizer.eps) == (0.9, 0.999, 1e-8)
     assert (optimizer.weight_decay, optimizer.clip_norm, optimizer.ema_decay) == (1e-3, 0.5, 0)
-    (stage,) = config.stages
-    assert (stage.horizon, stage.target_views, stage.learning_rate, stage.warm_up) == (12, 5, 2e-4, 0.01)
+    (phase,) = config.phases
+    assert (phase.horizon, phase.target_views, phase.learning_rate, phase.warm_up) == (12, 5, 2e-4, 0.01)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsim3d import presets
-from gsim3d.train.config import DataConfig, OptimizerConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, OptimizerConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import build_simulator
 from tests.tiny_scenes import write_scenes
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).parents[2]
 CUT = re.compile(r"dynamics\..*\.(norm1|norm2|attention|mlp)\.|encoder\.heads\.(conditioning|to_latents)\.")
 RUN = TrainConfig(
-    stages=(StageConfig(steps=2, horizon=2, target_views=1, learning_rate=1e-3),),
+    phases=(PhaseConfig(steps=2, horizon=2, target_views=1, learning_rate=1e-3),),
     model={"dynamics": {"zero_init": False}},
     data=DataConfig(context_views=2, background_stride=2),
     optimizer=OptimizerConfig(ema_decay=0),

@@ -19,19 +19,19 @@ from gsim3d.errors import InputError, NumericalError
 from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.evaluate.perceptual.weights import SOURCES, cache_folder
 from gsim3d.train import checkpoint
-from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.losses import image_loss, time_weights
 from gsim3d.train.restore import restore
-from gsim3d.train.samples import draw_batch, spread_views, thinned
+from gsim3d.train.samples import draw_batch, spread_views, subsampled
 from tests.tiny_scenes import write_scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 CONFIG = TrainConfig(
-    stages=(
-        StageConfig(steps=3, history=1, batch=2, target_views=2, learning_rate=1e-3),
-        StageConfig(steps=3, horizon=2, target_views=2, from_start=0.5, learning_rate=1e-3),
+    phases=(
+        PhaseConfig(steps=3, history=1, batch=2, target_views=2, learning_rate=1e-3),
+        PhaseConfig(steps=3, horizon=2, target_views=2, from_start=0.5, learning_rate=1e-3),
     ),
     data=DataConfig(history=2, context_views=2, target_only_cameras=(3,), background_stride=2),
     optimizer=OptimizerConfig(ema_decay=0.9),
@@ -62,8 +62,8 @@ def finished(folder, tmp_path_factory, one_thread):
 
 
 def test_training_on_a_device_repeats_and_resumes_bit_by_bit(folder, tmp_path, device):
-    for name, sittings in (("whole", [None]), ("again", [None]), ("parts", [2, 4, None])):
-        for until in sittings:
+    for name, runs in (("whole", [None]), ("again", [None]), ("parts", [2, 4, None])):
+        for until in runs:
             Trainer(CONFIG, scenes(folder), tmp_path / name, device=device.type).run(until=until, progress=False)
     assert curve(tmp_path / "whole") == curve(tmp_path / "again") == curve(tmp_path / "parts")
     whole, parts = (checkpoint.load(tmp_path / name).model for name in ("whole", "parts"))
@@ -155,7 +155,7 @@ def test_a_checkpoint_of_other_tensors_is_refused(folder, finished, tmp_path, pa
 def test_any_number_of_workers_gives_the_same_bits(folder, tmp_path):
     for workers in (1, 2, 3):
         torch.set_num_threads(workers)
-        config = dataclasses.replace(CONFIG, stages=CONFIG.stages[:1], workers=workers)
+        config = dataclasses.replace(CONFIG, phases=CONFIG.phases[:1], workers=workers)
         Trainer(config, scenes(folder), tmp_path / str(workers)).run(progress=False)
         assert torch.get_num_threads() == workers
     torch.set_num_threads(1)
@@ -183,7 +183,7 @@ def test_checkpointing_changes_no_gradient(folder, tmp_path):
         model = {"drop_path": 0.3, "shuffle_orders": True, "zero_init": False, "checkpointing": checkpointing}
         trainer = Trainer(dataclasses.replace(CONFIG, model={"dynamics": model}), scenes(folder), tmp_path)
         trainer.simulator.train()
-        trainer.step = 4  # of the second stage, which rolls out
+        trainer.step = 4  # of the second phase, which rolls out
         gradients.append(trainer._gradients([0])[2])
     names = list(trainer.parameters)
     unused = set(trainer.plan.unused)
@@ -209,7 +209,7 @@ def test_the_perceptual_part_joins_the_loss(folder, tmp_path, monkeypatch):
     file.parent.mkdir(parents=True)
     save_file(network.state_dict(), file, {"sha256": SOURCES["lpips_vgg"].sha256})
     trainers = [Trainer(c, scenes(folder), tmp_path / "run") for c in (config, CONFIG)]
-    batch = draw_batch(trainers[0].scenes, CONFIG.data, CONFIG.stages[1], CONFIG.seed, 0, [0])
+    batch = draw_batch(trainers[0].scenes, CONFIG.data, CONFIG.phases[1], CONFIG.seed, 0, [0])
     (loss, errors), (plain, same) = (trainer.loss(batch) for trainer in trainers)
     assert torch.equal(errors, same)
     simulator, targets = trainers[0].simulator, batch.targets
@@ -273,28 +273,28 @@ def test_a_switch_of_another_version_is_refused_only_where_it_is_on(finished, tm
 
 
 def test_what_does_not_fit_is_named(folder, tmp_path):
-    long = TrainConfig(stages=(StageConfig(steps=1, horizon=9),), data=CONFIG.data)
+    long = TrainConfig(phases=(PhaseConfig(steps=1, horizon=9),), data=CONFIG.data)
     with pytest.raises(InputError, match="windows of 11 steps do not fit"):
         Trainer(long, scenes(folder), tmp_path)
     with pytest.raises(InputError, match="too few cameras for 5 context views"):
         data = DataConfig(context_views=5, target_only_cameras=(0,))
-        Trainer(TrainConfig(stages=CONFIG.stages, data=data), scenes(folder), tmp_path)
+        Trainer(TrainConfig(phases=CONFIG.phases, data=data), scenes(folder), tmp_path)
     with pytest.raises(InputError, match="camera 77 of data.target_only_cameras does not exist"):
         data = DataConfig(context_views=1, target_only_cameras=(77,))
-        Trainer(TrainConfig(stages=CONFIG.stages, data=data), scenes(folder), tmp_path)
+        Trainer(TrainConfig(phases=CONFIG.phases, data=data), scenes(folder), tmp_path)
     with pytest.raises(InputError, match="5 steps, but this model sees up to 2"):
-        stages = (StageConfig(steps=1, horizon=1, target_views=2),)
-        Trainer(TrainConfig(stages=stages, data=DataConfig(history=5, context_views=2)), scenes(folder), tmp_path)
+        phases = (PhaseConfig(steps=1, horizon=1, target_views=2),)
+        Trainer(TrainConfig(phases=phases, data=DataConfig(history=5, context_views=2)), scenes(folder), tmp_path)
     with pytest.raises(InputError, match="preset: must be one of"):
         Trainer(TrainConfig(**{**vars(CONFIG), "preset": "huge"}), scenes(folder), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_samples_depend_on_seed_and_step_only(folder):
-    stage = CONFIG.stages[1]
+    phase = CONFIG.phases[1]
 
     def key(seed, step):
-        batch = draw_batch(scenes(folder), CONFIG.data, stage, seed, step, [0, 1])
+        batch = draw_batch(scenes(folder), CONFIG.data, phase, seed, step, [0, 1])
         return batch.targets.images.sum().item(), batch.context.images.sum().item()
 
     assert key(0, 3) == key(0, 3)
@@ -305,7 +305,7 @@ def test_target_only_cameras_are_never_an_input(folder):
     known = scenes(folder)
     forbidden = known[0].cameras_at([3], [0]).viewmats[0]
     for step in range(20):
-        batch = draw_batch(known, CONFIG.data, CONFIG.stages[0], 0, step, [0, 1])
+        batch = draw_batch(known, CONFIG.data, CONFIG.phases[0], 0, step, [0, 1])
         assert not (batch.context.cameras.viewmats == forbidden).all(-1).all(-1).any()
 
 
@@ -315,16 +315,16 @@ def test_views_are_spread_evenly():
     assert spread_views([0, 1, 3, 4], 4, 3) == (0, 1, 3, 4)
 
 
-def test_thinning_by_strides(folder):
-    frames = draw_batch(scenes(folder), DataConfig(context_views=2), CONFIG.stages[0], 0, 0, [0]).context
-    sparse = thinned(frames, DataConfig(background_stride=2))
+def test_subsampling_by_strides(folder):
+    frames = draw_batch(scenes(folder), DataConfig(context_views=2), CONFIG.phases[0], 0, 0, [0]).context
+    sparse = subsampled(frames, DataConfig(background_stride=2))
     body = frames.dynamic & frames.masks
     assert torch.equal(sparse.masks & frames.dynamic, body)
     ground = frames.masks & ~frames.dynamic
     share = (sparse.masks & ~frames.dynamic).sum() / ground.sum()
     assert 0.15 < share < 0.35
-    assert thinned(frames, DataConfig()) is frames
-    of_body = thinned(frames, DataConfig(body_stride=2)).masks
+    assert subsampled(frames, DataConfig()) is frames
+    of_body = subsampled(frames, DataConfig(body_stride=2)).masks
     assert torch.equal(of_body & ~frames.dynamic, ground) and 0.1 < (of_body & body).sum() / body.sum() < 0.4
 
 

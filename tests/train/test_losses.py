@@ -1,23 +1,12 @@
 """The loss and the learning-rate schedule."""
 
-import dataclasses
 import math
 
 import pytest
 import torch
 
-from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
-from gsim3d.train.losses import (
-    bodies_alone,
-    body_errors,
-    image_errors,
-    image_loss,
-    mean_by_step,
-    shape_errors,
-    time_weights,
-)
-from gsim3d.train.schedule import one_cycle
-from tests.dynamics.scenes import batch, make_history
+from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
+from gsim3d.train.optimizer import one_cycle
 
 
 def test_time_weights_are_the_papers():
@@ -84,78 +73,3 @@ def test_one_cycle_is_torchs():
         optimizer.step()
         if step < 199:
             theirs.step()
-
-
-ONE_STEP = (200,)
-
-
-def moved(state, change):
-    return dataclasses.replace(state, means=change(state.means))
-
-
-def test_bodies_that_move_as_they_are_keep_their_shape():
-    state = make_history(ONE_STEP, frozen_share=0.0, dtype=torch.float64)
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)).Q
-    steps = [moved(state, lambda x: x @ turn.T + 0.7), moved(state, lambda x: 1.2 * x), moved(state, lambda x: 1.4 * x)]
-    errors = shape_errors(state, steps, 0.2)
-    assert errors[0] < 1e-9 and 0.01 < errors[1] < errors[2]
-
-
-def test_shape_errors_by_hand():
-    """Three particles in a row, 10 cm apart; the third goes away by 20 cm, and pairs count less the farther apart."""
-    state = make_history((3,), frozen_share=0.0, dtype=torch.float64)
-    state = dataclasses.replace(state, means=torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]).double())
-    gone = torch.tensor([[0.0, 0, 0], [0, 0, 0], [0.2, 0, 0]]).double()
-    (error,) = shape_errors(state, [moved(state, lambda x: x + gone)], 0.2).tolist()
-    near, far = math.exp(-0.5 * 0.5**2), math.exp(-0.5)
-    assert error == pytest.approx((near + far) / (2 * near + far) * (math.sqrt(2) - 1), rel=1e-2)
-
-
-@pytest.mark.parametrize("activity", [FROZEN, ASLEEP])
-def test_what_does_not_move_and_other_scenes_have_no_shape(activity):
-    one, other = (make_history(ONE_STEP, seed=seed, frozen_share=0.0) for seed in range(2))
-    rests = torch.arange(200) % 2 == 0
-    one = dataclasses.replace(one, activity=torch.where(rests, activity, one.activity).to(torch.uint8))
-    both = batch([one, other])
-    apart = torch.where(torch.arange(400) < 200, 0.0, 5.0)[:, None]
-    lost = torch.where(torch.cat([rests, torch.zeros(200, dtype=torch.bool)])[:, None], torch.nan, 0.0)
-    leaf = (both.means + apart + lost).requires_grad_()
-    (error,) = shape_errors(both, [dataclasses.replace(both, means=leaf)], 0.2)
-    assert error.item() < 1e-6
-    error.backward()
-    assert leaf.grad.isfinite().all()
-
-
-def test_gradients_of_shape_errors():
-    state = make_history((12,), frozen_share=0.2, dtype=torch.float64)
-    leaf = (state.means + 0.05 * torch.rand(12, 3, dtype=torch.float64)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: shape_errors(state, [moved(state, lambda _: x)] * 2, 0.2), leaf)
-
-
-def square(at, size=4, edge=32):
-    image = torch.zeros(1, edge, edge, 3)
-    image[:, at : at + size, at : at + size] = 1.0
-    return image
-
-
-def test_body_errors_by_hand():
-    pred, target = torch.zeros(2, 16, 16, 3), torch.zeros(2, 16, 16, 3)
-    target[0, :4, :4] = 0.5
-    pixels, squares, whole = 0.25 / 16, 0.25 / 16, (0.5 / 16) ** 2
-    assert body_errors(pred, target).tolist() == pytest.approx([(pixels + squares + whole) / 3, 0])
-
-
-def test_body_errors_tell_how_far_away_a_body_is():
-    """Images of pixels do not, once it has left its place."""
-    target = square(0)
-    near, far = (body_errors(square(at), target).item() for at in (5, 24))
-    assert near < 0.95 * far
-    assert image_errors(square(5), target).item() == image_errors(square(24), target).item()
-
-
-def test_bodies_alone_hides_what_cannot_move():
-    particles = make_history((30,))
-    alone = bodies_alone(particles)
-    moves = particles.activity == DYNAMIC
-    assert torch.equal(alone.opacities[moves], particles.opacities[moves])
-    assert alone.opacities[~moves].eq(0).all() and (~moves).any() and torch.equal(alone.means, particles.means)

@@ -14,17 +14,17 @@ CONFIG = OptimizerConfig(beta1=0.8, beta2=0.95, weight_decay=0.1, clip_norm=0.5,
 RATES = (1e-2, 3e-2, 1e-3, 2e-2)
 
 
-@pytest.fixture(params=["as the device does it", "at once"])
+@pytest.fixture(params=["as the device does it", "on a GPU"])
 def step_of(request):
     """How an optimizer makes a step; without a GPU, that of a GPU too."""
 
-    def at_once(optimizer, gradients, norm, rate):
+    def on_gpu(optimizer, gradients, norm, rate):
         for group in optimizer.param_groups:
             group["lr"] = rate * group["factor"]
         with torch.no_grad():
-            optimizer._update_at_once(gradients, norm)
+            optimizer._update_on_gpu(gradients, norm)
 
-    return Optimizer.update if request.param != "at once" else at_once
+    return Optimizer.update if request.param != "on a GPU" else on_gpu
 
 
 def model(device):

@@ -9,22 +9,18 @@ import pytest
 import torch
 
 from gsim3d.errors import InputError
-from gsim3d.presets import paper_latent, small
-from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
 from gsim3d.train import checkpoint
-from gsim3d.train.config import DataConfig, StageConfig
+from gsim3d.train.config import DataConfig, PhaseConfig, PrecisionConfig
+from gsim3d.train.gradients import StepWatch
 from gsim3d.train.loop import Trainer, deterministic
-from gsim3d.train.parts import with_first_background
-from gsim3d.train.precision import STEPS_TO_DOUBLE, LossScale, PrecisionConfig
-from gsim3d.train.samples import LONG_AGO, draw_batch, draw_windows
+from gsim3d.train.optimizer import STEPS_TO_DOUBLE, LossScale
+from gsim3d.train.samples import draw_batch, draw_windows
 from gsim3d.train.settings import from_dict
-from gsim3d.train.watch import StepWatch
-from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
 from tests.tiny_scenes import write_scenes
 from tests.train.test_loop import CONFIG, curve, scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-LATER = 4  # a step of the second stage, which rolls out
+LATER = 4  # a step of the second phase, which rolls out
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +51,7 @@ def test_recomputing_changes_no_bit(folder, tmp_path, norm, precision, device):
         with deterministic():
             loss, errors, gradients, watch = trainer._gradients([0])
         result = [loss, errors, *gradients, *trainer.simulator.buffers()]
-        assert watch.seen(1.0).n_rows > 0 and len(watch.seen(1.0).norms) == 2
+        assert watch.seen(1.0).n_particles > 0 and len(watch.seen(1.0).norms) == 2
         for name, once in (("encoder", 1), ("steps", 2), ("images", 1)):
             assert calls.count(name) == (2 * once if name in recompute else once)
         known = known or result
@@ -93,7 +89,7 @@ def test_states_and_images_stay_float32(folder, tmp_path, precision, device):
     trainer = trainer_at(folder, tmp_path, device=device, precision=precision)
     render, seen = trainer.simulator.render, []
     trainer.simulator.render = lambda p, *given, **options: seen.append(p) or render(p, *given, **options)
-    images, *_ = trainer._steps(trainer._batch([0]), 0, StepWatch())
+    images = trainer._images(trainer._batch([0]), 0, StepWatch())
     (particles,) = seen
     floats = [value for value in particles.row_fields().values() if value.is_floating_point()]
     assert len(floats) == 4 and particles.n_clouds == 4
@@ -125,19 +121,19 @@ def test_scaling_the_loss_leaves_gradients_and_an_overflow_halves_it(folder, tmp
 
 def test_histories_and_views_are_drawn_for_each_step(folder, tmp_path):
     data = DataConfig(history=4, shortest_history=1, context_views=3, fewest_views=2, target_only_cameras=(3,))
-    stage = dataclasses.replace(CONFIG.stages[1], batch=2)
+    phase = dataclasses.replace(CONFIG.phases[1], batch=2)
     found = set()
     for step in range(24):
-        batch = draw_batch(scenes(folder), data, stage, 0, step, [0, 1])
-        (alone,) = {draw_batch(scenes(folder), data, stage, 0, step, [s]).n_context for s in (0, 1)}
+        batch = draw_batch(scenes(folder), data, phase, 0, step, [0, 1])
+        (alone,) = {draw_batch(scenes(folder), data, phase, 0, step, [s]).n_context for s in (0, 1)}
         n_images, n_clouds = batch.context.images.shape[0], batch.context.cloud_scene.shape[0]
         assert batch.n_context == alone and n_clouds == 2 * alone
         found.add((alone, n_images // n_clouds))
     assert {history for history, _ in found} == {1, 2, 3, 4} and {views for _, views in found} == {2, 3}
     model = {"dynamics": {"history_bits": 2}}
-    config = dataclasses.replace(CONFIG, data=data, model=model, stages=(dataclasses.replace(stage, steps=4, batch=1),))
-    for name, sittings in (("whole", [None]), ("parts", [2, None])):
-        for until in sittings:
+    config = dataclasses.replace(CONFIG, data=data, model=model, phases=(dataclasses.replace(phase, steps=4, batch=1),))
+    for name, runs in (("whole", [None]), ("parts", [2, None])):
+        for until in runs:
             Trainer(config, scenes(folder), tmp_path / name).run(until=until, progress=False)
     assert curve(tmp_path / "whole") == curve(tmp_path / "parts")
     with pytest.raises(InputError, match="data.shortest_history: must be at most data.history, 2; got 3"):
@@ -155,7 +151,7 @@ def test_tensorboard_gets_all_numbers_and_videos_and_changes_no_bit(folder, tmp_
     names = set(board.Tags()["scalars"])
     modules = {f"train/grad_norm_by_module/{part}" for part in ("encoder", "dynamics", "renderer")}
     assert {"train/particles", "train/step_seconds", "train/memory_gib", "train/grad_norm_by_step/2"} | modules <= names
-    (video,) = board.Images("sample/filmed, predicted")
+    (video,) = board.Images("sample/true, predicted")
     assert video.step == 5 and (video.width, video.height) == (64, 32) and video.encoded_image_string[:3] == b"GIF"
 
 
@@ -180,7 +176,7 @@ def test_a_trace_is_written_and_changes_no_bit(folder, tmp_path):
     (trace,) = (tmp_path / "traced" / "profile").iterdir()
     names = {event.get("name") for event in json.loads(trace.read_text())["traceEvents"]}
     assert trace.name == "process_0.json" and "ProfilerStep#3" in names and "gsim3d::rasterize_gaussians" in names
-    with pytest.raises(InputError, match="--profile traces steps 3 and 4 of a sitting; this one has 1"):
+    with pytest.raises(InputError, match="--profile traces steps 3 and 4 of a run; this one has 1"):
         Trainer(CONFIG, scenes(folder), tmp_path / "traced").run(progress=False, profile=True)
 
 
@@ -189,132 +185,26 @@ def test_the_log_tells_time_memory_and_particles(folder, tmp_path):
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert all(line["machine"]["step_seconds"] > 0 and 0.01 < line["machine"]["memory_gib"] < 100 for line in lines)
     assert lines[1]["machine"]["seconds"] > lines[0]["machine"]["seconds"]
-    batch = draw_batch(scenes(folder), CONFIG.data, CONFIG.stages[0], 0, 0, [0, 1])
+    batch = draw_batch(scenes(folder), CONFIG.data, CONFIG.phases[0], 0, 0, [0, 1])
     assert lines[0]["particles"] == pytest.approx(batch.context.masks.sum().item() / 2)
     assert math.isfinite(checkpoint.load(tmp_path).state["seconds"])
 
 
-@pytest.mark.parametrize("within, lead, starts", [(0, 0, 9), (3, 0, 3), (50, 0, 9), (6, 4, 5)])
-def test_windows_begin_within_the_steps_asked_for(within, lead, starts):
-    """Windows of 2 + 4 steps, or 4 more, in a scene of 14: what is asked for is bounded by what fits."""
+@pytest.mark.parametrize("within, starts", [(0, 9), (3, 3), (50, 9)])
+def test_windows_begin_within_the_first_steps(within, starts):
+    """Windows of 2 + 4 steps in a scene of 14: begin_within is bounded by what fits."""
 
     class Long:
         n_steps, n_cams = 14, 6
 
-    stage = StageConfig(steps=1, horizon=4, history=2, lead=lead, begin_within=within, target_views=1)
-    drawn = {True: set(), False: set()}
-    for step in range(60):
-        (window,) = draw_windows([Long()], DataConfig(context_views=2), stage, 0, step, [0])
-        drawn[window.lead > 0].add(window.steps[0])
-    assert drawn[lead > 0] == set(range(starts))
-    always = dataclasses.replace(stage, from_start=1.0)
-    assert draw_windows([Long()], DataConfig(context_views=2), always, 0, 3, [0])[0].steps[0] == 0
-
-
-def test_a_background_of_its_own_comes_from_an_earlier_step():
-    """Windows of 1 + 2 + 1 steps, with up to 5 between the first two, in a scene of 12."""
-
-    class Long:
-        n_steps, n_cams = 12, 6
-
-    stage = StageConfig(
-        steps=1, horizon=1, history=2, lit_before=5, begin_within=2, target_views=1, dynamics_alone=True
-    )
+    phase = PhaseConfig(steps=1, horizon=4, history=2, begin_within=within, target_views=1)
     drawn = set()
-    for step in range(80):
-        (window,) = draw_windows([Long()], DataConfig(context_views=2), stage, 0, step, [0])
-        first, *others = window.steps
-        assert others == [others[0], others[0] + 1, others[0] + 2] and window.n_context == 3
-        assert len(window.context_cams) == 3 and 0 <= first < 2
-        drawn.add(others[0] - first)
-    assert drawn == set(range(1, 7))
-
-
-def test_a_background_of_its_own_is_in_no_history(folder):
-    """What moves in its step tells nothing of how fast anything moves later."""
-    stage = dataclasses.replace(CONFIG.stages[1], history=2, horizon=1, dynamics_alone=True, lit_before=1)
-    steps = draw_batch(scenes(folder), CONFIG.data, stage, 0, 0, [0, 1]).context.cloud_step.tolist()
-    assert steps == [0, 1 + LONG_AGO, 2 + LONG_AGO] * 2
-    assert LONG_AGO >= 2 ** max(paper_latent(8).dynamics.history_bits, small().dynamics.history_bits)
-
-
-def test_the_background_of_the_first_step_lies_behind_the_bodies_of_the_last():
-    history = batch([make_history((30, 20, 10)), make_history((12, 0, 25), seed=1)])
-    dynamics = make_dynamics(dataclasses.replace(TINY, lights=((0.0, 0.0, 1.0),)))
-    state = with_first_background(history, dynamics)
-    assert (state.clouds.scenes, state.clouds.steps) == ((0, 0, 1, 1), (1, 2, 1, 2))
-    for scene, (first, newest) in enumerate(((0, 2), (3, 5))):
-        given = [history.select_clouds([cloud]) for cloud in (first, newest)]
-        seen = state.select_clouds([2 * scene + 1])
-        for activity, source in ((FROZEN, given[0]), (DYNAMIC, given[1])):
-            rows, wanted = seen.activity == activity, source.activity == activity
-            assert torch.equal(seen.means[rows], source.means[wanted])
-            assert torch.equal(seen.opacities[rows], source.opacities[wanted])
-        assert not seen.opacities[seen.activity == ASLEEP].any()
-        lit = dynamics.in_light(given[0]).light_occlusion[given[0].activity == FROZEN]
-        assert torch.equal(seen.light_occlusion[seen.activity == FROZEN], lit) and lit.any()
-    assert torch.equal(state.select_clouds([0]).activity, history.select_clouds([1]).activity)
-
-
-def test_some_windows_show_what_may_move_alone(folder):
-    stage = StageConfig(steps=1, history=1, batch=4, target_views=2)
-    chosen, shown = range(12), dataclasses.replace(stage, masked_out=0.4)
-    windows = draw_windows(scenes(folder), CONFIG.data, shown, 0, 0, chosen)
-    masked = torch.tensor([window.masked_out for window in windows])
-    assert 2 <= masked.sum() <= 9
-    whole, some = (draw_batch(scenes(folder), CONFIG.data, s, 0, 0, chosen) for s in (stage, shown))
-    for frames, given in ((some.context, whole.context), (some.targets, whole.targets)):
-        alone = masked[given.cloud_scene[given.cameras.image_cloud]]
-        bodies = given.dynamic & alone[:, None, None]
-        assert torch.equal(frames.images[~alone], given.images[~alone])
-        assert torch.equal(frames.masks[~alone], given.masks[~alone])
-        assert torch.equal(frames.masks[alone], (given.masks & given.dynamic)[alone]) and frames.masks[alone].any()
-        assert torch.equal(frames.images[alone], (given.images * bodies[:, None])[alone])
-        assert not torch.equal(frames.images[alone], given.images[alone])
-
-
-def test_a_background_that_nobody_knows_is_not_masked_out(tmp_path):
-    write_scenes(tmp_path, 1)
-    stage = StageConfig(steps=1, history=1, target_views=2, masked_out=1.0)
-    assert draw_batch(scenes(tmp_path), CONFIG.data, stage, 0, 0, [0]).context.masks.any()
-    for image in tmp_path.rglob("seg_*.png"):
-        image.unlink()
-    with pytest.raises(InputError, match="masked_out: needs scenes with a segmentation"):
-        draw_batch(scenes(tmp_path), CONFIG.data, stage, 0, 0, [0])
-
-
-@pytest.mark.parametrize("wrong", [{"masked_out": 1.5}, {"masked_out": 0.1, "horizon": 4}])
-def test_what_cannot_be_masked_out_is_refused(wrong):
-    with pytest.raises(InputError, match="masked_out"):
-        StageConfig(steps=1, **wrong)
-
-
-@pytest.mark.parametrize("where", ["calls", "graphs"])
-def test_the_dynamics_learns_alone(folder, tmp_path, where, device):
-    stage = dataclasses.replace(CONFIG.stages[1], steps=9, batch=2, dynamics_alone=True)
-    trainer = trainer_at(folder, tmp_path, 0, device.type, stages=(stage,))
-    if where == "graphs":
-        trainer.captured = trainer._capture()
-    before = {name: value.clone() for name, value in trainer.parameters.items()}
-    entries = [trainer.train_step() for _ in range(2)]
-    assert all("past_psnr" not in entry and entry["future_psnr"] > 0 for entry in entries)
-    assert set(entries[0]["grad_norm_by_module"]) == {"dynamics"} and entries[1]["grad_norm"] > 0
-    for name, value in trainer.parameters.items():
-        if not name.startswith("dynamics."):
-            assert torch.equal(value, before[name]), name
-    assert any(not torch.equal(value, before[name]) for name, value in trainer.parameters.items())
-
-
-def test_the_loss_of_the_dynamics_alone_is_that_of_the_simulated_steps(folder, tmp_path):
-    trainer = trainer_at(folder, tmp_path)
-    stage = dataclasses.replace(CONFIG.stages[1], batch=2)
-    whole, alone = (
-        trainer.loss(draw_batch(trainer.scenes, CONFIG.data, s, 0, LATER, [0, 1]))
-        for s in (stage, dataclasses.replace(stage, dynamics_alone=True))
-    )
-    torch.testing.assert_close(alone[1], whole[1][-stage.horizon :])
-    weights = torch.tensor([1.0, CONFIG.loss.discount])
-    assert alone[0].item() == pytest.approx((weights * alone[1]).sum().item() / weights.sum().item(), rel=1e-5)
+    for step in range(60):
+        (window,) = draw_windows([Long()], DataConfig(context_views=2), phase, 0, step, [0])
+        drawn.add(window.steps[0])
+    assert drawn == set(range(starts))
+    always = dataclasses.replace(phase, from_start=1.0)
+    assert draw_windows([Long()], DataConfig(context_views=2), always, 0, 3, [0])[0].steps[0] == 0
 
 
 def test_gradients_flow_back_through_as_many_steps_as_asked_for(folder, tmp_path):
@@ -325,10 +215,10 @@ def test_gradients_flow_back_through_as_many_steps_as_asked_for(folder, tmp_path
             parameter.normal_(0, 0.02, generator=torch.Generator().manual_seed(0))
     reached = {}
     for cut in (0, 1, 2, 3, 4):
-        stage = dataclasses.replace(CONFIG.stages[1], horizon=4, cut=cut, from_start=1.0)
-        batch, watch = draw_batch(trainer.scenes, CONFIG.data, stage, 0, LATER, [0]), StepWatch()
+        phase = dataclasses.replace(CONFIG.phases[1], horizon=4, cut=cut, from_start=1.0)
+        batch, watch = draw_batch(trainer.scenes, CONFIG.data, phase, 0, LATER, [0]), StepWatch()
         trainer.step = 0  # one that is logged
-        images, *_ = trainer._steps(batch, 0, watch)
+        images = trainer._images(batch, 0, watch)
         errors = (images - batch.targets.images.permute(0, 2, 3, 1)).square()
         errors[batch.target_step() == batch.n_context + 3].mean().backward()
         reached[cut] = [norm > 0 for norm in watch.norms()]

@@ -18,7 +18,7 @@ from torch.nn.parallel import DistributedDataParallel
 from gsim3d.errors import InputError
 from gsim3d.nn.layers import RowBatchNorm
 from gsim3d.train import checkpoint
-from gsim3d.train.config import StageConfig, TrainConfig
+from gsim3d.train.config import PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.processes import Processes, joined
 from gsim3d.train.restore import build_simulator, model_config
@@ -32,12 +32,12 @@ from tests.two_processes import run_in_two_processes
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 STAGES = (
-    StageConfig(steps=2, history=1, batch=2, target_views=2, learning_rate=1e-4),
-    StageConfig(steps=2, horizon=2, batch=2, target_views=2, learning_rate=1e-4),
+    PhaseConfig(steps=2, history=1, batch=2, target_views=2, learning_rate=1e-4),
+    PhaseConfig(steps=2, horizon=2, batch=2, target_views=2, learning_rate=1e-4),
 )
-LAYER = dataclasses.replace(CONFIG, stages=STAGES)
+LAYER = dataclasses.replace(CONFIG, phases=STAGES)
 BATCH = dataclasses.replace(LAYER, model={"dynamics": {"norm": "batch", "zero_init": False}}, recompute=("steps",))
-UNEVEN = dataclasses.replace(LAYER, stages=(dataclasses.replace(STAGES[1], batch=3),))
+UNEVEN = dataclasses.replace(LAYER, phases=(dataclasses.replace(STAGES[1], batch=3),))
 RUNS = {"layer": LAYER, "batch": BATCH, "uneven": UNEVEN, "captured": UNEVEN}
 # float32: a batch is added in another order, and AdamW turns a gradient near zero into a step of full size. Relative;
 # worst on an AMD EPYC: loss 3e-7, norms 8e-6, distance of the weights over the way they went 3e-4.
@@ -149,7 +149,7 @@ def test_what_one_process_cannot_use_all_skip(together):
 
 def test_torchrun_starts_the_command(folder, together, tmp_path):
     config = tmp_path / "train.yaml"
-    config.write_text(yaml.safe_dump(to_dict(dataclasses.replace(LAYER, stages=STAGES[:1]))))
+    config.write_text(yaml.safe_dump(to_dict(dataclasses.replace(LAYER, phases=STAGES[:1]))))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "gsim3d"]
     command += ["train", str(config), "--data", str(folder), "--out", str(tmp_path / "run")]
     environment = {**os.environ, "PYTHONPATH": os.getcwd(), "OMP_NUM_THREADS": "1"}
@@ -167,7 +167,7 @@ def test_shares_are_neighbours_and_cover_the_batch():
 
 
 def test_what_cannot_be_shared_is_named(folder, tmp_path):
-    with pytest.raises(InputError, match=r"stages\[0\].batch: 2 samples are too few for 3 processes"):
+    with pytest.raises(InputError, match=r"phases\[0\].batch: 2 samples are too few for 3 processes"):
         Trainer(LAYER, scenes(folder), tmp_path, processes=Processes(0, 3))
     with pytest.raises(InputError, match="workers: must be 0 in 2 processes"):
         Trainer(dataclasses.replace(LAYER, workers=2), scenes(folder), tmp_path, processes=Processes(0, 2))

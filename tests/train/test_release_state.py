@@ -18,12 +18,12 @@ from gsim3d.synth import generate
 from gsim3d.synth.cameras import two_rings
 from gsim3d.synth.run import write_trajectory
 from gsim3d.synth.worlds import VALIDATION_SEED, build_world
-from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.log import plain
 from gsim3d.train.loop import deterministic
 from gsim3d.train.processes import Processes
 from gsim3d.train.restore import build_simulator, model_config, restore
-from gsim3d.train.samples import draw_batch, longest_gap
+from gsim3d.train.samples import draw_batch
 from tools.release import curve, recipes, runs
 from tools.release.films import Filming, FilmStore
 from tools.release.recipes import ARMS, WORLDS, recipe
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 NAME = "ball-tiny"
 OPTIONS = {"image_size": 32, "n_frames": 6, "objects": ("ball",), "n_trajectories": 2}
 CONFIG = TrainConfig(
-    stages=(StageConfig(steps=2, history=1, batch=2, target_views=2), StageConfig(steps=98, horizon=2, target_views=2)),
+    phases=(PhaseConfig(steps=2, history=1, batch=2, target_views=2), PhaseConfig(steps=98, horizon=2, target_views=2)),
     data=DataConfig(history=2, context_views=2, target_only_cameras=(2, 7), background_stride=2),
     log_every=1,
 )
@@ -68,12 +68,11 @@ def test_a_store_gives_what_scene_folders_give(world, spread, tmp_path):
     options = {**OPTIONS, "camera_spread": spread}
     folders = generate(tmp_path / "data", preset="mini", processes=1, progress=False, **options).folders
     scenes = [Scene.open(folder) for folder in folders]
-    led = dataclasses.replace(CONFIG.stages[1], batch=3, lead=2)
-    for step, stage in enumerate((CONFIG.stages[0], led, dataclasses.replace(led, dynamics_alone=True))):
-        given = store.draw(CONFIG.data, stage, 5, step, range(3))
-        wanted = draw_batch(scenes, CONFIG.data, stage, 5, step, range(3))
-        assert (given.n_context, given.n_past, given.n_future) == (wanted.n_context, wanted.n_past, wanted.n_future)
-        assert len(given.targets.images) == len(given.target_step()) == 3 * 2 * (given.n_past + given.n_future)
+    for step, phase in enumerate((CONFIG.phases[0], dataclasses.replace(CONFIG.phases[1], batch=3))):
+        given = store.draw(CONFIG.data, phase, 5, step, range(3))
+        wanted = draw_batch(scenes, CONFIG.data, phase, 5, step, range(3))
+        assert (given.n_context, given.n_future) == (wanted.n_context, wanted.n_future)
+        assert len(given.targets.images) == len(given.target_step()) == 3 * 2 * (given.n_context + given.n_future)
         for part in ("context", "targets"):
             a, b = getattr(given, part), getattr(wanted, part)
             for name in ("images", "cloud_scene", "cloud_step", "origin", "masks", "dynamic"):
@@ -144,7 +143,7 @@ def test_batches_drawn_ahead_are_those_of_their_steps(tmp_path, device):
     ahead.begin_run(time.monotonic() + 1e4), plain.begin_run(time.monotonic() + 1e4)
     with deterministic():
         for step in range(4):
-            samples = list(range(CONFIG.stage_of(step)[0].batch))
+            samples = list(range(CONFIG.phase_of(step)[0].batch))
             assert torch.equal(ahead._prepared(samples).batch.targets.images, plain._batch(samples).targets.images)
             a, b = ahead.train_step(), plain.train_step()
             assert ahead._next[0] == step + 1 and a["particles"] == b["particles"]
@@ -292,7 +291,7 @@ def test_a_run_ends_on_time_with_a_saved_state_and_its_rate_falls_if_it_is_the_l
     assert progress.next_trajectory == 7 and progress.runs[1]["steps"] == [0, trainer.step]
     assert progress.windows == 13 and progress.runs[1]["windows"] == [10, 13]  # two steps simulate nothing
     rates = [row[-1] for row in progress.curve]
-    assert len(rates) == 5 and rates[0] == pytest.approx(CONFIG.stages[0].learning_rate)
+    assert len(rates) == 5 and rates[0] == pytest.approx(CONFIG.phases[0].learning_rate)
     assert (rates[-1] < 0.5 * rates[0]) == is_last
     scored = list((tmp_path / "state" / "scored").iterdir())
     assert [file.name for file in scored] == [f"{NAME}.0000012.weights.safetensors"]
@@ -303,14 +302,14 @@ def test_the_next_run_has_the_capacity_that_graphs_needed(store, tmp_path):
     for trainer in (first, second):
         trainer.captured = trainer._capture()
     known = {"rows": 10_000, "moving": 500, "geometry": [[[0], [0, 1], [7, 8]]]}
-    first.captured.make_room(known)
+    first.captured.reserve(known)
     end = time.monotonic() + 2
     train(first, NoFilming(), Progress(), {}, end=end, out=tmp_path / "state", name=NAME, say=lambda _: None)
     progress = load_progress(tmp_path / "state", NAME)
     assert progress.step and progress.needed == first.captured.needed
     assert known["geometry"][0] in progress.needed["geometry"]
     load_into(second, tmp_path / "state", NAME)
-    assert second.captured.needed == progress.needed and second.captured.most_rows == 10_000
+    assert second.captured.needed == progress.needed and second.captured.most_particles == 10_000
     for damaged in ({"rows": 1}, {**known, "geometry": [[[0], [0, 1], [7]]]}):
         save_state(first, tmp_path / "state", NAME, dataclasses.replace(progress, needed=damaged))
         with pytest.raises(InputError, match=NAME):
@@ -321,9 +320,9 @@ def test_the_next_run_has_the_capacity_that_graphs_needed(store, tmp_path):
 @pytest.mark.parametrize("world", WORLDS)
 def test_recipes_are_sound(world, arm):
     made = recipe(world, arm)
-    stream, data, stages = made.stream(), made.train.data, made.train.all_stages
+    stream, data, phases = made.stream(), made.train.data, made.train.phases
     assert made.name == f"{world}-{arm}" and stream.name == world and made.first_films <= made.capacity
-    assert stream.n_frames >= data.history + max(stage.lead + stage.horizon + longest_gap(stage) for stage in stages)
+    assert stream.n_frames >= data.history + max(phase.horizon for phase in phases)
     assert made.train.n_steps >= 1_000_000
     model = build_simulator(model_config(made.train), 0).config.dynamics  # raises where switches do not agree
     hand_made = model.position_features, model.motion_length is not None, model.pushes

@@ -82,8 +82,8 @@ def together(tmp_path_factory):
 def test_two_processes_make_the_steps_of_one_with_both_batches(together, tmp_path):
     (first, weights), (second, others) = (torch.load(together / f"steps_{rank}.pt") for rank in range(2))
     assert first == second and all(torch.equal(weights[name], others[name]) for name in weights)
-    doubled = tuple(dataclasses.replace(stage, batch=2 * stage.batch) for stage in CONFIG.stages)
-    alone, expected = steps_of(trainer_in(tmp_path, dataclasses.replace(CONFIG, stages=doubled)))
+    doubled = tuple(dataclasses.replace(phase, batch=2 * phase.batch) for phase in CONFIG.phases)
+    alone, expected = steps_of(trainer_in(tmp_path, dataclasses.replace(CONFIG, phases=doubled)))
     for a, b in zip(alone, first, strict=True):
         assert a.keys() == b.keys() and a["particles"] == b["particles"]
         assert b["loss"] == pytest.approx(a["loss"], rel=1e-5)

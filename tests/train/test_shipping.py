@@ -13,7 +13,7 @@ from gsim3d import pretrained
 from gsim3d.errors import InputError
 from gsim3d.synth.run import write_trajectory
 from gsim3d.synth.worlds import TEST_SEED, build_world
-from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.restore import restore
 from tools.release.films import FilmStore
 from tools.release.recipes import Recipe
@@ -25,7 +25,7 @@ ROOT = Path(__file__).parent.parent.parent
 NAME, RUN = "elastic-small", "elastic-pure"
 OPTIONS = {"image_size": 32, "n_frames": 6, "objects": ("ball",)}
 CONFIG = TrainConfig(
-    stages=(StageConfig(steps=9, horizon=1, target_views=2),),
+    phases=(PhaseConfig(steps=9, horizon=1, target_views=2),),
     data=DataConfig(history=2, context_views=2, target_only_cameras=(2, 7), background_stride=2),
     log_every=1,
 )

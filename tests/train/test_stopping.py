@@ -13,7 +13,7 @@ import yaml
 
 from gsim3d.cli import main as __main__
 from gsim3d.errors import RunStopped
-from gsim3d.train import checkpoint, liveness
+from gsim3d.train import checkpoint, stopping
 from gsim3d.train.loop import Trainer
 from gsim3d.train.processes import joined
 from gsim3d.train.settings import to_dict
@@ -126,7 +126,7 @@ def test_a_log_with_lines_that_are_none_is_cut_all_the_same(folder, tmp_path):
 
 def endless(out: str, folder: str = "") -> int:
     """A run that ends if another process, its launcher or a signal ends it; with a folder it trains."""
-    liveness.INTERVAL, liveness.SILENCE, liveness.GRACE = 0.1, 2.0, 20.0 if folder else 0.5
+    stopping.INTERVAL, stopping.SILENCE, stopping.GRACE = 0.1, 2.0, 20.0 if folder else 0.5
 
     def work(_args):
         torch.set_num_threads(1)

@@ -9,16 +9,16 @@ import torch
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.numerics.policy import StabilityReport
 from gsim3d.train import checkpoint
-from gsim3d.train.config import StageConfig
+from gsim3d.train.config import PhaseConfig
+from gsim3d.train.gradients import StepWatch, mean_of_norms, norms_by_module
 from gsim3d.train.loop import Trainer
-from gsim3d.train.watch import StepWatch, mean_of_norms, norms_by_module
 from tests.test_simulator import awake, make_frames, make_simulator
 from tests.tiny_scenes import write_scenes
 from tests.train.test_loop import CONFIG, curve, scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-STAGE = StageConfig(steps=8, horizon=2, target_views=1, learning_rate=1e-3)
-SETTINGS = dataclasses.replace(CONFIG, stages=(STAGE,), checkpoint_every=2)
+PHASE = PhaseConfig(steps=8, horizon=2, target_views=1, learning_rate=1e-3)
+SETTINGS = dataclasses.replace(CONFIG, phases=(PHASE,), checkpoint_every=2)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_a_number_that_cannot_be_used_skips_the_step(folder, tmp_path):
     trainer = Trainer(settings, scenes(folder), tmp_path)
     encode, trainer.simulator.encode = trainer.simulator.encode, broken
     entry = trainer.train_step()
-    assert "skipped" not in entry and entry["unusable_rows"] >= 1 and math.isfinite(entry["grad_norm"])
+    assert "skipped" not in entry and entry["unusable_particles"] >= 1 and math.isfinite(entry["grad_norm"])
 
 
 def test_a_run_that_only_skips_stops_and_can_go_on_with_another_rate(folder, tmp_path):
@@ -107,15 +107,15 @@ def test_a_run_that_only_skips_stops_and_can_go_on_with_another_rate(folder, tmp
     assert all(bool(value.isfinite().all()) for value in saved.model.values())
     calmer = dataclasses.replace(
         settings,
-        stages=(dataclasses.replace(STAGE, learning_rate=1e-4),),
+        phases=(dataclasses.replace(PHASE, learning_rate=1e-4),),
         optimizer=dataclasses.replace(optimizer, clip_norm=0.1),
     )
     trainer = Trainer(calmer, scenes(folder), tmp_path)
     assert trainer.step == saved.state["step"] == 4
     trainer.run(progress=False)
     assert trainer.step == 8 and trainer.n_skipped_in_a_row == 0
-    with pytest.raises(InputError, match="another 'stages'"):
-        Trainer(dataclasses.replace(calmer, stages=(dataclasses.replace(STAGE, horizon=1),)), scenes(folder), tmp_path)
+    with pytest.raises(InputError, match="another 'phases'"):
+        Trainer(dataclasses.replace(calmer, phases=(dataclasses.replace(PHASE, horizon=1),)), scenes(folder), tmp_path)
 
 
 def test_norms_of_gradients_are_logged_by_module_and_by_step(folder, tmp_path):

@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from gsim3d.data import Scene, find_scenes
-from gsim3d.train.config import DataConfig, StageConfig
+from gsim3d.train.config import DataConfig, PhaseConfig
 from gsim3d.train.samples import draw_batch
 
 BATCH, HISTORY, HORIZON, CONTEXT_VIEWS, TARGET_VIEWS = 4, 4, 12, 4, 5
@@ -26,11 +26,11 @@ WORKERS = (1, 2, 4)
 
 
 def measure(name: str, scenes: list[Scene], steps: range, n_workers: int) -> None:
-    stage = StageConfig(steps=1, horizon=HORIZON, batch=BATCH, target_views=TARGET_VIEWS)
+    phase = PhaseConfig(steps=1, horizon=HORIZON, batch=BATCH, target_views=TARGET_VIEWS)
     data = DataConfig(history=HISTORY, context_views=CONTEXT_VIEWS)
 
     def draw(step: int) -> int:
-        batch = draw_batch(scenes, data, stage, 0, step, range(BATCH))
+        batch = draw_batch(scenes, data, phase, 0, step, range(BATCH))
         return len(batch.context.images) + len(batch.targets.images)
 
     start, cpu = time.perf_counter(), time.process_time()

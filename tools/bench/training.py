@@ -31,10 +31,9 @@ import torch
 from harness import RESULTS, commit
 from torch.profiler import ProfilerActivity, profile
 
-from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, PhaseConfig, PrecisionConfig, TrainConfig
 from gsim3d.train.log import memory_gib
 from gsim3d.train.loop import Trainer, deterministic
-from gsim3d.train.precision import PrecisionConfig
 from gsim3d.train.processes import Processes, joined
 from gsim3d.train.samples import Batch
 
@@ -95,7 +94,7 @@ def make_trainer(name: str, args: argparse.Namespace, processes: Processes, fold
     """The trainer of a case, which sees the same batch in every step."""
     case = CASES[name]
     config = TrainConfig(
-        stages=(StageConfig(steps=1000, horizon=N_FUTURE, batch=args.batch * processes.count, target_views=N_TARGETS),),
+        phases=(PhaseConfig(steps=1000, horizon=N_FUTURE, batch=args.batch * processes.count, target_views=N_TARGETS),),
         preset=args.preset,
         model={"dynamics": case.dynamics},
         data=DataConfig(history=N_PAST, context_views=N_VIEWS),

@@ -22,9 +22,9 @@ from gsim3d.data.recording import BACKGROUND, MOVING
 from gsim3d.synth.cameras import Rig, workspace_origin
 from gsim3d.synth.run import start_data_worker, write_trajectory
 from gsim3d.synth.world import World
-from gsim3d.train.config import DataConfig, StageConfig
+from gsim3d.train.config import DataConfig, PhaseConfig
 from gsim3d.train.processes import Processes
-from gsim3d.train.samples import Batch, batch_of, draw_windows, first_target, thinned
+from gsim3d.train.samples import Batch, draw_windows, subsampled
 
 QUEUED = 2  # trajectories that wait for each process that films
 
@@ -84,17 +84,16 @@ class FilmStore:
                 place[slot].copy_(torch.from_numpy(values))
             self.count += 1
 
-    def draw(self, data: DataConfig, stage: StageConfig, seed: int, step: int, samples: Sequence[int]) -> Batch:
+    def draw(self, data: DataConfig, phase: PhaseConfig, seed: int, step: int, samples: Sequence[int]) -> Batch:
         """As :func:`gsim3d.train.samples.draw_batch`, of the trajectories that are there."""
         with self.lock:
             known = self.films[: min(self.count, self.capacity)]
-            windows = draw_windows(known, data, stage, seed, step, samples)
+            windows = draw_windows(known, data, phase, seed, step, samples)
             n_context = windows[0].n_context
             frames = partial(self._frames, windows, data.near_far or (self._near, self._far))
             context = frames([window.context_cams for window in windows], range(n_context))
-            shown = range(first_target(stage, n_context), n_context + stage.horizon)
-            targets = frames([window.target_cams for window in windows], shown)
-        return batch_of(stage, windows, thinned(context, data), targets)
+            targets = frames([window.target_cams for window in windows], range(n_context + phase.horizon))
+        return Batch(subsampled(context, data), targets, n_context, phase.horizon, phase.cut)
 
     def _frames(self, windows: Sequence[Window], depths: tuple[float, float], cams: Sequence, steps: range) -> Frames:
         """Some steps of the windows, seen by the cameras of each step."""

@@ -14,12 +14,11 @@ from gsim3d.errors import InputError
 from gsim3d.synth.scene_setup import GRAVITY
 from gsim3d.synth.world import World
 from gsim3d.synth.worlds import VALIDATION_SEED, build_world
-from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, StageConfig, TrainConfig
-from gsim3d.train.precision import PrecisionConfig
+from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseConfig, PrecisionConfig, TrainConfig
 
 SEED = 20261126  # of the training stream; `gsim3d generate` without --seed makes other trajectories
 RATE = 5e-4
-FOREVER = 100_000  # rounds of the last stage: the clock ends a run
+FOREVER = 10_000_000  # steps of the last phase: the clock ends a run
 
 
 @dataclass(frozen=True)
@@ -130,8 +129,8 @@ def recipe(world: str, arm: str = "pure") -> Recipe:
         if given not in known:
             raise InputError(f"{given!r} is not known; choose from {', '.join(known)}")
     settings, built_in = WORLDS[world], ARMS[arm](world)
-    joint = partial(StageConfig, begin_within=settings.begin_within, from_start=0.1, learning_rate=RATE)
-    images = StageConfig(
+    joint = partial(PhaseConfig, begin_within=settings.begin_within, from_start=0.1, learning_rate=RATE)
+    images = PhaseConfig(
         steps=1000, history=1, batch=16, target_views=6, begin_within=settings.begin_within, learning_rate=2 * RATE
     )
     train = TrainConfig(
@@ -147,14 +146,13 @@ def recipe(world: str, arm: str = "pure") -> Recipe:
             body_stride=settings.strides[1],
             targets_apart=True,
         ),
-        stages=(
+        phases=(
             images,
             joint(steps=600, horizon=2, batch=8),
             joint(steps=1200, horizon=6, batch=4),
             joint(steps=6000, horizon=12, batch=4),
+            joint(steps=FOREVER, horizon=24, cut=12, batch=4),
         ),
-        in_turn=(joint(steps=100, horizon=24, cut=12, batch=4),),
-        rounds=FOREVER,
         loss=LossConfig(),
         optimizer=OptimizerConfig(encoder_rate=0.3),
         precision=PrecisionConfig(encoder="bf16", dynamics="bf16"),
@@ -166,8 +164,5 @@ def recipe(world: str, arm: str = "pure") -> Recipe:
 
 def of_processes(config: TrainConfig, count: int) -> TrainConfig:
     """``config`` with batches of ``count`` processes together."""
-    larger = {
-        name: tuple(dataclasses.replace(stage, batch=count * stage.batch) for stage in getattr(config, name))
-        for name in ("stages", "in_turn")
-    }
-    return dataclasses.replace(config, **larger)
+    phases = tuple(dataclasses.replace(phase, batch=count * phase.batch) for phase in config.phases)
+    return dataclasses.replace(config, phases=phases)

@@ -6,14 +6,14 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import torch
 
 from gsim3d.errors import NumericalError, RunStopped
 from gsim3d.train.captured import CapturedLoss, Prepared
-from gsim3d.train.config import StageConfig, TrainConfig
+from gsim3d.train.config import PhaseConfig, TrainConfig
 from gsim3d.train.log import memory_gib
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.processes import Processes
@@ -46,6 +46,7 @@ class RunTrainer(Trainer):
         self.gone: str | None = None
         self._side = torch.cuda.Stream() if device == "cuda" else None
         self._next: tuple[int, Future] | None = None
+        self._reader = ThreadPoolExecutor(1)
 
     def _capture(self) -> CapturedLoss:
         captured = super()._capture()
@@ -66,8 +67,8 @@ class RunTrainer(Trainer):
         self.now, self.gone = seen[0][0], next((lost for _, lost in seen if lost), None)
         return self.now < self.end and self.gone is None
 
-    def learning_rate(self, stage: StageConfig, place: int) -> float:
-        rate = stage.learning_rate * min(1.0, (self.step - self.first_step + 1) / WARM_UP)
+    def learning_rate(self, phase: PhaseConfig, number: int) -> float:
+        rate = phase.learning_rate * min(1.0, (self.step - self.first_step + 1) / WARM_UP)
         if not self.is_last:
             return rate
         left = max(0.0, self.end - self.now) / max(1e-9, self.end - self.begin)
@@ -77,8 +78,8 @@ class RunTrainer(Trainer):
         return self._draw(self.step, samples)
 
     def _draw(self, step: int, samples: Sequence[int]) -> Batch:
-        stage, _ = self.config.stage_of(step)
-        return self.store.draw(self.config.data, stage, self.config.seed, step, samples)
+        phase, _ = self.config.phase_of(step)
+        return self.store.draw(self.config.data, phase, self.config.seed, step, samples)
 
     def _prepared(self, samples: list[int]) -> Prepared:
         """Drawn while the GPU computed the step before."""
@@ -96,11 +97,11 @@ class RunTrainer(Trainer):
     @torch.no_grad()
     def _draw_ahead(self, step: int) -> Prepared:
         """Draws a batch on a stream of its own."""
-        stage, _ = self.config.stage_of(step)
+        phase, _ = self.config.phase_of(step)
         if self._side is not None:
             torch.cuda.set_device(self._side.device)  # of this thread
         with self.store.lock, torch.cuda.stream(self._side):
-            prepared = self.captured.prepare(self._draw(step, self.processes.share(stage.batch)))
+            prepared = self.captured.prepare(self._draw(step, self.processes.share(phase.batch)))
             if self._side is not None:
                 self._side.synchronize()
         return prepared
@@ -148,7 +149,7 @@ def train(
         known = {"next_trajectory": max(gather(filming.next)), "runs": [*progress.runs, this], "windows": windows}
         if trainer.captured:
             for needed in gather(trainer.captured.needed):
-                trainer.captured.make_room(needed)
+                trainer.captured.reserve(needed)
             known["needed"] = trainer.captured.needed
         done = dataclasses.replace(progress, **known, curve=curve)
         return save_state(trainer, out, name, done) if is_first else done
@@ -157,12 +158,12 @@ def train(
     saved = trainer.begin
     with deterministic(), trainer.log.opened(tensorboard=False):
         while trainer.goes_on():
-            stage, _ = settings.stage_of(trainer.step)
+            phase, _ = settings.phase_of(trainer.step)
             start = time.perf_counter()
             entry = trainer.train_step()
             spent = time.perf_counter() - start
             trainer.seconds += spent
-            was, windows = windows, windows + stage.batch * (stage.horizon > 0)
+            was, windows = windows, windows + phase.batch * (phase.horizon > 0)
             if entry["step"] % settings.log_every == 0 or "skipped" in entry:
                 machine = {"seconds": trainer.seconds, "step_seconds": spent, "memory_gib": memory_gib(trainer.device)}
                 entry |= {

@@ -94,7 +94,7 @@ def load_into(trainer: Trainer, folder: str | Path, name: str) -> Progress:
     own = trainer.simulator.state_dict()
     try:
         if trainer.captured and progress.needed:
-            trainer.captured.make_room(progress.needed)
+            trainer.captured.reserve(progress.needed)
         weights = {key: _unpacked(tensors, key, value.shape) for key, value in own.items()}
         trainer.simulator.load_state_dict(weights)
         trainer.average = {key: value.clone() for key, value in trainer.simulator.state_dict().items()}
@@ -141,7 +141,7 @@ def add_scores(folder: str | Path, name: str, progress: Progress) -> None:
 def save_weights(trainer: Trainer, path: Path) -> None:
     """Writes the averaged weights in bfloat16 as a checkpoint."""
     averaged = {key: value.to(torch.bfloat16) for key, value in trainer.average.items()}
-    config = describe(trainer.config, trainer.simulator.config, trainer.scenes[0], trainer.plan_spec)
+    config = describe(trainer.config, trainer.simulator.config, trainer.scenes[0], trainer.effects)
     path.parent.mkdir(parents=True, exist_ok=True)
     checkpoint.export(checkpoint.Checkpoint(model=averaged, config=config, state={"step": trainer.step}), path)
 

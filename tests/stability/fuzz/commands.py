@@ -24,7 +24,7 @@ from tests.tiny_scenes import write_scenes
 
 TRAINING = """
 data: {history: 2, context_views: 2, target_only_cameras: [3], background_stride: 2}
-stages:
+phases:
   - {steps: 1, horizon: 1, target_views: 2}
 """
 # What each command takes: {good} has files to read, {out} does not exist, {file} is in the way of every output.

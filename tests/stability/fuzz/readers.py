@@ -216,7 +216,7 @@ def _read_splats(suffix: str, folder: Path, what: str) -> None:
 TRAINING = {
     "preset": "tiny",
     "data": {"history": 2, "context_views": 2, "target_only_cameras": [3]},
-    "stages": [{"steps": 2, "horizon": 1, "target_views": 2, "learning_rate": 1e-3}],
+    "phases": [{"steps": 2, "horizon": 1, "target_views": 2, "learning_rate": 1e-3}],
     "model": {"dynamics": {"grid_size": 0.05}, "renderer": {"sh_degree": 0}},
 }
 

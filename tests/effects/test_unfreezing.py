@@ -10,9 +10,9 @@ from gsim3d.data import Scene, find_scenes
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec, Sleep
 from gsim3d.errors import InputError
 from gsim3d.state import DYNAMIC, FROZEN
-from gsim3d.train.config import DataConfig, StageConfig, TrainConfig
+from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer
-from gsim3d.train.thawing import thaw
+from gsim3d.train.samples import unfreeze
 from tests.asserts import assert_same_bits
 from tests.effects.resting import make_scenes
 from tests.tiny_scenes import write_scenes
@@ -20,44 +20,44 @@ from tests.tiny_scenes import write_scenes
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 CONFIG = TrainConfig(
-    stages=(StageConfig(steps=3, horizon=2, target_views=2, learning_rate=1e-3),),
+    phases=(PhaseConfig(steps=3, horizon=2, target_views=2, learning_rate=1e-3),),
     model={"dynamics": {"background": "asymmetric", "zero_init": False}},
-    data=DataConfig(history=2, context_views=2, background_stride=2, thawed=1.0),
+    data=DataConfig(history=2, context_views=2, background_stride=2, unfrozen_background=1.0),
     log_every=1,
 )
 SPEC = EffectsSpec(dynamics=DynamicsEffects(sleep=Sleep(halo=0.2)))
 
 
-def thawed_rows(state, after):
+def unfrozen_particles(state, after):
     return (state.activity == FROZEN) & (after.activity == DYNAMIC)
 
 
-def test_whole_cubes_thaw_at_every_step_and_nothing_else_changes():
+def test_unfreeze_takes_whole_cubes_at_every_step():
     state = make_scenes()
-    after = thaw(state, 1.0, SPEC, np.random.default_rng(3))
-    rows, frozen = thawed_rows(state, after), state.activity == FROZEN
+    after = unfreeze(state, 1.0, SPEC, np.random.default_rng(3))
+    rows, frozen = unfrozen_particles(state, after), state.activity == FROZEN
     assert torch.equal(after.activity[~rows], state.activity[~rows])
     assert rows.any() and (frozen & ~rows).any()
     scene = state.cloud_scene[state.row_cloud()]
     cubes = {}
-    for place, is_thawed in zip(
+    for index, is_unfrozen in zip(
         torch.cat([scene[frozen, None], torch.floor(state.means[frozen].double() / 0.2).long()], 1).tolist(),
         rows[frozen].tolist(),
         strict=True,
     ):
-        cubes.setdefault(tuple(place), set()).add(is_thawed)
+        cubes.setdefault(tuple(index), set()).add(is_unfrozen)
     assert all(len(found) == 1 for found in cubes.values()) and len(cubes) > 20
 
 
-def test_the_share_is_drawn_up_to_the_given_one():
+def test_unfreeze_draws_its_share_up_to_the_given_one():
     state, shares = make_scenes(), []
     for seed in range(100):
-        after = thaw(state, 0.5, SPEC, np.random.default_rng(seed))
-        shares.append((thawed_rows(state, after).sum() / (state.activity == FROZEN).sum()).item())
+        after = unfreeze(state, 0.5, SPEC, np.random.default_rng(seed))
+        shares.append((unfrozen_particles(state, after).sum() / (state.activity == FROZEN).sum()).item())
     assert abs(np.mean(shares) - 0.25) < 0.05 and max(shares) < 0.8
     assert_same_bits(
-        thaw(state, 0.5, SPEC, np.random.default_rng(1)).activity,
-        thaw(state, 0.5, SPEC, np.random.default_rng(1)).activity,
+        unfreeze(state, 0.5, SPEC, np.random.default_rng(1)).activity,
+        unfreeze(state, 0.5, SPEC, np.random.default_rng(1)).activity,
     )
 
 
@@ -92,8 +92,8 @@ def test_recomputed_steps_change_no_bit(scenes, tmp_path):
             assert_same_bits(one, other)
 
 
-def test_a_symmetric_model_cannot_be_trained_so(scenes, tmp_path):
-    with pytest.raises(InputError, match="data.thawed"):
+def test_unfreezing_needs_an_asymmetric_model(scenes, tmp_path):
+    with pytest.raises(InputError, match="data.unfrozen_background"):
         Trainer(dataclasses.replace(CONFIG, model={}), scenes, tmp_path)
-    with pytest.raises(InputError, match="thawed must be at most 1"):
-        DataConfig(thawed=1.5)
+    with pytest.raises(InputError, match="unfrozen_background must be at most 1"):
+        DataConfig(unfrozen_background=1.5)

@@ -1,18 +1,26 @@
-"""Signs of life between the processes of a run: where the launcher or one of them is gone, the others end, too."""
+"""Why a training run ends before its last step: signals, and processes or a launcher that are gone.
+
+Processes of a run exchange signs of life; where the launcher or one of them is gone, the others end, too.
+"""
 
 from __future__ import annotations
 
 import os
 import selectors
+import signal
 import socket
 import struct
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
 
 from gsim3d.errors import RunStopped
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+TWICE = 2.0  # seconds: a launcher passes on what its processes also got themselves
 INTERVAL = 2.0  # seconds between two signs of life
 SILENCE = 40.0  # seconds without one after which a process is gone; one that loads a library gives none meanwhile
 GRACE = 45.0  # seconds in which a run without a launcher may save and end by itself
@@ -21,13 +29,44 @@ _MESSAGE = struct.Struct("!i")  # one of these two, or the rank of a process tha
 _ALIVE, _LEFT = -1, -2
 
 
+@contextmanager
+def noted_signals() -> Iterator[list[int]]:
+    """Within it SIGINT, SIGTERM and SIGUSR1 end nothing: their numbers are in the list, the first one first.
+
+    A second SIGINT raises KeyboardInterrupt. In other threads than the main one the list stays empty.
+    """
+    noted: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield noted
+        return
+    first = 0.0
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        nonlocal first
+        if not noted:
+            first = time.monotonic()
+            text = f"\ngsim3d: {signal.Signals(number).name}: ends after this step, with a checkpoint\n"
+            os.write(2, text.encode())  # print may be in use
+        elif number == signal.SIGINT and time.monotonic() - first > TWICE:
+            raise KeyboardInterrupt
+        noted.append(number)
+
+    before = {number: signal.signal(number, note) for number in SIGNALS}
+    try:
+        yield noted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
 class Liveness:
     """Watches the launcher of this process and, over connections to the first process, all others.
 
     An operation between processes waits for minutes, or for ever, where one is gone, and cannot be interrupted. So a
     thread ends this process with one line and exit code 2 where it has not ended by itself soon after.
 
-    lost: what is gone, a sentence; None while all are there.
+    Attributes:
+        lost: what is gone, a sentence; None while all are there.
     """
 
     def __init__(self, rank: int):
@@ -41,7 +80,7 @@ class Liveness:
         threading.Thread(target=self._watch, daemon=True).start()
 
     def connect(self, count: int, gather: Callable) -> None:
-        """Connects ``count`` processes. Args: gather: of the processes, which know each other already."""
+        """Connects ``count`` processes, whose ``gather`` works already."""
         try:
             others = self._accepted(count, gather) if self._rank == 0 else self._connected(gather)
         except OSError as error:
@@ -70,10 +109,10 @@ class Liveness:
         return {0: first}
 
     def end(self, *, failed: bool) -> None:
-        """Ends the watch. Args: failed: whether the others cannot go on without this process."""
+        """Ends the watch; ``failed``: the others cannot go on without this process."""
         if not self._over.is_set():
             self._over.set()
-            self._tell(self._rank if failed else _LEFT)
+            self._send(self._rank if failed else _LEFT)
 
     def error(self) -> RunStopped:
         """What to raise where an operation between processes failed."""
@@ -85,14 +124,14 @@ class Liveness:
         while not self._over.is_set():
             if self._launcher not in (None, os.getppid()):
                 return self._lose("the launcher of this run (torchrun) has ended", GRACE)
-            self._tell(_ALIVE)
+            self._send(_ALIVE)
             gone = self._listen(time.monotonic() + INTERVAL)
             if gone is not None and not self._over.is_set():
-                self._tell(gone)
+                self._send(gone)
                 return self._lose(f"process {gone} of this run has ended or does not answer", INTERVAL)
 
     def _listen(self, until: float) -> int | None:
-        """Listens for a while. Returns: the rank of a process that is gone."""
+        """The rank of a process that is gone, after listening for a while; None: all are there."""
         with selectors.DefaultSelector() as selector:
             for rank in self._heard:
                 selector.register(self._others[rank], selectors.EVENT_READ, rank)
@@ -110,7 +149,7 @@ class Liveness:
         silent = (rank for rank, heard in self._heard.items() if time.monotonic() - heard > SILENCE)
         return next(silent, None)
 
-    def _tell(self, message: int) -> None:
+    def _send(self, message: int) -> None:
         for other in self._others.values():
             try:
                 other.send(_MESSAGE.pack(message))
