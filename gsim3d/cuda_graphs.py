@@ -25,7 +25,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from gsim3d.cameras import Cameras
-from gsim3d.compat.quirks import Quirks
 from gsim3d.dynamics import Background, Parts
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
@@ -180,10 +179,8 @@ class CapturedRollout:
             raise InputError(f"CapturedRollout: n_steps must be at least 1; got {n_steps}")
         if not factor >= 1:
             raise InputError(f"CapturedRollout: factor must be at least 1; got {factor}")
-        if cameras is not None and simulator.config.renderer.quirks != Quirks():
-            raise InputError(
-                "CapturedRollout: cameras cannot be rendered as published inside a graph; render the steps"
-            )
+        if cameras is not None and not simulator.draws_in_graphs:
+            raise InputError("CapturedRollout: this model draws outside of graphs only; leave cameras out")
         self._simulator, self._n_steps, self._factor, self._copies = simulator, n_steps, factor, copies
         self._plan, self._drawn = plan or simulator.plan(), plan
         self._report = simulator.report if report is None else report

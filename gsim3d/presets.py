@@ -29,7 +29,6 @@ class ModelConfig:
             "encoder.explicit and dynamics.explicit": (encoder.explicit, dynamics.explicit),
             "renderer.latents and what it reads": (renderer.latents, 0 if encoder.explicit else latents),
             "the three sh_degree": sh_degrees if encoder.explicit else (0,),
-            "the three quirks": (encoder.quirks, dynamics.quirks, renderer.quirks),
         }
         for what, values in agreements.items():
             if len(set(values)) > 1:

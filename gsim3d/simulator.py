@@ -24,7 +24,6 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d.cameras import Cameras, Frames
-from gsim3d.compat.quirks import Quirks
 from gsim3d.dynamics import (
     Background,
     Dynamics,
@@ -43,14 +42,14 @@ from gsim3d.effects.plan import Plan, make_plan, unused_parameters
 from gsim3d.effects.selection import any_mask
 from gsim3d.effects.spec import EffectsSpec, OutputEffects, UnsupportedEffect
 from gsim3d.math.spherical_harmonics import SH_0
-from gsim3d.nn.gaussian_head import GaussianHead, render, render_as_published
+from gsim3d.nn.gaussian_head import GaussianHead, render
 from gsim3d.nn.multiview_encoder import Encoder, Room, pixel_rows
 from gsim3d.numerics.policy import OnInvalid, StabilityReport, check_on_invalid
 from gsim3d.numerics.validate import check_particles, drop_rows, guard_frames, guard_particles
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
-from gsim3d.state import DYNAMIC, FROZEN, Particles
+from gsim3d.state import DYNAMIC, FROZEN, Gaussians, Particles
 
 
 class Simulator(nn.Module):
@@ -58,7 +57,10 @@ class Simulator(nn.Module):
 
     report: StabilityReport of the calls that were given no other.
     absent: parameters that the weights it was given lack; plans that read them are refused.
+    draws_in_graphs: whether images can be part of a CUDA graph.
     """
+
+    draws_in_graphs = True
 
     def __init__(self, config: ModelConfig):
         super().__init__()
@@ -282,15 +284,21 @@ class Simulator(nn.Module):
         on_invalid, report = on_invalid or self.config.stability.on_invalid, self.report if report is None else report
         outputs = plan.spec.outputs if plan else OutputEffects(depth=True, alpha=True)
         gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None, rgb=outputs.rgb)
-        quirks, jacobian = self.config.renderer.quirks, self.config.renderer.jacobian
-        if quirks != Quirks():
-            image = render_as_published(gaussians, cameras, background, quirks=quirks, jacobian=jacobian)
-        else:
-            features = particles.latents if outputs.features else None
-            options = {"cutoff": cutoff, "jacobian": jacobian, "on_invalid": on_invalid, "report": report}
-            image = render(gaussians, cameras, background, features=features, **options)
+        image = self._rasterized(
+            gaussians,
+            cameras,
+            background,
+            features=particles.latents if outputs.features else None,
+            cutoff=cutoff,
+            jacobian=self.config.renderer.jacobian,
+            on_invalid=on_invalid,
+            report=report,
+        )
         asked = (outputs.rgb, outputs.alpha, outputs.depth, outputs.features)
         return Rendering(*(made if wanted else None for made, wanted in zip(image, asked, strict=True)))
+
+    def _rasterized(self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None, **options) -> Rendering:
+        return render(gaussians, cameras, background, **options)
 
     def _changes(self, plan: Plan) -> dict[str, str]:
         """Of each field that the dynamics predicts, whose values a step changes."""

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsim3d.cameras import Cameras
-from gsim3d.compat.quirks import Quirks
+from gsim3d.compat.released_model import ReleasedSimulator
 from gsim3d.cuda_graphs import Captured, CapturedRollout, collecting_nothing, has_no_room
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.errors import CaptureError, InputError, NumericalError
@@ -421,12 +421,8 @@ def test_arguments_that_do_not_fit(change, message):
 def test_models_that_cannot_be_captured():
     with pytest.raises(InputError, match="must be in evaluation mode"):
         CapturedRollout(make_simulator().train(), make_state(), 1)
-    rooms = ("encoder", "dynamics", "renderer")
-    published = {
-        room: dataclasses.replace(getattr(CONFIG, room), quirks=Quirks(three_sigma_tiles=True)) for room in rooms
-    }
-    with pytest.raises(InputError, match="cannot be rendered as published"):
-        CapturedRollout(make_simulator(**published), make_state(), 1, cameras=make_cameras())
+    with pytest.raises(InputError, match="draws outside of graphs only"):
+        CapturedRollout(ReleasedSimulator(CONFIG).eval(), make_state(), 1, cameras=make_cameras())
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 RINGS = {
     "library": """
         errors effects numerics
-        numerics.policy compat.quirks
+        numerics.policy compat.checkpoints
         io.terminal io.plain io.pickles io.locks
         cameras
         state
@@ -38,8 +38,9 @@ RINGS = {
     "workshop": """
         data evaluate.perceptual
         evaluate.metrics
+        compat
         train
-        viewer compat
+        viewer
         synth
         evaluate
         testing

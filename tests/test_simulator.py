@@ -8,10 +8,10 @@ import torch
 
 from gsim3d import presets
 from gsim3d.cameras import Cameras, Frames
-from gsim3d.compat.quirks import Quirks
+from gsim3d.compat.released_model import ReleasedDynamicsConfig, ReleasedModelConfig, ReleasedSimulator, render_released
 from gsim3d.dynamics import last_steps
 from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, UnsupportedEffect
-from gsim3d.nn.gaussian_head import RendererConfig, render, render_as_published
+from gsim3d.nn.gaussian_head import RendererConfig, render
 from gsim3d.presets import ModelConfig
 from gsim3d.simulator import Simulator
 from gsim3d.state import DYNAMIC, FROZEN
@@ -178,14 +178,14 @@ def test_several_steps_a_call(changing):
         assert torch.equal(step.dynamic_latents, newest.dynamic_latents) == (changing == "none")
 
 
-def with_quirks(quirks):
-    parts = (dataclasses.replace(p, quirks=quirks) for p in (CONFIG.encoder, CONFIG.dynamics, CONFIG.renderer))
-    return make_simulator(ModelConfig(*parts))
+def published_simulator():
+    dynamics = ReleasedDynamicsConfig(**vars(CONFIG.dynamics))
+    return ReleasedSimulator(ReleasedModelConfig(**{**vars(CONFIG), "dynamics": dynamics})).eval()
 
 
 def test_published_behaviour_end_to_end():
-    """Every switch on: finite, and gradients reach every parameter of the network that a clean model would train."""
-    simulator, frames = awake(with_quirks(Quirks.release())), make_frames((2,))
+    """Finite, and gradients reach every parameter of the network that a clean model would train."""
+    simulator, frames = awake(published_simulator()), make_frames((2,))
     steps = simulator.rollout(simulator.encode(frames), 2)
     image = simulator.render(steps[-1], target_cameras(frames, 1), torch.ones(3))
     assert image.color.shape == (1, SIZE, SIZE, 3) and torch.isfinite(image.color).all() and image.alpha.max() > 0.05
@@ -195,7 +195,7 @@ def test_published_behaviour_end_to_end():
 
 
 def test_the_published_renderer_draws_each_camera_s_cloud():
-    simulator, frames = with_quirks(Quirks.release()), make_frames((2, 1))
+    simulator, frames = published_simulator(), make_frames((2, 1))
     particles = simulator.encode(frames)
     cameras, background = frames.cameras, torch.rand(len(frames.cameras), 3)
     images = simulator.render(particles, cameras, background).color
@@ -204,8 +204,7 @@ def test_the_published_renderer_draws_each_camera_s_cloud():
         one = torch.tensor([i])
         alone = simulator.renderer(particles.select_clouds([cloud]))
         camera = cameras.select(one, torch.zeros_like(one))
-        options = {"quirks": Quirks.release(), "jacobian": CONFIG.renderer.jacobian}
-        image = render_as_published(alone, camera, background[i], **options).color
+        image = render_released(alone, camera, background[i], jacobian=CONFIG.renderer.jacobian).color
         assert_same_bits(image[0], images[i])
         assert not torch.equal(render(alone, camera, background[i]).color[0], images[i])
     none = simulator.render(particles, cameras.select(torch.zeros(0, dtype=torch.int64)))

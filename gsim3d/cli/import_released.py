@@ -8,7 +8,7 @@ EPILOG = """\
 CHECKPOINT is a .ckpt file of the release, CONFIG the resolved .yaml that lies beside it (configs/NAME.yaml for
 models/NAME.ckpt): sizes come from the weights, what no weight shows (cell size, strides, limits, history) from it.
 DIR becomes a checkpoint folder that simulate and evaluate take; its model reproduces the published one, oddities
-included (see "quirks" in DIR/config.yaml). Tensors that are missing or of another shape are named, and nothing is
+included (DIR/config.yaml has "release: true"). Tensors that are missing or of another shape are named, and nothing is
 written. The file is read without running anything in it: one that asks for other code is refused.
 
 examples:

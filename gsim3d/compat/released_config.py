@@ -11,15 +11,13 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from gsim3d.compat.quirks import Quirks
 from gsim3d.compat.released import DYNAMICS, ENCODER, HEAD, LATENTS
-from gsim3d.dynamics import DynamicsConfig
+from gsim3d.compat.released_model import ReleasedDynamicsConfig, ReleasedModelConfig
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.io.files import shown
 from gsim3d.nn.gaussian_head import RendererConfig
 from gsim3d.nn.multiview_encoder import EncoderConfig
-from gsim3d.presets import ModelConfig
 
 Shapes = dict[str, tuple[int, ...]]
 
@@ -57,7 +55,7 @@ class ReleasedConfig:
     ignored: keys of the file that change nothing here.
     """
 
-    model: ModelConfig
+    model: ReleasedModelConfig
     data: dict[str, Any]
     effects: EffectsSpec
     notes: tuple[str, ...]
@@ -189,14 +187,14 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
     )
     sh_degree = _sh_degree(sizes, explicit)
     updates = _updates(settings, sizes, explicit, n_dynamic, sh_degree)
-    common = dict(explicit=explicit, sh_degree=sh_degree, quirks=Quirks.release())
+    common = dict(explicit=explicit, sh_degree=sh_degree)
     history = settings.whole("dataset.n_step_state")
     if history not in HISTORIES:
         raise InputError(f"dataset.n_step_state: must be {', '.join(map(str, HISTORIES))}; got {history}")
     scale_min, scale_max = (settings.positive(f"model.state_adapter.gaussians.scale_{end}") for end in ("min", "max"))
     try:
         encoder = EncoderConfig(**_encoder(settings, sizes), dynamic_dim=n_dynamic, static_dim=n_static, **common)
-        dynamics = DynamicsConfig(
+        dynamics = ReleasedDynamicsConfig(
             **_dynamics(settings, sizes),
             **updates,
             dynamic_latents=n_dynamic,
@@ -212,9 +210,8 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
             scale_min=scale_min,
             scale_max=scale_max,
             jacobian="clamped",
-            quirks=common["quirks"],
         )
-        model = ModelConfig(encoder, dynamics, renderer)
+        model = ReleasedModelConfig(encoder, dynamics, renderer)
     except ValueError as error:
         raise InputError(f"the settings and the weights do not make a model: {error}") from None
     data, effects, notes = _data(settings, history, encoder.size_multiple)

@@ -12,9 +12,9 @@ from torch import Tensor
 from gsim3d.compat.released import DYNAMICS, ENCODER, LATENTS, from_published, to_published
 from gsim3d.compat.released_config import ReleasedConfig, Shapes, read_config
 from gsim3d.compat.released_file import ReleasedFile, state_dict
+from gsim3d.compat.released_model import ReleasedSimulator
 from gsim3d.errors import InputError
 from gsim3d.presets import ModelConfig
-from gsim3d.simulator import Simulator
 
 MAX_NAMED = 8  # tensors that a message lists
 
@@ -80,7 +80,7 @@ def import_released(checkpoint: str | Path, settings: dict) -> Imported:
 def published_shapes(config: ModelConfig) -> Shapes:
     """Names and shapes that a published checkpoint of this model has; no memory is taken for it."""
     with torch.device("meta"):
-        weights = Simulator(config).state_dict()
+        weights = ReleasedSimulator(config).state_dict()
     return {name: tuple(value.shape) for name, value in to_published(weights, config).items()}
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from gsim3d.compat.quirks import Quirks
 from gsim3d.errors import check_ranges
-from gsim3d.numerics.policy import LARGEST
 from gsim3d.ops.curve import PyramidSpec
 
 PREDICTS = ("from_newest", "from_previous", "absolute")
@@ -135,7 +133,6 @@ class DynamicsConfig:
     drop_path: float = 0.3
     shuffle_orders: bool = True
     checkpointing: bool = False
-    quirks: Quirks = field(default_factory=Quirks)
 
     def __post_init__(self):
         n = self.n_stages
@@ -165,8 +162,8 @@ class DynamicsConfig:
             raise ValueError(
                 f"DynamicsConfig: background must be one of {', '.join(BACKGROUNDS)}; got {self.background!r}"
             )
-        if self.is_asymmetric and (self.norm == "batch" or self.quirks != Quirks()):
-            raise ValueError('DynamicsConfig: background="asymmetric" needs norm="layer" and no quirks')
+        if self.is_asymmetric and self.norm == "batch":
+            raise ValueError('DynamicsConfig: background="asymmetric" needs norm="layer"')
         if self.is_relightable and self.explicit:
             raise ValueError('DynamicsConfig: background="relightable" needs a model that is not explicit')
         if self.motion_length is not None and (self.predicts == "absolute" or not self.motion_length > 0):
@@ -237,17 +234,22 @@ class DynamicsConfig:
     @property
     def origin_of_scene(self) -> bool:
         """Whether cells are counted from the origin of a scene, so that scenes do not see each other."""
-        return not self.quirks.anchor_at_minimum
+        return True
 
     @property
     def slots_from_newest(self) -> bool:
         """Whether steps are counted back from the newest, so that it has one place in histories of any length."""
-        return not self.quirks.slots_from_first
+        return True
 
     @property
     def max_opacity(self) -> float:
         """The largest opacity of a particle."""
-        return LARGEST if self.quirks.unbounded_opacity else 1.0
+        return 1.0
+
+    @property
+    def frozen_turn(self) -> bool:
+        """Whether frozen explicit particles change their orientation."""
+        return False
 
     def pyramid_spec(self, history_bits: int) -> PyramidSpec:
         """What the geometry op needs to know, for a history of up to 2^history_bits steps."""

@@ -99,12 +99,11 @@ class StateLayout:
             features: whose latents and colours change. Those of frozen particles may: a shadow may fall on them.
             opacities: whether they change, where they are predicted.
         """
-        quirk = self.config.steps_per_call == 1 and self.config.quirks.frozen_rows_turn
         who = {name: "dynamic" for name, _ in self.outputs}
         who |= {name: features for name in FEATURES if name in who}
         if "opacities" in who and not opacities:
             who["opacities"] = "none"
-        if "quats" in who and quirk:
+        if "quats" in who and self.config.frozen_turn:
             who["quats"] = "all"
         return who
 

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from gsim3d.compat.quirks import Quirks
 from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
 from gsim3d.effects.spec import EffectsSpec, UnsupportedEffect
 from gsim3d.presets import ModelConfig
@@ -92,7 +91,7 @@ def _is_asymmetric(spec: EffectsSpec, model: ModelConfig) -> bool:
 
 
 def _check_supported(spec: EffectsSpec, model: ModelConfig) -> None:
-    dynamics, outputs, published = spec.dynamics, spec.outputs, model.renderer.quirks != Quirks()
+    dynamics, outputs = spec.dynamics, spec.outputs
     refused = {
         "dynamics.background asymmetric": (
             dynamics.background == "asymmetric" and not model.dynamics.is_asymmetric,
@@ -111,8 +110,6 @@ def _check_supported(spec: EffectsSpec, model: ModelConfig) -> None:
         "outputs.features": (
             outputs.features and model.renderer.latents == 0, "this model's particles have no latents"
         ),
-        "outputs without colour": (not outputs.rgb and published, "the published renderer draws colour"),
-        "outputs.features with quirks": (outputs.features and published, "the published renderer draws none"),
     }  # fmt: skip
     for name, (asked, why) in refused.items():
         if asked:

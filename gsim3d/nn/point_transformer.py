@@ -34,15 +34,16 @@ from gsim3d.ops.streams import Branches
 Beside = Recorder | Reader
 TIME_EMBEDDING_STD = 0.02
 TOLD_MULTIPLE = 8  # of the columns of a matrix product; with others the bits of a row depend on its place in the list
-HALF_MAX = torch.finfo(torch.float16).max  # beyond it half precision has infinity, and attention NaN
 
 
 class SparseConv(nn.Module):
-    """Submanifold convolution; weight [C_out, K, K, K, C_in]."""
+    """Submanifold convolution; weight [C_out, K, K, K, C_in]. duplicates: as of :func:`gsim3d.ops.sparse_conv`."""
 
-    def __init__(self, in_channels: int, out_channels: int, kernel_size: int, *, bias: bool, duplicates: str):
+    duplicates = "mean"
+
+    def __init__(self, in_channels: int, out_channels: int, kernel_size: int, *, bias: bool):
         super().__init__()
-        self.kernel_size, self.duplicates = kernel_size, duplicates
+        self.kernel_size = kernel_size
         bound = (in_channels * kernel_size**3) ** -0.5
         shape = (out_channels, kernel_size, kernel_size, kernel_size, in_channels)
         self.weight = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
@@ -59,9 +60,9 @@ class SparseConv(nn.Module):
 class PositionEncoding(nn.Module):
     """What a row learns about its place from its neighbours, added to the row: convolution, linear layer, norm."""
 
-    def __init__(self, channels: int, duplicates: str):
+    def __init__(self, channels: int):
         super().__init__()
-        self.conv = SparseConv(channels, channels, BLOCK_KERNEL, bias=True, duplicates=duplicates)
+        self.conv = SparseConv(channels, channels, BLOCK_KERNEL, bias=True)
         self.linear = RowLinear(channels, channels)
         self.norm = RowLayerNorm(channels)
 
@@ -72,27 +73,20 @@ class PositionEncoding(nn.Module):
 class Attention(nn.Module):
     """Multi-head attention inside the patches of one serialization."""
 
-    def __init__(self, channels: int, heads: int, *, rounded_to_half: bool):
+    def __init__(self, channels: int, heads: int):
         super().__init__()
-        self.heads, self.rounded_to_half = heads, rounded_to_half
+        self.heads = heads
         self.qkv = RowLinear(channels, 3 * channels)
         self.proj = RowLinear(channels, channels)
 
     def forward(self, x: Tensor, patches: PatchTable, row: int = 0, beside: Beside | None = None) -> Tensor:
         """x [N, C] in the patches of serialization ``row``."""
-        q, k, v = self._rounded(self.qkv(x)).unflatten(1, (3, self.heads, -1)).unbind(1)
+        q, k, v = self.qkv(x).unflatten(1, (3, self.heads, -1)).unbind(1)
         if beside is None:
             out = ops.patch_attention(q, k, v, patches, check=False)
         else:
             out = beside.attended(self, q, k, v, patches, row)
-        return self.proj(self._rounded(out.flatten(1)))
-
-    def _rounded(self, x: Tensor) -> Tensor:
-        if not self.rounded_to_half:
-            return x
-        wide = widened(x).clamp(-HALF_MAX, HALF_MAX)  # bfloat16 would round the bound up
-        # Gradients are not rounded: those beyond the range would become infinite.
-        return (wide + (wide.half().to(wide) - wide).detach()).to(x.dtype)
+        return self.proj(out.flatten(1))
 
 
 class MLP(nn.Module):
@@ -114,9 +108,9 @@ class Block(nn.Module):
     def __init__(self, channels: int, heads: int, drop_path: float, config: DynamicsConfig):
         super().__init__()
         self.drop_path, self.checkpointing, self.fused = drop_path, config.checkpointing, None
-        self.position = PositionEncoding(channels, duplicates_rule(config))
+        self.position = PositionEncoding(channels)
         self.norm1 = RowLayerNorm(channels)
-        self.attention = Attention(channels, heads, rounded_to_half=config.quirks.half_attention)
+        self.attention = Attention(channels, heads)
         self.norm2 = RowLayerNorm(channels)
         self.mlp = MLP(channels, config.mlp_ratio * channels)
 
@@ -143,7 +137,7 @@ class Block(nn.Module):
     def is_fused(self, x: Tensor, beside: Beside | None = None) -> bool:
         if isinstance(beside, Recorder) or (beside is not None and torch.is_grad_enabled()):
             return False
-        if torch.compiler.is_compiling() or self.attention.rounded_to_half:
+        if torch.compiler.is_compiling() or type(self.attention) is not Attention:  # a subclass computes otherwise
             return False
         return x.is_cuda if self.fused is None else self.fused
 
@@ -184,10 +178,6 @@ def scaled(x: Tensor, keep: Tensor | None) -> Tensor:
     return x if keep is None else x * keep
 
 
-def duplicates_rule(config: DynamicsConfig) -> str:
-    return "first" if config.quirks.first_of_voxel else "mean"
-
-
 def run_blocks(
     blocks: nn.ModuleList,
     x: Tensor,
@@ -219,7 +209,7 @@ class Stem(nn.Module):
         super().__init__()
         channels = config.encoder_channels[0]
         self.widths = in_channels, told_channels
-        self.conv = SparseConv(in_channels, channels, STEM_KERNEL, bias=False, duplicates=duplicates_rule(config))
+        self.conv = SparseConv(in_channels, channels, STEM_KERNEL, bias=False)
         rounded = -(-told_channels // TOLD_MULTIPLE) * TOLD_MULTIPLE
         self.told = RowLinear(rounded, channels, bias=False) if told_channels else None
         if told_channels:  # what begins with these weights may be told more
@@ -306,11 +296,10 @@ class Unpool(nn.Module):
     def lift(self, skip: Tensor, stage: Stage) -> Tensor:
         return self.skip_norm.activated(self.skip(skip), stage.n_data)
 
-    def forward(self, x: Tensor, skip: Tensor, stage: Stage, coarse: Stage) -> tuple[Tensor, Tensor]:
-        """Both together, and ``skip``."""
+    def forward(self, x: Tensor, skip: Tensor, coarse: Stage) -> Tensor:
         below = self.proj_norm.activated(self.proj(x), coarse.n_data)
         cluster = coarse.cluster
-        return skip + ops.unpool(below, cluster.rows, cluster.cu_rows, skip.shape[0], check=False), skip
+        return skip + ops.unpool(below, cluster.rows, cluster.cu_rows, skip.shape[0], check=False)
 
 
 class DecoderStage(nn.Module):
@@ -322,7 +311,7 @@ class DecoderStage(nn.Module):
         self.blocks = nn.ModuleList(
             Block(channels[index], config.decoder_heads[index], drop_path, config) for drop_path in drop_paths
         )
-        self.stale_conv, self.is_last = config.quirks.stale_decoder_conv, index == 0
+        self.is_last = index == 0
 
     def forward(
         self,
@@ -333,9 +322,13 @@ class DecoderStage(nn.Module):
         generator: torch.Generator | None,
         beside: Beside | None = None,
     ) -> Tensor:
-        x, skip = self.unpool(x, skip, stage, coarse)
-        conv_input = skip if self.stale_conv else x
+        x = self.unpool(x, skip, coarse)
+        conv_input = self.conv_input(x, skip)
         return run_blocks(self.blocks, x, conv_input, stage, generator, beside, for_products=not self.is_last)
+
+    def conv_input(self, x: Tensor, skip: Tensor) -> Tensor:
+        """What the first convolution reads."""
+        return x
 
 
 class Head(nn.Module):

@@ -13,7 +13,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsim3d.cameras import Cameras, Frames
-from gsim3d.compat.quirks import Quirks
 from gsim3d.cuda_graphs import CapturedRollout
 from gsim3d.data import Scene, make_frames
 from gsim3d.dynamics import RestLog, append_step, concatenate, last_steps
@@ -171,9 +170,9 @@ class Runner:
     @property
     def draws_in_graph(self) -> bool:
         """Whether a graph of the rollout can draw as well: all rows of every step, in the precision of the dynamics."""
-        setting, quirks = self.setting, self.simulator.config.renderer.quirks
+        setting = self.setting
         all_of_it = not setting.least_opacity and setting.every == 1
-        return all_of_it and quirks == Quirks() and setting.renderer == setting.dynamics
+        return all_of_it and self.simulator.draws_in_graphs and setting.renderer == setting.dynamics
 
     def captured(self, state: Particles, n_steps: int, cameras: Cameras) -> CapturedRollout:
         """The rollout of ``state`` as a graph, in the precision of the dynamics; it draws where it can."""
@@ -276,7 +275,7 @@ def _changed(simulator: Simulator, setting: Setting) -> Simulator:
     if changed == dynamics and not setting.compiled:
         return simulator
     device = next(simulator.parameters()).device
-    other = Simulator(dataclasses.replace(simulator.config, dynamics=changed))
+    other = type(simulator)(dataclasses.replace(simulator.config, dynamics=changed))
     other.load_state_dict(simulator.state_dict())
     other.absent = simulator.absent
     if setting.compiled:

@@ -86,7 +86,7 @@ def compare_backgrounds(
     if not config.dynamics.is_asymmetric:
         raise InputError('compare_backgrounds: the model must have background="asymmetric"')
     dynamics = dataclasses.replace(config.dynamics, background="symmetric")
-    twin = Simulator(dataclasses.replace(config, dynamics=dynamics)).to(state.means).eval()
+    twin = type(simulator)(dataclasses.replace(config, dynamics=dynamics)).to(state.means).eval()
     twin.load_state_dict(simulator.state_dict())
     newest = last_steps(simulator.prepare(state, plan or simulator.plan()), 1)
     frozen = newest.activity == FROZEN

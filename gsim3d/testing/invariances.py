@@ -22,8 +22,9 @@ from gsim3d.cameras import Cameras, Frames
 from gsim3d.dynamics import last_steps
 from gsim3d.dynamics.state import rotate_left
 from gsim3d.effects.plan import Plan
+from gsim3d.math.rotations import rotation_matrices
 from gsim3d.math.spherical_harmonics import rotate_harmonics
-from gsim3d.nn.gaussian_head import render, rotation_matrices
+from gsim3d.nn.gaussian_head import render
 from gsim3d.simulator import Simulator
 from gsim3d.state import DYNAMIC, CloudTable, Gaussians, Particles, attributes_of, newest_clouds, take_runs
 

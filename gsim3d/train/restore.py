@@ -18,7 +18,8 @@ from torch.nn.modules.module import (
 from torch.overrides import TorchFunctionMode
 
 from gsim3d import presets, pretrained
-from gsim3d.compat.quirks import Quirks
+from gsim3d.compat.checkpoints import current_model
+from gsim3d.compat.released_model import ReleasedModelConfig, config_class, simulator_class
 from gsim3d.data import Scene
 from gsim3d.data.fitting import frame_stride
 from gsim3d.effects.plan import Plan
@@ -72,7 +73,7 @@ class Restored:
         """
         if unknown := [part for part in keep if part not in KEEP]:
             raise InputError(f"keep must name parts of {', '.join(KEEP)}; got {unknown[0]!r}")
-        exact = self.simulator.config.encoder.quirks != Quirks()
+        exact = isinstance(self.simulator.config, ReleasedModelConfig)
         fitting = dataclasses.replace(
             self.data.fitting, slack=math.inf if exact else SIMILAR, enlarge=True, whole="image" in keep
         )
@@ -160,27 +161,9 @@ def model_config(config: TrainConfig) -> ModelConfig:
     return from_dict(ModelConfig, config.model, "model", base)
 
 
-def without_old_switches(model: dict) -> dict:
-    """A saved model section without quirks that are off and that this version has under other names; one that says
-    nothing of the Jacobian is older than the choice, and clamped."""
-    known = {field.name for field in dataclasses.fields(Quirks)}
-    parts = {}
-    for name, part in model.items():
-        if isinstance(part, dict) and isinstance(part.get("quirks"), dict):
-            part = {**part, "quirks": {key: on for key, on in part["quirks"].items() if on or key in known}}
-        parts[name] = part
-    if isinstance(parts.get("renderer"), dict):
-        parts["renderer"] = {"jacobian": "clamped", **parts["renderer"]}
-    if isinstance(parts.get("dynamics"), dict) and parts["dynamics"].get("background") == "relit":
-        parts["dynamics"] = {**parts["dynamics"], "background": "relightable"}
-    if isinstance(parts.get("stability"), dict):
-        parts["stability"] = {"on_invalid" if k == "on_bad" else k: v for k, v in parts["stability"].items()}
-    return parts
-
-
 def keep_jacobian(simulator: Simulator, saved: dict) -> None:
     """``simulator`` draws as the run whose model section was ``saved``."""
-    jacobian = without_old_switches(saved)["renderer"]["jacobian"]
+    jacobian = current_model(saved)["renderer"]["jacobian"]
     renderer = dataclasses.replace(simulator.config.renderer, jacobian=jacobian)
     simulator.config = dataclasses.replace(simulator.config, renderer=renderer)
 
@@ -193,7 +176,7 @@ def build_simulator(config: ModelConfig, seed: int) -> Simulator:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         try:
-            return Simulator(config)
+            return simulator_class(config)(config)
         except InputError:
             raise
         except Exception as error:  # sizes of which no layer can be made raise anything
@@ -232,7 +215,7 @@ def check_sizes(config: ModelConfig, spec: EffectsSpec, weights: dict[str, Tenso
     hooks = [register_module_parameter_registration_hook(count), register_module_buffer_registration_hook(count)]
     try:
         with torch.device("meta"), _WithoutFirstWeights():
-            simulator = Simulator(config)
+            simulator = simulator_class(config)(config)
     finally:
         for hook in hooks:
             hook.remove()
@@ -289,7 +272,8 @@ def _restored(path: str | Path, saved: checkpoint.Checkpoint, device: str) -> Re
     if fps is not None and (isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 1e-3 <= fps <= 1e6):
         raise InputError(f"{path}: data.fps must be frames per second, a number from 0.001 to 1e6; got {shown(fps)}")
     try:
-        model = from_dict(ModelConfig, without_old_switches(saved.config["model"]), "model")
+        content = current_model(saved.config["model"])
+        model = from_dict(config_class(content), content, "model")
         settings = from_dict(DataConfig, upgraded(DataConfig, data), "data")
         spec = EffectsSpec.from_dict(saved.config.get("effects", {}).get("spec"))
     except InputError as error:

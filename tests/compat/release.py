@@ -9,50 +9,44 @@ import torch
 import yaml
 
 from gsim3d import presets
-from gsim3d.compat.quirks import Quirks
 from gsim3d.compat.released import to_published
-from gsim3d.dynamics import DynamicsConfig
+from gsim3d.compat.released_model import ReleasedDynamicsConfig, ReleasedModelConfig, ReleasedSimulator
 from gsim3d.nn.gaussian_head import RendererConfig
 from gsim3d.nn.multiview_encoder import EncoderConfig
-from gsim3d.presets import ModelConfig
-from gsim3d.simulator import Simulator
 
 EXPLICIT_PARAMS = ["means", "opacities", "rotations", "scales", "harmonics"]
 
 
-def small_config(explicit=False, dynamic=4, static=3, **dynamics) -> ModelConfig:
+def small_config(explicit=False, dynamic=4, static=3, **dynamics) -> ReleasedModelConfig:
     """The published architecture with few channels."""
-    quirks = Quirks.release()
     scales = {"scale_min": 0.004, "scale_max": 0.14}
-    return ModelConfig(
+    return ReleasedModelConfig(
         EncoderConfig(
             feature_dim=8, cnn_dims=(8, 12, 16), transformer_layers=2, n_depths=4, cost_unet_dim=8, refine_unet_dim=8,
-            dynamic_dim=dynamic, static_dim=static, explicit=explicit, quirks=quirks,
+            dynamic_dim=dynamic, static_dim=static, explicit=explicit,
         ),
-        DynamicsConfig(
+        ReleasedDynamicsConfig(
             dynamic_latents=dynamic, static_latents=static, explicit=explicit, max_step=0.25, grid_size=0.05,
             history_bits=1, strides=(4, 2), merge_windows=(2, 2), patch_sizes=(32,) * 3,
             encoder_depths=(1, 2, 1), encoder_channels=(8, 16, 16), encoder_heads=(2, 4, 4),
-            decoder_depths=(1, 1), decoder_channels=(8, 16), decoder_heads=(2, 4), quirks=quirks, **scales, **dynamics,
+            decoder_depths=(1, 1), decoder_channels=(8, 16), decoder_heads=(2, 4), **scales, **dynamics,
         ),
-        RendererConfig(latents=0 if explicit else dynamic + static, jacobian="clamped", quirks=quirks, **scales),
+        RendererConfig(latents=0 if explicit else dynamic + static, jacobian="clamped", **scales),
     )  # fmt: skip
 
 
-def full_config(preset="paper_latent", *arguments) -> ModelConfig:
+def full_config(preset="paper_latent", *arguments) -> ReleasedModelConfig:
     """A preset of the paper with every published oddity."""
     config = getattr(presets, preset)(*arguments)
-    quirks = Quirks.release()
-    parts = (dataclasses.replace(part, quirks=quirks) for part in (config.encoder, config.dynamics, config.renderer))
-    encoder, dynamics, renderer = parts
-    return ModelConfig(encoder, dynamics, dataclasses.replace(renderer, jacobian="clamped"))
+    dynamics = ReleasedDynamicsConfig(**vars(config.dynamics))
+    return ReleasedModelConfig(config.encoder, dynamics, dataclasses.replace(config.renderer, jacobian="clamped"))
 
 
-def random_weights(config: ModelConfig, seed=0) -> dict[str, torch.Tensor]:
+def random_weights(config: ReleasedModelConfig, seed=0) -> dict[str, torch.Tensor]:
     """Published names -> values among which no two layers are alike, statistics of norms included."""
     generator = torch.Generator().manual_seed(seed)
     with torch.device("meta"):
-        names = to_published(Simulator(config).state_dict(), config)
+        names = to_published(ReleasedSimulator(config).state_dict(), config)
     weights = OrderedDict()
     for name, value in names.items():
         if value.dtype == torch.int64:
@@ -64,7 +58,7 @@ def random_weights(config: ModelConfig, seed=0) -> dict[str, torch.Tensor]:
     return weights
 
 
-def settings_of(config: ModelConfig, image_size=32) -> dict:
+def settings_of(config: ReleasedModelConfig, image_size=32) -> dict:
     """The resolved settings that the release would have for this model."""
     encoder, dynamics, renderer = config.encoder, config.dynamics, config.renderer
     explicit = encoder.explicit

@@ -1,6 +1,5 @@
 """The published model's own weights, in a published file: imported, they predict what it predicted."""
 
-import dataclasses
 import functools
 import json
 
@@ -13,6 +12,7 @@ from gsim3d.cli.main import main
 from gsim3d.compat.released import dynamics_weights, encoder_weights, to_published
 from gsim3d.compat.released_config import read_config
 from gsim3d.compat.released_import import published_shapes
+from gsim3d.compat.released_model import ReleasedAttention, as_released
 from gsim3d.dynamics import Dynamics
 from gsim3d.nn.multiview_encoder import Encoder
 from gsim3d.nn.point_transformer import Attention
@@ -20,7 +20,7 @@ from gsim3d.state import DYNAMIC, FROZEN, Particles
 from gsim3d.train.restore import restore
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.compat.release import changed, write_release
-from tests.golden.published import FULL_PRECISION
+from tests.golden.published import NOT_IN_GOLDEN
 from tests.golden_files import golden, golden_path
 
 pytestmark = pytest.mark.golden
@@ -57,8 +57,8 @@ def _import(folder, dynamics, metric=None):
     assert main(["import", str(checkpoint), "--config", str(config), "-o", str(folder / "model")]) == 0
     simulator = restore(folder / "model").simulator
     for module in simulator.modules():
-        if isinstance(module, Attention):
-            module.rounded_to_half = False  # the tensors were made in full precision
+        if isinstance(module, ReleasedAttention):
+            module.__class__ = Attention  # the tensors were made in full precision
     return simulator, weights
 
 
@@ -111,7 +111,7 @@ def test_network(import_model, file, case):
         torch.zeros(n_scenes, 3, dtype=torch.float64),
         dynamics.config.pyramid_spec((n_steps - 1).bit_length()),
     )
-    direct = Dynamics(dataclasses.replace(dynamics.config, quirks=FULL_PRECISION)).eval()
+    direct = as_released(Dynamics(dynamics.config), without=NOT_IN_GOLDEN).eval()
     direct.net.load_state_dict(dynamics_weights(part(file, "")))
     out = torch.zeros_like(expected)
     with torch.no_grad():
@@ -166,7 +166,7 @@ def test_encoder(import_model):
     scene, step = torch.zeros(n_steps, dtype=torch.int64), torch.arange(n_steps)
     origin = torch.zeros(1, 3, dtype=torch.float64)
     frames = Frames(images.reshape(n_images, 3, size, size), cameras, scene, step, origin)
-    direct = Encoder(simulator.config.encoder)
+    direct = as_released(Encoder(simulator.config.encoder))
     direct.load_state_dict(encoder_weights(part("h_encoder", "")))
     with torch.no_grad():
         particles, same = simulator.encode(frames), direct(frames)

@@ -292,7 +292,7 @@ def test_errors_name_the_argument(change, message):
 )
 def test_config_errors(change, message):
     with pytest.raises(ValueError, match=message):
-        DynamicsConfig(**{**dataclasses.asdict(TINY), "quirks": TINY.quirks, **change})
+        DynamicsConfig(**{**dataclasses.asdict(TINY), **change})
 
 
 @pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING])

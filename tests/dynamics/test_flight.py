@@ -151,4 +151,4 @@ def test_compiled_it_is_the_same(device):
 )
 def test_settings_that_make_no_sense_are_refused(change):
     with pytest.raises(ValueError, match="gravity"):
-        DynamicsConfig(**{**dataclasses.asdict(FLYING), "quirks": FLYING.quirks, **change})
+        DynamicsConfig(**{**dataclasses.asdict(FLYING), **change})

@@ -353,7 +353,7 @@ def test_compiled_it_is_the_same(device):
 
 def test_pushes_need_gravity():
     with pytest.raises(ValueError, match="pushes needs gravity"):
-        DynamicsConfig(**{**dataclasses.asdict(PUSHED), "quirks": PUSHED.quirks, "gravity": None})
+        DynamicsConfig(**{**dataclasses.asdict(PUSHED), "gravity": None})
 
 
 def test_rows_count_as_much_as_the_surface_around_them():

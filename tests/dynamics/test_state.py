@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.compat.quirks import Quirks
+from gsim3d.compat.released_model import ReleasedDynamicsConfig
 from gsim3d.dynamics.state import StateLayout, bounded, position_features, rotate_left
-from gsim3d.nn.gaussian_head import rotation_matrices
+from gsim3d.math.rotations import rotation_matrices
 from gsim3d.state import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, TINY, float_fields, make_history
@@ -99,7 +99,7 @@ def test_differences_from_the_step_before_add_up():
 
 
 def test_absolute_predictions_are_the_state():
-    config = dataclasses.replace(EXPLICIT, predicts="absolute", quirks=Quirks(unbounded_opacity=True))
+    config = ReleasedDynamicsConfig(**{**vars(EXPLICIT), "predicts": "absolute"})
     layout = StateLayout.of(config)
     assert dict(layout.outputs)["quats"] == 4
     particles = make_history((20,), config=config, frozen_share=0.0)

@@ -5,7 +5,6 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.compat.quirks import Quirks
 from gsim3d.cuda_graphs import CapturedRollout
 from gsim3d.dynamics import DynamicsConfig, Parts, RestLog, last_steps, rollout, rollout_in_parts
 from gsim3d.dynamics.background import Background
@@ -354,9 +353,7 @@ def test_shuffled_curves_are_those_of_the_background():
     assert first.shape[0] == len(codes) == 4
 
 
-@pytest.mark.parametrize(
-    "values", [{"norm": "batch"}, {"quirks": Quirks(half_attention=True)}, {"background": "frozen"}]
-)
+@pytest.mark.parametrize("values", [{"norm": "batch"}, {"background": "frozen"}])
 def test_configs_that_cannot_be_asymmetric_raise(values):
     with pytest.raises(ValueError, match="background"):
         DynamicsConfig(**{"norm": "layer", "background": "asymmetric", **values})

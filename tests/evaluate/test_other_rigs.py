@@ -11,7 +11,7 @@ import torch
 
 from gsim3d import presets
 from gsim3d.cli.main import main
-from gsim3d.compat.quirks import Quirks
+from gsim3d.compat.released_model import ReleasedModelConfig
 from gsim3d.data import Scene
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import FitWarning, InputError
@@ -170,12 +170,7 @@ def test_missing_depths_are_guessed_and_kept(restored, tmp_path):
 
 
 def test_published_models_have_their_depths_whatever_a_scene_says(restored, tmp_path):
-    parts = {name: getattr(presets.tiny(), name) for name in ("encoder", "dynamics", "renderer")}
-    quirks = Quirks(integer_pixel_centers=True)
-    config = dataclasses.replace(
-        presets.tiny(), **{name: dataclasses.replace(part, quirks=quirks) for name, part in parts.items()}
-    )
-    published = dataclasses.replace(restored, simulator=SimpleNamespace(config=config))
+    published = dataclasses.replace(restored, simulator=SimpleNamespace(config=ReleasedModelConfig()))
     scene, said = opened(published, rig(tmp_path / "scene", 5, near=0.5, far=9.0))
     assert (scene.near, scene.far) == (1.2, 4.0) and "depths 0.5 to 9 replaced by 1.2 to 4" in said
 

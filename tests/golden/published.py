@@ -7,8 +7,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d import ops
-from gsim3d.compat.quirks import Quirks
 from gsim3d.compat.released import dynamics_weights
+from gsim3d.compat.released_model import ReleasedAttention, ReleasedDynamicsConfig
 from gsim3d.dynamics import DynamicsConfig
 from gsim3d.nn.gaussian_head import RendererConfig
 from gsim3d.nn.multiview_encoder import EncoderConfig
@@ -17,15 +17,14 @@ from gsim3d.state import DYNAMIC, FROZEN, Particles
 from tests.asserts import assert_close_relative_to_max
 from tests.golden_files import Golden, published_config
 
-# Attention ran in float32 except where a key says fp16qkv; harmonic 14 is the mathematical one.
-FULL_PRECISION = dataclasses.replace(Quirks.release(), half_attention=False, z_in_harmonic_14=False)
+NOT_IN_GOLDEN = (ReleasedAttention,)  # attention ran in float32 except where a key says fp16qkv
 
 
-def dynamics_config(name: str, quirks: Quirks = FULL_PRECISION) -> DynamicsConfig:
+def dynamics_config(name: str) -> ReleasedDynamicsConfig:
     config = published_config(name)
     net, state = config["model"]["dynamic_model"]["model"], config["model"]["state_adapter"]
     assert set(state["pred_modality"].values()) == {"cx_x"} and state["pred_inductive_bias"] and net["with_time_emb"]
-    return DynamicsConfig(
+    return ReleasedDynamicsConfig(
         dynamic_latents=state["dynamic_latent_feature_dim"],
         static_latents=state["static_latent_feature_dim"],
         sh_degree=state["gaussians"]["sh_degree"],
@@ -47,11 +46,10 @@ def dynamics_config(name: str, quirks: Quirks = FULL_PRECISION) -> DynamicsConfi
         mlp_ratio=net["mlp_ratio"],
         drop_path=net["drop_path"],
         shuffle_orders=net["shuffle_orders"],
-        quirks=quirks,
     )
 
 
-def encoder_config(name: str, quirks: Quirks = FULL_PRECISION) -> EncoderConfig:
+def encoder_config(name: str) -> EncoderConfig:
     model = published_config(name)["model"]
     net, state = model["encoder"], model["state_adapter"]
     return EncoderConfig(
@@ -68,11 +66,10 @@ def encoder_config(name: str, quirks: Quirks = FULL_PRECISION) -> EncoderConfig:
         dynamic_dim=state["dynamic_latent_feature_dim"],
         static_dim=state["static_latent_feature_dim"],
         sh_degree=state["gaussians"]["sh_degree"],
-        quirks=quirks,
     )
 
 
-def renderer_config(name: str, quirks: Quirks = FULL_PRECISION) -> RendererConfig:
+def renderer_config(name: str) -> RendererConfig:
     state = published_config(name)["model"]["state_adapter"]
     return RendererConfig(
         latents=state["dynamic_latent_feature_dim"] + state["static_latent_feature_dim"],
@@ -80,7 +77,6 @@ def renderer_config(name: str, quirks: Quirks = FULL_PRECISION) -> RendererConfi
         scale_min=state["gaussians"]["scale_min"],
         scale_max=state["gaussians"]["scale_max"],
         jacobian="clamped",
-        quirks=quirks,
     )
 
 

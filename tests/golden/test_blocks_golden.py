@@ -5,11 +5,11 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.compat.quirks import Quirks
+from gsim3d.compat.released_model import as_released
 from gsim3d.nn.point_transformer import Block, EncoderStage
 from gsim3d.ops import pool_mean, unpool
 from tests.golden.published import (
-    FULL_PRECISION,
+    NOT_IN_GOLDEN,
     assert_published_patches,
     assert_published_stage,
     assert_rounded_to_half,
@@ -105,17 +105,17 @@ def test_merging(file, stride, window, device):
     close(out, case["out/feat"], "features", "golden_float32")
 
 
-def block_and_stage(g, order, quirks=FULL_PRECISION, device="cpu"):
+def block_and_stage(g, order, without=NOT_IN_GOLDEN, device="cpu"):
     """A block with published weights, the rows' geometry and their features."""
     weights = renamed(g / f"order{order}" / "w", "enc.enc0.block0.", "encoder.0.blocks.0.")
     channels, heads = weights["norm1.weight"].shape[0], 2  # no array has the number of heads
     patch_size = int(g["cu_seqlens"].diff().max())
     config = dataclasses.replace(
-        dynamics_config("small", quirks), grid_size=float(g["grid_size"]), strides=(), merge_windows=(),
+        dynamics_config("small"), grid_size=float(g["grid_size"]), strides=(), merge_windows=(),
         patch_sizes=(patch_size,), encoder_depths=(1,), encoder_channels=(channels,), encoder_heads=(heads,),
         decoder_depths=(), decoder_channels=(), decoder_heads=(),
     )  # fmt: skip
-    block = Block(channels, heads, 0.0, config).eval()
+    block = as_released(Block(channels, heads, 0.0, config), without).eval()
     block.load_state_dict(weights)
     xyz = g["in/xyz"].to(device)
     (stage,) = pyramid_of(xyz, everywhere(xyz), config).stages
@@ -157,8 +157,8 @@ def test_block(file, order, device):
 def test_block_with_attention_rounded_to_half(file, order):
     g = golden(f"e_block_{file}")
     outs = []
-    for quirks in (Quirks.release(), FULL_PRECISION):
-        block, stage, x = block_and_stage(g, order, quirks)
+    for without in ((), NOT_IN_GOLDEN):
+        block, stage, x = block_and_stage(g, order, without)
         outs.append(block(x, stage, order))
     assert_rounded_to_half(outs[0], outs[1], g[f"order{order}/out_fp16qkv"])
 

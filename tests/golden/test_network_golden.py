@@ -6,12 +6,13 @@ import pytest
 import torch
 
 from gsim3d import ops
-from gsim3d.compat.quirks import Quirks
+from gsim3d.compat.released_model import ReleasedDecoderStage, ReleasedDynamicsConfig, ReleasedSparseConv, as_released
+from gsim3d.dynamics import DynamicsConfig
 from gsim3d.nn import point_transformer
 from gsim3d.nn.point_transformer import PointTransformer
 from tests.asserts import relative_to_max
 from tests.golden.published import (
-    FULL_PRECISION,
+    NOT_IN_GOLDEN,
     assert_published_stage,
     assert_rounded_to_half,
     close,
@@ -32,14 +33,14 @@ FILES = ["small_nodup", "small_dup", "deep_nodup", "deep_dup"]
 CASES = ["T4_nomask", "T4_mask", "T2_nomask", "T2_mask"]
 
 
-def load(file, quirks=FULL_PRECISION):
+def load(file, without=NOT_IN_GOLDEN):
     """The file, and its network with published weights."""
     g = golden(f"f_dynamics_{file}")
     name = {"small": "small", "deep": "small_deep_dynamics"}[file.split("_")[0]]
-    config = dataclasses.replace(dynamics_config(name, quirks), grid_size=float(g["grid_size"]))
+    config = dataclasses.replace(dynamics_config(name), grid_size=float(g["grid_size"]))
     weights = renamed(g / "w")
     in_channels, out_channels = weights["stem.conv.weight"].shape[-1], weights["head.fc2.bias"].shape[0]
-    net = PointTransformer(in_channels, 0, out_channels, config).eval()
+    net = as_released(PointTransformer(in_channels, 0, out_channels, config), without).eval()
     net.load_state_dict(weights)
     return g, net, config
 
@@ -67,16 +68,18 @@ def test_network(file, case, device):
 
 
 @pytest.mark.parametrize(
-    ("quirk", "file", "case"),
+    ("override", "file", "case"),
     [
-        ("stale_decoder_conv", "small_nodup", "T4_nomask"),
-        ("first_of_voxel", "small_dup", "T4_nomask"),
-        ("anchor_at_minimum", "small_nodup", "T4_mask"),
+        (ReleasedDecoderStage, "small_nodup", "T4_nomask"),
+        (ReleasedSparseConv, "small_dup", "T4_nomask"),
+        (ReleasedDynamicsConfig, "small_nodup", "T4_mask"),
     ],
 )
-def test_each_quirk_is_what_the_published_model_does(quirk, file, case):
+def test_each_override_is_what_the_published_model_does(override, file, case):
     """Without any one of them the published numbers are missed."""
-    g, net, config = load(file, dataclasses.replace(FULL_PRECISION, **{quirk: False}))
+    g, net, config = load(file, (*NOT_IN_GOLDEN, override))
+    if override is ReleasedDynamicsConfig:
+        config = DynamicsConfig(**vars(config))
     c = g / case
     with torch.no_grad():
         out = run(net, config, c, origin=c["xyz"].amin((1, 2)) - 0.05)
@@ -86,7 +89,7 @@ def test_each_quirk_is_what_the_published_model_does(quirk, file, case):
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("file", FILES)
 def test_network_with_attention_rounded_to_half(file, case):
-    (g, net, config), (_, exact, _) = load(file, Quirks.release()), load(file)
+    (g, net, config), (_, exact, _) = load(file, ()), load(file)
     c = g / case
     with torch.no_grad():
         assert_rounded_to_half(run(net, config, c), run(exact, config, c), c["out_fp16qkv"])

@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from gsim3d.compat.quirks import Quirks
-from gsim3d.dynamics import Dynamics, DynamicsConfig, last_steps, rollout
+from gsim3d.compat.released_model import ReleasedDynamicsConfig, as_released
+from gsim3d.dynamics import Dynamics, last_steps, rollout
 from gsim3d.dynamics.state import StateLayout
 from gsim3d.math.spherical_harmonics import degree_damping
 from gsim3d.state import FROZEN
 from tests.asserts import relative_to_max
-from tests.golden.published import close, dynamics_config, particles_of, renamed
+from tests.golden.published import NOT_IN_GOLDEN, close, dynamics_config, particles_of, renamed
 from tests.golden_files import golden
 
 pytestmark = pytest.mark.golden
@@ -30,7 +30,7 @@ PREDICTS = {"z_x": "absolute", "cx_x": "from_newest", "cx_dx": "from_previous"}
 
 def layout_of(g, bias, modality, n_steps):
     metric = float(g["metric"])
-    config = DynamicsConfig(
+    config = ReleasedDynamicsConfig(
         explicit=True,
         sh_degree=int(len(g["sh_mask"]) ** 0.5) - 1,
         scale_min=float(g["scale_min"]),
@@ -38,7 +38,6 @@ def layout_of(g, bias, modality, n_steps):
         max_step=metric / 2 if bias else None,
         predicts=PREDICTS[modality],
         steps_per_call=n_steps,
-        quirks=Quirks.release(),
     )
     return StateLayout.of(config)
 
@@ -110,7 +109,7 @@ def load_dynamics(g):
     config = dataclasses.replace(
         dynamics_config("small"), grid_size=float(g["grid_size"]), max_step=float(g["metric"]) / 2
     )
-    dynamics = Dynamics(config).eval()
+    dynamics = as_released(Dynamics(config), NOT_IN_GOLDEN).eval()
     dynamics.net.load_state_dict(renamed(g / "w"))
     return dynamics
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsim3d.math.spherical_harmonics import degree_damping, rotate_harmonics, rotate_unpaired_harmonics, sh_basis
-from gsim3d.nn.gaussian_head import rotation_matrices, unit_quats
+from gsim3d.compat.released_harmonics import rotate_unpaired_harmonics
+from gsim3d.math.rotations import rotation_matrices, unit_quats
+from gsim3d.math.spherical_harmonics import degree_damping, rotate_harmonics, sh_basis
 from tests.asserts import assert_close_relative_to_max
 
 

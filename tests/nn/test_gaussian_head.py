@@ -7,8 +7,9 @@ import torch
 
 from gsim3d import ops
 from gsim3d.cameras import Cameras
+from gsim3d.math.rotations import rotation_matrices, unit_quats
 from gsim3d.math.spherical_harmonics import sh_basis
-from gsim3d.nn.gaussian_head import GaussianHead, RendererConfig, render, rotation_matrices, unit_quats
+from gsim3d.nn.gaussian_head import GaussianHead, RendererConfig, render
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, TINY, make_history
 

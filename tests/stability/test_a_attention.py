@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsim3d import ops
-from gsim3d.compat.quirks import Quirks
+from gsim3d.compat.released_model import ReleasedAttention, as_released
 from gsim3d.errors import NumericalError
 from gsim3d.nn.layers import RowBatchNorm, RowLayerNorm
 from gsim3d.nn.multiview_encoder.heads import PixelRays
@@ -64,37 +64,42 @@ def test_a25_numbers_beyond_the_range_are_refused(setting, measured, name):
     measured.outcome("NumericalError names tensor and row")
 
 
-QUIRKS = pytest.mark.parametrize("quirks", [Quirks(), Quirks(half_attention=True)], ids=["", "half"])
+ROUNDED = pytest.mark.parametrize("rounded", [False, True], ids=["", "half"])
 
 
-def check_huge_network(setting, measured, quirks) -> None:
-    config = dataclasses.replace(TINY, quirks=quirks)
-    histories = make_history((30, 20)), ordinary(config)
-    step = simulate(setting, batch(histories), config, prepare=large_queries)
+def check_huge_network(setting, measured, rounded) -> None:
+    def prepare(dynamics):
+        large_queries(dynamics)
+        for module in dynamics.modules():
+            if rounded and isinstance(module, Attention):
+                as_released(module)
+
+    histories = make_history((30, 20)), ordinary(TINY)
+    step = simulate(setting, batch(histories), prepare=prepare)
     measured.finite(*step.tensors)
-    alone = simulate(setting, histories[1], config, prepare=large_queries)
+    alone = simulate(setting, histories[1], prepare=prepare)
     measured.finite(*alone.tensors)
     for name, value in alone.fields.items():
         measured.unchanged(setting, step.fields[name][20:], value, name)
 
 
-@QUIRKS
-def test_a25_a_network_with_such_logits(setting, measured, quirks):
-    check_huge_network(setting, measured, quirks)
+@ROUNDED
+def test_a25_a_network_with_such_logits(setting, measured, rounded):
+    check_huge_network(setting, measured, rounded)
 
 
-@QUIRKS
+@ROUNDED
 @pytest.mark.parametrize("setting", NAMES[1:2], indirect=True)
-def test_a25_a_network_with_such_logits_under_autocast_on_the_cpu(setting, measured, quirks):
+def test_a25_a_network_with_such_logits_under_autocast_on_the_cpu(setting, measured, rounded):
     half = Setting(setting.device, "bf16")
     with half.computing():
-        check_huge_network(half, measured, quirks)
+        check_huge_network(half, measured, rounded)
 
 
 def test_a25_gradients_beyond_half_precision(setting, measured):
     """Where attention imitates half precision: its gradients keep their range, and digits."""
     torch.manual_seed(0)
-    attention = setting.to(Attention(32, 2, rounded_to_half=True))
+    attention = setting.to(ReleasedAttention(32, 2))
     x, cotangent = setting.to(torch.randn(16, 32)), setting.to(torch.randn(16, 32))
     rows, whole = (torch.tensor(values, device=setting.device) for values in (range(16), (0, 16)))
     table = ops.PatchTable(rows, rows, whole, whole)

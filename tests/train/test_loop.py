@@ -260,18 +260,6 @@ def test_a_restored_simulator_predicts_with_the_averaged_weights(folder, finishe
     assert restored.image_size == (32, 32) and restored.data == CONFIG.data and not restored.simulator.training
 
 
-@pytest.mark.parametrize("on", [False, True])
-def test_a_switch_of_another_version_is_refused_only_where_it_is_on(finished, tmp_path, on):
-    saved = checkpoint.load(finished)
-    saved.config["model"]["renderer"]["quirks"]["released_head_harmonics"] = on
-    folder = checkpoint.write(tmp_path / "older", saved)
-    if on:
-        with pytest.raises(InputError, match="renderer.quirks.released_head_harmonics: unknown setting"):
-            restore(folder)
-    else:
-        assert restore(folder).simulator.config == restore(finished).simulator.config
-
-
 def test_what_does_not_fit_is_named(folder, tmp_path):
     long = TrainConfig(phases=(PhaseConfig(steps=1, horizon=9),), data=CONFIG.data)
     with pytest.raises(InputError, match="windows of 11 steps do not fit"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from gsim3d.compat.quirks import Quirks
 from gsim3d.errors import InputError, check_ranges
 
 
@@ -34,7 +33,6 @@ class EncoderConfig:
         explicit: also predict rotation, scale and spherical harmonics of each particle.
         sh_degree: degree of these harmonics.
         scale_range: smallest and largest predicted scale, in tenths of a pixel's width plus height at its depth.
-    quirks: published behaviour to imitate.
     """
 
     feature_dim: int = 128
@@ -59,7 +57,6 @@ class EncoderConfig:
     explicit: bool = False
     sh_degree: int = 3
     scale_range: tuple[float, float] = (0.5, 15.0)
-    quirks: Quirks = Quirks()
 
     def __post_init__(self):
         if self.downscale_factor not in (2, 4, 8) or self.downscale_factor > 2 ** len(self.cnn_dims):

@@ -11,7 +11,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsim3d import ops
-from gsim3d.compat.quirks import Quirks
 from gsim3d.nn.layers import widened
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
 from gsim3d.nn.multiview_encoder.layout import GroupNorm, by_pixel, for_convolution
@@ -50,33 +49,11 @@ class Depth:
     features: Tensor
 
 
-def upsampling_matrix(n: int, factor: int, corner_aligned: bool, like: Tensor) -> Tensor:
-    """[factor * n, n], the weights of bilinear upsampling along one axis.
-
-    Input i lies at output index factor * i, where strided convolutions took it from, and the last outputs repeat the
-    last input; corner-aligned, the first and last input lie at the first and last output.
-    """
-    stride = (factor * n - 1) / max(1, n - 1) if corner_aligned else factor
-    place = (torch.arange(factor * n, device=like.device) / stride).clamp(max=n - 1)
-    weights = 1 - (place[:, None] - torch.arange(n, device=like.device)).abs()
+def upsampling_matrix(n: int, factor: int, stride: float, like: Tensor) -> Tensor:
+    """[factor * n, n], the weights of linear upsampling along one axis, where input i lies at output i * stride."""
+    index = (torch.arange(factor * n, device=like.device) / stride).clamp(max=n - 1)
+    weights = 1 - (index[:, None] - torch.arange(n, device=like.device)).abs()
     return weights.clamp(min=0).to(like.dtype)
-
-
-def upsample(x: Tensor, factor: int, quirks: Quirks) -> Tensor:
-    """[N, C, h, w] -> [N, C, factor h, factor w], bilinear, as two matrix products (their gradients use no atomics)."""
-    aligned = quirks.corner_aligned_upsampling
-    rows = upsampling_matrix(x.shape[2], factor, aligned, x)
-    cols = upsampling_matrix(x.shape[3], factor, aligned, x)
-    return rows @ (x @ cols.T)
-
-
-def feature_intrinsics(Ks: Tensor, factor: int, quirks: Quirks) -> Tensor:
-    """Intrinsics of feature maps whose pixel i is centred on image pixel factor * i; centres at +0.5 in both."""
-    first_center = 0.0 if quirks.integer_pixel_centers else 0.5
-    scaled = Ks.clone()
-    scaled[:, :2] /= factor
-    scaled[:, :2, 2] = (Ks[:, :2, 2] - first_center) / factor + 0.5
-    return scaled
 
 
 def all_pairs(n_clouds: int, n_views: int, device) -> tuple[Tensor, Tensor]:
@@ -94,8 +71,7 @@ class CostVolume(nn.Module):
         super().__init__()
         depths, dim = config.n_depths, config.cost_unet_dim
         in_dim = depths + config.feature_dim
-        self.factor, self.quirks = config.downscale_factor, config.quirks
-        self.n_depths = depths
+        self.factor, self.n_depths = config.downscale_factor, depths
         self.refine_in = nn.Sequential(nn.Conv2d(in_dim, dim, 3, 1, 1), GroupNorm(8, dim), nn.GELU())
         self.unet = UNet(dim, config.cost_unet_levels, config.cost_unet_attention)
         self.refine_out = nn.Conv2d(dim, depths, 3, 1, 1)
@@ -110,12 +86,23 @@ class CostVolume(nn.Module):
         steps = torch.linspace(0, 1, self.n_depths, dtype=torch.float64, device=like.device)
         return (far[:, None] + steps * (near - far)[:, None]).to(like.dtype)
 
+    def feature_intrinsics(self, Ks: Tensor) -> Tensor:
+        """Intrinsics of feature maps whose pixel i is centred on image pixel factor * i; centres at +0.5 in both."""
+        scaled = Ks.clone()
+        scaled[:, :2] /= self.factor
+        scaled[:, :2, 2] = (Ks[:, :2, 2] - 0.5) / self.factor + 0.5
+        return scaled
+
+    def source_intrinsics(self, Ks: Tensor, src_images: Tensor, n_views: int) -> Tensor:
+        """[P, 3, 3], of the source view of each pair."""
+        return Ks[src_images]
+
     def sweep_geometry(self, views: Views) -> tuple[Tensor, Tensor]:
         """Homographies and translations between all views of a cloud, float64."""
         src_images, cu_src = all_pairs(len(views.Ks) // views.n_views, views.n_views, views.Ks.device)
-        Ks = feature_intrinsics(views.Ks, self.factor, self.quirks)
-        target = Ks.repeat_interleave(views.n_views - 1, 0) if self.quirks.reference_intrinsics else Ks[src_images]
-        return ops.sweep_geometry(Ks, views.viewmats, src_images, cu_src, Ks_target=target)
+        Ks = self.feature_intrinsics(views.Ks)
+        sources = self.source_intrinsics(Ks, src_images, views.n_views)
+        return ops.sweep_geometry(Ks, views.viewmats, src_images, cu_src, Ks_target=sources)
 
     def correlation(self, features: Tensor, views: Views, disparities: Tensor) -> Tensor:
         """[I, C, h, w] features -> [I, D, h, w] mean correlation with the other views."""
@@ -143,7 +130,7 @@ class DepthPredictor(nn.Module):
     def __init__(self, config: EncoderConfig):
         super().__init__()
         dim, upsampled = config.refine_unet_dim, config.upsampled_dim or config.feature_dim
-        self.factor, self.quirks = config.downscale_factor, config.quirks
+        self.factor = config.downscale_factor
         self.cost_volume = CostVolume(config)
         self.upsampler = nn.Conv2d(2 * config.feature_dim, upsampled, 3, 1, 1)
         self.proj_feature = nn.Conv2d(upsampled, dim, 3, 1, 1)
@@ -156,14 +143,23 @@ class DepthPredictor(nn.Module):
         nn.init.normal_(last.weight, std=INITIAL_OUTPUT / last.in_channels**0.5)
         last.bias.data.copy_(torch.tensor([0.0, math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))]))
 
+    def upsampling_stride(self, n: int) -> float:
+        """Outputs between two of ``n`` inputs: they lie where the strided convolutions took them from."""
+        return self.factor
+
+    def upsample(self, x: Tensor) -> Tensor:
+        """[N, C, h, w] -> [N, C, factor h, factor w], bilinear, as two products, whose gradients need no atomics."""
+        rows, cols = (upsampling_matrix(n, self.factor, self.upsampling_stride(n), x) for n in x.shape[2:])
+        return rows @ (x @ cols.T)
+
     def forward(self, view_features: Tensor, cnn_features: Tensor, views: Views) -> Depth:
         """view_features and cnn_features: [I, C, h, w], with and without knowledge of the other views."""
         coarse, confidence = self.cost_volume(view_features, views)
         # In float64, which neither autocast nor TF32 shortens: half a permille of depth is millimetres.
-        coarse = upsample(coarse.double(), self.factor, self.quirks).to(coarse.dtype)
+        coarse = self.upsample(coarse.double()).to(coarse.dtype)
         confidence = repeat_pixels(confidence, self.factor)
         fine = self.upsampler(torch.cat([view_features, cnn_features], 1))
-        fine = for_convolution(F.gelu(upsample(fine, self.factor, self.quirks)))
+        fine = for_convolution(F.gelu(self.upsample(fine)))
         x = torch.cat([views.images, self.proj_feature(fine), coarse, confidence], 1)
         x = self.refine_in(for_convolution(x))
         x = by_pixel(self.refine_unet(x, views.n_views))

@@ -147,7 +147,7 @@ class Encoder(nn.Module):
         cnn_features = self.cnn(views.images)
         view_features = self.transformer(cnn_features.unflatten(0, (-1, views.n_views))).flatten(0, 1)
         depth = self.depth(view_features, cnn_features, views)
-        return self.heads(depth, views, origin * 0 if self.config.quirks.world_moments else origin)
+        return self.heads(depth, views, origin)
 
     def _assemble(
         self, frames: Frames, parts: list[PixelParticles], images_of_parts: list[Tensor], order: Tensor, n_views: Tensor

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gsim3d.math.rotations import unit_quats
-from gsim3d.math.spherical_harmonics import degree_damping, turn_predicted_harmonics
+from gsim3d.math.spherical_harmonics import degree_damping, rotate_harmonics
 from gsim3d.nn.layers import widened
 from gsim3d.nn.multiview_encoder import camera_frame
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
@@ -106,7 +106,7 @@ class ParticleHeads(nn.Module):
         means = geometry.centers.to(raw.dtype)[:, :, None, None] + depth.depth * self._rays(geometry, raw_offset)
         latents = self._latents(depth, raw_offset, geometry, geometry.centers - origin)
         dynamic, static = latents.split([self.config.dynamic_dim, self.config.static_dim], -1)
-        explicit = explicit_gaussians(raw[:, 2:], depth.depth, geometry, self.config) if self.config.explicit else {}
+        explicit = self.explicit_gaussians(raw[:, 2:], depth.depth, geometry) if self.config.explicit else {}
         return PixelParticles(
             means=_rows(means),
             opacities=_rows(depth.opacity_logit.sigmoid())[..., 0],
@@ -125,29 +125,31 @@ class ParticleHeads(nn.Module):
         return _rows(widened(self.to_latents(features)))
 
     def _rays(self, geometry: PixelRays, raw_offset: Tensor) -> Tensor:
-        directions = geometry.directions(*raw_offset.shape[-2:], raw_offset.sigmoid() - 0.5)
-        return unit_vectors(directions) if self.config.quirks.ray_depth else directions
+        return geometry.directions(*raw_offset.shape[-2:], raw_offset.sigmoid() - 0.5)
+
+    def explicit_gaussians(self, raw: Tensor, depth: Tensor, geometry: PixelRays) -> dict[str, Tensor]:
+        """quats, scales and sh of the explicit variant, predicted in the camera frame and turned into the world."""
+        n_images = raw.shape[0]
+        raw_scales, raw_quats, raw_sh = _rows(raw).split([3, 4, raw.shape[1] - 7], -1)
+        smallest, largest = self.config.scale_range
+        pixel_size = geometry.inverse_Ks[:, :2, :2].sum((1, 2)).to(raw.dtype)[:, None, None]
+        scales = (smallest + (largest - smallest) * raw_scales.sigmoid()) * (_rows(depth) * 0.1 * pixel_size)
+        rotations = geometry.rotations.to(raw.dtype)
+        turn = camera_frame.rotation_to_quat(rotations)[:, None]
+        quats = camera_frame.quat_multiply(turn, unit_quats(raw_quats.roll(1, -1)))  # raw: real part last
+        quats = camera_frame.with_positive_largest(quats)  # as those that the dynamics writes and reads
+        damping = degree_damping(self.config.sh_degree, raw)
+        in_camera = raw_sh.reshape(n_images, -1, 3, damping.shape[0]) * damping
+        each = torch.eye(len(damping), dtype=geometry.rotations.dtype, device=raw.device).repeat(n_images, 1, 1)
+        turn_sh = self.rotate_harmonics(each, geometry.rotations)
+        turned = torch.einsum("ikl,incl->inkc", turn_sh.to(raw.dtype), in_camera)
+        return {"quats": quats, "scales": scales, "sh": turned}
+
+    def rotate_harmonics(self, sh: Tensor, rotations: Tensor) -> Tensor:
+        """Predicted coefficients [N, K, C] turned into the world by ``rotations`` [N, 3, 3]."""
+        return rotate_harmonics(sh, rotations)
 
 
 def _rows(maps: Tensor) -> Tensor:
     """[I, C, H, W] -> [I, H * W, C]."""
     return maps.flatten(2).transpose(1, 2)
-
-
-def explicit_gaussians(raw: Tensor, depth: Tensor, geometry: PixelRays, config: EncoderConfig) -> dict[str, Tensor]:
-    """quats, scales and sh of the explicit variant, predicted in the camera frame and turned into the world."""
-    n_images = raw.shape[0]
-    raw_scales, raw_quats, raw_sh = _rows(raw).split([3, 4, raw.shape[1] - 7], -1)
-    smallest, largest = config.scale_range
-    pixel_size = geometry.inverse_Ks[:, :2, :2].sum((1, 2)).to(raw.dtype)[:, None, None]
-    scales = (smallest + (largest - smallest) * raw_scales.sigmoid()) * (_rows(depth) * 0.1 * pixel_size)
-    rotations = geometry.rotations.to(raw.dtype)
-    turn = camera_frame.rotation_to_quat(rotations)[:, None]
-    quats = camera_frame.quat_multiply(turn, unit_quats(raw_quats.roll(1, -1)))  # raw: real part last
-    quats = camera_frame.with_positive_largest(quats)  # as those that the dynamics writes and reads
-    damping = degree_damping(config.sh_degree, raw)
-    in_camera = raw_sh.reshape(n_images, -1, 3, damping.shape[0]) * damping
-    each = torch.eye(len(damping), dtype=geometry.rotations.dtype, device=raw.device).repeat(n_images, 1, 1)
-    turn_sh = turn_predicted_harmonics(each, geometry.rotations, config.quirks)
-    turned = torch.einsum("ikl,incl->inkc", turn_sh.to(raw.dtype), in_camera)
-    return {"quats": quats, "scales": scales, "sh": turned}

@@ -7,7 +7,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from gsim3d.compat.quirks import Quirks
 from gsim3d.nn.layers import RowLayerNorm, widened
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
 
@@ -63,18 +62,6 @@ class Windows:
         col_band = bands(self.width, self.cols, self.shift[1])
         labels = self.cut((3 * row_band[:, None] + col_band)[None, None, ..., None], False)[0, ..., 0]
         return (labels[:, :, None] != labels[:, None, :]).to(like.dtype) * MASKED
-
-    def cross_mask(self, like: Tensor, n_views: int, quirks: Quirks) -> Tensor:
-        """[1 or V, K * K, L, (V - 1) * L], between the pixels of a view and those of the others, in the order of
-        :class:`OtherViews`, in shifted windows."""
-        mask = self.shift_mask(like)
-        if not quirks.tiled_shift_mask:
-            return mask.repeat(1, 1, n_views - 1)[None]
-        view, position = torch.arange(n_views, device=like.device), torch.arange(mask.shape[1], device=like.device)
-        other = (view[:, None] + view[1:]) % n_views
-        rank = other - (other > view[:, None]).long()  # of a key view among the others of a query view
-        column = (position * (n_views - 1) + rank[..., None]) % len(position)  # [V, V - 1, L]
-        return mask[:, :, column].permute(2, 0, 1, 3, 4).flatten(3)
 
 
 class OtherViews(torch.autograd.Function):
@@ -155,12 +142,17 @@ class MultiViewTransformer(nn.Module):
 
     def __init__(self, config: EncoderConfig):
         super().__init__()
-        dim, self.split, self.quirks = config.feature_dim, config.window_split, config.quirks
+        dim, self.split = config.feature_dim, config.window_split
         mlp_dim = 2 * dim * config.transformer_mlp_ratio
         self.layers = nn.ModuleList(Layer(dim, mlp_dim) for _ in range(config.transformer_layers))
         for parameter in self.parameters():
             if parameter.dim() > 1:
                 nn.init.xavier_uniform_(parameter)
+
+    def cross_mask(self, mask: Tensor, n_views: int) -> Tensor:
+        """[1 or V, K * K, L, (V - 1) * L]: :meth:`Windows.shift_mask` between the pixels of a view and those of the
+        others, in the order of :class:`OtherViews`."""
+        return mask.repeat(1, 1, n_views - 1)[None]
 
     def forward(self, x: Tensor) -> Tensor:
         n, n_views, dim, height, width = x.shape
@@ -169,7 +161,11 @@ class MultiViewTransformer(nn.Module):
         x = widened(x.permute(0, 1, 3, 4, 2) + code.repeat(self.split, self.split, 1))
         for i, layer in enumerate(self.layers):
             shifted = i % 2 == 1 and self.split > 1
-            within = windows.shift_mask(x)[None] if shifted else None
+            mask = windows.shift_mask(x) if shifted else None
+            within = None if mask is None else mask[None]
+            between = None if mask is None or n_views == 1 else self.cross_mask(mask, n_views)
+            if between is not None and between.shape[0] > 1:
+                between = between.repeat(n, 1, 1, 1)
 
             def attend_self(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
                 q, k, v = (windows.cut(t, shifted) for t in (q, k, v))
@@ -178,12 +174,9 @@ class MultiViewTransformer(nn.Module):
             def attend_others(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
                 if n_views == 1:
                     return torch.zeros_like(v)
-                mask = windows.cross_mask(x, n_views, self.quirks) if shifted else None
-                if mask is not None and mask.shape[0] > 1:
-                    mask = mask.repeat(n, 1, 1, 1)
                 q, k, v = (windows.cut(t, shifted) for t in (q, k, v))
                 k, v = (OtherViews.apply(t, n_views) for t in (k, v))
-                return windows.join(F.scaled_dot_product_attention(q, k, v, mask), n_views, shifted)
+                return windows.join(F.scaled_dot_product_attention(q, k, v, between), n_views, shifted)
 
             # Other views are read as they entered the layer, before they looked at themselves.
             x = layer.cross_attn_ffn(layer.self_attn(x, x, attend_self), x, attend_others)

@@ -9,14 +9,14 @@ from torch.nn import functional as F
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsim3d.cameras import Frames
-from gsim3d.compat.quirks import Quirks
+from gsim3d.compat.released_model import as_released
 from gsim3d.errors import InputError, NumericalError
+from gsim3d.math.rotations import rotation_matrices, unit_quats
 from gsim3d.math.spherical_harmonics import rotate_harmonics
-from gsim3d.nn.gaussian_head import rotation_matrices, unit_quats
 from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig, pixel_rows
 from gsim3d.nn.multiview_encoder.camera_frame import quat_multiply, rotation_to_quat
-from gsim3d.nn.multiview_encoder.depth import Views, feature_intrinsics, upsample, upsampling_matrix
-from gsim3d.nn.multiview_encoder.heads import PixelRays, explicit_gaussians
+from gsim3d.nn.multiview_encoder.depth import CostVolume, DepthPredictor, Views, upsampling_matrix
+from gsim3d.nn.multiview_encoder.heads import ParticleHeads, PixelRays
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.nn.multiview_encoder.scenes import ROW_FIELDS, SIZE, image_rows, make_encoder, make_frames, select
@@ -56,7 +56,7 @@ def test_a_shifted_crop_is_a_shifted_principal_point():
     cropped = K.clone()
     cropped[:, 0, 2] -= 8
     point = torch.tensor([0.3, 0.2, 2.0], dtype=torch.float64)
-    full, crop = (feature_intrinsics(k, 4, Quirks())[0] @ point for k in (K, cropped))
+    full, crop = (CostVolume(EncoderConfig()).feature_intrinsics(k)[0] @ point for k in (K, cropped))
     assert torch.allclose(full[:2] / full[2] - crop[:2] / crop[2], torch.tensor([2.0, 0.0], dtype=torch.float64))
 
 
@@ -64,7 +64,7 @@ def test_feature_pixels_are_where_strided_convolutions_look():
     """Image index 4 i and feature index i are the same direction."""
     K = make_frames([0]).cameras.Ks
     ray = torch.linalg.inv(K[0]) @ torch.tensor([4 * 2 + 0.5, 4 * 3 + 0.5, 1], dtype=torch.float64)
-    pixel = feature_intrinsics(K, 4, Quirks())[0] @ ray
+    pixel = CostVolume(EncoderConfig()).feature_intrinsics(K)[0] @ ray
     assert torch.allclose(pixel[:2] / pixel[2], torch.tensor([2.5, 3.5], dtype=torch.float64))
     encoder = make_encoder(transformer_layers=0)
     image = torch.zeros(1, 3, SIZE, SIZE)
@@ -230,14 +230,15 @@ def test_constant_images():
 @pytest.mark.parametrize("factor, aligned", [(2, False), (4, False), (4, True)])
 def test_upsampling(factor, aligned):
     x = torch.rand(2, 3, 5, 7, generator=torch.Generator().manual_seed(0))
-    quirks = dataclasses.replace(Quirks(), corner_aligned_upsampling=aligned)
-    ours = upsample(x, factor, quirks)
+    depth = DepthPredictor(EncoderConfig(downscale_factor=factor))
+    depth = as_released(depth) if aligned else depth
+    ours = depth.upsample(x)
     if aligned:
         expected = torch.nn.functional.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=True)
         assert_close_relative_to_max(ours, expected, 1e-5)
     else:
         assert torch.allclose(ours[..., ::factor, ::factor], x)
-    assert torch.allclose(upsampling_matrix(5, factor, aligned, x).sum(1), torch.ones(5 * factor))
+    assert torch.allclose(upsampling_matrix(5, factor, depth.upsampling_stride(5), x).sum(1), torch.ones(5 * factor))
 
 
 def test_the_paper_s_size():
@@ -252,10 +253,10 @@ def test_the_paper_s_size():
     assert counts == PUBLISHED_COUNTS
 
 
-@pytest.mark.parametrize("quirks", [Quirks(), Quirks.release()])
-def test_explicit_variant(quirks):
+@pytest.mark.parametrize("prepare", [lambda encoder: encoder, as_released], ids=["", "released"])
+def test_explicit_variant(prepare):
     frames = make_frames([0, 0])
-    particles = make_encoder(explicit=True, dynamic_dim=0, static_dim=0, quirks=quirks)(frames)
+    particles = prepare(make_encoder(explicit=True, dynamic_dim=0, static_dim=0))(frames)
     n = 2 * SIZE**2
     assert particles.quats.shape == (n, 4) and particles.scales.shape == (n, 3) and particles.sh.shape == (n, 16, 3)
     assert particles.dynamic_latents.shape == (n, 0)
@@ -302,7 +303,7 @@ def test_explicit_quaternions_are_those_that_a_matrix_gives():
     poses[:, :3, :3] = rotations(3)
     Ks = torch.eye(3, dtype=torch.float64).repeat(3, 1, 1)
     rays = PixelRays.of(Views(raw, Ks, torch.linalg.inv(poses), torch.ones(3), torch.ones(3), 3))
-    quats = explicit_gaussians(raw, torch.ones(3, 1, 5, 4).double(), rays, config)["quats"]
+    quats = ParticleHeads(config).explicit_gaussians(raw, torch.ones(3, 1, 5, 4).double(), rays)["quats"]
     x, y, z, w = F.normalize(raw[:, 3:7].flatten(2).transpose(1, 2), dim=-1).unbind(-1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
