@@ -2,7 +2,7 @@
 
     gsim3d generate elastic --preset mini --out runs/data
     python tools/cut_gradients.py --data runs/data --out runs/cut --device cuda --together 6
-    python tools/cut_gradients.py --picture runs/cut docs/cut-gradients.png
+    python tools/cut_gradients.py --picture runs/cut docs/figures/cut_gradients.png
 
 The release wraps attention, MLPs and the depth predictor in re-entrant checkpoints, which pass on no gradient of
 tensors inside dictionaries: attention and MLP of every block, their norms and the latents of the encoder keep their

@@ -97,7 +97,7 @@ devices() {
 tests() {
   local parallel=()
   "$PYTHON" -c 'import xdist' 2>/dev/null && parallel=(-n "$(at_once)" --dist load)
-  # What the hard cases measured: python tools/stability.py --add FILE puts it into docs/stability.md.
+  # What the hard cases measured: python tools/stability.py --add FILE puts it into docs/results/stability.json.
   GSIM3D_REQUIRE_CUDA=1 GSIM3D_STABILITY_JSON="$STATE/stability.json" OMP_NUM_THREADS=1 \
     "$PYTHON" -m pytest -q "${parallel[@]}" tests/stability tests -m "gpu and not slow"
 }

@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Long rollouts and the gradients through them: writes docs/rollouts.md and docs/rollouts.png.
+"""Long rollouts and the gradients through them: writes docs/results/long_rollouts.md and .png.
 
 python -m gsim3d demo --train --out runs/demo
 python tools/rollouts.py --demo runs/demo
@@ -32,7 +32,7 @@ from gsim3d.train.restore import build_simulator  # noqa: E402
 HORIZONS = (12, 48)  # steps that gradients are taken through
 SMALL_STEPS = (60, 20)  # of training `small`: from a history of 2 to the next step, and to the third
 EVERY = 32  # one of so many kept pixels becomes a particle
-PAGE, PICTURE = ROOT / "docs" / "rollouts.md", ROOT / "docs" / "rollouts.png"
+PAGE, PICTURE = (ROOT / "docs" / "results" / f"long_rollouts.{kind}" for kind in ("md", "png"))
 TEXT = """# Long rollouts
 
 Written by `python tools/rollouts.py --demo runs/demo` after `gsim3d demo --train --out runs/demo`; do not edit.
@@ -47,7 +47,7 @@ when the last moving one has left, the energy is 0. These models hold opacities,
 Metres, metres a step; from the first step to the last where there are two. `tests/stability/test_long_rollouts.py`
 and case D42 of [stability.md](stability.md) assert that speed, energy, extent and opacity stay bounded.
 
-![Energy and opacity over a rollout](rollouts.png)
+![Energy and opacity over a rollout](long_rollouts.png)
 
 | model | steps | top speed | its limit | kinetic energy | opacity mass drifts by | extent | awake | moves until |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- |

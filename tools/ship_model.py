@@ -1,13 +1,13 @@
 #!/usr/bin/env python
-"""Puts a trained simulator into the package, with its model card, and writes the page of all of them.
+"""Puts a trained simulator into the package, with its model card.
 
     python tools/release/train.py elastic --minutes 22 --state runs/elastic --out runs/elastic
     python tools/score_shipped.py elastic-small --checkpoint runs/elastic/elastic-pure.weights.safetensors \
         --data runs/held_out --out runs/scores
-    python tools/ship_model.py elastic-small --state runs/elastic --scores runs/scores --wrong runs/wrong.md
-    python tools/ship_model.py                        # writes docs/trained.md and its pictures anew
+    python tools/ship_model.py elastic-small --state runs/elastic --scores runs/scores --limitations runs/limitations.md
+    python tools/ship_model.py            # updates the invariances in all cards, and the curves in docs/results/models
 
-WRONG says what is wrong with the model's films, in one's own words, for the card; once shipped it is kept.
+LIMITATIONS is a list of 3 to 5 points, seen in the predicted videos; later calls keep the list of the card.
 """
 
 import argparse
@@ -22,17 +22,17 @@ import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
+import gsim3d  # noqa: E402
 from gsim3d import pretrained  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402
 from gsim3d.evaluate.pictures import write_curves  # noqa: E402
-from gsim3d.evaluate.report import markdown  # noqa: E402
 from gsim3d.profile.autotune import SPEEDS  # noqa: E402
 from gsim3d.synth.worlds import VALIDATION_SEED  # noqa: E402
 from gsim3d.train import checkpoint  # noqa: E402
 from tools.release.recipes import Recipe, recipe  # noqa: E402
 from tools.release.state import CURVE, load_progress, weights_file  # noqa: E402
 
-PAGE = ROOT / "docs" / "trained.md"
+PICTURES = ROOT / "docs" / "results" / "models"
 LOGGED = 400  # lines that are kept of a log
 CURVES = ("psnr_masked", "psnr", "ssim")
 SETS = {
@@ -42,25 +42,11 @@ SETS = {
     "no-ground": "no ground",
     "raised": "raised ground",
 }
-LAWS_HEAD = "## Laws that it breaks\n\n"
-WRONG_HEAD = "## What is wrong with it\n\n"
-INTRO = """# Trained simulators
-
-Written by `python tools/ship_model.py`; do not edit. Their names stand wherever a CHECKPOINT is expected:
-
-```bash
-gsim3d generate elastic --preset diverse --trajectories 7 --out runs/films
-gsim3d simulate elastic-small runs/films/ball/0000 --out runs/ball
-gsim3d evaluate elastic-small runs/films --scenes all
-```
-
-Scores are of trajectories that no training saw, from four cameras, {history} steps given, all later ones predicted, as
-[evaluation.md](evaluation.md) defines them; `tools/score_shipped.py` measures them. How they were trained:
-[training.md](training.md#the-simulators-that-come-with-gsim3d).
-"""
+INVARIANCES, LIMITATIONS = "### Invariances that it violates\n\n", "## Limitations\n\n"
+LICENCE = "\n\n## Licence and version\n"
 
 
-def ship(name: str, made: Recipe, state: Path, scores: Path, wrong: str) -> Path:
+def ship(name: str, made: Recipe, state: Path, scores: Path, limitations: str) -> Path:
     """Makes the folder of the simulator in the package, from the state of a run of the recipe ``made``."""
     progress = load_progress(state, made.name)
     measured = json.loads((scores / f"{name}.scores.json").read_text())
@@ -91,9 +77,9 @@ def ship(name: str, made: Recipe, state: Path, scores: Path, wrong: str) -> Path
         "held_out_seed": VALIDATION_SEED,
     }
     (folder / "recipe.json").write_text(json.dumps(described, indent=1) + "\n")
-    (folder / "README.md").write_text(card(name, described, measured, saved.config, wrong))
+    (folder / "README.md").write_text(card(name, described, measured, saved.config, limitations))
     if (picture := scores / f"{name}.frames.png").is_file():
-        shutil.copyfile(picture, PAGE.parent / f"trained-{name}-frames.png")
+        shutil.copyfile(picture, PICTURES / f"{name}-frames.png")
     return folder
 
 
@@ -103,39 +89,57 @@ def logged(row: list[float]) -> dict:
     return {**known, "step": int(known["step"]), "machine": {"seconds": known.pop("seconds")}}
 
 
-def card(name: str, recipe: dict, scores: dict, config: dict, wrong: str) -> str:
+def card(name: str, recipe: dict, scores: dict, config: dict, limitations: str) -> str:
     """The model card."""
     data, devices = config["data"], sorted({run["device"] for run in recipe["runs"]})
     used = sum(run["trajectories"] for run in recipe["runs"])
     changes = [json.dumps(options) for run in recipe["runs"] for options in run.get("in_turn", ()) if options]
-    changed = f" (some with {', '.join(dict.fromkeys(changes))})" if changes else ""
+    changed = f", some with {', '.join(dict.fromkeys(changes))}" if changes else ""
     world, begun = recipe["world"], recipe["runs"][0].get("began_with")
-    n_runs = len(recipe["runs"])
-    before = f"; begun with the weights of `{begun['name']}` at step {begun['step']:,}" if begun else ""
-    put = "".join(f"; then without training: {run['then']}" for run in recipe["runs"] if "then" in run)
+    n_runs, n_scored = len(recipe["runs"]), sum(scores[s]["n_scenes"] for s in SETS if s in scores)
+    before = f"\n- Initial weights: `{begun['name']}` at step {begun['step']:,}." if begun else ""
+    put = "".join(f"\n- Changed after training: {run['then']}." for run in recipe["runs"] if "then" in run)
     return f"""# {name}
 
-A gsim3d simulator of the world `{world["world"]}`: `gsim3d simulate {name} SCENE --out DIR`. Apache-2.0.
+Predicts videos of the generated world `{world["world"]}`.
 
-- **Sees** {data["history"]} steps from {data["context_views"]} calibrated cameras at {world["image_size"]} pixels with
-  masks, {world["fps"]:g} steps a second; predicts particles, drawn as 3D Gaussians from any view.
-- **Trained on** {used:,} trajectories of {world["n_frames"]} steps and {world["n_cams"]} cameras, made by
-  `gsim3d generate {world["world"]} --preset {world["preset"]} --seed {world["seed"]}`{changed}, never the same twice;
-  from images alone.
-- **Budget** {recipe["steps"]:,} optimizer steps in {recipe["training_seconds"]:,.0f} s of training,
-  {n_runs} run{"s" if n_runs > 1 else ""}, on {" and ".join(devices)}; {recipe["skipped_steps"]} steps were
-  skipped{before}{put}.
-- **Weights** averaged, bfloat16. `config.yaml` has all settings, `training.jsonl` a part of the log, `recipe.json` the
-  data.
+## Intended use
 
-## Scores
+Research on learned simulation, and a start for training on similar scenes. Not for safety-critical predictions.
+
+## Inputs and outputs
+
+- Input: {data["history"]} steps from {data["context_views"]} calibrated cameras at {world["image_size"]} pixels,
+  with masks, {world["fps"]:g} frames a second.
+- Output: particles of every later step, rendered as 3D Gaussians from any camera.
+
+## How to load
+
+```python
+from gsim3d import Simulator
+
+simulator = Simulator.from_pretrained("{name}")
+```
+
+## Training data and compute
+
+- Data: {used:,} trajectories of {world["n_frames"]} steps and {world["n_cams"]} cameras, each used once, from
+  `gsim3d generate {world["world"]} --preset {world["preset"]} --seed {world["seed"]}`{changed}.
+  Supervision: images alone.
+- Compute: {recipe["steps"]:,} optimizer steps in {recipe["training_seconds"]:,.0f} s,
+  {n_runs} run{"s" if n_runs > 1 else ""}, {" and ".join(devices)}; {recipe["skipped_steps"]} steps
+  skipped.{before}{put}
+- Weights: averaged, bfloat16. Settings: `config.yaml`; log: `training.jsonl`; data: `recipe.json`.
+
+## Evaluation
 
 {score_table(scores)}
 
-PSNR in dB, masked: without background. {sum(scores[s]["n_scenes"] for s in SETS if s in scores)} trajectories with seed
-{recipe["held_out_seed"]}; all numbers: `scores.json`.
+PSNR in dB; masked: without background. {n_scored} held-out trajectories, seed {recipe["held_out_seed"]}. All numbers:
+`scores.json`.
 
-{WRONG_HEAD}{wrong.strip()}
+{LIMITATIONS}{limitations.strip()}{LICENCE}
+Apache-2.0. gsim3d {gsim3d.__version__}, sha256 of the weights {scores["checkpoint"][:16]}.
 """
 
 
@@ -154,60 +158,49 @@ def score_table(scores: dict) -> str:
     return "\n".join(lines)
 
 
-def with_laws(card: str, name: str) -> str:
-    """The model card with a table of laws.json, where the model breaks laws."""
-    head, wrong = card.split(WRONG_HEAD)
-    head = head.split(LAWS_HEAD)[0].rstrip()
-    laws = pretrained.broken_laws(pretrained.FOLDER / name / pretrained.WEIGHTS)
-    if not laws:
-        return f"{head}\n\n{WRONG_HEAD}{wrong}"
+def with_invariances(card: str, name: str) -> str:
+    """The model card with a table of laws.json, where the model violates invariances."""
+    head, rest = card.split(LIMITATIONS)
+    head = head.split(INVARIANCES)[0].rstrip()
+    broken = pretrained.broken_laws(pretrained.FOLDER / name / pretrained.WEIGHTS)
+    if not broken:
+        return f"{head}\n\n{LIMITATIONS}{rest}"
     rows = "\n".join(
         f"| {law} | {found['what']} | {found['error']:.3g} | {found['bound'] or 'equal bits'} |"
-        for law, found in laws.items()
+        for law, found in broken.items()
     )
-    command = f"gsim3d doctor --stability {name} DATA"
-    said = f"Largest errors that `{command}`, sampled and with `--full`, found on two scenes:"
-    table = f"| law | number | error | allowed |\n| --- | --- | ---: | ---: |\n{rows}"
-    return f"{head}\n\n{LAWS_HEAD}{said}\n\n{table}\n\n{WRONG_HEAD}{wrong}"
+    said = f"Largest errors of `gsim3d doctor --stability {name} DATA`, sampled and with `--full`, on two scenes:"
+    table = f"| invariance | quantity | error | allowed |\n| --- | --- | ---: | ---: |\n{rows}"
+    return f"{head}\n\n{INVARIANCES}{said}\n\n{table}\n\n{LIMITATIONS}{rest}"
 
 
-def write_page() -> None:
-    """docs/trained.md of all simulators in the package, and their curves."""
-    history = {checkpoint.load(name).config["data"]["history"] for name in pretrained.names()}
-    parts = [INTRO.format(history=" or ".join(map(str, sorted(history))))]
+def update_cards() -> None:
+    """Writes the invariances into all cards, and the curves of the scores into the documentation."""
     for name in pretrained.names():
         folder = pretrained.FOLDER / name
         scores, recipe = (json.loads((folder / f"{part}.json").read_text()) for part in ("scores", "recipe"))
-        curves = PAGE.parent / f"trained-{name}.png"
-        write_curves(curves, scores["held_out"], recipe["world"]["fps"], CURVES)
-        text = with_laws((folder / "README.md").read_text(), name)
-        (folder / "README.md").write_text(text)
-        _, body = text.split("\n", 1)
-        parts.append(f"## {name}\n{body.replace(chr(10) + '## ', chr(10) + '### ')}")
-        parts.append(f"![Scores by step]({curves.name})\n")
-        if (picture := PAGE.parent / f"trained-{name}-frames.png").is_file():
-            sets = ", ".join(what for subset, what in SETS.items() if subset in scores)
-            parts.append(f"![Truth above prediction]({picture.name})\n\nTruth above prediction, from top: {sets}.\n")
-        parts.append("All methods over the full horizon:\n\n" + markdown(scores["held_out"], recipe["world"]["world"]))
-    PAGE.write_text("\n".join(parts))
+        write_curves(PICTURES / f"{name}.png", scores["held_out"], recipe["world"]["fps"], CURVES)
+        readme = folder / "README.md"
+        readme.write_text(with_invariances(readme.read_text(), name))
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("name", nargs="?", help="such as elastic-small (left out: only the page is written)")
+    parser.add_argument("name", nargs="?", help="such as elastic-small (left out: only the cards are updated)")
     parser.add_argument("--arm", default="pure", help="of the recipe (default: pure)")
     parser.add_argument("--state", type=Path, help="what tools/release/train.py wrote")
     parser.add_argument("--scores", type=Path, help="what score_shipped wrote")
-    parser.add_argument("--wrong", type=Path, help="text of what is wrong (default: that of the card that is there)")
+    parser.add_argument("--limitations", type=Path, help="markdown list (default: that of the present card)")
     args = parser.parse_args(arguments)
     if args.name:
         known = pretrained.FOLDER / args.name / "README.md"
-        if args.wrong is None and not known.is_file():
-            raise InputError("--wrong is needed: look at the films, and say what is wrong")
-        wrong = args.wrong.read_text() if args.wrong else known.read_text().split(WRONG_HEAD)[1]
-        print(f"written: {ship(args.name, recipe(args.name.split('-')[0], args.arm), args.state, args.scores, wrong)}")
-    write_page()
-    print(f"written: {PAGE}")
+        if args.limitations is None and not known.is_file():
+            raise InputError("--limitations is needed: a list of what is wrong in the predicted videos")
+        text = known.read_text().split(LIMITATIONS)[1].split(LICENCE)[0] if known.is_file() else ""
+        limitations = args.limitations.read_text() if args.limitations else text
+        made = recipe(args.name.split("-")[0], args.arm)
+        print(f"written: {ship(args.name, made, args.state, args.scores, limitations)}")
+    update_cards()
 
 
 if __name__ == "__main__":

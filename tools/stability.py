@@ -1,12 +1,13 @@
 #!/usr/bin/env python
-"""Runs the hard cases and writes docs/stability.md (and docs/stability.json, the numbers behind it).
+"""Runs the hard cases and writes their numbers to docs/results/stability.json.
 
 python tools/stability.py                   run all cases here: CPU, and CUDA where there is a GPU
 python tools/stability.py --add FILE        add what another machine measured: stability.json of tools/gpu_check.sh, or
                                             GSIM3D_STABILITY_JSON=FILE pytest tests/stability
-python tools/stability.py --costs FILE      add what guards cost: docs/benchmarks.json, or on a GPU
+python tools/stability.py --costs FILE      add what guards cost: docs/results/benchmarks.json, or on a GPU
                                             tools/bench/results/stability.jsonl of tools/bench/stability.py
-python tools/stability.py --page            only write the page again
+
+The tables of these numbers are made when the documentation is built (docs/generate.py).
 """
 
 import argparse
@@ -23,45 +24,8 @@ from tests.stability.cases import CASES, GROUPS  # noqa: E402
 from tests.stability.constants import CONSTANTS  # noqa: E402
 from tests.stability.setting import NAMES  # noqa: E402
 
-NUMBERS, PAGE = ROOT / "docs" / "stability.json", ROOT / "docs" / "stability.md"
-COSTS = ROOT / "docs" / "stability_costs.json"
+NUMBERS, COSTS = (ROOT / "docs" / "results" / f"{name}.json" for name in ("stability", "stability_costs"))
 GUARDS = ("guards", "guards_core")  # of tests/mutants
-INTRODUCTION = """# Stability
-
-Written by `python tools/stability.py` from the tests in `tests/stability`; do not edit.
-
-**For every input, every op and the whole simulator either return finite outputs and finite gradients, or raise a typed
-`gsim3d.NumericalError` that names scene, step, particle or camera and tensor, and says what to do. Never a silent NaN,
-never an abort of the process, never a changed result for another member of the batch.**
-
-What happens to a number that cannot be used is a policy, of a model or of a call: `on_invalid="raise"` (default),
-`"drop"` or `"clamp"`; a `StabilityReport` counts what, where and how many. `gsim3d/numerics/policy.py` has the rules.
-
-Every case below is a test that is named after it (`test_r01_...`), forward and backward. Most of them run beside an
-ordinary scene in the same call, which must not notice: its rows have equal bits in float32 on the CPU, and everywhere
-as long as the sizes of the call are the same. (In float64 and on a GPU, BLAS and cuDNN round by the number of rows or
-images: rows in calls of different sizes are equal to rounding. That of TF32 is large, and torch lets convolutions use
-it unless told otherwise; the encoder and training do only where matrix products may, too.)
-
-Every policy is run over hostile frames, cameras, origins and particles, forward and backward
-(`tests/stability/test_every_policy.py`). Where rows were dropped or clamped, a backward pass on the CPU raises
-`NumericalError` where a gradient behind them is not finite. On a GPU gradients are not looked at, as that would
-wait for it: the encoder refuses the frames that make such gradients there, too, and training skips steps that are not
-finite.
-
-Index lists that the CPU refuses are not looked at on a GPU, which would have to be waited for: entries out of range
-take no part, nothing else is read or written, and rows that no entry names are 0.
-
-The measured cells hold the largest error, relative to the largest expected value, against a float64 reference that
-knows nothing of gsim3d, or against the same computation in float64 on the CPU; in brackets the bound that the test
-sets. tf32: float32 with TF32 products allowed; bf16: under `torch.autocast`; the rasterizer, the geometry and the plane
-sweep compute in float32 under both. "held": what is expected holds bit by bit, or as an error that is raised; there is
-no number to compare.
-
-What the published release does was seen on the CPU or read in its code; of other packages, public issues
-(`name#number`), pull requests and commits are quoted.
-
-"""
 
 
 def cell(record: dict | None) -> str:
@@ -92,7 +56,8 @@ def measured(columns: dict, case: str) -> str:
 
 
 def page(columns: dict) -> str:
-    text = INTRODUCTION
+    """The tables of all cases, constants and guards, as markdown."""
+    text = ""
     for name in [*NAMES, "host"]:
         if name in columns:
             column, what = columns[name], "files and their readers" if name == "host" else name
@@ -113,7 +78,7 @@ rasterizer are float32 or wider in every setting; sums are added in float32 or w
 | --- | --- | --- | --- |
 """
     for c in CONSTANTS:
-        text += f"| `{c.name}` ([{Path(c.file).name}](../{c.file})) | `{c.value}` | {c.unit} | {c.consequence} |\n"
+        text += f"| `{c.name}` (`{c.file}`) | `{c.value}` | {c.unit} | {c.consequence} |\n"
     text += """
 ## Guards
 
@@ -126,7 +91,7 @@ the test beside it must fail.
     for name in GUARDS:
         for mutant in json.loads((ROOT / "tests" / "mutants" / f"{name}.json").read_text()):
             file, test = mutant["file"], mutant["test"].split("::")[1]
-            text += f"| {mutant['guard']} | [{Path(file).name}](../{file}) | `{test}` |\n"
+            text += f"| {mutant['guard']} | `{file}` | `{test}` |\n"
     return text
 
 
@@ -191,16 +156,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--add", metavar="FILE", help="run nothing, add these results")
     parser.add_argument("--costs", metavar="FILE", type=Path, help="run nothing, add what guards cost")
-    parser.add_argument("--page", action="store_true", help="run nothing, write the page from the stored numbers")
     args = parser.parse_args()
     columns = json.loads(NUMBERS.read_text()) if NUMBERS.exists() else {}
     if args.costs:
         known = json.loads(COSTS.read_text()) if COSTS.exists() else []
         COSTS.write_text(json.dumps(with_costs(known, args.costs), indent=1) + "\n")
-    elif not args.page:
+    else:
         columns = add(columns, json.loads(Path(args.add).read_text()) if args.add else run())
         NUMBERS.write_text(json.dumps(columns, indent=1, sort_keys=True) + "\n")
-    PAGE.write_text(page(columns))
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ EXPLAINED = """\
 PSNR in dB, means over the seeds and their standard deviation; masked: without background; body: what may move;
 constant: the row's own last encoded particles held still; copy: the last given image. Seconds are those of an optimizer
 step, the median of the last stage, with other runs beside it where --together says so. The paper's numbers are PSNR of
-its own data and budget (docs/accuracy-time.md says where they contradict each other): compare differences, not
-values."""
+its own data and budget (docs/results/accuracy_vs_time.md says where they contradict each other): compare
+differences, not values."""
 
 
 def as_dict(study: Study, results: dict[str, list[dict]], command: str) -> dict:

@@ -16,7 +16,8 @@ Written to DIR: ablation.md and ablation.json (one table: PSNR beside baselines,
 a run folder ROW/seed_N for each training. Stopped and started again, it goes on where it was; rows that are done stay.
 --steps is what every run gets; --minutes stops this call, and the next one goes on.
 More rows or seeds may be asked for later; the table has those of the last call. Differences are against its first row;
-with --seeds, those that are not larger than what the seed alone does are a tie. How to read it: docs/accuracy-time.md.
+with --seeds, those that are not larger than what the seed alone does are a tie. How to read it:
+docs/results/accuracy_vs_time.md.
 
 examples:
   gsim3d ablate --list
@@ -29,7 +30,9 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Trains and scores the paper's ablations at a budget of your choice; one table out."
     parser.epilog = EPILOG
-    parser.add_argument("data", metavar="DATA", nargs="?", help="folder with scenes of any layout (docs/data.md)")
+    parser.add_argument(
+        "data", metavar="DATA", nargs="?", help="folder with scenes of any layout (docs/reference/data.md)"
+    )
     parser.add_argument("--rows", metavar="ROW,...", help="rows to train (default: latent,explicit,no-tem)")
     parser.add_argument("--out", metavar="DIR", help="folder for the runs and the table; made if absent")
     parser.add_argument("--config", metavar="CONFIG", help="YAML file of the base run (default: one of --preset)")

@@ -8,7 +8,7 @@ EPILOG = """\
 Every file of every scene is read: descriptions, cameras, all images and masks. Each problem is one line that names
 file, camera and frame. Exit code: 0 nothing is wrong, 1 there are problems, 2 the check could not run.
 
-Layouts that load (docs/data.md has every key):
+Layouts that load (docs/reference/data.md has every key):
   genesis      metadata.json with n_steps, n_cams, file_path_template and cam_<j>: as `gsim3d generate` writes
   kubric       cam_<j>/metadata.json with rgba_<t>.png and segmentation_<t>.png: Kubric and MOVi
   transforms   transforms.json of nerfstudio, with a time for every frame

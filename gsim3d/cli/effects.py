@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Finds out which effects a scene needs, and writes them to effects.yaml."
     parser.epilog = EPILOG
     parser.add_argument("action", choices=("infer",), help="infer: switch effects off one by one and compare")
-    parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/data.md)")
+    parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/reference/data.md)")
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     parser.add_argument(
         "--tolerance", type=decibels, default="0.1dB", metavar="X", help="PSNR that may be lost (default: 0.1dB)"

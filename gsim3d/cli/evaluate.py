@@ -32,7 +32,7 @@ DIR/<scene folder as below DATA>/cam_<j>/<name>_<step>.png, or one video DIR/<sc
 the scene's images, and name DIR with --predictions. Without CHECKPOINT, --given says how many steps they were given.
 
 Written: FILE.json (all numbers), and beside it .csv (scene, method, step), .md (tables like the paper's) and .png
-(curves over time; needs matplotlib). docs/evaluation.md defines every number.
+(curves over time; needs matplotlib). docs/reference/evaluation.md defines every number.
 
 examples:
   gsim3d evaluate runs/model runs/data

@@ -7,7 +7,7 @@ import argparse
 from gsim3d.cli.arguments import number, whole
 
 EPILOG = """\
-FILE's suffix chooses the format (docs/formats.md has their bounds):
+FILE's suffix chooses the format (docs/reference/splat_formats.md has their bounds):
   .ply             3DGS layout, read by everything               .spz              Niantic, Babylon, Cesium
   .compressed.ply  PlayCanvas, SuperSplat                        .glb              glTF with KHR_gaussian_splatting
   .splat           web viewers; no view dependence               .usdc .usda       USD with time (gsim3d[usd])

@@ -10,8 +10,8 @@ EPILOG = """\
 Without --effects the spec is effects.yaml of the scene or of the data set around it, else that of the checkpoint,
 which is what gsim3d simulate computes without --effects. Without a checkpoint the model is the preset tiny.
 Multiply-adds are predicted from the sizes of layers and the scene's masks, for matrix products, attention and splats:
-they compare two plans of one model (docs/effects.md). If gsim3d profile has timed the checkpoint, milliseconds are
-predicted from its times.
+they compare two plans of one model (docs/reference/effects.md). If gsim3d profile has timed the checkpoint,
+milliseconds are predicted from its times.
 
 examples:
   gsim3d plan runs/data/ball/0000
@@ -23,7 +23,7 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Shows which effects are computed and what that costs."
     parser.epilog = EPILOG
-    parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/data.md)")
+    parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/reference/data.md)")
     parser.add_argument("checkpoint", metavar="CHECKPOINT", nargs="?", help=CHECKPOINT_HELP)
     add_fitting(parser)
     parser.add_argument("--effects", metavar="FILE", help="YAML file of what to compute (default: see below)")

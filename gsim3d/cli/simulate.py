@@ -19,7 +19,7 @@ examples:
   gsim3d simulate model.safetensors runs/data/ball/0000 --out runs/ball --steps 48 --cameras 2 7
   gsim3d simulate runs/model runs/data/ball/0000 --out runs/thrown --edit edits.yaml
 
-edits.yaml, a list (docs/effects.md has all operations):
+edits.yaml, a list (docs/reference/effects.md has all operations):
   - {step: 0, op: remove, of: frozen}                         no ground
   - {step: 8, op: throw, of: moving, velocity: [0, 0, 0.1]}   metres a step
 """
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Predicts the future of one scene and writes it as video and as 3D Gaussians."
     parser.epilog = EPILOG
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
-    parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/data.md)")
+    parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/reference/data.md)")
     parser.add_argument("--out", metavar="DIR", required=True, help="folder to write; must not exist yet")
     parser.add_argument("--steps", type=whole(1), help="steps to predict (default: to the end of the film)")
     parser.add_argument("--start", type=whole(0), default=0, help="first input step (default: 0)")

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Learns a simulator from multi-view video; writes checkpoints and a log into a run folder."
     parser.epilog = EPILOG
     parser.add_argument("config", metavar="CONFIG", nargs="?", help="YAML file with the run's settings")
-    parser.add_argument("--data", metavar="DIR", help="folder with scenes of any layout (docs/data.md)")
+    parser.add_argument("--data", metavar="DIR", help="folder with scenes of any layout (docs/reference/data.md)")
     parser.add_argument(
         "--cache", metavar="DIR", help="keep decoded images in files here, for sets larger than the memory"
     )

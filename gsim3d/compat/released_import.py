@@ -38,7 +38,7 @@ class UntrainedSigns:
         return (
             f"{self.blocks} of {self.n_blocks} attention and MLP blocks look as they were drawn at random, never "
             f"trained; {heads[self.latent_heads]} (the published training could lose these gradients: see "
-            "docs/migration.md)"
+            "docs/compat/migration.md)"
         )
 
 

@@ -21,7 +21,7 @@ def layout_of(folder: str | Path) -> ModuleType:
     """The layout of a scene folder. Raises InputError where it has none."""
     found = _find(Path(folder))
     if found is None:
-        raise InputError(f"{folder} is not a scene folder: it has no {_files()} (see docs/data.md)")
+        raise InputError(f"{folder} is not a scene folder: it has no {_files()} (see docs/reference/data.md)")
     return found
 
 

@@ -2,7 +2,7 @@
 
 A folder holds model.safetensors (bfloat16 weights with their configuration), config.yaml, training.jsonl (the log),
 recipe.json (what it was trained on, and for how long), scores.json, README.md, the model card, and laws.json where
-the model breaks laws of docs/stability.md: the worst number of each, as the card has it.
+the model breaks laws of docs/results/stability.md: the worst number of each, as the card has it.
 """
 
 from __future__ import annotations

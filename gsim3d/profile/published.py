@@ -101,7 +101,7 @@ PUBLISHED = (
     ),
 )
 
-# What contradicts itself in print; docs/accuracy-time.md has what differs from the released code as well.
+# What contradicts itself in print; docs/results/accuracy_vs_time.md has what differs from the released code as well.
 INCONSISTENT = (
     "3 of 6 views: 33.15 in the text, 31.60 in the table",
     "modality 4-4-1-3: 32.27 in the text, 31.98 in the table",

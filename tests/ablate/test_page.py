@@ -1,11 +1,11 @@
-"""docs/accuracy-time.md has every knob and every row as they are declared."""
+"""docs/results/accuracy_vs_time.md has every knob and every row as they are declared."""
 
 from pathlib import Path
 
 from gsim3d.ablate.rows import ROWS
 from gsim3d.profile.settings import KNOBS
 
-PAGE = Path(__file__).parents[2] / "docs" / "accuracy-time.md"
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "accuracy_vs_time.md"
 
 
 def table(*rows: tuple[str, ...]) -> str:

@@ -5,7 +5,6 @@ import dataclasses
 import importlib.util
 import json
 import re
-import shutil
 from html import escape
 from pathlib import Path
 
@@ -242,27 +241,15 @@ def test_wrong_arguments_are_one_line(capsys, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_report_goes_into_the_documentation(written, tmp_path, monkeypatch):
+def test_a_report_goes_into_the_documentation(written, tmp_path):
     spec = importlib.util.spec_from_file_location("ship_report", ROOT / "tools" / "ship_report.py")
     tool = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tool)
-    monkeypatch.setattr(tool, "DOCS", tmp_path)
-    page = tool.write_page("ball-small", {"cpu": written[0]}, tmp_path).read_text()
-    for picture in re.findall(r"\]\((\S+\.png)\)", page):
-        assert (tmp_path / picture).is_file()
-    assert page.count(".png)") == len(tool.PICTURES)
-    assert "gsim3d profile <x>" in page and "failed: out of memory at step 3" in page and "holds: a" in page
-    assert "| 1 | history 1 | model |" in page
-    both = tool.write_page("ball-small", {"h200": written[0]}, tmp_path).read_text()
-    assert both.count("\n## ") == 2 and tool.OTHER_WEIGHTS not in both and page.split("\n## ")[1] in both
-    other = tmp_path / "other"
-    shutil.copytree(written[0], other)
-    content = json.loads((other / "report.json").read_text())
-    content["subject"]["checkpoint"] = "another"
-    (other / "report.json").write_text(json.dumps(content))
-    for _ in range(2):  # marked once
-        first, *parts = tool.write_page("ball-small", {"cpu": other}, tmp_path).read_text().split("\n## ")
-        assert [part.count(tool.OTHER_WEIGHTS) for part in parts] == [0, 1] and "another" in parts[0]
+    kept = json.loads(tool.keep_report("ball-small", "cpu", written[0], tmp_path).read_text())
+    assert all((tmp_path / f"ball-small-cpu-{picture}").is_file() for picture in tool.PICTURES)
+    assert kept["command"].startswith("gsim3d profile") and any(check.startswith("holds") for check in kept["checks"])
+    assert {len(row) for row in kept["rows"]} == {10} and kept["rows"][1][:3] == ["1", "history 1", "model"]
+    assert "failed: out of memory at step 3" in {row[3] for row in kept["rows"]}
     reports = {name: tmp_path / name for name in ("cpu", "h200")}
     for (name, folder), device in zip(reports.items(), ("cpu", "cuda"), strict=True):
         folder.mkdir()

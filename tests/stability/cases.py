@@ -1,4 +1,4 @@
-"""The hard cases by number: what is expected of each, and what others do with it. docs/stability.md shows them."""
+"""The hard cases by number: what is expected of each, and what others do with it. the documentation shows them."""
 
 from dataclasses import dataclass
 

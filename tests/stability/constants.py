@@ -1,4 +1,4 @@
-"""The constants that keep numbers bounded, in the order in which docs/stability.md shows them."""
+"""The constants that keep numbers bounded, in the order in which the documentation shows them."""
 
 from dataclasses import dataclass
 

@@ -66,7 +66,7 @@ class Setting:
 
 @dataclass
 class Measured:
-    """What one test saw; docs/stability.md shows it. Every method fails the test where the case is not met."""
+    """What one test saw; the documentation shows it. Every method fails the test where the case is not met."""
 
     outcomes: list[str] = field(default_factory=list)
     error: float | None = None

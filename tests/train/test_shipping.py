@@ -1,4 +1,4 @@
-"""From the state of a run to a simulator in the package: scores, card, page."""
+"""From the state of a run to a simulator in the package: scores and model card."""
 
 import importlib.util
 import json
@@ -67,7 +67,7 @@ def package(tmp_path, monkeypatch):
     monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "pretrained")
     pretrained.FOLDER.mkdir()
     module = tool("ship_model")
-    monkeypatch.setattr(module, "PAGE", tmp_path / "trained.md")
+    monkeypatch.setattr(module, "PICTURES", tmp_path)
     monkeypatch.setattr(module, "recipe", lambda *_: MADE)
     return module
 
@@ -99,12 +99,12 @@ def test_some_sets_are_measured_anew(scored, tmp_path):
         tool("score_shipped").score(weights, NAME, scored / "films", tmp_path, **given)
 
 
-def test_a_state_becomes_a_simulator_with_card_and_page(scored, package, tmp_path):
-    (tmp_path / "wrong.md").write_text("It floats.\n")
+def test_state_becomes_simulator_with_card(scored, package, tmp_path):
+    (tmp_path / "limitations.md").write_text("- It floats.\n")
     paths = ["--state", str(scored / "state"), "--scores", str(scored / "scores")]
-    with pytest.raises(InputError, match="--wrong is needed"):
+    with pytest.raises(InputError, match="--limitations is needed"):
         package.main([NAME, *paths])
-    package.main([NAME, *paths, "--wrong", str(tmp_path / "wrong.md")])
+    package.main([NAME, *paths, "--limitations", str(tmp_path / "limitations.md")])
     folder = pretrained.FOLDER / NAME
     names = {path.name for path in folder.iterdir()}
     assert names == {"model.safetensors", "config.yaml", "training.jsonl", "recipe.json", "scores.json", "README.md"}
@@ -113,12 +113,12 @@ def test_a_state_becomes_a_simulator_with_card_and_page(scored, package, tmp_pat
     assert [(step["step"], step["past_psnr"], step["machine"]) for step in steps] == [
         (0, 20.0, {"seconds": 0.5}), (1, 20.0, {"seconds": 0.5})
     ]  # fmt: skip
-    text, page = (folder / "README.md").read_text(), (tmp_path / "trained.md").read_text()
+    text = (folder / "README.md").read_text()
     scores = json.loads((folder / "scores.json").read_text())
-    assert text.endswith("## What is wrong with it\n\nIt floats.\n") and "--seed 4321" in text
-    assert f"{scores['unseen']['future.psnr_masked']:.2f}" in text and "It floats." in page
-    assert (tmp_path / f"trained-{NAME}.png").is_file() and "Truth above prediction" in page
-    package.main([NAME, *paths])  # keeps what was said to be wrong
+    assert "## Limitations\n\n- It floats.\n\n## Licence" in text and "--seed 4321" in text
+    assert f"{scores['unseen']['future.psnr_masked']:.2f}" in text
+    assert (tmp_path / f"{NAME}.png").is_file() and (tmp_path / f"{NAME}-frames.png").is_file()
+    package.main([NAME, *paths])  # keeps the limitations
     assert (folder / "README.md").read_text() == text
 
 

@@ -1,11 +1,11 @@
 #!/usr/bin/env python
-"""Runs the benchmark of every op on the CPU and writes docs/benchmarks.md (and docs/benchmarks.json, its numbers).
+"""Runs the benchmark of every op on the CPU and writes its numbers to docs/results/benchmarks.json.
 
     python tools/bench/report.py                  all ops
     python tools/bench/report.py raster pool      run these again, keep the other numbers
-    python tools/bench/report.py --page           only write the page again, with what tools/gpu_check.sh bench measured
 
-It also puts what tools/bench/training.py measured on a GPU into docs/training.md. Let nothing else run meanwhile.
+Let nothing else run meanwhile. Tables of these numbers, and of what tools/gpu_check.sh bench and
+tools/bench/training.py measured on a GPU, are made when the documentation is built (docs/generate.py).
 """
 
 import argparse
@@ -28,24 +28,13 @@ ROOT = Path(__file__).resolve().parents[2]
 GUARDS, EFFECTS, SLEEPING = "stability", "effects", "sleeping"
 OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "decode", "background"]
 OPS.append(SLEEPING)
-NUMBERS, PAGE = ROOT / "docs" / "benchmarks.json", ROOT / "docs" / "benchmarks.md"
-EFFECTS_PAGE, MARKS = ROOT / "docs" / "effects.md", ("<!-- table -->\n", "<!-- end of table -->\n")
-REST_MARKS = "<!-- rest -->\n", "<!-- end of rest -->\n"
-STEPS, STEPS_PAGE = RESULTS / "training.json", ROOT / "docs" / "training.md"
-STEPS_MARKS = "<!-- steps: written by tools/bench/report.py -->\n", "<!-- end of steps -->"
-INTRODUCTION = """# Benchmarks
-
-Written by `python tools/bench/report.py`; do not edit. Every case first compares the results of both sides, then times
-them in turns in one process. [On a GPU](#on-a-gpu) against the fastest peer installed there, [on the CPU](#on-the-cpu)
-against plain torch.
-"""
+NUMBERS, STEPS = ROOT / "docs" / "results" / "benchmarks.json", RESULTS / "training.json"
 GPU = """
 ## On a GPU
 
 Medians of repeated calls between two events, as a program makes them: Python and launches included. "graph" is the same
 call replayed from a CUDA graph, "-" where it cannot be captured. "limit" is what the chip's rates allow by a count of
-bytes and operations; "wanted" is the ratio to the peer that we aim at. How each kernel got there:
-[performance log](performance-log.md).
+bytes and operations; "wanted" is the ratio to the peer that we aim at.
 """
 CPU = """
 ## On the CPU
@@ -58,7 +47,7 @@ float32. "torch" is the best form of the op in plain torch that we found (vector
 COSTS = """
 ### What guards cost
 
-A rollout and an image with the default policy for numbers that cannot be used ([stability](stability.md)) and without
+A rollout and an image with the default policy for invalid numbers ([stability](stability.md)) and without
 any guard: processor time on one thread, both sides in turns; the cost is the median over pairs, with its quartiles.
 """
 
@@ -84,7 +73,7 @@ def runs(rows: list[dict]):
 
 
 def gpu_tables() -> str:
-    ops = sorted(file.stem for file in RESULTS.glob("*.jsonl") if file.stem != EFFECTS)  # these are on their own page
+    ops = sorted(file.stem for file in RESULTS.glob("*.jsonl") if file.stem != EFFECTS)  # on a page of their own
     text = GPU + targets.table([row for op in ops for row in rows_of(op)]) if ops else ""
     for op in ops:
         rows = rows_of(op)
@@ -149,7 +138,8 @@ def run(op: str) -> dict:
 
 
 def page(records: dict[str, dict]) -> str:
-    text = INTRODUCTION + gpu_tables() + CPU
+    """The tables of all ops, as markdown."""
+    text = gpu_tables() + CPU
     for op in OPS:
         if op not in records:
             continue
@@ -191,13 +181,8 @@ def steps_table(rows: list[dict]) -> str:
     return text
 
 
-def with_steps(page: str, rows: list[dict]) -> str:
-    """``page`` with the table of ``rows`` between its marks."""
-    return between(page, STEPS_MARKS, steps_table(rows))
-
-
 def effects(r: dict) -> str:
-    """The tables of docs/effects.md."""
+    """The tables of what effects cost."""
     where = f"{r['machine']}, one thread, torch {r['torch']}, Python {r['python']}, commit {r['commit']}, {r['date']}."
     on_gpu = "".join(f"\n{where}.\n{cost_table(found)}" for where, found in runs(rows_of(EFFECTS)))
     return f"{where}\n{cost_table(r['results'])}{on_gpu}"
@@ -242,34 +227,14 @@ def rest(rows: list[dict]) -> str:
     return "".join(f"{where}.\n{resting(found)}" for where, found in runs(rows)) or "Not measured yet.\n"
 
 
-def between(page: str, marks: tuple[str, str], text: str) -> str:
-    """``page`` with ``text`` between its marks."""
-    begin, end = marks
-    before, _, after = page.partition(begin)
-    return before + begin + text + end + after.partition(end)[2]
-
-
-def effects_page(page: str, record: dict) -> str:
-    """``page`` with what effects cost and what rest saves."""
-    return between(between(page, MARKS, effects(record)), REST_MARKS, rest(rows_of(SLEEPING)))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("ops", nargs="*", choices=[[], *OPS, GUARDS, EFFECTS], help="default: all")
-    parser.add_argument("--page", action="store_true", help="run nothing, write the page from the stored numbers")
     args = parser.parse_args()
-    ops = [] if args.page else args.ops or [*OPS, GUARDS, EFFECTS]
     records = json.loads(NUMBERS.read_text()) if NUMBERS.exists() else {}
-    NUMBERS.parent.mkdir(exist_ok=True)
-    for op in ops:
+    for op in args.ops or [*OPS, GUARDS, EFFECTS]:
         records[op] = run(op)
         NUMBERS.write_text(json.dumps(records, indent=1) + "\n")
-    PAGE.write_text(page(records))
-    steps = json.loads(STEPS.read_text()) if STEPS.exists() else []
-    STEPS_PAGE.write_text(with_steps(STEPS_PAGE.read_text(), steps))
-    if EFFECTS in records:
-        EFFECTS_PAGE.write_text(effects_page(EFFECTS_PAGE.read_text(), records[EFFECTS]))
 
 
 if __name__ == "__main__":

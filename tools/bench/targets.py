@@ -36,8 +36,7 @@ INTRODUCTION = """
 Times of an op from a CUDA graph, "called" with Python and launches, which the ratio to the fastest peer of the run
 includes; the dynamics from a graph against the authors' release, recorded once with launches; the training step as
 `captured: true` runs it, against the time that the paper gives (launched kernel by kernel, with the release's batch
-norms, it waits for the host: [training](training.md#memory)). A row is held where each of its times is. Why the others
-are not: [performance log](performance-log.md).
+norms, it waits for the host). A row is held where each of its times is.
 """
 
 
