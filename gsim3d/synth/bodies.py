@@ -1,4 +1,4 @@
-"""Bodies by name: procedural shapes, meshes that come with the package, and those of an installed genesis-world."""
+"""Bodies by name: procedural shapes, meshes of the package, and meshes of an installed genesis-world."""
 
 from __future__ import annotations
 
@@ -60,16 +60,16 @@ def load_mesh(text: str, up: str = "y") -> shapes.Body:
 
 
 def mesh_bytes(text: str, up: str = "y") -> bytes:
-    """What decides the shape of :func:`load_mesh`: the content of its file."""
+    """The content of the file that :func:`load_mesh` reads."""
     file = _genesis_body(_genesis_folder(text), text, up)[0] if text.startswith(GENESIS) else Path(text)
     return file.read_bytes()
 
 
 def _genesis_folder(text: str) -> Path:
-    """The meshes of genesis-world, which is not imported.   Raises: InputError when it is not installed."""
+    """The meshes of genesis-world, which is not imported. Raises InputError when it is not installed."""
     spec = find_spec("genesis")
-    for place in (spec and spec.submodule_search_locations) or ():
-        if (folder := Path(place) / "assets" / "meshes").is_dir():
+    for root in (spec and spec.submodule_search_locations) or ():
+        if (folder := Path(root) / "assets" / "meshes").is_dir():
             return folder
     raise InputError(
         f"mesh {text} is a file of the package genesis-world, which is not installed: "
@@ -96,7 +96,7 @@ def _genesis_body(folder: Path, text: str, up: str) -> tuple[Path, shapes.Body]:
 
 
 def named_contact(name: str, friction: tuple[float, float], bounce: tuple[float, float]) -> tuple[float, float]:
-    """Friction and bounce of the body called ``name``: of CONTACTS, else what ``name`` gives in these ranges."""
+    """Friction and bounce of the body called ``name``: of CONTACTS, else drawn in these ranges, always the same."""
     if name in CONTACTS:
         return CONTACTS[name]
     rng = name_rng(name)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.errors import InputError
-from gsim3d.io.files import opencv_path
+from gsim3d.io.files import opencv_path, whole_file, write_whole
 from gsim3d.io.plain import parse_json
 from gsim3d.synth import writer
 from gsim3d.synth.render import BACKGROUND, BODY
@@ -37,7 +36,11 @@ METRICS = ("psnr_masked", "psnr_body")
 class StartErrors:
     """Lengths of the errors of each body at the last given step; directions are random.
 
-    velocity: metres a step.   place: metres.   angle: radians.   spin: share of the body's spin.
+    Attributes:
+        velocity: m/step.
+        place: metres; the name is part of stored results.
+        angle: radians.
+        spin: share of the body's spin.
     """
 
     velocity: float
@@ -69,11 +72,13 @@ def bound(
         out: folder for bound.json and the squared errors of each scene, which are not computed again; None: nothing
             is written.
 
-    Returns what bound.json holds. Of "one" (one simulation) and "mean" (the mean image of four), with "_given" where
-        the model's error is added: metric -> [mean over scenes of the mean over steps and cameras, its standard
-        error]; "objects": the same by object; "scenes": the values of each scene.
+    Returns:
+        What bound.json holds. Of "one" (one simulation) and "mean" (the mean image of four), with "_given" where the
+        model's error is added: metric -> [mean over scenes of the mean over steps and cameras, its standard error];
+        "objects": the same by object; "scenes": the values of each scene.
 
-    Raises: InputError for sets of another origin or version, and missing packages.
+    Raises:
+        InputError: sets of another origin or version, and missing packages.
     """
     folder, out = Path(folder), None if out is None else Path(out)
     check_processes(processes)
@@ -100,12 +105,12 @@ def bound(
         **_summary({scene: found[scene] for scene in chosen}, given or {}),
     }
     if out is not None:
-        writer.write_json(out / "bound.json", summary)
+        write_whole(out / "bound.json", json.dumps(summary, indent=1) + "\n")
     return summary
 
 
 def read_world(folder: Path) -> World:
-    """The settings of the set in ``folder``, from its manifest."""
+    """The settings of the set in ``folder``, from its manifest. Raises InputError where there is none that is read."""
     file = folder / "manifest.json"
     try:
         settings = parse_json(file.read_bytes())["settings"]
@@ -144,10 +149,8 @@ def _scene_errors(world: World, scene: tuple[str, int], folder: Path, out: Path 
     errors.append(_squared_error(total / SAMPLES, true, masks))
     errors = np.stack(errors).astype(np.float32)
     if file is not None:
-        unfinished = file.with_name(f".{file.name}.unfinished")
-        with unfinished.open("wb") as handle:
-            np.savez(handle, key=key, errors=errors)
-        os.replace(unfinished, file)
+        with whole_file(file) as part:
+            np.savez(part, key=key, errors=errors)
     return scene, errors
 
 
@@ -190,9 +193,9 @@ def _simulated(world: World, scene: tuple[str, int], attempt: int, sample: int) 
 
 
 def _with_errors(actor: Actor, errors: StartErrors, fps: float, rng: np.random.Generator) -> Actor:
-    """``actor`` as it starts when its errors at the last given step are as long as ``errors`` says.
+    """``actor`` at time 0, with errors whose lengths at the last given step are ``errors``.
 
-    Until then it flies: what it has come and turned too far by then, it starts behind.
+    Bodies are in free flight until then: the start makes up for what the errors of velocity and spin add by that step.
     """
     body, before = actor.body, GIVEN - 1
     velocity = errors.velocity * _direction(rng)

@@ -11,9 +11,12 @@ import numpy as np
 class Rig:
     """The cameras of a scene.
 
-    viewmats [V, 4, 4]: world-to-camera, OpenCV axes (x right, y down, z forward).
-    Ks [V, 3, 3]: pixels, pixel centres at +0.5.    size: image width and height in pixels.
-    near, far: metres, the depth range in which everything visible lies.
+    Attributes:
+        viewmats: [V, 4, 4] world-to-camera, OpenCV axes (x right, y down, z forward).
+        Ks: [V, 3, 3] pixels, pixel centres at +0.5.
+        size: width and height of the images, pixels.
+        near: metres, the smallest depth of what is visible.
+        far: metres, the largest.
     """
 
     viewmats: np.ndarray
@@ -44,7 +47,11 @@ def two_rings(n_cams, size, near, far, *, distance, target_height, elevations, f
     """``n_cams`` cameras on two rings, low and high in turn, all ``distance`` metres from the point they look at.
 
     Args:
-        elevations: (low, high) degrees above the horizon.   fov: vertical field of view, degrees.
+        n_cams, size, near, far: as of Rig.
+        distance: metres.
+        target_height: metres, of the point on the vertical axis that they look at.
+        elevations: (low, high) degrees above the horizon.
+        fov: vertical field of view, degrees.
         turned: radians, of both rings about the vertical.
     """
     target = np.array([0.0, 0.0, target_height])
@@ -68,7 +75,8 @@ def project(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[n
 def pixel_rays(rig: Rig, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Rays through ``samples`` x ``samples`` points of every pixel.
 
-    Returns: origins [V, 3] and unit directions [V, H, W, samples^2, 3] in the world.
+    Returns:
+        Origins [V, 3] and unit directions [V, H, W, samples^2, 3] in the world.
     """
     steps = (np.arange(samples) + 0.5) / samples
     grid = np.arange(rig.size)[:, None] + steps[None]

@@ -1,4 +1,4 @@
-"""What carries a surface through time: nodes that an engine moves, and points that are tied to them at rest."""
+"""Embeddings of surfaces: nodes that an engine moves, and points that are tied to them at frame 0."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ NEIGHBOURS = 12  # particles that carry a point; four that span space are enough
 class Binding:
     """Points as weighted sums of nodes.
 
-    corners: int64 [N, K], rows of the flattened nodes.
-    weights: [N, K]; each row adds up to 1, outside of what the nodes span some are negative.
+    Attributes:
+        corners: int64 [N, K], indices of the flattened nodes.
+        weights: [N, K], whose sums are 1; outside of what the nodes span some are negative.
     """
 
     corners: np.ndarray
     weights: np.ndarray
 
     def move(self, nodes: np.ndarray) -> np.ndarray:
-        """Where the points [N, 3] go when the nodes [..., 3] have moved."""
+        """The points [N, 3] of moved ``nodes`` [..., 3]."""
         nodes = nodes.reshape(-1, 3)
         points = np.zeros((len(self.corners), 3))
         for corner in range(self.corners.shape[1]):
@@ -31,11 +32,12 @@ class Binding:
 
 @dataclass(frozen=True)
 class ControlGrid:
-    """Control lattice of a soft body.
+    """Control grid of a soft body.
 
-    nodes [T, c+1, c+1, c+1, 3]: metres, world; frame 0 is an axis-aligned box of equal cells.
-    occupied bool [c, c, c]: cells that hold collision vertices and whose corners all move with the body; nodes of no
-        such cell drift freely or stay behind.
+    Attributes:
+        nodes: [T, c+1, c+1, c+1, 3] metres, world; frame 0 is an axis-aligned box of equal cells.
+        occupied: bool [c, c, c], cells that hold collision vertices and whose corners all move with the body; nodes of
+            other cells drift freely or stay behind.
     """
 
     nodes: np.ndarray
@@ -44,16 +46,16 @@ class ControlGrid:
     def bind(self, points: np.ndarray) -> Binding:
         """Ties ``points`` [N, 3] at frame 0 to the nearest occupied cell each.
 
-        Weights extrapolate where a point lies outside, so a rigid motion of the lattice moves every point rigidly.
+        Weights extrapolate where a point lies outside, so a rigid motion of the grid moves every point rigidly.
         """
         rest = self.nodes[0]
         n = rest.shape[0] - 1
         low, high = rest[0, 0, 0], rest[-1, -1, -1]
-        place = (points - low) / (high - low) * n
+        position = (points - low) / (high - low) * n
         cells = np.argwhere(self.occupied)
-        outside = np.maximum(np.abs(place[:, None] - (cells[None] + 0.5)) - 0.5, 0)
+        outside = np.maximum(np.abs(position[:, None] - (cells[None] + 0.5)) - 0.5, 0)
         cell = cells[(outside**2).sum(-1).argmin(1)]
-        part = place - cell
+        part = position - cell
         corners, weights = [], []
         for step in np.ndindex(2, 2, 2):
             corner = cell + np.array(step)
@@ -64,7 +66,11 @@ class ControlGrid:
 
 @dataclass(frozen=True)
 class RigidFrame:
-    """A rigid body: nodes [T, 4, 3], its origin and the tips of its three unit axes, metres, world."""
+    """Axes of a rigid body.
+
+    Attributes:
+        nodes: [T, 4, 3] metres, world: its origin and the tips of its three unit axes.
+    """
 
     nodes: np.ndarray
 
@@ -78,12 +84,16 @@ class RigidFrame:
 
 @dataclass(frozen=True)
 class ClothGrid:
-    """A cloth: nodes [T, n, n, 3] of a square grid, metres, world."""
+    """Grid of a cloth.
+
+    Attributes:
+        nodes: [T, n, n, 3] metres, world, of a square grid.
+    """
 
     nodes: np.ndarray
 
     def refine(self, times: int) -> Binding:
-        """``times`` x finer grid, smooth and through all nodes (Catmull-Rom along both axes), row by row."""
+        """A grid ``times`` x finer, smooth and through all nodes (Catmull-Rom along both axes), row by row."""
         n = self.nodes.shape[1]
         rows = _catmull_rom(n, times)
         m = len(rows)
@@ -94,13 +104,13 @@ class ClothGrid:
 
 def _catmull_rom(n: int, times: int) -> np.ndarray:
     """Weights [(n - 1) * times + 1, n] of a curve through n equal knots; past its ends it goes on straight."""
-    place = np.arange((n - 1) * times + 1) / times
-    first = np.minimum(place.astype(np.int64), n - 2)
-    t = place - first
+    position = np.arange((n - 1) * times + 1) / times
+    first = np.minimum(position.astype(np.int64), n - 2)
+    t = position - first
     basis = np.stack(
         [(-t + 2 * t**2 - t**3) / 2, (2 - 5 * t**2 + 3 * t**3) / 2, (t + 4 * t**2 - 3 * t**3) / 2, (t**3 - t**2) / 2], 1
     )
-    padded = np.zeros((len(place), n + 2))
+    padded = np.zeros((len(position), n + 2))
     np.put_along_axis(padded, first[:, None] + np.arange(4), basis, 1)
     weights = padded[:, 1:-1].copy()
     weights[:, :2] += padded[:, :1] * [2, -1]
@@ -117,7 +127,11 @@ def grid_faces(n: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ParticleCloud:
-    """Particles of a body: nodes [T, P, 3], metres, world."""
+    """Particles of a body.
+
+    Attributes:
+        nodes: [T, P, 3] metres, world.
+    """
 
     nodes: np.ndarray
 

@@ -1,6 +1,6 @@
 """Motion by Genesis, as the paper made its data: MPM for soft bodies, PBD for cloth; needs the package genesis-world.
 
-Bodies are clouds of particles that carry the surface. Bits repeat on one machine and device only as far as Genesis
+Surfaces are embedded in the particles of their bodies. Bits repeat on one machine and device only as far as Genesis
 repeats them, which its GPU atomics do not promise.
 """
 
@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.synth.embedding import ClothGrid, ParticleCloud, grid_faces
+from gsim3d.synth.meshes import enclosed_volume
 from gsim3d.synth.scene_setup import GRAVITY, Cloth, SceneSetup, SoftBody, Unstable
 
 TIMESTEP, SUBSTEPS = 1e-3, 20  # seconds, and parts of it: the paper's
@@ -23,11 +24,15 @@ FIX_DISTANCE = 1e-3  # metres between a corner of the cloth and its particle
 
 
 def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) -> list[ParticleCloud | ClothGrid]:
-    """What carries each body at every frame, and the cloth last; ``max_timestep`` is not used, the paper's is.
+    """The embedding of each body at every frame, and of the cloth last.
 
-    Bodies must be soft.
+    Args:
+        setup: with soft bodies only.
+        n_frames, fps: as they are kept.
+        max_timestep: not used; the paper's time step is.
 
-    Raises: Unstable when particles are not finite.
+    Raises:
+        Unstable: particles are not finite.
     """
     import genesis as gs
 
@@ -36,20 +41,20 @@ def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) 
     with tempfile.TemporaryDirectory() as folder:
         scene, bodies, cloth = _build(gs, setup, Path(folder))
     for entity, body in zip(bodies, setup.bodies):
-        places = _places(entity)
-        entity.set_velocity((body.velocity + np.cross(body.spin, places - places.mean(0))).astype(np.float32))
+        positions = _positions(entity)
+        entity.set_velocity((body.velocity + np.cross(body.spin, positions - positions.mean(0))).astype(np.float32))
     order = None if cloth is None else _pin(cloth, setup.cloth)
-    frames = [[_places(entity) for entity in bodies]]
-    sheets = [] if cloth is None else [_places(cloth)[order]]
+    frames = [[_positions(entity) for entity in bodies]]
+    sheets = [] if cloth is None else [_positions(cloth)[order]]
     n_steps = 0
     for frame in range(1, n_frames):
         wanted = round(frame / (fps * TIMESTEP))
         for _ in range(wanted - n_steps):
             scene.step()
         n_steps = wanted
-        frames.append([_places(entity) for entity in bodies])
+        frames.append([_positions(entity) for entity in bodies])
         if cloth is not None:
-            sheets.append(_places(cloth)[order])
+            sheets.append(_positions(cloth)[order])
     embeddings = [ParticleCloud(np.stack(nodes)) for nodes in zip(*frames)]
     if cloth is not None:
         embeddings.append(ClothGrid(np.stack(sheets).reshape(n_frames, setup.cloth.count, setup.cloth.count, 3)))
@@ -84,7 +89,7 @@ def _build(gs, setup: SceneSetup, folder: Path):
 
 def _add_soft(gs, scene, body: SoftBody, path: Path):
     _write_obj(path, body.vertices, body.faces)
-    material, volume = body.material, _volume(body.vertices, body.faces)
+    material, volume = body.material, abs(enclosed_volume(body.vertices, body.faces))
     common = {"E": material.young, "nu": POISSON, "rho": body.mass / volume, "sampler": "regular"}
     if material.yield_strain:
         shear = material.young / (2 * (1 + POISSON))
@@ -95,22 +100,17 @@ def _add_soft(gs, scene, body: SoftBody, path: Path):
 
 
 def _add_cloth(gs, scene, cloth: Cloth, path: Path):
-    _write_obj(path, _corners_of(cloth).reshape(-1, 3), grid_faces(cloth.count))
+    _write_obj(path, cloth.rest_nodes().reshape(-1, 3), grid_faces(cloth.count))
     return scene.add_entity(
         material=gs.materials.PBD.Cloth(rho=cloth.mass / cloth.width**2),
         morph=gs.morphs.Mesh(file=str(path), file_meshes_are_zup=True),
     )
 
 
-def _corners_of(cloth: Cloth) -> np.ndarray:
-    part = cloth.width * (np.arange(cloth.count) / (cloth.count - 1) - 0.5)
-    return np.stack(np.meshgrid(part, part, [cloth.height], indexing="ij"), -1)[:, :, 0]
-
-
 def _pin(entity, cloth: Cloth) -> np.ndarray:
     """Fixes the four corners; returns the particle of every node of the grid, row by row."""
-    nodes, places = _corners_of(cloth).reshape(-1, 3), _places(entity)
-    distance = np.linalg.norm(nodes[:, None] - places[None], axis=-1)
+    nodes, positions = cloth.rest_nodes().reshape(-1, 3), _positions(entity)
+    distance = np.linalg.norm(nodes[:, None] - positions[None], axis=-1)
     order = distance.argmin(1)
     if distance.min(1).max() > FIX_DISTANCE:
         raise RuntimeError("Genesis has made other particles of the cloth than the vertices of its mesh")
@@ -119,13 +119,8 @@ def _pin(entity, cloth: Cloth) -> np.ndarray:
     return order
 
 
-def _places(entity) -> np.ndarray:
+def _positions(entity) -> np.ndarray:
     return entity.get_particles_pos().cpu().numpy().astype(np.float64)
-
-
-def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return abs(float((a * np.cross(b, c)).sum())) / 6
 
 
 def _write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""The sets that models are scored on: trajectories with seeds of their own, which no training sees."""
+"""The sets that models are scored on: trajectories with seeds of their own, which training leaves out."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ SETS = {"validation": (VALIDATION_SEED, 24), "test": (TEST_SEED, 56)}
 
 @dataclass(frozen=True)
 class Origin:
-    """What `gsim3d generate` says of a scene. subset: of the held-out kinds of scenes; None: as in training."""
+    """How `gsim3d generate` made a scene.
+
+    Attributes:
+        world: elastic, rigid or cloth.
+        subset: of the held-out kinds of scenes; None: as in training.
+        seed: of the set.
+        body: name of its object.
+    """
 
     world: str
     subset: str | None
@@ -27,12 +34,12 @@ class Origin:
 
     @property
     def set_name(self) -> str | None:
-        """Of :data:`SETS`."""
+        """A key of :data:`SETS`, or None."""
         return next((name for name, (seed, _) in SETS.items() if seed == self.seed), None)
 
 
 def origin_of(folder: Path) -> Origin | None:
-    """Of the scene in ``folder``; None where `gsim3d generate` did not make it."""
+    """The origin of the scene in ``folder``; None where `gsim3d generate` did not make it."""
     try:
         metadata = read_json(folder / "metadata.json")
     except (InputError, OSError):

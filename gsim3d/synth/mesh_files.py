@@ -1,4 +1,7 @@
-"""Triangles of mesh files and their colours: every object, every material, or an error that says what is not read."""
+"""Triangles of mesh files and their colours: every object and material, or an error that names what is not read.
+
+Wavefront files are parsed here, because trimesh drops materials, colours and lines that it cannot use without an error.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +25,10 @@ SLOTS = 3  # numbers a corner that a piece's colour needs at most
 class Piece:
     """Triangles of one material.
 
-    triangles: [F, 3, 3] positions.
-    corners: [F, 3, C], what is interpolated over a face and given to ``paint``; None with ``paint`` None: no colour.
-    paint: [N, C] -> colours [N, 3] in [0, 1].
+    Attributes:
+        triangles: [F, 3, 3] positions.
+        corners: [F, 3, C], input of ``paint`` at the corners of a face; None: no colour.
+        paint: [N, C] -> colours [N, 3] in [0, 1]; None: no colour.
     """
 
     triangles: np.ndarray
@@ -63,7 +67,7 @@ def texture_lookup(image: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def joined_paint(pieces: list[Piece]) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """Corners [F, 3, C] and the paint of all pieces together: a first number says which piece it is."""
+    """Corners [F, 3, C] and paint of all pieces together; the first number of a corner is the index of its piece."""
     if len(pieces) == 1:
         return pieces[0].corners, pieces[0].paint
     widths = [piece.corners.shape[2] for piece in pieces]
@@ -150,21 +154,19 @@ def _read_obj(path: Path, data: bytes) -> list[Piece]:
 
 
 def _corner(word: str, n_vertices: int, n_uvs: int) -> tuple[int, int]:
-    """Rows of vertex and texture coordinate (-1: none) of "v/vt/vn"; negative numbers count back from the line."""
-    parts, rows = (word.split("/") + ["", ""])[:2], []
+    """Indices of vertex and texture coordinate (-1: none) of "v/vt/vn"; negative numbers count back from the line."""
+    parts, found = (word.split("/") + ["", ""])[:2], []
     for part, count in zip(parts, (n_vertices, n_uvs), strict=True):
-        place = int(part) if part or not rows else 0
-        row = place - 1 if place > 0 else count + place
-        if not part:
-            row = -1
-        elif not 0 <= row < count:
+        number = int(part) if part or not found else 0
+        index = number - 1 if number > 0 else count + number
+        if part and not 0 <= index < count:
             raise ValueError(f"{word}: there are {count} before it")
-        rows.append(row)
-    return rows[0], rows[1]
+        found.append(index if part else -1)
+    return found[0], found[1]
 
 
 def _materials(path: Path, libraries: list[str]) -> dict[str, np.ndarray | None]:
-    """Name -> texture uint8 [H, W, 3], colour [3], or None where the material says neither."""
+    """Name -> texture uint8 [H, W, 3], colour [3], or None for a material with neither."""
     found: dict[str, np.ndarray | None] = {}
     for library in libraries:
         names = [library] if (path.parent / library).is_file() else library.split()

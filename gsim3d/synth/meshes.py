@@ -37,14 +37,15 @@ def load_body(path: str | Path, up: str = "y", *, fill_holes: bool = False) -> B
     """A body from a mesh file (:data:`gsim3d.synth.mesh_files.SUFFIXES`): all its objects, with their textures and
     colours; a pattern where it has none.
 
+    Copies of a vertex along texture seams are merged by position; the surface must be closed then.
+
     Args:
         path: mesh file; material files and textures that it names must lie beside it.
         up: "y" (usual for .obj and .glb) or "z", the axis that points up in the file.
         fill_holes: close each border of the surface by a fan of triangles around its middle.
 
-    Copies of a vertex along texture seams are merged by position; the surface must be closed then.
-
-    Raises InputError when the file cannot be read, holds no closed surface or a face twice, or colours are lost.
+    Raises:
+        InputError: the file cannot be read, holds no closed surface or a face twice, or colours are lost.
     """
     path = Path(path)
     if not path.is_file():
@@ -82,7 +83,7 @@ def load_body(path: str | Path, up: str = "y", *, fill_holes: bool = False) -> B
 
 
 def _with_patterns(pieces: list[Piece], triangles: np.ndarray) -> list[Piece]:
-    """``pieces`` of which those without colours have a pattern of the places of ``triangles``."""
+    """``pieces``; those without colours get a pattern, which depends on the positions of ``triangles``."""
     colors, found, begin = PALETTE[[5, 8, 1]], [], 0
     for piece in pieces:
         end = begin + len(piece.triangles)
@@ -111,7 +112,7 @@ def _filled(positions: np.ndarray, faces: np.ndarray, corners: np.ndarray) -> tu
 
 
 def _components(n: int, cells: np.ndarray) -> np.ndarray:
-    """Of each of ``n`` vertices the lowest that ``cells`` [C, K], rows of vertices, connect with it."""
+    """int [n]: for each vertex the lowest one that it is connected with by ``cells`` [C, K], vertices each."""
     label, before = np.arange(n), None
     while before is None or (label != before).any():
         before = label.copy()
@@ -121,10 +122,9 @@ def _components(n: int, cells: np.ndarray) -> np.ndarray:
 
 
 def _turned_inwards(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """bool [F], faces of bodies that are turned inside out; cavities inside of a body stay as they are to it."""
+    """bool [F], faces of bodies that are turned inside out; a cavity inside a body is turned with the body."""
     bodies, body = np.unique(_components(len(positions), faces)[faces[:, 0]], return_inverse=True)
-    corner, cross = _corner_and_cross(positions, faces)
-    volume = np.bincount(body, (corner * cross).sum(1), len(bodies))
+    volume = np.bincount(body, _volumes(positions, faces), len(bodies))
     inverted = volume.sum() < 0
     low, high = np.full((len(bodies), 3), np.inf), np.full((len(bodies), 3), -np.inf)
     np.minimum.at(low, body, positions[faces].min(1))
@@ -136,10 +136,15 @@ def _turned_inwards(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return turned[body]
 
 
-def _corner_and_cross(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two arrays [F, 3] whose product, summed, is six times the volume that faces turned outwards enclose."""
+def _volumes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[F], whose sum is six times the volume that faces turned outwards enclose."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return a, np.cross(b, c)
+    return (a * np.cross(b, c)).sum(1)
+
+
+def enclosed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Volume that a closed surface encloses; negative where its faces are turned inwards."""
+    return float(_volumes(vertices, faces).sum()) / 6
 
 
 def convex_pieces(vertices: np.ndarray, faces: np.ndarray) -> list[np.ndarray]:
@@ -158,8 +163,8 @@ def convex_pieces(vertices: np.ndarray, faces: np.ndarray) -> list[np.ndarray]:
     cells = np.floor(((a + b + c) / 3 - vertices.min(0)) / size * SLAB_CELLS).astype(np.int64)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
     cell = cell.reshape(-1)
-    rows = [np.unique(faces[cell == k]) for k in range(cell.max() + 1)]
-    return [np.concatenate([vertices[row], inner[row]]) for row in rows]
+    chosen = [np.unique(faces[cell == k]) for k in range(cell.max() + 1)]
+    return [np.concatenate([vertices[some], inner[some]]) for some in chosen]
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

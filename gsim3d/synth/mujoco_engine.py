@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 
-from gsim3d.synth.embedding import ClothGrid, ControlGrid, RigidFrame
+from gsim3d.synth.embedding import ClothGrid, ControlGrid, Embedding, RigidFrame
 from gsim3d.synth.scene_setup import GRAVITY, Cloth, RigidBody, SceneSetup, SoftBody, Unstable
 
 NAME = "mujoco"
@@ -18,14 +18,13 @@ RIGID_CONTACT = 300.0  # rad/s of the spring between rigid bodies: at 3 m/s they
 POISSON = 0.3
 
 
-def simulate(
-    setup: SceneSetup, n_frames: int, fps: float, max_timestep: float
-) -> list[ControlGrid | RigidFrame | ClothGrid]:
-    """What carries each body at every frame, and the cloth last, if there is one.
+def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) -> list[Embedding]:
+    """The embedding of each body at every frame, and of the cloth last, if there is one.
 
-    A soft body's lattice is the bounding box of its collision mesh at time 0.
+    The control grid of a soft body is the bounding box of its collision mesh at time 0.
 
-    Raises: Unstable when the solver gives up.
+    Raises:
+        Unstable: the solver gives up.
     """
     os.environ.setdefault("MUJOCO_GL", "disable")
     import mujoco
@@ -35,24 +34,25 @@ def simulate(
     model = mujoco.MjModel.from_xml_string(model_xml(setup, 1 / (fps * substeps)))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    followers = [_Soft(model, data, i, b) if isinstance(b, SoftBody) else _Rigid(model, data, i, b)
-                 for i, b in enumerate(setup.bodies)]  # fmt: skip
+    parts = [
+        (_Soft if isinstance(body, SoftBody) else _Rigid)(model, data, i, body) for i, body in enumerate(setup.bodies)
+    ]
     if setup.cloth is not None:
-        followers.append(_Cloth(model, data, setup.cloth))
-    frames = [[follower.start()] for follower in followers]
+        parts.append(_Cloth(model, data, setup.cloth))
+    frames = [[part.rest] for part in parts]
     for _ in range(1, n_frames):
         mujoco.mj_step(model, data, substeps)
         mujoco.mj_kinematics(model, data)
-        for follower, nodes in zip(followers, frames):
-            nodes.append(follower.nodes())
-    embeddings = [follower.embedding(np.stack(nodes)) for follower, nodes in zip(followers, frames)]
+        for part, nodes in zip(parts, frames):
+            nodes.append(part.nodes())
+    embeddings = [part.embedding(np.stack(nodes)) for part, nodes in zip(parts, frames)]
     if any(w.number for w in data.warning) or not all(np.isfinite(embedding.nodes).all() for embedding in embeddings):
         raise Unstable("the solver gave up")
     return embeddings
 
 
 def model_xml(setup: SceneSetup, timestep: float) -> str:
-    """The scene in MuJoCo's language."""
+    """The scene as a model of MuJoCo."""
     contact_time = max(CONTACT_TIME, MIN_STEPS_PER_CONTACT * timestep)
     contact = f'solref="{contact_time:.9g} 1"'
     assets, bodies = [], []
@@ -80,7 +80,7 @@ def _numbers(values) -> str:
 
 
 def _soft_xml(index: int, body: SoftBody, contact: str) -> tuple[str, str]:
-    centre = (body.vertices.min(0) + body.vertices.max(0)) / 2  # the lattice always contains the flex's origin
+    centre = (body.vertices.min(0) + body.vertices.max(0)) / 2  # the grid always contains the flex's origin
     material = body.material
     lasting = f' yield="{material.yield_strain:.9g}"' if material.yield_strain else ""
     asset = f'<mesh name="m{index}" vertex="{_numbers(body.vertices)}" face="{_numbers(body.faces)}"/>'
@@ -137,7 +137,7 @@ class _Soft:
         first = model.flex_nodeadr[flex]
         self.data, self.body, self.bodies = data, body, model.flex_nodebodyid[first : first + model.flex_nodenum[flex]]
         self.shape = (body.cells + 1,) * 3
-        self.rest = _box_lattice(body)
+        self.rest = _box_grid(body)
         movable = model.body_dofnum[self.bodies] == 3  # a node without mass is welded to the world
         self.occupied = _occupied_cells(body)
         used = np.zeros(self.shape, dtype=bool)
@@ -151,9 +151,6 @@ class _Soft:
         velocity = body.velocity + np.cross(body.spin, self.rest - self.rest[used].mean(0))
         dofs = model.body_dofadr[self.bodies[movable]][:, None] + np.arange(3)
         data.qvel[dofs] = velocity.reshape(-1, 3)[movable]
-
-    def start(self) -> np.ndarray:
-        return self.rest
 
     def nodes(self) -> np.ndarray:
         return self.data.xpos[self.bodies].reshape(*self.shape, 3)
@@ -170,9 +167,7 @@ class _Rigid:
         arm = data.xipos[self.id] - data.xpos[self.id]
         data.qvel[first : first + 3] = body.velocity - np.cross(body.spin, arm)
         data.qvel[first + 3 : first + 6] = body.spin  # the frame starts unturned, so local axes are the world's
-
-    def start(self) -> np.ndarray:
-        return self.nodes()
+        self.rest = self.nodes()
 
     def nodes(self) -> np.ndarray:
         origin = self.data.xpos[self.id]
@@ -186,24 +181,19 @@ class _Cloth:
     def __init__(self, model, data, cloth: Cloth):
         flex = _flex_id(model, "cloth")
         first = model.flex_vertadr[flex]
-        self.data, self.rows = data, slice(first, first + model.flex_vertnum[flex])
-        self.n = cloth.count
-        part = cloth.width * (np.arange(self.n) / (self.n - 1) - 0.5)
-        self.rest = np.stack(np.meshgrid(part, part, [cloth.height], indexing="ij"), -1)[:, :, 0]
+        self.data, self.vertices = data, slice(first, first + model.flex_vertnum[flex])
+        self.rest = cloth.rest_nodes()
         if np.abs(self.nodes() - self.rest).max() > 1e-5:
             raise RuntimeError("MuJoCo has laid out the nodes of the cloth otherwise than by x, y")
 
-    def start(self) -> np.ndarray:
-        return self.rest
-
     def nodes(self) -> np.ndarray:
-        return self.data.flexvert_xpos[self.rows].reshape(self.n, self.n, 3).copy()
+        return self.data.flexvert_xpos[self.vertices].reshape(self.rest.shape).copy()
 
     def embedding(self, nodes: np.ndarray) -> ClothGrid:
         return ClothGrid(nodes)
 
 
-def _box_lattice(body: SoftBody) -> np.ndarray:
+def _box_grid(body: SoftBody) -> np.ndarray:
     low, high = body.vertices.min(0), body.vertices.max(0)
     part = np.arange(body.cells + 1) / body.cells
     return np.stack(np.meshgrid(*(a + (b - a) * part for a, b in zip(low, high)), indexing="ij"), -1)

@@ -1,7 +1,7 @@
 """Images of moving bodies over a round ground: ray casting with one light, ambient light and cast shadows.
 
-The ground is an exact disc. The bodies are triangle meshes in one Embree tree that is built once a frame and
-serves all cameras. Static work (the ground's points and colours) is done once a scene.
+The ground is an exact disc, whose points and colours are computed once a scene. The bodies are triangle meshes in one
+Embree tree a frame, for all cameras.
 """
 
 from __future__ import annotations
@@ -30,9 +30,12 @@ GROUND_SECTORS = 12
 class View:
     """Images of all cameras at one frame.
 
-    rgb uint8 [V, H, W, 3].   segmentation, instances uint8 [V, H, W].
-    depth: None, or float32 [V, H, W]: metres along the camera's axis, mean of the rays that hit what the pixel shows;
-        0 where that is nothing.
+    Attributes:
+        rgb: uint8 [V, H, W, 3].
+        segmentation: uint8 [V, H, W]: BACKGROUND, GROUND or BODY.
+        instances: uint8 [V, H, W]: BACKGROUND, GROUND, or FIRST_BODY and more.
+        depth: None, or float32 [V, H, W] metres along the camera's axis, mean of the rays that hit what the pixel
+            shows; 0 where that is nothing.
     """
 
     rgb: np.ndarray
@@ -45,7 +48,11 @@ class View:
 class Surface:
     """One body to draw.
 
-    faces [F, 3], corners [F, 3, C], paint: see shapes.Body.   two_sided: a sheet, seen and lit from both sides.
+    Attributes:
+        faces: [F, 3].
+        corners: [F, 3, C], see :class:`gsim3d.synth.shapes.Body`.
+        paint: [N, C] -> colours [N, 3].
+        two_sided: a sheet, seen and shaded from both sides.
     """
 
     faces: np.ndarray
@@ -56,9 +63,12 @@ class Surface:
 
 @dataclass(frozen=True)
 class Ground:
-    """A disc around the world's z axis: radius and height, metres.
+    """A disc around the world's z axis.
 
-    albedo: grey of the whole disc, in [0, 1]; None: rings cut into sectors of three colours.
+    Attributes:
+        radius: metres.
+        height: metres.
+        albedo: grey of the whole disc, in [0, 1]; None: rings cut into sectors of three colours.
     """
 
     radius: float
@@ -107,7 +117,7 @@ class Renderer:
         self._draw_ground(directions, ground, np.asarray(background, dtype=np.float64))
 
     def _draw_ground(self, directions, ground, background):
-        """The scene without bodies: lit colour, shadowed colour and distance of every ray."""
+        """The scene without bodies: colour in light and in shadow, and distance, of every ray."""
         if ground is None:
             ground = Ground(-1.0, 0.0)  # no point lies on it
         height = (self.origins[:, 2] - ground.height).reshape(-1, 1, 1, 1)
@@ -131,7 +141,7 @@ class Renderer:
         self.base_instance = np.where(hit, GROUND, BACKGROUND).astype(np.uint8).reshape(-1)
 
     def draw(self, vertices: Sequence[np.ndarray]) -> View:
-        """Images of the bodies with their vertices, [V, 3] each, at these places, metres, world."""
+        """Images of the bodies with these vertices, [V, 3] each, metres, world."""
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
@@ -189,9 +199,9 @@ class Renderer:
         return tree.run(points.astype(np.float32), toward, query="OCCLUDED") >= 0
 
     def _shade(self, tree, vertices, faces, face, weights, directions) -> np.ndarray:
-        rows = faces[face]
-        points = np.einsum("nk,nkc->nc", weights, vertices[rows])
-        normals = np.einsum("nk,nkc->nc", weights, vertex_normals(vertices, faces)[rows])
+        hit = faces[face]
+        points = np.einsum("nk,nkc->nc", weights, vertices[hit])
+        normals = np.einsum("nk,nkc->nc", weights, vertex_normals(vertices, faces)[hit])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         sheets = np.array([surface.two_sided for surface in self.surfaces])[self.owner[face]]
         away = sheets & (np.einsum("nc,nc->n", normals, directions) > 0)

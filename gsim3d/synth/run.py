@@ -29,8 +29,10 @@ NEEDED = {"embreex": "embreex", "trimesh": "trimesh", "PIL": "pillow"}
 class Report:
     """What `generate` did.
 
-    folders: scenes in the order of `gsim3d.data.find_scenes`, so that splits of both lists agree.
-    n_made: how many were made now.    rejected: number of draws that were not filmed, by reason.
+    Attributes:
+        folders: scenes in the order of `gsim3d.data.find_scenes`, so that splits of both lists agree.
+        n_made: how many were made now.
+        rejected: number of draws that could not be used, by reason.
     """
 
     folders: list[Path]
@@ -48,7 +50,7 @@ def generate(
     progress: bool = True,
     **changes,
 ) -> Report:
-    """Simulates and films a data set of multi-view video with masks, in the layout that `gsim3d.data` reads.
+    """Simulates and renders a data set of multi-view video with masks, in the layout that `gsim3d.data` reads.
 
     The bytes depend on the options only, not on the number of processes. Finished scenes are kept: after a
     kill, call it again; to get more trajectories, call it with a larger ``n_trajectories``.
@@ -57,13 +59,18 @@ def generate(
     Args:
         out: folder, made if absent; scenes go to out/<object>/<sample>.
         world: one of worlds.WORLDS.
-        preset: one of worlds.PRESETS; ``changes`` replace single options of it (fields of the world's class).
+        preset: one of worlds.PRESETS.
         processes: default: as many as there are cores.
         part: (i, n) makes the i-th of n parts of the scenes, from 1, and no manifest: other parts may be made at the
             same time, on other machines too. A call without it then makes what is missing, and the manifest.
         progress: show a progress bar.
+        changes: replace single options of the preset (fields of the world's class).
 
-    Raises: InputError for impossible options, missing packages, and folders that hold something else.
+    Returns:
+        What was made.
+
+    Raises:
+        InputError: impossible options, missing packages, and folders that hold something else.
     """
     require_packages(NEEDED)
     settings = build_world(world, preset, changes)
@@ -99,6 +106,7 @@ def generate(
 
 
 def require_packages(needed: dict[str, str]) -> None:
+    """Raises InputError unless all modules can be imported; ``needed`` has the package of each."""
     for module, package in needed.items():
         try:
             __import__(module)
@@ -107,6 +115,7 @@ def require_packages(needed: dict[str, str]) -> None:
 
 
 def require_engine(engine: str) -> None:
+    """Raises InputError unless the package of an engine is installed."""
     if engine == "mujoco":
         require_packages({"mujoco": "mujoco-core==4.0.0"})
     elif find_spec(engine) is None:
@@ -123,10 +132,13 @@ def check_processes(processes: int | None) -> None:
 
 
 def each(function: Callable, jobs: Sequence[tuple], processes: int | None, shown: str | None) -> Iterator:
-    """What ``function`` returns for the arguments of each job, in the order in which they end.
+    """Results of ``function`` for every job, in the order in which they end.
 
     Args:
-        processes: None: as many as there are cores.    shown: what the progress bar counts; None: no bar.
+        function: of a module, so that other processes find it.
+        jobs: its arguments.
+        processes: None: as many as there are cores.
+        shown: what the progress bar counts; None: no bar.
     """
     from gsim3d.io.terminal import progress
 

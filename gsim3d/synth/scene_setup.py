@@ -1,4 +1,5 @@
-"""What an engine is asked to move: bodies, a cloth and a ground at time 0, in metres, seconds and kilograms."""
+"""The input of an engine: bodies, a cloth and a ground at time 0, in metres, seconds and kilograms; and checks of what
+it returns."""
 
 from __future__ import annotations
 
@@ -8,15 +9,21 @@ import numpy as np
 
 GRAVITY = 9.81  # m/s^2, along -z
 MAX_STRETCH = 2.0  # a body's bounding box longer or shorter than so many times at rest: the simulation has failed
-MAX_SINK = 0.1  # of the body height below the ground: likewise
-MAX_THROUGH = 0.03  # metres of a body below the cloth over it, or of the cloth below the ground: likewise
+MAX_SINK = 0.1  # of the body height below the ground: the same
+MAX_THROUGH = 0.03  # metres of a body below the cloth over it, or of the cloth below the ground: the same
 STORED = 0.5  # seconds that a body stays squeezed at most
-MAX_GAIN = 0.3  # J/kg that a setup may gain: what a fall of 3 cm gives; centres are known to about a third of it
+MAX_GAIN = 0.3  # J/kg that bodies may gain: what a fall of 3 cm gives; centres are known to about a third of it
 
 
 @dataclass(frozen=True)
 class Material:
-    """What a soft body is made of: young: Pa.   damping: seconds.   yield_strain: of lasting deformation, 0: none."""
+    """Material of a soft body.
+
+    Attributes:
+        young: Young's modulus, Pa.
+        damping: seconds.
+        yield_strain: from which on deformation lasts; 0: never.
+    """
 
     young: float
     damping: float
@@ -25,9 +32,16 @@ class Material:
 
 @dataclass(frozen=True)
 class SoftBody:
-    """vertices [V, 3], faces [F, 3]: collision mesh in the world.   velocity, spin [3]: m/s, rad/s about the centre.
+    """A soft body.
 
-    cells: of the control lattice along each axis.
+    Attributes:
+        vertices: [V, 3] of its collision mesh, in the world.
+        faces: [F, 3] of its collision mesh.
+        velocity: [3] m/s.
+        spin: [3] rad/s about the centre.
+        material: of the whole body.
+        mass: kg.
+        cells: of the control grid along each axis.
     """
 
     vertices: np.ndarray
@@ -41,9 +55,15 @@ class SoftBody:
 
 @dataclass(frozen=True)
 class RigidBody:
-    """parts: vertices [V, 3] of convex pieces that make up the body, in the world.   velocity, spin [3]: as above.
+    """A rigid body.
 
-    friction: sliding.   bounce: 0 to 1, how much of the speed of an impact is kept, roughly.
+    Attributes:
+        parts: vertices [V, 3] of the convex pieces that make up the body, in the world.
+        velocity: [3] m/s.
+        spin: [3] rad/s about the centre.
+        mass: kg.
+        friction: sliding.
+        bounce: 0 to 1, part of the speed that an impact leaves, roughly.
     """
 
     parts: tuple[np.ndarray, ...]
@@ -58,8 +78,14 @@ class RigidBody:
 class Cloth:
     """A square cloth that hangs from its four corners.
 
-    width: metres.   height: of the corners.   count: nodes along a side.   mass: kg.
-    young: Pa.   thickness: metres, for stiffness.   damping: seconds.
+    Attributes:
+        width: metres.
+        height: metres, of the corners.
+        count: nodes along a side.
+        mass: kg.
+        young: Young's modulus, Pa.
+        thickness: metres, for stiffness.
+        damping: seconds.
     """
 
     width: float
@@ -70,10 +96,21 @@ class Cloth:
     thickness: float
     damping: float
 
+    def rest_nodes(self) -> np.ndarray:
+        """[n, n, 3] metres, world, at time 0."""
+        part = self.width * (np.arange(self.count) / (self.count - 1) - 0.5)
+        return np.stack(np.meshgrid(part, part, [self.height], indexing="ij"), -1)[:, :, 0]
+
 
 @dataclass(frozen=True)
 class SceneSetup:
-    """bodies: soft or rigid.   ground: height of the ground, or None.   cloth: or None."""
+    """A scene at time 0.
+
+    Attributes:
+        bodies: soft or rigid.
+        ground: height, metres; None: no ground.
+        cloth: or None.
+    """
 
     bodies: tuple[SoftBody | RigidBody, ...]
     ground: float | None
@@ -81,7 +118,7 @@ class SceneSetup:
 
 
 class Unstable(Exception):
-    """The trajectory is no motion of bodies: something exploded, or went through ground or cloth."""
+    """A trajectory is no motion of bodies: one exploded, or went through ground or cloth."""
 
 
 def check_motion(vertices: np.ndarray, ground: float | None) -> None:
@@ -96,14 +133,16 @@ def check_motion(vertices: np.ndarray, ground: float | None) -> None:
 
 
 def check_energy(centres: np.ndarray, masses: np.ndarray, spin: float, fps: float) -> None:
-    """Raises Unstable where bodies move faster or rise higher than what came before allows.
+    """Raises Unstable where bodies gain energy.
 
-    What a squeezed body stores, it gives back within STORED seconds: from then on the energy of the centres may only
-    fall, wherever one starts to look.
+    A squeezed body gives back its elastic energy within STORED seconds: over longer times the energy of the centres may
+    only fall.
 
     Args:
-        centres [B, T, 3]: of the bodies; what they do inside, and their turning, is not counted.
-        masses [B].   spin: J/kg of turning at the start.
+        centres: [B, T, 3] of the bodies; deformation and turning are not counted.
+        masses: [B] kg.
+        spin: J/kg of turning at the start.
+        fps: frames a second.
     """
     if centres.shape[1] < 2:
         return
@@ -128,9 +167,11 @@ def check_cloth(bodies: list[np.ndarray], cloth: np.ndarray, ground: float | Non
 
 
 def depth_below_cloth(points: np.ndarray, cloth: np.ndarray) -> float:
-    """How far the deepest of ``points`` [N, 3] lies below the cloth over it, metres; negative: all lie above.
+    """Metres by which the deepest point lies below the cloth; negative: all lie above.
 
-    cloth [n, n, 3]: a grid fine enough that the nearest node, seen from above, stands for the place.
+    Args:
+        points: [N, 3].
+        cloth: [n, n, 3], a grid so fine that the nearest node, seen from above, has the height of the cloth.
     """
     nodes = cloth.reshape(-1, 3)
     low, high = nodes[:, :2].min(0), nodes[:, :2].max(0)
@@ -139,9 +180,9 @@ def depth_below_cloth(points: np.ndarray, cloth: np.ndarray) -> float:
     lowest = np.full(tuple(n_cells), np.inf)
     cell = np.minimum(np.floor((nodes[:, :2] - low) / spacing).astype(np.int64), n_cells - 1)
     np.minimum.at(lowest, tuple(cell.T), nodes[:, 2])
-    place = np.floor((points[:, :2] - low) / spacing).astype(np.int64)
-    over = ((place >= 0) & (place < n_cells)).all(1)
-    heights = lowest[tuple(place[over].T)]
+    index = np.floor((points[:, :2] - low) / spacing).astype(np.int64)
+    over = ((index >= 0) & (index < n_cells)).all(1)
+    heights = lowest[tuple(index[over].T)]
     below = heights - points[over, 2]
     below = below[np.isfinite(below)]
     return float(below.max()) if len(below) else -np.inf

@@ -30,9 +30,14 @@ PALETTE = np.array(
 class Body:
     """A mesh to draw, a light mesh to collide, and the colour of every surface point.
 
-    vertices [V, 3], faces int [F, 3]: drawn.          collision_vertices, collision_faces: simulated.
-    corners [F, 3, C]: what is interpolated over a face and given to ``paint`` (texture or rest coordinates).
-    paint: [N, C] -> colours [N, 3] in [0, 1].
+    Attributes:
+        name: of the shape or file.
+        vertices: [V, 3] of the drawn mesh.
+        faces: int [F, 3] of the drawn mesh.
+        collision_vertices: [V', 3] of the simulated mesh.
+        collision_faces: int [F', 3] of the simulated mesh.
+        corners: [F, 3, C], input of ``paint`` at the corners of a face: texture or rest coordinates.
+        paint: [N, C] -> colours [N, 3] in [0, 1].
     """
 
     name: str
@@ -188,7 +193,6 @@ SHAPES = {
 }
 SOFT_SHAPES = ("ball", "blob", "box", "capsule", "ellipsoid", "star", "torus")
 RIGID_SHAPES = (*SOFT_SHAPES, "cone", "cylinder")
-UNSEEN_SHAPES = ("cross", "dumbbell", "knot", "pyramid")  # of held-out sets only
 
 
 def _stripes(p, colors):

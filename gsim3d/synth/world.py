@@ -1,4 +1,4 @@
-"""What all worlds share: options and their checks, and how one scene is drawn, simulated, validated and filmed."""
+"""What all worlds share: their options, and how one scene is drawn, simulated, checked and rendered."""
 
 from __future__ import annotations
 
@@ -17,20 +17,10 @@ import numpy as np
 
 from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects
 from gsim3d.errors import InputError, did_you_mean
-from gsim3d.synth import cameras, render, shapes, writer
+from gsim3d.synth import cameras, render, scene_setup, shapes, writer
 from gsim3d.synth.bodies import OBJECTS, load_mesh, mesh_bytes, mesh_name, name_rng, named_body
 from gsim3d.synth.embedding import Embedding, grid_faces
-from gsim3d.synth.scene_setup import (
-    GRAVITY,
-    Cloth,
-    RigidBody,
-    SceneSetup,
-    SoftBody,
-    Unstable,
-    check_cloth,
-    check_energy,
-    check_motion,
-)
+from gsim3d.synth.scene_setup import GRAVITY, Cloth, RigidBody, SceneSetup, SoftBody, Unstable
 
 MAX_ATTEMPTS = 40  # draws of one scene before the options are called impossible
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -43,15 +33,23 @@ CLOTH_COLOR = (0.78, 0.14, 0.12)  # where looks are functions of the name
 LATER_OPTIONS = ("by_name", "ground_albedo")  # at their defaults, sets that are older than them go on
 MAX_SPREAD = 0.25  # of cameras: bodies leave the views of closer ones
 HIGHER, STEEPER = 0.5, 45.0  # times the spread: the target in distances, the rings in degrees
+RIM_POINTS = 64  # of the ground, where its depths are checked
 
 
 class Rejected(Exception):
-    """A drawn trajectory that is not filmed: it leaves the view, the ground or the depth range."""
+    """A drawn trajectory that leaves the view, the ground or the depth range."""
 
 
 @dataclass(frozen=True)
 class Actor:
-    """One drawn body: what is simulated, what is seen, and where its visible vertices [V, 3] are at time 0."""
+    """One drawn body.
+
+    Attributes:
+        body: what is simulated.
+        surface: what is rendered.
+        vertices: [V, 3] metres, of the surface at time 0.
+        facts: what metadata.json says of it.
+    """
 
     body: SoftBody | RigidBody
     surface: render.Surface
@@ -60,10 +58,14 @@ class Actor:
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SceneDraw:
     """One draw of a trajectory.
 
-    ground: height, metres, or None.   cloth: or None.   surfaces: of the actors, and of the cloth last.
+    Attributes:
+        ground: height, metres; None: no ground.
+        cloth: or None.
+        actors: bodies.
+        surfaces: of the actors, and of the cloth last.
     """
 
     ground: float | None
@@ -76,49 +78,49 @@ class Drawn:
 class World(ABC):
     """Options of a data set. Lengths in metres, times in seconds; pairs are ranges that every trajectory draws from."""
 
-    n_trajectories: int = 34  # the usual split keeps 30 for training and 4 for tests
+    n_trajectories: int = 34  #: the usual split keeps 30 for training and 4 for tests
     n_frames: int = 24
     fps: float = 24.0
     image_size: int = 64
     n_cams: int = 12
     seed: int = 0
-    subset: str = TRAIN  # which set of scenes; a held-out one draws other random numbers
+    subset: str = TRAIN  #: which set of scenes; a held-out one draws other random numbers
     engine: str = "mujoco"
     objects: tuple[str, ...] = shapes.SOFT_SHAPES
-    meshes: tuple[str, ...] = ()  # files; they take part like objects, and alone where objects is empty
+    meshes: tuple[str, ...] = ()  #: files; they take part like objects, and alone where objects is empty
     mesh_up: str = "y"
-    by_name: bool = False  # paint, friction and bounce are functions of the body's name, not drawn; the cloth is red
+    by_name: bool = False  #: paint, friction and bounce are functions of the body's name, not drawn; the cloth is red
     background: str = "black"
     depth: bool = False
-    samples: int = 2  # rays along each side of a pixel
-    n_bodies: tuple[int, int] = (1, 1)  # the first is the scene's object, others are any
-    body_size: tuple[float, float] = (0.6, 0.76)  # diameter of the sphere that holds the body
-    drop_height: tuple[float, float] = (0.5, 0.7)  # of the lowest point above what it falls on
-    speed: float = 0.35  # largest horizontal speed at the start, m/s
-    lift: tuple[float, float] = (0.0, 0.0)  # upward speed at the start, m/s
-    spin: float = 1.2  # largest, rad/s
-    spread: float = 0.08  # largest distance from the middle, along x and y, of the place aimed at
+    samples: int = 2  #: rays along each side of a pixel
+    n_bodies: tuple[int, int] = (1, 1)  #: the first is the scene's object, others are any
+    body_size: tuple[float, float] = (0.6, 0.76)  #: diameter of the sphere that holds the body
+    drop_height: tuple[float, float] = (0.5, 0.7)  #: of the lowest point above what it falls on
+    speed: float = 0.35  #: largest horizontal speed at the start, m/s
+    lift: tuple[float, float] = (0.0, 0.0)  #: upward speed at the start, m/s
+    spin: float = 1.2  #: largest, rad/s
+    spread: float = 0.08  #: largest distance from the middle, along x and y, of the position aimed at
     max_timestep: float = 1 / 480
     distance: float = 2.6
-    elevations: tuple[float, float] = (18.0, 42.0)  # degrees, of the low and the high ring
+    elevations: tuple[float, float] = (18.0, 42.0)  #: degrees, of the low and the high ring
     target_height: float = 0.52
-    fov: float = 42.0  # degrees
-    camera_spread: float = 0.0  # how much cameras differ from scene to scene, see rig(); 0: not at all
+    fov: float = 42.0  #: degrees
+    camera_spread: float = 0.0  #: how much cameras differ from scene to scene, see rig(); 0: not at all
     ground: bool = True
     ground_height: tuple[float, float] = (0.0, 0.0)
     ground_radius: float = 0.85
-    ground_albedo: float | None = None  # grey of the whole ground; None: rings cut into sectors of three colours
+    ground_albedo: float | None = None  #: grey of the whole ground; None: rings cut into sectors of three colours
     near: float = 1.5
     far: float = 3.8
 
     name = ""
     engines = tuple(ENGINES)
 
+    # ---- options ----
+
     def check(self) -> None:
         """Raises InputError for options that cannot make a scene."""
-        for field in ("n_trajectories", "n_frames", "image_size", "n_cams", "samples"):
-            if not (isinstance(getattr(self, field), int) and getattr(self, field) >= 1):
-                raise InputError(f"{field} must be a whole number, 1 or more; got {getattr(self, field)!r}")
+        self._check_counts(n_trajectories=1, n_frames=1, image_size=1, n_cams=1, samples=1)
         for field in ("fps", "max_timestep", "distance", "fov", "ground_radius", "near"):
             if not 0 < getattr(self, field) < np.inf:
                 raise InputError(f"{field} must be positive; got {getattr(self, field)!r}")
@@ -149,23 +151,28 @@ class World(ABC):
             raise InputError(f"objects and mesh files need names of their own; repeated: {repeated}, all: {names}")
         for path in self.meshes:
             load_mesh(path, self.mesh_up)
-        self._check_ground()
+        if self.ground:
+            self._check_ground()
+
+    def _check_counts(self, **least: int) -> None:
+        for field, low in least.items():
+            value = getattr(self, field)
+            if not (isinstance(value, int) and value >= low):
+                raise InputError(f"{field} must be a whole number, {low} or more; got {value!r}")
 
     def _check_ground(self) -> None:
-        if not self.ground:
-            return
-        angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+        angle = np.linspace(0, 2 * np.pi, RIM_POINTS, endpoint=False)
         extremes = itertools.product((-1.0, 1.0), repeat=3) if self.camera_spread else [(0.0, 0.0, 0.0)]
         for height, extreme in itertools.product(self.ground_height, extremes):
             rig = self._rig(*extreme)
-            rim = np.stack([np.cos(angle), np.sin(angle), np.full(64, height)], 1)
+            rim = np.stack([np.cos(angle), np.sin(angle), np.full(RIM_POINTS, height)], 1)
             rim[:, :2] *= self.ground_radius
             pixels, depth = cameras.project(rim, rig.viewmats, rig.Ks)
-            seen = (depth > 0) & (pixels >= 0).all(-1) & (pixels <= rig.size).all(-1)
-            if seen.any() and not (rig.near <= depth[seen].min() and depth[seen].max() <= rig.far):
-                low, high = depth[seen].min(), depth[seen].max()
+            seen = depth[(depth > 0) & (pixels >= 0).all(-1) & (pixels <= rig.size).all(-1)]
+            if len(seen) and not (rig.near <= seen.min() and seen.max() <= rig.far):
                 raise InputError(
-                    f"the ground is seen from {low:.2f} to {high:.2f} m, beyond near {rig.near} and far {rig.far}"
+                    f"the ground is seen from {seen.min():.2f} to {seen.max():.2f} m, beyond near {rig.near} and far "
+                    f"{rig.far}"
                 )
 
     def object_names(self) -> list[str]:
@@ -181,12 +188,11 @@ class World(ABC):
         """Hash of all that the scenes of object ``name`` depend on, apart from their sample number."""
         fields = dataclasses.asdict(self)
         others = self.n_bodies[1] > 1  # then any object may appear in a scene of this one
-        one_rig = not self.camera_spread
-        for field in ("n_trajectories", "meshes", *(() if others else ("objects",)), *(("camera_spread",) * one_rig)):
-            del fields[field]
-        for field in LATER_OPTIONS:
-            if fields[field] == getattr(World, field):
-                del fields[field]
+        unused = (
+            ["n_trajectories", "meshes"] + ["objects"] * (not others) + ["camera_spread"] * (not self.camera_spread)
+        )
+        unused += [field for field in LATER_OPTIONS if fields[field] == getattr(World, field)]
+        fields = {field: value for field, value in fields.items() if field not in unused}
         text = json.dumps([writer.GENERATOR_VERSION, self.name, fields, name], sort_keys=True)
         digest = hashlib.sha256(text.encode())
         for path in self.meshes:
@@ -197,7 +203,7 @@ class World(ABC):
     def rig(self, scene: tuple[str, int] | None = None) -> cameras.Rig:
         """The cameras of a scene; None: those that all scenes differ from.
 
-        With a ``camera_spread`` of s they stand up to s times their distance nearer or farther, look at a place up to
+        With a ``camera_spread`` of s they stand up to s times their distance nearer or farther, look at a point up to
         s / 2 distances higher or lower, from up to 45 s degrees less or more above the horizon, and both rings are
         turned by any angle.
         """
@@ -229,8 +235,10 @@ class World(ABC):
             outputs=OutputEffects(depth=self.depth),
         )
 
+    # ---- one trajectory ----
+
     def make(self, name: str, sample: int) -> writer.Scene:
-        """Simulates and films trajectory ``sample`` of object ``name``; draws again until one can be used."""
+        """Trajectory ``sample`` of object ``name``, simulated and rendered; draws again until one can be used."""
         rejected = []
         rig = self.rig((name, sample))
         for attempt in range(MAX_ATTEMPTS):
@@ -238,18 +246,20 @@ class World(ABC):
             try:
                 # Before the costly part.
                 self._check_view(rig, drawn.ground, [actor.vertices[None] for actor in drawn.actors])
-                states, frames = self._move(rig, drawn)
+                embeddings, moved = self.simulate(drawn)
+                self._check_trajectory(rig, drawn, moved)
             except (Unstable, Rejected) as reason:
                 rejected.append(str(reason))
                 continue
+            names = [f"body_{index}" for index in range(len(drawn.actors))] + ["cloth"]
             renderer = self.renderer(rig, drawn)
             return writer.Scene(
                 name,
                 sample,
                 self.fps,
                 rig,
-                views=[renderer.draw(vertices) for vertices in zip(*frames)],
-                states=states,
+                views=[renderer.draw(vertices) for vertices in zip(*moved)],
+                states={name: embedding.nodes.astype(np.float32) for name, embedding in zip(names, embeddings)},
                 extras={
                     **{"world": self.name, "subset": self.subset, "engine": self.engine, "seed": self.seed},
                     **{"attempt": attempt, "rejected": rejected, "ground_height": drawn.ground},
@@ -262,40 +272,54 @@ class World(ABC):
             "lower the drop height or the body size, or widen the view"
         )
 
-    def draw(self, name: str, sample: int, attempt: int) -> Drawn:
-        """What is simulated and seen in trajectory ``sample`` of object ``name``, at its ``attempt``-th draw."""
+    def draw(self, name: str, sample: int, attempt: int) -> SceneDraw:
+        """Trajectory ``sample`` of object ``name`` at time 0, at its ``attempt``-th draw."""
         subset = [zlib.crc32(text.encode()) for text in (self.name, self.subset) if text not in ("elastic", TRAIN)]
         rng = np.random.default_rng([self.seed, zlib.crc32(name.encode()), sample, attempt, *subset])
         ground, cloth, actors = self._draw(name, rng)
         surfaces = [actor.surface for actor in actors]
         if cloth is not None:
             surfaces.append(self._cloth_surface(cloth, rng))
-        return Drawn(ground, cloth, actors, surfaces)
+        return SceneDraw(ground, cloth, actors, surfaces)
 
-    def renderer(self, rig: cameras.Rig, drawn: Drawn) -> render.Renderer:
-        """What films ``drawn`` with the cameras of ``rig``."""
+    def renderer(self, rig: cameras.Rig, drawn: SceneDraw) -> render.Renderer:
+        """A renderer of ``drawn``, seen by the cameras of ``rig``."""
         ground = None if drawn.ground is None else render.Ground(self.ground_radius, drawn.ground, self.ground_albedo)
+        background = BACKGROUNDS[self.background]
         return render.Renderer(
-            rig,
-            drawn.surfaces,
-            ground=ground,
-            background=BACKGROUNDS[self.background],
-            samples=self.samples,
-            depth=self.depth,
+            rig, drawn.surfaces, ground=ground, background=background, samples=self.samples, depth=self.depth
         )
 
+    def simulate(self, drawn: SceneDraw) -> tuple[list[Embedding], list[np.ndarray]]:
+        """The motion of a draw, not checked.
+
+        Returns:
+            The embedding of each body, and of the cloth last; and the vertices [T, V, 3] of every surface.
+
+        Raises:
+            Unstable: the solver gives up.
+        """
+        engine = importlib.import_module(ENGINES[self.engine])
+        setup = SceneSetup(tuple(actor.body for actor in drawn.actors), drawn.ground, drawn.cloth)
+        embeddings = engine.simulate(setup, self.n_frames, self.fps, self.max_timestep)
+        bindings = [embedding.bind(actor.vertices) for actor, embedding in zip(drawn.actors, embeddings)]
+        if drawn.cloth is not None:
+            bindings.append(embeddings[-1].refine(CLOTH_REFINEMENT))
+        moved = [np.stack([b.move(nodes) for nodes in e.nodes]) for b, e in zip(bindings, embeddings, strict=True)]
+        return embeddings, moved
+
     def _draw(self, name: str, rng: np.random.Generator) -> tuple[float | None, Cloth | None, list[Actor]]:
-        others = []
+        names = [name]
         if self.n_bodies[1] > 1:
             count = int(rng.integers(self.n_bodies[0], self.n_bodies[1] + 1))
-            names = self.object_names()
-            others = [names[rng.integers(len(names))] for _ in range(count - 1)]
+            known = self.object_names()
+            names += [known[rng.integers(len(known))] for _ in range(count - 1)]
         low, high = self.ground_height
         ground = (float(rng.uniform(low, high)) if high > low else low) if self.ground else None
         cloth = self._draw_cloth(rng)
         floor = cloth.height if cloth is not None else ground or 0.0
         actors = []
-        for body_name in (name, *others):
+        for body_name in names:
             actors.append(self._draw_actor(body_name, floor, actors, rng))
         return ground, cloth, actors
 
@@ -316,100 +340,85 @@ class World(ABC):
         if self.lift[1] > 0:
             velocity[2] = rng.uniform(*self.lift)
         aim = rng.uniform(-self.spread, self.spread, 2)
-        place = np.array([*aim, floor + drop - vertices[:, 2].min()])
+        position = np.array([*aim, floor + drop - vertices[:, 2].min()])
         # A body that will drift starts upwind, so that it lands, or is halfway, near the middle.
-        place[:2] -= velocity[:2] * self._flight(drop, velocity[2])
-        place = _clear_of(place, size / 2, before)
+        position[:2] -= velocity[:2] * self._flight(drop, velocity[2])
+        position = _clear_of(position, size / 2, before)
         axis = rng.normal(size=3)
         spin = rng.uniform(0, self.spin) * axis / np.linalg.norm(axis)
-        simulated, facts = self._make_body(name, collision + place, body.collision_faces, velocity, spin, rng)
+        simulated, facts = self._make_body(name, collision + position, body.collision_faces, velocity, spin, rng)
         facts = {"object": name, "mass": round(simulated.mass, 6), "size": round(size, 6), **facts}
         surface = render.Surface(body.faces, body.corners, self._painted(body.paint, facts))
-        return Actor(simulated, surface, vertices + place, facts)
+        return Actor(simulated, surface, vertices + position, facts)
+
+    def _flight(self, drop: float, lift: float) -> float:
+        """Seconds after which a body should pass over the position that it is aimed at."""
+        if not self.ground:
+            return self.n_frames / self.fps / 2
+        return (lift + np.sqrt(lift**2 + 2 * GRAVITY * drop)) / GRAVITY
+
+    def _cloth_surface(self, cloth: Cloth, rng: np.random.Generator) -> render.Surface:
+        n = (cloth.count - 1) * CLOTH_REFINEMENT + 1
+        part = np.arange(n) / (n - 1) - 0.5
+        points = np.stack(np.meshgrid(part, part, [0.0], indexing="ij"), -1).reshape(-1, 3)
+        faces = grid_faces(n)
+        paint = _plain_cloth if self.by_name else shapes.random_paint(rng)
+        return render.Surface(faces, points[faces], paint, two_sided=True)
+
+    # ---- what worlds differ in ----
+
+    @abstractmethod
+    def _make_body(self, name, vertices, faces, velocity, spin, rng) -> tuple[SoftBody | RigidBody, dict]:
+        """The body with its collision mesh at time 0, and more facts of it for metadata.json."""
 
     def _drop(self, height: float, body_height: float) -> float:
         """Height of the lowest point above what the body falls on, from the drawn one."""
         return height
 
-    def _flight(self, drop: float, lift: float) -> float:
-        """Seconds after which a body should pass over the place that it is aimed at."""
-        if not self.ground:
-            return self.n_frames / self.fps / 2
-        return (lift + np.sqrt(lift**2 + 2 * GRAVITY * drop)) / GRAVITY
-
-    @abstractmethod
-    def _make_body(self, name, vertices, faces, velocity, spin, rng) -> tuple[SoftBody | RigidBody, dict]:
-        """The body with its collision mesh at time 0, and what metadata.json tells of it."""
-
     def _painted(self, paint: Callable[[np.ndarray], np.ndarray], facts: dict) -> Callable[[np.ndarray], np.ndarray]:
-        """The paint of a body of which metadata.json tells ``facts``, from the one that was drawn."""
+        """The paint of a body with these facts, from the one that was drawn."""
         return paint
 
     def _draw_cloth(self, rng: np.random.Generator) -> Cloth | None:
         return None
 
-    def _cloth_surface(self, cloth: Cloth, rng: np.random.Generator) -> render.Surface:
-        n = (cloth.count - 1) * CLOTH_REFINEMENT + 1
-        part = np.arange(n) / (n - 1) - 0.5
-        places = np.stack(np.meshgrid(part, part, [0.0], indexing="ij"), -1).reshape(-1, 3)
-        faces = grid_faces(n)
-        paint = _plain_cloth if self.by_name else shapes.random_paint(rng)
-        return render.Surface(faces, places[faces], paint, two_sided=True)
+    # ---- what cannot be used ----
 
-    def simulate(self, drawn: Drawn) -> tuple[list[Embedding], list[np.ndarray]]:
-        """What carries each body, and the cloth last; and the vertices [T, V, 3] of every surface.
-
-        Raises: Unstable when the solver gives up; nothing else is checked.
-        """
-        engine = importlib.import_module(ENGINES[self.engine])
-        setup = SceneSetup(tuple(actor.body for actor in drawn.actors), drawn.ground, drawn.cloth)
-        embeddings = engine.simulate(setup, self.n_frames, self.fps, self.max_timestep)
-        bindings = [embedding.bind(actor.vertices) for actor, embedding in zip(drawn.actors, embeddings)]
-        if drawn.cloth is not None:
-            bindings.append(embeddings[-1].refine(CLOTH_REFINEMENT))
-        moved = [np.stack([b.move(nodes) for nodes in c.nodes]) for b, c in zip(bindings, embeddings, strict=True)]
-        return embeddings, moved
-
-    def _move(self, rig: cameras.Rig, drawn: Drawn) -> tuple[dict, list[np.ndarray]]:
-        """States by name, and the vertices [T, V, 3] of every surface, checked."""
-        embeddings, moved = self.simulate(drawn)
-        actors, cloth, bodies = drawn.actors, drawn.cloth, moved[: len(drawn.actors)]
+    def _check_trajectory(self, rig: cameras.Rig, drawn: SceneDraw, moved: list[np.ndarray]) -> None:
+        """Raises Unstable or Rejected; ``moved`` has the vertices [T, V, 3] of every surface."""
+        bodies = moved[: len(drawn.actors)]
         for vertices in bodies:
-            check_motion(vertices, drawn.ground)
+            scene_setup.check_motion(vertices, drawn.ground)
         self._check_view(rig, drawn.ground, bodies)
         centres = np.stack([vertices.mean(1) for vertices in bodies])
-        masses = np.array([actor.body.mass for actor in actors])
-        spins = [((actor.body.spin**2).sum() * (actor.facts["size"] / 2) ** 2) / 2 for actor in actors]
-        check_energy(centres, masses, max(spins), self.fps)
-        states = {f"body_{index}": embedding.nodes.astype(np.float32) for index, embedding in enumerate(embeddings)}
-        if cloth is not None:
-            states["cloth"] = states.pop(f"body_{len(actors)}")
-            n = (cloth.count - 1) * CLOTH_REFINEMENT + 1
-            check_cloth(bodies, moved[-1].reshape(self.n_frames, n, n, 3), drawn.ground)
-        return states, moved
+        masses = np.array([actor.body.mass for actor in drawn.actors])
+        spins = [((actor.body.spin**2).sum() * (actor.facts["size"] / 2) ** 2) / 2 for actor in drawn.actors]
+        scene_setup.check_energy(centres, masses, max(spins), self.fps)
+        if drawn.cloth is not None:
+            n = (drawn.cloth.count - 1) * CLOTH_REFINEMENT + 1
+            scene_setup.check_cloth(bodies, moved[-1].reshape(self.n_frames, n, n, 3), drawn.ground)
 
     def _check_view(self, rig: cameras.Rig, ground: float | None, bodies: list[np.ndarray]) -> None:
-        for vertices in bodies:
-            for frame in vertices:
-                pixels, depth = cameras.project(frame, rig.viewmats, rig.Ks)
-                if depth.min() < rig.near or depth.max() > rig.far:
-                    raise Rejected("a body leaves the depth range")
-                if pixels.min() < 0 or pixels.max() > rig.size:
-                    raise Rejected("a body leaves the view of a camera")
-                if ground is not None and np.hypot(frame[:, 0], frame[:, 1]).max() > 1.25 * self.ground_radius:
-                    raise Rejected("a body leaves the ground")
+        for frame in itertools.chain.from_iterable(bodies):
+            pixels, depth = cameras.project(frame, rig.viewmats, rig.Ks)
+            if depth.min() < rig.near or depth.max() > rig.far:
+                raise Rejected("a body leaves the depth range")
+            if pixels.min() < 0 or pixels.max() > rig.size:
+                raise Rejected("a body leaves the view of a camera")
+            if ground is not None and np.hypot(frame[:, 0], frame[:, 1]).max() > 1.25 * self.ground_radius:
+                raise Rejected("a body leaves the ground")
 
 
-def _clear_of(place: np.ndarray, radius: float, before: list[Actor]) -> np.ndarray:
-    """``place`` raised until a sphere around the body touches no other body's."""
-    place = place.copy()
+def _clear_of(position: np.ndarray, radius: float, before: list[Actor]) -> np.ndarray:
+    """``position`` raised until a sphere around the body touches no other body's."""
+    position = position.copy()
     for actor in sorted(before, key=lambda actor: actor.vertices[:, 2].mean()):
         centre = (actor.vertices.min(0) + actor.vertices.max(0)) / 2
         reach = radius + actor.facts["size"] / 2 + GAP
-        aside = ((place[:2] - centre[:2]) ** 2).sum()
-        if aside < reach**2 and abs(place[2] - centre[2]) ** 2 + aside < reach**2:
-            place[2] = centre[2] + np.sqrt(reach**2 - aside)
-    return place
+        aside = ((position[:2] - centre[:2]) ** 2).sum()
+        if aside < reach**2 and abs(position[2] - centre[2]) ** 2 + aside < reach**2:
+            position[2] = centre[2] + np.sqrt(reach**2 - aside)
+    return position
 
 
 def _plain_cloth(points: np.ndarray) -> np.ndarray:

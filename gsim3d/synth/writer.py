@@ -2,7 +2,7 @@
 
 Layout: OUT/<object>/<sample>/metadata.json, cam_<j>/{rgb,seg,inst,depth}_<step>.png, states.npz; OUT/manifest.json,
 OUT/effects.yaml (what the scenes call for, see gsim3d.effects.spec).
-A scene is written to a hidden folder beside its place and renamed when it is whole.
+A scene is written to a hidden folder and renamed when it is whole.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.errors import InputError
+from gsim3d.io.files import write_whole
 from gsim3d.io.plain import parse_json
 from gsim3d.synth.cameras import Rig, workspace_origin
 from gsim3d.synth.render import View
@@ -34,9 +35,17 @@ PACKAGES = ("numpy", "mujoco-core", "embreex", "trimesh", "opencv-contrib-python
 
 @dataclass(frozen=True)
 class Scene:
-    """One filmed trajectory, ready to be written.
+    """One rendered trajectory, ready to be written.
 
-    states: float32 [T, ..., 3] by name: what carries each body (lattice nodes, axes, particles) and the cloth, metres.
+    Attributes:
+        object: name of its first body.
+        sample: number among the trajectories of this object.
+        fps: frames a second.
+        rig: cameras.
+        views: images of every frame.
+        states: float32 [T, ..., 3] metres by name: nodes of the embedding of each body, and of the cloth.
+        extras: more keys of metadata.json.
+        fingerprint: hash of the options that it depends on.
     """
 
     object: str
@@ -50,11 +59,12 @@ class Scene:
 
 
 def scene_folder(out: Path, name: str, sample: int) -> Path:
+    """The folder of a trajectory in the data set ``out``."""
     return out / name / f"{sample:04d}"
 
 
 def is_finished(folder: Path, fingerprint: str) -> bool:
-    """Whether ``folder`` holds a finished scene; InputError when it was made with other options."""
+    """Whether ``folder`` holds a finished scene. Raises InputError where it was made with other options."""
     metadata = folder / "metadata.json"
     if not metadata.is_file():
         return False
@@ -64,6 +74,7 @@ def is_finished(folder: Path, fingerprint: str) -> bool:
 
 
 def read_metadata(folder: Path) -> dict:
+    """The metadata.json of a scene. Raises InputError where it cannot be read."""
     try:
         return parse_json((folder / "metadata.json").read_bytes())
     except (OSError, ValueError) as error:
@@ -91,7 +102,7 @@ def write_scene(out: Path, scene: Scene) -> Path:
         states_hash.update(name.encode() + nodes.tobytes())
     np.savez(unfinished / "states.npz", **scene.states)
     hashes = {"states_sha256": states_hash.hexdigest(), "images_sha256": images_hash.hexdigest()}
-    write_json(unfinished / "metadata.json", {**_metadata(scene), **hashes})
+    write_whole(unfinished / "metadata.json", json.dumps({**_metadata(scene), **hashes}, indent=1) + "\n")
     os.replace(unfinished, folder)
     return folder
 
@@ -141,13 +152,6 @@ def _metadata(scene: Scene) -> dict:
     }
 
 
-def write_json(path: Path, content: dict) -> None:
-    text = json.dumps(content, indent=1) + "\n"
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    unfinished.write_text(text)
-    os.replace(unfinished, path)
-
-
 def write_manifest(out: Path, folders: list[Path], settings: dict) -> dict:
     """Writes OUT/manifest.json: options, hashes of every scene, rejected draws, machine and versions."""
     scenes = {}
@@ -164,12 +168,12 @@ def write_manifest(out: Path, folders: list[Path], settings: dict) -> dict:
         "rejected": rejected_draws(folders),
         "scenes": scenes,
     }
-    write_json(out / "manifest.json", manifest)
+    write_whole(out / "manifest.json", json.dumps(manifest, indent=1) + "\n")
     return manifest
 
 
 def rejected_draws(folders: list[Path]) -> dict[str, int]:
-    """Number of draws that were not filmed, by reason."""
+    """Number of draws that could not be used, by reason."""
     return dict(Counter(reason for folder in folders for reason in read_metadata(folder)["rejected"]))
 
 
