@@ -20,6 +20,7 @@ RINGS = {
         ops
         math
         io.files
+        io.settings pretrained
         numerics.validate effects.selection
         effects.spec
         nn
@@ -33,7 +34,6 @@ RINGS = {
         simulator
         effects.by_scene
         cuda_graphs
-        pretrained
     """,
     "workshop": """
         data evaluate.perceptual

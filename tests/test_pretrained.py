@@ -10,9 +10,9 @@ from safetensors.torch import load_file
 from gsim3d import pretrained
 from gsim3d.cli.main import main
 from gsim3d.errors import InputError
+from gsim3d.io import checkpoint
 from gsim3d.profile.autotune import SPEEDS
 from gsim3d.testing.invariances import LAWS
-from gsim3d.train import checkpoint
 from gsim3d.train.restore import restore
 
 PARTS = {"model.safetensors", "config.yaml", "training.jsonl", "recipe.json", "scores.json", "README.md"}

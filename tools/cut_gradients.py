@@ -28,12 +28,12 @@ sys.path.insert(0, str(ROOT))
 from gsim3d.data import Scene, find_scenes, split_scenes  # noqa: E402
 from gsim3d.evaluate.protocol import score_scene  # noqa: E402
 from gsim3d.evaluate.report import summarize, write_json  # noqa: E402
+from gsim3d.io.settings import to_dict  # noqa: E402
 from gsim3d.nn.point_transformer import Block  # noqa: E402
 from gsim3d.simulator import Simulator  # noqa: E402
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseConfig, TrainConfig  # noqa: E402
 from gsim3d.train.loop import Trainer  # noqa: E402
 from gsim3d.train.restore import restore  # noqa: E402
-from gsim3d.train.settings import to_dict  # noqa: E402
 from gsim3d.train.side_by_side import side_by_side  # noqa: E402
 
 RUN = TrainConfig(

@@ -26,9 +26,9 @@ import gsim3d  # noqa: E402
 from gsim3d import pretrained  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402
 from gsim3d.evaluate.pictures import write_curves  # noqa: E402
+from gsim3d.io import checkpoint  # noqa: E402
 from gsim3d.profile.autotune import SPEEDS  # noqa: E402
 from gsim3d.synth.worlds import VALIDATION_SEED  # noqa: E402
-from gsim3d.train import checkpoint  # noqa: E402
 from tools.release.recipes import Recipe, recipe  # noqa: E402
 from tools.release.state import CURVE, load_progress, weights_file  # noqa: E402
 

@@ -18,11 +18,11 @@ from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import horizon
 from gsim3d.evaluate.report import write_json
+from gsim3d.io.settings import to_dict
 from gsim3d.train.captured import check_capturable
 from gsim3d.train.config import TrainConfig, check_settings
 from gsim3d.train.restore import check_device, model_config
 from gsim3d.train.samples import check_scenes
-from gsim3d.train.settings import to_dict
 from gsim3d.train.side_by_side import side_by_side
 
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from gsim3d.io.settings import to_dict
 from gsim3d.profile import machine
-from gsim3d.train.settings import to_dict
 
 if TYPE_CHECKING:
     from gsim3d.ablate.study import Study

@@ -16,12 +16,12 @@ from gsim3d.evaluate.protocol import score_scene
 from gsim3d.evaluate.report import summarize, write_json
 from gsim3d.io.files import MAX_TEXT, read_file
 from gsim3d.io.plain import parse_json
+from gsim3d.io.settings import to_dict
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.log import LOG, read_entry
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import restore
 from gsim3d.train.samples import context_cameras, spread_views
-from gsim3d.train.settings import to_dict
 from gsim3d.train.side_by_side import last_entry
 
 SCORE = "score.json"

@@ -83,8 +83,8 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.ablate.table import markdown
     from gsim3d.data import find_scenes
     from gsim3d.io.locks import only_one_writer
+    from gsim3d.io.settings import from_dict, load_yaml
     from gsim3d.train.config import TrainConfig
-    from gsim3d.train.settings import from_dict, load_yaml
 
     if args.config is None:
         base = base_run(args.preset or "tiny")

@@ -155,7 +155,7 @@ class _Stopwatch:
 def _train(out: Path, config: TrainConfig, folders: list[Path], progress: bool, seconds: _Stopwatch) -> None:
     """Trains to the end and exports."""
     from gsim3d.data import Scene
-    from gsim3d.train import checkpoint
+    from gsim3d.io import checkpoint
     from gsim3d.train.loop import Trainer
 
     trainer = Trainer(config, [Scene.open(folder) for folder in folders], out / "model")

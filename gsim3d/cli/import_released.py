@@ -31,9 +31,9 @@ def run(args: argparse.Namespace) -> int:
 
     from gsim3d.compat.released_import import import_released
     from gsim3d.errors import InputError
+    from gsim3d.io import checkpoint
     from gsim3d.io.files import new_output_path, with_parents
-    from gsim3d.train import checkpoint
-    from gsim3d.train.settings import load_yaml, to_dict
+    from gsim3d.io.settings import load_yaml, to_dict
 
     out = new_output_path(args.out)
     source, settings = Path(args.checkpoint), load_yaml(args.config)

@@ -54,11 +54,11 @@ def run(args: argparse.Namespace) -> int:
 
     from gsim3d.data import Scene, find_scenes, split_scenes
     from gsim3d.errors import InputError
+    from gsim3d.io import checkpoint
     from gsim3d.io.files import output_path, with_parents
+    from gsim3d.io.settings import from_dict, load_yaml, to_dict
     from gsim3d.synth.held_out import origin_of
-    from gsim3d.train import checkpoint
     from gsim3d.train.config import TrainConfig
-    from gsim3d.train.settings import from_dict, load_yaml, to_dict
 
     config = from_dict(TrainConfig, load_yaml(args.config)) if args.config else TrainConfig()
     if args.print_config:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsim3d.errors import InputError
+from gsim3d.io import checkpoint
 from gsim3d.io.files import read_file
 from gsim3d.pretrained import located
-from gsim3d.train import checkpoint
 from gsim3d.train.log import LOG
 
 LOGS = (LOG, "training.jsonl")  # of a run; of a simulator that comes with gsim3d

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 
 from gsim3d.errors import CaptureError, InputError
+from gsim3d.io.settings import from_dict, upgraded
 from gsim3d.profile.machine import energy
 from gsim3d.profile.settings import Setting
 from gsim3d.profile.stepping import Stepping
@@ -17,7 +18,6 @@ from gsim3d.profile.subject import Subject
 from gsim3d.profile.timing import Clock, Timing, time_call
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.loop import Trainer, deterministic
-from gsim3d.train.settings import from_dict, upgraded
 
 BATCH = 4
 LARGEST_KERNELS = 12  # that are listed

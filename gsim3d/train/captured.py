@@ -27,13 +27,13 @@ from gsim3d.cuda_graphs import Captured, with_background_as_it_is
 from gsim3d.dynamics import DynamicsConfig, concatenate
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
+from gsim3d.io.checkpoint import laid_out_as
 from gsim3d.nn.multiview_encoder import Room
 from gsim3d.numerics.policy import StabilityReport
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
 from gsim3d.simulator import Simulator
 from gsim3d.state import ASLEEP, DYNAMIC, Particles
-from gsim3d.train.checkpoint import laid_out_as
 from gsim3d.train.gradients import in_segments, recomputing, total_norm
 from gsim3d.train.samples import Batch
 

@@ -14,7 +14,7 @@ from gsim3d.data.scene import SIZE_MULTIPLE
 from gsim3d.dynamics import DynamicsConfig
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import InputError, check_ranges
-from gsim3d.train.settings import from_dict, to_dict, upgraded
+from gsim3d.io.settings import from_dict, to_dict, upgraded
 
 MANY = 10**9  # steps; more than any run has
 LARGEST_SIDE = 2**15  # pixels of an image

@@ -22,8 +22,8 @@ from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError, NumericalError, RunStopped
 from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.evaluate.perceptual.weights import load
+from gsim3d.io import checkpoint
 from gsim3d.io.locks import only_one_writer
-from gsim3d.train import checkpoint
 from gsim3d.train.captured import CapturedLoss, Gradients, Prepared
 from gsim3d.train.config import PhaseConfig, TrainConfig, check_same_run, check_settings
 from gsim3d.train.gradients import (

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
+from gsim3d.io.checkpoint import laid_out_as
 from gsim3d.nn.layers import tf32_only_if_asked
-from gsim3d.train.checkpoint import laid_out_as
 from gsim3d.train.config import OptimizerConfig
 
 START_DIVISOR = 25  # the first rate is the peak over this

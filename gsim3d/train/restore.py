@@ -25,14 +25,14 @@ from gsim3d.data.fitting import frame_stride
 from gsim3d.effects.plan import Plan
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import FitWarning, InputError, did_you_mean
+from gsim3d.io import checkpoint
 from gsim3d.io.files import shown
+from gsim3d.io.settings import from_dict, to_dict, upgraded
 from gsim3d.ops import cuda_compiled
 from gsim3d.presets import ModelConfig
 from gsim3d.pretrained import KEEP
 from gsim3d.simulator import Simulator
-from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, TrainConfig
-from gsim3d.train.settings import from_dict, to_dict, upgraded
 
 SIMILAR = 1.25  # near and far are replaced by those of the training where they differ by at most this factor
 PRESETS = ("tiny", "small", "paper_latent", "paper_explicit")

@@ -255,8 +255,8 @@ def test_weights_of_another_model_are_refused(capsys, work, tmp_path):
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     code, _, err = call(capsys, "evaluate", run, work / "data")
     assert code == 2 and "config.yaml: missing, truncated or changed" in err
+    from gsim3d.io.checkpoint import OWN_HASH, hash_of_state
     from gsim3d.io.files import sha256_of
-    from gsim3d.train.checkpoint import OWN_HASH, hash_of_state
 
     state.pop(OWN_HASH)
     state["sha256"]["config.yaml"] = sha256_of(folder / "config.yaml")

@@ -7,7 +7,7 @@ import pytest
 
 from gsim3d.cli.demo import DemoConfig, comparisons, run_demo
 from gsim3d.errors import InputError
-from gsim3d.train import checkpoint
+from gsim3d.io import checkpoint
 from gsim3d.train.config import PhaseConfig, TrainConfig
 from gsim3d.train.restore import model_config
 

@@ -6,7 +6,7 @@ from gsim3d import presets
 from gsim3d.compat.checkpoints import current_model
 from gsim3d.compat.released_model import ReleasedModelConfig, config_class
 from gsim3d.errors import InputError
-from gsim3d.train.settings import from_dict, to_dict
+from gsim3d.io.settings import from_dict, to_dict
 
 NAMES = ("ray_depth", "half_attention", "three_sigma_tiles")
 

@@ -12,8 +12,8 @@ from gsim3d.compat.released import DYNAMICS, from_published, to_published
 from gsim3d.compat.released_config import read_config
 from gsim3d.compat.released_import import import_released, published_shapes, untrained_signs
 from gsim3d.errors import InputError
+from gsim3d.io.checkpoint import load
 from gsim3d.simulator import Simulator
-from gsim3d.train.checkpoint import load
 from gsim3d.train.restore import restore
 from tests.compat.release import changed, full_config, random_weights, settings_of, small_config, write_release
 from tests.tiny_scenes import write_scene

@@ -31,6 +31,7 @@ from gsim3d.compat.released_model import (
 )
 from gsim3d.dynamics.state import StateLayout
 from gsim3d.effects.spec import EffectsSpec, OutputEffects, UnsupportedEffect
+from gsim3d.io.settings import from_dict, to_dict
 from gsim3d.math.rotations import rotation_matrices, unit_quats
 from gsim3d.math.spherical_harmonics import rotate_harmonics, sh_basis
 from gsim3d.nn.gaussian_head import render
@@ -40,7 +41,6 @@ from gsim3d.nn.multiview_encoder.transformer import MASKED, Windows
 from gsim3d.ops import build_pyramid
 from gsim3d.simulator import Simulator
 from gsim3d.state import Gaussians
-from gsim3d.train.settings import from_dict, to_dict
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, TINY, batch, make_dynamics, make_history
 from tests.nn.multiview_encoder.scenes import make_encoder, make_frames

@@ -19,9 +19,9 @@ from gsim3d.effects.spec import (
     UnsupportedEffect,
 )
 from gsim3d.errors import InputError
-from gsim3d.train import checkpoint
+from gsim3d.io import checkpoint
+from gsim3d.io.settings import to_dict
 from gsim3d.train.restore import build_simulator, restore
-from gsim3d.train.settings import to_dict
 from tests.asserts import assert_same_bits
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -12,8 +12,8 @@ from gsim3d.data.fitting import frame_stride
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import FitWarning, InputError
 from gsim3d.evaluate.predictions import Predictions
+from gsim3d.io import checkpoint
 from gsim3d.synth.worlds import build_world
-from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.restore import build_simulator, describe, model_config, restore
 from gsim3d.train.samples import check_scenes

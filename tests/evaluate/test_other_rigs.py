@@ -16,8 +16,8 @@ from gsim3d.data import Scene
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import FitWarning, InputError
 from gsim3d.evaluate.protocol import default_views, predict
+from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.pretrained import names
-from gsim3d.train.checkpoint import Checkpoint
 from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import Restored, build_simulator
 from tests.data.made_videos import trimmed, write_plain

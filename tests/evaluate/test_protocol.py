@@ -28,7 +28,7 @@ from gsim3d.evaluate.protocol import (
 )
 from gsim3d.evaluate.report import summarize, table, write_json
 from gsim3d.evaluate.scoring import SceneScores
-from gsim3d.train.checkpoint import Checkpoint
+from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import Restored, build_simulator
 from tests.tiny_scenes import write_scene

@@ -14,8 +14,8 @@ from gsim3d.cli.demo import run_demo
 from gsim3d.cli.main import main
 from gsim3d.errors import InputError
 from gsim3d.io.locks import LOCK_FILE, only_one_writer
+from gsim3d.io.settings import to_dict
 from gsim3d.train.loop import Trainer
-from gsim3d.train.settings import to_dict
 from tests.tiny_scenes import write_scenes
 from tests.train.test_loop import CONFIG, curve, scenes
 

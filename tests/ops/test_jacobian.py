@@ -8,11 +8,11 @@ import yaml
 
 from gsim3d import presets
 from gsim3d.compat.checkpoints import current_model
+from gsim3d.io.settings import from_dict, to_dict
 from gsim3d.nn.gaussian_head import RendererConfig, render
 from gsim3d.presets import ModelConfig
 from gsim3d.pretrained import located
 from gsim3d.train.restore import keep_jacobian
-from gsim3d.train.settings import from_dict, to_dict
 from tests.test_simulator import CONFIG, make_frames, make_simulator, target_cameras
 
 

@@ -6,8 +6,8 @@ import torch
 from gsim3d import presets
 from gsim3d.data import Scene
 from gsim3d.effects.spec import EffectsSpec
+from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.profile.subject import Subject
-from gsim3d.train.checkpoint import Checkpoint
 from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import Restored, build_simulator
 from tests.tiny_scenes import write_scenes

@@ -6,12 +6,12 @@ import pytest
 
 import gsim3d
 from gsim3d.errors import InputError
+from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.profile import autotune
 from gsim3d.profile.limit import TimeLimit
 from gsim3d.profile.measure import Agreement, Comparison, Effort, Point, measure
 from gsim3d.profile.settings import KNOBS, Setting
 from gsim3d.profile.timing import DeviceClock, Timing
-from gsim3d.train.checkpoint import Checkpoint
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SHORT = Effort(n_rounds=2, repeats=2, warm_up=0)

@@ -13,14 +13,14 @@ import pytest
 from gsim3d.ablate.rows import ROWS
 from gsim3d.cli import profile as command
 from gsim3d.cli.main import main
+from gsim3d.io import checkpoint
+from gsim3d.io.settings import to_dict
 from gsim3d.profile import budget, published, report
 from gsim3d.profile import measure as measuring
 from gsim3d.profile.autotune import SPEEDS
 from gsim3d.profile.measure import Comparison, Point, measure
 from gsim3d.profile.settings import Setting
 from gsim3d.profile.timing import DeviceClock
-from gsim3d.train import checkpoint
-from gsim3d.train.settings import to_dict
 from tests.profile.test_autotune import SHORT
 from tests.profile.test_budget import write_log
 

@@ -9,12 +9,12 @@ from gsim3d.dynamics import last_steps
 from gsim3d.effects.plan import Workload, predicted_cost
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.errors import InputError
+from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.profile import autotune
 from gsim3d.profile.measure import Point
 from gsim3d.profile.part_times import PartTimes
 from gsim3d.profile.settings import Setting
 from gsim3d.profile.timing import Timing
-from gsim3d.train.checkpoint import Checkpoint
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

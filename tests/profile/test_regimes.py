@@ -8,13 +8,13 @@ import torch
 
 from gsim3d.cuda_graphs import CapturedRollout
 from gsim3d.errors import CaptureError
+from gsim3d.io.checkpoint import Checkpoint
+from gsim3d.io.settings import to_dict
 from gsim3d.profile import report
 from gsim3d.profile.regimes import _steady_steps, throughput, training_step
 from gsim3d.profile.settings import Setting
 from gsim3d.profile.timing import DeviceClock
-from gsim3d.train.checkpoint import Checkpoint
 from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
-from gsim3d.train.settings import to_dict
 from tests.profile.fakes import FakeClock
 
 pytestmark = pytest.mark.usefixtures("one_thread")

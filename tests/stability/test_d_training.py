@@ -8,7 +8,7 @@ import torch
 
 from gsim3d.data import Scene, find_scenes
 from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr, ssim
-from gsim3d.train import checkpoint
+from gsim3d.io import checkpoint
 from gsim3d.train.config import DataConfig, OptimizerConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.losses import image_errors

@@ -16,10 +16,10 @@ from gsim3d.data import Fitting
 from gsim3d.effects.edits import load_edits
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
+from gsim3d.io.settings import from_dict, load_yaml, to_dict, upgraded
 from gsim3d.train import restore
 from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.restore import build_simulator, model_config
-from gsim3d.train.settings import from_dict, load_yaml, to_dict, upgraded
 
 
 def test_round_trip():

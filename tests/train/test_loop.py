@@ -18,7 +18,7 @@ from gsim3d.dynamics import concatenate
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.evaluate.perceptual.weights import SOURCES, cache_folder
-from gsim3d.train import checkpoint
+from gsim3d.io import checkpoint
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.losses import image_loss, time_weights

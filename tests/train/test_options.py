@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from gsim3d.errors import InputError
-from gsim3d.train import checkpoint
+from gsim3d.io import checkpoint
+from gsim3d.io.settings import from_dict
 from gsim3d.train.config import DataConfig, PhaseConfig, PrecisionConfig
 from gsim3d.train.gradients import StepWatch
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.optimizer import STEPS_TO_DOUBLE, LossScale
 from gsim3d.train.samples import draw_batch, draw_windows
-from gsim3d.train.settings import from_dict
 from tests.tiny_scenes import write_scenes
 from tests.train.test_loop import CONFIG, curve, scenes
 

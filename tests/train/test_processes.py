@@ -16,13 +16,13 @@ import yaml
 from torch.nn.parallel import DistributedDataParallel
 
 from gsim3d.errors import InputError
+from gsim3d.io import checkpoint
+from gsim3d.io.settings import to_dict
 from gsim3d.nn.layers import RowBatchNorm
-from gsim3d.train import checkpoint
 from gsim3d.train.config import PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.processes import Processes, joined
 from gsim3d.train.restore import build_simulator, model_config
-from gsim3d.train.settings import to_dict
 from tests.asserts import assert_close_relative_to_max
 from tests.tiny_scenes import write_scenes
 from tests.train.test_loop import CONFIG, assert_same_checkpoint, curve, scenes

@@ -11,10 +11,10 @@ import torch
 from gsim3d import Simulator, presets
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
-from gsim3d.train.checkpoint import Checkpoint, export
+from gsim3d.io.checkpoint import Checkpoint, export
+from gsim3d.io.settings import to_dict
 from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import build_simulator, check_sizes, restore
-from gsim3d.train.settings import to_dict
 
 ROOM = 2 * 2**30  # bytes that a child process may claim beyond what it starts with
 

@@ -13,10 +13,11 @@ import yaml
 
 from gsim3d.cli import main as __main__
 from gsim3d.errors import RunStopped
-from gsim3d.train import checkpoint, stopping
+from gsim3d.io import checkpoint
+from gsim3d.io.settings import to_dict
+from gsim3d.train import stopping
 from gsim3d.train.loop import Trainer
 from gsim3d.train.processes import joined
-from gsim3d.train.settings import to_dict
 from tests.tiny_scenes import write_scenes
 from tests.train.test_loop import CONFIG, assert_same_checkpoint, curve, scenes
 from tests.train.test_processes import LAYER

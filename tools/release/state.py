@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.errors import InputError
-from gsim3d.train import checkpoint
+from gsim3d.io import checkpoint
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import describe
 

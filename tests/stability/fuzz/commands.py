@@ -16,8 +16,7 @@ from functools import partial
 from pathlib import Path
 
 from gsim3d.cli.main import COMMANDS, main
-from gsim3d.io import write_ply
-from gsim3d.train import checkpoint
+from gsim3d.io import checkpoint, write_ply
 from tests.stability.fuzz.engine import Failure, Target
 from tests.stability.fuzz.readers import _gaussians, _saved
 from tests.tiny_scenes import write_scenes

@@ -35,17 +35,16 @@ from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.evaluate.perceptual import weights
 from gsim3d.evaluate.predictions import Predictions
-from gsim3d.io import read_ply, read_splats, write_ply, write_splats
+from gsim3d.io import checkpoint, read_ply, read_splats, write_ply, write_splats
+from gsim3d.io.settings import from_dict, load_yaml, to_dict
 from gsim3d.profile.autotune import TIMES, load_speed, load_times
 from gsim3d.simulator import Simulator
 from gsim3d.state import Gaussians
 from gsim3d.synth.meshes import load_body
 from gsim3d.testing import check_stability
-from gsim3d.train import checkpoint
 from gsim3d.train.config import DataConfig, TrainConfig
 from gsim3d.train.log import LOG, Log
 from gsim3d.train.restore import restore
-from gsim3d.train.settings import from_dict, load_yaml, to_dict
 from tests.compat.release import random_weights, settings_of, small_config, write_release
 from tests.data.made_scenes import WRITERS, edit_json, make_scene
 from tests.data.made_videos import trimmed, with_gaps, write_plain

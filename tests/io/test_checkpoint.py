@@ -14,9 +14,9 @@ import safetensors.torch
 import torch
 
 from gsim3d.errors import InputError, NumericalError
+from gsim3d.io import checkpoint
+from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.io.files import sha256_of
-from gsim3d.train import checkpoint
-from gsim3d.train.checkpoint import Checkpoint
 
 
 def example(step=10, **changes):
@@ -61,7 +61,7 @@ def test_a_kill_while_writing_leaves_the_last_one_good(tmp_path):
     checkpoint.save(tmp_path, example(5))
     script = (
         "import os, signal\n"
-        "from gsim3d.train import checkpoint\n"
+        "from gsim3d.io import checkpoint\n"
         "from tests.train.test_checkpoint import example\n"
         "checkpoint._sync = lambda path: os.kill(os.getpid(), signal.SIGKILL)\n"
         f"checkpoint.save({str(tmp_path)!r}, example(10))\n"

@@ -33,8 +33,8 @@ from gsim3d import __version__
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.io.files import MAX_TEXT, read_file, sha256_of
 from gsim3d.io.plain import is_number
+from gsim3d.io.settings import load_yaml
 from gsim3d.pretrained import located
-from gsim3d.train.settings import load_yaml
 
 FORMAT = 1
 STATE, CONFIG, POINTER = "state.json", "config.yaml", "last"
