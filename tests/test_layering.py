@@ -45,7 +45,6 @@ RINGS = {
         evaluate
         testing
         profile
-        ablate
     """,
     "commands": """
         cli.arguments

@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from gsim3d.ablate.rows import ROWS
 from gsim3d.cuda_graphs import Captured
 from gsim3d.data import Scene, find_scenes
 from gsim3d.errors import CaptureError, InputError
+from gsim3d.evaluate.ablations import changed, load_ablations
 from gsim3d.numerics.policy import StabilityReport
 from gsim3d.train.captured import CapturedLoss
 from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
@@ -21,6 +21,7 @@ from tests.asserts import assert_close_relative_to_max
 from tests.tiny_scenes import write_scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+ROWS = load_ablations()[1]
 
 CONFIG = TrainConfig(
     phases=(PhaseConfig(steps=9, horizon=2, batch=2, target_views=2),),
@@ -76,8 +77,8 @@ KINDS = {
     "moving": MOVING,
     "relit": RELIT,
     "flying": FLYING,
-    "moving, masked": ROWS["background-masked"].change(MOVING),
-    **{name: ROWS[name].change(CONFIG) for name in ("explicit", "background-masked")},
+    "moving, masked": changed(MOVING, ROWS["background-masked"].change),
+    **{name: changed(CONFIG, ROWS[name].change) for name in ("explicit", "background-masked")},
 }
 
 
@@ -281,7 +282,7 @@ class Ops(TorchDispatchMode):
     "row", ["latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relit", "flying"]
 )
 def test_nothing_in_a_graph_has_a_size_that_depends_on_numbers(row, scenes, tmp_path):
-    config = KINDS[row] if row in KINDS else ROWS[row].change(CONFIG)
+    config = KINDS[row] if row in KINDS else changed(CONFIG, ROWS[row].change)
     trainer = Trainer(config, scenes, tmp_path)
     captured = captured_loss(trainer)
     run(captured, batches(scenes, 1)[0], trainer)

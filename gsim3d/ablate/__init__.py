@@ -1,1 +1,0 @@
-"""The paper's ablations: the same training with one thing changed, scored side by side."""
