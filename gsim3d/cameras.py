@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Protocol
 
+import torch
 from torch import Tensor
 
 
@@ -87,3 +89,56 @@ class Frames(TensorRecord):
 
     def to(self, device):
         return dataclasses.replace(super().to(device), cameras=self.cameras.to(device))
+
+    def subsample(self, background_stride: int, body_stride: int) -> Frames:
+        """The same frames, of which every n-th row and column of pixels becomes particles.
+
+        Args:
+            background_stride: n of pixels that show what never moves.
+            body_stride: n of pixels that show what may move.
+        """
+        if background_stride == body_stride == 1 or self.masks is None or self.dynamic is None:
+            return self
+        of_body, of_background = (_every(n, self.masks) for n in (body_stride, background_stride))
+        return dataclasses.replace(self, masks=self.masks & torch.where(self.dynamic, of_body, of_background))
+
+
+def _every(stride: int, like: Tensor) -> Tensor:
+    """bool [H, W]: every n-th row and column of images [I, H, W]."""
+    chosen = torch.zeros(like.shape[1:], dtype=torch.bool, device=like.device)
+    chosen[stride // 2 :: stride, stride // 2 :: stride] = True
+    return chosen
+
+
+@dataclass(frozen=True)
+class InputSpec:
+    """What a trained simulator takes as input: the steps, views and pixels that it was trained with.
+
+    Attributes:
+        history: steps that are encoded.
+        context_views: images of each step.
+        context_cameras: the cameras they come from; empty: all but ``target_only_cameras``.
+        target_only_cameras: cameras that are never an input.
+        background_stride: as of :meth:`Frames.subsample`.
+        body_stride: as of :meth:`Frames.subsample`.
+        image_size: (width, height) pixels.
+        near_far: metres, the depth range of all scenes; empty: each scene's own.
+        fps: frames per second; None: not known.
+    """
+
+    history: int = 2
+    context_views: int = 4
+    context_cameras: tuple[int, ...] = ()
+    target_only_cameras: tuple[int, ...] = ()
+    background_stride: int = 1
+    body_stride: int = 1
+    image_size: tuple[int, ...] = ()
+    near_far: tuple[float, ...] = ()
+    fps: float | None = None
+
+
+class FrameSource(Protocol):
+    """Anything that shows scenes to a simulator, such as :class:`gsim3d.data.Scene`."""
+
+    def input_frames(self, inputs: InputSpec) -> Frames:
+        """The first ``inputs.history`` steps, from ``inputs.context_views`` cameras of ``inputs.image_size``."""

@@ -32,7 +32,6 @@ from gsim3d.nn.point_transformer import SparseConv
 from gsim3d.numerics.policy import StabilityReport, pack
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.ops.raster import Rendering
-from gsim3d.simulator import Simulator
 from gsim3d.state import DYNAMIC, CloudTable, Particles, keeping_constants, newest_clouds
 
 FACTOR = 1.25  # room over what was observed
@@ -142,7 +141,7 @@ class CapturedRollout:
     On the CPU there are no graphs: calls run the same steps one by one, with the same sizes and the same results.
 
     Args:
-        simulator: in evaluation mode.
+        simulator: :class:`gsim3d.Simulator` in evaluation mode.
         state: as of ``simulator.rollout``; says how many rows each cloud has.
         n_steps: how many steps to predict.
         plan: what to compute; default everything the model can.
@@ -151,7 +150,7 @@ class CapturedRollout:
         factor: room for geometry over what the rollout of ``state`` needs, at least 1.
         copies: results are copies; False: the graph's own memory, which the next call overwrites.
         report: is told what the simulator's guards find; default ``simulator.report``.
-        cutoff: of Gaussians, as of :meth:`Simulator.draw`.
+        cutoff: of Gaussians, as of :meth:`Simulator.render`.
     Raises:
         InputError: an argument does not fit; the message names it.
 
@@ -161,7 +160,7 @@ class CapturedRollout:
 
     def __init__(
         self,
-        simulator: Simulator,
+        simulator: Any,
         state: Particles,
         n_steps: int,
         plan: Plan | None = None,
@@ -188,7 +187,7 @@ class CapturedRollout:
         self._background, self._cutoff = background, cutoff
         if self._plan.spec.dynamics.sleep is not None:
             raise InputError("CapturedRollout: plan must be one without dynamics.sleep; a graph knows no sleep")
-        prepared = simulator.prepare(state, self._plan)
+        prepared = simulator._prepare(state, self._plan)
         self._table, self._state, self._rest = prepared.clouds, _own(prepared), None
         self._cameras = None if cameras is None else cameras.map(torch.clone)
         self._device = prepared.means.device
@@ -202,7 +201,7 @@ class CapturedRollout:
         self.captures = 0
         self._launched = self._is_stale = False
         if simulator.config.dynamics.is_asymmetric:
-            parts = simulator.parts(prepared, report=self._report)
+            parts = simulator._parts(prepared, report=self._report)
             if parts.nothing_moves:
                 raise InputError("CapturedRollout: state has no row that moves; there is nothing to capture")
             self._state = _own(parts.moving)
@@ -230,11 +229,11 @@ class CapturedRollout:
         Raises:
             NumericalError: of an earlier call, under the policy "raise".
         """
-        state = self._simulator.prepare(state, self._plan)
+        state = self._simulator._prepare(state, self._plan)
         self._check(state, self._table)
         tables, self._world_offset = state.clouds, state.world_offset
         if self._rest is not None:
-            state = self._load_parts(self._simulator.parts(state, report=self._report))
+            state = self._load_parts(self._simulator._parts(state, report=self._report))
         _copy(self._state, state)
         if cameras is not None:
             self._load(cameras)
@@ -278,11 +277,11 @@ class CapturedRollout:
             if rest is None:
                 steps = self._model.rollout(self._state, self._n_steps, plan, **options)
             else:
-                moving = self._model.advance(self._state, rest.background, self._n_steps, plan, **options)
+                moving = self._model._advance(self._state, rest.background, self._n_steps, plan, **options)
                 steps = [rest.parts.whole(step, 1 + i) for i, step in enumerate(moving)]
             if self._cameras is not None:
                 drawn = {"plan": self._drawn, "cutoff": self._cutoff, "report": report}
-                renderings += [self._model.draw(step, self._cameras, self._background, **drawn) for step in steps]
+                renderings += [self._model._draw(step, self._cameras, self._background, **drawn) for step in steps]
         return Predicted(steps, renderings)
 
     def _autocast(self) -> torch.autocast:
@@ -472,7 +471,7 @@ def with_background_as_it_is(plan: Plan) -> Plan:
     return dataclasses.replace(plan, spec=dataclasses.replace(plan.spec, dynamics=dynamics))
 
 
-def _rooms(simulator: Simulator) -> dict[str, nn.Module]:
+def _rooms(simulator: nn.Module) -> dict[str, nn.Module]:
     """What a rollout reads."""
     return {"dynamics": simulator.dynamics, "renderer": simulator.renderer}
 

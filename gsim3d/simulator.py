@@ -1,6 +1,6 @@
 """The simulator: images -> particles -> particles of later steps -> images. The file to read first.
 
-    simulator = Simulator(presets.tiny())
+    simulator = Simulator.from_pretrained("elastic-small")
     state = simulator.encode(frames)                  # particles of the last steps of every scene
     plan = simulator.plan(EffectsSpec())              # what to compute, and what not
     steps = simulator.rollout(state, 12, plan)        # particles of the next 12 steps
@@ -16,14 +16,18 @@ model's), and ``report``, which counts them (default ``simulator.report``).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from gsim3d.cameras import Cameras, Frames
+from gsim3d import pretrained
+from gsim3d.cameras import Cameras, Frames, FrameSource, InputSpec
+from gsim3d.cuda_graphs import CapturedRollout
 from gsim3d.dynamics import (
     Background,
     Dynamics,
@@ -41,26 +45,48 @@ from gsim3d.effects.edits import Edit, by_step
 from gsim3d.effects.plan import Plan, make_plan, unused_parameters
 from gsim3d.effects.selection import any_mask
 from gsim3d.effects.spec import EffectsSpec, OutputEffects, UnsupportedEffect
+from gsim3d.errors import InputError
+from gsim3d.io import checkpoint
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.nn.gaussian_head import GaussianHead, render
 from gsim3d.nn.multiview_encoder import Encoder, Room, pixel_rows
 from gsim3d.numerics.policy import OnInvalid, StabilityReport, check_on_invalid
+from gsim3d.numerics.speed import Setting, load_speed
 from gsim3d.numerics.validate import check_particles, drop_rows, guard_frames, guard_particles
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
+from gsim3d.pretrained.loading import Description, check_device, describe, is_released, with_weights
 from gsim3d.state import DYNAMIC, FROZEN, Gaussians, Particles
+
+
+class Prediction(NamedTuple):
+    """What :meth:`Simulator.predict` returns.
+
+    Attributes:
+        steps: particles of each predicted step, one cloud a scene.
+        renderings: images of each step; empty where no cameras were given.
+    """
+
+    steps: list[Particles]
+    renderings: list[Rendering]
 
 
 class Simulator(nn.Module):
     """Encoder, dynamics and renderer of one model.
 
-    report: StabilityReport of the calls that were given no other.
-    absent: parameters that the weights it was given lack; plans that read them are refused.
-    draws_in_graphs: whether images can be part of a CUDA graph.
+    Attributes:
+        config: sizes of its parts.
+        effects: what it was trained to simulate, the default of :meth:`plan`.
+        inputs: what it was trained on; None: not known.
+        setting: how :meth:`predict` computes.
+        report: StabilityReport of the calls that were given no other.
+        absent: parameters that the weights it was given lack; plans that read them are refused.
+        draws_in_graphs: whether images can be part of a CUDA graph.
     """
 
-    draws_in_graphs = True
+    config_class: type[ModelConfig] = ModelConfig
+    draws_in_graphs: bool = True
 
     def __init__(self, config: ModelConfig):
         super().__init__()
@@ -68,8 +94,132 @@ class Simulator(nn.Module):
         self.encoder = Encoder(config.encoder)
         self.dynamics = Dynamics(config.dynamics)
         self.renderer = GaussianHead(config.renderer)
+        self.effects, self.inputs, self.setting = EffectsSpec(), None, Setting()
         self.report = StabilityReport()
         self.absent: frozenset[str] = frozenset()
+
+    @classmethod
+    def from_pretrained(cls, name_or_path: str | Path, *, device: str = "cpu", speed: str = "exact") -> Simulator:
+        """A trained simulator, ready to predict.
+
+        Args:
+            name_or_path: name of a simulator that comes with gsim3d (:func:`gsim3d.pretrained.names`), a run folder, a
+                checkpoint folder or a .safetensors file.
+            device: "cpu" or "cuda".
+            speed: "exact", or "balanced" or "fast" where ``gsim3d profile`` tuned them for the checkpoint.
+        Returns:
+            The simulator, in evaluation mode.
+        Raises:
+            InputError: there is no such checkpoint, it is broken or one of the published model, ``device`` is not
+                there, or ``speed`` was not tuned; the message says what to do.
+        """
+        check_device(device)
+        saved = checkpoint.load(name_or_path)
+        if is_released(saved.config) != (cls.config_class is not ModelConfig):
+            wanted = "gsim3d.compat.load_released" if cls is Simulator else "Simulator.from_pretrained"
+            raise InputError(f"{name_or_path}: a checkpoint of another kind of model; load it with {wanted}")
+        try:
+            found = describe(saved.config, cls.config_class, pretrained.frame_rate(name_or_path))
+            folder = pretrained.located(name_or_path)
+            folder = folder if folder.is_dir() else folder.parent
+            setting = load_speed(folder, saved.digest, device.split(":")[0], speed)
+            simulator = with_weights(cls, setting.of_model(found.model), found.effects, saved.weights)
+        except InputError as error:
+            raise InputError(f"{name_or_path}: {error}") from None
+        except Exception as error:  # a configuration that describes no model raises anything
+            said = " ".join(str(error).split())[:200]
+            kind = type(error).__name__
+            raise InputError(f"{name_or_path}: its configuration describes no model: {kind}: {said}") from None
+        asymmetric = simulator.config.dynamics.is_asymmetric
+        simulator.effects, simulator.setting = setting.of_effects(found.effects, asymmetric), setting
+        simulator.inputs = setting.of_inputs(found.inputs)
+        return simulator.eval().to(device)
+
+    def save_pretrained(self, folder: str | Path) -> Path:
+        """Writes weights and configuration, for :meth:`from_pretrained`.
+
+        Args:
+            folder: is made, or replaced where it is a checkpoint.
+        Returns:
+            The folder.
+        Raises:
+            NumericalError: a weight is not finite; nothing is written.
+        """
+        config = Description(self.config, self.effects, self.inputs).to_dict()
+        folder = Path(folder)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        return checkpoint.write(folder, checkpoint.Checkpoint(self.state_dict(), config, {"step": 0}))
+
+    @torch.no_grad()
+    def predict(
+        self,
+        source: Frames | FrameSource,
+        steps: int,
+        *,
+        cameras: Cameras | None = None,
+        background: Tensor | None = None,
+        edits: Sequence[Edit] = (),
+    ) -> Prediction:
+        """The future of scenes: :meth:`encode`, :meth:`rollout` and :meth:`render` as the simulator's ``setting`` says.
+
+        Args:
+            source: input images, or anything that gives them: :class:`gsim3d.data.Scene`, or an own class with a method
+                ``input_frames(inputs)`` (:class:`gsim3d.cameras.FrameSource`).
+            steps: how many to predict, at least 1.
+            cameras: of the images of each step; None: none are drawn.
+            background: [3] or [I, 3], of the images; default black.
+            edits: changes of the scene on the way.
+        Returns:
+            Particles of the steps after the last input step, and their images.
+        Raises:
+            InputError: ``steps`` is below 1, the images have another size than those of the training, or an edit cannot
+                be made.
+        """
+        if steps < 1:
+            raise InputError(f"predict: steps must be at least 1; got {steps}")
+        inputs = InputSpec() if self.inputs is None else self.inputs
+        frames = source if isinstance(source, Frames) else source.input_frames(inputs)
+        size = (frames.cameras.width, frames.cameras.height)
+        if inputs.image_size and size != tuple(inputs.image_size):
+            wanted = "x".join(map(str, inputs.image_size))
+            raise InputError(f"predict: images must be of {wanted} pixels, as in training; got {size[0]}x{size[1]}")
+        weight = next(self.parameters())
+        setting, plan, device = self.setting, self.plan(), weight.device.type
+        frames = frames.subsample(inputs.background_stride, inputs.body_stride).to(weight.device)
+        with setting.precision("encoder", device):
+            state = setting.retained(self.encode(frames))
+        with setting.precision("dynamics", device):
+            states = self._states(state, steps, plan, edits)
+        renderings = []
+        if cameras is not None:
+            seen = states
+            if setting.least_opacity:
+                seen = [step.select_rows(step.opacities >= setting.least_opacity) for step in states]
+            shown = cameras.to(weight.device)
+            with setting.precision("renderer", device):
+                renderings = [self._draw(step, shown, background, plan, cutoff=setting.cutoff) for step in seen]
+        return Prediction(states, renderings)
+
+    def _states(self, state: Particles, n_steps: int, plan: Plan, edits: Sequence[Edit]) -> list[Particles]:
+        """:meth:`rollout` as the setting says."""
+        setting = self.setting
+        if setting.captured and not edits and state.means.is_cuda:
+            return CapturedRollout(self, state, n_steps, plan)(state).steps
+        if setting.orders == 1:
+            return self.rollout(state, n_steps, plan, edits=edits)
+        if edits:
+            raise InputError("predict: orders of curves cannot be averaged while a scene is edited; use another speed")
+        states, geometry = [], self.dynamics.geometry
+        for _ in range(n_steps):
+            state = self._prepare(state, plan)
+            states.append(
+                setting.averaged(
+                    lambda curves: self.rollout(state, 1, plan, geometry=partial(geometry, curves=curves))[0],
+                    self.config.dynamics.n_stages,
+                )
+            )
+            state = append_step(state, states[-1], plan.history)
+        return states
 
     def encode(
         self,
@@ -101,13 +251,17 @@ class Simulator(nn.Module):
         guard.keywords["report"].send()
         return particles
 
-    def plan(self, spec: EffectsSpec = EffectsSpec()) -> Plan:
-        """What will be computed for ``spec``, and what will not.
+    def plan(self, spec: EffectsSpec | None = None) -> Plan:
+        """What will be computed, and what will not.
 
+        Args:
+            spec: what the scene calls for; None: what the model was trained to simulate.
+        Returns:
+            The plan, which :meth:`step`, :meth:`rollout` and :meth:`render` take.
         Raises:
             UnsupportedEffect: this model cannot simulate an effect of ``spec``.
         """
-        plan = make_plan(spec, self.config)
+        plan = make_plan(self.effects if spec is None else spec, self.config)
         names = (name for name, _ in self.named_parameters())
         unused = unused_parameters(plan, self.config, names)
         if needed := sorted(self.absent.difference(unused)):
@@ -134,7 +288,7 @@ class Simulator(nn.Module):
         """
         plan, guard = plan or self.plan(), self._guard("step", on_invalid, report)
         self._check(state, "step")
-        state = guard(self.prepare(state, plan))
+        state = guard(self._prepare(state, plan))
         step = self._predict(state, plan=plan, generator=generator, guard=guard)
         guard.keywords["report"].send()
         return append_step(state, step, plan.history)
@@ -145,6 +299,7 @@ class Simulator(nn.Module):
         n_steps: int,
         plan: Plan | None = None,
         *,
+        plans: Sequence[Plan] | None = None,
         generator: torch.Generator | None = None,
         on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
@@ -155,22 +310,40 @@ class Simulator(nn.Module):
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
 
-        Rows are those of the newest step of ``state`` throughout, but for edits. Gradients flow through all steps.
-        Arguments as :meth:`step`.
+        The particles are those of the newest step of ``state`` throughout, but for edits.
 
         Args:
+            state: last steps of every scene.
+            n_steps: how many to predict.
+            plan: as of :meth:`step`.
+            plans: one for each scene, in place of ``plan``; each scene is computed as if it were alone, those with
+                equal plans together.
+            generator: as of :meth:`step`.
+            on_invalid: policy for numbers that cannot be used; None: the model's.
+            report: counts such numbers; None: ``self.report``.
             geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
             wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
-            log: is told which rows rested and were not computed.
-            edits: changes of the scene on the way (:mod:`gsim3d.effects.edits`); they wake everybody.
+            log: records which particles rested and were not computed.
+            edits: changes of the scene on the way (:mod:`gsim3d.effects.edits`); they wake all particles.
+        Returns:
+            Particles of each step.
         Raises:
-            InputError: an edit cannot be made; the message names its step and operation.
+            InputError: an edit cannot be made, and the message names its step and operation; or ``plans`` are not as
+                many as scenes.
+        Gradients: through all steps.
         """
+        if plans is not None:
+            options = {"generator": generator, "on_invalid": on_invalid, "report": report, "edits": edits, "log": log}
+            parts = [
+                self.rollout(state.select_clouds(clouds), n_steps, one, geometry=geometry, wrap=wrap, **options)
+                for one, clouds in _by_plan(state, plans)
+            ]
+            return [concatenate(step) for step in zip(*parts, strict=True)]
         plan, guard = plan or self.plan(), self._guard("rollout", on_invalid, report)
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
         predict = predict if wrap is None else wrap(predict)
         self._check(state, "rollout")
-        state, steps = self.prepare(state, plan), []
+        state, steps = self._prepare(state, plan), []
         structure = plan.spec.structure
         changes = by_step(edits, n_steps, insert=structure.insert, remove=structure.remove)
         for begin, end in pairwise(sorted({0, *changes, n_steps})):
@@ -203,7 +376,7 @@ class Simulator(nn.Module):
             log=log,
         )
 
-    def prepare(self, state: Particles, plan: Plan) -> Particles:
+    def _prepare(self, state: Particles, plan: Plan) -> Particles:
         """What the dynamics reads of ``state``: its last steps, with the background as the plan wants it, and marks on
         the bodies that it names."""
         background, appearance = plan.spec.dynamics.background, plan.spec.appearance
@@ -220,13 +393,13 @@ class Simulator(nn.Module):
         state = last_steps(state, plan.history)
         return self.dynamics.begin(self.dynamics.in_light(state))
 
-    def parts(
+    def _parts(
         self, prepared: Particles, *, on_invalid: OnInvalid | None = None, report: StabilityReport | None = None
     ) -> Parts:
-        """What moves and what rests of a state that :meth:`prepare` made, for a model with an asymmetric background."""
+        """What moves and what rests of a state of :meth:`_prepare`, for a model with an asymmetric background."""
         return Parts.of(self._guard("rollout", on_invalid, report)(prepared), asymmetric=True)
 
-    def advance(
+    def _advance(
         self,
         moving: Particles,
         background: Background,
@@ -248,6 +421,7 @@ class Simulator(nn.Module):
         background: Tensor | None = None,
         plan: Plan | None = None,
         *,
+        plans: Sequence[Plan] | None = None,
         cutoff: str = "exact",
         on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
@@ -259,17 +433,27 @@ class Simulator(nn.Module):
             cameras: I images.
             background: [3] or [I, 3], default black.
             plan: which images, and the degree of view-dependent colour; default colour as the model's, alpha and depth.
+            plans: one for each scene, in place of ``plan``; all for the same outputs.
             cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
+            on_invalid: policy for numbers that cannot be used; None: the model's.
+            report: counts such numbers; None: ``self.report``.
+        Returns:
+            The images that the plan asks for.
+        Raises:
+            InputError: ``plans`` are not as many as scenes, or ask for different images.
         """
+        if plans is not None:
+            options = {"cutoff": cutoff, "on_invalid": on_invalid, "report": report}
+            return self._render_by_plan(particles, cameras, background, plans, **options)
         guard = self._guard("render", on_invalid, report, in_workspace=False)
         self._check(particles, "render")
-        image = self.draw(
+        image = self._draw(
             guard(particles), cameras, background, plan, cutoff=cutoff, on_invalid=on_invalid, report=report
         )
         guard.keywords["report"].send()
         return image
 
-    def draw(
+    def _draw(
         self,
         particles: Particles,
         cameras: Cameras,
@@ -296,6 +480,24 @@ class Simulator(nn.Module):
         )
         asked = (outputs.rgb, outputs.alpha, outputs.depth, outputs.features)
         return Rendering(*(made if wanted else None for made, wanted in zip(image, asked, strict=True)))
+
+    def _render_by_plan(
+        self, particles: Particles, cameras: Cameras, background: Tensor | None, plans: Sequence[Plan], **options
+    ) -> Rendering:
+        if len({plan.spec.outputs for plan in plans}) > 1:
+            raise InputError("plans: those of one batch must ask for the same images (outputs)")
+        shown, order, images = cameras.image_cloud.tolist(), [], []
+        for plan, clouds in _by_plan(particles, plans):
+            rows = [i for i, cloud in enumerate(shown) if cloud in clouds]
+            chosen = torch.tensor(rows, device=cameras.near.device, dtype=torch.int64)
+            image_cloud = torch.tensor([clouds.index(shown[i]) for i in rows], device=chosen.device, dtype=torch.int64)
+            behind = background if background is None or background.dim() == 1 else background[chosen]
+            selected = cameras.select(chosen, image_cloud)
+            images.append(self.render(particles.select_clouds(clouds), selected, behind, plan, **options))
+            order += rows
+        back = torch.argsort(torch.tensor(order, device=cameras.near.device))
+        fields = zip(*images, strict=True)
+        return Rendering(*(None if parts[0] is None else torch.cat(parts)[back] for parts in fields))
 
     def _rasterized(self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None, **options) -> Rendering:
         return render(gaussians, cameras, background, **options)
@@ -355,3 +557,14 @@ class Simulator(nn.Module):
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
         changed = [name for name, who in changes.items() if who != "none"]
         return guard(step, previous=newest, changed=changed)
+
+
+def _by_plan(particles: Particles, plans: Sequence[Plan]) -> Iterator[tuple[Plan, list[int]]]:
+    """Each plan, once, and the clouds that it is for."""
+    n_scenes = particles.origin.shape[0]
+    if len(plans) != n_scenes:
+        raise InputError(f"plans: there must be one for each of {n_scenes} scenes; got {len(plans)}")
+    kinds: dict[str, tuple[Plan, list[int]]] = {}
+    for cloud, scene in enumerate(particles.clouds.scenes):
+        kinds.setdefault(plans[scene].spec.hash, (plans[scene], []))[1].append(cloud)
+    yield from kinds.values()

@@ -106,13 +106,13 @@ def test_a_state_that_is_prepared_knows_how_its_background_began(device):
         make_simulator(device, dynamics=dataclasses.replace(CONFIG.dynamics, background=background))
         for background in ("symmetric", "relightable")
     )
-    assert symmetric.prepare(state, symmetric.plan()).initial_latents is None
-    prepared = relit.prepare(state, relit.plan())
+    assert symmetric._prepare(state, symmetric.plan()).initial_latents is None
+    prepared = relit._prepare(state, relit.plan())
     assert_same_bits(prepared.initial_latents, prepared.dynamic_latents)
     step = rolled_out(relit, state, 2)[-1]
     frozen = step.activity == FROZEN
     assert frozen.any() and not torch.equal(step.initial_latents[frozen], step.dynamic_latents[frozen])
-    again = relit.prepare(step, relit.plan())
+    again = relit._prepare(step, relit.plan())
     assert_same_bits(again.initial_latents, step.initial_latents)
 
 

@@ -30,10 +30,9 @@ RINGS = {
         io
         effects.edits
         presets
-        effects.plan
-        simulator
-        effects.by_scene
+        effects.plan numerics.speed pretrained.loading
         cuda_graphs
+        simulator
     """,
     "workshop": """
         data evaluate.perceptual

@@ -11,7 +11,7 @@ from gsim3d import pretrained
 from gsim3d.cli.main import main
 from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
-from gsim3d.profile.autotune import SPEEDS
+from gsim3d.numerics.speed import SPEEDS_FILE
 from gsim3d.testing.invariances import LAWS
 from gsim3d.train.restore import restore
 
@@ -69,12 +69,12 @@ def test_commands_name_what_they_do_not_know(command, capsys, tmp_path, monkeypa
 @pytest.mark.parametrize("name", pretrained.names())
 def test_what_is_shipped_is_whole_and_described(name):
     folder = pretrained.FOLDER / name
-    assert {path.name for path in folder.iterdir()} - {pretrained.LAWS} == {*PARTS, SPEEDS}
+    assert {path.name for path in folder.iterdir()} - {pretrained.LAWS} == {*PARTS, SPEEDS_FILE}
     weights = load_file(folder / pretrained.WEIGHTS)
     assert all(value.dtype == torch.bfloat16 for value in weights.values())
     assert all(bool(value.isfinite().all()) for value in weights.values())
     restored = restore(name)
-    assert list(json.loads((folder / SPEEDS).read_text())) == [restored.checkpoint.digest]
+    assert list(json.loads((folder / SPEEDS_FILE).read_text())) == [restored.checkpoint.digest]
     assert restored.image_size == (128, 128)
     recipe, scores = (json.loads((folder / f"{part}.json").read_text()) for part in ("recipe", "scores"))
     steps = [json.loads(line)["step"] for line in (folder / "training.jsonl").read_text().splitlines()]

@@ -27,7 +27,7 @@ from gsim3d import pretrained  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402
 from gsim3d.evaluate.pictures import write_curves  # noqa: E402
 from gsim3d.io import checkpoint  # noqa: E402
-from gsim3d.profile.autotune import SPEEDS  # noqa: E402
+from gsim3d.numerics.speed import SPEEDS_FILE  # noqa: E402
 from gsim3d.synth.worlds import VALIDATION_SEED  # noqa: E402
 from tools.release.recipes import Recipe, recipe  # noqa: E402
 from tools.release.state import CURVE, load_progress, weights_file  # noqa: E402
@@ -57,7 +57,7 @@ def ship(name: str, made: Recipe, state: Path, scores: Path, limitations: str) -
     folder = pretrained.FOLDER / name
     folder.mkdir(exist_ok=True)
     shutil.copyfile(weights, folder / pretrained.WEIGHTS)
-    speeds = folder / SPEEDS
+    speeds = folder / SPEEDS_FILE
     if speeds.is_file() and saved.digest not in json.loads(speeds.read_text()):
         speeds.unlink()  # of the weights before
     (folder / pretrained.LAWS).unlink(missing_ok=True)  # of old weights; measured by gsim3d doctor --stability --full

@@ -21,7 +21,7 @@ sys.path.insert(0, str(ROOT))
 from gsim3d import pretrained  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402
 from gsim3d.evaluate.report import write_json  # noqa: E402
-from gsim3d.profile.autotune import SPEEDS  # noqa: E402
+from gsim3d.numerics.speed import SPEEDS_FILE  # noqa: E402
 from gsim3d.profile.page import share_in_words  # noqa: E402
 from gsim3d.profile.report import regimes_in_words  # noqa: E402
 
@@ -63,11 +63,11 @@ def row_of(point: dict) -> list[str]:
 
 def keep_speeds(folder: Path, reports: dict[str, Path]) -> Path:
     """What all reports tuned, in one file beside the weights."""
-    file = folder / SPEEDS
+    file = folder / SPEEDS_FILE
     known = json.loads(file.read_text()) if file.is_file() else {}
     for report in reports.values():
-        if (report / SPEEDS).is_file():
-            for digest, devices in json.loads((report / SPEEDS).read_text()).items():
+        if (report / SPEEDS_FILE).is_file():
+            for digest, devices in json.loads((report / SPEEDS_FILE).read_text()).items():
                 known[digest] = {**known.get(digest, {}), **devices}
     write_json(file, known)
     return file

@@ -244,7 +244,9 @@ def _keep_speeds(checkpoint, out, *kept):
     try:
         return autotune.save_speeds(checkpoint if checkpoint.is_dir() else checkpoint.parent, *kept)
     except OSError as error:
-        print(f"{error.filename or checkpoint}: {error.strerror}; copy {autotune.SPEEDS} there, for gsim3d simulate")
+        print(
+            f"{error.filename or checkpoint}: {error.strerror}; copy {autotune.SPEEDS_FILE} there, for gsim3d simulate"
+        )
         return autotune.save_speeds(out, *kept)
 
 

@@ -10,6 +10,7 @@ import dataclasses
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TypeVar
 
 import torch
@@ -191,13 +192,15 @@ def as_released(network: Module, without: Collection[type] = ()) -> Module:
 class ReleasedSimulator(Simulator):
     """A :class:`Simulator` that predicts what the published model predicts with the same weights."""
 
+    config_class = ReleasedModelConfig
     draws_in_graphs = False
 
     def __init__(self, config: ReleasedModelConfig):
         super().__init__(config)
         as_released(self)
 
-    def plan(self, spec: EffectsSpec = EffectsSpec()) -> Plan:
+    def plan(self, spec: EffectsSpec | None = None) -> Plan:
+        spec = self.effects if spec is None else spec
         if spec.outputs.features or not spec.outputs.rgb:
             raise UnsupportedEffect(
                 "unsupported effect outputs: the published renderer draws colour and no features; leave it out"
@@ -208,14 +211,23 @@ class ReleasedSimulator(Simulator):
         return render_released(gaussians, cameras, background, jacobian=options["jacobian"])
 
 
+def load_released(path: str | Path, *, device: str = "cpu") -> ReleasedSimulator:
+    """The simulator of a checkpoint that ``gsim3d import`` wrote.
+
+    Args:
+        path: its folder or .safetensors file.
+        device: "cpu" or "cuda".
+    Returns:
+        The simulator, in evaluation mode.
+    Raises:
+        InputError: as :meth:`gsim3d.Simulator.from_pretrained`.
+    """
+    return ReleasedSimulator.from_pretrained(path, device=device)
+
+
 def simulator_class(config: ModelConfig) -> type[Simulator]:
     """The class of the simulator that ``config`` describes."""
     return ReleasedSimulator if isinstance(config, ReleasedModelConfig) else Simulator
-
-
-def config_class(section: dict) -> type[ModelConfig]:
-    """The class of the configuration that a saved ``model`` section describes."""
-    return ReleasedModelConfig if section.get("release") is True else ModelConfig
 
 
 def rounded_to_half(x: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsim3d.cameras import Cameras
+from gsim3d.cameras import Cameras, Frames, InputSpec
 from gsim3d.data import layouts
 from gsim3d.data.cameras import check_directions, frusta_origin, near_zero, shared_view, spread_steps
 from gsim3d.data.fitting import Fitting, fit, own_depths, resample
@@ -182,6 +182,31 @@ class Scene:
                 inner = True if undistorter is None else torch.from_numpy(undistorter.valid(self._K(cam, step)))
                 valid[i, j, :height, :width] = inner
         return valid
+
+    def input_frames(self, inputs: InputSpec, *, start: int = 0, cams: Sequence[int] | None = None) -> Frames:
+        """What a simulator takes as input of the scene (:class:`gsim3d.cameras.FrameSource`).
+
+        Args:
+            inputs: of a simulator.
+            start: first step.
+            cams: cameras; None: as many as in training, spread evenly over those that may be an input.
+        Raises:
+            InputError: the scene has too few steps or cameras.
+        """
+        from gsim3d.data.dataset import make_frames
+
+        if not 0 <= start <= self.n_steps - inputs.history:
+            raise InputError(
+                f"{self.path}: {inputs.history} steps from step {start} on do not fit its {self.n_steps} steps"
+            )
+        if cams is None:
+            known = all(cam < self.n_cams for cam in (*inputs.context_cameras, *inputs.target_only_cameras))
+            kept = set(inputs.target_only_cameras) if known else set()
+            allowed = [cam for cam in (known and inputs.context_cameras) or range(self.n_cams) if cam not in kept]
+            n = min(inputs.context_views, len(allowed))
+            cams = sorted(allowed[k * len(allowed) // n] for k in range(n))
+        steps = range(start, start + inputs.history)
+        return make_frames([self], [list(cams)], [steps], masked=self.has_segmentation())
 
     def _numbers(self, cams, steps) -> tuple[list[int], list[int]]:
         cams, steps = [int(c) for c in cams], [int(s) for s in steps]

@@ -6,21 +6,21 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gsim3d.errors import InputError, did_you_mean
+from gsim3d.errors import InputError
 from gsim3d.evaluate.report import write_json
-from gsim3d.io.files import MAX_TEXT, read_file
-from gsim3d.io.plain import parse_json
+from gsim3d.numerics import speed
+from gsim3d.numerics.speed import SPEEDS_FILE, Setting, read_speeds
 from gsim3d.profile.limit import PRESETS, TimeLimit
 from gsim3d.profile.measure import Comparison, Effort, Point, measure, points_of, ties
 from gsim3d.profile.part_times import PartTimes
-from gsim3d.profile.settings import KNOBS, NOT_TUNED, Knob, Setting
+from gsim3d.profile.settings import KNOBS, NOT_TUNED, Knob
 from gsim3d.profile.subject import Subject
 from gsim3d.profile.timing import Clock, DeviceClock
 from gsim3d.train.restore import Restored
 
 # preset -> share of the reference's gain over the constant baseline, in dB, that it keeps at least
 PROMISES = {"exact": None, "balanced": 0.999, "fast": 0.99}
-SPEEDS, TIMES = "speeds.json", "measured"  # the file; the key of times in it, beside the presets of a device
+TIMES = "measured"  # the key of times, beside the presets of a device
 
 
 def autotune(
@@ -167,8 +167,7 @@ def _most_accurate(
 def save_speeds(folder: Path, restored: Restored, presets: dict[str, Point], times: PartTimes | None = None) -> Path:
     """Keeps the tuned presets of a checkpoint on its device, and what its reference took, in ``folder``/speeds.json,
     beside those of others."""
-    path = folder / SPEEDS
-    known = _read(path) if path.is_file() else {}
+    path, known = folder / SPEEDS_FILE, read_speeds(folder)
     digest, device = restored.checkpoint.digest, restored.device.type
     settings = {name: point.setting.to_dict() for name, point in presets.items()}
     if times is not None:
@@ -178,42 +177,17 @@ def save_speeds(folder: Path, restored: Restored, presets: dict[str, Point], tim
 
 
 def load_speed(folder: Path, restored: Restored, preset: str) -> Setting:
-    """The setting of a preset that was tuned for a checkpoint on this kind of device.
-
-    Raises:
-        InputError: it was not tuned; the message says how to.
-    """
-    if preset not in PROMISES:
-        raise InputError(
-            f"--speed: must be one of {', '.join(PROMISES)}; got {preset!r}{did_you_mean(preset, PROMISES)}"
-        )
-    if preset == "exact":
-        return Setting()
-    path, device = folder / SPEEDS, restored.device.type
-    found = _read(path) if path.is_file() else {}
-    for key in (restored.checkpoint.digest, device, preset):
-        found = found.get(key)
-        if not isinstance(found, dict):
-            raise InputError(
-                f"--speed {preset}: this checkpoint is not tuned for {device} (in {path}); run "
-                "gsim3d profile CHECKPOINT first"
-            )
-    return Setting.from_dict(found)
+    """As :func:`gsim3d.numerics.speed.load_speed`, of the option --speed."""
+    try:
+        return speed.load_speed(folder, restored.checkpoint.digest, restored.device.type, preset)
+    except InputError as error:
+        raise InputError(f"--{error}") from None
 
 
 def load_times(folder: Path, restored: Restored) -> dict[str, PartTimes]:
     """Kind of device -> what the reference of a checkpoint took where it was measured; empty where it was not."""
-    path = folder / SPEEDS
-    devices = _read(path).get(restored.checkpoint.digest) if path.is_file() else None
+    devices = read_speeds(folder).get(restored.checkpoint.digest)
     known = {name: kept[TIMES] for name, kept in (devices or {}).items() if isinstance(kept, dict) and TIMES in kept}
-    return {name: PartTimes.from_dict(values, f"{path}: {name}: {TIMES}") for name, values in known.items()}
-
-
-def _read(path: Path) -> dict:
-    try:
-        content = parse_json(read_file(path, MAX_TEXT))
-    except ValueError as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path} must hold a mapping of checkpoints")
-    return content
+    return {
+        name: PartTimes.from_dict(values, f"{folder / SPEEDS_FILE}: {name}: {TIMES}") for name, values in known.items()
+    }

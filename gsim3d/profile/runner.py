@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from functools import partial
 
 import torch
@@ -17,18 +17,14 @@ from gsim3d.cuda_graphs import CapturedRollout
 from gsim3d.data import Scene, make_frames
 from gsim3d.dynamics import RestLog, append_step, concatenate, last_steps
 from gsim3d.effects.edits import Edit
-from gsim3d.effects.spec import Sleep
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import Prediction
-from gsim3d.nn.layers import exact_convolutions
 from gsim3d.profile.settings import Setting
 from gsim3d.simulator import Simulator
-from gsim3d.state import DYNAMIC, Particles
-from gsim3d.train.config import PrecisionConfig
+from gsim3d.state import Particles
 from gsim3d.train.restore import Restored
 from gsim3d.train.samples import subsampled
 
-N_CURVES = 4  # along which a cloud is cut into patches
 TOGETHER = 4  # steps that are timed together where the first costs more than those that follow
 
 
@@ -47,17 +43,8 @@ class Runner:
     def __init__(self, restored: Restored, setting: Setting = Setting()):
         self.restored, self.setting, self.device = restored, setting, restored.device
         self.simulator = _changed(restored.simulator, setting)
-        spec = restored.plan.spec
-        dynamics = dataclasses.replace(
-            spec.dynamics,
-            history=setting.history or spec.dynamics.history,
-            background=setting.background or spec.dynamics.background,
-            sleep=None if setting.captured else self._sleep(spec.dynamics.sleep),
-        )
-        appearance = spec.appearance
-        if setting.sh_degree is not None:
-            appearance = dataclasses.replace(appearance, view_dependent=setting.sh_degree)
-        self.plan = self.simulator.plan(dataclasses.replace(spec, dynamics=dynamics, appearance=appearance))
+        asymmetric = self.simulator.config.dynamics.is_asymmetric
+        self.plan = self.simulator.plan(setting.of_effects(restored.plan.spec, asymmetric))
         config = self.simulator.config.dynamics
         # A background that rests, who sleeps, and several steps a call are the affair of a whole rollout.
         self.at_once = setting.sleep is not None or config.is_asymmetric or config.steps_per_call > 1
@@ -90,7 +77,7 @@ class Runner:
     @torch.no_grad()
     def chosen(self, particles: Particles) -> Particles:
         """What of :meth:`seen` is simulated."""
-        return self.simulator.prepare(self._most_opaque(particles), self.plan)
+        return self.simulator._prepare(self.setting.retained(particles), self.plan)
 
     @torch.no_grad()
     def step(self, state: Particles) -> Particles:
@@ -98,7 +85,7 @@ class Runner:
         with self._precision("dynamics"):
             if self.setting.orders == 1:
                 return self.simulator.step(state, self.plan)
-            state = self.simulator.prepare(state, self.plan)
+            state = self.simulator._prepare(state, self.plan)
             return append_step(state, self._averaged(state), self.plan.history)
 
     def steps(self, state: Particles, n_steps: int, log: RestLog | None = None) -> Iterator[Particles]:
@@ -126,7 +113,7 @@ class Runner:
         if self.setting.least_opacity:
             particles = particles.select_rows(particles.opacities >= self.setting.least_opacity)
         with self._precision("renderer"):
-            rendering = self.simulator.draw(
+            rendering = self.simulator._draw(
                 particles, self._smaller(cameras), plan=self.plan, cutoff=self.setting.cutoff
             )
         return rendering.color.float().clamp(0, 1)
@@ -182,23 +169,8 @@ class Runner:
                 self.simulator, state, n_steps, self.plan, cameras=drawn, copies=False, cutoff=self.setting.cutoff
             )
 
-    @contextlib.contextmanager
-    def _precision(self, part: str) -> Iterator[None]:
-        precision = getattr(self.setting, part)
-        tf32 = precision == "tf32"
-        autocast = PrecisionConfig(**{part: "fp32" if tf32 else precision}).of(part, self.device.type)
-        before = torch.backends.cuda.matmul.allow_tf32
-        convolutions = exact_convolutions()
-        if tf32:
-            convolutions = torch.backends.cudnn.flags(
-                enabled=True, benchmark=False, deterministic=True, allow_tf32=True
-            )
-        try:
-            torch.backends.cuda.matmul.allow_tf32 = tf32
-            with autocast, convolutions:
-                yield
-        finally:
-            torch.backends.cuda.matmul.allow_tf32 = before
+    def _precision(self, part: str) -> AbstractContextManager[None]:
+        return self.setting.precision(part, self.device.type)
 
     def _rollout(
         self, state: Particles, n_steps: int, edits: Sequence[Edit], log: RestLog, on_steps: Callable | None
@@ -220,35 +192,12 @@ class Runner:
 
     def _averaged(self, state: Particles) -> Particles:
         """The next step, by several orders of the curves: the mean of what each predicts."""
-        predictions, n_stages = [], self.simulator.config.dynamics.n_stages
-        for k in range(0, N_CURVES, N_CURVES // self.setting.orders):
-            curves = (tuple((k + row) % N_CURVES for row in range(N_CURVES)),) * n_stages
-            geometry = partial(self.simulator.dynamics.geometry, curves=curves)
-            predictions += self.simulator.rollout(state, 1, self.plan, geometry=geometry)
-        rows = [prediction.row_fields() for prediction in predictions]
-        means = {name: torch.stack([row[name] for row in rows]).mean(0) for name in rows[0] if _adds_up(rows[0][name])}
-        if "quats" in means:
-            means["quats"] = F.normalize(means["quats"], dim=-1)
-        return dataclasses.replace(predictions[0], **means)
+        geometry, n_levels = self.simulator.dynamics.geometry, self.simulator.config.dynamics.n_stages
 
-    def _sleep(self, trained: Sleep | None) -> Sleep | None:
-        if self.setting.sleep is None:
-            return trained
-        policy = "approx" if self.simulator.config.dynamics.is_asymmetric else "exact"
-        return Sleep(policy=policy, eps=self.setting.sleep)
+        def predict(curves: tuple) -> Particles:
+            return self.simulator.rollout(state, 1, self.plan, geometry=partial(geometry, curves=curves))[0]
 
-    def _most_opaque(self, particles: Particles) -> Particles:
-        """The share that the setting keeps of the moving and of the other particles of each cloud."""
-        if self.setting.kept == 1:
-            return particles
-        group = 2 * particles.row_cloud() + (particles.activity == DYNAMIC)
-        order = torch.argsort(particles.opacities, descending=True, stable=True)
-        order = order[torch.argsort(group[order], stable=True)]
-        counts = torch.bincount(group, minlength=2 * particles.n_clouds)
-        rank = torch.arange(len(order), device=order.device) - (counts.cumsum(0) - counts)[group[order]]
-        kept = torch.zeros_like(group, dtype=torch.bool)
-        kept[order] = rank < (counts[group[order]] * self.setting.kept).ceil()
-        return particles.select_rows(kept)
+        return self.setting.averaged(predict, n_levels)
 
     def _smaller(self, cameras: Cameras) -> Cameras:
         factor = self.setting.shrink
@@ -259,25 +208,19 @@ class Runner:
         return dataclasses.replace(cameras, Ks=cameras.Ks * scale[:, None], width=width, height=height)
 
 
-def _adds_up(values: Tensor) -> bool:
-    return values.is_floating_point()
-
-
 def _spread(cams: Sequence[int], count: int) -> list[int]:
     return [cams[k * len(cams) // count] for k in range(min(count, len(cams)))]
 
 
 def _changed(simulator: Simulator, setting: Setting) -> Simulator:
     """``simulator``, or one with its weights in another geometry, or compiled."""
-    dynamics = simulator.config.dynamics
-    patches = tuple(min(size, setting.patch_size or size) for size in dynamics.patch_sizes)
-    changed = dataclasses.replace(dynamics, grid_size=dynamics.grid_size * setting.grid, patch_sizes=patches)
-    if changed == dynamics and not setting.compiled:
+    config = setting.of_model(simulator.config)
+    if config == simulator.config and not setting.compiled:
         return simulator
     device = next(simulator.parameters()).device
-    other = type(simulator)(dataclasses.replace(simulator.config, dynamics=changed))
+    other = type(simulator)(config)
     other.load_state_dict(simulator.state_dict())
-    other.absent = simulator.absent
+    other.absent, other.effects, other.inputs = simulator.absent, simulator.effects, simulator.inputs
     if setting.compiled:
         other.dynamics.net.compile(dynamic=True)
     return other.to(device).train(simulator.training)

@@ -5,140 +5,20 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from gsim3d.errors import InputError
-from gsim3d.io.files import shown, typed
-from gsim3d.ops.raster import CUTOFFS
+from gsim3d.numerics.speed import PARTS, PRECISIONS, Setting
 from gsim3d.profile.products import compiler_problem, why_not
 
 if TYPE_CHECKING:
     from gsim3d.profile.subject import Subject
 
-PRECISIONS = ("fp32", "tf32", "bf16", "fp16")
-PARTS = ("encoder", "dynamics", "renderer")
 KINDS = {
     "exact": "changes what is simulated by rounding only",
     "near-exact": "leaves out what is below a stated threshold",
     "model": "changes the function that the model computes",
     "needs-training": "needs a checkpoint of its own",
 }
-
-
-@dataclass(frozen=True)
-class Setting:
-    """How a trained simulator is run. The default is the reference: float32 throughout, nothing left out.
-
-    encoder, dynamics, renderer: precision of each part, "fp32", "tf32", "bf16" or "fp16"; positions, codes, splats and
-        sums are float32 in all.
-    captured: the rollout is replayed from a CUDA graph.
-    context_views, history: input cameras and steps; None: those of the training.
-    background: as EffectsSpec.dynamics.background; None: that of the training.
-    kept: share of the particles of each step, moving and other ones alike, that is kept: the most opaque.
-    sh_degree: of rendered colours; None: the model's.
-    cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
-    least_opacity: Gaussians below it are not drawn; pixels leave out what is below 1/255 in any case.
-    patch_size: largest number of rows that attend to each other; None: the model's.
-    grid: factor to the model's cell size.
-    shrink: images are rendered this factor smaller, and enlarged again to be compared.
-    every: steps between two rendered ones.
-    compiled: the network of the dynamics runs through torch.compile.
-    sleep: cells that a particle at rest moves in one step at most, and is not computed; None: as in the training.
-    orders: of the curves that cut clouds into patches; the predictions of as many are averaged, at most 4.
-    checkpoint: name of another one that takes this one's place; None: none does.
-    """
-
-    encoder: str = "fp32"
-    dynamics: str = "fp32"
-    renderer: str = "fp32"
-    captured: bool = False
-    context_views: int | None = None
-    history: int | None = None
-    background: str | None = None
-    kept: float = 1.0
-    sh_degree: int | None = None
-    cutoff: str = "exact"
-    patch_size: int | None = None
-    grid: float = 1.0
-    shrink: int = 1
-    every: int = 1
-    least_opacity: float = 0.0
-    compiled: bool = False
-    sleep: float | None = None
-    orders: int = 1
-    checkpoint: str | None = None
-
-    def __post_init__(self):
-        for part in PARTS:
-            _require(part, getattr(self, part), getattr(self, part) in PRECISIONS, f"one of {', '.join(PRECISIONS)}")
-        _require("cutoff", self.cutoff, self.cutoff in CUTOFFS, f"one of {', '.join(CUTOFFS)}")
-        _require("kept", self.kept, 0 < self.kept <= 1, "above 0 and at most 1")
-        _require("grid", self.grid, 0 < self.grid < 1e3, "above 0")
-        _require("least_opacity", self.least_opacity, 0 <= self.least_opacity < 1, "at least 0 and below 1")
-        _require("sleep", self.sleep, self.sleep is None or 0 <= self.sleep < 1e3, "at least 0")
-        _require("orders", self.orders, self.orders in (1, 2, 4), "1, 2 or 4")
-        if self.captured and self._needs_python:
-            raise InputError("setting: captured does not fit " + " and ".join(self._needs_python))
-        _require("sh_degree", self.sh_degree, self.sh_degree in (None, 0, 1, 2, 3), "0, 1, 2 or 3")
-        for name in ("context_views", "history", "patch_size", "shrink", "every"):
-            value = getattr(self, name)
-            _require(name, value, value is None or (isinstance(value, int) and value >= 1), "an integer of at least 1")
-
-    @property
-    def _needs_python(self) -> list[str]:
-        """What of it a graph cannot repeat: it knows no sleep, and one order of the curves."""
-        changed = {name: getattr(self, name) for name in ("compiled", "sleep", "orders")}
-        defaults = {f.name: f.default for f in dataclasses.fields(self)}
-        return [name for name, value in changed.items() if value != defaults[name]]
-
-    @property
-    def fits_a_graph(self) -> bool:
-        """Whether what it changes can be replayed from a CUDA graph."""
-        return not self._needs_python
-
-    @property
-    def name(self) -> str:
-        """What differs from the reference, in words."""
-        changed = self.to_dict()
-        if precisions := {changed.pop(part, "fp32") for part in PARTS} - {"fp32"}:
-            parts = [part for part in PARTS if getattr(self, part) != "fp32"]
-            where = "" if len(parts) == len(PARTS) else f" {'+'.join(parts)}"
-            changed = {"precision": f"{'/'.join(sorted(precisions))}{where}", **changed}
-        for switch, what in (("captured", "graph captured"), ("compiled", "compiled")):
-            if changed.pop(switch, False):
-                changed = {what: "", **changed}
-        return (
-            ", ".join(f"{key.replace('_', ' ')} {_short(value)}".strip() for key, value in changed.items())
-            or "reference"
-        )
-
-    @property
-    def undrawn(self) -> Setting:
-        """What of it changes the particles."""
-        drawing = {
-            "renderer": "fp32",
-            "sh_degree": None,
-            "cutoff": "exact",
-            "least_opacity": 0.0,
-            "shrink": 1,
-            "every": 1,
-        }
-        return dataclasses.replace(self, **drawing)
-
-    @property
-    def given(self) -> Setting:
-        """What of it changes the encoder's work."""
-        names = ("encoder", "context_views", "history", "checkpoint")
-        return Setting(**{name: getattr(self, name) for name in names})
-
-    def to_dict(self) -> dict[str, Any]:
-        """Fields that differ from the reference."""
-        return {f.name: v for f in dataclasses.fields(self) if (v := getattr(self, f.name)) != f.default}
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Setting:
-        """Raises InputError for an unknown key or a value of another type."""
-        return typed(cls, values, "setting")
 
 
 @dataclass(frozen=True)
@@ -189,15 +69,6 @@ def _as_run(setting: Setting, subject: Subject) -> Setting:
     """On a GPU from a graph where it can be: else it waits for the host, and no knob makes that faster."""
     on_gpu = subject.device.type == "cuda"
     return dataclasses.replace(setting, captured=True) if on_gpu and setting.fits_a_graph else setting
-
-
-def _require(name: str, value: object, fine: bool, what: str) -> None:
-    if not fine:
-        raise InputError(f"setting: {name} must be {what}; got {shown(value)}")
-
-
-def _short(value: object) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def _powers_below(limit: int, least: int = 1) -> list[int]:

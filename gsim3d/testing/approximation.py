@@ -88,7 +88,7 @@ def compare_backgrounds(
     dynamics = dataclasses.replace(config.dynamics, background="symmetric")
     twin = type(simulator)(dataclasses.replace(config, dynamics=dynamics)).to(state.means).eval()
     twin.load_state_dict(simulator.state_dict())
-    newest = last_steps(simulator.prepare(state, plan or simulator.plan()), 1)
+    newest = last_steps(simulator._prepare(state, plan or simulator.plan()), 1)
     frozen = newest.activity == FROZEN
     steps, others = (model.rollout(state, n_steps, plan) for model in (simulator, twin))
     columns = []

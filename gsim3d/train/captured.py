@@ -278,7 +278,7 @@ class _Step:
         if plan.spec.dynamics.background == "masked_out":
             state, plan = _without_background(state), with_background_as_it_is(plan)
         else:
-            state = owner.simulator.prepare(state, plan)
+            state = owner.simulator._prepare(state, plan)
         rollout = partial(owner.simulator.rollout, plan=plan, geometry=geometry, report=report, on_invalid="drop")
         with owner.precision("dynamics"):
             return in_segments(partial(rollout, wrap=wrap), state, self._n_future, self._cut)
@@ -299,7 +299,7 @@ class _Step:
         particles = concatenate([state, *self._rollout(state, geometry, report, with_own_weights)])
         with owner.precision("renderer"):
             shown = {"plan": owner.plan, "report": report, "on_invalid": "drop"}
-            draw = owner.again("images")(lambda p: owner.simulator.draw(p, self._targets.cameras, **shown).color)
+            draw = owner.again("images")(lambda p: owner.simulator._draw(p, self._targets.cameras, **shown).color)
             images = draw(particles)
         report.close()  # what the backward pass computes again would be counted twice
         loss, errors = owner.loss(images, self._targets, self._weights)

@@ -390,7 +390,7 @@ class Trainer:
                 rng = generator(self.config.seed, self.step, sample, "thawed")  # as the first versions named it
                 particles = unfreeze(particles, self.config.data.unfrozen_background, self.effects, rng)
             with precision.of("dynamics", self.device):
-                begin = simulator.prepare(particles, self.plan)
+                begin = simulator._prepare(particles, self.plan)
                 given = {"plan": self.plan, "generator": noise, "wrap": again("steps", noise), **options}
                 steps = in_segments(partial(simulator.rollout, **given), begin, batch.n_future, batch.cut)
             if self._is_logged:

@@ -10,16 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
-from torch.nn.modules.module import (
-    register_module_buffer_registration_hook,
-    register_module_parameter_registration_hook,
-)
-from torch.overrides import TorchFunctionMode
 
 from gsim3d import presets, pretrained
 from gsim3d.compat.checkpoints import current_model
-from gsim3d.compat.released_model import ReleasedModelConfig, config_class, simulator_class
+from gsim3d.compat.released_model import ReleasedModelConfig, simulator_class
 from gsim3d.data import Scene
 from gsim3d.data.fitting import frame_stride
 from gsim3d.effects.plan import Plan
@@ -28,9 +22,9 @@ from gsim3d.errors import FitWarning, InputError, did_you_mean
 from gsim3d.io import checkpoint
 from gsim3d.io.files import shown
 from gsim3d.io.settings import from_dict, to_dict, upgraded
-from gsim3d.ops import cuda_compiled
 from gsim3d.presets import ModelConfig
-from gsim3d.pretrained import KEEP
+from gsim3d.pretrained import KEEP, loading
+from gsim3d.pretrained.loading import check_device
 from gsim3d.simulator import Simulator
 from gsim3d.train.config import DataConfig, TrainConfig
 
@@ -173,54 +167,7 @@ def build_simulator(config: ModelConfig, seed: int) -> Simulator:
 
     Raises InputError where ``config`` describes none.
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        try:
-            return simulator_class(config)(config)
-        except InputError:
-            raise
-        except Exception as error:  # sizes of which no layer can be made raise anything
-            said = " ".join(str(error).split())[:200]
-            raise InputError(f"model: no model has these sizes: {type(error).__name__}: {said}") from None
-
-
-class _WithoutFirstWeights(TorchFunctionMode):
-    """Within it tensors without memory stay as they are; else torch would import its compiler to fill them."""
-
-    def __torch_function__(self, function, types, args=(), kwargs=None):
-        if function.__name__.endswith(("normal_", "uniform_")):
-            return args[0] if args else kwargs["tensor"]
-        return function(*args, **(kwargs or {}))
-
-
-def first_weights(simulator: Simulator, spec: EffectsSpec, weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The simulator's own weights that no effect of ``spec`` reads, so that they need not be among ``weights``."""
-    lacks = set(simulator.plan(spec).unused).difference(weights)
-    return {name: value for name, value in simulator.state_dict().items() if name in lacks}
-
-
-def check_sizes(config: ModelConfig, spec: EffectsSpec, weights: dict[str, Tensor]) -> None:
-    """Raises RuntimeError where ``config`` describes other weights than those, before it takes memory for its own."""
-    n_most, n_made = sum(value.numel() for value in weights.values()), 0
-
-    def count(_module, _name, value):
-        nonlocal n_made
-        n_made += 1 if value is None else max(1, value.numel())
-        if n_made > 2 * n_most:  # some are made more than once
-            raise RuntimeError(f"it has more than twice their {n_most} numbers")
-
-    n_blocks = sum(config.dynamics.encoder_depths) + sum(config.dynamics.decoder_depths)
-    if n_blocks > len(weights):
-        raise RuntimeError(f"it has {n_blocks} blocks in its dynamics; the weights are {len(weights)} tensors")
-    hooks = [register_module_parameter_registration_hook(count), register_module_buffer_registration_hook(count)]
-    try:
-        with torch.device("meta"), _WithoutFirstWeights():
-            simulator = simulator_class(config)(config)
-    finally:
-        for hook in hooks:
-            hook.remove()
-    sizes = {name: torch.empty_like(value, device="meta") for name, value in weights.items()}
-    simulator.load_state_dict({**first_weights(simulator, spec, weights), **sizes})
+    return loading.build(simulator_class(config), config, seed)
 
 
 def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: EffectsSpec) -> dict:
@@ -232,13 +179,6 @@ def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: Eff
         "effects": {"spec": effects.to_dict(), "hash": effects.hash},
         "train": to_dict(config),
     }
-
-
-def check_device(device: str) -> None:
-    """Raises InputError where nothing can be computed on ``device``, "cpu" or "cuda"."""
-    if device == "cuda" and not (cuda_compiled() and torch.cuda.is_available()):
-        reason = "torch finds no GPU" if cuda_compiled() else "gsim3d was built without CUDA"
-        raise InputError(f"--device cuda: {reason} (see gsim3d doctor)")
 
 
 def restore(path: str | Path, device: str = "cpu") -> Restored:
@@ -260,30 +200,18 @@ def restore(path: str | Path, device: str = "cpu") -> Restored:
 
 
 def _restored(path: str | Path, saved: checkpoint.Checkpoint, device: str) -> Restored:
-    data = dict(saved.config["data"])
-    image_size = tuple(data.pop("image_size", None) or ())
-    fps = data.pop("fps", None)
-    if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
-        data.pop("near_far")
-    if len(image_size) != 2 or not all(isinstance(size, int) for size in image_size):
-        raise InputError(f"{path}: data.image_size must be [width, height]; got {list(image_size)}")
-    if fps is None:
-        fps = pretrained.frame_rate(path)
-    if fps is not None and (isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 1e-3 <= fps <= 1e6):
-        raise InputError(f"{path}: data.fps must be frames per second, a number from 0.001 to 1e6; got {shown(fps)}")
+    released = loading.is_released(saved.config)
     try:
-        content = current_model(saved.config["model"])
-        model = from_dict(config_class(content), content, "model")
+        kind = ReleasedModelConfig if released else ModelConfig
+        found = loading.describe(saved.config, kind, pretrained.frame_rate(path))
+        data = {key: value for key, value in saved.config["data"].items() if key not in ("image_size", "fps")}
+        if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
+            data.pop("near_far")
         settings = from_dict(DataConfig, upgraded(DataConfig, data), "data")
-        spec = EffectsSpec.from_dict(saved.config.get("effects", {}).get("spec"))
+        make = simulator_class(found.model)
+        simulator = loading.with_weights(make, found.model, found.effects, saved.weights)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    try:
-        check_sizes(model, spec, saved.weights)
-        simulator = build_simulator(model, seed=0)
-        own = first_weights(simulator, spec, saved.weights)
-        simulator.load_state_dict({**own, **saved.weights})
-    except RuntimeError as error:
-        raise InputError(f"{path}: the weights do not fit the model: {str(error).splitlines()[-1].strip()}") from None
-    simulator.absent = frozenset(own)
-    return Restored(simulator.eval().to(device), settings, image_size, simulator.plan(spec), saved, fps)
+    simulator.inputs = found.inputs
+    plan, size = simulator.plan(), tuple(found.inputs.image_size)
+    return Restored(simulator.eval().to(device), settings, size, plan, saved, found.inputs.fps)

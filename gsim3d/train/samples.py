@@ -174,18 +174,7 @@ def spread_views(cameras: Sequence[int], count: int, turn: int) -> tuple[int, ..
 
 def subsampled(frames: Frames, data: DataConfig) -> Frames:
     """``frames`` of which those pixels become particles that the strides of ``data`` retain."""
-    fixed, moving = data.background_stride, data.body_stride
-    if fixed == moving == 1 or frames.masks is None or frames.dynamic is None:
-        return frames
-    retained = torch.where(frames.dynamic, _every(moving, frames.masks), _every(fixed, frames.masks))
-    return dataclasses.replace(frames, masks=frames.masks & retained)
-
-
-def _every(stride: int, like: Tensor) -> Tensor:
-    """bool [H, W]: every n-th row and column of images [I, H, W]."""
-    retained = torch.zeros(like.shape[1:], dtype=torch.bool, device=like.device)
-    retained[stride // 2 :: stride, stride // 2 :: stride] = True
-    return retained
+    return frames.subsample(data.background_stride, data.body_stride)
 
 
 def unfreeze(particles: Particles, most: float, spec: EffectsSpec, rng: np.random.Generator) -> Particles:

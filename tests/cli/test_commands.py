@@ -140,7 +140,7 @@ def test_both_devices_predict(capsys, work, tmp_path, device):
 @pytest.mark.skipif(cuda_problem() is None, reason="there is a GPU that gsim3d can use")
 def test_a_gpu_that_is_not_there_is_named(capsys, work):
     code, _, err = call(capsys, "evaluate", work / "run", work / "data", "--device", "cuda")
-    assert code == 2 and "--device cuda: " in err and len(err.splitlines()) == 1
+    assert code == 2 and "device cuda: " in err and len(err.splitlines()) == 1
 
 
 def test_simulate_writes_video_frames_and_gaussians(capsys, work, tmp_path):

@@ -4,7 +4,7 @@ import pytest
 
 from gsim3d import presets
 from gsim3d.compat.checkpoints import current_model
-from gsim3d.compat.released_model import ReleasedModelConfig, config_class
+from gsim3d.compat.released_model import ReleasedModelConfig
 from gsim3d.errors import InputError
 from gsim3d.io.settings import from_dict, to_dict
 
@@ -22,7 +22,7 @@ def older(config, **on):
 
 def read(model):
     content = current_model(model)
-    return from_dict(config_class(content), content, "model")
+    return from_dict(ReleasedModelConfig if content.get("release") else presets.ModelConfig, content, "model")
 
 
 @pytest.mark.parametrize("on", [False, True])

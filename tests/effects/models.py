@@ -34,7 +34,7 @@ class Case:
     def __call__(self, spec: EffectsSpec, **options):
         plan = self.simulator.plan(spec)
         steps = self.simulator.rollout(self.state, self.n_steps, plan, **options)
-        return steps, self.simulator.draw(steps[-1], self.cameras, plan=plan)
+        return steps, self.simulator._draw(steps[-1], self.cameras, plan=plan)
 
     def run(self, values: dict):
         """Counts of operations, and names of modules, that the spec of plain ``values`` calls for."""

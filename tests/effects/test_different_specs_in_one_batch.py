@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from gsim3d.effects.by_scene import render_by_scene, rollout_by_scene
 from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects, Sleep
 from gsim3d.errors import InputError
 from tests.asserts import assert_same_bits
@@ -27,12 +26,12 @@ SPECS = [
 def test_different_specs_equal_separate_runs():
     simulator, frames = awake(make_simulator()), make_frames((2, 3, 1, 2))
     state, plans = simulator.encode(frames), [simulator.plan(spec) for spec in SPECS]
-    steps = rollout_by_scene(simulator, state, 3, plans)
+    steps = simulator.rollout(state, 3, plans=plans)
     cameras = target_cameras(frames, 4)
     twice = torch.tensor([3, 0, 2, 1, 0])
     cameras = cameras.select(torch.zeros(5, dtype=torch.int64), twice)
     behind = torch.rand(5, 3)
-    images = render_by_scene(simulator, steps[-1], cameras, behind, plans)
+    images = simulator.render(steps[-1], cameras, behind, plans=plans)
     assert images.alpha is None and images.depth.shape == (5, 16, 16)
     for scene, plan in enumerate(plans):
         alone = state.select_clouds([q for q, s in enumerate(state.clouds.scenes) if s == scene])
@@ -54,6 +53,6 @@ def test_plans_that_do_not_fit_the_batch():
     state = simulator.encode(frames)
     plans = [simulator.plan(EffectsSpec(outputs=OutputEffects(depth=on))) for on in (True, False)]
     with pytest.raises(InputError, match="plans: there must be one for each of 2 scenes; got 1"):
-        rollout_by_scene(simulator, state, 1, plans[:1])
+        simulator.rollout(state, 1, plans=plans[:1])
     with pytest.raises(InputError, match="plans: those of one batch must ask for the same images"):
-        render_by_scene(simulator, state, target_cameras(frames, 2), None, plans)
+        simulator.render(state, target_cameras(frames, 2), plans=plans)

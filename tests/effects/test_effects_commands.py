@@ -67,7 +67,7 @@ def test_plan_predicts_milliseconds_of_a_checkpoint_that_was_timed(capsys, work)
     times = PartTimes("a clock", workload(restored.open_scene(scene), restored.data), 8.0, 4.0, 2.0)
     autotune.save_speeds(run, restored, {}, times)
     code, out, _ = call(capsys, "plan", scene, run)
-    (run / autotune.SPEEDS).unlink()
+    (run / autotune.SPEEDS_FILE).unlink()
     assert code == 0 and out.startswith(before)
     assert "predicted milliseconds on cpu, from those that gsim3d profile measured (a clock)\n" in out
     table = re.findall(r"^(\w+) +(\d+\.\d) +\d+\.\d +\d\.\d\d$", out[len(before) :], re.MULTILINE)

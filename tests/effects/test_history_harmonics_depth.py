@@ -48,7 +48,7 @@ def make_render():
         spec = EffectsSpec(appearance=AppearanceEffects(view_dependent=degree), outputs=OutputEffects(**outputs))
         plan = simulator.plan(spec)
         with torch.no_grad(), counted() as count:
-            return simulator.draw(state, target_cameras(frames, 1), plan=plan), count
+            return simulator._draw(state, target_cameras(frames, 1), plan=plan), count
 
     return render
 

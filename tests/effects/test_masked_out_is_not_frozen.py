@@ -21,7 +21,7 @@ def test_cells_of_the_rest_stay_where_they_are():
     simulator, state = encoded()
     moving = state.activity == DYNAMIC
     state = state.with_clouds(state.clouds, means=torch.where(moving[:, None], state.means, state.means - 0.37))
-    masked = simulator.prepare(state, simulator.plan(EffectsSpec(DynamicsEffects("masked_out"))))
+    masked = simulator._prepare(state, simulator.plan(EffectsSpec(DynamicsEffects("masked_out"))))
     assert 0 < masked.n_rows == int(moving.sum()) < state.n_rows
     assert (state.means.min(0).values < masked.means.min(0).values).all(), "the background reaches further"
     whole, rest = simulator.dynamics.geometry(state), simulator.dynamics.geometry(masked)

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from gsim3d.effects.by_scene import render_by_scene, rollout_by_scene
 from gsim3d.effects.edits import Duplicate, Edit, Move, Recolor, Remove, Rotate, Throw
 from gsim3d.effects.spec import EffectsSpec
 from tests.asserts import assert_close_relative_to_max
@@ -80,6 +79,6 @@ def test_different_specs_in_one_batch(devices):
     results = []
     for case in cases(devices, steps=(2, 3, 1, 2)):
         plans = [case.simulator.plan(spec) for spec in SPECS]
-        steps = rollout_by_scene(case.simulator, case.state, 2, plans)
-        results.append((steps, render_by_scene(case.simulator, steps[-1], case.cameras, None, plans)))
+        steps = case.simulator.rollout(case.state, 2, plans=plans)
+        results.append((steps, case.simulator.render(steps[-1], case.cameras, plans=plans)))
     assert_equal(results, "batch")

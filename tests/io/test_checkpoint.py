@@ -62,7 +62,7 @@ def test_a_kill_while_writing_leaves_the_last_one_good(tmp_path):
     script = (
         "import os, signal\n"
         "from gsim3d.io import checkpoint\n"
-        "from tests.train.test_checkpoint import example\n"
+        "from tests.io.test_checkpoint import example\n"
         "checkpoint._sync = lambda path: os.kill(os.getpid(), signal.SIGKILL)\n"
         f"checkpoint.save({str(tmp_path)!r}, example(10))\n"
     )

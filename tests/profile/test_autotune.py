@@ -153,6 +153,6 @@ def test_tuned_presets_are_found_again(tmp_path, subject):
         autotune.load_speed(tmp_path, restored, "balanced")
     with pytest.raises(InputError, match="must be one of exact, balanced, fast"):
         autotune.load_speed(tmp_path, restored, "warp")
-    (tmp_path / autotune.SPEEDS).write_text("[1]")
+    (tmp_path / autotune.SPEEDS_FILE).write_text("[1]")
     with pytest.raises(InputError, match="must hold a mapping"):
         autotune.load_speed(tmp_path, restored, "fast")

@@ -15,9 +15,9 @@ from gsim3d.cli.main import main
 from gsim3d.evaluate.ablations import load_ablations
 from gsim3d.io import checkpoint
 from gsim3d.io.settings import to_dict
+from gsim3d.numerics.speed import SPEEDS_FILE
 from gsim3d.profile import budget, published, report
 from gsim3d.profile import measure as measuring
-from gsim3d.profile.autotune import SPEEDS
 from gsim3d.profile.measure import Comparison, Point, measure
 from gsim3d.profile.settings import Setting
 from gsim3d.profile.timing import DeviceClock
@@ -188,7 +188,7 @@ def test_the_command_from_end_to_end(subject, run, tmp_path, capsys, monkeypatch
     assert content["training"]["steps"] == [0, 20] and content["not_turned"] == {} and "unfinished" not in content
     assert content["subject"]["scenes"] == 2 and "training step (1 scenes" in capsys.readouterr().out
     assert content["regimes"]["training"]["step_ms"]["median"] > 0
-    speeds = json.loads((run / SPEEDS).read_text())
+    speeds = json.loads((run / SPEEDS_FILE).read_text())
     kept = speeds[checkpoint.load(run).digest]["cpu"]
     assert list(kept) == ["exact", "balanced", "fast", "measured"]
     assert all("checkpoint" not in setting for setting in kept.values())
@@ -253,6 +253,6 @@ def test_a_report_goes_into_the_documentation(written, tmp_path):
     reports = {name: tmp_path / name for name in ("cpu", "h200")}
     for (name, folder), device in zip(reports.items(), ("cpu", "cuda"), strict=True):
         folder.mkdir()
-        (folder / SPEEDS).write_text(json.dumps({"1f": {device: {"fast": {"history": 1}}}}))
+        (folder / SPEEDS_FILE).write_text(json.dumps({"1f": {device: {"fast": {"history": 1}}}}))
     kept = json.loads(tool.keep_speeds(tmp_path, reports).read_text())
     assert kept == {"1f": {"cpu": {"fast": {"history": 1}}, "cuda": {"fast": {"history": 1}}}}

@@ -73,12 +73,12 @@ def test_times_are_kept_beside_presets(tmp_path, subject):
 def test_files_that_hold_no_times(tmp_path, subject, change, message):
     restored = dataclasses.replace(subject.restored, checkpoint=Checkpoint({}, {}, digest="1f"))
     values = dataclasses.asdict(TIMES) | change
-    (tmp_path / autotune.SPEEDS).write_text(json.dumps({"1f": {"cpu": {autotune.TIMES: values}}}))
+    (tmp_path / autotune.SPEEDS_FILE).write_text(json.dumps({"1f": {"cpu": {autotune.TIMES: values}}}))
     with pytest.raises(InputError, match=message):
         autotune.load_times(tmp_path, restored)
 
 
 def test_a_file_of_speeds_that_is_nested_without_end(tmp_path, subject):
-    (tmp_path / autotune.SPEEDS).write_text("[" * 100_000)
+    (tmp_path / autotune.SPEEDS_FILE).write_text("[" * 100_000)
     with pytest.raises(InputError, match="speeds.json cannot be read: it is nested too deeply"):
         autotune.load_times(tmp_path, subject.restored)

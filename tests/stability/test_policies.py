@@ -446,7 +446,7 @@ def test_drawing_is_rendering_without_a_look(simulator, state):
         found = report.total
         cameras = make_frames(SCENES).cameras
         cameras = dataclasses.replace(cameras, image_cloud=cameras.image_cloud % len(SCENES)).to(step.means.device)
-        drawn = simulator.draw(step, cameras, on_invalid="drop", report=report)
+        drawn = simulator._draw(step, cameras, on_invalid="drop", report=report)
         rendered = simulator.render(step, cameras, on_invalid="drop", report=report)
     assert_same_bits(drawn.color, rendered.color)
     assert found == report.total > 0 and float(drawn.alpha.max()) > 0

@@ -13,8 +13,9 @@ from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.io.checkpoint import Checkpoint, export
 from gsim3d.io.settings import to_dict
+from gsim3d.pretrained.loading import check_sizes
 from gsim3d.train.config import DataConfig
-from gsim3d.train.restore import build_simulator, check_sizes, restore
+from gsim3d.train.restore import build_simulator, restore
 
 ROOM = 2 * 2**30  # bytes that a child process may claim beyond what it starts with
 
@@ -85,12 +86,12 @@ def test_a_good_configuration_is_restored(tmp_path):
 def test_sizes_are_compared_without_memory():
     config = presets.tiny()
     weights = {name: value.to("meta") for name, value in Simulator(config).state_dict().items()}
-    check_sizes(config, EffectsSpec(), weights)
+    check_sizes(Simulator, config, EffectsSpec(), weights)
     name = next(iter(weights))
     with pytest.raises(RuntimeError, match="Missing key"):
-        check_sizes(config, EffectsSpec(), {key: value for key, value in weights.items() if key != name})
+        check_sizes(Simulator, config, EffectsSpec(), {key: value for key, value in weights.items() if key != name})
     with pytest.raises(RuntimeError, match="size mismatch"):
-        check_sizes(config, EffectsSpec(), {**weights, name: torch.empty(1, 2, 3, device="meta")})
+        check_sizes(Simulator, config, EffectsSpec(), {**weights, name: torch.empty(1, 2, 3, device="meta")})
 
 
 def test_comparing_sizes_leaves_torch_as_it_was():
@@ -98,7 +99,7 @@ def test_comparing_sizes_leaves_torch_as_it_was():
     before = build_simulator(config, 0).state_dict()
     dynamics = dataclasses.replace(config.dynamics, mlp_ratio=100)
     with pytest.raises(RuntimeError, match="more than twice"):
-        check_sizes(dataclasses.replace(config, dynamics=dynamics), EffectsSpec(), before)
+        check_sizes(Simulator, dataclasses.replace(config, dynamics=dynamics), EffectsSpec(), before)
     for name, value in build_simulator(config, 0).state_dict().items():
         assert torch.equal(value, before[name])
 

@@ -47,7 +47,7 @@ def images(simulator: Simulator, state: Particles, values: dict):
     cameras = view(str(state.means.device))
 
     def run():
-        image = simulator.draw(newest, cameras, plan=plan)
+        image = simulator._draw(newest, cameras, plan=plan)
         return image.depth if image.color is None else image.color
 
     return run

@@ -1,0 +1,162 @@
+"""From checkpoints to simulators: what a saved configuration describes, and weights that fit it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn.modules.module import (
+    register_module_buffer_registration_hook,
+    register_module_parameter_registration_hook,
+)
+from torch.overrides import TorchFunctionMode
+
+from gsim3d.cameras import InputSpec
+from gsim3d.compat.checkpoints import current_model
+from gsim3d.effects.spec import EffectsSpec
+from gsim3d.errors import InputError
+from gsim3d.io.files import shown
+from gsim3d.io.settings import from_dict, to_dict
+from gsim3d.ops import cuda_compiled
+from gsim3d.presets import ModelConfig
+
+Model = TypeVar("Model", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a checkpoint's configuration says of its simulator.
+
+    Attributes:
+        model: sizes of its parts.
+        effects: what it was trained to simulate.
+        inputs: what it was trained on; None: the configuration does not say.
+    """
+
+    model: ModelConfig
+    effects: EffectsSpec
+    inputs: InputSpec | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of a checkpoint's config.yaml."""
+        data = {} if self.inputs is None else {k: v for k, v in to_dict(self.inputs).items() if v is not None}
+        effects = {"spec": self.effects.to_dict(), "hash": self.effects.hash}
+        return {"model": to_dict(self.model), "data": data, "effects": effects}
+
+
+def is_released(config: dict[str, Any]) -> bool:
+    """Whether a saved configuration is that of the published model."""
+    return current_model(config["model"]).get("release") is True
+
+
+def describe(config: dict[str, Any], kind: type[ModelConfig] = ModelConfig, fps: float | None = None) -> Description:
+    """What the saved configuration ``config`` says.
+
+    Args:
+        config: content of a checkpoint's config.yaml.
+        kind: class of the model's configuration.
+        fps: frames per second where ``config`` has none.
+    Raises:
+        InputError: it describes no model; the message names the key.
+    """
+    model = from_dict(kind, current_model(config["model"]), "model")
+    effects = EffectsSpec.from_dict(config.get("effects", {}).get("spec"))
+    names = {field.name for field in dataclasses.fields(InputSpec)}
+    data = {key: value for key, value in config["data"].items() if key in names and value is not None}
+    if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
+        data.pop("near_far")
+    fps = data.pop("fps", None) or fps
+    if fps is not None and (isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 1e-3 <= fps <= 1e6):
+        raise InputError(f"data.fps must be frames per second, a number from 0.001 to 1e6; got {shown(fps)}")
+    size = data.get("image_size")
+    if not isinstance(size, (list, tuple)) or len(size) != 2 or not all(isinstance(side, int) for side in size):
+        raise InputError(f"data.image_size must be [width, height]; got {shown(size)}")
+    return Description(model, effects, dataclasses.replace(from_dict(InputSpec, data, "data"), fps=fps))
+
+
+def build(make: Callable[[ModelConfig], Model], config: ModelConfig, seed: int = 0) -> Model:
+    """A simulator whose first weights are a function of the seed; torch's own random state stays as it was.
+
+    Raises:
+        InputError: no model has these sizes.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        try:
+            return make(config)
+        except InputError:
+            raise
+        except Exception as error:  # sizes of which no layer can be made raise anything
+            said = " ".join(str(error).split())[:200]
+            raise InputError(f"model: no model has these sizes: {type(error).__name__}: {said}") from None
+
+
+def with_weights(
+    make: Callable[[ModelConfig], Model], config: ModelConfig, effects: EffectsSpec, weights: dict[str, Tensor]
+) -> Model:
+    """A simulator with ``weights``; its own first ones, named in ``absent``, where no effect reads them.
+
+    Raises:
+        InputError: the weights do not fit the model.
+    """
+    try:
+        check_sizes(make, config, effects, weights)
+        simulator = build(make, config)
+        own = first_weights(simulator, effects, weights)
+        simulator.load_state_dict({**own, **weights})
+    except RuntimeError as error:
+        raise InputError(f"the weights do not fit the model: {str(error).splitlines()[-1].strip()}") from None
+    simulator.absent, simulator.effects = frozenset(own), effects
+    return simulator
+
+
+class _WithoutFirstWeights(TorchFunctionMode):
+    """Within it tensors without memory stay as they are; else torch would import its compiler to fill them."""
+
+    def __torch_function__(self, function, types, args=(), kwargs=None):
+        if function.__name__.endswith(("normal_", "uniform_")):
+            return args[0] if args else kwargs["tensor"]
+        return function(*args, **(kwargs or {}))
+
+
+def first_weights(simulator: nn.Module, effects: EffectsSpec, weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The simulator's own weights that no effect of ``effects`` reads, so that they need not be among ``weights``."""
+    lacks = set(simulator.plan(effects).unused).difference(weights)
+    return {name: value for name, value in simulator.state_dict().items() if name in lacks}
+
+
+def check_sizes(
+    make: Callable[[ModelConfig], nn.Module], config: ModelConfig, effects: EffectsSpec, weights: dict[str, Tensor]
+) -> None:
+    """Raises RuntimeError where ``config`` describes other weights than those, before it takes memory for its own."""
+    n_most, n_made = sum(value.numel() for value in weights.values()), 0
+
+    def count(_module, _name, value):
+        nonlocal n_made
+        n_made += 1 if value is None else max(1, value.numel())
+        if n_made > 2 * n_most:  # some are made more than once
+            raise RuntimeError(f"it has more than twice their {n_most} numbers")
+
+    n_blocks = sum(config.dynamics.encoder_depths) + sum(config.dynamics.decoder_depths)
+    if n_blocks > len(weights):
+        raise RuntimeError(f"it has {n_blocks} blocks in its dynamics; the weights are {len(weights)} tensors")
+    hooks = [register_module_parameter_registration_hook(count), register_module_buffer_registration_hook(count)]
+    try:
+        with torch.device("meta"), _WithoutFirstWeights():
+            simulator = make(config)
+    finally:
+        for hook in hooks:
+            hook.remove()
+    sizes = {name: torch.empty_like(value, device="meta") for name, value in weights.items()}
+    simulator.load_state_dict({**first_weights(simulator, effects, weights), **sizes})
+
+
+def check_device(device: str) -> None:
+    """Raises InputError where nothing can be computed on ``device``, such as "cpu" or "cuda"."""
+    if device.startswith("cuda") and not (cuda_compiled() and torch.cuda.is_available()):
+        reason = "torch finds no GPU" if cuda_compiled() else "gsim3d was built without CUDA"
+        raise InputError(f"device {device}: {reason} (see gsim3d doctor)")
