@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from gsim3d.data.recording import Problems, Recording
+from gsim3d.math.rotations import rotation_matrices
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes (y up, z backwards) <-> OpenCV's
 ROTATION_TOLERANCE = 1e-3
@@ -52,19 +54,7 @@ def near_zero(recording: Recording) -> Recording:
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:
     """Rotation matrices [S, 3, 3] of unit quaternions (w, x, y, z) [S, 4]."""
-    w, x, y, z = quaternions.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
-
-
-def by_step(matrices: Sequence[np.ndarray], n_steps: int) -> np.ndarray:
-    """[S, V, ...] of V cameras with [...] each that stands still or [n_steps, ...] that moves; S is 1 if none moves."""
-    full = np.stack([np.broadcast_to(matrix, (n_steps, *matrix.shape[-2:])) for matrix in matrices], 1)
-    return full[:1].copy() if (full == full[:1]).all() else full
+    return rotation_matrices(torch.from_numpy(quaternions)).numpy()
 
 
 def check_pose(matrices: np.ndarray, what: str, problems: Problems) -> bool:

@@ -21,7 +21,7 @@ import numpy as np
 
 from gsim3d.data import transforms
 from gsim3d.data.cameras import OPENGL, inverse, project, rotations, spread_steps
-from gsim3d.data.recording import MAX_NUMBER, Problems, Recording, positive, read_json, trailing_number
+from gsim3d.data.recording import MAX_NUMBER, Description, Problems, Recording, read_json, trailing_number
 from gsim3d.errors import InputError
 
 NAME = "colmap"
@@ -51,7 +51,7 @@ def read(folder: Path, problems: Problems) -> Recording:
     """The scene in ``folder``. Raises InputError where its description cannot be read at all."""
     model = _model_of(folder)
     settings = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
-    fps = positive(settings.get("fps"), f"{folder / SETTINGS}: fps", problems)
+    fps = Description(settings, f"{folder / SETTINGS}: ", problems).positive("fps")
     source = _file(model, "images")
     cameras = dict(_bounded(_cameras(_file(model, "cameras")), model))
     frames = []

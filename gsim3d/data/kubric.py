@@ -16,25 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.data.cameras import OPENGL, by_step, check_intrinsics, inverse, rotations
+from gsim3d.data import recording
+from gsim3d.data.cameras import OPENGL, check_intrinsics, inverse, rotations
 from gsim3d.data.images import as_color, is_marked, is_opaque, read_files, read_image
-from gsim3d.data.recording import (
-    BACKGROUND,
-    FIXED,
-    MAX_STEPS,
-    MOVING,
-    Problems,
-    Recording,
-    array,
-    common_numbers,
-    image_size,
-    inside,
-    natural_order,
-    positive,
-    read_json,
-    trailing_number,
-    workspace,
-)
+from gsim3d.data.recording import BACKGROUND, FIXED, MOVING, Camera, Description, Problems, Recording, inside, read_json
 from gsim3d.errors import InputError
 
 NAME = "kubric"
@@ -46,42 +31,40 @@ QUATERNION_TOLERANCE = 1e-2
 
 
 def recognises(folder: Path) -> bool:
-    """Camera folders with metadata.json, or a metadata.json that describes one camera."""
+    """Whether ``folder`` has camera folders with metadata.json, or a metadata.json that describes one camera."""
     return bool(_camera_folders(folder))
 
 
 def read(folder: Path, problems: Problems) -> Recording:
     """The scene in ``folder``. Raises InputError where its description cannot be read at all."""
-    cameras = [_Camera(folder, path, problems) for path in _camera_folders(folder)]
-    source = folder if len(cameras) > 1 else cameras[0].source
-    numbers = common_numbers({camera.name: list(camera.images) for camera in cameras}, source, problems)
+    files = [_CameraFiles(folder, path, problems) for path in _camera_folders(folder)]
+    first = files[0]
+    source = folder if len(files) > 1 else first.source
+    numbers = recording.common_numbers({camera.name: list(camera.images) for camera in files}, source, problems)
     if not numbers:
         raise InputError(f"{source}: the cameras have no frame in common (rgba/rgba_<number>.png or rgba_<number>.png)")
-    has_labels = any(camera.segmentation for camera in cameras)
+    has_labels = any(camera.segmentation for camera in files)
 
     def read_images(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
-        camera = cameras[cam]
-        files = ((camera.images[numbers[step]], camera.place(numbers[step])) for step in steps)
-        return read_files(files, camera.size, as_color, problems)
+        camera = files[cam]
+        images = ((camera.images[numbers[step]], camera.frame(numbers[step])) for step in steps)
+        return read_files(images, camera.size, as_color, problems)
 
     def read_labels(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
-        return (cameras[cam].labels(numbers[step], has_labels, problems) for step in steps)
+        return (files[cam].labels(numbers[step], has_labels, problems) for step in steps)
 
     stride = numbers[1] - numbers[0] if len(numbers) > 1 else 1
-    given = workspace(cameras[0].description, cameras[0].source, problems)
-    fps = positive(cameras[0].description.get("fps"), f"{cameras[0].source}: fps", problems)
-    return Recording(
+    given = first.description.workspace(DEFAULT_NEAR, DEFAULT_FAR)
+    fps = first.description.positive("fps") or first.frame_rate
+    return Recording.of_cameras(
+        [camera.camera(numbers) for camera in files],
+        len(numbers),
         layout=NAME,
-        source=cameras[0].source,
-        n_steps=len(numbers),
-        fps=(fps or cameras[0].frame_rate) / stride,
-        camera_names=tuple(camera.name for camera in cameras),
-        viewmats=by_step([camera.viewmats(numbers, problems) for camera in cameras], len(numbers)),
-        Ks=np.stack([camera.K for camera in cameras])[None],
-        sizes=tuple(camera.size for camera in cameras),
+        source=first.source,
+        fps=fps / stride,
         read_images=read_images,
         read_labels=read_labels,
-        **{**given, "near": given["near"] or DEFAULT_NEAR, "far": given["far"] or DEFAULT_FAR},
+        **given,
     )
 
 
@@ -91,7 +74,7 @@ def _camera_folders(folder: Path) -> list[Path]:
     if (folder / FILE).exists() or not folder.is_dir():
         return []
     folders = [path for path in folder.iterdir() if CAMERA_FOLDER.fullmatch(path.name) and (path / FILE).is_file()]
-    return sorted(folders, key=lambda path: natural_order(path.name))
+    return sorted(folders, key=lambda path: recording.natural_order(path.name))
 
 
 def _describes_camera(file: Path) -> bool:
@@ -101,94 +84,95 @@ def _describes_camera(file: Path) -> bool:
         return False
 
 
-class _Camera:
-    """One camera's folder.
-
-    images, segmentation: frame number -> file.    K [3, 3]: pixels.
-    """
+class _CameraFiles:
+    """One camera's folder. images, segmentation: frame number -> file."""
 
     def __init__(self, scene: Path, folder: Path, problems: Problems):
         self.name = folder.name
         self.source = inside(scene, (folder / FILE).relative_to(scene).as_posix(), f"camera {folder.name}")
-        self.description = read_json(self.source)
-        entry, metadata = self.description.get("camera"), self.description.get("metadata", {})
+        self.description = Description(read_json(self.source), f"{self.source}: ", problems)
+        entry, metadata = self.description.values.get("camera"), self.description.values.get("metadata", {})
         if not isinstance(entry, dict) or not isinstance(metadata, dict):
             raise InputError(f"{self.source}: camera and metadata must be JSON objects")
-        self._entry = entry
-        resolution = metadata.get("resolution", [metadata.get("width"), metadata.get("height")])
-        self.size = image_size(resolution, f"{self.source}: metadata.resolution", problems)
-        rate = positive(metadata.get("frame_rate"), f"{self.source}: metadata.frame_rate", problems)
-        self.frame_rate = rate or DEFAULT_FPS
-        self.K = self._intrinsics(problems)
-        self.images = self._frames(scene, folder, "rgba")
-        self.segmentation = self._frames(scene, folder, "segmentation")
+        self._entry = Description(entry, f"{self.source}: camera {self.name}: camera.", problems)
+        size = {"resolution": [metadata.get("width"), metadata.get("height")]}
+        metadata = Description(size | metadata, f"{self.source}: metadata.", problems)
+        self.size = metadata.size("resolution")
+        self.frame_rate = metadata.positive("frame_rate") or DEFAULT_FPS
+        self.images = self._files(scene, folder, "rgba")
+        self.segmentation = self._files(scene, folder, "segmentation")
 
-    def place(self, number: int) -> str:
+    def frame(self, number: int) -> str:
+        """Camera and frame, for messages."""
         return f"camera {self.name}, frame {number}"
 
     def labels(self, number: int, has_segmentation: bool, problems: Problems) -> np.ndarray | None:
         """uint8 [h, w] of frame ``number``; without any segmentation all that is no background may move."""
-        image = read_image(self.images[number], self.size, self.place(number), problems)
+        image = read_image(self.images[number], self.size, self.frame(number), problems)
         if image is None:
             return None
         solid = is_opaque(image)
         if not has_segmentation:
             return np.where(solid, MOVING, BACKGROUND).astype(np.uint8)
         if number not in self.segmentation:
-            problems.add(f"{self.source.parent}: segmentation of {self.place(number)} is missing")
+            problems.add(f"{self.source.parent}: segmentation of {self.frame(number)} is missing")
             return None
-        marked = read_image(self.segmentation[number], self.size, self.place(number), problems)
+        marked = read_image(self.segmentation[number], self.size, self.frame(number), problems)
         if marked is None:
             return None
         return np.where(is_marked(marked), MOVING, np.where(solid, FIXED, BACKGROUND)).astype(np.uint8)
 
-    def viewmats(self, numbers: Sequence[int], problems: Problems) -> np.ndarray:
-        """[S, 4, 4], world-to-camera, OpenCV axes, of the poses ``numbers``."""
-        matrices = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()
-        what = f"{self.source}: camera {self.name}"
-        positions = self._entry.get("positions")
+    def camera(self, numbers: Sequence[int]) -> Camera:
+        """Poses ``numbers`` of the camera."""
+        return Camera(self.name, self.size, self._viewmats(numbers), self._K())
+
+    def _viewmats(self, numbers: Sequence[int]) -> np.ndarray:
+        poses = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()
+        positions, what = self._entry.values.get("positions"), f"{self.source}: camera {self.name}"
         count = len(positions) if isinstance(positions, list) else 0
-        positions = array(positions, [(count, 3)], f"{what}: camera.positions", problems)
-        quaternions = array(self._entry.get("quaternions"), [(count, 4)], f"{what}: camera.quaternions", problems)
-        if positions is None or quaternions is None or not 0 < count <= MAX_STEPS:
-            return matrices
+        positions, quaternions = (
+            self._entry.array("positions", (count, 3)),
+            self._entry.array("quaternions", (count, 4)),
+        )
+        if positions is None or quaternions is None or not 0 < count <= recording.MAX_STEPS:
+            return poses
         late = [number for number in numbers if number >= count]
         if late:
-            problems.add(f"{what}: frame {late[0]} has no pose: positions and quaternions hold {count}")
-            return matrices
+            self._entry.problems.add(f"{what}: frame {late[0]} has no pose: positions and quaternions hold {count}")
+            return poses
         lengths = np.linalg.norm(quaternions[numbers], axis=1)
         wrong = np.abs(lengths - 1) > QUATERNION_TOLERANCE
         if wrong.any():
             bad = int(np.argmax(wrong))
-            problems.add(f"{what}, frame {numbers[bad]}: the quaternion must have length 1; got {lengths[bad]:.4g}")
-            return matrices
-        matrices[:, :3, :3] = rotations(quaternions[numbers] / lengths[:, None])
-        matrices[:, :3, 3] = positions[numbers]
-        return OPENGL @ inverse(matrices)
+            self._entry.problems.add(
+                f"{what}, frame {numbers[bad]}: the quaternion must have length 1; got {lengths[bad]:.4g}"
+            )
+            return poses
+        poses[:, :3, :3] = rotations(quaternions[numbers] / lengths[:, None])
+        poses[:, :3, 3] = positions[numbers]
+        return OPENGL @ inverse(poses)
 
-    def _intrinsics(self, problems: Problems) -> np.ndarray:
-        what = f"{self.source}: camera {self.name}: camera.K"
-        width, height = self.size
-        if self._entry.get("K") is not None:
-            normalised = array(self._entry["K"], [(3, 3)], what, problems)
+    def _K(self) -> np.ndarray:
+        """[3, 3], pixels."""
+        entry, (width, height) = self._entry, self.size
+        if entry.values.get("K") is not None:
+            normalised = entry.array("K", (3, 3))
             K = np.eye(3) if normalised is None else normalised @ np.diag([1.0, -1.0, -1.0])
             K = np.diag([width, height, 1.0]) @ K
         else:
-            focal = positive(self._entry.get("focal_length"), f"{self.source}: camera.focal_length", problems)
-            sensor = positive(self._entry.get("sensor_width"), f"{self.source}: camera.sensor_width", problems)
+            focal, sensor = entry.positive("focal_length"), entry.positive("sensor_width")
             if focal is None or sensor is None:
-                problems.add(f"{what} is missing, and so are focal_length and sensor_width")
+                entry.problems.add(f"{entry.where}K is missing, and so are focal_length and sensor_width")
                 return np.eye(3)
             pixels = focal / sensor * width
             K = np.array([[pixels, 0, width / 2], [0, pixels, height / 2], [0, 0, 1]])
-        return K if check_intrinsics(K, self.size, what, problems) else np.eye(3)
+        return K if check_intrinsics(K, self.size, f"{entry.where}K", entry.problems) else np.eye(3)
 
     @staticmethod
-    def _frames(scene: Path, folder: Path, kind: str) -> dict[int, Path]:
-        where = folder / kind if (folder / kind).is_dir() else folder
+    def _files(scene: Path, folder: Path, kind: str) -> dict[int, Path]:
         found = {}
-        for file in where.glob(f"{kind}_*.png"):
-            number = trailing_number(file.stem)
+        for file in (folder / kind if (folder / kind).is_dir() else folder).glob(f"{kind}_*.png"):
+            number = recording.trailing_number(file.stem)
             if number is not None:
                 found[number] = inside(scene, file.relative_to(scene).as_posix(), f"camera {folder.name}")
         return found

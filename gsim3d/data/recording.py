@@ -1,12 +1,13 @@
-"""What every reader makes of a scene folder, and what readers share: problems, numbers, files, frame numbers."""
+"""The canonical form of a recorded scene, and what readers share: problems, checked values, files, frame numbers."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from gsim3d.errors import InputError
 from gsim3d.io.files import MAX_TEXT, read_file
 
 MAX_STEPS, MAX_CAMS, MAX_SIZE = 1_000_000, 10_000, 16_384  # beyond them a description is taken to be broken
-MAX_NUMBER = 1e9  # metres, pixels, seconds: likewise
+MAX_NUMBER = 1e9  # metres, pixels, seconds: the same
 MAX_NAME = 200  # letters of a file name
 HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")  # what may be one in JSON
 SPACING_TOLERANCE = 0.01  # of the time between two steps
@@ -25,13 +26,14 @@ ReadImages = Callable[[int, Sequence[int], "Problems"], Iterator[np.ndarray | No
 
 
 class Problems:
-    """Where readers say what is wrong: the first problem is raised, or all are collected."""
+    """What is wrong with a scene: the first problem is raised as InputError, or all are collected in ``found``."""
 
     def __init__(self, collect: bool = False):
         self.collect = collect
         self.found: list[str] = []
 
     def add(self, message: str) -> None:
+        """Raises or keeps one problem."""
         if not self.collect:
             raise InputError(message)
         self.found.append(message)
@@ -39,7 +41,12 @@ class Problems:
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """coefficients: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 of its fisheye model.   fisheye: which."""
+    """A lens with distortion.
+
+    Attributes:
+        coefficients: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 of its fisheye model.
+        fisheye: which of both.
+    """
 
     coefficients: np.ndarray
     fisheye: bool = False
@@ -50,21 +57,45 @@ class Lens:
 
 
 @dataclass(frozen=True)
+class Camera:
+    """One camera of a recording, in gsim3d's conventions.
+
+    Attributes:
+        name: as messages show it.
+        size: (width, height) of its images.
+        viewmats: [4, 4], or [n_steps, 4, 4] where it moves.
+        Ks: [3, 3], or [n_steps, 3, 3].
+        lens: None: a pinhole.
+    """
+
+    name: str
+    size: tuple[int, int]
+    viewmats: np.ndarray
+    Ks: np.ndarray
+    lens: Lens | None = None
+
+
+@dataclass(frozen=True)
 class Recording:
     """One scene as its reader found it, in gsim3d's conventions (OpenCV axes, pixel centres at +0.5, metres).
 
-    layout: name of the layout.          source: file that describes the cameras.
-    n_steps, fps: steps, and steps a second.
-    camera_names: V names, as messages show them.
-    viewmats [S, V, 4, 4], Ks [S, V, 3, 3]: float64; S is 1 for cameras that stand still, else n_steps.
-    sizes: (width, height) of each camera's images.
-    read_images: uint8 [h, w, 3], RGB.   read_labels: uint8 [h, w] of BACKGROUND, FIXED, MOVING; None: no labels.
-    distortions: per camera its lens, None for a pinhole; images are not undistorted yet.
-    near, far, origin, bounds: None where nobody gave them.
-    world_offset: float64 [3], what all positions count from; a reader leaves them where they are, at 0.
-    real_background: shows a real background: it is painted black where labels say so.
-    subtract_background: labels come from what differs from the median image of the camera.
-    notes: what was left out or changed on reading; check-data prints them.
+    Attributes:
+        layout: name of the layout.
+        source: file that describes the cameras.
+        n_steps: steps.
+        fps: steps a second.
+        camera_names: V names, as messages show them.
+        viewmats: float64 [S, V, 4, 4]; S is 1 for cameras that stand still, else n_steps.
+        Ks: float64 [S, V, 3, 3]; S is 1 or n_steps here, too.
+        sizes: (width, height) of each camera's images.
+        read_images: uint8 [h, w, 3], RGB.
+        read_labels: uint8 [h, w] of BACKGROUND, FIXED, MOVING; None: no labels.
+        distortions: lens of each camera, None for a pinhole; images are not undistorted yet.
+        near, far, origin, bounds: None where the description has none.
+        real_background: labels of 0 mean a real background, which is painted black.
+        subtract_background: labels come from what differs from the median image of the camera.
+        notes: what was left out or changed on reading; check-data prints them.
+        world_offset: float64 [3], what all positions count from; 0 in what readers return.
     """
 
     layout: str
@@ -87,6 +118,127 @@ class Recording:
     notes: tuple[str, ...] = ()
     world_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
+    @classmethod
+    def of_cameras(cls, cameras: Sequence[Camera], n_steps: int, **others: Any) -> Recording:
+        """A recording of ``cameras``; ``others`` are its other attributes."""
+        return cls(
+            n_steps=n_steps,
+            camera_names=tuple(camera.name for camera in cameras),
+            viewmats=_by_step([camera.viewmats for camera in cameras], n_steps),
+            Ks=_by_step([camera.Ks for camera in cameras], n_steps),
+            sizes=tuple(camera.size for camera in cameras),
+            distortions=tuple(camera.lens for camera in cameras),
+            **others,
+        )
+
+    def cameras_at_step(self, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """viewmats [V, 4, 4] and Ks [V, 3, 3] of a step."""
+        return tuple(values[step if len(values) > 1 else 0] for values in (self.viewmats, self.Ks))
+
+
+def _by_step(matrices: Sequence[np.ndarray], n_steps: int) -> np.ndarray:
+    """[S, V, ...] of V cameras with [...] each that stands still or [n_steps, ...] that moves; S is 1 if none moves."""
+    full = np.stack([np.broadcast_to(matrix, (n_steps, *matrix.shape[-2:])) for matrix in matrices], 1)
+    return full[:1].copy() if (full == full[:1]).all() else full
+
+
+@dataclass(frozen=True)
+class Description:
+    """A JSON object whose values are checked as they are read.
+
+    Attributes:
+        values: the object.
+        where: start of the messages on its values, such as "metadata.json: cam_0.".
+        problems: what is wrong is added to them.
+    """
+
+    values: Mapping[str, Any]
+    where: str
+    problems: Problems
+
+    def whole(self, key: str, limit: int) -> int:
+        """A whole number from 1 to ``limit``; 1 where it is none."""
+        value = self.values.get(key)
+        if not _is_number(value) or value != value // 1 or not 1 <= value <= limit:
+            self.problems.add(f"{self.where}{key} must be a whole number from 1 to {limit}; got {value!r:.80}")
+            return 1
+        return int(value)
+
+    def positive(self, key: str) -> float | None:
+        """A positive number; None where it is none or absent."""
+        value = self.values.get(key)
+        if value is None:
+            return None
+        if not _is_number(value) or not 0 < value <= MAX_NUMBER:
+            self.problems.add(f"{self.where}{key} must be a positive number, at most {MAX_NUMBER:g}; got {value!r:.80}")
+            return None
+        return float(value)
+
+    def array(self, key: str, *shapes: tuple[int, ...]) -> np.ndarray | None:
+        """Finite float64 numbers of one of ``shapes``; None where they are not."""
+        return array(self.values.get(key), shapes, f"{self.where}{key}", self.problems)
+
+    def size(self, key: str) -> tuple[int, int]:
+        """(width, height) of an image; (1, 1) where it is none."""
+        size = self.array(key, (2,))
+        if size is None:
+            return 1, 1
+        if (size != np.round(size)).any() or (size < 1).any() or (size > MAX_SIZE).any():
+            self.problems.add(f"{self.where}{key} must be [width, height] in pixels; got {size.tolist()}")
+            return 1, 1
+        return int(size[0]), int(size[1])
+
+    def workspace(self, near: float | None = None, far: float | None = None, unit: float = 1.0) -> dict[str, Any]:
+        """The keys of every layout: near, far, origin and bounds in metres.
+
+        Args:
+            near, far: metres, where the description has none.
+            unit: metres of one unit of the description.
+        """
+        found: dict[str, Any] = {key: self.positive(key) for key in ("near", "far")}
+        if None not in found.values() and found["far"] <= found["near"]:
+            self.problems.add(f"{self.where}far must lie beyond near; got near {found['near']} and far {found['far']}")
+            found["near"] = found["far"] = None
+        for key, shape in (("origin", (3,)), ("bounds", (2, 3))):
+            found[key] = None if self.values.get(key) is None else self.array(key, shape)
+        bounds = found["bounds"]
+        if bounds is not None and (bounds[0] >= bounds[1]).any():
+            self.problems.add(f"{self.where}bounds must be [lower corner, upper corner]; got {bounds.tolist()}")
+            found["bounds"] = None
+        found = {key: None if value is None else value * unit for key, value in found.items()}
+        return {**found, "near": found["near"] or near, "far": found["far"] or far}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def array(value: Any, shapes: Sequence[tuple[int, ...]], what: str, problems: Problems) -> np.ndarray | None:
+    """``value`` as finite float64 numbers of one of ``shapes``; None, and a problem of ``what``, where it is not."""
+    if value is None:
+        problems.add(f"{what} is missing")
+        return None
+    try:
+        given = np.asarray(value)
+        numbers = np.asarray(value, dtype=np.float64) if given.dtype.kind in "iufO" else None
+    except (TypeError, ValueError, OverflowError):
+        numbers = None
+    if numbers is None or numbers.shape not in shapes:
+        wanted = " or ".join(str(list(shape)) for shape in shapes)
+        got = repr(value)[:80] if numbers is None else str(list(numbers.shape))
+        problems.add(f"{what} must be numbers of shape {wanted}; got {got}")
+        return None
+    if not np.isfinite(numbers).all():
+        index = np.argwhere(~np.isfinite(numbers))[0]
+        frame = f" (frame {index[0]})" if len(shapes) > 1 and numbers.ndim == max(map(len, shapes)) else ""
+        null = given.dtype.kind == "O" and given[tuple(index)] is None
+        problems.add(f"{what}{frame} holds {'null' if null else 'values that are not finite'}")
+        return None
+    if (np.abs(numbers) > MAX_NUMBER).any():
+        problems.add(f"{what} holds {np.abs(numbers).max():g}; numbers beyond {MAX_NUMBER:g} are taken to be broken")
+        return None
+    return numbers
+
 
 def read_json(file: Path) -> dict:
     """The JSON object in ``file``. Raises InputError when it cannot be read or is none."""
@@ -107,88 +259,16 @@ def read_json(file: Path) -> dict:
     return content
 
 
-def whole(value, limit: int, what: str, problems: Problems) -> int:
-    """``value`` as a whole number from 1 to ``limit``; 1 where it is none."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value // 1 or not 1 <= value <= limit:
-        problems.add(f"{what} must be a whole number from 1 to {limit}; got {value!r:.80}")
-        return 1
-    return int(value)
-
-
-def positive(value, what: str, problems: Problems) -> float | None:
-    """``value`` as a positive number; None where it is none or absent."""
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= MAX_NUMBER:
-        problems.add(f"{what} must be a positive number, at most {MAX_NUMBER:g}; got {value!r:.80}")
-        return None
-    return float(value)
-
-
-def array(value, shapes: Sequence[tuple[int, ...]], what: str, problems: Problems) -> np.ndarray | None:
-    """``value`` as finite float64 numbers of one of ``shapes``; None where it is not."""
-    if value is None:
-        problems.add(f"{what} is missing")
-        return None
-    try:
-        given = np.asarray(value)
-        numbers = np.asarray(value, dtype=np.float64) if given.dtype.kind in "iufO" else None
-    except (TypeError, ValueError, OverflowError):
-        numbers = None
-    if numbers is None or numbers.shape not in shapes:
-        wanted = " or ".join(str(list(shape)) for shape in shapes)
-        got = repr(value)[:80] if numbers is None else str(list(numbers.shape))
-        problems.add(f"{what} must be numbers of shape {wanted}; got {got}")
-        return None
-    if not np.isfinite(numbers).all():
-        place = np.argwhere(~np.isfinite(numbers))[0]
-        frame = f" (frame {place[0]})" if len(shapes) > 1 and numbers.ndim == max(map(len, shapes)) else ""
-        null = given.dtype.kind == "O" and given[tuple(place)] is None
-        problems.add(f"{what}{frame} holds {'null' if null else 'values that are not finite'}")
-        return None
-    if (np.abs(numbers) > MAX_NUMBER).any():
-        problems.add(f"{what} holds {np.abs(numbers).max():g}; numbers beyond {MAX_NUMBER:g} are taken to be broken")
-        return None
-    return numbers
-
-
-def image_size(value, what: str, problems: Problems) -> tuple[int, int]:
-    """(width, height); (1, 1) where ``value`` is none."""
-    size = array(value, [(2,)], what, problems)
-    if size is None:
-        return 1, 1
-    if (size != np.round(size)).any() or (size < 1).any() or (size > MAX_SIZE).any():
-        problems.add(f"{what} must be [width, height] in pixels; got {size.tolist()}")
-        return 1, 1
-    return int(size[0]), int(size[1])
-
-
-def workspace(description: dict, where: Path, problems: Problems) -> dict:
-    """The optional keys that every layout takes beside its own: near, far, origin, bounds."""
-    found = {key: positive(description.get(key), f"{where}: {key}", problems) for key in ("near", "far")}
-    if None not in found.values() and found["far"] <= found["near"]:
-        problems.add(f"{where}: far must lie beyond near; got near {found['near']} and far {found['far']}")
-        found["near"] = found["far"] = None
-    for key, shape in (("origin", (3,)), ("bounds", (2, 3))):
-        value = description.get(key)
-        found[key] = None if value is None else array(value, [shape], f"{where}: {key}", problems)
-    bounds = found["bounds"]
-    if bounds is not None and (bounds[0] >= bounds[1]).any():
-        problems.add(f"{where}: bounds must be [lower corner, upper corner]; got {bounds.tolist()}")
-        found["bounds"] = None
-    return found
-
-
-def inside(folder: Path, relative: str, where: str) -> Path:
+def inside(folder: Path, relative: str, what: str) -> Path:
     """``folder / relative``. Raises InputError when that is no file inside of ``folder``, links followed."""
     file = folder / relative
     try:
-        root, place = folder.resolve(), file.resolve()
-        if place != root and place.is_relative_to(root) and len(file.name) <= MAX_NAME:
+        root, target = folder.resolve(), file.resolve()
+        if target != root and target.is_relative_to(root) and len(file.name) <= MAX_NAME:
             return file
     except (OSError, ValueError, RuntimeError):
         pass
-    raise InputError(f"{where} is no file or leads out of the scene: {str(relative)[:200]!r}")
+    raise InputError(f"{what} is no file or leads out of the scene: {str(relative)[:200]!r}")
 
 
 def natural_order(text: str) -> list:
@@ -202,8 +282,8 @@ def trailing_number(name: str) -> int | None:
     return int(digits[-1]) if digits and len(digits[-1]) <= 9 else None
 
 
-def common_numbers(numbers: dict[str, Sequence[int]], where: Path, problems: Problems) -> list[int]:
-    """Frame numbers that all cameras have, evenly spaced; what a camera lacks is a problem."""
+def common_numbers(numbers: dict[str, Sequence[int]], source: Path, problems: Problems) -> list[int]:
+    """Frame numbers that all cameras have, evenly spaced; frames that a camera lacks are a problem."""
     every = sorted(set().union(*numbers.values()))
     for camera, own in numbers.items():
         missing = sorted(set(every) - set(own))
@@ -211,7 +291,7 @@ def common_numbers(numbers: dict[str, Sequence[int]], where: Path, problems: Pro
             shown = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
             longest = max(numbers, key=lambda name: len(numbers[name]))
             problems.add(
-                f"{where}: camera {camera} has {len(own)} frames, camera {longest} {len(numbers[longest])}; "
+                f"{source}: camera {camera} has {len(own)} frames, camera {longest} {len(numbers[longest])}; "
                 f"missing: frame {shown}"
             )
     common = sorted(set(every).intersection(*numbers.values()))
@@ -219,14 +299,14 @@ def common_numbers(numbers: dict[str, Sequence[int]], where: Path, problems: Pro
     if len(gaps) and (gaps != gaps.min()).any() and common == every:
         late = int(np.argmax(gaps != gaps.min()))
         problems.add(
-            f"{where}: frame numbers are times and must be evenly spaced; from frame {common[late]} on the next is "
+            f"{source}: frame numbers are times and must be evenly spaced; from frame {common[late]} on the next is "
             f"{common[late + 1]}, but elsewhere {gaps.min()} later"
         )
     return common
 
 
 def step_rate(times: np.ndarray) -> tuple[float, int | None]:
-    """Steps a second of ascending ``times``, and the first step after which the spacing breaks (None: nowhere)."""
+    """Steps a second of ascending ``times``, and the first step after which the spacing breaks (None: it does not)."""
     gaps = np.diff(times)
     usual = float(np.median(gaps))
     broken = np.abs(gaps - usual) > SPACING_TOLERANCE * usual

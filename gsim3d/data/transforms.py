@@ -21,23 +21,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.data import lenses
-from gsim3d.data.cameras import OPENGL, by_step, check_intrinsics, check_pose, inverse
+from gsim3d.data import lenses, recording
+from gsim3d.data.cameras import OPENGL, check_intrinsics, check_pose, inverse
 from gsim3d.data.images import IMAGE_SUFFIXES, as_color, as_labels, as_mask, as_opaque, header_of, read_files
-from gsim3d.data.recording import (
-    MAX_CAMS,
-    MAX_STEPS,
-    Problems,
-    Recording,
-    array,
-    image_size,
-    inside,
-    natural_order,
-    positive,
-    read_json,
-    step_rate,
-    workspace,
-)
+from gsim3d.data.recording import Camera, Description, Problems, Recording, array, inside, read_json
 from gsim3d.errors import InputError
 
 NAME = "transforms"
@@ -69,55 +56,61 @@ def read(folder: Path, problems: Problems) -> Recording:
 
 
 def recording_of(folder: Path, source: Path, description: dict, frames: list[dict], problems: Problems) -> Recording:
-    """The scene of ``frames`` that have all their keys; fps, near, far, origin and bounds lie in ``description``."""
-    if len(frames) > MAX_STEPS:
-        raise InputError(f"{source}: {len(frames)} frames; more than {MAX_STEPS} are taken to be a mistake")
+    """The scene of ``frames``.
+
+    Args:
+        folder: of the scene; paths of the frames lie in it.
+        source: file that describes the scene.
+        description: fps, near, far, origin and bounds.
+        frames: each with all its keys, see :func:`frames_of`.
+        problems: what is wrong is added to them.
+    """
+    if len(frames) > recording.MAX_STEPS:
+        raise InputError(f"{source}: {len(frames)} frames; more than {recording.MAX_STEPS} are taken to be a mistake")
     table, times = _table(frames, source, problems)
-    names = sorted(table, key=natural_order)
-    if len(names) > MAX_CAMS:
-        raise InputError(f"{source}: {len(names)} cameras; more than {MAX_CAMS} are taken to be a mistake")
-    cameras = [_Camera(name, table[name], folder, source, problems) for name in names]
-    n_steps = len(times)
-    fps = positive(description.get("fps"), f"{source}: fps", problems)
-    if n_steps > 1:
-        rate, broken = step_rate(times)
+    names = sorted(table, key=recording.natural_order)
+    if len(names) > recording.MAX_CAMS:
+        raise InputError(f"{source}: {len(names)} cameras; more than {recording.MAX_CAMS} are taken to be a mistake")
+    cameras = [_CameraFrames(name, table[name], folder, source, problems) for name in names]
+    given = Description(description, f"{source}: ", problems)
+    fps = given.positive("fps")
+    if len(times) > 1:
+        rate, broken = recording.step_rate(times)
         if broken is not None:
             problems.add(
                 f"{source}: times must be evenly spaced; after {times[broken]:g} the next is {times[broken + 1]:g}, "
                 f"elsewhere {1 / rate:g} later"
             )
         fps = fps or rate
+    has_labels = any("mask_path" in frame or "label_path" in frame for frame in frames)
 
     def read_images(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
-        return read_files(cameras[cam].files("file_path", steps), cameras[cam].size, as_color, problems)
+        return cameras[cam].read("file_path", as_color, steps, problems)
 
     def read_labels(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
         camera = cameras[cam]
+        if not has_labels:
+            yield from camera.read("file_path", as_opaque, steps, problems)
+            return
         for step in steps:
             frame = camera.frames[step]
             key, convert = ("label_path", as_labels) if "label_path" in frame else ("mask_path", as_mask)
-            if key not in frame and has_labels:
-                problems.add(f"{source}: {camera.place(step)} has no mask_path, though other frames have one")
+            if key in frame:
+                yield from camera.read(key, convert, [step], problems)
+            else:
+                problems.add(f"{source}: {camera.frame(step)} has no mask_path, though other frames have one")
                 yield None
-                continue
-            key, convert = (key, convert) if has_labels else ("file_path", as_opaque)
-            yield from read_files(camera.files(key, [step]), camera.size, convert, problems)
 
-    has_labels = any("mask_path" in frame or "label_path" in frame for frame in frames)
-    return Recording(
+    return Recording.of_cameras(
+        [camera.camera() for camera in cameras],
+        len(times),
         layout=NAME,
         source=source,
-        n_steps=n_steps,
         fps=fps or 1.0,
-        camera_names=tuple(names),
-        viewmats=by_step([camera.viewmats for camera in cameras], n_steps),
-        Ks=by_step([camera.Ks for camera in cameras], n_steps),
-        sizes=tuple(camera.size for camera in cameras),
         read_images=read_images,
         read_labels=read_labels if has_labels or any(camera.has_alpha() for camera in cameras) else None,
-        distortions=tuple(camera.lens for camera in cameras),
         real_background=True,
-        **workspace(description, source, problems),
+        **given.workspace(),
     )
 
 
@@ -191,61 +184,70 @@ def _camera_name(frame: dict) -> str:
     return re.sub(r"[_\-/]?\d+(?=\D*$)", "", str(Path(frame["file_path"]).with_suffix(""))) or "camera"
 
 
-class _Camera:
+class _CameraFrames:
     """All frames of one camera, step by step."""
 
     def __init__(self, name: str, frames: list[dict], folder: Path, source: Path, problems: Problems):
-        self.name, self.frames, self._folder, self._source = name, frames, folder, source
-        self.size = self._size(problems)
-        found = [self._lens(frame, step, problems) for step, frame in enumerate(frames)]
-        if any(lens != found[0] for lens in found):
-            problems.add(f"{source}: camera {name}: the lens (camera_model, k1 ...) must be the same in all frames")
-        self.lens = found[0]
-        self.viewmats = np.stack([self._viewmat(frame, step, problems) for step, frame in enumerate(frames)])
-        self.Ks = np.stack([self._K(frame, step, problems) for step, frame in enumerate(frames)])
+        self.name, self.frames, self._folder, self._source, self._problems = name, frames, folder, source, problems
+        self.size = self._size()
 
-    def place(self, step: int) -> str:
+    def camera(self) -> Camera:
+        """Lens, poses and intrinsics of all steps."""
+        steps = range(len(self.frames))
+        found = [
+            lenses.lens_of(frame, f"{self._source}: {self.frame(step)}", self._problems)
+            for step, frame in enumerate(self.frames)
+        ]
+        if any(lens != found[0] for lens in found):
+            self._problems.add(
+                f"{self._source}: camera {self.name}: the lens (camera_model, k1 ...) must be the same in all frames"
+            )
+        viewmats = np.stack([self._viewmat(step) for step in steps])
+        return Camera(self.name, self.size, viewmats, np.stack([self._K(step) for step in steps]), found[0])
+
+    def frame(self, step: int) -> str:
+        """Camera and frame, for messages."""
         return f"camera {self.name}, frame {step}"
 
-    def files(self, key: str, steps: Sequence[int]) -> Iterator[tuple[Path, str]]:
-        for step in steps:
-            file = inside(self._folder, self.frames[step][key], f"{self._source}: {key} of {self.place(step)}")
-            if file.suffix.lower() not in IMAGE_SUFFIXES:  # as in the synthetic sets
-                found = [file.with_name(file.name + suffix) for suffix in IMAGE_SUFFIXES]
-                file = next((path for path in found if path.is_file()), found[0])
-            yield file, self.place(step)
+    def read(self, key: str, convert, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
+        """``convert`` of the images that ``key`` names at ``steps``."""
+        return read_files((self._file(key, step) for step in steps), self.size, convert, problems)
 
     def has_alpha(self) -> bool:
-        header = header_of(*next(self.files("file_path", [0])), Problems(collect=True))
+        header = header_of(*self._file("file_path", 0), Problems(collect=True))
         return header is not None and header.alpha
 
-    def _size(self, problems: Problems) -> tuple[int, int]:
-        given = [self.frames[0].get(key) for key in ("w", "h")]
-        if given != [None, None]:
-            return image_size(given, f"{self._source}: w, h of camera {self.name}", problems)
-        header = header_of(*next(self.files("file_path", [0])), problems)
-        return (1, 1) if header is None else image_size(header.size, f"images of camera {self.name}", problems)
+    def _file(self, key: str, step: int) -> tuple[Path, str]:
+        file = inside(self._folder, self.frames[step][key], f"{self._source}: {key} of {self.frame(step)}")
+        if file.suffix.lower() not in IMAGE_SUFFIXES:  # as in the synthetic sets
+            found = [file.with_name(file.name + suffix) for suffix in IMAGE_SUFFIXES]
+            file = next((path for path in found if path.is_file()), found[0])
+        return file, self.frame(step)
 
-    def _lens(self, frame: dict, step: int, problems: Problems) -> lenses.Lens | None:
-        return lenses.lens_of(frame, f"{self._source}: {self.place(step)}", problems)
+    def _size(self) -> tuple[int, int]:
+        given, key = [self.frames[0].get(key) for key in ("w", "h")], f"w, h of camera {self.name}"
+        if given == [None, None]:
+            header = header_of(*self._file("file_path", 0), self._problems)
+            given = [1, 1] if header is None else list(header.size)
+        return Description({key: given}, f"{self._source}: ", self._problems).size(key)
 
-    def _viewmat(self, frame: dict, step: int, problems: Problems) -> np.ndarray:
-        what = f"{self._source}: transform_matrix of {self.place(step)}"
-        pose = array(frame.get("transform_matrix"), [(4, 4), (3, 4)], what, problems)
+    def _viewmat(self, step: int) -> np.ndarray:
+        what = f"{self._source}: transform_matrix of {self.frame(step)}"
+        pose = array(self.frames[step].get("transform_matrix"), [(4, 4), (3, 4)], what, self._problems)
         if pose is None:
             return np.eye(4)
         if len(pose) == 3:
             pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
-        return OPENGL @ inverse(pose) if check_pose(pose, what, problems) else np.eye(4)
+        return OPENGL @ inverse(pose) if check_pose(pose, what, self._problems) else np.eye(4)
 
-    def _K(self, frame: dict, step: int, problems: Problems) -> np.ndarray:
-        what = f"{self._source}: intrinsics of {self.place(step)}"
+    def _K(self, step: int) -> np.ndarray:
+        frame, what, problems = self.frames[step], f"{self._source}: intrinsics of {self.frame(step)}", self._problems
         size = [frame.get(key) for key in ("w", "h")]
         if size != list(self.size) and size != [None, None]:
             problems.add(f"{what}: w, h are {size}, but {list(self.size)} in its first frame")
         keys = ("fl_x", "fl_y", "cx", "cy")
         given = {key: frame[key] for key in keys if frame.get(key) is not None}
-        angles = [self._focal(frame, axis, what, problems) for axis in (0, 1)]
+        angles = [self._focal(Description(frame, f"{what}: ", problems), axis) for axis in (0, 1)]
         known = {"fl_x": angles[0] or angles[1], "fl_y": angles[1] or given.get("fl_x") or angles[0]}
         if any(angles):  # they are symmetric
             known |= {"cx": self.size[0] / 2, "cy": self.size[1] / 2}
@@ -261,12 +263,12 @@ class _Camera:
         K = np.array([[values[0], 0, values[2]], [0, values[1], values[3]], [0, 0, 1.0]])
         return K if check_intrinsics(K, self.size, what, problems) else np.eye(3)
 
-    def _focal(self, frame: dict, axis: int, what: str, problems: Problems) -> float | None:
-        """The focal length in pixels of the angle that an axis of the image spans; None where there is none."""
-        angle = positive(frame.get(ANGLES[axis]), f"{what}: {ANGLES[axis]}", problems)
+    def _focal(self, frame: Description, axis: int) -> float | None:
+        """The focal length in pixels of the angle that an axis of the image spans; None where it is not given."""
+        angle = frame.positive(ANGLES[axis])
         if angle is None:
             return None
         if angle >= math.pi:
-            problems.add(f"{what}: {ANGLES[axis]} must be below pi (radians); got {angle:g}")
+            frame.problems.add(f"{frame.where}{ANGLES[axis]} must be below pi (radians); got {angle:g}")
             return None
         return 0.5 * self.size[axis] / math.tan(0.5 * angle)

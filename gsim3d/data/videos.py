@@ -17,13 +17,15 @@ move, and without alpha the background of cameras that stand still is subtracted
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from gsim3d.data.cameras import by_step, check_intrinsics, check_pose
+from gsim3d.data import recording
+from gsim3d.data.cameras import check_intrinsics, check_pose
 from gsim3d.data.images import (
     IMAGE_SUFFIXES,
     as_color,
@@ -37,22 +39,7 @@ from gsim3d.data.images import (
 )
 from gsim3d.data.lenses import FISHEYE, FISHEYE_ORDER, OPENCV_ORDER, lens_of
 from gsim3d.data.masks import MIN_STEPS
-from gsim3d.data.recording import (
-    MAX_CAMS,
-    MAX_NAME,
-    MAX_STEPS,
-    Lens,
-    Problems,
-    Recording,
-    array,
-    common_numbers,
-    image_size,
-    inside,
-    positive,
-    read_json,
-    trailing_number,
-    workspace,
-)
+from gsim3d.data.recording import Camera, Description, Lens, Problems, Recording, array, inside
 from gsim3d.data.video_file import Video
 from gsim3d.errors import InputError
 
@@ -68,151 +55,139 @@ MAX_DRIFT = 0.5  # frames by which videos of nearly one rate may run apart
 
 
 def recognises(folder: Path) -> bool:
+    """Whether ``folder`` has a cameras.json."""
     return (folder / FILE).is_file()
 
 
 def read(folder: Path, problems: Problems) -> Recording:
     """The scene in ``folder``. Raises InputError where its description cannot be read at all."""
     source = folder / FILE
-    description = read_json(source)
-    entries = description.get("cameras")
-    if (
-        not isinstance(entries, list)
-        or not 1 <= len(entries) <= MAX_CAMS
-        or not all(isinstance(e, dict) for e in entries)
-    ):
-        raise InputError(f"{source}: cameras must be a list of 1 to {MAX_CAMS} JSON objects")
-    names = [_name(entry, number, source) for number, entry in enumerate(entries)]
-    if len(set(names)) < len(names):
-        raise InputError(f"{source}: two cameras have the same name: {', '.join(names)}")
-    fps = positive(description.get("fps"), f"{source}: fps", problems)
-    sizes = [
-        image_size(entry.get("size"), f"{source}: size of camera {n}", problems) for n, entry in zip(names, entries)
-    ]
-    sources = [_frames_of(folder, name, size, source, problems) for name, size in zip(names, sizes)]
-    resample = positive(description.get("resample"), f"{source}: resample", problems)
-    numbers, rate, notes = _steps(dict(zip(names, sources)), fps, resample, source, problems)
-    n_steps = len(numbers[0])
-    unit = description.get("units", "m")
-    if not isinstance(unit, str) or unit not in UNITS:
-        raise InputError(f"{source}: units must be one of {', '.join(UNITS)}; got {unit!r}")
-    cameras = [
-        _camera(entry, name, size, n_steps, description, source, problems)
-        for name, entry, size in zip(names, entries, sizes)
-    ]
-    viewmats, Ks = (by_step([camera[i] for camera in cameras], n_steps) for i in (0, 1))
-    viewmats[..., :3, 3] *= UNITS[unit]
-    given = {
-        key: None if value is None else value * UNITS[unit]
-        for key, value in workspace(description, source, problems).items()
-    }
-    masks = _masks(folder, description, source, sources)
-    stills = len(viewmats) == len(Ks) == 1
-    subtract = masks == "subtract" and stills and n_steps >= MIN_STEPS
-    if description.get("masks") == "subtract" and not subtract and masks == "subtract":
+    description = Description(recording.read_json(source), f"{source}: ", problems)
+    entries = _entries(description)
+    names = list(entries)
+    sizes = {name: entry.size("size") for name, entry in entries.items()}
+    sources = {name: _frames_of(folder, name, sizes[name], source, problems) for name in names}
+    fps, resample = description.positive("fps"), description.positive("resample")
+    numbers, rate, notes = _steps(sources, fps, resample, source, problems)
+    unit, center = _unit(description), _pixel_center(description)
+    cameras = [_camera(entry, name, sizes[name], len(numbers[0]), unit, center) for name, entry in entries.items()]
+    masks = _masks(folder, description, list(sources.values()))
+    labels = sources if masks == "alpha" else None
+    if masks in OWN_FOLDERS:
+        labels = {name: _Frames(folder, Path(masks) / name, name, sizes[name]) for name in names}
+
+    def read_images(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
+        return sources[names[cam]].read([numbers[cam][step] for step in steps], problems)
+
+    def read_labels(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
+        return labels[names[cam]].read([numbers[cam][step] for step in steps], problems, CONVERT[masks])
+
+    found = Recording.of_cameras(
+        cameras,
+        len(numbers[0]),
+        layout=NAME,
+        source=source,
+        fps=rate,
+        read_images=read_images,
+        read_labels=read_labels if labels else None,
+        real_background=True,
+        notes=tuple(notes),
+        **description.workspace(unit=unit),
+    )
+    subtract = masks == "subtract" and len(found.viewmats) == len(found.Ks) == 1 and found.n_steps >= MIN_STEPS
+    if description.values.get("masks") == masks == "subtract" and not subtract:
         problems.add(
             f"{source}: masks: the background can be subtracted from {MIN_STEPS} frames or more of still cameras"
         )
-
-    def read_images(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
-        return sources[cam].read([numbers[cam][step] for step in steps], problems)
-
-    def read_labels(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
-        return labels[cam].read([numbers[cam][step] for step in steps], problems, CONVERT[masks])
-
-    labels = [_Frames(folder, Path(masks) / n, n, s) for n, s in zip(names, sizes)] if masks in OWN_FOLDERS else None
-    if masks == "alpha":
-        labels = sources
-    return Recording(
-        layout=NAME,
-        source=source,
-        n_steps=n_steps,
-        fps=rate,
-        camera_names=tuple(names),
-        viewmats=viewmats,
-        Ks=Ks,
-        sizes=tuple(sizes),
-        read_images=read_images,
-        read_labels=read_labels if labels else None,
-        distortions=tuple(camera[2] for camera in cameras),
-        real_background=True,
-        subtract_background=subtract,
-        notes=tuple(notes),
-        **given,
-    )
+    return dataclasses.replace(found, subtract_background=subtract)
 
 
-def _name(entry: dict, number: int, source: Path) -> str:
-    name = entry.get("name")
-    plain = isinstance(name, str) and 0 < len(name) <= MAX_NAME and Path(name).name == name and "\0" not in name
-    if not plain or name in OWN_FOLDERS or name.startswith("."):
-        raise InputError(
-            f"{source}: cameras[{number}].name must be the name of its folder or video, without ending; "
-            f"got {str(name)[:80]!r}"
-        )
-    return name
+def _entries(description: Description) -> dict[str, Description]:
+    """The cameras of a description by name."""
+    values, found = description.values.get("cameras"), {}
+    most = recording.MAX_CAMS
+    if not isinstance(values, list) or not 1 <= len(values) <= most or not all(isinstance(e, dict) for e in values):
+        raise InputError(f"{description.where}cameras must be a list of 1 to {most} JSON objects")
+    for number, entry in enumerate(values):
+        name = entry.get("name")
+        plain = isinstance(name, str) and 0 < len(name) <= recording.MAX_NAME and Path(name).name == name
+        if not plain or "\0" in name or name in OWN_FOLDERS or name.startswith("."):
+            raise InputError(
+                f"{description.where}cameras[{number}].name must be the name of its folder or video, without ending; "
+                f"got {str(name)[:80]!r}"
+            )
+        if name in found:
+            raise InputError(f"{description.where}two cameras have the same name: {name}")
+        found[name] = Description(entry, f"{description.where}camera {name}: ", description.problems)
+    return found
 
 
-def _camera(
-    entry: dict, name: str, size: tuple[int, int], n_steps: int, description: dict, source: Path, problems: Problems
-) -> tuple[np.ndarray, np.ndarray, Lens | None]:
-    """viewmat [4, 4] or [S, 4, 4], K [3, 3] or [S, 3, 3], lens."""
-    what = f"{source}: camera {name}"
-    viewmat, K = np.eye(4), np.eye(3)
-    R = array(entry.get("R"), [(3, 3), (n_steps, 3, 3)], f"{what}: R", problems)
-    T = array(entry.get("T"), [(3,), (3, 1), (n_steps, 3)], f"{what}: T", problems)
+def _unit(description: Description) -> float:
+    """Metres of the unit of T, near, far, origin and bounds."""
+    unit = description.values.get("units", "m")
+    if not isinstance(unit, str) or unit not in UNITS:
+        raise InputError(f"{description.where}units must be one of {', '.join(UNITS)}; got {unit!r}")
+    return UNITS[unit]
+
+
+def _pixel_center(description: Description) -> float:
+    center = description.values.get("pixel_center", 0.5)
+    if center not in (0, 0.5):
+        raise InputError(f"{description.where}pixel_center must be 0 (OpenCV's calibration) or 0.5; got {center!r}")
+    return center
+
+
+def _camera(entry: Description, name: str, size: tuple[int, int], n_steps: int, unit: float, center: float) -> Camera:
+    viewmat, K, problems = np.eye(4), np.eye(3), entry.problems
+    R = entry.array("R", (3, 3), (n_steps, 3, 3))
+    T = entry.array("T", (3,), (3, 1), (n_steps, 3))
     if R is not None and T is not None:
         T = T[:, 0] if T.shape == (3, 1) and R.ndim == 2 else T
         moving = R.ndim == 3 or T.ndim == 2
         full = np.broadcast_to(np.eye(4), (n_steps if moving else 1, 4, 4)).copy()
         full[:, :3, :3], full[:, :3, 3] = R, T
         full = full if moving else full[0]
-        viewmat = full if check_pose(full, f"{what}: R", problems) else viewmat
-    found = array(entry.get("K"), [(3, 3), (n_steps, 3, 3)], f"{what}: K", problems)
+        viewmat = full if check_pose(full, f"{entry.where}R", problems) else viewmat
+    found = entry.array("K", (3, 3), (n_steps, 3, 3))
     if found is not None:
         found = found.copy()
-        found[..., :2, 2] += 0.5 - _pixel_center(description, source)
-        K = found if check_intrinsics(found, size, f"{what}: K", problems) else K
-    return viewmat, K, _lens(entry, what, problems)
+        found[..., :2, 2] += 0.5 - center
+        K = found if check_intrinsics(found, size, f"{entry.where}K", problems) else K
+    viewmat[..., :3, 3] *= unit
+    return Camera(name, size, viewmat, K, _lens(entry))
 
 
-def _lens(entry: dict, what: str, problems: Problems) -> Lens | None:
+def _lens(camera: Description) -> Lens | None:
     """The lens of distortion, or of keys as in transforms.json."""
-    given = entry.get("distortion", entry.get("dist_k1k2p1p2k3"))
-    entry = {key: value for key, value in entry.items() if key != "distortion"}
+    values, what, problems = camera.values, camera.where.removesuffix(": "), camera.problems
+    given = values.get("distortion", values.get("dist_k1k2p1p2k3"))
+    values = {key: value for key, value in values.items() if key != "distortion"}
     if given is None:
-        return lens_of(entry, what, problems)
+        return lens_of(values, what, problems)
     numbers = array(given, DISTORTIONS, f"{what}: distortion", problems)
     if numbers is None:
         return None
-    order = FISHEYE_ORDER if entry.get("camera_model") in FISHEYE or entry.get("is_fisheye") else OPENCV_ORDER
+    order = FISHEYE_ORDER if values.get("camera_model") in FISHEYE or values.get("is_fisheye") else OPENCV_ORDER
     if len(numbers) > len(order):
         problems.add(f"{what}: distortion of a fisheye must be {', '.join(order)}; got {len(numbers)} numbers")
         return None
     named = dict(zip(order, numbers.tolist(), strict=False))
-    if twice := next((key for key in named if key in entry), None):
+    if twice := next((key for key in named if key in values), None):
         problems.add(f"{what}: {twice} is given twice, also in distortion")
         return None
-    return lens_of({**entry, **named}, what, problems)
+    return lens_of({**values, **named}, what, problems)
 
 
-def _pixel_center(description: dict, source: Path) -> float:
-    center = description.get("pixel_center", 0.5)
-    if center not in (0, 0.5):
-        raise InputError(f"{source}: pixel_center must be 0 (OpenCV's calibration) or 0.5; got {center!r}")
-    return center
-
-
-def _masks(folder: Path, description: dict, source: Path, sources: list[_Frames | Video]) -> str:
+def _masks(folder: Path, description: Description, sources: list[_Frames | Video]) -> str:
     """Where labels come from: the folder labels or masks, "alpha", "subtract", or "none"."""
-    wanted = description.get("masks", "subtract")
+    wanted = description.values.get("masks", "subtract")
     if wanted not in ("subtract", "none"):
-        raise InputError(f'{source}: masks must be "subtract" or "none"; got {wanted!r}')
+        raise InputError(f'{description.where}masks must be "subtract" or "none"; got {wanted!r}')
     if wanted == "none":
         return wanted
     own = next((name for name in reversed(OWN_FOLDERS) if (folder / name).is_dir()), None)
     cut_out = all(isinstance(frames, _Frames) for frames in sources) and any(map(_Frames.is_cut_out, sources))
-    return own or ("alpha" if cut_out and "masks" not in description else wanted)
+    return own or ("alpha" if cut_out and "masks" not in description.values else wanted)
 
 
 def _frames_of(folder: Path, name: str, size: tuple[int, int], source: Path, problems: Problems) -> _Frames | Video:
@@ -274,7 +249,7 @@ def _steps(
         if high - low + 1 < longest:
             common = max(0, high - low + 1)
             notes.append(f"the videos start at different times: {common} of {longest} frames are common")
-    common = common_numbers(ticks, source, problems) if ticks else []
+    common = recording.common_numbers(ticks, source, problems) if ticks else []
     if not common:
         raise InputError(f"{source}: the cameras have no frame number in common")
     stride = common[1] - common[0] if len(common) > 1 else 1
@@ -295,8 +270,9 @@ def _resampled(
     count = math.floor((high - low) * rate + 1e-6) + 1 if high >= low else 0
     if count < 1:
         raise InputError(f"{source}: the cameras have no time in common")
-    if count > MAX_STEPS:
-        raise InputError(f"{source}: resample gives {count} steps; more than {MAX_STEPS} are taken to be a mistake")
+    most = recording.MAX_STEPS
+    if count > most:
+        raise InputError(f"{source}: resample gives {count} steps; more than {most} are taken to be a mistake")
     grid = low + np.arange(count) / rate
     numbers, off, again = {}, 0.0, 0
     for name, own in times.items():
@@ -316,7 +292,7 @@ class _Frames:
         self._name, self._size, self._folder = name, size, scene / folder
         self._files: dict[int, Path] = {}
         for path in sorted(self._folder.iterdir()) if self._folder.is_dir() else ():
-            number = trailing_number(path.stem) if path.suffix.lower() in IMAGE_SUFFIXES else None
+            number = recording.trailing_number(path.stem) if path.suffix.lower() in IMAGE_SUFFIXES else None
             if number is None:
                 continue
             if number in self._files:
@@ -338,9 +314,9 @@ class _Frames:
             yield from [None] * len(numbers)
             return
         for number in numbers:
-            place = f"camera {self._name}, frame {number}"
+            frame = f"camera {self._name}, frame {number}"
             if number not in self._files:
-                problems.add(f"{self._folder}: the image of {place} is missing")
+                problems.add(f"{self._folder}: the image of {frame} is missing")
                 yield None
                 continue
-            yield from read_files(iter([(self._files[number], place)]), self._size, convert, problems)
+            yield from read_files(iter([(self._files[number], frame)]), self._size, convert, problems)

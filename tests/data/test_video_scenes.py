@@ -372,7 +372,7 @@ def test_no_loss_and_no_metric_sees_the_padding(odd, tmp_path, one_thread):
 def test_train_simulate_evaluate_and_check_on_films(odd, tmp_path, capsys, one_thread):
     folder, _ = odd
     (tmp_path / "train.yaml").write_text(
-        "data: {history: 2, context_views: 2}\nstages:\n  - {steps: 1, horizon: 1, target_views: 2}\n"
+        "data: {history: 2, context_views: 2}\nphases:\n  - {steps: 1, horizon: 1, target_views: 2}\n"
     )
     run = ["train", tmp_path / "train.yaml", "--data", folder, "--out", tmp_path / "run"]
     simulate = ["simulate", tmp_path / "run", folder, "--out", tmp_path / "out", "--steps", "2"]
