@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ from gsim3d.dynamics import RestLog, concatenate
 from gsim3d.effects.edits import Edit
 from gsim3d.errors import FitWarning, InputError, NumericalError
 from gsim3d.evaluate.predictions import Predictions
-from gsim3d.evaluate.scoring import EXACT_PARTS, PLAIN_METRICS, SceneScores, SceneTruth
+from gsim3d.evaluate.scoring import PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.io.terminal import progress
 from gsim3d.nn.layers import exact_convolutions
 from gsim3d.state import DYNAMIC, Particles
@@ -38,7 +38,7 @@ from gsim3d.train.processes import Processes
 from gsim3d.train.restore import Restored
 from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
-METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant", *EXACT_PARTS)
+METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant")
 TOGETHER = 8  # scenes that a GPU predicts in one rollout, fewer where they are large
 MOST_PIXELS = 2**21  # of the input images of one rollout
 CLIPS = 48  # of which FVD is measured
@@ -48,9 +48,11 @@ CLIPS = 48  # of which FVD is measured
 class Prediction:
     """Encoded and predicted particles of one scene.
 
-    particles: one cloud a step, the first ``n_encoded`` of them encoded.
-    context_cams: cameras whose images were the input.
-    resting: share of the predicted particles that rested and were not computed.
+    Attributes:
+        particles: one cloud a step, the first ``n_encoded`` of them encoded.
+        n_encoded: encoded steps.
+        context_cams: cameras whose images were the input.
+        resting: share of the predicted particles that rested and were not computed.
     """
 
     particles: Particles
@@ -62,13 +64,17 @@ class Prediction:
     def n_steps(self) -> int:
         return self.particles.n_clouds
 
+    def step(self, number: int) -> Particles:
+        """The particles of one step."""
+        return self.particles.select_clouds(torch.tensor([number], device=self.particles.means.device))
+
 
 def default_views(
     restored: Restored, scene: Scene, context: Sequence[int] | None = None, target: Sequence[int] | None = None
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """(context, target) cameras: those named, and for what is not named
 
-    inputs spread evenly, none of them a named target; targets those kept from training's inputs, else all the rest.
+    inputs spread evenly, none of them a named target; targets those that training never had as inputs, else the rest.
     """
     data = restored.data_of(scene)
     if not context:
@@ -93,7 +99,25 @@ def default_views(
     return tuple(context), tuple(target)
 
 
-@torch.no_grad()
+def horizon(scene: Scene, n_encoded: int, n_future: int | None) -> int:
+    """Steps that can be predicted and compared: ``n_future``, or all that the scene has after ``n_encoded``.
+
+    Raises:
+        InputError: the scene is too short, or the number below 1.
+    """
+    if n_future is not None:
+        _check_count(n_future)
+    known = scene.n_steps - n_encoded
+    if known < (n_future or 1):
+        raise InputError(f"{scene.path}: {n_future or 1} steps to compare, but only {max(0, known)} after the input")
+    return n_future or known
+
+
+def _check_count(n_future: int) -> None:
+    if n_future < 1:
+        raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
+
+
 def predict(
     restored: Restored,
     scene: Scene,
@@ -102,82 +126,87 @@ def predict(
     start: int = 0,
     edits: Sequence[Edit] = (),
 ) -> Prediction:
-    """Encodes ``history`` steps of a scene from ``start`` and rolls out ``n_future`` steps, also beyond the film's end.
+    """Encodes ``history`` steps of a scene from ``start`` and rolls out ``n_future`` steps, also beyond its last frame.
 
     Args:
+        restored: the model.
+        scene: whose frames are given.
+        context_cams: input cameras.
+        n_future: steps to predict.
+        start: first given step.
         edits: changes of the scene on the way.
     Raises:
         InputError: images of another size than in training, cameras and steps that the scene has not, or an edit that
             cannot be made.
     """
-    if n_future < 1:
-        raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
-    encoded = encode_steps(restored, scene, context_cams, start)
-    with exact_convolutions():
-        steps = restored.simulator.rollout(encoded, n_future, restored.plan, edits=edits, log=(log := RestLog()))
-    return Prediction(concatenate([encoded, *steps]), restored.data.history, tuple(context_cams), log.resting_share)
-
-
-@torch.no_grad()
-def encode_steps(restored: Restored, scene: Scene, context_cams: Sequence[int], start: int = 0) -> Particles:
-    """``history`` steps of a scene from ``start``. Errors as :func:`predict`."""
-    restored.check_scene(scene)
-    n_encoded = restored.data.history
-    if not 0 <= start <= scene.n_steps - n_encoded:
-        raise InputError(f"{scene.path}: {n_encoded} steps from step {start} on do not fit its {scene.n_steps} steps")
-    masked = scene.has_segmentation()
-    frames = make_frames([scene], [list(context_cams)], [range(start, start + n_encoded)], masked=masked)
-    frames = subsampled(frames, restored.data).to(restored.device)
-    with exact_convolutions():
-        return restored.simulator.encode(frames)
+    return predict_together(restored, [scene], n_future, [context_cams], start=start, edits=edits)[0]
 
 
 @torch.no_grad()
 def predict_together(
-    restored: Restored, scenes: Sequence[Scene], n_future: int, contexts: Sequence[Sequence[int]] | None = None
+    restored: Restored,
+    scenes: Sequence[Scene],
+    n_future: int,
+    contexts: Sequence[Sequence[int]] | None = None,
+    *,
+    start: int = 0,
+    edits: Sequence[Edit] = (),
 ) -> list[Prediction]:
-    """:func:`predict` of several scenes from their first steps, in one rollout.
+    """:func:`predict` of several scenes in one rollout.
 
     Args:
+        restored: the model.
+        scenes: to predict.
+        n_future: steps to predict.
         contexts: input cameras of each scene; default: those of :func:`default_views`.
+        start: first given step.
+        edits: changes of the scenes on the way.
     """
-    for scene in scenes:
-        restored.check_scene(scene)
+    _check_count(n_future)
     contexts = [default_views(restored, scene)[0] for scene in scenes] if contexts is None else contexts
-    n_encoded, masked = restored.data.history, all(scene.has_segmentation() for scene in scenes)
-    frames = make_frames(scenes, contexts, [range(n_encoded)] * len(scenes), masked=masked)
+    encoded, log = _encode(restored, scenes, contexts, start), RestLog()
     with exact_convolutions():
-        encoded = restored.simulator.encode(subsampled(frames, restored.data).to(restored.device))
-        together = concatenate([encoded, *restored.simulator.rollout(encoded, n_future, restored.plan)])
+        steps = restored.simulator.rollout(encoded, n_future, restored.plan, edits=edits, log=log)
+    together, n_encoded = concatenate([encoded, *steps]), restored.data.history
     n_steps = n_encoded + n_future
     return [
-        Prediction(together.select_clouds(range(b * n_steps, (b + 1) * n_steps)), n_encoded, tuple(context))
+        Prediction(
+            together.select_clouds(range(b * n_steps, (b + 1) * n_steps)) if len(scenes) > 1 else together,
+            n_encoded,
+            tuple(context),
+            log.resting_share,
+        )
         for b, context in enumerate(contexts)
     ]
 
 
-def _batches(restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Sequence[int]]) -> list[list[int]]:
-    """Numbers of the scenes that are predicted together: neighbours, alone on a CPU.
+def encode_steps(restored: Restored, scene: Scene, context_cams: Sequence[int], start: int = 0) -> Particles:
+    """``history`` steps of a scene from ``start``. Errors as in :func:`predict`."""
+    return _encode(restored, [scene], [context_cams], start)
 
-    They depend on the scenes and the device only, so that any number of processes gets the same numbers.
-    """
-    found: list[list[int]] = []
-    for number, (scene, context) in enumerate(zip(scenes, contexts, strict=True)):
-        kind = scene.has_segmentation(), len(context)
-        most = min(TOGETHER, MOST_PIXELS // (scene.width * scene.height * restored.data.history * len(context)))
-        room = restored.device.type == "cuda" and found and len(found[-1]) < most
-        if room and kind == (scenes[found[-1][0]].has_segmentation(), len(contexts[found[-1][0]])):
-            found[-1].append(number)
-        else:
-            found.append([number])
-    return found
+
+@torch.no_grad()
+def _encode(
+    restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Sequence[int]], start: int = 0
+) -> Particles:
+    n_encoded = restored.data.history
+    for scene in scenes:
+        restored.check_scene(scene)
+        if not 0 <= start <= scene.n_steps - n_encoded:
+            raise InputError(
+                f"{scene.path}: {n_encoded} steps from step {start} on do not fit its {scene.n_steps} steps"
+            )
+    masked, steps = all(scene.has_segmentation() for scene in scenes), range(start, start + n_encoded)
+    frames = make_frames(scenes, [list(context) for context in contexts], [steps] * len(scenes), masked=masked)
+    with exact_convolutions():
+        return restored.simulator.encode(subsampled(frames, restored.data).to(restored.device))
 
 
 @torch.no_grad()
 def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int], start: int = 0) -> Tensor:
     """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles, seen by cameras ``cams``.
 
-    The first cloud is step ``start`` of the film, which matters where cameras move.
+    The first cloud is step ``start`` of the scene, which matters where cameras move.
     """
     n_steps, n_views = particles.n_clouds, len(cams)
     cameras = scene.cameras_at(cams, range(start, start + n_steps)).to(particles.means.device)
@@ -190,31 +219,19 @@ def constant_velocity(prediction: Prediction) -> Particles:
 
     Nothing moves where there was one step only, or where one of the last two shows nothing that may move.
     """
-    encoded = prediction.particles
     last = prediction.n_encoded - 1
-    final = _cloud(encoded, last)
-    centroids = [_moving_centroid(_cloud(encoded, q)) for q in range(max(0, last - 1), last + 1)]
-    velocity = torch.nan_to_num(centroids[-1] - centroids[0])
+    final = prediction.step(last)
+    centroids = [
+        cloud.means[cloud.activity == DYNAMIC].mean(0)  # NaN where nothing may move
+        for cloud in (prediction.step(max(0, last - 1)), final)
+    ]
+    velocity = torch.nan_to_num(centroids[1] - centroids[0])
     moving = (final.activity == DYNAMIC).to(final.means.dtype)[:, None]
-    steps = []
-    for j in range(1, prediction.n_steps - last):
-        moved = final.means + j * velocity * moving
-        steps.append(dataclasses.replace(final, means=moved, cloud_step=final.cloud_step + j))
+    steps = [
+        dataclasses.replace(final, means=final.means + j * velocity * moving, cloud_step=final.cloud_step + j)
+        for j in range(1, prediction.n_steps - last)
+    ]
     return concatenate(steps)
-
-
-def horizon(scene: Scene, n_encoded: int, n_future: int | None) -> int:
-    """Steps that can be predicted and compared: ``n_future``, or all that the film has after ``n_encoded``.
-
-    Raises:
-        InputError: the film is too short, or the number below 1.
-    """
-    if n_future is not None and n_future < 1:
-        raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
-    known = scene.n_steps - n_encoded
-    if known < (n_future or 1):
-        raise InputError(f"{scene.path}: {n_future or 1} steps to compare, but only {max(0, known)} after the input")
-    return n_future or known
 
 
 def score_scene(
@@ -226,6 +243,7 @@ def score_scene(
     n_encoded: int | None = None,
     n_future: int | None = None,
     metrics: Sequence[str] = PLAIN_METRICS,
+    methods: Sequence[str] = METHODS,
     others: Sequence[Predictions] = (),
     prediction: Prediction | None = None,
     start: int = 0,
@@ -234,10 +252,13 @@ def score_scene(
 
     Args:
         restored: the model; None: only ``others`` and ``copy`` are scored.
-        context_cams, target_cams: default those of :func:`default_views`; without a model targets must be given.
+        scene: to predict.
+        context_cams: input cameras; default: those of :func:`default_views`.
+        target_cams: cameras to compare; default: those of :func:`default_views`; without a model they must be given.
         n_encoded: steps that the others were given; the model always takes those of its training.
-        n_future: steps to predict; default to the end of the film.
+        n_future: steps to predict; default: to the end of the scene.
         metrics: see :func:`gsim3d.evaluate.scoring.measurable`.
+        methods: of METHODS.
         others: predictions of other models.
         prediction: what :func:`predict` gave for these cameras and steps; None: it is made here.
         start: first given step; the scores begin there.
@@ -254,29 +275,32 @@ def score_scene(
     digest = _digest(images, labels)
     images = images.permute(0, 1, 3, 4, 2).to(device).float() / 255
     labels = None if labels is None else labels.to(device)
-    filmed = scene.valid(cams, steps)
-    filmed = None if filmed is None else filmed.to(device)
-    truth = SceneTruth(scene.name, images, labels, filmed, n_encoded, metrics)
+    valid = scene.valid(cams, steps)
+    valid = None if valid is None else valid.to(device)
+    truth = SceneTruth(scene.name, images, labels, valid, n_encoded, metrics)
 
-    def methods() -> Iterator[tuple[str, Tensor]]:
-        nonlocal prediction
+    def predicted() -> Iterator[tuple[str, Tensor]]:
+        baselines: dict[str, Callable[[], Tensor]] = {
+            "copy": lambda: images[n_encoded - 1].expand(n_future, *images.shape[1:])
+        }
         if restored is not None:
-            prediction = prediction or predict(restored, scene, context_cams, n_future, start)
-            rendered = render_steps(restored, prediction.particles, scene, cams, start)
+            made = prediction or predict(restored, scene, context_cams, n_future, start)
+            rendered = render_steps(restored, made.particles, scene, cams, start)
             yield "model", rendered
+            baselines = {
+                "constant": lambda: _held(restored, made, rendered, n_encoded - 1, scene, cams, start),
+                **baselines,
+                "constant_velocity": lambda: render_steps(restored, constant_velocity(made), scene, cams, n_given),
+                "release_constant": lambda: _held(restored, made, rendered, n_encoded, scene, cams, start),
+            }
         for other in others:
-            predicted = other.images(scene, cams, n_given, n_future).to(device).float() / 255
-            if scene.recording.real_background and labels is not None:  # the film's own background is black there
-                predicted *= (labels[n_encoded:] != BACKGROUND)[..., None]
-            yield other.name, predicted
-        if restored is not None:
-            yield "constant", _held(restored, prediction, rendered, n_encoded - 1, scene, cams, start)
-        yield "copy", images[n_encoded - 1].expand(n_future, *images.shape[1:])
-        if restored is not None:
-            yield "constant_velocity", render_steps(restored, constant_velocity(prediction), scene, cams, n_given)
-            yield "release_constant", _held(restored, prediction, rendered, n_encoded, scene, cams, start)
+            theirs = other.images(scene, cams, n_given, n_future).to(device).float() / 255
+            if scene.recording.is_film and labels is not None:  # the video's own background is black there
+                theirs *= (labels[n_encoded:] != BACKGROUND)[..., None]
+            yield other.name, theirs
+        yield from ((name, make()) for name, make in baselines.items() if name in methods)
 
-    return dataclasses.replace(truth.score(methods()), digest=digest)
+    return dataclasses.replace(truth.score(predicted()), digest=digest)
 
 
 def score_scenes(
@@ -287,6 +311,7 @@ def score_scenes(
     n_encoded: int,
     n_future: int,
     metrics: Sequence[str] = PLAIN_METRICS,
+    methods: Sequence[str] = METHODS,
     others: Sequence[Predictions] = (),
     clips: int = CLIPS,
     processes: Processes | None = None,
@@ -295,6 +320,8 @@ def score_scenes(
     """:func:`score_scene` of every scene, in their order; a GPU predicts several together.
 
     Args:
+        restored: as in :func:`score_scene`, like n_encoded, n_future, metrics, methods and others.
+        scenes: to predict.
         views: (context, target) cameras of each scene.
         clips: of which FVD is measured, at most: those of scenes spread evenly.
         processes: that share the scenes; every one must call it, and each returns all scores: those of one process,
@@ -307,28 +334,17 @@ def score_scenes(
         groups = _batches(restored, scenes, [context for context, _ in views])
     n_for_fvd = min(len(scenes), max(1, clips // max(len(targets) for _, targets in views)))
     for_fvd = {k * len(scenes) // n_for_fvd for k in range(n_for_fvd)}
+    given = {"n_encoded": n_encoded, "n_future": n_future, "methods": methods, "others": others}
 
     def scored(group: Sequence[int]) -> Iterator[tuple[int, SceneScores]]:
         predictions = [None] * len(group)
         if len(group) > 1:
-            chosen, contexts = ([given[number] for number in group] for given in (scenes, [c for c, _ in views]))
-            predictions = predict_together(restored, chosen, n_future, contexts)
+            contexts = [views[number][0] for number in group]
+            predictions = predict_together(restored, [scenes[number] for number in group], n_future, contexts)
         for number, prediction in zip(group, predictions, strict=True):
-            context, targets = views[number]
-            yield (
-                number,
-                score_scene(
-                    restored,
-                    scenes[number],
-                    context_cams=context,
-                    target_cams=targets,
-                    n_encoded=n_encoded,
-                    n_future=n_future,
-                    metrics=[metric for metric in metrics if metric != "fvd" or number in for_fvd],
-                    others=others,
-                    prediction=prediction,
-                ),
-            )
+            (context, targets), own = views[number], [m for m in metrics if m != "fvd" or number in for_fvd]
+            cams = {"context_cams": context, "target_cams": targets}
+            yield number, score_scene(restored, scenes[number], **cams, **given, metrics=own, prediction=prediction)
 
     scores: dict[int, SceneScores] = {}
     quiet = quiet or not processes.is_first
@@ -339,12 +355,29 @@ def score_scenes(
                 found = [pair for group in groups[mine : mine + 1] for pair in scored(group)]
             except (InputError, NumericalError) as error:  # raised in all processes: none waits for another
                 found = error
-            for part in processes.gather(found):
-                if isinstance(part, Exception):
-                    raise part
-                scores.update(part)
+            for share in processes.gather(found):
+                if isinstance(share, Exception):
+                    raise share
+                scores.update(share)
             bar.update(len(scores) - bar.n)
     return [scores[number] for number in range(len(scenes))]
+
+
+def _batches(restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Sequence[int]]) -> list[list[int]]:
+    """Numbers of the scenes that are predicted together: neighbours, alone on a CPU.
+
+    They depend on the scenes and the device only, so that any number of processes gets the same numbers.
+    """
+    found: list[list[int]] = []
+    for number, (scene, context) in enumerate(zip(scenes, contexts, strict=True)):
+        kind = scene.has_segmentation(), len(context)
+        most = min(TOGETHER, MOST_PIXELS // (scene.width * scene.height * restored.data.history * len(context)))
+        fits = restored.device.type == "cuda" and found and len(found[-1]) < most
+        if fits and kind == (scenes[found[-1][0]].has_segmentation(), len(contexts[found[-1][0]])):
+            found[-1].append(number)
+        else:
+            found.append([number])
+    return found
 
 
 @contextmanager
@@ -374,20 +407,11 @@ def _held(
     step: int,
     scene: Scene,
     cams: Sequence[int],
-    start: int = 0,
+    start: int,
 ) -> Tensor:
     """Images of the predicted steps that would be seen if everything stood still as it is at cloud ``step``."""
     later = range(prediction.n_encoded, prediction.n_steps)
     if not scene.cameras_move:
         return rendered[step].expand(len(later), *rendered.shape[1:])
-    still = _cloud(prediction.particles, step)
+    still = prediction.step(step)
     return torch.cat([render_steps(restored, still, scene, cams, start + seen) for seen in later])
-
-
-def _cloud(particles: Particles, step: int) -> Particles:
-    return particles.select_clouds(torch.tensor([step], device=particles.means.device))
-
-
-def _moving_centroid(cloud: Particles) -> Tensor:
-    """[3]; NaN where nothing may move."""
-    return cloud.means[cloud.activity == DYNAMIC].mean(0)

@@ -19,7 +19,7 @@ from gsim3d.train.restore import build_simulator, describe, model_config, restor
 from gsim3d.train.samples import check_scenes
 from tests.data.made_scenes import make_scene, write_genesis
 from tests.tiny_scenes import write_scene, write_scenes
-from tools.release.films import FilmStore
+from tools.release.trajectories import TrajectoryStore
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -162,4 +162,4 @@ def test_commands_refuse_resample_and_say_once_what_is_not_checked(folder, tmp_p
 
 def test_films_of_a_training_run_have_the_rate_of_their_world():
     world = build_world("elastic", "mini", {"fps": 17.0, "image_size": 16, "n_frames": 2})
-    assert [film.fps for film in FilmStore(world, 2, "cpu").films] == [17.0, 17.0]
+    assert [film.fps for film in TrajectoryStore(world, 2, "cpu").films] == [17.0, 17.0]

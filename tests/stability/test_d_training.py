@@ -9,6 +9,7 @@ import torch
 from gsim3d.data import Scene, find_scenes
 from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr, ssim
 from gsim3d.io import checkpoint
+from gsim3d.train import loop
 from gsim3d.train.config import DataConfig, OptimizerConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.losses import image_errors
@@ -102,7 +103,7 @@ class Killed(BaseException):
 def test_d50_resume_after_kill(setting, measured, scenes, tmp_path, when, monkeypatch):
     """Killed once in every step, before or while its checkpoint is written: the curve of a run that never was."""
     Trainer(TRAINING, scenes, tmp_path / "whole", device=setting.device.type).run(progress=False)
-    victim = {"in the step": (Trainer, "_update_average"), "in the checkpoint": (checkpoint, "_sync")}[when]
+    victim = {"in the step": (loop, "update_average"), "in the checkpoint": (checkpoint, "_sync")}[when]
     original = getattr(*victim)
     for step in range(TRAINING.n_steps):
         trainer = Trainer(TRAINING, scenes, tmp_path / "killed", device=setting.device.type)

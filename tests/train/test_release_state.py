@@ -1,4 +1,4 @@
-"""Runs for release: films arrive while a run goes on, its state travels, and the next run goes on from it."""
+"""Runs for release: trajectories arrive while a run trains, its state is saved, and the next run goes on from it."""
 
 import dataclasses
 import itertools
@@ -25,10 +25,10 @@ from gsim3d.train.processes import Processes
 from gsim3d.train.restore import build_simulator, model_config, restore
 from gsim3d.train.samples import draw_batch
 from tools.release import curve, recipes, runs
-from tools.release.films import Filming, FilmStore
-from tools.release.recipes import ARMS, WORLDS, recipe
+from tools.release.recipes import WORLDS, recipe
 from tools.release.runs import RunTrainer, train
 from tools.release.state import Progress, load_into, load_progress, save_state, state_file, weights_file
+from tools.release.trajectories import DataWorkers, TrajectoryStore
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -47,24 +47,24 @@ def world():
 
 
 @pytest.fixture(scope="module")
-def films(world, tmp_path_factory):
-    out = tmp_path_factory.mktemp("films")
+def trajectories(world, tmp_path_factory):
+    out = tmp_path_factory.mktemp("trajectories")
     return [dict(np.load(write_trajectory(world, scene, str(out / f"{scene[1]}.npz")))) for scene in world.scenes()]
 
 
 @pytest.fixture
-def store(world, films):
-    store = FilmStore(world, 2, "cpu")
-    for given in films:
+def store(world, trajectories):
+    store = TrajectoryStore(world, 2, "cpu")
+    for given in trajectories:
         store.put(**given)
     return store
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.06])
 def test_a_store_gives_what_scene_folders_give(world, spread, tmp_path):
-    world, store = dataclasses.replace(world, camera_spread=spread), FilmStore(world, 2, "cpu")
+    world, store = dataclasses.replace(world, camera_spread=spread), TrajectoryStore(world, 2, "cpu")
     for scene in world.scenes():
-        store.put(**np.load(write_trajectory(world, scene, str(tmp_path / "film.npz"))))
+        store.put(**np.load(write_trajectory(world, scene, str(tmp_path / "video.npz"))))
     options = {**OPTIONS, "camera_spread": spread}
     folders = generate(tmp_path / "data", preset="mini", processes=1, progress=False, **options).folders
     scenes = [Scene.open(folder) for folder in folders]
@@ -81,63 +81,53 @@ def test_a_store_gives_what_scene_folders_give(world, spread, tmp_path):
                 assert torch.equal(getattr(a.cameras, name), getattr(b.cameras, name)), (part, name)
 
 
-def test_the_newest_replace_the_oldest(store, films):
-    darker = films[0]["images"] // 2
-    store.put(**{**films[0], "images": darker})
+def test_the_newest_replace_the_oldest(store, trajectories):
+    darker = trajectories[0]["images"] // 2
+    store.put(**{**trajectories[0], "images": darker})
     assert store.count == 3
-    assert torch.equal(store._films[0], torch.from_numpy(darker))
-    assert torch.equal(store._films[1], torch.from_numpy(films[1]["images"]))
+    assert torch.equal(store._videos[0], torch.from_numpy(darker))
+    assert torch.equal(store._videos[1], torch.from_numpy(trajectories[1]["images"]))
 
 
-def test_trajectories_are_filmed_once_each_while_others_work(world, films, tmp_path):
-    store = FilmStore(world, 4, "cpu")
-    with Filming([world], store, 1, 1, tmp_path) as filming:
-        assert filming.wait_for(2, seconds=60)
-        assert filming.wait_for(4, seconds=60) and 4 <= filming.next <= 8
-    assert torch.equal(store._films[0], torch.from_numpy(films[1]["images"]))  # it began with number 1
-    assert not torch.equal(store._films[0], store._films[1])
+def test_data_workers_make_each_trajectory_once(world, trajectories, tmp_path):
+    store = TrajectoryStore(world, 4, "cpu")
+    with DataWorkers(world, store, 1, 1, tmp_path) as workers:
+        assert workers.wait_for(2, seconds=60)
+        assert workers.wait_for(4, seconds=60) and 4 <= workers.next <= 8
+    assert torch.equal(store._videos[0], torch.from_numpy(trajectories[1]["images"]))  # it began with number 1
+    assert not torch.equal(store._videos[0], store._videos[1])
     assert not list(tmp_path.iterdir()) and threading.active_count() < 50
 
 
-def test_worlds_take_turns(world, films, tmp_path):
-    store = FilmStore(world, 2, "cpu")
-    raised = dataclasses.replace(world, ground_height=(0.2, 0.2))
-    with Filming([world, raised], store, 0, 1, tmp_path) as filming:
-        assert filming.wait_for(2, seconds=60)
-    assert torch.equal(store._films[0], torch.from_numpy(films[0]["images"]))
-    lower, higher = ((film[0, 0, ..., 3] == FIXED).nonzero()[:, 0].float().mean() for film in store._films)
-    assert higher < lower - 1  # rows are counted from the top of an image
-
-
-def test_what_a_process_raises_is_told(world, tmp_path):
-    store = FilmStore(dataclasses.replace(world, n_frames=5), 4, "cpu")  # its films are shorter than those that come
-    with Filming([world], store, 0, 1, tmp_path) as filming:
+def test_error_of_a_data_worker_is_raised(world, tmp_path):
+    store = TrajectoryStore(dataclasses.replace(world, n_frames=5), 4, "cpu")  # shorter than those that come
+    with DataWorkers(world, store, 0, 1, tmp_path) as workers:
         with pytest.raises(RuntimeError, match="size"):
-            filming.wait_for(1, seconds=60)
+            workers.wait_for(1, seconds=60)
 
 
 class Painted:
-    """Cameras of a world whose films are painted, not simulated."""
+    """Cameras of a world whose videos are painted, not simulated."""
 
     n_frames, size, fps = 6, 32, 24.0
 
     def rig(self):
         return two_rings(12, self.size, 1.5, 5.0, distance=3.2, target_height=0.7, elevations=(18.0, 42.0), fov=42.0)
 
-    def film(self, seed):
+    def trajectory(self, seed):
         rng = np.random.default_rng(seed)
-        film = rng.integers(0, 255, (self.n_frames, 12, self.size, self.size, 4), dtype=np.uint8)
-        film[..., 3] = BACKGROUND
-        film[..., self.size // 2 :, :, 3] = FIXED
+        video = rng.integers(0, 255, (self.n_frames, 12, self.size, self.size, 4), dtype=np.uint8)
+        video[..., 3] = BACKGROUND
+        video[..., self.size // 2 :, :, 3] = FIXED
         for step in range(self.n_frames):
-            film[step, :, 4 + step : 14 + step, 10:20, 3] = MOVING
-        return {"images": film, "viewmats": self.rig().viewmats, "Ks": self.rig().Ks}
+            video[step, :, 4 + step : 14 + step, 10:20, 3] = MOVING
+        return {"images": video, "viewmats": self.rig().viewmats, "Ks": self.rig().Ks}
 
 
 def test_batches_drawn_ahead_are_those_of_their_steps(tmp_path, device):
-    store = FilmStore(Painted(), 2, device.type)
+    store = TrajectoryStore(Painted(), 2, device.type)
     for seed in range(2):
-        store.put(**Painted().film(seed))
+        store.put(**Painted().trajectory(seed))
     ahead, plain = (RunTrainer(CONFIG, store, tmp_path / name, device.type) for name in "ab")
     ahead.captured = ahead._capture()
     ahead.begin_run(time.monotonic() + 1e4), plain.begin_run(time.monotonic() + 1e4)
@@ -166,11 +156,11 @@ def test_a_run_whose_launcher_is_gone_saves_and_ends(store, tmp_path):
     trainer.train_step = last_step
     given = {"end": time.monotonic() + 1e4, "out": tmp_path / "state", "name": NAME, "say": lambda _: None}
     with pytest.raises(RunStopped, match="torchrun is gone; the state of step 1 is saved"):
-        train(trainer, NoFilming(), Progress(), {}, **given)
+        train(trainer, NoWorkers(), Progress(), {}, **given)
     assert load_progress(tmp_path / "state", NAME).step == 1
 
 
-class NoFilming:
+class NoWorkers:
     count, next = 2, 7
 
     def check(self):
@@ -285,7 +275,7 @@ def test_a_run_ends_on_time_with_a_saved_state_and_its_rate_falls_if_it_is_the_l
     monkeypatch.setattr(runs, "time", stand_in)
     trainer, said = RunTrainer(CONFIG, store, tmp_path / "run", "cpu"), []
     given = {"end": 106, "out": tmp_path / "state", "name": NAME, "say": said.append, "is_last": is_last}
-    train(trainer, NoFilming(), Progress(windows=10, runs=[{"steps": [0, 0]}]), {"device": "cpu"}, **given)
+    train(trainer, NoWorkers(), Progress(windows=10, runs=[{"steps": [0, 0]}]), {"device": "cpu"}, **given)
     progress = load_progress(tmp_path / "state", NAME)
     assert progress.step == trainer.step == len(said) == 5
     assert progress.next_trajectory == 7 and progress.runs[1]["steps"] == [0, trainer.step]
@@ -304,7 +294,7 @@ def test_the_next_run_has_the_capacity_that_graphs_needed(store, tmp_path):
     known = {"rows": 10_000, "moving": 500, "geometry": [[[0], [0, 1], [7, 8]]]}
     first.captured.reserve(known)
     end = time.monotonic() + 2
-    train(first, NoFilming(), Progress(), {}, end=end, out=tmp_path / "state", name=NAME, say=lambda _: None)
+    train(first, NoWorkers(), Progress(), {}, end=end, out=tmp_path / "state", name=NAME, say=lambda _: None)
     progress = load_progress(tmp_path / "state", NAME)
     assert progress.step and progress.needed == first.captured.needed
     assert known["geometry"][0] in progress.needed["geometry"]
@@ -316,12 +306,12 @@ def test_the_next_run_has_the_capacity_that_graphs_needed(store, tmp_path):
             load_into(second, tmp_path / "state", NAME)
 
 
-@pytest.mark.parametrize("arm", ARMS)
+@pytest.mark.parametrize("arm", ["pure", "positions", "motion", "priors"])
 @pytest.mark.parametrize("world", WORLDS)
 def test_recipes_are_sound(world, arm):
     made = recipe(world, arm)
     stream, data, phases = made.stream(), made.train.data, made.train.phases
-    assert made.name == f"{world}-{arm}" and stream.name == world and made.first_films <= made.capacity
+    assert made.name == f"{world}-{arm}" and stream.name == world and made.n_first <= made.capacity
     assert stream.n_frames >= data.history + max(phase.horizon for phase in phases)
     assert made.train.n_steps >= 1_000_000
     model = build_simulator(model_config(made.train), 0).config.dynamics  # raises where switches do not agree

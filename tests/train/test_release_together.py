@@ -17,9 +17,9 @@ from gsim3d.train.restore import build_simulator, model_config
 from tests.train.test_release_state import CONFIG, NAME, Painted
 from tests.two_processes import run_in_two_processes
 from tools.release import runs
-from tools.release.films import QUEUED, Filming, FilmStore
 from tools.release.runs import RunTrainer, train
 from tools.release.state import Progress, load_progress
+from tools.release.trajectories import QUEUED, DataWorkers, TrajectoryStore
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -28,9 +28,9 @@ STEPS = 4  # of both kinds
 
 def trainer_in(out, config=CONFIG, processes=None) -> RunTrainer:
     """Computes as a graph does, call by call."""
-    store = FilmStore(Painted(), 2, "cpu")
+    store = TrajectoryStore(Painted(), 2, "cpu")
     for seed in range(2):
-        store.put(**Painted().film(seed))
+        store.put(**Painted().trajectory(seed))
     trainer = RunTrainer(config, store, out, "cpu", processes)
     trainer.captured = trainer._capture()
     return trainer
@@ -54,8 +54,8 @@ def run_together(rank: int, out: str) -> None:
         runs.SAVE_EVERY, saved, save = 2.0, [], runs.save_state
         runs.save_state = lambda *given: saved.append(save(*given).step)
         trainer = trainer_in(out / f"run_of_{rank}", processes=processes)
-        filming = SimpleNamespace(count=2 + rank, next=7 + 2 * rank, check=lambda: None)
-        train(trainer, filming, Progress(), {}, end=end, out=out / "state", name=NAME, say=lambda _: None)
+        workers = SimpleNamespace(count=2 + rank, next=7 + 2 * rank, check=lambda: None)
+        train(trainer, workers, Progress(), {}, end=end, out=out / "state", name=NAME, say=lambda _: None)
         assert trainer.step == 5 and saved == ([3, 5] if rank == 0 else [])
 
         if rank == 1:
@@ -96,7 +96,7 @@ def test_two_processes_make_the_steps_of_one_with_both_batches(together, tmp_pat
     assert (apart / moved).sqrt() < 0.01
 
 
-def test_one_state_counts_what_all_have_filmed(together):
+def test_state_counts_trajectories_of_all_processes(together):
     progress = load_progress(together / "state", NAME)
     assert progress.next_trajectory == 9 and progress.runs[0]["trajectories"] == 5
     assert len(list((together / "state").glob("*.safetensors"))) == 2 and len(progress.curve) == progress.step
@@ -104,17 +104,16 @@ def test_one_state_counts_what_all_have_filmed(together):
 
 
 @pytest.mark.parametrize("n_processes", [1, 2, 4, 5])
-def test_each_trajectory_is_filmed_by_one_process_and_each_process_films_all_kinds(n_processes, tmp_path):
-    names, n_worlds, first, n = "abcd", 3, 5, 400
+def test_each_trajectory_is_made_by_one_process_and_each_process_makes_all_objects(n_processes, tmp_path):
+    names, first, n = "abcd", 5, 400
     world, job, known = SimpleNamespace(object_names=lambda: [*names]), SimpleNamespace(add_done_callback=id), []
     for rank in range(n_processes):
-        filming = Filming([world] * n_worlds, None, first, n // QUEUED, tmp_path, Processes(rank, n_processes))
+        workers = DataWorkers(world, None, first, n // QUEUED, tmp_path, Processes(rank, n_processes))
         files = []
-        filming._pool = SimpleNamespace(submit=lambda *given: files.append(given[-1]) or job)
-        filming._begin()
+        workers._pool = SimpleNamespace(submit=lambda *given: files.append(given[-1]) or job)
+        workers._begin()
         numbers = [int(Path(file).stem) for file in files]
-        n_kinds = len(names) * n_worlds
-        assert len({number % n_kinds for number in numbers}) == n_kinds
-        assert filming.next == first + n * n_processes
+        assert len({number % len(names) for number in numbers}) == len(names)
+        assert workers.next == first + n * n_processes
         known += numbers
     assert sorted(known) == list(range(first, first + n * n_processes))

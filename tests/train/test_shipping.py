@@ -15,10 +15,11 @@ from gsim3d.synth.run import write_trajectory
 from gsim3d.synth.worlds import TEST_SEED, build_world
 from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.restore import restore
-from tools.release.films import FilmStore
+from tools.release import score
 from tools.release.recipes import Recipe
 from tools.release.runs import RunTrainer
 from tools.release.state import Progress, save_state, weights_file
+from tools.release.trajectories import TrajectoryStore
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).parent.parent.parent
@@ -47,8 +48,8 @@ def scored(tmp_path_factory, one_thread):
 
     out = tmp_path_factory.mktemp("shipping")
     world = build_world("elastic", "diverse", OPTIONS)
-    store = FilmStore(world, 1, "cpu")
-    store.put(**np.load(write_trajectory(world, ("ball", 0), str(out / "film.npz"))))
+    store = TrajectoryStore(world, 1, "cpu")
+    store.put(**np.load(write_trajectory(world, ("ball", 0), str(out / "video.npz"))))
     trainer = RunTrainer(CONFIG, store, out / "run", "cpu")
     trainer.begin_run(time.monotonic() + 60)
     for _ in range(2):
@@ -56,9 +57,8 @@ def scored(tmp_path_factory, one_thread):
     this = {"device": "cpu", "trajectories": 1, "steps": [0, 2], "seed": 4321}
     curve = [[step, 1, 0.5, 0.1, 20.0, math.nan, 1e-4] for step in range(2)]
     save_state(trainer, out / "state", RUN, Progress(next_trajectory=1, runs=[this], curve=curve))
-    score = tool("score_shipped").score
     given = {"device": "cpu", "counts": (2, 1), "changes": {**OPTIONS, "objects": ("ball",)}}
-    score(weights_file(out / "state", RUN), NAME, out / "films", out / "scores", **given)
+    score.score(weights_file(out / "state", RUN), NAME, out / "trajectories", out / "scores", **given)
     return out
 
 
@@ -86,17 +86,17 @@ def test_some_sets_are_measured_anew(scored, tmp_path):
     file.write_text(json.dumps({**before, "raised": {"n_scenes": 5}, "unseen": {"n_scenes": 6}}))
     weights = next((scored / "state").glob("*.weights.safetensors"))
     given = {"device": "cpu", "counts": (2, 1), "changes": {**OPTIONS, "objects": ("ball",)}, "subsets": ["raised"]}
-    tool("score_shipped").score(weights, NAME, scored / "films", tmp_path, **given)
+    score.score(weights, NAME, scored / "trajectories", tmp_path, **given)
     after = json.loads(file.read_text())
     assert after["raised"]["n_scenes"] == 1 and after["unseen"] == {"n_scenes": 6}
     assert after["raised"]["set"]["name"] == "validation" and after["raised"]["set"]["subset"] == "raised"
-    tool("score_shipped").score(weights, NAME, scored / "films", tmp_path, held_out="test", **given)
+    score.score(weights, NAME, scored / "trajectories", tmp_path, held_out="test", **given)
     assert json.loads(file.read_text()) == after
     test = json.loads((tmp_path / f"{NAME}.test.scores.json").read_text())
     assert test["raised"]["set"]["seed"] == TEST_SEED and test["raised"]["scenes"] != after["raised"]["scenes"]
     file.write_text(json.dumps({**before, "checkpoint": "0"}))
     with pytest.raises(InputError, match="of other weights"):
-        tool("score_shipped").score(weights, NAME, scored / "films", tmp_path, **given)
+        score.score(weights, NAME, scored / "trajectories", tmp_path, **given)
 
 
 def test_state_becomes_simulator_with_card(scored, package, tmp_path):

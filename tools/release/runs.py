@@ -1,4 +1,4 @@
-"""One run: a trainer that goes by the clock, on trajectories that are filmed meanwhile."""
+"""One run: a trainer that goes by the clock, on trajectories that data workers make meanwhile."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from gsim3d.train.log import memory_gib
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.processes import Processes
 from gsim3d.train.samples import Batch
-from tools.release.films import Filming, FilmStore
 from tools.release.recipes import of_processes
 from tools.release.state import CURVE, Progress, save_state, save_weights
+from tools.release.trajectories import DataWorkers, TrajectoryStore
 
 WARM_UP = 200  # steps after each start: first moments begin at zero
 COOL_DOWN = 0.5  # share of a last run in which the learning rate falls to LAST_RATE of its peak
@@ -37,11 +37,11 @@ class RunTrainer(Trainer):
     """
 
     def __init__(
-        self, config: TrainConfig, store: FilmStore, out: Path, device: str, processes: Processes | None = None
+        self, config: TrainConfig, store: TrajectoryStore, out: Path, device: str, processes: Processes | None = None
     ):
         self.store = store
         config = of_processes(config, processes.count if processes else 1)
-        super().__init__(config, store.films[:1], out, device=device, processes=processes)
+        super().__init__(config, store.trajectories[:1], out, device=device, processes=processes)
         self.first_step, self.begin, self.now, self.end, self.is_last = 0, 0.0, 0.0, math.inf, False
         self.gone: str | None = None
         self._side = torch.cuda.Stream() if device == "cuda" else None
@@ -109,7 +109,7 @@ class RunTrainer(Trainer):
 
 def train(
     trainer: RunTrainer,
-    filming: Filming,
+    workers: DataWorkers,
     progress: Progress,
     about: dict,
     *,
@@ -122,6 +122,8 @@ def train(
     """Trains until the clock (time.monotonic) shows ``end``; saves on the way and at last.
 
     Args:
+        trainer: of the run.
+        workers: that make its trajectories.
         progress: before this run.
         about: what the progress keeps of this run, beside steps, seconds and trajectories.
         out: folder of the state; checkpoints to be scored go to ``out/scored``.
@@ -144,9 +146,9 @@ def train(
             "steps": [first, trainer.step],
             "windows": [progress.windows, windows],
             "training_seconds": round(trainer.seconds - before, 1),
-            "trajectories": sum(gather(filming.count)),
+            "trajectories": sum(gather(workers.count)),
         }
-        known = {"next_trajectory": max(gather(filming.next)), "runs": [*progress.runs, this], "windows": windows}
+        known = {"next_trajectory": max(gather(workers.next)), "runs": [*progress.runs, this], "windows": windows}
         if trainer.captured:
             for needed in gather(trainer.captured.needed):
                 trainer.captured.reserve(needed)
@@ -168,7 +170,7 @@ def train(
                 machine = {"seconds": trainer.seconds, "step_seconds": spent, "memory_gib": memory_gib(trainer.device)}
                 entry |= {
                     "windows": windows,
-                    "trajectories": sum(gather(filming.count)),
+                    "trajectories": sum(gather(workers.count)),
                     "captures": trainer.captured.captures if trainer.captured else 0,
                 }
                 trainer.log.write(entry, machine)
@@ -177,7 +179,7 @@ def train(
                 curve.append([math.nan if row.get(column) is None else float(row[column]) for column in CURVE])
             if trainer.n_skipped_in_a_row >= settings.optimizer.max_skipped:
                 raise NumericalError(f"{name}: step {entry['step']}: {entry['skipped']}", step=entry["step"])
-            filming.check()
+            workers.check()
             if is_first and windows // SCORED_EVERY > was // SCORED_EVERY:
                 save_weights(trainer, out / "scored" / f"{name}.{windows:07d}.weights.safetensors")
             if trainer.now - saved > SAVE_EVERY:

@@ -4,15 +4,15 @@
     python tools/release/train.py elastic --arm pure --minutes 22 --state runs/elastic --out runs/elastic
     torchrun --nproc-per-node 4 tools/release/train.py elastic --minutes 22 --state ... --out ...    # on 4 GPUs
 
-Processes film trajectories on all spare cores; training begins with the first of them and goes on with what is there.
-Called again, the next run goes on from the state that the last one left. A run that is killed loses what came after its
-last save, two minutes or less. On several GPUs each training process has films, and processes that film, of its own.
+Data workers simulate trajectories on all spare cores; training begins with the first of them. Called again, the next
+run goes on from the state that the last one left. A run that is killed loses what came after its last save, two minutes
+or less. On several GPUs each training process has trajectories and data workers of its own.
 
 Written to OUT: NAME.state.safetensors and NAME.weights.safetensors (tools/release/state.py), NAME.mp4 (truth above
-prediction); scores of validation trajectories stand in the state.
+prediction); scores of validation trajectories are in the state.
 """
 
-# The processes that film import this file, too: what needs torch is imported where it is used.
+# Data workers import this file, too: what needs torch is imported where it is used.
 import argparse
 import gc
 import multiprocessing
@@ -28,11 +28,11 @@ from gsim3d.errors import CaptureError, InputError, NumericalError, RunStopped  
 
 SCORING_SHARE, SCORING_MOST = 0.2, 150.0  # of a run, seconds: for validation at its end
 SPARE_CORES = 3  # that each training process keeps
-VALIDATION_PROCESSES = 2  # that film validation trajectories
+VALIDATION_WORKERS = 2  # that make validation trajectories
 
 
-def run(recipe, state: Path, out: Path, *, minutes: float, device: str, processes: int, about: dict, is_last: bool):
-    """One run of a tools.release.recipes.Recipe; ``processes`` film for each that trains.
+def run(recipe, state: Path, out: Path, *, minutes: float, device: str, workers: int, about: dict, is_last: bool):
+    """One run of a tools.release.recipes.Recipe, with ``workers`` data workers for each process that trains.
 
     Raises:
         InputError: the state in ``state`` is broken or of another recipe, or the time is too short.
@@ -45,24 +45,24 @@ def run(recipe, state: Path, out: Path, *, minutes: float, device: str, processe
     import torch
 
     from gsim3d.train.processes import joined
-    from tools.release.films import Filming, FilmStore
     from tools.release.runs import RunTrainer, train
     from tools.release.state import load_into, load_progress
+    from tools.release.trajectories import DataWorkers, TrajectoryStore
 
     world, name = recipe.stream(), recipe.name
     with tempfile.TemporaryDirectory(prefix="release_") as scratch, joined(device) as together:
-        tell = say if together.is_first else lambda _: None
-        store = FilmStore(world, recipe.capacity, device)
+        report = say if together.is_first else lambda _: None
+        store = TrajectoryStore(world, recipe.capacity, device)
         first = load_progress(state, name).next_trajectory
         validation = Path(scratch) / "validation"
-        filmed = film_validation(recipe, validation) if together.is_first else None
-        with Filming([world], store, first, processes, scratch, together) as filming:
+        maker = make_validation(recipe, validation) if together.is_first else None
+        with DataWorkers(world, store, first, workers, scratch, together) as made:
             trainer = RunTrainer(recipe.train, store, Path(scratch) / "run", device, together)
             progress = load_into(trainer, state, name)
-            if not filming.wait_for(-(-recipe.first_films // together.count), end - time.monotonic()):
-                raise InputError(f"--minutes: {minutes:g} pass before {recipe.first_films} trajectories are filmed")
+            if not made.wait_for(-(-recipe.n_first // together.count), end - time.monotonic()):
+                raise InputError(f"--minutes: {minutes:g} pass before {recipe.n_first} trajectories are made")
             waited = round(time.monotonic() - begin, 1)
-            tell(f"{name}: {filming.count} trajectories after {waited} s; from step {trainer.step}")
+            report(f"{name}: {made.count} trajectories after {waited} s; from step {trainer.step}")
             machine = torch.cuda.get_device_name() if device == "cuda" else "cpu"
             about = {
                 **about,
@@ -71,21 +71,22 @@ def run(recipe, state: Path, out: Path, *, minutes: float, device: str, processe
                 "seed": world.seed,
                 "is_last": is_last,
             }
-            progress = train(trainer, filming, progress, about, end=end, out=out, name=name, is_last=is_last, say=tell)
-        tell(f"{name}: step {trainer.step}, {progress.windows} windows, {trainer.seconds:.0f} s of training in all")
-        del trainer, store, filming
+            given = {"end": end, "out": out, "name": name, "is_last": is_last, "say": report}
+            progress = train(trainer, made, progress, about, **given)
+        report(f"{name}: step {trainer.step}, {progress.windows} windows, {trainer.seconds:.0f} s of training in all")
+        del trainer, store, made
         gc.collect()  # the trainer and its graphs refer to each other
         if device == "cuda":
             torch.cuda.empty_cache()
         if together.is_first:
-            filmed.join()
-            if filmed.exitcode:
+            maker.join()
+            if maker.exitcode:
                 raise InputError("the validation set could not be made; its messages are above")
             score(out, name, progress, validation, device, deadline)
         together.gather(None)  # torchrun ends all where one ends badly: none leaves before the scores
 
 
-def film_validation(recipe, folder: Path) -> multiprocessing.Process:
+def make_validation(recipe, folder: Path) -> multiprocessing.Process:
     """Makes the recipe's own validation set in the background."""
     context = multiprocessing.get_context("spawn")
     process = context.Process(target=_generate, args=(str(folder), recipe.validation()))
@@ -97,7 +98,7 @@ def _generate(folder: str, given: dict) -> None:
     from gsim3d.synth import generate
 
     os.environ["OMP_NUM_THREADS"] = "1"
-    generate(folder, processes=VALIDATION_PROCESSES, progress=False, **given)
+    generate(folder, processes=VALIDATION_WORKERS, progress=False, **given)
 
 
 def score(out: Path, name: str, progress, validation: Path, device: str, deadline: float) -> None:
@@ -106,7 +107,7 @@ def score(out: Path, name: str, progress, validation: Path, device: str, deadlin
 
     from gsim3d.data import find_scenes
     from tools.release.state import add_scores, weights_file
-    from tools.release.validation import validate, write_film
+    from tools.release.validation import validate, write_comparison
 
     files = {progress.windows: weights_file(out, name)}
     files |= {int(path.name.split(".")[1]): path for path in (out / "scored").glob(f"{name}.*.weights.safetensors")}
@@ -117,7 +118,7 @@ def score(out: Path, name: str, progress, validation: Path, device: str, deadlin
         if longest and start + longest > deadline:
             say(f"no time to score {files[windows].name}")
             continue
-        entry, predicted = validate(files[windows], find_scenes(validation), device)
+        entry, restored, scenes = validate(files[windows], find_scenes(validation), device)
         scores.append({"windows": windows, **entry})
         add_scores(out, name, dataclasses.replace(progress, scores=sorted(scores, key=lambda e: e["windows"])))
         longest = max(longest, time.monotonic() - start)
@@ -127,7 +128,7 @@ def score(out: Path, name: str, progress, validation: Path, device: str, deadlin
             f"{time.monotonic() - start:.0f} s)"
         )
         if files[windows] == weights_file(out, name):
-            write_film(out / f"{name}.mp4", predicted)
+            write_comparison(out / f"{name}.mp4", restored, scenes)
 
 
 def say(text: str) -> None:
@@ -140,9 +141,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--arm", default="pure", help="pure (default), positions, motion or priors")
     parser.add_argument("--minutes", type=float, required=True, help="length of this run, everything included")
     parser.add_argument("--state", type=Path, required=True, help="folder with the state of the last run, if any")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the state and the film; may be the same")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the state and the video; may be the same")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda")
-    parser.add_argument("--processes", type=int, help="that film (default: all cores but three for each GPU)")
+    parser.add_argument("--workers", type=int, help="data workers (default: all cores but three for each GPU)")
     parser.add_argument("--last", action="store_true", help="the learning rate falls: the last run of a simulator")
     parser.add_argument("--commit", default="", help="of the code that runs, for the state")
     args = parser.parse_args(arguments)
@@ -151,8 +152,8 @@ def main(arguments: list[str] | None = None) -> None:
     from tools.release.recipes import recipe
 
     together = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    processes = args.processes or len(os.sched_getaffinity(0)) - SPARE_CORES * together
-    options = {"minutes": args.minutes, "device": args.device, "processes": max(1, processes // together)}
+    workers = args.workers or len(os.sched_getaffinity(0)) - SPARE_CORES * together
+    options = {"minutes": args.minutes, "device": args.device, "workers": max(1, workers // together)}
     about = {"commit": args.commit}
     run(recipe(args.world, args.arm), args.state, args.out, about=about, is_last=args.last, **options)
 

@@ -1,9 +1,9 @@
 #!/usr/bin/env python
 """Scores a simulator that comes with gsim3d, or is about to: held-out trajectories and sets over the full horizon.
 
-    python tools/score_shipped.py elastic-small --data runs/held_out --out runs/scores --device cuda
+    python tools/release/score.py elastic-small --data runs/held_out --out runs/scores --device cuda
 
-    torchrun --nproc-per-node 4 tools/score_shipped.py elastic-small ...          # scenes dealt over 4 GPUs
+    torchrun --nproc-per-node 4 tools/release/score.py elastic-small ...          # scenes dealt over 4 GPUs
 
 Trajectories are made in DATA where they are not there: of the kind it was trained on (24 with the validation seed, or
 with --held-out test 56 with the test seed), with unseen shapes, with several bodies, without ground, and on raised
@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 sys.path.insert(0, str(ROOT))
 from gsim3d.errors import InputError  # noqa: E402
 
@@ -46,6 +46,11 @@ def score(
     """Writes and returns the scores of ``name``; in several processes the first one makes trajectories and writes.
 
     Args:
+        checkpoint: its weights.
+        name: world and size, such as elastic-small.
+        data: folder of the trajectories; made if absent.
+        out: folder of the scores.
+        device: "cpu" or "cuda".
         held_out: "validation" or "test".
         counts: trajectories of its own kind, and of each other set; None: as many as the held-out set has, and OTHERS.
         subsets: to be measured; none: all that the world has.
@@ -84,7 +89,7 @@ def score(
                 options = {**changes, **({} if subset == KIND else {"subset": subset})}
                 folders = generate(place, world, preset=preset, n_trajectories=count, seed=seed, **options).folders
             folders = processes.gather(folders)[0]  # the others wait for the trajectories
-            filmed = time.monotonic()
+            ready = time.monotonic()
             scenes = [restored.open_scene(folder) for folder in folders]
             views, n_encoded = [default_views(restored, scene) for scene in scenes], restored.data.history
             n_future = min(scene.n_steps for scene in scenes) - n_encoded
@@ -92,12 +97,12 @@ def score(
             scores = score_scenes(restored, scenes, views, **given)
             if not processes.is_first:
                 continue
-            took = round(time.monotonic() - filmed, 1)
+            took = round(time.monotonic() - ready, 1)
             sets[subset] = {"seconds": took, "set": set_of(folders), **summarize(scores, missing)}
             if not subsets:
                 rows += frames_of(restored, scenes[0], n_future)
             model, still = (sets[subset][f"{method}future.psnr_masked"] for method in ("", "constant."))
-            seconds = f"filmed in {filmed - begin:.0f} s, scored in {took:.0f} s"
+            seconds = f"simulated in {ready - begin:.0f} s, scored in {took:.0f} s"
             print(f"{subset}: {count}, {seconds}: masked {model:.2f} dB, constant {still:.2f} dB", flush=True)
         if processes.is_first:
             out.mkdir(parents=True, exist_ok=True)
@@ -145,4 +150,4 @@ if __name__ == "__main__":
     try:
         main()
     except InputError as error:
-        sys.exit(f"score_shipped: error: {error}")
+        sys.exit(f"score: error: {error}")

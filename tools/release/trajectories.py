@@ -1,4 +1,4 @@
-"""Trajectories that are simulated and filmed while a training run goes on, and kept decoded where it computes."""
+"""Trajectories that data workers simulate while a run trains, and that lie decoded where it computes."""
 
 from __future__ import annotations
 
@@ -26,12 +26,22 @@ from gsim3d.train.config import DataConfig, PhaseConfig
 from gsim3d.train.processes import Processes
 from gsim3d.train.samples import Batch, draw_windows, subsampled
 
-QUEUED = 2  # trajectories that wait for each process that films
+QUEUED = 2  # trajectories that wait for each data worker
 
 
 @dataclass(frozen=True)
-class Film:
-    """One trajectory of a store, as far as the drawing of windows looks at it. slot: its place in the store."""
+class Trajectory:
+    """One trajectory of a store, as far as the drawing of windows reads it.
+
+    Attributes:
+        slot: its number in the store.
+        path: a name.
+        n_steps: frames of each camera.
+        n_cams: cameras.
+        width: pixels.
+        height: pixels.
+        fps: frames per second.
+    """
 
     slot: int
     path: Path
@@ -49,45 +59,45 @@ class Film:
         return True
 
 
-class FilmStore:
+class TrajectoryStore:
     """Images and labels of many trajectories of one world in the memory of a device; the newest replace the oldest.
 
     Args:
-        world: of the trajectories: how many cameras film how many frames.
-        capacity: trajectories that there is room for.
-        device: where they are kept.
+        world: of the trajectories: how many cameras record how many frames.
+        capacity: trajectories that it holds.
+        device: where they lie.
     """
 
     def __init__(self, world: World, capacity: int, device: str):
         rig = world.rig()
         self.capacity, self.count = capacity, 0
         self._shape = (world.n_frames, rig.n_cams, rig.size, rig.size)
-        self._films = torch.empty((capacity, *self._shape, 4), dtype=torch.uint8, device=device)
-        self.device = self._films.device  # with its number: each thread has a current one of its own
+        self._videos = torch.empty((capacity, *self._shape, 4), dtype=torch.uint8, device=device)
+        self.device = self._videos.device  # with its number: each thread has a current one of its own
         self._viewmats = torch.zeros(capacity, rig.n_cams, 4, 4, device=device)
         self._Ks = torch.zeros(capacity, rig.n_cams, 3, 3, device=device)
         self._origins = torch.zeros(capacity, 3, dtype=torch.float64, device=device)
         self._near, self._far = rig.near, rig.far
-        self.lock = threading.RLock()  # held while films come or are read
-        self.films = [
-            Film(slot, Path(f"film_{slot}"), *self._shape[:2], rig.size, rig.size, world.fps)
+        self.lock = threading.RLock()  # held while trajectories come or are read
+        self.trajectories = [
+            Trajectory(slot, Path(f"trajectory_{slot}"), *self._shape[:2], rig.size, rig.size, world.fps)
             for slot in range(capacity)
         ]
 
     def put(self, images: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> None:
-        """Keeps a trajectory, as :func:`gsim3d.synth.run.write_trajectory` writes it."""
+        """Stores a trajectory, as :func:`gsim3d.synth.run.write_trajectory` writes it."""
         rig = Rig(viewmats, Ks, images.shape[2], self._near, self._far)
         with self.lock:
             slot = self.count % self.capacity
-            kept = (self._films, images), (self._viewmats, viewmats), (self._Ks, Ks)
-            for place, values in (*kept, (self._origins, workspace_origin(rig))):
-                place[slot].copy_(torch.from_numpy(values))
+            stored = (self._videos, images), (self._viewmats, viewmats), (self._Ks, Ks)
+            for whole, values in (*stored, (self._origins, workspace_origin(rig))):
+                whole[slot].copy_(torch.from_numpy(values))
             self.count += 1
 
     def draw(self, data: DataConfig, phase: PhaseConfig, seed: int, step: int, samples: Sequence[int]) -> Batch:
         """As :func:`gsim3d.train.samples.draw_batch`, of the trajectories that are there."""
         with self.lock:
-            known = self.films[: min(self.count, self.capacity)]
+            known = self.trajectories[: min(self.count, self.capacity)]
             windows = draw_windows(known, data, phase, seed, step, samples)
             n_context = windows[0].n_context
             frames = partial(self._frames, windows, data.near_far or (self._near, self._far))
@@ -99,17 +109,17 @@ class FilmStore:
         """Some steps of the windows, seen by the cameras of each step."""
         n_views, (n_frames, n_cams, height, width) = len(cams[0][0]), self._shape
         slots = torch.tensor([window.scene.slot for window in windows], device=self.device)
-        places = [
+        numbers = [
             ((window.scene.slot * n_frames + window.steps[step]) * n_cams + cam, window.scene.slot * n_cams + cam)
             for window, by_step in zip(windows, cams, strict=True)
             for step in steps
             for cam in by_step[step]
         ]
-        image, cam = torch.tensor(places, device=self.device).T
+        image, cam = torch.tensor(numbers, device=self.device).T
         n_clouds = len(windows) * len(steps)
         cloud = torch.arange(n_clouds, device=self.device)
-        pixels = self._films.view(-1, height, width, 4)[image]
-        labels, depth = pixels[..., 3], torch.ones(len(places), device=self.device)
+        pixels = self._videos.view(-1, height, width, 4)[image]
+        labels, depth = pixels[..., 3], torch.ones(len(numbers), device=self.device)
         return Frames(
             images=pixels[..., :3].permute(0, 3, 1, 2).float().contiguous().div_(255),
             cameras=Cameras(
@@ -129,45 +139,48 @@ class FilmStore:
         )
 
 
-def place_of(process: Processes, first: int) -> int:
+def turn_of(process: Processes, first: int) -> int:
     """Which of as many numbers as there are processes is this one's; drawn anew in every round, else a process would
     always have the same few objects."""
     return (process.rank + int(generator(0, first, 0, "place").integers(process.count))) % process.count
 
 
-class Filming:
-    """Processes that simulate and film one trajectory after another, from number ``first`` on, into a store.
+class DataWorkers:
+    """Processes that simulate and record one trajectory after another, from number ``first`` on, into a store.
 
-    Trajectory n is the n-th of the worlds' list (one of each object in turn), whatever ``n_trajectories`` says; each
-    number is filmed once. Use as a context; leaving it ends the processes.
+    Trajectory n is the n-th of the world's list (one of each object in turn), whatever ``n_trajectories`` says; each
+    number is made once. Use as a context; leaving it ends the processes.
 
     Args:
-        worlds: take turns, from one round of the objects to the next; all have the objects and as many cameras as the
-            first.
-        together: training processes that film for themselves, each other numbers; any of each object and world.
+        world: of the trajectories.
+        store: that receives them.
+        first: number of the first one.
+        processes: data workers.
+        cache: folder for files on their way; None: a temporary one.
+        together: training processes that have data workers of their own, each other numbers; any of each object.
     Attributes:
         next: the smallest number from which on no process was given any.
     """
 
     def __init__(
         self,
-        worlds: Sequence[World],
-        store: FilmStore,
+        world: World,
+        store: TrajectoryStore,
         first: int,
         processes: int,
         cache: str | Path | None = None,
         together: Processes | None = None,
     ):
-        self._worlds, self._store, self.next = worlds, store, first
+        self._world, self._store, self.next = world, store, first
         self._together = together or Processes()
-        self._processes, self._names = processes, worlds[0].object_names()
+        self._processes, self._names = processes, world.object_names()
         self._wanted, self._begun = processes * QUEUED, 0
-        self._cache = Path(tempfile.mkdtemp(prefix="films_", dir=cache))
+        self._cache = Path(tempfile.mkdtemp(prefix="trajectories_", dir=cache))
         self._running = True
         self._failure: BaseException | None = None
         self._arrived = threading.Condition()
 
-    def __enter__(self) -> Filming:
+    def __enter__(self) -> DataWorkers:
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(self._processes, context, start_data_worker)
         threads = os.environ.get("OMP_NUM_THREADS")
@@ -203,27 +216,26 @@ class Filming:
             raise self._failure
 
     def _begin(self) -> None:
-        """Hands out trajectories until as many are being filmed as wanted."""
+        """Hands out trajectories until as many are being made as wanted."""
         while self._begun < self._wanted:
-            number, names = self.next + place_of(self._together, self.next), self._names
+            number, names = self.next + turn_of(self._together, self.next), self._names
             self.next, self._begun = self.next + self._together.count, self._begun + 1
             scene = names[number % len(names)], number // len(names)
-            world = self._worlds[scene[1] % len(self._worlds)]
-            job = self._pool.submit(write_trajectory, world, scene, str(self._cache / f"{number}.npz"))
+            job = self._pool.submit(write_trajectory, self._world, scene, str(self._cache / f"{number}.npz"))
             job.add_done_callback(self._take)
 
     def _take(self, job: Future) -> None:
-        """Moves what a process has filmed into the store; called in a thread of the pool."""
+        """Moves a trajectory that a worker has made into the store; called in a thread of the pool."""
         if not self._running:
             return
         try:
             file = Path(job.result())
-            with np.load(file) as film:
-                self._store.put(**film)
+            with np.load(file) as trajectory:
+                self._store.put(**trajectory)
             file.unlink()
             self._begun -= 1
             self._begin()
-        except BaseException as error:  # told to the thread that trains
+        except BaseException as error:  # raised by check() in the thread that trains
             self._failure = self._failure or error
         with self._arrived:
             self._arrived.notify_all()
