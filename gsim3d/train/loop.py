@@ -40,7 +40,7 @@ from gsim3d.train.gradients import (
 from gsim3d.train.log import Log, check_profile, memory_gib, plain, profiler, progress_note, sample_video
 from gsim3d.train.losses import time_weights, training_loss
 from gsim3d.train.optimizer import FIRST_SCALE, LossScale, Optimizer, deterministic, one_cycle, update_average
-from gsim3d.train.processes import Processes, shared_loss
+from gsim3d.train.processes import Processes
 from gsim3d.train.restore import build_simulator, check_device, describe, keep_jacobian, model_config
 from gsim3d.train.samples import Batch, BatchReader, check_scenes, draw_batch, history_at, unfreeze
 from gsim3d.train.stopping import noted_signals
@@ -106,8 +106,6 @@ class Trainer:
             **{"CONFIG": self.config, "--out": (self.step, self.parent), "--data": [s.name for s in self.scenes]}
         )
         self.captured = self._capture() if config.captured and device == "cuda" else None
-        together = self.processes.count > 1 and self.captured is None
-        self.shared = shared_loss(self.simulator, lambda *given: self.loss(*given)) if together else None
 
     def _capture(self) -> CapturedLoss:
         precision = partial(self.config.precision.of, device=self.device)
@@ -267,7 +265,7 @@ class Trainer:
         scale, norm, samples = self.scale.value, None, self.processes.share(batch)
         norms_scale = scale if self._is_logged else None
         if self.processes.count > 1:
-            loss, errors, gradients, seen = self._of_all_processes(samples, len(samples) / batch, norms_scale)
+            loss, errors, gradients, seen = self._of_all_processes(samples, batch, norms_scale)
         elif self.captured is not None:
             watch = StepWatch()
             found = self._captured_gradients(samples, watch)
@@ -282,12 +280,14 @@ class Trainer:
             gradients = [None if gradient is None else gradient / scale for gradient in gradients]
         return loss, errors, gradients, total_norm(gradients) if norm is None else norm, seen
 
-    def _gradients(self, samples: list[int]) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...], StepWatch]:
-        """Loss, errors by step, the gradient of the loss for every parameter (None where it has no part), and what was
-        seen on the way."""
-        watch, batch = StepWatch(), self._batch(samples)
+    def _gradients(
+        self, samples: list[int], watch: StepWatch | None = None, factor: float = 1.0
+    ) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...], StepWatch]:
+        """Loss, errors by step, the gradient of the loss for every parameter (None where it has no part), times the
+        scale and ``factor``, and what was seen on the way."""
+        watch, batch, factor = watch or StepWatch(), self._batch(samples), factor * self.scale.value
         loss, errors = self.loss(batch, samples[0], watch)
-        gradients = torch.autograd.grad(loss * self.scale.value, list(self.parameters.values()), allow_unused=True)
+        gradients = torch.autograd.grad(loss * factor, list(self.parameters.values()), allow_unused=True)
         return loss.detach(), errors, gradients, watch
 
     def _map(self, f: Callable, groups: list) -> list:
@@ -310,49 +310,32 @@ class Trainer:
     def _prepared(self, samples: list[int]) -> Prepared:
         return self.captured.prepare(self._batch(samples))
 
-    def _of_all_processes(self, samples: list[int], share: float, norms_scale: float | None) -> tuple:
+    def _of_all_processes(self, samples: list[int], batch: int, norms_scale: float | None) -> tuple:
         """Loss, errors, gradients and what was seen of all processes; this one computes ``samples``."""
-        compute = self._shared_gradients if self.captured is None else self._own_gradients
-        loss, errors, gradients, watch, error = compute(samples, share)
-        seen = Seen(error=error) if error else watch.seen(norms_scale)
-        gathered = self.processes.gather((loss.item(), errors.cpu(), share, seen, self._reason_to_stop()))
-        losses, errors, shares, seen, reasons = zip(*gathered, strict=True)
+        # One that raises within a step leaves the others waiting: what cannot be used is dropped, and reported later.
+        drops = self.captured is None and self.simulator.config.stability.on_invalid == "raise"
+        watch, share, count = StepWatch(strict=drops), len(samples) / batch, self.processes.count
+        try:
+            if self.captured is not None:
+                found = self._captured_gradients(samples, watch)
+                loss, errors, gradients = found.loss / self.scale.value, found.errors, found.parameters
+            else:  # the gradients of a batch norm are sums over processes: each loss has its weight before
+                loss, errors, gradients, _ = self._gradients(samples, watch, share * count)
+            seen = watch.seen(norms_scale)
+        except NumericalError as error:
+            loss, errors, gradients, seen = *torch.full((2,), math.nan), (), Seen(error=str(error))
+        known = [gradient is not None for gradient in gradients]
+        gathered = self.processes.gather((loss.item(), errors.cpu(), share, seen, known, self._reason_to_stop()))
+        losses, errors, shares, seen, known, reasons = zip(*gathered, strict=True)
         self._stop = next(filter(None, reasons), None)
         for rank, of_process in enumerate(seen):
             if of_process.error:
                 raise NumericalError(f"process {rank}: {of_process.error}")
         loss = sum(loss * share for loss, share in zip(losses, shares, strict=True))
         errors = sum(values * share for values, share in zip(errors, shares, strict=True))
-        if self.captured is not None:
-            gradients = self.processes.add(gradients, share)
-        return loss, errors, gradients, list(seen)
-
-    def _shared_gradients(self, samples: list[int], share: float) -> tuple:
-        """As :meth:`_gradients`, but gradients are those of the samples of all processes; and what is wrong with this
-        one's, or None."""
-        # One that raises within a step leaves the others waiting: what cannot be used is dropped, and told afterwards.
-        watch, error = StepWatch(strict=self.simulator.config.stability.on_invalid == "raise"), None
-        try:
-            loss, errors = self.shared(self._batch(samples), samples[0], watch)
-        except NumericalError as found:  # the others wait for gradients all the same
-            error = str(found)
-            loss, errors = self.shared()
-        for parameter in self.parameters.values():
-            parameter.grad = None
-        phase, _ = self.config.phase_of(self.step)
-        (loss * (self.scale.value * len(samples) * self.processes.count / phase.batch)).backward()
-        gradients = [parameter.grad for parameter in self.parameters.values()]
-        return loss.detach(), errors, gradients, watch, error
-
-    def _own_gradients(self, samples: list[int], share: float) -> tuple:
-        """As :meth:`_shared_gradients`, from a CUDA graph, but gradients are those of this process's samples."""
-        watch = StepWatch()
-        try:
-            found = self._captured_gradients(samples, watch)
-        except NumericalError as error:  # the others wait
-            nothing = torch.full((), math.nan)
-            return nothing, nothing, (), watch, str(error)
-        return found.loss / self.scale.value, found.errors, found.parameters, watch, None
+        triples = zip(self.parameters.values(), gradients, map(any, zip(*known, strict=True)), strict=True)
+        gradients = [torch.zeros_like(p) if gradient is None and has else gradient for p, gradient, has in triples]
+        return loss, errors, self.processes.add(gradients, share if self.captured else 1 / count), list(seen)
 
     # ---- the loss of a batch ----
 

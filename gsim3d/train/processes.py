@@ -6,15 +6,13 @@ import atexit
 import hashlib
 import os
 import sys
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import torch
 import torch.distributed as dist
-from torch import Tensor, nn
-from torch.nn.parallel import DistributedDataParallel
+from torch import Tensor
 
 from gsim3d.errors import InputError, RunStopped
 from gsim3d.train.stopping import Liveness
@@ -122,36 +120,6 @@ def joined(device: str) -> Iterator[Processes]:
         raise liveness.error() from None
     finally:
         liveness.end(failed=failed)
-
-
-def shared_loss(model: nn.Module, loss: Callable[..., tuple[Tensor, Tensor]]) -> DistributedDataParallel:
-    """``loss`` of this process's samples; its backward pass gives every process the gradient of all samples.
-
-    Without arguments it is a zero with all weights of ``model`` in it.
-    """
-    # Parts without gradients (the dynamics, in a phase that simulates nothing) are searched for in each step. Then
-    # torch also leaves its buckets as they are: it would order them anew after the first step, and a resumed run
-    # would add in another order. A group of its own, because batch normalisation communicates at the same time.
-    group = dist.new_group()
-    # What torch 2.13 warns about has no other name in 2.11.
-    with warnings.catch_warnings(category=FutureWarning, action="ignore"):
-        return DistributedDataParallel(
-            _Loss(model, loss), broadcast_buffers=False, find_unused_parameters=True, process_group=group
-        )
-
-
-class _Loss(nn.Module):
-    """The loss as a module that holds the model, as torch wants it."""
-
-    def __init__(self, model: nn.Module, loss: Callable[..., tuple[Tensor, Tensor]]):
-        super().__init__()
-        self.model, self._loss = model, loss
-
-    def forward(self, *arguments) -> tuple[Tensor, Tensor]:
-        if arguments:
-            return self._loss(*arguments)
-        zero = sum(parameter.sum() * 0 for parameter in self.model.parameters())
-        return zero, zero.detach()
 
 
 def _exit_immediately() -> None:
