@@ -242,7 +242,7 @@ def test_wrong_arguments_are_one_line(capsys, tmp_path):
 
 
 def test_a_report_goes_into_the_documentation(written, tmp_path):
-    spec = importlib.util.spec_from_file_location("ship_report", ROOT / "tools" / "ship_report.py")
+    spec = importlib.util.spec_from_file_location("ship_report", ROOT / "tools" / "release" / "ship_report.py")
     tool = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tool)
     kept = json.loads(tool.keep_report("ball-small", "cpu", written[0], tmp_path).read_text())

@@ -3,7 +3,7 @@
 
     gsim3d profile elastic-small --out runs/cpu                                    # on 2 CPU cores
     gsim3d profile elastic-small DATA --scenes all --device cuda --self-check --out runs/h200
-    python tools/ship_report.py elastic-small cpu=runs/cpu h200=runs/h200
+    python tools/release/ship_report.py elastic-small cpu=runs/cpu h200=runs/h200
 
 Every DIR holds report.json and the pictures, and speeds.json where `gsim3d profile` could not write beside the
 checkpoint. Written: docs/results/cost/NAME-MACHINE.json and its pictures, of which the documentation makes a page;
@@ -16,7 +16,7 @@ import shutil
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 sys.path.insert(0, str(ROOT))
 from gsim3d import pretrained  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402

@@ -4,8 +4,8 @@
     python tools/release/train.py elastic --minutes 22 --state runs/elastic --out runs/elastic
     python tools/release/score.py elastic-small --checkpoint runs/elastic/elastic-pure.weights.safetensors \
         --data runs/held_out --out runs/scores
-    python tools/ship_model.py elastic-small --state runs/elastic --scores runs/scores --limitations runs/limitations.md
-    python tools/ship_model.py            # updates the invariances in all cards, and the curves in docs/results/models
+    python tools/release/ship_model.py elastic-small --state runs/elastic --scores runs/scores --limitations runs/limitations.md
+    python tools/release/ship_model.py            # updates the invariances in all cards, and the curves in docs/results/models
 
 LIMITATIONS is a list of 3 to 5 points, seen in the predicted videos; later calls keep the list of the card.
 """
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import yaml
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent.parent
 sys.path.insert(0, str(ROOT))
 import gsim3d  # noqa: E402
 from gsim3d import pretrained  # noqa: E402
