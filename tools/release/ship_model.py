@@ -4,10 +4,10 @@
     python tools/release/train.py elastic --minutes 22 --state runs/elastic --out runs/elastic
     python tools/release/score.py elastic-small --checkpoint runs/elastic/elastic-pure.weights.safetensors \
         --data runs/held_out --out runs/scores
-    python tools/release/ship_model.py elastic-small --state runs/elastic --scores runs/scores --limitations runs/limitations.md
-    python tools/release/ship_model.py            # updates the invariances in all cards, and the curves in docs/results/models
+    python tools/release/ship_model.py elastic-small --state runs/elastic --scores runs/scores --limitations LIST.md
+    python tools/release/ship_model.py      # updates the invariances in all cards, and the curves in docs/results
 
-LIMITATIONS is a list of 3 to 5 points, seen in the predicted videos; later calls keep the list of the card.
+LIST.md has 3 to 5 points, seen in the predicted videos; later calls keep the list of the card.
 """
 
 import argparse
