@@ -24,7 +24,7 @@ from gsim3d.train.restore import Restored
 FRAME_SIZE = 256  # pixels; smaller frames are enlarged by a whole factor to at most this height
 GAP = 4  # pixels of white between frames
 SPLAT_SIZE = 320  # pixels, height and width of the picture of the Gaussians
-SPLAT_SHRINK = 0.45  # of their scales there, so that single ones can be told apart
+SPLAT_SHRINK = 0.45  # of their scales there, so that single ones can be distinguished
 CURVES = {  # method -> label, colour
     "model": ("model", "#1f5fbf"),
     "constant": ("constant (last encoded particles)", "#c0504d"),
@@ -42,7 +42,7 @@ def as_bytes(images: Tensor) -> np.ndarray:
 
 
 def true_images(scene: Scene, cams: Sequence[int], steps: Sequence[int]) -> np.ndarray:
-    """uint8 [S, V, H, W, 3]; black where the film has ended."""
+    """uint8 [S, V, H, W, 3]; black after the scene's last frame."""
     known = [step for step in steps if step < scene.n_steps]
     images = np.zeros((len(steps), len(cams), scene.height, scene.width, 3), np.uint8)
     if known:
@@ -113,8 +113,8 @@ def write_overview(
     margins = {"left": 0.01, "right": 0.995, "top": 0.86, "bottom": 0.05}
     parts = figure.add_gridspec(1, 3, width_ratios=(2, 2.05, 5.1), wspace=0.07, **margins)
 
-    def show(place, image, title=None, label=None):
-        axes = figure.add_subplot(place)
+    def show(cell, image, title=None, label=None):
+        axes = figure.add_subplot(cell)
         axes.imshow(image, interpolation="nearest")
         axes.set(xticks=[], yticks=[])
         for side in axes.spines.values():

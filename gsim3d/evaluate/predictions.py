@@ -3,8 +3,8 @@
     DIR/<scene folder, as below DATA>/cam_<j>/<frames>.png      each name ends in the number of its step
     DIR/<scene folder, as below DATA>/cam_<j>.mp4               or one video a camera
 
-Steps count from 0, the first frame of the film. Frames of steps that were given may be there; they are not read. A
-video holds all steps up to the last one compared or to the end of the film, or only those after the given ones.
+Steps count from 0, the first frame of the scene. Frames of steps that were given may be there; they are not read. A
+video holds all steps up to the last one compared or to the end of the scene, or only those after the given ones.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ RESERVED = ("model", "constant", "copy", "constant_velocity", "release_constant"
 class Predictions:
     """Predicted images of one model for the scenes of a data set.
 
-    name: in tables and reports.   folder: where they lie.   root: folder of the data set.
+    Attributes:
+        name: in tables and reports.
+        folder: where they lie.
+        root: folder of the data set.
     """
 
     def __init__(self, name: str, folder: Path, root: Path):
@@ -93,28 +96,28 @@ class Predictions:
 
 
 def _view(
-    place: Path, size: tuple[int, int], film: int, n_encoded: int, n_future: int, problems: Problems
+    path: Path, size: tuple[int, int], n_steps: int, n_encoded: int, n_future: int, problems: Problems
 ) -> list[np.ndarray]:
     """One camera's predicted frames [h, w, 3], RGB."""
     steps = range(n_encoded, n_encoded + n_future)
-    found = _find(place, steps)
+    found = _find(path, steps)
     if isinstance(found, Path):
-        return _from_video(found, size, film, n_encoded, n_future)
+        return _from_video(found, size, n_steps, n_encoded, n_future)
     named = ((file, f"predicted step {step}") for file, step in zip(found, steps, strict=True))
     frames = list(read_files(named, size, as_color, problems))
     if max(int(frame.max()) for frame in frames) == 1:
-        raise InputError(f"{place}: colours are 0 and 1 of 255, as of images in [0, 1] that were saved unscaled")
+        raise InputError(f"{path}: colours are 0 and 1 of 255, as in images in [0, 1] that were saved unscaled")
     return frames
 
 
-def _find(place: Path, steps: range) -> Path | list[Path]:
+def _find(path: Path, steps: range) -> Path | list[Path]:
     """The video, or the frames of ``steps``."""
-    if place.is_dir():
-        return _frames(place, steps)
+    if path.is_dir():
+        return _frames(path, steps)
     for suffix in VIDEOS:
-        if (video := place.with_name(place.name + suffix)).is_file():
+        if (video := path.with_name(path.name + suffix)).is_file():
             return video
-    raise InputError(f"{place} is missing: a folder of frames, or a video {place.name}{VIDEOS[0]}")
+    raise InputError(f"{path} is missing: a folder of frames, or a video {path.name}{VIDEOS[0]}")
 
 
 def _frames(folder: Path, steps: range) -> list[Path]:
@@ -134,20 +137,20 @@ def _frames(folder: Path, steps: range) -> list[Path]:
     return [files[step] for step in steps]
 
 
-def _from_video(file: Path, size: tuple[int, int], film: int, n_encoded: int, n_future: int) -> list[np.ndarray]:
+def _from_video(file: Path, size: tuple[int, int], n_steps: int, n_encoded: int, n_future: int) -> list[np.ndarray]:
     problems = Problems()
     video = Video(file, file.stem, size, problems)
     n_frames, last = len(video.numbers), n_encoded + n_future
     if video.rate is None and n_frames > 2:
         raise InputError(f"{file}: {video.unevenness}; write its frames at an even rate, or as images")
-    first = {film: 0, film - n_encoded: n_encoded, last: 0, n_future: n_encoded}
+    first = {n_steps: 0, n_steps - n_encoded: n_encoded, last: 0, n_future: n_encoded}
     if n_frames not in first:
         raise InputError(
-            f"{file} has {'more than ' if n_frames > film else ''}{min(n_frames, film)} frames; to compare the "
-            f"{n_future} steps after the {n_encoded} given ones, it must have {last} (or the film's {film}), or "
-            f"without the given ones {n_future} (or {film - n_encoded})"
+            f"{file} has {'more than ' if n_frames > n_steps else ''}{min(n_frames, n_steps)} frames; to compare the "
+            f"{n_future} steps after the {n_encoded} given ones, it must have {last} (or the scene's {n_steps}), or "
+            f"without the given ones {n_future} (or {n_steps - n_encoded})"
         )
-    if n_frames == film - n_encoded == last:
+    if n_frames == n_steps - n_encoded == last:
         raise InputError(f"{file} has {n_frames} frames: is the first one step 0 or {n_encoded}? Use frames instead")
     start = n_encoded - first[n_frames]
     return list(video.read(range(start, start + n_future), problems))

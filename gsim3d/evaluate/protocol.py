@@ -30,7 +30,7 @@ from gsim3d.dynamics import RestLog, concatenate
 from gsim3d.effects.edits import Edit
 from gsim3d.errors import FitWarning, InputError, NumericalError
 from gsim3d.evaluate.predictions import Predictions
-from gsim3d.evaluate.scoring import PLAIN_METRICS, SceneScores, SceneTruth
+from gsim3d.evaluate.scoring import EXACT_PARTS, PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.io.terminal import progress
 from gsim3d.nn.layers import exact_convolutions
 from gsim3d.state import DYNAMIC, Particles
@@ -38,7 +38,7 @@ from gsim3d.train.processes import Processes
 from gsim3d.train.restore import Restored
 from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
-METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant")
+METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant", *EXACT_PARTS)
 TOGETHER = 8  # scenes that a GPU predicts in one rollout, fewer where they are large
 MOST_PIXELS = 2**21  # of the input images of one rollout
 CLIPS = 48  # of which FVD is measured
@@ -295,7 +295,7 @@ def score_scene(
             }
         for other in others:
             theirs = other.images(scene, cams, n_given, n_future).to(device).float() / 255
-            if scene.recording.is_film and labels is not None:  # the video's own background is black there
+            if scene.recording.real_background and labels is not None:  # the video's own background is black there
                 theirs *= (labels[n_encoded:] != BACKGROUND)[..., None]
             yield other.name, theirs
         yield from ((name, make()) for name, make in baselines.items() if name in methods)
@@ -407,7 +407,7 @@ def _held(
     step: int,
     scene: Scene,
     cams: Sequence[int],
-    start: int,
+    start: int = 0,
 ) -> Tensor:
     """Images of the predicted steps that would be seen if everything stood still as it is at cloud ``step``."""
     later = range(prediction.n_encoded, prediction.n_steps)

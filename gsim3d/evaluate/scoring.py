@@ -17,10 +17,14 @@ from gsim3d.evaluate.perceptual import fvd, lpips, weights
 
 @dataclass(frozen=True)
 class Metric:
-    """label: its name in tables.   digits: after the point.   rises: whether more is better.
+    """A metric of predicted images.
 
-    weights: what must be installed to measure it (a key of gsim3d.evaluate.perceptual.weights.SOURCES), or nothing.
-    by_step: whether each image has a value of its own.
+    Attributes:
+        label: its name in tables.
+        digits: after the point.
+        rises: whether more is better.
+        weights: what must be installed to measure it (a key of gsim3d.evaluate.perceptual.weights.SOURCES), or nothing.
+        by_step: whether each image has a value of its own.
     """
 
     label: str
@@ -50,14 +54,18 @@ RING_WIDTH = 0.3  # of the diameter of a body in the image
 
 @dataclass(frozen=True)
 class SceneScores:
-    """Scores of one scene over ``n_steps`` steps, the first ``n_encoded`` of them given.
+    """Scores of one scene.
 
-    values: method -> metric -> float64 [S] by step, means over the target views. Steps before ``n_encoded`` are
-        reconstructions, which only the model has; a value that no image has (that step, or an empty mask) is NaN.
-    clips: method (and ``"truth"``) -> I3D features [V, 400] of the predicted steps in each target view, for FVD.
-    not_measured: metric -> why this scene has no value.
-    body_share: float64 [S], share of the mask that bodies cover, mean over the target views; None without labels.
-    digest: hash of the true images and labels that were compared.
+    Attributes:
+        scene: its name.
+        n_encoded: given steps.
+        n_steps: all steps, S.
+        values: method -> metric -> float64 [S] by step, means over the target views. Steps before ``n_encoded`` are
+            reconstructions, which only the model has; a value that no image has (that step, or an empty mask) is NaN.
+        clips: method (and ``"truth"``) -> I3D features [V, 400] of the predicted steps in each target view, for FVD.
+        not_measured: metric -> why this scene has no value.
+        body_share: float64 [S], share of the mask that bodies cover, mean over the target views; None without labels.
+        digest: hash of the true images and labels that were compared.
     """
 
     scene: str
@@ -121,7 +129,7 @@ class SceneTruth:
         name: of the scene.
         images: [S, V, H, W, 3], colours in [0, 1].
         labels: uint8 [S, V, H, W], 0 background, 3 bodies that may move; None: the scene has none.
-        filmed: bool [S, V, H, W], pixels that count; the others are black in the film; None: all.
+        valid: bool [S, V, H, W], pixels that count; the others are black in the recording; None: all.
         n_encoded: steps that were given.
         metrics: to measure; what does not apply here goes to ``not_measured``.
     """
@@ -131,14 +139,19 @@ class SceneTruth:
         name: str,
         images: Tensor,
         labels: Tensor | None,
-        filmed: Tensor | None,
+        valid: Tensor | None,
         n_encoded: int,
         metrics: Sequence[str],
     ):
-        self.name, self.images, self.labels, self.filmed, self.n_encoded = name, images, labels, filmed, n_encoded
+        self.name, self.images, self.labels, self.valid, self.n_encoded = name, images, labels, valid, n_encoded
         self.not_measured = {m: reason for m in metrics if (reason := self._problem(m))}
         self.metrics = [metric for metric in metrics if metric not in self.not_measured]
-        self.ring = ring_around_bodies(labels) if "psnr_ring" in self.metrics else None
+        self.masks = {"psnr": valid}
+        if labels is not None:
+            regions = {"masked": labels != BACKGROUND, "body": labels == MOVING, "ground": labels == FIXED}
+            self.masks |= {f"psnr_{region}": mask for region, mask in regions.items()}
+            if "psnr_ring" in self.metrics:
+                self.masks["psnr_ring"] = ring_around_bodies(labels)
 
     def score(self, methods: Iterable[tuple[str, Tensor]]) -> SceneScores:
         """Scores of (name, images) one after another, so that only one method's images need to be in memory.
@@ -150,23 +163,24 @@ class SceneTruth:
         if with_clips:
             clips["truth"] = self._clip_features(self.images)
         for name, images in methods:
-            if self.filmed is not None:
-                images = images * self.filmed[-len(images) :, ..., None]
+            if self.valid is not None:
+                images = images * self.valid[-len(images) :, ..., None]
             values[name] = self._by_step(images, self.metrics)
             if with_clips:
                 clips[name] = self._clip_features(images)
             if name == "constant" and "psnr_masked" in self.metrics:
-                parts = {part: self._by_step(images, ["psnr_masked"], label) for part, label in EXACT_PARTS.items()}
+                true, labels = self.images[-len(images) :], self.labels[-len(images) :, ..., None]
+                for part, label in EXACT_PARTS.items():
+                    parts[part] = self._by_step(torch.where(labels == label, true, images), ["psnr_masked"])
         values |= parts
-        return SceneScores(
-            self.name, self.n_encoded, len(self.images), values, clips, self.not_measured, self._body_share()
-        )
+        share, n_steps = self._body_share(), len(self.images)
+        return SceneScores(self.name, self.n_encoded, n_steps, values, clips, self.not_measured, share)
 
     def _body_share(self) -> Tensor | None:
         """float64 [S]; NaN at steps without a mask."""
         if self.labels is None:
             return None
-        bodies, mask = (part.sum((2, 3)).double() for part in (self.labels == MOVING, self.labels != BACKGROUND))
+        bodies, mask = (self.masks[f"psnr_{region}"].sum((2, 3)).double() for region in ("body", "masked"))
         return (bodies / mask).nanmean(1).cpu()
 
     def _problem(self, metric: str) -> str | None:
@@ -181,34 +195,23 @@ class SceneTruth:
             return f"it needs {fvd.MIN_FRAMES} predicted steps; {self.name} has {n_steps - self.n_encoded}"
         return None
 
-    def _by_step(self, images: Tensor, metrics: Sequence[str], exact: int | None = None) -> dict[str, Tensor]:
-        """Metric -> float64 [S], means over the views that have a value; NaN for steps without images.
-
-        Args:
-            exact: label of the pixels that are replaced by the true ones.
-        """
+    def _by_step(self, images: Tensor, metrics: Sequence[str]) -> dict[str, Tensor]:
+        """Metric -> float64 [S], means over the views that have a value; NaN for steps without images."""
         n_steps = len(self.images)
         scores = {m: torch.full((n_steps,), torch.nan, dtype=torch.float64) for m in metrics if METRICS[m].by_step}
         for step, pred in enumerate(images, n_steps - len(images)):
-            true = self.images[step]
-            labels, filmed, ring = (
-                None if mask is None else mask[step] for mask in (self.labels, self.filmed, self.ring)
-            )
-            if exact is not None:
-                pred = torch.where((labels == exact)[..., None], true, pred)
-            measure = {
-                "psnr": lambda: psnr(pred, true, filmed),
-                "psnr_masked": lambda: psnr(pred, true, labels != BACKGROUND),
-                "psnr_body": lambda: psnr(pred, true, labels == MOVING),
-                "psnr_ground": lambda: psnr(pred, true, labels == FIXED),
-                "psnr_ring": lambda: psnr(pred, true, ring),
-                "ssim": lambda: ssim(pred, true),
-                "lpips_alex": lambda: lpips.lpips(pred, true, "alex"),
-                "lpips_vgg": lambda: lpips.lpips(pred, true, "vgg"),
-            }
             for metric, values in scores.items():
-                values[step] = measure[metric]().nanmean()
+                values[step] = self._measured(metric, pred, self.images[step], step).nanmean()
         return scores
+
+    def _measured(self, metric: str, pred: Tensor, true: Tensor, step: int) -> Tensor:
+        """[V] of one step."""
+        if metric == "ssim":
+            return ssim(pred, true)
+        if metric.startswith("lpips"):
+            return lpips.lpips(pred, true, metric.removeprefix("lpips_"))
+        mask = self.masks[metric]
+        return psnr(pred, true, None if mask is None else mask[step])
 
     def _clip_features(self, images: Tensor) -> Tensor:
         """[V, 400], of the predicted steps."""

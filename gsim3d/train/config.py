@@ -294,8 +294,7 @@ def check_settings(config: TrainConfig, dynamics: DynamicsConfig, plan: Plan, n_
             raise InputError(f"data.history: {history} steps, but this model sees up to {plan.history}")
     if config.data.unfrozen_background and not dynamics.is_asymmetric:
         raise InputError(
-            'data.unfrozen_background: needs a model of background "asymmetric"; another does not tell frozen '
-            "particles apart"
+            'data.unfrozen_background: needs a model of background "asymmetric"; others do not know frozen particles'
         )
     if config.workers and dynamics.norm == "batch":
         raise InputError("workers: must be 0 for a model with batch normalisation, which needs all samples at once")

@@ -92,7 +92,7 @@ class Log:
                 self._stream.flush()
             except OSError as error:
                 raise InputError(
-                    f"{self.file}: cannot be written: {error.strerror}; make room and train again"
+                    f"{self.file}: cannot be written: {error.strerror}; free some space and train again"
                 ) from None
             if self.board is not None:
                 self.board.scalars({**entry, **machine}, entry["step"])

@@ -160,6 +160,6 @@ def test_commands_refuse_resample_and_say_once_what_is_not_checked(folder, tmp_p
     assert capsys.readouterr().err.count("frame rate not checked") == 1
 
 
-def test_films_of_a_training_run_have_the_rate_of_their_world():
+def test_trajectories_of_a_training_run_have_the_rate_of_their_world():
     world = build_world("elastic", "mini", {"fps": 17.0, "image_size": 16, "n_frames": 2})
-    assert [film.fps for film in TrajectoryStore(world, 2, "cpu").films] == [17.0, 17.0]
+    assert [trajectory.fps for trajectory in TrajectoryStore(world, 2, "cpu").trajectories] == [17.0, 17.0]

@@ -3,7 +3,7 @@
 #
 #   setsid bash DIR/start.sh DIR WORK [options of tools/release/train.py] >WORK.log 2>&1 &
 #
-# WORK/out holds the state and its film at any time. --state, --out, --device and --commit are set here. A build that
+# WORK/out holds the state and its video at any time. --state, --out, --device and --commit are set here. A build that
 # another run left in DIR/build (made by this script in WORK/build) is used if it is of the same sources.
 set -euo pipefail
 [ $# -ge 3 ] || { echo "usage: bash start.sh DIR WORK WORLD --minutes M [options]" >&2; exit 2; }
