@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from gsim3d.errors import InputError
+from gsim3d.io.settings import from_dict, load_yaml
 from gsim3d.synth.world import World
 from gsim3d.synth.worlds import VALIDATION_SEED, build_world
 from gsim3d.train.config import TrainConfig
-from gsim3d.train.settings import from_dict, load_yaml
 
 CONFIGS = Path(__file__).resolve().parent.parent.parent / "configs" / "train"
 WORLDS = ("elastic", "cloth", "rigid")
