@@ -12,7 +12,8 @@ commit="$(git -C "$root" rev-parse --verify "$1^{commit}")"
 mkdir -p "$2/state"
 configs="$(git -C "$root" ls-tree --name-only "$commit" configs)"  # which older commits lack
 git -C "$root" archive --format=tar.gz -o "$(realpath "$2")/source.tar.gz" "$commit" -- \
-  setup.py pyproject.toml README.md LICENSE csrc gsim3d tools $configs ':!gsim3d/pretrained/*/**' ':!tools/bench' ':!tools/release/state'
+  setup.py pyproject.toml README.md LICENSE csrc gsim3d tools $configs \
+  ':!gsim3d/pretrained/*/**' ':!tools/bench' ':!tools/release/state'
 echo "$commit" >"$2/commit"
 git -C "$root" show "$commit:tools/release/start.sh" >"$2/start.sh"
 if [ $# -ge 3 ]; then cp "$3"/*.state.safetensors "$2/state/"; fi
