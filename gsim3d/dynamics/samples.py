@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from gsim3d.ops.sentinel import CELLS
+from gsim3d.ops.validate_state import CELLS
 from gsim3d.state import DYNAMIC, Particles, constant
 
 SAMPLES = 1024  # rows of a cloud that are looked at, evenly spread over them

@@ -27,20 +27,20 @@ from gsim3d.numerics.policy import (
     at_most,
     usable_pixels,
 )
-from gsim3d.ops.sentinel import CELLS, FAST, OUTSIDE, joined, watch_rows
+from gsim3d.ops.validate_state import CELLS, FAST, OUTSIDE, join_records, validate_state
 from gsim3d.state import ASLEEP, ATTRIBUTES, CloudTable, Particles
 
 BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
 ALWAYS = ("means", "opacities")  # are looked at, changed or not
 
 
-_WATCHED = "gsim3d.watched"  # a node of a graph whose gradients are looked at
+_WATCHED = "gsim3d.validated"  # a node of a graph whose gradients are looked at
 
 
 class _Looks(NamedTuple):
     """How a guard looks at the fields of particles.
 
-    kinds: (tensor, what is wrong, action) of every kind that watch_rows counts.
+    kinds: (tensor, what is wrong, action) of every kind that validate_state counts.
     neutral: first number of what stands in for a row that nobody knows, others are 0.
     """
 
@@ -106,7 +106,7 @@ def guard_particles(
     is_told = particles.means.is_cuda and not torch.compiler.is_compiling()  # the report, later
     # the copies that the kernel mends carry no gradients
     in_kernel = not clamps and not (torch.is_grad_enabled() and _have_gradients(fields.values(), before or ()))
-    watched = watch_rows(
+    validated = validate_state(
         list(fields.values()),
         looks.bounds,
         particles.cu_rows,
@@ -122,17 +122,17 @@ def guard_particles(
     )
     if not torch.compiler.is_compiling():
         read = partial(_read, particles.clouds, where, looks, previous is not None)
-        counts = _places_of_counts(*watched.record.shape, len(looks.kinds))
-        report.record(watched.record, read, counts=counts, at_once=False, join=joined if is_told else None)
-        if watched.status.device.type == "cpu":
-            if not bool(watched.status.any()):
+        counts = _places_of_counts(*validated.record.shape, len(looks.kinds))
+        report.record(validated.record, read, counts=counts, at_once=False, join=join_records if is_told else None)
+        if validated.status.device.type == "cpu":
+            if not bool(validated.status.any()):
                 return particles
             if torch.is_grad_enabled():
-                _watch_gradients(fields.values(), read(watched.record).findings[0], report)
-    if watched.fields is not None:
-        return _with_rows(particles, dict(zip(fields, watched.fields)) | {"activity": watched.activity})
+                _watch_gradients(fields.values(), read(validated.record).findings[0], report)
+    if validated.fields is not None:
+        return _with_rows(particles, dict(zip(fields, validated.fields)) | {"activity": validated.activity})
     mend = _clamp if clamps else _put_to_sleep
-    return mend(particles, fields, looks.bounds, watched.status, config, grid_size, previous)
+    return mend(particles, fields, looks.bounds, validated.status, config, grid_size, previous)
 
 
 def guard_frames(
@@ -247,7 +247,7 @@ def _what(high: float) -> str:
 
 
 def _read(clouds: CloudTable, where: str, looks: _Looks, moved: bool, record: Tensor) -> Reading:
-    """What a record of watch_rows says."""
+    """What a record of validate_state says."""
     findings, sentinels, n_counts = [], {}, 2 * len(looks.kinds)
     for scene, step, numbers in zip(clouds.scenes, clouds.steps, record.tolist(), strict=True):
         if any(numbers[:n_counts:2]):
@@ -264,7 +264,7 @@ def _read(clouds: CloudTable, where: str, looks: _Looks, moved: bool, record: Te
 
 @functools.lru_cache(maxsize=64)
 def _places_of_counts(n_clouds: int, n_columns: int, n_kinds: int) -> tuple[int, ...]:
-    """Where a record of watch_rows holds how many rows were bad."""
+    """Where a record of validate_state holds how many rows were bad."""
     return tuple(q * n_columns + 2 * k for q in range(n_clouds) for k in range(n_kinds))
 
 

@@ -26,12 +26,13 @@ from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
 from gsim3d.ops.raster import Rendering, rasterize_gaussians
 from gsim3d.ops.row_norm import norm_gelu, residual_norm, row_norm
-from gsim3d.ops.sentinel import Watched, watch_rows
 from gsim3d.ops.sparse_conv import sparse_conv
+from gsim3d.ops.validate_state import PartialRecord, ValidatedState, join_records, validate_state
 
 __all__ = [
     "CURVES",
     "KernelMap",
+    "PartialRecord",
     "PatchTable",
     "Pyramid",
     "PyramidCapacity",
@@ -39,8 +40,8 @@ __all__ = [
     "Rendering",
     "Segments",
     "Stage",
+    "ValidatedState",
     "Voxels",
-    "Watched",
     "add_cells",
     "build_pyramid",
     "cuda_compiled",
@@ -48,6 +49,7 @@ __all__ = [
     "curve_sort",
     "decode_gaussians",
     "find_cells",
+    "join_records",
     "joint_attention",
     "norm_gelu",
     "overlapping_patches",
@@ -62,5 +64,5 @@ __all__ = [
     "sparse_conv",
     "sweep_geometry",
     "unpool",
-    "watch_rows",
+    "validate_state",
 ]

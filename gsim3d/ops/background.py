@@ -7,10 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole
-from gsim3d.ops._autocast import follow_autocast
-from gsim3d.ops._gradients import register_gradients
+from gsim3d.ops._register import fake, register_autocast, register_gradients
 from gsim3d.ops.curve import PatchTable, Segments
 
 RUN = 64  # rows that are summed one after another
@@ -128,17 +126,17 @@ def overlapping_patches(
     return tuple(PatchTable(*lists) for lists in zip(*(table.unbind() for table in tables), strict=True))
 
 
-@torch.library.register_fake("gsim3d::row_scenes")
+@fake("row_scenes")
 def _(cloud_scene, cu_input, rows, cu_rows):
     return [cloud_scene.new_empty(cu.shape[0] - 1) for cu in cu_rows]
 
 
-@torch.library.register_fake("gsim3d::find_cells")
+@fake("find_cells")
 def _(cells, scene, grid):
     return cells.new_empty(scene.shape)
 
 
-@torch.library.register_fake("gsim3d::add_cells")
+@fake("add_cells")
 def _(x, field, places):
     return x.new_empty(x.shape)
 
@@ -165,11 +163,10 @@ def _sum_by_cell(x: Tensor, places: Tensor, n_cells: int) -> Tensor:
 
 
 register_gradients("add_cells", _backward, _setup, gradient_ops=[])
-torch.library.register_autocast("gsim3d::add_cells", "cpu", torch.float32)
-follow_autocast("add_cells")
+register_autocast("add_cells", "follow")
 
 
-@torch.library.register_fake("gsim3d::overlapping_patches")
+@fake("overlapping_patches")
 def _(first, kv_rows, cu_k, codes, order, cu_clouds, patch_size):
     curves, n_parts = first.shape[0], first.shape[1] + codes.shape[1] // patch_size
     sizes = (codes.shape[1], kv_rows.shape[1] + codes.shape[1], n_parts + 1, n_parts + 1)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_real, check_tensors, check_whole
+from gsim3d.ops._register import fake
 from gsim3d.ops.streams import MANY_STREAMS, Branches
 
 CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
@@ -430,17 +430,17 @@ def _assemble(
     return Pyramid(rows, cu_rows, tuple(stages), take() if has_found else None)
 
 
-@torch.library.register_fake("gsim3d::curve_encode")
+@fake("curve_encode")
 def _(grid, cloud, curves, depth, shift):
     return grid.new_empty(len(curves), grid.shape[0])
 
 
-@torch.library.register_fake("gsim3d::curve_sort")
+@fake("curve_sort")
 def _(codes):
     return codes.new_empty(codes.shape), codes.new_empty(codes.shape)
 
 
-@torch.library.register_fake("gsim3d::build_pyramid")
+@fake("build_pyramid")
 def _(
     positions,
     cu_rows,

@@ -3,9 +3,8 @@
 import torch
 from torch import Tensor
 
-from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_real, check_tensors, check_whole
-from gsim3d.ops._gradients import register_gradients
+from gsim3d.ops._register import fake, is_narrow, register_autocast, register_gradients
 
 LARGEST_READING = 1e3  # cubes of readings times the largest ``raw`` stay finite; those of the table are below 2
 
@@ -47,13 +46,13 @@ def decode_gaussians(
     return torch.ops.gsim3d.decode_gaussians(raw, readings, degree, scale_min, scale_max)
 
 
-@torch.library.register_fake("gsim3d::decode_gaussians")
+@fake("decode_gaussians")
 def _(raw, readings, degree, scale_min, scale_max):
     n = raw.shape[0]
     return readings.new_empty(n, 4), readings.new_empty(n, 3), readings.new_empty(n, (degree + 1) ** 2, 3)
 
 
-@torch.library.register_fake("gsim3d::decode_gaussians_backward")
+@fake("decode_gaussians_backward")
 def _(grad_quats, grad_scales, grad_sh, raw, readings, degree, scale_min, scale_max):
     return raw.new_empty(raw.shape)
 
@@ -70,19 +69,11 @@ def _backward(ctx, *grads):
 
 _gradient_ops = ["decode_gaussians_backward"]
 register_gradients("decode_gaussians", _backward, _setup, gradient_ops=_gradient_ops, without=["readings"])
-_library = torch.library.Library("gsim3d", "FRAGMENT")
 
 
-def _autocast(device: str):
-    keys = torch._C.DispatchKeySet(getattr(torch._C.DispatchKey, f"Autocast{device.upper()}"))
-
-    def rule(raw, readings, *numbers):
-        raw = raw.float() if device == "cpu" and raw.dtype != torch.float64 else raw
-        with torch._C._ExcludeDispatchKeyGuard(keys):
-            return torch.ops.gsim3d.decode_gaussians(raw, readings, *numbers)
-
-    return rule
+def _autocast(device, arguments):
+    raw, *others = arguments
+    return raw.float() if device == "cpu" and is_narrow(raw) else raw, *others
 
 
-for _device in ("cpu", "cuda"):
-    _library.impl("decode_gaussians", _autocast(_device), f"Autocast{_device.upper()}")
+register_autocast("decode_gaussians", _autocast)

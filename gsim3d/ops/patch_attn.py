@@ -3,10 +3,8 @@
 import torch
 from torch import Tensor
 
-from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_real, check_tensors
-from gsim3d.ops._autocast import follow_autocast
-from gsim3d.ops._gradients import register_gradients
+from gsim3d.ops._register import fake, register_autocast, register_gradients
 from gsim3d.ops.curve import PatchTable
 
 
@@ -103,18 +101,18 @@ def joint_attention(
     return torch.ops.gsim3d.joint_attention(q, k, v, other_k, other_v, *lists, float(scale))[0]
 
 
-@torch.library.register_fake("gsim3d::patch_attention")
+@fake("patch_attention")
 def _(q, k, v, q_rows, kv_rows, cu_q, cu_k, scale):
     stats_dtype = torch.promote_types(q.dtype, torch.float32)
     return q.new_empty(q.shape), q.new_empty(q.shape[0], q.shape[1], 2, dtype=stats_dtype)
 
 
-@torch.library.register_fake("gsim3d::patch_attention_backward")
+@fake("patch_attention_backward")
 def _(grad, q, k, v, out, stats, q_rows, kv_rows, cu_q, cu_k, scale):
     return q.new_empty(q.shape), k.new_empty(k.shape), k.new_empty(k.shape)
 
 
-@torch.library.register_fake("gsim3d::patch_attention_backward_packed")
+@fake("patch_attention_backward_packed")
 def _(grad, q, k, v, out, stats, q_rows, kv_rows, cu_q, cu_k, scale):
     return q.new_empty(q.shape[0], 3, *q.shape[1:])
 
@@ -133,7 +131,7 @@ def _backward(ctx, grad, _grad_stats):
     return *grads, None, None, None, None, None
 
 
-@torch.library.register_fake("gsim3d::joint_attention")
+@fake("joint_attention")
 def _(q, k, v, other_k, other_v, *lists_and_scale):
     stats_dtype = torch.promote_types(q.dtype, torch.float32)
     return q.new_empty(q.shape), q.new_empty(q.shape[0], q.shape[1], 2, dtype=stats_dtype)
@@ -162,5 +160,4 @@ _own_ops = ["patch_attention_backward", "patch_attention_backward_packed"]
 _rules = {"patch_attention": (_backward, _setup, _own_ops), "joint_attention": (_joint_backward, _joint_setup, [])}
 for _name, (_gradients, _context, _gradient_ops) in _rules.items():
     register_gradients(_name, _gradients, _context, gradient_ops=_gradient_ops)
-    torch.library.register_autocast(f"gsim3d::{_name}", "cpu", torch.float32)
-    follow_autocast(_name)
+    register_autocast(_name, "follow")

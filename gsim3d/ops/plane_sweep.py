@@ -4,9 +4,8 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import NumericalError
-from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_floating, check_numbers, check_tensors
-from gsim3d.ops._gradients import register_gradients
+from gsim3d.ops._register import fake, register_autocast, register_gradients
 
 
 def sweep_geometry(
@@ -134,13 +133,13 @@ def plane_sweep(
     return torch.ops.gsim3d.plane_sweep(features, homographies, translations, inverse_depths, src_images, cu_src)
 
 
-@torch.library.register_fake("gsim3d::plane_sweep")
+@fake("plane_sweep")
 def _(features, homographies, translations, inverse_depths, src_images, cu_src):
     n_images, _, height, width = features.shape
     return features.new_empty(n_images, inverse_depths.shape[1], height, width)
 
 
-@torch.library.register_fake("gsim3d::plane_sweep_backward")
+@fake("plane_sweep_backward")
 def _(grad, features, homographies, translations, inverse_depths, src_images, cu_src):
     return features.new_empty(features.shape)
 
@@ -155,5 +154,4 @@ def _backward(ctx, grad):
 
 _without = ["homographies", "translations", "inverse_depths"]
 register_gradients("plane_sweep", _backward, _setup, gradient_ops=["plane_sweep_backward"], without=_without)
-for _device in ("cpu", "cuda"):
-    torch.library.register_autocast("gsim3d::plane_sweep", _device, torch.float32)
+register_autocast("plane_sweep", "float32")

@@ -3,9 +3,8 @@
 import torch
 from torch import Tensor
 
-from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole, within_memory
-from gsim3d.ops._gradients import register_gradients
+from gsim3d.ops._register import fake, register_autocast, register_gradients
 
 
 def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -> Tensor:
@@ -77,33 +76,33 @@ def unpool(x: Tensor, rows: Tensor, cu_rows: Tensor, n_rows: int, *, check: bool
     return within_memory("unpool", f"n_rows={n_rows}", kernel, x, rows, cu_rows, n_rows)
 
 
-@torch.library.register_fake("gsim3d::pool_max")
+@fake("pool_max")
 def _(x, rows, cu_rows):
     shape = (cu_rows.shape[0] - 1, x.shape[1])
     return x.new_empty(shape), x.new_empty(shape, dtype=torch.int64)
 
 
-@torch.library.register_fake("gsim3d::pool_max_backward")
+@fake("pool_max_backward")
 def _(grad, argmax, n_rows):
     return grad.new_empty(n_rows, grad.shape[1])
 
 
-@torch.library.register_fake("gsim3d::pool_mean")
+@fake("pool_mean")
 def _(x, rows, cu_rows):
     return x.new_empty(cu_rows.shape[0] - 1, x.shape[1])
 
 
-@torch.library.register_fake("gsim3d::pool_mean_backward")
+@fake("pool_mean_backward")
 def _(grad, rows, cu_rows, n_rows):
     return grad.new_empty(n_rows, grad.shape[1])
 
 
-@torch.library.register_fake("gsim3d::unpool")
+@fake("unpool")
 def _(x, rows, cu_rows, n_rows):
     return x.new_empty(n_rows, x.shape[1])
 
 
-@torch.library.register_fake("gsim3d::unpool_backward")
+@fake("unpool_backward")
 def _(grad, rows, cu_rows):
     return grad.new_empty(cu_rows.shape[0] - 1, grad.shape[1])
 
@@ -143,5 +142,4 @@ register_gradients("pool_max", _pool_max_backward, _pool_max_setup, gradient_ops
 register_gradients("pool_mean", _pool_mean_backward, _pool_mean_setup, gradient_ops=["pool_mean_backward"])
 register_gradients("unpool", _unpool_backward, _unpool_setup, gradient_ops=["unpool_backward"])
 for _op in ("pool_max", "pool_mean", "unpool"):
-    for _device in ("cpu", "cuda"):
-        torch.library.register_autocast(f"gsim3d::{_op}", _device, torch.float32)
+    register_autocast(_op, "float32")

@@ -9,38 +9,28 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsim3d._core import constants
 from gsim3d.cameras import Cameras
 from gsim3d.numerics.policy import Finding, OnInvalid, Reading, StabilityReport, check_on_invalid
-from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_floating, check_real, check_tensors, check_whole, within_memory
-from gsim3d.ops._gradients import register_gradients
+from gsim3d.ops._register import fake, register_autocast, register_gradients
 
 OP = "rasterize_gaussians"
-LARGEST = 1e15  # kLargest of csrc/gsim3d/raster/raster_math.h
-CUTOFFS = {"exact": 0, "tile3sigma": 1, "smooth": 2}
-JACOBIANS = {"exact": 0, "clamped": 1}
-# RasterFault of csrc/gsim3d/raster/raster.h
-FAULTS = (
-    "not finite or beyond 1e15",
-    "not finite",
-    "negative, not finite or beyond 1e15",
-    "outside [0, 1]",
-    "not finite or beyond 1e15",
-    "not finite or beyond 1e15",
-    "too large, the projection overflows",
-    "too large, together they touch 2^31 tiles or more",
-    "not a camera, or it shows no cloud",
-)
-FAULT_BITS, OF_ROWS = 9, 7  # the first faults are of rows
+LARGEST: float = constants["raster_largest"]
+CUTOFFS: dict[str, int] = constants["raster_cutoffs"]
+JACOBIANS: dict[str, int] = constants["raster_jacobians"]
+FAULTS: tuple[str, ...] = constants["raster_faults"]
+ROW_FAULTS: int = constants["raster_row_faults"]  # the first faults are of rows
 
 
 class Rendering(NamedTuple):
     """Images of one call; of a simulator, those that its plan asks for, and None for the others.
 
-    color: [I, H, W, 3].
-    alpha: [I, H, W] in [0, 1), how much of the background is hidden.
-    depth: [I, H, W] metres, sum of weight * camera z (divide by ``alpha`` for a mean).
-    features: [I, H, W, F], or None.
+    Attributes:
+        color: [I, H, W, 3].
+        alpha: [I, H, W] in [0, 1), how much of the background is hidden.
+        depth: [I, H, W] metres, sum of weight * camera z (divide by ``alpha`` for a mean).
+        features: [I, H, W, F], or None.
     """
 
     color: Tensor
@@ -192,7 +182,7 @@ def _unusable(numbers: Tensor, names: Sequence[str], action: str) -> Reading:
     for camera, (count, first) in enumerate(numbers.tolist()):
         if count:
             fault = next(k for k in range(len(FAULTS)) if first >> k & 1)
-            row = first >> FAULT_BITS if fault < OF_ROWS else None
+            row = first >> len(FAULTS) if fault < ROW_FAULTS else None
             findings.append(Finding(FAULTS[fault], OP, names[fault], action, count, row, camera=camera))
     return Reading(findings, {})
 
@@ -276,7 +266,7 @@ def _state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_slots)
     return sum((n + 63) // 64 * 64 for n in (64, view * n_images, 16 * n_clouds, 4 * n_images, *lists))
 
 
-@torch.library.register_fake("gsim3d::rasterize_gaussians")
+@fake("rasterize_gaussians")
 def _(means, quats, scales, opacities, color, features, background, viewmats, *rest):
     _, _, cu_rows, width, height, _, _, _, *sizes, watch = rest  # Ks, image_cloud, near_plane and modes do not count
     n_images = viewmats.shape[0]
@@ -294,7 +284,7 @@ def _(means, quats, scales, opacities, color, features, background, viewmats, *r
     )
 
 
-@torch.library.register_fake("gsim3d::rasterize_gaussians_backward")
+@fake("rasterize_gaussians_backward")
 def _(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state, *inputs):
     *inputs, viewmats_grad = inputs
     shapes = [x.shape for x in inputs[:7]] + [(inputs[7].shape[0] if viewmats_grad else 0, 4, 4)]
@@ -323,5 +313,4 @@ def _backward(ctx, *grads):
 
 _gradient_ops = ["rasterize_gaussians_backward"]
 register_gradients("rasterize_gaussians", _backward, _setup, gradient_ops=_gradient_ops, without=["Ks"])
-for _device in ("cpu", "cuda"):
-    torch.library.register_autocast("gsim3d::rasterize_gaussians", _device, torch.float32)
+register_autocast("rasterize_gaussians", "float32")

@@ -3,9 +3,8 @@
 import torch
 from torch import Tensor
 
-from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_tensors
-from gsim3d.ops._gradients import register_gradients
+from gsim3d.ops._register import fake, is_narrow, register_autocast, register_gradients
 
 
 def row_norm(
@@ -100,12 +99,12 @@ def residual_norm(
     return torch.ops.gsim3d.residual_norm(x, branch, keep, *weights, eps)[:2]
 
 
-@torch.library.register_fake("gsim3d::row_norm")
+@fake("row_norm")
 def _(x, weight, bias, residual, eps, dtype):
     return x.new_empty(x.shape, dtype=dtype), weight.new_empty(x.shape[0], 2)
 
 
-@torch.library.register_fake("gsim3d::row_norm_backward")
+@fake("row_norm_backward")
 def _(grad, x, weight, stats):
     return (
         torch.empty_like(x, memory_format=torch.contiguous_format),
@@ -129,20 +128,20 @@ def _backward(ctx, grad, _grad_stats):
 register_gradients("row_norm", _backward, _setup, gradient_ops=["row_norm_backward"])
 
 
-@torch.library.register_fake("gsim3d::residual_norm")
+@fake("residual_norm")
 def _(x, branch, keep, branch_weight, branch_bias, weight, bias, eps):
     stats = [x.new_empty(x.shape[0] if w is not None else 0, 2) for w in (branch_weight, weight)]
     return x.new_empty(x.shape), branch.new_empty(x.shape), *stats
 
 
-@torch.library.register_fake("gsim3d::residual_norm_backward")
+@fake("residual_norm_backward")
 def _(grad_sum, grad_out, branch, sum, keep, branch_weight, weight, branch_stats, stats):
     channels = sum.shape[1]
     of_norms = [sum.new_empty(channels if w is not None else 0) for w in (branch_weight, branch_weight, weight, weight)]
     return sum.new_empty(sum.shape), branch.new_empty(sum.shape), sum.new_empty(channels), *of_norms
 
 
-@torch.library.register_fake("gsim3d::linear_grad_bias")
+@fake("linear_grad_bias")
 def _(grad):
     return grad.new_empty(grad.shape[1], dtype=torch.promote_types(grad.dtype, torch.float32))
 
@@ -166,23 +165,17 @@ def _residual_backward(ctx, grad_sum, grad_out, *_):
 
 _residual_ops = ["residual_norm_backward", "linear_grad_bias"]  # of the linear layer of a branch
 register_gradients("residual_norm", _residual_backward, _residual_setup, gradient_ops=_residual_ops, without=["keep"])
-_library = torch.library.Library("gsim3d", "FRAGMENT")
 
 
-def _autocast(device: str):
-    keys = torch._C.DispatchKeySet(getattr(torch._C.DispatchKey, f"Autocast{device.upper()}"))
-
-    def rule(x, weight, bias, residual, eps, dtype):
-        if x.dtype != torch.float64:
-            weight, bias = weight.float(), bias.float()
-            if device == "cpu":
-                x, residual, dtype = x.float(), residual if residual is None else residual.float(), torch.float32
-            elif residual is None:
-                dtype = torch.get_autocast_dtype("cuda")
-        with torch._C._ExcludeDispatchKeyGuard(keys):
-            return torch.ops.gsim3d.row_norm(x, weight, bias, residual, eps, dtype)
-
-    return rule
+def _row_norm_autocast(device, arguments):
+    x, weight, bias, residual, eps, dtype = arguments
+    if is_narrow(x):
+        weight, bias = weight.float(), bias.float()
+        if device == "cpu":
+            x, residual, dtype = x.float(), residual if residual is None else residual.float(), torch.float32
+        elif residual is None:
+            dtype = torch.get_autocast_dtype("cuda")
+    return x, weight, bias, residual, eps, dtype
 
 
 def norm_gelu(x: Tensor, mean: Tensor, scale: Tensor, bias: Tensor, *, check: bool = True) -> Tensor:
@@ -211,12 +204,12 @@ def norm_gelu(x: Tensor, mean: Tensor, scale: Tensor, bias: Tensor, *, check: bo
     return torch.ops.gsim3d.norm_gelu(x, mean, scale, bias, scale.dtype)
 
 
-@torch.library.register_fake("gsim3d::norm_gelu")
+@fake("norm_gelu")
 def _(x, mean, scale, bias, dtype):
     return x.new_empty(x.shape, dtype=dtype)
 
 
-@torch.library.register_fake("gsim3d::norm_gelu_backward")
+@fake("norm_gelu_backward")
 def _(grad, x, mean, scale, bias):
     return x.new_empty(x.shape), scale.new_empty(scale.shape), scale.new_empty(scale.shape)
 
@@ -234,33 +227,22 @@ def _gelu_backward(ctx, grad):
 register_gradients("norm_gelu", _gelu_backward, _gelu_setup, gradient_ops=["norm_gelu_backward"])
 
 
-def _gelu_autocast(device: str):
-    keys = torch._C.DispatchKeySet(getattr(torch._C.DispatchKey, f"Autocast{device.upper()}"))
-
-    def rule(x, *others):
-        if x.dtype != torch.float64:
-            x = x.float() if device == "cpu" else x
-            others = [t.float() if isinstance(t, Tensor) else t for t in others]
-        with torch._C._ExcludeDispatchKeyGuard(keys):
-            return torch.ops.gsim3d.norm_gelu(x, *others)
-
-    return rule
+def _gelu_autocast(device, arguments):
+    x, *others = arguments
+    if x.dtype != torch.float64:
+        x = x.float() if device == "cpu" else x
+        others = [t.float() if isinstance(t, Tensor) else t for t in others]
+    return x, *others
 
 
-def _residual_autocast(device: str):
-    keys = torch._C.DispatchKeySet(getattr(torch._C.DispatchKey, f"Autocast{device.upper()}"))
-
-    def rule(x, branch, *others):
-        if branch.dtype != torch.float64:
-            branch = branch.to(torch.get_autocast_dtype("cuda") if device == "cuda" else torch.float32)
-            x, *others = (t.float() if isinstance(t, Tensor) else t for t in (x, *others))
-        with torch._C._ExcludeDispatchKeyGuard(keys):
-            return torch.ops.gsim3d.residual_norm(x, branch, *others)
-
-    return rule
+def _residual_autocast(device, arguments):
+    x, branch, *others = arguments
+    if branch.dtype != torch.float64:
+        branch = branch.to(torch.get_autocast_dtype("cuda") if device == "cuda" else torch.float32)
+        x, *others = (t.float() if isinstance(t, Tensor) else t for t in (x, *others))
+    return x, branch, *others
 
 
-for _device in ("cpu", "cuda"):
-    _library.impl("row_norm", _autocast(_device), f"Autocast{_device.upper()}")
-    _library.impl("residual_norm", _residual_autocast(_device), f"Autocast{_device.upper()}")
-    _library.impl("norm_gelu", _gelu_autocast(_device), f"Autocast{_device.upper()}")
+register_autocast("row_norm", _row_norm_autocast)
+register_autocast("residual_norm", _residual_autocast)
+register_autocast("norm_gelu", _gelu_autocast)

@@ -263,24 +263,27 @@ def _background(device: str) -> float:
     return _compare(device, lambda x, f: ops.add_cells(x, f, places), lambda x, f: x + f[places.cpu()], x, field)
 
 
-def _sentinel(device: str) -> float:
+def _validate_state(device: str) -> float:
     means, opacities, cu_rows = _random(50, 3), torch.linspace(0, 1, 50), torch.tensor([0, 20, 50])
     means[7, 1], opacities[30] = torch.nan, 2.0
     clouds = {"cloud_scene": torch.tensor([0, 1]), "origin": torch.full((2, 3), -9.0, dtype=torch.float64)}
     clouds |= {"activity": torch.zeros(50, dtype=torch.uint8)}
     arguments = [means.to(device), opacities.to(device)], [(-9, 9), (0, 1)], cu_rows.to(device)
     options = {name: value.to(device) for name, value in clouds.items()}
-    watched, parts = ops.watch_rows(*arguments, **options), ops.watch_rows(*arguments, **options, join=False)
-    if not torch.equal(ops.sentinel.joined([parts.record]).reshape(watched.record.shape), watched.record):
+    found, parts = ops.validate_state(*arguments, **options), ops.validate_state(*arguments, **options, join=False)
+    if not torch.equal(ops.join_records([parts.record]).reshape(found.record.shape), found.record):
         raise AssertionError("the parts of a record do not join")
     bad = (~(means.abs() <= 9).all(1)).int() | (opacities > 1).int() << 1
-    if not torch.equal(watched.status.cpu(), bad) or watched.record[:, :4].tolist() != [[1, 7, 0, -1], [0, -1, 1, 30]]:
+    if not torch.equal(found.status.cpu(), bad) or found.record[:, :4].tolist() != [
+        [1, 7, 0, -1],
+        [0, -1, 1, 30],
+    ]:
         raise AssertionError("rows that cannot be used are not those that are out of bounds")
     awake = [(bad == 0)[:20].sum(), (bad == 0)[20:].sum()]
-    if watched.record[:, 8].tolist() != [float(n) for n in awake]:
+    if found.record[:, 8].tolist() != [float(n) for n in awake]:
         raise AssertionError("rows that are awake are counted wrongly")
     opacity = torch.stack([opacities[:20].double().sum(), opacities[20:][opacities[20:] <= 1].double().sum()])
-    return float(((watched.record[:, 10].cpu() - opacity) / opacity).abs().max())
+    return float(((found.record[:, 10].cpu() - opacity) / opacity).abs().max())
 
 
 CHECKS: dict[str, Callable[[str], float]] = {
@@ -292,6 +295,6 @@ CHECKS: dict[str, Callable[[str], float]] = {
     "plane_sweep": _plane_sweep,
     "decode": _decode,
     "background": _background,
-    "sentinel": _sentinel,
+    "sentinel": _validate_state,
     "raster": _raster,
 }

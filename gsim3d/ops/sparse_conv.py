@@ -3,10 +3,8 @@
 import torch
 from torch import Tensor
 
-from gsim3d.ops import _load  # noqa: F401
 from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole
-from gsim3d.ops._autocast import follow_autocast
-from gsim3d.ops._gradients import register_gradients
+from gsim3d.ops._register import fake, register_autocast, register_gradients
 from gsim3d.ops.curve import KernelMap, Voxels
 
 
@@ -86,23 +84,23 @@ def sparse_conv(
     )
 
 
-@torch.library.register_fake("gsim3d::sparse_conv_plan")
+@fake("sparse_conv_plan")
 def _(row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, kernel_size):
     taps, groups = kernel_size**3, (row_voxel.shape[0] + 255) // 256 * 4
     return row_voxel.new_empty(groups * (64 * (taps + 1) + (taps + 31) // 32), dtype=torch.int32)
 
 
-@torch.library.register_fake("gsim3d::sparse_conv")
+@fake("sparse_conv")
 def _(x, weight, bias, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first, plan=None):
     return x.new_empty(x.shape[0], weight.shape[0])
 
 
-@torch.library.register_fake("gsim3d::sparse_conv_grad_input")
+@fake("sparse_conv_grad_input")
 def _(grad, weight, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first, plan=None):
     return grad.new_empty(grad.shape[0], weight.shape[4])
 
 
-@torch.library.register_fake("gsim3d::sparse_conv_grad_weight")
+@fake("sparse_conv_grad_weight")
 def _(grad, x, kernel_size, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first, rounded=False):
     c_out, k, dtype = grad.shape[1], kernel_size, grad.dtype
     if not rounded:
@@ -133,5 +131,4 @@ def _backward(ctx, grad):
 
 _gradient_ops = ["sparse_conv_grad_input", "sparse_conv_grad_weight"]
 register_gradients("sparse_conv", _backward, _setup, gradient_ops=_gradient_ops)
-torch.library.register_autocast("gsim3d::sparse_conv", "cpu", torch.float32)
-follow_autocast("sparse_conv")
+register_autocast("sparse_conv", "follow")

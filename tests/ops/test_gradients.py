@@ -139,7 +139,7 @@ def refused():
         activity = torch.zeros(6, dtype=torch.uint8)
         fields, bounds, cu_rows = [MEANS, x], [(-9, 9), (0, 1)], torch.tensor([0, 6])
         options = {"cloud_scene": zero, "origin": origin, "activity": activity}
-        return ops.watch_rows(fields, bounds, cu_rows, neutral=[0, 0], **options).fields[1]
+        return ops.validate_state(fields, bounds, cu_rows, neutral=[0, 0], **options).fields[1]
 
     return {
         "Ks": (raster, cameras().Ks),

@@ -59,7 +59,7 @@ def _off(value):
         ("background", "row_scenes"),
         ("background", "add_cells"),
         ("background", "overlapping_patches"),
-        ("sentinel", "watch_rows"),
+        ("validate_state", "validate_state"),
         ("patch_attn", "joint_attention"),
         ("row_norm", "residual_norm"),
         ("row_norm", "norm_gelu"),
@@ -70,7 +70,7 @@ def test_an_op_that_computes_wrongly_is_noticed(monkeypatch, check, op):
 
     def wrong(*args, **options):
         found = right(*args, **options)
-        return found._replace(status=found.status + 1) if op == "watch_rows" else _off(found)
+        return found._replace(status=found.status + 1) if op == "validate_state" else _off(found)
 
     monkeypatch.setattr(ops, op, wrong)
     with pytest.raises(AssertionError):

@@ -29,8 +29,8 @@ from tests.ops.test_background import cells_and_rows, chain, overlap
 from tests.ops.test_joint_attention import joint_case, results_of
 from tests.ops.test_patch_attn import cotangent_of, lists, random_case
 from tests.ops.test_plane_sweep import make, run
-from tests.ops.test_sentinel import look, state
 from tests.ops.test_sparse_conv import RULES, convolution, geometry, parameters, random_cells, with_plan
+from tests.ops.test_validate_state import look, state
 
 
 def every_third(wrong):

@@ -145,7 +145,7 @@ def look(bench: Bench):
     bounds = [(-math.inf, math.inf), (0.0, 1.0), (-1e4, 1e4), (-1e4, 1e4)]
 
     clouds = {"cloud_scene": zero, "origin": origin, "activity": activity, "grid_size": 0.01, "previous": previous}
-    watch = partial(ops.watch_rows, fields, bounds, cu_rows, **clouds)
+    watch = partial(ops.validate_state, fields, bounds, cu_rows, **clouds)
 
     def ours():
         return watch().record[0, 12:15].float()

@@ -289,7 +289,7 @@ def _call_watch_rows(a: Arguments):
     fields = [a[f"fields[{f}]"] for f in range(3)]
     previous = [a[f"previous[{f}]"] for f in range(3)] if "previous[0]" in a else None
     others = {name: value for name, value in a.items() if "[" not in name}
-    watched = ops.watch_rows(fields, previous=previous, **others)
+    watched = ops.validate_state(fields, previous=previous, **others)
     awake = a["activity"] != ASLEEP  # who sleeps is not looked at
     if watched.fields is None or not all(bool(field.isfinite().all()) for field in previous or ()):
         return watched.status, watched.record

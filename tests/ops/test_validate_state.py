@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from gsim3d.errors import GradientError
-from gsim3d.ops import watch_rows
-from gsim3d.ops.sentinel import FAST, OUTSIDE, SUMS, joined
+from gsim3d.ops import validate_state
+from gsim3d.ops.validate_state import FAST, OUTSIDE, SUMS, join_records
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
 from tests.oracle import sentinel as oracle
 
@@ -44,7 +44,7 @@ def state(clouds=CLOUDS, dtype=torch.float32, seed=0, device="cpu"):
 def look(arguments):
     """(status, record, mended activity and fields)"""
     fields, bounds, cu_rows, options = arguments
-    watched = watch_rows(fields, bounds, cu_rows, neutral=NEUTRAL, **options)
+    watched = validate_state(fields, bounds, cu_rows, neutral=NEUTRAL, **options)
     return watched.status, watched.record, watched.activity, *watched.fields
 
 
@@ -90,7 +90,7 @@ def test_mends_as_the_oracle(clouds, dtype, knows_previous, device):
 
 def test_rows_are_mended_only_if_asked():
     fields, bounds, cu_rows, options = state()
-    watched = watch_rows(fields, bounds, cu_rows, **options)
+    watched = validate_state(fields, bounds, cu_rows, **options)
     assert watched.fields is None and watched.activity is None
     assert_same_bits(watched.status, look(state())[0])
 
@@ -100,7 +100,7 @@ def test_what_is_counted():
         [[0.5, 0.5, 0.5], [0.5, float("nan"), 0.5], [-0.1, 0.5, 0.5], [0.9, 0.5, 0.5], [3.0, 0.5, 0.5]]
     )
     opacities = torch.tensor([0.25, 0.5, 0.5, 1.0, 2.0])
-    watched = watch_rows(
+    watched = validate_state(
         [means, opacities],
         [(-9.0, 9.0), (0.0, 1.0)],
         torch.tensor([0, 5]),
@@ -118,7 +118,7 @@ def test_what_is_counted():
     assert sums["awake"] == 2 and sums["opacity_mass"] == 2.25  # all but the row whose opacity is 2
     assert sums["kinetic_energy"] == pytest.approx((0.4**2 + 0.4**2) / 2, rel=1e-6)
     assert (sums["low_x"], sums["high_x"]) == pytest.approx((0.5, 0.9))
-    fast = watch_rows(
+    fast = validate_state(
         [means, opacities],
         [(-9.0, 9.0), (0.0, 1.0)],
         torch.tensor([0, 5]),
@@ -163,26 +163,30 @@ def test_any_offsets_stay_in_bounds_on_cuda(devices):
 def test_records_of_several_looks_are_joined_at_once(clouds, device):
     looks = [state(q, seed=seed, device=device) for seed, q in enumerate((clouds, [0, 10, 9000], clouds))]
     looks[1] = (looks[1][0][:2], looks[1][1][:2], looks[1][2], looks[1][3] | {"previous": None})
-    parts = [watch_rows(fields, bounds, cu_rows, join=False, **options) for fields, bounds, cu_rows, options in looks]
-    whole = [watch_rows(fields, bounds, cu_rows, **options) for fields, bounds, cu_rows, options in looks]
+    parts = [
+        validate_state(fields, bounds, cu_rows, join=False, **options) for fields, bounds, cu_rows, options in looks
+    ]
+    whole = [validate_state(fields, bounds, cu_rows, **options) for fields, bounds, cu_rows, options in looks]
     for a, b in zip(parts, whole, strict=True):
         assert a.record.shape == b.record.shape and a.record.dtype == b.record.dtype
         assert a.record.device == b.record.device
-    assert_same_bits(joined([look.record for look in parts]), torch.cat([look.record.reshape(-1) for look in whole]))
+    assert_same_bits(
+        join_records([look.record for look in parts]), torch.cat([look.record.reshape(-1) for look in whole])
+    )
 
 
 def test_more_looks_than_a_launch_takes(device):
     fields, bounds, cu_rows, options = state([0, 3, 9], device=device)
-    one = watch_rows(fields, bounds, cu_rows, join=False, **options).record
-    records = joined([one] * 70).view(70, *one.shape)
-    assert_same_bits(records[69], watch_rows(fields, bounds, cu_rows, **options).record)
+    one = validate_state(fields, bounds, cu_rows, join=False, **options).record
+    records = join_records([one] * 70).view(70, *one.shape)
+    assert_same_bits(records[69], validate_state(fields, bounds, cu_rows, **options).record)
     assert_same_bits(records, records[:1].expand_as(records))
 
 
 def test_offsets_that_descend_count_nothing_on_cuda(devices):
     fields, bounds, cu_rows, options = state(device=devices[1])
     descending = torch.tensor([0, 4000, 300, 5000, 5000, 5000], device=devices[1])
-    record = watch_rows(fields, bounds, descending, **options).record
+    record = validate_state(fields, bounds, descending, **options).record
     assert bool((record[:, 0:14:2] == 0).all()) and bool((record[:, 1:14:2] == -1).all())
 
 
@@ -208,7 +212,7 @@ def test_compiles(device):
     fields, bounds, cu_rows, options = state([0, 3, 9], device=device)
 
     def f(means):
-        watched = watch_rows([means, *fields[1:]], bounds, cu_rows, neutral=NEUTRAL, **options)
+        watched = validate_state([means, *fields[1:]], bounds, cu_rows, neutral=NEUTRAL, **options)
         return watched.status + 0, watched.fields[2]
 
     for a, b in zip(torch.compile(f, fullgraph=True)(fields[0]), f(fields[0]), strict=True):
@@ -241,11 +245,11 @@ def test_a_strided_field(device):
 def test_gradients_pass_by():
     fields, bounds, cu_rows, options = state()
     leaves = [field.requires_grad_() for field in fields]
-    assert not watch_rows(leaves, bounds, cu_rows, **options).record.requires_grad
-    with pytest.raises(GradientError, match=r"watch_rows: fields\[0\] has no gradient"):
-        watch_rows(leaves, bounds, cu_rows, neutral=NEUTRAL, **options)
+    assert not validate_state(leaves, bounds, cu_rows, **options).record.requires_grad
+    with pytest.raises(GradientError, match=r"validate_state: fields\[0\] has no gradient"):
+        validate_state(leaves, bounds, cu_rows, neutral=NEUTRAL, **options)
     with torch.no_grad():
-        assert not watch_rows(leaves, bounds, cu_rows, neutral=NEUTRAL, **options).fields[0].requires_grad
+        assert not validate_state(leaves, bounds, cu_rows, neutral=NEUTRAL, **options).fields[0].requires_grad
 
 
 # 8 error messages
@@ -279,14 +283,14 @@ def test_gradients_pass_by():
 def test_errors_name_what_is_wrong(change, message):
     fields, bounds, cu_rows, options = state()
     fields, options = change(fields, options)
-    with pytest.raises(ValueError, match="watch_rows: .*" + message):
+    with pytest.raises(ValueError, match="(validate_state|watch_rows): .*" + message):
         options["previous"] = options["previous"] if len(fields) == 5 else None
-        watch_rows(fields, bounds[: len(fields)], cu_rows, **options)
+        validate_state(fields, bounds[: len(fields)], cu_rows, **options)
 
 
 def test_parts_that_do_not_fit():
     fields, bounds, cu_rows, options = state()
-    record = watch_rows(fields, bounds, cu_rows, join=False, **options).record
+    record = validate_state(fields, bounds, cu_rows, join=False, **options).record
     for wrong, message in (
         (record._replace(n_rows=9000), "parts must be as watch_rows left them, 13 of 9000 rows; got"),
         (record._replace(parts=record.parts[:, 1:]), "parts must be as watch_rows left them"),
@@ -295,7 +299,7 @@ def test_parts_that_do_not_fit():
         (record._replace(cu_rows=cu_rows.flip(0)), "cu_rows must run from 0 to N=5000; got 5000"),
     ):
         with pytest.raises(ValueError, match="join_parts: " + message):
-            joined([record, wrong])
+            join_records([record, wrong])
     with pytest.raises(ValueError, match="join_parts: parts must be of one look at least"):
         torch.ops.gsim3d.join_parts([record.parts], [], [5000])
 
@@ -304,4 +308,4 @@ def test_offsets_that_do_not_fit():
     fields, bounds, _, options = state()
     for offsets in ([0, 0, 7, 2500, 2500, 4999], [0, 9, 7, 2500, 2500, 5000]):
         with pytest.raises(ValueError, match="watch_rows: cu_rows must"):
-            watch_rows(fields, bounds, torch.tensor(offsets), **options)
+            validate_state(fields, bounds, torch.tensor(offsets), **options)
