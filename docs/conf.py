@@ -1,0 +1,32 @@
+"""Sphinx configuration; build with ``sphinx-build -W docs docs/_build``."""
+
+import sys
+from pathlib import Path
+
+DOCS = Path(__file__).parent
+sys.path[:0] = [str(DOCS), str(DOCS.parent), str(DOCS.parent / "tools" / "bench")]
+
+import generate  # noqa: E402
+
+import gsim3d  # noqa: E402
+
+project, author = "gsim3d", "The gsim3d authors"
+release = version = gsim3d.__version__
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+exclude_patterns = ["_build", "_generated/[!.]*", "notes"]
+html_theme = "furo"
+html_title = f"gsim3d {release}"
+html_copy_source = False
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_heading_anchors = 4
+napoleon_use_rtype = False
+napoleon_custom_sections = ["Gradients", "Determinism", "Source", "Sources", "Shapes", "Wanted"]
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+maximum_signature_line_length = 100
+
+
+def setup(app):
+    """Writes the generated pages before Sphinx reads the sources."""
+    app.connect("builder-inited", lambda app: generate.write_pages(DOCS / "_generated"))

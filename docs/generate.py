@@ -1,0 +1,213 @@
+"""Pages made from the code and from stored numbers, written to docs/_generated when the documentation is built."""
+
+import argparse
+import dataclasses
+import importlib
+import importlib.util
+import inspect
+import json
+import re
+from pathlib import Path
+
+DOCS = Path(__file__).parent
+ROOT, RESULTS = DOCS.parent, DOCS / "results"
+COST_HEAD = ("#", "setting", "kind", "step ms", "p95", "encode ms", "faster", "agreement dB", "masked PSNR dB", "kept")
+
+
+def write_pages(folder: Path) -> None:
+    """Writes every page that changed."""
+    folder.mkdir(exist_ok=True)
+    pages = {
+        "commands": commands(),
+        "configuration": configuration(),
+        "benchmarks": benchmarks(),
+        "effects_cost": effects_cost(),
+        "resting": resting(),
+        "training_steps": training_steps(),
+        "stability": stability(),
+        "knobs": knobs(),
+        **{f"model_{name}": model(name) for name in model_names()},
+        **{f"cost_{name}": cost(name) for name in model_names()},
+    }
+    for name, text in pages.items():
+        file = folder / f"{name}.md"
+        if not file.is_file() or file.read_text() != text:
+            file.write_text(text)
+
+
+def table(head: tuple[str, ...], rows) -> str:
+    """A markdown table."""
+    lines = [head, ("---",) * len(head), *rows]
+    return "\n".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+
+
+# -------------------------------------------------------------------------------------------------- from the code
+
+
+def commands() -> str:
+    """The help of every command."""
+    from gsim3d.cli.arguments import Parser
+    from gsim3d.cli.main import COMMANDS
+
+    parts = []
+    for name, (module, summary) in COMMANDS.items():
+        parser = Parser(prog=f"gsim3d {name}")
+        parser.formatter_class = lambda prog: argparse.RawDescriptionHelpFormatter(prog, width=100)
+        importlib.import_module(module).add_arguments(parser)
+        parts.append(
+            f"## {name}\n\n{summary[0].upper()}{summary[1:]}.\n\n```text\n{parser.format_help().strip()}\n```\n"
+        )
+    return "\n".join(parts)
+
+
+def configuration() -> str:
+    """Every setting of a training run and of a model, from the dataclasses."""
+    from gsim3d.presets import ModelConfig
+    from gsim3d.train.config import TrainConfig
+
+    sections: dict[type, str] = {}
+    _collect(TrainConfig, "", sections)
+    _collect(ModelConfig, "model", sections)
+    return "\n".join(_section(kind, path) for kind, path in sections.items())
+
+
+def _collect(kind: type, path: str, sections: dict[type, str]) -> None:
+    """``kind`` and the dataclasses in its fields, with the key under which they stand."""
+    if kind in sections:
+        return
+    sections[kind] = path
+    for field in dataclasses.fields(kind):
+        default = _default(field)
+        values = default if isinstance(default, tuple) else (default,)
+        for value in values[:1]:
+            if dataclasses.is_dataclass(value):
+                _collect(type(value), f"{path}.{field.name}".lstrip("."), sections)
+
+
+def _default(field: dataclasses.Field):
+    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+
+
+def _section(kind: type, path: str) -> str:
+    known = attributes(kind)
+    rows = []
+    for field in dataclasses.fields(kind):
+        value = _default(field)
+        nested = value[:1] if isinstance(value, tuple) else (value,)
+        shown = "" if value is dataclasses.MISSING or any(map(dataclasses.is_dataclass, nested)) else f"`{value!r}`"
+        rows.append((f"`{field.name}`", shown, known.get(field.name, "")))
+    summary = inspect.getdoc(kind).split("\n\n")[0].replace("\n", " ")
+    title = f"`{path}`" if path else "Top level"
+    return f"## {title}\n\n{_markdown(summary)}\n\n{table(('setting', 'default', 'meaning'), rows)}"
+
+
+def attributes(kind: type) -> dict[str, str]:
+    """Field name -> text, from the section "Attributes" of the docstring of a dataclass."""
+    lines = inspect.getdoc(kind).split("\nAttributes:\n")[-1].splitlines()
+    found, names = {}, ()
+    for line in lines:
+        if entry := re.match(r" {0,4}((?:\w+)(?:, \w+)*): (.*)", line):
+            names = entry[1].split(", ")
+            found.update(dict.fromkeys(names, entry[2]))
+        elif names and line.strip():
+            found.update({name: f"{found[name]} {line.strip()}" for name in names})
+    return {name: _markdown(text) for name, text in found.items()}
+
+
+def _markdown(text: str) -> str:
+    """reStructuredText roles and literals as markdown."""
+    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text).replace("``", "`")
+
+
+def knobs() -> str:
+    """What ``gsim3d profile`` varies."""
+    from gsim3d.profile.settings import KNOBS
+
+    return table(("knob", "kind", "needs"), ((knob.name, knob.kind, knob.needs or "-") for knob in KNOBS))
+
+
+# ---------------------------------------------------------------------------------------------- from stored numbers
+
+
+def _tool(name: str):
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", ROOT / "tools" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _report():
+    return importlib.import_module("report")  # of tools/bench
+
+
+def _records() -> dict:
+    return json.loads((RESULTS / "benchmarks.json").read_text())
+
+
+def benchmarks() -> str:
+    """Every op against its peers."""
+    return _report().page(_records())
+
+
+def effects_cost() -> str:
+    """What each effect costs."""
+    return _report().effects(_records()["effects"])
+
+
+def resting() -> str:
+    """What particles at rest save."""
+    report = _report()
+    return report.rest(report.rows_of(report.SLEEPING))
+
+
+def training_steps() -> str:
+    """Time and memory of a training step."""
+    report = _report()
+    return report.steps_table(json.loads(report.STEPS.read_text()))
+
+
+def stability() -> str:
+    """Every hard case, constant and guard."""
+    return _tool("stability").page(json.loads((RESULTS / "stability.json").read_text()))
+
+
+def model_names() -> list[str]:
+    """The shipped simulators."""
+    from gsim3d import pretrained
+
+    return pretrained.names()
+
+
+def model(name: str) -> str:
+    """The model card, the curves, and the scores of all methods."""
+    from gsim3d import pretrained
+    from gsim3d.evaluate.report import markdown
+
+    folder = pretrained.FOLDER / name
+    scores, recipe = (json.loads((folder / f"{part}.json").read_text()) for part in ("scores", "recipe"))
+    card = (folder / "README.md").read_text()
+    parts = [card, "## Scores of all methods\n", markdown(scores["held_out"], recipe["world"]["world"])]
+    for picture, text in ((f"{name}.png", "Scores by step"), (f"{name}-frames.png", "Truth above prediction")):
+        if (RESULTS / "models" / picture).is_file():
+            parts.append(f"![{text}](../results/models/{picture})\n")
+    return "\n".join(parts)
+
+
+def cost(name: str) -> str:
+    """The reports of accuracy against time of a shipped simulator."""
+    from gsim3d import pretrained
+    from gsim3d.train import checkpoint
+
+    digest = checkpoint.load(pretrained.located(name)).digest
+    parts = []
+    for file in sorted((RESULTS / "cost").glob(f"{name}-*.json")):
+        content = json.loads(file.read_text())
+        old = "" if content["checkpoint"] == digest else "Measured with earlier weights of this simulator.\n\n"
+        facts = f"`{content['command']}`; {content['measured_on']}."
+        lines = "".join(f"- {line}\n" for line in content["throughput"])
+        shown = [f"![{part}](../results/cost/{file.stem}-{part}.png)" for part in ("cost", "stages", "horizon")]
+        parts.append(
+            f"## {content['device']}\n\n{old}{shown[0]}\n\n{table(COST_HEAD, content['rows'])}\n{lines}\n{facts}\n\n"
+            + "\n\n".join(shown[1:])
+        )
+    return "\n\n".join(parts) + "\n"
