@@ -1,5 +1,6 @@
 """Sphinx configuration; build with ``sphinx-build -W docs docs/_build``."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -27,6 +28,16 @@ autodoc_default_options = {"members": True, "show-inheritance": True}
 maximum_signature_line_length = 100
 
 
+def open_sections(app, what, name, obj, options, lines):
+    """Puts the text of ``Gradients: text`` on a line of its own, where napoleon reads it as a section."""
+    opened = []
+    for line in lines:
+        found = re.match(r"(\s*)(Gradients|Determinism|Source|Shapes): (.+)", line)
+        opened += [f"{found[1]}{found[2]}:", f"{found[1]}    {found[3]}"] if found else [line]
+    lines[:] = opened
+
+
 def setup(app):
     """Writes the generated pages before Sphinx reads the sources."""
     app.connect("builder-inited", lambda app: generate.write_pages(DOCS / "_generated"))
+    app.connect("autodoc-process-docstring", open_sections, priority=100)

@@ -189,23 +189,22 @@ def model(name: str) -> str:
     parts = [card, "## Scores of all methods\n", markdown(scores["held_out"], recipe["world"]["world"])]
     for picture, text in ((f"{name}.png", "Scores by step"), (f"{name}-frames.png", "Truth above prediction")):
         if (RESULTS / "models" / picture).is_file():
-            parts.append(f"![{text}](../results/models/{picture})\n")
+            parts.append(f"![{text}]({picture})\n")
     return "\n".join(parts)
 
 
 def cost(name: str) -> str:
     """The reports of accuracy against time of a shipped simulator."""
     from gsim3d import pretrained
-    from gsim3d.train import checkpoint
 
-    digest = checkpoint.load(pretrained.located(name)).digest
+    digest = json.loads((pretrained.FOLDER / name / "scores.json").read_text())["checkpoint"]
     parts = []
     for file in sorted((RESULTS / "cost").glob(f"{name}-*.json")):
         content = json.loads(file.read_text())
         old = "" if content["checkpoint"] == digest else "Measured with earlier weights of this simulator.\n\n"
         facts = f"`{content['command']}`; {content['measured_on']}."
         lines = "".join(f"- {line}\n" for line in content["throughput"])
-        shown = [f"![{part}](../results/cost/{file.stem}-{part}.png)" for part in ("cost", "stages", "horizon")]
+        shown = [f"![{part}]({file.stem}-{part}.png)" for part in ("cost", "stages", "horizon")]
         parts.append(
             f"## {content['device']}\n\n{old}{shown[0]}\n\n{table(COST_HEAD, content['rows'])}\n{lines}\n{facts}\n\n"
             + "\n\n".join(shown[1:])
