@@ -106,9 +106,9 @@ def validate_state(
 
     Example:
         >>> means, zero = torch.tensor([[0.5, 0.5, 0.5], [0.5, float("nan"), 0.5]]), torch.zeros(1, dtype=torch.int64)
-        >>> validated = validate_state([means, torch.ones(2)], [(-9, 9), (0, 1)], torch.tensor([0, 2]), cloud_scene=zero,
-        ...                      origin=torch.zeros(1, 3, dtype=torch.float64),
-        ...                      activity=torch.zeros(2, dtype=torch.uint8))
+        >>> clouds = {"cloud_scene": zero, "origin": torch.zeros(1, 3, dtype=torch.float64)}
+        >>> validated = validate_state([means, torch.ones(2)], [(-9, 9), (0, 1)], torch.tensor([0, 2]), **clouds,
+        ...                            activity=torch.zeros(2, dtype=torch.uint8))
         >>> validated.status.tolist(), validated.record[0, :2].tolist()
         ([0, 1], [1.0, 1.0])
     """
