@@ -8,7 +8,7 @@ import importlib
 
 from gsim3d.errors import check_processor
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 check_processor()
 

@@ -27,7 +27,8 @@ ROOT = Path(__file__).parent.parent
 def test_one_version():
     header = (ROOT / "csrc" / "gsim3d" / "core" / "version.h").read_text()
     assert re.search(r'GSIM3D_VERSION "(.+)"', header).group(1) == gsim3d.__version__
-    assert f"## {gsim3d.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"## [{gsim3d.__version__}] - " in (ROOT / "CHANGELOG.md").read_text()
+    assert f"version: {gsim3d.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 def test_public_names_load():

@@ -1,3 +1,3 @@
 #pragma once
 
-#define GSIM3D_VERSION "0.1.0"
+#define GSIM3D_VERSION "0.2.0"
