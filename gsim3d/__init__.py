@@ -23,7 +23,7 @@ _HOME = {
     "Particles": "gsim3d.state",
     "ProcessorError": "gsim3d.errors",
     "Simulator": "gsim3d.simulator",
-    "StabilityReport": "gsim3d.numerics.policy",
+    "StabilityReport": "gsim3d.numerics.report",
     "autotune": "gsim3d.profile.autotune",
 }
 

@@ -29,7 +29,7 @@ from gsim3d.dynamics import Background, Parts
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.nn.point_transformer import SparseConv
-from gsim3d.numerics.policy import StabilityReport, pack
+from gsim3d.numerics.report import StabilityReport, pack
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.ops.raster import Rendering
 from gsim3d.state import DYNAMIC, CloudTable, Particles, keeping_constants, newest_clouds

@@ -50,9 +50,10 @@ from gsim3d.io import checkpoint
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.nn.gaussian_head import GaussianHead, render
 from gsim3d.nn.multiview_encoder import Encoder, Room, pixel_rows
-from gsim3d.numerics.policy import OnInvalid, StabilityReport, check_on_invalid
+from gsim3d.numerics.policy import OnInvalid, check_on_invalid
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.numerics.speed import Setting, load_speed
-from gsim3d.numerics.validate import check_particles, drop_rows, guard_frames, guard_particles
+from gsim3d.numerics.validate import check_particles, drop_particles, validate_frames, validate_particles
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
@@ -237,9 +238,11 @@ class Simulator(nn.Module):
         config = guard.keywords["config"]
         if room is None:
             self.encoder.check(frames, pixels=config.on_invalid == "raise")
-        frames, spoiled = guard_frames(frames, config, guard.keywords["report"], "encode")
+        frames, spoiled = validate_frames(frames, config, guard.keywords["report"], "encode")
         particles = self.encoder(frames, room, check=False)
-        particles = guard(particles if spoiled is None else drop_rows(particles, pixel_rows(frames, spoiled, room)))
+        if spoiled is not None:
+            particles = drop_particles(particles, pixel_rows(frames, spoiled, room))
+        particles = guard(particles)
         particles = self.dynamics.with_bodies(particles)
         if (dynamics := self.config.dynamics).velocity:
             n_views = None if room is None else len(frames.cameras) // particles.n_clouds
@@ -520,7 +523,7 @@ class Simulator(nn.Module):
     def _guard(
         self, where: str, on_invalid: OnInvalid | None, report: StabilityReport | None, in_workspace: bool = True
     ) -> partial[Particles]:
-        """guard_particles with the limits of this model."""
+        """validate_particles with the limits of this model."""
         limits, dynamics = self.config.stability, self.config.dynamics
         if on_invalid is not None:
             check_on_invalid(on_invalid)
@@ -528,7 +531,7 @@ class Simulator(nn.Module):
         report = self.report if report is None else report
         report.poll()
         return partial(
-            guard_particles,
+            validate_particles,
             config=limits,
             report=report,
             where=where,

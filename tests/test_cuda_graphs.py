@@ -12,7 +12,8 @@ from gsim3d.compat.released_model import ReleasedSimulator
 from gsim3d.cuda_graphs import Captured, CapturedRollout, collecting_nothing, has_no_room
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.errors import CaptureError, InputError, NumericalError
-from gsim3d.numerics.policy import StabilityConfig, StabilityReport
+from gsim3d.numerics.policy import StabilityConfig
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops import PyramidCapacity
 from gsim3d.simulator import Simulator
 from gsim3d.state import DYNAMIC, FROZEN, constant, keeping_constants
@@ -182,7 +183,7 @@ def test_a_graph_tells_the_report(device):
     state, report = make_state(device=device), StabilityReport()
     captured = CapturedRollout(simulator, state, 2, report=report)
     captured(state)
-    assert report.total == 0 and len(report.sentinels) == 4
+    assert report.total == 0 and len(report.statistics) == 4
     means = state.means.clone()
     means[30] = torch.nan
     bad = dataclasses.replace(state, means=means)

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 RINGS = {
     "library": """
         errors effects numerics
-        numerics.policy compat.checkpoints
+        numerics.policy numerics.report compat.checkpoints
         io.terminal io.plain io.pickles io.locks
         cameras
         state

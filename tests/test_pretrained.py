@@ -12,7 +12,7 @@ from gsim3d.cli.main import main
 from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
 from gsim3d.numerics.speed import SPEEDS_FILE
-from gsim3d.testing.invariances import LAWS
+from gsim3d.testing.invariances import INVARIANCES
 from gsim3d.train.restore import restore
 
 PARTS = {"model.safetensors", "config.yaml", "training.jsonl", "recipe.json", "scores.json", "README.md"}
@@ -89,8 +89,8 @@ def test_what_is_shipped_is_whole_and_described(name):
 
 @pytest.mark.parametrize("name", pretrained.names())
 def test_violated_invariances_stand_in_the_model_card(name):
-    laws = pretrained.broken_laws(pretrained.located(name))
-    assert set(laws) <= set(LAWS)
+    laws = pretrained.known_failures(pretrained.located(name))
+    assert set(laws) <= set(INVARIANCES)
     card = (pretrained.FOLDER / name / "README.md").read_text()
     assert ("### Invariances that it violates" in card) == bool(laws)
     for law, found in laws.items():
@@ -100,8 +100,8 @@ def test_violated_invariances_stand_in_the_model_card(name):
 
 def test_other_checkpoints_have_no_known_failures(folder):
     (folder / "ball-tiny").mkdir()
-    assert pretrained.broken_laws(folder / "ball-tiny" / pretrained.WEIGHTS) == {}
-    assert pretrained.broken_laws(folder / "elsewhere" / "run" / pretrained.WEIGHTS) == {}
+    assert pretrained.known_failures(folder / "ball-tiny" / pretrained.WEIGHTS) == {}
+    assert pretrained.known_failures(folder / "elsewhere" / "run" / pretrained.WEIGHTS) == {}
 
 
 def test_all_that_is_shipped_is_small():

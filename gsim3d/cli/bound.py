@@ -1,14 +1,10 @@
-"""`gsim3d bound`: the command of gsim3d.synth.bound."""
+"""``gsim3d bound``: what a perfect simulator scores."""
 
 from __future__ import annotations
 
 import argparse
-import math
 
 from gsim3d.cli.arguments import whole
-from gsim3d.errors import InputError
-from gsim3d.io.files import MAX_TEXT, read_file
-from gsim3d.io.plain import parse_json
 
 EPILOG = """\
 The scenes of a set that gsim3d generate made are simulated again, with errors in how bodies start that images leave
@@ -31,10 +27,8 @@ With --out it may be killed at any time: run it again and it goes on where it st
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of `gsim3d bound` to ``parser``."""
     parser.description = "What a perfect simulator scores that sees the start of a scene as well as images show it."
     parser.epilog = EPILOG
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("set", metavar="SET", help="data set that gsim3d generate made")
     parser.add_argument(
         "--given",
@@ -48,64 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Prints the bounds of the set that ``args`` names; returns the exit code."""
-    from gsim3d.synth.bound import bound
+    from gsim3d.synth.bound import bound, read_given, table
 
     given = None if args.given is None else read_given(args.given)
-    summary = bound(
-        args.set,
-        given=given,
-        trajectories=args.trajectories,
-        processes=args.processes,
-        out=args.out,
-        progress=not args.quiet,
-    )
-    print(table(summary))
+    options = {"trajectories": args.trajectories, "processes": args.processes, "out": args.out}
+    print(table(bound(args.set, given=given, progress=not args.quiet, **options)))
     return 0
-
-
-def read_given(text: str) -> dict[str, float]:
-    """Metric -> PSNR of given steps, dB, from a number or from a file that `gsim3d evaluate` wrote.
-
-    Raises: InputError where it is neither.
-    """
-    try:
-        given = {"psnr_masked": float(text)}
-    except ValueError:
-        try:
-            scores = parse_json(read_file(text, MAX_TEXT))
-            given = {metric: scores.get(f"past.{metric}") for metric in ("psnr_masked", "psnr_body")}
-            given = {metric: float(value) for metric, value in given.items() if value is not None}
-        except (OSError, ValueError, TypeError, AttributeError) as error:
-            raise InputError(f"--given: {text} is neither a number nor a file of scores ({error})") from None
-    if "psnr_masked" not in given:
-        raise InputError(f"--given: {text} has no past.psnr_masked: name metrics.json of gsim3d evaluate")
-    for metric, value in given.items():
-        if not math.isfinite(value):
-            raise InputError(f"--given: {metric} must be finite; got {value}")
-    return given
-
-
-def table(summary: dict) -> str:
-    """The bounds by object and of all scenes, in dB with standard errors."""
-    kinds = [
-        (f"{part}{label}{more}", f"{kind}{suffix}", metric)
-        for metric, part in (("psnr_masked", ""), ("psnr_body", "bodies: "))
-        for suffix, more in (("", ""), ("_given", " + given"))
-        for kind, label in (("one", "one"), ("mean", f"mean of {summary['samples']}"))
-        if metric in summary.get(f"{kind}{suffix}", {})
-    ]
-    rows = [["", *(label for label, _, _ in kinds)]]
-    for name, values in [*summary["objects"].items(), ("all", summary)]:
-        cells = []
-        for _, kind, metric in kinds:
-            mean, error = values[kind][metric]
-            cells.append(f"{mean:.2f}" + ("" if error is None else f" +- {error:.2f}"))
-        rows.append([name, *cells])
-    widths = [max(map(len, column)) for column in zip(*rows)]
-    lines = [
-        "  ".join([row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:]))]) for row in rows
-    ]
-    given = "".join(f", {metric} of given steps {value:.2f}" for metric, value in (summary["given"] or {}).items())
-    head = f"{summary['world']}, {summary['n_scenes']} scenes, {summary['n_future_steps']} steps, dB{given}"
-    return "\n".join([head, *lines])

@@ -28,7 +28,7 @@ sets (--set), with the preset's cameras:
   train     what models learn from
   unseen    shapes that no training set has: cross, dumbbell, knot, pyramid
   several   two or three bodies (diverse rigid: four or five; cloth: two)
-  no-ground bodies are thrown up and fall freely, filmed for 0.7 s (elastic, rigid)
+  no-ground bodies are thrown up and fall freely, recorded for 0.7 s (elastic, rigid)
   raised    the ground lies 15 to 30 cm higher (elastic, rigid)
   higher    from greater heights
 
@@ -48,81 +48,48 @@ it goes on where it stopped. A larger --trajectories adds scenes to a finished s
 """
 
 LENGTH = number(0, above=True)  # metres
-_OPTIONS = {
-    "set": "subset",
-    "size": "image_size",
-    "frames": "n_frames",
-    "fps": "fps",
-    "trajectories": "n_trajectories",
-    "seed": "seed",
-    "objects": "objects",
-    "mesh": "meshes",
-    "mesh_up": "mesh_up",
-    "drop": "drop_height",
-    "body_size": "body_size",
-    "background": "background",
-    "camera_spread": "camera_spread",
-    "depth": "depth",
-    "engine": "engine",
-}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of `gsim3d generate` to ``parser``."""
-    parser.description = "Simulate bodies that fall and film them with calibrated cameras on two rings."
+    parser.description = "Simulates falling bodies and records them with calibrated cameras on two rings."
     parser.epilog = EPILOG
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("world", metavar="WORLD", help="what is simulated: elastic, rigid or cloth")
-    parser.add_argument(
-        "--out", metavar="DIR", required=True, help="folder of the data set; made if absent, continued if unfinished"
-    )
-    parser.add_argument("--preset", default="mini", help="options to start from: mini (default), published or diverse")
-    parser.add_argument("--set", metavar="NAME", help="train (default), or a held-out set, see below")
-    parser.add_argument("--size", type=whole(16, 4096), metavar="PX", help="width and height of the images")
-    parser.add_argument("--frames", type=whole(1), metavar="N", help="steps of a trajectory")
-    parser.add_argument("--fps", type=number(0, above=True), help="steps a second")
-    parser.add_argument(
-        "--trajectories", type=whole(1), metavar="N", help="number of scenes, dealt to the objects in turn"
-    )
-    parser.add_argument("--seed", type=whole(0), help="another seed gives other trajectories (default 0)")
-    parser.add_argument(
-        "--objects",
-        type=_names,
-        metavar="A,B",
-        help="ball,blob,box,capsule,cone,cylinder,ellipsoid,spot,star,torus (default: those of the preset), or none",
-    )
-    parser.add_argument(
+    add, lengths = parser.add_argument, {"type": LENGTH, "nargs": 2, "metavar": ("LOW", "HIGH")}
+    add("world", metavar="WORLD", help="what is simulated: elastic, rigid or cloth")
+    add("--out", metavar="DIR", required=True, help="folder of the data set; made if absent, continued if unfinished")
+    add("--preset", default="mini", help="options to start from: mini (default), published or diverse")
+    add("--set", dest="subset", metavar="NAME", help="train (default), or a held-out set, see below")
+    add("--size", dest="image_size", type=whole(16, 4096), metavar="PX", help="width and height of the images")
+    add("--frames", dest="n_frames", type=whole(1), metavar="N", help="steps of a trajectory")
+    add("--fps", type=number(0, above=True), help="steps a second")
+    add("--trajectories", dest="n_trajectories", type=whole(1), metavar="N", help="scenes, dealt to objects in turn")
+    add("--seed", type=whole(0), help="another seed gives other trajectories (default 0)")
+    objects = "ball,blob,box,capsule,cone,cylinder,ellipsoid,spot,star,torus"
+    add("--objects", type=_names, metavar="A,B", help=f"{objects} (default: those of the preset), or none")
+    add(
         "--mesh",
+        dest="meshes",
         action="append",
         metavar="FILE",
         help="a mesh as one more object, with its texture, or genesis:NAME (duck, dragon, worm, bunny ...) of an "
         "installed genesis-world; repeatable",
     )
-    parser.add_argument("--mesh-up", choices=("y", "z"), help="which axis of mesh files points up (default y)")
-    parser.add_argument("--drop", type=LENGTH, nargs=2, metavar=("LOW", "HIGH"), help="range of drop heights, metres")
-    parser.add_argument(
-        "--body-size", type=LENGTH, nargs=2, metavar=("LOW", "HIGH"), help="range of body diameters, metres"
-    )
-    parser.add_argument("--background", choices=("black", "white"), help="colour behind the ground (default black)")
-    parser.add_argument(
+    add("--mesh-up", choices=("y", "z"), help="which axis of mesh files points up (default y)")
+    add("--drop", dest="drop_height", help="range of drop heights, metres", **lengths)
+    add("--body-size", help="range of body diameters, metres", **lengths)
+    add("--background", choices=("black", "white"), help="colour behind the ground (default black)")
+    add(
         "--camera-spread",
         type=number(0, 0.25),
         metavar="S",
         help="cameras differ from scene to scene: up to S of their distance nearer or farther, other heights and "
         "angles (default 0: the same in all)",
     )
-    parser.add_argument("--depth", action="store_true", default=None, help="also write depth images")
-    parser.add_argument(
-        "--engine", help="mujoco (default), or genesis: the paper's MPM and PBD (pip install 'gsim3d[genesis]')"
-    )
-    parser.add_argument("--processes", type=whole(1), metavar="N", help="default: one a core")
-    parser.add_argument(
-        "--part",
-        type=_part,
-        metavar="I/N",
-        help="make only the I-th of N parts of the scenes, beside other parts; the same call without it ends the set",
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    add("--depth", action="store_true", default=None, help="also write depth images")
+    add("--engine", help="mujoco (default), or genesis: the paper's MPM and PBD (pip install 'gsim3d[genesis]')")
+    add("--processes", type=whole(1), metavar="N", help="default: one a core")
+    part = "make only the I-th of N parts of the scenes, beside other parts; the same call without it ends the set"
+    add("--part", type=_part, metavar="I/N", help=part)
+    add("--quiet", action="store_true", help="no progress bar")
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -138,20 +105,10 @@ def _part(text: str) -> tuple[int, int]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Makes the data set that ``args`` describe; returns the exit code."""
     from gsim3d.synth.run import generate
 
-    given = {field: getattr(args, option) for option, field in _OPTIONS.items()}
-    changes = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items() if v is not None}
-    report = generate(
-        args.out,
-        args.world,
-        preset=args.preset,
-        processes=args.processes,
-        part=args.part,
-        progress=not args.quiet,
-        **changes,
-    )
+    options = {k: tuple(v) if isinstance(v, list) else v for k, v in vars(args).items() if v is not None}
+    report = generate(options.pop("out"), options.pop("world"), progress=not options.pop("quiet"), **options)
     kept = len(report.folders) - report.n_made
     print(f"{len(report.folders)} scenes in {args.out}: {report.n_made} made, {kept} already there")
     for reason, count in sorted(report.rejected.items()):

@@ -15,28 +15,19 @@ from gsim3d.io.terminal import Terminal
 
 # command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called
 COMMANDS = {
-    "generate": ("gsim3d.cli.generate", "simulate and film bodies that fall: a data set of multi-view video"),
+    "generate": ("gsim3d.cli.generate", "make a data set: multi-view video of simulated bodies that fall"),
     "bound": ("gsim3d.cli.bound", "the scores that a perfect simulator has on a generated data set"),
     "check-data": ("gsim3d.cli.check_data", "what is wrong with recorded scenes, and a picture of their cameras"),
     "train": ("gsim3d.cli.train", "learn a simulator from a data set"),
     "simulate": ("gsim3d.cli.simulate", "predict the future of one scene: video and .ply"),
-    "export": ("gsim3d.cli.export", "write 3D Gaussians for other tools: .spz, .splat, .glb, USD, a film"),
-    "plan": ("gsim3d.cli.plan", "which effects of a scene are computed, which are not, and what that costs"),
+    "export": ("gsim3d.cli.export", "write 3D Gaussians for other tools: .spz, .splat, .glb, USD, a video"),
+    "plan": ("gsim3d.cli.plan", "which effects of a scene are computed, and what that costs"),
     "effects": ("gsim3d.cli.effects", "find out which effects a scene needs"),
-    "evaluate": (
-        "gsim3d.cli.evaluate",
-        "measure predictions on a data set, by step, beside baselines and other models",
-    ),
+    "evaluate": ("gsim3d.cli.evaluate", "measure predictions on a data set, beside baselines and other models"),
     "profile": ("gsim3d.cli.profile", "what accuracy costs in time: a report, and settings that keep a promise"),
-    "ablate": (
-        "gsim3d.cli.ablate",
-        "the paper's ablations: the same training with one thing changed, in one table",
-    ),
+    "ablate": ("gsim3d.cli.ablate", "the paper's ablations: the same training with one change, in one table"),
     "weights": ("gsim3d.cli.weights", "install the weights of LPIPS and FVD"),
-    "import": (
-        "gsim3d.cli.import_released",
-        "bring a checkpoint of the authors' release over: same weights, same predictions",
-    ),
+    "import": ("gsim3d.cli.import_released", "convert a checkpoint of the authors' release: the same predictions"),
     "demo": ("gsim3d.cli.demo", "all of it at a small size, in minutes on a CPU"),
     "doctor": ("gsim3d.cli.doctor", "what is installed, what was compiled, and whether every kernel works here"),
 }

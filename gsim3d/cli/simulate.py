@@ -9,7 +9,7 @@ from gsim3d.io.terminal import progress
 from gsim3d.pretrained import CHECKPOINT_HELP, add_fitting
 
 EPILOG = """\
-The scene's first steps are the input; the following ones are predicted, also beyond the end of the film. Written to
+The scene's first steps are the input; the following ones are predicted, also beyond the end of the video. Written to
 DIR: rollout.mp4 (truth above prediction, a column for each camera; VP9, plays in browsers), frames/ (predicted images
 as PNG) and gaussians/step_0000.ply ... (3D Gaussians of every step, for viewers of 3D Gaussian splatting).
 
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/reference/data.md)")
     parser.add_argument("--out", metavar="DIR", required=True, help="folder to write; must not exist yet")
-    parser.add_argument("--steps", type=whole(1), help="steps to predict (default: to the end of the film)")
+    parser.add_argument("--steps", type=whole(1), help="steps to predict (default: to the end of the video)")
     parser.add_argument("--start", type=whole(0), default=0, help="first input step (default: 0)")
     parser.add_argument(
         "--cameras", type=whole(0), nargs="+", metavar="CAM", help="cameras to show (default: up to 4 targets)"

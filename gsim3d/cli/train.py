@@ -47,17 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from contextlib import nullcontext
-    from pathlib import Path
-
     import yaml
 
-    from gsim3d.data import Scene, find_scenes, split_scenes
+    from gsim3d.data import find_scenes, split_scenes
     from gsim3d.errors import InputError
-    from gsim3d.io import checkpoint
-    from gsim3d.io.files import output_path, with_parents
+    from gsim3d.io.files import output_path
     from gsim3d.io.settings import from_dict, load_yaml, to_dict
-    from gsim3d.synth.held_out import origin_of
+    from gsim3d.synth.held_out import refuse_held_out
     from gsim3d.train.config import TrainConfig
 
     config = from_dict(TrainConfig, load_yaml(args.config)) if args.config else TrainConfig()
@@ -70,41 +66,10 @@ def run(args: argparse.Namespace) -> int:
     if args.export:
         output_path(args.export, ".safetensors", "--export")
     folders, _ = split_scenes(find_scenes(args.data))
-    for folder in folders:
-        if (origin := origin_of(folder)) and origin.set_name:
-            raise InputError(
-                f"{folder}: of the {origin.set_name} set (seed {origin.seed}), which no training may see; generate "
-                "trajectories with another --seed"
-            )
-    if args.cache:
-        Path(args.cache).mkdir(parents=True, exist_ok=True)  # a folder that cannot be is told before work begins
-    scenes = [Scene.open(folder, cache_dir=args.cache, fitting=config.data.fitting) for folder in folders]
+    refuse_held_out(folders)
+    options = {name: getattr(args, name) for name in ("cache", "device", "until", "export", "tensorboard", "profile")}
 
-    from gsim3d.cuda_graphs import has_no_room
-    from gsim3d.io.locks import only_one_writer
-    from gsim3d.train.loop import Trainer
-    from gsim3d.train.processes import joined
+    from gsim3d.train.run import train
 
-    out = Path(args.out)
-    out.mkdir(parents=True, exist_ok=True)
-    with joined(args.device) as processes, only_one_writer(out) if processes.is_first else nullcontext():
-        say = print if processes.is_first else lambda *_: None
-        trainer = Trainer(config, scenes, args.out, device=args.device, processes=processes)
-        if trainer.step:
-            came = "" if trainer.same_scenes else "; scenes have come since, so the curve is another one from here on"
-            say(f"going on from step {trainer.step} of {config.n_steps}{came}")
-        try:
-            trainer.run(until=args.until, tensorboard=args.tensorboard, profile=args.profile)
-        except (RuntimeError, MemoryError) as error:
-            if not has_no_room(error):
-                raise
-            raise InputError(
-                f"step {trainer.step}: out of memory ({args.device}): a smaller batch or fewer target_views, larger "
-                f"strides of data, or recompute: [encoder, steps, images] need less; {args.out} goes on from its last "
-                "checkpoint"
-            ) from None
-        say(f"trained to step {trainer.step} of {config.n_steps}: {args.out}")
-        if args.export and processes.is_first:
-            checkpoint.export(checkpoint.load(args.out), with_parents(Path(args.export)))
-            say(f"written: {args.export}")
+    train(config, folders, args.out, **options)
     return 0

@@ -14,6 +14,9 @@ from gsim3d.compat.released_config import ReleasedConfig, Shapes, read_config
 from gsim3d.compat.released_file import ReleasedFile, state_dict
 from gsim3d.compat.released_model import ReleasedSimulator
 from gsim3d.errors import InputError
+from gsim3d.io import checkpoint
+from gsim3d.io.files import new_output_path, with_parents
+from gsim3d.io.settings import load_yaml, to_dict
 from gsim3d.presets import ModelConfig
 
 MAX_NAMED = 8  # tensors that a message lists
@@ -55,14 +58,14 @@ class Imported:
     signs: UntrainedSigns
 
 
-def import_released(checkpoint: str | Path, settings: dict) -> Imported:
+def import_released(path: str | Path, settings: dict) -> Imported:
     """Reads a published checkpoint; ``settings`` is the mapping of its resolved YAML file.
 
     Raises:
         InputError: the file is not such a checkpoint or could run code, a setting is not supported, or tensors are
             missing or have another shape than the settings say; the message names them.
     """
-    with ReleasedFile(checkpoint) as file:
+    with ReleasedFile(path) as file:
         stored, counts = state_dict(file)
         shapes = {name: tensor.shape for name, tensor in stored.items()}
         config = read_config(settings, shapes)
@@ -133,3 +136,52 @@ def _drawn_layer(published: dict[str, Tensor], prefix: str) -> bool:
     weight, bias = published[f"{prefix}weight"], published[f"{prefix}bias"]
     bound = weight[0].numel() ** -0.5 * (1 + 1e-6)
     return weight.abs().max().item() <= bound and bias.abs().max().item() <= bound
+
+
+def write_imported(source: str | Path, settings_file: str | Path, out: str | Path) -> str:
+    """Imports a published checkpoint into the checkpoint folder ``out``; returns a report of what it held.
+
+    Args:
+        source: checkpoint of the authors' release (.ckpt).
+        settings_file: its resolved configuration (.yaml).
+        out: folder to write; must not exist yet.
+    Raises:
+        InputError: a file is none of the release, or its tensors and settings do not fit each other.
+    """
+    out, source, settings = new_output_path(out), Path(source), load_yaml(settings_file)
+    try:
+        imported = import_released(source, settings)
+    except InputError as error:
+        # Messages about the file start with its name, about shapes with "weights", about settings with a key.
+        message = str(error).replace("weights:", f"{source}:", 1) if str(error).startswith("weights:") else str(error)
+        raise InputError(message if message.startswith(str(source)) else f"{settings_file}: {message}") from None
+    config, effects = imported.config, imported.config.effects
+    origin = {"file": source.name, "untrained_blocks": imported.signs.blocks, "notes": list(config.notes)}
+    saved = {
+        "model": to_dict(config.model),
+        "data": config.data,
+        "effects": {"spec": effects.to_dict(), "hash": effects.hash},
+    }
+    state = {"step": imported.counts.get("global_step", 0), "imported": origin}
+    checkpoint.write(with_parents(out), checkpoint.Checkpoint(model=imported.weights, config=saved, state=state))
+    return f"{_report(imported)}\nwritten: {out}"
+
+
+def _report(imported: Imported) -> str:
+    config = imported.config
+    encoder, dynamics = config.model.encoder, config.model.dynamics
+    kind = "explicit" if encoder.explicit else "latent"
+    trained = "".join(f", {name.replace('_', ' ')} {count}" for name, count in imported.counts.items())
+    lines = [
+        f"{imported.n_parameters:,} parameters{trained}",
+        f"{kind} model: {encoder.dynamic_dim} changing and {encoder.static_dim} fixed latents, history of "
+        f"{config.data['history']}, {encoder.n_depths} depths, cells of {dynamics.grid_size:g} m, images of "
+        f"{config.data['image_size'][0]}x{config.data['image_size'][1]}",
+        f"training: {imported.signs.sentence()}",
+    ]
+    lines += [f"note: {note}" for note in config.notes]
+    if imported.ignored:
+        lines.append(f"tensors ignored, as the release does: {', '.join(imported.ignored)}")
+    if config.ignored:
+        lines.append(f"settings that change nothing here: {', '.join(config.ignored)}")
+    return "\n".join(lines)

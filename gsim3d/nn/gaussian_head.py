@@ -21,7 +21,8 @@ from gsim3d.math.spherical_harmonics import (
     rotate_harmonics,
 )
 from gsim3d.nn.layers import RowLinear
-from gsim3d.numerics.policy import OnInvalid, StabilityReport
+from gsim3d.numerics.policy import OnInvalid
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops.raster import Rendering
 from gsim3d.state import Gaussians, Particles
 

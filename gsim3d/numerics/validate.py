@@ -1,4 +1,4 @@
-"""Where data enters the simulator or leaves a step: what cannot be used is found, counted and handled by the policy."""
+"""Validation of data that enters the simulator or leaves a step: invalid values are counted and sanitized."""
 
 from __future__ import annotations
 
@@ -15,33 +15,23 @@ from torch import Tensor
 
 from gsim3d.cameras import Frames
 from gsim3d.errors import InputError, NumericalError
-from gsim3d.numerics.policy import (
-    ACTIONS,
-    FARTHEST,
-    LARGEST,
-    Finding,
-    Reading,
-    Sentinels,
-    StabilityConfig,
-    StabilityReport,
-    at_most,
-    usable_pixels,
-)
+from gsim3d.numerics.policy import ACTIONS, FARTHEST, LARGEST, StabilityConfig, at_most, usable_pixels
+from gsim3d.numerics.report import Finding, Reading, StabilityReport, Statistics
 from gsim3d.ops.validate_state import CELLS, FAST, OUTSIDE, join_records, validate_state
 from gsim3d.state import ASLEEP, ATTRIBUTES, CloudTable, Particles
 
 BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
-ALWAYS = ("means", "opacities")  # are looked at, changed or not
+ALWAYS = ("means", "opacities")  # are validated, changed or not
+_WATCHED = "gsim3d.validated"  # mark of a node of an autograd graph whose gradients are validated
 
 
-_WATCHED = "gsim3d.validated"  # a node of a graph whose gradients are looked at
+class _Checks(NamedTuple):
+    """How the attributes of particles are validated.
 
-
-class _Looks(NamedTuple):
-    """How a guard looks at the fields of particles.
-
-    kinds: (tensor, what is wrong, action) of every kind that validate_state counts.
-    neutral: first number of what stands in for a row that nobody knows, others are 0.
+    Attributes:
+        bounds: (lowest, highest) value of each attribute.
+        kinds: (tensor, what is wrong, action) of every kind that the kernel counts.
+        neutral: first number of the replacement of an invalid value without a previous one; others are 0.
     """
 
     bounds: list[tuple[float, float]]
@@ -49,7 +39,7 @@ class _Looks(NamedTuple):
     neutral: list[float]
 
 
-def _looks_at(names: tuple[str, ...], config: StabilityConfig, max_opacity: float) -> _Looks:
+def _checks(names: tuple[str, ...], config: StabilityConfig, max_opacity: float) -> _Checks:
     limits = {
         "means": (-LARGEST, LARGEST),
         "opacities": (0.0, max_opacity),
@@ -60,13 +50,13 @@ def _looks_at(names: tuple[str, ...], config: StabilityConfig, max_opacity: floa
     action, by_rule = ACTIONS[config.on_invalid], "clamped" if config.on_invalid == "clamp" else "asleep"
     kinds = [(f"particles.{name}", BOUNDED.get(name) or _what(high), action) for name, (_, high) in zip(names, bounds)]
     kinds += [("particles.means", "outside the workspace", by_rule), ("particles.means", "speed limit", by_rule)]
-    return _Looks(bounds, kinds, [float(name == "quats") for name in names])
+    return _Checks(bounds, kinds, [float(name == "quats") for name in names])
 
 
-_recent_looks = functools.lru_cache(maxsize=64)(_looks_at)
+_cached_checks = functools.lru_cache(maxsize=64)(_checks)
 
 
-def guard_particles(
+def validate_particles(
     particles: Particles,
     config: StabilityConfig,
     report: StabilityReport,
@@ -77,38 +67,39 @@ def guard_particles(
     changed: Collection[str] | None = None,
     max_opacity: float = 1.0,
 ) -> Particles:
-    """``particles`` with finite, bounded numbers only; rows that had others are handled by ``config.on_invalid``.
+    """``particles`` with finite, bounded values; invalid particles are handled by ``config.on_invalid``.
 
     Args:
         particles: any clouds.
         config: policy and limits.
-        report: is told of every such row and, with ``previous``, of the sentinels of every cloud.
-        where: what the report calls this place.
-        grid_size: metres, cells in which the dynamics sees them: a row outside the 2^16 cells from its scene's origin
-            falls asleep; 0: there is no such limit.
-        previous: the same rows one step before: a row that moved further than ``config.max_speed`` falls asleep, and
-            rows that cannot be used return to it.
-        changed: fields that differ from ``previous``; others are not looked at again. None: all.
-        max_opacity: larger ones count as out of range.
-    Gradients: through all rows that stay as they are. On the CPU a backward pass raises where a gradient behind rows
-        that did not stay is not finite, unless ``report`` is closed.
+        report: gets a finding for every kind of invalid value and, with ``previous``, statistics of every cloud.
+        where: name of this call in the report.
+        grid_size: metres, edge of a cell: a particle outside the 2^16 cells from its scene's origin falls asleep; 0: no
+            such limit.
+        previous: the same particles one step before: those that moved further than ``config.max_speed`` fall asleep,
+            and invalid ones return to it.
+        changed: attributes that differ from ``previous``; others are not validated again. None: all.
+        max_opacity: larger opacities are out of range.
     Raises:
         NumericalError: ``config.on_invalid`` is "raise", on the CPU.
+    Gradients:
+        Through all valid particles. On the CPU a backward pass raises where the gradient of an invalid particle is not
+        finite, unless ``report`` is closed.
     """
     fields = {
         name: value
         for name, value in particles.row_fields().items()
         if ATTRIBUTES[name].validated and (changed is None or name in changed or name in ALWAYS)
     }
-    looks = (_looks_at if torch.compiler.is_compiling() else _recent_looks)(tuple(fields), config, max_opacity)
+    checks = (_checks if torch.compiler.is_compiling() else _cached_checks)(tuple(fields), config, max_opacity)
     before = None if previous is None else [getattr(previous, name) for name in fields]
     clamps = config.on_invalid == "clamp"
-    is_told = particles.means.is_cuda and not torch.compiler.is_compiling()  # the report, later
-    # the copies that the kernel mends carry no gradients
+    on_gpu = particles.means.is_cuda and not torch.compiler.is_compiling()  # the report gets its record later
+    # the copies that the kernel sanitizes carry no gradients
     in_kernel = not clamps and not (torch.is_grad_enabled() and _have_gradients(fields.values(), before or ()))
     validated = validate_state(
         list(fields.values()),
-        looks.bounds,
+        checks.bounds,
         particles.cu_rows,
         cloud_scene=particles.cloud_scene,
         origin=particles.origin,
@@ -116,32 +107,32 @@ def guard_particles(
         grid_size=grid_size,
         previous=before,
         max_step=config.max_speed,
-        neutral=looks.neutral if in_kernel else None,
-        join=not is_told,
+        neutral=checks.neutral if in_kernel else None,
+        join=not on_gpu,
         check=False,
     )
     if not torch.compiler.is_compiling():
-        read = partial(_read, particles.clouds, where, looks, previous is not None)
-        counts = _places_of_counts(*validated.record.shape, len(looks.kinds))
-        report.record(validated.record, read, counts=counts, at_once=False, join=join_records if is_told else None)
+        read = partial(_read, particles.clouds, where, checks, previous is not None)
+        counts = _count_indices(*validated.record.shape, len(checks.kinds))
+        report.record(validated.record, read, counts=counts, send=False, join=join_records if on_gpu else None)
         if validated.status.device.type == "cpu":
             if not bool(validated.status.any()):
                 return particles
             if torch.is_grad_enabled():
-                _watch_gradients(fields.values(), read(validated.record).findings[0], report)
+                _validate_gradients(fields.values(), read(validated.record).findings[0], report)
     if validated.fields is not None:
-        return _with_rows(particles, dict(zip(fields, validated.fields)) | {"activity": validated.activity})
-    mend = _clamp if clamps else _put_to_sleep
-    return mend(particles, fields, looks.bounds, validated.status, config, grid_size, previous)
+        return _with_fields(particles, dict(zip(fields, validated.fields)) | {"activity": validated.activity})
+    sanitize = _clamp if clamps else _put_to_sleep
+    return sanitize(particles, fields, checks.bounds, validated.status, config, grid_size, previous)
 
 
-def guard_frames(
+def validate_frames(
     frames: Frames, config: StabilityConfig, report: StabilityReport, where: str
 ) -> tuple[Frames, Tensor | None]:
-    """``frames`` with pixels in [0, 1], and bool [I, H, W]: those that must not become particles (None: all may).
+    """``frames`` with pixels in [0, 1], and bool [I, H, W]: pixels that must not become particles (None: all may).
 
-    Numbers that are no colour are 0, where the policy is "clamp" the nearest one, and then particles like any other.
-    "raise" leaves them to the encoder, as every policy does with all other fields of ``frames``: these raise always.
+    Invalid pixels become 0 or, under the policy "clamp", the nearest colour. "raise" leaves them to the encoder, which
+    validates all other fields of ``frames`` under every policy.
     """
     images = frames.images
     if config.on_invalid == "raise":
@@ -158,23 +149,23 @@ _OF_SCENES = ("origin", "world_offset")  # float64, one row a scene
 
 
 def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths: dict[str, int]) -> None:
-    """Looks at what :func:`guard_particles` does not: types, shapes, offsets, indices, origins and choices.
+    """Checks what :func:`validate_particles` does not: types, shapes, offsets, indices, origins and choices.
 
     Args:
-        where: what the message calls this place.
-        dtype: of the network, and so of the rows.
-        widths: channels of fields that the network reads.
+        where: name of this call in messages.
+        dtype: of the network, and so of the particles.
+        widths: channels of attributes that the network reads.
     Raises:
         InputError: the message names the field and what it must be.
-        NumericalError: an origin, or what is remembered of a row, is not finite or too far; on a GPU these are not
-            looked at: rows far from their origin sleep.
+        NumericalError: an origin, or an attribute that steps do not validate, is not finite or too large; not checked
+            on a GPU, where particles far from their origin sleep.
     """
     if torch.compiler.is_compiling():
         return
     if not isinstance(particles, Particles):
         raise InputError(f"{where}: particles must be gsim3d.Particles; got {type(particles).__name__}")
-    rows, device = particles.row_fields(), particles.means.device
-    shapes = {name: (len(particles.means), *ATTRIBUTES[name].shape) for name in rows}
+    device = particles.means.device
+    shapes = {name: (len(particles.means), *ATTRIBUTES[name].shape) for name in particles.row_fields()}
     shapes |= {name: (len(particles.means), width) for name, width in widths.items()}
     shapes |= {"cu_rows": (len(particles.cloud_scene) + 1,), "cloud_scene": (None,), "cloud_step": (None,)}
     shapes["origin"] = (None, 3)
@@ -206,8 +197,10 @@ def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths
 def _check_choices(particles: Particles, where: str) -> None:
     if bool((particles.activity > ASLEEP).any()):
         raise InputError(f"{where}: particles.activity must be 0 (dynamic), 1 (frozen) or 2 (asleep)")
-    unwatched = (name for name, attribute in ATTRIBUTES.items() if not attribute.validated and attribute.dtype is None)
-    for name in (*unwatched, *_OF_SCENES):
+    unvalidated = (
+        name for name, attribute in ATTRIBUTES.items() if not attribute.validated and attribute.dtype is None
+    )
+    for name in (*unvalidated, *_OF_SCENES):
         value = getattr(particles, name)
         if value is None:
             continue
@@ -223,12 +216,12 @@ def _check_choices(particles: Particles, where: str) -> None:
         )
 
 
-def drop_rows(particles: Particles, rows: Tensor) -> Particles:
-    """``particles`` of which ``rows`` (bool [N]) sleep and are not drawn."""
+def drop_particles(particles: Particles, dropped: Tensor) -> Particles:
+    """``particles`` of which those in ``dropped`` (bool [N]) sleep and are not drawn."""
     return dataclasses.replace(
         particles,
-        opacities=torch.where(rows, 0.0, particles.opacities),
-        activity=torch.where(rows, ASLEEP, particles.activity),
+        opacities=torch.where(dropped, 0.0, particles.opacities),
+        activity=torch.where(dropped, ASLEEP, particles.activity),
     )
 
 
@@ -246,29 +239,29 @@ def _what(high: float) -> str:
     return "not finite" if high == LARGEST else f"not finite or beyond {high:g}"
 
 
-def _read(clouds: CloudTable, where: str, looks: _Looks, moved: bool, record: Tensor) -> Reading:
-    """What a record of validate_state says."""
-    findings, sentinels, n_counts = [], {}, 2 * len(looks.kinds)
+def _read(clouds: CloudTable, where: str, checks: _Checks, moved: bool, record: Tensor) -> Reading:
+    """The content of a record of the kernel."""
+    findings, statistics, n_counts = [], {}, 2 * len(checks.kinds)
     for scene, step, numbers in zip(clouds.scenes, clouds.steps, record.tolist(), strict=True):
         if any(numbers[:n_counts:2]):
-            for k, (name, what, action) in enumerate(looks.kinds):
+            for k, (name, what, action) in enumerate(checks.kinds):
                 count, row = (int(number) for number in numbers[2 * k : 2 * k + 2])
                 if count:
                     findings.append(Finding(what, where, name, action, count, row, scene, step))
         if moved:
             awake, energy, opacity, *corners = numbers[n_counts:]
             extent = math.dist(corners[:3], corners[3:]) if awake else 0.0
-            sentinels[scene, step] = Sentinels(int(awake), energy, opacity, extent)
-    return Reading(findings, sentinels)
+            statistics[scene, step] = Statistics(int(awake), energy, opacity, extent)
+    return Reading(findings, statistics)
 
 
 @functools.lru_cache(maxsize=64)
-def _places_of_counts(n_clouds: int, n_columns: int, n_kinds: int) -> tuple[int, ...]:
-    """Where a record of validate_state holds how many rows were bad."""
+def _count_indices(n_clouds: int, n_columns: int, n_kinds: int) -> tuple[int, ...]:
+    """Indices of the counts of invalid particles in a flat record of the kernel."""
     return tuple(q * n_columns + 2 * k for q in range(n_clouds) for k in range(n_kinds))
 
 
-def _with_rows(particles: Particles, fields: dict[str, Tensor]) -> Particles:
+def _with_fields(particles: Particles, fields: dict[str, Tensor]) -> Particles:
     """dataclasses.replace, which calls __init__, in a quarter of the time."""
     if torch.compiler.is_compiling():
         return dataclasses.replace(particles, **fields)
@@ -281,17 +274,17 @@ def _have_gradients(*groups: Iterable[Tensor]) -> bool:
     return any(value.requires_grad for group in groups for value in group)
 
 
-def _watch_gradients(values: Iterable[Tensor], finding: Finding, report: StabilityReport) -> None:
+def _validate_gradients(values: Iterable[Tensor], finding: Finding, report: StabilityReport) -> None:
     """Makes a backward pass through ``values`` raise where what it computes is not finite.
 
-    Rows that were mended have a gradient of 0, which becomes NaN where it meets what overflowed before them.
+    Sanitized particles have a gradient of 0, which becomes NaN where the value before them overflowed.
     """
 
-    def look(gradients, _):
+    def check(gradients, _):
         if not report.is_closed and not all(bool(g.isfinite().all()) for g in gradients if g is not None):
             raise NumericalError(
-                f"{finding}, {finding.action}, and gradients behind it are not finite; mend the inputs of its scene or "
-                "leave it out, or go on under torch.no_grad()",
+                f"{finding}, {finding.action}, and gradients behind it are not finite; correct the inputs of its scene "
+                "or leave it out, or go on under torch.no_grad()",
                 tensor=finding.tensor,
                 scene=finding.scene,
                 step=finding.step,
@@ -303,12 +296,12 @@ def _watch_gradients(values: Iterable[Tensor], finding: Finding, report: Stabili
         node = nodes.pop()
         if node.next_functions and _WATCHED not in node.metadata:  # leaves outlive their graph
             node.metadata[_WATCHED] = True
-            node.register_hook(look)
+            node.register_hook(check)
             nodes += [behind for behind, _ in node.next_functions if behind is not None]
 
 
 def _neutral(name: str, particles: Particles) -> Tensor:
-    """What stands in for a value that nobody knows."""
+    """The replacement of an invalid value that has no previous one."""
     value = getattr(particles, name)
     if name == "means":
         return particles.origin[particles.cloud_scene[particles.row_cloud()]].to(value)
@@ -320,30 +313,30 @@ def _neutral(name: str, particles: Particles) -> Tensor:
 
 def _put_to_sleep(particles, fields, bounds, status, config, grid_size, previous) -> Particles:
     unusable, stays = status & (OUTSIDE - 1) != 0, status & (OUTSIDE - 1 | FAST) == 0
-    mended = {}
+    sanitized = {}
     for name, value in fields.items():
         before = _neutral(name, particles) if previous is None else getattr(previous, name)
         if before is not value:
-            mended[name] = torch.where(stays.reshape(-1, *[1] * (value.dim() - 1)), value, before)
-    opacities = mended.get("opacities", particles.opacities)
-    mended["opacities"] = torch.where(unusable, 0.0, opacities)
-    mended["activity"] = torch.where(status == 0, particles.activity, ASLEEP)
-    return dataclasses.replace(particles, **mended)
+            sanitized[name] = torch.where(stays.reshape(-1, *[1] * (value.dim() - 1)), value, before)
+    opacities = sanitized.get("opacities", particles.opacities)
+    sanitized["opacities"] = torch.where(unusable, 0.0, opacities)
+    sanitized["activity"] = torch.where(status == 0, particles.activity, ASLEEP)
+    return dataclasses.replace(particles, **sanitized)
 
 
 def _clamp(particles, fields, bounds, status, config, grid_size, previous) -> Particles:
-    mended = {}
+    sanitized = {}
     for (name, value), (low, high) in zip(fields.items(), bounds, strict=True):
         before = _neutral(name, particles) if previous is None else getattr(previous, name)
-        mended[name] = torch.where(value.isnan(), before, value).clamp(low, high)
+        sanitized[name] = torch.where(value.isnan(), before, value).clamp(low, high)
     if previous is not None:
-        step = mended["means"] - previous.means
+        step = sanitized["means"] - previous.means
         length = step.double().norm(dim=1, keepdim=True)
         share = (config.max_speed / length.clamp(min=config.max_speed)).to(step)
-        mended["means"] = torch.where(status[:, None] & FAST != 0, previous.means + share * step, mended["means"])
+        sanitized["means"] = torch.where(status[:, None] & FAST != 0, previous.means + share * step, sanitized["means"])
     if grid_size > 0:
         origin = particles.origin[particles.cloud_scene[particles.row_cloud()]]
-        inside = (mended["means"].double() - origin).clamp(0, (CELLS - 0.5) * grid_size)
+        inside = (sanitized["means"].double() - origin).clamp(0, (CELLS - 0.5) * grid_size)
         outside = status[:, None] & (OUTSIDE | FAST | 1) != 0
-        mended["means"] = torch.where(outside, (origin + inside).to(mended["means"]), mended["means"])
-    return dataclasses.replace(particles, **mended)
+        sanitized["means"] = torch.where(outside, (origin + inside).to(sanitized["means"]), sanitized["means"])
+    return dataclasses.replace(particles, **sanitized)

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from gsim3d._core import constants
 from gsim3d.cameras import Cameras
-from gsim3d.numerics.policy import Finding, OnInvalid, Reading, StabilityReport, check_on_invalid
+from gsim3d.numerics.policy import OnInvalid, check_on_invalid
+from gsim3d.numerics.report import Finding, Reading, StabilityReport
 from gsim3d.ops._arguments import check_floating, check_real, check_tensors, check_whole, within_memory
 from gsim3d.ops._register import fake, register_autocast, register_gradients
 

@@ -35,7 +35,7 @@ def add_fitting(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def broken_laws(checkpoint: str | Path) -> dict[str, dict]:
+def known_failures(checkpoint: str | Path) -> dict[str, dict]:
     """Check -> {"what", "error", "bound"}: what a simulator that comes with gsim3d is known to break; {} of others."""
     folder = Path(checkpoint).resolve().parent
     file = folder / LAWS

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.errors import InputError
-from gsim3d.io.files import opencv_path, whole_file, write_whole
+from gsim3d.io.files import MAX_TEXT, opencv_path, read_file, whole_file, write_whole
 from gsim3d.io.plain import parse_json
+from gsim3d.io.terminal import in_columns
 from gsim3d.synth import writer
 from gsim3d.synth.render import BACKGROUND, BODY
 from gsim3d.synth.run import NEEDED, check_processes, each, require_engine, require_packages
@@ -268,3 +270,47 @@ def _mean_psnr(errors: np.ndarray) -> float:
 def _mean_and_error(values: np.ndarray) -> list[float | None]:
     error = float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
     return [float(values.mean()), error]
+
+
+def read_given(text: str) -> dict[str, float]:
+    """Metric -> PSNR of given steps in dB, from a number or from a file that `gsim3d evaluate` wrote.
+
+    Raises:
+        InputError: ``text`` is neither.
+    """
+    try:
+        given = {"psnr_masked": float(text)}
+    except ValueError:
+        try:
+            scores = parse_json(read_file(text, MAX_TEXT))
+            given = {metric: scores.get(f"past.{metric}") for metric in ("psnr_masked", "psnr_body")}
+            given = {metric: float(value) for metric, value in given.items() if value is not None}
+        except (OSError, ValueError, TypeError, AttributeError) as error:
+            raise InputError(f"--given: {text} is neither a number nor a file of scores ({error})") from None
+    if "psnr_masked" not in given:
+        raise InputError(f"--given: {text} has no past.psnr_masked: name metrics.json of gsim3d evaluate")
+    for metric, value in given.items():
+        if not math.isfinite(value):
+            raise InputError(f"--given: {metric} must be finite; got {value}")
+    return given
+
+
+def table(summary: dict) -> str:
+    """A table of the bounds by object and of all scenes, in dB with standard errors."""
+    kinds = [
+        (f"{part}{label}{more}", f"{kind}{suffix}", metric)
+        for metric, part in (("psnr_masked", ""), ("psnr_body", "bodies: "))
+        for suffix, more in (("", ""), ("_given", " + given"))
+        for kind, label in (("one", "one"), ("mean", f"mean of {summary['samples']}"))
+        if metric in summary.get(f"{kind}{suffix}", {})
+    ]
+    rows = [("", *(label for label, _, _ in kinds))]
+    for name, values in [*summary["objects"].items(), ("all", summary)]:
+        cells = []
+        for _, kind, metric in kinds:
+            mean, error = values[kind][metric]
+            cells.append(f"{mean:.2f}" + ("" if error is None else f" +- {error:.2f}"))
+        rows.append((name, *cells))
+    given = "".join(f", {metric} of given steps {value:.2f}" for metric, value in (summary["given"] or {}).items())
+    head = f"{summary['world']}, {summary['n_scenes']} scenes, {summary['n_future_steps']} steps, dB{given}"
+    return f"{head}\n{in_columns(rows)}"

@@ -50,6 +50,16 @@ def origin_of(folder: Path) -> Origin | None:
     return Origin(world, None if subset == TRAIN else str(subset), seed, str(metadata.get("object")))
 
 
+def refuse_held_out(folders: Sequence[Path]) -> None:
+    """Raises InputError where one of the scenes, which training would see, is of a set that models are scored on."""
+    for folder in folders:
+        if (origin := origin_of(folder)) and origin.set_name:
+            raise InputError(
+                f"{folder}: of the {origin.set_name} set (seed {origin.seed}), which no training may see; generate "
+                "trajectories with another --seed"
+            )
+
+
 def set_of(folders: Sequence[Path]) -> dict | None:
     """Which generated set the scenes are of; None: of several, or not of `gsim3d generate`.
 

@@ -1,12 +1,11 @@
-"""Laws that hold for a simulator with any weights: the same scene, told otherwise, has the same future.
+"""Invariances of a simulator with any weights, as metamorphic tests: the transformed scene has the transformed future.
 
-    for deviation in LAWS["permute particles"](simulator, sample):
+    for deviation in INVARIANCES["permute particles"](simulator, sample):
         assert deviation.holds, deviation
 
-Each law tells a scene in two ways, moved or reordered or packed with others, and compares what the simulator makes of
-them: exactly where the same sums are formed, to a bound where they are formed in another order or at another place.
-A rollout amplifies the last bit as the world does, so laws that hold to a bound are checked step by step, each from one
-state; laws that hold exactly are checked on the whole rollout.
+Each invariance is exact where the same sums are formed, and holds to a bound where they are formed in another order or
+at another position. A rollout amplifies rounding as the world does, so invariances with a bound are checked step by
+step, each from one state; exact ones are checked on the whole rollout.
 """
 
 from __future__ import annotations
@@ -30,20 +29,22 @@ from gsim3d.state import DYNAMIC, CloudTable, Gaussians, Particles, attributes_o
 
 EXACT = {torch.float32: 0.0, torch.float64: 1e-12}  # BLAS rounds a row of float64 as the number of rows suggests
 BOUND = 1e-4  # error over the largest value: float32 sums in another order; worst seen 7e-6, on small random models
-FOLLOWED_BOUND = 1e-3  # of velocities, fitted to pixels: images of noise have no motion to find; worst seen 2.9e-4
+VELOCITY_BOUND = 1e-3  # velocities are fitted to pixels, and images of noise have no motion; worst seen 2.9e-4
 IMAGE_BOUND = 1e-3  # root mean square of a pixel's error: one splat whose alpha crosses 1/255 moves one pixel by 0.004
 GRAIN = 2.0**-18  # metres; positions are rounded to it before a scene is moved, so that sums of float32 are exact
-PLACES = attributes_of("point")
-OF_PLACES = (*PLACES, *attributes_of("vector"), "irradiance_gain", "light_occlusion")  # rounded as positions are
+FROM_POSITIONS = (*attributes_of("point"), "velocity", "irradiance_gain", "light_occlusion")  # rounded as positions are
 FAR = 2.0**17  # cells: outside of the 2^16 that a grid has
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What the laws are tried on.
+    """What a check is applied to.
 
-    frames: images of one or more scenes.   targets: cameras to render, ``image_cloud`` is the scene of each.
-    n_steps: length of a rollout.   plan: what to compute; None: all that the model can.
+    Attributes:
+        frames: images of one or more scenes.
+        targets: cameras to render; ``image_cloud`` is the scene of each.
+        n_steps: length of a rollout.
+        plan: what to compute; None: all that the model can.
     """
 
     frames: Frames
@@ -58,7 +59,14 @@ class Sample:
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far one tensor is from what a law says. bound 0: every bit must agree. where: of the largest error."""
+    """How far one tensor is from its expected value.
+
+    Attributes:
+        what: the tensor.
+        error: relative to the largest expected value; absolute where every bit must agree.
+        bound: largest error that is allowed; 0: every bit must agree.
+        where: camera or particle of the largest error.
+    """
 
     what: str
     error: float
@@ -74,13 +82,14 @@ class Deviation:
         return f"{self.what}: error {self.error:.3g} ({wanted}), largest at {self.where}"
 
 
-Law = Callable[[Simulator, Sample], Iterator[Deviation]]
+Check = Callable[[Simulator, Sample], Iterator[Deviation]]
 
 
 def compare(what: str, actual: Tensor, expected: Tensor, bound: float, place: Callable[[int], str]) -> Deviation:
-    """``actual`` against ``expected``, both [N, ...]; the error is relative to the largest expected value.
+    """The deviation of ``actual`` from ``expected``, both [N, ...]; values that are not finite are an infinite error.
 
-    place: the name of row i. What is not finite on either side is an infinite error, unless both have the same bits.
+    Args:
+        place: index of the first dimension -> its name.
     """
     if actual.shape != expected.shape:
         return Deviation(what, float("inf"), bound, f"shape {list(actual.shape)}, expected {list(expected.shape)}")
@@ -88,23 +97,23 @@ def compare(what: str, actual: Tensor, expected: Tensor, bound: float, place: Ca
         return Deviation(what, 0.0, bound, "nothing")
     error = (actual.detach().double() - expected.detach().double()).abs()
     error = torch.where(error.isfinite(), error, torch.inf).reshape(len(error), -1).amax(1)
-    row = int(error.argmax())
+    worst = int(error.argmax())
     scale = float(expected.detach().abs().max()) if bound else 1.0
-    return Deviation(what, float(error[row]) / max(scale, 1e-30), bound, place(row))
+    return Deviation(what, float(error[worst]) / max(scale, 1e-30), bound, place(worst))
 
 
 def compare_particles(
     what: str, actual: Particles, expected: Particles, bound: float, names: Sequence[str] = ()
 ) -> Iterator[Deviation]:
-    """All floating-point fields of two sets of particles, or those of ``names``."""
+    """Deviations of all floating-point attributes of particles, or of those in ``names``."""
     for name, value in expected.row_fields().items():
         if value.is_floating_point() and (not names or name in names):
-            most = FOLLOWED_BOUND if bound == BOUND and name == "velocity" else bound
+            most = VELOCITY_BOUND if bound == BOUND and name == "velocity" else bound
             yield compare(f"{what} {name}", getattr(actual, name), value, most, lambda i: particle_name(expected, i))
 
 
 def compare_images(what: str, actual: Tensor, expected: Tensor, bound: float) -> Deviation:
-    """Images [I, H, W, 3]: bits where the bound is 0, else the root mean square error of the worst image."""
+    """The deviation of images [I, H, W, 3]; with a bound: the root mean square error of the worst image."""
     if not bound or actual.shape != expected.shape:
         return compare(what, actual, expected, bound, lambda i: f"camera {i}")
     error = (actual.detach().double() - expected.detach().double()).square().flatten(1).mean(1).sqrt()
@@ -112,11 +121,19 @@ def compare_images(what: str, actual: Tensor, expected: Tensor, bound: float) ->
     return Deviation(what, float(error.max()), bound, f"camera {int(error.argmax())}")
 
 
-def particle_name(particles: Particles, row: int) -> str:
-    """ "scene 0, step 3, particle 17" of a row."""
+def particle_name(particles: Particles, index: int) -> str:
+    """Scene, step and number in its cloud of a particle, such as "scene 0, step 3, particle 17"."""
     table = particles.clouds
-    cloud = next(q for q in range(len(table)) if row < table.starts[q + 1])
-    return f"scene {table.scenes[cloud]}, step {table.steps[cloud]}, particle {row - table.starts[cloud]}"
+    cloud = next(q for q in range(len(table)) if index < table.starts[q + 1])
+    return f"scene {table.scenes[cloud]}, step {table.steps[cloud]}, particle {index - table.starts[cloud]}"
+
+
+def select_images(frames: Frames, images: Tensor, image_cloud: Tensor | None = None) -> Frames:
+    """``frames`` with ``images`` (int64 [J]) only, in that order, of the clouds ``image_cloud`` (None: as before)."""
+    maps = {name: getattr(frames, name) for name in ("images", "masks", "dynamic", "valid")}
+    maps = {name: None if value is None else value[images] for name, value in maps.items()}
+    cameras = frames.cameras.select(images) if image_cloud is None else frames.cameras.select(images, image_cloud)
+    return dataclasses.replace(frames, **maps, cameras=cameras)
 
 
 def take_scenes(frames: Frames, scenes: Sequence[int]) -> Frames:
@@ -125,13 +142,10 @@ def take_scenes(frames: Frames, scenes: Sequence[int]) -> Frames:
     clouds = [(new, q) for new, scene in enumerate(scenes) for q, own in enumerate(cloud_scene) if own == scene]
     images = [(i, new) for new, (_, q) in enumerate(clouds) for i, cloud in enumerate(image_cloud) if cloud == q]
     device = frames.images.device
-    rows, image_cloud = (torch.tensor(column, device=device) for column in zip(*images, strict=True))
+    image, image_cloud = (torch.tensor(column, device=device) for column in zip(*images, strict=True))
     new_scene, chosen = (torch.tensor(column, device=device) for column in zip(*clouds, strict=True))
-    maps = {name: getattr(frames, name) for name in ("images", "masks", "dynamic", "valid")}
     return dataclasses.replace(
-        frames,
-        **{name: None if value is None else value[rows] for name, value in maps.items()},
-        cameras=frames.cameras.select(rows, image_cloud),
+        select_images(frames, image, image_cloud),
         cloud_scene=new_scene,
         cloud_step=frames.cloud_step[chosen],
         origin=frames.origin[list(scenes)],
@@ -156,15 +170,19 @@ def take_scenes_of_particles(particles: Particles, scenes: Sequence[int]) -> Par
     return particles.with_clouds(new, **fields)
 
 
-def permute_rows(particles: Particles, seed: int = 0) -> tuple[Particles, Tensor]:
-    """The particles of each cloud in another order, and where each new row came from. Clouds of as many rows have the
-    same order: in simulated steps a row is one particle throughout."""
+def reordered(particles: Particles, order: Tensor) -> Particles:
+    """``particles`` whose i-th one is number ``order[i]`` (int64 [N]); clouds must stay together."""
+    return dataclasses.replace(particles, **{name: value[order] for name, value in particles.row_fields().items()})
+
+
+def random_order(particles: Particles, seed: int = 0) -> Tensor:
+    """int64 [N], a permutation of the particles of each cloud, the same one for clouds of equal counts: in simulated
+    steps the n-th particle is the same throughout."""
     table = particles.clouds
     counts = [table.count(q) for q in range(len(table))]
     order = [torch.randperm(n, generator=torch.Generator().manual_seed(seed)) for n in counts]
-    order = torch.cat([start + rows for start, rows in zip(table.starts[:-1], order, strict=True)])
-    order = order.to(particles.means.device)
-    return dataclasses.replace(particles, **{n: v[order] for n, v in particles.row_fields().items()}), order
+    order = torch.cat([start + within for start, within in zip(table.starts[:-1], order, strict=True)])
+    return order.to(particles.means.device)
 
 
 def move_cameras(cameras: Cameras, rotation: Tensor, translation: Tensor) -> Cameras:
@@ -188,7 +206,7 @@ def move_gaussians(gaussians: Gaussians, rotation: Tensor, translation: Tensor) 
 
 
 def rotation_vector(rotation: Tensor) -> Tensor:
-    """[3] radians of a rotation [3, 3] by less than half a turn."""
+    """[3] axis times angle in radians of a rotation [3, 3] by less than half a turn."""
     axis = torch.stack(
         [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
     )
@@ -199,7 +217,7 @@ def rotation_vector(rotation: Tensor) -> Tensor:
 
 
 def random_motion(seed: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """A rotation about any axis by a third to two thirds of half a turn, and a translation of about a metre."""
+    """A random rotation [3, 3] by 60 to 120 degrees, and a random translation [3] of about a metre."""
     g = torch.Generator().manual_seed(seed)
     quat = torch.randn(1, 4, generator=g, dtype=torch.float64)
     quat[0, 0] = quat[0, 1:].norm() * (0.6 + torch.rand((), generator=g, dtype=torch.float64))
@@ -215,20 +233,23 @@ def voxel_shift(simulator: Simulator, like: Tensor) -> Tensor:
 
 
 def on_grain(particles: Particles) -> Particles:
-    """Particles whose positions are multiples of GRAIN."""
-    return _at(particles, lambda places: (places / GRAIN).round() * GRAIN)
+    """``particles`` with positions rounded to multiples of GRAIN."""
+    return _with_positions(particles, lambda positions: (positions / GRAIN).round() * GRAIN)
 
 
-def _at(particles: Particles, moved: Callable[[Tensor], Tensor]) -> Particles:
-    """``particles`` at other places, now and where they began; ``moved`` of float64."""
-    known = {name: value for name in PLACES if (value := getattr(particles, name)) is not None}
-    return dataclasses.replace(
-        particles, **{name: moved(places.double()).to(places.dtype) for name, places in known.items()}
-    )
+def _with_positions(particles: Particles, change: Callable[[Tensor], Tensor]) -> Particles:
+    """``particles`` with changed attributes of kind "point"; ``change`` gets and returns float64."""
+    points = {name: value for name in attributes_of("point") if (value := getattr(particles, name)) is not None}
+    return dataclasses.replace(particles, **{name: change(x.double()).to(x.dtype) for name, x in points.items()})
+
+
+def _moved(particles: Particles, shift: Tensor) -> Particles:
+    moved = _with_positions(particles, lambda positions: positions + shift)
+    return dataclasses.replace(moved, origin=particles.origin + shift)
 
 
 def _states(simulator: Simulator, sample: Sample) -> Iterator[Particles]:
-    """The encoded state and those of a rollout, each with its history."""
+    """The encoded state and the states of a rollout, each with its history."""
     state = simulator.encode(sample.frames).detach()
     for step in range(sample.n_steps):
         yield state
@@ -241,7 +262,7 @@ def _future(simulator: Simulator, state: Particles, sample: Sample) -> list[Part
 
 
 def _exact(particles: Particles) -> float:
-    """The bound of what has equal bits on the CPU: a GPU's BLAS rounds a row as the number of rows suggests, too."""
+    """The bound of sums that are equal on the CPU; the BLAS of a GPU rounds a row as the number of rows suggests."""
     dtype = particles.means.dtype
     return BOUND if particles.means.is_cuda and dtype == torch.float32 else EXACT[dtype]
 
@@ -251,7 +272,7 @@ def _color(simulator: Simulator, particles: Particles, cameras: Cameras) -> Tens
 
 
 def _scene_cameras(cameras: Cameras, scenes: Sequence[int]) -> Cameras:
-    """The cameras of ``scenes``, in that order, with the numbers of their new places."""
+    """The cameras of ``scenes``, in that order, renumbered."""
     owner = cameras.image_cloud.tolist()
     images = [(i, new) for new, scene in enumerate(scenes) for i, own in enumerate(owner) if own == scene]
     rows, clouds = zip(*images, strict=True)
@@ -288,7 +309,7 @@ def translate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
         state = on_grain(state)
         step, there = simulator.step(state, sample.plan), simulator.step(_moved(state, shift), sample.plan)
         step, there = last_steps(step, 1), last_steps(there, 1)
-        moved = [name for name in step.row_fields() if name in OF_PLACES]
+        moved = [name for name in step.row_fields() if name in FROM_POSITIONS]
         unmoved = [name for name in step.row_fields() if name not in moved]
         yield from compare_particles("step", there, step, 0, unmoved)
         yield from compare_particles("step", _moved(there, -shift), step, BOUND, moved)
@@ -298,14 +319,9 @@ def translate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
         yield compare_images("render", picture, image, IMAGE_BOUND)
 
 
-def _moved(particles: Particles, shift: Tensor) -> Particles:
-    particles = _at(particles, lambda places: places + shift)
-    return dataclasses.replace(particles, origin=particles.origin + shift)
-
-
 @torch.no_grad()
 def rotate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """Cameras turned and moved together: depths stay; Gaussians and cameras moved together: images stay."""
+    """Cameras rotated and moved together: depths stay; Gaussians and cameras moved together: images stay."""
     rotation, translation = random_motion(0, sample.frames.origin)
     cameras = move_cameras(sample.frames.cameras, torch.eye(3).to(rotation), 0 * translation)
     frames = dataclasses.replace(sample.frames, cameras=cameras)
@@ -329,13 +345,12 @@ def rotate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 def permute_particles(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     """The particles of each cloud in another order: each has the same future, and the image stays."""
     for state in _states(simulator, sample):
-        shuffled, order = permute_rows(state)
-        step, other = (last_steps(simulator.step(s, sample.plan), 1) for s in (state, shuffled))
+        order = random_order(state)
+        step, other = (last_steps(simulator.step(s, sample.plan), 1) for s in (state, reordered(state, order)))
         runs = state.clouds.row_runs(newest_clouds(state.clouds))
-        place = torch.empty_like(order)
-        place[take_runs(torch.arange(len(order), device=order.device), runs)] = torch.arange(step.n_rows).to(order)
-        came_from = place[take_runs(order, runs)]
-        expected = dataclasses.replace(step, **{n: v[came_from] for n, v in step.row_fields().items()})
+        index = torch.empty_like(order)  # in the newest step, of each particle of the state
+        index[take_runs(torch.arange(len(order), device=order.device), runs)] = torch.arange(step.n_rows).to(order)
+        expected = reordered(step, index[take_runs(order, runs)])
         yield from compare_particles("step", other, expected, BOUND)
         image = _color(simulator, step, sample.targets)
         yield compare_images("render", _color(simulator, expected, sample.targets), image, IMAGE_BOUND)
@@ -347,26 +362,20 @@ def permute_views(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     frames = sample.frames
     n_images = len(frames.cameras)
     reverse = torch.arange(n_images - 1, -1, -1, device=frames.images.device)
-    maps = {name: getattr(frames, name) for name in ("images", "masks", "dynamic", "valid")}
-    turned = dataclasses.replace(
-        frames,
-        **{name: None if value is None else value[reverse] for name, value in maps.items()},
-        cameras=frames.cameras.select(reverse),
-    )
-    state, other = simulator.encode(frames), simulator.encode(turned)
+    backwards = select_images(frames, reverse)
+    state, other = simulator.encode(frames), simulator.encode(backwards)
     n_pixels = frames.images[0, 0].numel()
-    pixels = _pixels_of_rows(turned)  # of the turned images; in terms of the images as they were:
+    pixels = _pixels_of_particles(backwards)  # of the reversed images; of the images as they were:
     pixels = (n_images - 1 - pixels // n_pixels) * n_pixels + pixels % n_pixels
-    back = torch.argsort(pixels)[torch.argsort(torch.argsort(_pixels_of_rows(frames)))]
-    ordered = dataclasses.replace(other, **{name: value[back] for name, value in other.row_fields().items()})
-    yield from compare_particles("encode", ordered, state, BOUND)
+    back = torch.argsort(pixels)[torch.argsort(torch.argsort(_pixels_of_particles(frames)))]
+    yield from compare_particles("encode", reordered(other, back), state, BOUND)
     newest = last_steps(state, 1)
     image = _color(simulator, newest, sample.targets)
     reverse = torch.arange(len(sample.targets) - 1, -1, -1, device=image.device)
     yield compare_images("render", _color(simulator, newest, sample.targets.select(reverse)), image[reverse], 0)
 
 
-def _pixels_of_rows(frames: Frames) -> Tensor:
+def _pixels_of_particles(frames: Frames) -> Tensor:
     """int64 [N], image * H * W + pixel of each encoded particle."""
     n_pixels = frames.images[0, 0].numel()
     order = torch.argsort(frames.cameras.image_cloud, stable=True)
@@ -375,8 +384,8 @@ def _pixels_of_rows(frames: Frames) -> Tensor:
 
 
 def _together_and_apart(simulator: Simulator, sample: Sample, scenes: Sequence[int]) -> Iterator[Deviation]:
-    """Scenes packed in the order ``scenes`` against the order of ``sample``. Equal bits from the particles on; how
-    torch's dense convolutions round in the encoder depends on the number of images."""
+    """Deviations of ``scenes`` packed in that order from the whole sample: equal bits after the encoder, whose dense
+    convolutions round as the number of images suggests."""
     state = simulator.encode(sample.frames)
     packed = take_scenes_of_particles(state, scenes)
     yield from compare_particles("encode", simulator.encode(take_scenes(sample.frames, scenes)), packed, BOUND)
@@ -400,7 +409,7 @@ def permute_scenes(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
 @torch.no_grad()
 def repeat_scene(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """A scene twice in the batch: the same future in both places, and the others do not notice."""
+    """A scene twice in the batch: the same future for both copies, and the others do not change."""
     yield from _together_and_apart(simulator, sample, [*range(sample.n_scenes), 0])
 
 
@@ -412,15 +421,15 @@ def split_batch(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
 
 @torch.no_grad()
-def append_sleeper(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """One more particle in each cloud, far outside the grid: it stays as it is, and the others do not notice."""
+def append_far_particle(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
+    """One more particle in each cloud, far outside the grid: it stays as it is, and the others do not change."""
     state = simulator.encode(sample.frames).detach()
     far, exact = FAR * simulator.config.dynamics.grid_size, _exact(state)
     grown = _with_far_particle(state, far)
-    sleepers = _beyond(last_steps(grown, 1), far)
+    distant = _beyond(last_steps(grown, 1), far)
     for step, other in zip(_future(simulator, state, sample), _future(simulator, grown, sample), strict=True):
         yield from compare_particles("rollout", _beyond(other, far, False), step, exact)
-        yield from compare_particles("the far particle's", _beyond(other, far), sleepers, 0)
+        yield from compare_particles("the far particle's", _beyond(other, far), distant, 0)
     hidden = other.means[:, 0] > far / 2
     invisible = dataclasses.replace(other, opacities=other.opacities.masked_fill(hidden, 0))
     image = _color(simulator, step, sample.targets)
@@ -434,16 +443,16 @@ def _beyond(particles: Particles, far: float, wanted: bool = True) -> Particles:
 
 
 def _with_far_particle(state: Particles, far: float) -> Particles:
-    """``state`` and behind the rows of each cloud that has any a copy of its first row, ``far`` metres away."""
-    table, rows, counts = state.clouds, [], []
+    """``state`` and at the end of each cloud that is not empty a copy of its first particle, ``far`` metres away."""
+    table, order, counts = state.clouds, [], []
     for q in range(len(table)):
         begin, count = table.starts[q], table.count(q)
-        rows += [*range(begin, begin + count), *[begin] * min(1, count)]
+        order += [*range(begin, begin + count), *[begin] * min(1, count)]
         counts.append(count + min(1, count))
-    rows = torch.tensor(rows, device=state.means.device)
-    fields = {name: value[rows] for name, value in state.row_fields().items()}
+    order = torch.tensor(order, device=state.means.device)
+    fields = {name: value[order] for name, value in state.row_fields().items()}
     new = CloudTable.make(counts, table.scenes, table.steps, state.cu_rows.device)
-    is_copy = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
+    is_copy = torch.zeros(len(order), dtype=torch.bool, device=order.device)
     is_copy[[new.starts[q + 1] - 1 for q in range(len(new)) if new.count(q)]] = True
     fields["means"] = fields["means"] + far * is_copy[:, None]
     fields["activity"] = fields["activity"].masked_fill(is_copy, DYNAMIC)
@@ -452,7 +461,7 @@ def _with_far_particle(state: Particles, far: float) -> Particles:
     return state.with_clouds(new, **fields)
 
 
-LAWS: dict[str, Law] = {
+INVARIANCES: dict[str, Check] = {
     "repeat": repeat,
     "translate": translate,
     "rotate": rotate,
@@ -461,5 +470,5 @@ LAWS: dict[str, Law] = {
     "permute scenes": permute_scenes,
     "repeat a scene": repeat_scene,
     "split the batch": split_batch,
-    "append a far particle": append_sleeper,
+    "append a far particle": append_far_particle,
 }

@@ -1,4 +1,4 @@
-"""How long a simulator stays in bounds: curves over a rollout, gradients through it, and hard input made of a sample.
+"""Stress tests of a simulator: curves over a long rollout, gradients through it, and hard inputs made of a sample.
 
 The checks have the form of those in :mod:`gsim3d.testing.invariances`: (simulator, sample) -> deviations.
 """
@@ -17,20 +17,26 @@ from gsim3d.cameras import Cameras, Frames
 from gsim3d.dynamics import last_steps
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import NumericalError
-from gsim3d.numerics.policy import StabilityReport
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.simulator import Simulator
 from gsim3d.state import CloudTable, Particles, take_runs
-from gsim3d.testing.invariances import Deviation, Law, Sample, particle_name, take_scenes_of_particles
+from gsim3d.testing.invariances import Check, Deviation, Sample, particle_name, select_images, take_scenes_of_particles
 
-MAX_MASS_DRIFT = 0.01  # share of the opacity mass that a rollout of a model that holds opacities may lose or gain
+MAX_MASS_DRIFT = 0.01  # relative change of the sum of opacities in a rollout of a model that does not predict them
 GRADIENT_STEPS = 12
 
 
 @dataclass(frozen=True)
 class Curves:
-    """One number a step, over all scenes. kinetic_energy: metres^2 a step^2, for unit masses. opacity_mass: sum of
-    opacities. extent: metres, the largest of a scene. speed: metres, the longest way of a particle in the step.
-    awake: particles that may still change."""
+    """One number per step, over all scenes.
+
+    Attributes:
+        kinetic_energy: (m/step)^2, for unit masses.
+        opacity_mass: sum of opacities.
+        extent: metres, diagonal of the bounds of the largest scene.
+        speed: m/step, the largest displacement of a particle.
+        awake: particles that may still change.
+    """
 
     kinetic_energy: list[float]
     opacity_mass: list[float]
@@ -42,7 +48,7 @@ class Curves:
 def rollout_curves(
     simulator: Simulator, state: Particles, n_steps: int, plan: Plan | None = None, on_step=None
 ) -> Curves:
-    """Energy, opacity, extent and speed of a rollout of any length, in the memory of one step.
+    """Curves of a rollout of any length, in the memory of one step.
 
     Args:
         on_step: called with the newest particles after each step.
@@ -54,7 +60,7 @@ def rollout_curves(
         before = last_steps(state, 1)
         state = simulator.step(state, plan, report=report).detach()
         newest = last_steps(state, 1)
-        rows = report.sentinels.values()
+        rows = report.statistics.values()
         curves.kinetic_energy.append(sum(row.kinetic_energy for row in rows))
         curves.opacity_mass.append(sum(row.opacity_mass for row in rows))
         curves.extent.append(max((row.extent for row in rows), default=0.0))
@@ -71,7 +77,7 @@ def rollout_curves(
 def gradient_norms(
     simulator: Simulator, state: Particles, targets: Cameras, n_steps: int, plan: Plan | None = None
 ) -> tuple[list[float], dict[str, Tensor]]:
-    """How the image of the last step depends on the states before it, and on the parameters.
+    """Gradients of the image of the last step of a rollout.
 
     Returns:
         The norm of the gradient of the image's mean squared value with respect to the state (positions and dynamic
@@ -100,7 +106,7 @@ def _holds(what: str, ok: bool, where: str) -> Deviation:
 
 
 def _finite(what: str, particles: Particles) -> Iterator[Deviation]:
-    """Every number of particles; the first row that holds another is named."""
+    """Whether each attribute is finite; names the first particle that is not."""
     for name, value in particles.row_fields().items():
         if value.is_floating_point() and value.numel():
             bad = ~value.detach().flatten(1).isfinite().all(1) if value.dim() > 1 else ~value.detach().isfinite()
@@ -116,7 +122,7 @@ def _finite_image(what: str, simulator: Simulator, particles: Particles, cameras
 
 
 def _goes_through(what: str, simulator: Simulator, frames: Frames, sample: Sample) -> Iterator[Deviation]:
-    """Encoded, rolled out and rendered, all of it finite."""
+    """Whether encoded particles, their rollout and its image are finite."""
     state = simulator.encode(frames)
     yield from _finite(f"{what}: encoded", state)
     steps = simulator.rollout(state, sample.n_steps, sample.plan, report=StabilityReport())
@@ -126,7 +132,7 @@ def _goes_through(what: str, simulator: Simulator, frames: Frames, sample: Sampl
 
 @torch.no_grad()
 def images(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """Black, white and grey images, and images without a pixel to keep: finite particles, futures and images."""
+    """Black, white and grey images, and images whose masks are empty: finite particles, rollouts and images."""
     frames = sample.frames
     for name, value in {"black": 0.0, "white": 1.0, "grey": 0.5}.items():
         painted = dataclasses.replace(frames, images=torch.full_like(frames.images, value))
@@ -141,20 +147,15 @@ def few_views(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     frames = sample.frames
     cloud = frames.cameras.image_cloud.tolist()
     firsts = [cloud.index(q) for q in sorted(set(cloud))]
-    for name, rows in {
-        "one camera": firsts,
-        "the same camera twice": [i for first in firsts for i in (first, first)],
-    }.items():
-        rows = torch.tensor(rows, device=frames.images.device)
-        maps = {key: getattr(frames, key) for key in ("images", "masks", "dynamic", "valid")}
-        chosen = {key: None if value is None else value[rows] for key, value in maps.items()}
-        few = dataclasses.replace(frames, **chosen, cameras=frames.cameras.select(rows))
+    chosen = {"one camera": firsts, "the same camera twice": [i for first in firsts for i in (first, first)]}
+    for name, images in chosen.items():
+        few = select_images(frames, torch.tensor(images, device=frames.images.device))
         yield from _goes_through(name, simulator, few, sample)
 
 
 @torch.no_grad()
 def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """A pixel, a camera and a particle that are no numbers: named errors, or under "drop" one particle that sleeps."""
+    """NaN in a pixel, a camera and a particle: errors that name them, or a particle that sleeps (on_invalid="drop")."""
     frames = sample.frames
     last = len(frames.cameras) - 1
     pixels, viewmats = frames.images.clone(), frames.cameras.viewmats.clone()
@@ -190,7 +191,7 @@ def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
             step, expected = (take_scenes_of_particles(p, others) for p in (step, expected))
             same = torch.equal(step.means, expected.means) or step.means.dtype == torch.float64
             yield _holds(
-                "scenes beside a particle that is no number go on bit-equal",
+                "scenes beside a particle that is not finite are bit-equal",
                 same,
                 f"step {expected.cloud_step.tolist()}",
             )
@@ -207,7 +208,7 @@ def _refuses(what: str, call: Callable, names: str) -> Deviation:
 
 @torch.no_grad()
 def crowds(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """One particle, all particles in one place, and every particle twice: finite futures and images."""
+    """One particle, all particles at one position, and every particle twice: finite rollouts and images."""
     state = simulator.encode(sample.frames).detach()
     table, device = state.clouds, state.means.device
     first = [(table.starts[q], table.starts[q] + min(1, table.count(q))) for q in range(len(table))]
@@ -231,7 +232,7 @@ def crowds(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
 @torch.no_grad()
 def strange_cameras(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """A camera inside of a particle, one that looks away, one with the scene far off: finite images."""
+    """A camera inside a particle, one facing away, one a thousand kilometres away: finite images."""
     newest = last_steps(simulator.encode(sample.frames).detach(), 1)
     targets = sample.targets.select(torch.zeros(1, dtype=torch.int64, device=newest.means.device))
     if not newest.n_rows:
@@ -251,7 +252,7 @@ def strange_cameras(simulator: Simulator, sample: Sample) -> Iterator[Deviation]
 
 
 def long_rollout(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """A rollout of many steps stays finite and bounded: speed, extent, and opacity where the model holds it."""
+    """A long rollout is finite and bounded: speed, extent, and opacity where the model does not predict it."""
     state, bad = simulator.encode(sample.frames).detach(), []
 
     def look(newest: Particles) -> None:
@@ -265,9 +266,8 @@ def long_rollout(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     limit, step = simulator.config.dynamics.max_step, max(range(sample.n_steps), key=curves.speed.__getitem__)
     limit = simulator.config.stability.max_speed if limit is None else math.sqrt(3) * limit
     yield Deviation("speed over its limit", curves.speed[step] / limit, 1 + 1e-6, f"step {step + 1} of the rollout")
-    held = not simulator.config.dynamics.explicit
     first = curves.opacity_mass[0] if curves.opacity_mass else 0.0
-    if held and first:
+    if first and not simulator.config.dynamics.explicit:
         drift = [abs(mass / first - 1) for mass in curves.opacity_mass]
         step = max(range(len(drift)), key=drift.__getitem__)
         yield Deviation("opacity mass drifts", drift[step], MAX_MASS_DRIFT, f"step {step + 1} of the rollout")
@@ -285,7 +285,7 @@ def gradients(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
         yield _holds("the gradient of a parameter is finite", bool(gradient.isfinite().all()), name)
 
 
-CASES: dict[str, Law] = {
+STRESS_TESTS: dict[str, Check] = {
     "images without content": images,
     "few and equal views": few_views,
     "what is not a number": not_a_number,

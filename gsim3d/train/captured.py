@@ -29,7 +29,7 @@ from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.io.checkpoint import laid_out_as
 from gsim3d.nn.multiview_encoder import Room
-from gsim3d.numerics.policy import StabilityReport
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
 from gsim3d.simulator import Simulator

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from gsim3d.dynamics import concatenate
-from gsim3d.numerics.policy import StabilityReport
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.state import Particles
 
 

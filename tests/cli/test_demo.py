@@ -5,8 +5,8 @@ import json
 
 import pytest
 
-from gsim3d.cli.demo import DemoConfig, comparisons, run_demo
 from gsim3d.errors import InputError
+from gsim3d.evaluate.demo import DemoConfig, comparisons, run_demo
 from gsim3d.io import checkpoint
 from gsim3d.train.config import PhaseConfig, TrainConfig
 from gsim3d.train.restore import model_config
@@ -116,12 +116,12 @@ def test_a_trained_simulator_needs_no_training(finished, tmp_path, capsys):
 
 @pytest.mark.parametrize("options, shipped", [([], True), (["--train"], False)])
 def test_the_command_trains_when_asked_or_when_nothing_is_shipped(options, shipped, tmp_path, monkeypatch):
-    from gsim3d.cli import demo
     from gsim3d.cli.main import main
+    from gsim3d.evaluate import demo
 
     calls = []
     monkeypatch.setattr(demo, "run_demo", lambda out, config: calls.append(config))
     for known in ([demo.SHIPPED.simulator], []):
-        monkeypatch.setattr(demo, "names", lambda known=known: known)
+        monkeypatch.setattr("gsim3d.pretrained.names", lambda known=known: known)
         assert main(["demo", "--out", str(tmp_path), *options]) == 0
     assert calls == [demo.SHIPPED if shipped else DemoConfig(), DemoConfig()]

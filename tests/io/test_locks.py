@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gsim3d.cli.demo import run_demo
 from gsim3d.cli.main import main
 from gsim3d.errors import InputError
+from gsim3d.evaluate.demo import run_demo
 from gsim3d.io.locks import LOCK_FILE, only_one_writer
 from gsim3d.io.settings import to_dict
 from gsim3d.train.loop import Trainer

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsim3d.errors import NumericalError
-from gsim3d.numerics.policy import StabilityReport
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops import rasterize_gaussians
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.ops.raster_scene import Scene, facing, gradients, random_scene

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import NumericalError
-from gsim3d.numerics.policy import StabilityReport
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.presets import ModelConfig
 from gsim3d.simulator import Simulator
 from gsim3d.state import Particles

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from gsim3d.dynamics.state import SCALE_STEP_SHARE, rotate_left
-from gsim3d.numerics.policy import StabilityConfig, StabilityReport
-from gsim3d.numerics.validate import guard_particles
+from gsim3d.numerics.policy import StabilityConfig
+from gsim3d.numerics.report import StabilityReport
+from gsim3d.numerics.validate import validate_particles
 from gsim3d.state import ASLEEP
 from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_history
 from tests.stability.rollouts import finite, make_simulator, of_scene, ordinary, raised
@@ -45,7 +46,7 @@ def test_d42_a_thousand_steps(setting, measured):
     assert means.min() >= -step and means.max() <= 2**16 * CONFIG.dynamics.grid_size + step
     mass = torch.stack([step.opacities.sum() for step in steps])
     assert (mass / mass[0] - 1).abs().max() < 0.01
-    sentinels = report.sentinels
+    sentinels = report.statistics
     assert len(sentinels) == N_LONG and all(math.isfinite(s.kinetic_energy) for s in sentinels.values())
     assert all(finding.action == "asleep" for finding in report.findings)
     measured.outcome("speed, extent and opacity bounded")
@@ -85,7 +86,7 @@ def test_d43_clamped_at_the_border(setting, measured, cell):
     means = newest.means.clone()
     means[3, 1] = cell * size
     report = StabilityReport()
-    held = guard_particles(
+    held = validate_particles(
         dataclasses.replace(newest, means=means), StabilityConfig("clamp"), report, "encode", grid_size=size
     )
     cells = (held.means.double() - newest.origin) / size
@@ -264,7 +265,7 @@ def test_d47_numbers_that_a_step_made_are_dropped(setting, measured, name):
     values = getattr(before, name).clone()
     values[3] = FIELDS[name]
     report = StabilityReport()
-    after = guard_particles(
+    after = validate_particles(
         dataclasses.replace(before, **{name: values}), StabilityConfig("drop"), report, "rollout", previous=before
     )
     assert after.opacities[3] == 0 and after.activity[3] == ASLEEP

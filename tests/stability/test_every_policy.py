@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from gsim3d import GradientError, InputError, NumericalError
-from gsim3d.numerics.policy import StabilityConfig, StabilityReport
-from gsim3d.numerics.validate import guard_particles
+from gsim3d.numerics.policy import StabilityConfig
+from gsim3d.numerics.report import StabilityReport
+from gsim3d.numerics.validate import validate_particles
 from tests.test_simulator import awake, make_frames, make_simulator, target_cameras
 
 NAN, INF = float("nan"), float("inf")
@@ -143,7 +144,7 @@ def test_a_graph_is_watched_once(simulator):
     means = leaf * 2
     bad = torch.where(torch.arange(len(means))[:, None] == 1, NAN, means)
     for _ in range(2):
-        guard_particles(dataclasses.replace(state, means=bad), StabilityConfig("drop"), StabilityReport(), "here")
+        validate_particles(dataclasses.replace(state, means=bad), StabilityConfig("drop"), StabilityReport(), "here")
     assert "gsim3d.watched" in means.grad_fn.metadata
     (grad,) = torch.autograd.grad(bad[2:].sum(), leaf)
     assert bool(grad.isfinite().all())

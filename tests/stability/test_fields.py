@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsim3d.errors import InputError, NumericalError
-from gsim3d.numerics.policy import StabilityReport
+from gsim3d.numerics.report import StabilityReport
 from tests.test_simulator import make_frames, make_simulator
 
 NAN, INF = float("nan"), float("inf")

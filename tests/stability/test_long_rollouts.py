@@ -10,10 +10,10 @@ from gsim3d import presets
 from gsim3d.dynamics import last_steps
 from gsim3d.simulator import Simulator
 from gsim3d.testing.invariances import Sample
-from gsim3d.testing.stress import CASES, gradient_norms, rollout_curves
+from gsim3d.testing.stress import STRESS_TESTS, gradient_norms, rollout_curves
 from gsim3d.train.loop import deterministic
 from tests.dynamics.scenes import batch, float_fields, make_history
-from tests.stability.test_laws import CONFIGS, make_sample, simulators  # noqa: F401
+from tests.stability.test_invariances import CONFIGS, make_sample, simulators  # noqa: F401
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -58,9 +58,9 @@ def test_a_thousand_steps_stay_finite_and_bounded(preset, n_rows, device):
 
 
 @pytest.mark.parametrize("model", CONFIGS)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", STRESS_TESTS)
 def test_case(case, model, device, simulators):  # noqa: F811
-    deviations = list(CASES[case](simulators[model, torch.float32].to(device), make_sample(device)))
+    deviations = list(STRESS_TESTS[case](simulators[model, torch.float32].to(device), make_sample(device)))
     assert deviations
     broken = [str(deviation) for deviation in deviations if not deviation.holds]
     assert not broken, "\n".join(broken)
@@ -78,7 +78,7 @@ def test_a_case_notices_a_simulator_that_diverges():
     diverging = awake(Diverging(CONFIG).eval())
     for case in ("images without content", "few and equal views", "crowds", "a long rollout"):
         try:
-            deviations = list(CASES[case](diverging, make_sample("cpu")))
+            deviations = list(STRESS_TESTS[case](diverging, make_sample("cpu")))
         except ValueError:
             continue
         assert any(not deviation.holds for deviation in deviations), case

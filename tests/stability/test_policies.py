@@ -12,7 +12,8 @@ from gsim3d import presets
 from gsim3d.cameras import Cameras
 from gsim3d.dynamics import last_steps
 from gsim3d.errors import InputError, NumericalError
-from gsim3d.numerics.policy import Finding, Reading, Sentinels, StabilityConfig, StabilityReport, _Record, pack
+from gsim3d.numerics.policy import StabilityConfig
+from gsim3d.numerics.report import Finding, Reading, StabilityReport, Statistics, _Record, pack
 from gsim3d.ops import rasterize_gaussians
 from gsim3d.state import ASLEEP
 from tests.asserts import assert_same_bits
@@ -205,7 +206,7 @@ def test_a_runaway_sleeps_and_the_rest_go_on(kick, what, stays, simulator, state
         assert_finite(after)
         other = rows_of_scene(after, 1)
         assert_same_bits(after.means[other], before.means[other])
-    sentinels = report.sentinels
+    sentinels = report.statistics
     assert sentinels[0, 2].awake - sentinels[0, 3].awake == 1
     assert sentinels[1, 4].awake == sentinels[1, 3].awake
 
@@ -237,7 +238,7 @@ def test_a_good_state_is_left_as_it_is(simulator, state):
             step = simulator.rollout(state, 1, on_invalid=on_invalid, report=report)[0]
             assert_same_bits(step.means, simulator.dynamics(state).means)
     assert report.total == 0 and str(report).startswith("nothing was")
-    assert sorted(report.sentinels) == [(0, 2), (1, 3)]
+    assert sorted(report.statistics) == [(0, 2), (1, 3)]
 
 
 def test_sentinels_are_the_sums_that_they_say(simulator, state):
@@ -246,7 +247,7 @@ def test_sentinels_are_the_sums_that_they_say(simulator, state):
         step = simulator.rollout(state, 1, report=report)[0]
     newest, rows = last_steps(state, 1), rows_of_scene(step, 1)
     now, before = step.means[rows].double(), newest.means[rows].double()
-    sums = report.sentinels[1, 3]
+    sums = report.statistics[1, 3]
     assert sums.awake == int(rows.sum())
     assert sums.kinetic_energy == pytest.approx(float((now - before).square().sum() / 2), rel=1e-9)
     assert sums.opacity_mass == pytest.approx(float(step.opacities[rows].double().sum()), rel=1e-9)
@@ -394,7 +395,7 @@ def test_a_report_is_a_table_plain_data_and_forgets(simulator, state):
     assert total == "total 3"
     assert report.to_dict()["findings"][0]["count"] == report.to_dict()["total"] == 3
     report.clear()
-    assert report.findings == () and report.sentinels == {}
+    assert report.findings == () and report.statistics == {}
 
 
 def replayed(*records):
@@ -403,7 +404,7 @@ def replayed(*records):
 
     def read(numbers, place):
         seen.append(numbers)
-        return Reading([], {(0, place): Sentinels(place, 0.0, 0.0, 0.0)})
+        return Reading([], {(0, place): Statistics(place, 0.0, 0.0, 0.0)})
 
     source._captured = [
         _Record(numbers, partial(read, place=place), counts) for place, (numbers, counts) in enumerate(records)
@@ -431,7 +432,7 @@ def test_records_without_findings_are_read_when_somebody_asks():
     assert len(seen) == 2  # in the order in which they came
     report, seen = replayed((good, (0, 2)), (good, (0, 2)))
     assert report.total == 0 and not seen
-    assert report.sentinels == {(0, place): Sentinels(place, 0.0, 0.0, 0.0) for place in (0, 1)}
+    assert report.statistics == {(0, place): Statistics(place, 0.0, 0.0, 0.0) for place in (0, 1)}
     assert_same_bits(seen[1], good)
     report, seen = replayed((bad, (0, 2)), (good, (0, 2)))
     assert report.total == 0

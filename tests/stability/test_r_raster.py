@@ -6,7 +6,7 @@ import itertools
 import pytest
 import torch
 
-from gsim3d.numerics.policy import StabilityReport
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops import rasterize_gaussians
 from tests.ops.raster_scene import Scene, facing
 from tests.stability.packed import (

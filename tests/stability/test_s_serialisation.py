@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsim3d import ops
-from gsim3d.numerics.policy import StabilityReport
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops import PyramidSpec, curve_encode, sparse_conv
 from gsim3d.simulator import Simulator
 from gsim3d.train.losses import image_errors

@@ -6,12 +6,11 @@ import json
 import numpy as np
 import pytest
 
-from gsim3d.cli.bound import read_given
 from gsim3d.cli.main import main
 from gsim3d.errors import InputError
 from gsim3d.synth import bound as module
 from gsim3d.synth import generate
-from gsim3d.synth.bound import ERRORS, GIVEN, StartErrors, bound
+from gsim3d.synth.bound import ERRORS, GIVEN, StartErrors, bound, read_given
 from gsim3d.synth.worlds import WORLDS, build_world
 
 SMALL = {"image_size": 32, "n_frames": 7, "n_cams": 2, "n_trajectories": 2, "samples": 1, "objects": ("box", "spot")}

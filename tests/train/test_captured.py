@@ -12,7 +12,7 @@ from gsim3d.cuda_graphs import Captured
 from gsim3d.data import Scene, find_scenes
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.evaluate.ablations import changed, load_ablations
-from gsim3d.numerics.policy import StabilityReport
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.train.captured import CapturedLoss
 from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer, deterministic

@@ -8,7 +8,7 @@ import torch
 
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.io import checkpoint
-from gsim3d.numerics.policy import StabilityReport
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.train.config import PhaseConfig
 from gsim3d.train.gradients import StepWatch, mean_of_norms, norms_by_module
 from gsim3d.train.loop import Trainer

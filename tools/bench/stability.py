@@ -19,7 +19,7 @@ import gsim3d.simulator
 from gsim3d import Simulator, ops, presets
 from gsim3d.cameras import Cameras
 from gsim3d.cuda_graphs import CapturedRollout
-from gsim3d.numerics.policy import StabilityReport
+from gsim3d.numerics.report import StabilityReport
 from gsim3d.state import Particles
 
 STEPS = 4  # of a rollout
@@ -59,8 +59,8 @@ def camera(device: torch.device) -> Cameras:
 @contextmanager
 def no_guards():
     """Within it states pass unseen, and nobody counts what the rasterizer leaves out."""
-    guard, render = gsim3d.simulator.guard_particles, gsim3d.simulator.render
-    gsim3d.simulator.guard_particles = lambda particles, *args, **options: particles
+    guard, render = gsim3d.simulator.validate_particles, gsim3d.simulator.render
+    gsim3d.simulator.validate_particles = lambda particles, *args, **options: particles
 
     def uncounted(*args, report, on_invalid, **options):
         return render(*args, **options, on_invalid="drop")
@@ -69,7 +69,7 @@ def no_guards():
     try:
         yield
     finally:
-        gsim3d.simulator.guard_particles, gsim3d.simulator.render = guard, render
+        gsim3d.simulator.validate_particles, gsim3d.simulator.render = guard, render
 
 
 def run_of(simulator: Simulator, state: Particles, cameras: Cameras):

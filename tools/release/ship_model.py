@@ -162,7 +162,7 @@ def with_invariances(card: str, name: str) -> str:
     """The model card with a table of laws.json, where the model violates invariances."""
     head, rest = card.split(LIMITATIONS)
     head = head.split(INVARIANCES)[0].rstrip()
-    broken = pretrained.broken_laws(pretrained.FOLDER / name / pretrained.WEIGHTS)
+    broken = pretrained.known_failures(pretrained.FOLDER / name / pretrained.WEIGHTS)
     if not broken:
         return f"{head}\n\n{LIMITATIONS}{rest}"
     rows = "\n".join(

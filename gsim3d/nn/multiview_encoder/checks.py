@@ -10,7 +10,8 @@ from torch import Tensor
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
-from gsim3d.numerics.policy import ADVICE, FARTHEST, NEAREST, at_most, usable_pixels
+from gsim3d.numerics.policy import FARTHEST, NEAREST, at_most, usable_pixels
+from gsim3d.numerics.report import ADVICE
 
 FLOATS = (torch.float32, torch.float64)
 MAX_PIXELS = 1e9  # of a focal length or a principal point

@@ -41,7 +41,7 @@ from gsim3d.profile.autotune import TIMES, load_speed, load_times
 from gsim3d.simulator import Simulator
 from gsim3d.state import Gaussians
 from gsim3d.synth.meshes import load_body
-from gsim3d.testing import check_stability
+from gsim3d.testing import stability
 from gsim3d.train.config import DataConfig, TrainConfig
 from gsim3d.train.log import LOG, Log
 from gsim3d.train.restore import restore
@@ -320,8 +320,8 @@ def _read_predictions(folder: Path, what: str) -> None:
 
 
 def _write_sample(folder: Path) -> None:
-    sample = check_stability.random_sample(check_stability.open_subject(None))
-    check_stability.save_sample(folder / "s.safetensors", sample, {"check": "repeat"})
+    sample = stability.random_sample(stability.open_subject(None))
+    stability.save_sample(folder / "s.safetensors", sample, {"check": "repeat"})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -387,9 +387,7 @@ READERS = {
     "weights": Reader(_write_weights, _read_weights),
     "predictions": Reader(partial(_write_predictions, video=False), _read_predictions, (), "predicted"),
     "predictions_video": Reader(partial(_write_predictions, video=True), _read_predictions, (), "predicted"),
-    "stability_sample": Reader(
-        _write_sample, lambda folder, what: check_stability.load_sample(folder / "s.safetensors")
-    ),
+    "stability_sample": Reader(_write_sample, lambda folder, what: stability.load_sample(folder / "s.safetensors")),
 }
 
 

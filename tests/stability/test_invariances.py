@@ -8,7 +8,7 @@ import torch
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.simulator import Simulator
 from gsim3d.testing import invariances as laws
-from gsim3d.testing.invariances import LAWS, Sample, take_scenes
+from gsim3d.testing.invariances import INVARIANCES, Sample, take_scenes
 from tests.dynamics.scenes import EXPLICIT
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
 
@@ -45,9 +45,9 @@ def simulators():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 @pytest.mark.parametrize("model", CONFIGS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", INVARIANCES)
 def test_law(law, model, dtype, device, simulators):
-    deviations = list(LAWS[law](simulators[model, dtype].to(device), make_sample(device, dtype)))
+    deviations = list(INVARIANCES[law](simulators[model, dtype].to(device), make_sample(device, dtype)))
     assert deviations
     broken = [str(deviation) for deviation in deviations if not deviation.holds]
     assert not broken, "\n".join(broken)
@@ -58,16 +58,16 @@ def test_law(law, model, dtype, device, simulators):
 def test_laws_hold_for_every_background(law, background, device, simulators):
     simulator = simulators["latent", torch.float32].to(device)
     plan = simulator.plan(EffectsSpec(dynamics=DynamicsEffects(background=background)))
-    assert all(deviation.holds for deviation in LAWS[law](simulator, make_sample(device, plan=plan)))
+    assert all(deviation.holds for deviation in INVARIANCES[law](simulator, make_sample(device, plan=plan)))
 
 
 # Bodies of noise that are stopped amplify the rounding of sums in another order: of rows in another one.
-@pytest.mark.parametrize("law", [law for law in LAWS if law != "permute particles"])
+@pytest.mark.parametrize("law", [law for law in INVARIANCES if law != "permute particles"])
 def test_laws_hold_for_bodies_that_the_ground_pushes(law, device):
     config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **PUSHED))
     # Products of a GPU are rounded by the batch: one step does not amplify that.
     sample = make_sample(device, n_steps=1 if device != "cpu" and law == "split the batch" else 3)
-    broken = [str(x) for x in LAWS[law](awake(make_simulator(config)).to(device), sample) if not x.holds]
+    broken = [str(x) for x in INVARIANCES[law](awake(make_simulator(config)).to(device), sample) if not x.holds]
     assert not broken, "\n".join(broken)
 
 
@@ -86,10 +86,10 @@ class Broken(Simulator):
         return dataclasses.replace(state, means=state.means + 0.01 * state.means.square() + 1e-4 * row)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", INVARIANCES)
 def test_a_law_notices_a_simulator_that_breaks_it(law):
     torch.manual_seed(0)
-    broken = [d for d in LAWS[law](awake(Broken(CONFIG).eval()), make_sample("cpu")) if not d.holds]
+    broken = [d for d in INVARIANCES[law](awake(Broken(CONFIG).eval()), make_sample("cpu")) if not d.holds]
     assert broken and all(":" in str(deviation) for deviation in broken)
 
 

@@ -1,15 +1,18 @@
-"""``gsim3d doctor --stability``: laws and hard cases on one's own model and scenes: a report, a file a failure."""
+"""Invariances and stress tests of a user's model and scenes (``gsim3d doctor --stability``): a report, and a file that
+reproduces each failure."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -23,14 +26,15 @@ from gsim3d.data.check import check_scene
 from gsim3d.errors import InputError, did_you_mean
 from gsim3d.io.files import write_whole
 from gsim3d.io.terminal import progress
-from gsim3d.pretrained import broken_laws, located, names
+from gsim3d.pretrained import known_failures, located, names
 from gsim3d.simulator import Simulator
-from gsim3d.testing.invariances import LAWS, Deviation, Sample
-from gsim3d.testing.stress import CASES
+from gsim3d.synth.cameras import look_at
+from gsim3d.testing.invariances import INVARIANCES, Deviation, Sample
+from gsim3d.testing.stress import STRESS_TESTS
 from gsim3d.train.restore import PRESETS, Restored, build_simulator, restore
 from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
-CHECKS = {**LAWS, **CASES}
+CHECKS = {**INVARIANCES, **STRESS_TESTS}
 LONG, SHORT = "a long rollout", 3  # steps of all other checks
 N_STEPS = 100
 MAX_SCENES, MAX_HISTORY, MAX_PIXELS = 2, 2, 150  # what a quick check computes with (pixels of an image)
@@ -41,9 +45,18 @@ RANDOM_SIZE = 32  # pixels of the images that are made where there are none
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found. outcome: "holds", "fails", "known failure" (the model card has it) or "not promised".
-    worst: the deviation nearest to, or farthest beyond, its bound.   failures: those that do not hold.   file: it
-    reproduces them.   reason: why it is not promised, or what the model card says."""
+    """What one check found.
+
+    Attributes:
+        check: its name.
+        outcome: "holds", "fails", "known failure" (the model card has it) or "not promised".
+        n_compared: number of deviations.
+        seconds: duration of the check.
+        worst: the deviation nearest to, or farthest beyond, its bound.
+        failures: deviations that do not hold.
+        file: reproduces the failures.
+        reason: why it is not promised, or what the model card says.
+    """
 
     check: str
     outcome: str
@@ -57,7 +70,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class Report:
-    """subject: what was checked, by name.   problems: of scenes that could not be read.   findings: one a check."""
+    """What all checks found.
+
+    Attributes:
+        subject: what was checked, by name.
+        problems: of scenes that could not be read.
+        findings: one per check.
+    """
 
     subject: dict[str, str]
     problems: tuple[str, ...] = ()
@@ -70,28 +89,35 @@ class Report:
 
 @dataclass(frozen=True)
 class Subject:
-    """A simulator to check, how to have it again, and what to call it."""
+    """A simulator to check.
+
+    Attributes:
+        simulator: the model.
+        origin: checkpoint or preset that it was made from.
+        restored: its checkpoint; None: random weights.
+        known: check -> failure that the model card has.
+    """
 
     simulator: Simulator
     origin: dict[str, str]
     restored: Restored | None = None
-    known: dict[str, dict] = dataclasses.field(default_factory=dict)  # what the model card says that it breaks
+    known: dict[str, dict] = dataclasses.field(default_factory=dict)
 
 
 def is_checkpoint(path: Path) -> bool:
-    """A run folder, a checkpoint folder or an exported file."""
+    """Whether ``path`` is a run folder, a checkpoint folder or an exported file."""
     if path.is_file():
         return path.suffix == ".safetensors"
     return (path / "checkpoints").is_dir() or (path / "state.json").is_file()
 
 
 def open_subject(path: str | Path | None, device: str = "cpu") -> Subject:
-    """The simulator of a checkpoint, or of a preset ("tiny" where None) with random weights of which none is zero."""
+    """The simulator of a checkpoint, or of a preset (None: "tiny") with random weights of which none is zero."""
     preset = "tiny" if path is None else str(path)
     if preset not in PRESETS:
         restored = restore(path, device)
         restored.simulator.requires_grad_()
-        return Subject(restored.simulator, {"checkpoint": str(path)}, restored, broken_laws(path))
+        return Subject(restored.simulator, {"checkpoint": str(path)}, restored, known_failures(path))
     simulator = build_simulator(getattr(presets, preset)(), seed=0)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -101,9 +127,10 @@ def open_subject(path: str | Path | None, device: str = "cpu") -> Subject:
 
 
 def sample_of_scenes(subject: Subject, folders: Sequence[Path], full: bool = False) -> tuple[Sample | None, list[str]]:
-    """The first steps and evenly spread views of up to two scenes that load; what is wrong with those that do not.
+    """First steps and evenly spread views of up to two scenes that load; problems of those that do not.
 
-    full: four views, the whole history and every particle that the model makes of them.
+    Args:
+        full: four views, the whole history and all particles, instead of few of each.
     """
     scenes, problems = [], []
     for folder in folders:
@@ -123,12 +150,11 @@ def sample_of_scenes(subject: Subject, folders: Sequence[Path], full: bool = Fal
     cams = [_views(subject, scene, FULL_VIEWS if full else None) for scene in scenes]
     masked = all(scene.has_segmentation() for scene in scenes)
     frames = make_frames(scenes, cams, [range(history)] * len(scenes), masked=masked)
-    frames = _as_trained(subject, frames) if full else _thinned(frames)
+    if not full:
+        frames = _subsampled(frames)
+    elif subject.restored is not None:
+        frames = subsampled(frames, subject.restored.data)
     return _sample(subject, frames), problems
-
-
-def _as_trained(subject: Subject, frames: Frames) -> Frames:
-    return frames if subject.restored is None else subsampled(frames, subject.restored.data)
 
 
 def _views(subject: Subject, scene: Scene, count: int | None = None) -> list[int]:
@@ -145,7 +171,9 @@ def random_sample(subject: Subject) -> Sample:
     generator = torch.Generator().manual_seed(0)
     n_steps = (min(MAX_HISTORY, 2**subject.simulator.config.dynamics.history_bits), 1)
     n_clouds, n_views = sum(n_steps), 3
-    viewmats = torch.stack([_looking_at_the_origin(0.4 + 2.0 * v) for v in range(n_views)]).float()
+    angles = [0.4 + 2.0 * view for view in range(n_views)]
+    centers = [np.array([2.0 * math.cos(angle), 2.0 * math.sin(angle), 1.0]) for angle in angles]
+    viewmats = torch.from_numpy(np.stack([look_at(center, np.zeros(3)) for center in centers])).float()
     K = torch.tensor([[1.2 * size[0], 0, size[0] / 2], [0, 1.2 * size[0], size[1] / 2], [0, 0, 1]])
     n = n_clouds * n_views
     cameras = Cameras(
@@ -165,25 +193,11 @@ def random_sample(subject: Subject) -> Sample:
         masks=torch.rand(n, size[1], size[0], generator=generator) < 0.3,
         dynamic=torch.rand(n, size[1], size[0], generator=generator) < 0.7,
     )
-    return _sample(subject, _thinned(frames))
+    return _sample(subject, _subsampled(frames))
 
 
-def _looking_at_the_origin(angle: float) -> Tensor:
-    """World-to-camera [4, 4] of a camera 2.2 m away, 1 m above."""
-    center = torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64)
-    turn = torch.tensor(angle, dtype=torch.float64)
-    center = torch.stack([center[0] * turn.cos(), center[0] * turn.sin(), center[2]])
-    forward = -center / center.norm()
-    right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-    right = right / right.norm()
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ center
-    return pose
-
-
-def _thinned(frames: Frames) -> Frames:
-    """At most MAX_PIXELS of the pixels that an image keeps, evenly spread."""
+def _subsampled(frames: Frames) -> Frames:
+    """``frames`` whose masks keep at most MAX_PIXELS of an image, evenly spread."""
     kept = torch.ones_like(frames.images[:, 0], dtype=torch.bool) if frames.masks is None else frames.masks
     number = kept.flatten(1).cumsum(1)
     every = (number[:, -1:] + MAX_PIXELS - 1).div(MAX_PIXELS, rounding_mode="floor").clamp(min=1)
@@ -191,7 +205,7 @@ def _thinned(frames: Frames) -> Frames:
 
 
 def _sample(subject: Subject, frames: Frames) -> Sample:
-    """Every scene also rendered by the cameras of its first step."""
+    """``frames`` as a sample whose target cameras are those of the first step of every scene."""
     scene_of_image = frames.cloud_scene[frames.cameras.image_cloud]
     first = (frames.cloud_step[frames.cameras.image_cloud] == 0).nonzero()[:, 0]
     targets = frames.cameras.select(first, scene_of_image[first])
@@ -207,19 +221,24 @@ def check(
     only: Sequence[str] = (),
     on_check: Callable = lambda name: None,
 ) -> Iterator[tuple[Finding, Sample]]:
-    """Every check, or those of ``only``, with the sample it was tried on."""
+    """The finding of every check, or of those in ``only``, with the sample it was applied to.
+
+    Args:
+        n_steps: of the long rollout.
+        on_check: called with the name of each check before it runs.
+    """
     released = isinstance(subject.simulator, ReleasedSimulator)  # the clouds of a call change each other
     for name in only or CHECKS:
         on_check(name)
         tried = dataclasses.replace(sample, n_steps=n_steps if name == LONG else SHORT)
-        if released and name in LAWS and name != "repeat":
+        if released and name in INVARIANCES and name != "repeat":
             yield Finding(name, "not promised", reason="the model repeats the behaviour of the release"), tried
             continue
         start, crash = time.perf_counter(), None
         deviations: list[Deviation] = []
         try:
             deviations.extend(CHECKS[name](subject.simulator, tried))
-        except Exception as error:  # whatever goes wrong is what is looked for, and the other checks go on
+        except Exception as error:  # is a finding; the other checks go on
             crash = Deviation(
                 f"ends with {type(error).__name__}", float("inf"), 0.0, " ".join(str(error).split())[:300]
             )
@@ -235,7 +254,11 @@ def check(
 
 
 def save_sample(path: Path, sample: Sample, what: dict) -> None:
-    """Everything that a check is a function of, but the model: tensors, and ``what`` as text."""
+    """Writes the sample of a check: all that it depends on besides the model.
+
+    Args:
+        what: name of the check, and origin of the model.
+    """
     tensors = {f"frames.{k}": v for k, v in vars(sample.frames).items() if isinstance(v, Tensor)}
     tensors |= {f"cameras.{k}": v for k, v in vars(sample.frames.cameras).items() if isinstance(v, Tensor)}
     tensors |= {f"targets.{k}": v for k, v in vars(sample.targets).items() if isinstance(v, Tensor)}
@@ -247,7 +270,7 @@ def save_sample(path: Path, sample: Sample, what: dict) -> None:
 
 
 def load_sample(path: str | Path) -> tuple[Sample, dict]:
-    """What :func:`save_sample` wrote. Raises InputError where it is no such file."""
+    """The sample and ``what`` of :func:`save_sample`. Raises InputError where ``path`` is no such file."""
     try:
         if not Path(path).is_file():  # a pipe would be waited for
             raise InputError(f"{path}: no such file")
@@ -268,7 +291,7 @@ def load_sample(path: str | Path) -> tuple[Sample, dict]:
 
 
 def write_report(report: Report, out: Path) -> None:
-    """report.md and report.json in ``out``."""
+    """Writes report.md and report.json into ``out``."""
     lines = ["# Stability", "", *(f"- {name}: {value}" for name, value in report.subject.items()), ""]
     if report.problems:
         lines += ["## Scenes that cannot be read", "", *(f"- {problem}" for problem in report.problems), ""]
@@ -290,7 +313,7 @@ def write_report(report: Report, out: Path) -> None:
 
 
 def _plain(report: Report) -> dict:
-    """The report as JSON holds it: an infinite error as text."""
+    """The report as plain values; an infinite error is a text."""
 
     def plain(value):
         if dataclasses.is_dataclass(value):
@@ -304,13 +327,18 @@ def _plain(report: Report) -> dict:
     return {"healthy": report.healthy, **plain(report)}
 
 
-@dataclass
+@dataclass(frozen=True)
 class Job:
-    """What the command was asked for.
+    """Options of ``gsim3d doctor --stability``.
 
-    paths: a checkpoint, a scene or a folder of scenes, in any order; none: random weights and images.
-    out: folder of the report.   n_steps: of the long rollout.   only: names of checks; all where empty.
-    full: all particles, four views and the model's whole history.
+    Attributes:
+        paths: a checkpoint, and a scene or folder of scenes, in any order; none: random weights and images.
+        out: folder of the report.
+        n_steps: of the long rollout.
+        only: names of checks; empty: all.
+        device: "cpu" or "cuda".
+        progress: whether a bar is shown.
+        full: all particles, four views and the model's whole history.
     """
 
     paths: Sequence[str] = ()
@@ -322,8 +350,8 @@ class Job:
     full: bool = False
 
 
-def run(job: Job) -> Report:
-    """Checks, writes the report and the files that reproduce failures, and returns the report.
+def check_stability(job: Job) -> Report:
+    """Runs the checks; writes and returns the report, and writes a file that reproduces each failure.
 
     Raises:
         InputError: a path is neither a checkpoint nor a scene nor a folder of scenes, or a check is unknown.
@@ -367,7 +395,7 @@ def run(job: Job) -> Report:
 
 
 def replay(path: str | Path, device: str = "cpu") -> Report:
-    """The check that a file reproduces, once more, on the model that it names."""
+    """The report of the check that a file reproduces, on the model that it names."""
     sample, what = load_sample(path)
     subject = open_subject(what.get("checkpoint") or what["preset"].partition(",")[0], device)
     plan = subject.restored.plan if subject.restored else None
@@ -381,8 +409,9 @@ def describe(report: Report) -> str:
     """The report as the terminal shows it."""
     lines = [f"{name}: {value}" for name, value in report.subject.items()]
     lines += [f"  FAIL problem: {problem}" for problem in report.problems]
+    marks = {"holds": "ok", "fails": "FAIL", "known failure": "FAIL", "not promised": "-"}
     for finding in report.findings:
-        mark = {"holds": "ok", "fails": "FAIL", "known failure": "FAIL", "not promised": "-"}[finding.outcome]
+        mark = marks[finding.outcome]
         what = f"{finding.n_compared} compared in {finding.seconds:.1f} s" if finding.n_compared else ""
         what = "; ".join(filter(None, (what, finding.reason)))
         lines.append(f"  {mark:<4} {finding.check:<24} {what}")
@@ -392,5 +421,5 @@ def describe(report: Report) -> str:
     count = [finding.outcome for finding in report.findings].count
     if known := count("known failure"):
         new = f"{count('fails')} more" if count("fails") else "no other"
-        lines.append(f"known failures that stand in the model card: {known}; {new} check fails")
+        lines.append(f"known failures, in the model card: {known}; {new} check fails")
     return "\n".join(lines)

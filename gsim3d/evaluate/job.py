@@ -1,0 +1,202 @@
+"""What ``gsim3d evaluate`` does: scores a checkpoint and predictions of other models, and writes the report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from gsim3d.data import Scene, find_scenes, published_split, split_scenes
+from gsim3d.errors import InputError
+from gsim3d.evaluate import compare
+from gsim3d.evaluate.pictures import write_curves
+from gsim3d.evaluate.predictions import Predictions
+from gsim3d.evaluate.protocol import default_views, horizon, score_scenes
+from gsim3d.evaluate.report import summarize, table, write_csv, write_json, write_markdown
+from gsim3d.evaluate.scoring import SceneScores, measurable
+from gsim3d.io.files import output_path, with_parents
+from gsim3d.pretrained import FOLDER, located
+from gsim3d.synth.held_out import set_of
+from gsim3d.train.processes import Processes, joined
+from gsim3d.train.restore import Restored, restore
+
+Views = list[tuple[Sequence[int] | None, Sequence[int]]]  # (input cameras, compared cameras) of each scene
+
+
+@dataclass(frozen=True)
+class Job:
+    """The options of ``gsim3d evaluate``.
+
+    Attributes:
+        data: folder with scenes, or a report to compare.
+        checkpoint: as of :func:`gsim3d.train.restore.restore`; None: only ``predictions`` are scored.
+        predictions: "[NAME=]DIR" of other models.
+        given: steps that the other models were given, without a checkpoint.
+        scenes: "test", "train" or "all"; None: "test", and "all" of held-out sets.
+        split: "gsim3d" or "published", the rule that holds scenes out.
+        steps: steps to predict; None: to the end of the shortest video.
+        cameras: cameras to compare; None: those kept from the training's inputs.
+        context: input cameras; None: spread evenly.
+        metrics: what to measure; None: all whose weights are installed.
+        clips: clips of which FVD is measured, at most.
+        keep, resample: as of :meth:`gsim3d.train.restore.Restored.open_scene`.
+        against: report of another model to compare with.
+        device: "cpu" or "cuda".
+        out: JSON file; None: metrics.json beside what is scored.
+    """
+
+    data: str
+    checkpoint: str | None = None
+    predictions: Sequence[str] = ()
+    given: int | None = None
+    scenes: str | None = None
+    split: str = "gsim3d"
+    steps: int | None = None
+    cameras: Sequence[int] | None = None
+    context: Sequence[int] | None = None
+    metrics: Sequence[str] | None = None
+    clips: int = 48
+    keep: Sequence[str] = ()
+    resample: bool = False
+    against: str | None = None
+    device: str = "cpu"
+    out: str | None = None
+
+
+def evaluate(job: Job) -> None:
+    """Runs ``job``; prints tables and writes the report.
+
+    Raises:
+        InputError: options contradict each other, or the data do not fit the models.
+    """
+    other = None if job.against is None else compare.read_report(job.against)
+    if other is not None and job.checkpoint is None and not job.predictions:
+        comparison = compare.compare(compare.read_report(job.data), other, job.against)
+        print(compare.table(comparison, job.against))
+        return
+    metrics, not_measured = measurable(job.metrics)
+    if job.checkpoint is None and not job.predictions:
+        raise InputError("nothing to evaluate: name a CHECKPOINT, or predictions of other models with --predictions")
+    if job.checkpoint is None and (job.given is None or job.given < 1):
+        raise InputError("--given: without a CHECKPOINT, say how many steps the other models were given, at least 1")
+    if job.checkpoint is not None and job.given is not None:
+        raise InputError("--given: with a CHECKPOINT it is the model's own history; leave the option out")
+    if job.checkpoint is None and (job.resample or job.keep):
+        raise InputError("--resample and --keep fit scenes to a CHECKPOINT; without one leave them out")
+    with joined(job.device) as processes:
+        _evaluate(job, metrics, not_measured, other, processes)
+
+
+def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None, processes: Processes) -> None:
+    """Scores this process's share of the scenes; the first process gathers and writes."""
+    restored = None if job.checkpoint is None else restore(job.checkpoint, job.device)
+    others = [Predictions.open(given, job.data) for given in job.predictions]
+    if len({other.name for other in others}) != len(others):
+        raise InputError("--predictions: two have the same name; write NAME=DIR")
+    out = _report_path(job, others)
+    n_encoded = job.given if restored is None else restored.data.history
+    scenes, conditions = _open_scenes(job, restored)
+    views, n_future = _views(job, restored, others, scenes, n_encoded)
+    for scene, (_, targets) in zip(scenes, views):
+        for other in others:
+            other.check(scene, targets, n_encoded, n_future)
+    names = [_name(scene, job.data) for scene in scenes]
+    conditions |= {
+        "checkpoint": None if restored is None else restored.checkpoint.digest,
+        "effects": None if restored is None else restored.plan.spec.hash,
+        "predictions": {other.name: str(other.folder) for other in others},
+        "data": str(job.data),
+        "split": job.split,
+        "fps": sorted({scene.fps for scene in scenes}),
+        "cameras": {
+            name: {"context": None if context is None else list(context), "target": list(targets)}
+            for name, (context, targets) in zip(names, views)
+        },
+    }
+    processes.check_agreement(**{"CHECKPOINT, DATA or options": (conditions, n_future, metrics)})
+    if against is not None:
+        compare.check_same({"n_encoded_steps": n_encoded, "n_future_steps": n_future}, names, against, job.against)
+    given = {"n_encoded": n_encoded, "n_future": n_future, "metrics": metrics, "others": others, "clips": job.clips}
+    scores = score_scenes(restored, scenes, views, **given, processes=processes, quiet=False)
+    if not processes.is_first:
+        return
+    scores = [replace(score, scene=name) for score, name in zip(scores, names, strict=True)]
+    summary = {**conditions, **summarize(scores, not_measured)}
+    print(table(summary))
+    refused = None
+    if against is not None:
+        try:
+            comparison = compare.compare(summary, against, job.against)
+            summary["against"] = {"file": job.against, "checkpoint": against.get("checkpoint"), **comparison[""]}
+            print(f"\n{compare.table(comparison, job.against)}")
+        except InputError as error:  # raised once the scores are written
+            refused = error
+    files = _write(out, job.data, scores, summary)
+    print("\nwritten: " + ", ".join(str(path) for path in files))
+    if refused is not None:
+        raise refused
+
+
+def _report_path(job: Job, others: list[Predictions]) -> Path:
+    if job.out:
+        return output_path(job.out, ".json")
+    place = located(job.checkpoint) if job.checkpoint else Path(others[0].folder)
+    if place.is_relative_to(FOLDER):  # nothing is written into the package
+        return Path("metrics.json")
+    return (place if place.is_dir() else place.parent) / "metrics.json"
+
+
+def _open_scenes(job: Job, restored: Restored | None) -> tuple[list[Scene], dict]:
+    """The chosen scenes as the model expects them, and which part of which set they are."""
+    folders = find_scenes(job.data)
+    found = set_of(folders)
+    part = job.scenes or ("all" if found and found["name"] else "test")
+    train, test = (split_scenes if job.split == "gsim3d" else published_split)(folders)
+    chosen = {"all": folders, "train": train, "test": test or folders}[part]
+    if restored is None:
+        scenes = [Scene.open(folder) for folder in chosen]
+    else:
+        scenes = [restored.open_scene(folder, keep=job.keep, resample=job.resample) for folder in chosen]
+    return scenes, {"set": set_of(chosen), "part": part}
+
+
+def _views(
+    job: Job, restored: Restored | None, others: list[Predictions], scenes: list[Scene], n_encoded: int
+) -> tuple[Views, int]:
+    """Cameras of each scene, and how many steps are predicted of all."""
+    views, n_future = [], job.steps
+    for scene in scenes:
+        context, targets = None, job.cameras
+        if restored is not None:
+            context, targets = default_views(restored, scene, job.context, job.cameras)
+        elif not targets:
+            targets = others[0].cameras(scenes[0])
+        if bad := [cam for cam in (*targets, *(context or ())) if not 0 <= cam < scene.n_cams]:
+            raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
+        views.append((context, targets))
+        n_future = min(horizon(scene, n_encoded, job.steps), n_future or scene.n_steps)
+    return views, n_future
+
+
+def _name(scene: Scene, root: str) -> str:
+    """The scene's folder below the data set's, which no two scenes share."""
+    below = scene.path.relative_to(root).as_posix()
+    return scene.name if below == "." else below
+
+
+def _write(out: Path, data: str, scores: list[SceneScores], summary: dict) -> list[Path]:
+    """Writes the report in all its forms; returns the files."""
+    with_parents(out)
+    files = [out, out.with_suffix(".csv"), out.with_suffix(".md")]
+    write_json(files[0], summary)
+    write_csv(files[1], scores)
+    write_markdown(files[2], summary, Path(data).absolute().name)
+    if not summary["by_step"]:
+        return files
+    rates, curves = summary["fps"], out.with_suffix(".png")
+    try:
+        write_curves(curves, summary, rates[0] if len(rates) == 1 else None)
+    except InputError as error:
+        print(f"no curves: {error}")
+        return files
+    return [*files, curves]

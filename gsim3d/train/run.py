@@ -1,0 +1,69 @@
+"""What ``gsim3d train`` does: a training run of one or several processes, from its last checkpoint to its end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+
+from gsim3d.cuda_graphs import has_no_room
+from gsim3d.data import Scene
+from gsim3d.errors import InputError
+from gsim3d.io import checkpoint
+from gsim3d.io.files import with_parents
+from gsim3d.io.locks import only_one_writer
+from gsim3d.train.config import TrainConfig
+from gsim3d.train.loop import Trainer
+from gsim3d.train.processes import joined
+
+
+def train(
+    config: TrainConfig,
+    folders: Sequence[Path],
+    out: str | Path,
+    *,
+    cache: str | Path | None = None,
+    device: str = "cpu",
+    until: int | None = None,
+    export: str | Path | None = None,
+    tensorboard: bool = False,
+    profile: bool = False,
+) -> None:
+    """Trains on the scenes in ``folders`` and writes the run folder ``out``.
+
+    Args:
+        cache: folder for decoded images; None: they stay in memory.
+        device: "cpu" or "cuda".
+        until: optimizer step to stop after; None: the last one.
+        export: .safetensors file for the result; None: none.
+        tensorboard: also log to OUT/tensorboard.
+        profile: write a trace of two steps to OUT/profile.
+    Raises:
+        InputError: scenes do not fit the settings, or the memory is full.
+        RunStopped: a signal, or another process, ended the run.
+    """
+    if cache:
+        Path(cache).mkdir(parents=True, exist_ok=True)  # fails before work begins
+    scenes = [Scene.open(folder, cache_dir=cache, fitting=config.data.fitting) for folder in folders]
+    Path(out).mkdir(parents=True, exist_ok=True)
+    with joined(device) as processes, only_one_writer(Path(out)) if processes.is_first else nullcontext():
+        report = print if processes.is_first else lambda *_: None
+        trainer = Trainer(config, scenes, out, device=device, processes=processes)
+        if trainer.step:
+            changed = (
+                "" if trainer.same_scenes else "; its scenes have changed, so the curve is another one from here on"
+            )
+            report(f"going on from step {trainer.step} of {config.n_steps}{changed}")
+        try:
+            trainer.run(until=until, tensorboard=tensorboard, profile=profile)
+        except (RuntimeError, MemoryError) as error:
+            if not has_no_room(error):
+                raise
+            raise InputError(
+                f"step {trainer.step}: out of memory ({device}): a smaller batch or fewer target_views, larger strides "
+                f"of data, or recompute: [encoder, steps, images] need less; {out} goes on from its last checkpoint"
+            ) from None
+        report(f"trained to step {trainer.step} of {config.n_steps}: {out}")
+        if export and processes.is_first:
+            checkpoint.export(checkpoint.load(out), with_parents(Path(export)))
+            report(f"written: {export}")
