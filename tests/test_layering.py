@@ -102,7 +102,7 @@ def test_imports_flow_one_way():
 
 
 def test_the_top_level_is_small():
-    modules = [path for path in (ROOT / "gsim3d").glob("*.py")]
+    modules = list((ROOT / "gsim3d").glob("*.py"))
     assert len(modules) <= MOST_AT_THE_TOP, sorted(path.name for path in modules)
 
 

@@ -203,7 +203,7 @@ def _backward(plan: Plan, w: Weights, kept: Kept, conv_input: Tensor, keep_atten
     return grad_x, grad_input, *of_layers, fc2_bias, *of_norms, norm2, norm2_bias
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _zeros_and_ones(n: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Mean and scale of a normalisation that changes nothing."""
     return torch.zeros(n, dtype=dtype, device=device), torch.ones(n, dtype=dtype, device=device)

@@ -52,6 +52,6 @@ class Branches:
         self._read.clear()
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _streams(device: torch.device) -> tuple[torch.cuda.Stream, ...]:
     return tuple(torch.cuda.Stream(device) for _ in range(MANY_STREAMS))

@@ -5,8 +5,8 @@ A body is centred on its bounding box and scaled to fit a sphere of diameter 1; 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Callable
 
 import numpy as np
 

@@ -99,7 +99,7 @@ def settings_of(config: ReleasedModelConfig, image_size=32) -> dict:
                 "state_3dgs_params": EXPLICIT_PARAMS if explicit else ["means", "opacities"],
                 "dynamic_latent_feature_dim": encoder.dynamic_dim, "static_latent_feature_dim": encoder.static_dim,
                 "learn_static_mask": False, "learn_background_mask": False,
-                "pred_modality": {key: modality for key in keys},
+                "pred_modality": dict.fromkeys(keys, modality),
                 "dynamic_state_keys": EXPLICIT_PARAMS if explicit else ["means", "rotations"],
                 "metric": 2 * dynamics.max_step, "immune_to_static": ["harmonics"], "pred_inductive_bias": True,
             },

@@ -89,10 +89,10 @@ def test_attention_reads_the_own_patch_and_the_patch_of_the_background_around_it
     own = {}
     for p, (a, b) in enumerate(zip(stage.patches[row].cu_q, stage.patches[row].cu_q[1:])):
         keys = stage.patches[row].kv_rows[stage.patches[row].cu_k[p] : stage.patches[row].cu_k[p + 1]]
-        own |= {r: keys for r in stage.patches[row].q_rows[a:b].tolist()}
+        own |= dict.fromkeys(stage.patches[row].q_rows[a:b].tolist(), keys)
     for i in range(stage.n_rows):
         around = None
-        for p, (a, b) in enumerate(zip(patches.cu_q, patches.cu_q[1:])):
+        for p, a in enumerate(patches.cu_q[:-1]):
             begins = patches.q_rows[a].item()
             if scene_rest[begins] == scene[i] and (around is None or rest_codes[begins] <= codes[i]):
                 around = patches.kv_rows[patches.cu_k[p] : patches.cu_k[p + 1]]
@@ -308,7 +308,7 @@ def test_gradients_through_a_rollout(checkpointing):
     config = dataclasses.replace(ASYMMETRIC, checkpointing=checkpointing)
     simulator, history = make_simulator(config, dtype=torch.float64), make_scenes(torch.float64)
     simulator.train()
-    parameters = [p for p in simulator.dynamics.parameters()]
+    parameters = list(simulator.dynamics.parameters())
     latents = history.static_latents.clone().requires_grad_()
     weights = torch.randn(last_steps(history, 1).n_rows, 3, generator=torch.Generator().manual_seed(1)).double()
 

@@ -146,9 +146,9 @@ def test_block(file, order, device):
     for name in inside:
         close(seen[name], case[name], name)
     block.fused = True
-    for out in (out, block(x, stage, order)):
-        close(out, case["out"], "out")
-        (grad,) = torch.autograd.grad(out, x, g["cotangent"].to(device))
+    for made in (out, block(x, stage, order)):
+        close(made, case["out"], "out")
+        (grad,) = torch.autograd.grad(made, x, g["cotangent"].to(device))
         close(grad, case["grad_features"].reshape(x.shape), "gradient")
 
 

@@ -182,7 +182,7 @@ def test_geometry_inside(file):
     stages = pyramid_of(xyz, mask, config).stages
     assert_published_stage(stages[0], inter, "embedding/")
     positions = xyz.reshape(-1, 3)
-    depth = inter["embedding/serialized_depth"] if "embedding/serialized_depth" in inter else None
+    depth = inter.get("embedding/serialized_depth", None)
     for s in range(1, len(stages)):
         unmerged = (*config.merge_windows[: s - 1], *(1,) * (len(stages) - s))
         before = pyramid_of(xyz, mask, dataclasses.replace(config, merge_windows=unmerged)).stages[s]

@@ -251,7 +251,7 @@ def test_a_report_goes_into_the_documentation(written, tmp_path):
     assert {len(row) for row in kept["rows"]} == {10} and kept["rows"][1][:3] == ["1", "history 1", "model"]
     assert "failed: out of memory at step 3" in {row[3] for row in kept["rows"]}
     reports = {name: tmp_path / name for name in ("cpu", "h200")}
-    for (name, folder), device in zip(reports.items(), ("cpu", "cuda"), strict=True):
+    for (_name, folder), device in zip(reports.items(), ("cpu", "cuda"), strict=True):
         folder.mkdir()
         (folder / SPEEDS_FILE).write_text(json.dumps({"1f": {device: {"fast": {"history": 1}}}}))
     kept = json.loads(tool.keep_speeds(tmp_path, reports).read_text())

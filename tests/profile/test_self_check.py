@@ -161,7 +161,7 @@ def test_a_noisy_host_fails_its_own_check_only():
     calls = {"graph": lambda: clock.work(1e-3), "reference": lambda: clock.work(1e-3 * next(signs))}
     replayed, launched = check_order(calls, ["reference"], clock)
     assert replayed.holds and "that the host launches" in launched.name
-    steady = {name: calls["graph"] for name in calls}
+    steady = dict.fromkeys(calls, calls["graph"])
     assert all(check.holds for check in check_order(steady, ["reference"], clock))
 
 

@@ -56,7 +56,7 @@ class CNN(nn.Module):
         return self.conv2(x)
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _statistics(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Mean and deviation [3, 1, 1] of the images that the network expects."""
     with torch.inference_mode(False):
