@@ -62,7 +62,7 @@ def check(tree, phase, **environment):
 
 
 def stopped(process) -> str:
-    """What a check said that was told to stop: again where bash was about to wait, which then hears it too late."""
+    """Output of a check that was stopped: again where bash was about to wait, which then hears it too late."""
     for _ in range(10):
         process.send_signal(signal.SIGTERM)
         try:

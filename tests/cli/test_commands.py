@@ -235,7 +235,7 @@ def test_a_wrong_setting_is_named(capsys, work, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_gpu_without_room_is_told_in_one_line(capsys, work, tmp_path, monkeypatch):
+def test_out_of_memory_is_one_line(capsys, work, tmp_path, monkeypatch):
     def full(*args, **options):
         raise CaptureError("captured: no room;\nlower batch", no_room=True)
 

@@ -34,7 +34,7 @@ def with_room(dynamics, history, factor=1.25, generator=None):
 @pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING, RELIT])
 @pytest.mark.parametrize("sizes", SIZES)
 @pytest.mark.parametrize("factor", [1.0, 1.25, 4.0])
-def test_room_changes_no_bit(factor, sizes, config, asleep):
+def test_capacity_changes_no_bit(factor, sizes, config, asleep):
     dynamics = make_dynamics(config)
     history = batch([make_history(n_rows, seed=i, config=config) for i, n_rows in enumerate(sizes)])
     history = some_asleep(history) if asleep else history

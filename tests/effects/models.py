@@ -27,7 +27,7 @@ class Case:
         self.simulator, self.frames, self.n_steps = awake(make_simulator(config)), make_frames(steps), n_steps
         with torch.no_grad():
             self.state = self.simulator.encode(self.frames)
-        self.state.clouds  # read once, by nobody's effect
+        self.state.clouds  # read once, before operations are counted
         self.cameras = target_cameras(self.frames, len(steps))
 
     @torch.no_grad()
@@ -39,7 +39,7 @@ class Case:
     def run(self, values: dict):
         """Counts of operations, and names of modules, that the spec of plain ``values`` calls for."""
         spec = EffectsSpec.from_dict(values)
-        self(spec)  # what is made once, as constants of a device, is nobody's effect
+        self(spec)  # constants of a device are made once
         with entered(self.simulator) as modules, counted() as count:
             self(spec)
         return count, modules

@@ -12,7 +12,7 @@ ASYMMETRIC = dataclasses.replace(TINY, background="asymmetric")
 
 
 def make_simulator(config=ASYMMETRIC, seed=0, dtype=torch.float32):
-    """A simulator with these dynamics, in evaluation, whose other parts nobody calls."""
+    """A simulator with these dynamics, in evaluation, whose other parts are not called."""
     torch.manual_seed(seed)
     tiny = presets.tiny()
     model = dataclasses.replace(

@@ -41,7 +41,7 @@ def scene_of_rows(particles):
 
 
 @pytest.mark.parametrize("kernel_size", [3, 5])
-def test_a_tap_adds_the_means_of_moving_and_of_frozen_rows_of_its_cell(kernel_size):
+def test_convolution_tap_adds_moving_and_frozen_means(kernel_size):
     parts, rest, moving, background, recorder = read_and_reader()
     conv = SparseConv(3, 4, kernel_size, bias=True, duplicates="mean").double()
     x_rest, x = torch.randn(rest.stages[0].n_rows, 3).double(), torch.randn(moving.stages[0].n_rows, 3).double()
@@ -74,7 +74,7 @@ def test_a_tap_adds_the_means_of_moving_and_of_frozen_rows_of_its_cell(kernel_si
 
 
 @pytest.mark.parametrize("row", range(4))
-def test_attention_reads_the_own_patch_and_the_patch_of_the_background_around_it(row):
+def test_joint_attention_reads_own_and_background_patch(row):
     parts, rest, moving, background, _ = read_and_reader()
     stage, frozen = moving.stages[0], rest.stages[0]
     q, k, v = torch.randn(3, stage.n_rows, 2, 4).double()
@@ -101,7 +101,7 @@ def test_attention_reads_the_own_patch_and_the_patch_of_the_background_around_it
         assert_close_relative_to_max(out[i], torch.einsum("nh,nhd->hd", shares, values), 1e-12)
 
 
-def test_joint_attention_has_the_gradients_of_one_softmax():
+def test_joint_attention_gradients_match_one_softmax():
     torch.manual_seed(0)
     q, k, v, other_k, other_v = (torch.randn(n, 2, 4).double().requires_grad_() for n in (9, 9, 9, 7, 7))
     cu, rows = torch.tensor([0, 4, 8]), torch.randperm(9)
@@ -112,7 +112,7 @@ def test_joint_attention_has_the_gradients_of_one_softmax():
     assert torch.autograd.gradcheck(lambda *x: joint_attention(*x, own, other), (q, k, v, other_k, other_v))
 
 
-def test_a_background_made_once_gives_the_bits_of_one_made_in_every_step():
+def test_cached_background_bits_match_recomputed():
     simulator, state, log = make_simulator(), make_scenes(), RestLog()
     steps = simulator.rollout(state, 4, log=log)
     assert log.remembered == 1 and log.calls == 4
@@ -122,7 +122,7 @@ def test_a_background_made_once_gives_the_bits_of_one_made_in_every_step():
 
 
 @pytest.mark.parametrize("values", [{"steps_per_call": 2}, {"steps_per_call": 2, "predicts": "from_previous"}])
-def test_several_steps_a_call(values):
+def test_background_with_several_steps_per_call(values):
     dynamics, history = make_dynamics(dataclasses.replace(ASYMMETRIC, **values)), make_scenes()
     steps = rollout_in_parts(
         lambda moving, background: dynamics(moving, background=background), history, 5, 4, remember=dynamics.remember
@@ -131,7 +131,7 @@ def test_several_steps_a_call(values):
         assert_same_particles(one, other)
 
 
-def test_explicit_particles():
+def test_background_of_explicit_model():
     config = dataclasses.replace(EXPLICIT, background="asymmetric")
     dynamics, history = make_dynamics(config), make_history((40, 50), config=config, frozen_share=0.5)
     newest, step = last_steps(history, 1), dynamics(history)
@@ -141,7 +141,7 @@ def test_explicit_particles():
         assert not torch.equal(getattr(step, name)[~frozen], getattr(newest, name)[~frozen])
 
 
-def test_rows_that_cannot_be_seen_are_in_no_background():
+def test_background_excludes_invalid_particles():
     dynamics, history = make_dynamics(ASYMMETRIC), make_history((40, 50), frozen_share=0.5)
     frozen = (history.activity == FROZEN)[:, None]
     lost = torch.arange(90)[:, None] % 3 == 0
@@ -153,7 +153,7 @@ def test_rows_that_cannot_be_seen_are_in_no_background():
     assert_same_bits(dynamics(nobody).means[~frozen[40:, 0]], dynamics(alone).means)
 
 
-def test_frozen_rows_of_the_newest_step_stay_and_older_ones_are_not_read():
+def test_background_reads_newest_step_only():
     dynamics, history = make_dynamics(ASYMMETRIC), make_scenes()
     newest, step = last_steps(history, 1), dynamics(history)
     frozen = newest.activity == FROZEN
@@ -171,7 +171,7 @@ def test_frozen_rows_of_the_newest_step_stay_and_older_ones_are_not_read():
     assert_same_particles(dynamics(moved), step)
 
 
-def test_moving_rows_read_the_background():
+def test_moving_particles_read_background():
     dynamics, history = make_dynamics(ASYMMETRIC), make_history((60, 60), frozen_share=0.5)
     latents = history.static_latents.clone().requires_grad_()
     step = dynamics(dataclasses.replace(history, static_latents=latents))
@@ -181,7 +181,7 @@ def test_moving_rows_read_the_background():
     assert not grad[:60][frozen[:60]].any()
 
 
-def test_scenes_without_frozen_rows_are_those_of_the_symmetric_model():
+def test_scene_without_background_matches_symmetric_model():
     history = batch([make_history((40, 30), seed=i, frozen_share=0.0) for i in range(2)])
     expected = make_dynamics(TINY)(history)
     assert_same_particles(make_dynamics(ASYMMETRIC)(history), expected)
@@ -191,7 +191,7 @@ def test_scenes_without_frozen_rows_are_those_of_the_symmetric_model():
     assert_same_bits(some.means[: expected.n_rows], expected.means)
 
 
-def test_scenes_of_a_batch_do_not_change_each_other():
+def test_background_keeps_scenes_apart():
     dynamics, history = make_dynamics(ASYMMETRIC), make_scenes()
     together, table = dynamics(history), history.clouds
     for scene, begin in enumerate(together.clouds.starts[:-1]):
@@ -200,7 +200,7 @@ def test_scenes_of_a_batch_do_not_change_each_other():
             assert_same_bits(getattr(together, name)[begin : begin + alone.n_rows], value, name)
 
 
-def test_neither_the_order_of_rows_nor_the_place_of_a_scene_matters():
+def test_background_permutation_invariance():
     config = dataclasses.replace(ASYMMETRIC, position_features=False)
     dynamics, history = make_dynamics(config, dtype=torch.float64), make_scenes(torch.float64)
     step = dynamics(history)
@@ -213,7 +213,7 @@ def test_neither_the_order_of_rows_nor_the_place_of_a_scene_matters():
     assert_close_relative_to_max(moved.means - by, step.means, 1e-12)
 
 
-def test_asleep_rows_are_in_neither_part():
+def test_sleeping_particles_are_in_neither_part():
     dynamics, history = make_dynamics(ASYMMETRIC), make_history((60, 60), frozen_share=0.5)
     asleep = torch.arange(120) % 4 == 0
     marked = dataclasses.replace(history, activity=torch.where(asleep, ASLEEP, history.activity))
@@ -223,7 +223,7 @@ def test_asleep_rows_are_in_neither_part():
 
 
 @pytest.mark.parametrize("room", [1.0, 1.5])
-def test_room_changes_no_bit(room):
+def test_capacity_changes_no_bit(room):
     dynamics, parts = make_dynamics(ASYMMETRIC), Parts.of(make_scenes(), asymmetric=True)
     background, exact = dynamics.remember(parts.background), dynamics.geometry(parts.moving)
     capacity = PyramidCapacity.of(exact, parts.moving.n_rows, room)
@@ -234,7 +234,7 @@ def test_room_changes_no_bit(room):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @torch.no_grad()
-def test_a_captured_rollout_has_the_same_bits_also_of_another_background(device, dtype):
+def test_captured_rollout_bits_for_other_background(device, dtype):
     simulator, state = make_simulator().to(device), make_scenes().to(device)
     turned = dataclasses.replace(state, static_latents=state.static_latents.flip(1))
     frozen = (state.activity == FROZEN)[:, None]
@@ -247,7 +247,7 @@ def test_a_captured_rollout_has_the_same_bits_also_of_another_background(device,
 
 
 @torch.no_grad()
-def test_a_background_is_made_anew_where_weights_have_changed(device):
+def test_captured_background_follows_changed_weights(device):
     simulator, state = make_simulator().to(device), make_scenes().to(device)
     captured = CapturedRollout(simulator, state, 2)
     before = captured(state).steps[1].means
@@ -260,7 +260,7 @@ def test_a_background_is_made_anew_where_weights_have_changed(device):
         assert_same_particles(step, expected)
 
 
-def test_a_background_without_room_for_another_is_made_anew():
+def test_captured_background_beyond_capacity():
     simulator = make_simulator()
     few, many = (make_history((60, 60), seed=2, frozen_share=0.5) for _ in range(2))
     frozen = (few.activity == FROZEN)[:, None]
@@ -272,13 +272,13 @@ def test_a_background_without_room_for_another_is_made_anew():
         assert_same_particles(step, expected)
 
 
-def test_a_rollout_repeats_bit_by_bit():
+def test_background_rollout_repeats_bits():
     simulator = make_simulator()
     for one, other in zip(*(simulator.rollout(make_scenes(), 3) for _ in range(2)), strict=True):
         assert_same_particles(one, other)
 
 
-def test_a_gpu_gives_what_the_cpu_gives(devices):
+def test_background_rollout_cuda_matches_cpu(devices):
     results = []
     for device in devices:
         simulator, state = make_simulator(dtype=torch.float64).to(device), make_scenes(torch.float64).to(device)
@@ -296,14 +296,14 @@ def test_a_gpu_gives_what_the_cpu_gives(devices):
         assert_close_relative_to_max(other, one, 1e-9)
 
 
-def test_joint_attention_has_the_same_bits_for_any_number_of_threads():
+def test_joint_attention_bits_for_any_number_of_threads():
     q, k, v, other_k, other_v = torch.randn(5, 301, 2, 4, generator=torch.Generator().manual_seed(0)).unbind(0)
     table = PatchTable(torch.arange(301), torch.arange(301), *[torch.tensor([0, 100, 301])] * 2)
     assert_same_bits_for_any_threads(lambda: (joint_attention(q, k, v, other_k, other_v, table, table),))
 
 
 @pytest.mark.parametrize("checkpointing", [False, True])
-def test_gradients_through_a_rollout(checkpointing):
+def test_background_rollout_gradients(checkpointing):
     """Of cached and uncached rollouts alike, and along a random direction those of finite differences."""
     config = dataclasses.replace(ASYMMETRIC, checkpointing=checkpointing)
     simulator, history = make_simulator(config, dtype=torch.float64), make_scenes(torch.float64)
@@ -340,7 +340,7 @@ def test_gradients_through_a_rollout(checkpointing):
     assert_close_relative_to_max(slope, (values[0] - values[1]) / (2 * step), 1e-5)
 
 
-def test_shuffled_curves_are_those_of_the_background():
+def test_shuffled_curves_match_background():
     config = dataclasses.replace(ASYMMETRIC, shuffle_orders=True, drop_path=0.2)
     dynamics, parts = make_dynamics(config).train(), Parts.of(make_scenes(), asymmetric=True)
     draws = [torch.Generator().manual_seed(3) for _ in range(2)]
@@ -354,6 +354,6 @@ def test_shuffled_curves_are_those_of_the_background():
 
 
 @pytest.mark.parametrize("values", [{"norm": "batch"}, {"background": "frozen"}])
-def test_configs_that_cannot_be_asymmetric_raise(values):
+def test_asymmetric_config_refuses_unsuitable_models(values):
     with pytest.raises(ValueError, match="background"):
         DynamicsConfig(**{"norm": "layer", "background": "asymmetric", **values})

@@ -56,7 +56,7 @@ def image(simulator, state, frames):
         return simulator.render(last_steps(state, 1), target_cameras(frames, len(frames.origin)))
 
 
-def test_the_ground_is_removed():
+def test_remove_background():
     simulator, state, _ = encoded()
     without = state.select_rows(state.activity != FROZEN)
     steps = future(simulator, state, 3, [Edit(0, Remove("frozen"))])
@@ -65,7 +65,7 @@ def test_the_ground_is_removed():
         assert_same_bits(step.dynamic_latents, expected.dynamic_latents)
 
 
-def test_the_ground_is_raised():
+def test_move_background():
     simulator, state, _ = encoded()
     raised = edited(simulator, state, Move("frozen", (0.0, 0.0, 0.25)))
     frozen = state.activity == FROZEN
@@ -73,7 +73,7 @@ def test_the_ground_is_raised():
     assert_same_bits(raised.means[~frozen], state.means[~frozen])
 
 
-def test_what_is_moved_keeps_its_speed():
+def test_move_keeps_velocity():
     simulator, state, _ = encoded()
     by = (0.5, -0.25, 0.125)
     moved = edited(simulator, state, Move("moving", by))
@@ -98,7 +98,7 @@ def test_duplicate():
 
 
 @pytest.mark.parametrize("model", CONFIGS)
-def test_a_rotated_scene_looks_the_same_from_a_rotated_camera(model):
+def test_rotate_matches_rotated_camera(model):
     """Positions, shapes and view-dependent colours turn; a quarter turn and an odd one."""
     simulator, state, frames = encoded(CONFIGS[model], (1,))
     before = image(simulator, state, frames)
@@ -116,7 +116,7 @@ def test_a_rotated_scene_looks_the_same_from_a_rotated_camera(model):
         assert not torch.allclose(turned.means, state.means, atol=0.1)
 
 
-def test_a_rotation_is_about_the_middle_of_what_turns_and_turns_its_speed():
+def test_rotate_pivot_and_velocity():
     simulator, state, _ = encoded(CONFIG, (2, 2))
     turned = edited(simulator, state, Rotate("moving", axis=(1.0, 0.0, 0.0), degrees=90.0))
     for scene in (0, 1):
@@ -128,7 +128,7 @@ def test_a_rotation_is_about_the_middle_of_what_turns_and_turns_its_speed():
         assert_same_bits(frozen[3], frozen[1])
 
 
-def test_throw_is_a_change_of_velocity():
+def test_throw_adds_velocity():
     simulator, state, _ = encoded(CONFIG, (3, 2))
     velocity = torch.tensor([0.03, 0.0, -0.02])
     thrown = edited(simulator, state, Throw("moving", tuple(velocity.tolist())))
@@ -144,7 +144,7 @@ def test_throw_is_a_change_of_velocity():
 
 
 @pytest.mark.parametrize("model", CONFIGS)
-def test_recolor_changes_the_look_and_for_latent_models_nothing_else(model):
+def test_recolor_changes_appearance_only(model):
     simulator, state, frames = encoded(CONFIGS[model], (2,))
     red = edited(simulator, state, Recolor("moving", (0.8, 0.1, 0.1)))
     newest, moving = last_steps(red, 1), last_steps(red, 1).activity == DYNAMIC
@@ -162,7 +162,7 @@ def test_recolor_changes_the_look_and_for_latent_models_nothing_else(model):
             assert step.color_transform is not None
 
 
-def test_two_scenes_are_merged():
+def test_insert_merges_scenes():
     simulator, both, _ = encoded(CONFIG, (2, 2))
     here, there = both.select_clouds([0, 1]), both.select_clouds([2, 3])
     merged = edited(simulator, here, Insert("all", there, by=(0.5, 0.0, 0.0)))
@@ -182,8 +182,8 @@ def test_two_scenes_are_merged():
 
 
 @pytest.mark.parametrize(("model", "policy"), [("latent", None), ("latent", "exact"), ("asymmetric", "approx")])
-def test_an_edit_on_the_way_is_a_rollout_from_the_edited_state(model, policy):
-    """Also where a background is remembered, and where somebody may sleep."""
+def test_edit_within_rollout_matches_edited_state(model, policy):
+    """Also with a cached background, and with sleep."""
     simulator, state, _ = encoded(MODELS[model])
     sleep = DynamicsEffects(sleep=None if policy is None else Sleep(policy, eps=0.5))
     spec = dataclasses.replace(EDITABLE, dynamics=sleep)
@@ -201,7 +201,7 @@ def test_an_edit_on_the_way_is_a_rollout_from_the_edited_state(model, policy):
         assert_same_bits(step.means, expected.means)
 
 
-def test_an_edit_wakes_a_scene_that_sleeps():
+def test_edit_wakes_sleeping_scene():
     simulator, state, _ = encoded()
     spec = dataclasses.replace(EDITABLE, dynamics=DynamicsEffects(sleep=Sleep("exact", eps=1e6, patience=1)))
     log, edit = RestLog(), Edit(8, Throw("moving", (0.0, 0.0, 0.05)))
@@ -210,7 +210,7 @@ def test_an_edit_wakes_a_scene_that_sleeps():
     assert log.moving[7] == 0 < log.moving[8], "asleep after as many steps as the model sees, until it is thrown"
 
 
-def test_a_box_means_what_is_inside():
+def test_selection_box():
     _, state, _ = encoded()
     means = last_steps(state, 1).means
     middle = means.median(0).values.tolist()
@@ -229,7 +229,7 @@ def test_a_box_means_what_is_inside():
         (Edit(-1, Move()), EDITABLE, "edit at step -1, move: the rollout has steps 0 to 2"),
     ],
 )
-def test_edits_that_cannot_be_made(edit, spec, message):
+def test_edit_refuses_invalid_operations(edit, spec, message):
     simulator, state, _ = encoded()
     with pytest.raises(InputError, match=message):
         future(simulator, state, 3, [edit], spec)
@@ -279,14 +279,14 @@ def test_files(tmp_path):
         ("- {step: 2, op: [", "cannot be read"),
     ],
 )
-def test_files_that_are_no_edits(tmp_path, text, message):
+def test_load_edits_refuses_malformed_files(tmp_path, text, message):
     (tmp_path / "edits.yaml").write_text(text)
     with pytest.raises(InputError, match=message):
         load_edits(tmp_path / "edits.yaml", lambda folder: None)
 
 
 @pytest.mark.parametrize("model", CONFIGS)
-def test_a_model_that_is_told_everything_goes_on_from_edits(model):
+def test_edit_of_model_with_all_priors(model):
     """Its particles have every field that there is."""
     more = {"motion_length": 0.5, "velocity": True, "deformation": True, "lights": ((0.0, 0.0, 1.0),)}
     more |= {"background": "relightable"} if model == "latent" else {}
@@ -303,8 +303,8 @@ def test_a_model_that_is_told_everything_goes_on_from_edits(model):
 
 
 @pytest.mark.parametrize("step", [0, 1])
-def test_who_is_removed_stands_in_no_light(step):
-    """What the network is told, from the step of the edit on."""
+def test_removed_particles_occlude_no_light(step):
+    """The conditioning features of the network, from the step of the edit on."""
     more = {"lights": ((0.1, 0.2, 1.0),)}
     config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **more))
     simulator, state, _ = encoded(config)

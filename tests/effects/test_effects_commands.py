@@ -15,13 +15,13 @@ from gsim3d.profile import autotune
 from gsim3d.profile.part_times import PartTimes
 from gsim3d.train.restore import build_simulator, restore
 from tests.cli.test_commands import call, work  # noqa: F401
-from tests.effects.test_round_trip import saved
+from tests.effects.test_spec import saved
 from tests.tiny_scenes import write_scene
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_plan_is_a_table_with_reasons_and_costs(capsys, work):  # noqa: F811
+def test_plan_command_lists_effects_and_costs(capsys, work):  # noqa: F811
     scene = work / "data" / "ball" / "0000"
     code, out, _ = call(capsys, "plan", scene, work / "run")
     assert code == 0 and re.search(r"ball/0000: \d+ moving and \d+ frozen particles a step, 1 image of 32x32", out)
@@ -31,7 +31,7 @@ def test_plan_is_a_table_with_reasons_and_costs(capsys, work):  # noqa: F811
     assert re.search(r"^dynamics +\d+\.\d +\d+\.\d +1\.00$", out, re.MULTILINE)
 
 
-def test_plan_reads_the_spec_that_the_data_ship(capsys, tmp_path):
+def test_plan_command_reads_spec_of_scene(capsys, tmp_path):
     scene = write_scene(tmp_path / "set" / "ball" / "0000")
     EffectsSpec(DynamicsEffects("masked_out", 1), AppearanceEffects(0)).save(tmp_path / "set" / "effects.yaml")
     code, out, _ = call(capsys, "plan", scene)
@@ -49,7 +49,7 @@ def test_plan_reads_the_spec_that_the_data_ship(capsys, tmp_path):
     assert code == 2 and "unsupported effect dynamics.history: this model goes up to 2; got 9" in err
 
 
-def test_plan_tells_what_a_background_costs_once(capsys, tmp_path):
+def test_plan_command_reports_background_cost(capsys, tmp_path):
     scene, tiny = write_scene(tmp_path / "ball" / "0000"), presets.tiny()
     model = dataclasses.replace(tiny, dynamics=dataclasses.replace(tiny.dynamics, background="asymmetric"))
     run = saved(tmp_path / "run", EffectsSpec(), build_simulator(model, 0).state_dict(), model)
@@ -59,7 +59,7 @@ def test_plan_tells_what_a_background_costs_once(capsys, tmp_path):
     assert float(re.search(r"^and of the background, once a rollout: (\d+\.\d)$", out, re.MULTILINE)[1]) > 0
 
 
-def test_plan_predicts_milliseconds_of_a_checkpoint_that_was_timed(capsys, work):  # noqa: F811
+def test_plan_command_predicts_milliseconds(capsys, work):  # noqa: F811
     scene, run = work / "data" / "ball" / "0000", work / "run"
     code, before, _ = call(capsys, "plan", scene, run)
     assert code == 0 and "milliseconds" not in before
@@ -74,7 +74,7 @@ def test_plan_predicts_milliseconds_of_a_checkpoint_that_was_timed(capsys, work)
     assert table == [("dynamics", "8.0"), ("gaussians", "4.0"), ("images", "2.0"), ("all", "14.0")]
 
 
-def test_infer_measures_every_effect_and_writes_the_smallest_spec(capsys, work, tmp_path, monkeypatch):  # noqa: F811
+def test_infer_command_writes_smallest_spec(capsys, work, tmp_path, monkeypatch):  # noqa: F811
     monkeypatch.setattr("time.perf_counter", map(float, itertools.count()).__next__)  # all settings are equally fast
     scene, out_file = work / "data" / "ball" / "0000", tmp_path / "effects.yaml"
     code, out, _ = call(capsys, "effects", "infer", scene, work / "run", "--tolerance", "100dB", "--out", out_file)
@@ -104,7 +104,7 @@ def test_infer_measures_every_effect_and_writes_the_smallest_spec(capsys, work, 
     assert out.endswith("  version: 1\n")
 
 
-def test_infer_puts_back_what_is_worth_most_when_together_too_much_is_lost():
+def test_propose_puts_back_most_valuable_effect():
     """A measure that loses 0.05 dB for each of three effects, and 0.5 dB for the fourth."""
     model, base = presets.paper_latent(2), EffectsSpec()
 
@@ -134,7 +134,7 @@ def timed(cost):
     return {(effect, setting): note for effect, setting, _, _, note in rows}, spec, measured
 
 
-def test_infer_proposes_nothing_that_it_measured_as_slower():
+def test_propose_skips_slower_settings():
     base = EffectsSpec()
     notes, spec, measured = timed(lambda spec: 1.16)
     assert spec == base and measured == (30.0, 1.0) and set(notes.values()) == {"slower"}
@@ -143,7 +143,7 @@ def test_infer_proposes_nothing_that_it_measured_as_slower():
     assert notes["history", "1 step"] == "proposed" and notes["background", "masked out"] == "slower"
 
 
-def test_infer_takes_settings_apart_that_are_slower_together():
+def test_propose_separates_settings_slower_together():
     """Each alone saves time; with a history of one step all others cost more."""
 
     def cost(spec):
@@ -157,13 +157,13 @@ def test_infer_takes_settings_apart_that_are_slower_together():
 
 
 @pytest.mark.parametrize("text", ["loud", "-1", "nandB", "inf"])
-def test_infer_wants_a_tolerance(capsys, work, text):  # noqa: F811
+def test_infer_command_refuses_invalid_tolerance(capsys, work, text):  # noqa: F811
     arguments = ["infer", work / "data" / "ball" / "0000", work / "run", f"--tolerance={text}"]
     code, _, err = call(capsys, "effects", *arguments)
     assert code == 2 and f"--tolerance: must be a number of dB of at least 0, such as 0.1dB; got '{text}'" in err
 
 
-def test_simulate_applies_edits(capsys, work, tmp_path):  # noqa: F811
+def test_simulate_command_applies_edits(capsys, work, tmp_path):  # noqa: F811
     (tmp_path / "edits.yaml").write_text(f"""
         - {{step: 1, op: remove, of: frozen}}
         - {{step: 2, op: recolor, color: [1, 0, 0]}}
@@ -182,7 +182,7 @@ def test_simulate_applies_edits(capsys, work, tmp_path):  # noqa: F811
     assert edited[:3] == plain[:3] and edited[3] < plain[3] and edited[4] > edited[3]
 
 
-def test_simulate_computes_what_a_file_asks_for(capsys, work, tmp_path):  # noqa: F811
+def test_simulate_command_applies_effects_file(capsys, work, tmp_path):  # noqa: F811
     EffectsSpec(DynamicsEffects("masked_out")).save(tmp_path / "spec.yaml")
     scene, options = work / "data" / "ball" / "0000", ["--steps", "1", "--cameras", "3"]
     masked = ["--effects", tmp_path / "spec.yaml"]
@@ -193,7 +193,7 @@ def test_simulate_computes_what_a_file_asks_for(capsys, work, tmp_path):  # noqa
     assert 0 < masked.means.shape[0] < plain.means.shape[0]
 
 
-def test_simulate_tells_how_much_rested(capsys, work, tmp_path):  # noqa: F811
+def test_simulate_command_reports_resting_share(capsys, work, tmp_path):  # noqa: F811
     scene, file = work / "data" / "ball" / "0000", tmp_path / "effects.yaml"
     file.write_text("dynamics: {sleep: {eps: 1000000.0, patience: 2}}")
     options = ["--steps", "4", "--cameras", "0", "--effects", file, "--out", tmp_path / "out"]
@@ -210,7 +210,7 @@ def test_simulate_tells_how_much_rested(capsys, work, tmp_path):  # noqa: F811
         ("- {step: 0, op: insert, scene: nowhere}", "edit 0 at step 0, insert: "),
     ],
 )
-def test_edits_that_cannot_be_made_end_with_one_line(capsys, work, tmp_path, text, message):  # noqa: F811
+def test_simulate_command_refuses_invalid_edits(capsys, work, tmp_path, text, message):  # noqa: F811
     (tmp_path / "edits.yaml").write_text(text)
     options = ["--steps", "2", "--edit", tmp_path / "edits.yaml", "--out", tmp_path / "out"]
     code, _, err = call(capsys, "simulate", work / "run", work / "data" / "ball" / "0000", *options)

@@ -15,7 +15,7 @@ from tests.test_simulator import make_frames, make_simulator, target_cameras
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_one_step_merges_nothing(monkeypatch):
+def test_history_of_one_merges_nothing(monkeypatch):
     """No index of steps, no product with the table of marks, and the bits of the network that does merge."""
     dynamics, history = make_dynamics(), make_history((40,))
     with torch.no_grad(), counted() as alone:
@@ -30,7 +30,7 @@ def test_one_step_merges_nothing(monkeypatch):
         assert_same_bits(value, getattr(merged, name), name)
 
 
-def test_a_model_of_one_step_has_no_use_for_its_tables():
+def test_history_of_one_needs_no_time_embedding():
     one = paper_latent(1)
     names = [f"dynamics.net.encoder.{s}.merge.time_embedding" for s in range(1, 5)]
     assert unused_parameters(make_plan(EffectsSpec(), one), one, names) == tuple(names)
@@ -53,7 +53,7 @@ def make_render():
     return render
 
 
-def test_degree_zero_computes_no_direction():
+def test_degree_zero_computes_no_view_direction():
     """The head has fewer columns, and nothing is turned."""
     render = make_render()
     (_, one), (image, zero) = render(1), render(0)
@@ -63,7 +63,7 @@ def test_degree_zero_computes_no_direction():
     assert image.color.max() > 0.05
 
 
-def test_depth_is_a_channel_of_the_same_pass():
+def test_depth_shares_rasterization_pass():
     render = make_render()
     (plain, off), (both, on) = render(1), render(1, depth=True, alpha=True, features=True)
     for count in (off, on):

@@ -7,8 +7,8 @@ from gsim3d.effects.edits import Duplicate, Edit, Move, Recolor, Remove, Rotate,
 from gsim3d.effects.spec import EffectsSpec
 from tests.asserts import assert_close_relative_to_max
 from tests.effects.models import MODELS, Case
-from tests.effects.test_different_specs_in_one_batch import SPECS
-from tests.effects.test_nothing_executed import EFFECTS
+from tests.effects.test_off_effects import EFFECTS
+from tests.effects.test_plans_of_one_batch import SPECS
 
 EDITS = [
     Edit(0, Recolor("moving", (0.8, 0.2, 0.1))),
@@ -40,7 +40,7 @@ def assert_equal(results, what):
             assert_close_relative_to_max(getattr(cuda_image, name).cpu(), value, 1e-9, f"{what}: {name}")
 
 
-def test_effects(devices):
+def test_plan(devices):
     for name, (model, on, off, _) in EFFECTS.items():
         for values in (on, off):
             results = [case(EffectsSpec.from_dict(values)) for case in cases(devices, model)]
@@ -49,7 +49,7 @@ def test_effects(devices):
 
 def launches(call) -> int:
     """How many kernels, copies and fills the GPU is given."""
-    call()  # what is made once, as constants, is nobody's effect
+    call()  # constants are made once
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         call()
         torch.cuda.synchronize()
@@ -60,7 +60,7 @@ LAUNCHED = ["history", "sleep", "changing", "frozen_appearance", "opacity_change
 
 
 @pytest.mark.parametrize("name", LAUNCHED)
-def test_what_is_off_launches_less(name, devices):
+def test_off_effect_launches_fewer_kernels(name, devices):
     model, on, off, _ = EFFECTS[name]
     *_, case = cases(devices, model)
     counts = [launches(lambda: case(EffectsSpec.from_dict(values))) for values in (off, on)]
@@ -75,7 +75,7 @@ def test_edits(devices):
 
 
 @torch.no_grad()
-def test_different_specs_in_one_batch(devices):
+def test_plans_of_one_batch(devices):
     results = []
     for case in cases(devices, steps=(2, 3, 1, 2)):
         plans = [case.simulator.plan(spec) for spec in SPECS]

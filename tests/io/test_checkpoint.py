@@ -32,7 +32,7 @@ def example(step=10, **changes):
     return Checkpoint(**{**fields, **changes})
 
 
-def test_round_trip(tmp_path):
+def test_spec(tmp_path):
     before = example()
     folder = checkpoint.save(tmp_path, before)
     assert folder == tmp_path / "checkpoints" / "step_000010"

@@ -32,7 +32,7 @@ def gaussians(n=7, degree=3, seed=0):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_round_trip(tmp_path, degree):
+def test_spec(tmp_path, degree):
     before = gaussians(degree=degree)
     write_ply(tmp_path / "a.ply", before)
     after = read_ply(tmp_path / "a.ply")

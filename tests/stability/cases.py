@@ -97,7 +97,7 @@ CASES = {
         "coordinates beyond 16 bits",
         "the op refuses and names the row (on a GPU its code is 0); in the model the particle sleeps, the others have "
         "the bits they have without it",
-        "release: an assertion ends the run at 131 m; PTv3#78, #84, #41 likewise",
+        "release: an assertion ends the run at 131 m; PTv3#78, #84, #41 are the same",
     ),
     "S17": Case(
         "coordinates that are no numbers",

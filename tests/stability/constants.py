@@ -141,7 +141,7 @@ CONSTANTS = (
         _CONFIG,
         "least scale of explicit Gaussians; of the model, this is the default",
     ),
-    Constant("scale_max", "0.1", "metres", _CONFIG, "largest scale, likewise"),
+    Constant("scale_max", "0.1", "metres", _CONFIG, "largest scale, of explicit models too"),
     Constant(
         "max_step",
         "0.5",

@@ -95,7 +95,7 @@ def curve(run):
 
 
 class Killed(BaseException):
-    """Nobody catches it, like a signal."""
+    """Not caught by the training loop, like a signal."""
 
 
 @FLOAT32

@@ -74,7 +74,7 @@ def hostile_frames():
 
 
 @pytest.mark.parametrize("on_invalid", POLICIES)
-def test_hostile_frames(on_invalid, simulator):
+def test_every_policy_on_invalid_frames(on_invalid, simulator):
     refused = set()
     for name, frames in hostile_frames().items():
         if check(simulator, encoded_and_simulated(simulator, frames, on_invalid)):
@@ -86,7 +86,7 @@ def test_hostile_frames(on_invalid, simulator):
 
 @pytest.mark.parametrize("on_invalid", POLICIES)
 @pytest.mark.parametrize("field", ["means", "opacities", "dynamic_latents", "static_latents", "origin"])
-def test_hostile_particles(field, on_invalid, simulator):
+def test_every_policy_on_invalid_particles(field, on_invalid, simulator):
     with torch.no_grad():
         state = simulator.encode(make_frames(SCENES))
     for number in NUMBERS:
@@ -118,7 +118,7 @@ def has_no_root(x):
 @pytest.mark.parametrize("on_invalid", ["drop", "clamp"])
 @pytest.mark.parametrize("spoil", [overflows, divides, has_no_root])
 @pytest.mark.parametrize("call", ["rollout", "render"])
-def test_gradients_behind_numbers_that_overflowed(call, spoil, on_invalid, simulator):
+def test_gradients_of_overflowed_values_raise(call, spoil, on_invalid, simulator):
     """Forward such rows are dropped or bounded; what made them has no gradient, and says so."""
     with torch.no_grad():
         state = simulator.encode(make_frames(SCENES))
@@ -137,7 +137,7 @@ def test_gradients_behind_numbers_that_overflowed(call, spoil, on_invalid, simul
     torch.autograd.grad(out.square().sum(), weight)
 
 
-def test_a_graph_is_watched_once(simulator):
+def test_autograd_graph_is_hooked_once(simulator):
     with torch.no_grad():
         state = simulator.encode(make_frames(SCENES))
     leaf = state.means.clone().requires_grad_()

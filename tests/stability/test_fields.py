@@ -149,7 +149,7 @@ def test_particles_are_refused_by_name(call, field, change, error, message, simu
 
 
 @pytest.mark.parametrize("field", ["body", "rest_positions", "initial_latents", "light_occlusion", "frozen_appearance"])
-def test_what_rows_remember_is_looked_at(field, simulator, state):
+def test_unvalidated_attributes_are_checked(field, simulator, state):
     values = torch.zeros(state.n_rows, 3)
     values[7, 1] = math.nan
     bad = dataclasses.replace(state, **{field: values})

@@ -12,10 +12,10 @@ from tests.stability.fuzz.ops import OPS, public_ops
 from tests.stability.fuzz.readers import READERS
 
 FEW, PER_OP = 25, 2000  # inputs of each op in the fast tests, and in the full ones
-FEW_FILES, PER_READER = 4, 2000  # damaged files of each reader, likewise
+FEW_FILES, PER_READER = 4, 2000  # damaged files of each reader: few, and many
 READER_SECONDS, LEAST_FILES = 10, 5  # no further file after so long; so many are read on a busy machine, too
 ENOUGH = 200  # inputs that are answered in several ways
-FEW_COMMANDS, PER_COMMAND = 4, 200  # wrong arguments of each command, likewise
+FEW_COMMANDS, PER_COMMAND = 4, 200  # wrong arguments of each command: few, and many
 
 
 def assert_none_failed(outcomes: list[Outcome], count: int, least: int | None = None) -> None:

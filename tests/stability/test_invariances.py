@@ -1,4 +1,4 @@
-"""Laws of the simulator (gsim3d/testing/invariances.py): the same scene told otherwise has the same future."""
+"""Invariances of the simulator (gsim3d/testing/invariances.py)."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ import torch
 
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.simulator import Simulator
-from gsim3d.testing import invariances as laws
+from gsim3d.testing import invariances
 from gsim3d.testing.invariances import INVARIANCES, Sample, take_scenes
 from tests.dynamics.scenes import EXPLICIT
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
@@ -45,34 +45,34 @@ def simulators():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 @pytest.mark.parametrize("model", CONFIGS)
-@pytest.mark.parametrize("law", INVARIANCES)
-def test_law(law, model, dtype, device, simulators):
-    deviations = list(INVARIANCES[law](simulators[model, dtype].to(device), make_sample(device, dtype)))
+@pytest.mark.parametrize("name", INVARIANCES)
+def test_invariance(name, model, dtype, device, simulators):
+    deviations = list(INVARIANCES[name](simulators[model, dtype].to(device), make_sample(device, dtype)))
     assert deviations
     broken = [str(deviation) for deviation in deviations if not deviation.holds]
     assert not broken, "\n".join(broken)
 
 
 @pytest.mark.parametrize("background", ["masked_out", "dynamic"])
-@pytest.mark.parametrize("law", ["permute scenes", "split the batch", "append a far particle"])
-def test_laws_hold_for_every_background(law, background, device, simulators):
+@pytest.mark.parametrize("name", ["permute scenes", "split the batch", "append a far particle"])
+def test_invariance_for_every_background(name, background, device, simulators):
     simulator = simulators["latent", torch.float32].to(device)
     plan = simulator.plan(EffectsSpec(dynamics=DynamicsEffects(background=background)))
-    assert all(deviation.holds for deviation in INVARIANCES[law](simulator, make_sample(device, plan=plan)))
+    assert all(deviation.holds for deviation in INVARIANCES[name](simulator, make_sample(device, plan=plan)))
 
 
 # Bodies of noise that are stopped amplify the rounding of sums in another order: of rows in another one.
-@pytest.mark.parametrize("law", [law for law in INVARIANCES if law != "permute particles"])
-def test_laws_hold_for_bodies_that_the_ground_pushes(law, device):
+@pytest.mark.parametrize("name", [name for name in INVARIANCES if name != "permute particles"])
+def test_invariance_with_contact(name, device):
     config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **PUSHED))
     # Products of a GPU are rounded by the batch: one step does not amplify that.
-    sample = make_sample(device, n_steps=1 if device != "cpu" and law == "split the batch" else 3)
-    broken = [str(x) for x in INVARIANCES[law](awake(make_simulator(config)).to(device), sample) if not x.holds]
+    sample = make_sample(device, n_steps=1 if device != "cpu" and name == "split the batch" else 3)
+    broken = [str(x) for x in INVARIANCES[name](awake(make_simulator(config)).to(device), sample) if not x.holds]
     assert not broken, "\n".join(broken)
 
 
 class Broken(Simulator):
-    """Breaks every law a little: particles look at batch mates, at their row and at absolute places."""
+    """Breaks every invariance a little: predictions depend on batch mates, row numbers and absolute positions."""
 
     def _predict(self, *args, **kwargs):
         step = super()._predict(*args, **kwargs)
@@ -86,26 +86,26 @@ class Broken(Simulator):
         return dataclasses.replace(state, means=state.means + 0.01 * state.means.square() + 1e-4 * row)
 
 
-@pytest.mark.parametrize("law", INVARIANCES)
-def test_a_law_notices_a_simulator_that_breaks_it(law):
+@pytest.mark.parametrize("name", INVARIANCES)
+def test_invariance_detects_broken_simulator(name):
     torch.manual_seed(0)
-    broken = [d for d in INVARIANCES[law](awake(Broken(CONFIG).eval()), make_sample("cpu")) if not d.holds]
+    broken = [d for d in INVARIANCES[name](awake(Broken(CONFIG).eval()), make_sample("cpu")) if not d.holds]
     assert broken and all(":" in str(deviation) for deviation in broken)
 
 
-def test_a_deviation_names_the_worst_row_and_takes_nothing_that_is_not_finite():
+def test_deviation_names_worst_particle():
     simulator = make_simulator()
     state = simulator.encode(make_frames((1, 2)))
     other = state.means.clone()
     row = int(state.cu_rows[2]) + 5
     other[row, 1] = float("nan")
-    (found,) = laws.compare_particles("encode", dataclasses.replace(state, means=other), state, 1e-3, ["means"])
+    (found,) = invariances.compare_particles("encode", dataclasses.replace(state, means=other), state, 1e-3, ["means"])
     assert not found.holds and found.where == "scene 1, step 1, particle 5"
     both = dataclasses.replace(state, means=other)
-    assert not next(laws.compare_particles("encode", both, both, 0, ["means"])).holds
+    assert not next(invariances.compare_particles("encode", both, both, 0, ["means"])).holds
 
 
-def test_scenes_are_taken_in_any_order_and_more_than_once():
+def test_take_scenes_repeats_and_reorders():
     frames = make_frames((2, 1))
     taken = take_scenes(frames, [1, 0, 1])
     assert taken.cloud_scene.tolist() == [0, 1, 1, 2] and taken.cloud_step.tolist() == [0, 0, 1, 0]

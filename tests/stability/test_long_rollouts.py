@@ -38,7 +38,7 @@ def state_of(simulator: Simulator, n_rows: int, seed: int = 0):
 
 
 @pytest.mark.parametrize(("preset", "n_rows"), [("tiny", 32), ("small", 8)])
-def test_a_thousand_steps_stay_finite_and_bounded(preset, n_rows, device):
+def test_long_rollout_is_finite_and_bounded(preset, n_rows, device):
     simulator = lively(preset, seed=1).to(device)
     state, finite = state_of(simulator, n_rows).to(device), []
 
@@ -59,7 +59,7 @@ def test_a_thousand_steps_stay_finite_and_bounded(preset, n_rows, device):
 
 @pytest.mark.parametrize("model", CONFIGS)
 @pytest.mark.parametrize("case", STRESS_TESTS)
-def test_case(case, model, device, simulators):  # noqa: F811
+def test_stress_test(case, model, device, simulators):  # noqa: F811
     deviations = list(STRESS_TESTS[case](simulators[model, torch.float32].to(device), make_sample(device)))
     assert deviations
     broken = [str(deviation) for deviation in deviations if not deviation.holds]
@@ -74,7 +74,7 @@ class Diverging(Simulator):
         return dataclasses.replace(step, means=3 * step.means, dynamic_latents=step.dynamic_latents / 0)
 
 
-def test_a_case_notices_a_simulator_that_diverges():
+def test_stress_test_detects_divergence():
     diverging = awake(Diverging(CONFIG).eval())
     for case in ("images without content", "few and equal views", "crowds", "a long rollout"):
         try:
@@ -95,7 +95,7 @@ def encoded():
 
 
 @pytest.mark.parametrize("n_steps", [12, 48])
-def test_gradients_through_a_rollout_neither_explode_nor_vanish(n_steps, encoded):
+def test_rollout_gradients_neither_explode_nor_vanish(n_steps, encoded):
     sample, state = encoded
     norms, gradients = gradient_norms(awake(make_simulator()), state, sample.targets, n_steps)
     assert len(norms) == n_steps and all(map(math.isfinite, norms))
@@ -122,7 +122,7 @@ def hard_state(kind, state):
 
 
 @pytest.mark.parametrize("kind", ["all in one voxel", "every particle twice", "one far away", "opaque, large latents"])
-def test_gradients_of_hard_states_stay_bounded(kind, encoded):
+def test_gradients_of_hard_states_are_bounded(kind, encoded):
     sample, state = encoded
     simulator = awake(make_simulator())
     norms, gradients = gradient_norms(simulator, hard_state(kind, state), sample.targets, 12)
@@ -131,7 +131,7 @@ def test_gradients_of_hard_states_stay_bounded(kind, encoded):
 
 
 @pytest.mark.parametrize("n_steps", [12, 48])
-def test_checkpointing_gives_the_same_gradients(n_steps, encoded):
+def test_checkpointing_gradients_are_equal(n_steps, encoded):
     """To the bit: what is computed again is the same."""
     sample, state = encoded
     found = []
@@ -146,7 +146,7 @@ def test_checkpointing_gives_the_same_gradients(n_steps, encoded):
         assert torch.equal(gradient, recomputed[name]), name
 
 
-def test_clipped_gradients_keep_their_direction_and_have_the_norm_asked_for(encoded):
+def test_clipped_gradients_direction_and_norm(encoded):
     sample, state = encoded
     simulator = awake(make_simulator())
     _, gradients = gradient_norms(simulator, state, sample.targets, 12)
@@ -160,7 +160,7 @@ def test_clipped_gradients_keep_their_direction_and_have_the_norm_asked_for(enco
     assert torch.nn.functional.cosine_similarity(clipped, plain, 0) == pytest.approx(1, abs=1e-6)
 
 
-def test_curves_are_those_of_the_rollout(encoded):
+def test_rollout_curves_match_rollout(encoded):
     sample, state = encoded
     simulator = awake(make_simulator())
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""raise, drop and clamp at every door of the simulator: what is refused, what sleeps, what is bounded, who is told."""
+"""raise, drop and clamp at every door of the simulator: what is refused, what sleeps, what is bounded, what is reported."""
 
 import copy
 import dataclasses
@@ -75,7 +75,7 @@ def test_raise_names_scene_step_row_and_tensor(name, value, what, simulator, sta
 
 @pytest.mark.parametrize("on_invalid", ["drop", "clamp"])
 @pytest.mark.parametrize("name, value, what", BAD)
-def test_the_other_scene_keeps_its_bits(name, value, what, on_invalid, simulator, state):
+def test_invalid_particle_keeps_other_scene_bits(name, value, what, on_invalid, simulator, state):
     row, report = int(state.cu_rows[-2]) + 4, StabilityReport()
     with torch.no_grad():
         good = simulator.rollout(state, 3)
@@ -93,8 +93,8 @@ def test_the_other_scene_keeps_its_bits(name, value, what, on_invalid, simulator
 
 
 @pytest.mark.parametrize("name, value, what", BAD)
-def test_a_dropped_row_is_as_if_it_were_absent(name, value, what, simulator, state):
-    """What it held changes nobody: not its scene, not the images."""
+def test_dropped_particle_matches_absent(name, value, what, simulator, state):
+    """Its values change no other particle and no image."""
     row = int(state.cu_rows[-2]) + 4
     kept = torch.arange(state.n_rows, device=state.means.device) != row
     with torch.no_grad():
@@ -110,7 +110,7 @@ def test_a_dropped_row_is_as_if_it_were_absent(name, value, what, simulator, sta
     assert_same_bits(images[0], images[1])
 
 
-def test_gradients_of_dropped_rows_are_zero_and_of_all_others_finite(simulator, state):
+def test_dropped_particle_gradients_are_zero(simulator, state):
     latents = state.dynamic_latents.clone()
     latents[-1, 0] = NAN
     latents.requires_grad_()
@@ -124,8 +124,8 @@ def test_gradients_of_dropped_rows_are_zero_and_of_all_others_finite(simulator, 
 
 
 @pytest.mark.parametrize("knows_previous", [False, True])
-def test_rows_are_mended_alike_with_and_without_gradients(simulator, state, knows_previous):
-    """The kernel mends where nobody asks for gradients, torch where somebody does."""
+def test_sanitized_values_with_and_without_gradients(simulator, state, knows_previous):
+    """The kernel sanitizes without gradients, torch with them."""
     newest, generator = last_steps(state, 1), torch.Generator().manual_seed(0)
     shapes = {"quats": (4,), "scales": (3,), "sh": (4, 3)}
     explicit = {name: torch.rand(newest.n_rows, *shape, generator=generator) for name, shape in shapes.items()}
@@ -152,7 +152,7 @@ def test_rows_are_mended_alike_with_and_without_gradients(simulator, state, know
     assert asleep == [row for row in range(len(cases)) if knows_previous or row != len(cases) - 2]
 
 
-def test_a_closed_report_keeps_what_it_knows_and_takes_nothing_more(simulator, state):
+def test_closed_report_takes_no_records(simulator, state):
     row, report = int(state.cu_rows[-2]) + 4, StabilityReport()
     bad = with_value(state, "means", row, NAN)
     with torch.no_grad():
@@ -185,8 +185,8 @@ def kick_row(simulator, row, call, kick):
     ("kick", "what", "stays"),
     [(50.0, "speed limit", True), (7000.0, "outside the workspace", False), (NAN, "not finite", True)],
 )
-def test_a_runaway_sleeps_and_the_rest_go_on(kick, what, stays, simulator, state):
-    """From the step on at which it runs away nobody sees it; the other scene keeps its bits."""
+def test_diverging_particle_sleeps(kick, what, stays, simulator, state):
+    """From the step on at which it diverges the network does not see it; the other scene keeps its bits."""
     with torch.no_grad():
         good = simulator.rollout(state, 4)
         kick_row(simulator, 3, 2, kick)
@@ -211,7 +211,7 @@ def test_a_runaway_sleeps_and_the_rest_go_on(kick, what, stays, simulator, state
     assert sentinels[1, 4].awake == sentinels[1, 3].awake
 
 
-def test_leaving_the_workspace_is_no_error(simulator, state):
+def test_leaving_workspace_is_no_error(simulator, state):
     report = StabilityReport()
     far = with_value(state, "means", -1, 1e6)
     steps = simulator.rollout(far, 2, report=report)  # on_invalid is "raise"
@@ -220,7 +220,7 @@ def test_leaving_the_workspace_is_no_error(simulator, state):
     assert_same_bits(steps[-1].means[-1], far.means[-1])
 
 
-def test_clamped_particles_stay_inside_and_below_the_speed_limit(simulator, state):
+def test_clamp_keeps_workspace_and_speed_limit(simulator, state):
     kick_row(simulator, 3, 1, torch.tensor([50.0, -1e9, 0.0], device=state.means.device))
     simulator.config = dataclasses.replace(simulator.config, stability=StabilityConfig("clamp", max_speed=2.0))
     with torch.no_grad():
@@ -231,7 +231,7 @@ def test_clamped_particles_stay_inside_and_below_the_speed_limit(simulator, stat
     assert bool(((inside >= 0) & (inside < 2**16)).all()) and not bool((step.activity == ASLEEP).any())
 
 
-def test_a_good_state_is_left_as_it_is(simulator, state):
+def test_valid_state_is_unchanged(simulator, state):
     report = StabilityReport()
     with torch.no_grad():
         for on_invalid in ("raise", "drop", "clamp"):
@@ -241,7 +241,7 @@ def test_a_good_state_is_left_as_it_is(simulator, state):
     assert sorted(report.statistics) == [(0, 2), (1, 3)]
 
 
-def test_sentinels_are_the_sums_that_they_say(simulator, state):
+def test_statistics_match_sums(simulator, state):
     report = StabilityReport()
     with torch.no_grad():
         step = simulator.rollout(state, 1, report=report)[0]
@@ -254,7 +254,7 @@ def test_sentinels_are_the_sums_that_they_say(simulator, state):
     assert sums.extent == pytest.approx(float((now.amax(0) - now.amin(0)).norm()), rel=1e-9)
 
 
-def test_the_model_s_policy_holds_where_a_call_names_none(simulator, state):
+def test_default_policy_is_the_model_s(simulator, state):
     bad = with_value(state, "opacities", 0, -0.5)
     simulator.config = dataclasses.replace(simulator.config, stability=StabilityConfig("drop"))
     simulator.step(bad)
@@ -266,7 +266,7 @@ def test_the_model_s_policy_holds_where_a_call_names_none(simulator, state):
     assert simulator.report.total == 0
 
 
-def test_an_error_is_raised_once(simulator, state):
+def test_error_is_raised_once(simulator, state):
     """The next good call on the same report does not fail for the bad one; check() still tells."""
     with pytest.raises(NumericalError):
         simulator.step(with_value(state, "opacities", 0, -0.5))
@@ -277,7 +277,7 @@ def test_an_error_is_raised_once(simulator, state):
         simulator.report.check()
 
 
-def test_nothing_waits_for_the_device_in_a_guard(devices):
+def test_validation_does_not_synchronize(devices):
     simulator = make_simulator().to(devices[1])
     with torch.no_grad():
         state = simulator.encode(make_frames(SCENES).to(devices[1]))
@@ -292,7 +292,7 @@ def test_nothing_waits_for_the_device_in_a_guard(devices):
             torch.cuda.set_sync_debug_mode("default")
 
 
-def test_a_captured_guard_counts_at_every_replay(devices):
+def test_captured_validation_counts_every_replay(devices):
     simulator = make_simulator().to(devices[1])
     with torch.no_grad():
         state = last_steps(simulator.encode(make_frames(SCENES).to(devices[1])), 1)
@@ -313,7 +313,7 @@ def test_a_captured_guard_counts_at_every_replay(devices):
     assert report.total == 1 + 2 and report.findings[0].what == "not finite"
 
 
-def test_a_guard_compiles():
+def test_validation_compiles():
     simulator = make_simulator()
     with torch.no_grad():
         state = last_steps(simulator.encode(make_frames(SCENES)), 1)
@@ -338,7 +338,7 @@ def spoiled_frames(device, value=NAN):
     return dataclasses.replace(frames, images=images).to(device), row
 
 
-def test_a_pixel_that_is_no_number(simulator, device):
+def test_invalid_pixel(simulator, device):
     frames, row = spoiled_frames(device)
     with pytest.raises(
         NumericalError, match=r"images must be finite; image 1 \(scene 0, step 0\) is not; on_invalid=\"drop\""
@@ -361,7 +361,7 @@ def test_a_pixel_that_is_no_number(simulator, device):
 
 
 @pytest.mark.parametrize("on_invalid", ["drop", "clamp"])
-def test_gradients_of_spoiled_images_are_finite(simulator, device, on_invalid):
+def test_gradients_of_invalid_pixels_are_finite(simulator, device, on_invalid):
     frames, _ = spoiled_frames(device, INF)
     images = frames.images.clone().requires_grad_()
     particles = simulator.encode(dataclasses.replace(frames, images=images), on_invalid=on_invalid)
@@ -371,7 +371,7 @@ def test_gradients_of_spoiled_images_are_finite(simulator, device, on_invalid):
 
 
 @pytest.mark.parametrize("on_invalid", ["raise", "drop", "clamp"])
-def test_a_camera_that_cannot_see_raises_under_every_policy(simulator, device, on_invalid):
+def test_invalid_camera_raises_under_every_policy(simulator, device, on_invalid):
     frames = make_frames((1,)).to(device)
     near = frames.cameras.near.clone()
     near[1] = 0
@@ -386,7 +386,7 @@ def test_a_camera_that_cannot_see_raises_under_every_policy(simulator, device, o
 # ---- the report ------------------------------------------------------------------------------------------------------
 
 
-def test_a_report_is_a_table_plain_data_and_forgets(simulator, state):
+def test_report_formats_and_clear(simulator, state):
     report = StabilityReport()
     simulator.step(with_value(state, "opacities", slice(0, 3), 2.0), on_invalid="drop", report=report)
     header, line, total = str(report).splitlines()
@@ -399,7 +399,7 @@ def test_a_report_is_a_table_plain_data_and_forgets(simulator, state):
 
 
 def replayed(*records):
-    """A report that a replay told of records (numbers, counts), and the list of those that it has read."""
+    """A report that got the records (numbers, counts) of a replay, and the list of those that it has read."""
     source, target, seen = StabilityReport(), StabilityReport(), []
 
     def read(numbers, place):
@@ -413,7 +413,7 @@ def replayed(*records):
     return target, seen
 
 
-def test_records_travel_as_one():
+def test_records_are_copied_together():
     generator = torch.Generator().manual_seed(0)
     counts, sums = torch.arange(6).reshape(3, 2), torch.randn(2, 5, generator=generator, dtype=torch.float64)
     sums[1, 2] = INF
@@ -424,7 +424,7 @@ def test_records_travel_as_one():
             assert_same_bits(a, b)
 
 
-def test_records_without_findings_are_read_when_somebody_asks():
+def test_quiet_records_are_read_lazily():
     bad = torch.tensor([[0.0, 7.0], [2.0, 8.0]], dtype=torch.float64)
     good = bad * torch.tensor([0.0, 1.0], dtype=torch.float64)
     report, seen = replayed((good, (0, 2)), (good + 1, ()))
@@ -440,7 +440,7 @@ def test_records_without_findings_are_read_when_somebody_asks():
     assert_same_bits(seen[0], bad)
 
 
-def test_drawing_is_rendering_without_a_look(simulator, state):
+def test_draw_matches_render(simulator, state):
     report = StabilityReport()
     with torch.no_grad():
         (step,) = simulator.rollout(with_value(state, "means", 1, NAN), 1, on_invalid="drop", report=report)
@@ -453,7 +453,7 @@ def test_drawing_is_rendering_without_a_look(simulator, state):
     assert found == report.total > 0 and float(drawn.alpha.max()) > 0
 
 
-def test_a_copied_model_has_a_report_of_its_own(simulator, state):
+def test_copied_model_has_own_report(simulator, state):
     simulator.step(with_value(state, "opacities", 0, 2.0), on_invalid="drop")
     other = copy.deepcopy(simulator)
     assert other.report is not simulator.report and other.report.total == 0 and simulator.report.total == 1
@@ -468,7 +468,7 @@ def test_a_copied_model_has_a_report_of_its_own(simulator, state):
         (lambda: make_simulator().step(None, on_invalid="sleep"), "on_invalid must be one of"),
     ],
 )
-def test_what_is_no_policy_or_limit(make, message):
+def test_config_refuses_invalid_policy_and_limits(make, message):
     with pytest.raises(InputError, match=message):
         make()
 
@@ -478,7 +478,7 @@ def test_every_preset_has_the_default_policy():
         assert preset().stability == StabilityConfig() and preset().stability.on_invalid == "raise"
 
 
-def test_one_bad_gaussian_in_one_camera_is_named():
+def test_raster_finding_names_camera():
     frames = make_frames((1,))
     n = 3
     means = torch.zeros(n, 3)
@@ -489,7 +489,7 @@ def test_one_bad_gaussian_in_one_camera_is_named():
     assert (caught.value.camera, caught.value.row) == (0, 1)
 
 
-def test_an_error_counts_the_rows_of_its_own_call():
+def test_error_counts_its_own_call():
     """One report of several calls: what earlier ones found is neither in the message nor in its count."""
     report, finding = StabilityReport(), Finding("not finite", "rollout", "means", "error", 1, row=4, scene=0, step=2)
     for row, count in ((4, 1), (7, 1), (1, 3), (4, 1)):
@@ -508,7 +508,7 @@ def test_an_error_counts_the_rows_of_its_own_call():
 
 
 @pytest.mark.parametrize("calls", [1, 3])
-def test_every_call_of_an_op_says_how_many_rows_are_bad(calls):
+def test_op_findings_count_every_call(calls):
     report, bad = StabilityReport(), torch.tensor([[0.0, 0, 3], [torch.nan, 0, 4], [0, torch.inf, 4]])
     K = torch.tensor([[[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]])
     cameras = Cameras(torch.eye(4)[None], K, torch.ones(1), torch.full((1,), 9.0), torch.tensor([0]), 64, 48)

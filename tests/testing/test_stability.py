@@ -1,4 +1,4 @@
-"""gsim3d doctor --stability: laws and hard cases on a user's model and scenes, a report, files for every failure."""
+"""gsim3d doctor --stability: invariances and stress tests of a user's model and scenes."""
 
 import dataclasses
 import json
@@ -50,7 +50,7 @@ def trained(tmp_path_factory, scenes):
     return root / "run"
 
 
-def test_random_weights_on_random_images_keep_every_law_and_case(tmp_path):
+def test_random_model_passes_all_checks(tmp_path):
     report = check_stability(job(tmp_path, only=()))
     assert report.healthy and [finding.check for finding in report.findings] == list(CHECKS)
     assert all(finding.n_compared > 0 for finding in report.findings)
@@ -61,7 +61,7 @@ def test_random_weights_on_random_images_keep_every_law_and_case(tmp_path):
     assert not list((tmp_path / "failures").iterdir())
 
 
-def test_the_small_preset_keeps_every_law_and_case_with_all_particles(tmp_path, capsys):
+def test_small_preset_passes_full_check(tmp_path, capsys):
     scenes = write_scenes(tmp_path / "data", 2, n_steps=2, size=16)
     arguments = ["--stability", "small", scenes, "--full", "--steps", "3", "--out", tmp_path / "report"]
     assert main(["doctor", *map(str, arguments)]) == 0, capsys.readouterr().out
@@ -71,7 +71,7 @@ def test_the_small_preset_keeps_every_law_and_case_with_all_particles(tmp_path, 
     assert all(finding["n_compared"] > 0 for finding in report["findings"])
 
 
-def test_a_full_check_has_all_particles_four_views_and_the_whole_history(tmp_path):
+def test_full_check_sample_size(tmp_path):
     folders = sorted((write_scenes(tmp_path, 2, n_steps=6, size=64) / "ball").iterdir())
     subject = open_subject("small")
     few, full = (stability.sample_of_scenes(subject, folders, full)[0].frames for full in (False, True))
@@ -89,13 +89,13 @@ def test_a_full_check_has_all_particles_four_views_and_the_whole_history(tmp_pat
         (["--stability", "small", "--full"], "--full needs scenes"),
     ],
 )
-def test_what_a_full_check_needs_is_said(tmp_path, capsys, arguments, message):
+def test_full_check_refuses_missing_scenes(tmp_path, capsys, arguments, message):
     assert main(["doctor", *arguments, "--out", str(tmp_path / "r")]) == 2
     assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_a_checkpoint_and_a_folder_of_scenes(tmp_path, trained, scenes, capsys, monkeypatch, terminal):
+def test_check_of_checkpoint_on_scenes(tmp_path, trained, scenes, capsys, monkeypatch, terminal):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     arguments = [
         "--stability",
@@ -118,18 +118,18 @@ def test_a_checkpoint_and_a_folder_of_scenes(tmp_path, trained, scenes, capsys, 
 
 
 @pytest.fixture
-def broken_law(monkeypatch):
-    """A law that fails in one place only: the particle and step that the report must name."""
+def broken_check(monkeypatch):
+    """A check that fails for one particle and step, which the report must name."""
 
-    def law(simulator, sample):
+    def failing(simulator, sample):
         yield Deviation("encode means", 0.0, 0.0, "scene 0, step 0, particle 0")
         red = float(sample.frames.images[3, 0].mean())
         yield Deviation("step means", red, 1e-9, "scene 1, step 4, particle 17")
 
-    monkeypatch.setitem(CHECKS, "repeat", law)
+    monkeypatch.setitem(CHECKS, "repeat", failing)
 
 
-def test_a_failure_is_named_and_can_be_made_again(tmp_path, broken_law, scenes, capsys):
+def test_failure_is_named_and_replayed(tmp_path, broken_check, scenes, capsys):
     folder = scenes / "ball" / "0000"
     arguments = ["--stability", folder, "--only", *FEW, "--out", tmp_path]
     assert main(["doctor", *map(str, arguments)]) == 1
@@ -144,7 +144,7 @@ def test_a_failure_is_named_and_can_be_made_again(tmp_path, broken_law, scenes, 
     assert main(["doctor", "--replay", str(file)]) == 1
 
 
-def test_what_the_model_card_has_is_a_known_failure(tmp_path, broken_law, monkeypatch, trained, scenes):
+def test_known_failure_of_model_card(tmp_path, broken_check, monkeypatch, trained, scenes):
     known = {"repeat": {"what": "step means", "error": 0.25, "bound": 1e-9}}
     monkeypatch.setattr(stability, "known_failures", lambda path: known)
     report = check_stability(job(tmp_path, trained, scenes))
@@ -157,12 +157,12 @@ def test_what_the_model_card_has_is_a_known_failure(tmp_path, broken_law, monkey
     assert check_stability(job(tmp_path, trained, scenes)).findings[0].outcome == "fails"
 
 
-def test_a_check_that_ends_with_an_error_fails_and_the_others_go_on(tmp_path, monkeypatch):
-    def law(simulator, sample):
+def test_check_that_raises_is_a_failure(tmp_path, monkeypatch):
+    def failing(simulator, sample):
         raise RuntimeError("the rollout is not finite")
         yield
 
-    monkeypatch.setitem(CHECKS, "repeat", law)
+    monkeypatch.setitem(CHECKS, "repeat", failing)
     report = check_stability(job(tmp_path))
     assert [finding.outcome for finding in report.findings] == ["fails", "holds"]
     failure = report.findings[0].failures[0]
@@ -170,7 +170,7 @@ def test_a_check_that_ends_with_an_error_fails_and_the_others_go_on(tmp_path, mo
     assert "RuntimeError" in describe(report) and not report.healthy
 
 
-def test_a_scene_that_cannot_be_read_is_a_problem_that_names_camera_and_frame(tmp_path, capsys):
+def test_unreadable_scene_is_reported(tmp_path, capsys):
     scene = write_scene(tmp_path / "scene", n_steps=2)
     (scene / "cam_2" / "rgb_0001.png").write_bytes(b"no picture")
     arguments = ["--stability", scene, "--only", "repeat", "--out", tmp_path / "report"]
@@ -180,7 +180,7 @@ def test_a_scene_that_cannot_be_read_is_a_problem_that_names_camera_and_frame(tm
     assert "cam_2/rgb_0001.png" in (tmp_path / "report" / "report.md").read_text()
 
 
-def test_what_imitates_published_behaviour_is_not_promised(tmp_path):
+def test_released_model_has_no_promised_invariances(tmp_path):
     subject = open_subject(None)
     subject = dataclasses.replace(subject, simulator=ReleasedSimulator(subject.simulator.config).eval())
     found = {f.check: f for f, _ in check(subject, random_sample(subject), 2, ["repeat", "split the batch"])}
@@ -188,7 +188,7 @@ def test_what_imitates_published_behaviour_is_not_promised(tmp_path):
     assert "repeats the behaviour of the release" in found["split the batch"].reason
 
 
-def test_a_sample_comes_back_as_it_was_saved(tmp_path):
+def test_sample_round_trip(tmp_path):
     sample = random_sample(open_subject(None))
     stability.save_sample(tmp_path / "s.safetensors", sample, {"check": "repeat"})
     again, what = load_sample(tmp_path / "s.safetensors")
@@ -225,7 +225,7 @@ def test_bad_input_gets_one_line_and_exit_code_2(arguments, message, tmp_path, s
 
 
 @pytest.mark.parametrize("damage", ["truncated", "no metadata", "missing tensor"])
-def test_a_damaged_sample_is_refused(damage, tmp_path):
+def test_load_sample_refuses_damaged_files(damage, tmp_path):
     from safetensors.torch import load_file, save_file
 
     file = Path(tmp_path / "s.safetensors")

@@ -22,7 +22,7 @@ from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.restore import build_simulator, model_config
 
 
-def test_round_trip():
+def test_spec():
     config = TrainConfig(phases=(PhaseConfig(steps=3, horizon=2, learning_rate=1e-3),), seed=4, model={"a": [1]})
     assert from_dict(TrainConfig, to_dict(config)) == config
 

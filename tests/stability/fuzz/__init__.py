@@ -1,4 +1,4 @@
-"""Fuzzing: seeded inputs that nobody should give, to every op, public function, command and reader.
+"""Fuzzing: seeded invalid inputs, to every op, public function, command and reader.
 
     python -m tests.stability.fuzz pool_max ply --count 1000000     many more than the tests take
     python -m tests.stability.fuzz --replay FAILURE                 a failing input again, in this process

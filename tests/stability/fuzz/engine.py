@@ -318,7 +318,7 @@ def finite(value: Any, what: str = "result") -> None:
         if value.is_meta or not (value.is_floating_point() or value.is_complex()):
             return
         if not torch.isfinite(value).all():
-            raise Failure(f"{what} is not finite, and nobody was told")
+            raise Failure(f"{what} is not finite, without an error or finding")
     elif isinstance(value, dict):
         for name, item in value.items():
             finite(item, f"{what}.{name}")

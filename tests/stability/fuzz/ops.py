@@ -426,7 +426,7 @@ def _call(name: str, arguments: Arguments, folder: Path) -> None:
 
 
 def _call_on_gpu(name: str, arguments: Arguments, folder: Path) -> None:
-    """The same on a GPU, where nobody looks at numbers and index lists: of those that the CPU refuses a result may be
+    """The same on a GPU, where numbers and index lists are not checked: of those that the CPU refuses a result may be
     anything, but images, which leave such rows out."""
     must_be_finite = name == "rasterize_gaussians" or _cpu_takes(name, arguments)
     moved = {k: v.to("cuda") if isinstance(v, Tensor) and not v.is_meta else v for k, v in arguments.items()}

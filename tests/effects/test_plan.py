@@ -20,7 +20,7 @@ SOME = EffectsSpec(
 )
 
 
-def test_absent_is_off():
+def test_spec_default_is_off():
     spec = EffectsSpec()
     assert spec.to_dict() == {"version": 1} and EffectsSpec.from_dict(None) == spec == EffectsSpec.from_dict({})
     plan = make_plan(spec, MODEL)
@@ -60,12 +60,12 @@ def test_old_key_of_frozen_appearance_is_converted():
         ({"appearance": {"opacity_changes": True}}, "unsupported effect appearance.opacity_changes"),
     ],
 )
-def test_what_cannot_be_simulated_raises(values, message):
+def test_plan_refuses_unsupported_effects(values, message):
     with pytest.raises(UnsupportedEffect, match=message):
         make_plan(EffectsSpec.from_dict(values), MODEL)
 
 
-def test_view_dependence_beyond_the_model_raises():
+def test_plan_refuses_degree_beyond_model():
     with pytest.raises(UnsupportedEffect, match="view_dependent: this model goes up to 0; got 2"):
         make_plan(EffectsSpec(appearance=AppearanceEffects(view_dependent=2)), presets.tiny())
 
@@ -89,12 +89,12 @@ def test_view_dependence_beyond_the_model_raises():
         ({"version": 2}, "version must be 1; got 2"),
     ],
 )
-def test_malformed_specs_raise(values, message):
+def test_spec_refuses_malformed_values(values, message):
     with pytest.raises(InputError, match=message):
         EffectsSpec.from_dict(values)
 
 
-def test_the_page_tells_of_every_field_and_its_examples_can_be_read(tmp_path):
+def test_documentation_lists_every_key(tmp_path):
     page = (Path(__file__).parents[2] / "docs" / "effects.md").read_text()
     spec, edits = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
     for name, text in (("spec.yaml", spec), ("edits.yaml", edits)):
@@ -111,7 +111,7 @@ def test_the_page_tells_of_every_field_and_its_examples_can_be_read(tmp_path):
     assert all(f"`{field.name}" in page for field in dataclasses.fields(read.outputs))
 
 
-def test_a_file_that_is_no_spec(tmp_path):
+def test_spec_refuses_other_files(tmp_path):
     (tmp_path / "bad.yaml").write_text("- 1\n- 2\n")
     with pytest.raises(InputError, match="must hold a mapping"):
         EffectsSpec.load(tmp_path / "bad.yaml")

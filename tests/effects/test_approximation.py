@@ -30,7 +30,7 @@ def asleep(**options):
     return EffectsSpec(dynamics=DynamicsEffects(sleep=Sleep(**options)))
 
 
-def test_the_error_of_sleep_is_that_of_the_steps_slept():
+def test_sleep_error_of_slept_steps():
     simulator, state = make_simulator(), make_history((50, 60), frozen_share=0.3)
     error = compare_sleep(simulator, state, 7, simulator.plan(asleep(eps=1e6)), camera())
     assert error.log.moving[4:] == [0] * 3
@@ -41,13 +41,13 @@ def test_the_error_of_sleep_is_that_of_the_steps_slept():
     assert error.moved[6] == pytest.approx(expected, rel=1e-6)
 
 
-def test_where_nobody_sleeps_there_is_no_error():
+def test_sleep_error_without_sleep_is_zero():
     simulator, state = make_simulator(), make_history((50, 60), frozen_share=0.3)
     error = compare_sleep(simulator, state, 5, simulator.plan(asleep(eps=0.0)), camera())
     assert error.moved == (0.0,) * 5 and error.psnr == (math.inf,) * 5 and error.log.resting_share > 0
 
 
-def test_an_asymmetric_background_is_compared_with_its_symmetric_twin():
+def test_background_error_against_symmetric_weights():
     simulator, state = make_simulator(), make_history((50, 60), frozen_share=0.6)
     error = compare_backgrounds(simulator, state, 3, camera())
     twin = make_simulator(TINY)
@@ -59,13 +59,13 @@ def test_an_asymmetric_background_is_compared_with_its_symmetric_twin():
     assert all(math.isfinite(p) for p in (*error.psnr, *error.shadow_psnr))
 
 
-def test_without_background_nothing_is_lost():
+def test_background_error_without_background_is_zero():
     simulator, state = make_simulator(), make_history((50, 60), frozen_share=0.0)
     error = compare_backgrounds(simulator, state, 2, camera())
     assert error.moved == error.shadow == (0.0, 0.0) and error.psnr == error.shadow_psnr == (math.inf, math.inf)
 
 
-def test_what_cannot_be_compared_raises():
+def test_comparison_refuses_unsuitable_models():
     simulator, state = make_simulator(TINY), make_history((50, 60))
     with pytest.raises(InputError, match="background"):
         compare_backgrounds(simulator, state, 2, camera())

@@ -41,7 +41,7 @@ def multiply_adds(net, call):
     return counted
 
 
-def test_pays_off_the_more_rests_the_less_is_computed():
+def test_sleep_cost_falls_with_resting_share():
     simulator, history = make_simulator(), make_history((N_ROWS,) * 4, frozen_share=0.0)
     dynamics, work = simulator.dynamics, []
     for share in (0.0, 0.5, 0.9, 0.99):
@@ -52,7 +52,7 @@ def test_pays_off_the_more_rests_the_less_is_computed():
     assert work[0] > 1.3 * work[1] and work[0] > 4 * work[2] and work[2] > 4 * work[3] > 0
 
 
-def test_a_background_costs_less_than_a_step_in_which_it_moves():
+def test_background_cost_is_below_dynamic_cost():
     simulator, history = make_simulator(), make_history((N_ROWS,) * 4, frozen_share=1.0)
     dynamics, net = simulator.dynamics, simulator.dynamics.net
     thawed = dataclasses.replace(history, activity=torch.zeros_like(history.activity))
@@ -61,7 +61,7 @@ def test_a_background_costs_less_than_a_step_in_which_it_moves():
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9])
-def test_the_predicted_cost_knows_the_second_patch(share):
+def test_predicted_cost_counts_joint_attention(share):
     """On a ground whose points are a cell apart it tells what moving rows pay for seeing those that rest."""
     simulator, n = make_simulator(), 48
     ground = torch.cartesian_prod(torch.arange(n), torch.arange(n), torch.tensor([3])) * ASYMMETRIC.grid_size

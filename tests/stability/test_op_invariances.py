@@ -1,5 +1,4 @@
-"""Laws of the ops: the same input told otherwise (moved, turned, reordered, repeated, split, with more beside) gives
-the same result, forward and backward; equal bits where the same sums are formed, else to a bound."""
+"""Invariances of the ops, forward and backward: equal bits where the same sums are formed, else to a bound."""
 
 import dataclasses
 
@@ -51,13 +50,13 @@ def to(device, *tensors):
 
 # curves
 @pytest.mark.parametrize("curve", ["z", "hilbert"])
-def test_exchanging_x_and_y_is_the_transposed_curve(curve, device):
+def test_curve_axis_exchange(curve, device):
     grid = torch.randint(0, 1 << 16, (300, 3), generator=generator()).to(device)
     assert torch.equal(curve_encode(grid[:, [1, 0, 2]], None, curve), curve_encode(grid, None, f"{curve}-trans"))
 
 
 @pytest.mark.parametrize("curve", ["z", "z-trans", "hilbert", "hilbert-trans"])
-def test_codes_know_nothing_of_other_rows(curve, device):
+def test_curve_codes_are_independent(curve, device):
     grid = torch.randint(0, 1 << 16, (300, 3), generator=generator()).to(device)
     cloud = (torch.arange(300) % 5).to(device)
     codes, order = curve_encode(grid, cloud, curve), torch.randperm(300, generator=generator(1)).to(device)
@@ -67,14 +66,14 @@ def test_codes_know_nothing_of_other_rows(curve, device):
     assert torch.equal(curve_encode(grid, cloud + 3, curve) - codes, torch.full_like(codes, 3 << 48))
 
 
-def test_z_codes_of_a_block_move_with_it(device):
+def test_z_codes_translate(device):
     grid = torch.randint(0, 1 << 8, (200, 3), generator=generator()).to(device)
     block = torch.tensor([[3, 5, 200]], device=device) << 8
     moved = curve_encode(grid + block, None, "z")
     assert torch.equal(moved, curve_encode(grid, None, "z") + curve_encode(block, None, "z"))
 
 
-def test_sorting_forgets_the_order_and_the_other_rows(device):
+def test_curve_sort_permutation_invariance(device):
     codes = torch.randint(0, 1 << 62, (3, 200), generator=generator()).to(device)
     order, _ = curve_sort(codes)
     shuffle = torch.randperm(200, generator=generator(1)).to(device)
@@ -100,7 +99,7 @@ def assert_same_pyramid(actual, expected):
 
 
 @DTYPES
-def test_a_pyramid_moves_with_its_origin(dtype, device):
+def test_pyramid_translation_with_origin(dtype, device):
     arguments = on(device, grained(dtype))
     shift = torch.tensor([12.5, -3.25, 7.0], dtype=torch.float64, device=device)
     moved = arguments | {"positions": arguments["positions"] + shift.to(dtype), "origin": arguments["origin"] + shift}
@@ -108,7 +107,7 @@ def test_a_pyramid_moves_with_its_origin(dtype, device):
 
 
 @DTYPES
-def test_whole_cells_of_translation_shift_the_cells_of_a_pyramid(dtype, device):
+def test_pyramid_translation_by_cells(dtype, device):
     spec = dataclasses.replace(SPEC, grid_size=0.125)
     arguments = on(device, grained(dtype))
     arguments["origin"][:] = -4.0
@@ -127,7 +126,7 @@ def test_whole_cells_of_translation_shift_the_cells_of_a_pyramid(dtype, device):
 
 
 @DTYPES
-def test_a_pyramid_turns_with_its_points(dtype, device):
+def test_pyramid_rotation(dtype, device):
     """Exchanging x and y, and each curve with its transpose, exchanges the coordinates of the cells and no more."""
     arguments = on(device, pyramid_scene(dtype=dtype))
     axes = [1, 0, 2]
@@ -144,10 +143,10 @@ def test_a_pyramid_turns_with_its_points(dtype, device):
 
 
 @DTYPES
-def test_a_pyramid_forgets_the_order_of_rows(dtype, device):
+def test_pyramid_permutation_invariance(dtype, device):
     arguments = pyramid_scene(dtype=dtype)
     arguments["positions"] += 1e-3 * normal(*arguments["positions"].shape, dtype=dtype).abs()  # no two at one place
-    arguments["origin"][:] = -0.5  # nobody sleeps
+    arguments["origin"][:] = -0.5  # no row sleeps
     cu = arguments["cu_rows"].tolist()
     order = torch.cat([a + torch.randperm(b - a, generator=generator(a)) for a, b in zip(cu, cu[1:])]).to(device)
     arguments = on(device, arguments)
@@ -163,7 +162,7 @@ def test_a_pyramid_forgets_the_order_of_rows(dtype, device):
 
 
 @DTYPES
-def test_a_pyramid_is_that_of_each_scene_alone(dtype, device):
+def test_pyramid_keeps_scenes_apart(dtype, device):
     arguments = on(device, pyramid_scene(dtype=dtype))
     pyramid = build_pyramid(**arguments, spec=SPEC)
     cu, scenes = arguments["cu_rows"], arguments["cloud_scene"]
@@ -190,7 +189,7 @@ def test_a_pyramid_is_that_of_each_scene_alone(dtype, device):
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -1e6, 1e6])
-def test_a_sleeping_row_changes_no_stage(bad, device):
+def test_pyramid_ignores_sleeping_rows(bad, device):
     arguments = on(device, pyramid_scene())
     pyramid = build_pyramid(**arguments, spec=SPEC)
     n = int(arguments["cu_rows"][-1])
@@ -210,7 +209,7 @@ def convolve(cells, x, weight, bias, cotangent, device):
 
 @DTYPES
 @pytest.mark.parametrize("axes", [(0, 1), (1, 2), (0, 2)])
-def test_a_convolution_turns_with_its_weights(axes, dtype, device):
+def test_sparse_conv_rotation(axes, dtype, device):
     """A turn by 90 degrees of cells and weights: the same rows."""
     cells, (x, weight, bias, cotangent) = random_cells(60, 4), parameters(60, 5, 7, 3, dtype)
     turned = cells.clone()
@@ -224,7 +223,7 @@ def test_a_convolution_turns_with_its_weights(axes, dtype, device):
 
 
 @DTYPES
-def test_a_convolution_moves_with_its_cells_and_keeps_clouds_apart(dtype, device):
+def test_sparse_conv_translation(dtype, device):
     cells, arguments = random_cells(60, 3, clouds=3), parameters(60, 5, 7, 3, dtype)
     expected = convolve(cells, *arguments, device)
     shift = torch.tensor([0, 1000, -7, 40])
@@ -239,7 +238,7 @@ def test_a_convolution_moves_with_its_cells_and_keeps_clouds_apart(dtype, device
 
 
 @DTYPES
-def test_a_convolution_forgets_the_order_of_rows(dtype, device):
+def test_sparse_conv_permutation_invariance(dtype, device):
     cells, (x, weight, bias, cotangent) = random_cells(60, 3), parameters(60, 5, 7, 3, dtype)
     order = torch.randperm(60, generator=generator(3))
     out, grad_x, grad_weight, _ = convolve(cells, x, weight, bias, cotangent, device)
@@ -250,7 +249,7 @@ def test_a_convolution_forgets_the_order_of_rows(dtype, device):
 
 # patch_attention
 @DTYPES
-def test_attention_knows_rows_by_their_patches_only(dtype, device):
+def test_attention_permutation_invariance(dtype, device):
     case = random_case(dtype=dtype).to(device)
     n_q, n_k, cotangent = len(case.q), len(case.k), normal(*case.q.shape, dtype=dtype).to(device)
     queries, keys = torch.randperm(n_q, generator=generator(1)), torch.randperm(n_k, generator=generator(2))
@@ -267,7 +266,7 @@ def test_attention_knows_rows_by_their_patches_only(dtype, device):
 
 
 @DTYPES
-def test_a_patch_is_the_same_alone(dtype, device):
+def test_attention_patches_are_independent(dtype, device):
     case = random_case(dtype=dtype).to(device)
     table, together = case.table, case.attend()
     for p in range(len(table.cu_q) - 1):
@@ -279,7 +278,7 @@ def test_a_patch_is_the_same_alone(dtype, device):
 
 
 @DTYPES
-def test_softmax_forgets_a_shift_and_attention_turns(dtype, device):
+def test_attention_shift_and_rotation(dtype, device):
     case = random_case(dtype=dtype).to(device)
     expected, bound = case.attend(), BOUNDS[dtype]
     shift = 0.3 * normal(1, *case.k.shape[1:], dtype=dtype).to(device)
@@ -299,7 +298,7 @@ def segments(device):
 
 @DTYPES
 @pytest.mark.parametrize("pool", [pool_max, pool_mean])
-def test_pooling_knows_rows_by_their_segments_only(pool, dtype, device):
+def test_pool_permutation_invariance(pool, dtype, device):
     x, cotangent = to(device, normal(40, 5, dtype=dtype), normal(5, 5, dtype=dtype, seed=2))
     rows, cu_rows = segments(device)
     out, grad = gradients(lambda x: pool(x, rows, cu_rows), [x], cotangent)
@@ -320,7 +319,7 @@ def test_pooling_knows_rows_by_their_segments_only(pool, dtype, device):
 
 
 @DTYPES
-def test_unpooling_splits_and_renames(dtype, device):
+def test_unpool_split_and_renumbering(dtype, device):
     x, cotangent = to(device, normal(5, 6, dtype=dtype), normal(40, 6, dtype=dtype, seed=2))
     rows, cu_rows = segments(device)
     out, grad = gradients(lambda x: unpool(x, rows, cu_rows, 40), [x], cotangent)
@@ -332,7 +331,7 @@ def test_unpooling_splits_and_renames(dtype, device):
 
 
 @DTYPES
-def test_rows_are_normalised_alone_and_forget_shift_and_scale(dtype, device):
+def test_row_norm_shift_and_scale_invariance(dtype, device):
     x, weight, bias, residual, cotangent = to(
         device,
         *(normal(*shape, dtype=dtype, seed=i) for i, shape in enumerate([(50, 24), (24,), (24,), (50, 24), (50, 24)])),
@@ -350,7 +349,7 @@ def test_rows_are_normalised_alone_and_forget_shift_and_scale(dtype, device):
 
 
 @DTYPES
-def test_a_residual_and_its_norm_know_their_row_only(dtype, device):
+def test_residual_norm_rows_are_independent(dtype, device):
     shapes = [(50, 24), (50, 24), (24,), (24,), (24,), (24,)]
     x, branch, *weights = to(device, *(normal(*shape, dtype=dtype, seed=i) for i, shape in enumerate(shapes)))
 
@@ -390,7 +389,7 @@ def sweep(Ks, viewmats, src, cu, depths, features, dtype, device):
 
 @DTYPES
 @pytest.mark.parametrize("seed", range(4))
-def test_a_sweep_forgets_where_its_cameras_stand(seed, dtype, device):
+def test_plane_sweep_rigid_motion_invariance(seed, dtype, device):
     Ks, viewmats, *rest = rig()
     rotation, translation = random_motion(seed, viewmats)
     motion = torch.eye(4, dtype=torch.float64)
@@ -401,7 +400,7 @@ def test_a_sweep_forgets_where_its_cameras_stand(seed, dtype, device):
 
 
 @DTYPES
-def test_a_sweep_forgets_the_unit_of_length_and_the_order_of_views(dtype, device):
+def test_plane_sweep_scale_and_view_order(dtype, device):
     Ks, viewmats, src, cu, depths, features = rig()
     expected = sweep(Ks, viewmats, src, cu, depths, features, dtype, device)
     longer = viewmats.clone()
@@ -414,7 +413,7 @@ def test_a_sweep_forgets_the_unit_of_length_and_the_order_of_views(dtype, device
 
 
 @DTYPES
-def test_a_sweep_keeps_clouds_apart_and_repeats(dtype, device):
+def test_plane_sweep_keeps_clouds_apart(dtype, device):
     Ks, viewmats, src, cu, depths, features = rig()
     out, _ = sweep(Ks, viewmats, src, cu, depths, features, dtype, device)
     A, b = (t.to(device, dtype) for t in sweep_geometry(Ks, viewmats, src, cu))
@@ -446,7 +445,7 @@ def moved(scene: Scene, rotation, translation) -> Scene:
 
 @DTYPES
 @pytest.mark.parametrize("seed", range(4))
-def test_an_image_forgets_where_the_world_is(seed, dtype, device):
+def test_raster_rigid_motion_invariance(seed, dtype, device):
     """Any rigid motion of Gaussians and cameras together; the smooth cutoff, so that no alpha jumps at 1/255."""
     scene = random_scene(images=3)
     rotation, translation = random_motion(seed, scene.means)
@@ -457,7 +456,7 @@ def test_an_image_forgets_where_the_world_is(seed, dtype, device):
 
 
 @DTYPES
-def test_an_image_forgets_the_unit_of_length(dtype, device):
+def test_raster_scale_invariance(dtype, device):
     scene = random_scene(dtype=dtype).to(device)
     viewmats = scene.viewmats.clone()
     viewmats[:, :3, 3] *= 4
@@ -468,7 +467,7 @@ def test_an_image_forgets_the_unit_of_length(dtype, device):
 
 
 @DTYPES
-def test_an_image_forgets_the_order_of_gaussians(dtype, device):
+def test_raster_permutation_invariance(dtype, device):
     scene = random_scene(dtype=dtype)
     cu = scene.cu_rows.tolist()
     order = torch.cat([a + torch.randperm(b - a, generator=generator(a)) for a, b in zip(cu, cu[1:])])
@@ -483,7 +482,7 @@ def test_an_image_forgets_the_order_of_gaussians(dtype, device):
 
 
 @DTYPES
-def test_images_know_nothing_of_each_other(dtype, device):
+def test_raster_images_are_independent(dtype, device):
     scene = random_scene(dtype=dtype).to(device)
     together = scene.render()
     reverse = torch.arange(len(scene.viewmats) - 1, -1, -1, device=device)
@@ -498,7 +497,7 @@ def test_images_know_nothing_of_each_other(dtype, device):
 
 
 @DTYPES
-def test_gaussians_that_nobody_sees_change_nothing(dtype, device):
+def test_raster_ignores_invisible_gaussians(dtype, device):
     """One behind all cameras, one of opacity 0, one far beside the images; and they get no gradient."""
     scene = random_scene(clouds=1, dtype=dtype)
     names = Scene.NAMES[:6]
@@ -517,7 +516,7 @@ def test_gaussians_that_nobody_sees_change_nothing(dtype, device):
 
 
 @DTYPES
-def test_a_window_of_an_image_is_the_image_of_the_window(dtype, device):
+def test_raster_crop(dtype, device):
     """The principal point moved by a tile shows another part of the same picture."""
     scene = random_scene(clouds=1, images=1, width=48, height=48, dtype=dtype, spread=0.15).to(device)
     Ks = scene.Ks.clone()

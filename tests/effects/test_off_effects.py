@@ -34,7 +34,7 @@ EFFECTS = {
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_what_is_off_calls_less_and_makes_less(name):
+def test_off_effect_calls_and_allocates_less(name):
     model, on, off, spared = EFFECTS[name]
     case = Case(MODELS[model])
     plans = [case.simulator.plan(EffectsSpec.from_dict(values)) for values in (on, off)]
@@ -45,7 +45,7 @@ def test_what_is_off_calls_less_and_makes_less(name):
         assert with_it.calls[operation] - without.calls[operation] >= count, operation
 
 
-def test_a_model_of_one_step_enters_no_merge():
+def test_model_of_one_step_enters_no_merge():
     config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, history_bits=0))
     case = Case(config, steps=(1,))
     _, modules = case.run({})
@@ -56,7 +56,7 @@ def test_a_model_of_one_step_enters_no_merge():
     assert set(case.simulator.plan().unused) == {f"{name}.time_embedding" for name in merges}
 
 
-def test_what_is_masked_out_has_no_row_in_the_network():
+def test_masked_out_particles_do_not_enter_network():
     case = Case()
     seen = []
     case.simulator.dynamics.net.register_forward_pre_hook(lambda _, args: seen.append(args[0].shape[0]))
@@ -66,7 +66,7 @@ def test_what_is_masked_out_has_no_row_in_the_network():
     assert seen[0] == case.state.n_rows and seen[2] == moving < seen[0]
 
 
-def test_nobody_keeps_a_log_of_rest_without_sleep_or_background(monkeypatch):
+def test_rollout_without_sleep_keeps_no_log(monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("called although it is off")
 
@@ -82,7 +82,7 @@ def test_nobody_keeps_a_log_of_rest_without_sleep_or_background(monkeypatch):
         case(EffectsSpec.from_dict({"dynamics": {"sleep": {}}}))
 
 
-def test_columns_of_what_is_held_are_not_computed():
+def test_constant_features_are_not_predicted():
     case = Case()
     layout, head = case.simulator.dynamics.layout, case.simulator.dynamics.net.head
     held = layout.changes("none")

@@ -17,7 +17,7 @@ def encoded():
     return simulator, simulator.encode(make_frames((2,))).detach()
 
 
-def test_cells_of_the_rest_stay_where_they_are():
+def test_masked_out_keeps_cells():
     simulator, state = encoded()
     moving = state.activity == DYNAMIC
     state = state.with_clouds(state.clouds, means=torch.where(moving[:, None], state.means, state.means - 0.37))
@@ -29,7 +29,7 @@ def test_cells_of_the_rest_stay_where_they_are():
     assert torch.equal(whole.stages[0].grid[kept], rest.stages[0].grid)
 
 
-def test_frozen_is_seen_and_masked_out_is_not():
+def test_frozen_background_changes_prediction():
     simulator, state = encoded()
     frozen, masked = (
         simulator.rollout(state, 1, simulator.plan(EffectsSpec(DynamicsEffects(mode))))[0]
@@ -41,7 +41,7 @@ def test_frozen_is_seen_and_masked_out_is_not():
     assert not torch.equal(masked.means, frozen.means[~still]), "who moves feels whether a ground is there"
 
 
-def test_what_is_masked_out_has_no_say():
+def test_masked_out_background_has_no_influence():
     """Any other background, at any place, and the rest has the same bits."""
     simulator, state = encoded()
     plan = simulator.plan(EffectsSpec(DynamicsEffects("masked_out")))

@@ -17,13 +17,13 @@ IDLE = {
 
 @pytest.mark.parametrize("what", IDLE)
 @pytest.mark.parametrize("model", MODELS)
-def test_on_but_idle_calls_nothing_more(what, model):
+def test_idle_effect_calls_no_operation(what, model):
     case = Case(MODELS[model])
     (idle, modules), (off, other_modules) = case.run(IDLE[what]), case.run({})
     assert idle.calls == off.calls and idle.bytes == off.bytes and modules == other_modules
 
 
-def test_sleep_that_finds_nobody_at_rest_looks_once_a_step_and_decides_once_in_four():
+def test_sleep_without_rest_costs_few_operations():
     case = Case(n_steps=6)
     (idle, modules), (off, other_modules) = case.run({"dynamics": {"sleep": {"eps": 0.0}}}), case.run({})
     assert modules == other_modules
@@ -36,7 +36,7 @@ def test_sleep_that_finds_nobody_at_rest_looks_once_a_step_and_decides_once_in_f
     assert more.total() / case.n_steps < 16, more
 
 
-def test_one_step_calls_what_a_model_without_merging_calls():
+def test_history_of_one_calls_no_merge():
     config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, history_bits=0))
     case, other = Case(config, steps=(1,)), Case(config, steps=(1,))
     for stage in other.simulator.dynamics.net.encoder:

@@ -70,7 +70,7 @@ LINE = [[0.5 + 0.03 * i, 0.0, 0.0] for i in range(3)] + [[2.0, 0.0, 0.0], [2.03,
 
 @pytest.mark.parametrize("speed", [0.2, 0.6, 1.0])
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0.6, 0.8, 0.0)])
-def test_waking_in_time_gives_the_trajectory_of_never_sleeping(speed, direction):
+def test_sleep_with_waking_matches_never_sleeping(speed, direction):
     """A row is shot at rows that sleep: they are hit, fly on, wake others and come to rest."""
     direction = torch.tensor(direction, dtype=torch.float64)
     across = torch.tensor([-direction[1], direction[0], 0.0])
@@ -80,12 +80,12 @@ def test_waking_in_time_gives_the_trajectory_of_never_sleeping(speed, direction)
     expected, _ = simulate(history, n_steps)
     steps, log = simulate(history, n_steps, Sleep("approx", eps=1e-6, patience=2, halo=HALO))
     assert_same_steps(steps, expected)
-    assert (expected[-1].means - history.means).norm(dim=1)[[1, 2, 3, 4]].min() > 0  # everybody was hit
+    assert (expected[-1].means - history.means).norm(dim=1)[[1, 2, 3, 4]].min() > 0  # all were hit
     assert log.resting_share > 0.4 and min(log.moving) < max(log.moving) == len(turned)
 
 
 @pytest.mark.parametrize("speed", [0.5, 3.0, 10.0])
-def test_whom_a_fast_row_will_reach_in_the_next_step_is_awake_before(speed):
+def test_sleeper_wakes_before_fast_particle_arrives(speed):
     """Seven places on its way: after each step those are awake where it is, and where it will be; the others sleep."""
     step = speed * HALO
     places = [[0.0, 0.0, 0.0]] + [[step * k, 1.5 * HALO, 0.0] for k in range(1, 8)]
@@ -102,7 +102,7 @@ def test_whom_a_fast_row_will_reach_in_the_next_step_is_awake_before(speed):
         assert speed < 1 or awake == [0, k, k + 1]
 
 
-def test_who_is_shot_too_fast_for_the_halo_is_woken_too_late():
+def test_sleeper_wakes_late_beyond_halo_speed():
     history = at([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[4 * REACH, 0.0, 0.0], [0.0] * 3])
     rule = Sleep("approx", eps=1e-6, patience=1, halo=REACH / 8)
     expected, _ = simulate(history, 12)
@@ -111,7 +111,7 @@ def test_who_is_shot_too_fast_for_the_halo_is_woken_too_late():
 
 
 @pytest.mark.parametrize("asymmetric", [False, True])
-def test_sleeping_and_awake_scenes_of_a_batch(asymmetric):
+def test_sleep_of_one_scene_in_batch(asymmetric):
     """Scene 1 rests from the start and sleeps; the others are computed, as if alone."""
     flying = at([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]], [[0.02, 0.0, 0.0], [0.0] * 3])
     resting = at([[0.0, 0.0, 0.0]] * 3, [[0.0] * 3] * 3)
@@ -127,7 +127,7 @@ def test_sleeping_and_awake_scenes_of_a_batch(asymmetric):
     assert_same_steps(steps, simulate(history, 8, asymmetric=asymmetric)[0])
 
 
-def test_an_action_on_a_sleeping_scene_wakes_it():
+def test_changed_state_wakes_scene():
     resting, rule = at([[0.0, 0.0, 0.0]], [[0.0] * 3]), Sleep("exact", eps=0.0, patience=1)
     steps, log = simulate(resting, 4, rule)
     assert log.calls == 1
@@ -136,7 +136,7 @@ def test_an_action_on_a_sleeping_scene_wakes_it():
     assert log.calls == 4 and (after[-1].means > 0.03).all()
 
 
-def test_a_row_that_the_others_no_longer_see_is_a_change():
+def test_removed_particle_wakes_scene():
     """A guard takes one row out in the second step: nothing moved, and yet the others see another scene."""
     history, calls = at([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[0.0] * 3] * 2), []
 
@@ -151,7 +151,7 @@ def test_a_row_that_the_others_no_longer_see_is_a_change():
 
 
 @pytest.mark.parametrize("policy", ["exact", "approx"])
-def test_what_sleep_misses_is_at_most_eps_a_step(policy):
+def test_sleep_error_is_bounded_by_eps(policy):
     history = at([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[9e-5, 0.0, 0.0], [0.0, -8e-5, 0.0]])
     rule = Sleep(policy, eps=1e-2, patience=3)  # of cells of 1 cm
     expected, _ = simulate(history, 20)
@@ -177,7 +177,7 @@ def asleep_by(policy, patience=4, **options):
 
 
 @pytest.mark.parametrize(("config", "policy"), [(TINY, "exact"), (ASYMMETRIC, "exact"), (ASYMMETRIC, "approx")])
-def test_where_nothing_is_awake_the_network_is_not_called(config, policy):
+def test_sleeping_scene_skips_network(config, policy):
     simulator, state, calls, log = still(config), make_scenes(), [], RestLog()
     simulator.dynamics.net.register_forward_hook(lambda *_: calls.append(1))
     plan = simulator.plan(asleep_by(policy))
@@ -187,14 +187,14 @@ def test_where_nothing_is_awake_the_network_is_not_called(config, policy):
     assert_same_steps(steps, simulator.rollout(state, 9))
 
 
-def test_a_state_without_moving_rows_needs_no_network():
+def test_frozen_state_skips_network():
     simulator, state = make_simulator(), make_history((30, 30), frozen_share=1.0)
     simulator.dynamics.net.register_forward_hook(lambda *_: pytest.fail("the network was called"))
     for step in simulator.rollout(state, 3):
         assert_same_bits(step.means, last_steps(state, 1).means)
 
 
-def test_rows_asleep_are_read_as_a_background():
+def test_sleeping_particles_act_as_background():
     """A part of a scene falls asleep after four steps: the next ones are those of a state in which it is frozen."""
     simulator, state = make_simulator(), make_history((50, 60), frozen_share=0.3)
     newest, dynamics, log = last_steps(state, 1), simulator.dynamics, RestLog()
@@ -225,7 +225,7 @@ def test_rows_asleep_are_read_as_a_background():
     assert_same_bits(steps[-1].means[asleep], steps[3].means[asleep])
 
 
-def test_sleep_repeats_bit_by_bit():
+def test_sleep_repeats_bits():
     simulator, state = make_simulator(), make_scenes()
     plan = simulator.plan(asleep_by("approx", eps=2.2))
     logs = [RestLog(), RestLog()]
@@ -234,7 +234,7 @@ def test_sleep_repeats_bit_by_bit():
     assert_same_steps(one, other)
 
 
-def test_gradients_reach_what_slept():
+def test_sleep_gradients():
     """Rows asleep hold their state, and its gradient: that of the last step in which they were awake."""
     simulator, state = (
         make_simulator(dtype=torch.float64),
@@ -250,7 +250,7 @@ def test_gradients_reach_what_slept():
     assert_close_relative_to_max(slept, awake, 1e-12)
 
 
-def test_a_symmetric_model_sleeps_by_whole_scenes_only():
+def test_symmetric_model_refuses_approx_sleep():
     simulator = make_simulator(TINY)
     assert "sleep" in simulator.plan(asleep_by("exact")).on
     with pytest.raises(InputError, match="unsupported effect dynamics.sleep.policy approx"):
@@ -258,6 +258,6 @@ def test_a_symmetric_model_sleeps_by_whole_scenes_only():
 
 
 @pytest.mark.parametrize("halo", [0.0, float("inf"), float("nan")])
-def test_a_halo_must_be_a_length(halo):
+def test_sleep_refuses_invalid_halo(halo):
     with pytest.raises(InputError, match="halo"):
         Sleep("approx", halo=halo)

@@ -26,7 +26,7 @@ def two_bodies(config, nudge=0.0):
 
 @torch.no_grad()
 @pytest.mark.parametrize("config", [TINY, ASYMMETRIC], ids=["symmetric", "asymmetric"])
-def test_a_body_feels_another_one_however_far_away(config):
+def test_exact_sleep_scene_with_distant_bodies_stays_awake(config):
     """Else one could sleep while the other moves, and both had the bits of never sleeping."""
     simulator = make_simulator(config)
     state, other = two_bodies(config)
@@ -42,7 +42,7 @@ def test_a_body_feels_another_one_however_far_away(config):
 
 @torch.no_grad()
 @pytest.mark.parametrize("config", [TINY, ASYMMETRIC], ids=["symmetric", "asymmetric"])
-def test_bodies_in_scenes_of_their_own_do_not(config):
+def test_exact_sleep_of_separate_scenes(config):
     simulator = make_simulator(config)
     state, other = two_bodies(config)
     bodies = [state.select_rows(rows) for rows in (~other, other)]

@@ -23,7 +23,7 @@ SPECS = [
 
 
 @torch.no_grad()
-def test_different_specs_equal_separate_runs():
+def test_plans_of_one_batch_match_separate_runs():
     simulator, frames = awake(make_simulator()), make_frames((2, 3, 1, 2))
     state, plans = simulator.encode(frames), [simulator.plan(spec) for spec in SPECS]
     steps = simulator.rollout(state, 3, plans=plans)
@@ -48,7 +48,7 @@ def test_different_specs_equal_separate_runs():
         assert_same_bits(images.depth[rows], image.depth, f"scene {scene}: depth")
 
 
-def test_plans_that_do_not_fit_the_batch():
+def test_plans_of_one_batch_refuse_mismatches():
     simulator, frames = make_simulator(), make_frames((1, 1))
     state = simulator.encode(frames)
     plans = [simulator.plan(EffectsSpec(outputs=OutputEffects(depth=on))) for on in (True, False)]

@@ -42,7 +42,7 @@ def rolled(case, values, n_steps=2, **options):
 
 
 @pytest.mark.parametrize("model", ["latent", "explicit"])
-def test_a_named_body_keeps_its_features_and_moves(model):
+def test_frozen_appearance_keeps_features_and_moves(model):
     """In the first step nothing else differs by a bit; in later ones the others see a body that looks as it did."""
     case = Case(MODELS[model])
     body, start = half(case.state), last_steps(case.state, 1)
@@ -59,7 +59,7 @@ def test_a_named_body_keeps_its_features_and_moves(model):
     assert not torch.equal(named[1].means, free[1].means)
 
 
-def test_several_bodies_of_one_kind():
+def test_frozen_appearance_of_several_selections():
     case = Case()
     start = last_steps(case.state, 1)
     moving = half(case.state, "moving")
@@ -69,7 +69,7 @@ def test_several_bodies_of_one_kind():
     assert not torch.equal(step.dynamic_latents[~rows], start.dynamic_latents[~rows])
 
 
-def test_who_is_held_is_asked_once_where_a_rollout_starts():
+def test_frozen_appearance_is_resolved_at_rollout_start():
     """A body that left its box is held still: along a rollout, in steps one by one, and in the next rollout."""
     case = Case(n_steps=4)
     values = holding(half(case.state, "moving"))
@@ -88,7 +88,7 @@ def test_who_is_held_is_asked_once_where_a_rollout_starts():
         assert_same_bits(last_steps(state, 1).dynamic_latents, expected.dynamic_latents)
 
 
-def test_edits_keep_the_marks_with_their_particles():
+def test_frozen_appearance_follows_edits():
     case = Case()
     values, start = EDITABLE | holding(Selection("moving")), last_steps(case.state, 1)
     edits = [Edit(0, Duplicate("moving", (0.4, 0.0, 0.0))), Edit(1, Remove("frozen"))]
@@ -97,12 +97,12 @@ def test_edits_keep_the_marks_with_their_particles():
     moving = start.dynamic_latents[start.activity == 0]
     assert_same_bits(first.dynamic_latents[first.frozen_appearance], torch.cat([moving, moving]))
     assert_same_bits(second.dynamic_latents[second.frozen_appearance], torch.cat([moving, moving]))
-    assert second.n_rows == 2 * len(moving) + start.n_rows, "what is inserted is held by nobody"
+    assert second.n_rows == 2 * len(moving) + start.n_rows, "the appearance of inserted particles is not frozen"
 
 
 @pytest.mark.parametrize("background", ["frozen", "masked_out", "dynamic"])
 @pytest.mark.parametrize("model", ["latent", "asymmetric"])
-def test_with_every_background(model, background):
+def test_frozen_appearance_with_every_background(model, background):
     case = Case(MODELS[model])
     body, start = half(case.state), last_steps(case.state, 1)
     step = rolled(case, {"dynamics": {"background": background}} | holding(body))[-1]
@@ -113,7 +113,7 @@ def test_with_every_background(model, background):
 
 
 @pytest.mark.parametrize("model", ["latent", "asymmetric"])
-def test_a_captured_rollout_holds_who_is_named_in_each_state(model, device):
+def test_frozen_appearance_of_captured_rollout(model, device):
     """Of a state that a rollout left, those who were named before, though all have moved away."""
     case = Case(MODELS[model], steps=(1,))
     dtype = torch.float32 if device.type == "cpu" else torch.float64  # see tests/test_cuda_graphs.py
@@ -143,7 +143,7 @@ def test_a_captured_rollout_holds_who_is_named_in_each_state(model, device):
     assert not torch.equal(captured(state).steps[0].frozen_appearance, captured(moved).steps[0].frozen_appearance)
 
 
-def test_nobody_is_marked_where_no_features_change():
+def test_frozen_appearance_is_off_without_changing_features():
     case = Case()
     plan = case.simulator.plan(EffectsSpec.from_dict(holding(half(case.state), changing="none")))
     assert "frozen_appearance" not in plan.on
@@ -152,7 +152,7 @@ def test_nobody_is_marked_where_no_features_change():
     assert dict(plan.switches)["frozen_appearance"] == "selections: 1"
 
 
-def test_gradients_do_not_reach_what_is_predicted_for_a_held_row():
+def test_frozen_appearance_gradients():
     case = Case(n_steps=1)
     plan = case.simulator.plan(EffectsSpec.from_dict(holding(Selection("all"))))
     latents = case.state.dynamic_latents.requires_grad_()
@@ -179,12 +179,12 @@ def test_gradients_do_not_reach_what_is_predicted_for_a_held_row():
         ),
     ],
 )
-def test_names_that_mean_nobody_can_be(held, message):
+def test_frozen_appearance_refuses_malformed_selections(held, message):
     with pytest.raises(InputError, match=message):
         EffectsSpec.from_dict({"appearance": {"frozen_appearance": held}})
 
 
-def test_a_body_that_is_not_there():
+def test_frozen_appearance_refuses_empty_selection():
     case = Case()
     nowhere = Selection("moving", ((8.0, 8.0, 8.0), (9.0, 9.0, 9.0)))
     message = (
@@ -199,7 +199,7 @@ def test_a_body_that_is_not_there():
 
 
 @pytest.mark.parametrize("model", ["latent", "explicit"])
-def test_bodies_keep_their_look_while_shadows_fall(model):
+def test_changing_frozen_keeps_appearance_of_bodies(model):
     """``changing: frozen``: features of what may move stay, bit by bit; the background's are those of ``all``."""
     case = Case(MODELS[model])
     start, (first, *_), (free, *_) = (

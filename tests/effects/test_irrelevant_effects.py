@@ -26,7 +26,7 @@ def assert_same_results(actual, expected):
 
 IRRELEVANT = {
     "insertion and removal without an edit": {"structure": {"insert": True, "remove": True}},
-    "sleep where nobody rests": {"dynamics": {"sleep": {"eps": 0.0}}},
+    "sleep without rest": {"dynamics": {"sleep": {"eps": 0.0}}},
     "as many steps as the model has": {"dynamics": {"history": 4}},
     "the model's own degree": {"appearance": {"view_dependent": 1}},
     "other images": {"outputs": {"depth": True, "alpha": True, "features": True}},
@@ -34,18 +34,18 @@ IRRELEVANT = {
 
 
 @pytest.mark.parametrize("what", IRRELEVANT)
-def test_on_and_irrelevant(what):
+def test_irrelevant_effect_changes_no_bit(what):
     case = Case(steps=(2, 1))
     assert_same_results(case(EffectsSpec.from_dict(IRRELEVANT[what])), case(EffectsSpec()))
 
 
-def test_sleep_of_an_asymmetric_model_where_nobody_rests():
+def test_sleep_without_rest_of_asymmetric_model():
     case = Case(MODELS["asymmetric"])
     asleep = {"dynamics": {"sleep": {"eps": 0.0, "policy": "approx"}}}
     assert_same_results(case(EffectsSpec.from_dict(asleep)), case(EffectsSpec()))
 
 
-def test_harmonics_of_zero_change_nothing():
+def test_zero_harmonics_change_nothing():
     case = Case()
     flat = case(EffectsSpec.from_dict({"appearance": {"view_dependent": 0}}))
     with torch.no_grad():
@@ -55,7 +55,7 @@ def test_harmonics_of_zero_change_nothing():
     assert_close_relative_to_max(image.color, flat[1].color, 1e-6)
 
 
-def test_one_step_equals_a_model_without_merging():
+def test_history_of_one_matches_model_without_merging():
     config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, history_bits=0))
     case, other = Case(config, steps=(1,)), Case(config, steps=(1,))
     for stage in other.simulator.dynamics.net.encoder:
@@ -63,7 +63,7 @@ def test_one_step_equals_a_model_without_merging():
     assert_same_results(case(EffectsSpec()), other(EffectsSpec()))
 
 
-def test_degree_zero_equals_a_model_of_degree_zero():
+def test_degree_zero_matches_model_of_degree_zero():
     case = Case()
     config = dataclasses.replace(CONFIG, renderer=dataclasses.replace(CONFIG.renderer, sh_degree=0))
     weights = case.simulator.state_dict()
@@ -76,7 +76,7 @@ def test_degree_zero_equals_a_model_of_degree_zero():
 
 
 @pytest.mark.parametrize("model", ["latent", "explicit"])
-def test_held_features_are_held_and_the_rest_moves_as_before(model):
+def test_changing_none_keeps_features(model):
     """Fewer columns are another product, which may round otherwise; what is held has the bits of the start."""
     case = Case(MODELS[model], n_steps=1)
     newest = case.state.select_clouds([1])
@@ -92,7 +92,7 @@ def test_held_features_are_held_and_the_rest_moves_as_before(model):
         assert not torch.equal(held.opacities, newest.opacities)
 
 
-def test_what_is_masked_out_equals_a_scene_without_it():
+def test_masked_out_matches_removed_background():
     case, other = Case(), Case()
     other.state = other.state.select_rows(other.state.activity == 0)
     masked = {"dynamics": {"background": "masked_out"}}

@@ -46,7 +46,7 @@ ROOMS = {
 SPECS = [EffectsSpec(**dict(zip(ROOMS, rooms))) for rooms in itertools.product(*ROOMS.values())]
 
 
-def test_json_and_yaml():
+def test_spec_round_trip():
     for spec in SPECS:
         plain = spec.to_dict()
         assert EffectsSpec.from_dict(json.loads(json.dumps(plain))) == spec
@@ -61,14 +61,14 @@ def test_files(tmp_path, name):
     assert [file.name for file in tmp_path.iterdir()] == [name]
 
 
-def test_hashes_tell_all_specs_apart_and_do_not_depend_on_order():
+def test_spec_hash_is_unique_and_order_independent():
     assert len({spec.hash for spec in SPECS}) == len(set(SPECS)) == len(SPECS) == 5 * 4 * 3 * 2
     for spec in SPECS:
         backwards = dict(reversed(spec.to_dict().items()))
         assert EffectsSpec.from_dict(backwards).hash == spec.hash
 
 
-def test_whole_numbers_hash_as_what_they_are_equal_to():
+def test_spec_hash_of_integers_and_floats():
     specs = [
         EffectsSpec.from_dict(
             {"dynamics": {"sleep": {"eps": zero}}, "appearance": {"frozen_appearance": [{"box": box}]}}
@@ -78,11 +78,11 @@ def test_whole_numbers_hash_as_what_they_are_equal_to():
     assert specs[0] == specs[1] and specs[0].hash == specs[1].hash != EffectsSpec().hash
 
 
-def test_the_hash_is_the_same_on_any_machine():
+def test_spec_hash_is_stable():
     assert EffectsSpec().hash == EffectsSpec.from_dict({"version": 1}).hash == "c3aa9744214caf6e"
 
 
-def test_a_scene_ships_its_spec(tmp_path):
+def test_spec_of_scene_folder(tmp_path):
     scene = tmp_path / "set" / "ball" / "0000"
     scene.mkdir(parents=True)
     assert EffectsSpec.of_scene(scene) is None
@@ -98,7 +98,7 @@ def saved(folder, spec, weights, model):
     return checkpoint.write(folder, checkpoint.Checkpoint(config=config, state={"step": 0}, model=weights))
 
 
-def test_checkpoints_and_exports_hold_spec_and_hash(tmp_path):
+def test_checkpoint_stores_spec_and_hash(tmp_path):
     spec, model = EffectsSpec(DynamicsEffects("masked_out", 1)), presets.tiny()
     folder = saved(tmp_path / "run", spec, build_simulator(model, 0).state_dict(), model)
     checkpoint.export(checkpoint.load(folder), tmp_path / "model.safetensors")
@@ -107,8 +107,8 @@ def test_checkpoints_and_exports_hold_spec_and_hash(tmp_path):
         assert restored.plan.spec == spec and restored.checkpoint.config["effects"]["hash"] == spec.hash
 
 
-def test_weights_of_effects_that_are_off_may_be_missing(tmp_path):
-    """A model of four steps whose last merging has no steps left to merge: its table is nobody's."""
+def test_restore_without_weights_of_off_effects(tmp_path):
+    """A model of four steps whose last merging has no steps left to merge: its table is not read."""
     tiny = presets.tiny()
     dynamics = dataclasses.replace(tiny.dynamics, merge_windows=(2, 2))
     model = dataclasses.replace(tiny, dynamics=dynamics)
