@@ -1,4 +1,4 @@
-"""raise, drop and clamp at every door of the simulator: what is refused, what sleeps, what is bounded, what is reported."""
+"""The policies raise, drop and clamp: what is refused, what sleeps, what is bounded, what is reported."""
 
 import copy
 import dataclasses
