@@ -1,7 +1,7 @@
-"""What is given up where frozen rows read only each other, and where rows sleep: measured against computing everything.
+"""Approximation error of an asymmetric background, and of sleep, against computing everything.
 
-compare_backgrounds(simulator, state, 12, cameras)   # an asymmetric model beside its symmetric twin
-compare_sleep(simulator, state, 12, plan, cameras)   # a plan with sleep beside one without
+compare_backgrounds(simulator, state, 12, cameras)   # an asymmetric model and its weights in a symmetric one
+compare_sleep(simulator, state, 12, plan, cameras)   # a plan with sleep and one without
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from gsim3d.state import FROZEN, Particles
 
 @dataclass(frozen=True)
 class SleepError:
-    """Of every step, against never sleeping.
+    """The error of sleep, one number per step.
 
-    moved: metres, the largest distance between the two places of a row.
-    psnr: dB between their images, inf where equal.
-    log: what was computed.
+    Attributes:
+        moved: metres, the largest distance between the two positions of a particle.
+        psnr: dB between their images, inf where equal.
+        log: particles that rested.
     """
 
     moved: tuple[float, ...]
@@ -37,12 +38,14 @@ class SleepError:
 
 @dataclass(frozen=True)
 class BackgroundError:
-    """Of every step, an asymmetric background against the same weights with a symmetric one.
+    """The error of an asymmetric background, one number per step.
 
-    moved: metres, mean distance between the two places of a moving row.   psnr: dB between their images.
-    shadow: mean change of a latent of the background in the symmetric one: of what may fall on it, such as a shadow; in
-        the asymmetric one it does not change.
-    shadow_psnr: dB between images of the symmetric one with and without these changes: what the background alone loses.
+    Attributes:
+        moved: metres, mean distance between the two positions of a moving particle.
+        psnr: dB between their images.
+        shadow: mean change of a latent of the background in the symmetric model, such as by a shadow; in the asymmetric
+            one it does not change.
+        shadow_psnr: dB between images of the symmetric model with and without these changes.
     """
 
     moved: tuple[float, ...]
@@ -55,11 +58,11 @@ class BackgroundError:
 def compare_sleep(
     simulator: Simulator, state: Particles, n_steps: int, plan: Plan, cameras: Cameras | None = None
 ) -> SleepError:
-    """What sleep changes in a rollout of ``n_steps``.
+    """The error of sleep in a rollout of ``n_steps``.
 
     Args:
         plan: with sleep.
-        cameras: of the images, as of :meth:`Simulator.render` of a step; None: no images are compared.
+        cameras: as in :meth:`Simulator.render` of a step; None: no images are compared.
     """
     if plan.spec.dynamics.sleep is None:
         raise InputError("compare_sleep: plan must be one with dynamics.sleep")
@@ -76,11 +79,11 @@ def compare_sleep(
 def compare_backgrounds(
     simulator: Simulator, state: Particles, n_steps: int, cameras: Cameras, plan: Plan | None = None
 ) -> BackgroundError:
-    """What an asymmetric background changes in a rollout of ``n_steps``.
+    """The error of an asymmetric background in a rollout of ``n_steps``.
 
     Args:
         simulator: of an asymmetric model.
-        cameras: of the images, as of :meth:`Simulator.render` of a step.
+        cameras: as in :meth:`Simulator.render` of a step.
     """
     config = simulator.config
     if not config.dynamics.is_asymmetric:
