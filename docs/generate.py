@@ -25,7 +25,7 @@ def write_pages(folder: Path) -> None:
         "resting": resting(),
         "training_steps": training_steps(),
         "stability": stability(),
-        "knobs": knobs(),
+        "settings": settings(),
         **{f"model_{name}": model(name) for name in model_names()},
         **{f"cost_{name}": cost(name) for name in model_names()},
     }
@@ -119,11 +119,11 @@ def _markdown(text: str) -> str:
     return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text).replace("``", "`")
 
 
-def knobs() -> str:
+def settings() -> str:
     """What ``gsim3d profile`` varies."""
-    from gsim3d.profile.settings import KNOBS
+    from gsim3d.profile.settings import GROUPS
 
-    return table(("knob", "kind", "needs"), ((knob.name, knob.kind, knob.needs or "-") for knob in KNOBS))
+    return table(("settings", "kind", "needs"), ((group.name, group.kind, group.needs or "-") for group in GROUPS))
 
 
 # ---------------------------------------------------------------------------------------------- from stored numbers

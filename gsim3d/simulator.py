@@ -203,24 +203,9 @@ class Simulator(nn.Module):
 
     def _states(self, state: Particles, n_steps: int, plan: Plan, edits: Sequence[Edit]) -> list[Particles]:
         """:meth:`rollout` as the setting says."""
-        setting = self.setting
-        if setting.captured and not edits and state.means.is_cuda:
+        if self.setting.captured and not edits and state.means.is_cuda:
             return CapturedRollout(self, state, n_steps, plan)(state).steps
-        if setting.orders == 1:
-            return self.rollout(state, n_steps, plan, edits=edits)
-        if edits:
-            raise InputError("predict: orders of curves cannot be averaged while a scene is edited; use another speed")
-        states, geometry = [], self.dynamics.geometry
-        for _ in range(n_steps):
-            state = self._prepare(state, plan)
-            states.append(
-                setting.averaged(
-                    lambda curves: self.rollout(state, 1, plan, geometry=partial(geometry, curves=curves))[0],
-                    self.config.dynamics.n_stages,
-                )
-            )
-            state = append_step(state, states[-1], plan.history)
-        return states
+        return self.rollout(state, n_steps, plan, edits=edits)
 
     def encode(
         self,

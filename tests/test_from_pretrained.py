@@ -72,7 +72,7 @@ def test_predict_is_encode_rollout_and_render(simulator):
 
 def test_speed_is_read_beside_the_weights(folder):
     digest = checkpoint.load(folder).digest
-    settings = {"fast": {"history": 1, "kept": 0.5, "sh_degree": 0, "patch_size": 16, "orders": 2}}
+    settings = {"fast": {"history": 1, "kept": 0.5, "sh_degree": 0, "patch_size": 16}}
     (folder / SPEEDS_FILE).write_text(json.dumps({digest: {"cpu": settings}}))
     fast = Simulator.from_pretrained(folder, speed="fast")
     assert fast.inputs.history == 1 and fast.plan().history == 1 and fast.plan().sh_degree == 0

@@ -68,9 +68,9 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.evaluate.protocol import default_views, render_steps
     from gsim3d.io import write_video
     from gsim3d.io.files import new_output_path, write_picture
+    from gsim3d.numerics.speed import load_speed
     from gsim3d.pretrained import located
-    from gsim3d.profile.autotune import load_speed
-    from gsim3d.profile.runner import Runner
+    from gsim3d.profile.settings import Runner
     from gsim3d.train.restore import restore
     from gsim3d.viewer import write_player
     from gsim3d.viewer.player import View
@@ -91,7 +91,8 @@ def run(args: argparse.Namespace) -> int:
         spec = replace(spec, structure=structure)
     restored = replace(restored, plan=restored.simulator.plan(replace(spec, outputs=OutputEffects())))
     checkpoint = located(args.checkpoint)
-    setting = load_speed(checkpoint if checkpoint.is_dir() else checkpoint.parent, restored, args.speed)
+    folder = checkpoint if checkpoint.is_dir() else checkpoint.parent
+    setting = load_speed(folder, restored.checkpoint.digest, args.device, args.speed)
     runner = Runner(restored, setting)
     with progress(None, "simulating", n_future, unit="step", quiet=args.quiet) as bar:
         prediction = runner.predict(scene, context, n_future, args.start, edits, bar.update)

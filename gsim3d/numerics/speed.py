@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import torch
 
 from gsim3d.cameras import InputSpec
 from gsim3d.effects.spec import EffectsSpec, Sleep
-from gsim3d.errors import InputError, did_you_mean
+from gsim3d.errors import InputError, check_ranges, did_you_mean
 from gsim3d.io.files import MAX_TEXT, read_file, shown, typed
 from gsim3d.io.plain import parse_json
 from gsim3d.ops.raster import CUTOFFS
@@ -24,7 +24,6 @@ PRECISIONS = ("fp32", "tf32", "bf16", "fp16")
 DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 PARTS = ("encoder", "dynamics", "renderer")
 SPEEDS = ("exact", "balanced", "fast")
-N_CURVES = 4  # along which a cloud is cut into patches
 SPEEDS_FILE = "speeds.json"  # {digest of a checkpoint: {kind of device: {speed: setting}}}
 
 
@@ -46,12 +45,8 @@ class Setting:
         patch_size: largest number of particles that attend to each other; None: the model's.
         grid: factor to the model's cell size.
         shrink: images are rendered this factor smaller, and enlarged again to be compared.
-        every: steps between two rendered ones.
         least_opacity: Gaussians below it are not drawn; pixels leave out what is below 1/255 in any case.
-        compiled: the network of the dynamics runs through torch.compile.
         sleep: cells that a particle at rest moves in one step at most, and is not computed; None: as in training.
-        orders: of the curves that cut clouds into patches; the predictions of as many are averaged, at most 4.
-        checkpoint: name of another one that takes this one's place; None: none does.
     """
 
     encoder: str = "fp32"
@@ -67,40 +62,17 @@ class Setting:
     patch_size: int | None = None
     grid: float = 1.0
     shrink: int = 1
-    every: int = 1
     least_opacity: float = 0.0
-    compiled: bool = False
     sleep: float | None = None
-    orders: int = 1
-    checkpoint: str | None = None
 
     def __post_init__(self):
-        for part in PARTS:
-            require(part, getattr(self, part), getattr(self, part) in PRECISIONS, f"one of {', '.join(PRECISIONS)}")
-        require("cutoff", self.cutoff, self.cutoff in CUTOFFS, f"one of {', '.join(CUTOFFS)}")
-        require("kept", self.kept, 0 < self.kept <= 1, "above 0 and at most 1")
-        require("grid", self.grid, 0 < self.grid < 1e3, "above 0")
-        require("least_opacity", self.least_opacity, 0 <= self.least_opacity < 1, "at least 0 and below 1")
-        require("sleep", self.sleep, self.sleep is None or 0 <= self.sleep < 1e3, "at least 0")
-        require("orders", self.orders, self.orders in (1, 2, 4), "1, 2 or 4")
-        if self.captured and self._needs_python:
-            raise InputError("setting: captured does not fit " + " and ".join(self._needs_python))
-        require("sh_degree", self.sh_degree, self.sh_degree in (None, 0, 1, 2, 3), "0, 1, 2 or 3")
-        for name in ("context_views", "history", "patch_size", "shrink", "every"):
-            value = getattr(self, name)
-            require(name, value, value is None or (isinstance(value, int) and value >= 1), "an integer of at least 1")
-
-    @property
-    def _needs_python(self) -> list[str]:
-        """What of it a graph cannot repeat: it knows no sleep, and one order of the curves."""
-        changed = {name: getattr(self, name) for name in ("compiled", "sleep", "orders")}
-        defaults = {f.name: f.default for f in dataclasses.fields(self)}
-        return [name for name, value in changed.items() if value != defaults[name]]
-
-    @property
-    def fits_a_graph(self) -> bool:
-        """Whether what it changes can be replayed from a CUDA graph."""
-        return not self._needs_python
+        for name, known in {**dict.fromkeys(PARTS, PRECISIONS), "cutoff": CUTOFFS}.items():
+            if getattr(self, name) not in known:
+                raise InputError(f"{name} must be one of {', '.join(known)}; got {shown(getattr(self, name))}")
+        check_ranges(self, kept=(1e-6, 1), grid=(1e-3, 1e3), least_opacity=(0, 1), sleep=(0, 1e3), sh_degree=(0, 3))
+        check_ranges(self, **dict.fromkeys(("context_views", "history", "patch_size", "shrink"), (1, 1e6)))
+        if self.captured and self.sleep is not None:
+            raise InputError("captured does not fit sleep: a CUDA graph computes every particle")
 
     @property
     def name(self) -> str:
@@ -110,32 +82,15 @@ class Setting:
             parts = [part for part in PARTS if getattr(self, part) != "fp32"]
             where = "" if len(parts) == len(PARTS) else f" {'+'.join(parts)}"
             changed = {"precision": f"{'/'.join(sorted(precisions))}{where}", **changed}
-        for switch, what in (("captured", "graph captured"), ("compiled", "compiled")):
-            if changed.pop(switch, False):
-                changed = {what: "", **changed}
-        return (
-            ", ".join(f"{key.replace('_', ' ')} {short(value)}".strip() for key, value in changed.items())
-            or "reference"
-        )
+        if changed.pop("captured", False):
+            changed = {"graph captured": "", **changed}
+        values = {key: f"{v:.3g}" if isinstance(v, float) else v for key, v in changed.items()}
+        return ", ".join(f"{key.replace('_', ' ')} {v}".strip() for key, v in values.items()) or "reference"
 
     @property
-    def undrawn(self) -> Setting:
-        """What of it changes the particles."""
-        drawing = {
-            "renderer": "fp32",
-            "sh_degree": None,
-            "cutoff": "exact",
-            "least_opacity": 0.0,
-            "shrink": 1,
-            "every": 1,
-        }
-        return dataclasses.replace(self, **drawing)
-
-    @property
-    def given(self) -> Setting:
+    def of_input(self) -> Setting:
         """What of it changes the encoder's work."""
-        names = ("encoder", "context_views", "history", "checkpoint")
-        return Setting(**{name: getattr(self, name) for name in names})
+        return Setting(encoder=self.encoder, context_views=self.context_views, history=self.history)
 
     def to_dict(self) -> dict[str, Any]:
         """Fields that differ from the reference."""
@@ -202,19 +157,6 @@ class Setting:
         kept[order] = rank < (counts[group[order]] * self.kept).ceil()
         return particles.select_rows(kept)
 
-    def averaged(self, predict: Callable[[tuple[tuple[int, ...], ...]], Particles], n_levels: int) -> Particles:
-        """The mean of what ``predict`` returns for several orders of the curves, of which it is given those of each
-        level."""
-        predictions = []
-        for k in range(0, N_CURVES, N_CURVES // self.orders):
-            predictions.append(predict((tuple((k + row) % N_CURVES for row in range(N_CURVES)),) * n_levels))
-        rows = [prediction.row_fields() for prediction in predictions]
-        floats = [name for name, value in rows[0].items() if value.is_floating_point()]
-        means = {name: torch.stack([row[name] for row in rows]).mean(0) for name in floats}
-        if "quats" in means:
-            means["quats"] = torch.nn.functional.normalize(means["quats"], dim=-1)
-        return dataclasses.replace(predictions[0], **means)
-
 
 def read_speeds(folder: Path) -> dict[str, Any]:
     """All that is tuned in ``folder``, a mapping by digest of a checkpoint and kind of device; empty where nothing is.
@@ -258,12 +200,3 @@ def load_speed(folder: Path, digest: str | None, device: str, speed: str) -> Set
                 "gsim3d profile CHECKPOINT first"
             )
     return Setting.from_dict(found)
-
-
-def require(name: str, value: object, fine: bool, what: str) -> None:
-    if not fine:
-        raise InputError(f"setting: {name} must be {what}; got {shown(value)}")
-
-
-def short(value: object) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -1,134 +1,111 @@
-"""Finds the fastest setting that keeps a promise, and keeps it for later runs."""
+"""Finds the fastest setting that keeps a promise, and keeps it beside the weights."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import fmean
+from typing import Any
 
+from gsim3d.effects.plan import Plan, Workload, predicted_cost
 from gsim3d.errors import InputError
 from gsim3d.evaluate.report import write_json
-from gsim3d.numerics import speed
+from gsim3d.io.files import typed
 from gsim3d.numerics.speed import SPEEDS_FILE, Setting, read_speeds
-from gsim3d.profile.limit import PRESETS, TimeLimit
-from gsim3d.profile.measure import Comparison, Effort, Point, measure, points_of, ties
-from gsim3d.profile.part_times import PartTimes
-from gsim3d.profile.settings import KNOBS, NOT_TUNED, Knob
-from gsim3d.profile.subject import Subject
-from gsim3d.profile.timing import Clock, DeviceClock
+from gsim3d.presets import ModelConfig
+from gsim3d.profile.settings import GROUPS, NOT_TUNED, Group
+from gsim3d.profile.sweep import MOST_KEPT, PRESETS, BenchmarkCase, Effort, Point, Sweep, tie
+from gsim3d.profile.timing import GAPS, machine
+from gsim3d.state import DYNAMIC
 from gsim3d.train.restore import Restored
 
-# preset -> share of the reference's gain over the constant baseline, in dB, that it keeps at least
+# preset -> share of the reference's gain over particles held still, in dB, that it keeps at least
 PROMISES = {"exact": None, "balanced": 0.999, "fast": 0.99}
 TIMES = "measured"  # the key of times, beside the presets of a device
+PART_OF_SECTION = {"head": "gaussians", "sort and raster": "images", GAPS: "host"}  # all others: the dynamics
 
 
 def autotune(
-    subject: Subject,
+    case: BenchmarkCase,
     *,
     max_ms: float | None = None,
     min_agreement_psnr: float | None = None,
-    knobs: Sequence[Knob] = KNOBS,
+    groups: Sequence[Group] = GROUPS,
     effort: Effort = Effort(),
 ) -> Point:
-    """The best setting within a limit: with ``max_ms`` the most accurate one whose step takes at most as long; with
-    ``min_agreement_psnr`` the fastest one that agrees with the reference that well. Measured on ``subject``.
+    """The best setting within a limit, measured on ``case``.
 
     Args:
-        knobs: that may be turned.   effort: how long to measure; at least 3 rounds tell differences from noise.
+        case: the simulator and scenes.
+        max_ms: of a step: the most accurate setting that is as fast.
+        min_agreement_psnr: against the reference, in dB: the fastest setting that is as near.
+        groups: of settings that may be taken.
+        effort: how long to measure; at least 3 rounds tell differences from noise.
     Raises:
-        InputError: not exactly one limit, or no setting keeps it; the message says how near one came.
+        InputError: not exactly one limit is given, or no setting keeps it; the message says how near one came.
     """
     if (max_ms is None) == (min_agreement_psnr is None):
         raise InputError("autotune: give either max_ms or min_agreement_psnr")
-    clock = DeviceClock(subject.device)
-    comparison = Comparison(subject, clock=None if effort.apart else clock)
-    points, _ = points_of(subject, knobs, effort)
-    measure(comparison, points, clock, effort)
+    sweep = Sweep(case, effort)
+    points, _ = sweep.points(groups)
+    sweep.run(points)
     if max_ms is not None:
-        return _most_accurate(comparison, points, max_ms, clock, effort)
-
-    def keeps(point: Point) -> bool:
-        return point.agreement.psnr >= min_agreement_psnr
-
-    return fastest(comparison, points, keeps, clock, effort)
+        return _most_accurate(sweep, points, max_ms)
+    return fastest(sweep, points, lambda point: point.agreement.psnr >= min_agreement_psnr)
 
 
-def tune(
-    comparison: Comparison,
-    points: Sequence[Point],
-    clock: Clock,
-    effort: Effort,
-    progress: Callable[[str], None] = lambda doing: None,
-    limit: TimeLimit = TimeLimit(),
-) -> dict[str, Point]:
+def tune(sweep: Sweep, points: Sequence[Point]) -> dict[str, Point]:
     """The setting of each preset, from measured ``points``, of which the first is the reference."""
-    reference, measured = points[0], {}
-
-    def keeping(share: float) -> Callable[[Point], bool]:
-        return lambda point: keeps_gain(comparison, point, reference, share)
-
-    found = {"exact": reference}
+    found = {}
     for name, share in PROMISES.items():
-        if share is not None:
-            found[name] = fastest(comparison, points, keeping(share), clock, effort, measured, progress, limit)
+        found[name] = points[0] if share is None else fastest(sweep, points, keeping(sweep.case, points[0], share))
     return found
 
 
-def keeps_gain(comparison: Comparison, point: Point, reference: Point, share: float) -> bool:
-    """Whether ``point`` keeps this share of the reference's gain over the constant baseline, at its rendered steps."""
-    kept = comparison.share_kept(point, reference)
-    return kept is not None and kept >= share
+def keeping(case: BenchmarkCase, reference: Point, share: float) -> Callable[[Point], bool]:
+    """Whether a point keeps this share of the reference's gain."""
+
+    def keeps(point: Point) -> bool:
+        kept = case.share_kept(point, reference)
+        return kept is not None and kept >= share
+
+    return keeps
 
 
-def fastest(
-    comparison: Comparison,
-    points: Sequence[Point],
-    keeps: Callable[[Point], bool],
-    clock: Clock,
-    effort: Effort,
-    measured: dict[Setting, Point] | None = None,
-    progress: Callable[[str], None] = lambda doing: None,
-    limit: TimeLimit = TimeLimit(),
-) -> Point:
-    """The reference with every turn that keeps the promise and saves time, added one by one and measured together.
-
-    measured: what was measured together before; what is now, is added.   limit: once it is over nothing more is.
-    """
-    measured = {} if measured is None else measured
-    useful = [p for p in points[1:] if p.knob not in NOT_TUNED and _saves(p, points) and keeps(p)]
+def fastest(sweep: Sweep, points: Sequence[Point], keeps: Callable[[Point], bool]) -> Point:
+    """The reference with every setting that keeps the promise and saves time, added one by one, measured together."""
+    useful = [p for p in points[1:] if p.group not in NOT_TUNED and _saves(p, points) and keeps(p)]
     if not useful:
         return points[0]
     useful.sort(key=lambda p: p.step_seconds)
-    best = max((p for p in useful if p is useful[0] or ties(p, useful[0])), key=lambda p: p.agreement.psnr)
+    best = max((p for p in useful if p is useful[0] or tie(p, useful[0])), key=lambda p: p.agreement.psnr)
     for point in useful:
-        both = _both(best, point)
+        both = _both(sweep, best, point)
         if both is None:
             continue
-        if both.setting not in measured:
-            if limit.is_over(PRESETS):
-                break
-            measured[both.setting] = both
-            measure(comparison, [both], clock, effort, progress)
-        both = measured[both.setting]
+        if not both.step and sweep.limit.is_over(PRESETS):
+            break
+        sweep.run([both])
         if not both.failure and keeps(both) and _faster(both, best):
             best = both
     return best
 
 
-def _both(best: Point, point: Point) -> Point | None:
-    """The settings of two points in one; None where both turn the same knob, or cannot be had together."""
+def _both(sweep: Sweep, best: Point, point: Point) -> Point | None:
+    """Two settings in one; None where both change the same thing, or do not fit each other."""
     changes, before = point.setting.to_dict(), best.setting.to_dict()
     if set(changes) & set(before) - {"captured"} or set(changes) <= set(before):
         return None
     try:
-        return Point(dataclasses.replace(best.setting, **changes), "together", "model")
+        return sweep.point(dataclasses.replace(best.setting, **changes), "together", "model")
     except InputError:
         return None
 
 
 def _saves(point: Point, points: Sequence[Point]) -> bool:
-    """Whether what ``point`` turns saves time, and not only the graph that it is replayed from."""
+    """Whether the setting of ``point`` saves time, and not only the graph that it is replayed from."""
     graph = next((p for p in points if p.setting == Setting(captured=True) and not p.failure), None)
     if graph is None or not point.setting.captured or point is graph:
         return _faster(point, points[0])
@@ -136,26 +113,21 @@ def _saves(point: Point, points: Sequence[Point]) -> bool:
 
 
 def _faster(point: Point, than: Point) -> bool:
-    return not point.failure and point.step_seconds < than.step_seconds and not ties(point, than)
+    return not point.failure and point.step_seconds < than.step_seconds and not tie(point, than)
 
 
-def _most_accurate(
-    comparison: Comparison, points: Sequence[Point], max_ms: float, clock: Clock, effort: Effort
-) -> Point:
-    usable = [p for p in points if not p.failure and p.knob not in NOT_TUNED]
+def _most_accurate(sweep: Sweep, points: Sequence[Point], max_ms: float) -> Point:
+    usable = [p for p in points if not p.failure and p.group not in NOT_TUNED]
     within = [p for p in usable if 1e3 * p.step_seconds <= max_ms]
     if within:
         return max(within, key=lambda p: p.agreement.psnr)
-    # None alone is fast enough: the nearest to the reference first, turns are added until one is.
-    best = points[0]
+    best = points[0]  # no setting alone is fast enough: they are added, the nearest to the reference first
     for point in sorted(usable, key=lambda p: -p.agreement.psnr):
-        both = _both(best, point)
+        both = _both(sweep, best, point)
         if both is None or not _faster(point, points[0]):
             continue
-        measure(comparison, [both], clock, effort)
-        if both.failure:
-            continue
-        if _faster(both, best):
+        sweep.run([both])
+        if not both.failure and _faster(both, best):
             best = both
         if 1e3 * best.step_seconds <= max_ms:
             return best
@@ -164,30 +136,79 @@ def _most_accurate(
     )
 
 
+# ---- what is kept beside the weights ----
+
+
+@dataclass(frozen=True)
+class PartTimes:
+    """What the parts of a reference's step took: all that the checkpoint's spec asks for, launched kernel by kernel.
+
+    Attributes:
+        on: the machine.
+        work: a step of the scenes that it was measured on, and its images.
+        dynamics, gaussians, images: milliseconds of the parts of :func:`gsim3d.effects.plan.predicted_cost`.
+        host: milliseconds in which a GPU waits for the host.
+    """
+
+    on: str
+    work: Workload
+    dynamics: float = 0.0
+    gaussians: float = 0.0
+    images: float = 0.0
+    host: float = 0.0
+
+    def __post_init__(self):
+        if not all(type(count) is int and count >= 0 for count in asdict(self.work).values()):
+            raise InputError(f"work must hold counts; got {asdict(self.work)}")
+
+    @classmethod
+    def of(cls, case: BenchmarkCase, reference: Point) -> PartTimes | None:
+        """Of a reference that was timed on ``case``; None where its sections were not told apart."""
+        if not reference.sections():
+            return None
+        parts: dict[str, float] = {}
+        for section, seconds in reference.sections().items():
+            part = PART_OF_SECTION.get(section, "dynamics")
+            parts[part] = parts.get(part, 0.0) + 1e3 * seconds
+        moving, counts = [], []
+        for number in range(len(case.scenes))[:MOST_KEPT]:
+            activity = case.newest(number).activity
+            moving.append(int((activity == DYNAMIC).sum()))
+            counts.append(len(activity))
+        height, width = case.restored.image_size
+        work = Workload(
+            round(fmean(moving)), round(fmean(counts)) - round(fmean(moving)), len(case.views[0][1]), height * width
+        )
+        facts = machine(case.device)
+        return cls(", ".join(facts[name] for name in ("processor", "device") if name in facts), work, **parts)
+
+    def predicted(self, own: Plan, plan: Plan, model: ModelConfig, work: Workload) -> dict[str, float]:
+        """Milliseconds of each part under ``plan``: as many times those measured as the multiply-adds are more.
+
+        Args:
+            own: the plan of the checkpoint, under which the times were measured.
+            plan: to predict.
+            model: of both.
+            work: what ``plan`` is applied to.
+        """
+        before, after = predicted_cost(own, model, self.work), predicted_cost(plan, model, work)
+        scaled = {part: getattr(self, part) * after[part] / max(before[part], 1.0) for part in after}
+        return {**scaled, "host": self.host} if self.host else scaled
+
+
 def save_speeds(folder: Path, restored: Restored, presets: dict[str, Point], times: PartTimes | None = None) -> Path:
-    """Keeps the tuned presets of a checkpoint on its device, and what its reference took, in ``folder``/speeds.json,
-    beside those of others."""
+    """Keeps the presets of a checkpoint on its device, and what its reference took, in ``folder``/speeds.json."""
     path, known = folder / SPEEDS_FILE, read_speeds(folder)
     digest, device = restored.checkpoint.digest, restored.device.type
-    settings = {name: point.setting.to_dict() for name, point in presets.items()}
+    settings: dict[str, Any] = {name: point.setting.to_dict() for name, point in presets.items()}
     if times is not None:
-        settings[TIMES] = dataclasses.asdict(times)
+        settings[TIMES] = asdict(times)
     write_json(path, {**known, digest: {**known.get(digest, {}), device: settings}})
     return path
 
 
-def load_speed(folder: Path, restored: Restored, preset: str) -> Setting:
-    """As :func:`gsim3d.numerics.speed.load_speed`, of the option --speed."""
-    try:
-        return speed.load_speed(folder, restored.checkpoint.digest, restored.device.type, preset)
-    except InputError as error:
-        raise InputError(f"--{error}") from None
-
-
 def load_times(folder: Path, restored: Restored) -> dict[str, PartTimes]:
     """Kind of device -> what the reference of a checkpoint took where it was measured; empty where it was not."""
-    devices = read_speeds(folder).get(restored.checkpoint.digest)
-    known = {name: kept[TIMES] for name, kept in (devices or {}).items() if isinstance(kept, dict) and TIMES in kept}
-    return {
-        name: PartTimes.from_dict(values, f"{folder / SPEEDS_FILE}: {name}: {TIMES}") for name, values in known.items()
-    }
+    devices, where = read_speeds(folder).get(restored.checkpoint.digest) or {}, folder / SPEEDS_FILE
+    known = {name: kept[TIMES] for name, kept in devices.items() if isinstance(kept, dict) and TIMES in kept}
+    return {name: typed(PartTimes, values, f"{where}: {name}: {TIMES}") for name, values in known.items()}

@@ -1,192 +1,280 @@
-"""What can be turned to trade accuracy for time: each knob declared once, with what turning it may change."""
+"""Which settings trade accuracy for time, and a trained simulator under one of them."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gsim3d.cameras import Cameras, Frames
+from gsim3d.cuda_graphs import CapturedRollout
+from gsim3d.data import Scene, make_frames
+from gsim3d.dynamics import RestLog, concatenate
+from gsim3d.effects.edits import Edit
+from gsim3d.errors import InputError
+from gsim3d.evaluate.protocol import Prediction
 from gsim3d.numerics.speed import PARTS, PRECISIONS, Setting
-from gsim3d.profile.products import compiler_problem, why_not
+from gsim3d.simulator import Simulator
+from gsim3d.state import Particles
+from gsim3d.train.restore import Restored
+from gsim3d.train.samples import subsampled
 
 if TYPE_CHECKING:
-    from gsim3d.profile.subject import Subject
+    from gsim3d.profile.sweep import BenchmarkCase
 
 KINDS = {
     "exact": "changes what is simulated by rounding only",
     "near-exact": "leaves out what is below a stated threshold",
     "model": "changes the function that the model computes",
-    "needs-training": "needs a checkpoint of its own",
 }
+TOGETHER = 4  # steps that are timed together where the first costs more than those that follow
+
+
+class Runner:
+    """A trained simulator under one setting.
+
+        runner = Runner(restored, Setting(history=2))
+        state = runner.encode(runner.frames([scene], [cameras]))
+        for newest in runner.steps(state, 12):
+            images = runner.images(newest, cameras)
+
+    Args:
+        restored: the simulator as it was trained.
+        setting: how to run it.
+    Raises:
+        InputError: the model cannot do what the setting asks for.
+
+    Attributes:
+        simulator, plan: what runs.
+        n_encoded: input steps.
+    """
+
+    def __init__(self, restored: Restored, setting: Setting = Setting()):
+        self.restored, self.setting, self.device = restored, setting, restored.device
+        self.simulator = _changed(restored.simulator, setting)
+        asymmetric = self.simulator.config.dynamics.is_asymmetric
+        self.plan = self.simulator.plan(setting.of_effects(restored.plan.spec, asymmetric))
+        self.n_encoded = min(setting.history or restored.data.history, restored.data.history)
+
+    @property
+    def skipped(self) -> int:
+        """First input steps that a history shorter than the training's leaves out."""
+        return self.restored.data.history - self.n_encoded
+
+    def frames(self, scenes: Sequence[Scene], context: Sequence[Sequence[int]], start: int = 0) -> Frames:
+        """Input images of cameras ``context``: of the training's history from step ``start`` on, the last steps."""
+        steps = [range(start + self.skipped, start + self.restored.data.history)] * len(scenes)
+        if self.setting.context_views is not None:
+            context = [_spread(cams, self.setting.context_views) for cams in context]
+        masked = all(scene.has_segmentation() for scene in scenes)
+        frames = make_frames(scenes, [list(cams) for cams in context], steps, masked=masked)
+        return subsampled(frames, self.restored.data).to(self.device)
+
+    def encode(self, frames: Frames) -> Particles:
+        """The state from which to simulate."""
+        return self.subsampled(self.encode_all(frames))
+
+    @torch.no_grad()
+    def encode_all(self, frames: Frames) -> Particles:
+        """All particles of ``frames``."""
+        with self.setting.precision("encoder", self.device.type):
+            return self.simulator.encode(frames)
+
+    @torch.no_grad()
+    def subsampled(self, particles: Particles) -> Particles:
+        """What of :meth:`encode_all` is simulated."""
+        return self.simulator._prepare(self.setting.retained(particles), self.plan)
+
+    @torch.no_grad()
+    def steps(self, state: Particles, n_steps: int, log: RestLog | None = None) -> list[Particles]:
+        """The newest step of every scene, ``n_steps`` times. ``log`` counts sleeping particles."""
+        with self.setting.precision("dynamics", self.device.type):
+            return self.simulator.rollout(state, n_steps, self.plan, log=log)
+
+    def span(self, n_steps: int) -> int:
+        """Steps that must be timed together, of ``n_steps`` that can be."""
+        config = self.simulator.config.dynamics
+        if self.setting.sleep is not None:
+            return n_steps  # no particle sleeps in a first step
+        needs_more = self.setting.captured or config.is_asymmetric
+        return max(config.steps_per_call, min(n_steps, TOGETHER) if needs_more else 1)
+
+    @torch.no_grad()
+    def images(self, particles: Particles, cameras: Cameras) -> Tensor:
+        """[I, H, W, 3] in [0, 1] of the particles of a step."""
+        if self.setting.least_opacity:
+            particles = particles.select_rows(particles.opacities >= self.setting.least_opacity)
+        with self.setting.precision("renderer", self.device.type):
+            rendering = self.simulator._draw(
+                particles, self._smaller(cameras), plan=self.plan, cutoff=self.setting.cutoff
+            )
+        return rendering.color.float().clamp(0, 1)
+
+    @torch.no_grad()
+    def predict(
+        self,
+        scene: Scene,
+        context: Sequence[int],
+        n_future: int,
+        start: int = 0,
+        edits: Sequence[Edit] = (),
+        on_steps: Callable[[int], object] | None = None,
+    ) -> Prediction:
+        """As :func:`gsim3d.evaluate.protocol.predict`, of the steps from ``start + skipped`` on, errors included.
+        ``on_steps`` is called with the number of steps that have just been simulated."""
+        self.restored.check_scene(scene)
+        if not 0 <= start <= scene.n_steps - self.restored.data.history:
+            raise InputError(f"{scene.path}: the input steps from step {start} on do not fit its {scene.n_steps} steps")
+        if n_future < 1:
+            raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
+
+        def counted(predict: Callable) -> Callable:
+            def wrapped(*state, **options):
+                steps = predict(*state, **options)
+                on_steps(steps.n_clouds)
+                return steps
+
+            return wrapped
+
+        encoded = self.encode(self.frames([scene], [context], start))
+        log = RestLog()
+        with self.setting.precision("dynamics", self.device.type):
+            if self.setting.captured and not edits:
+                steps = CapturedRollout(self.simulator, encoded, n_future, self.plan)(encoded).steps
+            else:
+                wrap = None if on_steps is None else counted
+                steps = self.simulator.rollout(encoded, n_future, self.plan, edits=edits, log=log, wrap=wrap)
+        return Prediction(concatenate([encoded, *steps]), self.n_encoded, tuple(context), log.resting_share)
+
+    @property
+    def draws_in_graph(self) -> bool:
+        """Whether a graph of the rollout can draw as well: all particles, in the precision of the dynamics."""
+        return (
+            self.simulator.draws_in_graphs
+            and not self.setting.least_opacity
+            and self.setting.renderer == self.setting.dynamics
+        )
+
+    def captured(self, state: Particles, n_steps: int, cameras: Cameras) -> CapturedRollout:
+        """The rollout of ``state`` as a graph, in the precision of the dynamics; it draws where it can."""
+        drawn = self._smaller(cameras) if self.draws_in_graph else None
+        with self.setting.precision("dynamics", self.device.type):
+            return CapturedRollout(
+                self.simulator, state, n_steps, self.plan, cameras=drawn, copies=False, cutoff=self.setting.cutoff
+            )
+
+    def _smaller(self, cameras: Cameras) -> Cameras:
+        factor = self.setting.shrink
+        if factor == 1:
+            return cameras
+        width, height = math.ceil(cameras.width / factor), math.ceil(cameras.height / factor)
+        scale = torch.tensor([width / cameras.width, height / cameras.height, 1.0], device=cameras.Ks.device)
+        return dataclasses.replace(cameras, Ks=cameras.Ks * scale[:, None], width=width, height=height)
+
+
+def enlarged(images: Tensor, height: int, width: int) -> Tensor:
+    """Images of a setting that shrinks them, in their full size."""
+    if images.shape[1:3] == (height, width):
+        return images
+    return F.interpolate(images.permute(0, 3, 1, 2), (height, width), mode="bilinear").permute(0, 2, 3, 1)
+
+
+def _spread(cams: Sequence[int], count: int) -> list[int]:
+    return [cams[k * len(cams) // count] for k in range(min(count, len(cams)))]
+
+
+def _changed(simulator: Simulator, setting: Setting) -> Simulator:
+    """``simulator``, or one with its weights in another geometry."""
+    config = setting.of_model(simulator.config)
+    if config == simulator.config:
+        return simulator
+    device = next(simulator.parameters()).device
+    other = type(simulator)(config)
+    other.load_state_dict(simulator.state_dict())
+    other.absent, other.effects, other.inputs = simulator.absent, simulator.effects, simulator.inputs
+    return other.to(device).train(simulator.training)
+
+
+# ---- which settings there are ----
 
 
 @dataclass(frozen=True)
-class Knob:
-    """kind: a key of KINDS.
+class Group:
+    """Settings that change one thing.
 
-    turns: settings of a simulator on its device, each with only this knob turned; none, or why there is none.
-    needs: what must be there, trained or built first, where ``turns`` gives nothing.
-    few: turns in a report that takes the fewest: the last one, both ends, or what is evenly between them too.
-    slow: takes minutes to turn.
-    shown: the report has it, but not as settings of its own.
+    Attributes:
+        name: of the thing.
+        kind: a key of KINDS.
+        settings: of a case; empty where its model or device has none.
+        needs: what must be there for any.
+        few: how many a quick report takes: the last one, both ends, or what is evenly between them too.
     """
 
     name: str
     kind: str
-    turns: Callable[[Subject], list[Setting] | str]
+    settings: Callable[[BenchmarkCase], list[Setting]]
     needs: str = ""
     few: int = 2
-    slow: bool = False
-    shown: bool = False
 
 
-SLOW = "minutes: name it with --knobs, or take --preset full"
-
-
-def turned(
-    subject: Subject, knobs: Sequence[Knob], *, fewest: bool = False, slow: bool = True
-) -> tuple[dict[Setting, Knob], dict[str, str]]:
-    """(settings of all knobs, {knob that has none: what it needs}).
-
-    fewest: as few as Knob says; of knobs that need training all.   slow: slow ones as well.
-    """
-    settings, missing = {}, {}
-    for knob in knobs:
-        found = knob.turns(subject) if slow or not knob.slow else SLOW
-        if isinstance(found, str) or not found:
-            if not knob.shown:
-                missing[knob.name] = found or knob.needs
-            continue
-        if fewest and knob.kind != "needs-training" and len(found) > knob.few:
-            apart = (len(found) - 1) / max(1, knob.few - 1)
-            found = [found[-1 - int(n * apart)] for n in reversed(range(knob.few))]
-        settings.update((_as_run(setting, subject), knob) for setting in found)
-    return settings, missing
-
-
-def _as_run(setting: Setting, subject: Subject) -> Setting:
-    """On a GPU from a graph where it can be: else it waits for the host, and no knob makes that faster."""
-    on_gpu = subject.device.type == "cuda"
-    return dataclasses.replace(setting, captured=True) if on_gpu and setting.fits_a_graph else setting
-
-
-def _powers_below(limit: int, least: int = 1) -> list[int]:
-    return [n for n in (2**k for k in range(20)) if least <= n < limit]
-
-
-def _precisions(subject: Subject) -> list[Setting]:
-    if subject.device.type != "cuda":
+def _precisions(case: BenchmarkCase) -> list[Setting]:
+    if case.device.type != "cuda":
         return []
     whole = [Setting(p, p, p) for p in PRECISIONS[1:]]
     encoder, dynamics, renderer = (Setting(**{part: "bf16"}) for part in PARTS)
     return [whole[0], encoder, renderer, dynamics, whole[2], whole[1]]  # tf32, bf16 of the dynamics, and bf16 if few
 
 
-def _fp8(subject: Subject) -> str:
-    return why_not(subject)
+def _powers_below(limit: int, least: int = 1) -> list[int]:
+    return [n for n in (2**k for k in range(20)) if least <= n < limit]
 
 
-def _compiled(subject: Subject) -> list[Setting] | str:
-    return compiler_problem(subject.device) or [Setting(compiled=True)]
+def _histories(case: BenchmarkCase) -> list[Setting]:
+    most = min(case.restored.data.history, case.restored.plan.history)
+    return [Setting(history=n) for n in _powers_below(most)]
 
 
-def _captured(subject: Subject) -> list[Setting]:
-    return [Setting(captured=True)] * (subject.device.type == "cuda")
+def _backgrounds(case: BenchmarkCase) -> list[Setting]:
+    trained = case.restored.plan.spec.dynamics.background
+    return [] if trained == "masked_out" else [Setting(background="masked_out")]
 
 
-def _views(subject: Subject) -> list[Setting]:
-    return [Setting(context_views=n) for n in range(1, subject.restored.data.context_views)]
-
-
-def _history(subject: Subject) -> list[Setting]:
-    return [
-        Setting(history=n) for n in _powers_below(min(subject.restored.data.history, subject.restored.plan.history))
-    ]
-
-
-def _background(subject: Subject) -> list[Setting]:
-    trained = subject.restored.plan.spec.dynamics.background
-    return [Setting(background="masked_out")] if trained != "masked_out" else []
-
-
-def _kept(subject: Subject) -> list[Setting]:
-    return [Setting(kept=share) for share in (0.75, 0.5, 0.25, 0.1)]
-
-
-def _degrees(subject: Subject) -> list[Setting]:
-    return [Setting(sh_degree=n) for n in range(subject.restored.plan.sh_degree)]
-
-
-def _cutoffs(subject: Subject) -> list[Setting]:
-    return [Setting(cutoff="tile3sigma"), *(Setting(least_opacity=least) for least in (1 / 255, 0.02))]
-
-
-def _sleeping(subject: Subject) -> list[Setting]:
-    return [Setting(sleep=cells) for cells in (1e-3, 1e-2, 0.1)]
-
-
-def _orders(subject: Subject) -> list[Setting]:
-    config = subject.restored.simulator.config.dynamics
-    return [] if config.is_asymmetric or config.steps_per_call > 1 else [Setting(orders=4), Setting(orders=2)]
-
-
-def _patches(subject: Subject) -> list[Setting]:
-    largest = max(subject.restored.simulator.config.dynamics.patch_sizes)
+def _patches(case: BenchmarkCase) -> list[Setting]:
+    largest = max(case.restored.simulator.config.dynamics.patch_sizes)
     return [Setting(patch_size=n) for n in reversed(_powers_below(largest, 32)[-3:])]
 
 
-def _grids(subject: Subject) -> list[Setting]:
-    return [Setting(grid=factor) for factor in (0.5, 2.0)]
+def _views(case: BenchmarkCase) -> list[Setting]:
+    return [Setting(context_views=n) for n in range(1, case.restored.data.context_views)]
 
 
-def _images(subject: Subject) -> list[Setting]:
-    return [Setting(shrink=2), Setting(every=4)]
-
-
-def _horizon(subject: Subject) -> list[Setting]:
-    return []
-
-
-def _others(knob: str) -> Callable[[Subject], list[Setting]]:
-    return lambda subject: [Setting(checkpoint=name) for name, of in subject.knob_of_other.items() if of == knob]
-
-
-KNOBS = (
-    Knob("precision", "model", _precisions, "a GPU: on a CPU there is only float32", few=3),
-    Knob("fp8 products", "model", _fp8, "wider layers, see below"),
-    Knob("compile", "exact", _compiled, "a compiler; up to 2 minutes, so `quick` leaves it out", slow=True),
-    Knob("graph capture", "exact", _captured, "a GPU"),
-    Knob("context views", "model", _views, "more than one context view"),
-    Knob("history", "model", _history, "a model of more than one step of history"),
-    Knob("background", "model", _background, "particles of a background"),
-    Knob("particles kept", "model", _kept),
-    Knob("degree of colours", "model", _degrees, "a model with view-dependent colour"),
-    Knob("cutoff of Gaussians", "near-exact", _cutoffs),
-    Knob("sleep", "near-exact", _sleeping, few=1),
-    Knob("patch size", "model", _patches, "patches of more than 32 rows", few=1),
-    Knob("orders of curves", "model", _orders, "one step a call, and no asymmetric background", few=1),
-    Knob("grid size", "model", _grids),
-    Knob("image size and decoded frames", "exact", _images),
-    Knob("horizon", "exact", _horizon, "a table and a figure of its own", shown=True),
-    Knob(
-        "steps a call",
-        "needs-training",
-        _others("steps a call"),
-        "`--others`: dynamics.steps_per_call in the training's model section",
+GROUPS = (
+    Group("precision", "model", _precisions, "a GPU: on a CPU there is only float32", few=3),
+    Group("graph capture", "exact", lambda case: [Setting(captured=True)] * (case.device.type == "cuda"), "a GPU"),
+    Group("context views", "model", _views, "more than one context view"),
+    Group("history", "model", _histories, "a model of more than one step of history"),
+    Group("background", "model", _backgrounds, "particles of a background"),
+    Group("particles kept", "model", lambda case: [Setting(kept=share) for share in (0.75, 0.5, 0.25, 0.1)]),
+    Group(
+        "degree of colours",
+        "model",
+        lambda case: [Setting(sh_degree=n) for n in range(case.restored.plan.sh_degree)],
+        "a model with view-dependent colour",
     ),
-    Knob(
-        "model size",
-        "needs-training",
-        _others("model size"),
-        "`--others`: another preset, or channels in the training's model section",
+    Group(
+        "cutoff of Gaussians",
+        "near-exact",
+        lambda case: [Setting(cutoff="tile3sigma"), *(Setting(least_opacity=least) for least in (1 / 255, 0.02))],
     ),
-    Knob(
-        "training steps",
-        "needs-training",
-        _others("training steps"),
-        "a run folder with earlier checkpoints, or `--others`; the log has a figure of its own",
-    ),
+    Group("sleep", "near-exact", lambda case: [Setting(sleep=cells) for cells in (1e-3, 1e-2, 0.1)], few=1),
+    Group("patch size", "model", _patches, "patches of more than 32 particles", few=1),
+    Group("grid size", "model", lambda case: [Setting(grid=factor) for factor in (0.5, 2.0)]),
+    Group("image size", "exact", lambda case: [Setting(shrink=2)]),
 )
-# What is simulated is tuned, not what is looked at nor what is trained; a command compiles longer than it then runs.
-NOT_TUNED = ("image size and decoded frames", "steps a call", "model size", "training steps", "compile")
+NOT_TUNED = ("image size",)  # what is looked at, not what is simulated

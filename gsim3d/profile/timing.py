@@ -1,34 +1,28 @@
-"""Where the time of a call goes: stages told apart by the ops they run, medians of many repeats, memory and energy."""
+"""Where the time of a call goes: medians of many repeats, sections told apart by the ops they run, and the machine."""
 
 from __future__ import annotations
 
+import hashlib
+import platform
 import resource
 import statistics
+import subprocess
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 
+import gsim3d
 from gsim3d.cuda_graphs import Captured
 from gsim3d.simulator import Simulator
 
-STAGES = (
-    "encode",
-    "serialise",
-    "convolution",
-    "attention",
-    "pooling",
-    "dense layers",
-    "state and guards",
-    "head",
-    "sort and raster",
-    "host gaps",
-)
-STAGE_OF_OP = {
+REST, GAPS = "state and guards", "host gaps"  # everything in no other section; a GPU that waits for the host
+SECTION_OF_OP = {
     "build_pyramid": "serialise",
     "sparse_conv_plan": "serialise",
     "sparse_conv": "convolution",
@@ -38,23 +32,25 @@ STAGE_OF_OP = {
     "unpool": "pooling",
     "rasterize_gaussians": "sort and raster",
 }
-REST, GAPS = "state and guards", "host gaps"  # everything in no other stage; a GPU that waits for the host
+SECTIONS = ("encode", *dict.fromkeys(SECTION_OF_OP.values()), "dense layers", "head", REST, GAPS)
 CHAIN, REPLAYS = 64, 9  # kernels between which marks are made, to tell what a mark takes
-WARM_UP, REPEATS = 3, 20
-ADDS_UP = 0.03  # the stages of a call may differ from the whole by this share
+PACKAGE = Path(gsim3d.__file__).parent
+
+
+# ---- clocks ----
 
 
 class Clock(Protocol):
     """What a stopwatch reads."""
 
     def wait(self) -> None:
-        """Returns once the device has done everything asked of it."""
+        """Returns once the device has done all its work."""
 
     def now(self) -> float:
         """Seconds of the host."""
 
     def mark(self) -> Any:
-        """The point in the device's work that has been asked for so far; in a capture, in the work of every replay."""
+        """The current point in the device's work; in a capture, a point in the work of every replay."""
 
     def capturing(self) -> bool:
         """Whether a graph is being captured."""
@@ -65,22 +61,16 @@ class Clock(Protocol):
     def seconds(self, first: Any, last: Any) -> float:
         """Between two marks that the device has passed."""
 
-    def delay(self, seconds: float) -> None:
-        """Keeps the device busy."""
-
 
 class DeviceClock:
-    """The clock of the CPU or a GPU, whose marks are events.
+    """The clock of the CPU or of a GPU, whose marks are events."""
 
-    waits: False leaves out the wait for the device, which a timing must never do: see :mod:`gsim3d.profile.self_check`.
-    """
-
-    def __init__(self, device: torch.device | str, waits: bool = True):
+    def __init__(self, device: torch.device | str):
         self._gpu = torch.device(device) if torch.device(device).type == "cuda" else None
-        self._waits, self._mark_cost = waits, None
+        self._mark_cost: float | None = None
 
     def wait(self) -> None:
-        if self._gpu is not None and self._waits:
+        if self._gpu is not None:
             torch.cuda.synchronize(self._gpu)
 
     def now(self) -> float:
@@ -129,83 +119,70 @@ class DeviceClock:
         last.synchronize()
         return first.elapsed_time(last) / 1e3
 
-    def delay(self, seconds: float) -> None:
-        if self._gpu is None:
-            end = time.perf_counter() + seconds
-            while time.perf_counter() < end:
-                pass
-        else:
-            kilohertz = torch.cuda.get_device_properties(self._gpu).clock_rate
-            torch.cuda._sleep(int(seconds * 1e3 * kilohertz))
+
+# ---- sections of a call ----
 
 
 class Stopwatch:
-    """Splits the time of a call into stages; a stage within another counts as itself only.
+    """Splits the time of a call into sections; a section within another counts as itself only.
 
         stopwatch = Stopwatch(clock)
-        with stopwatch.running():
-            with stopwatch.stage("encode"):
-                ...
-        stopwatch.seconds                      # {"encode": ..., "state and guards": ...}
+        with watched(simulator, stopwatch), stopwatch.running():
+            simulator.step(state)
+        stopwatch.seconds                      # {"convolution": ..., "state and guards": ...}
 
-    delays: stage -> seconds to waste the first time that it is entered in each run; shows what the stopwatch sees.
+    Attributes:
+        seconds: by section, of the last call.
     """
 
-    def __init__(self, clock: Clock, delays: dict[str, float] | None = None):
+    def __init__(self, clock: Clock):
         self.seconds: dict[str, float] = {}
-        self._clock, self._delays = clock, delays or {}
+        self._clock = clock
         self._marks: list[tuple[str, Any]] = []
         self._open: list[str] = []
 
     @contextmanager
-    def running(self, rest: str = REST) -> Iterator[None]:
-        """One call. ``rest``: the stage of everything outside any other."""
-        self._marks, self._open, self._due = [], [], dict(self._delays)
-        self._enter(rest)
+    def running(self) -> Iterator[None]:
+        """One call; what is in no other section is in REST."""
+        self._marks, self._open = [], []
+        self.enter(REST)
         try:
             yield
         finally:
             self._marks.append(("", self._clock.mark()))
             self._open = []
-            self._add_up(self._marks)
+            self.seconds = self._sums(self._marks)
 
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        self._enter(name)
-        try:
-            yield
-        finally:
-            self._leave()
-
-    def _enter(self, name: str) -> None:
+    def enter(self, name: str) -> None:
+        """A section begins."""
         if not self._open or self._open[-1] != name:
             self._note(name)
         self._open.append(name)
-        if name in self._due and self._counts():
-            self._clock.delay(self._due.pop(name))
 
-    def _leave(self) -> None:
+    def leave(self) -> None:
+        """The section that began last ends."""
         name = self._open.pop()
         if self._open and name != self._open[-1]:
             self._note(self._open[-1])
 
+    @property
+    def current(self) -> str:
+        """The section that began last and has not ended; "" outside of a call."""
+        return self._open[-1] if self._open else ""
+
     def _note(self, name: str) -> None:
-        if self._counts():
-            self._marks.append((name, self._clock.mark()))
+        self._marks.append((name, self._clock.mark()))
 
-    def _counts(self) -> bool:
-        return True
-
-    def _add_up(self, marks: list[tuple[str, Any]]) -> None:
+    def _sums(self, marks: list[tuple[str, Any]]) -> dict[str, float]:
         self._clock.wait()
         totals: dict[str, float] = defaultdict(float)
         for (name, begin), (_, end) in zip(marks, marks[1:]):
             totals[name] += self._clock.seconds(begin, end)
-        self.seconds = dict(totals)
+        return dict(totals)
 
 
 class GraphStopwatch(Stopwatch):
-    """Splits the time of a CUDA graph: marks and delays become part of it, and every replay passes them.
+    """Splits the time of a CUDA graph: marks become a part of it, and every replay passes them.
 
         stopwatch = GraphStopwatch(clock)
         with watched(simulator, stopwatch), stopwatch.capturing():
@@ -214,54 +191,50 @@ class GraphStopwatch(Stopwatch):
             graph(state)
         stopwatch.seconds
 
-    The host is not in it: a GPU that waits for no launch shows in each stage what that stage takes. What the marks
-    themselves take is measured apart and taken off.
+    The host is not in it: the GPU waits for no launch. What the marks themselves take is measured apart and taken off.
     """
 
     @contextmanager
-    def capturing(self, rest: str = REST) -> Iterator[None]:
+    def capturing(self) -> Iterator[None]:
         """The one capture of the graph; what is run before it, to try it out, has no marks."""
-        self._marks, self._open, self._due, self._behind = [], [rest], dict(self._delays), None
+        self._marks, self._open, self._behind = [], [REST], None
         try:
             yield
         finally:
             self._open = []
 
     @contextmanager
-    def running(self, rest: str = REST) -> Iterator[None]:
+    def running(self) -> Iterator[None]:
         """One replay, and what the host launches behind it, such as images that a graph cannot draw."""
-        self._open, self._behind, begin = [rest], [], self._clock.mark()
+        self._open, self._behind, begin = [REST], [], self._clock.mark()
         try:
             yield
         finally:
             end, self._open = self._clock.mark(), []
-            self._add_up([(rest, begin), *self._marks, *self._behind, ("", end)])
-            for name, _ in [(rest, begin), *self._marks][: len(self._marks)]:  # each ends at a mark in the graph
-                self.seconds[name] -= self._clock.mark_cost()
-            self.seconds = {name: max(0.0, seconds) for name, seconds in self.seconds.items()}
+            seconds = self._sums([(REST, begin), *self._marks, *self._behind, ("", end)])
+            for name, _ in [(REST, begin), *self._marks][: len(self._marks)]:  # each ends at a mark in the graph
+                seconds[name] -= self._clock.mark_cost()
+            self.seconds = {name: max(0.0, value) for name, value in seconds.items()}
 
     def _note(self, name: str) -> None:
-        if self._counts():
+        if self._open and self._clock.capturing():
             self._marks.append((name, self._clock.mark()))
         elif self._behind is not None:
             self._behind.append((name, self._clock.mark()))
 
-    def _counts(self) -> bool:
-        return bool(self._open) and self._clock.capturing()
-
 
 @contextmanager
 def watched(simulator: Simulator, stopwatch: Stopwatch) -> Iterator[None]:
-    """Within it, calls of ``simulator`` tell ``stopwatch`` their stages; ops are known wherever they are called."""
+    """Within it ``stopwatch`` follows the sections of ``simulator``: its modules, and ops wherever they are called."""
     hooks = []
-    rooms = {simulator.encoder: "encode", simulator.dynamics.net: "dense layers", simulator.renderer: "head"}
-    for module, name in rooms.items():
-        hooks.append(module.register_forward_pre_hook(lambda *_, name=name: stopwatch._enter(name)))
-        hooks.append(module.register_forward_hook(lambda *_: stopwatch._leave(), always_call=True))
+    sections = {simulator.encoder: "encode", simulator.dynamics.net: "dense layers", simulator.renderer: "head"}
+    for module, name in sections.items():
+        hooks.append(module.register_forward_pre_hook(lambda *_, name=name: stopwatch.enter(name)))
+        hooks.append(module.register_forward_hook(lambda *_: stopwatch.leave(), always_call=True))
     ops = torch.ops.gsim3d
-    known = {name: getattr(ops, name) for name in STAGE_OF_OP}
+    known = {name: getattr(ops, name) for name in SECTION_OF_OP}
     for name, op in known.items():
-        setattr(ops, name, _TimedOp(op, STAGE_OF_OP[name], stopwatch))
+        setattr(ops, name, _TimedOp(op, SECTION_OF_OP[name], stopwatch))
     try:
         yield
     finally:
@@ -272,48 +245,62 @@ def watched(simulator: Simulator, stopwatch: Stopwatch) -> Iterator[None]:
 
 
 class _TimedOp:
-    """An op of torch.ops that tells the stopwatch when it runs; what is an overload of it does so too."""
+    """An op of torch.ops, or an overload of one, that is a section of the stopwatch."""
 
-    def __init__(self, op: Any, stage: str, stopwatch: Stopwatch):
-        self._op, self._stage, self._stopwatch = op, stage, stopwatch
+    def __init__(self, op: Any, section: str, stopwatch: Stopwatch):
+        self._op, self._section, self._stopwatch = op, section, stopwatch
 
     def __call__(self, *args, **kwargs):
-        if self._stopwatch._open and self._stopwatch._open[-1] == "encode":  # all of the encoder is one stage
+        if self._stopwatch.current == "encode":  # all of the encoder is one section
             return self._op(*args, **kwargs)
-        with self._stopwatch.stage(self._stage):
+        self._stopwatch.enter(self._section)
+        try:
             return self._op(*args, **kwargs)
+        finally:
+            self._stopwatch.leave()
 
     def __getattr__(self, name: str):
         value = getattr(self._op, name)
-        return _TimedOp(value, self._stage, self._stopwatch) if name == "default" else value
+        return _TimedOp(value, self._section, self._stopwatch) if name == "default" else value
+
+
+# ---- timings ----
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds of one call: all repeats, in order; stages by name, medians of repeats in which they were watched."""
+    """Seconds of one call.
+
+    Attributes:
+        repeats: all of them, in order.
+        sections: medians by name, where they were watched.
+    """
 
     repeats: tuple[float, ...]
-    stages: dict[str, float] = field(default_factory=dict)
+    sections: dict[str, float] = field(default_factory=dict)
 
     @property
     def median(self) -> float:
         return statistics.median(self.repeats)
 
     @property
-    def steady(self) -> float:
-        """Mean of the middle half: repeats of two scenes have two levels, between which a median jumps."""
-        ordered, cut = sorted(self.repeats), len(self.repeats) // 4
-        return statistics.fmean(ordered[cut : len(ordered) - cut])
-
-    @property
     def p95(self) -> float:
         ordered = sorted(self.repeats)
         return ordered[min(len(ordered) - 1, round(0.95 * (len(ordered) - 1)))]
 
+    def split_over(self, n_steps: int) -> Timing:
+        """The timing of one of ``n_steps`` that are a call."""
+        sections = {name: seconds / n_steps for name, seconds in self.sections.items()}
+        return Timing(tuple(seconds / n_steps for seconds in self.repeats), sections)
 
-def time_call(call: Callable[[], Any], clock: Clock, repeats: int = REPEATS, warm_up: int = WARM_UP) -> Timing:
-    """Times ``call``, each time from an idle device to an idle device; the first ``warm_up`` do not count."""
-    seconds = []
+
+def time_call(call: Callable[[], Any], clock: Clock, repeats: int, warm_up: int = 1, sections=None) -> Timing:
+    """Times ``call``, each time from an idle device to an idle device; the first ``warm_up`` do not count.
+
+    Args:
+        sections: gives those of the call that has just ended; None: they are not told apart.
+    """
+    seconds, found = [], []
     for n in range(warm_up + repeats):
         clock.wait()
         start = clock.now()
@@ -321,61 +308,79 @@ def time_call(call: Callable[[], Any], clock: Clock, repeats: int = REPEATS, war
         clock.wait()
         if n >= warm_up:
             seconds.append(clock.now() - start)
-    return Timing(tuple(seconds))
+            found.append({} if sections is None else dict(sections()))
+    return Timing(tuple(seconds), medians_of(found))
 
 
-def time_stages(
-    call: Callable[[], Any],
-    simulators: Sequence[Simulator],
-    clock: Clock,
-    repeats: int = REPEATS,
-    warm_up: int = WARM_UP,
-    *,
-    alone: bool = True,
-) -> Timing:
-    """As :func:`time_call`, and the stages of it.
-
-    alone: plain and watched calls take turns, so that both see the same machine; False: the watched call is the one
-        that is timed, where marks cost next to nothing.
-    """
-    seconds, stages = [], defaultdict(list)
-    stopwatch = Stopwatch(clock)
-    for n in range(warm_up + repeats):
-        with _all_watched([] if alone else simulators, stopwatch):
-            clock.wait()
-            start = clock.now()
-            with nullcontext() if alone else stopwatch.running():
-                call()
-            clock.wait()
-            whole = clock.now() - start
-        if alone:
-            with _all_watched(simulators, stopwatch), stopwatch.running():
-                call()
-        if n >= warm_up:
-            seconds.append(whole)
-            for name in STAGES:
-                stages[name].append(stopwatch.seconds.get(name, 0.0))
-    medians = {name: statistics.median(values) for name, values in stages.items()}
-    return Timing(tuple(seconds), {name: value for name, value in medians.items() if value > 0})
+def medians_of(found: list[dict[str, float]]) -> dict[str, float]:
+    """Of each section over calls, in the order of SECTIONS."""
+    names = [name for name in SECTIONS if any(name in sections for sections in found)]
+    return {name: statistics.median(sections.get(name, 0.0) for sections in found) for name in names}
 
 
 @contextmanager
-def _all_watched(simulators: Sequence[Simulator], stopwatch: Stopwatch) -> Iterator[None]:
-    if not simulators:
-        yield
-        return
-    with watched(simulators[0], stopwatch), _all_watched(simulators[1:], stopwatch):
-        yield
-
-
-@contextmanager
-def peak_memory(device: torch.device, held: int = 0) -> Iterator[Callable[[], int]]:
-    """A function that says how many bytes the block needed at most: of the GPU beyond what lay there before, and
-    ``held`` of that; of a CPU the whole process so far."""
+def peak_memory(device: torch.device) -> Iterator[Callable[[], int]]:
+    """A function that says how many bytes were allocated at most in the block; on a CPU, by the process so far."""
     if device.type == "cuda":
-        torch.cuda.synchronize(device)
         torch.cuda.reset_peak_memory_stats(device)
-        before = torch.cuda.memory_allocated(device)
-        yield lambda: torch.cuda.max_memory_allocated(device) - before + held
+        yield lambda: torch.cuda.max_memory_allocated(device)
     else:
         yield lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+# ---- the machine ----
+
+
+def machine(device: torch.device) -> dict[str, str]:
+    """What numbers were measured on, and with: the commit where git knows it, and a hash of the package's sources."""
+    found = {
+        "gsim3d": gsim3d.__version__,
+        "commit": _commit(),
+        "sources": _hash_of_sources(),
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
+    if device.type == "cuda":
+        found |= {"device": torch.cuda.get_device_name(device), "cuda": torch.version.cuda, "driver": _driver(device)}
+    else:
+        found |= {"device": f"CPU, {torch.get_num_threads()} threads", "processor": _processor()}
+    return {name: value for name, value in found.items() if value}
+
+
+def _said(*words: str) -> str:
+    """What a program prints; "" where it fails."""
+    try:
+        return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+def _commit() -> str:
+    """Of the checkout that this package is in, with "+" where it was changed; "" outside of one."""
+    git = ("git", "-C", str(PACKAGE.parent))
+    root = _said(*git, "rev-parse", "--show-toplevel")
+    if not root or Path(root).resolve() != PACKAGE.parent.resolve():
+        return ""
+    return _said(*git, "rev-parse", "--short=12", "HEAD") + "+" * bool(_said(*git, "status", "--porcelain", "-uno"))
+
+
+def _hash_of_sources() -> str:
+    digest = hashlib.sha256()
+    for file in sorted(PACKAGE.rglob("*.py")):
+        digest.update(file.relative_to(PACKAGE).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _driver(device: torch.device) -> str:
+    """Its version and the clocks of the GPU, as nvidia-smi prints them."""
+    uuid = getattr(torch.cuda.get_device_properties(device), "uuid", None)
+    query = "--query-gpu=driver_version,clocks.gr,clocks.mem"
+    return _said("nvidia-smi", f"--id=GPU-{uuid}", query, "--format=csv,noheader") if uuid else ""

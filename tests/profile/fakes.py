@@ -1,4 +1,4 @@
-"""A clock that only moves when something says so, and a simulator whose stages take given times on it."""
+"""A clock that moves with the work of a fake device, and a simulator whose sections take given times on it."""
 
 import torch
 from torch import nn
@@ -11,14 +11,16 @@ class Mark:
 
 
 class FakeClock:
-    """A device that works through what it is asked for while the host runs on; ``wait`` lets the host catch up.
+    """A device that works through its queue while the host runs on; ``wait`` lets the host catch up.
 
-    host_share: seconds that the host takes to ask for a second of work.   launch: seconds that it takes beside.
-    cost: seconds that a mark takes in a graph.
+    Args:
+        host_share: seconds of the host for a second of work.
+        launch: seconds of the host for each piece of work, beside.
+        cost: seconds that a mark takes in a graph.
     """
 
-    def __init__(self, waits=True, host_share=1.0, launch=0.0, cost=0.0):
-        self.host, self.device, self.waits, self.host_share, self.launch = 0.0, 0.0, waits, host_share, launch
+    def __init__(self, host_share=1.0, launch=0.0, cost=0.0):
+        self.host, self.device, self.host_share, self.launch = 0.0, 0.0, host_share, launch
         self.program, self.cost = None, cost
 
     def work(self, seconds):
@@ -30,8 +32,7 @@ class FakeClock:
         self.host += seconds * self.host_share
 
     def wait(self):
-        if self.waits:
-            self.host = max(self.host, self.device)
+        self.host = max(self.host, self.device)
 
     def now(self):
         return self.host
@@ -53,9 +54,6 @@ class FakeClock:
     def seconds(self, first, last):
         return last.at - first.at
 
-    def delay(self, seconds):
-        self.work(seconds)
-
     def _does(self, item):
         if isinstance(item, Mark):
             item.at = self.device
@@ -64,21 +62,8 @@ class FakeClock:
             self.device = max(self.device, self.host) + item
 
 
-class TickingClock(FakeClock):
-    """Every look at it is a millisecond after the one before: what else the machine does changes nothing."""
-
-    def now(self):
-        self.host += 1e-3
-        return self.host
-
-    def mark(self):
-        mark = super().mark()
-        mark.at = self.now()
-        return mark
-
-
 class FakeGraph:
-    """What a function asks of a clock's device, as one launch."""
+    """The work of a function on a clock's device, as one launch."""
 
     def __init__(self, function, clock):
         function()  # tried out before, as of a real one

@@ -1,96 +1,90 @@
 """Presets keep what they promise, limits are kept, and what was tuned is found again."""
 
 import dataclasses
+import json
 
 import pytest
 
 import gsim3d
+from gsim3d.effects.plan import Workload, predicted_cost
+from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.io.checkpoint import Checkpoint
+from gsim3d.numerics.speed import SPEEDS_FILE, Setting, load_speed
 from gsim3d.profile import autotune
-from gsim3d.profile.limit import TimeLimit
-from gsim3d.profile.measure import Agreement, Comparison, Effort, Point, measure
-from gsim3d.profile.settings import KNOBS, Setting
-from gsim3d.profile.timing import DeviceClock, Timing
+from gsim3d.profile.autotune import PartTimes
+from gsim3d.profile.settings import GROUPS
+from gsim3d.profile.sweep import Agreement, Effort, Point, Sweep, TimeLimit
+from gsim3d.profile.timing import Timing
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SHORT = Effort(n_rounds=2, repeats=2, warm_up=0)
-
-
-@pytest.fixture(scope="module")
-def comparison(subject):
-    return Comparison(subject)
-
-
-@pytest.fixture(scope="module")
-def points(subject, comparison):
-    settings = [
-        Setting(),
-        Setting(history=1),
-        Setting(kept=0.5),
-        Setting(kept=0.05),
-        Setting(every=3),
-        Setting(grid=2.0),
-    ]
-    points = [Point(s, "", "model") for s in settings]
-    measure(comparison, points, DeviceClock("cpu"), SHORT)
-    return points
-
-
-def test_every_preset_keeps_its_promise(subject, comparison, points):
-    """Verified anew: the tuned setting is run again, and its gain compared with that of the reference."""
-    presets = autotune.tune(comparison, points, DeviceClock("cpu"), SHORT)
-    assert list(presets) == list(autotune.PROMISES)
-    assert presets["exact"].setting == Setting()
-    for name, share in (("balanced", 0.999), ("fast", 0.99)):
-        every = presets[name].setting.every
-        gain = comparison.gain(comparison.of(presets[name].setting).by_step, every)
-        reference = {metric: values[::every] for metric, values in points[0].by_step.items()}
-        whole = comparison.gain(reference, every)
-        assert gain >= whole - (1 - share) * abs(whole)
-        assert presets[name].step_seconds <= points[0].step_seconds
-
-
-def test_a_setting_that_loses_too_much_keeps_no_promise(comparison, points):
-    worst = points[3]
-    assert not autotune.keeps_gain(comparison, worst, points[0], 0.999)
-    assert autotune.keeps_gain(comparison, points[0], points[0], 1.0)
+SECTIONS = {"serialise": 0.002, "attention": 0.003, "state and guards": 0.001, "head": 0.004, "sort and raster": 0.005}
+REFERENCE = Point(Setting(), "", "exact", step=(Timing((0.015,), SECTIONS),))
+TIMES = PartTimes("here", Workload(100, 300, 2, 1024), dynamics=6.0, gaussians=4.0, images=5.0, host=2.0)
 
 
 def at(setting, seconds, psnr, other_round=None):
-    timings = [Timing((seconds,)), Timing((other_round or seconds,))]
+    timings = Timing((seconds,)), Timing((other_round or seconds,))
     return Point(setting, "", "model", agreement=Agreement(psnr, psnr, None, None), step=timings)
 
 
-def test_turns_that_keep_the_promise_are_added_up(subject, comparison, monkeypatch):
-    """Two turns that help alone are measured together; one that ties, fails or breaks the promise is not taken."""
-    reference = at(Setting(), 10.0, 100.0)
-    turns = [
+def all_points(point):
+    return True
+
+
+@pytest.fixture
+def fake(case, monkeypatch):
+    """(sweep, settings that it measured together): each of them takes 3 s and agrees to 55 dB."""
+    sweep, measured = Sweep(case, SHORT), []
+
+    def run(points):
+        for point in points:
+            if not point.step:
+                measured.append(point.setting)
+                point.agreement, point.step = Agreement(55.0, 50.0, None, None), (Timing((3.0,)),)
+
+    monkeypatch.setattr(sweep, "run", run)
+    return sweep, measured
+
+
+def test_presets_keep_their_promises(case):
+    """Verified anew: the tuned setting is run again, and its gain compared with that of the reference."""
+    sweep = Sweep(case, SHORT)
+    settings = (Setting(), Setting(history=1), Setting(kept=0.5), Setting(kept=0.05), Setting(grid=2.0))
+    points = [sweep.point(setting, "", "model") for setting in settings]
+    sweep.run(points)
+    presets = autotune.tune(sweep, points)
+    assert list(presets) == list(autotune.PROMISES) and presets["exact"] is points[0]
+    for name, share in (("balanced", 0.999), ("fast", 0.99)):
+        again = Point(presets[name].setting, "", "model")
+        case.compare(again)
+        whole = case.gain(points[0])
+        assert case.gain(again) >= whole - (1 - share) * abs(whole)
+        assert presets[name].step_seconds <= points[0].step_seconds
+    assert not autotune.keeping(case, points[0], 0.999)(points[3])  # it loses too much
+    assert autotune.keeping(case, points[0], 1.0)(points[0])
+
+
+def test_settings_that_keep_the_promise_are_added_up(fake):
+    """Two that help alone are measured together; one that ties, fails or breaks the promise is not taken."""
+    sweep, measured = fake
+    points = [
+        at(Setting(), 10.0, 100.0),
         at(Setting(history=1), 6.0, 60.0),
         at(Setting(grid=2.0), 8.0, 70.0),
         at(Setting(kept=0.1), 2.0, 10.0),
         at(Setting(cutoff="tile3sigma"), 9.9, 90.0, other_round=10.2),
     ]
-    turns[2].failure = "out of memory"
-    measured = []
-
-    def fill(_, points, *others):
-        measured.extend(point.setting for point in points)
-        points[0].agreement = Agreement(55.0, 50.0, None, None)
-        points[0].step.append(Timing((4.0,)))
-
-    monkeypatch.setattr(autotune, "measure", fill)
-    best = autotune.fastest(comparison, [reference, *turns], lambda p: p.agreement.psnr >= 50, None, SHORT)
-    assert best.setting == Setting(history=1, grid=2.0)
-    assert measured == [Setting(history=1, grid=2.0)]
-    again = autotune.fastest(
-        comparison, [reference, *turns], lambda p: p.agreement.psnr >= 40, None, SHORT, {best.setting: best}
-    )
-    assert again is best and len(measured) == 1  # nothing is measured twice
+    points[3].failure = "out of memory"
+    best = autotune.fastest(sweep, points, lambda p: p.agreement.psnr >= 50)
+    assert best.setting == Setting(history=1, grid=2.0) and measured == [best.setting]
+    assert autotune.fastest(sweep, points, lambda p: p.agreement.psnr >= 40) is best and len(measured) == 1
 
 
-def test_a_turn_must_save_more_than_its_graph_does(comparison, monkeypatch):
-    """All that is replayed is faster than the launched reference; what saves nothing beside the graph is not tried."""
+def test_setting_must_save_more_than_its_graph_does(fake):
+    """Every replay is faster than the launched reference; what saves nothing beside the graph is not tried."""
+    sweep, measured = fake
     points = [
         at(Setting(), 10.0, 100.0),
         at(Setting(captured=True), 6.0, 100.0),
@@ -98,61 +92,126 @@ def test_a_turn_must_save_more_than_its_graph_does(comparison, monkeypatch):
         at(Setting(captured=True, history=1), 4.0, 60.0),
         at(Setting(captured=True, kept=0.5), 5.0, 50.0),
     ]
-    measured = []
-
-    def fill(_, points, *others):
-        measured.append(points[0].setting)
-        points[0].agreement, points[0].step = Agreement(50.0, 50.0, None, None), [Timing((3.0,))]
-
-    monkeypatch.setattr(autotune, "measure", fill)
-    best = autotune.fastest(comparison, points, lambda p: True, None, SHORT)
+    best = autotune.fastest(sweep, points, all_points)
     assert best.setting == Setting(captured=True, history=1, kept=0.5) and measured == [best.setting]
-    only = autotune.fastest(comparison, points[:3], lambda p: True, None, SHORT)
-    assert only is points[1]
+    assert autotune.fastest(sweep, points[:3], all_points) is points[1]
 
 
-def test_what_ties_with_the_fastest_is_chosen_by_agreement(comparison):
+def test_settings_that_do_not_fit_each_other_are_not_combined(fake):
+    sweep, measured = fake
+    points = [at(Setting(), 10.0, 100.0), at(Setting(captured=True), 6.0, 100.0), at(Setting(sleep=0.1), 8.0, 99.0)]
+    assert autotune.fastest(sweep, points, all_points) is points[1] and not measured
+
+
+def test_tie_with_the_fastest_is_decided_by_agreement(fake):
     points = [
         at(Setting(), 10.0, 100.0),
         at(Setting(history=1), 5.0, 40.0, other_round=5.2),
         at(Setting("bf16", "bf16", "bf16", history=1), 5.1, 60.0, other_round=5.3),
     ]
-    assert autotune.fastest(comparison, points, lambda p: True, None, SHORT) is points[2]
+    assert autotune.fastest(fake[0], points, all_points) is points[2]
 
 
-def test_nothing_is_tried_when_the_time_is_over(comparison, monkeypatch):
-    monkeypatch.setattr(autotune, "measure", lambda *args: pytest.fail("measured"))
+def test_no_combination_is_tried_when_the_time_is_over(fake):
+    sweep, measured = fake
+    sweep.limit = TimeLimit(1.0, iter([0.0, *[2.0] * 9]).__next__)
     points = [at(Setting(), 10.0, 100.0), at(Setting(history=1), 6.0, 60.0), at(Setting(grid=2.0), 8.0, 70.0)]
-    over = TimeLimit(1.0, iter([0.0, *[2.0] * 9]).__next__)
-    best = autotune.fastest(comparison, points, lambda p: True, None, SHORT, limit=over)
-    assert best is points[1]
+    assert autotune.fastest(sweep, points, all_points) is points[1] and not measured
 
 
-def test_limits_are_kept(subject):
-    few = {"knobs": [knob for knob in KNOBS if knob.name in ("history", "grid size")], "effort": SHORT}
-    tuned = gsim3d.autotune(subject, min_agreement_psnr=30.0, **few)
-    again = Comparison(subject).of(tuned.setting).agreement
-    assert again.psnr >= 30.0
-    assert autotune.autotune(subject, max_ms=1e6, **few).setting == Setting()
+def test_autotune_keeps_limits(case):
+    few = {"groups": [group for group in GROUPS if group.name in ("history", "grid size")], "effort": SHORT}
+    tuned = gsim3d.autotune(case, min_agreement_psnr=30.0, **few)
+    case.compare(again := Point(tuned.setting, "", "model"))
+    assert again.agreement.psnr >= 30.0
+    assert autotune.autotune(case, max_ms=1e6, **few).setting == Setting()
     with pytest.raises(InputError, match="no setting takes at most 1e-06 ms"):
-        autotune.autotune(subject, max_ms=1e-6, **few)
+        autotune.autotune(case, max_ms=1e-6, **few)
     with pytest.raises(InputError, match="either max_ms or min_agreement_psnr"):
-        autotune.autotune(subject)
+        autotune.autotune(case)
 
 
-def test_tuned_presets_are_found_again(tmp_path, subject):
-    restored, other = (
-        dataclasses.replace(subject.restored, checkpoint=Checkpoint({}, {}, digest=digest)) for digest in ("1f", "2e")
-    )
+# ---- what is kept beside the weights ----
+
+
+def speed_of(folder, restored, name):
+    return load_speed(folder, restored.checkpoint.digest, restored.device.type, name)
+
+
+@pytest.fixture
+def restored(case):
+    return dataclasses.replace(case.restored, checkpoint=Checkpoint({}, {}, digest="1f"))
+
+
+def test_tuned_presets_are_found_again(tmp_path, restored):
+    other = dataclasses.replace(restored, checkpoint=Checkpoint({}, {}, digest="2e"))
     autotune.save_speeds(tmp_path, restored, {"fast": at(Setting(history=1, kept=0.9), 1.0, 50.0)})
     autotune.save_speeds(tmp_path, other, {"fast": at(Setting(grid=2.0), 1.0, 50.0)})
-    assert autotune.load_speed(tmp_path, restored, "fast") == Setting(history=1, kept=0.9)
-    assert autotune.load_speed(tmp_path, other, "fast") == Setting(grid=2.0)
-    assert autotune.load_speed(tmp_path / "none", restored, "exact") == Setting()
+    assert speed_of(tmp_path, restored, "fast") == Setting(history=1, kept=0.9)
+    assert speed_of(tmp_path, other, "fast") == Setting(grid=2.0)
+    assert speed_of(tmp_path / "none", restored, "exact") == Setting()
     with pytest.raises(InputError, match="not tuned for cpu .*run gsim3d profile"):
-        autotune.load_speed(tmp_path, restored, "balanced")
+        speed_of(tmp_path, restored, "balanced")
     with pytest.raises(InputError, match="must be one of exact, balanced, fast"):
-        autotune.load_speed(tmp_path, restored, "warp")
-    (tmp_path / autotune.SPEEDS_FILE).write_text("[1]")
+        speed_of(tmp_path, restored, "warp")
+    (tmp_path / SPEEDS_FILE).write_text("[1]")
     with pytest.raises(InputError, match="must hold a mapping"):
-        autotune.load_speed(tmp_path, restored, "fast")
+        speed_of(tmp_path, restored, "fast")
+
+
+def test_sections_are_summed_to_parts(case):
+    times = PartTimes.of(case, REFERENCE)
+    assert (times.dynamics, times.gaussians, times.images, times.host) == pytest.approx((6.0, 4.0, 5.0, 0.0))
+    newest = [case.newest(number).activity for number in range(2)]
+    moving, count = (sum(counts) / 2 for counts in zip(*((int((a == 0).sum()), len(a)) for a in newest)))
+    assert times.work == Workload(round(moving), round(count) - round(moving), len(case.views[0][1]), 32 * 32)
+    waits = Point(Setting(), "", "exact", step=(Timing((0.015,), {**SECTIONS, "host gaps": 0.01}),))
+    assert PartTimes.of(case, waits).host == pytest.approx(10.0)
+    assert PartTimes.of(case, Point(Setting(), "", "exact", step=(Timing((0.015,), {}),))) is None
+
+
+def test_milliseconds_grow_as_multiply_adds(case):
+    simulator = case.restored.simulator
+    own, masked = simulator.plan(), simulator.plan(EffectsSpec(DynamicsEffects("masked_out")))
+    same = TIMES.predicted(own, own, simulator.config, TIMES.work)
+    assert same == pytest.approx({"dynamics": 6.0, "gaussians": 4.0, "images": 5.0, "host": 2.0})
+    work = dataclasses.replace(TIMES.work, views=1)
+    before = predicted_cost(own, simulator.config, TIMES.work)
+    after, found = predicted_cost(masked, simulator.config, work), TIMES.predicted(own, masked, simulator.config, work)
+    assert found["host"] == 2.0, "however little is computed"
+    for part in ("dynamics", "gaussians", "images"):
+        measured = getattr(TIMES, part)
+        assert 0 < found[part] < measured and found[part] == pytest.approx(measured * after[part] / before[part])
+
+
+def test_times_are_kept_beside_presets(tmp_path, restored):
+    assert autotune.load_times(tmp_path, restored) == {}
+    autotune.save_speeds(tmp_path, restored, {"exact": REFERENCE})
+    assert autotune.load_times(tmp_path, restored) == {}
+    autotune.save_speeds(tmp_path, restored, {"exact": REFERENCE}, TIMES)
+    assert autotune.load_times(tmp_path, restored) == {"cpu": TIMES}
+    assert speed_of(tmp_path, restored, "exact") == Setting()
+    other = dataclasses.replace(restored, checkpoint=Checkpoint({}, {}, digest="2e"))
+    assert autotune.load_times(tmp_path, other) == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"dynamics": "long"}, "speeds.json: cpu: measured: dynamics must be a number; got 'long'"),
+        ({"work": {"moving": "many", "frozen": 0}}, "speeds.json: cpu: measured: work.moving must be a whole number"),
+        ({"until": 3}, "speeds.json: cpu: measured: unknown key until"),
+        ({"work": {"moving": 3}}, "speeds.json: cpu: measured: key work.frozen is missing"),
+    ],
+)
+def test_damaged_times_are_refused(tmp_path, restored, change, message):
+    values = dataclasses.asdict(TIMES) | change
+    (tmp_path / SPEEDS_FILE).write_text(json.dumps({"1f": {"cpu": {autotune.TIMES: values}}}))
+    with pytest.raises(InputError, match=message):
+        autotune.load_times(tmp_path, restored)
+
+
+def test_file_of_speeds_that_is_nested_without_end(tmp_path, restored):
+    (tmp_path / SPEEDS_FILE).write_text("[" * 100_000)
+    with pytest.raises(InputError, match="speeds.json cannot be read: it is nested too deeply"):
+        autotune.load_times(tmp_path, restored)

@@ -1,77 +1,87 @@
-"""Stages and medians, on a clock that does what it is told."""
+"""Timings and their sections, on a clock that moves with the work of a fake device."""
+
+import re
+import subprocess
 
 import pytest
 import torch
 
 from gsim3d.cuda_graphs import Captured
-from gsim3d.profile.timing import DeviceClock, GraphStopwatch, Stopwatch, Timing, time_call, time_stages, watched
+from gsim3d.profile import timing
+from gsim3d.profile.timing import DeviceClock, GraphStopwatch, Stopwatch, Timing, time_call, watched
 from tests.profile.fakes import FakeClock, FakeGraph, FakeSimulator
 
-
-def stages_of(clock, **options):
-    simulator = FakeSimulator(clock)
-    return time_stages(simulator, [simulator], clock, repeats=5, **options)
+SECTIONS = {"encode": 2e-3, "dense layers": 3e-3, "head": 1e-3, "state and guards": 0.5e-3}
 
 
-def test_stages_add_up_to_the_whole():
-    timing = stages_of(FakeClock())
-    assert timing.median == pytest.approx(6.5e-3)
-    assert timing.stages == pytest.approx(
-        {"encode": 2e-3, "dense layers": 3e-3, "head": 1e-3, "state and guards": 0.5e-3}
-    )
-    assert sum(timing.stages.values()) == pytest.approx(timing.median)
+def watched_call(clock, repeats=5):
+    simulator, stopwatch = FakeSimulator(clock), Stopwatch(clock)
+
+    def call():
+        with watched(simulator, stopwatch), stopwatch.running():
+            simulator()
+
+    return time_call(call, clock, repeats, sections=lambda: stopwatch.seconds)
 
 
-def test_a_stage_within_another_counts_as_itself_only():
+def test_sections_add_up_to_the_whole():
+    found = watched_call(FakeClock())
+    assert found.median == pytest.approx(6.5e-3) and found.sections == pytest.approx(SECTIONS)
+    assert list(found.sections) == [name for name in timing.SECTIONS if name in SECTIONS]
+
+
+def test_section_within_another_counts_as_itself_only():
     clock = FakeClock()
     stopwatch = Stopwatch(clock)
     with stopwatch.running():
-        with stopwatch.stage("dense layers"):
-            clock.work(1.0)
-            with stopwatch.stage("attention"):
-                clock.work(5.0)
-            clock.work(2.0)
+        stopwatch.enter("dense layers")
+        clock.work(1.0)
+        stopwatch.enter("attention")
+        clock.work(5.0)
+        stopwatch.leave()
+        clock.work(2.0)
+        stopwatch.leave()
     assert stopwatch.seconds == pytest.approx({"state and guards": 0.0, "dense layers": 3.0, "attention": 5.0})
 
 
 @pytest.mark.parametrize("cost", [0.0, 0.2e-3])
-def test_stages_of_a_graph_are_those_of_every_replay(cost):
+def test_sections_of_a_graph_are_those_of_every_replay(cost):
     """Neither the host nor the marks are in them, and what is run before the capture has no marks."""
     clock = FakeClock(launch=4e-3, cost=cost)
     simulator, stopwatch = FakeSimulator(clock), GraphStopwatch(clock)
     with watched(simulator, stopwatch), stopwatch.capturing():
         graph = FakeGraph(simulator, clock)
-    expected = {"encode": 2e-3, "dense layers": 3e-3, "head": 1e-3, "state and guards": 0.5e-3}
     for _ in range(2):
         with stopwatch.running():
             graph()
-        assert stopwatch.seconds == pytest.approx(expected)
+        assert stopwatch.seconds == pytest.approx(SECTIONS)
     with watched(simulator, stopwatch), stopwatch.running():
         graph()
-        simulator.renderer()  # drawn behind the graph; the host asks for it while the graph runs
-    assert stopwatch.seconds == pytest.approx({**expected, "head": 2e-3})
+        simulator.renderer()  # drawn behind the graph; the host launches it while the graph runs
+    assert stopwatch.seconds == pytest.approx({**SECTIONS, "head": 2e-3})
     simulator()  # no longer watched
     assert len(stopwatch._marks) == 6
-    eager = stages_of(FakeClock(host_share=0.0, launch=4e-3))
-    assert sum(eager.stages.values()) > 2 * 6.5e-3  # one by one the device waits for the host in between
+    eager = watched_call(FakeClock(host_share=0.0, launch=4e-3))
+    assert sum(eager.sections.values()) > 2 * 6.5e-3  # launched one by one, the device waits for the host
 
 
 def test_warm_up_does_not_count():
     clock, seconds = FakeClock(), iter([9.0, 9.0, 1.0, 2.0, 4.0])
-    timing = time_call(lambda: clock.work(next(seconds)), clock, repeats=3, warm_up=2)
-    assert timing.repeats == (1.0, 2.0, 4.0)
-    assert timing.median == 2.0 and timing.p95 == 4.0
+    found = time_call(lambda: clock.work(next(seconds)), clock, repeats=3, warm_up=2)
+    assert found.repeats == (1.0, 2.0, 4.0)
+    assert found.median == 2.0 and found.p95 == 4.0
 
 
-def test_two_levels_do_not_look_like_noise():
-    """A scene of 1 s and one of 2 s: the median of both jumps where the mean of the middle half hardly moves."""
-    first, second = Timing((1.0, 1.0, 1.0, 2.0, 2.0, 2.0, 2.0)), Timing((1.0, 1.0, 1.0, 1.0, 2.0, 2.0, 2.0))
-    assert abs(first.median - second.median) == 1.0
-    assert abs(first.steady - second.steady) < 0.25
-    assert Timing((3.0,)).steady == 3.0 and Timing((1.0, 2.0, 3.0, 100.0)).steady == 2.5
+def test_timing_waits_for_the_device():
+    clock = FakeClock(host_share=0.0)
+    assert time_call(lambda: clock.work(3.0), clock, repeats=2).repeats == (3.0, 3.0)
 
 
-def test_ops_are_put_back():
+def test_timing_of_several_steps_is_split():
+    assert Timing((2.0, 4.0), {"head": 1.0}).split_over(2) == Timing((1.0, 2.0), {"head": 0.5})
+
+
+def test_watched_puts_ops_back():
     before = torch.ops.gsim3d.unpool
     with pytest.raises(KeyError, match="fails"):
         with watched(FakeSimulator(FakeClock()), Stopwatch(FakeClock())):
@@ -80,32 +90,58 @@ def test_ops_are_put_back():
     assert torch.ops.gsim3d.unpool is before
 
 
-def test_the_clock_of_a_device(device):
+def test_clock_of_a_device(device):
     clock = DeviceClock(device)
-    clock.wait()
     first, start = clock.mark(), clock.now()
-    clock.delay(0.02)
+    torch.randn(500, 500, device=device) @ torch.randn(500, 500, device=device)
     last = clock.mark()
     clock.wait()
-    assert 0.01 < clock.seconds(first, last) < 10
-    assert clock.now() - start > 0.01
+    assert 0 < clock.seconds(first, last) < 10 and clock.now() > start
 
 
-def test_marks_and_delays_are_part_of_a_graph(device):
-    """And are passed in every replay; what a mark takes is little."""
+def test_marks_are_part_of_a_graph(device):
     clock = DeviceClock(device)
     assert not clock.capturing()
     if torch.device(device).type == "cpu":
         assert clock.mark_cost() == 0.0
         return
+    cell = torch.zeros((), device=device)
 
-    def delayed():
+    def marked():
         first = clock.mark()
-        clock.delay(0.01)
+        cell.add_(1)
         return first, clock.mark()
 
-    graph = Captured(delayed, device)
+    graph = Captured(marked, device)
     for _ in range(2):
         first, last = graph()
-        assert 0.005 < clock.seconds(first, last) < 0.1
+        assert 0 < clock.seconds(first, last) < 0.1
     assert 0 <= clock.mark_cost() < 1e-4
+
+
+def test_machine_names_device_and_sources():
+    facts = timing.machine(torch.device("cpu"))
+    assert facts["device"].startswith("CPU, ") and facts["processor"]
+    assert re.fullmatch("[0-9a-f]{12}", facts["sources"]) and facts["torch"] == torch.__version__
+
+
+def test_commit_is_that_of_the_checkout(tmp_path, monkeypatch):
+    package = tmp_path / "checkout" / "gsim3d"
+    package.mkdir(parents=True)
+    (package / "a.py").write_text("1\n")
+    monkeypatch.setattr(timing, "PACKAGE", package)
+    assert timing._commit() == ""  # not in a checkout of its own
+
+    def git(*words):
+        author = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        run = ["git", "-C", package.parent, *author, *words]
+        return subprocess.run(run, check=True, capture_output=True, text=True).stdout
+
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-qm", "first")
+    commit = git("rev-parse", "--short=12", "HEAD").strip()
+    assert timing._commit() == commit
+    before = timing._hash_of_sources()
+    (package / "a.py").write_text("2\n")
+    assert timing._commit() == commit + "+" and timing._hash_of_sources() != before

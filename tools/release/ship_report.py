@@ -1,8 +1,8 @@
 #!/usr/bin/env python
 """Puts reports of accuracy against time of a trained simulator into the documentation, its speeds into the package.
 
-    gsim3d profile elastic-small --out runs/cpu                                    # on 2 CPU cores
-    gsim3d profile elastic-small DATA --scenes all --device cuda --self-check --out runs/h200
+    gsim3d profile elastic-small DATA --scenes all --out runs/cpu                  # on 2 CPU cores
+    gsim3d profile elastic-small DATA --scenes all --device cuda --out runs/h200
     python tools/release/ship_report.py elastic-small cpu=runs/cpu h200=runs/h200
 
 Every DIR holds report.json and the pictures, and speeds.json where `gsim3d profile` could not write beside the
@@ -22,29 +22,27 @@ from gsim3d import pretrained  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402
 from gsim3d.evaluate.report import write_json  # noqa: E402
 from gsim3d.numerics.speed import SPEEDS_FILE  # noqa: E402
-from gsim3d.profile.page import share_in_words  # noqa: E402
-from gsim3d.profile.report import regimes_in_words  # noqa: E402
+from gsim3d.profile.report import share_in_words, throughput_in_words  # noqa: E402
 
 COST = ROOT / "docs" / "results" / "cost"
-PICTURES = ("cost.png", "stages.png", "horizon.png")
+PICTURES = {"cost.png": "cost.png", "stages.png": "sections.png", "horizon.png": "horizon.png"}
 FACTS = ("scenes", "steps", "image")
 
 
 def keep_report(name: str, machine: str, folder: Path, cost: Path = COST) -> Path:
     """Copies what the documentation shows of a report, and its pictures, into the folder ``cost``."""
     content = json.loads((folder / "report.json").read_text())
-    for picture in PICTURES:
-        shutil.copyfile(folder / picture, cost / f"{name}-{machine}-{picture}")
-    facts = {**content["machine"], **{key: content["subject"][key] for key in FACTS}}
+    for picture, source in PICTURES.items():
+        shutil.copyfile(folder / source, cost / f"{name}-{machine}-{picture}")
+    facts = {**content["machine"], **{key: content["case"][key] for key in FACTS}}
     file = cost / f"{name}-{machine}.json"
     shown = {
         "device": content["machine"]["device"],
-        "checkpoint": content["subject"]["checkpoint"],
+        "checkpoint": content["case"]["checkpoint"],
         "command": content["command"],
         "measured_on": ", ".join(f"{key} {value}" for key, value in facts.items()),
-        "throughput": regimes_in_words(content["regimes"]),
-        "checks": content["self_check"],
-        "rows": [row_of(point) for point in content["points"]],
+        "throughput": throughput_in_words(content),
+        "rows": [row_of(point) for point in content["settings"]],
     }
     file.write_text(json.dumps(shown, indent=1) + "\n")
     return file

@@ -37,7 +37,8 @@ from gsim3d.evaluate.perceptual import weights
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.io import checkpoint, read_ply, read_splats, write_ply, write_splats
 from gsim3d.io.settings import from_dict, load_yaml, to_dict
-from gsim3d.profile.autotune import TIMES, load_speed, load_times
+from gsim3d.numerics.speed import load_speed
+from gsim3d.profile.autotune import TIMES, load_times
 from gsim3d.simulator import Simulator
 from gsim3d.state import Gaussians
 from gsim3d.synth.meshes import load_body
@@ -288,7 +289,7 @@ def _write_speeds(folder: Path) -> None:
 
 def _read_speeds(folder: Path, what: str) -> None:
     restored = SimpleNamespace(checkpoint=SimpleNamespace(digest="digest"), device=torch.device("cpu"))
-    load_speed(folder, restored, "fast")
+    load_speed(folder, restored.checkpoint.digest, restored.device.type, "fast")
     load_times(folder, restored)
 
 
