@@ -41,14 +41,14 @@ def test_differences_and_errors_by_hand():
         ([21.0], "of one scene: no standard error"),
     ],
 )
-def test_nothing_below_two_standard_errors_is_called_better(ours, verdict):
+def test_verdict_needs_two_standard_errors(ours, verdict):
     other = [20.0] * len(ours)
     found = compare(report(ours), report(other), "b.json")
     assert found[""]["future.psnr"]["verdict"] == verdict
     assert ("better" in table(found, "b.json")) == (verdict == "better")
 
 
-def test_pairs_count_not_the_spread_between_scenes():
+def test_standard_error_is_of_pairs():
     scenes = [10.0, 20.0, 30.0, 40.0]
     ours = [value + gain for value, gain in zip(scenes, (0.9, 1.0, 1.1, 1.0))]
     assert compare(report(ours), report(scenes), "b")[""]["future.psnr"]["verdict"] == "better"

@@ -90,7 +90,7 @@ def test_another_rate_is_refused_with_both_numbers(restored, tmp_path):
     assert restored.open_scene(at_rate(folder, 12.01)).n_steps == 6
 
 
-def test_every_kth_frame_is_kept_with_its_cameras(restored, tmp_path):
+def test_resampling_takes_every_kth_frame_with_its_cameras(restored, tmp_path):
     made = make_scene(moving=True, zoom=0.01, width=32, n_steps=7)
     folder = at_rate(write_genesis(tmp_path / "moving", made), 36)
     whole, scene = Scene.open(folder), Scene.open(folder, fps=12)
@@ -105,7 +105,7 @@ def test_every_kth_frame_is_kept_with_its_cameras(restored, tmp_path):
     assert torch.equal(cached.images([0], [1]), Scene.open(folder, cache_dir=tmp_path).images([0], [3]))
 
 
-def test_predictions_of_other_models_count_the_steps_that_are_kept(folder, tmp_path):
+def test_predictions_of_other_models_count_resampled_steps(folder, tmp_path):
     scene = Scene.open(at_rate(write_scene(tmp_path / "b", n_steps=7), 24), fps=12)
     for step in (2, 3):
         (tmp_path / "other" / "cam_1").mkdir(parents=True, exist_ok=True)

@@ -66,7 +66,7 @@ VIEWS = {
 }
 
 
-def test_what_a_reader_changed_is_said(restored, tmp_path):
+def test_changes_of_a_reader_are_reported(restored, tmp_path):
     for name in ("a", "b"):
         write_plain(tmp_path / f"{name}.mp4")
     trimmed(tmp_path / "b.mp4", 0.0, late=0.3)
@@ -95,7 +95,7 @@ def test_one_camera_is_refused_unless_it_is_named(restored, tmp_path):
     assert default_views(restored, scene, (0,)) == ((0,), (0,))
 
 
-def test_small_images_are_enlarged_and_that_is_said(restored, tmp_path):
+def test_small_images_are_enlarged_with_a_warning(restored, tmp_path):
     scene, said = opened(restored, rig(tmp_path / "scene", 5, size=16))
     assert said == "fitted to the model: images of 16x16 pixels scaled to 32x32"
     assert torch.allclose(scene.cameras_at([0], [0]).Ks[0, :2], torch.tensor([[41.6, 0, 16], [0, 41.6, 16]]))
@@ -117,7 +117,7 @@ def portrait(folder):
     return folder
 
 
-def test_what_is_cut_off_is_said_and_can_be_kept(restored, tmp_path):
+def test_cropping_is_reported_and_can_be_avoided(restored, tmp_path):
     folder = portrait(tmp_path / "scene")
     cut, said = opened(restored, folder)
     assert said == (
@@ -169,7 +169,7 @@ def test_missing_depths_are_guessed_and_kept(restored, tmp_path):
     assert (scene.near, scene.far) == Scene.open(folder).own_depths and said == ""
 
 
-def test_published_models_have_their_depths_whatever_a_scene_says(restored, tmp_path):
+def test_published_models_keep_their_depths(restored, tmp_path):
     published = dataclasses.replace(restored, simulator=SimpleNamespace(config=ReleasedModelConfig()))
     scene, said = opened(published, rig(tmp_path / "scene", 5, near=0.5, far=9.0))
     assert (scene.near, scene.far) == (1.2, 4.0) and "depths 0.5 to 9 replaced by 1.2 to 4" in said
@@ -181,7 +181,7 @@ def test_an_unknown_part_is_named(restored, tmp_path):
 
 
 @pytest.mark.skipif("elastic-small" not in names(), reason="no simulator is shipped")
-def test_a_shipped_model_says_in_one_line_what_it_changed(tmp_path, capsys):
+def test_shipped_model_reports_changes_in_one_line(tmp_path, capsys):
     folder = rig(tmp_path / "scene", 3, size=16, fps=42.0)
     assert main(["plan", str(folder), "elastic-small"]) == 0
     assert capsys.readouterr().err == "gsim3d: fitted to the model: images of 16x16 pixels scaled to 128x128\n"

@@ -66,7 +66,7 @@ def test_perfect_predictions_score_perfectly_and_the_copy_beside_them_does_not(d
     assert (scores.values["copy"]["psnr_body"][GIVEN:] < 40).all()
 
 
-def test_what_is_done_to_the_film_is_done_to_its_predictions(tmp_path):
+def test_predictions_are_fitted_like_their_scene(tmp_path):
     """Odd sizes, a lens, a real background: a prediction that repeats the camera's own frames is perfect."""
     write_odd_videos(tmp_path / "room")
     scene = Scene.open(tmp_path / "room")
@@ -78,7 +78,7 @@ def test_what_is_done_to_the_film_is_done_to_its_predictions(tmp_path):
         assert (values["copy"][metric][2:] < 0.99 * best).all()
 
 
-def test_they_are_scaled_with_the_film_of_a_model_of_another_size(data, folder):
+def test_predictions_are_resized_to_the_model(data, folder):
     scene = Scene.open(data / "ball" / "0000", fitting=Fitting(size=(24, 16)))
     images = Predictions.open(str(folder), data).images(scene, [3], GIVEN, 4)
     assert images.shape == (4, 1, scene.height, scene.width, 3)
@@ -86,7 +86,7 @@ def test_they_are_scaled_with_the_film_of_a_model_of_another_size(data, folder):
 
 
 @pytest.mark.parametrize("n_future, n_frames, first", [(4, 6, 2), (4, 4, 0), (1, 6, 2), (1, 3, 2), (1, 1, 0)])
-def test_the_length_of_a_video_tells_where_it_starts(data, folder, n_future, n_frames, first):
+def test_length_of_a_video_gives_its_start(data, folder, n_future, n_frames, first):
     place = folder / "ball" / "0000"
     shutil.rmtree(place / "cam_1")
     levels = [20 + 30 * k for k in range(n_frames)]
@@ -100,7 +100,7 @@ def test_the_length_of_a_video_tells_where_it_starts(data, folder, n_future, n_f
     assert means[:, 1:].tolist() == [pytest.approx([60, 200], abs=8)] * n_future
 
 
-def test_a_video_whose_length_says_two_things_is_refused(data, folder):
+def test_video_of_ambiguous_length_is_refused(data, folder):
     shutil.rmtree(folder / "ball" / "0000" / "cam_1")
     flat_video(folder / "ball" / "0000" / "cam_1.mp4", [9] * 4)  # steps 0 to 3, or 2 to 5?
     with pytest.raises(InputError, match="is the first one step 0 or 2"):
@@ -193,7 +193,7 @@ def two_dozen_digits(place):
     (place / "cam_1" / "frame4.png").rename(place / "cam_1" / ("frame" + "4" * 200 + ".png"))
 
 
-def test_sixteen_bits_and_alpha_are_read_as_those_of_films(data, folder):
+def test_sixteen_bits_and_alpha_are_read_like_recordings(data, folder):
     place = folder / "ball" / "0000" / "cam_1"
     before = Predictions.open(str(folder), data).images(scene_of(data), [1], GIVEN, 4)
     for number, file in enumerate(sorted(place.iterdir())):

@@ -87,7 +87,7 @@ def test_views_that_are_named(restored, scene):
     assert default_views(elsewhere, scene, None, (2,)) == ((0, 3), (2,))  # of the training's rig no number holds here
 
 
-def test_scores_from_a_later_step_are_those_of_the_film_cut_there(restored, tmp_path):
+def test_scores_from_a_later_step_equal_those_of_a_cut_scene(restored, tmp_path):
     whole, cut = (write_scene(tmp_path / name) for name in ("whole", "cut"))
     for folder in cut.glob("cam_*"):
         for image in sorted(folder.iterdir()):  # step 0 is lost, the others move up
@@ -107,7 +107,7 @@ def test_scores_from_a_later_step_are_those_of_the_film_cut_there(restored, tmp_
         score_scene(restored, Scene.open(whole), start=4)
 
 
-def test_rollout_rows_keep_their_number_and_frozen_ones_their_place(restored, scene):
+def test_rollout_keeps_number_of_particles_and_frozen_positions(restored, scene):
     prediction = predict(restored, scene, (0, 2), 3)
     assert prediction.n_steps == 5
     clouds = [prediction.particles.select_clouds(torch.tensor([q])) for q in range(1, 5)]

@@ -64,7 +64,7 @@ def db(mse):
     return pytest.approx(-10 * math.log10(mse), abs=1e-4)
 
 
-def test_parts_by_hand():
+def test_regions_by_hand():
     scores = scored()
     values = scores.values
     assert list(values) == ["model", "constant", "copy", "perfect_ground", "perfect_body"]

@@ -49,7 +49,7 @@ def test_masks_by_hand():
     assert scores.not_measured == {} and scores.clips == {}
 
 
-def test_what_was_not_filmed_is_no_error():
+def test_invalid_pixels_are_no_error():
     truth, filmed = film(), torch.ones(S, V, H, W, dtype=torch.bool)
     filmed[..., 11:] = False  # padding
     truth = truth * filmed[..., None]
@@ -61,7 +61,7 @@ def test_what_was_not_filmed_is_no_error():
     assert scores["exact"]["psnr"][3].item() == 100 and scores["exact"]["ssim"][3].item() == pytest.approx(1)
 
 
-def test_what_cannot_be_measured_is_told(monkeypatch):
+def test_metrics_that_do_not_apply_are_reported(monkeypatch):
     judge = SceneTruth("ball/3", film(height=10), None, None, GIVEN, tuple(METRICS))
     assert judge.metrics == ["psnr"]
     assert judge.not_measured == {
@@ -115,7 +115,7 @@ def test_fvd_compares_the_predicted_steps_of_all_scenes_and_views(cheap_features
     assert "needs 2 clips" in summarize([one])["not_measured"]["fvd"]
 
 
-def test_lpips_is_measured_where_its_weights_are(monkeypatch):
+def test_lpips_is_measured_with_both_networks(monkeypatch):
     called = []
     monkeypatch.setattr(
         scoring.lpips, "lpips", lambda a, b, network: called.append(network) or (a - b).abs().mean((1, 2, 3)).double()

@@ -133,7 +133,7 @@ def run(captured, batch, trainer, report=None, factor=1.0):
     ids=["rollout", "encoded", "explicit", "masked", "moving", "moving, masked", "all moving", "relit", "flying"],
     indirect=["trainer"],
 )
-def test_gradients_are_those_of_the_loss(phase, scenes, trainer, device):
+def test_captured_gradients_equal_autograd(phase, scenes, trainer, device):
     captured, report = captured_loss(trainer), StabilityReport()
     drawn = batches(scenes, 4, **phase)
     assert_gradients_of_the_loss(captured, drawn, trainer, device, report)
@@ -146,7 +146,7 @@ def test_gradients_are_those_of_the_loss(phase, scenes, trainer, device):
     ids=["rollout", "flying"],
     indirect=["trainer"],
 )
-def test_what_is_computed_again_changes_no_bit(phase, scenes, trainer, device):
+def test_captured_recomputing_changes_no_bit(phase, scenes, trainer, device):
     batch, counts = batches(scenes, 2, **phase)[1].to(device), {"calls": 0, "geometry": 0}
     reports, found, counted = (StabilityReport(), StabilityReport()), [], []
     dynamics, geometry = trainer.simulator.dynamics, trainer.simulator.dynamics.geometry
@@ -235,7 +235,7 @@ def test_full_gpu_drops_other_graphs_and_shares_memory(scenes, trainer, full_gpu
     assert gpu.pools[2:] == [(0, 7)] and list(captured._steps.values()) == [last, first]
 
 
-def test_memory_whose_graphs_are_all_gone_is_not_used_again(scenes, trainer, full_gpu, monkeypatch):
+def test_memory_pool_without_graphs_is_not_reused(scenes, trainer, full_gpu, monkeypatch):
     """torch has forgotten it."""
     handles = ((0, number) for number in itertools.count(7))
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: next(handles))
@@ -281,7 +281,7 @@ class Ops(TorchDispatchMode):
 @pytest.mark.parametrize(
     "row", ["latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relit", "flying"]
 )
-def test_nothing_in_a_graph_has_a_size_that_depends_on_numbers(row, scenes, tmp_path):
+def test_captured_ops_have_fixed_sizes(row, scenes, tmp_path):
     config = KINDS[row] if row in KINDS else changed(CONFIG, ROWS[row].change)
     trainer = Trainer(config, scenes, tmp_path)
     captured = captured_loss(trainer)
@@ -353,7 +353,7 @@ def test_weights_are_read_anew(scenes, trainer, device):
     assert abs(other.item() / once - 1) > 1e-4
 
 
-def test_training_from_graphs_is_training(scenes, tmp_path, device):
+def test_captured_training_equals_eager(scenes, tmp_path, device):
     if device.type != "cuda":
         pytest.skip("graphs need a GPU")
     for name, config in (("plain", CONFIG), ("captured", dataclasses.replace(CONFIG, captured=True))):
@@ -365,7 +365,7 @@ def test_training_from_graphs_is_training(scenes, tmp_path, device):
     assert captured == pytest.approx(plain, rel=1e-3)
 
 
-def test_models_that_draw_are_refused(scenes, trainer):
+def test_capture_refuses_models_that_draw(scenes, trainer):
     config = trainer.simulator.config
     for changes in ({"drop_path": 0.1}, {"shuffle_orders": True}):
         trainer.simulator.config = dataclasses.replace(config, dynamics=dataclasses.replace(config.dynamics, **changes))

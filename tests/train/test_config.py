@@ -27,7 +27,7 @@ def test_spec():
     assert from_dict(TrainConfig, to_dict(config)) == config
 
 
-def test_what_is_left_out_comes_from_the_base():
+def test_missing_settings_come_from_the_base():
     base = TrainConfig(seed=4)
     changed = from_dict(TrainConfig, {"optimizer": {"clip_norm": 2}}, base=base)
     assert changed.seed == 4 and changed.optimizer.clip_norm == 2.0
@@ -64,7 +64,7 @@ def test_what_is_left_out_comes_from_the_base():
         ({"data": {"context_cameras": [1], "target_only_cameras": [1]}}, r"share a camera"),
     ],
 )
-def test_mistakes_are_named(content, message):
+def test_wrong_settings_are_named(content, message):
     with pytest.raises(InputError, match=message):
         from_dict(TrainConfig, content)
 
@@ -111,12 +111,12 @@ def test_every_number_of_a_run_has_a_finite_range(tmp_path, text):
         ({"encoder": {"cnn_dims": [-3, 32]}}, "encoder: cnn_dims must be at least 1"),
     ],
 )
-def test_a_model_that_cannot_be_is_refused(content, message):
+def test_impossible_model_is_refused(content, message):
     with pytest.raises(InputError, match=message):
         build_simulator(model_config(TrainConfig(model=content)), 0)
 
 
-def test_sizes_of_which_no_layer_can_be_made_are_told(monkeypatch):
+def test_impossible_layer_sizes_are_named(monkeypatch):
     monkeypatch.setattr(restore, "simulator_class", lambda config: lambda config: torch.zeros(3) @ torch.zeros(2))
     with pytest.raises(InputError, match="model: no model has these sizes: RuntimeError: inconsistent tensor size"):
         build_simulator(presets.tiny(), 0)
@@ -208,7 +208,7 @@ def test_optional_fixed_length_and_nested_fields():
         from_dict(Outer, {"inner": {"pair": [1, 2, 3]}})
 
 
-def test_stages_follow_one_another():
+def test_phases_follow_one_another():
     config = TrainConfig(phases=(PhaseConfig(steps=3), PhaseConfig(steps=2, horizon=4)))
     assert config.n_steps == 5
     assert [(config.phase_of(i)[0].horizon, config.phase_of(i)[1]) for i in range(5)] == [
@@ -227,7 +227,7 @@ def test_settings_that_earlier_versions_saved_are_renamed():
         from_dict(TrainConfig, upgraded(TrainConfig, {"stages": [{**phase, "dynamics_alone": True}]}))
 
 
-def test_the_documented_training_is_the_published_one():
+def test_documented_training_equals_published_one():
     text = (Path(__file__).parents[2] / "docs" / "compat" / "migration.md").read_text()
     config = from_dict(TrainConfig, yaml.safe_load(re.search(r"```yaml\n(.*?)```", text, re.DOTALL)[1]))
     model, paper = model_config(config), presets.paper_latent(4)

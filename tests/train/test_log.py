@@ -11,14 +11,14 @@ from gsim3d.errors import InputError
 from gsim3d.train.log import LOG, Log
 
 
-def test_steps_that_will_be_repeated_are_dropped(tmp_path):
+def test_log_cut_drops_steps_to_repeat(tmp_path):
     lines = [json.dumps({"step": step, "loss": 0.5}) for step in range(5)]
     (tmp_path / LOG).write_text("\n".join([*lines[:3], "{", "\x00" * 100, *lines[3:], lines[4][:9]]))
     Log(tmp_path).cut(4)
     assert (tmp_path / LOG).read_text().splitlines() == lines[:4] and os.listdir(tmp_path) == [LOG]
 
 
-def test_a_line_without_an_end_takes_no_memory(tmp_path):
+def test_log_cut_reads_endless_line_in_bounded_memory(tmp_path):
     (tmp_path / LOG).write_text('{"step": 1}\n')
     os.truncate(tmp_path / LOG, 2**28)
     tracemalloc.start()
@@ -30,7 +30,7 @@ def test_a_line_without_an_end_takes_no_memory(tmp_path):
     assert (tmp_path / LOG).read_text() == '{"step": 1}\n'
 
 
-def test_what_is_no_file_is_not_opened(tmp_path):
+def test_log_that_is_no_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / LOG)
     with pytest.raises(InputError, match=f"{LOG}: cannot be read: it is not a file"):
         Log(tmp_path).cut(4)

@@ -78,7 +78,7 @@ def assert_same_checkpoint(a, b):
         assert all(torch.equal(before[name], after[name]) for name in before), part
 
 
-def test_the_log_and_the_weights_change(finished):
+def test_run_writes_log_and_changes_weights(finished):
     log = curve(finished)
     assert [line["step"] for line in log] == list(range(6))
     assert all(math.isfinite(line["loss"]) and line["grad_norm"] > 0 for line in log)
@@ -95,14 +95,14 @@ def test_the_same_run_twice_gives_the_same_bits(folder, finished, tmp_path):
     assert_same_checkpoint(tmp_path, finished)
 
 
-def test_stopped_and_resumed_equals_never_stopped(folder, finished, tmp_path):
+def test_resumed_run_equals_uninterrupted(folder, finished, tmp_path):
     for until in (2, 4, None):
         Trainer(CONFIG, scenes(folder), tmp_path).run(until=until, progress=False)
     assert curve(tmp_path) == curve(finished)
     assert_same_checkpoint(tmp_path, finished)
 
 
-def test_out_of_time_it_saves_after_the_step_and_goes_on(folder, finished, tmp_path):
+def test_run_out_of_time_saves_and_goes_on(folder, finished, tmp_path):
     for steps in (1, 2):
         trainer = Trainer(CONFIG, scenes(folder), tmp_path)
         trainer.run(end=time.monotonic(), progress=False)
@@ -111,7 +111,7 @@ def test_out_of_time_it_saves_after_the_step_and_goes_on(folder, finished, tmp_p
     assert curve(tmp_path) == curve(finished)
 
 
-def test_killed_after_the_last_checkpoint_repeats_those_steps(folder, finished, tmp_path):
+def test_killed_run_repeats_steps_after_checkpoint(folder, finished, tmp_path):
     script = (
         "import os, signal, sys\n"
         "from pathlib import Path\n"
@@ -196,7 +196,7 @@ def test_checkpointing_changes_no_gradient(folder, tmp_path):
     assert any("attention.qkv" in name for name in trained) and any("mlp.fc1" in name for name in trained)
 
 
-def test_the_perceptual_part_joins_the_loss(folder, tmp_path, monkeypatch):
+def test_perceptual_loss_is_added(folder, tmp_path, monkeypatch):
     monkeypatch.setenv("GSIM3D_CACHE_DIR", str(tmp_path / "cache"))
     config = dataclasses.replace(CONFIG, loss=LossConfig(perceptual=0.05))
     with pytest.raises(InputError, match="gsim3d weights lpips"):
@@ -228,7 +228,7 @@ def test_another_configuration_does_not_resume(folder, finished):
     assert Trainer(TrainConfig(**{**vars(CONFIG), "log_every": 5}), scenes(folder), finished).step == 6
 
 
-def test_scenes_may_come_but_not_go(folder, tmp_path):
+def test_resumed_run_accepts_more_scenes_only(folder, tmp_path):
     known = scenes(folder)
     Trainer(CONFIG, known[:1], tmp_path).run(until=1, progress=False)
     assert Trainer(CONFIG, known[:1], tmp_path).same_scenes and not Trainer(CONFIG, known, tmp_path).same_scenes
@@ -236,7 +236,7 @@ def test_scenes_may_come_but_not_go(folder, tmp_path):
         Trainer(CONFIG, known[1:], tmp_path)
 
 
-def test_steps_that_are_not_finite_change_nothing(folder, tmp_path):
+def test_steps_that_are_not_finite_are_skipped(folder, tmp_path):
     trainer = Trainer(CONFIG, scenes(folder), tmp_path)
     loss = trainer.loss
     trainer.loss = lambda *given: tuple(value * (math.nan if trainer.step == 1 else 1) for value in loss(*given))

@@ -9,7 +9,7 @@ from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_wei
 from gsim3d.train.optimizer import one_cycle
 
 
-def test_time_weights_are_the_papers():
+def test_time_weights_equal_the_papers():
     weights = time_weights(4, 12)
     assert weights[:4].tolist() == pytest.approx([0.125] * 4)
     assert weights[4:].tolist() == pytest.approx([0.5 * 0.87**j for j in range(12)], rel=1e-6)
@@ -45,7 +45,7 @@ def test_pixel_weights_make_a_weighted_mean():
     assert image_errors(pred, target, torch.ones(1, 1, 2)).item() == image_errors(pred, target).item()
 
 
-def test_a_step_without_images_counts_nothing():
+def test_mean_by_step_of_a_step_without_images():
     assert mean_by_step(torch.tensor([2.0, 4.0]), torch.tensor([2, 2]), 4).tolist() == [0, 0, 3, 0]
 
 
@@ -64,7 +64,7 @@ def test_the_published_schedule():
     assert rates == pytest.approx([8e-6, 2e-4, 8e-10], rel=1e-9)
 
 
-def test_one_cycle_is_torchs():
+def test_one_cycle_equals_torch():
     parameter = torch.nn.Parameter(torch.zeros(1))
     optimizer = torch.optim.SGD([parameter], lr=1)
     theirs = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-4, total_steps=200, pct_start=0.1, cycle_momentum=False)

@@ -56,7 +56,7 @@ def moments(optimizer, parameters):
 
 
 @pytest.mark.parametrize("clip_norm", [0.5, 0.0])
-def test_a_step_is_that_of_torch(clip_norm, step_of, device):
+def test_optimizer_step_equals_torch(clip_norm, step_of, device):
     config = dataclasses.replace(CONFIG, clip_norm=clip_norm)
     ours, theirs = (list(model(device).parameters()) for _ in range(2))
     optimizer = Optimizer(named(ours), config)
@@ -82,7 +82,7 @@ def test_a_step_is_that_of_torch(clip_norm, step_of, device):
             torch.testing.assert_close(mine[kind].cpu(), value.cpu(), rtol=1e-5, atol=1e-9)
 
 
-def test_what_was_saved_goes_on_with_the_same_bits(step_of, device):
+def test_optimizer_restores_the_same_bits(step_of, device):
     first = list(model(device).parameters())
     optimizer = Optimizer(named(first), CONFIG)
     for k in range(2):
@@ -101,7 +101,7 @@ def test_what_was_saved_goes_on_with_the_same_bits(step_of, device):
         assert all(torch.equal(value, resumed.state[q][kind]) for kind, value in optimizer.state[p].items())
 
 
-def test_without_gradients_nothing_changes(step_of, device):
+def test_optimizer_without_gradients_changes_nothing(step_of, device):
     parameters = list(model(device).parameters())
     before = [p.detach().clone() for p in parameters]
     step_of(Optimizer(named(parameters), CONFIG), [None] * len(parameters), torch.zeros((), device=device), 0.1)

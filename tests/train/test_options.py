@@ -63,7 +63,7 @@ def test_recomputing_changes_no_bit(folder, tmp_path, norm, precision, device):
 
 @pytest.mark.parametrize("part", ["encoder", "dynamics", "renderer"])
 @pytest.mark.parametrize("precision, error", [("bf16", 0.05), ("fp16", 0.01)])
-def test_a_part_in_another_precision(folder, tmp_path, part, precision, error):
+def test_precision_of_one_part(folder, tmp_path, part, precision, error):
     """Products of that part are rounded and those of no other; losses, particles and gradients stay float32."""
     model = {"dynamics": {"zero_init": False}}
     exact = trainer_at(folder, tmp_path, model=model)
@@ -96,7 +96,7 @@ def test_states_and_images_stay_float32(folder, tmp_path, precision, device):
     assert all(value.dtype == torch.float32 for value in [images, *floats, *trainer.simulator.state_dict().values()])
 
 
-def test_scaling_the_loss_leaves_gradients_and_an_overflow_halves_it(folder, tmp_path, device):
+def test_loss_scale_leaves_gradients_and_halves_on_overflow(folder, tmp_path, device):
     trainers = [
         trainer_at(folder, tmp_path, device=device, precision=PrecisionConfig(dynamics=p)) for p in ("fp16", "fp16")
     ]
@@ -161,7 +161,7 @@ def test_tensorboard_that_is_not_installed_is_named(folder, tmp_path, monkeypatc
         Trainer(CONFIG, scenes(folder), tmp_path).run(progress=False, tensorboard=True)
 
 
-def test_a_sample_video_shows_film_and_prediction(folder, tmp_path):
+def test_sample_video_shows_truth_and_prediction(folder, tmp_path):
     trainer = trainer_at(folder, tmp_path)
     video = trainer.sample_video()
     assert video.shape == (4, 32, 64, 3) and video.dtype == torch.uint8 and trainer.simulator.training
@@ -180,7 +180,7 @@ def test_a_trace_is_written_and_changes_no_bit(folder, tmp_path):
         Trainer(CONFIG, scenes(folder), tmp_path / "traced").run(progress=False, profile=True)
 
 
-def test_the_log_tells_time_memory_and_particles(folder, tmp_path):
+def test_log_has_time_memory_and_particles(folder, tmp_path):
     Trainer(CONFIG, scenes(folder), tmp_path).run(progress=False, until=2)
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert all(line["machine"]["step_seconds"] > 0 and 0.01 < line["machine"]["memory_gib"] < 100 for line in lines)
@@ -207,7 +207,7 @@ def test_windows_begin_within_the_first_steps(within, starts):
     assert draw_windows([Long()], DataConfig(context_views=2), always, 0, 3, [0])[0].steps[0] == 0
 
 
-def test_gradients_flow_back_through_as_many_steps_as_asked_for(folder, tmp_path):
+def test_cut_bounds_steps_of_gradients(folder, tmp_path):
     """The last of four steps is compared: gradients reach the particles of those steps that are not cut off."""
     trainer = trainer_at(folder, tmp_path)
     with torch.no_grad():

@@ -105,7 +105,7 @@ def together(folder, tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_two_processes_give_the_curve_of_one(folder, together, tmp_path, name):
+def test_curve_of_two_processes_equals_curve_of_one(folder, together, tmp_path, name):
     trainer_of(name, RUNS[name], folder, tmp_path).run(progress=False)
     alone, two = curve(tmp_path), curve(together / name)
     assert len(alone) == len(two) == RUNS[name].n_steps
@@ -122,7 +122,7 @@ def test_two_processes_give_the_curve_of_one(folder, together, tmp_path, name):
     assert (apart / moved).sqrt() < TOLERANCE["weights"]
 
 
-def test_batch_norm_as_one_node_counts_the_rows_of_all(together):
+def test_batch_norm_counts_rows_of_all_processes(together):
     out, x, weight, bias, *running = normalised(slice(None))
     parts = [torch.load(together / f"rows_{rank}.pt", weights_only=True) for rank in range(2)]
     for rank, part in enumerate(parts):
@@ -139,7 +139,7 @@ def test_two_processes_resume_exactly(together):
     assert_same_checkpoint(together / "parts", together / "layer")
 
 
-def test_what_one_process_cannot_use_all_skip(together):
+def test_unusable_step_of_one_process_is_skipped_by_all(together):
     log = curve(together / "skips")
     assert log[1]["skipped"] == "the loss is not finite"
     assert log[2]["skipped"].startswith("process 1: ") and "particles.opacities" in log[2]["skipped"]
@@ -160,13 +160,13 @@ def test_torchrun_starts_the_command(folder, together, tmp_path):
     assert [line["step"] for line in lines] == [0, 1]
 
 
-def test_shares_are_neighbours_and_cover_the_batch():
+def test_shares_cover_the_batch():
     for count in (1, 2, 3, 5):
         shares = [Processes(rank, count).share(7) for rank in range(count)]
         assert sum(shares, []) == list(range(7)) and max(map(len, shares)) - min(map(len, shares)) <= 1
 
 
-def test_what_cannot_be_shared_is_named(folder, tmp_path):
+def test_batches_that_cannot_be_shared_are_refused(folder, tmp_path):
     with pytest.raises(InputError, match=r"phases\[0\].batch: 2 samples are too few for 3 processes"):
         Trainer(LAYER, scenes(folder), tmp_path, processes=Processes(0, 3))
     with pytest.raises(InputError, match="workers: must be 0 in 2 processes"):
@@ -180,5 +180,5 @@ def leave(rank: int) -> None:
     assert group() is None
 
 
-def test_threads_of_the_group_end_before_python_does():
+def test_process_group_threads_end_before_python():
     run_in_two_processes(leave)

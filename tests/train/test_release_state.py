@@ -61,7 +61,7 @@ def store(world, trajectories):
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.06])
-def test_a_store_gives_what_scene_folders_give(world, spread, tmp_path):
+def test_store_batches_equal_those_of_scene_folders(world, spread, tmp_path):
     world, store = dataclasses.replace(world, camera_spread=spread), TrajectoryStore(world, 2, "cpu")
     for scene in world.scenes():
         store.put(**np.load(write_trajectory(world, scene, str(tmp_path / "video.npz"))))
@@ -81,7 +81,7 @@ def test_a_store_gives_what_scene_folders_give(world, spread, tmp_path):
                 assert torch.equal(getattr(a.cameras, name), getattr(b.cameras, name)), (part, name)
 
 
-def test_the_newest_replace_the_oldest(store, trajectories):
+def test_store_replaces_oldest_trajectories(store, trajectories):
     darker = trajectories[0]["images"] // 2
     store.put(**{**trajectories[0], "images": darker})
     assert store.count == 3
@@ -124,7 +124,7 @@ class Painted:
         return {"images": video, "viewmats": self.rig().viewmats, "Ks": self.rig().Ks}
 
 
-def test_batches_drawn_ahead_are_those_of_their_steps(tmp_path, device):
+def test_batches_drawn_ahead_belong_to_their_steps(tmp_path, device):
     store = TrajectoryStore(Painted(), 2, device.type)
     for seed in range(2):
         store.put(**Painted().trajectory(seed))
@@ -141,7 +141,7 @@ def test_batches_drawn_ahead_are_those_of_their_steps(tmp_path, device):
     assert ahead.captured.captures == 2  # one for each kind of step
 
 
-def test_a_run_whose_launcher_is_gone_saves_and_ends(store, tmp_path):
+def test_release_run_without_launcher_saves_and_ends(store, tmp_path):
     class Lonely(Processes):
         lost = None
 
@@ -179,7 +179,7 @@ def first_run(store, tmp_path):
     return trainer, tmp_path / "state", save_state(trainer, tmp_path / "state", NAME, progress)
 
 
-def test_the_next_run_goes_on(first_run, store, tmp_path):
+def test_next_run_goes_on_from_state(first_run, store, tmp_path):
     trainer, state, done = first_run
     progress = load_progress(state, NAME)
     assert (progress.step, progress.next_trajectory, progress.windows) == (3, 7, 1)
@@ -203,7 +203,7 @@ def test_the_next_run_goes_on(first_run, store, tmp_path):
     assert np.isfinite(other.train_step()["loss"])
 
 
-def test_moments_of_rank_one_come_back_and_a_state_takes_about_a_byte_a_weight(store, tmp_path):
+def test_state_restores_rank_one_moments_in_a_byte_a_weight(store, tmp_path):
     trainer = RunTrainer(dataclasses.replace(CONFIG, preset="small"), store, tmp_path / "run", "cpu")
     name, parameter = max(trainer.parameters.items(), key=lambda item: item[1].numel())
     rows, columns = torch.rand(len(parameter)), torch.rand(parameter[0].numel())
@@ -265,9 +265,7 @@ def test_a_state_of_another_model_is_refused(first_run, store, tmp_path):
 
 
 @pytest.mark.parametrize("is_last", [False, True])
-def test_a_run_ends_on_time_with_a_saved_state_and_its_rate_falls_if_it_is_the_last(
-    store, tmp_path, monkeypatch, is_last
-):
+def test_run_ends_on_time_and_last_one_decays(store, tmp_path, monkeypatch, is_last):
     monkeypatch.setattr(runs, "WARM_UP", 1)
     monkeypatch.setattr(runs, "SCORED_EVERY", 2)
     clock = itertools.count(100)  # a second for every look at it: a busy machine takes no fewer steps
@@ -335,7 +333,7 @@ def test_validation_is_of_the_recipes_own_world_with_another_seed():
     assert dataclasses.replace(world, seed=recipes.SEED, n_trajectories=made.stream().n_trajectories) == made.stream()
 
 
-def test_a_step_that_was_skipped_is_said_to_be_whatever_its_numbers():
+def test_line_of_a_skipped_step():
     entry = {"step": 7, "loss": math.nan, "grad_norm": math.inf, "learning_rate": 1e-3, "future_psnr": math.nan}
     why = "the gradient is not finite, first that of dynamics.gravity"
     said = runs.line(plain({**entry, "skipped": why}), {"step_seconds": 0.1, "memory_gib": 1.0})

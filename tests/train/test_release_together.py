@@ -79,7 +79,7 @@ def together(tmp_path_factory):
     return out
 
 
-def test_two_processes_make_the_steps_of_one_with_both_batches(together, tmp_path):
+def test_two_processes_equal_one_with_twice_the_batch(together, tmp_path):
     (first, weights), (second, others) = (torch.load(together / f"steps_{rank}.pt") for rank in range(2))
     assert first == second and all(torch.equal(weights[name], others[name]) for name in weights)
     doubled = tuple(dataclasses.replace(phase, batch=2 * phase.batch) for phase in CONFIG.phases)
@@ -104,7 +104,7 @@ def test_state_counts_trajectories_of_all_processes(together):
 
 
 @pytest.mark.parametrize("n_processes", [1, 2, 4, 5])
-def test_each_trajectory_is_made_by_one_process_and_each_process_makes_all_objects(n_processes, tmp_path):
+def test_data_workers_share_trajectories_and_make_all_objects(n_processes, tmp_path):
     names, first, n = "abcd", 5, 400
     world, job, known = SimpleNamespace(object_names=lambda: [*names]), SimpleNamespace(add_done_callback=id), []
     for rank in range(n_processes):

