@@ -6,6 +6,7 @@ import math
 import threading
 import time
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,6 +34,7 @@ from tools.release.trajectories import DataWorkers, TrajectoryStore
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 NAME = "ball-tiny"
+STATES = Path(curve.__file__).parent / "state"
 OPTIONS = {"image_size": 32, "n_frames": 6, "objects": ("ball",), "n_trajectories": 2}
 CONFIG = TrainConfig(
     phases=(PhaseConfig(steps=2, history=1, batch=2, target_views=2), PhaseConfig(steps=98, horizon=2, target_views=2)),
@@ -357,3 +359,19 @@ def test_scores_against_windows_are_printed_with_paired_differences(first_run, t
         curve.main([str(state_file(state, name)) for name in ("a", "b")])
     with pytest.raises(InputError, match="no state"):
         curve.main([str(tmp_path / "c.state.safetensors")])
+
+
+def test_committed_states_are_read_and_load(tmp_path, capsys):
+    """Also where the settings and the parameters of the model had other names when they were saved."""
+    (file,) = STATES.glob("*.state.safetensors")
+    curve.main([str(file)])
+    assert "| windows | minutes |" in capsys.readouterr().out
+    name = file.name.split(".")[0]
+    made = recipe(*name.split("-"))
+    trainer = RunTrainer(made.train, TrajectoryStore(made.stream(), 1, "cpu"), tmp_path, "cpu")
+    before = {key: value.clone() for key, value in trainer.parameters.items()}
+    progress = load_into(trainer, STATES, name)
+    assert trainer.step == progress.step > 0 and progress.windows > 10_000
+    moments = [trainer.optimizer.state[parameter].get("exp_avg_sq") for parameter in trainer.parameters.values()]
+    assert sum(value is not None and bool(value.any()) for value in moments) > 0.9 * len(moments)
+    assert sum(not torch.equal(before[key], value) for key, value in trainer.parameters.items()) > 0.9 * len(before)
