@@ -34,7 +34,7 @@ from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
 from gsim3d.simulator import Simulator
 from gsim3d.state import ASLEEP, DYNAMIC, Particles
-from gsim3d.train.gradients import in_segments, recomputing, total_norm
+from gsim3d.train.gradients import in_segments, recomputing
 from gsim3d.train.samples import Batch
 
 FACTOR = 1.5  # capacity for geometry over what was observed: little costs captures, much costs time in every step
@@ -50,13 +50,11 @@ class Gradients:
     Attributes:
         loss: a number.
         errors: [S], mean squared error of each step.
-        norm: of all gradients together.
         parameters: gradients of ``CapturedLoss.parameters``, or None.
     """
 
     loss: Tensor
     errors: Tensor
-    norm: Tensor
     parameters: tuple[Tensor | None, ...]
 
 
@@ -234,7 +232,7 @@ class _Step:
         if not self._is_ready:
             self._grow(self._observed())
             self._capture()
-        loss, errors, norm, gradients, found, records = self._replay()
+        loss, errors, gradients, found, records = self._replay()
         self._owner.meanwhile()
         while True:
             numbers = found.tolist()
@@ -245,9 +243,9 @@ class _Step:
             observed = zip(grown, self._observed(), strict=True)  # behind what did not fit, found is of other particles
             self._grow([c.grown((0, *seen.sizes), 1) for c, seen in observed])
             self._capture()
-            loss, errors, norm, gradients, found, records = self._replay()
+            loss, errors, gradients, found, records = self._replay()
         records.replayed(report)
-        return Gradients(loss, errors, norm, gradients)
+        return Gradients(loss, errors, gradients)
 
     def _grow(self, needed: Sequence[PyramidCapacity]) -> None:
         """Capacity that was too small for one simulated step, of whatever kind, will soon be for others."""
@@ -314,7 +312,7 @@ class _Step:
             None if (gradient := known.get(parameter)) is None else laid_out_as(parameter, gradient)
             for parameter in owner.parameters
         )
-        return loss.detach(), errors, total_norm(gradients), gradients
+        return loss.detach(), errors, gradients
 
     @torch.no_grad()
     def _observed(self) -> list[PyramidCapacity]:

@@ -24,7 +24,7 @@ from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.evaluate.perceptual.weights import load
 from gsim3d.io import checkpoint
 from gsim3d.io.locks import only_one_writer
-from gsim3d.train.captured import CapturedLoss, Gradients, Prepared
+from gsim3d.train.captured import CapturedLoss, Prepared
 from gsim3d.train.config import PhaseConfig, TrainConfig, check_same_run, check_settings
 from gsim3d.train.gradients import (
     Seen,
@@ -186,7 +186,8 @@ class Trainer:
         n_past = history_at(self.config.data, phase, self.config.seed, self.step)
         errors = torch.full((n_past + phase.horizon,), math.nan)
         try:
-            loss, errors, gradients, norm, seen = self._whole_batch(phase.batch)
+            loss, errors, gradients, seen = self._whole_batch(phase.batch)
+            norm = total_norm(gradients)
             problem = self._check(entry, loss, gradients, norm, seen)
         except NumericalError as error:
             problem = str(error)
@@ -260,17 +261,12 @@ class Trainer:
 
     # ---- gradients of a batch, computed here, by threads, by processes or from a graph ----
 
-    def _whole_batch(self, batch: int) -> tuple[float, Tensor, Sequence[Tensor | None], Tensor, list[Seen]]:
-        """Loss, errors by step, gradients of the whole batch and their norm; what was seen in each share of it."""
-        scale, norm, samples = self.scale.value, None, self.processes.share(batch)
+    def _whole_batch(self, batch: int) -> tuple[float, Tensor, Sequence[Tensor | None], list[Seen]]:
+        """Loss, errors by step and gradients of the whole batch; what was seen in each share of it."""
+        scale, samples = self.scale.value, self.processes.share(batch)
         norms_scale = scale if self._is_logged else None
         if self.processes.count > 1:
             loss, errors, gradients, seen = self._of_all_processes(samples, batch, norms_scale)
-        elif self.captured is not None:
-            watch = StepWatch()
-            found = self._captured_gradients(samples, watch)
-            gradients, norm, seen = found.parameters, found.norm / scale, [watch.seen(norms_scale)]
-            loss, errors = found.loss.item() / scale, found.errors.cpu()
         else:
             groups = [[sample] for sample in samples] if self.config.workers else [samples]
             results = self._map(self._gradients, groups)
@@ -278,17 +274,25 @@ class Trainer:
             loss, seen = loss.item(), [watch.seen(norms_scale) for *_, watch in results]
         if scale != 1:
             gradients = [None if gradient is None else gradient / scale for gradient in gradients]
-        return loss, errors, gradients, total_norm(gradients) if norm is None else norm, seen
+        return loss, errors, gradients, seen
 
     def _gradients(
         self, samples: list[int], watch: StepWatch | None = None, factor: float = 1.0
-    ) -> tuple[Tensor, Tensor, tuple[Tensor | None, ...], StepWatch]:
+    ) -> tuple[Tensor, Tensor, Sequence[Tensor | None], StepWatch]:
         """Loss, errors by step, the gradient of the loss for every parameter (None where it has no part), times the
-        scale and ``factor``, and what was seen on the way."""
-        watch, batch, factor = watch or StepWatch(), self._batch(samples), factor * self.scale.value
-        loss, errors = self.loss(batch, samples[0], watch)
+        scale and ``factor``, and what was seen on the way. Those of a CUDA graph are overwritten by the next call."""
+        watch, factor = watch or StepWatch(), factor * self.scale.value
+        if self.captured is not None:
+            prepared = self._prepared(samples)
+            watch.count(sum(prepared.counts), len(prepared.counts))
+            found = self.captured(prepared, self.step_weights(prepared.batch) * factor, watch.report)
+            return found.loss / factor, found.errors, found.parameters, watch
+        loss, errors = self.loss(self._batch(samples), samples[0], watch)
         gradients = torch.autograd.grad(loss * factor, list(self.parameters.values()), allow_unused=True)
         return loss.detach(), errors, gradients, watch
+
+    def _prepared(self, samples: list[int]) -> Prepared:
+        return self.captured.prepare(self._batch(samples))
 
     def _map(self, f: Callable, groups: list) -> list:
         """f of every group, in order; with workers, several at a time, each with its share of the cores."""
@@ -301,26 +305,13 @@ class Trainer:
         finally:
             torch.set_num_threads(n_threads)
 
-    def _captured_gradients(self, samples: list[int], watch: StepWatch) -> Gradients:
-        """Loss, errors and gradients from a CUDA graph, times the scale; the next call overwrites them."""
-        prepared = self._prepared(samples)
-        watch.count(sum(prepared.counts), len(prepared.counts))
-        return self.captured(prepared, self.step_weights(prepared.batch) * self.scale.value, watch.report)
-
-    def _prepared(self, samples: list[int]) -> Prepared:
-        return self.captured.prepare(self._batch(samples))
-
     def _of_all_processes(self, samples: list[int], batch: int, norms_scale: float | None) -> tuple:
         """Loss, errors, gradients and what was seen of all processes; this one computes ``samples``."""
         # One that raises within a step leaves the others waiting: what cannot be used is dropped, and reported later.
         drops = self.captured is None and self.simulator.config.stability.on_invalid == "raise"
         watch, share, count = StepWatch(strict=drops), len(samples) / batch, self.processes.count
-        try:
-            if self.captured is not None:
-                found = self._captured_gradients(samples, watch)
-                loss, errors, gradients = found.loss / self.scale.value, found.errors, found.parameters
-            else:  # the gradients of a batch norm are sums over processes: each loss has its weight before
-                loss, errors, gradients, _ = self._gradients(samples, watch, share * count)
+        try:  # a batch norm sums gradients over processes: each loss has its weight before
+            loss, errors, gradients, _ = self._gradients(samples, watch, share * count)
             seen = watch.seen(norms_scale)
         except NumericalError as error:
             loss, errors, gradients, seen = *torch.full((2,), math.nan), (), Seen(error=str(error))
@@ -333,9 +324,11 @@ class Trainer:
                 raise NumericalError(f"process {rank}: {of_process.error}")
         loss = sum(loss * share for loss, share in zip(losses, shares, strict=True))
         errors = sum(values * share for values, share in zip(errors, shares, strict=True))
-        triples = zip(self.parameters.values(), gradients, map(any, zip(*known, strict=True)), strict=True)
-        gradients = [torch.zeros_like(p) if gradient is None and has else gradient for p, gradient, has in triples]
-        return loss, errors, self.processes.add(gradients, share if self.captured else 1 / count), list(seen)
+        gradients = [  # what has none in this process alone is 0
+            torch.zeros_like(parameter) if gradient is None and any(elsewhere) else gradient
+            for parameter, gradient, elsewhere in zip(self.parameters.values(), gradients, zip(*known, strict=True))
+        ]
+        return loss, errors, self.processes.add(gradients, 1 / count), list(seen)
 
     # ---- the loss of a batch ----
 

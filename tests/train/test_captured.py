@@ -180,8 +180,6 @@ def assert_gradients_of_the_loss(captured, drawn, trainer, device, report):
             if gradient is not None:
                 assert (gradient - wanted).abs().max() <= TOLERANCE[device.type] * largest, name
                 assert gradient.stride() == trainer.parameters[name].stride(), name
-        squares = sum(gradient.double().square().sum() for gradient in actual.parameters if gradient is not None)
-        assert actual.norm.item() == pytest.approx(squares.sqrt().item(), rel=1e-5)
 
 
 class FullGPU:
