@@ -69,7 +69,8 @@ def describe(config: dict[str, Any], kind: type[ModelConfig] = ModelConfig, fps:
     data = {key: value for key, value in config["data"].items() if key in names and value is not None}
     if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
         data.pop("near_far")
-    fps = data.pop("fps", None) or fps
+    given = data.pop("fps", None)
+    fps = fps if given is None else given
     if fps is not None and (isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 1e-3 <= fps <= 1e6):
         raise InputError(f"data.fps must be frames per second, a number from 0.001 to 1e6; got {shown(fps)}")
     size = data.get("image_size")
