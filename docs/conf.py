@@ -21,7 +21,8 @@ html_copy_source = False
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 4
 napoleon_use_rtype = False
-napoleon_custom_sections = ["Gradients", "Determinism", "Source", "Sources", "Shapes", "Wanted"]
+napoleon_use_ivar = True
+napoleon_custom_sections = ["Gradients", "Determinism", "Source", "Sources", "Shapes", "GPU"]
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "show-inheritance": True}
@@ -32,7 +33,7 @@ def open_sections(app, what, name, obj, options, lines):
     """Puts the text of ``Gradients: text`` on a line of its own, where napoleon reads it as a section."""
     opened = []
     for line in lines:
-        found = re.match(r"(\s*)(Gradients|Determinism|Source|Shapes): (.+)", line)
+        found = re.match(r"(\s*)(Gradients|Determinism|Source|Shapes|GPU): (.+)", line)
         opened += [f"{found[1]}{found[2]}:", f"{found[1]}    {found[3]}"] if found else [line]
     lines[:] = opened
 
