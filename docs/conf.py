@@ -11,7 +11,7 @@ import generate  # noqa: E402
 
 import gsim3d  # noqa: E402
 
-project, author = "gsim3d", "The gsim3d authors"
+project, author, copyright = "gsim3d", "The gsim3d authors", "The gsim3d authors, Apache-2.0"
 release = version = gsim3d.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
 exclude_patterns = ["_build", "_generated/[!.]*", "notes"]
