@@ -1,4 +1,4 @@
-"""Are these cameras what they should be? Checks in one convention, and what follows from cameras alone.
+"""Checks of cameras in one convention, and quantities that follow from cameras alone.
 
 Everything here is float64, world-to-camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
 """
@@ -21,15 +21,15 @@ MIN_FOCAL = 1e-3  # pixels; shorter ones make rays that overflow
 NORMALISED_FOCAL = 8.0  # pixels; a focal length below it, of an image larger than it, is no focal length in pixels
 MAX_ERROR = 0.5  # of axes that meet: their distance from the point over its distance
 MIN_SPREAD = 0.02  # mean squared sine of the optical axes around their mean: about 8 degrees
-MANY_STEPS = 64  # of moving cameras, so many steps are enough to see where they look
+MANY_STEPS = 64  # of moving cameras; so many show where they look
 NEAR_SHARE, FAR_SHARE = 0.3, 2.0  # near and far relative to the distances of the point that the cameras look at
-FAR_FROM_ZERO = 16  # near depths; from there on float32 moves what is near by more than 2^-20 of its depth
+FAR_FROM_ZERO = 16  # near depths; farther away float32 moves near points by more than 2^-20 of their depth
 MAX_REACH = 1000  # times far: how far away from the cameras the lower corner of the workspace may lie
 SAMPLES = 12  # points along each side of a frustum
 
 
 def inverse(viewmats: np.ndarray) -> np.ndarray:
-    """Camera-to-world from world-to-camera or back, [..., 4, 4], of rigid motions."""
+    """Inverses [..., 4, 4] of rigid motions: camera-to-world from world-to-camera, or back."""
     result = np.zeros_like(viewmats)
     rotation = viewmats[..., :3, :3].swapaxes(-1, -2)
     result[..., :3, :3] = rotation
@@ -39,8 +39,11 @@ def inverse(viewmats: np.ndarray) -> np.ndarray:
 
 
 def near_zero(recording: Recording) -> Recording:
-    """``recording`` with positions that float32 holds: where cameras are far from 0 for what they see, positions count
-    from a ``world_offset`` amid them, whole metres. Survey coordinates are an example."""
+    """``recording`` with positions that float32 holds.
+
+    Where cameras lie far from 0 for what they see, as in survey coordinates, positions count from a ``world_offset``
+    amid them, in whole metres.
+    """
     middle = inverse(recording.viewmats)[..., :3, 3].reshape(-1, 3).mean(0)
     near = recording.near or min(depth_range(spread_steps(recording.viewmats).reshape(-1, 4, 4)) or (np.inf,))
     offset = np.round(middle)
@@ -48,8 +51,8 @@ def near_zero(recording: Recording) -> Recording:
         return recording
     viewmats = recording.viewmats.copy()
     viewmats[..., :3, 3] += viewmats[..., :3, :3] @ offset
-    places = {name: value - offset for name in ("origin", "bounds") if (value := getattr(recording, name)) is not None}
-    return dataclasses.replace(recording, viewmats=viewmats, world_offset=recording.world_offset + offset, **places)
+    points = {name: value - offset for name in ("origin", "bounds") if (value := getattr(recording, name)) is not None}
+    return dataclasses.replace(recording, viewmats=viewmats, world_offset=recording.world_offset + offset, **points)
 
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:
@@ -59,51 +62,45 @@ def rotations(quaternions: np.ndarray) -> np.ndarray:
 
 def check_pose(matrices: np.ndarray, what: str, problems: Problems) -> bool:
     """Whether [4, 4] or [S, 4, 4] are rigid motions of right-handed axes; names the frame of the first that is not."""
-    moving = matrices.ndim == 3
-    stack = matrices if moving else matrices[None]
+    stack = matrices.reshape(-1, 4, 4)
     rotation = stack[:, :3, :3]
-    last_row = np.abs(stack[:, 3] - [0, 0, 0, 1]).max(1)
-    skewed = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max((1, 2))
-    determinant = np.linalg.det(rotation)
-    for wrong, describe in (
-        (last_row > ROTATION_TOLERANCE, lambda s: f"must end in the row 0 0 0 1; got {stack[s, 3].tolist()}"),
-        (
-            skewed > ROTATION_TOLERANCE,
-            lambda s: (
-                f"must be a rigid motion: its rotation is not orthonormal (off by {skewed[s]:.3g}); "
-                "it holds a scale or shear, or is cut off"
-            ),
-        ),
-        (
-            determinant < 0,
-            lambda s: "must be a rigid motion: its rotation is left-handed (determinant -1); one axis is mirrored",
-        ),
-    ):
-        if wrong.any():
-            step = int(np.argmax(wrong))
-            problems.add(f"{what}{f' (frame {step})' if moving else ''} {describe(step)}")
-            return False
-    return True
+    end = np.abs(stack[:, 3] - [0, 0, 0, 1]).max(1)
+    skew = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max((1, 2))
+    wrong = (end > ROTATION_TOLERANCE) | (skew > ROTATION_TOLERANCE) | (np.linalg.det(rotation) < 0)
+    if not wrong.any():
+        return True
+    step = int(np.argmax(wrong))
+    if end[step] > ROTATION_TOLERANCE:
+        reason = f"must end in the row 0 0 0 1; got {stack[step, 3].tolist()}"
+    elif skew[step] > ROTATION_TOLERANCE:
+        reason = (
+            f"must be a rigid motion: its rotation is not orthonormal (off by {skew[step]:.3g}); it holds a scale or "
+            "shear, or is cut off"
+        )
+    else:
+        reason = "must be a rigid motion: its rotation is left-handed (determinant -1); one axis is mirrored"
+    problems.add(f"{what}{f' (frame {step})' if matrices.ndim == 3 else ''} {reason}")
+    return False
 
 
 def check_intrinsics(Ks: np.ndarray, size: tuple[int, int], what: str, problems: Problems) -> bool:
     """Whether [3, 3] or [S, 3, 3] are pinhole intrinsics in pixels of an image of ``size``."""
     moving = Ks.ndim == 3
     for step, K in enumerate(Ks if moving else Ks[None]):
-        place = f"{what}{f' (frame {step})' if moving else ''}"
+        which = f"{what}{f' (frame {step})' if moving else ''}"
         (fx, fy), (cx, cy) = np.diag(K)[:2], K[:2, 2]
         if np.abs(K[2] - [0, 0, 1]).max() > ROTATION_TOLERANCE or abs(K[1, 0]) > ROTATION_TOLERANCE * abs(K[1, 1]):
-            problems.add(f"{place} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
+            problems.add(f"{which} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]]; got {K.tolist()}")
         elif not (fx >= MIN_FOCAL and fy >= MIN_FOCAL):
-            problems.add(f"{place}: focal lengths must be positive, {MIN_FOCAL:g} or more; got fx {fx:g}, fy {fy:g}")
+            problems.add(f"{which}: focal lengths must be positive, {MIN_FOCAL:g} or more; got fx {fx:g}, fy {fy:g}")
         elif min(fx, fy) < NORMALISED_FOCAL < max(size) and max(cx, cy) <= 2:
             problems.add(
-                f"{place}: focal lengths must be in pixels; fx {fx:g}, fy {fy:g} of a {size[0]}x{size[1]} image look "
+                f"{which}: focal lengths must be in pixels; fx {fx:g}, fy {fy:g} of a {size[0]}x{size[1]} image look "
                 "as if divided by its size"
             )
         elif not (0 <= cx <= size[0] and 0 <= cy <= size[1]):
             problems.add(
-                f"{place}: the principal point ({cx:g}, {cy:g}) lies outside the image of {size[0]}x{size[1]} pixels"
+                f"{which}: the principal point ({cx:g}, {cy:g}) lies outside the image of {size[0]}x{size[1]} pixels"
             )
         else:
             continue
@@ -127,10 +124,12 @@ def focus(viewmats: np.ndarray) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class _Convergence:
-    """How [N, 4, 4] look at the point nearest to all their axes.
+    """How cameras look at the point nearest to all their axes.
 
-    behind: bool [N], who has it behind.   error: distance of the axes from it over its distance.
-    plausible: share of the cameras that have it before them at a distance that a scene may have.
+    Attributes:
+        behind: bool [N], cameras that have it behind them.
+        error: distance of the axes from it over its distance.
+        plausible: share of the cameras that have it before them at a distance that a scene may have.
     """
 
     behind: np.ndarray
@@ -143,8 +142,8 @@ class _Convergence:
 
 
 def check_directions(recording: Recording, problems: Problems) -> None:
-    """Do the cameras look at one scene? Finds flipped axes and exchanged directions, which no single matrix shows."""
-    viewmats, where = spread_steps(recording.viewmats), recording.source
+    """Finds flipped axes and exchanged directions, which no single matrix shows: cameras look at one scene."""
+    viewmats, source = spread_steps(recording.viewmats), recording.source
     _check_origin(recording, viewmats.reshape(-1, 4, 4), problems)
     if recording.bounds is not None:
         _check_view_of_bounds(recording, viewmats, problems)
@@ -156,19 +155,19 @@ def check_directions(recording: Recording, problems: Problems) -> None:
     hint = _better_convention(viewmats.reshape(-1, 4, 4), depths)
     if found.behind.all() or (hint and (found.plausible < 0.5 or found.error > MAX_ERROR)):
         hint = hint or "are the camera axes OpenGL's (y up, z backwards)?"
-        problems.add(f"{where}: the cameras look away from one another's views: {hint}")
+        problems.add(f"{source}: the cameras look away from one another's views: {hint}")
         return
     behind = found.behind.reshape(viewmats.shape[:2])
     for cam in np.flatnonzero(behind.any(0)):
         frame = f", frame {int(np.argmax(behind[:, cam]))}" if len(viewmats) > 1 else ""
         problems.add(
-            f"{where}: camera {recording.camera_names[cam]}{frame} looks away from the point that the others look at: "
+            f"{source}: camera {recording.camera_names[cam]}{frame} looks away from the point that the others look at: "
             "are its y and z axes flipped? (if it is right, give the bounds of the scene)"
         )
 
 
 def _check_origin(recording: Recording, viewmats: np.ndarray, problems: Problems) -> None:
-    """Voxels are counted from it: far from it float32 cannot separate them."""
+    """Voxels are counted from the origin: far from it float32 cannot separate them."""
     key = "bounds" if recording.origin is None else "origin"
     corner = recording.bounds[0] if recording.origin is None and recording.bounds is not None else recording.origin
     if corner is None:
@@ -183,7 +182,7 @@ def _check_origin(recording: Recording, viewmats: np.ndarray, problems: Problems
 
 
 def _convergence(viewmats: np.ndarray, depths: tuple[float | None, float | None]) -> _Convergence | None:
-    """None where the axes are nearly parallel. ``depths``: near and far, None where nobody gave them."""
+    """None where the axes are nearly parallel. ``depths``: near and far, None where they are not given."""
     point = focus(viewmats)
     if point is None:
         return None
@@ -192,7 +191,7 @@ def _convergence(viewmats: np.ndarray, depths: tuple[float | None, float | None]
     depth = (to_point * axes).sum(1)
     distance = np.linalg.norm(to_point, axis=1)
     off = np.sqrt(np.maximum(distance**2 - depth**2, 0))
-    # Cameras read the wrong way round often stand at nearly one place, where their axes meet too.
+    # Cameras read the wrong way round often have nearly one position, where their axes meet too.
     least = 0.2 * np.linalg.norm(viewmats[:, :3, 3], axis=1).mean() if depths[0] is None else depths[0] / 2
     most = np.inf if depths[1] is None else 2 * depths[1]
     plausible = (depth > 0) & (distance >= least) & (distance <= most)
@@ -201,7 +200,7 @@ def _convergence(viewmats: np.ndarray, depths: tuple[float | None, float | None]
 
 
 def _better_convention(viewmats: np.ndarray, depths: tuple[float | None, float | None]) -> str | None:
-    """What the matrices seem to be instead, where another reading makes all cameras look at one point."""
+    """The convention of the matrices, as a question, in which all cameras look at one point; None: there is none."""
     readings = {
         "are the camera axes OpenGL's (y up, z backwards) where OpenCV's are expected, or the reverse?": OPENGL
         @ viewmats,
@@ -244,13 +243,13 @@ def project(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[n
 
 
 def _visible(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """bool [S, V, N]: is a point in front of a camera and inside its image?"""
+    """bool [S, V, N], points in front of a camera and inside its image."""
     pixels, depth = project(points, viewmats, Ks)
     return (depth > 0) & (pixels >= 0).all(-1) & (pixels <= sizes[:, None]).all(-1)
 
 
 def depth_range(viewmats: np.ndarray) -> tuple[float, float] | None:
-    """near and far around the point that cameras [N, 4, 4] look at; None where they look at none."""
+    """near and far around the point that cameras [N, 4, 4] look at; None where there is no such point."""
     point = focus(viewmats)
     if point is None:
         return None
@@ -277,7 +276,7 @@ def frusta_origin(viewmats, Ks, sizes: Sequence[tuple[int, int]], near: float, f
 
 
 def shared_view(viewmats, Ks, sizes: Sequence[tuple[int, int]], near: float, far: float) -> np.ndarray:
-    """Box [2, 3] around what most cameras see at one step: by default what is shown as the scene's bounds."""
+    """Box [2, 3] around what most cameras see at one step: the default of a scene's bounds."""
     points = frusta_points(viewmats[:1], Ks[:1], sizes, near, far, SAMPLES)[0].reshape(-1, 3)
     seen_by = _visible(points, viewmats[:1], Ks[:1], np.asarray(sizes, dtype=np.float64))[0].sum(0)
     shared = points[seen_by >= 0.75 * seen_by.max()]

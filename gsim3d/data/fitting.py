@@ -1,4 +1,4 @@
-"""Films as a model expects them: of another size, with other depth bounds, in other units."""
+"""Recordings as a model expects them: of another size, rate and depth range, in other units."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from gsim3d.data.recording import BACKGROUND, FIXED, MOVING, ReadImages, Recordi
 from gsim3d.errors import InputError
 
 MIN_EXTENT = 1e-3  # metres; cameras nearer to the origin than this have no length to divide by
-
-
 RATE_TOLERANCE = 1.0001e-3  # relative difference of frame rates that are the same: 29.97 and 30 are
 
 
@@ -31,7 +29,7 @@ def resample(recording: Recording, fps: float) -> Recording:
     """Every k-th frame of ``recording``, which has k times ``fps`` frames per second.
 
     Raises:
-        InputError: its rate is no whole multiple.
+        InputError: its rate is no whole multiple of ``fps``.
     """
     if recording.n_steps == 1:
         return recording
@@ -60,14 +58,15 @@ def resample(recording: Recording, fps: float) -> Recording:
 
 @dataclass(frozen=True)
 class Fitting:
-    """What is done to every scene; the defaults change nothing.
+    """Changes of every recording of a data set; the defaults change nothing.
 
-    size: (width, height) pixels: images are scaled until they cover it, smoothly, and cropped around their centre.
-    near_far: metres, the depth range of all scenes (in the new unit).
-    unit_cameras: lengths are divided by the largest coordinate of a scene's cameras at its first step.
-    slack: a scene whose own near or far is not that of ``near_far`` up to this factor keeps its own range.
-    enlarge: images smaller than ``size`` are scaled up; else they are refused.
-    whole: images are scaled until ``size`` holds them, and not cropped; padding fills the rest.
+    Attributes:
+        size: (width, height) pixels: images are scaled until they cover it, smoothly, and cropped around their centre.
+        near_far: metres, the depth range of all scenes (in the new unit).
+        unit_cameras: lengths are divided by the largest coordinate of a scene's cameras at its first step.
+        slack: a scene whose own near or far is not that of ``near_far`` up to this factor keeps its own range.
+        enlarge: images smaller than ``size`` are scaled up; else they are refused.
+        whole: images are scaled until ``size`` holds them, and not cropped; padding fills the rest.
     """
 
     size: tuple[int, int] | None = None
@@ -79,7 +78,7 @@ class Fitting:
 
 
 def fit(recording: Recording, fitting: Fitting) -> Recording:
-    """``recording`` as ``fitting`` wants it. Raises InputError where images are smaller than the wanted size."""
+    """``recording``, fitted. Raises InputError where images are smaller than ``fitting.size``."""
     if fitting.unit_cameras:
         recording = _in_units_of_cameras(recording)
     if fitting.size is not None and any(size != fitting.size for size in recording.sizes):

@@ -16,8 +16,14 @@ MAX_TAGS, MAX_VALUES = 1000, 1 << 20
 
 @dataclass(frozen=True)
 class Header:
-    """size: (width, height).   whole: the file has its end.   alpha: it has transparency.   refused: why it is not
-    read, "" where it is."""
+    """The header of an image file.
+
+    Attributes:
+        size: (width, height).
+        whole: the file has its end.
+        alpha: it has transparency.
+        refused: why it is not read; "" where it is.
+    """
 
     size: tuple[int, int]
     whole: bool
@@ -43,11 +49,11 @@ def _png(data: bytes) -> Header | None:
     if len(data) < 33 or data[12:16] != b"IHDR":
         return None
     # Chunk by chunk: decoders take memory for as many bytes as a chunk claims to have, up to 2 GiB.
-    place, alpha, whole = 8, data[25] in (4, 6), False
-    while place + 12 <= len(data) and not whole:
-        kind = data[place + 4 : place + 8]
+    at, alpha, whole = 8, data[25] in (4, 6), False
+    while at + 12 <= len(data) and not whole:
+        kind = data[at + 4 : at + 8]
         alpha, whole = alpha or kind == b"tRNS", kind == b"IEND"
-        place += 12 + int.from_bytes(data[place : place + 4], "big")
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
     return Header(struct.unpack_from(">II", data, 16), whole, alpha)
 
 

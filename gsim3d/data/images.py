@@ -25,17 +25,21 @@ MAX_SOFT = 0.2  # of the pixels of a mask may be nearer to half of its range tha
 MAX_LABELS = 256  # masks of more values hold none
 
 
-def read_image(file: Path, size: tuple[int, int], place: str, problems: Problems) -> np.ndarray | None:
+def read_image(file: Path, size: tuple[int, int], frame: str, problems: Problems) -> np.ndarray | None:
     """The pixels of a PNG, JPEG, WebP or TIFF file as it stores them, [h, w] or [h, w, 3 or 4] (blue first).
 
     Args:
-        size: (width, height) that it must have; the file's header is asked before pixels are decoded.
-        place: camera and frame, for messages.
-    Returns: uint8 or uint16; None where there is a problem.
+        file: path.
+        size: (width, height) that it must have; the header is read before pixels are decoded.
+        frame: camera and frame, for messages.
+        problems: what is wrong is added to them.
+
+    Returns:
+        uint8 or uint16; None where there is a problem.
     """
     import cv2
 
-    what = f"image {file} ({place})"
+    what = f"image {file} ({frame})"
     data = _bytes_of(file, what, problems)
     if data is None:
         return None
@@ -75,9 +79,9 @@ def _bytes_of(file: Path, what: str, problems: Problems, most: int = -1) -> byte
     return None
 
 
-def header_of(file: Path, place: str, problems: Problems) -> Header | None:
+def header_of(file: Path, frame: str, problems: Problems) -> Header | None:
     """Size and kind of an image file, without its pixels; None where there is a problem."""
-    what = f"image {file} ({place})"
+    what = f"image {file} ({frame})"
     data = _bytes_of(file, what, problems, HEADER)
     header = None if data is None else read_header(data)
     if header is None and data is not None and len(data) == HEADER:  # it lies farther behind
@@ -88,7 +92,7 @@ def header_of(file: Path, place: str, problems: Problems) -> Header | None:
     return header
 
 
-def as_color(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray:
+def as_color(image: np.ndarray, file: Path, frame: str, problems: Problems) -> np.ndarray:
     """uint8 [h, w, 3], RGB: grey is repeated, 16 bits are rounded to 8, transparency is composed on black."""
     image = _over_black(image)
     if image.dtype == np.uint16:
@@ -96,19 +100,19 @@ def as_color(image: np.ndarray, file: Path, place: str, problems: Problems) -> n
     return np.repeat(image[..., None], 3, 2) if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
 
 
-def as_labels(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray | None:
+def as_labels(image: np.ndarray, file: Path, frame: str, problems: Problems) -> np.ndarray | None:
     """uint8 [h, w], the one channel of a label image."""
     if image.ndim == 3 and (image[..., :1] != image[..., :3]).any():
-        problems.add(f"image {file} ({place}) must hold labels in one channel; got a colour image")
+        problems.add(f"image {file} ({frame}) must hold labels in one channel; got a colour image")
         return None
     labels = image if image.ndim == 2 else image[..., 0]
     if file.suffix.lower() in LOSSY_SUFFIXES or labels.max() > 255:
-        problems.add(f"image {file} ({place}) must hold labels from 0 to 255, in a lossless format (PNG or TIFF)")
+        problems.add(f"image {file} ({frame}) must hold labels from 0 to 255, in a lossless format (PNG or TIFF)")
         return None
     return labels.astype(np.uint8)
 
 
-def as_mask(image: np.ndarray, file: Path | None, place: str, problems: Problems) -> np.ndarray | None:
+def as_mask(image: np.ndarray, file: Path | None, frame: str, problems: Problems) -> np.ndarray | None:
     """uint8 [h, w]: MOVING where a mask is set, else BACKGROUND.
 
     A mask of two values, up to compression noise and soft borders, is set above half of its range; one of labels is set
@@ -120,14 +124,14 @@ def as_mask(image: np.ndarray, file: Path | None, place: str, problems: Problems
     marked = _marked(grey, lossy)
     if marked is None:
         problems.add(
-            f"image {file} ({place}) is no mask: its values are neither two, up to noise and soft borders, nor labels; "
+            f"image {file} ({frame}) is no mask: its values are neither two, up to noise and soft borders, nor labels; "
             "save it as 0 and 255"
         )
         return None
     return np.where(marked, MOVING, BACKGROUND).astype(np.uint8)
 
 
-def as_opaque(image: np.ndarray, file: Path, place: str, problems: Problems) -> np.ndarray:
+def as_opaque(image: np.ndarray, file: Path, frame: str, problems: Problems) -> np.ndarray:
     """uint8 [h, w]: MOVING where an image is more opaque than transparent, else BACKGROUND."""
     return np.where(is_opaque(image), MOVING, BACKGROUND).astype(np.uint8)
 
@@ -195,11 +199,11 @@ class ImageCache:
     """Images of one kind of one scene, uint8 [H, W, 3] or [H, W], decoded once.
 
     Args:
-        shape: [T, V, H, W, ...] of all of them; memory is taken for what was asked for only.
+        shape: [T, V, H, W, ...] of all of them; only images that were read take memory.
         read: (cam, steps) -> the images of one camera, in the order of ``steps``.
-        cache_dir: where to keep all of them decoded, a .npy file of which single images are read; None: in memory.
-            A file is open while it is read only, so a set may have any number of scenes.
-        key: tells this scene, kind and state of its files from any other.
+        cache_dir: folder of a .npy file with all of them decoded, of which single images are read; None: they stay in
+            memory. A file is open only while it is read, so a set may have any number of scenes.
+        key: differs for every scene, kind and state of its files.
     """
 
     def __init__(self, shape, read, cache_dir: str | Path | None, key: tuple):
@@ -208,7 +212,7 @@ class ImageCache:
         if cache_dir is not None:
             name = hashlib.sha256(repr((*key, self._shape)).encode()).hexdigest()[:32]
             self._file = Path(cache_dir) / f"{name}.npy"
-        self._start: int | None = None  # where the pixels of the file begin, once it was seen to be ours
+        self._start: int | None = None  # byte at which the pixels of the file begin, once the file was checked
         self._images: dict[tuple[int, int], np.ndarray] = {}
         self._lock = threading.Lock()  # samples of a training step are read side by side
 
@@ -223,9 +227,8 @@ class ImageCache:
                 missing = sorted({step for step in steps if (step, cam) not in self._images})
                 for step, image in zip(missing, self._read(cam, missing), strict=True):
                     self._images[step, cam] = image
-        for i, step in enumerate(steps):
-            for j, cam in enumerate(cams):
-                images[i, j] = self._images[step, cam]
+        for i, j in np.ndindex(images.shape[:2]):
+            images[i, j] = self._images[steps[i], cams[j]]
         return images
 
     def _fetch(self, steps: Sequence[int], cams: Sequence[int], images: np.ndarray) -> None:
@@ -237,11 +240,10 @@ class ImageCache:
                 self._start = self._checked_start()
         n_bytes = images[0, 0].nbytes if images.size else 0
         with open(self._file, "rb", buffering=0) as file:
-            for i, step in enumerate(steps):
-                for j, cam in enumerate(cams):
-                    place = self._start + (step * self._shape[1] + cam) * n_bytes
-                    if os.preadv(file.fileno(), [memoryview(images[i, j]).cast("B")], place) != n_bytes:
-                        raise InputError(f"{self._file} has become shorter; remove it")
+            for i, j in np.ndindex(images.shape[:2]):
+                begin = self._start + (steps[i] * self._shape[1] + cams[j]) * n_bytes
+                if os.preadv(file.fileno(), [memoryview(images[i, j]).cast("B")], begin) != n_bytes:
+                    raise InputError(f"{self._file} has become shorter; remove it")
 
     def _checked_start(self) -> int:
         with open(self._file, "rb") as file:
@@ -263,23 +265,28 @@ class ImageCache:
         needed, free = int(np.prod(self._shape, dtype=object)), shutil.disk_usage(folder).free
         if needed > free:
             raise InputError(f"{folder}: the decoded images need {needed >> 20} MiB, {free >> 20} MiB are free")
-        handle, unfinished = tempfile.mkstemp(dir=folder, prefix=".", suffix=".unfinished")
-        os.close(handle)
-        try:
-            images = np.lib.format.open_memmap(unfinished, mode="w+", dtype=np.uint8, shape=self._shape)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".") as unfinished:
+            file = Path(unfinished) / self._file.name
+            images = np.lib.format.open_memmap(file, mode="w+", dtype=np.uint8, shape=self._shape)
             for cam in range(self._shape[1]):
                 for step, image in enumerate(self._read(cam, range(self._shape[0]))):
                     images[step, cam] = image
             images.flush()
-            del images
-            os.replace(unfinished, self._file)
-        except BaseException:
-            os.unlink(unfinished)
-            raise
+            os.replace(file, self._file)
 
 
 def read_files(files: Iterator[tuple[Path, str]], size, convert, problems: Problems) -> Iterator[np.ndarray | None]:
-    """``convert`` of the image in each of ``files`` (with its place for messages); None where there is a problem."""
-    for file, place in files:
-        image = read_image(file, size, place, problems)
-        yield None if image is None else convert(image, file, place, problems)
+    """Images of files, one after the other.
+
+    Args:
+        files: path, and camera and frame for messages.
+        size: (width, height) that they must have.
+        convert: :func:`as_color`, :func:`as_labels`, :func:`as_mask` or :func:`as_opaque`.
+        problems: what is wrong is added to them.
+
+    Yields:
+        Converted images; None where there is a problem.
+    """
+    for file, frame in files:
+        image = read_image(file, size, frame, problems)
+        yield None if image is None else convert(image, file, frame, problems)

@@ -1,7 +1,7 @@
 """The layouts of scene folders that can be read, and the search for such folders.
 
-A layout is a module with NAME, FILE (what describes a scene), ``recognises(folder)`` and
-``read(folder, problems) -> Recording``. To read another kind of folder, write one and list it here.
+A layout is a module with NAME, FILE (which describes a scene), ``recognises(folder)`` and
+``read(folder, problems) -> Recording``. To read another kind of folder, write such a module and list it here.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ def find_scenes(root: str | Path) -> list[Path]:
     """Scene folders at or below ``root`` (at most three levels down), in natural order of their paths.
 
     Hidden folders are skipped: a scene that is being written lies in one. Scenes hold no other scenes.
+
+    Raises:
+        InputError: there is none.
     """
     root = Path(root)
     if not root.is_dir():

@@ -37,14 +37,20 @@ UNREAD = re.compile(
     r"(dist|distortion)(_?(coeffs?|coefficients))?|D|lens(_?(coeffs?|params))?|(radial|tangential)_distortion",
     re.IGNORECASE,
 )
-SAMPLES = 2000  # of the radius, where it is asked whether it grows
+SAMPLES = 2000  # of the radius, which must grow with the angle
 WIDEST = 1.55  # radians from the axis: a pinhole sees less than 90 degrees of it
 
 
 def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
-    """The lens that the keys of a description give; None: a pinhole. ``what``: for messages."""
+    """The lens of a description; None: a pinhole.
+
+    Args:
+        values: keys of the description.
+        what: for messages.
+        problems: keys of lenses that are not read are added to them.
+    """
     for key, value in values.items():
-        if (key in OTHER_KEYS or UNREAD.fullmatch(str(key))) and _says(value):
+        if (key in OTHER_KEYS or UNREAD.fullmatch(str(key))) and _is_set(value):
             known = ", ".join(COEFFICIENTS)
             problems.add(f"{what}: the lens key {key:.80} is not read; use {known}, or undistort the images")
             return None
@@ -76,7 +82,7 @@ def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
     return Lens(short) if coefficients.any() else None
 
 
-def _says(value) -> bool:
+def _is_set(value) -> bool:
     """Whether a value is more than 0, false, nothing or a word."""
     if isinstance(value, (list, dict)):
         return any(item not in (0, None) for item in (value.values() if isinstance(value, dict) else value))
@@ -94,7 +100,12 @@ def _coefficients(values: Mapping, what: str, problems: Problems) -> dict[str, f
 
 
 class Undistorter:
-    """Images of one camera as a pinhole of the same intrinsics would see them. ``size``: (width, height)."""
+    """Images of one camera, as a pinhole of the same intrinsics sees them.
+
+    Args:
+        lens: of the camera.
+        size: (width, height) of its images.
+    """
 
     def __init__(self, lens: Lens, size: tuple[int, int]):
         self._lens, self._size = lens, size
@@ -112,14 +123,14 @@ class Undistorter:
         return (x >= 0) & (x <= self._size[0] - 1) & (y >= 0) & (y <= self._size[1] - 1)
 
     def _sources(self, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where each pixel lies in the distorted image, x and y, float32 [h, w]; kept for the next image."""
+        """x and y of each pixel in the distorted image, float32 [h, w]; kept for the next image."""
         import cv2
 
         if self._key is None or not np.array_equal(self._key, K):
             centred = K.copy()
             centred[:2, 2] -= 0.5  # OpenCV's pixel centres are whole numbers
             make = cv2.fisheye.initUndistortRectifyMap if self._lens.fisheye else cv2.initUndistortRectifyMap
-            # As a camera of focal length 1, because OpenCV's lenses know no skew.
+            # As a camera of focal length 1, because OpenCV's lenses have no skew.
             x, y = make(np.eye(3), self._lens.coefficients, np.eye(3), centred, self._size, cv2.CV_32FC1)
             folded = self._radius(K) > _reach(self._lens)
             sources = centred[0, 0] * x + centred[0, 1] * y + centred[0, 2], centred[1, 1] * y + centred[1, 2]
@@ -135,18 +146,18 @@ class Undistorter:
 
 
 def _reach(lens: Lens) -> float:
-    """The tangent of the angle up to which the lens puts rays farther and farther out. Beyond it the polynomial turns
-    back, and pixels would show what lies elsewhere."""
+    """The tangent of the angle up to which the radius in the image grows. Beyond it the polynomial turns back, and
+    pixels would show other directions."""
     angles = np.linspace(0, WIDEST, SAMPLES)
     if lens.fisheye:
         k1, k2, k3, k4 = lens.coefficients
         square = angles**2
-        placed = angles * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
+        radius = angles * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
     else:
         k1, k2, _, _, k3, k4, k5, k6 = np.pad(lens.coefficients, (0, 8 - len(lens.coefficients)))
         square = np.tan(angles) ** 2
         below = 1 + square * (k4 + square * (k5 + square * k6))
         above = 1 + square * (k1 + square * (k2 + square * k3))
-        placed = np.sqrt(square) * above / np.where(below > 0, below, np.nan)
-    grows = np.diff(placed) > 0
+        radius = np.sqrt(square) * above / np.where(below > 0, below, np.nan)
+    grows = np.diff(radius) > 0
     return float(np.tan(angles[-1 if grows.all() else int(np.argmin(grows))]))

@@ -1,4 +1,4 @@
-"""From films of real cameras to labels: moving bodies cut out of a background that stands still."""
+"""Labels of real videos: moving bodies cut out of a background that stands still."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-MEDIAN_STEPS = 51  # of the film, evenly spread; more change the median little
+MEDIAN_STEPS = 51  # evenly spread; more change the median little
 MIN_STEPS = 8  # fewer show no background
 NOISE_FACTOR = 6.0  # a pixel is foreground where it differs by so many times the camera's noise ...
 MIN_DIFFERENCE = 18.0  # ... and by at least so much of 255
@@ -16,16 +16,21 @@ MIN_AREA = 0.001  # of the image; smaller spots are noise ...
 MAX_HOLE = 0.005  # ... and smaller holes are body that looks like what is behind it
 
 
-def median_image(film: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> np.ndarray:
-    """uint8 [h, w, 3]: the median over at most MEDIAN_STEPS steps of a camera that stands still: its background."""
+def median_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> np.ndarray:
+    """uint8 [h, w, 3], the background of a camera that stands still: its median over at most MEDIAN_STEPS steps.
+
+    Args:
+        read: steps -> uint8 [S, h, w, 3].
+        n_steps: of the camera.
+    """
     steps = np.unique(np.linspace(0, n_steps - 1, min(n_steps, MEDIAN_STEPS)).round().astype(int)).tolist()
-    frames = film(steps)
+    frames = read(steps)
     middle = len(steps) // 2
     return np.partition(frames, middle, axis=0)[middle]
 
 
 def foreground(image: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """bool [h, w]: where ``image`` differs from ``background`` by more than noise, gaps closed, spots removed."""
+    """bool [h, w], pixels that differ from ``background`` by more than noise; gaps closed, spots removed."""
     import cv2
 
     smooth = [cv2.GaussianBlur(picture, (0, 0), BLUR).astype(np.float32) for picture in (image, background)]
@@ -41,7 +46,7 @@ def foreground(image: np.ndarray, background: np.ndarray) -> np.ndarray:
 
 
 def _large(mask: np.ndarray, least: float) -> np.ndarray:
-    """bool [h, w]: the connected parts of ``mask`` that cover at least ``least`` of the image."""
+    """bool [h, w], the connected parts of ``mask`` that cover at least ``least`` of the image."""
     import cv2
 
     _, parts, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)

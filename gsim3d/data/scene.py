@@ -28,13 +28,22 @@ SIZE_MULTIPLE = 16  # pixels; images are padded to it, so that the encoders of a
 class Scene:
     """One recorded scene.
 
-    path, name: folder, and its last two parts.    layout: of the folder, see :mod:`gsim3d.data.layouts`.
-    n_steps, n_cams, fps: steps, cameras, steps a second.    camera_names: as messages show them.
-    near, far: metres, the depth range in which the scene lies.
-    width, height: pixels of all images: those of the largest camera, padded on the right and below to multiples of 16.
-    origin: float64 [3] metres, lower corner of the workspace.
-    world_offset: float64 [3] metres, the point that cameras, origin and bounds count from, so that float32 holds them:
-        a position plus it has the coordinates of the scene's files. 0, except for scenes that lie far from 0.
+    Attributes:
+        path: folder.
+        name: its last two parts.
+        layout: of the folder, see :mod:`gsim3d.data.layouts`.
+        recording: cameras and readers, fitted as ``fitting`` says.
+        recorded_sizes: (width, height) of each camera's images, before they are fitted.
+        fitting: what was done to the recording.
+        n_steps, n_cams: steps and cameras.
+        fps: steps a second.
+        camera_names: as messages show them.
+        near, far: metres, the depth range in which the scene lies.
+        width, height: pixels of all images: those of the largest camera, padded on the right and below to multiples of
+            16.
+        origin: float64 [3] metres, lower corner of the workspace.
+        world_offset: float64 [3] metres, the point that cameras, origin and bounds count from, so that float32 holds
+            them: a position plus it has the coordinates of the scene's files. 0, except for scenes far from 0.
     """
 
     def __init__(
@@ -75,15 +84,17 @@ class Scene:
         fitting: Fitting = Fitting(),
         fps: float | None = None,
     ) -> Scene:
-        """Reads the description of the scene in ``folder``; images are decoded when they are asked for, each once.
+        """The scene in ``folder``, whose images are decoded when they are first read, each once.
 
         Args:
-            cache_dir: folder for decoded images as memory-mapped files, for sets larger than the memory;
-                default: they stay in memory.
-            fitting: image size, depth range and unit that a model wants; default: as recorded.
+            folder: of any layout.
+            cache_dir: folder for decoded images in files, for sets larger than the memory; default: they stay in
+                memory.
+            fitting: image size, depth range and unit of a model; default: as recorded.
             fps: frames per second; of a recording with k times as many every k-th is kept. Default: all.
 
-        Raises: InputError that names file, camera and frame, and what is wrong with it.
+        Raises:
+            InputError: names file, camera and frame, and what is wrong with it.
         """
         path = Path(folder)
         problems = Problems()
@@ -95,12 +106,12 @@ class Scene:
 
     @cached_property
     def bounds(self) -> np.ndarray:
-        """float64 [2, 3] metres, corners of the box that is shown as the scene's: given, or what most cameras see."""
+        """float64 [2, 3] metres, corners of the box around the scene: given, or what most cameras see."""
         return shared_view(*self._view()) if self.recording.bounds is None else self.recording.bounds
 
     @property
     def own_depths(self) -> tuple[float, float] | None:
-        """near and far without ``fitting.near_far``; None where nothing tells them."""
+        """near and far without ``fitting.near_far``; None where they do not follow from the recording."""
         return own_depths(fit(self._recorded, Fitting(unit_cameras=self.fitting.unit_cameras)))
 
     def _view(self) -> tuple:
@@ -114,9 +125,9 @@ class Scene:
         )
 
     def cameras_at(self, cams, steps) -> Cameras:
-        """Cameras ``cams`` at each of ``steps``: len(steps) * len(cams) rows, step by step.
+        """Cameras ``cams`` at each of ``steps``: len(steps) * len(cams) of them, step by step.
 
-        ``image_cloud`` counts the steps from 0. Steps beyond the end of the film have the cameras of the last one.
+        ``image_cloud`` counts the steps from 0. Steps beyond the end have the cameras of the last one.
         """
         steps = [min(int(step), self.n_steps - 1) for step in steps]
         steps, cams = self._numbers(cams, steps)
@@ -124,12 +135,12 @@ class Scene:
             torch.from_numpy(values[np.ix_([step if len(values) > 1 else 0 for step in steps], cams)]).flatten(0, 1)
             for values in (self.recording.viewmats, self.recording.Ks)
         )
-        n_rows = len(viewmats)
+        n_images = len(viewmats)
         return Cameras(
             viewmats=viewmats.float(),
             Ks=Ks.float(),
-            near=torch.full((n_rows,), self.near),
-            far=torch.full((n_rows,), self.far),
+            near=torch.full((n_images,), self.near),
+            far=torch.full((n_images,), self.far),
             image_cloud=torch.arange(len(steps)).repeat_interleave(len(cams)),
             width=self.width,
             height=self.height,
@@ -137,13 +148,16 @@ class Scene:
 
     @property
     def cameras_move(self) -> bool:
-        """Whether a camera's place or lens changes with time."""
+        """Whether a camera's pose or intrinsics change with time."""
         return len(self.recording.viewmats) > 1 or len(self.recording.Ks) > 1
 
     def images(self, cams, steps) -> Tensor:
-        """uint8 [len(steps), len(cams), 3, H, W], RGB. Args: lists of camera and step numbers.
+        """uint8 [len(steps), len(cams), 3, H, W], RGB.
 
-        Padding is black; so is the real background of films that have labels, because nothing of it is simulated.
+        Padding is black; so is the real background of scenes with labels, because it is not simulated.
+
+        Args:
+            cams, steps: numbers of cameras and steps.
         """
         images = self.recorded_images(cams, steps)
         if self.recording.real_background and self.has_segmentation():
@@ -158,7 +172,7 @@ class Scene:
     def segmentation(self, cams, steps) -> Tensor:
         """uint8 [len(steps), len(cams), H, W]: 0 background, 1 ground and fixed parts, 3 bodies that may move."""
         if not self.has_segmentation():
-            raise InputError(f"{self.path}: the scene has no labels: no image says what is background and what moves")
+            raise InputError(f"{self.path}: the scene has no labels of what is background and what moves")
         return torch.from_numpy(self._labels.get(*self._numbers(cams, steps)))
 
     def has_segmentation(self) -> bool:
@@ -166,9 +180,9 @@ class Scene:
         return self.recording.read_labels is not None or self.recording.subtract_background
 
     def valid(self, cams, steps) -> Tensor | None:
-        """bool [len(steps), len(cams), H, W], pixels that were filmed: no padding, no border left by undistortion.
+        """bool [len(steps), len(cams), H, W], pixels that were recorded: no padding, no border of undistortion.
 
-        None where that is all of them.
+        None where all were.
         """
         steps, cams = self._numbers(cams, steps)
         full = all(self.recording.sizes[cam] == (self.width, self.height) for cam in cams)
@@ -217,7 +231,7 @@ class Scene:
         return steps, cams
 
     def _K(self, cam: int, step: int) -> np.ndarray:
-        return self.recording.Ks[step if len(self.recording.Ks) > 1 else 0, cam]
+        return self.recording.cameras_at_step(step)[1][cam]
 
     def with_images(self, read_images: ReadImages) -> Scene:
         """The scene with other images, of ``recorded_sizes``: they are fitted and undistorted as its own are."""
@@ -242,14 +256,14 @@ class Scene:
     def _subtracted(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
         width, height = self.recording.sizes[cam]
 
-        def film(wanted: Sequence[int]) -> np.ndarray:
+        def read(wanted: Sequence[int]) -> np.ndarray:
             return self._images.get(wanted, [cam])[:, 0, :height, :width]
 
         if cam not in self._medians:
-            self._medians[cam] = median_image(film, self.n_steps)
+            self._medians[cam] = median_image(read, self.n_steps)
         valid = self.valid([cam], [0])
         for step in steps:
-            labels = self._padded(foreground(film([step])[0], self._medians[cam]).astype(np.uint8) * MOVING)
+            labels = self._padded(foreground(read([step])[0], self._medians[cam]).astype(np.uint8) * MOVING)
             yield labels if valid is None else labels * valid[0, 0].numpy()
 
     def _padded(self, image: np.ndarray) -> np.ndarray:
@@ -269,7 +283,7 @@ def _depths(recording: Recording) -> tuple[float, float]:
     if depths is None:
         raise InputError(
             f"{recording.source}: near and far (metres) are needed: the cameras look at no common point that "
-            "would tell how far the scene is"
+            "would give the distance of the scene"
         )
     near, far = depths
     if not 0 < np.float32(near) < np.float32(far):  # as cameras hold them
