@@ -32,7 +32,13 @@ EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count(
 
 @dataclass(frozen=True)
 class SceneCheck:
-    """scene: None where it could not be opened.   problems: one line each, in the order in which they were found."""
+    """Result of reading everything in a scene folder.
+
+    Attributes:
+        path: folder.
+        scene: None where it could not be opened.
+        problems: one line each, in the order in which they were found.
+    """
 
     path: Path
     scene: Scene | None
@@ -40,7 +46,7 @@ class SceneCheck:
 
 
 def check_scene(folder: str | Path) -> SceneCheck:
-    """Reads everything in a scene folder, every image too, and collects what is wrong with it."""
+    """Everything that is wrong with a scene folder, of which every image is read."""
     path, problems = Path(folder), Problems(collect=True)
     recording = scene = None
     try:
@@ -84,54 +90,53 @@ def _check_labels(recording: Recording, problems: Problems) -> None:
 
 
 def _check_agreement(scene: Scene, problems: Problems) -> None:
-    """Moving bodies lie where the views of the cameras cross: wrong poses leave no such place."""
+    """Moving bodies lie where the views of the cameras cross: with wrong poses there is no such region."""
     if not scene.has_segmentation() or scene.n_cams < 2:
         return
     hulls = [moving_box(scene, step) for step in _spread(scene.n_steps, HULL_STEPS)]
     compared = [box for box, n_cams in hulls if n_cams > 1]
     if compared and all(box is None for box in compared):
         problems.add(
-            f"{scene.recording.source}: the bodies that move in the masks of the cameras are at no common place in "
-            "space: a pose, an intrinsic or the order of the cameras is wrong, or the bounds are (see the picture)"
+            f"{scene.recording.source}: the moving bodies in the masks of the cameras have no common position: a pose, "
+            "an intrinsic or the order of the cameras is wrong, or the bounds are (see the picture)"
         )
 
 
 def moving_box(scene: Scene, step: int) -> tuple[np.ndarray | None, int]:
-    """Box [2, 3] around the points that all cameras that see them see on a moving body, and how many cameras see one.
+    """Box [2, 3] around a step's moving bodies, and how many cameras see one.
 
-    None where there is no such point. Points are tried on a grid in the scene's bounds, those that most cameras see,
-    then on a finer one around those that were found; masks are widened by half a cell.
+    The box holds the points that lie on a moving body for all cameras that see them; None where there are none. Points
+    are tried on a grid in the scene's bounds, then on a finer one around those that were found; masks are widened by
+    half a cell.
     """
     labels = scene.segmentation(range(scene.n_cams), [step])[0].numpy()
     seeing = np.flatnonzero((labels == MOVING).any((1, 2)))
-    coarse = _common_place(scene, step, labels, seeing, scene.bounds) if len(seeing) else None
-    fine = None if coarse is None else _common_place(scene, step, labels, seeing, coarse)
+    coarse = _common_box(scene, step, labels, seeing, scene.bounds) if len(seeing) else None
+    fine = None if coarse is None else _common_box(scene, step, labels, seeing, coarse)
     return (coarse if fine is None else fine), len(seeing)
 
 
-def _common_place(
-    scene: Scene, step: int, labels: np.ndarray, seeing: np.ndarray, box: np.ndarray
-) -> np.ndarray | None:
+def _common_box(scene: Scene, step: int, labels: np.ndarray, seeing: np.ndarray, box: np.ndarray) -> np.ndarray | None:
     """Box around the grid points in ``box`` that lie on a moving body for the cameras ``seeing``."""
     import cv2
 
     recording = scene.recording
-    viewmats, Ks = (values[step if len(values) > 1 else 0] for values in (recording.viewmats, recording.Ks))
+    viewmats, Ks = recording.cameras_at_step(step)
     cell = (box[1] - box[0]) / (HULL_GRID - 1)
     points = box[0] + np.stack(np.meshgrid(*[np.arange(HULL_GRID)] * 3, indexing="ij"), -1).reshape(-1, 3) * cell
     inside, seen_by = np.ones(len(points), bool), np.zeros(len(points), int)
     for cam in seeing:
         pixels, depth = project(points, viewmats[cam], Ks[cam])
         width, height = recording.sizes[cam]
-        place = np.floor(pixels.clip(-1, MAX_COORDINATE)).astype(int)
-        seen = (depth > 0) & (place >= 0).all(1) & (place < [width, height]).all(1)
+        index = np.floor(pixels.clip(-1, MAX_COORDINATE)).astype(int)
+        seen = (depth > 0) & (index >= 0).all(1) & (index < [width, height]).all(1)
         if not seen.any():
             continue
         radius = int(np.ceil(Ks[cam, 0, 0] * np.linalg.norm(cell) / 2 / np.median(depth[seen])))
-        radius = min(radius, max(width, height))  # all of the image; calibration that is wrong asks for any
+        radius = min(radius, max(width, height))  # all of the image; wrong calibration gives any radius
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
         mask = cv2.dilate((labels[cam] == MOVING).astype(np.uint8), disc) > 0
-        inside[seen] &= mask[place[seen, 1], place[seen, 0]]
+        inside[seen] &= mask[index[seen, 1], index[seen, 0]]
         seen_by += seen
     body = points[inside & (seen_by >= max(1, 0.75 * len(seeing)))]
     return np.stack([body.min(0) - cell / 2, body.max(0) + cell / 2]) if len(body) else None
@@ -155,12 +160,14 @@ def describe(scene: Scene) -> str:
 
 
 def contact_sheet(scenes: Sequence[Scene]) -> np.ndarray:
-    """Frames of some cameras at some steps of some scenes, with what should lie in them drawn on top.
+    """Frames of some cameras at some steps of some scenes, with cameras, boxes and masks drawn on top.
 
-    Returns uint8 [H, W, 3], blue first.
-    The blue box is the scene's bounds, the orange one the place where all cameras see a moving body; the arrows are the
+    The blue box is the scene's bounds, the orange one is where all cameras see a moving body; the arrows are the
     world's x, y and z axes (red, green, blue) at the middle of the lower face of the bounds; magenta squares are the
     other cameras; the yellow line is the outline of what is not background.
+
+    Returns:
+        uint8 [H, W, 3], blue first.
     """
     shown = [scenes[i] for i in _spread(len(scenes), MAX_SCENES)]
     blocks = []
@@ -172,14 +179,16 @@ def contact_sheet(scenes: Sequence[Scene]) -> np.ndarray:
         blocks.append(_text(describe(scene)))
         for step in steps:
             body = _try(lambda: moving_box(scene, step)[0] if scene.has_segmentation() else None)
-            blocks.append(_row([_tile(scene, cam, step, tile_height, body) for cam in cams]))
+            blocks.append(_side_by_side([_tile(scene, cam, step, tile_height, body) for cam in cams]))
     legend = (
         "blue box: bounds of the scene; orange box: where all cameras see what moves; red, green, blue: x, y, z of the "
         "world; magenta: other cameras; yellow: masks"
     )
     blocks.append(_text(legend))
     width = max(block.shape[1] for block in blocks)
-    return np.concatenate([_widened(block, width) for block in blocks])
+    return np.concatenate(
+        [np.pad(block, ((0, 0), (0, width - block.shape[1]), (0, 0)), constant_values=255) for block in blocks]
+    )
 
 
 def _try(compute):
@@ -199,14 +208,13 @@ def _tile(scene: Scene, cam: int, step: int, tile_height: int, body: np.ndarray 
     width, height = scene.recording.sizes[cam]
     zoom = tile_height / height
     size = max(1, round(width * zoom)), tile_height
-    film = _try(
-        lambda: scene.recorded_images([cam], [step])[0, 0, :, :height, :width].permute(1, 2, 0).numpy()[..., ::-1]
-    )
-    if film is None:
+    image = _try(lambda: scene.recorded_images([cam], [step])[0, 0, :, :height, :width])
+    if image is None:
         tile = np.full((size[1], size[0], 3), MISSING, np.uint8)
         _write(tile, "unreadable", (8, tile_height // 2), INK)
     else:
-        tile = cv2.resize(film, size, interpolation=cv2.INTER_AREA if zoom < 1 else cv2.INTER_NEAREST)
+        how = cv2.INTER_AREA if zoom < 1 else cv2.INTER_NEAREST
+        tile = cv2.resize(image.permute(1, 2, 0).numpy()[..., ::-1], size, interpolation=how)
     labels = _try(lambda: scene.segmentation([cam], [step])[0, 0, :height, :width].numpy())
     if labels is not None:
         mask = cv2.resize((labels > 0).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
@@ -223,13 +231,11 @@ def _tile(scene: Scene, cam: int, step: int, tile_height: int, body: np.ndarray 
 def _draw_scene(tile: np.ndarray, scene: Scene, cam: int, step: int, zoom: float, body: np.ndarray | None) -> None:
     import cv2
 
-    recording = scene.recording
-    at = step if len(recording.viewmats) > 1 else 0
-    viewmat = recording.viewmats[at, cam]
-    K = np.diag([zoom, zoom, 1.0]) @ recording.Ks[step if len(recording.Ks) > 1 else 0, cam]
+    viewmats, Ks = scene.recording.cameras_at_step(step)
+    viewmat, K = viewmats[cam], np.diag([zoom, zoom, 1.0]) @ Ks[cam]
 
     def line(start: np.ndarray, end: np.ndarray, color: tuple, thickness: int) -> np.ndarray | None:
-        """Draws the part in front of the camera; returns where it ends."""
+        """Draws the part in front of the camera. Returns the pixel at which the line ends, None behind the camera."""
         pixels, depth = project(start + np.linspace(0, 1, EDGE_POINTS)[:, None] * (end - start), viewmat, K)
         pixels = pixels.clip(-MAX_COORDINATE, MAX_COORDINATE).round().astype(int)
         for i in np.flatnonzero((depth[:-1] > 1e-3) & (depth[1:] > 1e-3)):
@@ -247,7 +253,7 @@ def _draw_scene(tile: np.ndarray, scene: Scene, cam: int, step: int, zoom: float
         end = line(foot, foot + np.eye(3)[axis] * 0.3 * (high - low).min(), color, 2)
         if end is not None:
             _write(tile, name, (end + 2).tolist(), color)
-    centres, _ = positions_and_axes(recording.viewmats[at])
+    centres, _ = positions_and_axes(viewmats)
     pixels, depth = project(centres, viewmat, K)
     for other in np.flatnonzero(depth > 1e-3):
         x, y = pixels[other].clip(-MAX_COORDINATE, MAX_COORDINATE).round().astype(int).tolist()
@@ -256,16 +262,15 @@ def _draw_scene(tile: np.ndarray, scene: Scene, cam: int, step: int, zoom: float
             _write(tile, scene.camera_names[other][-12:], (x + 5, y + 4), CAMERA)
 
 
-def _write(image: np.ndarray, text: str, place: Sequence[int], color: tuple) -> None:
+def _write(image: np.ndarray, text: str, corner: Sequence[int], color: tuple) -> None:
     import cv2
 
-    cv2.putText(image, plain(text), tuple(place), cv2.FONT_HERSHEY_SIMPLEX, TEXT, color, 1, cv2.LINE_AA)
+    cv2.putText(image, plain(text), tuple(corner), cv2.FONT_HERSHEY_SIMPLEX, TEXT, color, 1, cv2.LINE_AA)
 
 
-def _row(tiles: list[np.ndarray]) -> np.ndarray:
-    gap = np.full((len(tiles[0]), GAP, 3), PAPER, np.uint8)
-    row = np.concatenate([part for tile in tiles for part in (gap, tile)][1:], 1)
-    return np.concatenate([row, np.full((GAP, row.shape[1], 3), PAPER, np.uint8)])
+def _side_by_side(tiles: list[np.ndarray]) -> np.ndarray:
+    padded = [np.pad(tile, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for tile in tiles]
+    return np.concatenate(padded, 1)[:, :-GAP]
 
 
 def _text(text: str) -> np.ndarray:
@@ -275,8 +280,3 @@ def _text(text: str) -> np.ndarray:
     line = np.full((LINE, width + 8, 3), PAPER, np.uint8)
     _write(line, text, (4, LINE - 7), INK)
     return line
-
-
-def _widened(block: np.ndarray, width: int) -> np.ndarray:
-    rest = np.full((block.shape[0], width - block.shape[1], 3), PAPER, np.uint8)
-    return np.concatenate([block, rest], 1)

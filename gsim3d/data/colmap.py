@@ -38,7 +38,7 @@ MODELS = (  # in the order of their numbers in binary files
 MAX_LINE, MAX_PATH = 1 << 25, 4096  # bytes of a line of text, and of the name of an image
 MAX_ENTRIES = 100_000
 MAX_POINTS, FEW_POINTS = 3_000_000, 20_000  # read, and projected
-MIN_SEEN = 8  # points; cameras that see fewer say nothing of depths
+MIN_SEEN = 8  # points; depths of cameras that see fewer are not used
 QUANTILES, MARGINS = (0.01, 0.99), (0.8, 1.2)  # of the depths of points
 QUATERNION_TOLERANCE = 1e-2
 

@@ -37,8 +37,8 @@ def split_scenes(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, l
 def published_split(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, list]:
     """(train, test) by the rule of the published evaluation, to compare with its numbers; not for other use.
 
-    Fewer than 15 scenes are tested on one, of which training has seen all; more than 15 may give more test scenes than
-    the fraction says (150 of 1200).
+    Of fewer than 15 scenes one is tested, which is also trained on; more than 15 may give more test scenes than the
+    fraction (150 of 1200).
     """
     if not 0 < test_fraction < 1:
         raise InputError(f"test_fraction must lie between 0 and 1; got {test_fraction}")
@@ -50,7 +50,7 @@ def published_split(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list
 
 
 def generator(seed: int, step: int, sample: int, purpose: str) -> np.random.Generator:
-    """Random numbers of one purpose of one sample of one step; they do not depend on what was drawn before."""
+    """A generator for one purpose of one sample of one step; it does not depend on what was drawn before."""
     return np.random.default_rng([seed, step, sample, zlib.crc32(purpose.encode())])
 
 
@@ -63,12 +63,14 @@ def make_frames(
     must ascend; ``cloud_step`` counts them from 0.
 
     Args:
+        scenes: one or more, with images of one size.
         cams_per_scene: for each scene its camera numbers, the same at every step, or one list a step.
         steps_per_scene: for each scene its step numbers.
         masked: also read the labels: masks = not background, dynamic = bodies that may move. Otherwise masks leave
-            out what was not filmed only (padding, borders of undistorted images).
+            out only what was not recorded (padding, borders of undistorted images).
 
-    Raises: InputError for missing files, numbers out of range, and scenes whose image sizes differ.
+    Raises:
+        InputError: missing files, numbers out of range, and scenes whose image sizes differ.
     """
     if not (len(scenes) == len(cams_per_scene) == len(steps_per_scene)) or not len(scenes):
         raise InputError(
@@ -109,15 +111,11 @@ def make_frames(
 
 
 def _join_valid(valid: list[Tensor | None], images: list[Tensor]) -> Tensor | None:
-    """bool [I, H, W], pixels that were filmed; None where that is all of them."""
-    if all(filmed is None for filmed in valid):
+    """bool [I, H, W], pixels that were recorded; None where all were."""
+    if all(one is None for one in valid):
         return None
-    joint = torch.cat(
-        [
-            torch.ones(stack[:, 0].shape, dtype=torch.bool) if filmed is None else filmed[0]
-            for filmed, stack in zip(valid, images)
-        ]
-    )
+    full = torch.ones(images[0][:, 0].shape[1:], dtype=torch.bool)
+    joint = torch.cat([full.expand(len(i), -1, -1) if v is None else v[0] for v, i in zip(valid, images)])
     return None if bool(joint.all()) else joint
 
 
@@ -155,7 +153,7 @@ class Window:
     """Consecutive steps of one scene: the first ``n_context`` are given, the rest is to be predicted.
 
     Attributes:
-        scene: whose steps.
+        scene: of the steps.
         start: number of the first step.
         n_context: given steps.
         context_cams: camera numbers for each given step.

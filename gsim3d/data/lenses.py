@@ -83,7 +83,7 @@ def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
 
 
 def _is_set(value) -> bool:
-    """Whether a value is more than 0, false, nothing or a word."""
+    """Whether a value is a number other than 0, or a list or object that holds one."""
     if isinstance(value, (list, dict)):
         return any(item not in (0, None) for item in (value.values() if isinstance(value, dict) else value))
     return isinstance(value, (int, float)) and value != 0

@@ -1,4 +1,4 @@
-"""Video files: frames counted by decoding, the times that stand in the file, and pixels."""
+"""Video files: frames counted by decoding, their times as stored in the file, and pixels."""
 
 from __future__ import annotations
 
@@ -27,8 +27,11 @@ EBML, SEGMENT = b"\x1aE\xdf\xa3", b"\x18S\x80g"
 class Video:
     """A video file. It is opened for each read and closed after it; frames are decoded from the first one on.
 
-    numbers: of its frames, from 0; none where there is a problem.    times: float64 [N], seconds.
-    rate: frames a second; None where they are not evenly spaced.    note: what is left out, "" where nothing is.
+    Attributes:
+        numbers: of its frames, from 0; none where there is a problem.
+        times: float64 [N], seconds.
+        rate: frames a second; None where they are not evenly spaced.
+        note: frames that are left out; "" where none are.
     """
 
     def __init__(self, file: Path, name: str, size: tuple[int, int], problems: Problems):
@@ -75,7 +78,12 @@ class Video:
 
 @dataclass(frozen=True)
 class _Scan:
-    """times: float64 [N] seconds, of all frames that can be decoded.   rate: as the header has it, may be nonsense."""
+    """Result of decoding a file.
+
+    Attributes:
+        times: float64 [N] seconds, of all frames that can be decoded.
+        rate: as the header has it; may be nonsense.
+    """
 
     times: np.ndarray
     rate: float
@@ -83,7 +91,16 @@ class _Scan:
 
 @lru_cache(maxsize=10_000)
 def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
-    """Decodes a file once. ``stamp``: changes with the file. Raises InputError with what is wrong, without its name."""
+    """Times of the frames of a file, which is decoded once.
+
+    Args:
+        file: path.
+        size: (width, height) that it must have.
+        stamp: changes with the file.
+
+    Raises:
+        InputError: what is wrong, without the name of the file.
+    """
     import cv2
 
     index = _index(file)
@@ -136,8 +153,10 @@ def _open(file: Path, what: str = ""):
 
 
 def _start(times: np.ndarray, marks: np.ndarray, rate: float) -> float:
-    """Seconds from the start of the container to the first frame: OpenCV counts ``times`` from that frame, and
-    reports its own time in ``marks``, rounded to whole frames of ``rate``."""
+    """Seconds from the start of the container to the first frame.
+
+    OpenCV counts ``times`` from that frame, and reports the container's time in ``marks``, in whole frames of ``rate``.
+    """
     if not 0 < rate < 1e6:
         return 0.0
     low, high = ((marks - 0.5) / rate - times).max(), ((marks + 0.5) / rate - times).min()
@@ -145,8 +164,11 @@ def _start(times: np.ndarray, marks: np.ndarray, rate: float) -> float:
 
 
 def _even_part(times: np.ndarray, header: float) -> tuple[int, float | None]:
-    """How many frames at the end lie apart, and the rate of the others. Editors that cut without encoding anew leave
-    such frames: those that were stored after them, and are shown before, are gone."""
+    """How many frames at the end lie apart, and the rate of the others.
+
+    Editors that cut without encoding anew leave such frames: those that were stored after them, and are shown before,
+    are gone.
+    """
     for cut in range(MAX_APART + 1 if len(times) > MIN_EVEN else 1):
         rate = _even_rate(times[: len(times) - cut], header)
         if rate is not None:
@@ -155,7 +177,7 @@ def _even_part(times: np.ndarray, header: float) -> tuple[int, float | None]:
 
 
 def _even_rate(times: np.ndarray, header: float) -> float | None:
-    """Frames a second, as the header says or as measured; None where neither fits."""
+    """Frames a second, of the header or as measured; None where neither fits."""
     header = header if 0 < header < 1e6 else None
     if len(times) == 1:
         return header or 1.0
@@ -168,10 +190,11 @@ def _even_rate(times: np.ndarray, header: float) -> float | None:
 
 @dataclass(frozen=True)
 class _Index:
-    """What OpenCV does not report of a file.
+    """Properties of a file that OpenCV does not report.
 
-    mirrored: the display matrix of an MP4 mirrors it.   duration: seconds of its video track with what was cut off by
-    edits left out; None where it is not known.
+    Attributes:
+        mirrored: the display matrix of an MP4 mirrors it.
+        duration: seconds of its video track without what edits cut off; None where it is not known.
     """
 
     mirrored: bool = False
@@ -179,7 +202,7 @@ class _Index:
 
 
 def _index(file: Path) -> _Index:
-    """Raises InputError where the container declares more bytes than the file has."""
+    """The index of a container. Raises InputError where it declares more bytes than the file has."""
     size = file.stat().st_size
     with open(file, "rb") as opened:
         start = opened.read(12)
@@ -195,14 +218,14 @@ def _index(file: Path) -> _Index:
             else:
                 return _Index()
         except (struct.error, IndexError, OverflowError):
-            return _Index()  # whether it can be read is for the decoder to say
+            return _Index()  # the decoder decides whether it can be read
     if end > size:
         raise InputError(f"cannot be decoded to its end: it has {size} of {end} bytes; it is cut off")
     return _Index()
 
 
 def _segment_end(file: BinaryIO) -> int:
-    """Where the segment of a Matroska or WebM file ends; 0 where it does not say so, as in live recordings."""
+    """The byte at which the segment of a Matroska or WebM file ends; 0 where it is not stored, as in live videos."""
 
     def number() -> int:
         first = file.read(1)[0]
@@ -220,7 +243,7 @@ def _segment_end(file: BinaryIO) -> int:
 
 
 def _mp4(file: BinaryIO, size: int) -> tuple[int, _Index]:
-    """Where the last box of an MP4 or MOV file ends, and what its video track says."""
+    """The byte at which the last box of an MP4 or MOV file ends, and the index of its video track."""
     end, index = 0, _Index()
     for kind, start, stop in _boxes(file, 0, size):
         if kind in (b"mdat", b"moov", b"moof"):
@@ -235,7 +258,7 @@ def _mp4(file: BinaryIO, size: int) -> tuple[int, _Index]:
 
 
 def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """(kind, where its content starts, where it ends) of the boxes between two offsets."""
+    """Kind, start and end of the content of each box between two offsets."""
     while start + 8 <= end:
         file.seek(start)
         length, kind = struct.unpack(">I4s", file.read(8))

@@ -191,7 +191,7 @@ def _masks(folder: Path, description: Description, sources: list[_Frames | Video
 
 
 def _frames_of(folder: Path, name: str, size: tuple[int, int], source: Path, problems: Problems) -> _Frames | Video:
-    """Where the frames of a camera come from; without any numbers where there is a problem."""
+    """The frames of a camera; without any numbers where there is a problem."""
     videos = [folder / f"{name}{suffix}" for suffix in VIDEO_SUFFIXES if (folder / f"{name}{suffix}").is_file()]
     frames = _Frames(folder, Path(name), name, size)
     if len(videos) == 1 and not (folder / name).is_dir():
@@ -208,7 +208,7 @@ def _frames_of(folder: Path, name: str, size: tuple[int, int], source: Path, pro
 def _steps(
     sources: dict[str, _Frames | Video], fps: float | None, resample: float | None, source: Path, problems: Problems
 ) -> tuple[list[list[int]], float, list[str]]:
-    """Frame numbers of every camera step by step, steps a second, notes: frames of all cameras that show one time."""
+    """Frames of all cameras that show one time: numbers of every camera step by step, steps a second, and notes."""
     videos = {name: frames for name, frames in sources.items() if isinstance(frames, Video) and frames.numbers}
     folders = {name: frames for name, frames in sources.items() if isinstance(frames, _Frames) and frames.numbers}
     if folders and fps is None:
@@ -259,7 +259,7 @@ def _steps(
 def _resampled(
     sources: dict[str, _Frames | Video], fps: float | None, rate: float, source: Path
 ) -> tuple[dict[str, list[int]], list[str]]:
-    """For every camera the frames nearest to steps at ``rate`` a second, from where all have one to where all end."""
+    """For every camera the frames nearest to steps at ``rate`` a second, over the time that all cameras recorded."""
     if not sources:
         raise InputError(f"{source}: the cameras have no frame in common")
     times = {}

@@ -132,17 +132,17 @@ def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         [N] index of the largest component, and [N, 3] the others, of the quaternions whose largest is positive.
     """
-    largest, rows = np.abs(quats).argmax(1), np.arange(len(quats))
-    signed = quats * np.where(quats[rows, largest] < 0, -1, 1)[:, None]
-    return largest.astype(np.uint32), np.stack([signed[rows, k + (k >= largest)] for k in range(3)], 1)
+    largest, index = np.abs(quats).argmax(1), np.arange(len(quats))
+    signed = quats * np.where(quats[index, largest] < 0, -1, 1)[:, None]
+    return largest.astype(np.uint32), np.stack([signed[index, k + (k >= largest)] for k in range(3)], 1)
 
 
 def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     """[N, 4] unit quaternions of what :func:`smallest_three` returned."""
-    largest, rows, quats = largest.astype(np.int64), np.arange(len(largest)), np.zeros((len(largest), 4))
+    largest, index, quats = largest.astype(np.int64), np.arange(len(largest)), np.zeros((len(largest), 4))
     for k in range(3):
-        quats[rows, k + (k >= largest)] = others[:, k]
-    quats[rows, largest] = np.sqrt(np.clip(1 - (quats**2).sum(1), 0, 1))
+        quats[index, k + (k >= largest)] = others[:, k]
+    quats[index, largest] = np.sqrt(np.clip(1 - (quats**2).sum(1), 0, 1))
     return quats
 
 

@@ -75,7 +75,7 @@ def write_splats(
     Args:
         path: ends in one of FORMATS.
         gaussians: packed frames, z up, metres; or a sequence of single frames for formats with time.
-        frame: of ``gaussians``; None: all rows as one frame (formats without time) or all frames.
+        frame: of ``gaussians``; None: all Gaussians as one frame (formats without time) or all frames.
         fps: frames a second, of formats with time.
         up: "y" or "z", the axis that points up in the file (default: as the format's readers expect).
     Raises:

@@ -30,11 +30,11 @@ def write(path: Path, splats: Splats) -> None:
     columns |= {_coefficient(k): splats.sh[:, k] for k in range(splats.sh.shape[1])}
     colors = np.concatenate([unorm(colors_of(splats), 8), unorm(splats.opacities, 8)[:, None]], 1)
     columns["COLOR_0"] = colors.astype(np.uint8)
-    views, accessors, attributes, parts, place = [], [], {}, [], 0
+    views, accessors, attributes, parts, begin = [], [], {}, [], 0
     for name, values in columns.items():
         is_float = values.dtype != np.uint8
         data = np.ascontiguousarray(values, "<f4" if is_float else "u1").tobytes()
-        views.append({"buffer": 0, "byteOffset": place, "byteLength": len(data), "target": 34962})
+        views.append({"buffer": 0, "byteOffset": begin, "byteLength": len(data), "target": 34962})
         attributes[name] = len(accessors)
         kind = "SCALAR" if values.shape[1] == 1 else f"VEC{values.shape[1]}"
         accessor = {"bufferView": len(accessors), "count": splats.count, "type": kind}
@@ -43,7 +43,7 @@ def write(path: Path, splats: Splats) -> None:
             accessor |= {"min": splats.means.min(0).tolist(), "max": splats.means.max(0).tolist()}
         accessors.append(accessor)
         parts.append(data)
-        place += len(data)
+        begin += len(data)
     how = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     how["sortingMethod"] = "cameraDistance"
     w, x, y, z = Z_TO_Y_UP
@@ -56,13 +56,13 @@ def write(path: Path, splats: Splats) -> None:
         "meshes": [{"primitives": [{"mode": POINTS, "attributes": attributes, "extensions": {EXTENSION: how}}]}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": place}],
+        "buffers": [{"byteLength": begin}],
     }
     if not splats.count:
         raise InputError(f"{path}: a glTF accessor needs one Gaussian at least; there is none")
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    data = b"".join(parts) + b"\0" * (-place % 4)
+    data = b"".join(parts) + b"\0" * (-begin % 4)
     total = 12 + 8 + len(text) + 8 + len(data)
     head = struct.pack("<III", MAGIC, 2, total) + struct.pack("<II", len(text), JSON_CHUNK)
     write_whole(path, head, text, struct.pack("<II", len(data), BIN_CHUNK), data)
@@ -135,16 +135,16 @@ def _accessor(path: Path, document: dict, data: bytes, index: int) -> np.ndarray
     packed = view.get("byteStride", 4 * channels) == 4 * channels
     if accessor["componentType"] != FLOAT or "sparse" in accessor or not packed:
         raise InputError(f"{path}: attributes must be packed floats to be read here")
-    count, place = accessor["count"], view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    if not all(type(value) is int and value >= 0 for value in (count, place)):
+    count, begin = accessor["count"], view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    if not all(type(value) is int and value >= 0 for value in (count, begin)):
         raise InputError(f"{path}: an accessor has a count or an offset that is none")
-    if view.get("buffer", 0) != 0 or place + 4 * channels * count > len(data):
+    if view.get("buffer", 0) != 0 or begin + 4 * channels * count > len(data):
         raise InputError(f"{path}: truncated: an accessor ends behind the file")
-    return np.frombuffer(data, "<f4", count * channels, place).reshape(count, channels)
+    return np.frombuffer(data, "<f4", count * channels, begin).reshape(count, channels)
 
 
 def _placed(path: Path, document: dict, mesh: int, splats: Splats) -> Splats:
-    """``splats`` as the node of the mesh places them: turned, scaled alike along all axes, moved."""
+    """``splats`` transformed by the node of its mesh: turned, scaled alike along all axes, moved."""
     node = next((node for node in document.get("nodes", ()) if node.get("mesh") == mesh), {})
     if "matrix" in node or any(mesh in other.get("children", ()) for other in document.get("nodes", ())):
         raise InputError(f"{path}: nodes with a matrix or a parent are not read; apply transforms before exporting")

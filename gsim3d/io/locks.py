@@ -27,8 +27,8 @@ def only_one_writer(out: Path, parts: range | None = None) -> Iterator[None]:
     Raises:
         InputError: another process writes there; the message has its number, if it locked the folder as a whole.
     """
-    place = out.resolve()
-    if place in _held:
+    folder = out.resolve()
+    if folder in _held:
         yield
         return
     # Each part is one byte of a file, which calls that lock all of it remove when they end.
@@ -50,12 +50,12 @@ def only_one_writer(out: Path, parts: range | None = None) -> Iterator[None]:
     os.ftruncate(handle, 0)
     if parts is None:
         os.write(handle, f"{os.getpid()} on {socket.gethostname()}\n".encode())
-        _held.add(place)
+        _held.add(folder)
     try:
         yield
     finally:
         if parts is None:
-            _held.discard(place)
+            _held.discard(folder)
             file.unlink(missing_ok=True)
         os.close(handle)
 

@@ -1,4 +1,4 @@
-"""A film of Gaussians from a camera that circles around them."""
+"""A video of Gaussians from a camera that circles around them."""
 
 from __future__ import annotations
 

@@ -69,8 +69,8 @@ def _read_gzip(path: Path, content: bytes) -> Splats:
         raise InputError(f"{path}: damaged: {error}") from None
     if len(body) < sum(sizes) or not stream.eof:
         raise InputError(f"{path}: truncated: {len(body)} bytes of {count} Gaussians; expected {sum(sizes)}")
-    places = np.cumsum([0, *sizes])
-    return _decoded(version, count, degree, bits, [body[a:b] for a, b in zip(places, places[1:])])
+    bounds = np.cumsum([0, *sizes])
+    return _decoded(version, count, degree, bits, [body[a:b] for a, b in zip(bounds, bounds[1:])])
 
 
 def _read_streams(path: Path, content: bytes) -> Splats:
@@ -88,19 +88,19 @@ def _read_streams(path: Path, content: bytes) -> Splats:
         import zstandard
     except ImportError:
         raise InputError(f"{path}: version 4 of .spz needs zstandard: pip install 'gsim3d[splats]'") from None
-    place, parts = table + n_streams * STREAMS.size, []
+    begin, parts = table + n_streams * STREAMS.size, []
     for index, size in zip(range(n_streams), expected + [0] * n_streams):
         packed, whole = STREAMS.unpack_from(content, table + index * STREAMS.size)
-        if whole != size or place + packed > len(content):
+        if whole != size or begin + packed > len(content):
             raise InputError(f"{path}: stream {index} has {whole} bytes; expected {size} within the file")
         try:
-            part = zstandard.ZstdDecompressor().decompressobj().decompress(content[place : place + packed])
+            part = zstandard.ZstdDecompressor().decompressobj().decompress(content[begin : begin + packed])
         except zstandard.ZstdError as error:
             raise InputError(f"{path}: stream {index} is damaged: {error}") from None
         if len(part) != size:
             raise InputError(f"{path}: stream {index} holds {len(part)} bytes; expected {size}")
         parts.append(part)
-        place += packed
+        begin += packed
     return _decoded(version, count, degree, bits, parts + [b""] * (6 - n_streams))
 
 

@@ -12,7 +12,7 @@ HIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066
 
 
 def plain(text: str) -> str:
-    """``text`` with escapes such as \\x1b in place of characters that are not shown, but change what is."""
+    """``text`` with escapes such as \\x1b for characters that are not shown, but change the text."""
     return HIDDEN.sub(lambda match: match[0].encode("unicode_escape", "surrogatepass").decode(), text)
 
 
@@ -51,7 +51,7 @@ class Terminal:
 
 
 def progress(iterable: Any = None, what: str = "", total: int | None = None, *, unit: str = "it", quiet: bool = False):
-    """A bar that shows how far something is and how long the rest takes; none where stderr is no terminal."""
+    """A progress bar with the time left; hidden where stderr is no terminal."""
     from tqdm import tqdm
 
     return tqdm(iterable, what, total, unit=unit, disable=True if quiet else None)

@@ -84,11 +84,11 @@ def _split(frames: Sequence[Splats]) -> list[tuple[str, list[Splats]]]:
             now, before = (getattr(one, name).reshape(first.count, -1) for one in (frame, first))
             still &= (now == before).all(1)
 
-    def rows(frame: Splats, chosen: np.ndarray) -> Splats:
+    def some(frame: Splats, chosen: np.ndarray) -> Splats:
         return Splats(*(getattr(frame, name)[chosen] for name in FIELDS))
 
-    parts = [("still", [rows(first, still)])] if still.any() else []
-    return parts + ([("moving", [rows(frame, ~still) for frame in frames])] if not still.all() else [])
+    parts = [("still", [some(first, still)])] if still.any() else []
+    return parts + ([("moving", [some(frame, ~still) for frame in frames])] if not still.all() else [])
 
 
 def _field(prim, frames: Sequence[Splats], Sdf, Vt) -> None:

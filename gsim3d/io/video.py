@@ -52,12 +52,12 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> N
 
 def _is_whole(path: Path) -> bool:
     """Whether the boxes of an MP4 file fill it, and its index is one of them."""
-    size, place, kinds = path.stat().st_size, 0, []
+    size, at, kinds = path.stat().st_size, 0, []
     with open(path, "rb") as file:
-        while place + 8 <= size:
-            file.seek(place)
+        while at + 8 <= size:
+            file.seek(at)
             length, kind = int.from_bytes(file.read(4)), file.read(4)
             length = int.from_bytes(file.read(8)) if length == 1 else length
-            place += max(8, length)
+            at += max(8, length)
             kinds.append(kind)
-    return place == size and b"moov" in kinds
+    return at == size and b"moov" in kinds

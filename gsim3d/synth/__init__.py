@@ -1,4 +1,4 @@
-"""Physics scenes filmed by many cameras: data to train and test a simulator on (MuJoCo moves, Embree draws)."""
+"""Physics scenes seen by many cameras: data to train and test a simulator on (MuJoCo moves, Embree draws)."""
 
 from gsim3d.synth.run import Report, generate
 from gsim3d.synth.worlds import HELD_OUT, PRESETS, WORLDS

@@ -161,17 +161,17 @@ def _truth(world: World, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     import cv2
 
     def read(kind: str, flag: int) -> np.ndarray:
-        rows = []
+        steps = []
         for step in range(GIVEN, world.n_frames):
-            row = []
+            images = []
             for cam in range(world.n_cams):
                 name = writer.FILE_TEMPLATE.format(cam_ix=cam, img_type=kind, n_step=step)
                 image = cv2.imread(opencv_path(folder / f"{name}.png"), flag)
                 if image is None or image.shape[:2] != (world.image_size, world.image_size):
                     raise InputError(f"{folder / name}.png cannot be read as an image of {world.image_size} pixels")
-                row.append(image)
-            rows.append(row)
-        return np.array(rows)
+                images.append(image)
+            steps.append(images)
+        return np.array(steps)
 
     labels = read("seg", cv2.IMREAD_GRAYSCALE)
     return read("rgb", cv2.IMREAD_COLOR)[..., ::-1], np.stack([labels != BACKGROUND, labels == BODY])
@@ -210,10 +210,10 @@ def _with_errors(actor: Actor, errors: StartErrors, fps: float, rng: np.random.G
         return ((points - centre)[:, None] * turn).sum(-1) + centre + shift
 
     if isinstance(body, SoftBody):
-        placed = {"vertices": moved(body.vertices)}
+        moved_body = {"vertices": moved(body.vertices)}
     else:
-        placed = {"parts": tuple(moved(part) for part in body.parts)}
-    body = dataclasses.replace(body, **placed, velocity=body.velocity + velocity * fps, spin=body.spin + spin)
+        moved_body = {"parts": tuple(moved(part) for part in body.parts)}
+    body = dataclasses.replace(body, **moved_body, velocity=body.velocity + velocity * fps, spin=body.spin + spin)
     return dataclasses.replace(actor, body=body, vertices=moved(actor.vertices))
 
 
@@ -241,9 +241,9 @@ def _squared_error(images: np.ndarray, true: np.ndarray, masks: np.ndarray) -> n
 def _summary(scenes: dict[tuple[str, int], np.ndarray], given: dict[str, float]) -> dict:
     """Means and standard errors of all scenes and of those of each object, and the value of each scene."""
     table: dict[str, dict[str, np.ndarray]] = {}  # "one", "mean_given" ... -> metric -> values of the scenes
-    for kind, rows in (("one", slice(0, SAMPLES)), ("mean", slice(SAMPLES, None))):
+    for kind, samples in (("one", slice(0, SAMPLES)), ("mean", slice(SAMPLES, None))):
         for column, metric in enumerate(METRICS):
-            errors = [some[rows, ..., column] for some in scenes.values()]
+            errors = [some[samples, ..., column] for some in scenes.values()]
             added = {kind: 0.0}
             if metric in given:
                 added[f"{kind}_given"] = 10 ** (-given[metric] / 10)
@@ -251,12 +251,16 @@ def _summary(scenes: dict[tuple[str, int], np.ndarray], given: dict[str, float])
                 table.setdefault(name, {})[metric] = np.array([_mean_psnr(error + more) for error in errors])
 
     def means(of: np.ndarray) -> dict:
-        return {kind: {m: _mean_and_error(values[of]) for m, values in row.items()} for kind, row in table.items()}
+        return {
+            kind: {m: _mean_and_error(values[of]) for m, values in metrics.items()} for kind, metrics in table.items()
+        }
 
     names = np.array([name for name, _ in scenes])
     by_scene = {
-        f"{name}/{sample:04d}": {kind: {m: float(v[place]) for m, v in row.items()} for kind, row in table.items()}
-        for place, (name, sample) in enumerate(scenes)
+        f"{name}/{sample:04d}": {
+            kind: {m: float(v[index]) for m, v in metrics.items()} for kind, metrics in table.items()
+        }
+        for index, (name, sample) in enumerate(scenes)
     }
     by_object = {str(name): means(names == name) for name in dict.fromkeys(names)}
     return {**means(np.ones(len(names), bool)), "objects": by_object, "scenes": by_scene}

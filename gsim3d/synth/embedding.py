@@ -95,9 +95,9 @@ class ClothGrid:
     def refine(self, times: int) -> Binding:
         """A grid ``times`` x finer, smooth and through all nodes (Catmull-Rom along both axes), row by row."""
         n = self.nodes.shape[1]
-        rows = _catmull_rom(n, times)
-        m = len(rows)
-        dense = np.einsum("ia,jb->ijab", rows, rows).reshape(m * m, n * n)
+        weights = _catmull_rom(n, times)
+        m = len(weights)
+        dense = np.einsum("ia,jb->ijab", weights, weights).reshape(m * m, n * n)
         corners = np.argsort(dense == 0, axis=1, kind="stable")[:, : int((dense != 0).sum(1).max())]
         return Binding(corners, np.take_along_axis(dense, corners, 1))
 

@@ -223,10 +223,10 @@ def _read_other(path: Path, data: bytes) -> list[Piece]:
         raise InputError(f"mesh {path} has colours, which are not read from STL files: save it as PLY or OBJ")
     try:
         scene = trimesh.load_scene(path, process=False)
-        placed = [(scene.graph[node][0], scene.geometry[scene.graph[node][1]]) for node in scene.graph.nodes_geometry]
+        nodes = [(scene.graph[node][0], scene.geometry[scene.graph[node][1]]) for node in scene.graph.nodes_geometry]
     except Exception as error:  # trimesh raises whatever its parsers raise
         raise InputError(f"mesh {path} cannot be read: {' '.join(str(error).split())[:200]}") from error
-    pieces = [_of_trimesh(mesh, place, path) for place, mesh in placed if isinstance(mesh, trimesh.Trimesh)]
+    pieces = [_of_trimesh(mesh, matrix, path) for matrix, mesh in nodes if isinstance(mesh, trimesh.Trimesh)]
     if kind == ".ply" and b"TextureFile" in start and any(piece.corners is None for piece in pieces):
         raise InputError(f"mesh {path} names a texture that is not beside it, or has no coordinates in it")
     return pieces
@@ -248,11 +248,11 @@ def _has_off_colours(data: bytes) -> bool:
         return False
 
 
-def _of_trimesh(mesh, place: np.ndarray, path: Path) -> Piece:
-    """``mesh`` moved by the matrix ``place`` [4, 4]."""
+def _of_trimesh(mesh, matrix: np.ndarray, path: Path) -> Piece:
+    """``mesh`` moved by the matrix ``matrix`` [4, 4]."""
     faces, vertices = np.asarray(mesh.faces, dtype=np.int64), np.asarray(mesh.vertices, dtype=np.float64)
-    if not np.array_equal(place, np.eye(4)):
-        vertices = vertices @ place[:3, :3].T + place[:3, 3]
+    if not np.array_equal(matrix, np.eye(4)):
+        vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
     if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
         raise InputError(f"mesh {path} cannot be read: a face names a vertex that it does not have")
     triangles = vertices[faces]

@@ -61,8 +61,8 @@ def write_player(
 
     Args:
         path: ends in .html.
-        frames: z up, metres: packed frames, or a sequence of single ones. Row n of one frame is row n of the next;
-            where frames have fewer rows than others, the rest is invisible.
+        frames: z up, metres: packed frames, or a sequence of single ones. Gaussian n of one frame is Gaussian n of
+            the next; where frames have fewer Gaussians than others, the rest is invisible.
         fps: frames a second.
         title: shown above the scene.
         view: the camera of the first look (default: one that sees all).
@@ -106,7 +106,7 @@ def _packed(path: Path, frames: Sequence[Splats]) -> tuple[dict, list[bytes]]:
     channels: dict[str, tuple[np.ndarray, float]] = {}
 
     def stacked(values: Sequence[np.ndarray], width: int, step: float, most: float) -> np.ndarray:
-        """int32 [frames, count, width]; rows that a frame lacks stay where they were, at 0 before."""
+        """int32 [frames, count, width]; Gaussians that a frame lacks keep their last values, 0 at first."""
         table = np.zeros((len(values), count, width), np.int32)
         for index, value in enumerate(values):
             if index:

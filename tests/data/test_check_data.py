@@ -121,7 +121,7 @@ def test_masks_of_other_places_have_nothing_in_common(tmp_path):
     made.labels[:, 1:] = 0
     made.labels[:, 1, :4, :4], made.labels[:, 2, -4:, -4:] = 3, 3
     (problem,) = check_scene(write_genesis(tmp_path / "scene", made)).problems
-    assert "no common place" in problem and "metadata.json" in problem
+    assert "no common position" in problem and "metadata.json" in problem
 
 
 def test_unreadable_frames_do_not_stop_the_sheet(tmp_path):
