@@ -97,7 +97,7 @@ class Trainer:
         self.same_scenes = True
         self._signals: list[int] = []
         self._stop: tuple[str, int] | None = None  # why, and the exit code
-        self._read = BatchReader(self._draw, config.n_steps)
+        self._read = BatchReader(lambda *given: self._draw(*given), config.n_steps)
         if checkpoint.exists(self.out):
             self._resume()
         self.log = Log(self.out, writes=self.processes.is_first)

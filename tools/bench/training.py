@@ -71,6 +71,7 @@ class SyntheticScene:
     path: str = "synthetic"
     n_steps: int = N_PAST + N_FUTURE
     n_cams: int = surface_scene.N_CAMS
+    fps: float = 24.0
 
     @property
     def width(self) -> int:
@@ -176,13 +177,13 @@ class Stages:
         self._end(simulator, "encode", "encode", lambda state: self._reached(state, "steps backward"))
         self._end(simulator, "rollout", "steps", lambda steps: self._reached(steps[-1], "images backward"))
         self._end(simulator, "render", "images")
-        look_at = trainer._look_at
+        check = trainer._check
 
         def after_gradients(*arguments):
             self.mark("encoder backward")
-            return look_at(*arguments)
+            return check(*arguments)
 
-        trainer._look_at = after_gradients
+        trainer._check = after_gradients
 
     def mark(self, name: str) -> None:
         event, gib = None, memory_gib(self._device)
