@@ -13,7 +13,6 @@ import pytest
 
 from gsim3d.cli.arguments import Parser
 from gsim3d.cli.main import COMMANDS
-from gsim3d.evaluate.ablations import load_ablations, rows_named
 from gsim3d.pretrained import located
 from gsim3d.synth.worlds import build_world
 
@@ -50,10 +49,7 @@ def assert_parses(arguments: list[str]) -> None:
     module.add_arguments(parser)
     args = parser.parsed(arguments[1:])
     if arguments[0] == "generate":
-        changes = {"subset": args.set} if args.set else {}
-        build_world(args.world, args.preset, changes)
-    if arguments[0] == "ablate" and args.rows:
-        rows_named(args.rows, load_ablations()[1])
+        build_world(args.world, args.preset, {})
     for word in arguments[1:]:
         if word.endswith("-small"):
             located(word)
