@@ -20,14 +20,11 @@ BANNED = re.compile(
 STORED = ("gsim3d/compat/", "gsim3d/pretrained/", "tools/release/state/", "tests/compat/", "tests/test_style.py")
 # Areas whose owners have not landed yet.
 PENDING = (
-    *("csrc/", "tools/"),
-    *(f"tests/{name}" for name in ("compat", "data", "dynamics", "evaluate", "io", "nn", "ops", "profile", "train")),
+    *("csrc/", "tools/bench/"),
+    *(f"tests/{name}" for name in ("compat", "data", "dynamics", "io", "nn", "ops", "profile")),
     *("tests/test_cuda_graphs.py", "tests/tolerances.py", "tests/synth", "tests/viewer"),
-    *(
-        f"gsim3d/{name}/"
-        for name in ("data", "dynamics", "io", "math", "nn", "ops", "profile", "synth", "train", "viewer")
-    ),
-    *("gsim3d/evaluate/", "gsim3d/cameras.py", "gsim3d/state.py", "gsim3d/presets.py", "gsim3d/simulator.py"),
+    *(f"gsim3d/{name}/" for name in ("data", "dynamics", "io", "math", "nn", "ops", "profile", "synth", "viewer")),
+    *("gsim3d/cameras.py", "gsim3d/state.py", "gsim3d/presets.py", "gsim3d/simulator.py"),
     *("gsim3d/cuda_graphs.py", "gsim3d/priors/"),
 )
 

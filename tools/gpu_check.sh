@@ -44,7 +44,7 @@ step() {
     0)
       echo "$KEY" >"$STATE/$name.done"
       say "$name: passed in $((SECONDS - started)) s; $(tail -n 1 "$STATE/$name.log")" ;;
-    130 | 143) say "$name: stopped after $((SECONDS - started)) s" ;;  # told to: SIGINT, SIGTERM
+    130 | 143) say "$name: stopped after $((SECONDS - started)) s" ;;  # by SIGINT, SIGTERM
     *)
       echo "$KEY" >"$STATE/$name.failed"
       say "$name: FAILED after $((SECONDS - started)) s; the end of $STATE/$name.log:"
@@ -172,7 +172,7 @@ run_bench() {
 
 stop() {
   local group
-  trap '' INT TERM  # told again, it would begin again
+  trap '' INT TERM  # a second signal would begin again
   for _ in 1 2 3 4 5; do  # a job that was just begun may miss the first
     for group in $(jobs -rp); do kill -- "-$group" 2>/dev/null; done
     [ -n "$(jobs -rp)" ] || break

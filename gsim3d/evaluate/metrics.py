@@ -52,7 +52,8 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
         float64 [I] in [-1, 1].
     Raises:
         InputError: shapes differ, or images are not in [0, 1] or too small.
-    Source: Wang et al. 2004, "Image quality assessment: from error visibility to structural similarity".
+    Source:
+        Wang et al. 2004, "Image quality assessment: from error visibility to structural similarity".
     """
     x, y = _checked(pred, target)
     size, radius = SSIM_WINDOW, SSIM_WINDOW // 2

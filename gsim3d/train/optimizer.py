@@ -130,7 +130,8 @@ def one_cycle(step: int, n_steps: int, peak: float, warm_up: float = 0.01) -> fl
     Args:
         step: from 0 to n_steps - 1.
         warm_up: share of the steps until the peak.
-    Source: Smith and Topin 2019, "Super-convergence".
+    Source:
+        Smith and Topin 2019, "Super-convergence".
     """
     start, end = peak / START_DIVISOR, peak / START_DIVISOR / END_DIVISOR
     turn = max(1.0, warm_up * n_steps - 1)

@@ -36,10 +36,13 @@ PRESETS = ("tiny", "small", "paper_latent", "paper_explicit")
 class Restored:
     """A trained simulator and what it was trained for.
 
-    data: which frames and views it saw.   image_size: (width, height) pixels.
-    plan: of the effects it was trained with.
-    checkpoint: where it came from.
-    fps: frames per second of the scenes it was trained on; None: the checkpoint does not say.
+    Attributes:
+        simulator: ready to predict.
+        data: which frames and views it saw.
+        image_size: (width, height) pixels.
+        plan: of the effects it was trained with.
+        checkpoint: where it came from.
+        fps: frames per second of the scenes it was trained on; None: the checkpoint does not say.
     """
 
     simulator: Simulator
@@ -91,11 +94,11 @@ class Restored:
         changes, (width, height) = [], self.image_size
         sizes = sorted(set(scene.recorded_sizes) - {self.image_size})
         if sizes and self.data.resize:
-            filmed = ", ".join(f"{w}x{h}" for w, h in sizes)
+            recorded = ", ".join(f"{w}x{h}" for w, h in sizes)
             areas = [w * h * max(width / w, height / h) ** 2 for w, h in sizes]
             lost = 0.0 if scene.fitting.whole else max(0.0, 1 - width * height / max(areas))
             cut = f", of which {lost:.0%} is cut off (--keep image keeps it)" if lost >= 0.005 else ""
-            changes.append(f"images of {filmed} pixels scaled to {width}x{height}{cut}")
+            changes.append(f"images of {recorded} pixels scaled to {width}x{height}{cut}")
         own = scene.own_depths
         if own is not None and (scene.near > own[0] or scene.far < own[1]):
             changes.append(

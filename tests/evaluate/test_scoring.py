@@ -74,7 +74,7 @@ def test_metrics_that_do_not_apply_are_reported(monkeypatch):
         "lpips_vgg": "ball/3 has images of 14x10 pixels; it needs 16",
         "fvd": "it needs 10 predicted steps; ball/3 has 3",
     }
-    summary = summarize([judge.score([("model", film(height=10))])], {"psnr": "nobody wanted it"})
+    summary = summarize([judge.score([("model", film(height=10))])], {"psnr": "not wanted"})
     assert "future.psnr" not in summary and len(notes(summary)) == len(METRICS)
     assert "PSNR masked: not measured: ball/3 has no segmentation" in table(summary)
     assert "FVD: not measured: it needs 10 predicted steps" in markdown(summary, "data")

@@ -43,7 +43,7 @@ MOVING = dataclasses.replace(
     model={"dynamics": {"motion_length": 0.3}},
     effects={"appearance": {"changing": "frozen"}},
 )
-RELIT = dataclasses.replace(
+RELIGHTABLE = dataclasses.replace(
     MOVING,
     model={
         "dynamics": {
@@ -57,10 +57,10 @@ RELIT = dataclasses.replace(
     },
 )
 FLYING = dataclasses.replace(
-    RELIT,
+    RELIGHTABLE,
     model={
         "dynamics": {
-            **RELIT.model["dynamics"], "deformation": True, "surfaces": True, "gravity": (0.0, 0.0, -0.005),
+            **RELIGHTABLE.model["dynamics"], "deformation": True, "surfaces": True, "gravity": (0.0, 0.0, -0.005),
             "pushes": True,
         }
     },
@@ -75,7 +75,7 @@ KINDS = {
     "latent": CONFIG,
     "all moving": ALL_MOVING,
     "moving": MOVING,
-    "relit": RELIT,
+    "relightable": RELIGHTABLE,
     "flying": FLYING,
     "moving, masked": changed(MOVING, ROWS["background-masked"].change),
     **{name: changed(CONFIG, ROWS[name].change) for name in ("explicit", "background-masked")},
@@ -127,10 +127,10 @@ def run(captured, batch, trainer, report=None, factor=1.0):
         ({"horizon": 3, "cut": 2}, "moving"),
         ({}, "moving, masked"),
         ({}, "all moving"),
-        ({"horizon": 3, "cut": 2}, "relit"),
+        ({"horizon": 3, "cut": 2}, "relightable"),
         ({"horizon": 3, "cut": 2}, "flying"),
     ],
-    ids=["rollout", "encoded", "explicit", "masked", "moving", "moving, masked", "all moving", "relit", "flying"],
+    ids=["rollout", "encoded", "explicit", "masked", "moving", "moving, masked", "all moving", "relightable", "flying"],
     indirect=["trainer"],
 )
 def test_captured_gradients_equal_autograd(phase, scenes, trainer, device):
@@ -205,7 +205,7 @@ def full_gpu(monkeypatch):
     return fill
 
 
-@pytest.mark.parametrize("trainer", ["latent", "relit"], indirect=True)
+@pytest.mark.parametrize("trainer", ["latent", "relightable"], indirect=True)
 def test_graphs_that_share_memory_do_not_change_each_other(scenes, trainer, full_gpu, device):
     if device.type != "cuda":
         pytest.skip("graphs need a GPU")
@@ -277,7 +277,8 @@ class Ops(TorchDispatchMode):
 
 
 @pytest.mark.parametrize(
-    "row", ["latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relit", "flying"]
+    "row",
+    ["latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relightable", "flying"],
 )
 def test_captured_ops_have_fixed_sizes(row, scenes, tmp_path):
     config = KINDS[row] if row in KINDS else changed(CONFIG, ROWS[row].change)

